@@ -1,40 +1,40 @@
-"""The service: a door with the socket, a process that filters, a keeper of both.
+"""The service: a front end with the socket, render workers, and a supervisor.
 
-launch          starting: signals, the line that says it is ready
-keeper          the supervisor: starts the processes, restarts those that end
-child           what those processes have in common
-devices         what filters side by side, as the settings name it
-door_process    the process of the door
-door            its loop: sessions, credit, answers while a frame is filtered
+launch          startup: signals, ready message
+keeper          supervisor: starts the processes and restarts those that end
+child           startup code shared by these processes
+devices         names of the devices that filter
+door_process    main program of the front end
+door            event loop of the front end: messages, frames, rate limits
 mailbox         the ROUTER socket
-listening       the socket that it listens on
-authenticator   the ZAP handler: numbers connections, checks their keys
-connections     open connections, with a limit to their number
-descriptors     file descriptors: the limit, and a reserve
-dropped_parts   the rest of a message that has too many parts
-rate_limit      how many messages a connection may send
-served_devices  the devices as the door knows them
-load            how busy one was of late
+listening       the listening socket
+authenticator   ZAP handler: numbers connections and checks their keys
+connections     open connections, limited in number
+descriptors     file descriptors: limit and reserve
+dropped_parts   removal of surplus message parts
+rate_limit      rate limits of a connection
+served_devices  the devices as the front end sees them
+load            recent load of a device
 metrics         counters for Prometheus
-asking          a question to a running service
-reception       who comes and who goes
-guests          all sessions, with a client or without
-session         one client: its waiting frame, its credit, its profiles
-sharing         memory that clients share
-frame_desk      frames on their way, and their answers
-places          whether a frame's images lie where they may
-render_end      the door's end of what follows
-turns           whose frame is next: fair queuing
-render_process  the process that filters
-render_loop     its loop
-session_eyes    a filter for each eye of a session
-frame_reply     a frame and its answer
-frame_in_slots  with its images in shared memory
+asking          status query to a running service
+reception       start, resumption and end of sessions; their profiles
+guests          all sessions, with or without a client
+session         state of one client: waiting frame, credit, profiles
+sharing         shared memory of clients
+frame_desk      queue of frames and their replies
+places          validation of a frame's positions in shared memory
+render_end      render client: the front end's link to a render worker
+turns           fair queuing of frames
+render_process  main program of a render worker
+render_loop     event loop of a render worker
+session_eyes    one filter for each eye of a session
+frame_reply     the reply to a frame
+frame_in_slots  the same with images in shared memory
 link            messages between the processes
-config          the settings file
-process_info    version and memory
+config          settings file
+process_info    version and memory of the process
 
-`ocufilter.service` is a unit for systemd.
+`ocufilter.service` is a systemd unit.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Asks a running service how it is, as anybody may who can connect."""
+"""Status query to a running service, open to every client that can connect."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from filter_service.messages import Ping, Pong, decode_reply, encode
 def ask_status(
     endpoint: str, *, key_file: Path | None = None, timeout_s: float = 3.0
 ) -> dict[str, Any]:
-    """Return what a service answers to ping.
+    """Ping a service and return the fields of its reply.
 
     Raises
     ------
     ServiceTimeout
-        It does not answer.
+        If the service does not answer in time.
     ValueError
-        An endpoint or a key file that is none.
+        If the endpoint or the key file is invalid.
     """
     key = None if key_file is None else load_client_key(key_file)
     context = zmq.Context()

@@ -19,22 +19,22 @@ log = logging.getLogger("ocufilter")
 
 
 class Authenticator:
-    """Gives every connection a number, and lets in only those with an allowed key.
+    """ZAP handler that numbers connections and admits only those with an allowed key.
 
     Parameters
     ----------
     context : zmq.Context
-        Of the socket to guard, which must be bound after this is made.
+        Context of the guarded socket, which must be bound after this handler exists.
     keys : KeyRing, optional
-        Without it every connection is let in.
+        Allowed keys; if None, every connection is admitted.
     before_numbering : callable
-        Called when a connection has asked and has no number yet: what the socket's
-        monitor has reported by then includes that it was accepted.
+        Called when a connection has sent its request and has no number yet; by then
+        the socket's monitor has reported that the connection was accepted.
 
     Attributes
     ----------
     next_number : int
-        Of the next connection that is let in.
+        Number of the next connection that is admitted.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class Authenticator:
         self.socket.bind(ENDPOINT)
 
     def guard(self, socket: zmq.Socket[bytes]) -> None:
-        """Have libzmq ask about each connection of a socket before it is bound."""
+        """Enable authentication on a socket that is not bound yet."""
         socket.zap_domain = DOMAIN
         if self._keys is not None:
             pair = self._keys.server
@@ -59,7 +59,7 @@ class Authenticator:
             socket.curve_publickey = pair.public.encode()
 
     def answer(self) -> None:
-        """Answer the requests that wait."""
+        """Answer pending requests."""
         for _ in range(MAX_REQUESTS_PER_TURN):
             try:
                 request = self.socket.recv_multipart(zmq.NOBLOCK)
@@ -69,7 +69,7 @@ class Authenticator:
             self.socket.send_multipart(self._reply(request))
 
     def lets_in(self, key: str) -> bool:
-        """Return whether a client's public key is allowed now."""
+        """Return whether a client's public key is currently allowed."""
         return self._keys is None or key in self._keys.allowed()
 
     def _reply(self, request: list[bytes]) -> list[bytes]:
@@ -94,6 +94,6 @@ class Authenticator:
 
 
 def connection_of(user_id: str) -> tuple[int, str]:
-    """Return the number and the key of a connection from its ``User-Id``."""
+    """Return a connection's number and key, parsed from its ``User-Id``."""
     number, _, key = user_id.partition(" ")
     return int(number), key

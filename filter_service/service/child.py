@@ -1,4 +1,4 @@
-"""What the processes of the service have in common when they start."""
+"""Startup code shared by the processes of the service."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ PR_SET_PDEATHSIG = 1
 
 
 def begin(name: str) -> tuple[Link, ServiceConfig, list[tuple[Any, list[int]]]]:
-    """Return the link to the keeper, the settings, and what was said besides.
+    """Return the link to the supervisor, the settings, and any further messages.
 
-    The descriptor of the link is the first argument of the program.
+    The first argument of the program is the descriptor of the link.
     """
     _end_with_parent()
-    # Ctrl-C goes to the whole group; the keeper ends its processes in its own time.
+    # Ctrl-C goes to the whole process group; the supervisor stops its processes itself.
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     start_log(name)
@@ -33,11 +33,11 @@ def begin(name: str) -> tuple[Link, ServiceConfig, list[tuple[Any, list[int]]]]:
 
 
 def _end_with_parent() -> None:
-    """Have this process killed when the one that started it dies (Linux)."""
+    """Make the kernel kill this process when its parent dies (Linux)."""
     parent = os.getppid()
     try:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     except (OSError, AttributeError):
-        return  # the end of the link says so, too
+        return  # the closed link ends the process, too
     if os.getppid() != parent:
         sys.exit(1)

@@ -1,4 +1,4 @@
-"""The service's settings, read once from TOML and command line, and checked once."""
+"""Settings of the service, read from a TOML file and the command line."""
 
 from __future__ import annotations
 
@@ -22,88 +22,85 @@ MB = 10**6
 
 @dataclass(frozen=True)
 class ServiceConfig:
-    """Everything a user may set.
+    """Settings of the service.
 
     Attributes
     ----------
     bind : str
-        Where to listen: ``tcp://127.0.0.1:5577``, port ``*`` for any free one, or
-        ``ipc://`` and a path.
+        Endpoint to listen on: ``tcp://127.0.0.1:5577``, port ``*`` for any free port,
+        or ``ipc://`` and a path.
     keys_dir : str
-        Folder of keys, as ``ocufilter keys`` makes it: only clients whose keys are in
-        it are let in, and what travels is encrypted.  Needed for any other interface
-        than loopback; with it no memory is shared.
+        Folder of keys, created by ``ocufilter keys``: only clients whose keys are in it
+        are admitted, and traffic is encrypted.  Required for any interface but
+        loopback; disables shared memory.
     credit : int
-        Unanswered frames a client may have.
+        Unanswered frames that a client may have.
     max_sessions : int
-        Clients served at once.
+        Maximum number of clients served at once.
     max_width_px, max_height_px, max_views, max_part_mb, max_profile_kb : int
         Limits of one message; published in ``welcome``.
     max_blur_radius_px : int
-        A profile that needs a wider kernel is refused.
+        Largest kernel radius; a profile that needs a wider kernel is refused.
     max_store_mb : int
-        A profile that needs more memory for its PSFs is refused.
+        Memory for the PSFs of one profile; a profile that needs more is refused.
     max_stores_mb : int
-        What the PSFs of all clients may take together: those that no frame has used
-        for longest make room, and are prepared again when they are wanted.  Of several
-        devices each has so much.
+        Memory for the PSFs of all clients, on each device.  Beyond it, the least
+        recently used PSFs are evicted and computed again when a frame needs them.
     engine : "auto", "gl" or "native"
-        What filters frames: a GPU's compute shaders, or compiled loops on all cores.
-        "auto" takes gl on a hardware GPU, else native.
+        Engine that filters frames: compute shaders on a GPU, or compiled loops on all
+        cores.  "auto" selects gl on a hardware GPU, otherwise native.
     gl_device : str
-        The EGL device that OpenGL works on, by its index, which asks for the engine gl;
-        "auto": the first that works, hardware before software.
+        Index of the EGL device for OpenGL; an index selects the engine gl.  "auto" is
+        the first device that works, hardware before software.
     devices : tuple of str
-        What filters side by side, a process for each behind the one socket: up to eight
-        of ``native``, ``native:THREADS``, ``gl``, ``gl:INDEX`` and ``auto``, as in
-        ``devices = ["gl:0", "gl:1"]``.  A session is on the one that was least busy at
-        its beginning; a device that cannot be started again is given up.  Empty: one
-        process, as ``engine`` and ``gl_device`` say.
+        Devices that filter, each in a process of its own behind the one socket: up to
+        eight of ``native``, ``native:THREADS``, ``gl``, ``gl:INDEX`` and ``auto``, as
+        in ``devices = ["gl:0", "gl:1"]``.  A new session is assigned to the least busy
+        device; a device that cannot be restarted is given up.  Empty: one process, set
+        by ``engine`` and ``gl_device``.
     max_cameras : int
         Cameras that one session keeps prepared.
     store_cache_dir : str
-        Where estimated eyes and the nodes of their PSFs are kept for the next time.
-        ``""`` keeps none, which is so unless ``$OCUFILTER_CACHE_DIR`` names a folder.
+        Cache folder for estimated eyes and the nodes of their PSFs.  ``""``, the
+        default unless ``$OCUFILTER_CACHE_DIR`` names a folder, disables the cache.
     store_cache_max_mb : int
-        What that folder may hold; those unused for longest go.
+        Maximum size of that folder; the least recently used entries are evicted.
     threads : int
-        Of everything that is computed on the processor; 0 takes the cores that this
-        process may use, capped by a container's quota.  Several devices share them,
-        those apart that name a number of their own.
+        CPU threads; 0 uses the cores available to this process, capped by a container's
+        quota.  Devices share them, except those that specify a number of their own.
     build_niceness : int
-        Of the process that estimates eyes, beside those that filter.
+        Niceness of the process that estimates eyes beside the render workers.
     cancel_grace_s : float
-        A build that does not stop within this time is stopped by force.
+        Time after which a canceled build that is still running is killed.
     build_limit_s : float
-        The longest that a profile's build may take.
+        Maximum duration of a profile's build.
     alive_interval_s : float
-        How often clients are probed; who is gone is found out then.
+        Interval between ``alive`` messages, which detect vanished clients.
     session_keep_s : float
-        How long a client that is gone may come back to its session.
+        Time within which a disconnected client may resume its session.
     frame_limit_s : float
-        The longest that filtering one frame, or anything else in the process that does
-        it, may take: then it is taken for hung, and started again.
+        Maximum time for filtering one frame, or for anything else in a render worker;
+        a worker that takes longer is considered hung and restarted.
     give_up_after_s : float
-        End with an error where a process of the service has ended again and again for
-        so long; 0: never.  The service restarts it after pauses of up to a minute.
+        Time after which the service ends with an error if one of its processes keeps
+        ending; 0: never.  The process is restarted after pauses of up to a minute.
     standby : bool
-        A second process that filters stands by: after a fault of the first, frames go
-        on a second sooner.  It takes some hundred megabytes, for each of several
-        devices.
+        Keep a second render worker on standby for each device: after a fault of the
+        first, frames resume a second sooner.  It takes some hundred megabytes.
     max_image_mb : int
-        Images of all frames and results that the service holds; of several devices each
-        has an equal part.
+        Memory for the images of all frames and results, divided equally among the
+        devices.
     shared_memory : bool
-        Offer memory that images lie in to clients of this user on this machine.
+        Offer shared memory for images to clients of the same user on this machine.
     max_socket_mb : int
-        Memory of the process that owns the socket, incomplete messages included:
-        beyond it that process is started again.
+        Memory limit of the process that owns the socket, incomplete messages included;
+        the process is restarted beyond it.
     log_format : "text" or "json"
-        Lines for people, or one JSON object a line.
+        Format of the log: plain text, or one JSON object per line.
     metrics_port : int
-        Port of 127.0.0.1 for counters in Prometheus' format; 0 for none.
+        Port on 127.0.0.1 for metrics in the Prometheus format; 0 disables them.
     ready_file : Path, optional
-        Written with the bound endpoint once the service is ready; removed at its end.
+        File that holds the bound endpoint while the service is ready.
     """
 
     bind: str = DEFAULT_ENDPOINT
@@ -141,7 +138,7 @@ class ServiceConfig:
     ready_file: Path | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot work, naming the setting."""
+        """Raise ValueError, with the name of the setting, for invalid values."""
         _check_bind(self.bind, has_keys=bool(self.keys_dir))
         for name, allowed in (
             ("engine", ENGINES),
@@ -160,11 +157,11 @@ class ServiceConfig:
 
     @property
     def device_names(self) -> tuple[str, ...]:
-        """Return what the devices are called: that of one alone after its engine."""
+        """Return the names of the devices; a single one is named after its engine."""
         return self.devices or (self.engine,)
 
     def of_device(self, index: int) -> ServiceConfig:
-        """Return the settings of one device's process: of one alone the same."""
+        """Return the settings for one device's process."""
         if not self.devices:
             return self
         device = device_named(self.devices[index])
@@ -190,7 +187,7 @@ class ServiceConfig:
 
     @property
     def build_limits(self) -> BuildLimits:
-        """Return what every build has to keep to."""
+        """Return the limits of every build."""
         return BuildLimits(
             max_blur_radius_px=self.max_blur_radius_px,
             max_store_mb=self.max_store_mb,
@@ -201,7 +198,7 @@ class ServiceConfig:
 
     @property
     def max_message_part_bytes(self) -> int:
-        """Return the size beyond which libzmq cuts a client off."""
+        """Return the part size beyond which libzmq disconnects a client."""
         limits = self.limits
         return max(limits.max_part_bytes, limits.max_profile_bytes)
 
@@ -237,8 +234,8 @@ CHANGEABLE = (
     *("credit", "max_sessions", "max_width_px", "max_height_px"),
     *("alive_interval_s", "session_keep_s", "frame_limit_s", "give_up_after_s"),
 )
-"""What a running service takes from the file at SIGHUP; of a session those of its
-beginning hold where it was told of them."""
+"""Settings that a running service reads again at SIGHUP.  A session keeps the values
+that it was told at its start."""
 
 
 REMOVED = {"psf_engine": "PSFs are computed on the processor, in C"}
@@ -247,13 +244,13 @@ REMOVED = {"psf_engine": "PSFs are computed on the processor, in C"}
 def changed_while_running(
     config: ServiceConfig, wanted: ServiceConfig
 ) -> tuple[ServiceConfig, list[str], list[str]]:
-    """Return the settings with those of others that may change while a service runs.
+    """Apply the wanted settings that may change while a service runs.
 
     Returns
     -------
     config : ServiceConfig
     changed, others : list of str
-        Names of settings that are others now, and of those that would have to be.
+        Names of the settings that changed, and of those that require a restart.
     """
     differing = [
         field.name
@@ -293,14 +290,14 @@ def _check_bind(bind: object, *, has_keys: bool) -> None:
 
 
 def load_config(path: Path | str | None = None, **overrides: Any) -> ServiceConfig:
-    """Return the settings of a TOML file, with overrides that are not None on top.
+    """Read settings from a TOML file, overridden by arguments that are not None.
 
     Raises
     ------
     ValueError
-        Unknown setting, wrong type or value out of range; the text names it.
+        For an unknown setting, a wrong type or a value out of range, which is named.
     OSError
-        The file cannot be read.
+        If the file cannot be read.
     """
     settings: dict[str, Any] = {}
     if path is not None:
@@ -313,7 +310,7 @@ def load_config(path: Path | str | None = None, **overrides: Any) -> ServiceConf
 
 
 def _words(name: str, value: object) -> tuple[str, ...]:
-    """Return words that stand in a list, or between commas."""
+    """Return the words of a list, or of a comma-separated text."""
     words = [w.strip() for w in value.split(",")] if isinstance(value, str) else value
     if isinstance(words, list | tuple) and all(type(word) is str for word in words):
         return tuple(words)
@@ -321,7 +318,7 @@ def _words(name: str, value: object) -> tuple[str, ...]:
 
 
 def _typed(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings with the types of their fields."""
+    """Convert settings to the types of their fields."""
     defaults = {field.name: field.default for field in fields(ServiceConfig)}
     for name in REMOVED.keys() & settings.keys():
         raise ValueError(f"{name} was removed: {REMOVED[name]}; delete the setting")

@@ -1,9 +1,9 @@
-"""The connections of the ROUTER socket, as its monitor and its messages show them.
+"""The connections of the ROUTER socket, tracked by its monitor and its messages.
 
-libzmq neither limits connections nor says which routing id is behind which of them.
-Here each has a number that no other ever has: the authenticator hands it out, and
-libzmq attaches it to every message (`User-Id`).  Sessions belong to that number, not to
-a routing id, which a client chooses itself.
+libzmq neither limits connections nor reports which connection has which routing id.
+The authenticator therefore assigns each connection a unique number, which libzmq
+attaches to every message (`User-Id`).  Sessions belong to that number, not to a routing
+id, which a client chooses itself.
 """
 
 from __future__ import annotations
@@ -22,36 +22,36 @@ from filter_service.log_lines import ONCE_A_SECOND
 from filter_service.service.rate_limit import RateLimit
 
 MAX_UNREAD_BYTES = 262_144
-"""What a connection without a session may send without a whole message: it has nothing
-large to say.  libzmq keeps what is incomplete, and shows it to nobody."""
+"""Bytes that a connection without a session may send without completing a message.  It
+needs no large ones, and libzmq buffers incomplete messages without exposing them."""
 
 CHECK_INTERVAL_S = 0.01
 MAX_CHECKED = 64
-"""Connections looked at in one interval, 0.006 ms each."""
+"""Connections checked per interval, 0.006 ms each."""
 
 GREETING_BYTES = 64
-"""Of ZMTP: what a client of ZeroMQ sends before anything else."""
+"""Size of the ZMTP greeting, which a ZeroMQ client sends first."""
 
 TCP_INFO_BYTES = 136
 BYTES_RECEIVED = struct.Struct("=Q")
 BYTES_RECEIVED_AT = 128
-"""Place of `tcpi_bytes_received` in Linux's ``struct tcp_info``."""
+"""Offset of `tcpi_bytes_received` in Linux's ``struct tcp_info``."""
 
 log = logging.getLogger("ocufilter")
 
 
 @dataclass(frozen=True)
 class Peer:
-    """Where a message came from, and where its answer goes.
+    """The sender of a message, to which its reply goes.
 
     Attributes
     ----------
     routing_id : bytes
-        The address of answers.  Two connections may have the same one in turn.
+        Address of replies.  Successive connections may use the same one.
     connection : int
-        Number of the connection, unique while the process lives.
+        Number of the connection, unique in this process.
     key : str
-        The client's public CURVE key; empty where the service has no keys.
+        The client's public CURVE key; empty if the service has no keys.
     """
 
     routing_id: bytes
@@ -66,13 +66,13 @@ class Connection:
     Attributes
     ----------
     descriptor, inode : int
-        The inode tells whether the descriptor is still this connection's.
+        The inode shows whether the descriptor is still this connection's.
     address : str
-        Of the other side; clients of a Unix socket are told apart by process.
+        Address of the client; for a Unix socket, its process.
     first_number : int
-        The connection's number is this one or a later one.
+        Lower bound of the connection's number.
     number : int, optional
-        Known from its first message on.
+        Number of the connection, known from its first message on.
     """
 
     descriptor: int
@@ -82,25 +82,25 @@ class Connection:
     number: int | None = None
     is_ended: bool = False
     has_had_session: bool = False
-    counted_bytes: int | None = None  # received, when its last message was complete
+    counted_bytes: int | None = None  # received when its last message was complete
     rates: RateLimit = field(default_factory=RateLimit)
 
 
 class Connections:
-    """All connections, with a limit to their number.
+    """All connections, limited in number.
 
-    Where too many are open, the oldest ones without a session are closed, those first
-    that have not sent a greeting, and of the address that has most of them.  A client
-    says hello within milliseconds of connecting, so others keep it out seldom.
+    When too many are open, the oldest ones without a session are closed: first those
+    that have not sent a greeting, from the address that has most of them.  A client
+    sends hello within milliseconds of connecting, so it is rarely crowded out.
 
     Parameters
     ----------
     max_count : int
     with_session : collection of int
-        Numbers of the connections that have a session now.
+        Numbers of the connections that have a session now (a live view).
     family : socket.AddressFamily
-        Of all of them.  To ask the system each time took a third of the whole cost of a
-        connection.
+        Address family of all connections.  Querying it each time took a third of the
+        total cost of a connection.
 
     Attributes
     ----------
@@ -119,30 +119,30 @@ class Connections:
         self._with_session = with_session
         self._open: dict[int, Connection] = {}  # by descriptor, oldest first
         self._numbered: dict[int, Connection] = {}
-        # By address and descriptor, oldest first: those that have not been seen to have
-        # sent a greeting, and the others.
+        # By address and descriptor, oldest first: connections without a known greeting,
+        # and the others.
         self._silent: dict[str, dict[int, Connection]] = {}
         self._greeted: dict[str, dict[int, Connection]] = {}
         self._next_check_s = 0.0
         self._to_check: list[Connection] = []
-        self._n_ending = 0  # shut down, and not reported as ended yet
+        self._n_ending = 0  # shut down, not yet reported as ended
 
     def __len__(self) -> int:
         """Return the number of open connections."""
         return len(self._open)
 
     def add(self, descriptor: int, next_number: int) -> None:
-        """Note that libzmq has accepted a connection.
+        """Record a connection that libzmq has accepted.
 
         Parameters
         ----------
         next_number : int
-            What the authenticator hands out next; this connection's comes from there.
+            Next number of the authenticator; the connection's number is not lower.
         """
         try:
             inode = os.fstat(descriptor).st_ino
             address = self._address(descriptor)
-        except OSError:  # closed already; its end is reported next
+        except OSError:  # already closed; the monitor reports its end next
             return
         self.remove(descriptor)
         connection = Connection(descriptor, inode, address, next_number)
@@ -150,7 +150,7 @@ class Connections:
         self._silent.setdefault(address, {})[descriptor] = connection
 
     def remove(self, descriptor: int) -> int | None:
-        """Note that a connection has ended; return its number if it has one."""
+        """Remove a connection that has ended; return its number if it has one."""
         connection = self._open.pop(descriptor, None)
         if connection is None:
             return None
@@ -168,13 +168,13 @@ class Connections:
                 groups.pop(connection.address, None)
 
     def of_message(self, number: int, descriptor: int) -> Connection | None:
-        """Return the connection of a message; None where it has ended meanwhile.
+        """Return the connection of a message; None if it has ended since.
 
         Parameters
         ----------
         number, descriptor : int
-            As libzmq attached them to the message.  By now another connection may
-            have the descriptor: its number is a later one.
+            As attached to the message by libzmq.  Another connection, with a higher
+            number, may have the descriptor by now.
         """
         found = self._numbered.get(number)
         if found is None:
@@ -187,25 +187,25 @@ class Connections:
         return None if found.is_ended else found
 
     def is_open(self, number: int) -> bool:
-        """Return whether a connection that has sent a message is still there."""
+        """Return whether a connection that has sent a message is still open."""
         found = self._numbered.get(number)
         return found is not None and not found.is_ended
 
     def note_refusal(self, number: int) -> None:
-        """Count a message that another process found wrong."""
+        """Count a message that another process refused."""
         found = self._numbered.get(number)
         if found is not None:
             found.rates.note_refusal()
 
     def close(self, number: int, why: str) -> None:
-        """End a connection that misbehaves."""
+        """Close a connection that violates the protocol."""
         found = self._numbered.get(number)
         if found is not None and not found.is_ended:
             self._shut_down(found)
             log.warning("a connection from %s is closed: %s", found.address, why)
 
     def evict(self) -> None:
-        """Close connections without a session where there are too many."""
+        """Close surplus connections that have no session."""
         n_surplus = len(self._open) - self._n_ending - self.max_count
         if n_surplus <= 0:
             return
@@ -220,7 +220,7 @@ class Connections:
         )
 
     def _evict_silent(self) -> bool:
-        """Close the oldest one without a greeting; return whether there was one."""
+        """Close the oldest connection without a greeting; return whether any was."""
         while self._silent:
             address = max(self._silent, key=lambda a: len(self._silent[a]))
             connection = next(iter(self._silent[address].values()))
@@ -233,7 +233,7 @@ class Connections:
         return False
 
     def _evict_greeted(self) -> bool:
-        """Close the oldest one with a greeting, and without a session; likewise."""
+        """Close the oldest one with a greeting but no session; return likewise."""
         by_size = sorted(self._greeted.values(), key=len, reverse=True)
         for connection in chain.from_iterable(group.values() for group in by_size):
             if connection.number not in self._with_session:
@@ -242,7 +242,7 @@ class Connections:
         return False
 
     def check_unread(self, now_s: float) -> None:
-        """Close connections that fill libzmq's memory before they say hello."""
+        """Close connections that fill libzmq's memory before they send hello."""
         if now_s < self._next_check_s:
             return
         self._next_check_s = now_s + CHECK_INTERVAL_S
@@ -265,7 +265,7 @@ class Connections:
                 )
 
     def _shut_down(self, connection: Connection) -> None:
-        """Have libzmq find the connection ended; it closes the descriptor itself."""
+        """Shut a connection down; libzmq then closes the descriptor itself."""
         connection.is_ended = True
         self._n_ending += 1
         self._forget_candidate(connection)
@@ -276,7 +276,7 @@ class Connections:
             end.detach()
 
     def _bytes_received(self, connection: Connection) -> int:
-        """Return what the system has received on a TCP connection; 0 for others."""
+        """Return the bytes received on a TCP connection; 0 for other kinds."""
         end = self._borrowed(connection)
         if end is None:
             return 0
@@ -289,19 +289,19 @@ class Connections:
             end.detach()
 
     def _borrowed(self, connection: Connection) -> socket.socket | None:
-        """Return libzmq's socket, to be detached; None where it is another's by now."""
+        """Return libzmq's socket, to be detached; None if the descriptor was reused."""
         try:
             if os.fstat(connection.descriptor).st_ino != connection.inode:
                 return None
             return self._socket_at(connection.descriptor)
-        except OSError:  # libzmq closes it at any time
+        except OSError:  # libzmq may close it at any time
             return None
 
     def _socket_at(self, descriptor: int) -> socket.socket:
         return socket.socket(self._family, socket.SOCK_STREAM, 0, fileno=descriptor)
 
     def _address(self, descriptor: int) -> str:
-        """Return who is at the other end of a connection."""
+        """Return the address or process of the peer."""
         end = self._socket_at(descriptor)
         try:
             if self._family != socket.AF_UNIX:

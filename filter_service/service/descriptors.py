@@ -1,8 +1,8 @@
-"""File descriptors of the front end: a limit for connections, a reserve for itself.
+"""File descriptors of the front end: a limit for connections and a reserve.
 
-libzmq accepts connections until the process has no descriptor left.  The soft limit of
-this process therefore stands below what it may have: memory for images and links to
-new processes are opened while the limit is raised for a moment.
+libzmq accepts connections until the process runs out of descriptors.  The soft limit is
+therefore kept below the maximum, and raised briefly to open shared memory and links to
+new processes.
 """
 
 from __future__ import annotations
@@ -14,37 +14,37 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 WANTED = 4096
-"""Descriptors to ask for where the hard limit allows more than the soft one."""
+"""Descriptors to request if the hard limit exceeds the soft one."""
 
 RESERVE = 32
-"""Only the front end itself opens these."""
+"""Descriptors that only the front end itself may open."""
 
 BASE = 96
-"""The reserve, and what is open before the first client connects (30 of them)."""
+"""The reserve, plus the descriptors open before the first client connects (30)."""
 
 OUT_OF_RESOURCES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
-"""What the system says where descriptors or kernel memory are used up."""
+"""Errors of the system when descriptors or kernel memory are exhausted."""
 
 
 class DescriptorLimit:
-    """The descriptors that this process may have.
+    """Limit of the descriptors of this process.
 
     Parameters
     ----------
     max_sessions : int
-        Clients that must be served: two descriptors each.
+        Clients that must be served, with two descriptors each.
 
     Attributes
     ----------
     max_connections : int
-        Clients that may be connected at once, with a session or without.
+        Maximum number of simultaneous connections, with or without a session.
     max_slots : int
-        Pieces of shared memory that may be open at once.
+        Maximum number of open shared-memory slots.
 
     Raises
     ------
     OSError
-        The hard limit is too low to serve that many.
+        If the hard limit is too low for that many sessions.
     """
 
     def __init__(self, max_sessions: int) -> None:
@@ -68,7 +68,7 @@ class DescriptorLimit:
 
     @contextmanager
     def reserve(self) -> Iterator[None]:
-        """Let this process open descriptors that no connection can take."""
+        """Raise the limit by the reserve while the block runs."""
         self._set(self._most)
         try:
             yield

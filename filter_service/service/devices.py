@@ -1,8 +1,8 @@
-"""The devices that filter, as the settings name them: a process for each.
+"""Names of the devices that filter, each in a process of its own.
 
 ``native`` and ``native:2`` are the compiled loops, with a share of all threads or with
-so many; ``gl`` and ``gl:1`` are OpenGL on the first EGL device that works, or on that
-one; ``auto`` is what one process alone would take.
+the given number; ``gl`` and ``gl:1`` are OpenGL on the first EGL device that works, or
+on the given one; ``auto`` is the default choice of a single process.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ ALLOWED = (
 
 @dataclass(frozen=True)
 class Device:
-    """What one process filters with.
+    """Engine and resources of one render worker.
 
     Attributes
     ----------
     engine, gl_device : str
-        As the settings of these names.
+        See the settings of the same names.
     threads : int, optional
-        None: a share of all.
+        Number of threads; None: a share of all threads.
     """
 
     engine: str
@@ -37,7 +37,7 @@ class Device:
 
 
 def device_named(text: str) -> Device:
-    """Return what a name says.
+    """Parse the name of a device.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def device_named(text: str) -> Device:
 
 
 def check_devices(names: tuple[str, ...], *, engine: str, gl_device: str) -> None:
-    """Refuse devices that cannot be, and engines told twice.
+    """Check the names of devices, and that no other setting selects an engine.
 
     Raises
     ------

@@ -1,10 +1,11 @@
-"""The door: the process that owns the socket, the sessions and their credit.
+"""The front end: the process that owns the socket, the sessions and their credit.
 
-It checks every message, answers what it can by itself, and hands frames and profiles
-to a render loop over a link, one at a time, or a small one beside a large one: the
-newest frame of each client, clients by time used.  Where several devices filter, each
-has such a loop, and a session is on one of them.  Images go through shared memory.  It
-renders nothing, so that it answers while a frame is rendered, however long that takes.
+It validates every message, answers what it can itself, and passes frames and profiles
+to a render worker over a link.  The worker filters one frame at a time, or a small one
+during a large one: the newest frame of each client, scheduled by the time that clients
+have used.  Each device has a worker of its own, and a session is on one device.  Images
+travel in shared memory.  The front end renders nothing, so it answers while a frame is
+rendered, however long that takes.
 """
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ from filter_service.service.session import Session, SessionRecord
 from filter_service.service.sharing import MAX_PARTS_PER_VIEW, Sharing
 from filter_service.wire.message import Message
 
-MAX_MESSAGES_PER_TURN = 64  # a client that floods must not keep others waiting
-MAX_PARTS_LEFT_OUT = 1000  # a message with more of them was never meant to be one
+MAX_MESSAGES_PER_TURN = 64  # a flooding client must not delay the others
+MAX_PARTS_LEFT_OUT = 1000  # more surplus parts are no accident
 IDLE_WAIT_S = 1.0
 TRIM_INTERVAL_S = 10.0
 CLOSING_LINGER_MS = 200
@@ -74,13 +75,13 @@ log = logging.getLogger("ocufilter")
 
 
 class Door:
-    """Sessions behind one ROUTER socket.
+    """The front end: serves sessions behind one ROUTER socket.
 
     Parameters
     ----------
     config : ServiceConfig
     keeper : Link
-        To the process that started this one.
+        Link to the supervisor.
     """
 
     def __init__(self, config: ServiceConfig, keeper: Link) -> None:
@@ -124,7 +125,7 @@ class Door:
             serve_metrics(config.metrics_port, self.metrics)
 
     def metrics(self) -> dict[str, float]:
-        """Return the values of `METRICS`; another thread asks."""
+        """Return the values of `METRICS`; called from another thread."""
         desks = [device.frames for device in self._devices]
         return {
             "ocufilter_ready": float(self._devices.are_ready),
@@ -153,10 +154,10 @@ class Door:
     def _frames_of(self, session: Session) -> FrameDesk:
         return self._devices.of(session).frames
 
-    # The loop
+    # Event loop
 
     def run(self) -> None:
-        """Serve until the keeper says so, or is gone."""
+        """Serve until the supervisor sends stop or is gone."""
         try:
             while self._turn():
                 pass
@@ -166,13 +167,13 @@ class Door:
             self._close()
 
     def _listen_to_keeper(self) -> bool:
-        """Do what the keeper says; return whether to go on."""
-        with self._descriptors.reserve():  # links to new processes come this way
+        """Handle the supervisor's messages; return whether to go on."""
+        with self._descriptors.reserve():  # may receive links to new processes
             messages = self._keeper.receive()
         return all([self.take_control(*message) for message in messages])
 
     def take_control(self, message: tuple[Any, ...], descriptors: list[int]) -> bool:
-        """Do what the keeper says; return whether to go on."""
+        """Handle a message of the supervisor; return whether to go on."""
         if message[0] == "link":
             device = self._devices[message[1]]
             device.frames.lose_held()
@@ -191,7 +192,7 @@ class Door:
         return bool(message[0] != "stop")
 
     def _turn(self) -> bool:
-        """Handle what has come; return whether to go on."""
+        """Run one iteration of the event loop; return whether to go on."""
         readable, writable = self._devices.descriptors()
         readable = readable | {self._keeper.fileno()}
         if self._keeper.has_unsent:
@@ -199,7 +200,7 @@ class Door:
         self._mailbox.watch(readable, writable)
         self._mailbox.wait(self._wait_s())
         self._keeper.flush()
-        # Before clients, whose answers must not lag behind what the keeper has said.
+        # Before clients, so that replies reflect the supervisor's latest messages.
         if not self._listen_to_keeper():
             return False
         for device in self._devices:
@@ -230,7 +231,7 @@ class Door:
         self._mailbox.close(linger_ms=CLOSING_LINGER_MS)
 
     def _tidy(self) -> None:
-        """Do what is due now and then."""
+        """Run periodic tasks."""
         now_s = time.monotonic()
         for device in self._devices:
             device.frames.tidy()
@@ -250,7 +251,7 @@ class Door:
             device.render.excuse()
             self._keeper.send(("hung", device.index))
 
-    # The render loops
+    # Render workers
 
     def _listen_to(self, device: ServedDevice) -> None:
         try:
@@ -267,7 +268,7 @@ class Door:
             device.frames.lose_held()
 
     def _pass_on(self, key: str, eye: EyeName, reply: Reply) -> None:
-        """Tell a client what became of its profile; a wrong one counts against it."""
+        """Pass a reply about a profile to its client; count a refusal."""
         session = self._guests.by_key(key)
         if session is not None and session.peer is not None:
             if isinstance(reply, ErrorReply) and reply.code != BuildCancelled.code:
@@ -281,7 +282,7 @@ class Door:
         eyes: list[tuple[Any, ...]],
         may_rest: bool,
     ) -> None:
-        """Learn which eyes there are; bring both sides to the same sessions."""
+        """Synchronize the sessions with those of a new render worker."""
         device.server, device.render.may_rest = server, may_rest
         self._reception.meet(device, eyes)
         device.render.is_ready = True
@@ -289,7 +290,7 @@ class Door:
         self._reception.greet_who_waits()
 
     def _give_up(self, device: ServedDevice) -> None:
-        """End the sessions of a device that is gone; they begin anew on another."""
+        """End the sessions of a lost device; new ones start on other devices."""
         device.give_up()
         device.frames.lose_held()
         self._reception.give_up(device)
@@ -297,10 +298,10 @@ class Door:
     # Messages
 
     def _take_in_messages(self) -> None:
-        """Handle what waits.
+        """Handle pending messages.
 
-        Answers to frames are sent only afterwards: a client that keeps to its credit
-        then never seems to exceed it, however fast it reacts to an answer.
+        Superseded frames are answered only afterwards.  A client that keeps to its
+        credit then never appears to exceed it, however fast it reacts to a reply.
         """
         superseded: list[tuple[Session, Frame]] = []
         for _ in range(MAX_MESSAGES_PER_TURN):
@@ -315,7 +316,7 @@ class Door:
                 continue
             try:
                 self._take_in(received, superseded)
-            except Exception:  # whatever it is, other clients shall not notice
+            except Exception:  # must not affect other clients
                 self._n_faults += 1
                 log.exception("fault %d: a refusal failed", self._n_faults)
                 self._reception.end_session(received.peer)
@@ -324,9 +325,9 @@ class Door:
             self._frames_of(session).answer(session, frame, dropped)
 
     def _is_heard(self, received: Received) -> bool:
-        """Return whether a message is handled; a flood of them ends its connection."""
+        """Return whether to handle a message; close connections that send too many."""
         if received.connection is None:
-            # Its client is gone: it wants nothing more than to say so.
+            # Its client is gone, so only a bye still matters.
             if is_bye(received.parts):
                 self._reception.end_session(received.peer)
             return False
@@ -370,7 +371,7 @@ class Door:
             received.connection.rates.note_request()
 
     def _refuse(self, received: Received, error: Exception) -> None:
-        """Tell a client what is wrong with its message; the service lives on."""
+        """Answer a message with an error; the service continues."""
         if received.connection is not None:
             received.connection.rates.note_refusal()
         if not isinstance(error, FilterError):
@@ -399,7 +400,7 @@ class Door:
             self._sharing.unshare(self._reception.session_at(peer), request)
 
     def _turn_out(self, refused: Refused) -> None:
-        """End the session of a client whose key was taken from the list."""
+        """End the session of a client whose key was removed."""
         log.warning("a client's key is not allowed any more")
         self._reception.end_session(refused.peer)
         error = NotAllowed(str(refused))
@@ -424,29 +425,29 @@ class Door:
         )
 
     def _record(self, key: str, record: SessionRecord | None) -> None:
-        """Have the keeper keep a session, for the front end after this one."""
-        with suppress(LinkClosed):  # this process ends then
+        """Store a session with the supervisor, for the front end after a restart."""
+        with suppress(LinkClosed):  # this process then ends
             self._keeper.send(("session", key, record))
 
     def _send(self, peer: Peer, reply: Reply) -> Tracker | None:
-        """Send a reply; a client that does not read loses session and connection."""
+        """Send a reply; end session and connection of a client that does not read."""
         outcome, tracker = self._mailbox.send(peer, encode(reply))
         if outcome is Outcome.GONE:
             self._reception.leave(peer)
         elif outcome is Outcome.STALLED:
-            # Each further reply would be waited for.
+            # Every further reply would block, too.
             self._connections.close(peer.connection, "it does not read")
             self._reception.end_session(peer, outcome)
         return tracker
 
 
 def _checked_keys(folder: str) -> KeyRing | None:
-    """Return the keys of a service that has some.
+    """Return the keys of a folder; None without a folder.
 
     Raises
     ------
     OSError
-        The folder cannot be used as it is.
+        If the folder is not usable.
     """
     if not folder:
         return None

@@ -1,4 +1,4 @@
-"""The process of the door: ``python -m`` this, with the descriptor of a link."""
+"""Main program of the front end; run with ``python -m`` and the link's descriptor."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ log = logging.getLogger("ocufilter")
 
 
 def main() -> None:
-    """Serve clients until the keeper says so."""
+    """Serve clients until the supervisor sends stop."""
     keeper, config, others = begin("door")
-    # Of parts of messages that are not complete yet nothing is seen here.  Beyond the
-    # limit libzmq ends the process, whose memory is then free; sessions go on.
+    # Parts of incomplete messages are invisible here.  Beyond the limit libzmq ends the
+    # process, which frees its memory; sessions continue.
     limit = config.max_socket_mb * MB
     try:
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))

@@ -1,8 +1,8 @@
-"""Drops the parts of a message that has too many of them.
+"""Removal of the surplus parts of a message that has too many.
 
-A message of six million one-byte parts fits into 18 MB.  Taken from the socket one by
-one in Python they cost 5.9 s, in which no other message is received; the compiled loop
-takes 0.3 s (`drop_parts.c`).
+A message of six million one-byte parts fits into 18 MB.  Reading them from the socket
+one by one takes 5.9 s in Python, during which no other message is received, and 0.3 s
+in the compiled loop (`drop_parts.c`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ CALLS = ("init", "recv", "more", "close")
 
 
 class _ZmqCalls(ctypes.Structure):
-    """Addresses of libzmq's functions, as `drop_parts.c` calls them."""
+    """Addresses of the libzmq functions that `drop_parts.c` calls."""
 
     _fields_ = tuple(
         (name, ctypes.c_void_p) for name in ("init", "recv", "more", "close")
@@ -28,21 +28,21 @@ class _ZmqCalls(ctypes.Structure):
 
 
 def drop_parts(socket: zmq.Socket[Any], max_count: int) -> tuple[int, bool]:
-    """Drop parts of the message that is being received.
+    """Drop the next parts of the message that is being received.
 
     Parameters
     ----------
     socket : zmq.Socket
-        In the middle of a message: its last part had `more` set.
+        Socket in the middle of a message: the last part received had `more` set.
     max_count : int
-        Stop after so many.
+        Maximum number of parts to drop.
 
     Returns
     -------
     count : int
-        Parts that were dropped.
+        Number of dropped parts.
     has_more : bool
-        The message has further ones.
+        Whether the message has further parts.
     """
     loop = _compiled()
     if loop is None:
@@ -57,7 +57,7 @@ def drop_parts(socket: zmq.Socket[Any], max_count: int) -> tuple[int, bool]:
 
 
 def drop_parts_in_python(socket: zmq.Socket[Any], max_count: int) -> tuple[int, bool]:
-    """Do the same as `drop_parts` without the compiled loop."""
+    """Do the same as `drop_parts`, without the compiled loop."""
     receive = socket.recv
     for count in range(1, max_count + 1):
         if not receive(copy=False).more:
@@ -67,14 +67,14 @@ def drop_parts_in_python(socket: zmq.Socket[Any], max_count: int) -> tuple[int, 
 
 @cache
 def _compiled() -> tuple[ctypes.CDLL, _ZmqCalls] | None:
-    """Return the compiled loop and libzmq's functions; None where they are missing."""
+    """Return the compiled loop and libzmq's functions; None if either is missing."""
     folder = Path(__file__).parent
     found = (folder / f"{STEM}{suffix}" for suffix in EXTENSION_SUFFIXES)
     path = next((path for path in found if path.is_file()), None)
     try:
         from zmq.backend.cython import _zmq
 
-        # Functions of the libzmq that this extension is linked with.
+        # The libzmq that pyzmq's extension is linked with.
         libzmq = ctypes.CDLL(_zmq.__file__)
         calls = _ZmqCalls(
             *(

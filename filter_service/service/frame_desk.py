@@ -1,7 +1,6 @@
-"""Frames on their way: from a client's newest to the render loop, and its answer back.
+"""Queue of frames: from the clients to the render worker, and the replies back.
 
-Every frame is answered once; which is next is a matter of the time that its client has
-used.
+Every frame is answered once.  The order depends on the time that each client has used.
 """
 
 from __future__ import annotations
@@ -20,33 +19,33 @@ from filter_service.service.render_end import Held, RenderEnd, Unsent, completed
 from filter_service.service.session import Session, WaitingFrame
 from filter_service.service.turns import Turns
 
-MAX_UNSENT_RESULTS = 4  # large replies a client has not taken; bounds memory
+MAX_UNSENT_RESULTS = 4  # large replies that a client has not read; bounds memory
 MARK_SENT_S = 0.03  # less than most frames take to filter
 SOON_S = 0.002
 RETRY_AFTER_MS = 100.0
-"""A first guess of when a preview is there."""
+"""Delay after which a client may retry a dropped frame."""
 
 Answer = Result | Dropped | ErrorReply
 
 
 class FrameDesk:
-    """Takes frames in, hands them over, and passes the answers on.
+    """Queues frames of one device, passes them to its worker and returns the replies.
 
     Parameters
     ----------
     sessions : callable
-        Returns those that have a client and live on its device.
+        Returns the sessions on this device that have a client.
     render : RenderEnd
     send : callable
-        ``send(peer, reply)`` returns what tracks a large one.
+        ``send(peer, reply)`` returns the tracker of a large reply.
 
     Attributes
     ----------
     n_rendered, n_dropped : int
     filtered_s : float
-        What filtering has taken in all.
+        Total time spent filtering.
     load : Load
-        What it took of late.
+        Recent filtering time.
     """
 
     def __init__(
@@ -62,10 +61,10 @@ class FrameDesk:
         self._render = render
         self._send = send
         self._turns: Turns[str] = Turns()
-        self._leaving: Unsent = []  # results of clients that are gone
+        self._leaving: Unsent = []  # results sent to clients that are gone
 
     def wait_s(self, now_s: float) -> float | None:
-        """Return how soon a frame may be handed over; None where none waits."""
+        """Return the time until a frame may be handed over; None if no frame waits."""
         takeable = [s for s in self._sessions() if self._is_takeable(s)]
         if any(self._is_ready(session, now_s) for session in takeable):
             return 0.0
@@ -78,11 +77,11 @@ class FrameDesk:
         return not waits and not self._render.held
 
     def tidy(self) -> None:
-        """Take the memory back of what is sent by now."""
+        """Reclaim the memory of results that have been sent."""
         self._leaving = self._render.still_unsent(self._leaving)
 
     def leave(self, session: Session) -> None:
-        """Note that a client is gone; what it is being sent it may not take."""
+        """Handle a vanished client, which may never read the results being sent."""
         self._leaving += session.unsent
         session.unsent = []
 
@@ -93,7 +92,7 @@ class FrameDesk:
     def take_in(
         self, session: Session, frame: Frame, received_s: float
     ) -> Frame | None:
-        """Keep a frame as its client's newest; return the one that it supersedes."""
+        """Queue a frame as its client's newest; return the frame that it supersedes."""
         check_places(session, frame)
         waiting = WaitingFrame(frame, received_s, time.monotonic())
         superseded = session.take_in(waiting)
@@ -106,10 +105,10 @@ class FrameDesk:
         return waiting is not None and self._render.takes(session, waiting.frame)
 
     def _is_ready(self, session: Session, now_s: float) -> bool:
-        """Return whether a session's frame may be handed over, or be given up.
+        """Return whether to hand a session's frame over, or to drop it.
 
-        A thread of pyzmq's marks results as sent; it gets a moment before a client is
-        said not to read.
+        A pyzmq thread marks results as sent.  It is given a moment before the client
+        counts as a slow consumer.
         """
         session.unsent = self._render.still_unsent(session.unsent)
         if not self._is_behind(session):
@@ -120,7 +119,7 @@ class FrameDesk:
         return now_s - session.behind_since_s > MARK_SENT_S
 
     def _is_behind(self, session: Session) -> bool:
-        """Return whether a client has too much to read before it may have more."""
+        """Return whether a client has too many unread results to get another."""
         n_bytes = sum(slot.size_bytes for _, slot in session.unsent)
         return (
             len(session.unsent) >= MAX_UNSENT_RESULTS
@@ -128,7 +127,7 @@ class FrameDesk:
         )
 
     def hand_over_one(self) -> None:
-        """Hand over the frame whose turn it is, if one may be handed over."""
+        """Hand over the next frame by fair queuing, if any may be handed over."""
         now_s = time.monotonic()
         ready = {
             s.key: s
@@ -162,11 +161,11 @@ class FrameDesk:
         used_s: float,
         blocks_bytes: Sequence[int],
     ) -> None:
-        """Pass an answer of the render loop on to who asked."""
+        """Pass a reply of the render worker on to its client."""
         held = self._render.take_back(number)
         if held is None:
             return
-        # A frame that came between the parts of another kept nobody waiting.
+        # A frame filtered during another one delayed nobody.
         here_s = started_s if self._render.held else held.waiting.decoded_s
         self._turns.note(held.session.key, used_s, here_s, started_s, ended_s)
         self.filtered_s += used_s
@@ -188,7 +187,7 @@ class FrameDesk:
             held.session.unsent.append((tracker, result_slot))
 
     def _answer_held(self, held: Held, answer: Answer) -> Tracker | None:
-        """Answer a frame, if its client is where it was: else it counts it as lost."""
+        """Answer a frame if its client is still on the same connection."""
         if held.peer is None or held.session.peer != held.peer:
             return None
         return self.answer(held.session, held.waiting.frame, answer)
@@ -206,7 +205,7 @@ class FrameDesk:
         return self._send(session.peer, answer)
 
     def lose_waiting(self, session: Session) -> None:
-        """Answer the frame of a session that can be handed over no more."""
+        """Answer a session's waiting frame with an error: its device is gone."""
         waiting, session.waiting = session.waiting, None
         if waiting is not None:
             error = RenderFailed("the device that filtered frames is gone")
@@ -215,7 +214,7 @@ class FrameDesk:
             self.answer(session, frame, failed)
 
     def lose_held(self) -> None:
-        """Answer the frames that are lost with a render loop."""
+        """Answer the frames that were lost with a render worker."""
         for lost in self._render.lose():
             error = RenderFailed(
                 "the process that filters frames ended; it starts again"

@@ -1,4 +1,4 @@
-"""A frame whose images lie in shared memory, and its pictures where they are wanted."""
+"""Filtering of a frame with its input and output images in shared memory."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ def reply_in_slots(
     places: SharedPlaces,
     sizes_bytes: Sequence[int],
 ) -> tuple[Reply, list[int]]:
-    """Filter a frame; return the reply and the bytes of each picture.
+    """Filter a frame; return the reply and the size of each picture in bytes.
 
     Parameters
     ----------
     filter_of : callable
-        Gives the filter of an eye.
+        Returns the filter of an eye.
     frame : Frame
-        Without its images.
+        The frame without its images.
     slots : (Slot, Slot)
-        Where the images lie, and where the pictures go.
+        Slots of the images and of the pictures.
     places : SharedPlaces
-        Where in them.
+        Positions in these slots.
     sizes_bytes : sequence of int
-        Of the images where they are compressed.
+        Sizes of the images if they are compressed.
 
     Raises
     ------
     ValueError
-        Images reach beyond their slot.
+        If images extend beyond their slot.
     BadMessage
-        They are compressed, and one of them cannot be unpacked.
+        If a compressed image cannot be unpacked.
     """
     slot, result_slot = slots
     begin_s = time.monotonic()
@@ -76,7 +76,7 @@ def reply_in_slots(
 
 
 def rooms_in(slot: Slot, frame: Frame, places: SharedPlaces) -> list[NDArray[Any]]:
-    """Return where the pictures of a frame go, (height, width, 3) each."""
+    """Return the output arrays of a frame in a slot, (height, width, 3) each."""
     dtype = np.dtype(frame.output.dtype)
     return [
         slot.array(start, (view.height_px, view.width_px, 3), dtype)
@@ -87,7 +87,7 @@ def rooms_in(slot: Slot, frame: Frame, places: SharedPlaces) -> list[NDArray[Any
 def with_images(
     frame: Frame, slot: Slot, starts: Sequence[int], sizes_bytes: Sequence[int]
 ) -> Frame:
-    """Return a frame with its images, which lie in a slot; see `reply_in_slots`."""
+    """Return a frame with its images from a slot; see `reply_in_slots`."""
     waiting = iter(zip(starts, sizes_bytes or starts, strict=True))
     found = []
     for view in frame.views:

@@ -1,4 +1,4 @@
-"""Filters one frame and makes the reply to it."""
+"""The reply to a frame."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from filter_service.wire.images import OUTPUT_OF_FORMAT
 MS_PER_S = 1000.0
 
 PSF_BUDGET_S = 1.0
-"""A frame computes PSFs for so long; then it is dropped, and the next one goes on.  A
-first frame of 1280x720 takes 0.3 to 0.7 s of two cores."""
+"""Time limit of a frame for computing PSFs; beyond it the frame is dropped; the next
+one continues.  A first frame of 1280x720 takes 0.3 to 0.7 s of two cores."""
 
 log = logging.getLogger("ocufilter")
 
@@ -36,10 +36,10 @@ def frame_reply(
     frame: Frame,
     out: Sequence[NDArray[Any]] | None,
 ) -> Result | Dropped | ErrorReply:
-    """Return the reply to a frame; anything that goes wrong becomes an error reply.
+    """Filter a frame and return the reply; any failure becomes an error reply.
 
-    Pictures may lie in ``out`` by then.  ``total_ms`` is for the caller to say: it
-    knows when the frame came.
+    The pictures may have been written to ``out``.  The caller sets ``total_ms``,
+    because it knows when the frame arrived.
     """
     started_s = time.monotonic()
     try:
@@ -69,7 +69,7 @@ def frame_reply(
     except FilterError as error:
         return ErrorReply.from_exception(error, frame_id=frame.frame_id)
     except Exception as error:
-        # The loop serves other clients too, so one frame must not end it.
+        # The worker serves other clients too, so one frame must not end it.
         log.exception("frame %d could not be filtered", frame.frame_id)
         failure = RenderFailed(f"{type(error).__name__}: {error}")
         return ErrorReply.from_exception(failure, frame_id=frame.frame_id)

@@ -1,4 +1,4 @@
-"""The sessions of the service: those with a client, and those whose client is away."""
+"""All sessions of the service, with or without a connected client."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from filter_service.service.session import Session
 
 
 class Guests:
-    """Sessions by the connection of their client, and by key while it is away."""
+    """Sessions, by connection while their client is connected and by key while not."""
 
     def __init__(self) -> None:
         self._present: dict[int, Session] = {}
@@ -17,16 +17,16 @@ class Guests:
         self._next_id = 1
 
     def __len__(self) -> int:
-        """Return the number of sessions, with a client or without."""
+        """Return the number of sessions, with or without a client."""
         return len(self._present) + len(self._away)
 
     def __iter__(self) -> Iterator[Session]:
-        """Go through all sessions."""
+        """Iterate over all sessions."""
         return iter([*self._present.values(), *self._away.values()])
 
     @property
     def connections(self) -> Collection[int]:
-        """Return the connections that have a session, as they are at any time."""
+        """Return a live view of the connections that have a session."""
         return self._present.keys()
 
     @property
@@ -36,7 +36,7 @@ class Guests:
 
     @property
     def away(self) -> list[Session]:
-        """Return the sessions that have none, longest away first."""
+        """Return the sessions without a client, longest away first."""
         return sorted(self._away.values(), key=lambda s: s.away_since_s or 0.0)
 
     def at(self, peer: Peer) -> Session | None:
@@ -44,7 +44,7 @@ class Guests:
         return self._present.get(peer.connection)
 
     def on_connection(self, number: int) -> Session | None:
-        """Return the session whose client has a connection, or had it last."""
+        """Return the session whose client uses a connection, or used it last."""
         found = self._present.get(number)
         if found is not None:
             return found
@@ -63,7 +63,7 @@ class Guests:
     def begin(
         self, peer: Peer, client: str, credit: int, *, device: int = 0
     ) -> Session:
-        """Return a new session on a device."""
+        """Start a new session on a device."""
         session = Session(
             *(self._next_id, peer, client, credit), owner=peer.key, device=device
         )
@@ -72,24 +72,24 @@ class Guests:
         return session
 
     def remember(self, session: Session) -> None:
-        """Add a session that was there before this process; its client is away."""
+        """Add a session restored after a restart; its client is away."""
         self._away[session.key] = session
         self._next_id = max(self._next_id, session.session_id + 1)
 
     def come_back(self, session: Session, peer: Peer, client: str) -> None:
-        """Give a session to a client that knows its key."""
+        """Resume a session for a client that knows its key."""
         self.remove(session)
         session.come_back(peer, client)
         self._present[peer.connection] = session
 
     def leave(self, session: Session, now_s: float) -> None:
-        """Keep a session whose client is gone."""
+        """Keep the session of a client that has gone."""
         self.remove(session)
         session.leave(now_s)
         self._away[session.key] = session
 
     def remove(self, session: Session) -> None:
-        """Forget a session."""
+        """Remove a session."""
         if session.peer is not None:
             self._present.pop(session.peer.connection, None)
         self._away.pop(session.key, None)

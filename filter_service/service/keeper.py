@@ -1,11 +1,11 @@
 """The supervisor: starts the processes of the service and restarts those that end.
 
-The door owns the socket, a render process the eyes, those of one device where there are
-several.  Each outlives the others; a new one is given a link to those that are there,
-and a new door the sessions that there were.  A process that hangs or was stopped is
-killed and restarted.  Once the service has been ready, no fault ends it: a process that
-ends again and again is restarted after ever longer pauses, and a device among several
-is given up meanwhile, so that its sessions go to another one.
+The front end owns the socket, and each device has a render worker that owns its eyes.
+The processes survive each other: a new one gets links to the others, and a new front
+end gets the existing sessions.  A process that hangs or was stopped is killed and
+restarted.  Once the service has been ready, no fault ends it.  A process that keeps
+ending is restarted after increasing pauses.  Meanwhile its device, if there are others,
+is given up, so that its sessions move to another one.
 """
 
 from __future__ import annotations
@@ -35,35 +35,35 @@ RENDER_MODULE = "filter_service.service.render_process"
 DOOR, RENDER = "door", "render"
 OPEN_WORKSHOP = "filter_service.service.render_process:open_real_workshop"
 STABLE_S = 60.0
-"""A process that has run for so long starts a new row of deaths when it ends."""
+"""Run time after which the count of consecutive deaths starts again."""
 
 FIRST_PAUSE_S, MAX_PAUSE_S = 1.0, 60.0
-"""Before a restart: none the first two times, then ever twice as long."""
+"""Pause before a restart: none the first two times, then doubled each time."""
 
 DEATHS_WITHOUT_PAUSE = 2
 GIVE_UP_DEVICE_DEATHS = 4
-"""Deaths in a row after which a device's sessions go to others, where there are any."""
+"""Consecutive deaths after which a device's sessions move to other devices, if any."""
 
 CHECK_INTERVAL_S = 0.5
 STOPPED_LIMIT_S = 3.0
-"""Stopped by a signal for longer, a process is taken for one that stays so."""
+"""Time after which a process stopped by a signal is killed."""
 
 STOP_GRACE_S = 2.0
 
 STANDBY_AFTER_S = 5.0
-"""A process that stands by is started so long after the last one that filters: until
-then that one, or its client, needs the processor."""
+"""Delay between the last start of a process and that of a standby worker: until then
+that process, or its client, needs the processor."""
 
 log = logging.getLogger("ocufilter")
 
 
 class ServiceFailed(Exception):
-    """A process of the service cannot start, or does not stay for too long."""
+    """A process of the service cannot start, or has kept ending for too long."""
 
 
 @dataclass
 class _Child:
-    """A process, and the link to it."""
+    """A process and the link to it."""
 
     process: subprocess.Popen[bytes] | None = None
     link: Link | None = None
@@ -72,13 +72,13 @@ class _Child:
     started_s: float = field(default_factory=time.monotonic)
 
     def tell(self, message: object, descriptors: Sequence[int] = ()) -> None:
-        """Send a message; that a process is gone is found out by listening to it."""
+        """Send a message; ignores a closed link, which the next receive reports."""
         if self.link is not None:
             with suppress(LinkClosed):
                 self.link.send(message, descriptors)
 
     def end(self) -> str:
-        """End the process, with patience first; return how it ended."""
+        """End the process, by force after a grace period; return how it ended."""
         how = "gone"
         if self.process is not None:
             how = how_it_ended(end(self.process, STOP_GRACE_S))
@@ -89,7 +89,7 @@ class _Child:
 
 @dataclass
 class _Restarts:
-    """The deaths of one process, and when it is started next."""
+    """Consecutive deaths of one process, and the time of its next start."""
 
     n_deaths: int = 0  # in a row
     failing_since_s: float | None = None
@@ -110,20 +110,20 @@ class _Restarts:
 
 
 class Keeper:
-    """Keeps a door and a render process going, or one for each of several devices.
+    """Supervises the front end and a render worker for each device.
 
     Parameters
     ----------
     config : ServiceConfig
     open_workshop : str
-        ``module:function``, see `render_process`.
+        ``module:function`` that opens the builder, see `render_process`.
     when_ready : callable
-        Called with the endpoint once frames may come, and again after each time that
-        they could not.
+        Called with the endpoint when the service becomes ready for frames, also after
+        an interruption.
     when_not_ready : callable
         Called when a process has ended and is not restarted at once.
     read_again : callable, optional
-        Returns the settings as they are now.
+        Returns the current settings.
     """
 
     def __init__(
@@ -152,26 +152,26 @@ class Keeper:
         )
         self._children = {name: _Child() for name in (DOOR, *self._devices)}
         self._standbys: dict[str, _Child] = {}
-        self._lost: set[int] = set()  # devices that are given up for now
-        self._met: set[int] = set()  # devices whose render process the door works with
-        self._spawned_s = 0.0  # the last process of all
+        self._lost: set[int] = set()  # devices given up for now
+        self._met: set[int] = set()  # devices connected to the front end
+        self._spawned_s = 0.0  # last start of any process
         self._restarts = {name: _Restarts() for name in self._children}
-        self._sessions: dict[str, object] = {}  # by key, for the next door
+        self._sessions: dict[str, object] = {}  # by key, for the next front end
         self._wake_reader, self._wake_writer = socket.socketpair()
         self._wake_reader.setblocking(False)
         self._wake_writer.setblocking(False)
 
     @property
     def wake_file_descriptor(self) -> int:
-        """Return where a byte written ends the wait of the loop."""
+        """Return the descriptor that wakes the event loop when written to."""
         return self._wake_writer.fileno()
 
     def stop(self) -> None:
-        """Let `run` return; may be called from a signal handler."""
+        """Make `run` return; may be called from a signal handler."""
         self._is_stopping = True
 
     def ask_to_read_again(self) -> None:
-        """Have the settings read again; may be called from a signal handler."""
+        """Request that settings be read again; may be called from a signal handler."""
         self._is_to_read_again = True
 
     def run(self) -> None:
@@ -180,11 +180,11 @@ class Keeper:
         Raises
         ------
         ServiceFailed
-            A process cannot start the first time, or one ends again and again for
-            longer than `give_up_after_s`.
+            If a process cannot start the first time, or keeps ending for longer than
+            `give_up_after_s`.
         """
         try:
-            for name in (*self._devices, DOOR):  # the last takes least
+            for name in (*self._devices, DOOR):  # the fastest starts last
                 self._start(name)
             while not self._is_stopping:
                 try:
@@ -195,7 +195,7 @@ class Keeper:
             self._end_all()
 
     def _bear(self, error: OSError) -> None:
-        """Go on after the system has refused something, once all had been ready.
+        """Log an error of the system and continue, once the service has been ready.
 
         Raises
         ------
@@ -243,12 +243,12 @@ class Keeper:
         return [*self._children.values(), *self._standbys.values()]
 
     def _start(self, name: str) -> None:
-        """Start a process, or let the one that stands by take its place."""
+        """Start a process, or replace it by its standby."""
         standby = self._standbys.pop(name, None)
         try:
             self._children[name] = standby or self._spawned(name)
             self._join(name)
-        except OSError as error:  # no memory, processes or descriptors for it now
+        except OSError as error:  # out of memory, processes or descriptors
             if not self._was_ready:
                 raise ServiceFailed(f"its {name} process: {error}") from None
             self._children[name].end()
@@ -257,15 +257,15 @@ class Keeper:
     def _spawned(self, name: str) -> _Child:
         self._spawned_s = time.monotonic()
         link, theirs = Link.pair()
-        # A new door listens where the one before it did.
+        # A new front end listens on the endpoint of the previous one.
         config = replace(self._config, bind=self._endpoint or self._config.bind)
         module, arguments = DOOR_MODULE, [str(theirs.fileno())]
         if name in self._devices:
             config = config.of_device(self._devices[name])
             module, arguments = RENDER_MODULE, [*arguments, self._open_workshop, name]
         process = subprocess.Popen(
-            # Without -P a file of the current folder would come before every module of
-            # its name.
+            # Without -P, files in the current folder would shadow modules of the same
+            # name.
             [sys.executable, "-P", "-m", module, *arguments],
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,
@@ -279,7 +279,7 @@ class Keeper:
         return child
 
     def _keep_standby(self, name: str) -> None:
-        """Have a second process ready to filter, with a worker of its own."""
+        """Keep a standby render worker ready, with a build worker of its own."""
         standby = self._standbys.get(name)
         if standby is None:
             is_quiet = time.monotonic() - self._spawned_s > STANDBY_AFTER_S
@@ -297,7 +297,7 @@ class Keeper:
             log.error("the standby process %s; a new one is started", standby.end())
 
     def _change_settings(self) -> None:
-        """Take what may change while the service runs; say what may not."""
+        """Apply changed settings; warn about those that require a restart."""
         if self._read_again is None:
             return
         try:
@@ -314,7 +314,7 @@ class Keeper:
             self._children[DOOR].tell(("config", self._config))
 
     def _join(self, new: str) -> None:
-        """Give the door, and each render process that it lacks, the ends of a link."""
+        """Link a new worker to the front end, or a new front end to all workers."""
         if self._children[DOOR].link is None:
             return
         for name, index in self._devices.items():
@@ -368,7 +368,7 @@ class Keeper:
         self._announce()
 
     def _announce(self) -> None:
-        """Say that frames may come, once the door would say so, too."""
+        """Report that the service is ready, once the front end agrees."""
         if (
             not self._is_announced
             and all(child.is_ready for child in self._children.values())
@@ -379,7 +379,7 @@ class Keeper:
             self._was_ready = True
 
     def _tell_degraded(self) -> None:
-        """Have the door say so while a process is down for longer than a restart."""
+        """Tell the front end whether a process is down for longer than a restart."""
         is_degraded = bool(self._lost) or any(
             restarts.n_deaths > DEATHS_WITHOUT_PAUSE
             and not self._children[name].is_ready
@@ -388,7 +388,7 @@ class Keeper:
         self._children[DOOR].tell(("degraded", is_degraded))
 
     def _restart(self, name: str, child: _Child) -> None:
-        """Bury a process that has ended; have another one started when it is time."""
+        """Clean up after a process that has ended, and schedule its restart."""
         how = child.end()
         if name in self._standbys:
             log.error("the %s process %s; the one that stood by takes over", name, how)
@@ -398,12 +398,12 @@ class Keeper:
         self._note_death(name, child.started_s, how)
 
     def _note_death(self, name: str, started_s: float, how: str) -> None:
-        """Decide when a process is started again.
+        """Schedule the restart of a process.
 
         Raises
         ------
         ServiceFailed
-            It has never been ready, or the service is to give up by now.
+            If the service has never been ready, or `give_up_after_s` has passed.
         """
         now_s, restarts = time.monotonic(), self._restarts[name]
         pause_s = restarts.note_death(started_s, now_s)
@@ -428,7 +428,7 @@ class Keeper:
         self._tell_degraded()
 
     def _give_up_device(self, name: str, index: int) -> None:
-        """Have the sessions of a device go to others, where there are any."""
+        """Move the sessions of a device to other devices, if there are any."""
         if index in self._lost or len(self._lost) + 1 >= len(self._devices):
             return
         log.error("the %s process is given up until it stays", name)
@@ -436,23 +436,23 @@ class Keeper:
         self._children[DOOR].tell(("lost", index))
 
     def _fail(self, name: str, child: _Child, why: str) -> None:
-        """Handle a process that says that it cannot work.
+        """Handle a process that reports that it cannot work.
 
         Raises
         ------
         ServiceFailed
-            The service has not been ready yet.
+            If the service has not been ready yet.
         """
         if not self._was_ready:
             raise ServiceFailed(why)
         child.end()
         restarts = self._restarts[name]
-        # It would say the same again at once.
+        # An immediate restart would fail again.
         restarts.n_deaths = max(restarts.n_deaths, GIVE_UP_DEVICE_DEATHS - 1)
         self._note_death(name, time.monotonic(), f"cannot work ({why})")
 
     def _check_stopped(self, name: str, child: _Child) -> None:
-        """End a process that was stopped by a signal and is not let go on."""
+        """Kill a process that has been stopped by a signal for too long."""
         if child.process is None or not is_stopped(child.process.pid):
             child.stopped_since_s = None
             return
@@ -470,7 +470,7 @@ class Keeper:
                 process.kill()
 
     def _end_all(self) -> None:
-        """End all processes: asked first, by force where they take long."""
+        """Stop all processes, by force after a grace period."""
         for child in self._all_children:
             child.tell(("stop",))
         for child in self._all_children:

@@ -1,4 +1,4 @@
-"""Starts the service: signals, the line that says it is ready."""
+"""Startup of the service: signal handlers and the ready message."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ def run(
     open_workshop: str = OPEN_WORKSHOP,
     read_again: Callable[[], ServiceConfig] | None = None,
 ) -> None:
-    """Serve until SIGINT or SIGTERM; prints one line when ready.
+    """Serve until SIGINT or SIGTERM; print one line when ready.
 
     Must run in the main thread.
 
     Parameters
     ----------
     open_workshop : str
-        ``module:function``, see `render_process`.
+        ``module:function`` that opens the builder, see `render_process`.
     read_again : callable, optional
-        Returns the settings as they are now; called at SIGHUP.
+        Returns the current settings; called at SIGHUP.
 
     Raises
     ------
     OSError
-        The service cannot start, or does not stay.
+        If the service cannot start, or has failed for too long.
     """
-    os.environ[FORMAT_VARIABLE] = config.log_format  # of all processes
+    os.environ[FORMAT_VARIABLE] = config.log_format  # for all processes
     start_log("service")
     keeper = Keeper(
         config,
@@ -61,14 +61,14 @@ def run(
 
 
 class Announcement:
-    """Says that the service is ready, in its output once and in its ready file."""
+    """Reports that the service is ready: once on stdout, and in the ready file."""
 
     def __init__(self, config: ServiceConfig) -> None:
         self._config = config
         self._is_printed = False
 
     def ready(self, endpoint: str) -> None:
-        """Write the ready file, and the line of output the first time."""
+        """Write the ready file, and print one line the first time."""
         if self._config.ready_file is not None:
             write_atomically(self._config.ready_file, endpoint + "\n")
         if not self._is_printed:

@@ -1,7 +1,7 @@
-"""Messages between two processes of the service, file descriptors with them.
+"""Messages, with file descriptors, between two processes of the service.
 
-Neither side ever waits for the other: what the socket does not take stays in a queue.
-The link joins processes of ours, so it may carry pickles; nothing from outside does.
+Neither side waits for the other: what the socket does not accept stays in a queue.
+Messages are pickled, which is safe because both processes belong to the service.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Link:
     Parameters
     ----------
     end : socket
-        Of a `socket.socketpair`; the link owns it.
+        One end of a `socket.socketpair`; the link owns it.
     """
 
     def __init__(self, end: socket.socket) -> None:
@@ -42,32 +42,32 @@ class Link:
 
     @classmethod
     def pair(cls) -> tuple[Self, socket.socket]:
-        """Return our end, and the other as a process that is started is given it."""
+        """Return our end as a link, and the other one as a socket for a new process."""
         ours, theirs = socket.socketpair()
         return cls(ours), theirs
 
     @classmethod
     def from_descriptor(cls, descriptor: int) -> Self:
-        """Return the end that a descriptor is, which is now the link's."""
+        """Return a link that takes ownership of a descriptor."""
         return cls(socket.socket(fileno=descriptor))
 
     def wait(self) -> list[tuple[Any, list[int]]]:
-        """Return the next messages, however long they take to come."""
+        """Block until messages arrive and return them."""
         while not (messages := self.receive()):
             select.select([self._socket], [], [])
         return messages
 
     def fileno(self) -> int:
-        """Return what to poll."""
+        """Return the descriptor to poll."""
         return self._socket.fileno()
 
     @property
     def has_unsent(self) -> bool:
-        """Return whether `flush` has something to do, once the socket takes more."""
+        """Return whether messages are waiting for `flush`."""
         return bool(self._unsent)
 
     def send(self, message: object, descriptors: Sequence[int] = ()) -> None:
-        """Send a message; descriptors stay the caller's.
+        """Send a message; the caller keeps its descriptors.
 
         Raises
         ------
@@ -76,7 +76,7 @@ class Link:
         body = pickle.dumps(message, protocol=5)
         data = memoryview(HEAD.pack(len(body), len(descriptors)) + body)
         if not self._unsent:
-            # Most messages go at once; a copy of a descriptor may not be to be had.
+            # Most messages are sent at once, and duplicating a descriptor may fail.
             count = self._sent(data, descriptors)
             if count == len(data):
                 return
@@ -84,7 +84,7 @@ class Link:
         self._unsent.append((data, [os.dup(number) for number in descriptors]))
 
     def flush(self) -> None:
-        """Send what the socket takes now.
+        """Send as much as the socket accepts now.
 
         Raises
         ------
@@ -103,7 +103,7 @@ class Link:
                 self._unsent.popleft()
 
     def _sent(self, data: memoryview, descriptors: Sequence[int]) -> int:
-        """Send what the socket takes of a message; return the number of bytes.
+        """Send as much of a message as the socket accepts; return the number of bytes.
 
         Raises
         ------
@@ -119,12 +119,12 @@ class Link:
             raise LinkClosed(str(error)) from None
 
     def receive(self) -> list[tuple[Any, list[int]]]:
-        """Return the messages that have come, each with its descriptors, now ours.
+        """Return received messages with their descriptors, which the caller then owns.
 
         Raises
         ------
         LinkClosed
-            Nothing more will come; messages that came before were returned.
+            If the other end is closed and all its messages have been returned.
         """
         is_closed = self._read()
         messages = self._complete()
@@ -133,7 +133,7 @@ class Link:
         return messages
 
     def _read(self) -> bool:
-        """Take in what is there; return whether the other end is closed."""
+        """Read available data; return whether the other end is closed."""
         while True:
             try:
                 data, descriptors, _, _ = socket.recv_fds(
@@ -156,7 +156,7 @@ class Link:
             end = start + HEAD.size + length
             if len(held) < end:
                 break
-            if len(self._descriptors) < count:  # the system had none for them
+            if len(self._descriptors) < count:  # the system had no free ones
                 raise LinkClosed("descriptors of a message are lost")
             message = pickle.loads(held[start + HEAD.size : end])
             descriptors = [self._descriptors.popleft() for _ in range(count)]
@@ -167,7 +167,7 @@ class Link:
         return messages
 
     def close(self) -> None:
-        """Close it; what is not sent is lost."""
+        """Close the link; unsent messages are lost."""
         for _, descriptors in self._unsent:
             for descriptor in descriptors:
                 os.close(descriptor)

@@ -1,25 +1,25 @@
-"""The socket that the service listens on, made here where the system can do more."""
+"""The listening socket, created here where the system offers more than libzmq uses."""
 
 from __future__ import annotations
 
 import socket
 from pathlib import Path
 
-# Longer than libzmq's 100, so that the first packet of a client is not lost where many
-# connect at once: the system sends it again only after a second.
+# Larger than libzmq's 100, so that the first packet of a client is not lost when many
+# connect at once: the system resends it only after a second.
 BACKLOG = 4096
 DEFER_ACCEPT_S = 5
-"""TCP connections that say nothing wait in the kernel for so long or somewhat longer; a
-client of ZeroMQ speaks first.  1,500 of them that come again and again then cost at
-most 200 accepted connections a second instead of 5,000."""
+"""Minimum time that silent TCP connections wait in the kernel; a ZeroMQ client speaks
+first.  1,500 of them that keep reconnecting then cause at most 200 accepted connections
+per second instead of 5,000."""
 
 TCP_DEFER_ACCEPT: int | None = getattr(socket, "TCP_DEFER_ACCEPT", None)
 
 
 def check_path_is_free(bind: str) -> None:
-    """Refuse an ``ipc://`` path that holds a file or a live endpoint.
+    """Raise FileExistsError if an ``ipc://`` path is a file or a live endpoint.
 
-    Binding removes whatever is at the path; only a dead socket may go that way.
+    Binding removes whatever is at the path, so only a stale socket may be there.
     """
     if not bind.startswith("ipc://"):
         return
@@ -37,21 +37,21 @@ def check_path_is_free(bind: str) -> None:
 
 
 def socket_family(bind: str) -> socket.AddressFamily:
-    """Return of what kind the connections of an endpoint are."""
+    """Return the address family of an endpoint's connections."""
     if bind.startswith("ipc://"):
         return socket.AF_UNIX
     return socket.AF_INET6 if bind.startswith("tcp://[") else socket.AF_INET
 
 
 def deferring_listener(bind: str) -> socket.socket | None:
-    """Return a TCP socket that shows connections once their clients have spoken.
+    """Return a TCP socket that accepts connections once their clients have sent data.
 
-    None for other transports, and for names that only libzmq knows, of interfaces.
+    Return None for other transports, and for interface names, which only libzmq knows.
 
     Raises
     ------
     OSError
-        The address is taken, or is none of this machine.
+        If the address is in use, or is not one of this machine.
     """
     if not bind.startswith("tcp://") or TCP_DEFER_ACCEPT is None:
         return None

@@ -1,4 +1,4 @@
-"""How busy a device was in the last seconds."""
+"""Recent load of a device."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ WINDOW_S = 10.0
 
 
 class Load:
-    """Time used, of which what is longer ago counts ever less."""
+    """Exponentially decaying sum of the time used."""
 
     def __init__(self) -> None:
         self._used_s = 0.0
         self._at_s = 0.0
 
     def note(self, used_s: float, now_s: float) -> None:
-        """Note that so much time was used until now."""
+        """Add time that was used until now."""
         self._used_s = self._left_s(now_s) + used_s
         self._at_s = now_s
 
     def busy_ratio(self, now_s: float) -> float:
-        """Return the share of the last seconds that was used, 0 to 1."""
+        """Return the used share of the last seconds, 0 to 1."""
         return min(1.0, self._left_s(now_s) / WINDOW_S)
 
     def _left_s(self, now_s: float) -> float:

@@ -1,4 +1,4 @@
-"""The service's ROUTER socket: messages in, replies out, connections and their ends."""
+"""The ROUTER socket of the service: messages, replies and connection events."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from filter_service.service.listening import (
 COPY_BELOW_BYTES = 65536  # pyzmq copies smaller parts in any case
 # With fewer than about 64, libzmq drops replies of a ROUTER although one is in flight.
 SEND_HIGH_WATER_MARK = 128
-# Counts messages, so it is what bounds memory: with the default of 1000 an overload of
-# 720p frames took 1.5 GB.  More wait in the kernel, and the client is held back.
+# Counted in messages, this bounds memory: with the default of 1000, an overload of 720p
+# frames took 1.5 GB.  Further messages wait in the kernel and apply back-pressure.
 RECEIVE_HIGH_WATER_MARK = 4
 HANDSHAKE_LIMIT_MS = 10_000
 RETRY_S = 0.001
 KEEPALIVE_IDLE_S = 20
 MAX_PARTS_DROPPED = 200_000
-"""Parts of an oversized message that are dropped before other work goes on (20 ms)."""
+"""Parts of an oversized message dropped before other work continues (20 ms)."""
 
 MONITOR_PAUSE_S = 0.005
-"""Between looks at connections that come and go, where nothing else happens: thousands
-of them a second would otherwise wake the front end one by one."""
+"""Minimum interval between reads of connection events while idle: otherwise thousands
+of them per second would wake the front end one by one."""
 
 MONITOR_ENDPOINT = "inproc://ocufilter.monitor"
-EVENT = struct.Struct("=HI")  # what happened, and to which descriptor
+EVENT = struct.Struct("=HI")  # event and descriptor
 MONITORED = zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
 SEED_VARIABLE = "OCUFILTER_TEST_RANDOM_SEED"
 
@@ -51,10 +51,10 @@ Tracker = zmq.MessageTracker
 
 
 class Outcome(enum.Enum):
-    """What became of a reply."""
+    """Outcome of sending a reply."""
 
     SENT = "sent"
-    GONE = "gone"  # the client is not connected any more
+    GONE = "gone"  # the client is no longer connected
     STALLED = "stalled"  # the client does not read
 
 
@@ -68,17 +68,17 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Received:
-    """A message as it came.
+    """A received message.
 
     Attributes
     ----------
     peer : Peer
     connection : Connection, optional
-        None where it has ended since.
+        None if it has ended since.
     parts : list of memoryview
-        Nothing is copied.
+        Message parts, not copied.
     n_left_out : int
-        Parts beyond the most that a message may have; they were dropped unread.
+        Number of parts beyond the maximum, which were dropped unread.
     """
 
     peer: Peer
@@ -88,26 +88,26 @@ class Received:
 
 
 class Mailbox:
-    """A bound ROUTER socket that never blocks and never drops silently.
+    """A bound ROUTER socket that never blocks and never drops messages silently.
 
     Parameters
     ----------
     bind : str
-        Endpoint; ``tcp://127.0.0.1:*`` takes a free port.
+        Endpoint; ``tcp://127.0.0.1:*`` selects a free port.
     max_part_bytes : int
-        A client that sends a larger part is cut off.
+        Size beyond which a part disconnects its client.
     max_parts : int
-        Of one message, after the routing id; more are dropped unread.
+        Maximum number of parts after the routing id; further ones are dropped unread.
     connections : Connections
-        Kept up to date with what the socket's monitor reports.
+        Updated from the socket's monitor.
     keys : KeyRing, optional
-        Only its clients are let in, and what travels is encrypted.
+        If given, only its clients are admitted, and traffic is encrypted.
 
     Attributes
     ----------
     is_dropping : bool
-        The rest of an oversized message is being dropped; nothing else is received
-        until that is done.
+        Whether the rest of an oversized message is being dropped; nothing else is
+        received until then.
     """
 
     def __init__(
@@ -135,10 +135,10 @@ class Mailbox:
         socket.maxmsgsize = max_part_bytes
         socket.backlog = BACKLOG
         socket.handshake_ivl = HANDSHAKE_LIMIT_MS
-        # No heartbeats of our own: libzmq aborts the process (stream_engine_base.cpp)
-        # where one is due on a connection that has ended while more messages of it
-        # wait than the mark above.  `Alive` and the monitor find out who is gone, and
-        # answers to the clients' heartbeats are sent all the same.
+        # The service sends no heartbeats: libzmq aborts the process
+        # (stream_engine_base.cpp) when one is due on a connection that has ended while
+        # more of its messages wait than the mark above.  `Alive` and the monitor detect
+        # vanished clients, and clients' heartbeats are answered all the same.
         socket.heartbeat_ivl = 0
         socket.tcp_keepalive = 1
         socket.tcp_keepalive_idle = KEEPALIVE_IDLE_S
@@ -146,7 +146,7 @@ class Mailbox:
             socket.ipv6 = 1
         self._monitor = self._context.socket(zmq.PAIR)
         self._monitor.linger = 0
-        # Without a limit: libzmq's thread would wait for this one while it is full.
+        # Unlimited, because libzmq's thread would block on a full queue.
         self._monitor.rcvhwm = 0
         try:
             socket.monitor(MONITOR_ENDPOINT, MONITORED)
@@ -177,7 +177,7 @@ class Mailbox:
         return self._oversized is not None
 
     def watch(self, readable: set[int], writable: set[int]) -> None:
-        """Let `wait` also return when one of these can be read, or written."""
+        """Make `wait` also return when one of these is readable or writable."""
         for gone in self._watched - readable - writable:
             self._poller.unregister(gone)
         for descriptor in readable | writable:
@@ -187,7 +187,7 @@ class Mailbox:
         self._watched = readable | writable
 
     def wait(self, timeout_s: float) -> None:
-        """Return when there is something to read, or in time."""
+        """Wait until there is something to read, or for the timeout."""
         pause_s = self._next_monitored_s - time.monotonic()
         if pause_s > 0.0:
             self._poller.modify(self._monitor, 0)
@@ -205,7 +205,7 @@ class Mailbox:
         return ended
 
     def _read_monitor(self) -> None:
-        """Take in which connections have come and gone."""
+        """Process connection events of the monitor."""
         receive, count = self._monitor.recv, 0
         try:
             while True:
@@ -224,15 +224,15 @@ class Mailbox:
             self._connections.evict()
 
     def receive(self) -> Received | None:
-        """Return a message, or None where none has come whole.
+        """Return the next complete message, or None.
 
-        The whole message is taken off the socket whatever its number of parts: what
-        is left of it would be read as the next one.
+        All parts of a message are taken off the socket, however many it has: the rest
+        would be read as the next message.
 
         Raises
         ------
         Refused
-            The sender's key is not allowed any more.
+            If the sender's key is no longer allowed.
         """
         if self._oversized is not None:
             return self._drop_rest(self._oversized)
@@ -255,9 +255,9 @@ class Mailbox:
         return received
 
     def _drop_rest(self, received: Received) -> Received | None:
-        """Drop parts of a message that has too many, in slices: it may have millions.
+        """Drop surplus parts of a message in slices, since it may have millions.
 
-        Nothing of it is held meanwhile but the parts that it may have.
+        Only the allowed parts are held meanwhile.
         """
         count, has_more = drop_parts(self._socket, MAX_PARTS_DROPPED)
         received = replace(received, n_left_out=received.n_left_out + count)
@@ -270,15 +270,15 @@ class Mailbox:
         """Send a message; large parts are not copied and must not change.
 
         Another client may have taken the routing id of one that has just gone.  libzmq
-        chooses the connection when it is given the routing id; by then its monitor has
-        reported the end of the one before, so that end is looked for afterwards, and
-        the reply is not sent: the other client receives one empty part.
+        chooses the connection when it gets the routing id.  By then its monitor has
+        reported the end of the previous connection, so the monitor is read afterwards.
+        In that case the reply is not sent; the other client receives one empty part.
 
         Returns
         -------
         outcome : Outcome
         tracker : MessageTracker or None
-            Of the last large part: done once libzmq has let go of it.
+            Tracker of the last large part, done once libzmq has released it.
         """
         tracker = None
         if not self._connections.is_open(peer.connection):
@@ -305,17 +305,17 @@ class Mailbox:
         return Outcome.SENT, tracker
 
     def _send_routing_id(self, routing_id: bytes) -> None:
-        """Name the receiver; whether it can take a message is decided here."""
+        """Send the routing id; fails if the receiver cannot accept a message."""
         flags = zmq.NOBLOCK | zmq.SNDMORE
         try:
             self._socket.send(routing_id, flags)
         except zmq.Again:
-            # Room that a client has made is noticed about once per millisecond.
+            # libzmq notices free space in a queue about once per millisecond.
             time.sleep(RETRY_S)
             self._socket.send(routing_id, flags)
 
     def close(self, *, linger_ms: int = 0) -> None:
-        """Close; what is not sent then is lost."""
+        """Close the socket; replies unsent after the linger time are lost."""
         endpoint = getattr(self, "endpoint", "")
         self._socket.close(linger=linger_ms)
         self._authenticator.close()
@@ -326,9 +326,9 @@ class Mailbox:
 
 
 def _seed_random() -> None:
-    """Have libzmq begin its routing ids at a number that nobody can know.
+    """Seed libzmq's routing ids with an unpredictable number.
 
-    It takes them from the C library's generator, which it never seeds: the first
+    libzmq takes them from the C library's generator, which it never seeds: the first
     routing id of every process was the same.
     """
     seed = os.environ.get(SEED_VARIABLE)

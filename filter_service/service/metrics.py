@@ -1,4 +1,4 @@
-"""Counters of the service in Prometheus' format, on a port of this machine alone."""
+"""Metrics of the service in the Prometheus format, on a loopback port."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ HOST = "127.0.0.1"
 REQUEST_LIMIT_S = 1.0
 
 METRICS = {
-    # name: what it is; those in _total only grow
+    # name: description; a suffix _total marks a counter
     "ocufilter_ready": "1 while frames can be filtered",
     "ocufilter_degraded": "1 while a process does not stay up, or a device is missing",
     "ocufilter_connections": "open connections, with a session or without",
@@ -29,11 +29,11 @@ METRICS = {
 
 
 class NoMetrics(Exception):
-    """What speaks Prometheus' format is not installed, or the port is taken."""
+    """The Prometheus client is not installed, or the port is taken."""
 
 
 def serve_metrics(port: int, values: Callable[[], dict[str, float]]) -> Any:
-    """Serve the values of `METRICS`, in a thread; return what ends it.
+    """Serve the values of `METRICS` in a thread; return the server.
 
     Raises
     ------
@@ -62,13 +62,13 @@ def serve_metrics(port: int, values: Callable[[], dict[str, float]]) -> Any:
         timeout = REQUEST_LIMIT_S
 
         def log_message(self, format: str, *args: Any) -> None:
-            """Say nothing of each request."""
+            """Do not log requests."""
 
     registry = CollectorRegistry()
     registry.register(Collector())
     try:
-        # One request at a time, each with a limit: a server with a thread for each
-        # connection would give descriptors and memory to whoever connects.
+        # One request at a time, each with a time limit: with a thread per connection,
+        # anyone who connects could use up descriptors and memory.
         server = make_server(HOST, port, make_wsgi_app(registry), handler_class=Handler)
     except OSError as error:
         raise NoMetrics(f"metrics_port is {port}: {error.strerror}") from None

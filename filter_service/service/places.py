@@ -1,4 +1,4 @@
-"""Whether a frame's images lie where they may, in memory that a client shares."""
+"""Validation of the positions of a frame's images in shared memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from filter_service.wire.compression import largest_block_bytes
 
 
 def check_places(session: Session, frame: Frame) -> None:
-    """Refuse a frame whose images do not lie in free slots of its session.
+    """Check that a frame's images are in free slots of its session.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def check_places(session: Session, frame: Frame) -> None:
 
 
 def result_sizes(frame: Frame) -> list[int]:
-    """Return the most bytes that each view's picture may take."""
+    """Return the maximum size of each view's picture in bytes."""
     bytes_per_pixel = frame.output.bytes_per_pixel
     sizes = [view.camera.pixel_count * bytes_per_pixel for view in frame.views]
     if frame.compression == "none":
@@ -58,7 +58,7 @@ def result_sizes(frame: Frame) -> list[int]:
 def _check_room(
     slot: Slot, starts: Sequence[int], sizes: Sequence[int], name: str
 ) -> None:
-    """Refuse images that reach beyond a slot or into each other."""
+    """Check that images neither exceed a slot nor overlap."""
     end = 0
     for start, size in sorted(zip(starts, sizes, strict=True)):
         if start < end or start + size > slot.size_bytes:

@@ -1,4 +1,4 @@
-"""What the service tells about its own process, and the memory that it gives back."""
+"""Version and memory of the process."""
 
 import ctypes
 import resource
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def package_version() -> str:
-    """Return the installed version, or ``checkout`` where it is not installed."""
+    """Return the installed version, or ``checkout`` if it is not installed."""
     try:
         return version("ocufilter")
     except PackageNotFoundError:
@@ -16,7 +16,7 @@ def package_version() -> str:
 
 
 def resident_memory_mb() -> float:
-    """Return the memory that this process holds (Linux; 0 elsewhere)."""
+    """Return the resident memory of this process (Linux; 0 elsewhere)."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except (OSError, IndexError, ValueError):
@@ -26,6 +26,6 @@ def resident_memory_mb() -> float:
 
 
 def give_memory_back() -> None:
-    """Return what was freed to the system (glibc; nothing elsewhere)."""
+    """Return freed memory to the system (glibc; does nothing elsewhere)."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

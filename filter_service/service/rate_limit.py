@@ -1,4 +1,4 @@
-"""How many messages a connection may send before it is not answered, or closed."""
+"""Rate limits of a connection, beyond which it is ignored or closed."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import enum
 
 WINDOW_S = 1.0
 MAX_REFUSALS = 100
-"""Wrong messages of a connection within a window; the rest of it is not answered."""
+"""Refused messages per window, beyond which the rest of the window is ignored."""
 
 MAX_REQUESTS = 200
-"""Messages that are no frames, likewise: each takes about 0.1 ms of the front end."""
+"""Likewise for messages other than frames; each costs the front end about 0.1 ms."""
 
 MAX_IGNORED = 400
-"""Messages within a window that nobody answers any more; then the connection ends.
-To take one from the socket and throw it away costs about 0.01 ms."""
+"""Ignored messages per window, beyond which the connection is closed.  Reading and
+discarding one takes about 0.01 ms."""
 
 
 class Verdict(enum.Enum):
-    """What becomes of the next message of a connection."""
+    """Decision about the next message of a connection."""
 
     HANDLE = "handle"
     IGNORE = "ignore"
@@ -32,7 +32,7 @@ class RateLimit:
         self._n_refusals = self._n_requests = self._n_ignored = 0
 
     def verdict(self, now_s: float) -> Verdict:
-        """Return whether the next message is to be handled."""
+        """Return the decision about the next message."""
         if now_s >= self._ends_s:
             self._ends_s = now_s + WINDOW_S
             self._n_refusals = self._n_requests = self._n_ignored = 0
@@ -42,13 +42,13 @@ class RateLimit:
         return Verdict.IGNORE if self._n_ignored <= MAX_IGNORED else Verdict.CLOSE
 
     def end_patience(self) -> None:
-        """Have the next message within the window end the connection."""
+        """Make the next message within the window close the connection."""
         self._n_refusals, self._n_ignored = MAX_REFUSALS, MAX_IGNORED
 
     def note_refusal(self) -> None:
-        """Count a message that was wrong, or that another process refused."""
+        """Count a message that was refused, here or by another process."""
         self._n_refusals += 1
 
     def note_request(self) -> None:
-        """Count a message that is no frame."""
+        """Count a message other than a frame."""
         self._n_requests += 1

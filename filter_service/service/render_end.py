@@ -1,7 +1,7 @@
-"""The door's end of the render loop: a link that may break, memory, frames.
+"""Render client: the front end's link to a render worker, with memory and frames.
 
-What the loop has to say comes from `receive`; whatever is sent while there is no loop
-is lost, and the door says it again to the next one.
+Messages of the worker come from `receive`.  Messages sent while there is no worker are
+lost; the front end sends their content again to the next one.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from filter_service.slots import Slot, SlotPool, starts_of
 MS_PER_S = 1000.0
 
 SMALLER_RATIO = 4
-"""A frame may come between the parts of one that has so many times its pixels."""
+"""Ratio of pixels from which a frame may be filtered during a larger one."""
 
 SESSION_QUOTA = 0.25
-"""Of the memory for images: what one session may share, or leave unread."""
+"""Share of the image memory that one session may share, or leave unread."""
 
 SHARED_QUOTA = 0.5
-"""What all clients may share; the rest is for frames that travel as parts."""
+"""Share of it that all clients may share; the rest is for frames sent as parts."""
 
 MB = 1e6
 
@@ -42,35 +42,35 @@ Unsent = list[tuple[Tracker, Slot]]
 
 @dataclass(frozen=True)
 class Held:
-    """A frame that the render loop has."""
+    """A frame that the render worker has."""
 
     number: int
     session: Session
     peer: Peer | None
     waiting: WaitingFrame
     places: SharedPlaces
-    own_slots: tuple[Slot, ...]  # not the client's: what is sent, and is given back
+    own_slots: tuple[Slot, ...]  # the service's: sent, then returned to the pool
     handed_s: float
 
 
 class RenderEnd:
-    """Where frames, profiles and memory are handed over.
+    """Passes frames, profiles and memory to a render worker.
 
     Parameters
     ----------
     max_image_bytes : int
-        Of all slots.
+        Maximum size of all slots together.
     descriptors : DescriptorLimit
 
     Attributes
     ----------
     held : dict of Held
-        The frames that are being filtered, by number: one, or a large one and a small
-        one that comes between its parts.
+        Frames being filtered, by number: one, or a large one and a small one that is
+        filtered during it.
     may_rest : bool
-        The loop can do that.
+        Whether the worker can filter a small frame during a large one.
     is_ready : bool
-        The loop has said which eyes it has, and was told of the others.
+        Whether the worker has reported its eyes and received the others.
     """
 
     def __init__(self, max_image_bytes: int, descriptors: DescriptorLimit) -> None:
@@ -81,7 +81,7 @@ class RenderEnd:
         self._slots = SlotPool(
             max_image_bytes, descriptors.max_slots, descriptors.reserve
         )
-        self._shared: set[int] = set()  # numbers of the slots of clients
+        self._shared: set[int] = set()  # numbers of the clients' slots
         self._next_number = 1
         self._heard_s = self._excused_s = time.monotonic()
 
@@ -89,33 +89,33 @@ class RenderEnd:
 
     @property
     def is_up(self) -> bool:
-        """Return whether there is a render loop."""
+        """Return whether there is a render worker."""
         return self._link is not None
 
     @property
     def silent_s(self) -> float:
-        """Return since when the loop has given no sign of life."""
+        """Return the seconds since the worker's last heartbeat."""
         return time.monotonic() - self._heard_s
 
     @property
     def stuck_s(self) -> float:
-        """Return for how long it has said nothing, or has had a frame."""
+        """Return how long the worker has been silent, or has had a frame."""
         begins_s = [self._heard_s, *(held.handed_s for held in self.held.values())]
         return time.monotonic() - max(min(begins_s), self._excused_s)
 
     def excuse(self) -> None:
-        """Count the time anew: what was to be done about it is being done."""
+        """Restart the timeout, because the stuck worker is being handled."""
         self._excused_s = self._heard_s = time.monotonic()
 
     def descriptors(self) -> tuple[set[int], set[int]]:
-        """Return what to poll for reading, and for writing."""
+        """Return the descriptors to poll for reading and for writing."""
         if self._link is None:
             return set(), set()
         found = {self._link.fileno()}
         return found, found if self._link.has_unsent else set()
 
     def join(self, link: Link) -> None:
-        """Work with a new render loop, which is told of all memory."""
+        """Connect to a new render worker and send it all slots."""
         self._link = link
         self.is_ready = False
         self.excuse()
@@ -123,12 +123,12 @@ class RenderEnd:
             self._send_slot(slot)
 
     def receive(self) -> list[tuple[Any, ...]]:
-        """Return what the loop says.
+        """Return messages of the worker.
 
         Raises
         ------
         LinkClosed
-            It is gone; `lose` is to be called.
+            If the worker is gone; the caller then calls `lose`.
         """
         if self._link is None:
             return []
@@ -139,7 +139,7 @@ class RenderEnd:
         return messages
 
     def lose(self) -> list[Held]:
-        """Give up the link; return the frames that are lost with it."""
+        """Close the link; return the frames that are lost with it."""
         if self._link is not None:
             self._link.close()
             self._link = None
@@ -150,7 +150,7 @@ class RenderEnd:
         return lost
 
     def tell(self, *message: Any) -> None:
-        """Send a message; one that does not arrive is found out by `receive`."""
+        """Send a message; ignores a closed link, which `receive` reports."""
         if self._link is not None:
             try:
                 self._link.send(message)
@@ -161,16 +161,16 @@ class RenderEnd:
 
     @property
     def session_quota_bytes(self) -> int:
-        """Return the memory that one session may hold between its frames."""
+        """Return the memory that one session may hold between its frames, bytes."""
         return int(SESSION_QUOTA * self._slots.max_bytes)
 
     def share(self, size_bytes: int) -> Slot:
-        """Return memory that no other client has had.
+        """Return a slot that no other client has had.
 
         Raises
         ------
         OutOfMemory
-            Also where only what is reserved for ordinary frames is left.
+            Also if only the memory reserved for frames sent as parts is left.
         """
         held = [slot for slot in self._slots if slot.number in self._shared]
         most_bytes = int(SHARED_QUOTA * self._slots.max_bytes)
@@ -189,23 +189,23 @@ class RenderEnd:
         return slot
 
     def drop(self, slot: Slot) -> None:
-        """Give up memory for good."""
+        """Free a slot permanently."""
         self._shared.discard(slot.number)
         self._slots.drop(slot)
         self.tell("drop_slot", slot.number)
 
     def give_back(self, *slots: Slot) -> None:
-        """Take memory back, for other frames."""
+        """Return slots to the pool, for other frames."""
         for slot in slots:
             self._slots.give_back(slot)
 
     def trim(self) -> None:
-        """Give up the memory that is free."""
+        """Free the unused slots of the pool."""
         for slot in self._slots.trim():
             self.tell("drop_slot", slot.number)
 
     def still_unsent(self, unsent: Unsent) -> Unsent:
-        """Return those of which libzmq still reads; the slots of others are free."""
+        """Return results that libzmq is still reading; free the slots of the others."""
         left = []
         for tracker, slot in unsent:
             if tracker.done:
@@ -231,7 +231,7 @@ class RenderEnd:
     # Frames
 
     def takes(self, session: Session, frame: Frame) -> bool:
-        """Return whether a frame may be handed over now."""
+        """Return whether the worker can accept a frame now."""
         if not self.is_ready or len(self.held) >= (2 if self.may_rest else 1):
             return False
         return all(
@@ -241,7 +241,7 @@ class RenderEnd:
         )
 
     def hand_over(self, session: Session, waiting: WaitingFrame) -> None:
-        """Have a frame filtered.
+        """Send a frame to the worker.
 
         Raises
         ------
@@ -264,7 +264,7 @@ class RenderEnd:
         self.tell("frame", number, session.key, bare, places, sizes_bytes)
 
     def _copied_in(self, frame: Frame) -> tuple[SharedPlaces, tuple[Slot, ...]]:
-        """Copy the images of a frame to slots of the service."""
+        """Copy the images of a frame to the service's own slots."""
         images = frame.parts()
         starts, n_in = starts_of([image.nbytes for image in images])
         result_starts, n_out = starts_of(result_sizes(frame))
@@ -281,14 +281,14 @@ class RenderEnd:
         return places, (slot, result_slot)
 
     def take_back(self, number: int) -> Held | None:
-        """Return the frame that an answer is to, if it is one that is awaited."""
+        """Return the frame that a reply belongs to, or None if it is not expected."""
         return self.held.pop(number, None)
 
 
 def completed(
     result: Result, held: Held, started_s: float, blocks_bytes: Sequence[int]
 ) -> Result:
-    """Return a result with its pictures and with the times that the door knows."""
+    """Return a result with its pictures and the times known to the front end."""
     if held.own_slots:
         _, slot = held.own_slots
         result = replace(

@@ -1,15 +1,15 @@
-"""The loop that filters frames: a filter for each eye, behind a link to the door.
+"""Event loop of the render worker: a filter for each eye, linked to the front end.
 
-The door owns the socket and the sessions' credit; here are their eyes.  Neither waits
-for the other, and each outlives the other: a new door is told which sessions there are.
+The front end owns the socket and the sessions' credit, the worker their eyes.  Neither
+waits for the other, and each survives the other: a new front end is sent the sessions.
 
-From the door: ``("slot", number, size)`` with its descriptor, ``("drop_slot",
+From the front end: ``("slot", number, size)`` with its descriptor, ``("drop_slot",
 number)``, ``("open", key, session_id, generations)`` of eyes, ``("profile", key,
 request)``, ``("frame", number, key, frame, places, sizes)``, ``("close",
 key)``.
-To the door: ``("here", server, eyes, may_rest)`` first, ``("tell", key, eye, reply)``,
-``("answer", number, reply, started_s, ended_s, used_s, blocks_bytes)`` and ``("state",
-memory_mb, stores_mb, is_building)``.  Sizes are of parts that are compressed.
+To the front end: ``("here", server, eyes, may_rest)`` first, ``("tell", key, eye,
+reply)``, ``("answer", number, reply, started_s, ended_s, used_s, blocks_bytes)`` and
+``("state", memory_mb, stores_mb, is_building)``.  Sizes are those of compressed parts.
 """
 
 from __future__ import annotations
@@ -49,25 +49,25 @@ ATTENTION_WAIT_S = 0.1
 STATE_INTERVAL_S = 0.5
 BETWEEN_S = 0.01
 LONG_FRAME_S = 0.2
-"""While a frame takes longer, eyes are prepared in its rests, too."""
+"""Frame time from which interruptions of the frame also prepare eyes."""
 
 TRIM_AFTER_S = 10.0
-"""Without a frame for so long, the memory of frames goes back to the system."""
+"""Time without a frame after which frame memory is returned to the system."""
 
 log = logging.getLogger("ocufilter")
 
 
 class RenderLoop:
-    """Filters the frames that come over a link.
+    """Filters the frames received over a link.
 
     Parameters
     ----------
     workshop : Workshop
-        Where all sessions' eyes are made; the loop closes it.
+        Builder of all sessions' eyes; the loop closes it.
     read_profile : callable
-        ``read_profile(body)`` gives what the workshop takes, or raises a FilterError.
+        ``read_profile(body)`` returns a parsed profile, or raises a FilterError.
     max_cameras : int
-        That one session keeps prepared.
+        Number of cameras that one session keeps prepared.
     """
 
     def __init__(
@@ -85,9 +85,9 @@ class RenderLoop:
         self._door: Link | None = None
         self._inbox: deque[tuple[Any, list[int]]] = deque()
         self._next_state_s = 0.0
-        self._trim_at_s: float | None = None  # where frames hold memory
-        self._frame_since_s: float | None = None  # the one that is being filtered
-        self._rested_s = 0.0  # of that
+        self._trim_at_s: float | None = None  # None while frames hold no memory
+        self._frame_since_s: float | None = None  # start of the current frame
+        self._rested_s = 0.0  # interruptions of it
         self._next_rest_s = 0.0
         self._listen: Callable[[], None] = lambda: None
         self._is_over = False
@@ -96,7 +96,7 @@ class RenderLoop:
     def run(
         self, control: Link, take_control: Callable[[Any, list[int]], bool]
     ) -> None:
-        """Serve until the control link says so, or closes.
+        """Serve until the control link sends stop or closes.
 
         Parameters
         ----------
@@ -125,12 +125,12 @@ class RenderLoop:
             self._close()
 
     def join(self, door: Link) -> None:
-        """Serve a door; one before it is gone."""
+        """Serve a new front end; the previous one is gone."""
         if self._door is not None:
             self._door.close()
         self._door = door
         self._drop_slots()
-        while self._inbox:  # of the door before
+        while self._inbox:  # of the previous front end
             for descriptor in self._inbox.popleft()[1]:
                 os.close(descriptor)
         server = {
@@ -138,12 +138,12 @@ class RenderLoop:
             "version": package_version(),
             "engine": self._workshop.engine_name,
             "renderer": self._workshop.engine.name,
-            "gl_renderer": self._workshop.engine.name,  # what it was called before
+            "gl_renderer": self._workshop.engine.name,  # its old name
         }
         eyes = [(key, session.profiles) for key, session in self._sessions.items()]
         self._send(("here", server, eyes, self._may_rest))
 
-    # The loop
+    # Event loop
 
     def _watch(self, selector: selectors.BaseSelector, control: Link) -> None:
         wanted = {control.fileno(): selectors.EVENT_READ}
@@ -175,7 +175,7 @@ class RenderLoop:
         if self._door is not None:
             try:
                 self._door.flush()
-                # What comes in a rest may not overtake what came with the frame.
+                # Messages read during a frame must not overtake earlier ones.
                 self._inbox.extend(self._door.receive())
                 while self._inbox:
                     self._handle(*self._inbox.popleft())
@@ -198,10 +198,10 @@ class RenderLoop:
         return self._trim_at_s is not None and time.monotonic() > self._trim_at_s
 
     def _rest(self) -> None:
-        """In the middle of a frame: do what others want, a smaller frame too.
+        """Interrupt a frame to handle messages, which may filter a smaller frame.
 
-        That takes half of the time at most.  Whatever is asked for meanwhile, what the
-        frame is filtered with stays in memory until it is done.
+        Interruptions take at most half of the time.  The resources of the frame stay in
+        memory until it is done, whatever is requested meanwhile.
         """
         begin_s = time.monotonic()
         since_s = self._frame_since_s
@@ -212,7 +212,7 @@ class RenderLoop:
             self._turn(is_short=begin_s < since_s + LONG_FRAME_S)
         except LinkClosed:
             self._is_over = True
-        except Exception:  # it cannot be raised through the compiled loops
+        except Exception:  # must not propagate through the compiled loops
             log.exception("what came between the parts of a frame failed")
         end_s = time.monotonic()
         self._rested_s += end_s - begin_s
@@ -286,7 +286,7 @@ class RenderLoop:
             session.close()
 
     def _take_profile(self, key: str, request: ProfileRequest) -> None:
-        """Accept a profile; what becomes of it is told as events."""
+        """Accept a profile; events report its progress."""
         session = self._sessions.get(key)
         if session is not None:
             self._tell(key, request.eye, session.take(request, self._read_profile))
@@ -305,7 +305,7 @@ class RenderLoop:
         places: SharedPlaces,
         sizes_bytes: Sequence[int],
     ) -> None:
-        """Filter a frame; one that comes between the parts of another does not rest."""
+        """Filter a frame; one that is filtered during another is not interrupted."""
         started_s = time.monotonic()
         is_first = self._frame_since_s is None
         if is_first:
@@ -325,12 +325,12 @@ class RenderLoop:
     def _answer_to(
         self, key: str, frame: Frame, places: SharedPlaces, sizes_bytes: Sequence[int]
     ) -> tuple[Reply, list[int]]:
-        """Return the answer to a frame; whatever goes wrong is an answer, too."""
+        """Return the reply to a frame; any failure becomes an error reply."""
         try:
             session = self._sessions.get(key)
             if session is None:
                 raise NoSession("the session has ended")
-            # By the end the door may have given them up.
+            # During the frame the front end may drop them.
             slots = self._slots[places.slot], self._slots[places.result_slot]
             return reply_in_slots(session.filter_of, frame, slots, places, sizes_bytes)
         except Exception as error:

@@ -1,9 +1,8 @@
-"""The process that filters: ``python -m`` this, with a link's descriptor and two names.
+"""Main program of a render worker; run with ``python -m``.
 
-One is its own, for the log.  The other, ``module:function``, is of what opens the
-workshop: ``function(config,
-closing)`` returns it, what reads profiles, and what to call once all is ready.  Tests
-have one of their own.
+Its arguments are the link's descriptor, the ``module:function`` that opens the builder,
+and the process's name in the log.  ``function(config, closing)`` returns the builder, a
+function that reads profiles, and one to call when all is ready.  Tests use their own.
 """
 
 from __future__ import annotations
@@ -36,18 +35,18 @@ log = logging.getLogger("ocufilter")
 
 
 def open_real_workshop(config: ServiceConfig, closing: ExitStack) -> Opened:
-    """Return the real engine with the real PSFs."""
+    """Open the builder with the real engine and PSFs."""
     if config.threads:
         os.environ[THREADS_VARIABLE] = str(config.threads)  # the worker's, too
     if config.gl_device != AUTO:
-        os.environ[GL_DEVICE_VARIABLE] = config.gl_device  # the same
+        os.environ[GL_DEVICE_VARIABLE] = config.gl_device  # likewise
     worker = WorkerHandle(
         cancel_grace_s=config.cancel_grace_s,
         build_limit_s=config.build_limit_s,
         niceness=config.build_niceness,
     )
     closing.callback(worker.close)
-    worker.start()  # it imports what takes long while this process does the same
+    worker.start()  # slow imports run in both processes at once
     from filter_service.building.read_profile import read_profile
     from filter_service.filtering.load_ahead import load_ahead
     from filter_service.filtering.shared_workshop import open_workshop
@@ -57,7 +56,7 @@ def open_real_workshop(config: ServiceConfig, closing: ExitStack) -> Opened:
 
 
 def main() -> None:
-    """Filter frames until the keeper says so."""
+    """Filter frames until the supervisor sends stop."""
     keeper, config, others = begin(sys.argv[3])
     module, _, function = sys.argv[2].partition(":")
     open_workshop = getattr(importlib.import_module(module), function)
@@ -80,7 +79,7 @@ def main() -> None:
 def take_control(
     loop: RenderLoop, message: tuple[Any, ...], descriptors: list[int]
 ) -> bool:
-    """Do what the keeper says; return whether to go on."""
+    """Handle a message of the supervisor; return whether to go on."""
     if message[0] == "link":
         loop.join(Link.from_descriptor(descriptors[0]))
     return bool(message[0] != "stop")

@@ -1,6 +1,6 @@
-"""The door's side of the devices: frames, memory and news of each, and all together.
+"""The devices as the front end sees them: frames, memory and state of each.
 
-A session lives on one of them, with its eyes and its memory, as long as it is there.
+A session stays on one device, with its eyes and memory, as long as the device exists.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from filter_service.service.session import Session
 
 
 class ServedDevice:
-    """One device, as the door knows it.
+    """One device, as the front end sees it.
 
     Parameters
     ----------
     index : int
     name : str
-        As the settings have it.
+        Name of the device in the settings.
     max_image_bytes : int
-        Of the images of its sessions.
+        Memory for the images of its sessions.
     descriptors : DescriptorLimit
-        Of this process.
+        Descriptor limit of this process.
     guests : Guests
     send : callable
         See `FrameDesk`.
@@ -39,13 +39,13 @@ class ServedDevice:
     ----------
     render : RenderEnd
     frames : FrameDesk
-        Of its sessions.
+        Frames of its sessions.
     server : dict, optional
-        What its process says of itself; None until it has.
+        Description reported by its process; None until then.
     memory_mb, stores_mb, is_building
-        As that process told last.
+        State last reported by that process.
     is_lost : bool
-        It was given up; no session is on it.
+        Whether it was given up; then no session is on it.
     """
 
     def __init__(
@@ -66,12 +66,12 @@ class ServedDevice:
         self.is_building = self.is_lost = False
 
     def give_up(self) -> None:
-        """Note that it will not come again."""
+        """Mark the device as given up."""
         self.is_lost, self.is_building = True, False
         self.memory_mb = self.stores_mb = 0.0
 
     def state(self, sessions: Sequence[Session]) -> DeviceState:
-        """Return what `pong` says of it; the sessions are those with a client."""
+        """Return the device's state for `pong`, given its sessions with a client."""
         return DeviceState(
             name=self.name,
             renderer=(self.server or {}).get("renderer", ""),
@@ -94,7 +94,7 @@ class ServedDevices:
     ----------
     names : sequence of str
     max_image_bytes : int
-        Of all of them; each has an equal part, so that none can use up another's.
+        Image memory of all devices, divided equally so that none can exhaust another's.
     descriptors, guests, send
         See `ServedDevice`.
     """
@@ -117,26 +117,26 @@ class ServedDevices:
         ]
 
     def __iter__(self) -> Iterator[ServedDevice]:
-        """Go through them in their order."""
+        """Iterate over the devices in order."""
         return iter(self._devices)
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Return the number of devices."""
         return len(self._devices)
 
     def __getitem__(self, index: int) -> ServedDevice:
-        """Return one of them."""
+        """Return a device by its index."""
         return self._devices[index]
 
     def of(self, session: Session) -> ServedDevice:
-        """Return the device that a session lives on."""
+        """Return the device of a session."""
         return self._devices[session.device]
 
     def least_busy(self) -> ServedDevice:
         """Return the device for a new session.
 
-        One that is ready before one that is being started; then the one with the fewest
-        sessions that have a client; then the one that had least to do of late.
+        Ready devices precede those that are starting, then the fewest sessions with a
+        client count, then the lowest recent load.
         """
         now_s = time.monotonic()
         return min(
@@ -149,19 +149,19 @@ class ServedDevices:
         )
 
     def states(self) -> tuple[DeviceState, ...]:
-        """Return what `pong` says of each."""
+        """Return the states of all devices for `pong`."""
         return tuple(
             device.state(self._guests.present_on(device.index)) for device in self
         )
 
     @property
     def _left(self) -> list[ServedDevice]:
-        """Return those that were not given up: one at least."""
+        """Return the devices that were not given up, at least one."""
         return [device for device in self._devices if not device.is_lost]
 
     @property
     def are_known(self) -> bool:
-        """Return whether each has said who it is."""
+        """Return whether all devices have reported."""
         return all(device.server is not None for device in self._left)
 
     @property
@@ -171,20 +171,20 @@ class ServedDevices:
 
     @property
     def silent_s(self) -> float:
-        """Return since when one of them has given no sign of life."""
+        """Return the seconds since the last heartbeat of the most silent device."""
         return max(device.render.silent_s for device in self._left)
 
     @property
     def memory_mb(self) -> float:
-        """Return the memory of all their processes."""
+        """Return the memory of all devices' processes."""
         return sum(device.memory_mb for device in self)
 
     def descriptors(self) -> tuple[set[int], set[int]]:
-        """Return what to poll for reading, and for writing."""
+        """Return the descriptors to poll for reading and for writing."""
         pairs = [device.render.descriptors() for device in self]
         return set().union(*(r for r, _ in pairs)), set().union(*(w for _, w in pairs))
 
     def wait_s(self, now_s: float) -> float | None:
-        """Return how soon a frame may be handed over; None where none waits."""
+        """Return the time until a frame may be handed over; None if no frame waits."""
         soon_s = [device.frames.wait_s(now_s) for device in self]
         return min((s for s in soon_s if s is not None), default=None)

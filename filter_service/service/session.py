@@ -1,6 +1,6 @@
-"""One client's session: its waiting frame, its credit, the profiles of its eyes.
+"""State of one client's session: waiting frame, credit and profiles of its eyes.
 
-State only: no sockets.  `door` acts on what it says.
+This module uses no sockets; `door` acts on the state.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from filter_service.slots import Slot
 
 KEY_BYTES = 16
 MAX_RECORDED_BYTES = 65_536
-"""Of a profile's body, as JSON: 100 measurements of 28 coefficients take 60,000.  The
-client of a larger one sends it again where the service has lost it."""
+"""Largest JSON body of a profile that is recorded: 100 measurements of 28 coefficients
+take 60,000 bytes.  A client sends a larger one again if the service has lost it."""
 
 
 @dataclass(frozen=True)
 class WaitingFrame:
-    """A frame with the times that its stages need."""
+    """A frame with the times needed for its stage times."""
 
     frame: Frame
     received_s: float
@@ -31,23 +31,23 @@ class WaitingFrame:
 
 
 def new_key() -> str:
-    """Return a key that nobody guesses."""
+    """Return a random key."""
     return secrets.token_hex(KEY_BYTES)
 
 
 @dataclass
 class EyeProfiles:
-    """The profiles of one eye: the last that was accepted, and those to come."""
+    """The profiles of one eye: the last accepted one, and those in progress."""
 
-    profile: ProfileRequest | None = None  # the last that was accepted
-    asked_profile: ProfileRequest | None = None  # on its way
-    next_profile: ProfileRequest | None = None  # waits for the one on its way
+    profile: ProfileRequest | None = None  # last accepted
+    asked_profile: ProfileRequest | None = None  # sent to the render worker
+    next_profile: ProfileRequest | None = None  # waits for the one sent
     profile_id: int | None = None
     generation: int = 0
-    next_ask_s: float = 0.0  # no sooner is another one asked for
+    next_ask_s: float = 0.0  # earliest time to send another
 
     def record(self) -> EyeProfiles:
-        """Return the accepted profile alone, without its body where that is large."""
+        """Return a copy with the accepted profile only, omitted if it is large."""
         profile = self.profile
         if profile is not None and len(profile.parts()[0]) > MAX_RECORDED_BYTES:
             profile = None
@@ -58,7 +58,7 @@ class EyeProfiles:
 
 @dataclass(frozen=True)
 class SessionRecord:
-    """A session as the supervisor keeps it, in case the front end ends."""
+    """State of a session that the supervisor keeps in case the front end ends."""
 
     session_id: int
     key: str
@@ -71,7 +71,7 @@ class SessionRecord:
 
 @dataclass(eq=False)
 class Session:
-    """What the service knows of one client.
+    """State of one client.
 
     Parameters
     ----------
@@ -79,16 +79,16 @@ class Session:
     peer : Peer, optional
         The client's connection; None while it is away.
     client : str
-        What it calls itself.
+        Name that the client gives itself.
     credit : int
-        Frames it may have unanswered.
+        Maximum number of unanswered frames.
     key : str
-        With which it may come back.
+        Session key, which resumes the session.
     owner : str
-        The CURVE key of the client that began it, which alone may come back; empty
-        where the service has no keys.
+        CURVE key of the client that started the session and that alone may resume it;
+        empty if the service has no keys.
     device : int
-        Index of the device that its eyes are on.
+        Index of the device that has its eyes.
     """
 
     session_id: int
@@ -101,9 +101,9 @@ class Session:
     n_unanswered: int = 0
     waiting: WaitingFrame | None = None
     unsent: list[tuple[Tracker, Slot]] = field(default_factory=list)  # large replies
-    behind_since_s: float | None = None  # too many of them
-    shared: dict[int, Slot] = field(default_factory=dict)  # memory of the client
-    lent: set[int] = field(default_factory=set)  # of those, in use by frames
+    behind_since_s: float | None = None  # since there have been too many of them
+    shared: dict[int, Slot] = field(default_factory=dict)  # slots of the client
+    lent: set[int] = field(default_factory=set)  # slots in use by frames
     away_since_s: float | None = None
     last_connection: int = 0
     eyes: dict[EyeName, EyeProfiles] = field(default_factory=dict)
@@ -113,7 +113,7 @@ class Session:
         return self.eyes.setdefault(name, EyeProfiles())
 
     def record(self) -> SessionRecord:
-        """Return what is kept of the session while this process is started again."""
+        """Return the state that survives a restart of this process."""
         return SessionRecord(
             *(self.session_id, self.key, self.owner, self.client, self.credit),
             *(self.device, {name: eye.record() for name, eye in self.eyes.items()}),
@@ -121,7 +121,7 @@ class Session:
 
     @classmethod
     def restored(cls, record: SessionRecord, now_s: float) -> Self:
-        """Return a session as it was; its client is away."""
+        """Return a session from its record; its client is away."""
         session = cls(
             *(record.session_id, None, record.client, record.credit),
             key=record.key,
@@ -134,7 +134,7 @@ class Session:
 
     @property
     def profile_ids(self) -> dict[EyeName, int]:
-        """Return the last accepted profile of each eye."""
+        """Return the id of the last accepted profile of each eye."""
         return {
             name: eye.profile_id
             for name, eye in self.eyes.items()
@@ -143,16 +143,16 @@ class Session:
 
     @property
     def asks(self) -> bool:
-        """Return whether a profile is on its way."""
+        """Return whether the render worker has yet to accept a profile."""
         return any(eye.asked_profile is not None for eye in self.eyes.values())
 
     def take_in(self, waiting: WaitingFrame) -> WaitingFrame | None:
-        """Keep a frame as the newest; return the one that it supersedes.
+        """Store a frame as the newest; return the one that it supersedes.
 
         Raises
         ------
         CreditExceeded
-            The client has too many unanswered frames; this one is not kept.
+            If the client has too many unanswered frames; this one is then discarded.
         """
         if self.n_unanswered >= self.credit:
             raise CreditExceeded(
@@ -165,17 +165,17 @@ class Session:
         return superseded
 
     def lend(self, frame: Frame) -> None:
-        """Note that a frame uses memory of the client."""
+        """Mark the client's slots that a frame uses."""
         if frame.memory is not None:
             self.lent |= {frame.memory.slot, frame.memory.result_slot}
 
     def get_back(self, frame: Frame) -> None:
-        """Note that it does not any more."""
+        """Unmark the client's slots that a frame has used."""
         if frame.memory is not None:
             self.lent -= {frame.memory.slot, frame.memory.result_slot}
 
     def leave(self, now_s: float) -> None:
-        """Note that the client is away; what it waited for it does not wait for."""
+        """Mark the client as away, and discard its waiting frame and credit use."""
         if self.peer is not None:
             self.last_connection = self.peer.connection
         self.peer = None
@@ -184,7 +184,7 @@ class Session:
         self.n_unanswered = 0
 
     def come_back(self, peer: Peer, client: str) -> None:
-        """Note that the client is there again, or from somewhere else."""
+        """Attach a reconnected client, or one that takes the session over."""
         self.peer, self.client = peer, client
         self.away_since_s = None
         self.waiting = None

@@ -1,4 +1,4 @@
-"""The eyes of one session: a filter for each, made when it is first spoken of."""
+"""The eyes of one session, each with a filter that is created on first use."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ log = logging.getLogger("ocufilter")
 
 @dataclass(eq=False)
 class _Eye:
-    """The filter of one eye, and the profile that it was last given."""
+    """The filter of one eye and its last accepted profile."""
 
     eye_filter: EyeFilter
     profile_id: int | None = None
@@ -43,13 +43,13 @@ class SessionEyes:
     ----------
     session_id : int
     workshop : Workshop
-        Where all eyes are made.
+        Builder of the eyes.
     tell : callable
-        ``tell(eye, reply)``: what happens to the profile of an eye.
+        ``tell(eye, reply)`` is called with replies about the profile of an eye.
     max_cameras : int
-        That each eye keeps prepared.
+        Number of cameras that each eye keeps prepared.
     generations : mapping
-        How many profiles each eye has had before.
+        Number of earlier profiles of each eye.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class SessionEyes:
         }
 
     def close(self) -> None:
-        """Give up all eyes."""
+        """Release all eyes."""
         self._is_over = True
         for eye in self._eyes.values():
             eye.eye_filter.close()
@@ -88,7 +88,7 @@ class SessionEyes:
         Raises
         ------
         NoSession
-            The session has ended meanwhile.
+            If the session has ended.
         """
         return self._eye(name).eye_filter
 
@@ -110,7 +110,7 @@ class SessionEyes:
         request: ProfileRequest,
         read_profile: Callable[[dict[str, Any]], EyeProfile],
     ) -> Reply:
-        """Accept a profile, or say what is wrong with it."""
+        """Return the reply to a profile: accepted, or an error."""
         try:
             eye = self._eye(request.eye)
             accepted = eye.eye_filter.set_profile(
@@ -134,7 +134,7 @@ class SessionEyes:
         )
 
     def _tell_event(self, name: EyeName, event: EyeEvent) -> None:
-        """Tell what happens to a profile."""
+        """Report an event of a profile."""
         profile_id, generation = event.eye.profile_id, event.eye.generation
         reply: Reply
         if isinstance(event, BuildingEye):
