@@ -1,17 +1,17 @@
-"""Streams of frames through eyes that may change on the way.
+"""Streams of frames through eyes that may change during the stream.
 
 eye_filter        `EyeFilter`: one stream; the public API
-planned_frame     a frame whose eye is known
-several_eyes      a frame whose views have eyes of their own
-filtered          a filtered frame, and events on the way
-accepted_profile  one profile and the stores of it
-stream_eyes       which eye serves, and what is to be estimated
-warm_up           the states that the next frames of a stream will have
-workshop          one worker and one engine for all streams
-shared_workshop   the one that a process shares
-choose_engine     which one filters here, and why
-compile_loops     every compiled loop, made ahead on all cores
-load_ahead        what frames need, loaded while nobody asks
+planned_frame     a frame whose eye is prepared
+several_eyes      a frame whose views have different eyes
+filtered          a filtered frame, and events of an eye
+accepted_profile  one profile and its stores
+stream_eyes       the eyes of a stream: requested, building, ready
+warm_up           prediction of the next frames' states
+workshop          builder and engine shared by all streams
+shared_workshop   builders shared within a process
+choose_engine     choice of the engine, with the reason
+compile_loops     compilation of all loops, on all cores
+load_ahead        imports in the background before the first frame
 """
 
 import lazy_loader

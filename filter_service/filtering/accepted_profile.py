@@ -1,4 +1,4 @@
-"""One accepted profile with the stores that exist of it."""
+"""An accepted profile and its stores."""
 
 from __future__ import annotations
 
@@ -18,28 +18,28 @@ from filter_service.settings import FilterSettings
 
 @dataclass(eq=False)
 class PreparedStore:
-    """A loaded store and the camera that it was made for.
+    """A loaded store and the camera that it was built for.
 
     Attributes
     ----------
     camera : Camera
     store : LoadedStore
     started_s : float
-        When its profile was accepted, or a frame first asked for the camera.
+        Time when its profile was accepted, or when a frame first used the camera.
     notes : tuple of str
-        About the eye, in sentences.
+        Notes about the eye, in sentences.
     is_ready : bool
-        The PSFs of a first frame are computed; from then on it serves.
+        Whether the PSFs of a first frame are computed; from then on frames use it.
     used_s : float
-        When a frame last went through it, or when it was loaded.
+        Time when a frame last used it, or when it was loaded.
     pending : (n,)
-        PSFs of a first frame that are being computed.
+        Indices of a first frame's PSFs that are being computed.
     next_progress_s : float
-        When progress may be told again.
+        Earliest time of the next progress event.
     n_checks : int
-        How often missing PSFs of a first frame were found and computed.
+        Number of times that missing PSFs of a first frame were found and computed.
     ticket : int
-        Of its build.
+        Ticket of its build.
     """
 
     camera: Camera
@@ -56,7 +56,7 @@ class PreparedStore:
 
 @dataclass(eq=False)
 class AcceptedProfile:
-    """One accepted profile with the stores that exist of it.
+    """An accepted profile and its stores.
 
     ``generation`` counts the accepted profiles of a session; every result names it.
     Stores are in order of last use, at most one for each camera.
@@ -68,31 +68,31 @@ class AcceptedProfile:
     settings: FilterSettings
     wanted: tuple[Camera, ...] = ()  # cameras whose first frame would wait
     stores: list[PreparedStore] = field(default_factory=list)
-    was_ready: bool = False  # for some camera, whatever has become of it
+    was_ready: bool = False  # for any camera, at any time
     failures: list[tuple[Camera, FilterError]] = field(default_factory=list)
     accepted_s: float = field(default_factory=time.monotonic)
 
     def is_same(self, first: Camera, second: Camera) -> bool:
-        """Return whether one store of this eye serves both cameras."""
+        """Return whether one store of this eye fits both cameras."""
         return is_same_camera(first, second, follows_field=self.settings.follows_field)
 
     def store_for(self, camera: Camera) -> PreparedStore | None:
-        """Return the store that serves a camera."""
+        """Return the store for a camera, if there is one."""
         return next((s for s in self.stores if self.is_same(s.camera, camera)), None)
 
     def note_use(self, camera: Camera) -> None:
-        """Move a camera's store to the end."""
+        """Mark a camera's store as the last used."""
         found = self.store_for(camera)
         if found is not None:
             found.used_s = time.monotonic()
         self.stores.sort(key=lambda prepared: self.is_same(prepared.camera, camera))
 
     def failure_for(self, camera: Camera) -> FilterError | None:
-        """Return why no store could be made for a camera."""
+        """Return the error of a failed build for a camera, if any."""
         return next((e for c, e in self.failures if self.is_same(c, camera)), None)
 
     def want(self, cameras: Iterable[Camera]) -> None:
-        """Ask for stores for cameras that have none; one that failed stays failed."""
+        """Request stores for cameras that have none, except for failed ones."""
         new = [
             camera
             for camera in cameras
@@ -103,5 +103,5 @@ class AcceptedProfile:
         )
 
     def want_no_more(self, camera: Camera) -> None:
-        """Forget the wish for a camera."""
+        """Withdraw the request for a camera."""
         self.wanted = tuple(c for c in self.wanted if not self.is_same(c, camera))

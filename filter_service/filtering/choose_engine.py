@@ -1,4 +1,4 @@
-"""Which engine filters frames on this machine, and why."""
+"""Choice of the engine that filters frames on this machine."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from filter_service.gl_device import is_device_named
 
 @dataclass(frozen=True)
 class ChosenEngine:
-    """A frame engine that is ready for stores.
+    """An open frame engine.
 
     Attributes
     ----------
     name : "gl" or "native"
     engine : FrameEngine
     reason : str
-        Why this one, in a few words.
+        Reason for the choice, in a few words.
     """
 
     name: str
@@ -32,23 +32,23 @@ class ChosenEngine:
 def open_engine(
     choice: str, closing: ExitStack, *, warm_up: bool = False
 ) -> ChosenEngine:
-    """Open the engine of a choice.
+    """Open a frame engine.
 
     Parameters
     ----------
     choice : "auto", "gl" or "native"
-        "auto" takes gl on a hardware GPU, or where one device is named, else native.
+        "auto" selects gl on a hardware GPU or if a device is named, otherwise native.
     closing : ExitStack
-        Ends it.
+        Closes the engine.
     warm_up : bool
-        Compile shaders now, and not in the first frames.
+        Whether to compile shaders now instead of in the first frames.
 
     Raises
     ------
     ValueError
-        Another choice.
+        For an unknown choice.
     RenderFailed
-        It does not work on this machine; names what to install.
+        If the engine does not work on this machine; the message names what to install.
     """
     if choice not in ENGINES:
         raise ValueError(f"engine {choice!r}; allowed: {', '.join(ENGINES)}")

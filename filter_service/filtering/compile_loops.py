@@ -1,11 +1,11 @@
-"""Compiles every loop of the service, once on a machine, on all its cores.
+"""Compiles every loop of the service, once per machine, on all cores.
 
     python -m filter_service.filtering.compile_loops
 
-`setup.sh` runs it beside the installation of packages, and `ocufilter prepare` after
-that of a wheel; without either the worker does it when it is first idle.  numba keeps
-what it compiles beside the sources, or in the user's cache where it may not write
-there.  The halves share hardly a loop, so that two processes take half the time.
+`setup.sh` runs it while packages are installed, and `ocufilter prepare` after a wheel
+is installed; otherwise the build worker does it when first idle.  numba caches the
+results beside the sources, or in the user's cache if it cannot write there.  The halves
+share hardly any loop, so two processes take half the time.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from filter_service.progress import Progress, Task
 
 MODULE = "filter_service.filtering.compile_loops"
 PARTS = {"tracing": "eyes", "psfs": "PSFs", "frames": "frames"}
-"""What a process can compile, longest first, and what those loops are for."""
+"""Parts that a process can compile, longest first, and the purpose of their loops."""
 
 POLL_S = 0.1
 
 
 def compile_loops(progress: Progress) -> None:
-    """Compile all parts, as many at once as there are cores.
+    """Compile all parts, one process per core.
 
     Raises
     ------
     BuildFailed
-        A process has failed; it has said why.
+        If a process has failed; it has printed the reason.
     """
     waiting, running = list(PARTS), dict[str, subprocess.Popen[bytes]]()
     task = progress.task(
@@ -64,7 +64,7 @@ def _take_finished(running: dict[str, subprocess.Popen[bytes]], task: Task) -> N
 
 
 def compile_part(part: str) -> None:
-    """Compile one part in this process, or read what is compiled already."""
+    """Compile one part in this process, or load it from numba's cache."""
     if part == "tracing":
         from filter_service.building.compile_builds import trace_an_eye
 
@@ -80,7 +80,7 @@ def compile_part(part: str) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Compile the parts that are named, one after the other; all at once if none is."""
+    """Compile the named parts one after the other, or all parts in parallel."""
     if arguments:
         end_with_parent()
         for part in arguments:

@@ -1,10 +1,10 @@
-"""`EyeFilter`: pictures through a person's eye, in this process, without a socket.
+"""`EyeFilter`: images as a person's eye sees them, in this process.
 
     camera = Camera.from_fov(50, width_px=480, height_px=270)
     with EyeFilter("keratoconus", camera) as eye_filter:
         seen = eye_filter.filter(color, depth_m, pupil_diameter_mm=4, focus_dpt=0)
 
-The service holds one of these for each client.
+The service uses one for each eye of a session.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ Profile = EyeProfile | Mapping[str, Any] | str | Path
 
 
 def as_profile(profile: Profile) -> EyeProfile:
-    """Return a profile of any form: parsed, a map, a preset's name or a file.
+    """Convert a parsed profile, a mapping, a preset's name or a file to a profile.
 
     Raises
     ------
     ValueError
-        Names the field, the bad value and what is allowed.
+        Names the field, the invalid value and the allowed ones.
     """
     if isinstance(profile, Mapping):
         return parse_profile(profile)
@@ -73,40 +73,40 @@ def _as_cameras(cameras: Camera | Sequence[Camera]) -> tuple[Camera, ...]:
 
 
 class EyeFilter:
-    """One stream of frames through one person's eye, which may change on the way.
+    """One stream of frames through one person's eye, which may change during it.
 
-    Every frame shows the state that it asks for: PSFs that it lacks are computed before
-    it is rendered, and kept.  A change of profile does not stop the stream: frames go
-    through the old eye until a first frame through the new one would not wait.  All
-    filters of a process share a worker and an engine unless told otherwise: one thread
-    at a time may use them.
+    Every frame shows the state that it asks for: missing PSFs are computed before it is
+    rendered, and kept.  A change of profile does not stop the stream: frames go through
+    the old eye until a first frame through the new one would not have to wait.  By
+    default all filters of a process share a build worker and an engine, which only one
+    thread at a time may use.
 
     Parameters
     ----------
     profile : EyeProfile, mapping, str or Path, optional
         A parsed profile, its JSON object, a preset's name, or a file.
     camera : Camera, or several, optional
-        What to prepare for; other cameras are prepared for when their frames come.
-        Frames given as bare arrays are taken with the first.
+        Cameras to prepare for; others are prepared for when their frames arrive.
+        Frames given as arrays use the first one.
     settings : FilterSettings or mapping, optional
     on_event : callable, optional
-        Told of every `BuildingEye`, `EyeReady` and `EyeFailed`.
+        Called with every `BuildingEye`, `EyeReady` and `EyeFailed`.
     workshop : Workshop, optional
-        Where eyes are made; all filters of a process share one unless told otherwise.
+        Builder and engine; by default those shared by all filters of the process.
     max_cameras : int
-        Cameras that are kept prepared.
+        Number of cameras that are kept prepared.
     first_generation : int
-        Where profiles are counted from.
+        Generation of the first profile.
     engine : "auto", "gl" or "native"
-        What filters frames where the workshop is shared: compute shaders, or compiled
-        loops on all cores; "auto" takes gl on a hardware GPU, else native.
+        Engine of the shared workshop: compute shaders, or compiled loops on all cores;
+        "auto" selects gl on a hardware GPU, otherwise native.
 
     Raises
     ------
     ValueError
-        A profile that is wrong; names the field.
+        If the profile is invalid; the message names the field.
     RenderError
-        No engine works on this machine; names what to install.
+        If no engine works on this machine; the message names what to install.
     """
 
     def __init__(
@@ -137,13 +137,13 @@ class EyeFilter:
         self._workshop.streams.append(self._eyes)
         self._newest: AcceptedProfile | None = None
         self._failure: EyeFailed | None = None
-        self.is_extending = False  # whether only PSFs of the last frame are missing
+        self.is_extending = False  # only PSFs of the last frame are missing
         self.ready: EyeReady | None = None
         if first is not None:
             try:
                 self.set_profile(first, cameras=self.cameras)
             except BaseException:
-                self.close()  # nobody else can: there is no filter to be closed
+                self.close()  # the caller has no filter to close
                 raise
 
     def __enter__(self) -> Self:
@@ -151,11 +151,11 @@ class EyeFilter:
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        """Give up what the filter holds."""
+        """Release the filter's resources."""
         self.close()
 
     def close(self) -> None:
-        """Give up what the filter holds; closing twice is allowed."""
+        """Release the filter's resources; closing twice is allowed."""
         if self._workshop is None or self._pid != os.getpid():
             return
         self._workshop.end(self._eyes)
@@ -165,12 +165,12 @@ class EyeFilter:
 
     @property
     def workshop(self) -> Workshop:
-        """Return where the filter's eyes are made.
+        """Return the filter's builder and engine.
 
         Raises
         ------
         ValueError
-            The filter is closed, or is that of the process which this one was forked
+            If the filter is closed, or was made in the process that this one was forked
             from.
         """
         if self._workshop is None:
@@ -184,7 +184,7 @@ class EyeFilter:
 
     @property
     def prepared_stores(self) -> tuple[PreparedStore, ...]:
-        """Return the stores of the newest eye, the one used last at the end."""
+        """Return the stores of the newest eye, in order of last use."""
         return tuple(self._newest.stores) if self._newest is not None else ()
 
     # The eye
@@ -202,17 +202,17 @@ class EyeFilter:
         Parameters
         ----------
         settings : FilterSettings or mapping, optional
-            Those of the filter where it is None.
+            Settings of the eye; by default those of the filter.
         cameras : sequence of Camera, optional
-            What to prepare for; else the cameras of the last frame, else those of the
-            eye in use.
+            Cameras to prepare for; by default those of the last frame, otherwise those
+            of the eye in use.
         profile_id : int, optional
-            The caller's own number, which comes back with results; else the generation.
+            The caller's own number, returned with results; by default the generation.
 
         Raises
         ------
         ValueError
-            The profile is wrong, and the eye stays as it was.
+            If the profile is invalid; the eye is then unchanged.
         """
         self._newest = self.workshop.accept(
             self._eyes,
@@ -224,23 +224,23 @@ class EyeFilter:
         return self._newest
 
     def keep_going(self) -> None:
-        """Let new eyes be prepared where the workshop has no owner who does that."""
+        """Advance builds of new eyes if the shared workshop is used."""
         if self._shared is not None:
             self.workshop.advance(ahead=False)
 
     def advance(self) -> None:
-        """Let new eyes be prepared between frames, and compute PSFs ahead."""
+        """Advance builds of new eyes between frames, and compute PSFs ahead."""
         self.workshop.advance()
 
     def wait(self, timeout_s: float = 120.0) -> EyeReady:
-        """Return when the newest eye is ready for all cameras it was asked for.
+        """Wait until the newest eye is ready for all cameras requested of it.
 
         Raises
         ------
         FilterError
-            What the build of the eye ended with, or `ServiceTimeout`.
+            The error of the eye's build, or `ServiceTimeout`.
         BadMessage
-            There is no profile, or no camera that it could be prepared for.
+            If there is no profile, or no camera to prepare for.
         """
         deadline_s = time.monotonic() + timeout_s
         if self._newest is None:
@@ -255,10 +255,10 @@ class EyeFilter:
             self._wait_for_worker(deadline_s, "the eye to be ready")
 
     def _ending(self, eye: AcceptedProfile) -> EyeReady:
-        """Return what came of an eye for which nothing more is built."""
+        """Return or raise the outcome of an eye whose builds are finished."""
         if self.ready is not None and self.ready.eye is eye and self.ready.is_complete:
             return self.ready
-        if eye.failures:  # told before: nothing has changed since
+        if eye.failures:  # reported before, and unchanged
             raise eye.failures[-1][1].with_traceback(None)
         raise BadMessage(
             "it is not known", field="camera", allowed="a camera to prepare for"
@@ -279,7 +279,7 @@ class EyeFilter:
         descriptor = self.workshop.worker.file_descriptor
         watched = [] if descriptor is None else [descriptor]
         if not self.workshop.is_warming:
-            wait(watched, min(remaining_s, WAIT_SLICE_S))  # select ends at 1024
+            wait(watched, min(remaining_s, WAIT_SLICE_S))  # select fails above 1024
 
     # Frames
 
@@ -298,35 +298,35 @@ class EyeFilter:
         whole: bool = False,
         timeout_s: float = 120.0,
     ) -> Filtered:
-        """Filter one frame; computes the PSFs that it lacks.
+        """Filter one frame, computing the PSFs that it lacks.
 
         Parameters
         ----------
         color : (height, width, 3) array, RgbdView, or several views
             uint8 sRGB, or float32 or float16 linear light.
         depth_m : (height, width) float32
-            View-space z in metres, beside an array of colour; else part of the view.
+            View-space z in meters, with an array of color; otherwise part of the view.
         pupil_diameter_mm : float, 0.5 to 9
             Entrance pupil.
         focus_dpt : float, 0 to 20
-            Where the person wants to focus; 0 is infinity.
+            Distance that the person wants to focus on; 0 is infinity.
         gaze_deg : (h, v), optional
-            Where the eye looks in the image; as in the settings where it is None.
+            Gaze direction in the image; by default that of the settings.
         output : "srgb8", "linear" or "linear16"
             8-bit sRGB, or linear light in float32 or float16.
         accumulation : "coverage" or "paper"
-            How light of several distances is put together: nearer surfaces hide what
-            they cover, or the published sum.
+            Combination of light from several distances: nearer surfaces hide what they
+            cover, or the published sum.
         merge : bool
-            Let near-equal pixels share a splat; off is slower.
+            Whether similar pixels share a splat; off is slower.
         render_tolerance : float, 0 to 8
-            Errors of rendering against the usual, which leaves no visible difference;
-            0 is exact, more is faster.
+            Rendering errors relative to the default, which leaves no visible
+            difference; 0 is exact, more is faster.
         whole : bool
-            Wait for the newest eye, as a single picture may: a stream would rather see
-            the eye before until then.
+            Whether to wait for the newest eye, for single pictures; a stream uses the
+            previous eye until then.
         timeout_s : float
-            For the eye to be estimated and for its PSFs.
+            Timeout for estimating the eye and computing its PSFs.
 
         Returns
         -------
@@ -335,11 +335,11 @@ class EyeFilter:
         Raises
         ------
         BadMessage
-            An argument out of range (a ValueError, too).
+            If an argument is out of range (a ValueError, too).
         SessionError
-            There is no profile, or its build failed.
+            If there is no profile, or its build failed.
         RenderError
-            The engine failed.
+            If the engine failed.
         ServiceTimeout
         """
         views = as_views(color, depth_m, next(iter(self.cameras), None))
@@ -357,7 +357,7 @@ class EyeFilter:
                 newest_only=whole,
                 until_s=deadline_s,
             )
-            self.workshop.advance(ahead=False)  # it knows what this frame asks for
+            self.workshop.advance(ahead=False)  # after this frame's request
             if seen is not None:
                 return seen
             self._wait_for_worker(deadline_s, "the eye to be prepared for this camera")
@@ -377,27 +377,28 @@ class EyeFilter:
         until_s: float | None = None,
         out: Sequence[NDArray[Any] | None] | None = None,
     ) -> Filtered | None:
-        """Filter one frame like `filter`; None while its eye is being prepared.
+        """Filter one frame like `filter`; return None while its eye is being prepared.
 
         Parameters
         ----------
         newest_only : bool
-            None, and `is_extending`, while there is an older eye to show.
+            Whether to return None, and set `is_extending`, while only an older eye is
+            ready.
         until_s : float, optional
-            Time of `time.monotonic` after which no more PSFs are computed: None, and
-            `is_extending`, where some are left.  Those that were computed are kept, so
-            that the next frame goes on from there.
+            Time of `time.monotonic` after which no more PSFs are computed.  If some are
+            missing then, this returns None and sets `is_extending`; the computed ones
+            are kept, so that the next frame continues from there.
         out : sequence of arrays, optional
-            Memory for the pictures, which may be used; what is returned counts.
+            Output arrays that may be used; only the returned arrays are valid.
 
         Raises
         ------
         BadMessage
-            An argument out of range (a ValueError, too).
+            If an argument is out of range (a ValueError, too).
         SessionError
-            There is no profile, or its build failed.
+            If there is no profile, or its build failed.
         RenderError
-            The engine failed.
+            If the engine failed.
         """
         self.keep_going()
         if gaze_deg is not None:
@@ -434,11 +435,11 @@ class EyeFilter:
         gaze_deg: tuple[float, float] | None = None,
         newest_only: bool = False,
     ) -> PlannedFrame | None:
-        """Return a frame ready to be rendered, before anything else is asked for.
+        """Return a frame that is ready to be rendered, before any other request.
 
-        None, and what it raises: as of `try_filter`.  The frames of a person's two eyes
-        are both planned before one is rendered, so that both are being prepared; what
-        `keep_going` puts in place may free what was planned with.
+        Returns None and raises as `try_filter` does.  The frames of a person's two eyes
+        are both planned before one is rendered, so that both are being prepared.
+        `keep_going` may free the stores of a plan.
         """
         pupil_diameter_mm = checked(pupil_diameter_mm, PupilMm, "pupil_diameter_mm")
         focus_dpt = checked(focus_dpt, VergenceDpt, "focus_dpt")

@@ -1,4 +1,4 @@
-"""A filtered frame, and events on the way to the eye that it is seen through."""
+"""A filtered frame, and events during the preparation of its eye."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from filter_service.filtering.accepted_profile import AcceptedProfile
 
 @dataclass(frozen=True)
 class Filtered:
-    """A filtered frame with everything that decided how it looks.
+    """A filtered frame with everything that determines how it looks.
 
     Attributes
     ----------
     colors : tuple of (height, width, 3)
         One picture for each view: uint8 sRGB, or float32 or float16 linear light.
     profile_id : int
-        The caller's number of the profile, else the generation.
+        The caller's number of the profile, by default the generation.
     generation : int
-        Counts the profiles that the filter was given.
+        Number of the profile, counted by the filter.
     is_complete : bool
-        True: every frame shows the state that it asks for.
+        Always true: every frame shows the state that it asks for.
     pupil_diameter_mm, focus_dpt
-        As used: a profile may cap the pupil, and an eye can only add power.
+        Values used: a profile may cap the pupil, and an eye can only add power.
     gazes_deg : tuple of (h, v)
-        As used, one for each view.
+        Gaze used, one for each view.
     missing_depth_count, clamped_depth_count, bad_color_count, overflow_count : int
-        Pixels whose depth was filled in, or lay outside of the prepared distances, or
-        whose color is not finite; shares of light that found no room.
+        Number of pixels whose depth was filled in, was outside the prepared distances,
+        or whose color was not finite; number of light shares lost to full buffers.
     notes : tuple of str
-        What the user should know, in sentences.
+        Notes for the user, in sentences.
     stage_times_ms : dict
         Time of each stage of the frame.
     """
@@ -66,7 +66,7 @@ class Filtered:
 
 @dataclass(frozen=True)
 class BuildingEye:
-    """How far the PSFs of a profile are: the share done, 0 to 1, and the stage."""
+    """Progress of a profile: the completed fraction, 0 to 1, and the stage."""
 
     eye: AcceptedProfile
     fraction: float
@@ -75,20 +75,20 @@ class BuildingEye:
 
 @dataclass(frozen=True)
 class EyeReady:
-    """A first frame through a profile would not wait for PSFs of a camera.
+    """A first frame of a camera would not have to wait for a profile's PSFs.
 
     Attributes
     ----------
     build_ms : float
-        From the profile's acceptance to here.
+        Time since the profile was accepted.
     psf_count : int
-        PSFs that are computed.
+        Number of computed PSFs.
     memory_mb : float
-        What they take, in 10^6 bytes.
+        Their memory, 10^6 bytes.
     notes : tuple of str
-        What the user should know, in sentences.
+        Notes for the user, in sentences.
     is_complete : bool
-        True.
+        Always true.
     """
 
     eye: AcceptedProfile
@@ -102,7 +102,7 @@ class EyeReady:
 
 @dataclass(frozen=True)
 class EyeFailed:
-    """A profile, or its PSFs for a camera, came to nothing."""
+    """A profile, or its PSFs for a camera, could not be prepared."""
 
     eye: AcceptedProfile
     error: FilterError

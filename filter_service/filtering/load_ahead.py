@@ -1,4 +1,4 @@
-"""Loads what plans of frames need while the service waits for its first client."""
+"""Loads the code that frames need while the service waits for its first client."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ log = logging.getLogger("ocufilter")
 
 
 def load_ahead() -> None:
-    """Begin to load in a thread; a frame that comes first waits for what it needs.
+    """Start loading in a thread; an earlier frame waits for what it needs.
 
-    Python's imports let other threads run every 5 ms, so that clients hardly notice.
+    Python's imports let other threads run every 5 ms, so clients hardly notice.
     """
     threading.Thread(target=_load, name="load ahead", daemon=True).start()
 
@@ -21,5 +21,5 @@ def _load() -> None:
         from filter_service.rendering.plan_once import plan_once
 
         plan_once()
-    except Exception:  # the first frame will say what is wrong
+    except Exception:  # the first frame reports the error
         log.exception("could not load ahead")

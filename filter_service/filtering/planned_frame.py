@@ -1,4 +1,4 @@
-"""A frame whose eye is prepared: what it is rendered with, and how."""
+"""Rendering of a frame whose eye is prepared."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ GazeDegrees = tuple[float, float] | None
 
 @dataclass(frozen=True)
 class PlannedFrame:
-    """Views that one eye sees, in one state of it, and what is prepared for them."""
+    """Views that one eye sees in one state, and the stores prepared for them."""
 
-    workshop: Workshop  # a service may close the filter in the middle
+    workshop: Workshop  # the filter may be closed during the frame
     stream: StreamEyes
     plan: RenderPlan
     views: tuple[RgbdView, ...]
@@ -50,16 +50,16 @@ class PlannedFrame:
         ----------
         gazes_deg : one (h, v) for each view, or None
         out : sequence of arrays, optional
-            Memory for the pictures, which may be used; what is returned counts.
+            Output arrays that may be used; only the returned arrays are valid.
         until_s : float, optional
             Time of `time.monotonic` after which no more PSFs are computed.
 
         Raises
         ------
         NotPrepared
-            PSFs that the frame needs were not computed by ``until_s``.
+            If PSFs that the frame needs were not computed by ``until_s``.
         RenderError
-            The engine failed.
+            If the engine failed.
         """
         return self.begin(
             gazes_deg=gazes_deg,
@@ -78,9 +78,10 @@ class PlannedFrame:
         out: Sequence[NDArray[Any] | None] | None = None,
         **options: Any,
     ) -> Callable[[], Filtered]:
-        """Begin the frame, as `render` takes it; call what is returned for the answer.
+        """Begin the frame; the returned function finishes it.
 
-        Other eyes' frames may be begun between.
+        It takes the arguments of `render`.  Frames of other eyes may be begun before
+        this one is finished.
         """
         plan = self.plan
         rooms = out or [None] * len(self.views)

@@ -1,4 +1,4 @@
-"""One frame through several eyes: each view through the eye that it names.
+"""One frame through several eyes, each view through the eye that it names.
 
 eyes = {"left": EyeFilter("myopia", left_camera),
 "right": EyeFilter("keratoconus", right_camera)}
@@ -26,7 +26,7 @@ from filter_service.view_state import EyeName, ViewState, check_states
 
 @dataclass(frozen=True)
 class SeenView:
-    """One picture and the eye that it was seen through."""
+    """One picture and the eye that it was filtered through."""
 
     color: NDArray[Any]
     gaze_deg: tuple[float, float]
@@ -42,12 +42,12 @@ class SeenViews:
 
     @property
     def is_complete(self) -> bool:
-        """Return True: every frame shows the state that it asks for."""
+        """Return true: every frame shows the state that it asks for."""
         return all(seen.is_complete for seen in self.by_eye.values())
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return the notes of all eyes; those of one of two say which."""
+        """Return the notes of all eyes; those of a left or right eye name it."""
         return tuple(
             note if eye == "both" else f"{eye} eye: {note}"
             for eye, seen in self.by_eye.items()
@@ -56,7 +56,7 @@ class SeenViews:
 
     @property
     def stage_times_ms(self) -> dict[str, float]:
-        """Return the time of each stage, of all eyes together."""
+        """Return the time of each stage, summed over the eyes."""
         stages_ms: dict[str, float] = {}
         for seen in self.by_eye.values():
             for name, value_ms in seen.stage_times_ms.items():
@@ -64,16 +64,16 @@ class SeenViews:
         return stages_ms
 
     def total(self, counter: str) -> int:
-        """Return the sum over the eyes of a counter of `Filtered`, by its name."""
+        """Return a counter of `Filtered`, by name, summed over the eyes."""
         return sum(int(getattr(seen, counter)) for seen in self.by_eye.values())
 
 
 @dataclass(frozen=True)
 class PlannedViews:
-    """A frame of which every eye is prepared."""
+    """A frame for which every eye is prepared."""
 
     by_eye: Mapping[EyeName, PlannedFrame]
-    indices: Mapping[EyeName, tuple[int, ...]]  # of their views
+    indices: Mapping[EyeName, tuple[int, ...]]  # indices of their views
     gazes_deg: tuple[GazeDegrees, ...]
 
     def render(
@@ -86,14 +86,14 @@ class PlannedViews:
         out: Sequence[NDArray[Any] | None] | None = None,
         until_s: float | None = None,
     ) -> SeenViews:
-        """Filter the frame, all eyes begun before one is finished.
+        """Filter the frame; all eyes are begun before one is finished.
 
         See `EyeFilter.filter`.
 
         Raises
         ------
         NotPrepared
-            PSFs that the frame needs were not computed by ``until_s``.
+            If PSFs that the frame needs were not computed by ``until_s``.
         """
         found: dict[EyeName, Filtered] = {}
         views: dict[int, SeenView] = {}
@@ -128,26 +128,26 @@ def plan_views(
     focus_dpt: float,
     gaze_deg: tuple[float, float] | None = None,
 ) -> PlannedViews | None:
-    """Plan a frame through the eyes that its views name; None while one is estimated.
+    """Plan a frame through the eyes of its views; return None while one is estimated.
 
-    Every eye is told of the frame, so that all of them are being prepared.
+    The frame is planned for every eye, so that all of them are being prepared.
 
     Parameters
     ----------
     filter_of : callable
-        Gives the filter of an eye.
+        Returns the filter of an eye.
     views : sequence of RgbdView
     states : sequence of ViewState, one for each view
-        Where a value is None there, that of the frame counts.
+        Values that are None default to those of the frame.
     pupil_diameter_mm, focus_dpt, gaze_deg
-        Of the frame, as of `EyeFilter.try_filter`.
+        Values of the frame, as for `EyeFilter.try_filter`.
 
     Raises
     ------
     BadMessage
-        An argument out of range, or an eye with two pupils.
+        If an argument is out of range, or one eye has two pupils.
     SessionError
-        An eye has no profile (field ``views[i].eye``), or its build failed.
+        If an eye has no profile (field ``views[i].eye``), or its build failed.
     """
     if len(states) != len(views):
         raise BadMessage(
@@ -191,7 +191,7 @@ def plan_views(
 
 
 def _of_eye(error: SessionError, eye: EyeName, view: int) -> SessionError:
-    """Say of which eye there is no profile."""
+    """Return the error with the name of an eye that has no profile."""
     if not isinstance(error, NoProfile):
         return error
     return NoProfile(

@@ -1,4 +1,4 @@
-"""The workshops that filters of a process share, one for each choice of engine."""
+"""Builders shared by the filters of a process, one for each choice of engine."""
 
 from __future__ import annotations
 
@@ -21,45 +21,45 @@ def open_workshop(
     *,
     engine: str = "auto",
 ) -> Workshop:
-    """Start the worker, and the engine while it gets ready; ``closing`` ends both.
+    """Start the build worker and the engine at the same time; ``closing`` ends both.
 
     Parameters
     ----------
     engine : "auto", "gl" or "native"
-        What filters frames.
+        Engine that filters frames.
 
     Raises
     ------
     RenderError
-        No engine works on this machine; names what to install.
+        If no engine works on this machine; the message names what to install.
     """
     closing.callback(worker.close)
     worker.start()
-    # What takes long to import is imported while the worker process does the same.
+    # Slow imports run in this process and in the worker at the same time.
     from filter_service.filtering.choose_engine import open_engine
 
     chosen = open_engine(engine, closing, warm_up=True)
-    # Here mypy sees that what is chosen is a `FrameEngine`.
+    # Here mypy checks that the chosen engine is a `FrameEngine`.
     workshop = Workshop(worker, chosen.engine, limits, engine_name=chosen.name)
     closing.callback(workshop.close)
     return workshop
 
 
 def open_inline_workshop(closing: ExitStack, *, engine: str = "auto") -> Workshop:
-    """Open a workshop that estimates eyes in the caller's thread.
+    """Open a builder that estimates eyes in the caller's thread.
 
-    For a program that filters one picture: to start a process takes longer.
+    For a program that filters one picture, starting a process would take longer.
 
     Raises
     ------
     RenderError
-        No engine works on this machine; names what to install.
+        If no engine works on this machine; the message names what to install.
     """
     return open_workshop(InlineWorker(), BuildLimits(), closing, engine=engine)
 
 
 class _Shared:
-    """One workshop and how many use it."""
+    """One builder and the number of its users."""
 
     def __init__(self, engine: str) -> None:
         self._engine = engine
@@ -69,7 +69,7 @@ class _Shared:
         atexit.register(self._closing.close)
 
     def take(self) -> Workshop:
-        """Return the workshop, for one more user; the first starts it."""
+        """Return the builder for one more user; the first user starts it."""
         if self._workshop is None:
             limits = BuildLimits(store_cache_dir=default_cache_dir())
             with ExitStack() as closing:
@@ -81,15 +81,15 @@ class _Shared:
         return self._workshop
 
     def give_back(self) -> None:
-        """Say that one user is done; the last one closes the workshop."""
+        """Release one user; the last one closes the builder."""
         self._n_users -= 1
         if self._n_users == 0:
             self._workshop = None
             self._closing.close()
 
     def leave_to_parent(self) -> None:
-        """Close nothing: this process was forked, and the worker is its parent's."""
-        self._parents = self._closing.pop_all()  # kept: nothing of it is to be freed
+        """Leave everything open after a fork: the worker belongs to the parent."""
+        self._parents = self._closing.pop_all()  # kept, so that nothing is freed
 
 
 _opened: list[_Shared] = []
@@ -97,13 +97,13 @@ _opened: list[_Shared] = []
 
 @cache
 def shared(engine: str) -> _Shared:
-    """Return what filters of an engine share."""
+    """Return the builder that filters of an engine share."""
     _opened.append(_Shared(engine))
     return _opened[-1]
 
 
 def _begin_anew() -> None:
-    """Let a forked process open workshops of its own."""
+    """Make a forked process open builders of its own."""
     for workshops in _opened:
         workshops.leave_to_parent()
     shared.cache_clear()

@@ -1,6 +1,7 @@
-"""The eyes of one stream of frames: which one serves, and what is to be estimated.
+"""The eyes of one stream of frames: the eye in use, and the eyes to be estimated.
 
-State only: no GL, no processes.  `workshop` acts on what it says.
+A profile is requested, then building, then ready.  This module keeps the state only,
+without GL or processes; `workshop` acts on it.
 """
 
 from __future__ import annotations
@@ -36,18 +37,18 @@ class Wanted(NamedTuple):
 
 @dataclass(eq=False)
 class StreamEyes:
-    """The newest eye of a stream, and the one that serves until it is ready.
+    """The newest eye of a stream, and the previous one until the newest is ready.
 
     Parameters
     ----------
     on_event : callable
         Called with every `EyeEvent`.
     max_cameras : int
-        Stores that one eye keeps.
+        Maximum number of stores of one eye.
     first_cameras : tuple of Camera
-        What to prepare for while no frame has come.
+        Cameras to prepare for before the first frame.
     first_generation : int
-        Where profiles are counted from.
+        Generation of the first profile.
     """
 
     on_event: Callable[[EyeEvent], None]
@@ -56,7 +57,7 @@ class StreamEyes:
     first_generation: int = 1
     ticket: int | None = None
     building: Wanted | None = None
-    eyes: list[AcceptedProfile] = field(default_factory=list)  # newest first, two
+    eyes: list[AcceptedProfile] = field(default_factory=list)  # newest first; two
     retired: list[LoadedStore] = field(default_factory=list)  # stores to be freed
     use: StreamUse = field(default_factory=StreamUse)
     _n_accepted: int = 0
@@ -65,9 +66,8 @@ class StreamEyes:
     def plan(self, cameras: Sequence[Camera]) -> RenderPlan | None:
         """Return how to render a frame; None while its eye is being estimated.
 
-        The newest eye is asked to prepare for the frame's cameras.  Until its first
-        frame would be whole, the eye before it goes on serving; that one is given up as
-        soon as the newest serves.
+        This requests the frame's cameras of the newest eye.  Until that eye is ready,
+        the previous one stays in use; it is released as soon as the newest is used.
 
         Raises
         ------
@@ -99,7 +99,7 @@ class StreamEyes:
         return None
 
     def is_newest(self, plan: RenderPlan) -> bool:
-        """Return whether the newest eye renders a frame."""
+        """Return whether a plan uses the newest eye."""
         return plan.eye is self.eyes[0]
 
     def add_profile(
@@ -110,10 +110,10 @@ class StreamEyes:
         *,
         profile_id: int | None = None,
     ) -> AcceptedProfile:
-        """Make a profile the newest eye; the one in use stays until then.
+        """Make a profile the newest eye; the eye in use stays until it is ready.
 
-        It is prepared for the given cameras, else for those of the last frame, else for
-        those of the eye in use.
+        It is prepared for the given cameras, by default for those of the last frame,
+        otherwise for those of the eye in use.
         """
         generation = self.first_generation + self._n_accepted
         self._n_accepted += 1
@@ -138,7 +138,7 @@ class StreamEyes:
         return newest if newest.wanted or not newest.failures else None
 
     def next_build(self) -> Wanted | None:
-        """Return what should be estimated next, if anything."""
+        """Return the next eye and camera to estimate, if any."""
         if not self.eyes:
             return None
         eye = self.eyes[0]
@@ -146,7 +146,7 @@ class StreamEyes:
         return None if camera is None else Wanted(eye, camera)
 
     def warming(self) -> tuple[AcceptedProfile, PreparedStore] | None:
-        """Return a store of the newest eye whose first frame would not be whole."""
+        """Return the newest eye and a store of it that is not ready, if any."""
         if not self.eyes:
             return None
         eye = self.eyes[0]
@@ -154,14 +154,14 @@ class StreamEyes:
         return None if store is None else (eye, store)
 
     def serving(self) -> PreparedStore | None:
-        """Return the store that the last frame went through, of the newest eye."""
+        """Return the newest eye's store for the last frame, if it is ready."""
         if not self.eyes or not self._last_cameras:
             return None
         found = self.eyes[0].store_for(self._last_cameras[0])
         return found if found is not None and found.is_ready else None
 
     def put_in_place(self, eye: AcceptedProfile, prepared: PreparedStore) -> None:
-        """Keep a loaded store; forget the camera unused for longest."""
+        """Add a loaded store; evict the least recently used one."""
         replaced = eye.store_for(prepared.camera)
         if replaced is not None:
             eye.stores.remove(replaced)
@@ -171,14 +171,14 @@ class StreamEyes:
             self.retired.append(eye.stores.pop(0).store)
 
     def set_ready(self, eye: AcceptedProfile, prepared: PreparedStore) -> None:
-        """Let frames go through a store from now on."""
+        """Mark a store as ready for frames."""
         prepared.is_ready = eye.was_ready = True
         eye.want_no_more(prepared.camera)
 
     def fail_build(
         self, eye: AcceptedProfile, camera: Camera, error: FilterError
     ) -> None:
-        """Note why an eye failed; one that never worked gives way to the old."""
+        """Record a failed build; the old eye replaces one that never worked."""
         eye.want_no_more(camera)
         eye.failures.append((camera, error))
         failed = eye.store_for(camera)
@@ -189,7 +189,7 @@ class StreamEyes:
             self._retire(self.eyes.pop(0))
 
     def end(self) -> None:
-        """Give up everything; `retired` then holds all stores."""
+        """Retire all eyes; `retired` then holds all stores."""
         for eye in self.eyes:
             self._retire(eye)
         self.eyes = []

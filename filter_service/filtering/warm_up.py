@@ -1,7 +1,7 @@
-"""The last frames of a stream, and the states that its next ones will have.
+"""The last frames of a stream, and the predicted states of its next ones.
 
-Computing PSFs ahead, while nothing else is to be done, saves the next frame time and
-cannot change a picture: a frame computes whatever it lacks.
+Computing PSFs ahead while idle saves time in the next frame and cannot change a
+picture, because a frame computes whatever it lacks.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class StreamUse:
     def __init__(self) -> None:
         self._states: deque[tuple[float, float, float]] = deque()
         self.last: FrameUse | None = None
-        self.warmed: FrameUse | None = None  # for which everything is computed ahead
+        self.warmed: FrameUse | None = None  # last one that is fully warmed
 
     def note(
         self,
@@ -51,7 +51,7 @@ class StreamUse:
         return (self._states[-1][0] - self._states[0][0]) / (len(self._states) - 1)
 
     def states_ahead(self) -> list[tuple[float, float]]:
-        """Return predicted states (pupil_diameter_mm, focus_dpt), one a horizon."""
+        """Return predicted states (pupil_diameter_mm, focus_dpt), one per horizon."""
         if len(self._states) < 2:
             return []
         (first_s, *first), (last_s, *last) = self._states[0], self._states[-1]

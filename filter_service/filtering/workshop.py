@@ -1,6 +1,6 @@
-"""One worker that estimates eyes and one engine, for all streams of a process.
+"""Builder: one build worker and one engine, shared by all streams of a process.
 
-Profiles of all streams go through the worker to the engine; the streams get events
+Profiles of all streams go through the worker to the engine; the streams receive events
 about them.
 """
 
@@ -44,48 +44,48 @@ EYE_SHARE = 0.3
 """Progress at which the eye is estimated and its nodes are known."""
 
 KEPT_SHARE = 0.8
-"""Of the memory that an eye may keep: room for what comes next."""
+"""Share of its memory limit that an eye keeps at eviction, to leave free space."""
 
 FIRST_RANGE_S, FIRST_SHARE = (0.004, 0.08), 1.0
-"""Time between two frames for the first PSFs of a new eye: as long as a frame took,
-within the range.  Beside a stream of 1280x720 that takes both cores, and with a worker
-of niceness 0, new eyes were shown after 0.7 to 1.5 s; with half of the time, and 0.03 s
-at most, after 1.1 to 2.5 s."""
+"""Time between two frames for the first PSFs of a new eye: the duration of a frame,
+within the range.  During a stream of 1280x720 that takes both cores, with a worker of
+niceness 0, new eyes appeared after 0.7 to 1.5 s; with half of the time, and at most
+0.03 s, after 1.1 to 2.5 s."""
 
 AHEAD_RANGE_S, AHEAD_SHARE = (0.004, 0.03), 0.5
 """The same for PSFs that the next frames may need: half of a frame's time, so that they
 never delay a stream by a whole frame."""
 
 WARM_BATCH = 256
-"""PSFs per batch; the deadline is checked after each.  On two cores they take 5 ms."""
+"""PSFs per batch, 5 ms on two cores; the deadline is checked after each batch."""
 
 CHECK_GROWTH = 4
-"""A new eye is ready once a check finds at most `WARM_BATCH` PSFs missing.  Each check
-allows this many times more than the last: a pupil that keeps moving needs new PSFs at
-every check."""
+"""Factor by which each check allows more missing PSFs than the last, from `WARM_BATCH`
+on.  A new eye is ready once a check finds no more than allowed; a pupil that keeps
+moving needs new PSFs at every check."""
 
 BUSY_SHARE = 0.4
-"""Of the time between two frames: a stream whose frames take longer gets no PSFs ahead.
-At 0.8, on two cores, they made 26 to 52 % of the frames whole instead of 49 to 73: the
-next frame waited for the batch in hand."""
+"""Share of the frame interval beyond which a frame time stops the computation of PSFs
+ahead.  At 0.8, on two cores, 26 to 52 % of the frames were complete instead of 49 to
+73: the next frame waited for the current batch."""
 
 PROGRESS_INTERVAL_S = 0.1
-"""Between two progress events of an eye."""
+"""Minimum interval between two progress events of an eye."""
 
 log = logging.getLogger("ocufilter")
 
 
 class Workshop:
-    """Estimates eyes in the worker, and computes PSFs before frames need them.
+    """Estimates eyes in the build worker, and computes PSFs before frames need them.
 
     Parameters
     ----------
     worker : WorkerHandle
-        Started, or to be started by the first `advance`; `close` ends it.
+        Build worker, started by the first `advance` if necessary; ended by `close`.
     engine : FrameEngine
     limits : BuildLimits
     engine_name : str
-        Of the engine, among those that may be chosen.
+        Name of the engine in the settings.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Workshop:
         self.engine = engine
         self.engine_name = engine_name
         self.streams: list[StreamEyes] = []
-        self.frame_s = 0.0  # what the last frame took to filter
+        self.frame_s = 0.0  # duration of the last frame
         self._limits = limits
         self._released: list[Any] = []
         self._going: list[Any] = []
@@ -108,7 +108,7 @@ class Workshop:
 
     @property
     def stores_mb(self) -> float:
-        """Return what the PSFs of all streams take."""
+        """Return the memory of all streams' PSFs."""
         return sum(prepared.store.memory_mb for prepared in self._prepared())
 
     def _prepared(self) -> list[PreparedStore]:
@@ -121,7 +121,7 @@ class Workshop:
 
     @property
     def is_warming(self) -> bool:
-        """Return whether `advance` has something to do at once."""
+        """Return whether `advance` has immediate work."""
         return self._is_warming
 
     def accept(
@@ -133,9 +133,9 @@ class Workshop:
         *,
         profile_id: int | None = None,
     ) -> AcceptedProfile:
-        """Take a profile in; a build of an older one that still runs is cancelled."""
-        # Accepted in the same pass counts as well: its build has not begun, but its
-        # sender awaits an ending too.
+        """Accept a profile; cancel the build of an older one that is still running."""
+        # This includes a profile accepted in the same pass: its build has not started,
+        # but its sender also expects an outcome.
         building = stream.building
         replaced = [building.eye] if building is not None else []
         unfinished = stream.unfinished_eye()
@@ -153,7 +153,7 @@ class Workshop:
         return eye
 
     def end(self, stream: StreamEyes) -> None:
-        """Give up a stream with all its eyes."""
+        """End a stream and release its eyes."""
         if stream in self.streams:
             self.streams.remove(stream)
         self.cancel(stream)
@@ -167,23 +167,23 @@ class Workshop:
         self.worker.close()
 
     def cancel(self, stream: StreamEyes) -> None:
-        """Stop what is being estimated for a stream."""
+        """Cancel the running build of a stream."""
         if stream.ticket is not None:
             self.worker.cancel(stream.ticket)
         stream.ticket = stream.building = None
 
     def free_retired(self, stream: StreamEyes) -> None:
-        """Free the stores that a stream has given up."""
+        """Free the stores that a stream has retired."""
         for store in stream.retired:
             store.release()
         self._released += stream.retired
         stream.retired = []
 
     def _drop_released(self) -> None:
-        """Let go of what was released, one turn later and in a thread.
+        """Drop released stores one iteration later, in a thread.
 
-        To return half a gigabyte to the system takes 0.2 s; by then the renderer has
-        let go of it too.
+        Returning half a gigabyte to the system takes 0.2 s; by then the renderer has
+        dropped them, too.
         """
         dropped, self._going = self._going, self._released
         self._released = []
@@ -198,8 +198,8 @@ class Workshop:
         Parameters
         ----------
         ahead : bool
-            Predict what the next frames of eyes in use need, too; otherwise compute
-            PSFs for new eyes alone.
+            Whether to also predict what the next frames of eyes in use need; otherwise
+            only PSFs of new eyes are computed.
         """
         self._drop_released()
         for event in self.worker.poll():
@@ -207,7 +207,7 @@ class Workshop:
                 self._take_part(event)
                 continue
             stream = next((s for s in self.streams if s.ticket == event.ticket), None)
-            # Without a stream, it has ended or wants something newer.
+            # If there is none, the stream has ended or requested something newer.
             if stream is not None:
                 self._handle(stream, event)
         for stream in list(self.streams):
@@ -230,7 +230,7 @@ class Workshop:
 
     def _handle(self, stream: StreamEyes, event: BuildEvent) -> None:
         if stream.building is None:
-            return  # its last word, after it was given up
+            return  # a late event of a canceled build
         wanted = stream.building
         if isinstance(event, BuildProgress):
             fraction = EYE_SHARE * event.fraction
@@ -252,7 +252,7 @@ class Workshop:
             self._fail(stream, wanted, event.error)
 
     def _take_part(self, event: BuildPart) -> None:
-        """Give a store what the worker planned for it, if it is still in use."""
+        """Pass a part from the worker to its store, if that is still in use."""
         for prepared in self._prepared():
             if prepared.ticket == event.ticket:
                 prepared.store.take(event.part)
@@ -265,7 +265,7 @@ class Workshop:
         return min(max(share * self.frame_s, low_s), high_s)
 
     def _warm_first_frames(self) -> None:
-        """Compute PSFs of new eyes' first frames, for the time that these have."""
+        """Compute PSFs of new eyes' first frames, for a limited time."""
         until_s = time.monotonic() + self._share_of_frame_s(FIRST_SHARE, FIRST_RANGE_S)
         self._is_warming = False
         for stream in list(self.streams):
@@ -291,7 +291,7 @@ class Workshop:
         prepared: PreparedStore,
         until_s: float,
     ) -> bool:
-        """Compute what a first frame needs; return whether that is over."""
+        """Compute the PSFs of a first frame; return whether this is finished."""
         store, use = prepared.store, stream.use.last
         is_all = eye.settings.prepare == "ranges"
         try:
@@ -304,14 +304,14 @@ class Workshop:
             if n_pending:
                 store.fill(prepared.pending, until_s=until_s, batch_count=WARM_BATCH)
                 prepared.pending = prepared.pending[:0]
-                # Pupil and focus have changed meanwhile: check again.
+                # Pupil and focus may have changed meanwhile, so check again.
                 prepared.n_checks += 1
                 if n_pending > WARM_BATCH * CHECK_GROWTH ** (prepared.n_checks - 1):
                     return False
         except NotPrepared:
             self._tell_progress(stream, eye, prepared)
             return False
-        except Exception as error:  # other streams go on
+        except Exception as error:  # other streams continue
             wanted = Wanted(eye, prepared.camera)
             self._fail(stream, wanted, _as_filter_error(error))
             return True
@@ -353,7 +353,7 @@ class Workshop:
         )
 
     def _warm_ahead(self, stream: StreamEyes, until_s: float) -> None:
-        """Compute what the next frames need if pupil and focus keep their speed."""
+        """Compute PSFs of the next frames, if pupil and focus keep their speed."""
         prepared, last = stream.serving(), stream.use.last
         if prepared is None or last is None or last is stream.use.warmed:
             return
@@ -368,12 +368,12 @@ class Workshop:
         except NotPrepared:
             self._is_warming = True
             return
-        except Exception as error:  # other streams go on; a frame that needs it fails
+        except Exception as error:  # others continue; a frame that needs it fails
             log.info("PSFs ahead of frames: %s", _as_filter_error(error))
         stream.use.warmed = last
 
     def _limit_memory(self) -> None:
-        """Evict PSFs of the eyes used longest ago beyond ``max_stores_mb``."""
+        """Evict PSFs of the least recently used eyes beyond ``max_stores_mb``."""
         beyond_mb = self.stores_mb - self._limits.max_stores_mb
         for prepared in sorted(self._prepared(), key=lambda own: own.used_s):
             if beyond_mb <= 0.0:
@@ -383,7 +383,7 @@ class Workshop:
             beyond_mb -= before_mb - prepared.store.memory_mb
 
     def _fail(self, stream: StreamEyes, wanted: Wanted, error: FilterError) -> None:
-        """End the preparation of an eye for a camera."""
+        """Fail the preparation of an eye for a camera."""
         self.cancel(stream)
         stream.fail_build(wanted.eye, wanted.camera, error)
         self.free_retired(stream)
@@ -391,13 +391,13 @@ class Workshop:
 
 
 def _state_near(stream: StreamEyes, wanted: Wanted) -> tuple[float, float]:
-    """Return the pupil and focus that the next frame is likely to have."""
+    """Return the likely pupil and focus of the next frame."""
     use = stream.use.last or first_frame(wanted.camera, wanted.eye.settings)
     return use.pupil_diameter_mm, use.focus_dpt
 
 
 def _as_filter_error(error: Exception) -> FilterError:
-    """Return an error as clients receive it; log an unexpected one."""
+    """Convert an error for clients; log an unexpected one."""
     if isinstance(error, FilterError):
         return error
     log.error("an eye could not be prepared", exc_info=error)

@@ -1,4 +1,4 @@
-"""Who comes and who goes: sessions begun, found again and ended, and their profiles."""
+"""Session management: start, resumption and end of sessions, and their profiles."""
 
 from __future__ import annotations
 
@@ -33,35 +33,36 @@ from filter_service.service.session import EyeProfiles, Session, SessionRecord
 from filter_service.service.sharing import Sharing
 
 MAX_GREETINGS = 256
-"""Clients that wait for the answer to hello while a device is started."""
+"""Maximum number of clients that wait for the reply to hello while a device starts."""
 
 PROFILE_PAUSE_S = 0.05
-"""Between two profiles of an eye: the process that filters needs some milliseconds to
-read one and to begin with it.  Of those that come meanwhile the newest counts."""
+"""Minimum interval between two profiles of an eye: the render worker needs some
+milliseconds to read and start one.  Of profiles that arrive meanwhile, only the newest
+counts."""
 
 log = logging.getLogger("ocufilter")
 
 
 class Reception:
-    """Sessions of clients, each on a device.
+    """Manages the sessions of clients, each on one device.
 
     Parameters
     ----------
     config : ServiceConfig
     endpoint : str
-        Where the socket is.
+        Endpoint of the socket.
     guests : Guests
     devices : ServedDevices
     sharing : Sharing
     send : callable
         Sends a reply to a peer.
     record : callable
-        ``record(key, session)`` keeps what a session is, or that it has ended (None).
+        ``record(key, session)`` stores a session, or its end (None).
 
     Attributes
     ----------
     config : ServiceConfig
-        As it was read last.
+        The settings as last read.
     """
 
     def __init__(
@@ -84,10 +85,10 @@ class Reception:
 
     @property
     def due_s(self) -> float:
-        """When `tidy` has something to do next, on the monotonic clock."""
+        """Time when `tidy` next has work to do, on the monotonic clock."""
         return min(self._next_alive_s, self._next_profile_s)
 
-    # Coming
+    # Start and resumption
 
     def session_at(self, peer: Peer) -> Session:
         """Return the session of a client.
@@ -102,13 +103,13 @@ class Reception:
         return session
 
     def greet(self, peer: Peer, hello: Hello) -> None:
-        """Welcome a client: to its session, to one it had before, or to a new one.
+        """Answer hello: with the client's session, a resumed one, or a new one.
 
         Raises
         ------
         TooManySessions
         """
-        if not self._devices.are_known:  # one is about to say who it is
+        if not self._devices.are_known:  # one has not reported yet
             self._greetings = [g for g in self._greetings if g[0] != peer]
             self._greetings = [*self._greetings[1 - MAX_GREETINGS :], (peer, hello)]
             return
@@ -116,7 +117,7 @@ class Reception:
         if session is None:
             session = self._guests.by_key(hello.session_key)
             if session is not None and session.owner != peer.key:
-                session = None  # another client's
+                session = None  # belongs to another client
             is_resumed = session is not None
             if session is None:
                 session = self._new_session(peer, hello)
@@ -142,7 +143,7 @@ class Reception:
         self._send(peer, welcome)
 
     def greet_who_waits(self) -> None:
-        """Answer those who said hello before all devices had said who they are."""
+        """Answer the clients that sent hello before all devices had reported."""
         if not self._devices.are_known:
             return
         for peer, hello in self._greetings:
@@ -174,18 +175,18 @@ class Reception:
         return session
 
     def restore(self, records: Sequence[SessionRecord]) -> None:
-        """Take over the sessions of the front end before this one."""
+        """Restore the sessions of the previous front end."""
         for record in records:
             self._guests.remember(Session.restored(record, time.monotonic()))
 
     def meet(self, device: ServedDevice, eyes: Sequence[tuple[Any, ...]]) -> None:
-        """Bring a device that is there to the sessions that there are.
+        """Synchronize a device with the current sessions.
 
         Parameters
         ----------
         eyes : sequence of (key, profiles)
-            Sessions whose eyes it has; ``profiles`` are (profile id, generation) by
-            eye.
+            Sessions whose eyes the device has; ``profiles`` maps each eye to (profile
+            id, generation).
         """
         held = dict(eyes)
         for session in self._guests:
@@ -203,7 +204,7 @@ class Reception:
             device.render.tell("close", key)
 
     def _open(self, session: Session) -> None:
-        """Have the render loop hold the eyes of a session, with their profiles."""
+        """Send the eyes of a session, with their profiles, to the render worker."""
         generations = {name: eye.generation for name, eye in session.eyes.items()}
         render = self._devices.of(session).render
         render.tell("open", session.key, session.session_id, generations)
@@ -216,7 +217,7 @@ class Reception:
     # Profiles
 
     def take_profile(self, session: Session, request: ProfileRequest) -> None:
-        """Ask for a profile; of several that wait for their turn the newest counts."""
+        """Request a profile; of several pending ones the newest counts."""
         eye = session.eye(request.eye)
         replaced, eye.next_profile = eye.next_profile, request
         if replaced is not None and session.peer is not None:
@@ -229,7 +230,7 @@ class Reception:
         self._ask_next_profile(session, eye)
 
     def _ask_next_profile(self, session: Session, eye: EyeProfiles) -> None:
-        """Hand the newest profile over, unless one is on its way or was just now."""
+        """Send the newest profile, unless one is in progress or was just sent."""
         now_s = time.monotonic()
         if eye.next_profile is None or eye.asked_profile is not None:
             return
@@ -250,7 +251,7 @@ class Reception:
                 self._ask_next_profile(session, eye)
 
     def pass_on(self, key: str, name: EyeName, reply: Reply) -> None:
-        """Tell a session what the render loop says of the profile of an eye."""
+        """Pass a render worker's reply about an eye's profile on to the client."""
         session = self._guests.by_key(key)
         if session is None:
             return
@@ -267,10 +268,10 @@ class Reception:
         if session.peer is not None:
             self._send(session.peer, reply)
 
-    # Going
+    # End
 
     def tidy(self) -> None:
-        """Find out who is gone, and forget who did not come back."""
+        """Probe clients, and end the sessions of those that did not return."""
         self._probe_clients()
         now_s = time.monotonic()
         self._ask_due_profiles(now_s)
@@ -279,7 +280,7 @@ class Reception:
                 self._forget(session, "its client did not come back")
 
     def give_up(self, device: ServedDevice) -> None:
-        """End the sessions of a device that is gone; they begin anew on another."""
+        """End the sessions of a lost device; new ones start on other devices."""
         for session in self._guests:
             if session.device == device.index:
                 device.frames.lose_waiting(session)
@@ -287,7 +288,7 @@ class Reception:
         self.greet_who_waits()
 
     def _probe_clients(self, *, is_due: bool = False) -> None:
-        """Send every client a sign of life; who is gone is found out by that."""
+        """Send `Alive` to every client, which detects vanished ones."""
         now_s = time.monotonic()
         if is_due or now_s >= self._next_alive_s:
             self._next_alive_s = now_s + self.config.alive_interval_s
@@ -296,11 +297,11 @@ class Reception:
                     self._send(session.peer, Alive())
 
     def leave(self, peer: Peer) -> None:
-        """Keep the session of a client that is gone for a while."""
+        """Keep the session of a vanished client for a while."""
         self.lose(peer.connection)
 
     def lose(self, connection: int) -> None:
-        """Note that a connection has ended; keep its session for a while."""
+        """Handle the end of a connection; keep its session for a while."""
         session = self._guests.on_connection(connection)
         if session is not None and session.peer is not None:
             self._end_sharing(session)
@@ -308,7 +309,7 @@ class Reception:
             log.info("session %d: its client is gone", session.session_id)
 
     def end_session(self, peer: Peer, outcome: Outcome | None = None) -> None:
-        """Forget a client's session, if it has one."""
+        """End the session of a client, if it has one."""
         session = self._guests.on_connection(peer.connection)
         if session is not None:
             why = "" if outcome is None else f"the client is {outcome.value}"
@@ -324,6 +325,6 @@ class Reception:
         log.info("session %d ends%s", session.session_id, f": {why}" if why else "")
 
     def _end_sharing(self, session: Session) -> None:
-        """Give up the memory of a client that is gone."""
+        """Release the shared memory of a client that is gone."""
         self._sharing.end(session)
         self._devices.of(session).frames.leave(session)

@@ -47,7 +47,7 @@ class EyeProfiles:
     next_ask_s: float = 0.0  # earliest time to send another
 
     def record(self) -> EyeProfiles:
-        """Return a copy with the accepted profile only, omitted if it is large."""
+        """Return a record of the accepted profile; only the numbers of a large one."""
         profile = self.profile
         if profile is not None and len(profile.parts()[0]) > MAX_RECORDED_BYTES:
             profile = None
@@ -175,7 +175,7 @@ class Session:
             self.lent -= {frame.memory.slot, frame.memory.result_slot}
 
     def leave(self, now_s: float) -> None:
-        """Mark the client as away, and discard its waiting frame and credit use."""
+        """Mark the client as away; discard its waiting frame and reset its credit."""
         if self.peer is not None:
             self.last_connection = self.peer.connection
         self.peer = None

@@ -1,4 +1,4 @@
-"""Memory that clients on this machine share with the service for their images."""
+"""Shared memory for the images of clients on this machine."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from filter_service.service.session import Session
 
 MAX_PARTS_PER_VIEW = 4
 MAX_SHARED_SLOTS = 16
-"""Of one session."""
+"""Maximum number of slots of one session."""
 
 
 class Sharing:
-    """Gives sessions memory, and takes it back.
+    """Allocates and frees the shared memory of sessions.
 
     Parameters
     ----------
     config : ServiceConfig
     endpoint : str
-        Where clients connect.
+        Endpoint that clients connect to.
     render_of : callable
-        Returns the end of a session's device, which owns the memory.
+        Returns the render client of a session's device, which owns the memory.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Sharing:
         self.is_offered = config.shared_memory and is_local and not config.keys_dir
 
     def share(self, session: Session, request: Share) -> Shared:
-        """Give a client memory for its images, or say why not."""
+        """Allocate a slot for a client, or reply with the reason for refusal."""
         limits = self._limits
         most = MAX_PARTS_PER_VIEW * limits.max_views * limits.max_part_bytes
         if not self.is_offered:
@@ -67,7 +67,7 @@ class Sharing:
         return Shared(slot.number, slot.size_bytes, slot.path)
 
     def unshare(self, session: Session, request: Unshare) -> None:
-        """Take memory back that a client does not need any more.
+        """Free a slot that a client no longer needs.
 
         Raises
         ------
@@ -82,7 +82,7 @@ class Sharing:
         self._render_of(session).drop(session.shared.pop(request.slot))
 
     def end(self, session: Session) -> None:
-        """Give up the memory of a client that is gone."""
+        """Free the slots of a client that is gone."""
         for slot in session.shared.values():
             self._render_of(session).drop(slot)
         session.shared, session.lent = {}, set()

@@ -1,4 +1,4 @@
-"""Whose frame is next: sessions share processor time, not numbers of frames."""
+"""Fair queuing of frames: sessions share processor time, not numbers of frames."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Generic, TypeVar
 Client = TypeVar("Client", bound=Hashable)
 
 MAX_CLAIM_S = 0.5
-"""Of the time that others used while a session asked for nothing, it may catch up so
-much: enough for the round trip between two frames, and no more than makes a heavy
-client wait for a second or two where many light ones pause."""
+"""Time that an idle session may catch up on: enough for the round trip between two
+frames, and little enough that a heavy client waits only a second or two when many light
+ones pause."""
 
 MAX_DEBT_S = 20.0
-"""What one frame may cost its session in turns; a frame that hung for a minute would
-otherwise keep it waiting for that long beside each other session."""
+"""Maximum time that one frame counts for its session; otherwise a frame that hung for a
+minute would make the session wait that long for each other session."""
 
 
 @dataclass
@@ -25,27 +25,27 @@ class _Share:
 
 
 class Turns(Generic[Client]):
-    """Fair queuing: of the sessions that wait, the one that has used least is next.
+    """Fair queuing: among waiting sessions, the one that has used the least is next.
 
-    A session that begins to wait has used as much as the one served last, less
-    `MAX_CLAIM_S` at most.  So nobody owes more than its own last frame, and nobody can
-    save up claims.
+    A session that starts to wait counts as having used as much as the one served last,
+    less at most `MAX_CLAIM_S`.  So no session owes more than its own last frame, and
+    none can accumulate claims.
     """
 
     def __init__(self) -> None:
         self._shares: dict[Client, _Share] = {}
-        self._level_s = 0.0  # what the session served last had used before
-        self._free_since_s = 0.0  # when the last frame ended
+        self._level_s = 0.0  # time used by the session served last, before
+        self._free_since_s = 0.0  # end of the last frame
 
     def arrive(self, client: Client) -> None:
-        """Note that a session has a frame waiting."""
+        """Record that a session has a waiting frame."""
         share = self._shares.setdefault(client, _Share(self._level_s))
         if not share.is_waiting:
             share.used_s = max(share.used_s, self._level_s - MAX_CLAIM_S)
             share.is_waiting = True
 
     def next_of(self, waiting: Iterable[Client]) -> Client | None:
-        """Return whose turn it is; all of those who wait have arrived."""
+        """Return the session to serve next; all that wait must have arrived."""
         chosen = min(
             waiting, key=lambda client: self._shares[client].used_s, default=None
         )
@@ -63,11 +63,11 @@ class Turns(Generic[Client]):
         started_s: float,
         ended_s: float,
     ) -> None:
-        """Note what a session's frame has taken, and what it took to begin it.
+        """Record the time that a session's frame took, including the gap before it.
 
-        From the end of one frame to the start of the next, nobody is served.  Frames of
-        160x90 that take 5 ms have 4 ms of that: uncounted, they left a large frame
-        beside them waiting for 1.8 times what equal shares allow.
+        From the end of one frame to the start of the next, no session is served.  For
+        frames of 160x90 that take 5 ms, this gap is 4 ms.  While it was not counted, a
+        large frame beside them waited 1.8 times what equal shares allow.
         """
         idle_s = max(0.0, started_s - max(self._free_since_s, here_since_s))
         self._free_since_s = max(self._free_since_s, ended_s)

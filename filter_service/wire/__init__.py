@@ -1,10 +1,10 @@
-"""Messages, field by field; `filter_service.messages` is their face.
+"""Messages of the wire protocol; `filter_service.messages` is their public API.
 
-message    what every message has in common
+message    base class of messages, limits
 images     images, formats, views
-depths     depth in fewer bytes
-compression  parts in fewer, without loss
-requests   what a client says
-replies    what the service answers
+depths     depth encodings
+compression  lossless compression of parts
+requests   messages from the client
+replies    messages from the service
 unpacking  bounded unpacking of untrusted bytes
 """

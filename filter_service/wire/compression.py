@@ -1,7 +1,7 @@
-"""Parts in fewer bytes without loss, for thin networks.
+"""Lossless compression of message parts, for slow networks.
 
-Each part is one LZ4 block, without a frame around it: how large the image is the
-header says, so that a block can never fill more memory than that.
+Each part is one LZ4 block without a frame.  The header gives the size of the image, so
+a block can never expand to more memory than that.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ COMPRESSIONS: tuple[str, ...] = get_args(Compression)
 
 
 def largest_block_bytes(size_bytes: int) -> int:
-    """Return the most that a block of so many bytes may have (LZ4's own bound)."""
+    """Return the maximum block size for this many bytes (LZ4's own bound)."""
     return size_bytes + size_bytes // 255 + 16
 
 
 def packed(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return the block (n_bytes,) of an image of any shape and type."""
+    """Compress an image of any shape and type to a block (n_bytes,)."""
     from lz4 import block
 
     contiguous = np.ascontiguousarray(image)
@@ -36,12 +36,12 @@ def packed(image: NDArray[Any]) -> NDArray[np.uint8]:
 def unpacked(
     part: NDArray[np.uint8], shape: Sequence[int], dtype: str, path: str
 ) -> NDArray[Any]:
-    """Return the image of a block (n_bytes,), of a shape and type.
+    """Decompress a block (n_bytes,) to an image of the given shape and type.
 
     Raises
     ------
     BadMessage
-        It is no block, or that of an image of another size.
+        If it is not an LZ4 block, or its image has another size.
     """
     from lz4 import block
 
@@ -63,7 +63,7 @@ def unpacked(
 
 
 def block_from_part(part: Any, size_bytes: int, path: str) -> NDArray[np.uint8]:
-    """Return an array over a part that may be the block of so many bytes.
+    """Return an array over a part that may be the block of this many bytes.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Depth in fewer bytes, for thin networks: what each encoding keeps, and what it loses.
+"""Encodings of depth, with their errors, for slow networks.
 
-Depth in a frame is metres in float32; on the wire it may be half as large.  Missing
-depth stays missing and infinity stays infinity in every encoding.
+Depth in a frame is in meters, float32; on the wire it may take half as many bytes.
+Missing depth stays missing and infinity stays infinity in every encoding.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 DepthEncoding = Literal["float32", "float16", "dpt16", "mm16"]
-"""Metres; metres in half precision; dioptres in half precision; whole millimetres."""
+"""Meters; meters in half precision; diopters in half precision; whole millimeters."""
 
 DEPTH_ENCODINGS: tuple[str, ...] = get_args(DepthEncoding)
 
@@ -25,15 +25,15 @@ WIRE_DTYPES = {
 
 MM_PER_M = 1000.0
 MISSING_MM, INFINITE_MM = 0, 65535
-"""Of mm16: 1 to 65534 are millimetres."""
+"""Special values of mm16; 1 to 65534 are millimeters."""
 
 
 def encoded_depth(depth_m: NDArray[np.float32], encoding: str) -> NDArray[Any]:
-    """Return depth as it travels.
+    """Encode depth for the wire.
 
-    Errors: float16 and dpt16 0.05 % of the distance (of dpt16 nothing beyond 16 km or
-    nearer than 0.1 mm is told apart), mm16 half a millimetre up to 65.5 m and infinity
-    beyond.
+    Errors are 0.05 % of the distance for float16 and dpt16, and half a millimeter for
+    mm16.  dpt16 cannot distinguish distances beyond 16 km or nearer than 0.1 mm; mm16
+    represents distances beyond 65.5 m as infinity.
     """
     if encoding == "float32":
         return np.ascontiguousarray(depth_m, dtype=np.float32)
@@ -48,7 +48,7 @@ def encoded_depth(depth_m: NDArray[np.float32], encoding: str) -> NDArray[Any]:
 
 
 def decoded_depth(sent: NDArray[Any], encoding: str) -> NDArray[np.float32]:
-    """Return depth in metres; 0 is missing."""
+    """Decode depth to meters; 0 is missing."""
     if encoding == "float32":
         return sent
     if encoding == "float16":

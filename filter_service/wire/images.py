@@ -1,4 +1,4 @@
-"""Images on the wire: their formats, what a header says of them, their parts."""
+"""Images on the wire: formats, headers of views, message parts."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ SPACE_OF_DTYPE: dict[DType, Space] = {
 
 @dataclass(frozen=True)
 class ImageFormat(Record):
-    """How colour is stored: 8-bit sRGB, or linear float32 or float16."""
+    """Format of color: 8-bit sRGB, or linear float32 or float16."""
 
     dtype: DType
     space: Space
 
     def __post_init__(self) -> None:
-        """Refuse other pairs: 8 bits are sRGB and floats linear, nothing else."""
+        """Check that the pair is valid: 8 bits are sRGB, floats are linear."""
         wanted = SPACE_OF_DTYPE[self.dtype]
         if self.space != wanted:
             raise BadMessage(
@@ -66,7 +66,7 @@ FORMATS: dict[Output, ImageFormat] = {
     "linear": LINEAR,
     "linear16": LINEAR16,
 }
-"""Formats by the names that settings and renderers give them."""
+"""Formats by their names in settings and renderers."""
 
 FORMAT_OF_DTYPE: dict[str, ImageFormat] = {
     color.dtype: color for color in FORMATS.values()
@@ -79,7 +79,7 @@ OUTPUT_OF_FORMAT: dict[ImageFormat, Output] = {
 
 @dataclass(frozen=True)
 class DepthFormat(Record):
-    """What depth means, view-space z or distance, and how it travels."""
+    """Meaning of depth, view-space z or distance, and its encoding."""
 
     kind: DepthKind = "planar"
     encoding: DepthEncoding = "float32"
@@ -87,7 +87,7 @@ class DepthFormat(Record):
 
 @dataclass(frozen=True)
 class ViewHeader(Record):
-    """One view of a frame as its header describes it."""
+    """Header of one view of a frame."""
 
     width_px: SidePx
     height_px: SidePx
@@ -102,7 +102,7 @@ class ViewHeader(Record):
     pose: Pose | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a camera that is none."""
+        """Check that the camera is valid."""
         _ = self.camera
 
     @classmethod
@@ -128,7 +128,7 @@ class ViewHeader(Record):
         depth_encoding: DepthEncoding = "float32",
         state: ViewState = USUAL_STATE,
     ) -> ViewHeader:
-        """Return what a frame's header says about a view."""
+        """Return the header that describes a view."""
         return cls.of(
             view.camera,
             FORMAT_OF_DTYPE[view.color.dtype.name],
@@ -139,7 +139,7 @@ class ViewHeader(Record):
         )
 
     def view(self, images: ViewImages) -> RgbdView:
-        """Return the view of these images, depth in metres."""
+        """Return the view of these images, with depth in meters."""
         hidden = images.hidden_depth_m
         encoding = self.depth.encoding
         return RgbdView(
@@ -153,7 +153,7 @@ class ViewHeader(Record):
 
     @property
     def state(self) -> ViewState:
-        """Return through whose eye the view is seen, and in which state."""
+        """Return the eye that sees the view, and its state."""
         return ViewState(
             self.eye, self.pupil_diameter_mm, self.focus_dpt, self.gaze_deg, self.pose
         )
@@ -178,17 +178,17 @@ class ViewHeader(Record):
 
     @property
     def part_count(self) -> int:
-        """Return how many parts follow for this view."""
+        """Return the number of message parts of this view."""
         return len(self.images)
 
 
 @dataclass(frozen=True)
 class ViewImages:
-    """The images of one view: what is seen, and maybe what it hides.
+    """The images of one view: the visible surface, and optionally the hidden layer.
 
     color : (height, width, 3) uint8 sRGB, or float32 or float16 linear
-        The renderer takes values that are not finite as black, and says so.
-    depth_m : (height, width) float32, metres, or as the header's encoding has it
+        The renderer replaces non-finite values by black and reports them.
+    depth_m : (height, width) float32, meters, or as the header's encoding has it
         0, negative and NaN are missing.
     hidden_color, hidden_depth_m : like color and depth_m, optional
         Depth of 0, negative or NaN: nothing is hidden here.
@@ -211,12 +211,12 @@ class ViewImages:
         return [array for array in found if array is not None]
 
     def parts(self, view: ViewHeader) -> list[NDArray[Any]]:
-        """Return the images as they are sent.
+        """Return the images in wire format.
 
         Raises
         ------
         ValueError
-            They are not what the header says.
+            If the images do not match the header.
         """
         if view.has_hidden != self.has_hidden:
             raise ValueError(
@@ -232,17 +232,17 @@ class ViewImages:
 if TYPE_CHECKING:
     Images = tuple[ViewImages, ...]
     Pictures = tuple[NDArray[Any], ...]
-else:  # they travel in parts of their own, of which msgspec reads nothing
+else:  # sent as separate parts, which msgspec does not decode
     Images = Pictures = tuple
 
 
 def as_sent(image: NDArray[Any], color: ImageFormat) -> NDArray[Any]:
-    """Return the image contiguous and little-endian, in the format it claims.
+    """Return the image contiguous and little-endian, after checking its format.
 
     Raises
     ------
     ValueError
-        It is of another shape or type.
+        If the image has another shape or type.
     """
     if image.dtype != np.dtype(color.dtype) or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(
@@ -276,9 +276,9 @@ def images_from_parts(
     limits: Limits,
     compression: Compression = "none",
 ) -> tuple[ViewImages, ...]:
-    """Return arrays over the parts of a frame's views; nothing is copied.
+    """Return arrays over the parts of a frame's views, without copying.
 
-    Where they are compressed the arrays are of bytes, see `unpacked_images`.
+    Compressed parts give arrays of bytes, see `unpacked_images`.
     """
     expect_parts(parts, sum(view.part_count for view in views))
     waiting = iter(parts)
@@ -306,7 +306,7 @@ def _from_part(
 def packed_images(
     views: Sequence[ViewHeader], images: Sequence[ViewImages]
 ) -> tuple[ViewImages, ...]:
-    """Return the images of a frame's views as blocks."""
+    """Compress the images of a frame's views to blocks."""
     result = []
     for view, found in zip(views, images, strict=True):
         blocks: list[Any] = [packed(part) for part in found.parts(view)]
@@ -317,12 +317,12 @@ def packed_images(
 def unpacked_images(
     views: Sequence[ViewHeader], images: Sequence[ViewImages]
 ) -> tuple[ViewImages, ...]:
-    """Return the images of blocks.
+    """Decompress the blocks of a frame's views to images.
 
     Raises
     ------
     BadMessage
-        Names the one that is none.
+        If a block is invalid; the message names it.
     """
     result = []
     for i, (view, found) in enumerate(zip(views, images, strict=True)):
@@ -337,7 +337,7 @@ def unpacked_images(
 
 
 def check_camera(camera: Camera, path: str, limits: Limits) -> None:
-    """Refuse an image larger than a service takes."""
+    """Raise BadMessage for an image larger than the service accepts."""
     for name, largest in (
         ("width_px", limits.max_width_px),
         ("height_px", limits.max_height_px),
@@ -354,7 +354,7 @@ def check_camera(camera: Camera, path: str, limits: Limits) -> None:
 def check_part_size(
     camera: Camera, color: ImageFormat, path: str, limits: Limits
 ) -> None:
-    """Refuse an image whose part would be larger than a service takes."""
+    """Raise BadMessage for an image whose part would exceed the limit."""
     size_bytes = camera.pixel_count * color.bytes_per_pixel
     if size_bytes > limits.max_part_bytes:
         raise BadMessage(

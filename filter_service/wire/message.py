@@ -1,4 +1,4 @@
-"""What every message has in common: header fields from annotated types, and parts."""
+"""Base class of messages: header fields from annotated types, and parts."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ Size = Annotated[int, Meta(ge=1, le=2**40)]
 
 @dataclass(frozen=True)
 class Limits(Record):
-    """What one service accepts; it is published in ``welcome``."""
+    """Limits of a service, published in ``welcome``."""
 
     max_width_px: Size = 4096
     max_height_px: Size = 4096
     max_views: Size = 2
-    max_part_bytes: Size = 100_000_000  # 3840 x 2160 linear float32 colour fits
+    max_part_bytes: Size = 100_000_000  # 3840 x 2160 linear float32 color fits
     max_profile_bytes: Size = 2**20
 
     def narrowed(self, error: BadMessage) -> BadMessage:
-        """Return a refusal that states this service's limit, not the protocol's."""
+        """Return the error with this service's limit in place of the protocol's."""
         name, allowed = (error.field or "").rpartition(".")[2], error.allowed
         if allowed and allowed.startswith(("an integer", "a list")):
             allowed = {
@@ -55,43 +55,43 @@ class Limits(Record):
 
 @dataclass(frozen=True)
 class Message(Record):
-    """Base of all messages: frozen dataclasses whose fields are the header's.
+    """Base class of all messages: frozen dataclasses of header fields.
 
     Attributes
     ----------
     payload : str
-        Name of the field that travels in parts of its own; empty for most.
+        Name of the field that is sent as separate parts; empty for most messages.
     """
 
     type_name: ClassVar[str]
     payload: ClassVar[str] = ""
 
     def fields(self) -> dict[str, Any]:
-        """Return the header fields; what is None does not travel."""
+        """Return the header fields, without those that are None."""
         fields = super().fields()
         fields.pop(self.payload, None)
         return fields
 
     def parts(self) -> list[Any]:
-        """Return what follows the header."""
+        """Return the parts that follow the header."""
         return []
 
     @classmethod
     def parse(
         cls, header: Mapping[str, Any], parts: Sequence[Part], limits: Limits
     ) -> Self:
-        """Return the checked message with what follows its header.
+        """Validate a header and its parts, and return the message.
 
         Raises
         ------
         BadMessage
-            Names the field, the bad value and what is allowed.
+            Names the field, the invalid value and the allowed ones.
         """
         given = {name: value for name, value in header.items() if name != cls.payload}
         return checked(given, cls).with_parts(parts, limits)
 
     def with_parts(self, parts: Sequence[Part], limits: Limits) -> Self:
-        """Return the message with its parts; most have none."""
+        """Return the message with its parts; most messages have none."""
         expect_parts(parts, 0)
         return self
 
@@ -100,7 +100,7 @@ class Message(Record):
 
 
 def expect_parts(parts: Sequence[Part], count: int) -> None:
-    """Raise unless exactly ``count`` parts follow the header."""
+    """Raise BadMessage unless exactly ``count`` parts follow the header."""
     if len(parts) != count:
         raise BadMessage(
             f"{len(parts)} parts follow the header",
@@ -110,7 +110,7 @@ def expect_parts(parts: Sequence[Part], count: int) -> None:
 
 
 def clip(text: str, max_bytes: int) -> str:
-    """Return the text, shortened with dots where its UTF-8 form is too long."""
+    """Return the text, shortened with dots if its UTF-8 form is too long."""
     encoded = text.encode("utf-8", "replace")
     if len(encoded) <= max_bytes:
         return encoded.decode("utf-8")

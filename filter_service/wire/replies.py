@@ -1,4 +1,4 @@
-"""What the service answers: to hello, to a profile, to frames, to ping."""
+"""Messages from the service."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ MAX_RENDERER_BYTES = 80
 
 
 def _clipped(reply: Message, /, **limits: int) -> None:
-    """Cut texts to what a header holds, as the message is made."""
+    """Shorten texts of a new message to fit into a header."""
     for name, max_bytes in limits.items():
         value = getattr(reply, name)
         if value is not None:
@@ -67,10 +67,10 @@ def _clipped(reply: Message, /, **limits: int) -> None:
 
 @dataclass(frozen=True)
 class Welcome(Message):
-    """The answer to hello: who serves, what it accepts, how many frames may wait.
+    """The reply to hello: the service's description, limits and credit.
 
-    With ``is_resumed`` the session of the key goes on with the profiles named: that of
-    the eye ``both`` alone, and those of all eyes.
+    If ``is_resumed``, the session of the key continues: ``profile_id`` is the last
+    accepted profile of the eye ``both``, and ``profile_ids`` those of all its eyes.
     """
 
     session_id: Id
@@ -87,7 +87,7 @@ class Welcome(Message):
     type_name: ClassVar[str] = "welcome"
 
     def __post_init__(self) -> None:
-        """Cut what the service says of itself to what a header holds."""
+        """Shorten the service's description to fit into a header."""
         server = {
             key: clip(text, MAX_SERVER_BYTES) for key, text in self.server.items()
         }
@@ -98,7 +98,7 @@ class Welcome(Message):
 class Accepted(Message):
     """A profile is well formed; ``is_building`` is false while no camera is known.
 
-    ``n_cameras`` counts the cameras that it is being prepared for.
+    ``n_cameras`` is the number of cameras that it is being prepared for.
     """
 
     profile_id: Id
@@ -112,7 +112,7 @@ class Accepted(Message):
 
 @dataclass(frozen=True)
 class Progress(Message):
-    """How far the PSFs of a profile are."""
+    """Progress of preparing a profile."""
 
     profile_id: Id
     generation: Id
@@ -123,16 +123,15 @@ class Progress(Message):
     type_name: ClassVar[str] = "progress"
 
     def __post_init__(self) -> None:
-        """Cut the stage to what a header holds."""
+        """Shorten the stage to fit into a header."""
         _clipped(self, stage=MAX_STAGE_BYTES)
 
 
 @dataclass(frozen=True)
 class Ready(Message):
-    """The PSFs of a profile are in place; frames are filtered with them from now on.
+    """The PSFs of a profile are computed; from now on, frames are filtered with them.
 
-    ``is_complete`` is false for a preview: good for what the last frame looked at, and
-    followed by another Ready.
+    ``is_complete`` is always true; it was false in releases that had previews.
     """
 
     profile_id: Id
@@ -161,7 +160,7 @@ UsedFocus = Annotated[float, Meta(ge=-100.0, le=100.0)]
 
 @dataclass(frozen=True)
 class ResultView(Record):
-    """Size and format of one filtered view, and the eye that it was seen through."""
+    """Size and format of one filtered view, and the eye and state used for it."""
 
     width_px: Annotated[int, Meta(ge=1, le=2**20)]
     height_px: Annotated[int, Meta(ge=1, le=2**20)]
@@ -178,10 +177,10 @@ class ResultView(Record):
 
 @dataclass(frozen=True)
 class Result(Message):
-    """A filtered frame, with everything that decided how it looks.
+    """A filtered frame, with everything that determines how it looks.
 
-    What a view says of itself stands here too, of the first one; ``is_complete`` is so
-    where all are.
+    Fields that a view also has are those of the first view; ``is_complete`` is true if
+    it is true for all views.
     """
 
     frame_id: Id
@@ -207,12 +206,12 @@ class Result(Message):
     payload: ClassVar[str] = "colors"
 
     def __post_init__(self) -> None:
-        """Keep the notes that fit into a header, of which views beyond two take."""
+        """Keep the notes that fit into a header, fewer with more than two views."""
         most = MAX_NOTES - max(0, len(self.views) - 2)
         object.__setattr__(self, "notes", clip_notes(self.notes, max(1, most)))
 
     def parts(self) -> list[Any]:
-        """Return the images of all views; none where they lie in shared memory."""
+        """Return the images of all views; none if they are in shared memory."""
         if self.in_memory:
             return []
         if self.compression != "none":
@@ -244,8 +243,8 @@ class Result(Message):
 class Shared(Message):
     """Shared memory for a client of the same user and machine, or why there is none.
 
-    ``path`` is opened and mapped like a file; the memory is the session's until it is
-    given back or the connection ends.
+    The client opens and maps ``path`` like a file.  The memory belongs to the session
+    until it is returned or the connection ends.
     """
 
     slot: Id | None = None
@@ -258,9 +257,9 @@ class Shared(Message):
 
 @dataclass(frozen=True)
 class Dropped(Message):
-    """A frame that was not filtered, and why; reasons of later versions pass.
+    """A frame that was not filtered, and why; unknown reasons are accepted.
 
-    ``retry_after_ms`` says when the next may have more luck, where that is known.
+    ``retry_after_ms`` is the time after which a next frame may succeed, if known.
     """
 
     frame_id: Id
@@ -272,7 +271,7 @@ class Dropped(Message):
 
 @dataclass(frozen=True)
 class ErrorReply(Message):
-    """What was wrong, where, and what would have been accepted."""
+    """An error: what was wrong, in which field, and what is allowed."""
 
     code: Word
     message: Text
@@ -284,7 +283,7 @@ class ErrorReply(Message):
     type_name: ClassVar[str] = "error"
 
     def __post_init__(self) -> None:
-        """Cut the texts to what a header holds."""
+        """Shorten the texts to fit into a header."""
         _clipped(
             self,
             message=MAX_TEXT_BYTES,
@@ -314,10 +313,10 @@ class ErrorReply(Message):
 
 @dataclass(frozen=True)
 class DeviceState(Record):
-    """What `pong` says of one of the devices that filter.
+    """State of one device in `pong`.
 
-    ``busy_ratio`` is the share of the last ten seconds or so in which it filtered.  One
-    that ``is_lost`` was given up: it could not be started again.
+    ``busy_ratio`` is the share of about the last ten seconds in which it filtered.
+    ``is_lost`` means that it was given up because it could not be restarted.
     """
 
     name: Word
@@ -333,16 +332,16 @@ class DeviceState(Record):
     render_silent_s: Annotated[float, Meta(ge=0.0, le=1e12)] = 0.0
 
     def __post_init__(self) -> None:
-        """Cut the renderer's name to what a header of many devices holds."""
+        """Shorten the renderer's name, so that many devices fit into a header."""
         object.__setattr__(self, "renderer", clip(self.renderer, MAX_RENDERER_BYTES))
 
 
 @dataclass(frozen=True)
 class Pong(Message):
-    """The answer to ping, with the state of the service.
+    """The reply to ping, with the state of the service.
 
-    ``render_silent_s`` is since when the loop that filters has given no sign of life:
-    of several, the one that is silent for longest.
+    ``render_silent_s`` is the time since the last heartbeat of the render worker; of
+    several workers, the longest such time.
     """
 
     t: Moment
@@ -364,7 +363,7 @@ class Pong(Message):
 
 @dataclass(frozen=True)
 class Closing(Message):
-    """The service ends, by its owner's will; there may be another one later."""
+    """The owner ends the service, which may be started again later."""
 
     reason: Word = "shutdown"
 
@@ -373,6 +372,6 @@ class Closing(Message):
 
 @dataclass(frozen=True)
 class Alive(Message):
-    """Sent now and then to every client: the service finds out who is gone."""
+    """Sent periodically to every client, to detect vanished ones."""
 
     type_name: ClassVar[str] = "alive"

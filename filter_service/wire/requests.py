@@ -1,4 +1,4 @@
-"""What a client says: hello, a profile, frames, ping, bye."""
+"""Messages from the client."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 @dataclass(frozen=True)
 class Hello(Message):
-    """The first message of a client; a key takes up the session of an earlier one."""
+    """The first message of a client; a session key resumes an earlier session."""
 
     client: Word = ""
     session_key: Word = ""
@@ -64,9 +64,10 @@ class Hello(Message):
 
 @dataclass(frozen=True)
 class ProfileRequest(Message):
-    """A new eye: its body is a part of its own; ``views`` are cameras to prepare.
+    """Request for a new eye; the body is a separate part.
 
-    ``eye`` is which one of the session's; views of a frame name theirs.
+    ``views`` are cameras to prepare for.  ``eye`` selects one of the session's eyes,
+    which views of a frame refer to.
     """
 
     profile_id: Id
@@ -83,7 +84,7 @@ class ProfileRequest(Message):
         return [json.dumps(self.body, allow_nan=False).encode("utf-8")]
 
     def with_parts(self, parts: Sequence[Part], limits: Limits) -> Self:
-        """Return the request with its body, which is only unpacked, not understood."""
+        """Return the request with its body, which is unpacked but not interpreted."""
         _check_count(self.views, limits)
         for i, camera in enumerate(self.views):
             check_camera(camera, f"views[{i}]", limits)
@@ -93,7 +94,7 @@ class ProfileRequest(Message):
 
 @dataclass(frozen=True)
 class FrameOptions(Record):
-    """How a frame's fragments are made and added up."""
+    """Options for creating and accumulating a frame's fragments."""
 
     accumulation: Accumulation = "coverage"
     merge: bool = True
@@ -103,9 +104,9 @@ class FrameOptions(Record):
 
 @dataclass(frozen=True)
 class SharedPlaces(Record):
-    """Where a frame's images lie in shared memory, and where the result shall lie.
+    """Positions in shared memory of a frame's images and of its result.
 
-    ``starts`` are in the order in which the parts would be, and ``result_starts`` too.
+    ``starts`` and ``result_starts`` are in the order that the parts would have.
     """
 
     slot: Id
@@ -116,7 +117,7 @@ class SharedPlaces(Record):
 
 @dataclass(frozen=True)
 class Frame(Message):
-    """One RGB-D frame of one or more views, to be seen through the session's eye."""
+    """One RGB-D frame of one or more views, to be filtered by the session's eyes."""
 
     frame_id: Id
     views: Annotated[tuple[ViewHeader, ...], Meta(min_length=1, max_length=MAX_VIEWS)]
@@ -135,11 +136,11 @@ class Frame(Message):
 
     @property
     def pixel_count(self) -> int:
-        """Return the pixels of all views."""
+        """Return the number of pixels of all views."""
         return sum(view.camera.pixel_count for view in self.views)
 
     def parts(self) -> list[Any]:
-        """Return the images of each view in turn; none where they lie in memory."""
+        """Return the images of each view in turn; none if they are in shared memory."""
         if self.memory is not None:
             return []
         if self.compression != "none":
@@ -148,14 +149,14 @@ class Frame(Message):
         return [part for view, images in pairs for part in images.parts(view)]
 
     def packed(self, compression: Compression) -> Self:
-        """Return the frame with its images compressed, as it is sent."""
+        """Return the frame with compressed images, ready to be sent."""
         if compression == "none":
             return self
         images = packed_images(self.views, self.images)
         return replace(self, images=images, compression=compression)
 
     def unpacked(self) -> Self:
-        """Return the frame with its images as they are seen; its result may be packed.
+        """Return the frame with decompressed images; its result may be compressed.
 
         Raises
         ------
@@ -166,7 +167,7 @@ class Frame(Message):
         return replace(self, images=unpacked_images(self.views, self.images))
 
     def with_parts(self, parts: Sequence[Part], limits: Limits) -> Self:
-        """Return the frame with arrays over its parts (nothing is copied)."""
+        """Return the frame with arrays over its parts, without copying."""
         _check_count(self.views, limits)
         for i, view in enumerate(self.views):
             check_camera(view.camera, f"views[{i}]", limits)
@@ -207,7 +208,7 @@ def _check_count(views: Sequence[object], limits: Limits) -> None:
 
 @dataclass(frozen=True)
 class Share(Message):
-    """Asks for shared memory, for images to lie in."""
+    """Requests shared memory for images."""
 
     size_bytes: Size
 
@@ -216,7 +217,7 @@ class Share(Message):
 
 @dataclass(frozen=True)
 class Unshare(Message):
-    """Gives shared memory back."""
+    """Returns shared memory."""
 
     slot: Id
 
@@ -225,7 +226,7 @@ class Unshare(Message):
 
 @dataclass(frozen=True)
 class Ping(Message):
-    """A question whether the render loop is alive; ``t`` comes back unchanged."""
+    """Requests the state of the service; ``t`` is returned unchanged."""
 
     t: Moment = 0.0
 
@@ -234,6 +235,6 @@ class Ping(Message):
 
 @dataclass(frozen=True)
 class Bye(Message):
-    """The end of a session; it is not answered."""
+    """Ends the session; there is no reply."""
 
     type_name: ClassVar[str] = "bye"

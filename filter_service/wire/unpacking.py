@@ -13,17 +13,18 @@ from filter_service.errors import BadMessage
 
 MAX_HEADER_BYTES = 4096
 MAX_DEPTH = 32
-"""Of maps and lists within each other."""
+"""Maximum nesting depth of maps and lists."""
 
 MAX_BITS = 64
-"""Of an integer: what msgpack has, so JSON may have no more."""
+"""Maximum size of an integer: the limit of msgpack, applied to JSON, too."""
 
 MAX_TEXT = 4096
-"""Characters of a text in a profile."""
+"""Maximum number of characters of a text in a profile."""
 
 MAX_ITEMS = 16_384
-"""Of a profile, in all its maps and lists: 100 measurements of 28 coefficients have
-3,400.  To refuse a megabyte that has more takes 1 ms; to read it took 300."""
+"""Maximum number of items in all maps and lists of a profile: 100 measurements of 28
+coefficients have 3,400.  Refusing a megabyte with more takes 1 ms; parsing it took
+300."""
 
 # Nested arrays are the expensive input: 64 KiB of them cost 98 ms without a bound on
 # their length and 0.03 ms with one of 64.
@@ -55,7 +56,7 @@ def unpack_header(data: bytes | bytearray | memoryview) -> dict[str, Any]:
     Raises
     ------
     BadMessage
-        Too long, not msgpack, not a map, or a repeated or non-text key.
+        If it is too long, not msgpack or not a map, or has a repeated or non-text key.
     """
     size_bytes = memoryview(data).nbytes
     if size_bytes > MAX_HEADER_BYTES:
@@ -78,13 +79,14 @@ def unpack_profile(
 ) -> dict[str, Any]:
     """Return the profile map from its part, JSON or msgpack.
 
-    The two cannot be confused: a JSON object begins with ``{`` (perhaps after white
-    space), and no msgpack map begins with any of those bytes.
+    The two are unambiguous: a JSON object begins with ``{``, perhaps after white space,
+    and no msgpack map begins with any of these bytes.
 
     Raises
     ------
     BadMessage
-        Too long, neither of the two, a repeated key, or a number that is not finite.
+        If it is too long or neither of the two, or has a repeated key or a non-finite
+        number.
     """
     size_bytes = memoryview(data).nbytes
     if not 1 <= size_bytes <= max_bytes:
@@ -107,7 +109,7 @@ def unpack_profile(
 
 
 class _Items:
-    """Counts the items of maps and lists while they are read, to stop in time."""
+    """Counts the items of maps and lists during parsing, to stop early."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -123,7 +125,7 @@ class _Items:
         return items
 
     def of_map(self, pairs: list[tuple[object, object]]) -> dict[str, object]:
-        """Count the pairs of a map, and return it."""
+        """Count the pairs of a map, and return the map."""
         self._add(len(pairs))
         return _unique_keys(pairs)
 
@@ -137,7 +139,7 @@ def _unpacked(
             data,
             raw=False,
             use_list=True,
-            strict_map_key=False,  # _unique_keys says it with the key's value
+            strict_map_key=False,  # the error of _unique_keys includes the key
             list_hook=items.of_list,
             object_pairs_hook=items.of_map,
             ext_hook=_refuse_extension,
@@ -153,7 +155,7 @@ def _unpacked(
 
 
 def _unique_keys(pairs: list[tuple[object, object]]) -> dict[str, object]:
-    """Return the pairs as a dict; refuse repeated keys and keys that are no text."""
+    """Return the pairs as a dict; raise ValueError for repeated or non-text keys."""
     result: dict[str, object] = {}
     for key, value in pairs:
         if not isinstance(key, str):
@@ -169,7 +171,7 @@ def _refuse_extension(code: int, data: bytes) -> object:
 
 
 def _load_json(body: bytes) -> object:
-    # Here: a client, which reads no profiles, does without the package.
+    # Imported here because clients parse no profiles and do not need the package.
     from estimator.bounded_files import loads_bounded
 
     try:
@@ -183,14 +185,14 @@ def _load_json(body: bytes) -> object:
 
 
 _Path = tuple[Any, Any]
-"""Of a value: the path of the map or list that holds it, and its key there."""
+"""Path of a value: the path of the map or list that holds it, and its key there."""
 
 
 def _refuse_strange_values(root: object, name: str, *, finite: bool = False) -> None:
-    """Raise for what lies too deep or is too large a number; no recursion.
+    """Raise BadMessage for values nested too deep and for too large texts or integers.
 
-    With ``finite`` also for any NaN or infinity.  The text of a path is made for what
-    is refused alone.
+    With ``finite``, raise also for NaN and infinity.  This does not recurse, and it
+    formats a path only for a refused value.
     """
     waiting: list[tuple[_Path, object, int]] = [((None, name), root, 1)]
     while waiting:
