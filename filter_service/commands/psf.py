@@ -38,6 +38,11 @@ ARCMIN_PER_DEG = 60.0
 MAX_RADIUS_PX = 1023
 """Largest radius of a kernel written to a file; the service's own cap is lower."""
 
+WITHOUT_TYPICAL = (
+    "on axis the prescription alone, without the higher-order aberrations that are "
+    "typical of the age; `ocufilter filter`, and psf off the axis, add them"
+)
+
 
 class Method(StrEnum):
     """PSF computation method."""
@@ -161,6 +166,9 @@ def _measured(source: str, focus_dpt: float | None, **view) -> _State:
     profile = load_profile(source)
     worn = MeasuredWavefront.from_profile(profile)
     found = worn.state(focus_dpt=focus_dpt or 0.0, **view)
+    notes = tuple(found.notes)
+    if profile.higher_order == "typical":
+        notes = (*notes, WITHOUT_TYPICAL)
     return _State(
         name=profile.name,
         zernike_um=found.zernike_um,
@@ -168,7 +176,7 @@ def _measured(source: str, focus_dpt: float | None, **view) -> _State:
         pupil_diameter_mm=found.pupil_diameter_mm,
         ellipse=None,
         eye_side=profile.eye_side,
-        notes=tuple(found.notes),
+        notes=notes,
         rings=worn.rings,
     )
 

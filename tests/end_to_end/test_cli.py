@@ -488,6 +488,15 @@ def test_psf_writes_a_kernel_of_unit_sum(tmp_path):
     assert facts["method"] in ("fourier", "geometric")
 
 
+@pytest.mark.parametrize(
+    ("more", "is_said"), [({}, True), ({"higher_order": "none"}, False)]
+)
+def test_psf_of_a_prescription_says_what_it_leaves_out(tmp_path, more, is_said):
+    body = json.dumps({"kind": "prescription", "sphere_dpt": -3, **more})
+    facts = run_json("psf", body, *PSF_OPTIONS, "-o", tmp_path / "psf.npy")
+    assert any("without the higher-order" in note for note in facts["notes"]) == is_said
+
+
 def test_psf_writes_a_picture_with_a_scale_bar(tmp_path):
     run_json("psf", "myopia", *PSF_OPTIONS, "-o", tmp_path / "psf.png")
     picture = np.asarray(Image.open(tmp_path / "psf.png"))

@@ -28,8 +28,9 @@ def test_the_examples_of_a_page_run(path, tmp_path):
     if path.stem == "python":
         lines = printed.splitlines()
         assert lines[0].startswith("(90, 160, 3) 1 True")
-        assert lines[1] in ("1", "2")
-        assert f"print(error)  # {lines[3]}\n" in path.read_text(encoding="utf-8")
+        assert lines[1] == "float32 True"
+        assert lines[2] in ("1", "2")
+        assert f"print(error)  # {lines[4]}\n" in path.read_text(encoding="utf-8")
     if path.stem == "stereo":
         assert printed == "[(90, 160, 3), (90, 160, 3)]\n"
     if path.stem == "stream":
@@ -38,6 +39,7 @@ def test_the_examples_of_a_page_run(path, tmp_path):
         eye_length_mm, error_um = map(float, printed.splitlines()[0].split())
         assert 20.0 < eye_length_mm < 30.0
         assert error_um < 1e-3
+        assert printed.splitlines()[-1] == "1.0"
 
 
 def test_the_readme_s_example_prints_what_it_shows(tmp_path):

@@ -43,6 +43,16 @@ def test_the_command_shows_a_scene_in_a_simulated_headset(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"left.png", "right.png"}
 
 
+def test_a_counted_run_ends_where_no_service_answers():
+    finished = run_program(
+        *("--simulated", "--size", "96x108", "--scene", "primitives", "--seconds", "2"),
+        *("--service", "tcp://127.0.0.1:1"),
+        timeout_s=40.0,
+    )
+    assert finished.returncode == 1
+    assert "tcp://127.0.0.1:1" in finished.stderr
+
+
 OWN_SCENERY = """
 import numpy as np
 from clients.headset.look import RgbdPicture
