@@ -28,7 +28,7 @@ from filter_service.messages import (
     encoded_depth,
 )
 from filter_service.settings import DepthKind
-from filter_service.slots import starts_of
+from filter_service.shared_memory import starts_of
 
 LEND_WAIT_S = 0.1
 

@@ -81,22 +81,25 @@ class ServiceProcess:
         return self._log_file.read_text(encoding="utf-8", errors="replace")
 
     def pids(self) -> dict[str, int]:
-        """Return the processes of the service by name: keeper, door, render (Linux).
+        """Return process ids by name: supervisor, front-end, render (Linux only).
 
         If there is a second render process, the spare one is `standby`; the render
         processes of several devices are `render 0` and so on.
         """
-        keeper = self.process.pid
-        found = {"keeper": keeper}
-        children = Path(f"/proc/{keeper}/task/{keeper}/children").read_text().split()
+        supervisor = self.process.pid
+        found = {"supervisor": supervisor}
+        children = (
+            Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text().split()
+        )
         for child in map(int, children):
             try:
                 words = Path(f"/proc/{child}/cmdline").read_bytes().split(b"\0")
             except FileNotFoundError:
                 continue
-            module = next((w for w in words if w.endswith(b"_process")), b"")
-            name = module.decode().rpartition(".")[2].removesuffix("_process")
-            if name == "render":
+            name = ""
+            if b"filter_service.service.front_end_process" in words:
+                name = "front-end"
+            elif b"filter_service.service.render_worker_process" in words:
                 name = words[-2].decode()  # its last argument; an empty word follows
             if name in found:
                 name = name.replace("render", "standby")  # the older one filters

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.messages import Share, Shared, Unshare
-from filter_service.slots import PAGE_BYTES, Slot, starts_of
+from filter_service.shared_memory import PAGE_BYTES, Slot, starts_of
 
 KEPT_RATIO = 4
 MAX_SLOTS = 12

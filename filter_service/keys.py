@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from filter_service.atomic_files import write_atomically
 from filter_service.log_lines import ONCE_A_SECOND
-from filter_service.whole_files import write_atomically
 
 MAX_FILE_BYTES = 4096
 """Largest size of a key file; those of `KeyRing` have 300 bytes."""

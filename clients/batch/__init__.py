@@ -16,7 +16,7 @@ work               runs units: frames in, files and records out
 worker             worker process that runs units
 process_pool       a worker process per core
 ray_pool           workers on many machines
-whole_files        atomic writes and file hashes
+atomic_files       atomic writes and file hashes
 manifest           record of the finished frames
 run                runs the missing frames
 dry_run            time and cost estimate

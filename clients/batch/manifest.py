@@ -19,8 +19,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from clients.batch.atomic_files import is_unchanged, write_whole
 from clients.batch.job import fingerprint
-from clients.batch.whole_files import is_unchanged, write_whole
 from clients.batch.work import Record
 from estimator import InvalidFile
 from estimator.bounded_files import loads_bounded

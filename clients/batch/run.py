@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from clients.batch.atomic_files import content_of, remove_parts, write_whole
 from clients.batch.job import Job, code_version
 from clients.batch.manifest import (
     LINES,
@@ -23,7 +24,6 @@ from clients.batch.manifest import (
     write_summary,
 )
 from clients.batch.source import SourceFrame
-from clients.batch.whole_files import content_of, remove_parts, write_whole
 from clients.batch.work import Record, Unit
 from estimator import InvalidFile
 

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clients.batch.atomic_files import input_of, write_whole
 from clients.batch.exact_filter import ExactFilter
 from clients.batch.job import Job
 from clients.batch.source import BadFrame, SourceFrame, check_sizes
-from clients.batch.whole_files import input_of, write_whole
 from filter_service import Filtered, FilterError, RgbdView
 from filter_service.image_files import read_color, write_image
 

@@ -10,7 +10,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from clients.batch.whole_files import write_whole
+from clients.batch.atomic_files import write_whole
 from clients.extra import what_to_install
 from clients.scenes.paths import PATHS
 from clients.scenes.scene import Scene

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from clients.arguments import read_size_px
-from clients.batch.whole_files import write_whole
+from clients.batch.atomic_files import write_whole
 from clients.extra import what_to_install
 from clients.web.picture import Picture, picture_of
 from estimator import InvalidFile

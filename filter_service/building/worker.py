@@ -24,7 +24,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
-from filter_service.building.head_start import HeadStart
+from filter_service.building.background_warm_up import BackgroundWarmUp
 from filter_service.building.jobs import Build, BuildJob
 from filter_service.errors import BuildCancelled, BuildFailed, FilterError
 from filter_service.log_lines import start_log
@@ -53,17 +53,17 @@ def serve_builds(pipe: Connection, build_name: str, warm_up_name: str = "") -> N
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     start_log("worker")
     try:
-        build, head_start = _named(build_name), None
+        build, warm_up = _named(build_name), None
         pipe.send(("ready",))
         # After a restart of the service, clients reconnect at once, possibly for a
         # store from the disk; the warm-up must not compete with them for the processor.
         if warm_up_name and not pipe.poll(IDLE_S):
-            head_start = HeadStart(_named(warm_up_name))
+            warm_up = BackgroundWarmUp(_named(warm_up_name))
         while True:
             message = pipe.recv()
             if message[0] == "build":
                 ticket, job = message[1:]
-                _build_one(pipe, build, head_start, ticket=ticket, job=job)
+                _build_one(pipe, build, warm_up, ticket=ticket, job=job)
     except (EOFError, OSError, ParentGone):
         return
 
@@ -77,7 +77,7 @@ def _named(name: str) -> Callable[..., Any]:
 def _build_one(
     pipe: Connection,
     build: Build,
-    head_start: HeadStart | None,
+    warm_up: BackgroundWarmUp | None,
     *,
     ticket: int,
     job: BuildJob,
@@ -87,8 +87,8 @@ def _build_one(
     def cancelled() -> bool:
         return _is_cancelled(pipe, ticket)
 
-    if head_start is not None:
-        progress = head_start.before(progress, cancelled)
+    if warm_up is not None:
+        progress = warm_up.before(progress, cancelled)
     try:
         built = build(job, progress=progress, cancelled=cancelled)
     except ParentGone:

@@ -45,9 +45,9 @@ def list_kept(folder: Folder = None, json_output: Json = False) -> None:
 
     ocufilter eyes list --dir ~/.cache/ocufilter
     """
-    from filter_service.psfs.kept_eyes import kept_eyes
+    from filter_service.psfs.cached_eyes import cached_eyes
 
-    found = kept_eyes(_folder(folder))
+    found = cached_eyes(_folder(folder))
     if json_output:
         print_json({"eyes": [vars(eye) for eye in found]})
         return
@@ -80,7 +80,7 @@ def erase(
 
     ocufilter eyes erase anna.json --dir ~/.cache/ocufilter
     """
-    from filter_service.psfs.kept_eyes import erase_eyes
+    from filter_service.psfs.cached_eyes import erase_eyes
 
     if (profile is not None) + (name is not None) + every != 1:
         raise ValueError("whose? one of PROFILE, --name HASH and --all")

@@ -286,7 +286,7 @@ def _filtered(
     """Filter one view like a stream, with the eye estimated in this process."""
     from filter_service.filtering.eye_filter import EyeFilter
     from filter_service.filtering.filtered import BuildingEye, EyeReady
-    from filter_service.filtering.shared_workshop import open_inline_workshop
+    from filter_service.filtering.shared_builder import open_inline_builder
 
     def report(event: "EyeEvent") -> None:
         if isinstance(event, BuildingEye):
@@ -295,18 +295,18 @@ def _filtered(
             progress(1.0, "frame")
 
     begin_s = time.perf_counter()
-    workshop = open_inline_workshop(closing, engine=engine)
+    builder = open_inline_builder(closing, engine=engine)
     start_ms = 1e3 * (time.perf_counter() - begin_s)
     eye_filter = closing.enter_context(
-        EyeFilter(eye, view.camera, settings, on_event=report, workshop=workshop)
+        EyeFilter(eye, view.camera, settings, on_event=report, builder=builder)
     )
     seen = eye_filter.filter(view, whole=True, timeout_s=TIMEOUT_S, **options)
     store = eye_filter.prepared_stores[-1].store
     return _Filtered(
         seen,
         eye_filter.prepared_stores[-1].notes,
-        workshop.engine_name,
-        workshop.engine.name,
+        builder.engine_name,
+        builder.engine.name,
         start_ms,
         store.computed_count,
     )

@@ -29,9 +29,9 @@ def status(
 
     ocufilter status tcp://127.0.0.1:5577
     """
-    from filter_service.service.asking import ask_status
+    from filter_service.service.status_query import query_status
 
-    found = ask_status(endpoint, key_file=key, timeout_s=timeout_s)
+    found = query_status(endpoint, key_file=key, timeout_s=timeout_s)
     if json_output:
         print_json(found)
         return

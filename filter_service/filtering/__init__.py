@@ -6,12 +6,11 @@ several_eyes      a frame whose views have different eyes
 filtered          a filtered frame, and events of an eye
 accepted_profile  one profile and its stores
 stream_eyes       the eyes of a stream: requested, building, ready
-warm_up           prediction of the next frames' states
-workshop          builder and engine shared by all streams
-shared_workshop   builders shared within a process
+predicted_states  prediction of the next frames' states
+builder           builder and engine shared by all streams
+shared_builder    builders shared within a process
 choose_engine     choice of the engine, with the reason
 compile_loops     compilation of all loops, on all cores
-load_ahead        imports in the background before the first frame
 """
 
 import lazy_loader

@@ -24,11 +24,11 @@ from filter_service.camera import Camera
 from filter_service.checked import checked
 from filter_service.errors import BadMessage, NotPrepared, ServiceTimeout
 from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
+from filter_service.filtering.builder import Builder
 from filter_service.filtering.filtered import EyeEvent, EyeFailed, EyeReady, Filtered
 from filter_service.filtering.planned_frame import PlannedFrame
-from filter_service.filtering.shared_workshop import shared
+from filter_service.filtering.shared_builder import shared
 from filter_service.filtering.stream_eyes import StreamEyes
-from filter_service.filtering.workshop import Workshop
 from filter_service.rgbd_view import ColorImage, RgbdView, as_views
 from filter_service.settings import (
     DEFAULTS,
@@ -91,14 +91,14 @@ class EyeFilter:
     settings : FilterSettings or mapping, optional
     on_event : callable, optional
         Called with every `BuildingEye`, `EyeReady` and `EyeFailed`.
-    workshop : Workshop, optional
+    builder : Builder, optional
         Builder and engine; by default those shared by all filters of the process.
     max_cameras : int
         Number of cameras that are kept prepared.
     first_generation : int
         Generation of the first profile.
     engine : "auto", "gl" or "native"
-        Engine of the shared workshop: compute shaders, or compiled loops on all cores;
+        Engine of the shared builder: compute shaders, or compiled loops on all cores;
         "auto" selects gl on a hardware GPU, otherwise native.
 
     Raises
@@ -116,7 +116,7 @@ class EyeFilter:
         settings: FilterSettings | Mapping[str, Any] = DEFAULTS,
         *,
         on_event: Callable[[EyeEvent], None] | None = None,
-        workshop: Workshop | None = None,
+        builder: Builder | None = None,
         max_cameras: int = 4,
         first_generation: int = 1,
         engine: Engine = "auto",
@@ -126,15 +126,15 @@ class EyeFilter:
         self.settings = as_settings(settings)
         self._on_event = on_event
         self._pid = os.getpid()
-        self._shared = shared(engine) if workshop is None else None
-        self._workshop: Workshop | None = workshop or shared(engine).take()
+        self._shared = shared(engine) if builder is None else None
+        self._builder: Builder | None = builder or shared(engine).take()
         self._eyes = StreamEyes(
             self._take_event,
             max_cameras,
             self.cameras,
             first_generation=first_generation,
         )
-        self._workshop.streams.append(self._eyes)
+        self._builder.streams.append(self._eyes)
         self._newest: AcceptedProfile | None = None
         self._failure: EyeFailed | None = None
         self.is_extending = False  # only PSFs of the last frame are missing
@@ -156,15 +156,15 @@ class EyeFilter:
 
     def close(self) -> None:
         """Release the filter's resources; closing twice is allowed."""
-        if self._workshop is None or self._pid != os.getpid():
+        if self._builder is None or self._pid != os.getpid():
             return
-        self._workshop.end(self._eyes)
+        self._builder.end(self._eyes)
         if self._shared is not None:
             self._shared.give_back()
-        self._workshop = None
+        self._builder = None
 
     @property
-    def workshop(self) -> Workshop:
+    def builder(self) -> Builder:
         """Return the filter's builder and engine.
 
         Raises
@@ -173,14 +173,14 @@ class EyeFilter:
             If the filter is closed, or was made in the process that this one was forked
             from.
         """
-        if self._workshop is None:
+        if self._builder is None:
             raise ValueError("this EyeFilter is closed")
         if self._pid != os.getpid():
             raise ValueError(
                 f"this EyeFilter was made in process {self._pid}, whose threads and "
                 "worker it needs; expected one made in this process"
             )
-        return self._workshop
+        return self._builder
 
     @property
     def prepared_stores(self) -> tuple[PreparedStore, ...]:
@@ -214,7 +214,7 @@ class EyeFilter:
         ValueError
             If the profile is invalid; the eye is then unchanged.
         """
-        self._newest = self.workshop.accept(
+        self._newest = self.builder.accept(
             self._eyes,
             as_profile(profile),
             self.settings if settings is None else as_settings(settings),
@@ -224,13 +224,13 @@ class EyeFilter:
         return self._newest
 
     def keep_going(self) -> None:
-        """Advance builds of new eyes if the shared workshop is used."""
+        """Advance builds of new eyes if the shared builder is used."""
         if self._shared is not None:
-            self.workshop.advance(ahead=False)
+            self.builder.advance(ahead=False)
 
     def advance(self) -> None:
         """Advance builds of new eyes between frames, and compute PSFs ahead."""
-        self.workshop.advance()
+        self.builder.advance()
 
     def wait(self, timeout_s: float = 120.0) -> EyeReady:
         """Wait until the newest eye is ready for all cameras requested of it.
@@ -246,7 +246,7 @@ class EyeFilter:
         if self._newest is None:
             raise BadMessage("there is no profile", field="profile")
         while True:
-            self.workshop.advance()
+            self.builder.advance()
             failure, self._failure = self._failure, None
             if failure is not None and failure.eye is self._newest:
                 raise failure.error
@@ -276,9 +276,9 @@ class EyeFilter:
         remaining_s = deadline_s - time.monotonic()
         if remaining_s <= 0.0:
             raise ServiceTimeout(f"waited in vain for {what}")
-        descriptor = self.workshop.worker.file_descriptor
+        descriptor = self.builder.worker.file_descriptor
         watched = [] if descriptor is None else [descriptor]
-        if not self.workshop.is_warming:
+        if not self.builder.is_warming:
             wait(watched, min(remaining_s, WAIT_SLICE_S))  # select fails above 1024
 
     # Frames
@@ -357,7 +357,7 @@ class EyeFilter:
                 newest_only=whole,
                 until_s=deadline_s,
             )
-            self.workshop.advance(ahead=False)  # after this frame's request
+            self.builder.advance(ahead=False)  # after this frame's request
             if seen is not None:
                 return seen
             self._wait_for_worker(deadline_s, "the eye to be prepared for this camera")
@@ -450,14 +450,14 @@ class EyeFilter:
             gaze_deg=gaze_deg,
             at_s=time.monotonic(),
         )
-        workshop = self.workshop
+        builder = self.builder
         plan = self._eyes.plan([view.camera for view in views])
-        workshop.free_retired(self._eyes)
+        builder.free_retired(self._eyes)
         self.is_extending = (
             plan is not None and newest_only and not self._eyes.is_newest(plan)
         )
         if plan is None or self.is_extending:
             return None
         return PlannedFrame(
-            workshop, self._eyes, plan, tuple(views), pupil_diameter_mm, focus_dpt
+            builder, self._eyes, plan, tuple(views), pupil_diameter_mm, focus_dpt
         )

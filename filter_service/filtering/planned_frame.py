@@ -10,9 +10,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from filter_service.filtering.builder import Builder
 from filter_service.filtering.filtered import Filtered
 from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
-from filter_service.filtering.workshop import Workshop
 from filter_service.rendering.engine import Rendered
 from filter_service.rendering.filtered_view import FilteredView
 from filter_service.rendering.media_effects import MediaEffects, begin_through_media
@@ -26,7 +26,7 @@ GazeDegrees = tuple[float, float] | None
 class PlannedFrame:
     """Views that one eye sees in one state, and the stores prepared for them."""
 
-    workshop: Workshop  # the filter may be closed during the frame
+    builder: Builder  # the filter may be closed during the frame
     stream: StreamEyes
     plan: RenderPlan
     views: tuple[RgbdView, ...]
@@ -89,7 +89,7 @@ class PlannedFrame:
         effects = MediaEffects.of(plan.eye.profile, plan.eye.settings.display)
         begun = [
             begin_through_media(
-                self.workshop.engine,
+                self.builder.engine,
                 view,
                 store,
                 effects,
@@ -109,8 +109,8 @@ class PlannedFrame:
         self, begun: Sequence[Callable[[], FilteredView]], started_s: float
     ) -> Filtered:
         rendered = [finish() for finish in begun]
-        self.workshop.frame_s = time.monotonic() - started_s
-        self.workshop.note_served(self.stream, self.plan)
+        self.builder.frame_s = time.monotonic() - started_s
+        self.builder.note_served(self.stream, self.plan)
         return _filtered(self.plan, rendered)
 
 

@@ -1,7 +1,7 @@
 """The eyes of one stream of frames: the eye in use, and the eyes to be estimated.
 
 A profile is requested, then building, then ready.  This module keeps the state only,
-without GL or processes; `workshop` acts on it.
+without GL or processes; `builder` acts on it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from filter_service.camera import Camera
 from filter_service.errors import FilterError, NoProfile
 from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
 from filter_service.filtering.filtered import EyeEvent
-from filter_service.filtering.warm_up import StreamUse
+from filter_service.filtering.predicted_states import StreamUse
 from filter_service.rendering.engine import LoadedStore
 from filter_service.settings import FilterSettings
 

@@ -68,7 +68,7 @@ class Authenticator:
             self._before_numbering()
             self.socket.send_multipart(self._reply(request))
 
-    def lets_in(self, key: str) -> bool:
+    def accepts(self, key: str) -> bool:
         """Return whether a client's public key is currently allowed."""
         return self._keys is None or key in self._keys.allowed()
 
@@ -77,7 +77,7 @@ class Authenticator:
         key = ""
         if self._keys is not None:
             key = z85.encode(credentials[0]).decode() if credentials else ""
-            if mechanism != b"CURVE" or not self.lets_in(key):
+            if mechanism != b"CURVE" or not self.accepts(key):
                 log.warning(
                     "a client at %s has no key that is allowed", address.decode()
                 )

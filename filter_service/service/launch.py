@@ -8,10 +8,10 @@ import signal
 from collections.abc import Callable
 from functools import partial
 
+from filter_service.atomic_files import write_atomically
 from filter_service.log_lines import FORMAT_VARIABLE, start_log
 from filter_service.service.config import ServiceConfig
-from filter_service.service.keeper import OPEN_WORKSHOP, Keeper, ServiceFailed
-from filter_service.whole_files import write_atomically
+from filter_service.service.supervisor import OPEN_BUILDER, ServiceFailed, Supervisor
 
 log = logging.getLogger("ocufilter")
 
@@ -19,7 +19,7 @@ log = logging.getLogger("ocufilter")
 def run(
     config: ServiceConfig,
     *,
-    open_workshop: str = OPEN_WORKSHOP,
+    open_builder: str = OPEN_BUILDER,
     read_again: Callable[[], ServiceConfig] | None = None,
 ) -> None:
     """Serve until SIGINT or SIGTERM; print one line when ready.
@@ -28,8 +28,8 @@ def run(
 
     Parameters
     ----------
-    open_workshop : str
-        ``module:function`` that opens the builder, see `render_process`.
+    open_builder : str
+        ``module:function`` that opens the builder, see `render_worker_process`.
     read_again : callable, optional
         Returns the current settings; called at SIGHUP.
 
@@ -40,19 +40,19 @@ def run(
     """
     os.environ[FORMAT_VARIABLE] = config.log_format  # for all processes
     start_log("service")
-    keeper = Keeper(
+    supervisor = Supervisor(
         config,
-        open_workshop=open_workshop,
+        open_builder=open_builder,
         when_ready=Announcement(config).ready,
         when_not_ready=partial(_remove_ready_file, config),
         read_again=read_again,
     )
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: keeper.stop())
-    signal.signal(signal.SIGHUP, lambda *_: keeper.ask_to_read_again())
-    signal.set_wakeup_fd(keeper.wake_file_descriptor, warn_on_full_buffer=False)
+        signal.signal(number, lambda *_: supervisor.stop())
+    signal.signal(signal.SIGHUP, lambda *_: supervisor.ask_to_read_again())
+    signal.set_wakeup_fd(supervisor.wake_file_descriptor, warn_on_full_buffer=False)
     try:
-        keeper.run()
+        supervisor.run()
     except ServiceFailed as error:
         raise OSError(str(error)) from None
     finally:

@@ -41,7 +41,7 @@ class RateLimit:
         self._n_ignored += 1
         return Verdict.IGNORE if self._n_ignored <= MAX_IGNORED else Verdict.CLOSE
 
-    def end_patience(self) -> None:
+    def exhaust(self) -> None:
         """Make the next message within the window close the connection."""
         self._n_refusals, self._n_ignored = MAX_REFUSALS, MAX_IGNORED
 

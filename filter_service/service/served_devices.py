@@ -12,11 +12,11 @@ from functools import partial
 from filter_service.messages import DeviceState, Reply
 from filter_service.service.connections import Peer
 from filter_service.service.descriptors import DescriptorLimit
-from filter_service.service.frame_desk import FrameDesk
-from filter_service.service.guests import Guests
-from filter_service.service.mailbox import Tracker
-from filter_service.service.render_end import RenderEnd
+from filter_service.service.frame_queue import FrameQueue
+from filter_service.service.render_client import RenderClient
+from filter_service.service.router import Tracker
 from filter_service.service.session import Session
+from filter_service.service.session_table import SessionTable
 
 
 class ServedDevice:
@@ -31,9 +31,9 @@ class ServedDevice:
         Memory for the images of its sessions.
     descriptors : DescriptorLimit
         Descriptor limit of this process.
-    guests : Guests
+    sessions : SessionTable
     send : callable
-        See `FrameDesk`.
+        See `FrameQueue`.
 
     Attributes
     ----------
@@ -54,13 +54,13 @@ class ServedDevice:
         name: str,
         max_image_bytes: int,
         descriptors: DescriptorLimit,
-        guests: Guests,
+        sessions: SessionTable,
         send: Callable[[Peer, Reply], Tracker | None],
     ) -> None:
         self.index = index
         self.name = name
-        self.render = RenderEnd(max_image_bytes, descriptors)
-        self.frames = FrameDesk(partial(guests.present_on, index), self.render, send)
+        self.render = RenderClient(max_image_bytes, descriptors)
+        self.frames = FrameQueue(partial(sessions.present_on, index), self.render, send)
         self.server: dict[str, str] | None = None
         self.memory_mb = self.stores_mb = 0.0
         self.is_building = self.is_lost = False
@@ -95,7 +95,7 @@ class ServedDevices:
     names : sequence of str
     max_image_bytes : int
         Image memory of all devices, divided equally so that none can exhaust another's.
-    descriptors, guests, send
+    descriptors, sessions, send
         See `ServedDevice`.
     """
 
@@ -104,14 +104,14 @@ class ServedDevices:
         names: Sequence[str],
         max_image_bytes: int,
         descriptors: DescriptorLimit,
-        guests: Guests,
+        sessions: SessionTable,
         send: Callable[[Peer, Reply], Tracker | None],
     ) -> None:
-        self._guests = guests
+        self._sessions = sessions
         self._devices = [
             ServedDevice(
                 *(index, name, max_image_bytes // len(names)),
-                *(descriptors, guests, send),
+                *(descriptors, sessions, send),
             )
             for index, name in enumerate(names)
         ]
@@ -143,7 +143,7 @@ class ServedDevices:
             self._left,
             key=lambda device: (
                 not device.render.is_ready,
-                len(self._guests.present_on(device.index)),
+                len(self._sessions.present_on(device.index)),
                 device.frames.load.busy_ratio(now_s),
             ),
         )
@@ -151,7 +151,7 @@ class ServedDevices:
     def states(self) -> tuple[DeviceState, ...]:
         """Return the states of all devices for `pong`."""
         return tuple(
-            device.state(self._guests.present_on(device.index)) for device in self
+            device.state(self._sessions.present_on(device.index)) for device in self
         )
 
     @property

@@ -1,6 +1,6 @@
 """State of one client's session: waiting frame, credit and profiles of its eyes.
 
-This module uses no sockets; `door` acts on the state.
+This module uses no sockets; `front_end` acts on the state.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Self
 from filter_service.errors import CreditExceeded
 from filter_service.messages import EyeName, Frame, ProfileRequest
 from filter_service.service.connections import Peer
-from filter_service.service.mailbox import Tracker
-from filter_service.slots import Slot
+from filter_service.service.router import Tracker
+from filter_service.shared_memory import Slot
 
 KEY_BYTES = 16
 MAX_RECORDED_BYTES = 65_536
@@ -183,7 +183,7 @@ class Session:
         self.waiting = None
         self.n_unanswered = 0
 
-    def come_back(self, peer: Peer, client: str) -> None:
+    def reconnect(self, peer: Peer, client: str) -> None:
         """Attach a reconnected client, or one that takes the session over."""
         self.peer, self.client = peer, client
         self.away_since_s = None

@@ -10,9 +10,9 @@ from typing import Any
 
 from estimator.profiles.parse import EyeProfile
 from filter_service.errors import FilterError, NoSession
+from filter_service.filtering.builder import Builder
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.filtered import BuildingEye, EyeEvent, EyeReady
-from filter_service.filtering.workshop import Workshop
 from filter_service.messages import (
     Accepted,
     ErrorReply,
@@ -42,7 +42,7 @@ class SessionEyes:
     Parameters
     ----------
     session_id : int
-    workshop : Workshop
+    builder : Builder
         Builder of the eyes.
     tell : callable
         ``tell(eye, reply)`` is called with replies about the profile of an eye.
@@ -55,14 +55,14 @@ class SessionEyes:
     def __init__(
         self,
         session_id: int,
-        workshop: Workshop,
+        builder: Builder,
         tell: Callable[[EyeName, Reply], None],
         *,
         max_cameras: int,
         generations: Mapping[EyeName, int],
     ) -> None:
         self.session_id = session_id
-        self._workshop = workshop
+        self._builder = builder
         self._tell = tell
         self._max_cameras = max_cameras
         self._generations = generations
@@ -97,9 +97,9 @@ class SessionEyes:
             raise NoSession("the session has ended")
         if name not in self._eyes:
             eye_filter = EyeFilter(
-                workshop=self._workshop,
+                builder=self._builder,
                 max_cameras=self._max_cameras,
-                on_event=partial(self._tell_event, name),
+                on_event=partial(self._send_event, name),
                 first_generation=self._generations.get(name, 0) + 1,
             )
             self._eyes[name] = _Eye(eye_filter)
@@ -133,7 +133,7 @@ class SessionEyes:
             eye=request.eye,
         )
 
-    def _tell_event(self, name: EyeName, event: EyeEvent) -> None:
+    def _send_event(self, name: EyeName, event: EyeEvent) -> None:
         """Report an event of a profile."""
         profile_id, generation = event.eye.profile_id, event.eye.generation
         reply: Reply

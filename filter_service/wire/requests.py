@@ -21,7 +21,7 @@ from filter_service.settings import (
     RenderTolerance,
     VergenceDpt,
 )
-from filter_service.slots import ALIGNMENT_BYTES
+from filter_service.shared_memory import ALIGNMENT_BYTES
 from filter_service.view_state import EyeName, check_states
 from filter_service.wire.compression import Compression
 from filter_service.wire.images import (

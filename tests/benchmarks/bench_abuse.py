@@ -34,7 +34,7 @@ from clients.service_process import ServiceProcess
 from filter_service.camera import tangents_from_fov
 from filter_service.errors import FilterError
 from filter_service.keys import KeyRing
-from filter_service.service.mailbox import SEED_VARIABLE
+from filter_service.service.router import SEED_VARIABLE
 from tests.benchmarks.attacks import ATTACKS
 from tests.benchmarks.harness import Row, publish
 from tests.benchmarks.mutated_messages import view_of
@@ -154,7 +154,7 @@ def attack_rows(
         guest = closing.enter_context(Guest(service.endpoint, key_file))
         time.sleep(2.0)
         before = service.pids()
-        load_before = front_end_load(before["door"])
+        load_before = front_end_load(before["front-end"])
         words = [f"{n_files} files"] * bool(n_files) + ["keys"] * has_keys
         for name in names:
             measured = []
@@ -169,7 +169,7 @@ def attack_rows(
                 newcomer_s = welcome_s(service.endpoint, key_file)
                 counts = json.loads(attack.communicate()[0])
             time.sleep(1.0)
-            load_after = front_end_load(before["door"])
+            load_after = front_end_load(before["front-end"])
             (base_hz, _), (hz, silence_s) = measured
             case = ", ".join([*words, f"{base_hz:.0f}/s"])
             setting = ", ".join(f"{value} {key}" for key, value in counts.items())
@@ -201,20 +201,22 @@ def assertion_rows() -> list[Row]:
             Guest(service.endpoint) as guest,
         ):
             time.sleep(2.0)
-            before = service.pids()["door"]
+            before = service.pids()["front-end"]
             attack = subprocess.Popen(
                 [*ATTACK, "chosen_ids", service.endpoint, "4"],
                 stdout=subprocess.DEVNULL,
             )
             end_s = time.monotonic() + 5.0
             gaps_s = []
-            while service.pids().get("door") == before and time.monotonic() < end_s:
+            while (
+                service.pids().get("front-end") == before and time.monotonic() < end_s
+            ):
                 gaps_s.append(guest.watch(0.2)[1])
             attack.kill()
             attack.wait()
             gap_s = max([*gaps_s, guest.watch(3.0)[1]])
             rate_hz = guest.rate_hz(1.0)
-            is_ended = service.pids().get("door") != before
+            is_ended = service.pids().get("front-end") != before
             n_begun = service.log.count("begins ('filter_client')")
     finally:
         del os.environ[SEED_VARIABLE]

@@ -24,8 +24,8 @@ import numpy as np
 from filter_service import Camera, EyeFilter
 from filter_service.building.limits import BuildLimits
 from filter_service.building.worker_handle import WorkerHandle
+from filter_service.filtering.builder import Builder
 from filter_service.filtering.filtered import EyeReady
-from filter_service.filtering.workshop import Workshop
 from filter_service.rendering.native.lanes import NativeLanes
 from tests.benchmarks.harness import Row, memory_mb, publish
 from tests.benchmarks.published_figures import CONDITIONS
@@ -72,10 +72,10 @@ class Following:
     """An `EyeFilter` with an engine and a worker of its own."""
 
     def __init__(self, eye: str, camera: Camera) -> None:
-        self.workshop = Workshop(WorkerHandle(), NativeLanes(), LIMITS)
+        self.builder = Builder(WorkerHandle(), NativeLanes(), LIMITS)
         self.ready_s: list[float] = []
         self.filter = EyeFilter(
-            preset(eye), camera, on_event=self._note, workshop=self.workshop
+            preset(eye), camera, on_event=self._note, builder=self.builder
         )
         self.filter.wait(WAIT_S)
 
@@ -90,8 +90,8 @@ class Following:
     def __exit__(self, *exc_info: object) -> None:
         """End the engine and the worker."""
         self.filter.close()
-        self.workshop.close()
-        self.workshop.engine.close()
+        self.builder.close()
+        self.builder.engine.close()
 
     def waited(self, moment: Moment) -> float:
         """Filter a frame however long it takes; ms."""

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.errors import RenderFailed
-from filter_service.filtering.workshop import Workshop
-from filter_service.service import keeper
+from filter_service.filtering.builder import Builder
+from filter_service.service import supervisor
 from filter_service.service.config import load_config
 from filter_service.service.launch import run
 from tests.end_to_end.doubles import EngineDouble, read_profile
@@ -20,7 +20,7 @@ GONE_FILE = "OCUFILTER_TEST_GONE_FILE"
 STANDBY_AFTER_S = "OCUFILTER_TEST_STANDBY_AFTER_S"
 
 
-def open_workshop(config, closing):
+def open_builder(config, closing):
     gone = os.environ.get(GONE_FILE)
     if gone and config.threads == 2 and Path(gone).exists():
         raise RenderFailed("the double has no such device")
@@ -32,8 +32,8 @@ def open_workshop(config, closing):
     )
     closing.callback(worker.close)
     engine = EngineDouble(float(os.environ[FILTER_MS]))
-    workshop = Workshop(worker, engine, config.build_limits)
-    return workshop, read_profile, lambda: None
+    builder = Builder(worker, engine, config.build_limits)
+    return builder, read_profile, lambda: None
 
 
 def main():
@@ -44,11 +44,11 @@ def main():
     os.environ[FILTER_MS] = str(arguments.filter_ms)
     after_s = os.environ.get(STANDBY_AFTER_S)
     if after_s is not None:
-        keeper.STANDBY_AFTER_S = float(after_s)
+        supervisor.STANDBY_AFTER_S = float(after_s)
     load = partial(load_config, arguments.config)
     run(
         load(),
-        open_workshop="tests.end_to_end.double_service:open_workshop",
+        open_builder="tests.end_to_end.double_service:open_builder",
         read_again=load,
     )
 

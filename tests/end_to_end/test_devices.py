@@ -9,7 +9,7 @@ import pytest
 from clients.filter_client import FilterClient, FilteredFrame
 from filter_service.errors import FilterError
 from filter_service.messages import Hello, Ping, Share, encode
-from filter_service.service.asking import ask_status
+from filter_service.service.status_query import query_status
 from tests.end_to_end.conftest import TIMEOUT_S, make_view, small_frame
 from tests.end_to_end.test_lifecycle import wait_until
 
@@ -25,7 +25,7 @@ def connected(service):
 
 
 def devices_of(service):
-    return ask_status(service.endpoint)["devices"]
+    return query_status(service.endpoint)["devices"]
 
 
 def sessions_on(service):
@@ -37,14 +37,14 @@ def test_one_device_is_what_it_was(shared_service, client):
     assert device["name"] == "auto"
     assert device["renderer"] == client.hello().server["renderer"]
     assert device["n_sessions"] >= 1
-    assert set(shared_service.pids()) == {"keeper", "door", "render"}
+    assert set(shared_service.pids()) == {"supervisor", "front-end", "render"}
 
 
 def test_sessions_spread_and_fill_the_place_that_becomes_free(
     start_service, raw_client
 ):
     service = start_service(devices=TWO)
-    assert set(service.pids()) == {"keeper", "door", "render 0", "render 1"}
+    assert set(service.pids()) == {"supervisor", "front-end", "render 0", "render 1"}
     raws, seen = [], []
     for _ in range(4):
         raws.append(raw_client(service))
@@ -179,13 +179,15 @@ def test_what_hangs_is_ended_alone(start_service, raw_client):
     assert service.pids()["render 0"] == before["render 0"]
 
 
-def test_a_new_door_finds_each_session_on_its_device(start_service, raw_client):
+def test_a_new_front_end_finds_each_session_on_its_device(start_service, raw_client):
     service = start_service(devices=TWO)
     raws = [raw_client(service) for _ in range(3)]
     welcomes = [raw.begin(mark=mark) for mark, raw in enumerate(raws)]
     before = service.pids()
-    os.kill(before["door"], signal.SIGKILL)
-    wait_until(lambda: service.pids().get("door") not in (None, before["door"]))
+    os.kill(before["front-end"], signal.SIGKILL)
+    wait_until(
+        lambda: service.pids().get("front-end") not in (None, before["front-end"])
+    )
     for mark, (raw, welcome) in enumerate(zip(raws, welcomes, strict=True)):
         raw.close()
         raws[mark] = raw = raw_client(service)
@@ -247,11 +249,11 @@ def test_a_device_that_does_not_come_again_is_given_up(
     assert second.n_seen > 0
     assert [device["is_lost"] for device in devices_of(service)] == [False, True]
     assert sessions_on(service) == [2, 0]
-    assert ask_status(service.endpoint)["is_ready"]
+    assert query_status(service.endpoint)["is_ready"]
     for stream in (first, second):
         stream.client.close()
     # A new door is told of it.
-    os.kill(service.pids()["door"], signal.SIGKILL)
+    os.kill(service.pids()["front-end"], signal.SIGKILL)
     fresh = raw_client(service)
     fresh.begin(mark=9)
     assert fresh.ask(small_frame(1)).colors[0][0, 0, 0] == 9

@@ -31,7 +31,7 @@ from filter_service.errors import (
     RenderFailed,
     ServiceTimeout,
 )
-from filter_service.filtering.workshop import Workshop
+from filter_service.filtering.builder import Builder
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.native import NativeRenderer
 from tests.end_to_end.doubles import EngineDouble, ProfileDouble
@@ -44,11 +44,11 @@ DEPTH_M = np.full((8, 16), 2.0, np.float32)
 
 
 @pytest.fixture(scope="module")
-def workshop():
+def builder():
     worker = WorkerHandle("tests.end_to_end.doubles:build", warm_up="")
-    workshop = Workshop(worker, EngineDouble(0.0), BuildLimits())
-    yield workshop
-    workshop.close()
+    builder = Builder(worker, EngineDouble(0.0), BuildLimits())
+    yield builder
+    builder.close()
 
 
 @pytest.fixture
@@ -57,8 +57,8 @@ def events():
 
 
 @pytest.fixture
-def eye_filter(workshop, events):
-    with EyeFilter(None, CAMERA, workshop=workshop, on_event=events.append) as made:
+def eye_filter(builder, events):
+    with EyeFilter(None, CAMERA, builder=builder, on_event=events.append) as made:
         yield made
 
 
@@ -102,12 +102,12 @@ def test_a_profile_that_fails_leaves_the_old_eye_in_use(eye_filter, events):
     assert isinstance(events[-1], EyeFailed)
 
 
-def test_a_wait_ends_where_nothing_more_will_come(eye_filter, workshop):
+def test_a_wait_ends_where_nothing_more_will_come(eye_filter, builder):
     eye_filter.set_profile(eye(2, fail=True))
     for _ in range(2):
         with pytest.raises(BuildFailed, match="told to fail"):
             eye_filter.wait(10.0)
-    with EyeFilter(eye(1), workshop=workshop) as blind:
+    with EyeFilter(eye(1), builder=builder) as blind:
         with pytest.raises(BadMessage, match="camera: it is not known"):
             blind.wait(10.0)
 
@@ -122,20 +122,20 @@ def test_a_program_with_many_open_files_can_wait():
         for _ in range(1024):
             closing.callback(os.close, os.open(os.devnull, os.O_RDONLY))
         worker = WorkerHandle("tests.end_to_end.doubles:build", warm_up="")
-        many = Workshop(worker, EngineDouble(0.0), BuildLimits())
+        many = Builder(worker, EngineDouble(0.0), BuildLimits())
         closing.callback(many.close)
-        with EyeFilter(eye(1), CAMERA, workshop=many) as made:
+        with EyeFilter(eye(1), CAMERA, builder=many) as made:
             assert made.wait(10.0).is_complete
 
 
-def test_a_filter_that_could_not_be_made_holds_nothing(workshop, monkeypatch):
+def test_a_filter_that_could_not_be_made_holds_nothing(builder, monkeypatch):
     def fails(*_, **__):
         raise MemoryError
 
-    monkeypatch.setattr(workshop, "accept", fails)
+    monkeypatch.setattr(builder, "accept", fails)
     with pytest.raises(MemoryError):
-        EyeFilter(eye(1), CAMERA, workshop=workshop)
-    assert workshop.streams == []
+        EyeFilter(eye(1), CAMERA, builder=builder)
+    assert builder.streams == []
 
 
 def test_a_newer_profile_takes_the_place_of_one_that_is_being_built(eye_filter, events):
@@ -161,22 +161,22 @@ def test_frames_that_never_wait_are_enough_to_prepare_an_eye():
     assert seen.color.shape == COLOR.shape
 
 
-def test_a_new_eye_keeps_the_settings_unless_told_others(workshop):
+def test_a_new_eye_keeps_the_settings_unless_told_others(builder):
     own = FilterSettings(mode="on-axis")
-    with EyeFilter(None, CAMERA, own, workshop=workshop) as made:
+    with EyeFilter(None, CAMERA, own, builder=builder) as made:
         assert made.set_profile(eye(1)).settings is own
         other = FilterSettings(mode="quality")
         assert made.set_profile(eye(2), settings=other).settings is other
 
 
-def test_streams_share_a_workshop_and_keep_their_eyes(workshop):
+def test_streams_share_a_workshop_and_keep_their_eyes(builder):
     with (
-        EyeFilter(eye(1), CAMERA, workshop=workshop) as left,
-        EyeFilter(eye(2), CAMERA, workshop=workshop) as right,
+        EyeFilter(eye(1), CAMERA, builder=builder) as left,
+        EyeFilter(eye(2), CAMERA, builder=builder) as right,
     ):
         assert mark_of(left.filter(COLOR, DEPTH_M, **SEE)) == 1
         assert mark_of(right.filter(COLOR, DEPTH_M, **SEE)) == 2
-    assert workshop.streams == []
+    assert builder.streams == []
 
 
 def test_two_views_make_two_pictures_and_a_new_camera_is_waited_for(eye_filter):
@@ -187,7 +187,7 @@ def test_two_views_make_two_pictures_and_a_new_camera_is_waited_for(eye_filter):
     assert len(seen.colors) == 2
 
 
-def test_what_is_missing_or_wrong_is_named(eye_filter, workshop):
+def test_what_is_missing_or_wrong_is_named(eye_filter, builder):
     with pytest.raises(NoProfile):
         eye_filter.filter(COLOR, DEPTH_M, **SEE)
     with pytest.raises(BadMessage, match="depth: it is missing"):
@@ -200,10 +200,10 @@ def test_what_is_missing_or_wrong_is_named(eye_filter, workshop):
     with pytest.raises(ValueError, match="is out of range"):
         eye_filter.set_profile({"kind": "prescription", "sphere_dpt": -100})
     with pytest.raises(BadMessage, match=r"camera: .*64x36"):
-        EyeFilter(eye(1), ["64x36"], workshop=workshop)
+        EyeFilter(eye(1), ["64x36"], builder=builder)
     with pytest.raises(BadMessage, match=r"settings: .*'mod'"):
-        EyeFilter(eye(1), CAMERA, {"mod": "quality"}, workshop=workshop)
-    with EyeFilter(eye(1), workshop=workshop) as blind:
+        EyeFilter(eye(1), CAMERA, {"mod": "quality"}, builder=builder)
+    with EyeFilter(eye(1), builder=builder) as blind:
         with pytest.raises(BadMessage, match="camera: it is not known"):
             blind.filter(COLOR, DEPTH_M, **SEE)
     with pytest.raises(ValueError, match="is closed"):
@@ -256,10 +256,10 @@ def test_psfs_of_the_eye_used_longest_ago_are_evicted(rng):
     color = rng.integers(0, 256, (68, 120, 3)).astype(np.uint8)
     depth_m = rng.uniform(0.4, 4.0, (68, 120)).astype(np.float32)
     camera = Camera.from_fov(50.0, width_px=120, height_px=68)
-    own = Workshop(InlineWorker(), NativeRenderer(), BuildLimits())
+    own = Builder(InlineWorker(), NativeRenderer(), BuildLimits())
     with (
-        EyeFilter("myopia", camera, workshop=own) as first,
-        EyeFilter("keratoconus", camera, workshop=own) as second,
+        EyeFilter("myopia", camera, builder=own) as first,
+        EyeFilter("keratoconus", camera, builder=own) as second,
     ):
         before = first.filter(color, depth_m, **SEE).color
         (stored,) = [prepared.store.store for prepared in first.prepared_stores]
@@ -277,10 +277,8 @@ def test_psfs_that_cannot_be_computed_fail_their_eye_alone(monkeypatch, rng):
     camera = Camera.from_fov(50.0, width_px=64, height_px=36)
     color = rng.integers(0, 256, (36, 64, 3)).astype(np.uint8)
     depth_m = np.full((36, 64), 2.0, np.float32)
-    own, events = Workshop(InlineWorker(), NativeRenderer(), BuildLimits()), []
-    with EyeFilter(
-        "myopia", camera, workshop=own, on_event=events.append
-    ) as eye_filter:
+    own, events = Builder(InlineWorker(), NativeRenderer(), BuildLimits()), []
+    with EyeFilter("myopia", camera, builder=own, on_event=events.append) as eye_filter:
         before = eye_filter.filter(color, depth_m, **SEE).color
 
         def fail(*_, **__):

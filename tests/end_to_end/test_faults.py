@@ -46,7 +46,7 @@ def filtered_again(client, view, *, limit_s=TIMEOUT_S):
 # What dies or stands still
 
 
-@pytest.mark.parametrize("name", ["door", "render"])
+@pytest.mark.parametrize("name", ["front-end", "render"])
 @pytest.mark.parametrize(
     "when",
     [pytest.param("idle", marks=pytest.mark.slow), "in mid-frame", "in mid-build"],
@@ -77,7 +77,7 @@ def test_a_process_that_is_killed_is_started_again_and_the_eye_is_there(
         else:
             assert reply.color[0, 0, 0] == 5
         assert client.hello().session_id == session_id
-        assert service.pids()["keeper"] == before["keeper"]
+        assert service.pids()["supervisor"] == before["supervisor"]
     assert f"the {name} process was killed by SIGKILL" in service.log
 
 
@@ -114,7 +114,7 @@ def test_a_frame_that_dies_with_its_process_is_answered(start_service, raw_clien
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) for n in ("door", "render")]
+    "name", [pytest.param(n, marks=pytest.mark.slow) for n in ("front-end", "render")]
 )
 def test_a_process_that_stands_still_is_ended_and_started_again(start_service, name):
     service = start_service()
@@ -163,7 +163,7 @@ def test_both_processes_killed_at_once_are_both_started_again(start_service):
         client.set_profile(EYE, views=[view])
         for n_killed in range(1, 4):
             pids = service.pids()
-            for name in ("render", "door"):
+            for name in ("render", "front-end"):
                 os.kill(pids[name], signal.SIGKILL)
             wait_until(lambda n=n_killed: service.log.count("SIGKILL") >= 2 * n)
             seen = client.filter(view, **SEE)
@@ -243,7 +243,7 @@ def test_a_clean_end_is_told(start_service, raw_client):
 # Who waits for whom
 
 
-def test_the_door_answers_while_a_frame_is_filtered(start_service, raw_client):
+def test_the_front_end_answers_while_a_frame_is_filtered(start_service, raw_client):
     service = start_service(filter_ms=1500)
     raw, other = raw_client(service), raw_client(service)
     raw.begin()
@@ -389,7 +389,7 @@ def test_unfinished_messages_stay_below_the_ceiling_and_harm_nobody(start_servic
         try:
             for _ in range(15):
                 connections.append(half_a_message(service.endpoint, 45_000_000))
-                held_mb.append(resident_mb(service.pids()["door"]))
+                held_mb.append(resident_mb(service.pids()["front-end"]))
                 assert filtered_again(client, view)[0].color[0, 0, 0] == 5
         finally:
             for connection in connections:

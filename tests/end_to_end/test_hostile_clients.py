@@ -16,7 +16,7 @@ from clients.service_process import CHECKOUT, ServiceProcess
 from filter_service.errors import FilterError
 from filter_service.keys import KeyRing, load_client_key
 from filter_service.messages import Hello, Ping, Share, encode
-from filter_service.service.mailbox import SEED_VARIABLE
+from filter_service.service.router import SEED_VARIABLE
 from tests.benchmarks.attacks import spoken_to
 from tests.end_to_end.conftest import (
     DOUBLE,
@@ -98,9 +98,11 @@ def test_connections_without_a_session_keep_nobody_out(
         if attack_name == "one_byte":  # the others never got out of the kernel
             assert "the oldest without a session are closed" in service.log
         time.sleep(0.5)
-        begin_s = cpu_s(before["door"])
+        begin_s = cpu_s(before["front-end"])
         time.sleep(1.0)
-        assert cpu_s(before["door"]) - begin_s < 0.1, "idle, it takes a tenth at most"
+        assert cpu_s(before["front-end"]) - begin_s < 0.1, (
+            "idle, it takes a tenth at most"
+        )
 
 
 def test_too_few_descriptors_are_told_at_the_start():
@@ -228,7 +230,12 @@ def test_an_assertion_of_libzmq_costs_a_second_and_no_session(
             cwd=CHECKOUT,
             stdout=subprocess.DEVNULL,
         )
-        wait_until(lambda: service.pids().get("door", before["door"]) != before["door"])
+        wait_until(
+            lambda: (
+                service.pids().get("front-end", before["front-end"])
+                != before["front-end"]
+            )
+        )
         attack.kill()
         attack.wait()
         begin_s, seen = time.monotonic(), None
@@ -386,7 +393,7 @@ def test_a_session_survives_one_process_after_the_other(start_service):
         before = service.pids()
         os.kill(before["render"], signal.SIGSTOP)  # its successor knows nothing yet
         os.kill(before["render"], signal.SIGKILL)
-        os.kill(before["door"], signal.SIGKILL)
+        os.kill(before["front-end"], signal.SIGKILL)
         wait_until(lambda: service.log.count("was killed by SIGKILL") == 2)
         seen = None
         while seen is None:
@@ -416,11 +423,11 @@ def test_a_process_that_never_stays_does_not_end_the_service(start_service, raw_
     pong = raw.ask(Ping(1.0))
     assert (pong.is_ready, pong.is_degraded) == (False, True)
     wait_until(lambda: "render" in service.pids())
-    door = service.pids()["door"]
-    os.kill(door, signal.SIGSTOP)  # it does not know yet that frames may come
+    front_end = service.pids()["front-end"]
+    os.kill(front_end, signal.SIGSTOP)  # it does not know yet that frames may come
     time.sleep(1.5)  # the other process takes less to be ready
     was_early = ready_file.exists()
-    os.kill(door, signal.SIGCONT)
+    os.kill(front_end, signal.SIGCONT)
     assert not was_early
     wait_until(ready_file.exists)
     pong = raw.ask(Ping(2.0))
@@ -432,7 +439,7 @@ def test_a_service_gives_up_where_its_owner_says_so(start_service):
     service = start_service(give_up_after_s=0.5)
     for _ in range(4):
         try:
-            ended_again(service, "door", 1)
+            ended_again(service, "front-end", 1)
         except (AssertionError, OSError, KeyError):
             break
         time.sleep(0.3)

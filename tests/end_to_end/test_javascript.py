@@ -45,7 +45,7 @@ def checked(service, *profiles, meanwhile=lambda: None):
 
 @needs_node
 @pytest.mark.parametrize(
-    "name", ["door", pytest.param("render", marks=pytest.mark.slow)]
+    "name", ["front-end", pytest.param("render", marks=pytest.mark.slow)]
 )
 def test_frames_eyes_errors_and_a_lost_connection_from_javascript(start_service, name):
     service = start_service()

@@ -107,7 +107,7 @@ def test_frames_on_their_way_to_a_killed_service_are_reported_as_lost(start_serv
             client.ping(timeout_s=0.3)
 
 
-@pytest.mark.parametrize("name", ["keeper", "door", "render"])
+@pytest.mark.parametrize("name", ["supervisor", "front-end", "render"])
 def test_a_service_that_is_stopped_for_a_moment_is_used_again(start_service, name):
     service = start_service()
     view = make_view()
@@ -116,7 +116,7 @@ def test_a_service_that_is_stopped_for_a_moment_is_used_again(start_service, nam
         pid = service.pids()[name]
         os.kill(pid, signal.SIGSTOP)
         try:
-            if name == "keeper":  # nobody needs it as long as all is well
+            if name == "supervisor":  # nobody needs it as long as all is well
                 assert client.filter(view, **SEE).color[0, 0, 0] == 5
             else:
                 with pytest.raises(ServiceTimeout, match="waited in vain for frame 0"):

@@ -133,7 +133,7 @@ def test_the_log_is_json_for_programs(start_service):
     assert first.startswith("ocufilter: serving on")  # not of the log
     found = [json.loads(line) for line in lines]
     assert {"time", "process", "pid", "level", "message"} <= set(found[0])
-    assert {line["process"] for line in found} >= {"door", "service"}
+    assert {line["process"] for line in found} >= {"front-end", "service"}
     assert any("SIGKILL" in line["message"] for line in found)
 
 

@@ -8,11 +8,11 @@ import pytest
 
 from filter_service.building.limits import BuildLimits
 from filter_service.building.worker_handle import WorkerHandle
-from filter_service.filtering.workshop import Workshop
+from filter_service.filtering.builder import Builder
 from filter_service.messages import ProfileRequest, SharedPlaces
-from filter_service.service.link import HEAD, Link
-from filter_service.service.render_loop import RenderLoop
-from filter_service.slots import Slot
+from filter_service.service.process_channel import HEAD, Link
+from filter_service.service.render_worker import RenderWorker
+from filter_service.shared_memory import Slot
 from tests.end_to_end.conftest import TIMEOUT_S, small_frame
 from tests.end_to_end.doubles import EngineDouble, read_profile
 
@@ -39,13 +39,13 @@ class RestingEngine(EngineDouble):
         return super().render(*arguments, **options)
 
 
-class Door:
+class FrontEnd:
     """The door's end of a link, and what the loop has said."""
 
     def __init__(self, engine):
         worker = WorkerHandle("tests.end_to_end.doubles:build", warm_up="")
-        workshop = Workshop(worker, engine, BuildLimits())
-        loop = RenderLoop(workshop, read_profile, max_cameras=4)
+        builder = Builder(worker, engine, BuildLimits())
+        loop = RenderWorker(builder, read_profile, max_cameras=4)
         self.link, theirs = Link.pair()
         self.control, control = Link.pair()
         self.theirs = Link(theirs), Link(control)
@@ -98,29 +98,29 @@ def resting():
 
 
 @pytest.fixture
-def door(resting):
-    door = Door(resting)
-    door.tell("open", "a", 1, {})
+def front_end(resting):
+    front_end = FrontEnd(resting)
+    front_end.tell("open", "a", 1, {})
     camera = small_frame(0).views[0].camera
     body = {"kind": "double", "mark": 3}
-    door.tell("profile", "a", ProfileRequest(0, body, views=(camera,)))
-    door.await_one(lambda m: m[0] == "tell" and m[3].type_name == "ready")
-    yield door
-    door.stop()
+    front_end.tell("profile", "a", ProfileRequest(0, body, views=(camera,)))
+    front_end.await_one(lambda m: m[0] == "tell" and m[3].type_name == "ready")
+    yield front_end
+    front_end.stop()
 
 
-def test_what_comes_in_a_rest_does_not_overtake_what_came_before(door, resting):
+def test_what_comes_in_a_rest_does_not_overtake_what_came_before(front_end, resting):
     """The frame of `b` comes in the rest; `b` was opened before, in the same batch."""
-    resting.in_the_middle = lambda: door.frame(2, "b")
+    resting.in_the_middle = lambda: front_end.frame(2, "b")
     frame = ("frame", 1, "a", small_frame(1, images=()), PLACES, ())
-    door.tell_at_once(frame, ("open", "b", 2, {}))
-    assert door.answer_to(2).code == "no_profile", "not no_session: it was open"
-    assert door.answer_to(1).type_name == "result"
+    front_end.tell_at_once(frame, ("open", "b", 2, {}))
+    assert front_end.answer_to(2).code == "no_profile", "not no_session: it was open"
+    assert front_end.answer_to(1).type_name == "result"
 
 
-def test_a_frame_that_cannot_be_answered_is_answered(door):
+def test_a_frame_that_cannot_be_answered_is_answered(front_end):
     """A slot that the door has given up, say: nothing waits for a time limit."""
-    door.frame(5, "a", SharedPlaces(9, (0, 512), 2, (0,)))
-    assert door.answer_to(5).code == "render_failed"
-    door.frame(6, "a")
-    assert door.answer_to(6).type_name == "result"
+    front_end.frame(5, "a", SharedPlaces(9, (0, 512), 2, (0,)))
+    assert front_end.answer_to(5).code == "render_failed"
+    front_end.frame(6, "a")
+    assert front_end.answer_to(6).type_name == "result"

@@ -11,7 +11,7 @@ import pytest
 
 from clients.filter_client import FilterClient
 from filter_service.messages import Hello, Share, SharedPlaces, Unshare, encode
-from filter_service.slots import Slot, SlotPool, starts_of
+from filter_service.shared_memory import Slot, SlotPool, starts_of
 from tests.end_to_end.conftest import TIMEOUT_S, make_view, small_frame
 from tests.end_to_end.test_faults import filtered_again
 from tests.end_to_end.test_lifecycle import wait_until
@@ -119,7 +119,7 @@ def test_a_client_may_do_without(start_service):
             assert not client.filter(view, **SEE).header.in_memory
 
 
-@pytest.mark.parametrize("name", ["door", "render"])
+@pytest.mark.parametrize("name", ["front-end", "render"])
 def test_memory_is_shared_again_after_a_process_was_killed(start_service, name):
     service = start_service()
     view = make_view()

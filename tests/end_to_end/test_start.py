@@ -10,13 +10,13 @@ from tests.source_tree import ROOT
 
 UP_TO_READY = """
 import json, sys
-from filter_service.service import keeper as keeping, render_process
+from filter_service.service import render_worker_process, supervisor
 from filter_service.service.config import load_config
-from filter_service.service.link import Link
+from filter_service.service.process_channel import Link
 
-keeper, end = Link.pair()
-keeper.send(("config", load_config(bind="tcp://127.0.0.1:*", engine="native")))
-sys.argv[1:] = [str(end.detach()), keeping.OPEN_WORKSHOP, keeping.RENDER]
+near, end = Link.pair()
+near.send(("config", load_config(bind="tcp://127.0.0.1:*", engine="native")))
+sys.argv[1:] = [str(end.detach()), supervisor.OPEN_BUILDER, supervisor.RENDER]
 send = Link.send
 
 def report(link, message, descriptors=()):
@@ -26,7 +26,7 @@ def report(link, message, descriptors=()):
     raise SystemExit
 
 Link.send = report
-render_process.main()
+render_worker_process.main()
 """
 
 LIGHT = """
@@ -86,8 +86,8 @@ def test_a_service_is_ready_before_it_loads_numba_or_scipy():
 @pytest.mark.parametrize(
     ("module", "heavy"),
     [
-        ("door", NOT_BEFORE_READY | {"moderngl", "OpenGL"}),
-        ("keeper", NOT_BEFORE_READY | {"moderngl", "OpenGL", "zmq"}),
+        ("front_end", NOT_BEFORE_READY | {"moderngl", "OpenGL"}),
+        ("supervisor", NOT_BEFORE_READY | {"moderngl", "OpenGL", "zmq"}),
     ],
 )
 def test_what_stands_before_the_frames_is_light(module, heavy):

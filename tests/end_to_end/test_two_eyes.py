@@ -205,7 +205,7 @@ def test_wrong_eyes_and_poses_are_named_by_field(shared_service, raw_client):
 
 
 @pytest.mark.clock
-@pytest.mark.parametrize("name", ["door", "render"])
+@pytest.mark.parametrize("name", ["front-end", "render"])
 def test_both_eyes_are_there_again_after_a_process_is_killed(start_service, pair, name):
     service = start_service()
     with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:

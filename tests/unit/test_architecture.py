@@ -34,7 +34,7 @@ MAY_IMPORT = {
         "filter_service.errors",
         "filter_service.progress",  # of long programs
         "filter_service.keys",  # a client's own
-        "filter_service.slots",  # memory shared with the service
+        "filter_service.shared_memory",  # memory shared with the service
         "filter_service.settings",
         "filter_service.camera",  # and its options
         "filter_service.image_files",  # pictures and depth in files
@@ -115,10 +115,10 @@ HOME = {
     "glfw": ("clients/window.py", "clients/headset/openxr_gl.py"),
     "xr": ("clients/headset/openxr_*",),  # makes PyOpenGL use GLX
     "zmq": (
-        "filter_service/service/mailbox.py",  # the server's socket and nothing else
+        "filter_service/service/router.py",  # the server's socket and nothing else
         "filter_service/service/authenticator.py",  # who may connect to it
         "filter_service/service/dropped_parts.py",  # messages of too many parts
-        "filter_service/service/asking.py",  # one ping
+        "filter_service/service/status_query.py",  # one ping
         "filter_service/keys.py",  # makes pairs of them
         "clients/connection.py",  # the client's socket and nothing else
     ),

@@ -10,13 +10,13 @@ import msgpack
 import pytest
 import zmq
 
+from filter_service.atomic_files import write_atomically
 from filter_service.errors import BadMessage, OutOfMemory
 from filter_service.log_lines import ONCE_A_SECOND, RepeatFilter
 from filter_service.service.connections import Connections
 from filter_service.service.descriptors import BASE, DescriptorLimit
 from filter_service.service.dropped_parts import drop_parts, drop_parts_in_python
-from filter_service.service.keeper import _Restarts
-from filter_service.service.mailbox import Mailbox, Outcome
+from filter_service.service.fair_queue import MAX_CLAIM_S, MAX_DEBT_S, FairQueue
 from filter_service.service.rate_limit import (
     MAX_IGNORED,
     MAX_REFUSALS,
@@ -25,9 +25,9 @@ from filter_service.service.rate_limit import (
     RateLimit,
     Verdict,
 )
-from filter_service.service.turns import MAX_CLAIM_S, MAX_DEBT_S, Turns
-from filter_service.slots import SlotPool
-from filter_service.whole_files import write_atomically
+from filter_service.service.router import Outcome, Router
+from filter_service.service.supervisor import _Restarts
+from filter_service.shared_memory import SlotPool
 from filter_service.wire.unpacking import MAX_ITEMS, MAX_TEXT, unpack_profile
 
 # Connections
@@ -189,25 +189,25 @@ IDLE_S = 0.004
 
 def simulated(costs_s, duration_s):
     """Serve sessions that always wait; return the time of each and its waits."""
-    turns = Turns()
+    queue = FairQueue()
     used_s, waits_s = dict.fromkeys(costs_s, 0.0), {name: [] for name in costs_s}
     since_s, now_s = dict.fromkeys(costs_s, 0.0), 0.0
     for name in costs_s:
-        turns.arrive(name)
+        queue.arrive(name)
     while now_s < duration_s:
-        chosen = turns.next_of(costs_s)
+        chosen = queue.next_of(costs_s)
         started_s = now_s + IDLE_S
         waits_s[chosen].append(started_s - since_s[chosen])
         now_s = started_s + costs_s[chosen]
-        turns.note(chosen, costs_s[chosen], since_s[chosen], started_s, now_s)
+        queue.note(chosen, costs_s[chosen], since_s[chosen], started_s, now_s)
         used_s[chosen] += IDLE_S + costs_s[chosen]
         since_s[chosen] = now_s
-        turns.arrive(chosen)
+        queue.arrive(chosen)
     return used_s, waits_s
 
 
-def note(turns, name, used_s):
-    turns.note(name, used_s, 0.0, 0.0, 0.0)
+def note(queue, name, used_s):
+    queue.note(name, used_s, 0.0, 0.0, 0.0)
 
 
 def test_heavy_and_light_sessions_that_wait_have_equal_time():
@@ -219,36 +219,36 @@ def test_heavy_and_light_sessions_that_wait_have_equal_time():
 
 
 def test_who_asked_for_nothing_has_little_claim():
-    turns = Turns()
+    queue = FairQueue()
     for name in ("busy", "idle"):
-        turns.arrive(name)
-    assert turns.next_of(["idle"]) == "idle"
-    note(turns, "idle", 0.01)
+        queue.arrive(name)
+    assert queue.next_of(["idle"]) == "idle"
+    note(queue, "idle", 0.01)
     for _ in range(10):
-        turns.arrive("busy")
-        assert turns.next_of(["busy"]) == "busy"
-        note(turns, "busy", 1.0)
-    turns.arrive("idle")  # after ten seconds
-    turns.arrive("busy")
+        queue.arrive("busy")
+        assert queue.next_of(["busy"]) == "busy"
+        note(queue, "busy", 1.0)
+    queue.arrive("idle")  # after ten seconds
+    queue.arrive("busy")
     served_s = 0.0
-    while turns.next_of(["busy", "idle"]) == "idle":
-        note(turns, "idle", 0.1)
-        turns.arrive("idle")
+    while queue.next_of(["busy", "idle"]) == "idle":
+        note(queue, "idle", 0.1)
+        queue.arrive("idle")
         served_s += 0.1
     assert served_s <= 1.0 + MAX_CLAIM_S + 0.2, "its frame's worth, and the claim"
 
 
 def test_a_frame_that_hung_is_not_owed_for_ever():
-    turns = Turns()
+    queue = FairQueue()
     for name in ("hung", "other"):
-        turns.arrive(name)
-    assert turns.next_of(["hung"]) == "hung"
-    note(turns, "hung", 600.0)
-    turns.arrive("hung")
+        queue.arrive(name)
+    assert queue.next_of(["hung"]) == "hung"
+    note(queue, "hung", 600.0)
+    queue.arrive("hung")
     served_s = 0.0
-    while turns.next_of(["hung", "other"]) == "other":
-        note(turns, "other", 1.0)
-        turns.arrive("other")
+    while queue.next_of(["hung", "other"]) == "other":
+        note(queue, "other", 1.0)
+        queue.arrive("other")
         served_s += 1.0
     assert served_s <= MAX_DEBT_S + 1.0
 
@@ -370,74 +370,74 @@ def test_pauses_before_restarts_grow_to_a_minute_and_end_with_a_stable_process()
 
 
 @pytest.fixture
-def mailbox():
+def router():
     connections = Connections(9, set())
-    box = Mailbox("tcp://127.0.0.1:*", 10**6, 4, connections=connections)
+    box = Router("tcp://127.0.0.1:*", 10**6, 4, connections=connections)
     yield box
     box.close()
 
 
-def received_within(mailbox, limit_s=5.0):
+def received_within(router, limit_s=5.0):
     end_s = time.monotonic() + limit_s
     while time.monotonic() < end_s:
-        mailbox.wait(0.05)
-        message = mailbox.receive()
+        router.wait(0.05)
+        message = router.receive()
         if message is not None:
             return message
     raise AssertionError("nothing was received")
 
 
 def test_a_connection_that_comes_between_is_known_before_it_has_a_number(
-    mailbox, monkeypatch
+    router, monkeypatch
 ):
     """It was not, on a busy machine: its client was never answered."""
     context = zmq.Context()
     dealer = context.socket(zmq.DEALER)
-    answer = mailbox._authenticator.answer
+    answer = router._authenticator.answer
     calls = []
 
     def late():
         if not calls:  # after the monitor was read, and before requests are answered
-            dealer.connect(mailbox.endpoint)
+            dealer.connect(router.endpoint)
             dealer.send(b"hello")
             time.sleep(0.2)
         calls.append(1)
         answer()
 
-    monkeypatch.setattr(mailbox._authenticator, "answer", late)
+    monkeypatch.setattr(router._authenticator, "answer", late)
     try:
-        message = received_within(mailbox)
+        message = received_within(router)
         assert bytes(message.parts[0]) == b"hello"
         assert message.connection is not None
-        outcome, _ = mailbox.send(message.peer, [b"welcome"])
+        outcome, _ = router.send(message.peer, [b"welcome"])
         assert (outcome, dealer.recv()) == (Outcome.SENT, b"welcome")
     finally:
         dealer.close(linger=0)
         context.term()
 
 
-def test_a_reply_to_a_connection_that_has_ended_is_not_sent(mailbox):
+def test_a_reply_to_a_connection_that_has_ended_is_not_sent(router):
     context = zmq.Context()
     dealer = context.socket(zmq.DEALER)
     dealer.setsockopt(zmq.IDENTITY, b"camera")
-    dealer.connect(mailbox.endpoint)
+    dealer.connect(router.endpoint)
     dealer.send(b"hello")
-    peer = received_within(mailbox).peer
+    peer = received_within(router).peer
     dealer.close(linger=0)
     thief = context.socket(zmq.DEALER)
     try:
         end_s = time.monotonic() + 5.0
-        while not mailbox.take_ended():
+        while not router.take_ended():
             assert time.monotonic() < end_s
-            mailbox.wait(0.05)
+            router.wait(0.05)
         thief.setsockopt(zmq.IDENTITY, b"camera")
-        thief.connect(mailbox.endpoint)
+        thief.connect(router.endpoint)
         thief.send(b"mine")
-        other = received_within(mailbox).peer
+        other = received_within(router).peer
         assert other.routing_id == peer.routing_id
         assert other.connection != peer.connection
-        assert mailbox.send(peer, [b"secret"])[0] is Outcome.GONE
-        assert mailbox.send(other, [b"hello"])[0] is Outcome.SENT
+        assert router.send(peer, [b"secret"])[0] is Outcome.GONE
+        assert router.send(other, [b"hello"])[0] is Outcome.SENT
         thief.rcvtimeo = 5000
         assert thief.recv() == b"hello"
     finally:

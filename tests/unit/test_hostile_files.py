@@ -11,12 +11,12 @@ import pytest
 from PIL import Image
 
 from clients.arguments import read_object
+from clients.batch.atomic_files import write_whole
 from clients.batch.layout_middlebury import read_calibration
 from clients.batch.layout_nyu import KinectCounts
 from clients.batch.layout_tum import tum_frames
 from clients.batch.manifest import Manifest, below, records_of
 from clients.batch.states import read_states
-from clients.batch.whole_files import write_whole
 from clients.headset.gltf_scene import load_gltf
 from estimator.bounded_files import (
     InvalidFile,

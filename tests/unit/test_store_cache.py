@@ -20,7 +20,7 @@ from filter_service.errors import BuildCancelled
 from filter_service.messages import Camera
 from filter_service.planning.plan import plan_cache
 from filter_service.psfs import store_cache, store_codec, store_file
-from filter_service.psfs.kept_eyes import erase_eyes, kept_eyes
+from filter_service.psfs.cached_eyes import cached_eyes, erase_eyes
 from filter_service.psfs.store import PsfStore
 from filter_service.psfs.store_cache import StoreCache, Stored, eye_name, store_key
 from tests.grid_specs import grid_spec
@@ -396,7 +396,7 @@ def test_a_folder_under_an_entrys_name_is_passed_over_and_logged_once(
     told = [record for record in caplog.records if str(path) in record.getMessage()]
     assert len(told) == 2, caplog.text  # one of reading, one of writing
     assert path.is_dir()
-    assert kept_eyes(path.parent) == []
+    assert cached_eyes(path.parent) == []
     assert erase_eyes(path.parent) == 0
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filter_service.camera import Camera
-from filter_service.filtering.warm_up import LEAD_S, SPEED_S, StreamUse
+from filter_service.filtering.predicted_states import LEAD_S, SPEED_S, StreamUse
 from filter_service.rendering.frame_use import STEP_PX, SeenView, first_frame
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
@@ -34,13 +34,13 @@ def noted(states, interval_s=0.05):
 def test_states_go_on_at_their_speed():
     use = noted([(4.0 + 0.1 * k, 2.0 - 0.05 * k) for k in range(20)])
     expected = [(5.9 + 2.0 * lead_s, 1.05 - 1.0 * lead_s) for lead_s in LEAD_S]
-    np.testing.assert_allclose(use.states_ahead(), expected, rtol=1e-9)
+    np.testing.assert_allclose(use.predicted_states(), expected, rtol=1e-9)
 
 
 def test_only_the_last_frames_tell_the_speed():
     n_last = int(SPEED_S / 0.05) + 2
     use = noted([(2.0, 0.0), (7.0, 5.0)] * 10 + [(4.0, 1.0)] * n_last)
-    np.testing.assert_allclose(use.states_ahead(), [(4.0, 1.0)] * len(LEAD_S))
+    np.testing.assert_allclose(use.predicted_states(), [(4.0, 1.0)] * len(LEAD_S))
 
 
 def test_the_interval_is_that_of_the_last_frames():
@@ -50,11 +50,11 @@ def test_the_interval_is_that_of_the_last_frames():
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_a_single_frame_tells_no_speed(count):
-    assert noted([(4.0, 1.0)] * count).states_ahead() == []
+    assert noted([(4.0, 1.0)] * count).predicted_states() == []
 
 
 def test_frames_at_the_same_time_tell_no_speed():
-    assert noted([(4.0, 1.0), (5.0, 2.0)], interval_s=0.0).states_ahead() == []
+    assert noted([(4.0, 1.0), (5.0, 2.0)], interval_s=0.0).predicted_states() == []
 
 
 def test_a_view_is_remembered_by_some_of_its_depths():

@@ -9,7 +9,7 @@ list_passes      passes that build, sort and splat the lists
 frame_passes     all passes of a strip, and the output image
 kernel_passes    passes that blend a frame's kernels
 expected_pairs   prediction of kernels from the previous frame
-kept_eyes        state of two eyes kept between frames
+eye_states       state of two eyes kept between frames
 list_bands       division of lists into bands that fit a buffer
 compile_passes   compilation of every pass before the first frame
 """

@@ -22,9 +22,9 @@ from filter_service.rendering.frame import (
 )
 from filter_service.rendering.frame_options import FrameOptions
 from filter_service.rendering.gl.expected_pairs import FrameState
+from filter_service.rendering.gl.eye_states import EyeState
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.frame_passes import FramePasses
-from filter_service.rendering.gl.kept_eyes import KeptEye
 from filter_service.rendering.gl.kernel_passes import KernelSet, words_per_cell
 from filter_service.rendering.gl.strip import Strip
 from filter_service.rendering.gl.strips import Rows, counted_px, cut_in_strips
@@ -67,7 +67,7 @@ class FrameRun:
     def __init__(
         self,
         gpu: Gpu,
-        kept: KeptEye,
+        kept: EyeState,
         view: RgbdView,
         options: FrameOptions,
         room: NDArray,

@@ -18,8 +18,8 @@ from filter_service.rendering.frame_options import (
     picture_room,
 )
 from filter_service.rendering.frame_states import FrameStore
+from filter_service.rendering.gl.eye_states import EyeStates
 from filter_service.rendering.gl.frame_run import FrameRun
-from filter_service.rendering.gl.kept_eyes import KeptEyes
 from filter_service.rendering.image_cells import image_cells
 from filter_service.rgbd_view import RgbdView
 
@@ -82,7 +82,7 @@ class FilterRenderer:
 
     def __init__(self, gpu: Gpu):
         self._gpu = gpu
-        self._kept = KeptEyes(gpu)
+        self._kept = EyeStates(gpu)
         self._lacks_depth = False
 
     @property

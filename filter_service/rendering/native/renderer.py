@@ -26,8 +26,8 @@ from filter_service.rendering.frame_options import (
 )
 from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
 from filter_service.rendering.native.arrays import Arrays
+from filter_service.rendering.native.eye_states import EyeState, EyeStates
 from filter_service.rendering.native.frame_record import BlendSizes, FrameRecord
-from filter_service.rendering.native.kept_states import KeptState, KeptStates
 from filter_service.rendering.native.kernel_plan import KernelPlan, plan_kernels
 from filter_service.rendering.native.native_store import NativeStore
 from filter_service.rendering.white_level import white_level
@@ -61,7 +61,7 @@ class NativeRenderer:
         self._rest_between: Callable[[], None] | None = None
         self._is_syncing = False
         self._rested_s = 0.0  # total
-        self._kept = KeptStates()
+        self._kept = EyeStates()
         self._arrays = Arrays()
 
     @property
@@ -80,7 +80,7 @@ class NativeRenderer:
         After a frame of 4096x4096 they take a gigabyte.
         """
         self._arrays = Arrays()
-        self._kept = KeptStates()
+        self._kept = EyeStates()
 
     def close(self) -> None:
         """Stop the threads; the renderer cannot be used afterwards."""
@@ -176,7 +176,7 @@ class NativeRenderer:
         self,
         timer,
         view,
-        kept: KeptState,
+        kept: EyeState,
         layers: FrameLayers,
         image,
         options: FrameOptions,
@@ -233,7 +233,7 @@ class NativeRenderer:
         timer,
         frame: FrameRecord,
         view,
-        kept: KeptState,
+        kept: EyeState,
         layers,
         image: ImageCells,
     ) -> tuple[int, NDArray[np.bool_]]:
@@ -252,7 +252,7 @@ class NativeRenderer:
             self._loops.run("pixels", frame.c)
         return missing_count, used
 
-    def _planned(self, kept: KeptState, layers, image, used, fill: Fill) -> KernelPlan:
+    def _planned(self, kept: EyeState, layers, image, used, fill: Fill) -> KernelPlan:
         """Return the last frame's kernels if they suffice; otherwise plan new ones."""
         state = (kept.handle, layers, image)
         if kept.plan is None or not kept.plan.serves(state, used):
@@ -277,7 +277,7 @@ class NativeRenderer:
             handle.store.fill(psfs, until_s=until_s, between=self._rest_between)
 
     def _blend(
-        self, timer, frame: FrameRecord, plan: KernelPlan, kept: KeptState
+        self, timer, frame: FrameRecord, plan: KernelPlan, kept: EyeState
     ) -> BlendSizes:
         """Blend the kernels that fragments use, unless they already exist."""
         levels = plan.shapes["levels_used"]

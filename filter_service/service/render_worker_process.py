@@ -19,22 +19,22 @@ from estimator.threads import THREADS_VARIABLE
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.errors import FilterError
 from filter_service.gl_device import AUTO, GL_DEVICE_VARIABLE
-from filter_service.service.child import begin
 from filter_service.service.config import ServiceConfig
-from filter_service.service.link import Link
+from filter_service.service.process_channel import Link
+from filter_service.service.process_startup import begin
 
 if TYPE_CHECKING:
     from estimator.profiles.parse import EyeProfile
-    from filter_service.filtering.workshop import Workshop
-    from filter_service.service.render_loop import RenderLoop
+    from filter_service.filtering.builder import Builder
+    from filter_service.service.render_worker import RenderWorker
 
     ReadProfile = Callable[[dict[str, Any]], EyeProfile]
-    Opened = tuple[Workshop, ReadProfile, Callable[[], None]]
+    Opened = tuple[Builder, ReadProfile, Callable[[], None]]
 
 log = logging.getLogger("ocufilter")
 
 
-def open_real_workshop(config: ServiceConfig, closing: ExitStack) -> Opened:
+def open_real_builder(config: ServiceConfig, closing: ExitStack) -> Opened:
     """Open the builder with the real engine and PSFs."""
     if config.threads:
         os.environ[THREADS_VARIABLE] = str(config.threads)  # the worker's, too
@@ -48,36 +48,35 @@ def open_real_workshop(config: ServiceConfig, closing: ExitStack) -> Opened:
     closing.callback(worker.close)
     worker.start()  # slow imports run in both processes at once
     from filter_service.building.read_profile import read_profile
-    from filter_service.filtering.load_ahead import load_ahead
-    from filter_service.filtering.shared_workshop import open_workshop
+    from filter_service.filtering.shared_builder import open_builder, preload
 
-    workshop = open_workshop(worker, config.build_limits, closing, engine=config.engine)
-    return workshop, read_profile, load_ahead
+    builder = open_builder(worker, config.build_limits, closing, engine=config.engine)
+    return builder, read_profile, preload
 
 
 def main() -> None:
     """Filter frames until the supervisor sends stop."""
-    keeper, config, others = begin(sys.argv[3])
+    supervisor, config, others = begin(sys.argv[3])
     module, _, function = sys.argv[2].partition(":")
-    open_workshop = getattr(importlib.import_module(module), function)
+    open_builder = getattr(importlib.import_module(module), function)
     with ExitStack() as closing:
         try:
-            workshop, read_profile, when_ready = open_workshop(config, closing)
+            builder, read_profile, when_ready = open_builder(config, closing)
         except (FilterError, ValueError, OSError) as error:
-            keeper.send(("failed", str(error)))
+            supervisor.send(("failed", str(error)))
             raise SystemExit(1) from None
-        from filter_service.service.render_loop import RenderLoop
+        from filter_service.service.render_worker import RenderWorker
 
-        loop = RenderLoop(workshop, read_profile, max_cameras=config.max_cameras)
-        keeper.send(("ready", ""))
+        loop = RenderWorker(builder, read_profile, max_cameras=config.max_cameras)
+        supervisor.send(("ready", ""))
         when_ready()
         for message, descriptors in others:
             take_control(loop, message, descriptors)
-        loop.run(keeper, lambda *said: take_control(loop, *said))
+        loop.run(supervisor, lambda *said: take_control(loop, *said))
 
 
 def take_control(
-    loop: RenderLoop, message: tuple[Any, ...], descriptors: list[int]
+    loop: RenderWorker, message: tuple[Any, ...], descriptors: list[int]
 ) -> bool:
     """Handle a message of the supervisor; return whether to go on."""
     if message[0] == "link":

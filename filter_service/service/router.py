@@ -20,7 +20,7 @@ from filter_service.keys import KeyRing
 from filter_service.service.authenticator import Authenticator, connection_of
 from filter_service.service.connections import Connection, Connections, Peer
 from filter_service.service.dropped_parts import drop_parts
-from filter_service.service.listening import (
+from filter_service.service.listening_socket import (
     BACKLOG,
     check_path_is_free,
     deferring_listener,
@@ -87,7 +87,7 @@ class Received:
     n_left_out: int = 0
 
 
-class Mailbox:
+class Router:
     """A bound ROUTER socket that never blocks and never drops messages silently.
 
     Parameters
@@ -250,7 +250,7 @@ class Mailbox:
             parts.append(frame.buffer)
         if frame.more:
             return self._drop_rest(received)
-        if not self._authenticator.lets_in(key):
+        if not self._authenticator.accepts(key):
             raise Refused(received.peer)
         return received
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from filter_service.log_lines import start_log
 from filter_service.service.config import ServiceConfig
-from filter_service.service.link import Link
+from filter_service.service.process_channel import Link
 
 PR_SET_PDEATHSIG = 1
 
@@ -25,11 +25,11 @@ def begin(name: str) -> tuple[Link, ServiceConfig, list[tuple[Any, list[int]]]]:
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     start_log(name)
-    keeper = Link.from_descriptor(int(sys.argv[1]))
-    (first, _), *others = keeper.wait()
+    supervisor = Link.from_descriptor(int(sys.argv[1]))
+    (first, _), *others = supervisor.wait()
     kind, config = first
     assert kind == "config"
-    return keeper, config, others
+    return supervisor, config, others
 
 
 def _end_with_parent() -> None:

@@ -9,11 +9,11 @@ import numpy as np
 from filter_service.errors import BadMessage
 from filter_service.messages import Frame
 from filter_service.service.session import Session
-from filter_service.slots import Slot
+from filter_service.shared_memory import Slot
 from filter_service.wire.compression import largest_block_bytes
 
 
-def check_places(session: Session, frame: Frame) -> None:
+def check_positions(session: Session, frame: Frame) -> None:
     """Check that a frame's images are in free slots of its session.
 
     Raises
@@ -41,9 +41,9 @@ def check_places(session: Session, frame: Frame) -> None:
         for view in frame.views
         for _, shape, dtype in view.images
     ]
-    _check_room(session.shared[places.slot], places.starts, sizes, "starts")
+    _check_bounds(session.shared[places.slot], places.starts, sizes, "starts")
     slot, sizes = session.shared[places.result_slot], result_sizes(frame)
-    _check_room(slot, places.result_starts, sizes, "result_starts")
+    _check_bounds(slot, places.result_starts, sizes, "result_starts")
 
 
 def result_sizes(frame: Frame) -> list[int]:
@@ -55,7 +55,7 @@ def result_sizes(frame: Frame) -> list[int]:
     return [largest_block_bytes(size) for size in sizes]
 
 
-def _check_room(
+def _check_bounds(
     slot: Slot, starts: Sequence[int], sizes: Sequence[int], name: str
 ) -> None:
     """Check that images neither exceed a slot nor overlap."""

@@ -10,7 +10,7 @@ from filter_service.psfs.store_cache import BETWEEN, SUFFIX
 
 
 @dataclass(frozen=True)
-class KeptEye:
+class CachedEye:
     """Files of one eye in the on-disk cache.
 
     Attributes
@@ -29,19 +29,19 @@ class KeptEye:
     used_s: float
 
 
-def kept_eyes(folder: Path) -> list[KeptEye]:
+def cached_eyes(folder: Path) -> list[CachedEye]:
     """Return the eyes cached in a folder, most recently used first.
 
     Raises
     ------
     FileNotFoundError
     """
-    found: dict[str, KeptEye] = {}
+    found: dict[str, CachedEye] = {}
     for path in _stores(folder):
         status = path.lstat()
         name = path.name.split(BETWEEN)[0]
-        before = found.get(name, KeptEye(name, 0, 0, 0.0))
-        found[name] = KeptEye(
+        before = found.get(name, CachedEye(name, 0, 0, 0.0))
+        found[name] = CachedEye(
             name,
             before.n_files + 1,
             before.size_bytes + status.st_size,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from filter_service.errors import BadMessage, OutOfMemory
 from filter_service.messages import Share, Shared, Unshare
 from filter_service.service.config import LOOPBACK_HOSTS, ServiceConfig
-from filter_service.service.render_end import RenderEnd
+from filter_service.service.render_client import RenderClient
 from filter_service.service.session import Session
 
 MAX_PARTS_PER_VIEW = 4
@@ -15,7 +15,7 @@ MAX_SHARED_SLOTS = 16
 """Maximum number of slots of one session."""
 
 
-class Sharing:
+class ClientMemory:
     """Allocates and frees the shared memory of sessions.
 
     Parameters
@@ -31,7 +31,7 @@ class Sharing:
         self,
         config: ServiceConfig,
         endpoint: str,
-        render_of: Callable[[Session], RenderEnd],
+        render_of: Callable[[Session], RenderClient],
     ) -> None:
         self._render_of = render_of
         self._limits = config.limits

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import atexit
+import logging
 import os
+import threading
 from contextlib import ExitStack
 from functools import cache
 
 from filter_service.building.inline_worker import InlineWorker
 from filter_service.building.limits import BuildLimits
 from filter_service.building.worker_handle import WorkerHandle
-from filter_service.filtering.workshop import Workshop
+from filter_service.filtering.builder import Builder
 from filter_service.psfs.cache_folder import default_cache_dir
 
+log = logging.getLogger("ocufilter")
 
-def open_workshop(
+
+def open_builder(
     worker: WorkerHandle | InlineWorker,
     limits: BuildLimits,
     closing: ExitStack,
     *,
     engine: str = "auto",
-) -> Workshop:
+) -> Builder:
     """Start the build worker and the engine at the same time; ``closing`` ends both.
 
     Parameters
@@ -40,12 +44,12 @@ def open_workshop(
 
     chosen = open_engine(engine, closing, warm_up=True)
     # Here mypy checks that the chosen engine is a `FrameEngine`.
-    workshop = Workshop(worker, chosen.engine, limits, engine_name=chosen.name)
-    closing.callback(workshop.close)
-    return workshop
+    builder = Builder(worker, chosen.engine, limits, engine_name=chosen.name)
+    closing.callback(builder.close)
+    return builder
 
 
-def open_inline_workshop(closing: ExitStack, *, engine: str = "auto") -> Workshop:
+def open_inline_builder(closing: ExitStack, *, engine: str = "auto") -> Builder:
     """Open a builder that estimates eyes in the caller's thread.
 
     For a program that filters one picture, starting a process would take longer.
@@ -55,7 +59,7 @@ def open_inline_workshop(closing: ExitStack, *, engine: str = "auto") -> Worksho
     RenderError
         If no engine works on this machine; the message names what to install.
     """
-    return open_workshop(InlineWorker(), BuildLimits(), closing, engine=engine)
+    return open_builder(InlineWorker(), BuildLimits(), closing, engine=engine)
 
 
 class _Shared:
@@ -63,28 +67,28 @@ class _Shared:
 
     def __init__(self, engine: str) -> None:
         self._engine = engine
-        self._workshop: Workshop | None = None
+        self._builder: Builder | None = None
         self._closing = ExitStack()
         self._n_users = 0
         atexit.register(self._closing.close)
 
-    def take(self) -> Workshop:
+    def take(self) -> Builder:
         """Return the builder for one more user; the first user starts it."""
-        if self._workshop is None:
+        if self._builder is None:
             limits = BuildLimits(store_cache_dir=default_cache_dir())
             with ExitStack() as closing:
-                self._workshop = open_workshop(
+                self._builder = open_builder(
                     WorkerHandle(), limits, closing, engine=self._engine
                 )
                 self._closing.push(closing.pop_all())
         self._n_users += 1
-        return self._workshop
+        return self._builder
 
     def give_back(self) -> None:
         """Release one user; the last one closes the builder."""
         self._n_users -= 1
         if self._n_users == 0:
-            self._workshop = None
+            self._builder = None
             self._closing.close()
 
     def leave_to_parent(self) -> None:
@@ -104,9 +108,27 @@ def shared(engine: str) -> _Shared:
 
 def _begin_anew() -> None:
     """Make a forked process open builders of its own."""
-    for workshops in _opened:
-        workshops.leave_to_parent()
+    for builders in _opened:
+        builders.leave_to_parent()
     shared.cache_clear()
 
 
 os.register_at_fork(after_in_child=_begin_anew)
+
+
+def preload() -> None:
+    """Load the code that frames need, in a thread, before the first client.
+
+    Python's imports let other threads run every 5 ms, so clients hardly notice; an
+    earlier frame waits for what it needs.
+    """
+
+    def load() -> None:
+        try:
+            from filter_service.rendering.plan_once import plan_once
+
+            plan_once()
+        except Exception:  # the first frame reports the error
+            log.exception("could not preload")
+
+    threading.Thread(target=load, name="preload", daemon=True).start()

@@ -8,7 +8,7 @@ from filter_service.service.connections import Peer
 from filter_service.service.session import Session
 
 
-class Guests:
+class SessionTable:
     """Sessions, by connection while their client is connected and by key while not."""
 
     def __init__(self) -> None:
@@ -76,10 +76,10 @@ class Guests:
         self._away[session.key] = session
         self._next_id = max(self._next_id, session.session_id + 1)
 
-    def come_back(self, session: Session, peer: Peer, client: str) -> None:
+    def reconnect(self, session: Session, peer: Peer, client: str) -> None:
         """Resume a session for a client that knows its key."""
         self.remove(session)
-        session.come_back(peer, client)
+        session.reconnect(peer, client)
         self._present[peer.connection] = session
 
     def leave(self, session: Session, now_s: float) -> None:

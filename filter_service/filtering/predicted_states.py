@@ -50,7 +50,7 @@ class StreamUse:
             return 0.0
         return (self._states[-1][0] - self._states[0][0]) / (len(self._states) - 1)
 
-    def states_ahead(self) -> list[tuple[float, float]]:
+    def predicted_states(self) -> list[tuple[float, float]]:
         """Return predicted states (pupil_diameter_mm, focus_dpt), one per horizon."""
         if len(self._states) < 2:
             return []

@@ -41,28 +41,28 @@ from filter_service.messages import (
     is_bye,
     peek_ids,
 )
+from filter_service.service.client_memory import MAX_PARTS_PER_VIEW, ClientMemory
 from filter_service.service.config import ServiceConfig
 from filter_service.service.connections import Connections, Peer
 from filter_service.service.descriptors import DescriptorLimit
-from filter_service.service.frame_desk import FrameDesk
-from filter_service.service.guests import Guests
-from filter_service.service.link import Link, LinkClosed
-from filter_service.service.listening import socket_family
-from filter_service.service.mailbox import (
-    Mailbox,
+from filter_service.service.frame_queue import FrameQueue
+from filter_service.service.listening_socket import socket_family
+from filter_service.service.metrics import serve_metrics
+from filter_service.service.process_channel import Link, LinkClosed
+from filter_service.service.process_info import resident_memory_mb
+from filter_service.service.rate_limit import Verdict
+from filter_service.service.render_client import RenderClient
+from filter_service.service.router import (
     Outcome,
     Received,
     Refused,
+    Router,
     Tracker,
 )
-from filter_service.service.metrics import serve_metrics
-from filter_service.service.process_info import resident_memory_mb
-from filter_service.service.rate_limit import Verdict
-from filter_service.service.reception import Reception
-from filter_service.service.render_end import RenderEnd
 from filter_service.service.served_devices import ServedDevice, ServedDevices
 from filter_service.service.session import Session, SessionRecord
-from filter_service.service.sharing import MAX_PARTS_PER_VIEW, Sharing
+from filter_service.service.session_manager import SessionManager
+from filter_service.service.session_table import SessionTable
 from filter_service.wire.message import Message
 
 MAX_MESSAGES_PER_TURN = 64  # a flooding client must not delay the others
@@ -74,50 +74,50 @@ MB = 10**6
 log = logging.getLogger("ocufilter")
 
 
-class Door:
+class FrontEnd:
     """The front end: serves sessions behind one ROUTER socket.
 
     Parameters
     ----------
     config : ServiceConfig
-    keeper : Link
+    supervisor : Link
         Link to the supervisor.
     """
 
-    def __init__(self, config: ServiceConfig, keeper: Link) -> None:
+    def __init__(self, config: ServiceConfig, supervisor: Link) -> None:
         self.config = config
         self._limits = config.limits
-        self._keeper = keeper
-        self._guests = Guests()
+        self._supervisor = supervisor
+        self._sessions = SessionTable()
         self._descriptors = DescriptorLimit(config.max_sessions)
         self._connections = Connections(
             self._descriptors.max_connections,
-            self._guests.connections,
+            self._sessions.connections,
             socket_family(config.bind),
         )
         self._n_unheard = 0
         self._is_degraded = False
         self._devices = ServedDevices(
             *(config.device_names, config.max_image_mb * MB, self._descriptors),
-            *(self._guests, self._send),
+            *(self._sessions, self._send),
         )
         self._n_faults = 0
         self._next_trim_s = time.monotonic() + TRIM_INTERVAL_S
-        self._mailbox = Mailbox(
+        self._router = Router(
             config.bind,
             config.max_message_part_bytes,
             1 + MAX_PARTS_PER_VIEW * self._limits.max_views,
             connections=self._connections,
             keys=_checked_keys(config.keys_dir),
         )
-        self.endpoint = self._mailbox.endpoint
-        self._sharing = Sharing(config, self.endpoint, self._render_of)
-        self._reception = Reception(
+        self.endpoint = self._router.endpoint
+        self._client_memory = ClientMemory(config, self.endpoint, self._render_of)
+        self._session_manager = SessionManager(
             config,
             self.endpoint,
-            self._guests,
+            self._sessions,
             self._devices,
-            self._sharing,
+            self._client_memory,
             self._send,
             self._record,
         )
@@ -132,8 +132,8 @@ class Door:
             "ocufilter_degraded": float(self._is_degraded),
             "ocufilter_connections": len(self._connections),
             "ocufilter_connections_evicted_total": self._connections.n_evicted,
-            "ocufilter_sessions": len(self._guests.present),
-            "ocufilter_sessions_away": len(self._guests.away),
+            "ocufilter_sessions": len(self._sessions.present),
+            "ocufilter_sessions_away": len(self._sessions.away),
             "ocufilter_frames_filtered_total": sum(d.n_rendered for d in desks),
             "ocufilter_frames_dropped_total": sum(d.n_dropped for d in desks),
             "ocufilter_filter_seconds_total": sum(d.filtered_s for d in desks),
@@ -148,10 +148,10 @@ class Door:
     def _memory_mb(self) -> float:
         return resident_memory_mb() + self._devices.memory_mb
 
-    def _render_of(self, session: Session) -> RenderEnd:
+    def _render_of(self, session: Session) -> RenderClient:
         return self._devices.of(session).render
 
-    def _frames_of(self, session: Session) -> FrameDesk:
+    def _frames_of(self, session: Session) -> FrameQueue:
         return self._devices.of(session).frames
 
     # Event loop
@@ -159,17 +159,17 @@ class Door:
     def run(self) -> None:
         """Serve until the supervisor sends stop or is gone."""
         try:
-            while self._turn():
+            while self._run_once():
                 pass
         except LinkClosed:
             log.error("the process that owns this one is gone")
         finally:
             self._close()
 
-    def _listen_to_keeper(self) -> bool:
+    def _listen_to_supervisor(self) -> bool:
         """Handle the supervisor's messages; return whether to go on."""
         with self._descriptors.reserve():  # may receive links to new processes
-            messages = self._keeper.receive()
+            messages = self._supervisor.receive()
         return all([self.take_control(*message) for message in messages])
 
     def take_control(self, message: tuple[Any, ...], descriptors: list[int]) -> bool:
@@ -179,7 +179,7 @@ class Door:
             device.frames.lose_held()
             device.render.join(Link.from_descriptor(descriptors[0]))
         elif message[0] == "sessions":
-            self._reception.restore(message[1])
+            self._session_manager.restore(message[1])
         elif message[0] == "lost":
             self._give_up(self._devices[message[1]])
         elif message[0] == "found":
@@ -187,55 +187,55 @@ class Door:
         elif message[0] == "degraded":
             self._is_degraded = message[1]
         elif message[0] == "config":
-            self.config = self._reception.config = message[1]
+            self.config = self._session_manager.config = message[1]
             self._limits = self.config.limits
         return bool(message[0] != "stop")
 
-    def _turn(self) -> bool:
+    def _run_once(self) -> bool:
         """Run one iteration of the event loop; return whether to go on."""
         readable, writable = self._devices.descriptors()
-        readable = readable | {self._keeper.fileno()}
-        if self._keeper.has_unsent:
-            writable = writable | {self._keeper.fileno()}
-        self._mailbox.watch(readable, writable)
-        self._mailbox.wait(self._wait_s())
-        self._keeper.flush()
+        readable = readable | {self._supervisor.fileno()}
+        if self._supervisor.has_unsent:
+            writable = writable | {self._supervisor.fileno()}
+        self._router.watch(readable, writable)
+        self._router.wait(self._wait_s())
+        self._supervisor.flush()
         # Before clients, so that replies reflect the supervisor's latest messages.
-        if not self._listen_to_keeper():
+        if not self._listen_to_supervisor():
             return False
         for device in self._devices:
             self._listen_to(device)
-        for number in self._mailbox.take_ended():
-            self._reception.lose(number)
+        for number in self._router.take_ended():
+            self._session_manager.lose(number)
         self._take_in_messages()
         for device in self._devices:
-            device.frames.hand_over_one()
+            device.frames.submit_one()
         self._tidy()
         return True
 
     def _wait_s(self) -> float:
         now_s = time.monotonic()
-        if self._mailbox.is_dropping:
+        if self._router.is_dropping:
             return 0.0
         soon_s = self._devices.wait_s(now_s)
         if soon_s is not None:
             return soon_s
-        due_s = min(self._reception.due_s, self._next_trim_s)
+        due_s = min(self._session_manager.due_s, self._next_trim_s)
         return min(IDLE_WAIT_S, max(0.0, due_s - now_s))
 
     def _close(self) -> None:
-        for session in self._guests.present:
+        for session in self._sessions.present:
             with suppress(Exception):
                 if session.peer is not None:
-                    self._mailbox.send(session.peer, encode(Closing()))
-        self._mailbox.close(linger_ms=CLOSING_LINGER_MS)
+                    self._router.send(session.peer, encode(Closing()))
+        self._router.close(linger_ms=CLOSING_LINGER_MS)
 
     def _tidy(self) -> None:
         """Run periodic tasks."""
         now_s = time.monotonic()
         for device in self._devices:
             device.frames.tidy()
-        self._reception.tidy()
+        self._session_manager.tidy()
         if now_s >= self._next_trim_s:
             self._next_trim_s = now_s + TRIM_INTERVAL_S
             for device in self._devices:
@@ -249,7 +249,7 @@ class Door:
         if device.render.is_up and device.render.stuck_s > limit_s:
             log.error("the process that filters frames is stuck for %g s", limit_s)
             device.render.excuse()
-            self._keeper.send(("hung", device.index))
+            self._supervisor.send(("hung", device.index))
 
     # Render workers
 
@@ -257,7 +257,7 @@ class Door:
         try:
             for kind, *rest in device.render.receive():
                 if kind == "answer":
-                    device.frames.take_answer(*rest)
+                    device.frames.accept_result(*rest)
                 elif kind == "tell":
                     self._pass_on(*rest)
                 elif kind == "state":
@@ -269,11 +269,11 @@ class Door:
 
     def _pass_on(self, key: str, eye: EyeName, reply: Reply) -> None:
         """Pass a reply about a profile to its client; count a refusal."""
-        session = self._guests.by_key(key)
+        session = self._sessions.by_key(key)
         if session is not None and session.peer is not None:
             if isinstance(reply, ErrorReply) and reply.code != BuildCancelled.code:
                 self._connections.note_refusal(session.peer.connection)
-        self._reception.pass_on(key, eye, reply)
+        self._session_manager.pass_on(key, eye, reply)
 
     def _begin_with(
         self,
@@ -284,16 +284,16 @@ class Door:
     ) -> None:
         """Synchronize the sessions with those of a new render worker."""
         device.server, device.render.may_rest = server, may_rest
-        self._reception.meet(device, eyes)
+        self._session_manager.attach_device(device, eyes)
         device.render.is_ready = True
-        self._keeper.send(("met", device.index))
-        self._reception.greet_who_waits()
+        self._supervisor.send(("met", device.index))
+        self._session_manager.greet_waiting()
 
     def _give_up(self, device: ServedDevice) -> None:
         """End the sessions of a lost device; new ones start on other devices."""
         device.give_up()
         device.frames.lose_held()
-        self._reception.give_up(device)
+        self._session_manager.give_up(device)
 
     # Messages
 
@@ -306,9 +306,9 @@ class Door:
         superseded: list[tuple[Session, Frame]] = []
         for _ in range(MAX_MESSAGES_PER_TURN):
             try:
-                received = self._mailbox.receive()
+                received = self._router.receive()
             except Refused as refused:
-                self._turn_out(refused)
+                self._disconnect(refused)
                 continue
             if received is None:
                 break
@@ -319,7 +319,7 @@ class Door:
             except Exception:  # must not affect other clients
                 self._n_faults += 1
                 log.exception("fault %d: a refusal failed", self._n_faults)
-                self._reception.end_session(received.peer)
+                self._session_manager.end_session(received.peer)
         for session, frame in superseded:
             dropped = Dropped(frame.frame_id, "superseded")
             self._frames_of(session).answer(session, frame, dropped)
@@ -329,7 +329,7 @@ class Door:
         if received.connection is None:
             # Its client is gone, so only a bye still matters.
             if is_bye(received.parts):
-                self._reception.end_session(received.peer)
+                self._session_manager.end_session(received.peer)
             return False
         verdict = received.connection.rates.verdict(time.monotonic())
         if verdict is Verdict.HANDLE:
@@ -348,7 +348,7 @@ class Door:
             if received.n_left_out:
                 is_many = received.n_left_out > MAX_PARTS_LEFT_OUT
                 if received.connection is not None and is_many:
-                    received.connection.rates.end_patience()
+                    received.connection.rates.exhaust()
                 raise BadMessage(
                     f"{len(parts) + received.n_left_out - 1} parts follow the header",
                     field="parts",
@@ -356,7 +356,7 @@ class Door:
                 )
             request = decode_request(parts, self._limits)
             if isinstance(request, Frame):
-                session = self._reception.session_at(peer)
+                session = self._session_manager.session_at(peer)
                 frames = self._frames_of(session)
                 older = frames.take_in(session, request, received_s)
                 superseded += [(session, older)] if older is not None else []
@@ -388,21 +388,25 @@ class Door:
         if isinstance(request, Ping):
             self._send(peer, self._pong(request))
         elif isinstance(request, Hello):
-            self._reception.greet(peer, request)
+            self._session_manager.greet(peer, request)
         elif isinstance(request, Bye):
-            self._reception.end_session(peer)
+            self._session_manager.end_session(peer)
         elif isinstance(request, ProfileRequest):
-            self._reception.take_profile(self._reception.session_at(peer), request)
+            self._session_manager.take_profile(
+                self._session_manager.session_at(peer), request
+            )
         elif isinstance(request, Share):
-            shared = self._sharing.share(self._reception.session_at(peer), request)
+            shared = self._client_memory.share(
+                self._session_manager.session_at(peer), request
+            )
             self._send(peer, shared)
         elif isinstance(request, Unshare):
-            self._sharing.unshare(self._reception.session_at(peer), request)
+            self._client_memory.unshare(self._session_manager.session_at(peer), request)
 
-    def _turn_out(self, refused: Refused) -> None:
+    def _disconnect(self, refused: Refused) -> None:
         """End the session of a client whose key was removed."""
         log.warning("a client's key is not allowed any more")
-        self._reception.end_session(refused.peer)
+        self._session_manager.end_session(refused.peer)
         error = NotAllowed(str(refused))
         self._send(refused.peer, ErrorReply.from_exception(error))
 
@@ -412,7 +416,7 @@ class Door:
             t=ping.t,
             server_time_s=time.monotonic(),
             memory_mb=self._memory_mb,
-            n_sessions=len(self._guests.present),
+            n_sessions=len(self._sessions.present),
             n_rendered=sum(state.n_rendered for state in states),
             n_dropped=sum(device.frames.n_dropped for device in self._devices),
             is_building=any(state.is_building for state in states),
@@ -427,17 +431,17 @@ class Door:
     def _record(self, key: str, record: SessionRecord | None) -> None:
         """Store a session with the supervisor, for the front end after a restart."""
         with suppress(LinkClosed):  # this process then ends
-            self._keeper.send(("session", key, record))
+            self._supervisor.send(("session", key, record))
 
     def _send(self, peer: Peer, reply: Reply) -> Tracker | None:
         """Send a reply; end session and connection of a client that does not read."""
-        outcome, tracker = self._mailbox.send(peer, encode(reply))
+        outcome, tracker = self._router.send(peer, encode(reply))
         if outcome is Outcome.GONE:
-            self._reception.leave(peer)
+            self._session_manager.leave(peer)
         elif outcome is Outcome.STALLED:
             # Every further reply would block, too.
             self._connections.close(peer.connection, "it does not read")
-            self._reception.end_session(peer, outcome)
+            self._session_manager.end_session(peer, outcome)
         return tracker
 
 

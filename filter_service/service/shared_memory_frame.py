@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.messages import EyeName, Frame, Reply, Result, SharedPlaces
 from filter_service.service.frame_reply import frame_reply
-from filter_service.slots import Slot
+from filter_service.shared_memory import Slot
 from filter_service.wire.compression import packed
 from filter_service.wire.images import ViewImages
 

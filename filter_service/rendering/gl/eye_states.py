@@ -20,7 +20,7 @@ class Released(Protocol):
 
 
 @dataclass(eq=False)
-class KeptEye:
+class EyeState:
     """State of an eye's last frame that the next frame in the same state reuses."""
 
     handle: Released
@@ -28,21 +28,21 @@ class KeptEye:
     states: FrameStates = field(default_factory=FrameStates)
 
 
-class KeptEyes:
+class EyeStates:
     """Cache of the most recently used eyes; older ones are evicted."""
 
     def __init__(self, gpu: Gpu) -> None:
         self._free = [KernelMaker(gpu, slot) for slot in range(MAX_KEPT)]
-        self._kept: list[KeptEye] = []  # most recently used last
+        self._kept: list[EyeState] = []  # most recently used last
 
-    def of(self, handle: Released) -> KeptEye:
+    def of(self, handle: Released) -> EyeState:
         """Return the state of an eye, and mark it as most recently used."""
         self.drop_released()
         found = next((kept for kept in self._kept if kept.handle is handle), None)
         others = [kept for kept in self._kept if kept is not found]
         if found is None and len(others) == MAX_KEPT:
             self._let_go(others.pop(0))
-        found = found or KeptEye(handle, self._free.pop(0))
+        found = found or EyeState(handle, self._free.pop(0))
         self._kept = [*others, found]
         return found
 
@@ -52,6 +52,6 @@ class KeptEyes:
             self._kept.remove(kept)
             self._let_go(kept)
 
-    def _let_go(self, kept: KeptEye) -> None:
+    def _let_go(self, kept: EyeState) -> None:
         kept.kernels.forget()
         self._free.append(kept.kernels)

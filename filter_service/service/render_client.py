@@ -18,11 +18,11 @@ from filter_service.errors import OutOfMemory
 from filter_service.messages import Frame, Result, SharedPlaces
 from filter_service.service.connections import Peer
 from filter_service.service.descriptors import DescriptorLimit
-from filter_service.service.link import Link, LinkClosed
-from filter_service.service.mailbox import Tracker
-from filter_service.service.places import result_sizes
+from filter_service.service.image_positions import result_sizes
+from filter_service.service.process_channel import Link, LinkClosed
+from filter_service.service.router import Tracker
 from filter_service.service.session import Session, WaitingFrame
-from filter_service.slots import Slot, SlotPool, starts_of
+from filter_service.shared_memory import Slot, SlotPool, starts_of
 
 MS_PER_S = 1000.0
 
@@ -53,7 +53,7 @@ class Held:
     handed_s: float
 
 
-class RenderEnd:
+class RenderClient:
     """Passes frames, profiles and memory to a render worker.
 
     Parameters
@@ -240,7 +240,7 @@ class RenderEnd:
             for held in self.held.values()
         )
 
-    def hand_over(self, session: Session, waiting: WaitingFrame) -> None:
+    def submit(self, session: Session, waiting: WaitingFrame) -> None:
         """Send a frame to the worker.
 
         Raises

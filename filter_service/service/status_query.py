@@ -12,7 +12,7 @@ from filter_service.keys import load_client_key
 from filter_service.messages import Ping, Pong, decode_reply, encode
 
 
-def ask_status(
+def query_status(
     endpoint: str, *, key_file: Path | None = None, timeout_s: float = 3.0
 ) -> dict[str, Any]:
     """Ping a service and return the fields of its reply.

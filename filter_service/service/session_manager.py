@@ -24,13 +24,13 @@ from filter_service.messages import (
     Reply,
     Welcome,
 )
+from filter_service.service.client_memory import ClientMemory
 from filter_service.service.config import ServiceConfig
 from filter_service.service.connections import Peer
-from filter_service.service.guests import Guests
-from filter_service.service.mailbox import Outcome, Tracker
+from filter_service.service.router import Outcome, Tracker
 from filter_service.service.served_devices import ServedDevice, ServedDevices
 from filter_service.service.session import EyeProfiles, Session, SessionRecord
-from filter_service.service.sharing import Sharing
+from filter_service.service.session_table import SessionTable
 
 MAX_GREETINGS = 256
 """Maximum number of clients that wait for the reply to hello while a device starts."""
@@ -43,7 +43,7 @@ counts."""
 log = logging.getLogger("ocufilter")
 
 
-class Reception:
+class SessionManager:
     """Manages the sessions of clients, each on one device.
 
     Parameters
@@ -51,9 +51,9 @@ class Reception:
     config : ServiceConfig
     endpoint : str
         Endpoint of the socket.
-    guests : Guests
+    sessions : SessionTable
     devices : ServedDevices
-    sharing : Sharing
+    client_memory : ClientMemory
     send : callable
         Sends a reply to a peer.
     record : callable
@@ -69,15 +69,16 @@ class Reception:
         self,
         config: ServiceConfig,
         endpoint: str,
-        guests: Guests,
+        sessions: SessionTable,
         devices: ServedDevices,
-        sharing: Sharing,
+        client_memory: ClientMemory,
         send: Callable[[Peer, Reply], Tracker | None],
         record: Callable[[str, SessionRecord | None], None],
     ) -> None:
         self.config = config
         self._endpoint = endpoint
-        self._guests, self._devices, self._sharing = guests, devices, sharing
+        self._sessions, self._devices = sessions, devices
+        self._client_memory = client_memory
         self._send, self._record = send, record
         self._greetings: list[tuple[Peer, Hello]] = []  # until devices are known
         self._next_alive_s = time.monotonic() + config.alive_interval_s
@@ -97,7 +98,7 @@ class Reception:
         ------
         NoSession
         """
-        session = self._guests.at(peer)
+        session = self._sessions.at(peer)
         if session is None:
             raise NoSession("hello was not said", allowed="hello before anything else")
         return session
@@ -113,20 +114,20 @@ class Reception:
             self._greetings = [g for g in self._greetings if g[0] != peer]
             self._greetings = [*self._greetings[1 - MAX_GREETINGS :], (peer, hello)]
             return
-        session, is_resumed = self._guests.at(peer), False
+        session, is_resumed = self._sessions.at(peer), False
         if session is None:
-            session = self._guests.by_key(hello.session_key)
+            session = self._sessions.by_key(hello.session_key)
             if session is not None and session.owner != peer.key:
                 session = None  # belongs to another client
             is_resumed = session is not None
             if session is None:
                 session = self._new_session(peer, hello)
             else:
-                self._end_sharing(session)
-                self._guests.come_back(session, peer, hello.client)
+                self._free_client_memory(session)
+                self._sessions.reconnect(session, peer, hello.client)
                 log.info("session %d goes on (%r)", session.session_id, hello.client)
         transports = [self._endpoint.split("://", 1)[0]]
-        if self._sharing.is_offered:
+        if self._client_memory.is_offered:
             transports.append("shm")
         welcome = Welcome(
             session.session_id,
@@ -142,7 +143,7 @@ class Reception:
         )
         self._send(peer, welcome)
 
-    def greet_who_waits(self) -> None:
+    def greet_waiting(self) -> None:
         """Answer the clients that sent hello before all devices had reported."""
         if not self._devices.are_known:
             return
@@ -155,17 +156,17 @@ class Reception:
 
     def _new_session(self, peer: Peer, hello: Hello) -> Session:
         most = self.config.max_sessions
-        if len(self._guests) >= most:
+        if len(self._sessions) >= most:
             self._probe_clients(is_due=True)
-        while len(self._guests) >= most and self._guests.away:
-            self._forget(self._guests.away[0], "its place is needed")
-        if len(self._guests) >= most:
+        while len(self._sessions) >= most and self._sessions.away:
+            self._forget(self._sessions.away[0], "its place is needed")
+        if len(self._sessions) >= most:
             raise TooManySessions(
-                f"{len(self._guests)} clients are being served",
+                f"{len(self._sessions)} clients are being served",
                 allowed=f"{most} clients",
             )
         device = self._devices.least_busy()
-        session = self._guests.begin(
+        session = self._sessions.begin(
             peer, hello.client, self.config.credit, device=device.index
         )
         self._record(session.key, session.record())
@@ -177,9 +178,11 @@ class Reception:
     def restore(self, records: Sequence[SessionRecord]) -> None:
         """Restore the sessions of the previous front end."""
         for record in records:
-            self._guests.remember(Session.restored(record, time.monotonic()))
+            self._sessions.remember(Session.restored(record, time.monotonic()))
 
-    def meet(self, device: ServedDevice, eyes: Sequence[tuple[Any, ...]]) -> None:
+    def attach_device(
+        self, device: ServedDevice, eyes: Sequence[tuple[Any, ...]]
+    ) -> None:
         """Synchronize a device with the current sessions.
 
         Parameters
@@ -189,7 +192,7 @@ class Reception:
             id, generation).
         """
         held = dict(eyes)
-        for session in self._guests:
+        for session in self._sessions:
             if session.device != device.index:
                 continue
             if session.key not in held:
@@ -246,13 +249,13 @@ class Reception:
         if now_s < self._next_profile_s:
             return
         self._next_profile_s = math.inf
-        for session in self._guests:
+        for session in self._sessions:
             for eye in session.eyes.values():
                 self._ask_next_profile(session, eye)
 
     def pass_on(self, key: str, name: EyeName, reply: Reply) -> None:
         """Pass a render worker's reply about an eye's profile on to the client."""
-        session = self._guests.by_key(key)
+        session = self._sessions.by_key(key)
         if session is None:
             return
         eye = session.eye(name)
@@ -275,24 +278,24 @@ class Reception:
         self._probe_clients()
         now_s = time.monotonic()
         self._ask_due_profiles(now_s)
-        for session in self._guests.away:
+        for session in self._sessions.away:
             if now_s - (session.away_since_s or 0.0) > self.config.session_keep_s:
                 self._forget(session, "its client did not come back")
 
     def give_up(self, device: ServedDevice) -> None:
         """End the sessions of a lost device; new ones start on other devices."""
-        for session in self._guests:
+        for session in self._sessions:
             if session.device == device.index:
                 device.frames.lose_waiting(session)
                 self._forget(session, "its device is gone")
-        self.greet_who_waits()
+        self.greet_waiting()
 
     def _probe_clients(self, *, is_due: bool = False) -> None:
         """Send `Alive` to every client, which detects vanished ones."""
         now_s = time.monotonic()
         if is_due or now_s >= self._next_alive_s:
             self._next_alive_s = now_s + self.config.alive_interval_s
-            for session in self._guests.present:
+            for session in self._sessions.present:
                 if session.peer is not None:
                     self._send(session.peer, Alive())
 
@@ -302,29 +305,29 @@ class Reception:
 
     def lose(self, connection: int) -> None:
         """Handle the end of a connection; keep its session for a while."""
-        session = self._guests.on_connection(connection)
+        session = self._sessions.on_connection(connection)
         if session is not None and session.peer is not None:
-            self._end_sharing(session)
-            self._guests.leave(session, time.monotonic())
+            self._free_client_memory(session)
+            self._sessions.leave(session, time.monotonic())
             log.info("session %d: its client is gone", session.session_id)
 
     def end_session(self, peer: Peer, outcome: Outcome | None = None) -> None:
         """End the session of a client, if it has one."""
-        session = self._guests.on_connection(peer.connection)
+        session = self._sessions.on_connection(peer.connection)
         if session is not None:
             why = "" if outcome is None else f"the client is {outcome.value}"
             self._forget(session, why)
 
     def _forget(self, session: Session, why: str) -> None:
-        self._guests.remove(session)
-        self._end_sharing(session)
+        self._sessions.remove(session)
+        self._free_client_memory(session)
         self._record(session.key, None)
         session.peer = None
         self._devices.of(session).frames.forget(session)
         self._devices.of(session).render.tell("close", session.key)
         log.info("session %d ends%s", session.session_id, f": {why}" if why else "")
 
-    def _end_sharing(self, session: Session) -> None:
+    def _free_client_memory(self, session: Session) -> None:
         """Release the shared memory of a client that is gone."""
-        self._sharing.end(session)
+        self._client_memory.end(session)
         self._devices.of(session).frames.leave(session)

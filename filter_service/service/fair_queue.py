@@ -24,7 +24,7 @@ class _Share:
     is_waiting: bool = False
 
 
-class Turns(Generic[Client]):
+class FairQueue(Generic[Client]):
     """Fair queuing: among waiting sessions, the one that has used the least is next.
 
     A session that starts to wait counts as having used as much as the one served last,

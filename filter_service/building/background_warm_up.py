@@ -19,7 +19,7 @@ Progress = Callable[[float, str], None]
 log = logging.getLogger("ocufilter.worker")
 
 
-class HeadStart:
+class BackgroundWarmUp:
     """Warm-up call that runs in a thread, and for which the first build waits.
 
     Failures are only logged; the build then does the remaining work.

@@ -28,12 +28,12 @@ from filter_service.building.helper_process import (
     is_stopped,
 )
 from filter_service.service.config import ServiceConfig, changed_while_running
-from filter_service.service.link import Link, LinkClosed
+from filter_service.service.process_channel import Link, LinkClosed
 
-DOOR_MODULE = "filter_service.service.door_process"
-RENDER_MODULE = "filter_service.service.render_process"
-DOOR, RENDER = "door", "render"
-OPEN_WORKSHOP = "filter_service.service.render_process:open_real_workshop"
+FRONT_END_MODULE = "filter_service.service.front_end_process"
+RENDER_MODULE = "filter_service.service.render_worker_process"
+FRONT_END, RENDER = "front-end", "render"
+OPEN_BUILDER = "filter_service.service.render_worker_process:open_real_builder"
 STABLE_S = 60.0
 """Run time after which the count of consecutive deaths starts again."""
 
@@ -62,7 +62,7 @@ class ServiceFailed(Exception):
 
 
 @dataclass
-class _Child:
+class _Process:
     """A process and the link to it."""
 
     process: subprocess.Popen[bytes] | None = None
@@ -71,7 +71,7 @@ class _Child:
     stopped_since_s: float | None = None
     started_s: float = field(default_factory=time.monotonic)
 
-    def tell(self, message: object, descriptors: Sequence[int] = ()) -> None:
+    def send(self, message: object, descriptors: Sequence[int] = ()) -> None:
         """Send a message; ignores a closed link, which the next receive reports."""
         if self.link is not None:
             with suppress(LinkClosed):
@@ -109,14 +109,14 @@ class _Restarts:
         return pause_s
 
 
-class Keeper:
+class Supervisor:
     """Supervises the front end and a render worker for each device.
 
     Parameters
     ----------
     config : ServiceConfig
-    open_workshop : str
-        ``module:function`` that opens the builder, see `render_process`.
+    open_builder : str
+        ``module:function`` that opens the builder, see `render_worker_process`.
     when_ready : callable
         Called with the endpoint when the service becomes ready for frames, also after
         an interruption.
@@ -130,13 +130,13 @@ class Keeper:
         self,
         config: ServiceConfig,
         *,
-        open_workshop: str = OPEN_WORKSHOP,
+        open_builder: str = OPEN_BUILDER,
         when_ready: Callable[[str], None],
         when_not_ready: Callable[[], None] = lambda: None,
         read_again: Callable[[], ServiceConfig] | None = None,
     ) -> None:
         self._config = config
-        self._open_workshop = open_workshop
+        self._open_builder = open_builder
         self._when_ready, self._when_not_ready = when_ready, when_not_ready
         self._was_ready = self._is_announced = False
         self._read_again = read_again
@@ -150,12 +150,12 @@ class Keeper:
             if n_devices > 1
             else {RENDER: 0}
         )
-        self._children = {name: _Child() for name in (DOOR, *self._devices)}
-        self._standbys: dict[str, _Child] = {}
+        self._processes = {name: _Process() for name in (FRONT_END, *self._devices)}
+        self._standbys: dict[str, _Process] = {}
         self._lost: set[int] = set()  # devices given up for now
         self._met: set[int] = set()  # devices connected to the front end
         self._spawned_s = 0.0  # last start of any process
-        self._restarts = {name: _Restarts() for name in self._children}
+        self._restarts = {name: _Restarts() for name in self._processes}
         self._sessions: dict[str, object] = {}  # by key, for the next front end
         self._wake_reader, self._wake_writer = socket.socketpair()
         self._wake_reader.setblocking(False)
@@ -184,11 +184,11 @@ class Keeper:
             `give_up_after_s`.
         """
         try:
-            for name in (*self._devices, DOOR):  # the fastest starts last
+            for name in (*self._devices, FRONT_END):  # the fastest starts last
                 self._start(name)
             while not self._is_stopping:
                 try:
-                    self._turn()
+                    self._run_once()
                 except OSError as error:
                     self._bear(error)
         finally:
@@ -206,12 +206,12 @@ class Keeper:
         log.error("the system refused something (%s)", error)
         time.sleep(CHECK_INTERVAL_S)
 
-    def _turn(self) -> None:
+    def _run_once(self) -> None:
         with selectors.DefaultSelector() as selector:
             selector.register(self._wake_reader, selectors.EVENT_READ)
-            for child in self._all_children:
-                if child.link is not None:
-                    selector.register(child.link, selectors.EVENT_READ)
+            for process in self._all_processes:
+                if process.link is not None:
+                    selector.register(process.link, selectors.EVENT_READ)
             selector.select(self._wait_s())
         try:
             self._wake_reader.recv(4096)
@@ -220,9 +220,9 @@ class Keeper:
         if self._is_to_read_again:
             self._is_to_read_again = False
             self._change_settings()
-        for name, child in list(self._children.items()):
-            self._listen(name, child)
-            self._check_stopped(name, child)
+        for name, process in list(self._processes.items()):
+            self._listen(name, process)
+            self._check_stopped(name, process)
         for name, restarts in self._restarts.items():
             if restarts.due_s is not None and time.monotonic() >= restarts.due_s:
                 restarts.due_s = None
@@ -239,31 +239,31 @@ class Keeper:
         return max(0.0, min([CHECK_INTERVAL_S, *due_s]))
 
     @property
-    def _all_children(self) -> list[_Child]:
-        return [*self._children.values(), *self._standbys.values()]
+    def _all_processes(self) -> list[_Process]:
+        return [*self._processes.values(), *self._standbys.values()]
 
     def _start(self, name: str) -> None:
         """Start a process, or replace it by its standby."""
         standby = self._standbys.pop(name, None)
         try:
-            self._children[name] = standby or self._spawned(name)
+            self._processes[name] = standby or self._spawned(name)
             self._join(name)
         except OSError as error:  # out of memory, processes or descriptors
             if not self._was_ready:
                 raise ServiceFailed(f"its {name} process: {error}") from None
-            self._children[name].end()
+            self._processes[name].end()
             self._note_death(name, time.monotonic(), f"cannot be started ({error})")
 
-    def _spawned(self, name: str) -> _Child:
+    def _spawned(self, name: str) -> _Process:
         self._spawned_s = time.monotonic()
         link, theirs = Link.pair()
         # A new front end listens on the endpoint of the previous one.
         config = replace(self._config, bind=self._endpoint or self._config.bind)
-        module, arguments = DOOR_MODULE, [str(theirs.fileno())]
+        module, arguments = FRONT_END_MODULE, [str(theirs.fileno())]
         if name in self._devices:
             config = config.of_device(self._devices[name])
-            module, arguments = RENDER_MODULE, [*arguments, self._open_workshop, name]
-        process = subprocess.Popen(
+            module, arguments = RENDER_MODULE, [*arguments, self._open_builder, name]
+        started = subprocess.Popen(
             # Without -P, files in the current folder would shadow modules of the same
             # name.
             [sys.executable, "-P", "-m", module, *arguments],
@@ -272,18 +272,18 @@ class Keeper:
             env=os.environ | {"PYTHONPATH": os.pathsep.join(import_path())},
         )
         theirs.close()
-        child = _Child(process, link)
-        child.tell(("config", config))
-        if name == DOOR:
-            child.tell(("sessions", list(self._sessions.values())))
-        return child
+        process = _Process(started, link)
+        process.send(("config", config))
+        if name == FRONT_END:
+            process.send(("sessions", list(self._sessions.values())))
+        return process
 
     def _keep_standby(self, name: str) -> None:
         """Keep a standby render worker ready, with a build worker of its own."""
         standby = self._standbys.get(name)
         if standby is None:
             is_quiet = time.monotonic() - self._spawned_s > STANDBY_AFTER_S
-            if is_quiet and self._children[name].is_ready:
+            if is_quiet and self._processes[name].is_ready:
                 self._standbys[name] = self._spawned(name)
             return
         try:
@@ -311,46 +311,46 @@ class Keeper:
         if others:
             log.warning("for %s the service has to be started again", ", ".join(others))
         if changed:
-            self._children[DOOR].tell(("config", self._config))
+            self._processes[FRONT_END].send(("config", self._config))
 
     def _join(self, new: str) -> None:
         """Link a new worker to the front end, or a new front end to all workers."""
-        if self._children[DOOR].link is None:
+        if self._processes[FRONT_END].link is None:
             return
         for name, index in self._devices.items():
-            if new in (DOOR, name) and self._children[name].link is not None:
+            if new in (FRONT_END, name) and self._processes[name].link is not None:
                 self._met.discard(index)
                 ours, theirs = socket.socketpair()
-                self._children[name].tell(("link", index), [ours.fileno()])
-                self._children[DOOR].tell(("link", index), [theirs.fileno()])
+                self._processes[name].send(("link", index), [ours.fileno()])
+                self._processes[FRONT_END].send(("link", index), [theirs.fileno()])
                 ours.close()
                 theirs.close()
-        if new == DOOR:
+        if new == FRONT_END:
             for index in self._lost:
-                self._children[DOOR].tell(("lost", index))
-            self._tell_degraded()
+                self._processes[FRONT_END].send(("lost", index))
+            self._report_degraded()
 
-    def _listen(self, name: str, child: _Child) -> None:
+    def _listen(self, name: str, process: _Process) -> None:
         try:
-            if child.link is None:
+            if process.link is None:
                 return
-            for (kind, *rest), _ in child.link.receive():
+            for (kind, *rest), _ in process.link.receive():
                 if kind == "ready":
-                    child.is_ready = True
+                    process.is_ready = True
                     self._endpoint = rest[0] or self._endpoint
-                    self._tell_ready(name)
+                    self._report_ready(name)
                 elif kind == "met":
                     self._met.add(rest[0])
                     self._announce()
                 elif kind == "failed":
-                    self._fail(name, child, rest[0])
+                    self._fail(name, process, rest[0])
                     return
                 elif kind == "hung":
                     self._kill_device(rest[0])
                 elif kind == "session":
                     self._keep_session(*rest)
         except LinkClosed:
-            self._restart(name, child)
+            self._restart(name, process)
 
     def _keep_session(self, key: str, record: object | None) -> None:
         if record is None:
@@ -358,44 +358,44 @@ class Keeper:
         else:
             self._sessions[key] = record
 
-    def _tell_ready(self, name: str) -> None:
+    def _report_ready(self, name: str) -> None:
         index = self._devices.get(name)
         if index in self._lost:
             self._lost.discard(index)
-            self._children[DOOR].tell(("found", index))
+            self._processes[FRONT_END].send(("found", index))
             log.info("the %s process is there again", name)
-        self._tell_degraded()
+        self._report_degraded()
         self._announce()
 
     def _announce(self) -> None:
         """Report that the service is ready, once the front end agrees."""
         if (
             not self._is_announced
-            and all(child.is_ready for child in self._children.values())
+            and all(process.is_ready for process in self._processes.values())
             and self._met == set(self._devices.values())
         ):
             self._is_announced = True
             self._when_ready(self._endpoint)
             self._was_ready = True
 
-    def _tell_degraded(self) -> None:
+    def _report_degraded(self) -> None:
         """Tell the front end whether a process is down for longer than a restart."""
         is_degraded = bool(self._lost) or any(
             restarts.n_deaths > DEATHS_WITHOUT_PAUSE
-            and not self._children[name].is_ready
+            and not self._processes[name].is_ready
             for name, restarts in self._restarts.items()
         )
-        self._children[DOOR].tell(("degraded", is_degraded))
+        self._processes[FRONT_END].send(("degraded", is_degraded))
 
-    def _restart(self, name: str, child: _Child) -> None:
+    def _restart(self, name: str, process: _Process) -> None:
         """Clean up after a process that has ended, and schedule its restart."""
-        how = child.end()
+        how = process.end()
         if name in self._standbys:
             log.error("the %s process %s; the one that stood by takes over", name, how)
             self._restarts[name].due_s = time.monotonic()
-            self._children[name] = _Child()
+            self._processes[name] = _Process()
             return
-        self._note_death(name, child.started_s, how)
+        self._note_death(name, process.started_s, how)
 
     def _note_death(self, name: str, started_s: float, how: str) -> None:
         """Schedule the restart of a process.
@@ -407,7 +407,7 @@ class Keeper:
         """
         now_s, restarts = time.monotonic(), self._restarts[name]
         pause_s = restarts.note_death(started_s, now_s)
-        self._children[name] = _Child()
+        self._processes[name] = _Process()
         failing_s = now_s - (restarts.failing_since_s or now_s)
         limit_s = self._config.give_up_after_s
         if not self._was_ready:
@@ -425,7 +425,7 @@ class Keeper:
         index = self._devices.get(name)
         if index is not None and restarts.n_deaths >= GIVE_UP_DEVICE_DEATHS:
             self._give_up_device(name, index)
-        self._tell_degraded()
+        self._report_degraded()
 
     def _give_up_device(self, name: str, index: int) -> None:
         """Move the sessions of a device to other devices, if there are any."""
@@ -433,9 +433,9 @@ class Keeper:
             return
         log.error("the %s process is given up until it stays", name)
         self._lost.add(index)
-        self._children[DOOR].tell(("lost", index))
+        self._processes[FRONT_END].send(("lost", index))
 
-    def _fail(self, name: str, child: _Child, why: str) -> None:
+    def _fail(self, name: str, process: _Process, why: str) -> None:
         """Handle a process that reports that it cannot work.
 
         Raises
@@ -445,35 +445,35 @@ class Keeper:
         """
         if not self._was_ready:
             raise ServiceFailed(why)
-        child.end()
+        process.end()
         restarts = self._restarts[name]
         # An immediate restart would fail again.
         restarts.n_deaths = max(restarts.n_deaths, GIVE_UP_DEVICE_DEATHS - 1)
         self._note_death(name, time.monotonic(), f"cannot work ({why})")
 
-    def _check_stopped(self, name: str, child: _Child) -> None:
+    def _check_stopped(self, name: str, process: _Process) -> None:
         """Kill a process that has been stopped by a signal for too long."""
-        if child.process is None or not is_stopped(child.process.pid):
-            child.stopped_since_s = None
+        if process.process is None or not is_stopped(process.process.pid):
+            process.stopped_since_s = None
             return
         now_s = time.monotonic()
-        if child.stopped_since_s is None:
-            child.stopped_since_s = now_s
-        elif now_s - child.stopped_since_s > STOPPED_LIMIT_S:
+        if process.stopped_since_s is None:
+            process.stopped_since_s = now_s
+        elif now_s - process.stopped_since_s > STOPPED_LIMIT_S:
             log.error("the %s process stands still", name)
-            child.process.kill()
+            process.process.kill()
 
     def _kill_device(self, index: int) -> None:
         for name, of_index in self._devices.items():
-            process = self._children[name].process
+            process = self._processes[name].process
             if of_index == index and process is not None:
                 process.kill()
 
     def _end_all(self) -> None:
         """Stop all processes, by force after a grace period."""
-        for child in self._all_children:
-            child.tell(("stop",))
-        for child in self._all_children:
-            child.end()
+        for process in self._all_processes:
+            process.send(("stop",))
+        for process in self._all_processes:
+            process.end()
         self._wake_reader.close()
         self._wake_writer.close()

@@ -19,7 +19,7 @@ same time."""
 
 
 @dataclass(eq=False)
-class KeptState:
+class EyeState:
     """State of an eye's last frame that the next frame in the same state reuses.
 
     Attributes
@@ -39,13 +39,13 @@ class KeptState:
     blended: tuple[KernelPlan, NDArray[np.uint8], BlendSizes] | None = None
 
 
-class KeptStates:
+class EyeStates:
     """States of the most recently used eyes; those of released stores are dropped."""
 
     def __init__(self) -> None:
-        self._kept: list[KeptState] = []
+        self._kept: list[EyeState] = []
 
-    def of(self, handle: NativeStore) -> KeptState:
+    def of(self, handle: NativeStore) -> EyeState:
         """Return the state of an eye, and mark it as most recently used."""
         found = next((kept for kept in self._kept if kept.handle is handle), None)
         others = [
@@ -53,7 +53,7 @@ class KeptStates:
             for kept in self._kept
             if kept is not found and not kept.handle.is_released
         ]
-        found = found or KeptState(handle)
+        found = found or EyeState(handle)
         self._kept = [*others[1 - MAX_KEPT :], found]
         return found
 

@@ -6,9 +6,9 @@ import logging
 import resource
 
 import estimator.bounded_files  # noqa: F401  read now: later no file may be opened
-from filter_service.service.child import begin
-from filter_service.service.door import Door
+from filter_service.service.front_end import FrontEnd
 from filter_service.service.metrics import NoMetrics
+from filter_service.service.process_startup import begin
 
 MB = 10**6
 
@@ -17,7 +17,7 @@ log = logging.getLogger("ocufilter")
 
 def main() -> None:
     """Serve clients until the supervisor sends stop."""
-    keeper, config, others = begin("door")
+    supervisor, config, others = begin("front-end")
     # Parts of incomplete messages are invisible here.  Beyond the limit libzmq ends the
     # process, which frees its memory; sessions continue.
     limit = config.max_socket_mb * MB
@@ -26,14 +26,14 @@ def main() -> None:
     except (OSError, ValueError) as error:
         log.warning("max_socket_mb is not kept to on this system: %s", error)
     try:
-        door = Door(config, keeper)
+        front_end = FrontEnd(config, supervisor)
     except (OSError, NoMetrics) as error:
-        keeper.send(("failed", str(error)))
+        supervisor.send(("failed", str(error)))
         raise SystemExit(1) from None
-    keeper.send(("ready", door.endpoint))
+    supervisor.send(("ready", front_end.endpoint))
     for message, descriptors in others:
-        door.take_control(message, descriptors)
-    door.run()
+        front_end.take_control(message, descriptors)
+    front_end.run()
 
 
 if __name__ == "__main__":

@@ -12,12 +12,12 @@ from dataclasses import replace
 from filter_service.errors import OutOfMemory, RenderFailed
 from filter_service.messages import Dropped, ErrorReply, Frame, Reply, Result
 from filter_service.service.connections import Peer
+from filter_service.service.fair_queue import FairQueue
+from filter_service.service.image_positions import check_positions
 from filter_service.service.load import Load
-from filter_service.service.mailbox import Tracker
-from filter_service.service.places import check_places
-from filter_service.service.render_end import Held, RenderEnd, Unsent, completed
+from filter_service.service.render_client import Held, RenderClient, Unsent, completed
+from filter_service.service.router import Tracker
 from filter_service.service.session import Session, WaitingFrame
-from filter_service.service.turns import Turns
 
 MAX_UNSENT_RESULTS = 4  # large replies that a client has not read; bounds memory
 MARK_SENT_S = 0.03  # less than most frames take to filter
@@ -28,7 +28,7 @@ RETRY_AFTER_MS = 100.0
 Answer = Result | Dropped | ErrorReply
 
 
-class FrameDesk:
+class FrameQueue:
     """Queues frames of one device, passes them to its worker and returns the replies.
 
     Parameters
@@ -51,7 +51,7 @@ class FrameDesk:
     def __init__(
         self,
         sessions: Callable[[], Sequence[Session]],
-        render: RenderEnd,
+        render: RenderClient,
         send: Callable[[Peer, Reply], Tracker | None],
     ) -> None:
         self.n_rendered = self.n_dropped = 0
@@ -60,7 +60,7 @@ class FrameDesk:
         self._sessions = sessions
         self._render = render
         self._send = send
-        self._turns: Turns[str] = Turns()
+        self._queue: FairQueue[str] = FairQueue()
         self._leaving: Unsent = []  # results sent to clients that are gone
 
     def wait_s(self, now_s: float) -> float | None:
@@ -87,17 +87,17 @@ class FrameDesk:
 
     def forget(self, session: Session) -> None:
         """Forget the time that a session has used."""
-        self._turns.forget(session.key)
+        self._queue.forget(session.key)
 
     def take_in(
         self, session: Session, frame: Frame, received_s: float
     ) -> Frame | None:
         """Queue a frame as its client's newest; return the frame that it supersedes."""
-        check_places(session, frame)
+        check_positions(session, frame)
         waiting = WaitingFrame(frame, received_s, time.monotonic())
         superseded = session.take_in(waiting)
         session.lend(frame)
-        self._turns.arrive(session.key)
+        self._queue.arrive(session.key)
         return None if superseded is None else superseded.frame
 
     def _is_takeable(self, session: Session) -> bool:
@@ -126,7 +126,7 @@ class FrameDesk:
             or n_bytes > self._render.session_quota_bytes
         )
 
-    def hand_over_one(self) -> None:
+    def submit_one(self) -> None:
         """Hand over the next frame by fair queuing, if any may be handed over."""
         now_s = time.monotonic()
         ready = {
@@ -134,7 +134,7 @@ class FrameDesk:
             for s in self._sessions()
             if self._is_takeable(s) and self._is_ready(s, now_s)
         }
-        key = self._turns.next_of(ready)
+        key = self._queue.next_of(ready)
         if key is None:
             return
         session = ready[key]
@@ -147,12 +147,12 @@ class FrameDesk:
             self.answer(session, frame, dropped)
             return
         try:
-            self._render.hand_over(session, waiting)
+            self._render.submit(session, waiting)
         except OutOfMemory as error:
             failed = ErrorReply.from_exception(error, frame_id=frame.frame_id)
             self.answer(session, frame, failed)
 
-    def take_answer(
+    def accept_result(
         self,
         number: int,
         reply: Answer,
@@ -167,7 +167,7 @@ class FrameDesk:
             return
         # A frame filtered during another one delayed nobody.
         here_s = started_s if self._render.held else held.waiting.decoded_s
-        self._turns.note(held.session.key, used_s, here_s, started_s, ended_s)
+        self._queue.note(held.session.key, used_s, here_s, started_s, ended_s)
         self.filtered_s += used_s
         self.load.note(used_s, ended_s)
         if isinstance(reply, Result):

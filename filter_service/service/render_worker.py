@@ -25,7 +25,7 @@ from typing import Any
 
 from estimator.profiles.parse import EyeProfile
 from filter_service.errors import FilterError, NoSession, RenderFailed
-from filter_service.filtering.workshop import Workshop
+from filter_service.filtering.builder import Builder
 from filter_service.messages import (
     ErrorReply,
     EyeName,
@@ -34,15 +34,15 @@ from filter_service.messages import (
     Reply,
     SharedPlaces,
 )
-from filter_service.service.frame_in_slots import reply_in_slots
-from filter_service.service.link import Link, LinkClosed
+from filter_service.service.process_channel import Link, LinkClosed
 from filter_service.service.process_info import (
     give_memory_back,
     package_version,
     resident_memory_mb,
 )
 from filter_service.service.session_eyes import SessionEyes
-from filter_service.slots import Slot
+from filter_service.service.shared_memory_frame import reply_in_slots
+from filter_service.shared_memory import Slot
 
 IDLE_WAIT_S = 0.5
 ATTENTION_WAIT_S = 0.1
@@ -57,12 +57,12 @@ TRIM_AFTER_S = 10.0
 log = logging.getLogger("ocufilter")
 
 
-class RenderLoop:
+class RenderWorker:
     """Filters the frames received over a link.
 
     Parameters
     ----------
-    workshop : Workshop
+    builder : Builder
         Builder of all sessions' eyes; the loop closes it.
     read_profile : callable
         ``read_profile(body)`` returns a parsed profile, or raises a FilterError.
@@ -72,17 +72,17 @@ class RenderLoop:
 
     def __init__(
         self,
-        workshop: Workshop,
+        builder: Builder,
         read_profile: Callable[[dict[str, Any]], EyeProfile],
         *,
         max_cameras: int,
     ) -> None:
-        self._workshop = workshop
+        self._builder = builder
         self._read_profile = read_profile
         self._max_cameras = max_cameras
         self._sessions: dict[str, SessionEyes] = {}
         self._slots: dict[int, Slot] = {}
-        self._door: Link | None = None
+        self._front_end: Link | None = None
         self._inbox: deque[tuple[Any, list[int]]] = deque()
         self._next_state_s = 0.0
         self._trim_at_s: float | None = None  # None while frames hold no memory
@@ -91,7 +91,7 @@ class RenderLoop:
         self._next_rest_s = 0.0
         self._listen: Callable[[], None] = lambda: None
         self._is_over = False
-        self._may_rest = workshop.engine.call_between(self._rest, BETWEEN_S)
+        self._may_rest = builder.engine.call_between(self._rest, BETWEEN_S)
 
     def run(
         self, control: Link, take_control: Callable[[Any, list[int]], bool]
@@ -113,22 +113,22 @@ class RenderLoop:
 
         self._listen = listen
         try:
-            self._workshop.worker.start()
+            self._builder.worker.start()
             while not self._is_over:
                 self._watch(selector, control)
                 selector.select(self._wait_s())
                 listen()
-                self._turn()
+                self._run_once()
         except LinkClosed:
             log.error("the process that owns this one is gone")
         finally:
             self._close()
 
-    def join(self, door: Link) -> None:
+    def join(self, front_end: Link) -> None:
         """Serve a new front end; the previous one is gone."""
-        if self._door is not None:
-            self._door.close()
-        self._door = door
+        if self._front_end is not None:
+            self._front_end.close()
+        self._front_end = front_end
         self._drop_slots()
         while self._inbox:  # of the previous front end
             for descriptor in self._inbox.popleft()[1]:
@@ -136,9 +136,9 @@ class RenderLoop:
         server = {
             "name": "ocufilter",
             "version": package_version(),
-            "engine": self._workshop.engine_name,
-            "renderer": self._workshop.engine.name,
-            "gl_renderer": self._workshop.engine.name,  # its old name
+            "engine": self._builder.engine_name,
+            "renderer": self._builder.engine.name,
+            "gl_renderer": self._builder.engine.name,  # its old name
         }
         eyes = [(key, session.profiles) for key, session in self._sessions.items()]
         self._send(("here", server, eyes, self._may_rest))
@@ -147,14 +147,14 @@ class RenderLoop:
 
     def _watch(self, selector: selectors.BaseSelector, control: Link) -> None:
         wanted = {control.fileno(): selectors.EVENT_READ}
-        worker = self._workshop.worker.file_descriptor
+        worker = self._builder.worker.file_descriptor
         if worker is not None:
             wanted[worker] = selectors.EVENT_READ
-        if self._door is not None:
+        if self._front_end is not None:
             events = selectors.EVENT_READ
-            if self._door.has_unsent:
+            if self._front_end.has_unsent:
                 events |= selectors.EVENT_WRITE
-            wanted[self._door.fileno()] = events
+            wanted[self._front_end.fileno()] = events
         known = {key.fd: key for key in selector.get_map().values()}
         for descriptor in set(known) - set(wanted):
             selector.unregister(known[descriptor].fileobj)
@@ -165,33 +165,33 @@ class RenderLoop:
                 selector.modify(known[descriptor].fileobj, events)
 
     def _wait_s(self) -> float:
-        if self._workshop.is_warming:
+        if self._builder.is_warming:
             return 0.0
-        if self._workshop.worker.needs_attention_soon:
+        if self._builder.worker.needs_attention_soon:
             return ATTENTION_WAIT_S
         return IDLE_WAIT_S
 
-    def _turn(self, *, is_short: bool = False) -> None:
-        if self._door is not None:
+    def _run_once(self, *, is_short: bool = False) -> None:
+        if self._front_end is not None:
             try:
-                self._door.flush()
+                self._front_end.flush()
                 # Messages read during a frame must not overtake earlier ones.
-                self._inbox.extend(self._door.receive())
+                self._inbox.extend(self._front_end.receive())
                 while self._inbox:
                     self._handle(*self._inbox.popleft())
             except LinkClosed:
-                log.warning("the door is gone; sessions wait for the next one")
-                if self._door is not None:
-                    self._door.close()
-                self._door = None
+                log.warning("the front end ended; sessions wait for its replacement")
+                if self._front_end is not None:
+                    self._front_end.close()
+                self._front_end = None
         if is_short:
             return
-        self._workshop.advance()
+        self._builder.advance()
         if self._frame_since_s is None and self._is_time_to_trim:
             self._trim_at_s = None
-            self._workshop.engine.trim()
+            self._builder.engine.trim()
             give_memory_back()
-        self._tell_state()
+        self._send_state()
 
     @property
     def _is_time_to_trim(self) -> bool:
@@ -209,7 +209,7 @@ class RenderLoop:
             return
         try:
             self._listen()
-            self._turn(is_short=begin_s < since_s + LONG_FRAME_S)
+            self._run_once(is_short=begin_s < since_s + LONG_FRAME_S)
         except LinkClosed:
             self._is_over = True
         except Exception:  # must not propagate through the compiled loops
@@ -218,30 +218,30 @@ class RenderLoop:
         self._rested_s += end_s - begin_s
         self._next_rest_s = end_s + (end_s - begin_s)
 
-    def _tell_state(self, *, is_due: bool = False) -> None:
+    def _send_state(self, *, is_due: bool = False) -> None:
         now_s = time.monotonic()
         if is_due or now_s >= self._next_state_s:
             self._next_state_s = now_s + STATE_INTERVAL_S
-            is_building = self._workshop.worker.is_busy
-            stores_mb = self._workshop.stores_mb
+            is_building = self._builder.worker.is_busy
+            stores_mb = self._builder.stores_mb
             self._send(("state", resident_memory_mb(), stores_mb, is_building))
 
     def _send(self, message: tuple[Any, ...]) -> None:
-        if self._door is None:
+        if self._front_end is None:
             return
         try:
-            self._door.send(message)
+            self._front_end.send(message)
         except LinkClosed:
-            self._door.close()
-            self._door = None
+            self._front_end.close()
+            self._front_end = None
 
     def _close(self) -> None:
         for key in list(self._sessions):
             self._end_session(key)
-        self._workshop.close()
+        self._builder.close()
         self._drop_slots()
-        if self._door is not None:
-            self._door.close()
+        if self._front_end is not None:
+            self._front_end.close()
 
     # Messages
 
@@ -274,7 +274,7 @@ class RenderLoop:
         self._end_session(key)
         self._sessions[key] = SessionEyes(
             session_id,
-            self._workshop,
+            self._builder,
             partial(self._tell, key),
             max_cameras=self._max_cameras,
             generations=generations,
@@ -290,7 +290,7 @@ class RenderLoop:
         session = self._sessions.get(key)
         if session is not None:
             self._tell(key, request.eye, session.take(request, self._read_profile))
-            self._tell_state(is_due=True)
+            self._send_state(is_due=True)
 
     def _tell(self, key: str, eye: EyeName, reply: Reply) -> None:
         self._send(("tell", key, eye, reply))

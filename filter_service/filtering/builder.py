@@ -75,7 +75,7 @@ PROGRESS_INTERVAL_S = 0.1
 log = logging.getLogger("ocufilter")
 
 
-class Workshop:
+class Builder:
     """Estimates eyes in the build worker, and computes PSFs before frames need them.
 
     Parameters
@@ -361,7 +361,7 @@ class Workshop:
             return
         store = prepared.store
         try:
-            for state in stream.use.states_ahead():
+            for state in stream.use.predicted_states():
                 left = store.missing_psfs(last, state=state)
                 if left.size:
                     store.fill(left, until_s=until_s, batch_count=WARM_BATCH)

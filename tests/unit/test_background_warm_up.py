@@ -4,15 +4,15 @@ import threading
 
 import pytest
 
-from filter_service.building import head_start
-from filter_service.building.head_start import COMPILING_STAGE, HeadStart
+from filter_service.building import background_warm_up
+from filter_service.building.background_warm_up import COMPILING_STAGE, BackgroundWarmUp
 from filter_service.errors import BuildCancelled
 
 
 @pytest.fixture(autouse=True)
 def soon(monkeypatch):
-    monkeypatch.setattr(head_start, "QUIET_S", 0.02)
-    monkeypatch.setattr(head_start, "POLL_S", 0.01)
+    monkeypatch.setattr(background_warm_up, "QUIET_S", 0.02)
+    monkeypatch.setattr(background_warm_up, "POLL_S", 0.01)
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def release():
 
 def test_a_build_waits_and_says_why(release, caplog):
     caplog.set_level("INFO")
-    start, said = HeadStart(release.wait), []
+    start, said = BackgroundWarmUp(release.wait), []
 
     def progress(fraction, stage):
         said.append((fraction, stage))
@@ -37,7 +37,9 @@ def test_a_build_waits_and_says_why(release, caplog):
 
 def test_what_takes_no_progress_waits_for_nothing(release):
     said = []
-    progress = HeadStart(release.wait).before(lambda *of: said.append(of), lambda: 0)
+    progress = BackgroundWarmUp(release.wait).before(
+        lambda *of: said.append(of), lambda: 0
+    )
     assert not said
     release.set()
     progress(0.5, "eye")
@@ -48,19 +50,19 @@ def test_what_takes_no_progress_waits_for_nothing(release):
 def test_what_is_there_already_is_not_spoken_of(caplog):
     caplog.set_level("INFO")
     said = []
-    HeadStart(lambda: None).wait(lambda *of: said.append(of), lambda: False)
+    BackgroundWarmUp(lambda: None).wait(lambda *of: said.append(of), lambda: False)
     assert not said and not caplog.text
 
 
 def test_a_cancelled_build_does_not_wait(release):
     with pytest.raises(BuildCancelled):
-        HeadStart(release.wait).wait(lambda *_: None, lambda: True)
+        BackgroundWarmUp(release.wait).wait(lambda *_: None, lambda: True)
 
 
 def test_a_head_start_that_fails_stops_no_build(caplog):
     def fail():
         raise OSError("disk full")
 
-    HeadStart(fail).wait(lambda *_: None, lambda: False)
+    BackgroundWarmUp(fail).wait(lambda *_: None, lambda: False)
     assert "could not prepare for builds" in caplog.text
     assert "disk full" in caplog.text
