@@ -41,7 +41,7 @@ try:
     from clients.frame_log import FrameLog
     from clients.pyrender_stream import path_settings
     from clients.scene_renderer import SceneFrame, scene_frames
-    from clients.scenes.catalogue import build_scene
+    from clients.scenes.catalog import build_scene
     from clients.streaming import change_eye, filter_in_order
     from clients.video import write_video
 except ModuleNotFoundError as error:

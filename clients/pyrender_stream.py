@@ -42,7 +42,7 @@ try:
         frame_at,
         scene_frames,
     )
-    from clients.scenes.catalogue import SCENE_BUILDERS, build_scene
+    from clients.scenes.catalog import SCENE_BUILDERS, build_scene
     from clients.scenes.paths import PATHS, path_moments
     from clients.scenes.scene import Scene
     from clients.streaming import view_of

@@ -1,9 +1,9 @@
-"""First picture: what a person with -6 dioptres sees of a courtyard without glasses.
+"""First picture: what a person with -6 diopters sees of a courtyard without glasses.
 
     python examples/01_first_picture.py
 
-Five lines do it: a scene, an eye, a frame.  Distances are in metres, pupils in
-millimetres, focus in dioptres (1 / metres; 0 is far away).
+Five lines do it: a scene, an eye, a frame.  Distances are in meters, pupils in
+millimeters, focus in diopters (1 / meters; 0 is far away).
 """
 
 from common import load_courtyard, save_pictures
@@ -16,5 +16,5 @@ with EyeFilter("myopia", camera) as eye:
 
 save_pictures(
     "01_first_picture.png",
-    [("the scene", color), ("-6 dioptres, pupil 4 mm, looking far away", seen.color)],
+    [("the scene", color), ("-6 diopters, pupil 4 mm, looking far away", seen.color)],
 )

@@ -70,7 +70,7 @@ axes = horizon.subplots()
 axes.plot(along_deg, refraction_dpt, color="#0b5d8a")
 axes.axhline(0.0, color="#59636c", linewidth=0.8)
 axes.set_xlabel("direction, degrees (the person's right is +)")
-axes.set_ylabel("refraction, dioptres")
+axes.set_ylabel("refraction, diopters")
 axes.set_title("Refraction along the horizon")
 axes.grid(alpha=0.3)
 

@@ -2,8 +2,8 @@
 
     python examples/03_own_scene.py
 
-Here three cards hang before a wall, at 25 cm, 1 m and 5 m.  Colour is an array of 8-bit
-sRGB, distance one of 32-bit floats in metres: what a renderer or a depth camera gives.
+Here three cards hang before a wall, at 25 cm, 1 m and 5 m.  Color is an array of 8-bit
+sRGB, distance one of 32-bit floats in meters: what a renderer or a depth camera gives.
 A person of 40, who cannot focus quite as near as 25 cm, looks at each card in turn.
 """
 

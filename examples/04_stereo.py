@@ -31,7 +31,7 @@ px_per_tangent = HEIGHT_PX / (camera.tangents[2] - camera.tangents[3])
 
 
 def rendered(eye_x_m):
-    """Colour and distance of the cards, for an eye so far to the right."""
+    """Color and distance of the cards, for an eye so far to the right."""
     picture = Image.new("RGB", (WIDTH_PX, HEIGHT_PX), "#9db0a5")
     draw = ImageDraw.Draw(picture)
     depth_m = np.full((HEIGHT_PX, WIDTH_PX), WALL_M, np.float32)
@@ -68,7 +68,7 @@ save_pictures(
     [
         ("left view", views[0].color),
         ("right view", views[1].color),
-        ("left eye, -2.5 dioptres, focused at 2 m", seen[0].color),
+        ("left eye, -2.5 diopters, focused at 2 m", seen[0].color),
         ("right eye, no error, focused at 2 m", seen[1].color),
     ],
 )

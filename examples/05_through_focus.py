@@ -17,7 +17,7 @@ CARD_DPT = 2.0  # 50 cm
 FOCI_DPT = (0.0, 1.0, 2.0, 3.0, 4.0)
 EYES = {
     "no error": "emmetropia",
-    "-3 dioptres": {"kind": "prescription", "sphere_dpt": -3.0},
+    "-3 diopters": {"kind": "prescription", "sphere_dpt": -3.0},
     "after LASIK": "post_lasik",
 }
 

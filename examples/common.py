@@ -1,7 +1,7 @@
 """What the examples share: a scene to look at, and pictures in a row.
 
-The scene is a courtyard of 480 x 270 pixels: colour in a JPEG, distance in a 16-bit PNG
-of millimetres, in which 65535 stands for the sky.
+The scene is a courtyard of 480 x 270 pixels: color in a JPEG, distance in a 16-bit PNG
+of millimeters, in which 65535 stands for the sky.
 """
 
 from pathlib import Path
@@ -21,10 +21,10 @@ GAP_PX = 6
 
 
 def load_courtyard():
-    """Return colour (sRGB, 8 bits), distance in metres, and the camera."""
+    """Return color (sRGB, 8 bits), distance in meters, and the camera."""
     color = np.array(Image.open(DATA / "courtyard.jpg"))
-    millimetres = np.array(Image.open(DATA / "courtyard_depth.png"))
-    depth_m = np.where(millimetres == SKY_MM, np.inf, millimetres / 1000.0)
+    millimeters = np.array(Image.open(DATA / "courtyard_depth.png"))
+    depth_m = np.where(millimeters == SKY_MM, np.inf, millimeters / 1000.0)
     height_px, width_px = depth_m.shape
     camera = Camera.from_fov(FIELD_OF_VIEW_DEG, width_px=width_px, height_px=height_px)
     return color, depth_m.astype(np.float32), camera

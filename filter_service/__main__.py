@@ -36,7 +36,7 @@ app = typer.Typer(
     name="ocufilter",
     help="See through another person's eyes.  Start with `ocufilter demo`; "
     "`ocufilter doctor` says what this machine lacks.",
-    epilog="Units end names: mm, nm, dpt (dioptres; infinity is 0), deg.  "
+    epilog="Units end names: mm, nm, dpt (diopters; infinity is 0), deg.  "
     "Exit codes: 0 done, 1 failure, 2 bad input.",
     add_completion=False,
     rich_markup_mode=None,

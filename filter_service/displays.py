@@ -122,13 +122,13 @@ def primaries_of_spectra(
     try:
         shares = primary_shares(at_nm, power)
     except np.linalg.LinAlgError:
-        raise ValueError("spectra: red, green and blue must be three colours") from None
+        raise ValueError("spectra: red, green and blue must be three colors") from None
     own = np.stack([shares[k, k] / shares[k, k].sum() for k in range(3)])
     found_nm = own @ at_nm
     variance = np.sum(own * (at_nm - found_nm[:, None]) ** 2, axis=1)
     widths_nm = np.sqrt(np.clip(variance, 0.0, MAX_WIDTH_NM**2))
     if not np.isfinite(found_nm).all():
-        raise ValueError("spectra: red, green and blue must be three colours")
+        raise ValueError("spectra: red, green and blue must be three colors")
     red, green, blue = zip(found_nm.tolist(), widths_nm.tolist(), strict=True)
     return (red[0], green[0], blue[0]), (red[1], green[1], blue[1])
 
@@ -154,9 +154,9 @@ def matching_functions(wavelengths_nm: NDArray[np.float64]) -> NDArray[np.float6
     Fit of Wyman, Sloan & Shirley 2013, JCGT 2(2).
     """
 
-    def lobe(centre_nm: float, below_nm: float, above_nm: float) -> NDArray:
-        width_nm = np.where(wavelengths_nm < centre_nm, below_nm, above_nm)
-        return np.exp(-0.5 * ((wavelengths_nm - centre_nm) / width_nm) ** 2)
+    def lobe(center_nm: float, below_nm: float, above_nm: float) -> NDArray:
+        width_nm = np.where(wavelengths_nm < center_nm, below_nm, above_nm)
+        return np.exp(-0.5 * ((wavelengths_nm - center_nm) / width_nm) ** 2)
 
     return np.stack(
         [

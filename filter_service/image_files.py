@@ -27,7 +27,7 @@ DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff", ".exr", ".pfm", ".pgm")
 OUTPUT_SUFFIXES = (".png", ".npy", ".exr")
 LINEAR_SUFFIXES = (".npy", ".exr")
 
-METRES_PER_INTEGER_STEP = 0.001
+METERS_PER_INTEGER_STEP = 0.001
 """Default depth scale of integer files: millimeters, as from depth cameras."""
 
 ROW_VALUES = 1 << 20
@@ -105,7 +105,7 @@ def read_depth(
         if stored.dtype == np.uint8:  # in mm it would end at 25 cm
             allowed = "16 bits in mm, 32-bit float in m; with --depth-scale also 8 bits"
             _refuse(option, path, "8 bits deep", allowed)
-        depth_scale = 1.0 if stored.dtype.kind == "f" else METRES_PER_INTEGER_STEP
+        depth_scale = 1.0 if stored.dtype.kind == "f" else METERS_PER_INTEGER_STEP
     if not (math.isfinite(depth_scale) and depth_scale > 0.0):
         raise ValueError(f"--depth-scale {depth_scale}: allowed is a positive number")
     return _scaled(stored, depth_scale)

@@ -155,7 +155,7 @@ def as_views(
     """
     if isinstance(color, np.ndarray):
         if depth_m is None:
-            raise BadMessage("it is missing", field="depth", allowed="depth in metres")
+            raise BadMessage("it is missing", field="depth", allowed="depth in meters")
         if camera is None:
             raise BadMessage(
                 "it is not known", field="camera", allowed="a camera, or an RgbdView"

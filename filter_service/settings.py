@@ -136,7 +136,7 @@ class FilterSettings(Record):
         ),
     ] = False
     diffraction: Annotated[bool, _doc("Off: geometrical optics only.")] = True
-    chromatic: Annotated[bool, _doc("Off: all colours are focused alike.")] = True
+    chromatic: Annotated[bool, _doc("Off: all colors are focused alike.")] = True
     lateral_color: Annotated[
         bool,
         _doc("Displace red and blue against green off the axis; a traced eye only."),
@@ -144,7 +144,7 @@ class FilterSettings(Record):
     stiles_crawford: Annotated[
         bool,
         _doc(
-            "Dim light towards the pupil's rim as cones see it, about the centre usual "
+            "Dim light toward the pupil's rim as cones see it, about the center usual "
             "for the eye's side."
         ),
     ] = False

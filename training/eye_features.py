@@ -194,7 +194,7 @@ class EyeFeatures(nn.Module):
             lens = _lens(other, one, zero)
             return of_offsets + excess_vergence(
                 retina_mm=cornea["length"],
-                surfaces=_centred(other, cornea, lens, apex[0]),
+                surfaces=_centered(other, cornea, lens, apex[0]),
                 indices=(*indices[::-1], one),
                 radius_mm=radius_mm,
                 pupil_z_mm=_pupil_depth_mm(cornea, lens),
@@ -316,7 +316,7 @@ def _apex_matrix() -> np.ndarray:
     return np.stack([xx + yy, xx - yy, xy, one], axis=1)
 
 
-def _centred(eye: Tensor, cornea: dict, lens: dict, offset_curvature: Tensor):
+def _centered(eye: Tensor, cornea: dict, lens: dict, offset_curvature: Tensor):
     """Return the surfaces without tilts and offsets, from the retina outward."""
     before_mm = cornea["thickness"] + lens["aqueous"]
     surfaces = (

@@ -57,7 +57,7 @@ class FocusFeatures(nn.Module):
             + aqueous_mm[:, None] * self.aqueous_column
         )
 
-    def _centred(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _centered(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return lens change, mm, its slope, mm/dpt, and the focus error, dpt (N,)."""
         eye, focus_dpt = x[:, :45], x[:, 46]
         lowest_mm, highest_mm = _room_mm(eye)
@@ -80,8 +80,8 @@ class FocusFeatures(nn.Module):
         return change_mm, slope / torch.clamp(share, *SLOPE_SHARES), missed_dpt
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return features (N, 54); the last three are those of `_centred`."""
-        change_mm, slope, missed_dpt = self._centred(x)
+        """Return features (N, 54); the last three are those of `_centered`."""
+        change_mm, slope, missed_dpt = self._centered(x)
         one, zero = torch.ones_like(x[:, 0]), torch.zeros_like(x[:, 0])
         color_nm = torch.full_like(one, REFERENCE_WAVELENGTH_NM)
         focused = self._accommodated(x[:, :45], change_mm)

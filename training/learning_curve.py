@@ -42,7 +42,7 @@ def plot(rows: list[Judged], file: Path) -> None:
         1, 2, figsize=(10, 4.5), sharey=True, layout="constrained"
     )
     for number, task in enumerate(dict.fromkeys(row.task for row in rows)):
-        mine, colour = [row for row in rows if row.task == task], f"C{number}"
+        mine, color = [row for row in rows if row.task == task], f"C{number}"
         for axes, name, kept in (
             (by_rows, "rows_seen", [r for r in mine if r.width == WIDTH]),
             (by_weights, "n_parameters", _of_one_budget(mine)),
@@ -50,8 +50,8 @@ def plot(rows: list[Judged], file: Path) -> None:
             kept.sort(key=lambda row: getattr(row, name))
             x = [getattr(row, name) / 1e6 for row in kept]
             y = [row.error["mean_abs"] for row in kept]
-            axes.loglog(x, y, "o-", color=colour, label=f"{task}, {TASKS[task].unit}")
-            axes.axhline(PUBLISHED[task, "ours", ""], color=colour, linestyle="--")
+            axes.loglog(x, y, "o-", color=color, label=f"{task}, {TASKS[task].unit}")
+            axes.axhline(PUBLISHED[task, "ours", ""], color=color, linestyle="--")
     by_rows.plot([], [], "k--", label="the paper's, 72 million weights")
     label = "mean absolute error against ray tracing"
     by_rows.set(xlabel="rows seen, millions", ylabel=label)

@@ -30,7 +30,7 @@ from training.losses import (
     physical_loss,
     standard_loss,
 )
-from training.optimiser import make_optimiser, pace
+from training.optimizer import make_optimizer, pace
 from training.run_file import Run, RunFileError, read_run
 from training.validation import validation_error
 
@@ -91,14 +91,14 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict:
             load_checkpoint(Path(settings.start_from))[0].state_dict()
         )
     network.to(device)
-    optimiser = make_optimiser(
+    optimizer = make_optimizer(
         network.parameters(),
         learning_rate=settings.learning_rate,
         weight_decay=settings.weight_decay,
     )
     folder = run.output_folder
     folder.mkdir(parents=True, exist_ok=True)
-    step, spent_s, smooth, entry = _resumed(run, batches, network, optimiser)
+    step, spent_s, smooth, entry = _resumed(run, batches, network, optimizer)
     if rank == 0:
         _cut_log(folder / LOG, step)
     model = _Whole(network, _loss(run, device))
@@ -118,16 +118,16 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict:
                 decay_per_epoch=settings.decay_per_epoch,
                 final_ratio=settings.final_ratio,
             )
-            optimiser.set_pace(
+            optimizer.set_pace(
                 learning_rate=settings.learning_rate * share,
                 weight_decay=settings.weight_decay * share,
             )
             network.train()
             network.is_mixed = device.type == "cuda" and step < n_mixed
             loss = model(x, y)
-            optimiser.zero_grad()
+            optimizer.zero_grad()
             loss.backward()
-            optimiser.step()
+            optimizer.step()
             step += 1
             value = float(loss.detach())
             smooth = value if smooth is None else 0.98 * smooth + 0.02 * value
@@ -154,7 +154,7 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict:
                     network,
                     run,
                     {
-                        "optimiser": optimiser.state_dict(),
+                        "optimizer": optimizer.state_dict(),
                         "step": step,
                         "n_steps": n_steps,
                         "rows_per_step": batches.rows_per_step,
@@ -180,7 +180,7 @@ def _finished_log(run: Run) -> dict:
     return state["log"] if is_done else {}
 
 
-def _resumed(run: Run, batches: Batches, network, optimiser) -> tuple:
+def _resumed(run: Run, batches: Batches, network, optimizer) -> tuple:
     """Restore a checkpoint; return step, seconds spent, loss and last entry."""
     file = run.output_folder / CHECKPOINT
     if not file.exists():
@@ -195,7 +195,7 @@ def _resumed(run: Run, batches: Batches, network, optimiser) -> tuple:
             "as before, or remove it to start anew"
         )
     network.load_state_dict(saved.state_dict())
-    optimiser.load_state_dict(state["optimiser"])
+    optimizer.load_state_dict(state["optimizer"])
     return state["step"], state["seconds"], state["smooth_loss"], state["log"]
 
 

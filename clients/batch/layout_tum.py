@@ -75,7 +75,7 @@ def _listed(path: Path) -> list[tuple[str, str]]:
         color, depth = (second, first) if first.startswith("depth/") else fields[1::2]
         if color in seen:
             found = f"line {number}: '{color:.60}' again"
-            raise InvalidFile(path, found, "each image of colour once")
+            raise InvalidFile(path, found, "each image of color once")
         seen.add(color)
         pairs.append((color, depth))
     return pairs

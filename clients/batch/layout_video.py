@@ -35,7 +35,7 @@ def video_frames(
 
     if depth is None:
         raise ValueError(
-            f"--depth: not given; allowed with '{source}': a video of 16-bit grey, or "
+            f"--depth: not given; allowed with '{source}': a video of 16-bit gray, or "
             "a folder of depth images"
         )
     count = frame_count(source)

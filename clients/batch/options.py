@@ -29,7 +29,7 @@ from filter_service.settings import (
 )
 
 DESCRIPTION = """\
-Folders and videos of colour and depth, as people see them: each frame through each
+Folders and videos of color and depth, as people see them: each frame through each
 profile, on all cores.  Started again after whatever happened, it does what is missing.
 
   ocufilter batch rgbd_dataset_freiburg1_desk -p myopia -p keratoconus -o seen
@@ -46,7 +46,7 @@ layouts, found by what is in the folder:
   middlebury  im0.png, disp0.pfm, calib.txt of one scene or of a folder of scenes
   pairs       color/ and depth/, or NAME_color with NAME_depth; depth as PNG of 16 bits,
               float TIFF, NPY, EXR, PFM; wants --fov-deg or --intrinsics
-  video       colour in a video, depth in another of 16-bit grey, or in a folder
+  video       color in a video, depth in another of 16-bit gray, or in a folder
 
 results: OUT/PROFILE/FRAME.png, or OUT/PROFILE.mkv; OUT/manifest.jsonl has a line for
 each frame, OUT/manifest.json the whole.  Exit codes: 0 done, 1 some frames failed,
@@ -92,7 +92,7 @@ def _add_source(group) -> None:
         "--depth", type=Path, metavar="PATH", help="folder or video of depth"
     )
     group.add_argument(
-        "--depth-scale", type=float, metavar="M", help="metres per unit of its numbers"
+        "--depth-scale", type=float, metavar="M", help="meters per unit of its numbers"
     )
     group.add_argument("--fov-deg", type=float, help="vertical field of view, deg")
     group.add_argument(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service import Camera, tangents_from_fov
-from filter_service.image_files import METRES_PER_INTEGER_STEP, read_depth
+from filter_service.image_files import METERS_PER_INTEGER_STEP, read_depth
 
 Tangents = tuple[float, float, float, float]
 
@@ -96,7 +96,7 @@ class Scaled:
 
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
         """Return the depth in a video frame, m."""
-        scale_m = self.depth_scale_m or METRES_PER_INTEGER_STEP
+        scale_m = self.depth_scale_m or METERS_PER_INTEGER_STEP
         with np.errstate(over="ignore"):
             return (stored * np.float64(scale_m)).astype(np.float32)
 

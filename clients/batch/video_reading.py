@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from estimator.bounded_files import InvalidFile, reason_of
 
-GREY = ("gray16le", "gray16be")
+GRAY = ("gray16le", "gray16be")
 
 MAX_VIDEO_PIXELS = 1 << 25
 """Pixels of a frame, as in 8K: a decoder holds up to 17 frames, and one more in
@@ -127,11 +127,11 @@ class VideoReader:
             The video is of another kind.
         """
         frame = self._frame(index)
-        if frame.format.name not in GREY:
+        if frame.format.name not in GRAY:
             raise InvalidFile(
                 self._path,
                 f"pixels are {frame.format.name}",
-                "16-bit grey without loss, as `ffmpeg -pix_fmt gray16le -c:v ffv1`",
+                "16-bit gray without loss, as `ffmpeg -pix_fmt gray16le -c:v ffv1`",
             )
         return self._array(frame).astype(np.uint16)
 

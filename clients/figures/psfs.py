@@ -42,7 +42,7 @@ def ray_directions_mrad(wavefront: PupilWavefront) -> NDArray[np.float64]:
     return slopes[in_circle(SLOPE_COUNT).ravel()]
 
 
-def centred(wavefront: PupilWavefront) -> tuple[PupilWavefront, float]:
+def centered(wavefront: PupilWavefront) -> tuple[PupilWavefront, float]:
     """Return the wavefront with its blur centered, and the blur's radius, arcmin."""
     slopes = ray_directions_mrad(wavefront)
     middle = (slopes.min(axis=0) + slopes.max(axis=0)) / 2.0
@@ -122,7 +122,7 @@ def draw_psfs(panel: FigureBase, study: EyeStudy) -> None:
     }
     grid = panel.subplots(2, 2)
     for across, (name, wavefronts) in zip(grid, rows.items(), strict=True):
-        pictures = [centred(wavefront) for wavefront in wavefronts]
+        pictures = [centered(wavefront) for wavefront in wavefronts]
         reach_arcmin = max(reach for _, reach in pictures)
         side_arcmin = max(LEAST_SIDE_ARCMIN, 2.0 * ROOM_RATIO * reach_arcmin)
         for axes, (wavefront, _) in zip(across, pictures, strict=True):

@@ -63,7 +63,7 @@ def built_scene(name: str) -> Scene:
 def main(name: str, file: str) -> None:
     """Build a scene and write it to a file, in the child process."""
     try:
-        from clients.scenes.catalogue import build_scene
+        from clients.scenes.catalog import build_scene
     except ModuleNotFoundError as error:
         sys.exit(what_to_install(error))
     content = pickle.dumps(build_scene(name))

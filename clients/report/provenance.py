@@ -25,7 +25,7 @@ def provenance_table(study: EyeStudy, cite: Citations) -> Table:
         _periphery(study, cite),
         _accommodation(study, cite),
         _shape(study, cite),
-        ("Colour", TYPICAL, f"longitudinal colour of measured eyes {cite('colour')}"),
+        ("Color", TYPICAL, f"longitudinal color of measured eyes {cite('color')}"),
         _media(study, cite),
         _nerves(cite),
         _worn(study),

@@ -7,14 +7,14 @@ SOURCES = {
     "visual aberrations across the entire visual field with interactive "
     "personalization: the eye model, and the measured conditions among the presets",
     "osa": "Thibos, Applegate, Schwiegerling & Webb 2002 (J Refract Surg 18:S652): "
-    "Zernike terms, their order and normalisation",
+    "Zernike terms, their order and normalization",
     "vectors": "Thibos, Wheeler & Horner 1997 (Optom Vis Sci 74:367): M, J0, J45",
     "typical": "Thibos, Hong, Bradley & Cheng 2002 (JOSA A 19:2329): typical "
     "higher-order aberrations of 200 eyes",
     "growth": "Berrio, Tabernero & Artal 2010 (J Vis 10(14):34): their growth with age",
     "amplitude": "Anderson, Hentz, Glasser et al. 2008 (IOVS 49:2919): objective "
     "amplitude of accommodation by age",
-    "colour": "Thibos, Ye, Zhang & Bradley 1992 (Appl Opt 31:3594): the chromatic eye",
+    "color": "Thibos, Ye, Zhang & Bradley 1992 (Appl Opt 31:3594): the chromatic eye",
     "periphery": "Jaeken & Artal 2012 (IOVS 53:3405): wavefronts of 65 people over the "
     "horizontal meridian",
     "length": "Atchison 2006 (Vision Res 46:2236): eye length and corneal radius by "

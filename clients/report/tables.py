@@ -63,7 +63,7 @@ def _refraction_note(facts: EyeFacts) -> str:
     )
     light_nm = facts.study.found.wavelength_nm
     if light_nm != WAVELENGTH_NM:
-        note += f" Measured at {light_nm:g} nm, moved to 555 nm by the eye's colour."
+        note += f" Measured at {light_nm:g} nm, moved to 555 nm by the eye's color."
     lens = facts.study.profile.correction
     if lens is not None:
         note += (

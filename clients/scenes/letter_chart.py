@@ -167,9 +167,9 @@ def _pixels(start: float, size: float, pitch: float, count: int) -> NDArray[np.i
 
 
 def _view(camera: Camera, ink: NDArray, distance_m: float) -> RgbdView:
-    grey = np.round(255.0 * srgb_from_linear(1.0 - ink)).astype(np.uint8)
+    gray = np.round(255.0 * srgb_from_linear(1.0 - ink)).astype(np.uint8)
     return RgbdView(
-        color=np.repeat(grey[..., None], 3, axis=2),
-        depth_m=np.full(grey.shape, distance_m, np.float32),
+        color=np.repeat(gray[..., None], 3, axis=2),
+        depth_m=np.full(gray.shape, distance_m, np.float32),
         tangents=camera.tangents,
     )

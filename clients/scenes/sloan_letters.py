@@ -22,8 +22,8 @@ def _box(x: Places, y: Places, x_range, y_range) -> Ink:
     return inside_x & (y >= y_range[0]) & (y <= y_range[1])
 
 
-def _ring(x: Places, y: Places, centre, outer: float) -> Ink:
-    radius = np.hypot(x - centre[0], y - centre[1])
+def _ring(x: Places, y: Places, center, outer: float) -> Ink:
+    radius = np.hypot(x - center[0], y - center[1])
     return (radius <= outer) & (radius >= outer - 1.0)
 
 

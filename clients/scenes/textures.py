@@ -89,9 +89,9 @@ def board(size_px, lines, *, paper: str, ink: str, grain: float = 0.1) -> Array:
     width, height = size_px
     image = Image.new("RGB", size_px, paper)
     draw = ImageDraw.Draw(image)
-    for text, centre, font_px, color in lines:
+    for text, center, font_px, color in lines:
         draw.text(
-            (width / 2, centre * height),
+            (width / 2, center * height),
             text,
             fill=color or ink,
             font=ImageFont.load_default(size=font_px),

@@ -102,6 +102,6 @@ def distance_text(vergence_dpt: float) -> str:
     """Return a distance in dpt and in meters or centimeters."""
     if vergence_dpt < 0.005:
         return "0 dpt · far away"
-    metres = 1.0 / vergence_dpt
-    told = f"{100 * metres:.0f} cm" if metres < 1.0 else f"{metres:.1f} m"
+    meters = 1.0 / vergence_dpt
+    told = f"{100 * meters:.0f} cm" if meters < 1.0 else f"{meters:.1f} m"
     return f"{vergence_dpt:.2f} dpt · {told}"

@@ -33,7 +33,7 @@ readers."""
 
 DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff", ".exr")
 FAR_DPT = 0.0
-DEPTH_HELP = ".npy or .exr in metres, 16-bit .png in millimetres, float .tif"
+DEPTH_HELP = ".npy or .exr in meters, 16-bit .png in millimeters, float .tif"
 
 
 @dataclass(frozen=True)

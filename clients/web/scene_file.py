@@ -147,7 +147,7 @@ def main(source: str, file: str, size: str) -> int:
     """Render a scene and write it to a file, in the child process."""
     try:
         from clients.scene_renderer import SceneRenderer
-        from clients.scenes.catalogue import build_scene
+        from clients.scenes.catalog import build_scene
     except ModuleNotFoundError as error:
         sys.stderr.write(what_to_install(error) + "\n")
         return 1

@@ -108,7 +108,7 @@ def optical_transfer(
         it; a honeycomb of lenslets.
     """
     if pupil_screen is not None and pupil_screen.lattice_mm is not None:
-        raise ValueError("pupil_screen: rings about one centre, not lenslets")
+        raise ValueError("pupil_screen: rings about one center, not lenslets")
     if not np.all(np.isfinite(zernike_um)):
         raise ValueError("zernike_um: all 28 coefficients must be finite")
     per_mm_cpd = math.radians(1.0) * NM_PER_MM / wavelength_nm

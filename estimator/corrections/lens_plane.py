@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
 
-ROTATION_CENTRE_MM = 13.5
+ROTATION_CENTER_MM = 13.5
 """Depth of the eye's center of rotation behind the cornea."""
 
 
@@ -21,7 +21,7 @@ def lens_point_mm(
     The origin is in front of the pupil of an eye that looks straight ahead.  Gaze
     rotates about the center of rotation, field directions about the entrance pupil.
     """
-    by_gaze_mm = vertex_mm + ROTATION_CENTRE_MM
+    by_gaze_mm = vertex_mm + ROTATION_CENTER_MM
     by_field_mm = vertex_mm + TYPICAL_ENTRANCE_PUPIL_MM
     x, y = (
         by_gaze_mm * np.tan(np.radians(gaze)) + by_field_mm * np.tan(direction)

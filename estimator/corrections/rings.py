@@ -69,8 +69,8 @@ class DiffractiveRings:
 
     def added_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
         """Return the power (K,) of each order relative to the far focus."""
-        colour = wavelength_nm / self.design_nm
-        return self.spacing_dpt * (self.followed_orders * colour - self.far_order)
+        color = wavelength_nm / self.design_nm
+        return self.spacing_dpt * (self.followed_orders * color - self.far_order)
 
     @property
     def lattice_mm(self) -> None:

@@ -211,8 +211,8 @@ class AccommodatingEye(Focusing):
 
     def _taken_off_dpt(self, pupil_diameter_mm: float) -> float:
         """Return M of the correction through a pupil."""
-        at_centre_dpt, per_mm2 = self._correction_dpt
-        return at_centre_dpt + per_mm2 * (pupil_diameter_mm / 2.0) ** 2
+        at_center_dpt, per_mm2 = self._correction_dpt
+        return at_center_dpt + per_mm2 * (pupil_diameter_mm / 2.0) ** 2
 
     def accommodation_for_dpt(
         self, refraction_dpt: float, *, pupil_diameter_mm: float

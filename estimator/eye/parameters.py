@@ -67,7 +67,7 @@ def _offset_row(index: int) -> Parameter:
         (-allowed, allowed),
         0.0,
         deviation,
-        f"anterior offset, un-normalised Zernike ({n},{m}), towards the retina",
+        f"anterior offset, un-normalized Zernike ({n},{m}), toward the retina",
     )
 
 
@@ -88,9 +88,9 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter("cornea_posterior_conic_constant", (-1.5, -0.01), (-1.8, 0.1),
               -0.34, 0.24, "0 is a sphere, -1 a paraboloid"),
     Parameter("cornea_anterior_rotation_deg", (-45.0, 45.0), (-45.0, 45.0), 0.0, 5.0,
-              "about z, from x towards y"),
+              "about z, from x toward y"),
     Parameter("cornea_posterior_rotation_deg", (-45.0, 45.0), (-45.0, 45.0), 0.0, 5.0,
-              "about z, from x towards y"),
+              "about z, from x toward y"),
     *(_offset_row(index) for index in range(1, N_TERMS)),
     Parameter("aqueous_thickness_mm", (1.5, 4.5), (1.5, 4.5), 2.90, 0.39,
               "posterior cornea to the anterior pole of the lens, which is the stop"),

@@ -36,8 +36,8 @@ def media_density(
     return scattered + tryptophan + young + old_ultraviolet + old + 0.111
 
 
-def _bell(nm: NDArray, centre_nm: float, slope: float) -> NDArray[np.float64]:
-    return np.exp(-np.square(slope * (nm - centre_nm)))
+def _bell(nm: NDArray, center_nm: float, slope: float) -> NDArray[np.float64]:
+    return np.exp(-np.square(slope * (nm - center_nm)))
 
 
 def channel_gains(

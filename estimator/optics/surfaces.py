@@ -137,7 +137,7 @@ def horner_order() -> NDArray[np.int64]:
 
 
 @cache
-def _unnormalised_monomials() -> NDArray[np.float64]:
+def _unnormalized_monomials() -> NDArray[np.float64]:
     norms = [
         math.sqrt((2 - (m == 0)) * (n + 1))
         for n, m in (nm_from_index(j) for j in range(N_TERMS))
@@ -156,7 +156,7 @@ def offset_monomials(offset_mm: ArrayLike, *, offset_radius_mm: ArrayLike) -> ND
     """
     degree = EXPONENTS.sum(axis=1)
     radius_mm = np.asarray(offset_radius_mm, dtype=np.float64)[..., None]
-    monomials = np.asarray(offset_mm, dtype=np.float64) @ _unnormalised_monomials()
+    monomials = np.asarray(offset_mm, dtype=np.float64) @ _unnormalized_monomials()
     return (monomials / radius_mm**degree)[..., horner_order()]
 
 

@@ -14,7 +14,7 @@ from estimator.periphery.population import POPULATION_FILE, Population
 
 SOURCE = (
     "Jaeken & Artal, IOVS 53(7), 2012: half of 65 people's eyes along the horizontal "
-    "meridian, 4 mm, as distributed with ISETBio (MIT licence)"
+    "meridian, 4 mm, as distributed with ISETBio (MIT license)"
 )
 
 

@@ -131,8 +131,8 @@ def _regressed(
     for k, column in enumerate(changes_um.T):
         known = np.isfinite(column)
         inputs = axis_um[known] / deviation_um
-        centre = inputs.mean(axis=0)
-        inputs, targets = inputs - centre, column[known] - column[known].mean()
+        center = inputs.mean(axis=0)
+        inputs, targets = inputs - center, column[known] - column[known].mean()
         square = inputs.T @ inputs
         ridge = np.linalg.inv(square + np.diag(penalty))
         weights = ridge @ inputs.T @ targets
@@ -141,7 +141,7 @@ def _regressed(
         freedom = float(np.trace(ridge @ square)) / known.sum()
         weights *= max(1.0 - freedom * left / explained, 0.0)
         slopes[k] = weights / deviation_um
-        mean_um.append(column[known].mean() - centre @ weights)
+        mean_um.append(column[known].mean() - center @ weights)
     return slopes, np.array(mean_um)
 
 

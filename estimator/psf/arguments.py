@@ -82,8 +82,8 @@ def checked_ellipse(
     array = np.asarray(pupil_ellipse, dtype=np.float64)
     if array.shape not in ((ELLIPSE_COLUMNS,), (count, ELLIPSE_COLUMNS)):
         raise ValueError(
-            f"pupil_ellipse has shape {array.shape}: must be ({count}, 5), centre x, "
-            "centre y, semi-major, semi-minor in mm and the angle in rad"
+            f"pupil_ellipse has shape {array.shape}: must be ({count}, 5), center x, "
+            "center y, semi-major, semi-minor in mm and the angle in rad"
         )
     array = broadcast_copy(array, (count, ELLIPSE_COLUMNS))
     if not np.all(np.isfinite(array)) or not np.all(array[:, 2:4] > 0.0):

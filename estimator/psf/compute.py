@@ -238,7 +238,7 @@ def plan_psfs(
             wavelength_nm=wavelength_nm,
             pixel_from_mrad=pixel_from_mrad,
             pupil_ellipse=ellipse,
-            apodisation=(
+            apodization=(
                 stiles_crawford.amplitude(wavelength_nm) if stiles_crawford else None
             ),
         )

@@ -63,8 +63,8 @@ def _chord(y, r, shear, samples_x, middle):
     square = (r * r - y * y) * (1.0 - shear * shear)
     if r <= 0.0 or square <= 0.0:
         return 0.0, -1.0
-    half, centre = 0.5 * samples_x * math.sqrt(square), 0.5 * samples_x * shear * y
-    return middle + centre - half, middle + centre + half
+    half, center = 0.5 * samples_x * math.sqrt(square), 0.5 * samples_x * shear * y
+    return middle + center - half, middle + center + half
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
@@ -126,9 +126,9 @@ def fill_mask(samples, shear, log_amplitude, edge, mask, spans):
     least = math.sqrt(mean - math.hypot(half, shear * ax * ay))
     border = (EDGE_HALF_WIDTH + 0.5) / least
     middle = (mx - 1) / 2.0
-    is_apodised = False
+    is_apodized = False
     for c in log_amplitude:
-        is_apodised = is_apodised or c != 0.0
+        is_apodized = is_apodized or c != 0.0
     for j in range(my):
         y = (j - (my - 1) / 2.0) / ay
         row = mask[j]
@@ -144,7 +144,7 @@ def fill_mask(samples, shear, log_amplitude, edge, mask, spans):
         _edge_row(first, in_first, x, y, shear, axes, edge, places, row)
         row[in_first:in_end] = edge[-1]
         _edge_row(in_end, end, x, y, shear, axes, edge, places, row)
-        if is_apodised:
+        if is_apodized:
             c0, c1, c2, c3, c4, c5 = log_amplitude
             for i in range(first, end):
                 exponent = c0 + x[i] * (c1 + c3 * x[i] + c4 * y) + y * (c2 + c5 * y)

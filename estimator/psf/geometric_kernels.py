@@ -168,9 +168,9 @@ def splat_pupil(polynomial, half, shear, log_amplitude, n_cells, image):
     boxes, weights = np.empty((6, n_cells), np.float32), np.empty(n_cells, np.float32)
     row = np.empty((3, 7), np.float32)
     room = 1.0 - shear * shear
-    is_apodised = False
+    is_apodized = False
     for c in log_amplitude:
-        is_apodised = is_apodised or c != 0.0
+        is_apodized = is_apodized or c != 0.0
     # Cells within this radius lie wholly inside, even at the ellipse's narrowest.
     inner = max(0.0, 1.0 - 0.75 * cell / math.sqrt(1.0 - abs(shear)))
     total = 0.0
@@ -193,8 +193,8 @@ def splat_pupil(polynomial, half, shear, log_amplitude, n_cells, image):
             steep = math.sqrt(slope_x * slope_x + slope_y * slope_y)
             depth = (1.0 - r) * r * room / max(steep, 1e-9)
             weights[i] = min(1.0, max(0.0, depth / cell + 0.5))
-        if is_apodised:
-            _apodise(x, y, log_amplitude, first, end, weights)
+        if is_apodized:
+            _apodize(x, y, log_amplitude, first, end, weights)
         for i in range(first, end):
             total += weights[i]
         factors = np.float32(1.0 / half[0]), np.float32(1.0 / half[1])
@@ -205,7 +205,7 @@ def splat_pupil(polynomial, half, shear, log_amplitude, n_cells, image):
 
 
 @njit(cache=True, nogil=True)
-def _apodise(x, y, log_amplitude, first, end, weights):
+def _apodize(x, y, log_amplitude, first, end, weights):
     c0, c1, c2, c3, c4, c5 = log_amplitude
     for i in range(first, end):
         exponent = c0 + x[i] * (c1 + c3 * x[i] + c4 * y) + y * (c2 + c5 * y)

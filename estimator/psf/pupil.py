@@ -144,12 +144,12 @@ def _frames(polynomial, radius, jacobian, ellipse, tables, box, disc, half, shea
             )
 
 
-def _log_amplitudes(apodisation, jacobian, ellipse, half) -> NDArray[np.float64]:
+def _log_amplitudes(apodization, jacobian, ellipse, half) -> NDArray[np.float64]:
     """Expand -k |u - u0|² (log amplitude) over boxes; k (P,) per mm², u0 (P, 2) mm."""
     log_amplitude = np.zeros((ellipse.shape[0], 6))
-    if apodisation is None:
+    if apodization is None:
         return log_amplitude
-    per_mm2, centre_mm = apodisation
+    per_mm2, centre_mm = apodization
     offset = ellipse[:, :2] - centre_mm
     matrix = np.swapaxes(jacobian, 1, 2) * half[:, None, :]
     square = np.swapaxes(matrix, 1, 2) @ matrix
@@ -179,7 +179,7 @@ def pupil_frames(
     wavelength_nm: NDArray[np.float64],
     pixel_from_mrad: NDArray[np.float64],
     pupil_ellipse: NDArray[np.float64] | None = None,
-    apodisation: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+    apodization: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> PupilFrames:
     """Convert pupils to pixel coordinates.
 
@@ -192,7 +192,7 @@ def pupil_frames(
         Visual angle (x right, y up) to image pixels (x right, y up).
     pupil_ellipse : (P, 5), optional
         See `ELLIPSE_COLUMNS`; default: the whole circle.
-    apodisation : ((P,), (P, 2)), optional
+    apodization : ((P,), (P, 2)), optional
         k in mm^-2 and center in mm of the amplitude exp(-k |u - u0|²).
     """
     count = polynomial_um.shape[0]
@@ -216,6 +216,6 @@ def pupil_frames(
         disc_polynomial_um=disc,
         half_width_um_per_px=half,
         shear_ratio=shear,
-        log_amplitude=_log_amplitudes(apodisation, jacobian, pupil_ellipse, half),
+        log_amplitude=_log_amplitudes(apodization, jacobian, pupil_ellipse, half),
         wavelength_nm=wavelength_nm,
     )

@@ -65,7 +65,7 @@ class _Pupil:
 
 
 def _pupil(
-    zernike_um, pupil_diameter_mm, wavelength_nm, jacobian, ellipse, apodisation
+    zernike_um, pupil_diameter_mm, wavelength_nm, jacobian, ellipse, apodization
 ):
     circle_mm = pupil_diameter_mm / 2.0
     if ellipse is None:
@@ -80,8 +80,8 @@ def _pupil(
     # Rotates the last row of `image` to (0, norm).
     swing = np.array([[image[1, 1], image[1, 0]], [-image[1, 0], image[1, 1]]]) / norm
     per_mm2, bright_mm = 0.0, np.zeros(2)
-    if apodisation is not None:
-        per_mm2, bright_mm = (np.asarray(part)[0] for part in apodisation)
+    if apodization is not None:
+        per_mm2, bright_mm = (np.asarray(part)[0] for part in apodization)
     return _Pupil(
         zernike_um=np.asarray(zernike_um, dtype=np.float64),
         circle_mm=circle_mm,
@@ -290,7 +290,7 @@ def reference_kernel(
     Gauss-Legendre nodes inside a pixel converge faster than exponentially.
     """
     jacobian = checked_scale(pixel_pitch_mrad, pixel_from_mrad, 1)[0]
-    apodisation = (
+    apodization = (
         stiles_crawford.amplitude(np.array([wavelength_nm], dtype=np.float64))
         if stiles_crawford
         else None
@@ -301,7 +301,7 @@ def reference_kernel(
         wavelength_nm,
         jacobian,
         pupil_ellipse,
-        apodisation,
+        apodization,
     )
     pixels = np.arange(-radius_px, radius_px + 1).astype(np.float64)
     # The phase of |E|² changes by at most 4 pi a / lambda per pixel, a the pupil's half

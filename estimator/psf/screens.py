@@ -21,7 +21,7 @@ BEYOND_EDGE = 1.5
 """Extent of tables in pupil radii: the smoothed edge extends beyond the pupil."""
 
 
-ONE_CENTRE = (0.0, 0.0, 0.0)
+ONE_CENTER = (0.0, 0.0, 0.0)
 """Lattice without a honeycomb."""
 
 
@@ -65,18 +65,18 @@ class ScreenTables:
         matrix = np.swapaxes(pixel_from_mrad, 1, 2) * half_width_um_per_px[:, None, :]
         offset = pupil_ellipse[:, :2] - np.array(screen.centre_mm)
         largest_mm = pupil_ellipse[:, 2] + np.hypot(*offset.T)
-        lattice_mm = screen.lattice_mm or ONE_CENTRE
+        lattice_mm = screen.lattice_mm or ONE_CENTER
         radius_mm = BEYOND_EDGE * float(largest_mm.max())
         if screen.lattice_mm is not None:
             radius_mm = lattice_mm[0]
         square_mm2 = (np.arange(TABLE_COUNT) + 0.5) / TABLE_COUNT * radius_mm**2
-        colours_nm, which = np.unique(wavelength_nm, return_inverse=True)
-        reaches = [screen.reach_mrad(largest_mm, nm) for nm in colours_nm.tolist()]
+        colors_nm, which = np.unique(wavelength_nm, return_inverse=True)
+        reaches = [screen.reach_mrad(largest_mm, nm) for nm in colors_nm.tolist()]
         reach_mrad = np.stack(reaches)[which, np.arange(which.size)]
         return cls(
             from_box_mm=np.concatenate([matrix, offset[:, :, None]], axis=2),
             tables=np.stack(
-                [screen.transmission(square_mm2, nm) for nm in colours_nm.tolist()]
+                [screen.transmission(square_mm2, nm) for nm in colors_nm.tolist()]
             ).astype(np.complex64),
             which=which,
             radius_mm=radius_mm,

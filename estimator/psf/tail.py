@@ -32,25 +32,25 @@ def _distances(x, y, edge_x, edge_y, near, far):
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _densities(x, centre, half, shear, strength, near, far, light):
+def _densities(x, center, half, shear, strength, near, far, light):
     """Compute the light of a row of pixels from their squared distances.
 
-    ``centre`` holds x of the spot's center and the row's height above it.
+    ``center`` holds x of the spot's center and the row's height above it.
     """
-    y = centre[1]
+    y = center[1]
     xx, yy = np.float32(half[0] * half[0]), np.float32(half[1] * half[1])
     xy = np.float32(2.0 * shear * half[0] * half[1] * y)
     y_square = np.float32(y * y)
-    at_centre, factor = np.float32(half[0] * half[1]), np.float32(strength)
-    centre_x = np.float32(centre[0])
+    at_center, factor = np.float32(half[0] * half[1]), np.float32(strength)
+    center_x = np.float32(center[0])
     one, little = np.float32(1.0), np.float32(1e-6)
     for i in range(near.shape[0]):
-        from_x = x[i] - centre_x
+        from_x = x[i] - center_x
         close = max(near[i], np.float32(0.25))
         distant = max(far[i], close)
         rho2 = from_x * from_x + y_square
         chord2 = (xx * from_x + xy) * from_x + yy * y_square
-        ratio2 = (chord2 + little * at_centre) / (rho2 + little)
+        ratio2 = (chord2 + little * at_center) / (rho2 + little)
         reach2 = max(rho2, close)
         light[i] = (
             factor / (ratio2 * np.sqrt(ratio2 * reach2)) * (one / close + one / distant)
@@ -88,7 +88,7 @@ def add_tail(kernel, window, border_px, edge, half, shear, wavelength_um):
     radius = kernel.shape[0] // 2
     edge_x = np.ascontiguousarray(edge[::EDGE_STRIDE, 0]).astype(np.float32)
     edge_y = np.ascontiguousarray(edge[::EDGE_STRIDE, 1]).astype(np.float32)
-    centre_x, centre_y = float(edge_x.mean()), float(edge_y.mean())
+    center_x, center_y = float(edge_x.mean()), float(edge_y.mean())
     border2 = np.float32(border_px * border_px)
     area = half[0] * half[1] * math.sqrt(1.0 - shear * shear)
     strength = wavelength_um * area / (4.0 * math.pi**3)
@@ -100,9 +100,9 @@ def add_tail(kernel, window, border_px, edge, half, shear, wavelength_um):
         side = 2 * reach + 1
         near, far, light = distances[0, :side], distances[1, :side], distances[2, :side]
         x = pixels[radius - reach : radius + reach + 1]
-        centre = (centre_x, dy - centre_y)
+        center = (center_x, dy - center_y)
         _distances(x, dy, edge_x, edge_y, near, far)
-        _densities(x, centre, half, shear, strength, near, far, light)
+        _densities(x, center, half, shear, strength, near, far, light)
         row = kernel[radius - dy, radius - reach : radius + reach + 1]
         if window[2] <= dy <= window[3]:
             near[max(0, window[0] + reach) : max(0, window[1] + reach + 1)] = -1.0

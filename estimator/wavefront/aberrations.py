@@ -157,7 +157,7 @@ def wavefront_grid(
     viewed = (float(object_dpt), pupil_z, at_pupil, fit == "slope")
 
     def work(part: slice) -> None:
-        bundle.analyse_fields(
+        bundle.analyze_fields(
             packed,
             indices,
             fields_rad[part],
@@ -281,7 +281,7 @@ def eyes_aberrations(
     planes_z_mm[:] = pupil_z_mm
 
     def work(part: slice) -> None:
-        bundle.analyse_eyes(
+        bundle.analyze_eyes(
             packed[part],
             indices[part],
             fields_rad[part],

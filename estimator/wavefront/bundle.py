@@ -237,7 +237,7 @@ def _read_pupil(samples, edge, ring_weights, distance_mm, use_slopes, result):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def analyse_field(packed, indices, field_rad, stop_radii, viewed, nodes, results):
+def analyze_field(packed, indices, field_rad, stop_radii, viewed, nodes, results):
     """Compute the results of one field and wavelength, one row per stop.
 
     Parameters
@@ -282,24 +282,24 @@ def analyse_field(packed, indices, field_rad, stop_radii, viewed, nodes, results
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def analyse_fields(packed, indices, fields_rad, stop_radii, viewed, nodes, results):
-    """Run `analyse_field` over fields (F, 2) and wavelengths (L, n_surfaces + 1).
+def analyze_fields(packed, indices, fields_rad, stop_radii, viewed, nodes, results):
+    """Run `analyze_field` over fields (F, 2) and wavelengths (L, n_surfaces + 1).
 
     ``results`` is (F, L, n_stops, N_RESULT).
     """
     for f in range(fields_rad.shape[0]):
         field_rad = (fields_rad[f, 0], fields_rad[f, 1])
         for w in range(indices.shape[0]):
-            analyse_field(
+            analyze_field(
                 packed, indices[w], field_rad, stop_radii, viewed, nodes, results[f, w]
             )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def analyse_eyes(
+def analyze_eyes(
     packed, indices, fields_rad, stop_radii, pupil_z_mm, use_slopes, nodes, results
 ):
-    """Run `analyse_field` over eyes, each with its own field and stop.
+    """Run `analyze_field` over eyes, each with its own field and stop.
 
     ``packed`` (E, n_surfaces + 1, 48), ``indices`` (E, n_surfaces + 1), ``fields_rad``
     (E, 2), ``stop_radii`` and ``pupil_z_mm`` (E,), nan for the plane at the cornea,
@@ -309,4 +309,4 @@ def analyse_eyes(
         field_rad = (fields_rad[e, 0], fields_rad[e, 1])
         stop, result = stop_radii[e : e + 1], results[e : e + 1]
         viewed = (0.0, pupil_z_mm[e], not math.isnan(pupil_z_mm[e]), use_slopes)
-        analyse_field(packed[e], indices[e], field_rad, stop, viewed, nodes, result)
+        analyze_field(packed[e], indices[e], field_rad, stop, viewed, nodes, result)

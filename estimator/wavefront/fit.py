@@ -18,7 +18,7 @@ _NO_DERIVATIVE = np.int64(0)
 """A plain 0 has a different type and would compile the loops twice."""
 
 # --- columns of the ellipse ---
-CENTRE_X, CENTRE_Y, SEMI_MAJOR, SEMI_MINOR, MAJOR_AXIS_RAD = 0, 1, 2, 3, 4
+CENTER_X, CENTER_Y, SEMI_MAJOR, SEMI_MINOR, MAJOR_AXIS_RAD = 0, 1, 2, 3, 4
 N_ELLIPSE = 5
 
 
@@ -246,7 +246,7 @@ def fit_ellipse(x, y, radius_mm, ellipse):
     cx, cy = (b * e - 2.0 * c * d) / determinant, (b * d - 2.0 * a * e) / determinant
     level = 1.0 + a * cx * cx + b * cx * cy + c * cy * cy
     half, spread = 0.5 * (a + c), 0.5 * math.hypot(a - c, b)
-    ellipse[CENTRE_X], ellipse[CENTRE_Y] = cx * radius_mm, cy * radius_mm
+    ellipse[CENTER_X], ellipse[CENTER_Y] = cx * radius_mm, cy * radius_mm
     ellipse[SEMI_MAJOR] = radius_mm * math.sqrt(level / (half - spread))
     ellipse[SEMI_MINOR] = radius_mm * math.sqrt(level / (half + spread))
     # The direction of the larger eigenvalue is the minor axis; the major is at 90 deg.

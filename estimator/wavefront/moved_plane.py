@@ -95,7 +95,7 @@ def moved_rim(
     moved = np.stack([px, py], axis=-1) + np.asarray(depth_mm)[..., None, None] * (
         np.moveaxis(slopes, 0, -1) / UM_PER_MM
     )
-    centre = moved.mean(axis=-2)
+    center = moved.mean(axis=-2)
     matrix = 2.0 * np.swapaxes(moved, -1, -2) @ _RIM / len(_RIM)
     square = matrix @ np.swapaxes(matrix, -1, -2)
     root = np.sqrt(np.linalg.det(square))
@@ -103,8 +103,8 @@ def moved_rim(
     scale = 1.0 / np.sqrt(trace + 2.0 * root)
     return np.stack(
         [
-            centre[..., 0],
-            centre[..., 1],
+            center[..., 0],
+            center[..., 1],
             scale * (square[..., 0, 0] + root),
             scale * square[..., 0, 1],
             scale * (square[..., 1, 1] + root),

@@ -121,7 +121,7 @@ def filter_image(
     ] = "planar",
     depth_scale: Annotated[
         float | None,
-        typer.Option(help="Metres per unit of the depth file [integers: 0.001]."),
+        typer.Option(help="Meters per unit of the depth file [integers: 0.001]."),
     ] = None,
     no_merge: Annotated[
         bool, typer.Option("--no-merge", help="Keep every pixel a fragment.")
@@ -377,7 +377,7 @@ def _read_hidden(
     if hidden.dtype != color.dtype:
         raise ValueError(
             f"--hidden-color '{color_path}': {hidden.dtype}; "
-            f"allowed: as the colour image, {color.dtype}"
+            f"allowed: as the color image, {color.dtype}"
         )
     depth_m = read_depth(depth_path, depth_scale=depth_scale, option="hidden-depth")
     _check_size("hidden-depth", depth_path, depth_m, color)

@@ -139,7 +139,7 @@ def psf(
         wavelength_nm=wavelength_nm,
         pixel_arcmin=pixel_arcmin,
         method=method.value,
-        stiles_crawford=_apodisation(state) if stiles_crawford else None,
+        stiles_crawford=_apodization(state) if stiles_crawford else None,
     )
     _write(out, computed, pixel_arcmin=pixel_arcmin)
     summary = {
@@ -208,7 +208,7 @@ def _traced(source: str, focus_dpt: float | None, **view) -> _State:
     )
 
 
-def _apodisation(state: _State) -> "StilesCrawford":
+def _apodization(state: _State) -> "StilesCrawford":
     from estimator.psf.stiles_crawford import EYE_SIDES, StilesCrawford
 
     if state.eye_side in EYE_SIDES:

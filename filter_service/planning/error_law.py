@@ -56,8 +56,8 @@ def mean_square(vectors_px: NDArray) -> NDArray[np.float64]:
 
 def spot_covariance(slopes_px: NDArray) -> NDArray[np.float64]:
     """Return the covariance (P, 3) xx, yy, xy of landing points of rays, px²."""
-    centred = slopes_px - (WEIGHTS[:, None] * slopes_px).sum(axis=-2, keepdims=True)
-    x, y = centred[..., 0], centred[..., 1]
+    centered = slopes_px - (WEIGHTS[:, None] * slopes_px).sum(axis=-2, keepdims=True)
+    x, y = centered[..., 0], centered[..., 1]
     return np.stack([(x * x) @ WEIGHTS, (y * y) @ WEIGHTS, (x * y) @ WEIGHTS], axis=-1)
 
 

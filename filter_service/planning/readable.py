@@ -145,8 +145,8 @@ def readable_defocus(
     if spec.blends_at_equal_blur:  # nodes are read at the defocus between them
         own_lows, own_highs = lows, highs
         for axis in (0, 1):
-            lows = _over_neighbours(lows, axis, np.min)
-            highs = _over_neighbours(highs, axis, np.max)
+            lows = _over_neighbors(lows, axis, np.min)
+            highs = _over_neighbors(highs, axis, np.max)
         lows = np.maximum(lows, own_lows - MAX_FIELD_STEP_DPT)
         highs = np.minimum(highs, own_highs + MAX_FIELD_STEP_DPT)
     objects_dpt = eye.vergence.vergence_dpt(_roomy(spec.object_ranges_dpt))
@@ -187,7 +187,7 @@ def _readers(
     return values, is_read, int(np.searchsorted(values, nodes[0]))
 
 
-def _over_neighbours(
+def _over_neighbors(
     values: NDArray[np.float64], axis: int, extreme
 ) -> NDArray[np.float64]:
     """Return extremes over each field node and its neighbors along an axis."""

@@ -206,10 +206,10 @@ def axis_errors(use: Use, axis: str, choices: list[NDArray]) -> list[float]:
     ends += [nodes[high] for nodes, (_, high, _) in zip(choices, found, strict=True)]
     count = use.vergence_dpt.size
     repeated = use.taken(np.tile(np.arange(count), 2 * len(choices)))
-    neighbours = moved(repeated, axis, np.concatenate(ends))
+    neighbors = moved(repeated, axis, np.concatenate(ends))
     own = use.taken(np.tile(np.arange(count), len(choices)))
     share = np.concatenate([share for _, _, share in found])
-    errors = _errors_of(own, neighbours, share).reshape(len(choices), count)
+    errors = _errors_of(own, neighbors, share).reshape(len(choices), count)
     return (AXIS_FACTOR[axis] * errors.mean(axis=1)).tolist()
 
 
@@ -261,19 +261,17 @@ def _at_infinity_dpt(use: Use, states: PupilStates) -> NDArray[np.float64]:
     return use.eye.total_defocus_dpt(**columns)
 
 
-def _error(use: Use, neighbours: PupilStates, share: NDArray) -> float:
+def _error(use: Use, neighbors: PupilStates, share: NDArray) -> float:
     """Return the mean square error; neighbors are all lower, then all upper ones."""
-    return float(_errors_of(use, neighbours, share).mean())
+    return float(_errors_of(use, neighbors, share).mean())
 
 
-def _errors_of(
-    use: Use, neighbours: PupilStates, share: NDArray
-) -> NDArray[np.float64]:
+def _errors_of(use: Use, neighbors: PupilStates, share: NDArray) -> NDArray[np.float64]:
     """Return square errors (P,); neighbors are all lower, then all upper ones."""
     found = np.zeros(share.size)
     for light_ratio, added_dpt in light_of_foci(use):
         lower_px, upper_px = np.split(
-            focus_slopes_px(use, neighbours, np.tile(added_dpt, 2)), 2
+            focus_slopes_px(use, neighbors, np.tile(added_dpt, 2)), 2
         )
         found += light_ratio**2 * blend_error(
             lower_px,

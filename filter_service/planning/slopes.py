@@ -19,7 +19,7 @@ from filter_service.planning.node_wavefronts import PupilStates
 N_RINGS, N_AZIMUTHS = 5, 16
 
 
-def apodisation(eye: EyeOptics, spec: GridSpec) -> StilesCrawford | None:
+def apodization(eye: EyeOptics, spec: GridSpec) -> StilesCrawford | None:
     """Return the Stiles-Crawford weights of an eye's pupil, or None if disabled."""
     if not spec.settings.stiles_crawford:
         return None
@@ -43,14 +43,14 @@ def state_frames(
     if pixel_from_mrad is None:
         pixel_from_mrad = spec.node_pixel_from_mrad(states.h_deg, states.v_deg)
     found = eye.wavefronts(**vars(states))
-    weighed = apodisation(eye, spec)
+    weighed = apodization(eye, spec)
     return pupil_frames(
         wavefront_polynomial(found.zernike_um),
         circle_radius_mm=found.circle_diameter_mm / 2.0,
         wavelength_nm=states.wavelength_nm,
         pixel_from_mrad=pixel_from_mrad,
         pupil_ellipse=found.pupil_ellipse,
-        apodisation=weighed and weighed.amplitude(states.wavelength_nm),
+        apodization=weighed and weighed.amplitude(states.wavelength_nm),
     )
 
 

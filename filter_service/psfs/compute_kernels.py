@@ -17,7 +17,7 @@ from filter_service.planning.cost import COMPUTED_BEYOND
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.node_wavefronts import NodeWavefronts
 from filter_service.planning.nodes import PlanNodes
-from filter_service.planning.slopes import apodisation
+from filter_service.planning.slopes import apodization
 from filter_service.psfs.native_psfs import MAX_PRIMARIES, NodeRings
 from filter_service.psfs.pack import PackedKernels, pack_kernels
 from filter_service.psfs.psf_engine import PsfEngine
@@ -69,7 +69,7 @@ def computed_kernels(
         kept_energy_ratio=spec.kept_energy_ratio,
         max_radius_px=spec.max_blur_radius_px,
         diffraction=spec.settings.diffraction,
-        stiles_crawford=apodisation(eye, spec),
+        stiles_crawford=apodization(eye, spec),
         rings=rings,
     )
     if left.size:
@@ -96,7 +96,7 @@ def generic_kernels(
         found.zernike_um,
         pupil_diameter_mm=found.circle_diameter_mm,
         pupil_ellipse=found.pupil_ellipse,
-        stiles_crawford=apodisation(eye, spec),
+        stiles_crawford=apodization(eye, spec),
         pupil_screen=rings
         and rings.seen_from(wavefronts.h_deg[each], wavefronts.v_deg[each]),
         wavelength_nm=wavefronts.wavelength_nm[channels].ravel(),

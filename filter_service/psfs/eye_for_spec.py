@@ -13,7 +13,7 @@ from estimator.profiles.parse import EyeProfile
 from filter_service.errors import BuildCancelled
 from filter_service.planning.grid import GridSpec, pupil_nodes_mm
 
-NO_LATERAL_COLOR = "a measured wavefront holds no lateral colour: it needs a traced eye"
+NO_LATERAL_COLOR = "a measured wavefront holds no lateral color: it needs a traced eye"
 
 
 ONE_GAZE = (

@@ -88,7 +88,7 @@ def frame_layers(
 
     References
     ----------
-    Csoba & Kunkli 2023, section 6.4 (cached neighbours of pupil and focus) and 6.2.
+    Csoba & Kunkli 2023, section 6.4 (cached neighbors of pupil and focus) and 6.2.
     """
     # Imported here: the service must be ready before numba is loaded.
     from filter_service.psfs.layer_loops import layer_distances_dpt

@@ -19,7 +19,7 @@ from estimator.optics.zernike import N_TERMS, monomial_matrix
 from estimator.psf import fourier, geometric, geometric_kernels, pupil, survey, switch
 from estimator.psf import fourier_kernels as waves
 from estimator.psf.compute import ACCURACY
-from estimator.psf.screens import BEYOND_EDGE, ONE_CENTRE, TABLE_COUNT
+from estimator.psf.screens import BEYOND_EDGE, ONE_CENTER, TABLE_COUNT
 from estimator.psf.stiles_crawford import StilesCrawford
 from estimator.threads import thread_count
 from filter_service.errors import RenderFailed
@@ -91,7 +91,7 @@ class NodeRings:
         offset_mm = ellipse[..., :2] - center_mm[:, None, None]
         largest_mm = ellipse[..., 2] + np.linalg.norm(offset_mm, axis=-1)
         is_lattice = seen.lattice_mm is not None
-        lattice_mm = seen.lattice_mm if is_lattice else ONE_CENTRE
+        lattice_mm = seen.lattice_mm if is_lattice else ONE_CENTER
         radius_mm = lattice_mm[0] if is_lattice else BEYOND_EDGE * largest_mm.max()
         square_mm2 = (np.arange(TABLE_COUNT) + 0.5) / TABLE_COUNT * radius_mm**2
         reach_mrad = np.empty(largest_mm.shape)
@@ -172,7 +172,7 @@ class NativePsfs:
         center_mm = (0.0, 0.0)
         if stiles_crawford is not None:
             per_mm2, _ = stiles_crawford.amplitude(wavefronts.wavelength_nm.ravel())
-            arrays["apodisation_per_mm2"] = per_mm2
+            arrays["apodization_per_mm2"] = per_mm2
             center_mm = stiles_crawford.centre_mm
         if rings is not None:
             arrays["ring_offset_mm"] = rings.offset_mm
@@ -191,9 +191,9 @@ class NativePsfs:
             threads=self.threads,
             tables=ctypes.addressof(tables),
             **{name: pointer_to(array) for name, array in arrays.items()},
-            apodisation_center_mm=center_mm,
+            apodization_center_mm=center_mm,
             ring_steps_per_mm2=TABLE_COUNT / rings.radius_mm**2 if rings else 0.0,
-            ring_lattice_mm=rings.lattice_mm if rings else ONE_CENTRE,
+            ring_lattice_mm=rings.lattice_mm if rings else ONE_CENTER,
             ring_count=TABLE_COUNT,
             cut_ratio=CORNERS_TWICE * (1.0 - kept_energy_ratio),
             oversampling=sampling.oversampling,

@@ -107,7 +107,7 @@ def pack_kernels(
     radius_px = np.empty(count, np.int64)
     peak_ratio, spread_px = np.empty(count), np.empty(count)
     shared(
-        lambda *parts: _quantise(batch.flat_kernels, weights, *parts),
+        lambda *parts: _quantize(batch.flat_kernels, weights, *parts),
         *(batch.offset_count, batch.radius_px, offsets, reach_px),
         *(radius_px, peak_ratio, spread_px),
     )
@@ -181,7 +181,7 @@ def _ends(light, allowed, full):
 
 
 @njit(nogil=True, cache=True)
-def _quantise(
+def _quantize(
     kernels,
     weights,
     starts,

@@ -39,10 +39,10 @@ def draw_psf(kernel: NDArray[np.float32], *, pixel_arcmin: float) -> NDArray[np.
     """
     floor = kernel.max() * 10.0**-DECADES
     decades = np.log10(np.maximum(kernel, floor) / floor)
-    grey = np.round(255.0 * decades / DECADES).astype(np.uint8)
+    gray = np.round(255.0 * decades / DECADES).astype(np.uint8)
     zoom = max(1, -(-MIN_EDGE_PX // kernel.shape[0]))
-    grey = grey.repeat(zoom, axis=0).repeat(zoom, axis=1)
-    picture = Image.fromarray(grey).convert("RGB")
+    gray = gray.repeat(zoom, axis=0).repeat(zoom, axis=1)
+    picture = Image.fromarray(gray).convert("RGB")
     _draw_scale_bar(picture, arcmin_per_px=pixel_arcmin / zoom)
     return np.asarray(picture)
 

@@ -49,12 +49,12 @@ def seen_through(view: RgbdView, magnification: Matrix) -> RgbdView:
     to_source = np.linalg.inv(np.array(magnification))
     images = {}
     for color, depth in (("color", "depth_m"), ("hidden_color", "hidden_depth_m")):
-        light, metres = getattr(view, color), getattr(view, depth)
+        light, meters = getattr(view, color), getattr(view, depth)
         if light is None:
             continue
         light = _linear(light)
-        drawn, deep = np.empty_like(light), np.empty_like(metres)
-        draw_anew(light, metres, place, to_source, drawn, deep)
+        drawn, deep = np.empty_like(light), np.empty_like(meters)
+        draw_anew(light, meters, place, to_source, drawn, deep)
         images |= {color: drawn, depth: deep}
     return replace(view, **images)
 

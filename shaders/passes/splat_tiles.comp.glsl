@@ -266,9 +266,9 @@ void main() {
         vec3 own = pixels[pixel].rgb;
         close_depth(sums[p]);
         vec3 coverage = sums[p].near_coverage;
-        vec3 normalised = sums[p].near_light / max(coverage, vec3(MIN_COVERAGE));
+        vec3 normalized = sums[p].near_light / max(coverage, vec3(MIN_COVERAGE));
         vec3 lit = vec3(greaterThanEqual(coverage, vec3(MIN_COVERAGE)));
-        color_out[pixel] = vec4(mix(own, normalised, lit),
+        color_out[pixel] = vec4(mix(own, normalized, lit),
                                 dot(coverage, vec3(1.0 / float(RGB))));
     }
 }

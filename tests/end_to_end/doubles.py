@@ -55,7 +55,7 @@ class RenderedDouble:
 
 
 class EngineDouble:
-    """Inverts colours and takes the time it is told to take."""
+    """Inverts colors and takes the time it is told to take."""
 
     name = "numpy double"
 

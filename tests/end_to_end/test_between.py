@@ -20,7 +20,7 @@ SHORT = (320, 180)
 
 
 def noise_view(rng, width_px, height_px):
-    """Every pixel of another colour, nothing to merge; a ramp of distances."""
+    """Every pixel of another color, nothing to merge; a ramp of distances."""
     color = rng.integers(0, 256, (height_px, width_px, 3), dtype=np.uint8)
     ramp_m = np.linspace(1.0, 6.0, width_px, dtype=np.float32)
     depth_m = np.tile(ramp_m, (height_px, 1))

@@ -52,7 +52,7 @@ def psnr_db(image, reference):
 
 @pytest.fixture
 def scene(tmp_path, rng):
-    """Linear colour, planar depth with a step and a hole, as files."""
+    """Linear color, planar depth with a step and a hole, as files."""
     linear = rng.random((HEIGHT_PX, WIDTH_PX, 3), dtype=np.float32)
     depth_m = np.full((HEIGHT_PX, WIDTH_PX), np.inf, np.float32)
     np.save(tmp_path / "color.npy", linear)
@@ -168,8 +168,8 @@ def test_png_input_and_output_are_srgb(scene, rng):
     folder, _ = scene
     srgb = rng.integers(0, 256, (HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)
     Image.fromarray(srgb).save(folder / "color.png")
-    millimetres = np.full((HEIGHT_PX, WIDTH_PX), 50_000, np.uint16)
-    Image.fromarray(millimetres).save(folder / "depth.png")
+    millimeters = np.full((HEIGHT_PX, WIDTH_PX), 50_000, np.uint16)
+    Image.fromarray(millimeters).save(folder / "depth.png")
     arguments = (
         *("filter", "--color", folder / "color.png", "--depth", folder / "depth.png"),
         *("--fov-deg", 30, "--profile", "emmetropia", "--focus-dpt", 0.02),

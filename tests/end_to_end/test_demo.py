@@ -17,7 +17,7 @@ from clients.arguments import read_profile, read_size_px
 from clients.demo_eyes import EYES
 from clients.frame_log import FrameLog, percentiles
 from clients.pyrender_stream import path_settings
-from clients.scenes.catalogue import build_scene
+from clients.scenes.catalog import build_scene
 from clients.service_process import CHECKOUT, ServiceProcess
 from filter_service.progress import INTERVAL_S
 
@@ -106,7 +106,7 @@ def _decoded(path, width, height):
 
 
 def _detail(image):
-    """Mean step between neighbours in a row."""
+    """Mean step between neighbors in a row."""
     return np.abs(np.diff(image.astype(int).mean(axis=-1), axis=1)).mean()
 
 
@@ -157,13 +157,13 @@ def test_gif_stands_in_where_the_encoder_fails(encoder, monkeypatch, tmp_path):
         assert np.asarray(gif.convert("RGB")).mean() == pytest.approx(250, abs=3)
 
 
-def test_mp4_keeps_colours_and_order(tmp_path):
+def test_mp4_keeps_colors_and_order(tmp_path):
     colors = ((200, 30, 30), (30, 200, 30), (30, 30, 200))
     images = [np.full((64, 96, 3), color, np.uint8) for color in colors]
     written = video.write_video(tmp_path / "film", lambda: iter(images), 10)
     assert written == tmp_path / "film.mp4"
     means = _decoded(written, 96, 64).mean(axis=(1, 2))
-    # Chroma at half resolution and video levels cost a few steps on flat colours.
+    # Chroma at half resolution and video levels cost a few steps on flat colors.
     assert means == pytest.approx(np.array(colors, float), abs=8)
 
 

@@ -61,7 +61,7 @@ def off_center(edges, *, near, far, ahead, ndc):
 
 
 CONVENTIONS = {
-    # name: ahead, ndc of near and far plane, from where ndc begins, far, metres a unit
+    # name: ahead, ndc of near and far plane, from where ndc begins, far, meters a unit
     "OpenGL": (-1.0, (-1.0, 1.0), -1.0, FAR_M, 1.0),
     "Unity, Direct3D, Vulkan, Metal": (-1.0, (1.0, 0.0), 0.0, FAR_M, 1.0),
     "Direct3D, usual": (1.0, (0.0, 1.0), 0.0, FAR_M, 1.0),
@@ -94,7 +94,7 @@ def buffer_of(points_m, matrix, *, ahead, begin, unit_m):
 
 @BY_CONVENTION
 @pytest.mark.parametrize("edges", [WIDE, LEFT_EYE, RIGHT_EYE])
-def test_metres_come_back_from_any_depth_buffer(
+def test_meters_come_back_from_any_depth_buffer(
     points_m, edges, ahead, ndc, begin, far_m, unit_m
 ):
     planes = {"near": NEAR_M / unit_m, "far": far_m / unit_m}
@@ -127,7 +127,7 @@ def test_unitys_shader_function_is_the_pages_formula():
         assert_allclose(formula(d, NEAR_M, FAR_M), eye_m)
 
 
-def test_dioptres_are_linear_in_the_buffer_and_16_bits_are_enough():
+def test_diopters_are_linear_in_the_buffer_and_16_bits_are_enough():
     d = np.linspace(0.0, 1.0, 2**16)
     names = printed()
     for formula in (names["depth_reversed_m"], names["depth_usual_m"]):
@@ -202,7 +202,7 @@ def test_gaze_is_in_the_angles_of_a_frame():
         assert_allclose(gaze_deg(*point), angles_of(point), atol=1e-9)
 
 
-def test_a_degree_of_vergence_is_as_many_dioptres_as_the_page_says():
+def test_a_degree_of_vergence_is_as_many_diopters_as_the_page_says():
     said_dpt, apart_mm = map(
         float, re.search(r"([\d.]+) dpt for each degree .*?(\d+) mm", PAGE).groups()
     )

@@ -38,7 +38,7 @@ def picture(path: Path) -> np.ndarray:
 
 
 def detail(part: np.ndarray) -> float:
-    """How much neighbouring pixels differ: less where it is blurred."""
+    """How much neighboring pixels differ: less where it is blurred."""
     return float(np.abs(np.diff(part[..., 1], axis=1)).mean())
 
 

@@ -50,7 +50,7 @@ def test_half_floats_go_there_and_back(client):
 
 
 @pytest.mark.parametrize("encoding", ["float16", "dpt16", "mm16"])
-def test_depth_in_two_bytes_arrives_as_metres(client, encoding):
+def test_depth_in_two_bytes_arrives_as_meters(client, encoding):
     """Eight frames: the first ones as parts, the others in shared memory."""
     view = make_view()
     view.depth_m[0, :3] = (0.0, -1.0, np.nan)

@@ -57,7 +57,7 @@ OWN_SCENERY = """
 import numpy as np
 from clients.headset.look import RgbdPicture
 
-class Grey:
+class Gray:
     def pictures(self, views, size_px):
         with open("rendered", "a") as file:
             file.write(".")
@@ -68,7 +68,7 @@ class Grey:
 
 def make(context):
     assert context.version_code >= 430
-    return Grey()
+    return Gray()
 """
 
 

@@ -101,7 +101,7 @@ def test_nodes_place_and_turn_a_mesh_each_for_itself(show, tmp_path):
 
 
 @pytest.mark.parametrize("is_unlit", [False, True])
-def test_vertex_colours_and_factors_are_lit_once(show, tmp_path, is_unlit):
+def test_vertex_colors_and_factors_are_lit_once(show, tmp_path, is_unlit):
     tint, factor = np.array([200, 100, 50]) / 255, np.array([102, 204, 255]) / 255
     material = PBRMaterial(baseColorFactor=[102, 204, 255, 255])
     look = TextureVisuals(material=material)

@@ -31,7 +31,7 @@ import sys
 import numpy as np
 from clients.pyrender_setup import pyrender
 from clients.scene_renderer import SceneRenderer
-from clients.scenes.catalogue import build_scene
+from clients.scenes.catalog import build_scene
 from clients.scenes.paths import PATHS, path_moments
 name, width, height, out = sys.argv[1:]
 scene = build_scene(name)
@@ -81,7 +81,7 @@ def test_a_scene_looks_as_pyrender_shows_it(seen, show):
     assert np.isinf(depth_m).any() == np.isinf(wanted_m).any()
     assert same_depth(depth_m, wanted_m).mean() >= 0.9995  # all, on llvmpipe
     assert psnr_db(color, wanted) >= 45.0
-    # Where colours differ, two surfaces lie in one plane, and rounding chooses.
+    # Where colors differ, two surfaces lie in one plane, and rounding chooses.
     differs = (np.abs(color.astype(int) - wanted) > 1).any(axis=-1)
     assert differs.mean() < 0.002
     assert same_depth(depth_m, wanted_m)[differs].all()
@@ -118,7 +118,7 @@ def test_edges_that_are_not_symmetric_cut_out_a_part(seen, show):
 
 
 def scene_of(*meshes, textures=None, **fields):
-    """A scene in which every surface is as bright as its colour."""
+    """A scene in which every surface is as bright as its color."""
     batches = tuple(
         finished(mesh, np.ones((len(mesh.vertices_m), 3)), textures or {})
         for mesh in meshes
@@ -135,7 +135,7 @@ def square(center_m, side_m, color="#ffffff", **look):
     return patch(origin, (side_m, 0, 0), (0, side_m, 0), color=color, **look)
 
 
-def test_the_background_is_its_colour_and_at_infinity(show):
+def test_the_background_is_its_color_and_at_infinity(show):
     color, depth_m = show(
         scene_of(square((0, 0, -60), 200)), np.eye(4), ONE_TO_ONE, (8, 6)
     )
@@ -202,7 +202,7 @@ def test_two_eyes_see_a_point_apart_by_their_distance_over_its_own(show):
     for side in (-1, 1):
         pose = head.copy()
         pose[:3, 3] = pose[:3, 0] * side * 0.0315
-        # the edges of a headset: wide towards the temple, mirrored in the other eye
+        # the edges of a headset: wide toward the temple, mirrored in the other eye
         left, right = (-1.2, 0.9) if side < 0 else (-0.9, 1.2)
         color, _ = show(
             scene, pose, (left, right, 1.1, -1.0), (400, 400), supersampling=6

@@ -20,22 +20,22 @@ from filter_service import Camera
 CAMERA = Camera.from_fov(60.0, width_px=160, height_px=120)
 
 
-def wall(depth_m, *, grey=128):
-    color = np.full((120, 160, 3), grey, np.uint8)
+def wall(depth_m, *, gray=128):
+    color = np.full((120, 160, 3), gray, np.uint8)
     return color, np.full((120, 160), depth_m, np.float32)
 
 
-def frame(depth_m, *, grey=128, gaze_deg=None):
-    color, depth = wall(depth_m, grey=grey)
+def frame(depth_m, *, gray=128, gaze_deg=None):
+    color, depth = wall(depth_m, gray=gray)
     return SceneFrame(
         color, depth, CAMERA.tangents, np.eye(4), 9.0, 9.0, gaze_deg=gaze_deg
     )
 
 
-@pytest.mark.parametrize("grey", [0, 10, 128, 255])
-def test_luminance_is_that_of_the_display(grey):
-    color, _ = wall(1.0, grey=grey)
-    level = grey / 255
+@pytest.mark.parametrize("gray", [0, 10, 128, 255])
+def test_luminance_is_that_of_the_display(gray):
+    color, _ = wall(1.0, gray=gray)
+    level = gray / 255
     linear = level / 12.92 if level <= 0.04045 else ((level + 0.055) / 1.055) ** 2.4
     assert luminance_cd_m2(color, 250.0) == pytest.approx(250.0 * linear, rel=1e-5)
 
@@ -93,7 +93,7 @@ def test_an_eye_begins_steady_in_what_it_sees():
 def test_a_stream_follows_light_and_distance():
     """Far and dark, then near and bright: the focus comes first, the pupil closes."""
     clock = iter(np.arange(0.0, 12.0, 1 / 60))
-    far, near = frame(np.inf, grey=20), frame(0.4, grey=250)
+    far, near = frame(np.inf, gray=20), frame(0.4, gray=250)
     frames = [far] * 60 + [near] * 600
     seen = list(
         looking_naturally(

@@ -14,7 +14,7 @@ from clients.scene_renderer import (
     _mean_color,
     _sample_depth,
 )
-from clients.scenes.catalogue import build_scene
+from clients.scenes.catalog import build_scene
 from clients.scenes.geometry import box, patch, placed, sphere
 from clients.scenes.lighting import Lights, baker
 from clients.scenes.paths import PATHS, look_at, path_moments
@@ -53,7 +53,7 @@ def primitives():
 
 @pytest.fixture(scope="module")
 def primitives_frame(primitives):
-    """Colour, depth and the view ray (h, w, 3), z = -1, of every pixel's centre."""
+    """Color, depth and the view ray (h, w, 3), z = -1, of every pixel's center."""
     size_px = (241, 135)
     with SceneRenderer(primitives, size_px, supersampling=1) as renderer:
         color, depth_m = renderer.render(np.eye(4))
@@ -100,7 +100,7 @@ def test_ball_depth_is_where_the_pixels_rays_meet_it(primitives_frame):
     assert (depth_m <= farthest + dent_m + 1e-5)[steep].all()
 
 
-def test_letter_plane_is_at_4_17_m_and_cube_centre_at_0_35(primitives_frame):
+def test_letter_plane_is_at_4_17_m_and_cube_center_at_0_35(primitives_frame):
     _, depth_m, rays = primitives_frame
     height, width = depth_m.shape
     letter = depth_m[height // 3, width // 2]
@@ -118,7 +118,7 @@ def test_letter_reads_as_an_e_from_left_to_right_and_top_to_bottom(primitives_fr
     dark = color.max(-1) < 60
 
     def at(x_m, y_m):
-        """Whether the plane is dark at a point of it, from its centre."""
+        """Whether the plane is dark at a point of it, from its center."""
         point = np.array([x_m, y_m + 100 / UNITS_PER_M, 0]) / (750 / UNITS_PER_M)
         error = ((rays[..., :2] - point[:2]) ** 2).sum(-1)
         return dark[np.unravel_index(error.argmin(), error.shape)]
@@ -156,7 +156,7 @@ def test_courtyard_path_spans_0_3_to_30_m_and_moves_eye_and_camera(courtyard):
     finite = depths[np.isfinite(depths)]
     assert 0.25 < finite.min() < 0.5
     assert 28 < finite.max() < 33
-    # A frame is a picture: many colours, neither crushed nor burnt out.
+    # A frame is a picture: many colors, neither crushed nor burnt out.
     for color, _ in frames:
         luminance = color.mean(-1)
         assert np.percentile(luminance, 95) - np.percentile(luminance, 5) > 90
@@ -189,7 +189,7 @@ def test_path_goes_through_its_keys():
         assert moment.focus_dpt == pytest.approx(1 / key.focus_m)
 
 
-def test_pixel_colour_is_the_mean_light_and_depth_a_sample():
+def test_pixel_color_is_the_mean_light_and_depth_a_sample():
     black_and_white = np.zeros((2, 2, 3), np.uint8)
     black_and_white[0] = 255
     # Half the light is sRGB 188, not 128.

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.clock
 SHOW_AND_READ_BACK = """
 import glfw, numpy as np
 from clients.scene_renderer import SceneRenderer
-from clients.scenes.catalogue import build_scene
+from clients.scenes.catalog import build_scene
 from clients.window import LiveWindow, _close_on_escape
 
 scene = build_scene("primitives")

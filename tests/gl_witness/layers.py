@@ -1,7 +1,7 @@
 """What Vulkan's validation layers say about our frames, beneath zink.
 
 Two runs, for the two exclude each other: one watches that what a command writes is
-ordered before what reads it (synchronisation), one that no pass leaves its buffers
+ordered before what reads it (synchronization), one that no pass leaves its buffers
 (GPU-assisted: the layer rewrites each pass to look).  Each is proved first on a fault,
 see `between.c`, so that no message means something.
 """
@@ -26,7 +26,7 @@ MANIFEST = """{"file_format_version": "1.1.2", "layer": {
 """
 
 WATCHES = {
-    "synchronisation": "SYNCHRONIZATION_VALIDATION_EXT",
+    "synchronization": "SYNCHRONIZATION_VALIDATION_EXT",
     "GPU-assisted": "GPU_ASSISTED_EXT,"
     "VK_VALIDATION_FEATURE_ENABLE_GPU_ASSISTED_RESERVE_BINDING_SLOT_EXT",
 }
@@ -42,7 +42,7 @@ MESSAGE = re.compile(rf"^([A-Z][\w.\- ]+)\(({LEVELS}) / \w+\): (.*)$", re.MULTIL
 ENABLED = re.compile(r"Current Enables: (.*)\.$", re.MULTILINE)
 
 FAULTS = {
-    "synchronisation": "SYNC-HAZARD-READ-AFTER-WRITE",
+    "synchronization": "SYNC-HAZARD-READ-AFTER-WRITE",
     "GPU-assisted": "VUID-vkCmdDispatch-None-02706",
 }
 """Kinds of message about the deliberate faults."""
@@ -148,7 +148,7 @@ def prove(watch: str, frames: tuple[str, ...]) -> Messages:
     RuntimeError
         They do not see it: what they say of other frames then means nothing.
     """
-    if watch == "synchronisation":
+    if watch == "synchronization":
         said = watched(watch, "hardware", frames, GL_WITNESS_DROP_BARRIERS="1")
     else:
         said = watched(watch, "hardware", ("tests.gl_witness.out_of_bounds",))

@@ -228,7 +228,7 @@ def read_xwd(content: bytes) -> np.ndarray:
     Parameters
     ----------
     content : bytes
-        A header of 25 big-endian numbers and a name, a table of colours, the rows.
+        A header of 25 big-endian numbers and a name, a table of colors, the rows.
 
     Returns
     -------

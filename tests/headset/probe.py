@@ -1,4 +1,4 @@
-"""A small OpenXR program: two coloured views with depth, and a line for all it sees.
+"""A small OpenXR program: two colored views with depth, and a line for all it sees.
 
     python tests/headset/probe.py --frames 60
 
@@ -7,7 +7,7 @@ Each line on standard output is a JSON object: ``runtime`` and ``size_px`` of a 
 and the angles in degrees (left, right, up, down) of the views in the stage; and at the
 end ``frames``, how many were taken, or ``error``, what was raised.
 
-Each view is filled with the colour of its eye, at `FAR_M`; its upper left quarter is
+Each view is filled with the color of its eye, at `FAR_M`; its upper left quarter is
 white, at `NEAR_M`.  With ``--fault`` it does one thing wrong.
 """
 
@@ -236,7 +236,7 @@ class Eye:
 
 
 def fractions(srgb: tuple[int, int, int]) -> list[float]:
-    """Return an opaque colour as shares of the largest value."""
+    """Return an opaque color as shares of the largest value."""
     return [value / 255 for value in (*srgb, 255)]
 
 

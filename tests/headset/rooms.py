@@ -13,7 +13,7 @@ WALL_M = 4.0
 def stripes(path: Path, *, width_m: float = 12.0, n_stripes: int = 48) -> Path:
     """Write a wall of upright black and white stripes, `WALL_M` ahead of the origin.
 
-    It is unlit, so that colours are those of its texture, and reaches far enough down
+    It is unlit, so that colors are those of its texture, and reaches far enough down
     and up that a viewer stands before its middle.
     """
     texels = np.zeros((8, 2 * n_stripes, 3), np.uint8)

@@ -2,7 +2,7 @@
 
     python -m tests.headset.test_glx [--frames N] [--hide-egl]
 
-As a program it shows each eye in one colour and tells in JSON what became of it; the
+As a program it shows each eye in one color and tells in JSON what became of it; the
 tests start it.  Started by `run_in_root.sh`, like test_runtime.py.
 """
 
@@ -193,7 +193,7 @@ def show(context, frame_count: int) -> None:
 
 
 def pictures(views, size_px):
-    """Return each eye's colour, as far as `DEPTH_M`."""
+    """Return each eye's color, as far as `DEPTH_M`."""
     from clients.headset.runtime import ShownView
 
     width, height = size_px

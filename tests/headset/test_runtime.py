@@ -18,7 +18,7 @@ START = ["IDLE", "READY", "SYNCHRONIZED", "VISIBLE", "FOCUSED"]
 END = ["VISIBLE", "SYNCHRONIZED", "STOPPING", "IDLE", "EXITING"]
 MANY_FRAMES = "100000"
 
-POSE_ERROR = 1e-6  # of metres, of quaternions, of radians
+POSE_ERROR = 1e-6  # of meters, of quaternions, of radians
 SCREEN_ERROR = 3  # of 255: two conversions between sRGB and linear light
 EDGE_PX = 3  # that lie beside a step, and mix
 

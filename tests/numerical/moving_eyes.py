@@ -22,7 +22,7 @@ def light_for(pupil_mm, age_years=28.58):
 
 
 def pupil_of_a_pulse(times_s, *, begin_mm, end_mm, off_s, latency_s=None):
-    """A pulse of light that leads a pupil from one size towards another."""
+    """A pulse of light that leads a pupil from one size toward another."""
     dark, bright = 10 ** light_for(begin_mm), 10 ** light_for(end_mm)
     reflex = PupilReflex(28.58, AREA_DEG2, dark, latency_s=latency_s)
     reflex.follow(dark, -1.0)

@@ -21,7 +21,7 @@ from filter_service.psfs.boxes import box_sizes, pack_reach
 from filter_service.rendering.map_loops import MAX_REACH_PX, UNMOVED_PX, UNMOVED_RATIO
 
 
-def neighbours(store, reads, fields, total_dpt):
+def neighbors(store, reads, fields, total_dpt):
     """PSFs and weights (n, 3, 2 n_corners) of states (n, 3) at fields (n,)."""
     nodes = store.nodes
     channels = np.arange(RGB)
@@ -40,7 +40,7 @@ def layer_blur_px(store, reads, zero_dpt, at_dpt):
     n_fields = len(zero_dpt)
     fields = np.tile(np.arange(n_fields), len(at_dpt))
     total_dpt = at_dpt[:, None, None] + zero_dpt
-    psfs, weights = neighbours(store, reads, fields, total_dpt.reshape(-1, RGB))
+    psfs, weights = neighbors(store, reads, fields, total_dpt.reshape(-1, RGB))
     blur_px = (store.blur_px[psfs] * weights).sum(axis=-1)
     return blur_px.reshape(len(at_dpt), n_fields * RGB)
 
@@ -160,7 +160,7 @@ def node_kernels(store, layers, fields, intervals):
     wanted, recipe_of = np.unique(fields * n_layers + ends, return_inverse=True)
     near, far = recipe_of.reshape(ends.shape)
     recipe_fields, recipe_layers = np.divmod(wanted, n_layers)
-    psfs, weights = neighbours(
+    psfs, weights = neighbors(
         store,
         layers.reads,
         recipe_fields,

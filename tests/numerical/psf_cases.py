@@ -137,10 +137,10 @@ def truth(
 class Window:
     """Square of pixels about a spot: the spot and the Airy rings around it.
 
-    ``centre_px``: x right, y up, whole pixels from the chief ray.
+    ``center_px``: x right, y up, whole pixels from the chief ray.
     """
 
-    centre_px: tuple[int, int]
+    center_px: tuple[int, int]
     radius_px: int
 
     @classmethod
@@ -156,7 +156,7 @@ class Window:
 
     def cut(self, psf) -> np.ndarray:
         """Shares of the whole light in the window of a PSF, float64."""
-        x, y = self.centre_px
+        x, y = self.center_px
         room = max(0, max(abs(x), abs(y)) + self.radius_px - psf.radius_px)
         kernel = psf.kernel.astype(np.float64) * (1.0 - psf.lost_energy_ratio)
         kernel, middle = np.pad(kernel, room), psf.radius_px + room
@@ -168,7 +168,7 @@ class Window:
         jacobian = checked_scale(
             options.get("pixel_pitch_mrad"), options.get("pixel_from_mrad"), 1
         )[0]
-        shift_mrad = np.linalg.solve(jacobian, self.centre_px)
+        shift_mrad = np.linalg.solve(jacobian, self.center_px)
         zernike_um = np.array(zernike_um)
         # W = 2 C(1,1) x + 2 C(1,-1) y on the unit circle.
         zernike_um[[2, 1]] -= shift_mrad * options["pupil_diameter_mm"] / 4.0

@@ -86,7 +86,7 @@ def cartesian_eye():
 
 
 def irregular_eye():
-    """No symmetry at all: offsets, toric surfaces, tilted and decentred lens."""
+    """No symmetry at all: offsets, toric surfaces, tilted and decentered lens."""
     rng = np.random.default_rng(7)
     scale = np.repeat([0.0, 0.04, 0.04, 0.02, 0.02, 0.01, 0.01], range(1, 8))
     lens = {"decentration_mm": (0.2, -0.13), "tilt_deg": (2.5, -1.7)}

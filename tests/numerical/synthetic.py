@@ -20,7 +20,7 @@ def tangents(width_px, height_px, vertical_fov_deg):
 
 
 def texture(rng, height_px, width_px, cell_px=4):
-    """Smoothly varying coloured noise in 0..1, float32 linear."""
+    """Smoothly varying colored noise in 0..1, float32 linear."""
     coarse = rng.random((height_px // cell_px + 2, width_px // cell_px + 2, 3))
     fine = zoom(coarse, (cell_px, cell_px, 1), order=1)[:height_px, :width_px]
     return np.clip(fine, 0.0, 1.0).astype(np.float32)

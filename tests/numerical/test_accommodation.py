@@ -132,7 +132,7 @@ def test_lens_shrinks_thickens_and_moves_its_pole_forward(myope):
     grown_mm = shape.anterior_thickness_mm - relaxed.anterior_thickness_mm
     assert grown_mm > 0.0 > state.lens_diameter_change_mm
     assert state.aqueous_thickness_change_mm == pytest.approx(-grown_mm, abs=1e-12)
-    # Expected: about -0.09 mm of diameter per dioptre of the lens, and the eye gets
+    # Expected: about -0.09 mm of diameter per diopter of the lens, and the eye gets
     # some 0.8 of the lens's power
     slope_mm_dpt = state.lens_diameter_change_mm / state.accommodation_dpt
     assert -0.16 < slope_mm_dpt < -0.08

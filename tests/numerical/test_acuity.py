@@ -229,7 +229,7 @@ def test_the_retina_samples_as_published():
 
 
 def test_through_focus_is_best_where_the_eye_looks():
-    """An eye 2 dpt short-sighted reads best at half a metre."""
+    """An eye 2 dpt short-sighted reads best at half a meter."""
     zernike_um = typical(3.0, 2.0)
     at_dpt = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
     log_mar, ratio = acuity_through_focus(

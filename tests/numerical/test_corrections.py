@@ -165,20 +165,20 @@ def test_published_modulation_is_met():
             assert found == expected, (name, focus)
 
 
-def test_a_lens_off_its_centre_has_coma_and_keeps_its_power():
+def test_a_lens_off_its_center_has_coma_and_keeps_its_power():
     lens = WornLens(0.0, spherical_aberration_um=0.3, centre_mm=(0.3, -0.4))
     zernike_um = zernike_from_polynomial(own_polynomial(lens), 3.0)
     per_mm = -0.3 / 3.0 * 2.0 * np.sqrt(10.0)
     assert zernike_um[index_from_nm(4, 0)] == pytest.approx(0.3)
     assert zernike_um[index_from_nm(3, 1)] == pytest.approx(0.3 * per_mm)
     assert zernike_um[index_from_nm(3, -1)] == pytest.approx(-0.4 * per_mm)
-    centred = own_polynomial(WornLens(0.0, spherical_aberration_um=0.3))
-    through = zernike_from_polynomial(centred, 2.0)
+    centered = own_polynomial(WornLens(0.0, spherical_aberration_um=0.3))
+    through = zernike_from_polynomial(centered, 2.0)
     assert total_defocus_dpt(through, 2.0) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_polynomial_is_shifted(rng):
-    polynomial, centre = rng.normal(size=28), (0.4, -0.7)
+    polynomial, center = rng.normal(size=28), (0.4, -0.7)
     x, y = rng.normal(size=(2, 9))
 
     def value(coefficients, x, y):
@@ -186,15 +186,15 @@ def test_a_polynomial_is_shifted(rng):
             coefficients
         )
 
-    moved = shifted_polynomial(polynomial, centre)
-    expected = value(polynomial, x - centre[0], y - centre[1])
+    moved = shifted_polynomial(polynomial, center)
+    expected = value(polynomial, x - center[0], y - center[1])
     assert value(moved, x, y) == pytest.approx(expected)
 
 
 def test_refraction_of_a_lens_through_any_pupil():
     lens = WornLens(-3.0, spherical_aberration_um=-0.2, centre_mm=(0.3, 0.0))
-    at_centre_dpt, per_mm2 = worn_refraction(lens, entrance_pupil_mm=3.0)
-    through = at_centre_dpt + per_mm2 * 2.0**2
+    at_center_dpt, per_mm2 = worn_refraction(lens, entrance_pupil_mm=3.0)
+    through = at_center_dpt + per_mm2 * 2.0**2
     paraxial_dpt = -3.0 / 1.009
     aside_dpt = total_defocus_dpt(
         zernike_from_polynomial(own_polynomial(lens), 2.0), 2.0

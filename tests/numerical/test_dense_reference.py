@@ -353,7 +353,7 @@ def test_transitional_layers_follow_the_equations():
     )
 
 
-def test_colour_difference_and_ssim_know_published_values(rng):
+def test_color_difference_and_ssim_know_published_values(rng):
     # Sharma, Wu & Dalal 2005, table 1, pairs 1, 7, 13, 17 and 25
     pairs = [
         ((50.0, 2.6772, -79.7751), (50.0, 0.0, -82.7485), 2.0425),

@@ -84,7 +84,7 @@ def test_parts_of_intervals_are_pairs(rng):
 
 
 def test_the_same_state_tells_little_more_than_is_used(rng):
-    """Neighbouring intervals alone, and those only from parts at their border."""
+    """Neighboring intervals alone, and those only from parts at their border."""
     layer_dpt = np.linspace(0.0, 4.0, 30)
     edge_dpt = part_edges_dpt(SimpleNamespace(layer_dpt=layer_dpt))
     change_dpt = np.zeros((ROWS + 1, COLUMNS + 1))
@@ -149,10 +149,10 @@ def test_frames_whose_state_changes_wait_once(hardware, store, monkeypatch):
         np.testing.assert_allclose(seen.color, wanted.color, rtol=1e-5, atol=1e-6)
 
 
-def test_a_moving_scene_is_whole_and_told_by_its_neighbours(
+def test_a_moving_scene_is_whole_and_told_by_its_neighbors(
     hardware, store, monkeypatch
 ):
-    """Once told wrongly, the neighbours count: then it waits once, as a still one."""
+    """Once told wrongly, the neighbors count: then it waits once, as a still one."""
     view = scene_view("courtyard", **SIZE)
     renderer = FilterRenderer(hardware)
     handle = renderer.load(store)

@@ -139,9 +139,9 @@ def test_every_offset_term_moves_the_cornea_by_its_own_polynomial(index):
     plain_mm = apex_ray(eye_surfaces(EyeParameters.mean_eye()), x_mm, y_mm)[0, 2]
     values = zernike_values(x_mm / 6.2, y_mm / 6.2)
     n, m = nm_from_index(index)
-    # the offsets are un-normalised: take the OSA norm out
+    # the offsets are un-normalized: take the OSA norm out
     peak = values[index] / np.sqrt((2 - (m == 0)) * (n + 1))
-    # towards the retina is +z
+    # toward the retina is +z
     assert moved_mm - plain_mm == pytest.approx(size_mm * peak, abs=1e-12)
 
 

@@ -359,7 +359,7 @@ def test_colors_beside_the_traced_one_are_as_good(name, h_deg, allowed_um, allow
 
 
 def test_a_vignetted_field_is_seen_through_the_open_area():
-    """The cut-off pupil's own fit, here nonsense, must not reach its neighbours."""
+    """The cut-off pupil's own fit, here nonsense, must not reach its neighbors."""
     source = estimated(kind="preset", name="emmetropia")
     axes = {"pupil_diameters_mm": (4.0, 7.0), "accommodations_dpt": (0.0,)}
     axes |= {"wavelengths_nm": (BLUE_NM,)}

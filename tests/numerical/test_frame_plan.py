@@ -101,7 +101,7 @@ def case(request, rng):
     return store, layers, image, used
 
 
-def test_the_cases_read_one_two_and_three_neighbours():
+def test_the_cases_read_one_two_and_three_neighbors():
     found = set()
     for (name, settings), pupil_mm, focus_dpt, *_ in CASES.values():
         store = store_for(name, **settings)

@@ -84,7 +84,7 @@ def test_hard_eyes_are_finite_and_smooth_through_sweeps(rng, name):
         steps = np.array(
             [np.sqrt(np.mean((b - a) ** 2)) for a, b in pairwise(pictures)]
         )
-        # no step stands out: the largest is within a few of its neighbours
+        # no step stands out: the largest is within a few of its neighbors
         beside = np.maximum(np.roll(steps, 1), np.roll(steps, -1))[1:-1]
         assert np.all(steps[1:-1] <= 3.0 * beside + 2e-3), steps
 
@@ -99,10 +99,10 @@ def test_any_display_is_filtered(rng, display):
     seen = renderer.render(view, handle, pupil_diameter_mm=4.0, focus_dpt=1.0)
     assert np.isfinite(seen.color).all()
     if display == "550,550,550":
-        grey = RgbdView(
+        gray = RgbdView(
             np.repeat(view.color[..., :1], 3, axis=2), view.depth_m, view.tangents
         )
-        seen = renderer.render(grey, handle, pupil_diameter_mm=4.0, focus_dpt=1.0)
+        seen = renderer.render(gray, handle, pupil_diameter_mm=4.0, focus_dpt=1.0)
         assert np.ptp(seen.color, axis=2).max() < 1e-3  # one light for all three
 
 

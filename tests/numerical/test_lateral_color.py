@@ -1,4 +1,4 @@
-"""Lateral colour: chief rays against other tracers, and white points in images."""
+"""Lateral color: chief rays against other tracers, and white points in images."""
 
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ def test_chief_rays_of_another_program_lie_apart_alike():
         seen = np.linspace(low, high, 20001)
         heights_mm = (seen[:, None] ** powers) @ odd
         expected = -np.radians(np.interp(landed_mm, heights_mm, seen) - field)
-        assert expected > 0.0  # up: towards the axis
+        assert expected > 0.0  # up: toward the axis
         assert shift == pytest.approx([0.0, expected], rel=0.02, abs=1e-9)
 
 
@@ -76,7 +76,7 @@ def paraxial_height_mm(eye, wavelength_nm):
         matrix = np.array([[1.0, 0.0], [-power, 1.0]]) @ matrix
         z = surface.z_mm
     to_retina = np.array([[1.0, (eye.retina.z_mm - z) / n[-1]], [0.0, 1.0]]) @ matrix
-    start_mm = -to_stop[0, 1] / to_stop[0, 0]  # at the cornea, towards the stop
+    start_mm = -to_stop[0, 1] / to_stop[0, 0]  # at the cornea, toward the stop
     return to_retina[0] @ [start_mm, 1.0]
 
 
@@ -93,7 +93,7 @@ def test_near_the_axis_it_is_the_paraxial_difference_of_magnification(wavelength
     assert found[0, 0] == pytest.approx([expected_mrad, 0.0], rel=2e-3, abs=1e-9)
 
 
-def test_a_centred_eye_has_none_on_its_axis_and_the_same_on_both_sides():
+def test_a_centered_eye_has_none_on_its_axis_and_the_same_on_both_sides():
     fields = [(0.0, 0.0), (25.0, 10.0), (-25.0, 10.0), (25.0, -10.0)]
     axis, *sides = chief_shift_mrad(
         navarro(reference()), fields_deg=fields, wavelengths_nm=RGB_WAVELENGTHS_NM
@@ -122,7 +122,7 @@ def landing(eye, direction, wavelength_nm):
 
 @pytest.mark.parametrize("field", [(18.0, -11.0), (-25.0, 6.0), (0.0, 0.0)])
 @pytest.mark.parametrize("wavelength_nm", [RED, BLUE])
-def test_light_seen_there_lands_where_the_colour_does(field, wavelength_nm):
+def test_light_seen_there_lands_where_the_color_does(field, wavelength_nm):
     """An eye without symmetry: both directions traced inwards, by a solver."""
     eye = irregular_eye()
     shift = chief_shift_mrad(eye, fields_deg=[field], wavelengths_nm=[wavelength_nm])
@@ -236,7 +236,7 @@ def test_red_and_blue_lie_beside_green_by_the_table(engine):
         assert np.abs(moved_px[1]).max() <= 1e-3  # green
         lateral_px[h_deg] = moved_px[:, 0]
     red, _, blue = lateral_px[20.0]
-    assert red > 0.3 and blue < -0.8  # red outwards, blue towards the axis
+    assert red > 0.3 and blue < -0.8  # red outwards, blue toward the axis
     np.testing.assert_allclose(lateral_px[-20.0], -lateral_px[20.0], atol=0.005)
     np.testing.assert_allclose(lateral_px[0.0], 0.0, atol=0.05)
 

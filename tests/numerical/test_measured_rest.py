@@ -88,7 +88,7 @@ def test_the_rest_fades_and_does_not_run_away_in_wide_pupils():
         assert rms_um == pytest.approx(rest.rms_um, rel=1e-9)
 
 
-def test_colour_is_that_of_measured_eyes():
+def test_color_is_that_of_measured_eyes():
     profile = parse_profile({"kind": "preset", "name": "post_lasik"})
     wavelengths_nm = np.array([464.0, 549.0, 612.0])
     traced = TracedEye.trace(

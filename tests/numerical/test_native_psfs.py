@@ -193,7 +193,7 @@ def test_cases_are_as_near_the_quadrature_as_the_python_engine(name):
     assert error <= 0.04
 
 
-def test_apodised_pupils_and_wide_primaries_are_those_of_the_python_engine():
+def test_apodized_pupils_and_wide_primaries_are_those_of_the_python_engine():
     rng = np.random.default_rng(3)
     effect = StilesCrawford(centre_mm=(0.5, 0.2))
     wide_nm = np.array(

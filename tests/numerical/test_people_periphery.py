@@ -59,11 +59,11 @@ def preset(name, **more):
 def nodal(h_deg, v_deg):
     """Aberrations of a round eye about an axis of its own, in closed form (n, 12)."""
     place = h_deg + 1j * v_deg
-    centre = 5.0 - 2.0j
+    center = 5.0 - 2.0j
     terms = np.zeros((place.size, len(TERMS)))
-    defocus = 1e-3 * np.abs(place - centre) ** 2
-    astigmatism = 8e-4 * (place - centre) ** 2
-    coma = -6e-3 * (place - centre)
+    defocus = 1e-3 * np.abs(place - center) ** 2
+    astigmatism = 8e-4 * (place - center) ** 2
+    coma = -6e-3 * (place - center)
     for index, values in (
         (4, defocus),
         (5, astigmatism.real),

@@ -43,7 +43,7 @@ def defocus_um(vergence_dpt, pupil_mm):
 
 
 def centroid_px(kernel):
-    """Centre of mass (x right, y up), px."""
+    """Center of mass (x right, y up), px."""
     offset = np.arange(kernel.shape[0]) - kernel.shape[0] // 2
     kernel = kernel.astype(np.float64)
     return (kernel.sum(0) @ offset, -(kernel.sum(1) @ offset))

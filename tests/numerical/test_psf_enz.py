@@ -48,7 +48,7 @@ def test_without_defocus_the_function_is_zernikes_bessel_image(n, m):
 
 @pytest.mark.parametrize("defocus_rad", [0.0, 1e-12, -1e-12, 2.5, -40.0])
 @pytest.mark.parametrize(("n", "m"), TERMS)
-def test_at_the_centre_and_without_defocus_there_is_no_gap(n, m, defocus_rad):
+def test_at_the_center_and_without_defocus_there_is_no_gap(n, m, defocus_rad):
     """Limits r -> 0 and f -> 0, where the published series is 0/0 and infinity."""
     near = enz_function(n, m, np.array([0.0, 1e-9, 1e-6]), defocus_rad)
     assert np.isfinite(near).all()

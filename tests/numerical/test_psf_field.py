@@ -1,4 +1,4 @@
-"""PSFs away from the axis: elliptical pupil, local image scale, apodisation."""
+"""PSFs away from the axis: elliptical pupil, local image scale, apodization."""
 
 import math
 
@@ -55,7 +55,7 @@ def errors(zernike_um, options, image, *, is_kept=False, **engine):
 GEOMETRIES = {
     "sheared scale": {"pixel_from_mrad": SHEARED},
     "ellipse": {"pixel_pitch_mrad": PITCH_MRAD, "pupil_ellipse": ELLIPSE},
-    "both, apodised": {
+    "both, apodized": {
         "pixel_from_mrad": SHEARED,
         "pupil_ellipse": ELLIPSE,
         "stiles_crawford": StilesCrawford.of_eye("OD"),

@@ -135,7 +135,7 @@ METHODS = ["fourier", "enz", "geometric"]
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("pupil_mm", [0.5, 3.0, 7.0])
 def test_no_aberration_is_the_airy_disc_by_every_method(method, pupil_mm):
-    """Encircled energy 1 - J0² - J1² bounds the centre pixel from both sides."""
+    """Encircled energy 1 - J0² - J1² bounds the center pixel from both sides."""
     psf = compute_psfs(
         np.zeros((1, 28)), pupil_diameter_mm=pupil_mm, method=method, **COMMON
     )[0]
@@ -169,7 +169,7 @@ def test_defocus_passes_through_zero_without_a_step(method):
     for i in range(4):
         # float32 of two different grids.
         np.testing.assert_allclose(kernels[i], kernels[8 - i], atol=3e-6)
-    # The centre's light falls with the square of the defocus.
+    # The center's light falls with the square of the defocus.
     assert changes[0] > 10.0 * changes[1] > 0.0
     # Another FFT length may begin anywhere, at zero too: its sampling error, no more.
     limit = 1e-4 if method == "enz" else 2e-3

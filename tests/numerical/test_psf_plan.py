@@ -42,7 +42,7 @@ def measured_eye(name):
     return MeasuredWavefront.from_profile(load_profile(name))
 
 
-# ----- nodes and their neighbours
+# ----- nodes and their neighbors
 
 
 def test_brackets_are_those_of_each_group():

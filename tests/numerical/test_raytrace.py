@@ -54,7 +54,7 @@ def test_opticstudio_rays_are_reproduced_to_1e_8_mm():
     for ray in data["rays"]:
         points = np.array(ray["points_cornea_front_to_retina"])
         points[:, 2] += eye.stop_z_mm
-        # Field angles are positive where the light travels towards +x and +y.
+        # Field angles are positive where the light travels toward +x and +y.
         slopes = np.tan(np.radians(ray["field_deg"]))
         direction = np.array([*slopes, 1.0])
         traced = trace_rays(

@@ -221,7 +221,7 @@ def test_whole_field_agrees_with_the_exact_psf_of_every_pixel(engine, rng, name)
         engine, name, tangents(width, height, 40.0), size=(width, height)
     )
     color = texture(rng, height, width, cell_px=3)
-    # a floor that comes nearer: half a dioptre to two
+    # a floor that comes nearer: half a diopter to two
     depth_m = 1.0 / np.linspace(0.4, 1.6, height)[:, None] * np.ones((1, width))
     truth = splat_exactly(bench, color, depth_m.astype(np.float32))
     result = bench.render(color, depth_m)

@@ -152,7 +152,7 @@ def test_all_depth_missing_is_infinity(bench, rng):
     assert np.array_equal(nothing.color, bench.render(bench.view(image, np.inf)).color)
 
 
-def test_colour_that_is_not_finite_is_black_and_counted(bench, rng):
+def test_color_that_is_not_finite_is_black_and_counted(bench, rng):
     image = texture(rng, 101, 150)
     image[5, 7] = np.nan
     image[6, 9, 1] = np.inf

@@ -1,4 +1,4 @@
-"""High dynamic range and wide gamut: any unit of light, and colours below zero."""
+"""High dynamic range and wide gamut: any unit of light, and colors below zero."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from filter_service.constants import HALF_MAX
 from filter_service.rendering.srgb import half_from_linear
 from tests.numerical.synthetic import Bench, psnr_db, texture
 
-WIDTH, HEIGHT = 101, 61  # odd: halves of a pixel share words with its neighbours
+WIDTH, HEIGHT = 101, 61  # odd: halves of a pixel share words with its neighbors
 MYOPIA = {"kind": "preset", "name": "myopia"}
 
 
@@ -52,7 +52,7 @@ def test_merging_keeps_the_dark_of_a_bright_scene(bench, rng):
 
 @pytest.mark.parametrize("merge", [True, False])
 def test_negative_light_is_filtered_like_positive(bench, rng, merge):
-    """Light minus an even grey: the filter of the difference is the difference."""
+    """Light minus an even gray: the filter of the difference is the difference."""
     color, depth_m = hdr_scene(rng)
     color = np.minimum(color, 2.0)
     plain = bench.render(bench.view(color, depth_m), merge=False)

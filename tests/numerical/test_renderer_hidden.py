@@ -200,7 +200,7 @@ def test_a_hidden_layer_that_does_not_fit_is_refused(bench, rng, changes, field)
     assert caught.value.allowed
 
 
-def test_bad_colour_counts_only_where_something_is_hidden(bench, rng):
+def test_bad_color_counts_only_where_something_is_hidden(bench, rng):
     view = disc_view(bench, rng)
     view.hidden_color[0, 0] = np.nan  # nothing is hidden here
     view.hidden_color[HEIGHT // 2, WIDTH // 2] = np.inf

@@ -150,7 +150,7 @@ def test_a_frame_whose_lists_outgrow_their_buffers_loses_nothing(gl_engine, rng)
 
 
 def faulty_view(bench, rng):
-    """A scene with pixels without depth, too near, and without a finite colour."""
+    """A scene with pixels without depth, too near, and without a finite color."""
     color, depth_m = texture(rng, 101, 150), depth_scene()
     color[70:73, 20:30, 1] = np.nan
     color[90, 100] = np.inf

@@ -67,17 +67,17 @@ def airy_kernel(*, pupil_mm, wavelength_nm, pitch_mrad, radius_px):
     """Airy pattern (2 J1(x)/x)² integrated over pixels by Gauss-Legendre."""
     order = 40  # several rings cross a pixel
     nodes, weights = np.polynomial.legendre.leggauss(order)
-    centres = np.arange(-radius_px, radius_px + 1)
-    points = (centres[:, None] + nodes / 2).ravel() * pitch_mrad
-    weight = np.tile(weights / 2, len(centres)) * pitch_mrad
+    centers = np.arange(-radius_px, radius_px + 1)
+    points = (centers[:, None] + nodes / 2).ravel() * pitch_mrad
+    weight = np.tile(weights / 2, len(centers)) * pitch_mrad
     theta_rad = np.hypot(points[:, None], points[None]) * 1e-3
     scale = math.pi * pupil_mm * 1e6 / wavelength_nm
     x = np.maximum(scale * theta_rad, 1e-12)
-    # normalised to unit volume: pi (D / 2 lambda)² at the centre, per rad²
+    # normalized to unit volume: pi (D / 2 lambda)² at the center, per rad²
     peak = math.pi * (pupil_mm * 1e6 / (2 * wavelength_nm)) ** 2 * 1e-6
     density = peak * (2 * j1(x) / x) ** 2
     cells = (density * weight[:, None] * weight[None]).reshape(
-        len(centres), order, len(centres), order
+        len(centers), order, len(centers), order
     )
     return cells.sum(axis=(1, 3))
 
@@ -104,12 +104,12 @@ def test_uniform_image_stays_uniform_for_every_preset(engine, name):
     bench = Bench(
         engine, {"kind": "preset", "name": name}, **SIZE, vertical_fov_deg=50.0
     )
-    colour = np.array([0.8, 0.4, 0.1], np.float32)
-    image = np.broadcast_to(colour, (120, 160, 3)).copy()
+    color = np.array([0.8, 0.4, 0.1], np.float32)
+    image = np.broadcast_to(color, (120, 160, 3)).copy()
     depth_m = np.where(np.arange(160) < 80, 0.3, 6.0)[None, :]
     for accumulation in ("coverage", "paper"):
         result = bench.render(bench.view(image, depth_m), accumulation=accumulation)
-        assert np.abs(result.color - colour).max() < 1e-3
+        assert np.abs(result.color - color).max() < 1e-3
 
 
 SKEWED = {
@@ -188,7 +188,7 @@ def test_plane_through_a_myope_is_true_convolution(engine, rng, object_dpt):
     assert psnr_db(result.color[inside, inside], truth[inside, inside]) >= 60.0
 
 
-def test_slanted_plane_is_the_normalised_gather(engine, rng):
+def test_slanted_plane_is_the_normalized_gather(engine, rng):
     bench = Bench(engine, MYOPE, **NARROW)
     eye = MeasuredWavefront.from_profile(parse_profile(MYOPE))
     # blur 0.1 px per px across the image: d from 0.5 dpt on
@@ -217,7 +217,7 @@ def test_slanted_plane_is_the_normalised_gather(engine, rng):
     assert psnr_db(result.color[inside], truth[inside]) >= 50.0
 
 
-def test_two_planes_of_equal_colour_stay_flat_across_their_edge(engine):
+def test_two_planes_of_equal_color_stay_flat_across_their_edge(engine):
     bench = Bench(engine, MYOPE, **NARROW)
     image = np.full((120, 160, 3), 0.5, np.float32)
     depth_m = np.where(np.arange(160) < 80, 0.4, 4.0)[None, :]

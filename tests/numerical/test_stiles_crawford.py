@@ -67,7 +67,7 @@ def point_through(engine, profile, spec):
 
 
 def focused_state(eye, pupil_mm):
-    """State of the axis for the three colours: the eye looks at infinity."""
+    """State of the axis for the three colors: the eye looks at infinity."""
     used_dpt = eye.accommodation_dpt(0.0, pupil_diameter_mm=pupil_mm)
     known = {
         "pupil_diameter_mm": pupil_mm,
@@ -120,7 +120,7 @@ def test_a_point_of_light_is_the_kernel_of_that_eyes_effect(
 
 
 @pytest.mark.parametrize("eye_side", SIDES)
-def test_geometric_blur_falls_from_the_centre_as_cones_see_it(engine, eye_side):
+def test_geometric_blur_falls_from_the_center_as_cones_see_it(engine, eye_side):
     """Light of the pupil point u lands at -M u: log10 of it is a paraboloid about u0.
 
     The rims of the disc, where nodes of defocus are blended, are left out.
@@ -157,21 +157,21 @@ def test_the_left_eye_is_the_right_one_mirrored(engine):
 
 
 @pytest.mark.parametrize("mode", ["on-axis", "dynamic"])
-def test_apodised_kernels_are_narrower_and_lose_no_light(mode):
+def test_apodized_kernels_are_narrower_and_lose_no_light(mode):
     """Of one plan: what it predicts without the effect is an upper bound with it."""
     spec = spec_for(pupil_mm=6.0, mode=mode, object_range_dpt=(0.0, 3.0))
     profile = myope(-1.0)
     eye, _ = eye_for_spec(profile, spec)
     plan = plan_cache(eye, spec)
-    apodised_spec = spec.with_settings(stiles_crawford=True)
+    apodized_spec = spec.with_settings(stiles_crawford=True)
     without = build_psf_store(eye, spec, plan=plan)
-    with_it = build_psf_store(eye, apodised_spec, plan=plan)
+    with_it = build_psf_store(eye, apodized_spec, plan=plan)
     np.testing.assert_array_equal(with_it.blur_px, without.blur_px)
     assert np.all(with_it.radius_px <= without.radius_px)
     assert np.all(with_it.spread_px <= 1.001 * without.spread_px)
     assert with_it.max_lost_energy_ratio <= 1.0 - spec.kept_energy_ratio
     assert with_it.memory_mb <= without.memory_mb
-    predicted = plan_cache(eye, apodised_spec).prediction
+    predicted = plan_cache(eye, apodized_spec).prediction
     assert predicted.memory_mb <= plan.prediction.memory_mb
     assert predicted.memory_mb == pytest.approx(with_it.memory_mb, rel=0.15)
 

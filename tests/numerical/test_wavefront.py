@@ -95,7 +95,7 @@ def test_coddington_refractions_to_1e_3_dpt():
             stop_diameter_mm=0.2,
             v_deg=-row["field_deg"],
         )
-        # Curvatures at the centre of the pupil: higher orders take part there.
+        # Curvatures at the center of the pupil: higher orders take part there.
         area, c = found.zernike_radius_mm**2, found.zernike_um
         mean_dpt = (
             -SPHERE_PER_C20 * c[4]
@@ -257,12 +257,12 @@ def test_slopes_and_path_differences_describe_one_wavefront():
 
 
 def test_the_chief_ray_has_no_slope():
-    """Tilt balances coma: the fitted surface is flat at its centre."""
+    """Tilt balances coma: the fitted surface is flat at its center."""
     found = wavefront_aberrations(
         irregular_eye(), wavelength_nm=555.0, stop_diameter_mm=2.0, h_deg=20.0
     )
     slopes = zernike_gradient(0.0, 0.0) @ found.zernike_um
-    # what the fit leaves at its centre, next to a tilt that coma needs
+    # what the fit leaves at its center, next to a tilt that coma needs
     assert np.abs(slopes).max() < 1e-4
     assert np.abs(found.zernike_um[[1, 2]]).max() > 0.03
 

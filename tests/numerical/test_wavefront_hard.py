@@ -76,7 +76,7 @@ def test_the_reference_eye_passes_7_mm_at_45_deg_whole():
 
 
 def test_a_lost_chief_ray_is_a_status():
-    """A posterior cornea so small that oblique light to the stop's centre misses it."""
+    """A posterior cornea so small that oblique light to the stop's center misses it."""
     eye = navarro(REFERENCE)
     back = replace(eye.surfaces[1], clear_radius_mm=1.0)
     view = {"wavelength_nm": 555.0, "stop_diameter_mm": 4.0}

@@ -94,7 +94,7 @@ def test_horizontal_flip_mirrors_the_wavefront(rng):
     assert np.abs(mirrored - zernike_values(-x, y) @ zernike_um).max() < 1e-13
 
 
-def test_removing_tilt_flattens_the_centre_and_keeps_coma(rng):
+def test_removing_tilt_flattens_the_center_and_keeps_coma(rng):
     zernike_um = rng.normal(size=N_TERMS)
     level = remove_central_tilt(zernike_um)
     assert np.abs(zernike_gradient(0.0, 0.0) @ level).max() < 1e-13

@@ -1,4 +1,4 @@
-"""Data sets: the same rows whatever makes them, labelled by the tracer itself."""
+"""Data sets: the same rows whatever makes them, labeled by the tracer itself."""
 
 import numpy as np
 import pytest

@@ -171,7 +171,7 @@ def test_the_lens_is_bounded_by_the_features():
 
 
 @pytest.mark.parametrize(("pupil_mm", "close_mm"), [(0.4, 3e-3), (3, 6e-3), (6, 0.04)])
-def test_a_centred_eye_hardly_needs_a_network_to_focus(pupil_mm, close_mm):
+def test_a_centered_eye_hardly_needs_a_network_to_focus(pupil_mm, close_mm):
     """No offsets, no tilts: the closed form alone nearly finds the lens."""
     eye = torch.from_numpy(mean_vector())[None].repeat(6, 1)
     focus_dpt = torch.linspace(0.0, 5.0, 6, dtype=torch.float64)
@@ -185,7 +185,7 @@ def test_a_centred_eye_hardly_needs_a_network_to_focus(pupil_mm, close_mm):
     assert labels.abs().max() > 0.5
 
 
-def test_spherical_aberration_of_a_centred_eye_is_the_traced_one():
+def test_spherical_aberration_of_a_centered_eye_is_the_traced_one():
     eye = torch.from_numpy(mean_vector())[None]
     features = FocusFeatures().double()
     pupils_mm = torch.tensor([2.0, 4.0, 6.0, 7.0], dtype=torch.float64)

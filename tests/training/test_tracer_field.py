@@ -41,7 +41,7 @@ def random_rows(rng, count):
 
 
 def as_matrix(ellipse_mm):
-    """Centre and R diag(major, minor) R^T, (..., 5), of the compiled ellipse."""
+    """Center and R diag(major, minor) R^T, (..., 5), of the compiled ellipse."""
     cx, cy, major, minor, angle = np.moveaxis(ellipse_mm, -1, 0)
     c, s = np.cos(angle), np.sin(angle)
     xx, yy = major * c * c + minor * s * s, major * s * s + minor * c * c

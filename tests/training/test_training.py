@@ -1,4 +1,4 @@
-"""Training: its optimiser by hand, exact resumption, two processes, a whole run."""
+"""Training: its optimizer by hand, exact resumption, two processes, a whole run."""
 
 import json
 import os
@@ -20,7 +20,7 @@ from training.eye_prior import squared_deviation
 from training.generate import generate
 from training.losses import DiscriminatorLoss
 from training.models import ModelSettings, Network
-from training.optimiser import Lookahead, make_optimiser, pace
+from training.optimizer import Lookahead, make_optimizer, pace
 from training.run_file import RunFileError, read_run
 from training.tasks import TASKS
 from training.train import CHECKPOINT, LOG, train
@@ -82,9 +82,9 @@ def test_slow_weights_follow_the_fast_ones():
 
 def test_weight_decay_is_decoupled():
     weight = torch.nn.Parameter(torch.tensor([2.0]))
-    optimiser = make_optimiser([weight], learning_rate=0.1, weight_decay=0.5)
+    optimizer = make_optimizer([weight], learning_rate=0.1, weight_decay=0.5)
     weight.grad = torch.zeros(1)
-    optimiser.step()
+    optimizer.step()
     assert weight.item() == pytest.approx(2.0 * (1.0 - 0.1 * 0.5))
 
 
@@ -323,7 +323,7 @@ def test_an_estimated_eye_is_judged_by_its_light():
     own_um = misfit_of_eyes(y[:, :45].astype(float), x.astype(float))
     assert np.abs(own_um).max() < 1e-4  # eyes and wavefronts are kept in 32 bits
     shifted = y[:, :45].astype(float)
-    shifted[:, 0] += 0.1  # mm of eye length: a quarter of a dioptre
+    shifted[:, 0] += 0.1  # mm of eye length: a quarter of a diopter
     moved_um = misfit_of_eyes(shifted, x.astype(float))[:, 1]
     radius_mm = x[:, -2] / 2
     moved_dpt = -4 * np.sqrt(3) * moved_um / radius_mm**2

@@ -62,7 +62,7 @@ def test_tum_joins_what_is_nearest_in_time_and_uses_each_once(tum):
     ]
 
 
-def test_tum_depth_is_5000_units_a_metre_and_0_is_missing(tum):
+def test_tum_depth_is_5000_units_a_meter_and_0_is_missing(tum):
     _, frames = list_frames(tum, "auto", Told())
     depth_m = frames[0].depth_form.read(frames[0].depth)
     np.testing.assert_allclose(depth_m, [[1.0, 0.0, 0.0002, 13.107]], rtol=1e-6)
@@ -144,7 +144,7 @@ def test_a_calibration_without_a_baseline_is_refused(tmp_path):
 # --- NYU depth v2 ------------------------------------------------------------
 
 
-def test_nyu_pairs_are_millimetres_with_the_color_camera_of_the_toolbox(tmp_path):
+def test_nyu_pairs_are_millimeters_with_the_color_camera_of_the_toolbox(tmp_path):
     write_color(tmp_path / "00001_colors.png")
     write_integers(tmp_path / "00001_depth.png", [[1500, 0, 9999, 1]] * 2)
     layout, (frame,) = list_frames(tmp_path, "auto", Told())
@@ -178,7 +178,7 @@ def test_nyu_pairs_have_other_names_too(tmp_path):
     assert frame.depth.name == "sync_depth_00045.png"
 
 
-def test_nyu_counts_are_turned_into_metres_by_the_toolbox_formula():
+def test_nyu_counts_are_turned_into_meters_by_the_toolbox_formula():
     # beyond 1092.5 - 35.13 = 1057.37 it is more than 10 m, then less than 0
     counts = np.array([[741, 1057, 1058, 2047, 0]], np.uint16)
     np.testing.assert_allclose(
@@ -193,7 +193,7 @@ def test_nyu_raw_depth_is_put_where_the_color_camera_sees_it():
     seen_m = registered_m(depth_m)
     (row,), (column,) = np.nonzero(seen_m)
     # Turned back, (0, 0, 2) m is -(-0.0086, 0.0073, 2); moved by 25, -0.3 and 0.7 mm
-    # (0.0337, -0.0076, -1.9993).  That is 518.9 x / z = -8.7 px from the centre at
+    # (0.0337, -0.0076, -1.9993).  That is 518.9 x / z = -8.7 px from the center at
     # 325.6, and 519.5 y / z = 2.0 px, less the 0.4 px off the axis, from 253.7.
     assert (row, column) == (255, 317)
     assert seen_m[row, column] == pytest.approx(1.9993, abs=1e-4)
@@ -311,15 +311,15 @@ def test_frames_of_videos_are_read_by_their_numbers_in_any_order(tmp_path, rng):
     """Groups of 5 pictures: a frame in the middle needs those before it."""
     from clients.batch.video_reading import VideoReader
 
-    greys = 10 * np.arange(20) + 20
-    colors = [np.full((32, 48, 3), grey, np.uint8) for grey in greys]
+    grays = 10 * np.arange(20) + 20
+    colors = [np.full((32, 48, 3), gray, np.uint8) for gray in grays]
     write_video(tmp_path / "c.mp4", colors, "libx264", "yuv420p", "rgb24", g="5")
     depths = [rng.integers(0, 65536, (32, 48)).astype(np.uint16) for _ in range(20)]
     write_video(tmp_path / "d.mkv", depths, "ffv1", "gray16le", "gray16le")
     with VideoReader(tmp_path / "c.mp4") as reader:
         assert (reader.count, reader.rate_hz) == (20, 25.0)
         for index in (0, 1, 2, 13, 3, 19, 12, 13):
-            assert abs(reader.color(index).mean() - greys[index]) < 3.0
+            assert abs(reader.color(index).mean() - grays[index]) < 3.0
     with VideoReader(tmp_path / "d.mkv") as reader:
         for index in (7, 8, 2, 19):
             np.testing.assert_array_equal(reader.integers(index), depths[index])
@@ -343,7 +343,7 @@ def test_depth_of_a_video_is_scaled_and_other_pixels_are_refused(tmp_path):
     np.testing.assert_allclose(depth_m, 1.5)
     told = Told(tmp_path / "c.mkv", FieldOfView(40.0))
     _, frames = list_frames(tmp_path / "c.mkv", "auto", told)
-    with pytest.raises(ValueError, match=r"pixels are .*; allowed: 16-bit grey"):
+    with pytest.raises(ValueError, match=r"pixels are .*; allowed: 16-bit gray"):
         runner._read(frames[0])
 
 
@@ -405,7 +405,7 @@ def test_the_middles_depth_is_the_median_of_what_is_known_there():
     assert center_depth_m(np.zeros((4, 4), np.float32)) == math.inf
 
 
-def test_focus_at_the_center_is_in_dioptres_and_within_reach():
+def test_focus_at_the_center_is_in_diopters_and_within_reach():
     states = States(3.0, None)
     assert states.of("a", np.full((8, 8), 0.5, np.float32)) == (3.0, 2.0)
     assert states.of("a", np.full((8, 8), np.inf, np.float32)) == (3.0, 0.0)

@@ -41,7 +41,7 @@ def test_what_is_missing_and_what_is_infinite_stay_so(encoding):
     assert np.all(found[5:] > 60.0)
 
 
-def test_both_zeros_of_dioptres_are_infinity():
+def test_both_zeros_of_diopters_are_infinity():
     sent = np.array([0.0, -0.0, -1e-3, np.inf, np.nan], np.float16)
     found = decoded_depth(sent, "dpt16")
     assert np.isposinf(found[:2]).all()

@@ -28,9 +28,9 @@ from tests.grid_specs import grid_spec
 AT_NM = np.arange(400.0, 701.0, 5.0)
 
 
-def lines(*centres_nm, width_nm=4.0):
+def lines(*centers_nm, width_nm=4.0):
     """Narrow primaries (n, 3)."""
-    away = (AT_NM[:, None] - np.array(centres_nm)) / width_nm
+    away = (AT_NM[:, None] - np.array(centers_nm)) / width_nm
     return np.exp(-0.5 * away**2)
 
 
@@ -59,7 +59,7 @@ def test_narrow_primaries_are_found_where_they_are():
 
 
 @pytest.mark.parametrize("spectra", [np.ones((61, 2)), np.ones((61, 3))])
-def test_spectra_that_are_no_three_colours_are_refused(spectra):
+def test_spectra_that_are_no_three_colors_are_refused(spectra):
     with pytest.raises(ValueError, match="spectra"):
         primaries_of_spectra(AT_NM, spectra)
 

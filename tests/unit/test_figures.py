@@ -22,7 +22,7 @@ from clients.figures import (
 )
 from clients.figures.acuity import acuity_log_mar, distances_dpt
 from clients.figures.field_maps import blur_arcmin
-from clients.figures.psfs import centred, psf_picture, ray_directions_mrad
+from clients.figures.psfs import centered, psf_picture, ray_directions_mrad
 from clients.figures.study import FIELD_H_DEG, FIELD_V_DEG
 from estimator import load_profile
 from tests.source_tree import package_imports
@@ -101,7 +101,7 @@ def test_a_far_sighted_eye_accommodates_before_it_is_blurred():
 
 def test_rays_of_defocus_fill_a_disc(myope):
     wavefront = myope.wavefront(4.0)
-    slopes, reach_arcmin = ray_directions_mrad(wavefront), centred(wavefront)[1]
+    slopes, reach_arcmin = ray_directions_mrad(wavefront), centered(wavefront)[1]
     # far light meets 2 mm of an eye of -2 and -3 dpt, at the entrance pupil
     strongest_mrad = 2.0 * 3.0 / (1 + 0.00305 * 3.0)
     assert np.linalg.norm(slopes, axis=1).max() == pytest.approx(
@@ -113,7 +113,7 @@ def test_rays_of_defocus_fill_a_disc(myope):
 
 
 def test_a_point_lies_in_the_middle_of_its_picture_with_all_its_light(cone):
-    wavefront, reach_arcmin = centred(cone.wavefront(5.0))
+    wavefront, reach_arcmin = centered(cone.wavefront(5.0))
     kernel = psf_picture(wavefront, side_arcmin=2.5 * reach_arcmin)
     assert kernel.sum() == pytest.approx(1.0, abs=1e-3)
     rows, columns = np.nonzero(kernel > 0.05 * kernel.max())
@@ -215,7 +215,7 @@ def test_through_lenslets_no_acuity_is_told_but_through_their_clear_middle():
 @pytest.mark.parametrize("sphere_dpt", [-20.0, 15.0])
 def test_the_strongest_prescriptions_have_a_point(sphere_dpt):
     eye = EyeStudy.of({"kind": "prescription", "sphere_dpt": sphere_dpt})
-    wavefront, reach_arcmin = centred(eye.wavefront(5.0))
+    wavefront, reach_arcmin = centered(eye.wavefront(5.0))
     kernel = psf_picture(wavefront, side_arcmin=2.5 * reach_arcmin)
     assert kernel.sum() == pytest.approx(1.0, abs=0.01)
 
@@ -253,7 +253,7 @@ def test_rms_bars_are_of_the_smaller_circle(perfect, cone):
 @pytest.mark.parametrize(
     ("figure_of", "axes_count"),
     [
-        (wavefront_map_figure, 4),  # two of them are colour bars
+        (wavefront_map_figure, 4),  # two of them are color bars
         (psfs_figure, 4),
         (mtf_figure, 1),
         (field_maps_figure, 8),

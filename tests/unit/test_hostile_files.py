@@ -256,8 +256,8 @@ def test_an_exr_with_damaged_pixels_is_refused_without_a_word(
 
 def test_a_tiff_with_damaged_pixels_is_refused_without_a_word(tmp_path, rng, capfd):
     path = tmp_path / "a.tif"
-    metres = Image.fromarray(rng.random((64, 64), np.float32))
-    metres.save(path, compression="tiff_deflate")
+    meters = Image.fromarray(rng.random((64, 64), np.float32))
+    meters.save(path, compression="tiff_deflate")
     content = bytearray(path.read_bytes())
     content[8:40] = bytes(32)
     path.write_bytes(content)

@@ -1,4 +1,4 @@
-"""Colour and depth files: what is read is what was written, or a refusal by name."""
+"""Color and depth files: what is read is what was written, or a refusal by name."""
 
 import numpy as np
 import OpenEXR
@@ -31,12 +31,12 @@ def test_png_keeps_srgb_bytes_and_drops_alpha(tmp_path, rng):
     np.testing.assert_array_equal(read_color(tmp_path / "rgba.png"), srgb[:, :, :3])
 
 
-def test_grey_becomes_three_equal_channels(tmp_path):
-    grey = np.arange(35, dtype=np.uint8).reshape(5, 7)
-    Image.fromarray(grey).save(tmp_path / "grey.png")
-    color = read_color(tmp_path / "grey.png")
+def test_gray_becomes_three_equal_channels(tmp_path):
+    gray = np.arange(35, dtype=np.uint8).reshape(5, 7)
+    Image.fromarray(gray).save(tmp_path / "gray.png")
+    color = read_color(tmp_path / "gray.png")
     assert color.shape == (5, 7, 3)
-    np.testing.assert_array_equal(color[:, :, 1], grey)
+    np.testing.assert_array_equal(color[:, :, 1], gray)
 
 
 def test_exr_channels_come_back_in_rgb_order(tmp_path):
@@ -63,13 +63,13 @@ def test_float_depth_keeps_infinity_and_holes(tmp_path, dtype, depth_scale, expe
     np.testing.assert_array_equal(depth_m, [expected_m])
 
 
-@pytest.mark.parametrize(("depth_scale", "metres"), [(None, 1.5), (0.0002, 0.3)])
-def test_16_bit_png_is_millimetres_unless_a_scale_is_given(
-    tmp_path, depth_scale, metres
+@pytest.mark.parametrize(("depth_scale", "meters"), [(None, 1.5), (0.0002, 0.3)])
+def test_16_bit_png_is_millimeters_unless_a_scale_is_given(
+    tmp_path, depth_scale, meters
 ):
     Image.fromarray(np.array([[1500, 0]], np.uint16)).save(tmp_path / "depth.png")
     depth_m = read_depth(tmp_path / "depth.png", depth_scale=depth_scale)
-    np.testing.assert_allclose(depth_m, [[metres, 0.0]], rtol=1e-6)
+    np.testing.assert_allclose(depth_m, [[meters, 0.0]], rtol=1e-6)
 
 
 def test_8_bit_depth_wants_a_scale(tmp_path):
@@ -80,13 +80,13 @@ def test_8_bit_depth_wants_a_scale(tmp_path):
     np.testing.assert_allclose(depth_m, [[3.0, 0.0]], rtol=1e-6)
 
 
-def test_float_tiff_and_exr_depth_are_metres(tmp_path, rng):
-    metres = rng.random((5, 7), dtype=np.float32)
-    Image.fromarray(metres).save(tmp_path / "depth.tif")
-    np.testing.assert_array_equal(read_depth(tmp_path / "depth.tif"), metres)
-    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Z": metres}) as file:
+def test_float_tiff_and_exr_depth_are_meters(tmp_path, rng):
+    meters = rng.random((5, 7), dtype=np.float32)
+    Image.fromarray(meters).save(tmp_path / "depth.tif")
+    np.testing.assert_array_equal(read_depth(tmp_path / "depth.tif"), meters)
+    with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"Z": meters}) as file:
         file.write(str(tmp_path / "depth.exr"))
-    np.testing.assert_array_equal(read_depth(tmp_path / "depth.exr"), metres)
+    np.testing.assert_array_equal(read_depth(tmp_path / "depth.exr"), meters)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_float_tiff_and_exr_depth_are_metres(tmp_path, rng):
         (np.zeros((4, 6, 3), np.int32), "int32"),
     ],
 )
-def test_unfit_colour_is_refused_with_what_was_found(tmp_path, array, said):
+def test_unfit_color_is_refused_with_what_was_found(tmp_path, array, said):
     np.save(tmp_path / "color.npy", array)
     with pytest.raises(ValueError, match=said) as caught:
         read_color(tmp_path / "color.npy")
@@ -128,7 +128,7 @@ def test_a_depth_file_that_is_none_is_refused(tmp_path, name):
         read_depth(tmp_path / name)
 
 
-def test_colour_with_three_channels_is_no_depth(tmp_path):
+def test_color_with_three_channels_is_no_depth(tmp_path):
     Image.fromarray(np.zeros((4, 6, 3), np.uint8)).save(tmp_path / "depth.png")
     with pytest.raises(ValueError, match="one channel"):
         read_depth(tmp_path / "depth.png")

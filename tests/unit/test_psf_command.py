@@ -69,7 +69,7 @@ def test_off_axis_the_eye_is_traced_through_its_elliptical_pupil(psf):
 
 
 def _spread_px(kernel):
-    """Mean distance of the light from its centre."""
+    """Mean distance of the light from its center."""
     offset = np.arange(kernel.shape[0]) - kernel.shape[0] // 2
     x, y = kernel.sum(0) @ offset, kernel.sum(1) @ offset
     return float((kernel * np.hypot(offset - x, offset[:, None] - y)).sum())

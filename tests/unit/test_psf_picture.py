@@ -23,7 +23,7 @@ def test_a_point_has_no_radius():
     assert half_light_radius_px(_disc(0, 3)) == 0.0
 
 
-def test_grey_falls_by_a_fixed_step_with_every_decade():
+def test_gray_falls_by_a_fixed_step_with_every_decade():
     kernel = np.zeros((401, 401), np.float32)
     kernel[0, :4] = [1.0, 0.1, 0.01, 10.0**-DECADES / 2]
     row = draw_psf(kernel, pixel_arcmin=1.0)[0, :5, 0]

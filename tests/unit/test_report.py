@@ -318,8 +318,8 @@ def test_charts_of_a_strong_blur_have_fewer_pixels():
 
 
 def test_charts_that_exist_are_shown_with_what_is_read(myope):
-    grey = np.full((8, 8, 3), 128, np.uint8)
-    charts = {(p, d): grey for p in (3.0, 5.0) for d in (0.4, 1.0, 6.0)}
+    gray = np.full((8, 8, 3), 128, np.uint8)
+    charts = {(p, d): gray for p in (3.0, 5.0) for d in (0.4, 1.0, 6.0)}
     shown = EyeFacts(myope.study, "x", myope.numbers, charts)
     row = document_of([shown]).sections[0].rows[3]
     assert all(isinstance(block, Picture) for block in row.blocks)
@@ -330,12 +330,12 @@ def test_charts_that_exist_are_shown_with_what_is_read(myope):
 
 
 def test_the_summary_fits_on_the_first_page(corrected):
-    grey = np.full((8, 8, 3), 128, np.uint8)
-    charts = {(p, d): grey for p in (3.0, 5.0) for d in (0.4, 1.0, 6.0)}
+    gray = np.full((8, 8, 3), 128, np.uint8)
+    charts = {(p, d): gray for p in (3.0, 5.0) for d in (0.4, 1.0, 6.0)}
     shown = EyeFacts(corrected.study, "x", corrected.numbers, charts)
     rows = document_of([shown]).sections[0].rows
     used_mm = HEAD_MM + sum(row_height_mm(row) + ROW_GAP_MM for row in rows)
-    two_notes_mm = 2 * line_mm(NOTE_PT)  # of another colour, of a wider pupil
+    two_notes_mm = 2 * line_mm(NOTE_PT)  # of another color, of a wider pupil
     assert used_mm + two_notes_mm < BOTTOM_MM - MARGIN_MM
 
 

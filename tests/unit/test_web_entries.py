@@ -122,7 +122,7 @@ def test_the_gaze_slider_turns_a_progressive_lens_of_the_figures():
     wish = state.wish()
     assert "gaze_deg" not in wish.bodies["OD"]["correction"]  # the settings have it
     seen = parse_profile(state.looking_body("OD")).correction
-    # 25.5 mm before the centre of rotation 15 deg are 6.8 mm, half of the corridor
+    # 25.5 mm before the center of rotation 15 deg are 6.8 mm, half of the corridor
     assert seen.sphere_dpt == pytest.approx(2.0 / 2, abs=0.15)
     form.worn.kind = "contact_lens"
     state.wish()

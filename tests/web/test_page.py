@@ -161,7 +161,7 @@ def test_the_gaze_goes_through_another_part_of_a_progressive_lens(page):
     page.press("gaze_v_deg", "ArrowLeft", 30)  # to its end, as -15 deg is
     page.page.wait_for_timeout(1500)  # one of the pictures on the way was full, too
     told = page.settle(after=number)
-    # 25.5 mm before the centre of rotation that is 6.8 mm down: half of the corridor,
+    # 25.5 mm before the center of rotation that is 6.8 mm down: half of the corridor,
     # half of the addition of 2 dpt, with which nothing farther than 1 m is sharp
     assert told["focus_dpt"] == pytest.approx(1.0, abs=0.15)
     assert _change(ahead, page.seen()) > 0.5

@@ -56,8 +56,8 @@ typedef struct {
     const double *pupil_ellipse;      /* (..., 5) */
     const double *pixel_from_mrad;    /* (groups, 2, 2) */
     const double *wavelength_nm;      /* (3, primaries) */
-    const double *apodisation_per_mm2; /* (3, primaries), or none */
-    double apodisation_center_mm[2];
+    const double *apodization_per_mm2; /* (3, primaries), or none */
+    double apodization_center_mm[2];
     /* Rings in the pupils; none if there is no table. */
     const double *ring_offset_mm;     /* (..., 2): of the pupil's center from the rings' */
     const double *ring_reach_mrad;    /* (...): reach of their light beyond the rays */

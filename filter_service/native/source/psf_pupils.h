@@ -13,7 +13,7 @@ typedef struct {
     float edge[2][N_EDGE], normal[2][N_EDGE];
     double narrow_ratio, passed_ratio, edge_um, rays_ratio;
     double weight;            /* share of the kernel */
-    int is_apodised;
+    int is_apodized;
     const float *rings;       /* a table, or NULL */
     double from_box_mm[6];    /* rows: position relative to the rings, of x, y and 1 */
 } pupil;
@@ -124,7 +124,7 @@ static void frame_pupil(const psf_tables *tables, const double *zernike_um,
 }
 
 /* Computes the apodization -k |u - u0|^2 over the box, and the light that passes. */
-static void apodise_pupil(const psf_tables *tables, double per_mm2, const double *center_mm,
+static void apodize_pupil(const psf_tables *tables, double per_mm2, const double *center_mm,
                           const double *ellipse, const double *jacobian, pupil *own) {
     double matrix[2][2], offset[2];
     for (int i = 0; i < 2; ++i) {
@@ -156,7 +156,7 @@ static void apodise_pupil(const psf_tables *tables, double per_mm2, const double
         mean /= tables->n_ring;
         if (ring + 1 < tables->n_rings) passed += mean * tables->ring_weights[ring];
     }
-    own->is_apodised = 1;
+    own->is_apodized = 1;
     own->passed_ratio = passed;
     own->edge_um = own->wavelength_um * mean / passed; /* mean: of the edge */
 }

@@ -179,7 +179,7 @@ INLINE f32x8 edge_weights(const pupil *own, f32x8 x, float y, float cell) {
     return larger8(smaller8(depth * all8(1.0f / cell) + all8(0.5f), one), zero);
 }
 
-INLINE f32x8 apodised(const pupil *own, f32x8 x, double y, f32x8 weight) {
+INLINE f32x8 apodized(const pupil *own, f32x8 x, double y, f32x8 weight) {
     const double *a = own->log_amplitude;
     for (int i = 0; i < LANES; ++i) {
         double u = x[i];
@@ -227,7 +227,7 @@ static double splat_pupil(const pupil *own, double dense[N_POWERS][N_POWERS], in
         for (int step = 0; step < span; ++step, number += one) {
             f32x8 x = (number + half) * all8(r.cell) - one;
             f32x8 weight = (f32x8)((i32x8)one & (number < all8((float)core_end)));
-            if (own->is_apodised) weight = apodised(own, x, y, weight);
+            if (own->is_apodized) weight = apodized(own, x, y, weight);
             total += weight;
             splat_cells(&r, x, weight);
         }
@@ -242,7 +242,7 @@ static double splat_pupil(const pupil *own, double dense[N_POWERS][N_POWERS], in
             f32x8 x = (number + skipped + begun + half) * all8(r.cell) - one;
             f32x8 weight = edge_weights(own, x, (float)y, r.cell);
             weight = (f32x8)((i32x8)weight & (number < all8((float)count)));
-            if (own->is_apodised) weight = apodised(own, x, y, weight);
+            if (own->is_apodized) weight = apodized(own, x, y, weight);
             total += weight;
             splat_cells(&r, x, weight);
         }
@@ -361,7 +361,7 @@ static void add_edge_light(const psf_tables *tables, const pupil *own,
         f32x8 v_per_px = (f32x8)((i32x8)root8(all8(2.0f / um) / size) | turned_sign);
         f32x8 strength = length * all8((float)(2.0 / count / own->passed_ratio))
                          * root8(all8(0.5f * um) / size);
-        if (own->is_apodised)
+        if (own->is_apodized)
             for (int i = 0; i < LANES; ++i) {
                 const double *a = own->log_amplitude;
                 double u = x[i], v = y[i];

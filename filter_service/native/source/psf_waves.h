@@ -131,7 +131,7 @@ static int fill_mask(const psf_tables *tables, const pupil *own, const grid *g,
                 pairs8(tables->edge_response, at, &value, &change);
                 value += (place - __builtin_convertvector(at, f32x8)) * change;
             }
-            for (int k = 0; own->is_apodised && k < 8; ++k)
+            for (int k = 0; own->is_apodized && k < 8; ++k)
                 value[k] *= (float)exp(a[0] + u[k] * (a[1] + a[3] * u[k] + a[4] * y)
                                        + y * (a[2] + a[5] * y));
             store8(mask + ((size_t)(i / STRIP) * rows + j) * STRIP + i % STRIP, value);

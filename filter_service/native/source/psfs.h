@@ -46,11 +46,11 @@ static void prepare_pupil(const psf_job *job, int psf, int primary, pupil *own) 
                 own);
     own->wavelength_um = job->wavelength_nm[color] / 1000.0;
     memset(own->log_amplitude, 0, sizeof own->log_amplitude);
-    own->is_apodised = 0;
+    own->is_apodized = 0;
     own->passed_ratio = 1.0;
     own->edge_um = own->wavelength_um;
-    if (job->apodisation_per_mm2 != NULL)
-        apodise_pupil(tables, job->apodisation_per_mm2[color], job->apodisation_center_mm,
+    if (job->apodization_per_mm2 != NULL)
+        apodize_pupil(tables, job->apodization_per_mm2[color], job->apodization_center_mm,
                       ellipse, jacobian, own);
     survey_pupil(tables, own);
     own->rays_ratio = job->is_diffracting ? share_of_rays(tables, own) : 1.0;

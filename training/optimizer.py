@@ -67,7 +67,7 @@ class Lookahead:
         self.n_done = state["n_done"]
 
 
-def make_optimiser(parameters, *, learning_rate: float, weight_decay: float):
+def make_optimizer(parameters, *, learning_rate: float, weight_decay: float):
     """Return RAdam (Liu et al. 2020) in a `Lookahead`, as in the paper's 7.1.2."""
     fast = RAdam(
         list(parameters),
