@@ -24,7 +24,7 @@ import numpy as np
 from clients.arguments import read_profile, size_px_argument
 from clients.extra import what_to_install
 from clients.filter_client import FilterClient, FilteredFrame
-from clients.natural import (
+from clients.natural_eye import (
     USUAL_AGE_YEARS,
     USUAL_WHITE_CD_M2,
     NaturalEye,

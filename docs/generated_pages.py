@@ -21,9 +21,9 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
-from filter_service.checked import allowed_values
 from filter_service.service.config import RANGES, ServiceConfig
 from filter_service.settings import DEFAULTS, setting_help, setting_types
+from filter_service.validation import allowed_values
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {

@@ -14,8 +14,8 @@ from typing import Annotated, cast
 
 from msgspec import Meta
 
-from filter_service.checked import Record, checked, show
 from filter_service.errors import BadMessage
+from filter_service.validation import Record, checked, show
 
 MAX_SIDE_PX = 16384
 MAX_TANGENT = 20.0  # 87 degrees to one side; a pinhole image cannot use more

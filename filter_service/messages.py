@@ -17,9 +17,9 @@ from typing import Any
 import msgpack
 
 from filter_service.camera import Camera, tangents_from_fov
-from filter_service.checked import show
 from filter_service.errors import BadMessage, UnknownType, VersionMismatch
 from filter_service.settings import FilterSettings
+from filter_service.validation import show
 from filter_service.view_state import (
     EYE_NAMES,
     EyeName,

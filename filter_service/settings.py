@@ -13,9 +13,9 @@ from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 from msgspec import Meta
 
-from filter_service.checked import RISING, Record, check_rising, checked
 from filter_service.displays import display_wavelengths_nm
 from filter_service.errors import BadMessage
+from filter_service.validation import RISING, Record, check_rising, checked
 
 MIN_PUPIL_MM = 0.5
 MAX_PUPIL_MM = 9.0

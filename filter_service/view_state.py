@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal, get_args
 
 from msgspec import Meta
 
-from filter_service.checked import Record
 from filter_service.errors import BadMessage
 from filter_service.settings import GazeDeg, PupilMm, VergenceDpt
+from filter_service.validation import Record
 
 EyeName = Literal["both", "left", "right"]
 EYE_NAMES: tuple[EyeName, ...] = get_args(EyeName)

@@ -26,7 +26,7 @@ from filter_service.camera import read_intrinsics
 
 
 @dataclass(frozen=True)
-class Told:
+class LayoutOptions:
     """Options of the command line that complement or override the data set.
 
     Attributes
@@ -57,7 +57,9 @@ DETECTED: dict[str, tuple[Callable[[Path], bool], Listing]] = {
 LAYOUTS = ("auto", *DETECTED, "pairs", "video")
 
 
-def list_frames(source: Path, layout: str, told: Told) -> tuple[str, list[SourceFrame]]:
+def list_frames(
+    source: Path, layout: str, told: LayoutOptions
+) -> tuple[str, list[SourceFrame]]:
     """Return the layout of a data set and its frames, in the order of their names.
 
     Raises
@@ -81,7 +83,7 @@ def list_frames(source: Path, layout: str, told: Told) -> tuple[str, list[Source
     if not frames:
         raise ValueError(f"'{source}': no frames of the layout {layout}")
     _check_names(frames)
-    return layout, [_as_told(frame, told) for frame in frames]
+    return layout, [_with_options(frame, told) for frame in frames]
 
 
 def _layout_of(source: Path, layout: str) -> str:
@@ -105,7 +107,7 @@ def _layout_of(source: Path, layout: str) -> str:
     )
 
 
-def _optics(told: Told) -> Optics:
+def _optics(told: LayoutOptions) -> Optics:
     if told.optics is None:
         raise ValueError(
             "--fov-deg: not given, and the data has no calibration; allowed: the "
@@ -114,11 +116,11 @@ def _optics(told: Told) -> Optics:
     return told.optics
 
 
-def _scaled(told: Told) -> Scaled:
+def _scaled(told: LayoutOptions) -> Scaled:
     return Scaled(told.depth_scale_m)
 
 
-def _as_told(frame: SourceFrame, told: Told) -> SourceFrame:
+def _with_options(frame: SourceFrame, told: LayoutOptions) -> SourceFrame:
     """Return a frame with the overrides of the command line."""
     if told.optics is not None:
         frame = replace(frame, optics=told.optics)

@@ -16,7 +16,7 @@ from clients.batch.job import (
     Job,
     batch_settings,
 )
-from clients.batch.layouts import LAYOUTS, Told, list_frames, optics_of
+from clients.batch.layouts import LAYOUTS, LayoutOptions, list_frames, optics_of
 from clients.batch.run import Batch
 from clients.batch.source import SourceFrame
 from clients.batch.states import CENTER, States, read_states
@@ -189,7 +189,7 @@ def batch_of(options: argparse.Namespace) -> Batch:
         Names the option, the value and what is allowed.
     """
     _check(options)
-    told = Told(
+    told = LayoutOptions(
         options.depth,
         optics_of(options.fov_deg, options.intrinsics),
         options.depth_scale,

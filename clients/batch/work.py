@@ -52,7 +52,7 @@ class Unit:
 
 
 @dataclass
-class Seen:
+class FilteredPicture:
     """A filtered frame to be written to its file."""
 
     filtered: Filtered
@@ -99,7 +99,7 @@ class UnitRunner:
 
     def _picture(self, profile: str, frame: SourceFrame) -> Record:
         seen = self._attempt(profile, frame)
-        if not isinstance(seen, Seen):
+        if not isinstance(seen, FilteredPicture):
             return seen
         start_s = time.perf_counter()
         file = Path(profile) / f"{frame.name}.{self._job.format}"
@@ -125,10 +125,10 @@ class UnitRunner:
             shape = None
             for number, frame in enumerate(unit.frames):
                 if not is_wanted():
-                    raise Unwanted
+                    raise Cancelled
                 cpu_s = time.process_time()
                 seen = self._attempt(unit.profile, frame)
-                if isinstance(seen, Seen):
+                if isinstance(seen, FilteredPicture):
                     image = seen.filtered.color
                     shape = shape or image.shape
                     if image.shape == shape:
@@ -145,7 +145,7 @@ class UnitRunner:
 
         try:
             told = write_whole(self._out / unit.segment, write)
-        except Unwanted:
+        except Cancelled:
             return
         except FAILURES as error:
             for frame in unit.frames:
@@ -158,13 +158,13 @@ class UnitRunner:
                 record = {**record, "file": unit.segment.as_posix(), **told}
             yield record
 
-    def _attempt(self, profile: str, frame: SourceFrame) -> Seen | Record:
+    def _attempt(self, profile: str, frame: SourceFrame) -> FilteredPicture | Record:
         try:
-            return self._see(profile, frame)
+            return self._filter(profile, frame)
         except FAILURES as error:
             return _failed(profile, frame, error)
 
-    def _see(self, profile: str, frame: SourceFrame) -> Seen:
+    def _filter(self, profile: str, frame: SourceFrame) -> FilteredPicture:
         if frame.fault is not None:
             raise BadFrame(frame.fault)
         start_s = time.perf_counter()
@@ -193,7 +193,7 @@ class UnitRunner:
         }
         if built_now:
             record["ms"]["build"] = 1e3 * (self._filter.build_s - built_s)
-        return Seen(seen, record)
+        return FilteredPicture(seen, record)
 
     def _read(self, frame: SourceFrame) -> tuple[NDArray, NDArray[np.float32]]:
         if frame.color_index is None:
@@ -213,7 +213,7 @@ class UnitRunner:
         return self._readers[path]
 
 
-class Unwanted(Exception):
+class Cancelled(Exception):
     """The unit is no longer needed."""
 
 

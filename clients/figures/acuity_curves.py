@@ -20,7 +20,7 @@ from clients.figures.style import (
     dress,
     legend_below,
     new_figure,
-    say_unknown,
+    raise_unknown,
     with_grid,
 )
 
@@ -44,7 +44,7 @@ def draw_through_focus_acuity(
     black = {name: {"color": INK} | style for name, style in styles.items()}
     _finish(axes, found.object_dpt[-1], looks | black, "Acuity by distance")
     if np.isnan(found.far_log_mar[0]):
-        say_unknown(axes)
+        raise_unknown(axes)
 
 
 def draw_acuity_of_several(
@@ -62,7 +62,7 @@ def draw_acuity_of_several(
     title = f"Acuity by distance, accommodating, {pupil_mm:g} mm"
     _finish(axes, nearest_dpt, looks, title)
     if not is_known:
-        say_unknown(axes)
+        raise_unknown(axes)
 
 
 def _finish(axes: Axes, nearest_dpt: float, looks: dict, title: str) -> None:

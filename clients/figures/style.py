@@ -72,7 +72,7 @@ def legend_below(axes: Axes, entries: Mapping[str, Mapping[str, Any]]) -> None:
     )  # fmt: skip
 
 
-def say_unknown(axes: Axes) -> None:
+def raise_unknown(axes: Axes) -> None:
     """Write in the middle of axes why there are no curves."""
     axes.text(
         0.5, 0.5, "not known through lenslets", fontsize=SMALL_PT, color=SOFT,

@@ -20,7 +20,7 @@ from clients.figures.style import (
     dress,
     legend_below,
     new_figure,
-    say_unknown,
+    raise_unknown,
     with_grid,
 )
 from estimator import perfect_transfer
@@ -84,7 +84,7 @@ def _draw_states(axes: Axes, study: EyeStudy, pupil_mm: float, color: str) -> No
         values = modulation(study, pupil_mm, is_corrected=is_corrected)
         axes.plot(FREQUENCY_CPD, values, color=color, **looks)
     if not study.wavefront(pupil_mm).is_readable:
-        say_unknown(axes)
+        raise_unknown(axes)
 
 
 def _perfect(pupil_mm: float) -> NDArray[np.float64]:

@@ -12,12 +12,12 @@ openxr_swapchains  swapchain images and projection layers
 openxr_actions     controller buttons and the eye tracker
 simulated_runtime  simulated runtime, without a headset
 poses              positions and orientations
-look               gaze, focus and pupils of both eyes
-seeing             frames before and after the filter; interface of the filters
-seeing_here        filter in this process
-seeing_by_service  filter through a service
+stereo_gaze        gaze, focus and pupils of both eyes
+stereo_filter      frames before and after the filter; interface of the filters
+local_filter       filter in this process
+service_filter     filter through a service
 scenery            renders a scene for both eyes
-presenting         draws pictures into the headset's images
+presenter          draws pictures into the headset's images
 scene_view         renders a scene's color and depth in an OpenGL context
 scene_buffers      its OpenGL objects
 projection         its matrices

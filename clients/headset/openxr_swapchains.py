@@ -10,7 +10,7 @@ import moderngl
 import xr
 
 from clients.headset.openxr_gl import Framebuffers
-from clients.headset.presenting import NEAR_M, Presenter
+from clients.headset.presenter import NEAR_M, Presenter
 from clients.headset.runtime import ShownView
 from filter_service.messages import Pose
 

@@ -11,7 +11,7 @@ from typing import Any
 from clients.arguments import read_object, read_profile
 from clients.headset.controls import HELP
 from clients.headset.runtime import EYES, Eye
-from clients.natural import USUAL_AGE_YEARS, USUAL_WHITE_CD_M2
+from clients.natural_eye import USUAL_AGE_YEARS, USUAL_WHITE_CD_M2
 from filter_service import FilterSettings
 
 

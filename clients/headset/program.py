@@ -29,7 +29,7 @@ from clients.arguments import read_size_px
 from clients.extra import HEADSET_INSTALL
 from clients.headset.built_scene import SceneNotBuilt, built_scene
 from clients.headset.controls import HELP, Controls
-from clients.headset.look import StereoLook
+from clients.headset.local_filter import LocalFilter
 from clients.headset.options import (
     arguments_of,
     check_limits,
@@ -38,9 +38,9 @@ from clients.headset.options import (
 )
 from clients.headset.poses import upright
 from clients.headset.runtime import Eye, NoRuntime, Runtime, ShownView
-from clients.headset.seeing import Seeing
-from clients.headset.seeing_by_service import SeeingByService
-from clients.headset.seeing_here import SeeingHere
+from clients.headset.service_filter import ServiceFilter
+from clients.headset.stereo_filter import StereoFilter
+from clients.headset.stereo_gaze import StereoGaze
 from clients.headset.viewer import Viewer, ViewerLog
 from filter_service import FilterSettings
 from filter_service.errors import FilterError
@@ -110,8 +110,8 @@ class _Eyes:
 
     settings: FilterSettings
     is_range_told: bool
-    look: StereoLook
-    seeing: Seeing
+    look: StereoGaze
+    seeing: StereoFilter
     profiles: dict[Eye, Mapping[str, Any]]
     is_begun: bool = False
 
@@ -139,7 +139,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
 
     settings, profiles = settings_of(options), profiles_of(options)
     size_px = read_size_px(options.size)
-    look = StereoLook(
+    look = StereoGaze(
         age_years=options.age,
         pupil_diameter_mm=options.pupil_mm,
         white_cd_m2=options.white_cd_m2,
@@ -248,13 +248,13 @@ def _open_xr(context, options: argparse.Namespace) -> Runtime:
     return runtime
 
 
-def _seeing(options: argparse.Namespace, settings: FilterSettings) -> Seeing:
+def _seeing(options: argparse.Namespace, settings: FilterSettings) -> StereoFilter:
     if options.service is not None:
-        seeing = SeeingByService(options.service, settings, say, key_file=options.key)
+        seeing = ServiceFilter(options.service, settings, say, key_file=options.key)
         if options.frames is not None or options.seconds is not None:
             seeing.wait_for_service()  # a run that counts frames needs one
         return seeing
-    return SeeingHere(settings, say)
+    return LocalFilter(settings, say)
 
 
 class _Pictures:
@@ -281,14 +281,14 @@ class _Pictures:
 
 
 def _report(
-    options: argparse.Namespace, log: ViewerLog, took_s: float, seeing: Seeing
+    options: argparse.Namespace, log: ViewerLog, took_s: float, seeing: StereoFilter
 ) -> dict[str, Any]:
     report = {
         "where": options.service or "in this process",
         "seconds": round(took_s, 3),
         **log.summary(),
     }
-    if isinstance(seeing, SeeingByService):
+    if isinstance(seeing, ServiceFilter):
         report["dropped"] = seeing.n_dropped
     return report
 

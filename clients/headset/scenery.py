@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import moderngl
 import numpy as np
 
-from clients.headset.look import RgbdPicture
 from clients.headset.poses import matrix_of
 from clients.headset.runtime import EyeView
 from clients.headset.scene_view import SceneView
+from clients.headset.stereo_gaze import RgbdPicture
 from clients.scenes.geometry import Array
 from clients.scenes.scene import Scene
 

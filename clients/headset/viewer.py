@@ -9,7 +9,6 @@ from typing import Any, Protocol
 
 from clients.frame_log import NUMBER, percentiles
 from clients.headset.controls import Controls
-from clients.headset.look import RgbdPicture, StereoLook
 from clients.headset.runtime import (
     DueFrame,
     EyeView,
@@ -19,7 +18,8 @@ from clients.headset.runtime import (
     SessionLost,
     ShownView,
 )
-from clients.headset.seeing import LookedAt, Seeing, Seen
+from clients.headset.stereo_filter import FilteredStereoFrame, StereoFilter, StereoFrame
+from clients.headset.stereo_gaze import RgbdPicture, StereoGaze
 
 MS_PER_S = 1e3
 STALE_S = 1.0
@@ -116,8 +116,8 @@ class Viewer:
         self,
         open_runtime: Callable[[], Runtime],
         scenery: Scenery,
-        seeing: Seeing,
-        look: StereoLook,
+        seeing: StereoFilter,
+        look: StereoGaze,
         controls: Controls,
         *,
         read_keys: Callable[[], str] = str,
@@ -132,7 +132,7 @@ class Viewer:
         self._read_keys = read_keys
         self._say = say
         self._on_session = on_session
-        self._last: Seen | None = None
+        self._last: FilteredStereoFrame | None = None
         self._was_tracked: bool | None = None
         self._was_stale = False
         self.log = ViewerLog()
@@ -225,14 +225,14 @@ class Viewer:
 
     def _frame(
         self, due: DueFrame, begun_s: float, size_px: tuple[int, int]
-    ) -> tuple[Seen | None, tuple[ShownView, ...], dict[str, float]]:
+    ) -> tuple[FilteredStereoFrame | None, tuple[ShownView, ...], dict[str, float]]:
         """Return the filtered frame, the views to show, and the times of the stages."""
         pictures = self._scenery.pictures(due.views, size_px)
         rendered_s = time.monotonic()
         eyes = self._look.follow(due, pictures)
         looked_s = time.monotonic()
         self._tell_tracking()
-        frame = LookedAt(due, pictures, eyes, begun_s)
+        frame = StereoFrame(due, pictures, eyes, begun_s)
         seen = self._seeing.see(frame)
         is_stale = seen is not None and begun_s - seen.frame.begun_s > STALE_S
         if is_stale and not self._was_stale:
@@ -245,7 +245,9 @@ class Viewer:
         seen = None if is_stale else seen
         return seen, self._shown(frame, seen), times_ms
 
-    def _shown(self, frame: LookedAt, seen: Seen | None) -> tuple[ShownView, ...]:
+    def _shown(
+        self, frame: StereoFrame, seen: FilteredStereoFrame | None
+    ) -> tuple[ShownView, ...]:
         """Return the views to show: each picture with the view it was rendered for."""
         if seen is None or not self._controls.is_on:
             return tuple(
@@ -260,7 +262,9 @@ class Viewer:
             )
         )
 
-    def _note(self, seen: Seen | None, times_ms: dict[str, float]) -> None:
+    def _note(
+        self, seen: FilteredStereoFrame | None, times_ms: dict[str, float]
+    ) -> None:
         if seen is None:
             self.log.n_plain += 1
             return

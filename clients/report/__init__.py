@@ -1,20 +1,20 @@
 """Reports of simulated eyes: `ocufilter report` and `report_html`.
 
-program     the command
-make        reports from profiles
-facts       computed content of a report on one eye
-numbers     numbers of a report
-worn_words  descriptions of corrections
-charts      filtered letter charts, near and far
-provenance  measured, entered and assumed data
-sources     literature references
-blocks      building blocks of a report
-tables      tables of a report
-content     the report of one eye
-comparison  the report of two eyes
-html_page   HTML output
-pdf_pages   PDF output
-pdf_text    text layout of the PDF
+program          the command
+make             reports from profiles
+facts            computed content of a report on one eye
+numbers          numbers of a report
+correction_text  descriptions of corrections
+charts           filtered letter charts, near and far
+provenance       measured, entered and assumed data
+sources          literature references
+blocks           building blocks of a report
+tables           tables of a report
+content          the report of one eye
+comparison       the report of two eyes
+html_page        HTML output
+pdf_pages        PDF output
+pdf_text         text layout of the PDF
 """
 
 import lazy_loader

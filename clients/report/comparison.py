@@ -36,17 +36,17 @@ from clients.report.content import (
     sources,
     subtitle,
 )
+from clients.report.correction_text import limits_text
 from clients.report.facts import EyeFacts
 from clients.report.sources import Citations
 from clients.report.tables import (
     REFRACTION_ROWS,
     VISION_ROWS,
-    pupil_word,
-    refraction_words,
+    acuity_text,
+    pupil_text,
+    refraction_text,
     signed,
-    told_acuity,
 )
-from clients.report.worn_words import limits_words
 
 NEAR_M, FAR_M = DISTANCES_M[0], DISTANCES_M[-1]
 MAP_MM, PSF_MM = 46.0, 58.0
@@ -101,7 +101,7 @@ def _difference(before: EyeFacts, after: EyeFacts) -> Section:
 
 def _limits(before: EyeFacts, after: EyeFacts) -> tuple[tuple[str, ...], ...]:
     """Return the limitations that lenses impose on the report, each once."""
-    of_all = [limits_words(f.study.profile.correction) for f in (before, after)]
+    of_all = [limits_text(f.study.profile.correction) for f in (before, after)]
     return tuple(dict.fromkeys(limits for limits in of_all if limits))
 
 
@@ -135,7 +135,7 @@ def _refraction_table(before: EyeFacts, after: EyeFacts) -> Table:
     rows = [
         (
             word,
-            *(refraction_words(pair, name) for pair in pairs),
+            *(refraction_text(pair, name) for pair in pairs),
             "" if name == "axis_deg" else signed(pairs[1][name] - pairs[0][name]),
         )
         for word, name in REFRACTION_ROWS.items()
@@ -160,7 +160,7 @@ def _vision_table(before: EyeFacts, after: EyeFacts) -> Table:
         zip(before.numbers["pupils"], after.numbers["pupils"], strict=True)
     )
     pupils = [
-        f"{pupil_word(numbers)} {when}"
+        f"{pupil_text(numbers)} {when}"
         for pair in of_pupils
         for when, numbers in zip(("before", "after"), pair, strict=True)
     ]
@@ -184,7 +184,7 @@ def _charts(before: EyeFacts, after: EyeFacts, pupil_mm: float) -> Row:
         if not facts.charts:
             return chart_row(facts, pupil_mm)
         for distance_m, where in ((NEAR_M, "40 cm"), (FAR_M, "6 m")):
-            told = told_acuity(facts.chart_numbers[pupil_mm, distance_m])
+            told = acuity_text(facts.chart_numbers[pupil_mm, distance_m])
             pictures.append(
                 Picture(
                     facts.charts[pupil_mm, distance_m],

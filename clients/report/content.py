@@ -29,17 +29,17 @@ from clients.report.blocks import (
     Words,
 )
 from clients.report.charts import DISTANCES_M
+from clients.report.correction_text import limits_text, subtitle_text
 from clients.report.facts import EyeFacts
 from clients.report.provenance import provenance_table
 from clients.report.sources import Citations
 from clients.report.tables import (
+    acuity_text,
     coefficient_table,
     field_table_block,
     refraction_table,
-    told_acuity,
     vision_table,
 )
-from clients.report.worn_words import limits_words, subtitle_words
 
 DAY_MM, DUSK_MM = PUPILS_MM
 
@@ -73,7 +73,7 @@ def subtitle(study: EyeStudy) -> str:
     if profile.age_years is not None:
         age = f"{profile.age_years:g} years"
     whose = f"{SIDES[profile.eye_side]}, {age}, from a {KIND_WORDS[profile.kind]}"
-    return whose + subtitle_words(profile)
+    return whose + subtitle_text(profile)
 
 
 KIND_WORDS = {
@@ -114,7 +114,7 @@ def summary(facts: EyeFacts) -> Section:
             Row((maps, orders), (2.0, 1.0)),
             Row((points, contrast), (1.0, 1.4)),
             chart_row(facts, DAY_MM),
-            Row((Words((_legend(study), *limits_words(study.profile.correction))),)),
+            Row((Words((_legend(study), *limits_text(study.profile.correction))),)),
         ),
     )
 
@@ -151,7 +151,7 @@ def chart_row(facts: EyeFacts, pupil_mm: float) -> Row:
             Picture(
                 facts.charts[pupil_mm, distance_m],
                 f"{where}, {pupil_mm:g} mm: logMAR "
-                f"{told_acuity(facts.chart_numbers[pupil_mm, distance_m])}",
+                f"{acuity_text(facts.chart_numbers[pupil_mm, distance_m])}",
             )
         )
     return Row(tuple(pictures))

@@ -5,9 +5,9 @@ from __future__ import annotations
 from clients.figures import EyeStudy
 from clients.figures.study import PUPILS_MM
 from clients.report.blocks import Table
+from clients.report.correction_text import correction_text
 from clients.report.numbers import is_beyond_measured
 from clients.report.sources import Citations
-from clients.report.worn_words import worn_words
 from estimator import Prescription, WornLens
 
 WELL_DETERMINED = 0.5
@@ -153,4 +153,4 @@ def _nerves(cite: Citations) -> tuple[str, ...]:
 
 def _worn(study: EyeStudy) -> tuple[str, ...]:
     lens = study.profile.correction
-    return () if lens is None else ("Correction worn", STATED, worn_words(lens))
+    return () if lens is None else ("Correction worn", STATED, correction_text(lens))

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 from clients.figures.study import WAVELENGTH_NM
 from clients.report.blocks import Table
+from clients.report.correction_text import correction_text
 from clients.report.facts import EyeFacts
 from clients.report.numbers import SPECTACLE_VERTEX_MM, spectacles_for, written
-from clients.report.worn_words import worn_words
 
 THROUGH_LENSLETS = "not known"
 """Text in place of an acuity; the summary gives the reason."""
@@ -23,7 +23,7 @@ REFRACTION_ROWS = {
 }
 
 
-def refraction_words(refraction: dict, name: str) -> str:
+def refraction_text(refraction: dict, name: str) -> str:
     """Return one number of a refraction as text."""
     if name != "axis_deg":
         return signed(refraction[name])
@@ -39,7 +39,7 @@ def refraction_table(facts: EyeFacts) -> Table:
     return Table(
         "Refraction",
         tuple(
-            (word, *(refraction_words(pair, name) for pair in pairs))
+            (word, *(refraction_text(pair, name) for pair in pairs))
             for word, name in REFRACTION_ROWS.items()
         ),
         head=(
@@ -67,7 +67,7 @@ def _refraction_note(facts: EyeFacts) -> str:
     lens = facts.study.profile.correction
     if lens is not None:
         note += (
-            f" Worn: {worn_words(lens)}; M through it "
+            f" Worn: {correction_text(lens)}; M through it "
             f"{signed(fit['refraction_through_correction_dpt'])} dpt."
         )
     return note
@@ -89,12 +89,12 @@ def vision_table(facts: EyeFacts) -> Table:
     return Table(
         "Vision on the axis",
         tuple((word, *map(words, pupils)) for word, words in VISION_ROWS.items()),
-        head=("far object, 555 nm", *(pupil_word(p) for p in pupils)),
+        head=("far object, 555 nm", *(pupil_text(p) for p in pupils)),
         note=note,
     )
 
 
-def distance_words(distance_dpt: float) -> str:
+def distance_text(distance_dpt: float) -> str:
     """Return a far or near point in dpt, and as a distance."""
     if abs(distance_dpt) < 0.02:
         return "infinity"
@@ -107,8 +107,8 @@ def distance_words(distance_dpt: float) -> str:
 
 VISION_ROWS: dict[str, Callable[[dict], str]] = {
     "higher orders, RMS, µm": lambda p: f"{p['higher_order_rms_um']:.2f}",
-    "acuity as it is": lambda p: told_acuity(p["as_it_is"]),
-    "acuity best corrected": lambda p: told_acuity(p["best_corrected"]),
+    "acuity as it is": lambda p: acuity_text(p["as_it_is"]),
+    "acuity best corrected": lambda p: acuity_text(p["best_corrected"]),
     "visual Strehl as it is": lambda p: _ratio(p["as_it_is"]["visual_strehl_ratio"]),
     "visual Strehl corrected": lambda p: _ratio(
         p["best_corrected"]["visual_strehl_ratio"]
@@ -116,12 +116,12 @@ VISION_ROWS: dict[str, Callable[[dict], str]] = {
     "MTF 10 / 30 cpd, corrected": lambda p: _modulations(
         p["best_corrected"]["modulation"]
     ),
-    "far point, dpt": lambda p: distance_words(p["far_point_dpt"]),
-    "near point, dpt": lambda p: distance_words(p["near_point_dpt"]),
+    "far point, dpt": lambda p: distance_text(p["far_point_dpt"]),
+    "near point, dpt": lambda p: distance_text(p["near_point_dpt"]),
 }
 
 
-def pupil_word(pupil: dict) -> str:
+def pupil_text(pupil: dict) -> str:
     """Return a pupil, with a star if it is wider than the measured one."""
     star = "*" if pupil["is_beyond_measured"] else ""
     return f"{pupil['pupil_diameter_mm']:.3g} mm{star}"
@@ -137,12 +137,12 @@ def _modulations(values: dict | None) -> str:
     return f"{values['10_cpd']:.2f} / {values['30_cpd']:.2f}"
 
 
-def told_acuity(state: dict) -> str:
+def acuity_text(state: dict) -> str:
     """Return the acuity of a state, or that it is not known."""
-    return acuity_words(state["log_mar"]) if state["is_told"] else THROUGH_LENSLETS
+    return acuity_range_text(state["log_mar"]) if state["is_told"] else THROUGH_LENSLETS
 
 
-def acuity_words(log_mar: float | None) -> str:
+def acuity_range_text(log_mar: float | None) -> str:
     """Return an acuity in logMAR and as a decimal fraction."""
     if log_mar is None:
         return "worse than 2"

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from clients.web.worn_form import PRESCRIPTION, WornForm, read_numbers
+from clients.web.correction_form import PRESCRIPTION, CorrectionForm, read_numbers
 from estimator import (
     InvalidFile,
     load_profile,
@@ -69,7 +69,7 @@ class EyeForm:
     file_body: dict[str, Any] | None = None
     file_name: str = ""
     wears_correction: bool = False
-    worn: WornForm = field(default_factory=WornForm)
+    worn: CorrectionForm = field(default_factory=CorrectionForm)
 
     def body(self, *, age_years: float) -> dict[str, Any]:
         """Return the profile.

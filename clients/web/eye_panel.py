@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from nicegui import events, ui
 
+from clients.web.correction_form import DESIGNS, HINTS, PRESCRIPTION, SPHERE
 from clients.web.eye_form import (
     MAX_PROFILE_BYTES,
     PROFILE_SUFFIXES,
@@ -15,7 +16,6 @@ from clients.web.eye_form import (
 from clients.web.numbers import NumberField
 from clients.web.slider_row import THROTTLE_S
 from clients.web.upload_entry import upload_entry
-from clients.web.worn_form import DESIGNS, HINTS, PRESCRIPTION, SPHERE
 
 SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
 SLIDER_REACH_DPT = 10.0

@@ -11,11 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from clients.web.correction_form import turns_with_gaze
 from clients.web.eye_form import EyeSide
 from clients.web.picture import coarser
 from clients.web.picture_files import jpeg_of, png_of
-from clients.web.wishes import Kind, Seen, Wish
-from clients.web.worn_form import turns_with_gaze
+from clients.web.picture_requests import Kind, PictureRequest, SentPicture
 from filter_service import EyeFilter, Filtered, FilterError, FilterSettings, RgbdView
 
 MS_PER_S = 1e3
@@ -29,7 +29,7 @@ LEAST_WIDTH_PX = 200
 
 
 @dataclass
-class _Through:
+class _ProfiledFilter:
     """A filter with the profile that it was last given."""
 
     filter: EyeFilter
@@ -42,11 +42,13 @@ class _Through:
             self.given = given
             self.filter.set_profile(body, settings=settings, cameras=[view.camera])
 
-    def see(self, view: RgbdView, wish: Wish, *, gaze_deg) -> Filtered | None:
+    def see(
+        self, view: RgbdView, request: PictureRequest, *, gaze_deg
+    ) -> Filtered | None:
         """Return the picture through the newest eye; None while the eye is prepared."""
         state = {
-            "pupil_diameter_mm": wish.pupil_diameter_mm,
-            "focus_dpt": wish.focus_dpt,
+            "pupil_diameter_mm": request.pupil_diameter_mm,
+            "focus_dpt": request.focus_dpt,
         }
         seen = self.filter.try_filter(
             [view],
@@ -69,67 +71,76 @@ class EyeView:
 
     def __init__(self, side: EyeSide) -> None:
         self.side = side
-        self._quick: _Through | None = None
-        self._full: _Through | None = None
+        self._quick: _ProfiledFilter | None = None
+        self._full: _ProfiledFilter | None = None
         self._merged = 1
         self.seen: dict[Kind, int] = {"preview": 0, "full": 0}
 
-    def preview(self, wish: Wish) -> Seen | None:
+    def preview(self, request: PictureRequest) -> SentPicture | None:
         """Return the preview; None while its eye is being prepared."""
-        self._stop_other(wish)
+        self._stop_other(request)
         if self._quick is None:
-            self._quick = _Through(EyeFilter())
-        settings = QUICK.covering(foci_dpt=(wish.focus_dpt,))
-        if turns_with_gaze(wish.bodies[self.side]):
-            settings = settings.changed(gaze_deg=wish.gaze_deg)
-        return self._look(self._quick, "preview", wish, settings, wish.picture.small)
+            self._quick = _ProfiledFilter(EyeFilter())
+        settings = QUICK.covering(foci_dpt=(request.focus_dpt,))
+        if turns_with_gaze(request.bodies[self.side]):
+            settings = settings.changed(gaze_deg=request.gaze_deg)
+        return self._look(
+            self._quick, "preview", request, settings, request.picture.small
+        )
 
-    def full(self, wish: Wish) -> Seen | None:
+    def full(self, request: PictureRequest) -> SentPicture | None:
         """Return the full picture; None while its eye is being prepared."""
         if self._full is None:
-            self._full = _Through(EyeFilter())
-        settings = FULL.covering(foci_dpt=(wish.focus_dpt,)).changed(
-            gaze_deg=wish.gaze_deg
+            self._full = _ProfiledFilter(EyeFilter())
+        settings = FULL.covering(foci_dpt=(request.focus_dpt,)).changed(
+            gaze_deg=request.gaze_deg
         )
-        view = wish.picture.view
+        view = request.picture.view
         if self._merged > 1:
             view = coarser(view, self._merged)
-        return self._look(self._full, "full", wish, settings, view)
+        return self._look(self._full, "full", request, settings, view)
 
-    def _stop_other(self, wish: Wish) -> None:
+    def _stop_other(self, request: PictureRequest) -> None:
         """Cancel the full eye if it is outdated, to free the worker."""
         full = self._full
         if full is None or full.given is None:
             return
         body, settings, _ = full.given
-        if (body, settings.gaze_deg) != (wish.bodies[self.side], wish.gaze_deg):
+        if (body, settings.gaze_deg) != (request.bodies[self.side], request.gaze_deg):
             full.filter.close()
             self._full, self._merged = None, 1
 
     def _look(
-        self, through: _Through, kind: Kind, wish: Wish, settings, view: RgbdView
-    ) -> Seen | None:
+        self,
+        through: _ProfiledFilter,
+        kind: Kind,
+        request: PictureRequest,
+        settings,
+        view: RgbdView,
+    ) -> SentPicture | None:
         began_s = time.monotonic()
         try:
-            through.give(wish.bodies[self.side], settings, view)
-            seen = through.see(view, wish, gaze_deg=settings.gaze_deg)
+            through.give(request.bodies[self.side], settings, view)
+            seen = through.see(view, request, gaze_deg=settings.gaze_deg)
         except FilterError as error:
             through.given = None
             if kind == "full" and view.width_px >= 2 * LEAST_WIDTH_PX:
                 self._merged *= 2
                 return None
-            self.seen[kind] = wish.number
-            return Seen("failed", self.side, wish.number, b"", {"error": str(error)})
+            self.seen[kind] = request.number
+            return SentPicture(
+                "failed", self.side, request.number, b"", {"error": str(error)}
+            )
         if seen is None:
             return None
-        self.seen[kind] = wish.number
+        self.seen[kind] = request.number
         encode = png_of if kind == "full" else jpeg_of
-        return Seen(
+        return SentPicture(
             kind,
             self.side,
-            wish.number,
+            request.number,
             encode(seen.color),
-            _facts(seen, wish, MS_PER_S * (time.monotonic() - began_s)),
+            _facts(seen, request, MS_PER_S * (time.monotonic() - began_s)),
         )
 
     def close(self) -> None:
@@ -140,13 +151,13 @@ class EyeView:
         self._quick = self._full = None
 
 
-def _facts(seen: Filtered, wish: Wish, took_ms: float) -> dict[str, Any]:
+def _facts(seen: Filtered, request: PictureRequest, took_ms: float) -> dict[str, Any]:
     return {
         "width_px": seen.color.shape[1],
         "height_px": seen.color.shape[0],
         "pupil_diameter_mm": round(seen.pupil_diameter_mm, 3),
         "focus_dpt": round(seen.focus_dpt, 3),
-        "wanted_focus_dpt": wish.focus_dpt,
+        "wanted_focus_dpt": request.focus_dpt,
         "frame_ms": round(sum(seen.stage_times_ms.values()), 2),
         "took_ms": round(took_ms, 2),
         "notes": list(seen.notes),

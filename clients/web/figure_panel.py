@@ -11,10 +11,10 @@ from nicegui import events, ui
 
 from clients.web.eye_figures import FIGURE_TITLES, eye_figure
 from clients.web.eye_form import SIDES, EyeSide
+from clients.web.figure_worker import FigureWorker, StudyFailed
 from clients.web.numbers import distance_text
 from clients.web.page_state import FOCUS, PUPIL, PageState
 from clients.web.point_spread import PointState, point_spread
-from clients.web.studying import StudyFailed, Studying
 
 
 def data_url(png: bytes) -> str:
@@ -31,8 +31,10 @@ class FigurePanel:
         Page that owns the requests.
     """
 
-    def __init__(self, page: str, state: PageState, studying: Studying) -> None:
-        self._page, self._state, self._studying = page, state, studying
+    def __init__(
+        self, page: str, state: PageState, figure_worker: FigureWorker
+    ) -> None:
+        self._page, self._state, self._studying = page, state, figure_worker
         self._side: EyeSide = "OD"
         self._at = (0.5, 0.5)
         self._figure = next(iter(FIGURE_TITLES))

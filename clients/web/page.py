@@ -15,17 +15,17 @@ from clients.report import report_html
 from clients.web.eye_form import SIDES, EyeSide
 from clients.web.eye_panel import EyePanel
 from clients.web.figure_panel import FigurePanel
+from clients.web.figure_worker import FigureWorker, StudyFailed
+from clients.web.filter_thread import FilterThread
 from clients.web.numbers import distance_text
 from clients.web.page_state import AGE, DISTANCE, FOCUS, LOOKS, PUPIL, PageState
 from clients.web.picture import Picture
 from clients.web.picture_files import png_of
-from clients.web.pictures_out import PicturesOut
+from clients.web.picture_requests import SentPicture
+from clients.web.picture_sender import PictureSender
+from clients.web.picture_view import PictureView
 from clients.web.scene_panel import ScenePanel
-from clients.web.seeing import Seeing
-from clients.web.seen_view import SeenView
 from clients.web.slider_row import SliderRow
-from clients.web.studying import StudyFailed, Studying
-from clients.web.wishes import Seen
 
 STYLE = (Path(__file__).parent / "style.css").read_text(encoding="utf-8")
 SHOWN = {"OD": "Right eye", "OS": "Left eye", "both": "Both"}
@@ -39,18 +39,18 @@ PICTURES_PATH = "/pictures/"
 NamedProfile = tuple[Mapping[str, Any], str]
 
 
-class Desk:
+class SharedResources:
     """Resources shared by all pages of a process."""
 
     def __init__(self) -> None:
-        self.seeing = Seeing()
-        self.studying = Studying()
-        self.out: dict[str, PicturesOut] = {}
+        self.filter_thread = FilterThread()
+        self.figure_worker = FigureWorker()
+        self.out: dict[str, PictureSender] = {}
 
     def close(self) -> None:
         """Stop the thread and the process; closing twice is allowed."""
-        self.seeing.close()
-        self.studying.close()
+        self.filter_thread.close()
+        self.figure_worker.close()
 
 
 class Page:
@@ -61,19 +61,21 @@ class Page:
     profile : initial profile of both eyes, and its name
     """
 
-    def __init__(self, desk: Desk, profile: NamedProfile | None) -> None:
-        self.desk = desk
+    def __init__(
+        self, resources: SharedResources, profile: NamedProfile | None
+    ) -> None:
+        self.resources = resources
         self.name = secrets.token_urlsafe(16)
         self.state = PageState()
         if profile is not None:
-            self._take_profile(*profile)
-        self.out = desk.out[self.name] = PicturesOut()
+            self._set_profile(*profile)
+        self.out = resources.out[self.name] = PictureSender()
         self._loop = asyncio.get_running_loop()
         self._renewal: asyncio.Task | None = None
-        desk.seeing.open(self.name, self._from_thread)
+        resources.filter_thread.open(self.name, self._from_thread)
         self._build()
 
-    def _take_profile(self, body: Mapping[str, Any], name: str) -> None:
+    def _set_profile(self, body: Mapping[str, Any], name: str) -> None:
         for form in self.state.eyes.values():
             form.take_body(body, name)
         self.state.values[AGE.name] = body.get(AGE.name, self.state.values[AGE.name])
@@ -96,7 +98,9 @@ class Page:
             with ui.element("div").classes("oc-left"):
                 self._eyes_card()
             with ui.element("div").classes("oc-right"):
-                self.figures = FigurePanel(self.name, self.state, self.desk.studying)
+                self.figures = FigurePanel(
+                    self.name, self.state, self.resources.figure_worker
+                )
         ui.timer(0.0, self.scene.first, once=True)
 
     def _download_buttons(self) -> None:
@@ -111,8 +115,8 @@ class Page:
 
     def _picture_card(self) -> None:
         with ui.element("section").classes("oc-card oc-picture"):
-            self.scene = ScenePanel(self.state, self._take_picture)
-            self.view = SeenView(
+            self.scene = ScenePanel(self.state, self._set_picture)
+            self.view = PictureView(
                 PICTURES_PATH + self.name, list(self.state.sides), FIRST_ASPECT
             )
             self.view.on("point", self._point)
@@ -149,7 +153,7 @@ class Page:
                 with ui.element("div").classes("oc-eye-box") as box:
                     heading = ui.label(title).classes("oc-eye-title")
                     self.panels[side] = EyePanel(
-                        self.state.eyes[side], self.wish, self._take_age
+                        self.state.eyes[side], self.request, self._set_age
                     )
                 self._boxes[side] = (box, heading)
             self._show_boxes()
@@ -157,16 +161,16 @@ class Page:
 
     # Event handlers
 
-    def wish(self) -> None:
+    def request(self) -> None:
         """Request a picture for the current entries; report invalid entries."""
-        wish = self.state.wish()
+        request = self.state.request()
         problems = self.state.problems()
         if problems and self.state.right:
             problems.append("The pictures show the last valid entries.")
         self._problem.text = "\n".join(problems)
-        if wish is None:
+        if request is None:
             return
-        self.desk.seeing.wish(self.name, wish)
+        self.resources.filter_thread.request(self.name, request)
         if self._renewal is not None:
             self._renewal.cancel()
         self._renewal = asyncio.create_task(self._renew_figures())
@@ -178,14 +182,14 @@ class Page:
 
     def _slide(self, name: str, value: float) -> None:
         self.state.values[name] = value
-        self.wish()
+        self.request()
 
-    def _take_age(self, age_years: float) -> None:
+    def _set_age(self, age_years: float) -> None:
         self.state.values[AGE.name] = age_years
         self.rows[AGE.name].show(age_years)
 
-    def _take_picture(self, picture: Picture) -> None:
-        self.state.take_picture(picture)
+    def _set_picture(self, picture: Picture) -> None:
+        self.state.set_picture(picture)
         for name in (PUPIL.name, FOCUS.name, DISTANCE.name):
             self.rows[name].show(self.state.values[name])
         self.rows[DISTANCE.name].enable(
@@ -193,8 +197,8 @@ class Page:
         )
         self.view.show_aspect(picture.aspect_ratio)
         number = self.state.number + 1
-        self.out.put(Seen("scene", None, number, png_of(picture.view.color)))
-        self.wish()
+        self.out.put(SentPicture("scene", None, number, png_of(picture.view.color)))
+        self.request()
 
     def _show(self, event: events.ValueChangeEventArguments) -> None:
         self.state.shown = event.value
@@ -202,7 +206,7 @@ class Page:
         self.view.show_eyes(list(self.state.sides))
         self._show_notes()
         self._copy.set_visibility(self.state.shown != "both")
-        self.wish()
+        self.request()
 
     def _show_boxes(self) -> None:
         for side, (box, heading) in self._boxes.items():
@@ -222,14 +226,14 @@ class Page:
     def _look(self, event: events.GenericEventArguments) -> None:
         self.state.look_at(*_share(event))
         self.rows[FOCUS.name].show(self.state.values[FOCUS.name])
-        self.wish()
+        self.request()
 
     # Pictures from the filter thread
 
-    def _from_thread(self, seen: Seen) -> None:
-        self._loop.call_soon_threadsafe(self._take_seen, seen)
+    def _from_thread(self, seen: SentPicture) -> None:
+        self._loop.call_soon_threadsafe(self._show_picture, seen)
 
-    def _take_seen(self, seen: Seen) -> None:
+    def _show_picture(self, seen: SentPicture) -> None:
         self.out.put(seen)
         if seen.kind in ("full", "failed"):
             notes = seen.facts.get("notes") or [seen.facts.get("error", "")]
@@ -263,7 +267,7 @@ class Page:
                 f"Writing the report: {title.lower()} …", spinner=True, timeout=None
             )
             try:
-                text = await self.desk.studying.ask(
+                text = await self.resources.figure_worker.ask(
                     self.name, f"report {side}", report_html, body, label=title
                 )
             except StudyFailed as error:
@@ -274,7 +278,7 @@ class Page:
             if text is not None:
                 ui.download(text.encode(), f"ocufilter_{side}.html")
 
-    def _full(self, side: EyeSide) -> Seen | None:
+    def _full(self, side: EyeSide) -> SentPicture | None:
         seen = self.out.last(side)
         return seen if seen is not None and seen.kind == "full" else None
 
@@ -289,9 +293,9 @@ class Page:
 
     def close(self) -> None:
         """Release the page's resources."""
-        self.desk.seeing.forget(self.name)
-        self.desk.studying.forget(self.name)
-        self.desk.out.pop(self.name, None)
+        self.resources.filter_thread.forget(self.name)
+        self.resources.figure_worker.forget(self.name)
+        self.resources.out.pop(self.name, None)
 
 
 def _share(event: events.GenericEventArguments) -> tuple[float, float]:
@@ -304,12 +308,12 @@ def _sentence(note: str) -> str:
     return note[:1].upper() + note[1:].rstrip(".") + "."
 
 
-def add_page(desk: Desk, profile: NamedProfile | None) -> None:
+def add_page(resources: SharedResources, profile: NamedProfile | None) -> None:
     """Serve the page at `/`."""
 
     @ui.page("/", title="ocufilter")
     async def _page(client: Client) -> None:
-        page = Page(desk, profile)
+        page = Page(resources, profile)
         client.on_delete(page.close)
 
-    app.on_shutdown(desk.close)
+    app.on_shutdown(resources.close)

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from clients.web.correction_form import looking
 from clients.web.eye_form import SIDES, EyeForm, EyeSide
 from clients.web.numbers import NumberField
 from clients.web.picture import Picture, Place
-from clients.web.wishes import Wish
-from clients.web.worn_form import looking
+from clients.web.picture_requests import PictureRequest
 
 Shown = Literal["OD", "OS", "both"]
 
@@ -88,7 +88,7 @@ class PageState:
         body = self.right.get(side)
         return None if body is None else looking(body, self.gaze_deg)
 
-    def take_picture(self, picture: Picture) -> None:
+    def set_picture(self, picture: Picture) -> None:
         """Set the picture; the first one also sets the state that it suggests."""
         if self.picture is None:
             for number, value in (
@@ -101,8 +101,8 @@ class PageState:
         if picture.distance_dpt is not None:
             self.values[DISTANCE.name] = picture.distance_dpt
 
-    def wish(self) -> Wish | None:
-        """Return the wish for the current state; None without a picture or an eye.
+    def request(self) -> PictureRequest | None:
+        """Return the request for the current state; None without a picture or an eye.
 
         An eye with an invalid entry keeps its last profile: see `problems`.
         """
@@ -116,7 +116,7 @@ class PageState:
             return None
         self.picture = self.picture.at(self.values[DISTANCE.name])
         self.number += 1
-        return Wish(
+        return PictureRequest(
             number=self.number,
             picture=self.picture,
             bodies=bodies,

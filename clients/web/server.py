@@ -14,7 +14,7 @@ from nicegui import app, ui
 from clients.web.bounds import MAX_MESSAGE_BYTES, MAX_PAGES, Bounds
 from clients.web.connections import MAX_HEAD_BYTES, BoundedConnection
 from clients.web.guard import POLICY_VIOLATION, Guard
-from clients.web.page import PICTURES_PATH, Desk, add_page
+from clients.web.page import PICTURES_PATH, SharedResources, add_page
 
 MESSAGE_HISTORY = 50
 """Messages kept for a browser that reconnects; figures are large."""
@@ -37,7 +37,7 @@ def make_server(
     ----------
     opening, hosts : as in `Guard`
     """
-    desk: list[Desk] = []
+    resources: list[SharedResources] = []
 
     @asynccontextmanager
     async def lifespan(_: FastAPI):
@@ -50,14 +50,14 @@ def make_server(
 
     @application.websocket(PICTURES_PATH + "{page}")
     async def _pictures(socket: WebSocket, page: str) -> None:
-        out = desk[0].out.get(page)
+        out = resources[0].out.get(page)
         if out is None:
             await socket.close(POLICY_VIOLATION)
         else:
             await out.serve(socket)
 
-    desk.append(Desk())
-    add_page(desk[0], profile)
+    resources.append(SharedResources())
+    add_page(resources[0], profile)
     ui.run_with(
         application,
         title="ocufilter",
@@ -69,7 +69,7 @@ def make_server(
     )
     # NiceGUI's own handler creates a page for each unknown address
     app.add_exception_handler(404, http_exception_handler)
-    bounded = Bounds(application, is_full=lambda: len(desk[0].out) >= MAX_PAGES)
+    bounded = Bounds(application, is_full=lambda: len(resources[0].out) >= MAX_PAGES)
     guarded = Guard(
         bounded,
         token=token,

@@ -1,17 +1,17 @@
 """Estimation of an eye from a measurement.
 
-estimation      entry point: refined, by network, or by pattern search
-problem         compared coefficients and the model of them
-prior           prior distribution of eyes, by refraction
-bounded_fit     least squares with bounds
-plausible       properties of an eye that are unusual in people
-measured_rest   residual of the estimate, kept as a phase
-table           start eyes of a fit
-make_table      program that computes the table
+estimation         entry point: refined, by network, or by pattern search
+problem            compared coefficients and the model of them
+prior              prior distribution of eyes, by refraction
+bounded_fit        least squares with bounds
+plausible          properties of an eye that are unusual in people
+measured_residual  residual of the estimate, kept as a phase
+table              start eyes of a fit
+make_table         program that computes the table
 eye_table.json  the table
-network_guess   start eye from the eye network
-pattern_search  pattern search of the earlier work
-plot            plot of an estimated eye
+network_guess      start eye from the eye network
+pattern_search     pattern search of the earlier work
+plot               plot of an estimated eye
 """
 
 import lazy_loader

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.estimate.bounded_fit import BoundedFit
-from estimator.estimate.measured_rest import MeasuredRest
+from estimator.estimate.measured_residual import MeasuredResidual
 from estimator.estimate.network_guess import network_guess
 from estimator.estimate.pattern_search import pattern_search
 from estimator.estimate.plausible import unusual
@@ -125,9 +125,9 @@ class EstimatedEye:
         problem = EstimationProblem(self.profile)
         return problem.determined_ratio(self.parameters.to_vector())
 
-    def rest(self, wavelengths_nm: ArrayLike) -> MeasuredRest:
+    def rest(self, wavelengths_nm: ArrayLike) -> MeasuredResidual:
         """Return the residual of the measurement and this eye, at wavelengths."""
-        return MeasuredRest.of(
+        return MeasuredResidual.of(
             self.parameters, self.profile, wavelengths_nm=wavelengths_nm
         )
 
@@ -178,7 +178,7 @@ def accommodating_eye(
         pupil_diameter_mm=profile.pupil_diameter_mm,
         amplitude_dpt=profile_amplitude_dpt(profile),
         correction=profile.correction,
-        rest=MeasuredRest.of(
+        rest=MeasuredResidual.of(
             parameters, profile, wavelengths_nm=REFERENCE_WAVELENGTH_NM
         ),
     )

@@ -27,9 +27,9 @@ FIRST_COMPARED = 3
 
 FIT_NOISE_UM = 1e-3
 """Weight of a coefficient against the prior: a tenth of the repeatability of
-instruments.  The residual is kept as a phase (`measured_rest`), so that an eye need not
-leave human ranges for the last nanometers: with 1e-4 an eye of 8 dpt of cylinder got a
-chamber 4.6 mm deep."""
+instruments.  The residual is kept as a phase (`measured_residual`), so that an eye need
+not leave human ranges for the last nanometers: with 1e-4 an eye of 8 dpt of cylinder
+got a chamber 4.6 mm deep."""
 
 INSTRUMENT_NOISE_UM = 0.01
 """Repeatability of an aberrometer's coefficient, used by `determined_ratio`."""

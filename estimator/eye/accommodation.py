@@ -67,8 +67,8 @@ class FocusedEye:
     notes: tuple[str, ...]
 
 
-class Rest(Protocol):
-    """Phase added to that of the traced eye, see `estimate.measured_rest`."""
+class ResidualPhase(Protocol):
+    """Phase added to that of the traced eye, see `estimate.measured_residual`."""
 
     def on_axis_um(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
         """Return monomials (n, 28) at 555 nm in the plane of pupils (n,)."""
@@ -117,7 +117,7 @@ class AccommodatingEye(Focusing):
         pupil_diameter_mm: float = 4.0,
         amplitude_dpt: float = math.inf,
         correction: rx.Prescription | None = None,
-        rest: Rest | None = None,
+        rest: ResidualPhase | None = None,
     ):
         self.parameters = parameters
         self.retina = retina

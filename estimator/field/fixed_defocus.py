@@ -6,9 +6,9 @@ Terms that depend only on field and wavelength are summed once; see `defocus_loo
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.estimate.measured_rest import MeasuredRest
+from estimator.estimate.measured_residual import MeasuredResidual
 from estimator.field.interpolation import POWER, FieldInterpolation, FieldValues
-from estimator.field.peripheral_rest import WIDEST_RATIO
+from estimator.field.peripheral_residual import WIDEST_RATIO
 from estimator.optics.prescription import C20
 from estimator.optics.zernike import N_TERMS, monomial_matrix
 from estimator.periphery.meridian import CIRCLE_MM
@@ -41,7 +41,7 @@ class FixedDefocus:
         self,
         field: tuple[FieldInterpolation, FieldValues],
         on_axis: tuple[FieldInterpolation, FieldValues],
-        rest: MeasuredRest,
+        rest: MeasuredResidual,
         *,
         left_share: NDArray[np.float64],
         people_um: NDArray[np.float64] | None,

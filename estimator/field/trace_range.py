@@ -13,7 +13,7 @@ from estimator.field.aberration_grid import (
     AberrationGrid,
 )
 from estimator.field.interpolation import FieldInterpolation, field_nodes_deg
-from estimator.field.peripheral_rest import PeripheralRest
+from estimator.field.peripheral_residual import PeripheralResidual
 from estimator.periphery.change import peripheral_change
 from estimator.wavefront.aberrations import TRACED_FIELD_LIMIT_DEG
 
@@ -83,16 +83,16 @@ def trace_field(
     return axis, ON_AXIS_DEG
 
 
-def peripheral_rest(
+def peripheral_residual(
     eye: EstimatedEye, field_range_deg: FieldRange
-) -> PeripheralRest | None:
+) -> PeripheralResidual | None:
     """Return people's periphery for an eye, or None if it has the model's.
 
     It has the model's if light does not pass the usual eye over the whole range.
     """
     if eye.profile.periphery == "model" or not np.any(field_range_deg):
         return None
-    rest = PeripheralRest(peripheral_change(eye.profile), eye, field_range_deg)
+    rest = PeripheralResidual(peripheral_change(eye.profile), eye, field_range_deg)
     return rest if rest.passes else None
 
 

@@ -24,14 +24,14 @@ from estimator.field.interpolation import (
     FieldInterpolation,
     accommodation_nodes_dpt,
 )
-from estimator.field.peripheral_rest import PeripheralRest
+from estimator.field.peripheral_residual import PeripheralResidual
 from estimator.field.trace_range import (
     ON_AXIS_DEG,
     FieldRange,
     check_field_range,
     field_pupils_mm,
     largest_open_pupil_mm,
-    peripheral_rest,
+    peripheral_residual,
     share_of,
     trace_field,
 )
@@ -65,8 +65,8 @@ class TracedEye(FocusingEye):
     On axis the circle circumscribed about the pupil is the requested pupil: the traced
     rim, up to a few percent smaller than the paraxial entrance pupil, is scaled to it,
     and at other fields by the same factor.  The residual of the estimate is added to
-    the wavefronts, see `measured_rest`.  The correction is subtracted equally at every
-    field, except for a progressive lens, see `worn_lens.worn_polynomial`.
+    the wavefronts, see `measured_residual`.  The correction is subtracted equally at
+    every field, except for a progressive lens, see `worn_lens.worn_polynomial`.
 
     Vignetting: the largest pupil is the largest traced one that is open on axis.  Where
     the rim of a pupil is vignetted off axis, the pupil is reduced to one of the open
@@ -99,7 +99,7 @@ class TracedEye(FocusingEye):
         *,
         field_range_deg: FieldRange = ON_AXIS_DEG,
         traced_range_deg: FieldRange = ON_AXIS_DEG,
-        periphery: PeripheralRest | None = None,
+        periphery: PeripheralResidual | None = None,
     ):
         self.grid = axis.grid
         self.eye_side = eye.profile.eye_side
@@ -193,7 +193,7 @@ class TracedEye(FocusingEye):
             field,
             field_range_deg=field_range_deg,
             traced_range_deg=traced_range_deg,
-            periphery=peripheral_rest(eye, traced_range_deg),
+            periphery=peripheral_residual(eye, traced_range_deg),
         )
 
     def refraction_at_dpt(

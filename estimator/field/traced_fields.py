@@ -9,10 +9,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.estimate.measured_rest import MeasuredRest
+from estimator.estimate.measured_residual import MeasuredResidual
 from estimator.field.fixed_defocus import FixedDefocus
 from estimator.field.interpolation import FieldInterpolation
-from estimator.field.peripheral_rest import PeripheralRest, stretch_ratio
+from estimator.field.peripheral_residual import PeripheralResidual, stretch_ratio
 from estimator.wavefront.field_wavefronts import (
     circumscribed_radius_mm,
     distinct_rows,
@@ -64,9 +64,9 @@ class TracedFields:
         field: FieldInterpolation,
         on_axis: FieldInterpolation,
         correction_um: NDArray[np.float64],
-        rest: MeasuredRest,
+        rest: MeasuredResidual,
         *,
-        periphery: PeripheralRest | None = None,
+        periphery: PeripheralResidual | None = None,
         h_deg: NDArray[np.float64],
         v_deg: NDArray[np.float64],
         wavelength_nm: NDArray[np.float64],

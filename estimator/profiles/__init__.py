@@ -1,7 +1,7 @@
 """Eye profiles: prescriptions, measurements and eye models.
 
 parse                validation of a profile object, returned as an `EyeProfile`
-worn                 the correction in a profile
+correction           the correction in a profile
 options              options of any kind of profile
 files                .json, .abp and .csv profiles, and presets by name
 presets.json         the six presets

@@ -34,7 +34,7 @@ from estimator.optics.zernike import (
     flip_horizontal,
     index_from_nm,
 )
-from estimator.profiles import options, worn
+from estimator.profiles import correction, options
 
 __all__ = [
     "EyeProfile",
@@ -53,7 +53,7 @@ COMMON_FIELDS = (
     "retina",
     *options.FIELDS,
 )
-PRESCRIPTION_FIELDS = (*worn.SPECTACLE_FIELDS, "add_dpt", "higher_order")
+PRESCRIPTION_FIELDS = (*correction.SPECTACLE_FIELDS, "add_dpt", "higher_order")
 HIGHER_ORDERS = ("typical", "none")
 """Aberrations that a traced eye adds to its prescription: those of its age, or none."""
 
@@ -229,19 +229,19 @@ def _common(data: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "eye_side": fields.choice(data, "eye_side", ("OD", "OS"), default="OD"),
         "age_years": age_years,
-        "correction": worn.correction(data),
+        "correction": correction.correction(data),
         "retina": retina,
         "periphery": options.periphery(data, has_own=retina is not None),
         "straylight": options.straylight(data, age_years),
         "yellowing": options.yellowing(data),
         "spectacle_magnification": options.spectacle_magnification(data),
-        "notes": worn.vertex_notes(data),
+        "notes": correction.vertex_notes(data),
     }
 
 
 def _parse_prescription_profile(data: Mapping[str, Any]) -> EyeProfile:
     fields.only_known(data, COMMON_FIELDS + PRESCRIPTION_FIELDS)
-    prescription = worn.prescription(data)
+    prescription = correction.prescription(data)
     common = _common(data)
     zernike_um = rx.zernike_from_power_vector(
         *rx.power_vector(prescription), zernike_radius_mm=PRESCRIPTION_RADIUS_MM

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from estimator.profiles.files import load_profile
 from estimator.profiles.parse import EyeProfile, parse_profile
 from filter_service.camera import Camera
-from filter_service.checked import checked
 from filter_service.errors import BadMessage, NotPrepared, ServiceTimeout
 from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
 from filter_service.filtering.builder import Builder
@@ -41,6 +40,7 @@ from filter_service.settings import (
     VergenceDpt,
     as_settings,
 )
+from filter_service.validation import checked
 
 WAIT_SLICE_S = 0.02
 

@@ -14,13 +14,13 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from filter_service.checked import checked
 from filter_service.errors import BadMessage, NoProfile, SessionError
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.filtered import Filtered
 from filter_service.filtering.planned_frame import GazeDegrees, PlannedFrame
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import Accumulation, GazeDeg, Output
+from filter_service.validation import checked
 from filter_service.view_state import EyeName, ViewState, check_states
 
 

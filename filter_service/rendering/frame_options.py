@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.checked import checked
 from filter_service.errors import BadMessage, CameraMismatch
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.gaze import usable_gaze
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import ACCUMULATIONS, OUTPUTS, RenderTolerance
+from filter_service.validation import checked
 
 OUTPUT_DTYPES = {"linear": np.float32, "srgb8": np.uint8, "linear16": np.float16}
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.camera import Camera, SidePx, Tangents
-from filter_service.checked import Record
 from filter_service.errors import BadMessage
 from filter_service.rgbd_view import ColorImage, RgbdView
 from filter_service.settings import DepthKind, GazeDeg, Output, PupilMm, VergenceDpt
+from filter_service.validation import Record
 from filter_service.view_state import EyeName, Pose, ViewState
 from filter_service.wire.compression import (
     Compression,

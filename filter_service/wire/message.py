@@ -8,8 +8,8 @@ from typing import Annotated, Any, ClassVar, Self
 
 from msgspec import Meta
 
-from filter_service.checked import Record, checked
 from filter_service.errors import BadMessage
+from filter_service.validation import Record, checked
 
 DEFAULT_ENDPOINT = "tcp://127.0.0.1:5577"
 

@@ -10,8 +10,8 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from filter_service.checked import Record
 from filter_service.errors import FilterError, error_from_code
+from filter_service.validation import Record
 from filter_service.view_state import EyeName, Pose
 from filter_service.wire.compression import Compression, unpacked
 from filter_service.wire.images import (

@@ -10,7 +10,6 @@ from typing import Annotated, Any, ClassVar, Self
 from msgspec import Meta
 
 from filter_service.camera import Camera
-from filter_service.checked import Record, show
 from filter_service.errors import BadMessage
 from filter_service.settings import (
     DEFAULTS,
@@ -22,6 +21,7 @@ from filter_service.settings import (
     VergenceDpt,
 )
 from filter_service.shared_memory import ALIGNMENT_BYTES
+from filter_service.validation import Record, show
 from filter_service.view_state import EyeName, check_states
 from filter_service.wire.compression import Compression
 from filter_service.wire.images import (

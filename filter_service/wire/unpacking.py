@@ -8,8 +8,8 @@ from typing import Any
 
 import msgpack
 
-from filter_service.checked import show
 from filter_service.errors import BadMessage
+from filter_service.validation import show
 
 MAX_HEADER_BYTES = 4096
 MAX_DEPTH = 32

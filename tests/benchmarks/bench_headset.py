@@ -32,13 +32,13 @@ import numpy as np
 from clients.headset.built_scene import built_scene
 from clients.headset.controls import Controls
 from clients.headset.gltf_scene import load_gltf
-from clients.headset.look import StereoLook
+from clients.headset.local_filter import LocalFilter
 from clients.headset.poses import upright
 from clients.headset.scenery import SceneScenery
-from clients.headset.seeing import Seeing
-from clients.headset.seeing_by_service import SeeingByService
-from clients.headset.seeing_here import SeeingHere
+from clients.headset.service_filter import ServiceFilter
 from clients.headset.simulated_runtime import SimulatedRuntime
+from clients.headset.stereo_filter import StereoFilter
+from clients.headset.stereo_gaze import StereoGaze
 from clients.headset.viewer import Viewer
 from clients.headset.viewpoint import viewpoint
 from clients.service_process import ServiceProcess
@@ -62,7 +62,7 @@ SETTINGS = FilterSettings(pupil_range_mm=(2.0, 5.0), object_range_dpt=(0.0, 8.5)
 class Watched:
     """Passes on what is seen, and keeps the last frame and when eyes are complete."""
 
-    def __init__(self, seeing: Seeing):
+    def __init__(self, seeing: StereoFilter):
         self._seeing = seeing
         self.last = None
 
@@ -85,7 +85,7 @@ def viewer_of(open_runtime, scenery, seeing):
         open_runtime,
         scenery,
         seeing,
-        StereoLook(age_years=30.0),
+        StereoGaze(age_years=30.0),
         Controls(dict(PROFILES), seeing.change),
         say=lambda line: None,
     )
@@ -93,7 +93,7 @@ def viewer_of(open_runtime, scenery, seeing):
 
 def error_db(seen) -> float:
     """Return the PSNR of what was seen to the same frame without tolerance."""
-    exact = SeeingHere(SETTINGS, lambda line: None)
+    exact = LocalFilter(SETTINGS, lambda line: None)
     try:
         for eye, profile in PROFILES.items():
             exact.change(eye, profile)
@@ -153,9 +153,9 @@ def ways(names):
                 service = stack.enter_context(
                     ServiceProcess({"bind": f"ipc://{folder}/service"})
                 )
-                seeing = SeeingByService(service.endpoint, SETTINGS, lambda line: None)
+                seeing = ServiceFilter(service.endpoint, SETTINGS, lambda line: None)
             else:
-                seeing = SeeingHere(SETTINGS, lambda line: None)
+                seeing = LocalFilter(SETTINGS, lambda line: None)
             stack.callback(seeing.close)
             yield name, seeing
 

@@ -28,8 +28,8 @@ from playwright.sync_api import sync_playwright
 
 from clients.web.eye_view import FULL, EyeView
 from clients.web.picture import linear_from_srgb8
+from clients.web.picture_requests import PictureRequest
 from clients.web.scene_file import scene_picture
-from clients.web.wishes import Wish
 from filter_service import EyeFilter
 from tests.benchmarks.harness import ROOT, Row, publish
 from tests.web.browser import PageUnderTest, open_browser
@@ -121,11 +121,11 @@ def times(count: int) -> tuple[dict[tuple[str, str], list[float]], float]:
     return found, memory_mb
 
 
-def _wish(number: int, picture, changes) -> Wish:
+def _wish(number: int, picture, changes) -> PictureRequest:
     state = {"pupil_diameter_mm": PUPIL_MM, "focus_dpt": FOCUS_DPT} | changes
     sphere_dpt = state.pop("sphere_dpt", SPHERE_DPT)
     body = {"kind": "prescription", "sphere_dpt": sphere_dpt, "age_years": 30.0}
-    return Wish(number, picture, {"OD": body}, gaze_deg=(0.0, 0.0), **state)
+    return PictureRequest(number, picture, {"OD": body}, gaze_deg=(0.0, 0.0), **state)
 
 
 def errors(states) -> dict[str, float]:

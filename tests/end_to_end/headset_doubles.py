@@ -3,12 +3,12 @@
 import numpy as np
 
 from clients.headset.controls import Controls
-from clients.headset.look import RgbdPicture, StereoLook
 from clients.headset.poses import matrix_of
-from clients.headset.seeing import Seen
 from clients.headset.simulated_runtime import (
     eye_views,
 )
+from clients.headset.stereo_filter import FilteredStereoFrame
+from clients.headset.stereo_gaze import RgbdPicture, StereoGaze
 from clients.headset.viewer import Viewer
 
 SIZE_PX = (40, 36)
@@ -57,7 +57,7 @@ class Inverting:
         if len(self.frames) <= self.late:
             return None
         frame = self.frames[-1 - self.late]
-        return Seen(
+        return FilteredStereoFrame(
             frame,
             tuple(picture.view for picture in frame.pictures),
             tuple(255 - picture.color for picture in frame.pictures),
@@ -89,7 +89,7 @@ def viewer_of(
         open_runtime,
         scenery or Wall(),
         seeing,
-        look or StereoLook(age_years=35.0),
+        look or StereoGaze(age_years=35.0),
         Controls(profiles or {}, seeing.change),
         read_keys=keys,
         say=(said if said is not None else []).append,

@@ -55,7 +55,7 @@ def test_a_counted_run_ends_where_no_service_answers():
 
 OWN_SCENERY = """
 import numpy as np
-from clients.headset.look import RgbdPicture
+from clients.headset.stereo_gaze import RgbdPicture
 
 class Gray:
     def pictures(self, views, size_px):

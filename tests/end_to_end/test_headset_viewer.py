@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from clients.headset import program
-from clients.headset.look import StereoLook
 from clients.headset.poses import angles_of, direction_of, matrix_of, turned, upright
 from clients.headset.runtime import (
     EYES,
@@ -27,6 +26,7 @@ from clients.headset.simulated_runtime import (
     still,
     swaying,
 )
+from clients.headset.stereo_gaze import StereoGaze
 from tests.end_to_end.headset_doubles import (
     SIZE_PX,
     Inverting,
@@ -140,7 +140,7 @@ def test_a_session_that_the_user_ends_is_not_begun_again():
 def test_a_clock_that_starts_again_does_not_stop_the_eyes():
     """As Monado's does when it is started again: to the eyes it is another day."""
     head = still(0.0)
-    look = StereoLook(age_years=25.0, gaze_range_deg=(20.0, 20.0))
+    look = StereoGaze(age_years=25.0, gaze_range_deg=(20.0, 20.0))
     pictures = pictures_of(head)
 
     def gaze_at(at_s, h_deg):

@@ -130,7 +130,7 @@ HOME = {
     "lz4": ("filter_service/wire/compression.py",),
     "msgpack": ("filter_service/messages.py", "filter_service/wire/unpacking.py"),
     "msgspec": (
-        "filter_service/checked.py",  # values against annotated types
+        "filter_service/validation.py",  # values against annotated types
         "filter_service/settings.py",  # their limits
         "filter_service/camera.py",
         "filter_service/view_state.py",

@@ -20,6 +20,7 @@ from clients.report.blocks import (
     Words,
 )
 from clients.report.charts import picture_side_px
+from clients.report.correction_text import correction_text
 from clients.report.facts import EyeFacts, facts_of
 from clients.report.html_page import html_of
 from clients.report.make import document_of
@@ -35,7 +36,6 @@ from clients.report.pdf_text import column_widths_mm, line_mm, lines_of, width_m
 from clients.report.program import main
 from clients.report.provenance import provenance_table
 from clients.report.sources import SOURCES, Citations
-from clients.report.worn_words import worn_words
 from estimator import parse_profile
 
 SPECTACLES = {"sphere_dpt": -4.0, "cylinder_dpt": -1.0, "axis_deg": 20.0}
@@ -208,7 +208,7 @@ def test_haze_and_the_worn_lens_are_told():
 )
 def test_what_is_worn_is_told_in_plain_words(lens, said):
     body = {"kind": "prescription", "sphere_dpt": 0.0, "correction": lens}
-    assert worn_words(parse_profile(body).correction) == said
+    assert correction_text(parse_profile(body).correction) == said
 
 
 def test_a_report_through_lenslets_says_what_is_not_known():

@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 from filter_service.__main__ import app
 from filter_service.camera import Camera
-from filter_service.checked import RISING, checked
 from filter_service.commands.setting_options import with_setting_options
 from filter_service.errors import BadMessage
 from filter_service.settings import (
@@ -21,6 +20,7 @@ from filter_service.settings import (
     setting_help,
     setting_types,
 )
+from filter_service.validation import RISING, checked
 
 
 @pytest.mark.parametrize("name", setting_types())

@@ -4,10 +4,17 @@ import json
 
 import pytest
 
+from clients.web.correction_form import (
+    AXIS,
+    DESIGNS,
+    KINDS,
+    SPHERE,
+    CorrectionForm,
+    first_texts,
+)
 from clients.web.eye_form import EyeForm, preset_titles
 from clients.web.numbers import distance_text
 from clients.web.page_state import AGE, FOCUS, GAZE_V, PageState
-from clients.web.worn_form import AXIS, DESIGNS, KINDS, SPHERE, WornForm, first_texts
 from estimator import parse_profile, preset_names
 from tests.unit.web_parts import a_picture
 
@@ -93,10 +100,10 @@ def test_every_lens_of_the_page_is_one_that_a_profile_may_have(kind, design, sou
 def test_a_lens_that_the_page_has_no_entries_for_stays_as_it_is():
     zones = {"kind": "iol", "design": "zones", "zone_adds_dpt": [2, 0]}
     zones["zone_diameters_mm"] = [1.5, 6]
-    form = WornForm()
+    form = CorrectionForm()
     form.take(zones)
     assert form.body() == zones and "file" in form.kinds and form.entries == ()
-    assert "file" not in WornForm(texts=first_texts()).kinds
+    assert "file" not in CorrectionForm(texts=first_texts()).kinds
 
 
 def test_additions_that_no_lens_can_have_are_told():
@@ -119,13 +126,13 @@ def test_the_gaze_slider_turns_a_progressive_lens_of_the_figures():
     form = state.eyes["OD"]
     form.wears_correction, form.worn.kind = True, "progressive"
     state.values[GAZE_V.name] = -15.0
-    wish = state.wish()
-    assert "gaze_deg" not in wish.bodies["OD"]["correction"]  # the settings have it
+    request = state.request()
+    assert "gaze_deg" not in request.bodies["OD"]["correction"]  # the settings have it
     seen = parse_profile(state.looking_body("OD")).correction
     # 25.5 mm before the center of rotation 15 deg are 6.8 mm, half of the corridor
     assert seen.sphere_dpt == pytest.approx(2.0 / 2, abs=0.15)
     form.worn.kind = "contact_lens"
-    state.wish()
+    state.request()
     assert state.looking_body("OD") == state.right["OD"]
 
 
@@ -183,10 +190,10 @@ def test_coefficients_are_called_as_their_file_is():
 
 def test_a_wrong_entry_leaves_the_eye_as_it_was_and_the_sliders_alive():
     state = PageState(picture=a_picture())
-    first = state.wish()
+    first = state.request()
     state.eyes["OD"].texts["sphere_dpt"] = "abc"
     state.values[FOCUS.name] = 1.0
-    second = state.wish()
+    second = state.request()
     assert second.bodies == first.bodies
     assert (second.focus_dpt, second.number) == (1.0, first.number + 1)
     (problem,) = state.problems()
@@ -196,7 +203,7 @@ def test_a_wrong_entry_leaves_the_eye_as_it_was_and_the_sliders_alive():
 def test_both_eyes_are_asked_for_with_the_age_of_the_person():
     state = PageState(picture=a_picture(), shown="both")
     state.values[AGE.name] = 61.0
-    bodies = state.wish().bodies
+    bodies = state.request().bodies
     assert {side: body["eye_side"] for side, body in bodies.items()} == {
         "OD": "OD",
         "OS": "OS",

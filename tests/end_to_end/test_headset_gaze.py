@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clients.headset.look import StereoLook
 from clients.headset.poses import angles_of, direction_of, turned
 from clients.headset.runtime import (
     DueFrame,
@@ -18,6 +17,7 @@ from clients.headset.simulated_runtime import (
     eye_views,
     still,
 )
+from clients.headset.stereo_gaze import StereoGaze
 from tests.end_to_end.headset_doubles import (
     SIZE_PX,
     WALL_M,
@@ -30,7 +30,7 @@ from tests.end_to_end.headset_doubles import (
 
 def test_focus_follows_the_depth_at_the_gaze_and_not_vergence():
     """A wall at 2 m, seen 20 deg aside: the ray is longer than the depth."""
-    look = StereoLook(age_years=25.0, gaze_range_deg=(40.0, 30.0))
+    look = StereoGaze(age_years=25.0, gaze_range_deg=(40.0, 30.0))
     pictures = pictures_of(still(0.0))
     head = still(0.0)
     for step in range(400):
@@ -58,14 +58,14 @@ def test_a_pupil_that_is_measured_counts_and_the_light_does_not():
     head = still(0.0)
     for measured_mm, used_mm in ((5.5, 5.5), (0.1, 0.5), (None, None)):
         due = DueFrame(0, True, eye_views(head), head, pupil_diameter_mm=measured_mm)
-        for eye in StereoLook(age_years=25.0).follow(due, pictures_of(head)):
+        for eye in StereoGaze(age_years=25.0).follow(due, pictures_of(head)):
             found_mm = eye.state.pupil_diameter_mm
             assert found_mm == used_mm if used_mm else 2.0 < found_mm < 5.0
 
 
 def test_without_a_tracker_eyes_look_straight_ahead():
     head = still(0.0)
-    look = StereoLook(age_years=25.0)
+    look = StereoGaze(age_years=25.0)
     left, right = look.follow(
         DueFrame(0, True, eye_views(head), head), pictures_of(head)
     )
@@ -88,7 +88,7 @@ def test_a_tracker_that_is_lost_is_told_once():
         seeing,
         said=said,
         keys=keys,
-        look=StereoLook(age_years=30.0, gaze_range_deg=(10.0, 10.0)),
+        look=StereoGaze(age_years=30.0, gaze_range_deg=(10.0, 10.0)),
     ).run(limit_s=1.0)
     about = [line for line in said if "track" in line]
     assert about == [
@@ -107,7 +107,7 @@ def test_the_far_point_is_learnt_from_what_the_filter_says():
     head = still(0.0)
     pictures = pictures_of(head)
     near = tuple(replace(p, depth_m=np.full_like(p.depth_m, 0.2)) for p in pictures)
-    look = StereoLook(age_years=25.0)
+    look = StereoGaze(age_years=25.0)
 
     def at(at_s, seen):
         due = DueFrame(int(1e9 * at_s), True, eye_views(head), head)
@@ -130,6 +130,6 @@ def test_straight_ahead_is_the_heads_own_in_canted_views(with_head):
     )
     due = DueFrame(0, True, views, head if with_head else None)
     wall = Wall().pictures(views, (400, 360))
-    left, right = StereoLook(age_years=25.0).follow(due, wall)
+    left, right = StereoGaze(age_years=25.0).follow(due, wall)
     assert left.ahead_deg == left.gaze_deg == pytest.approx((10.0, 0.0), abs=0.01)
     assert right.ahead_deg == right.gaze_deg == pytest.approx((-10.0, 0.0), abs=0.01)

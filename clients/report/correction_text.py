@@ -27,7 +27,7 @@ DESIGNS = {
 STRAIGHT_DEG = 0.5
 
 
-def short_words(lens: Prescription) -> str:
+def short_text(lens: Prescription) -> str:
     """Return the type of a correction, in two or three words."""
     if isinstance(lens, ProgressiveLens):
         return "progressive spectacles"
@@ -40,7 +40,7 @@ def short_words(lens: Prescription) -> str:
     return f"intraocular lens, {DESIGNS[lens.design]}"
 
 
-def worn_words(lens: Prescription) -> str:
+def correction_text(lens: Prescription) -> str:
     """Return the type of a correction, its powers and its alignment to the eye."""
     if isinstance(lens, ProgressiveLens):
         own, more = lens.distance, _progressive(lens)
@@ -49,8 +49,8 @@ def worn_words(lens: Prescription) -> str:
     else:
         own, more = lens, ()
     if isinstance(lens, WornLens) and lens.replaces_lens:
-        return ", ".join([short_words(lens), *_own_power(lens), *more])
-    return ", ".join([f"{short_words(lens)} {written(own)}{_where(own)}", *more])
+        return ", ".join([short_text(lens), *_own_power(lens), *more])
+    return ", ".join([f"{short_text(lens)} {written(own)}{_where(own)}", *more])
 
 
 def _own_power(lens: WornLens) -> tuple[str, ...]:
@@ -75,7 +75,7 @@ def _seated(lens: WornLens) -> tuple[str, ...]:
     rings = lens.rings
     if isinstance(rings, Lenslets):
         parts.append(f"lenslets of {_power(rings.power_dpt)} dpt")
-        parts.append(gaze_words(rings.gaze_deg))
+        parts.append(gaze_text(rings.gaze_deg))
     elif isinstance(rings, DiffractiveRings):
         adds = [_power(lens.at_lens_dpt(d)) for d in design_adds_dpt(rings)]
         many = "adds" if len(adds) > 1 else "add"
@@ -104,12 +104,12 @@ def _progressive(lens: ProgressiveLens) -> tuple[str, ...]:
     words = (
         f"add {_power(lens.add_dpt)} dpt",
         f"corridor {lens.corridor_mm:g} mm",
-        gaze_words(lens.gaze_deg),
+        gaze_text(lens.gaze_deg),
     )
     return (*words[:2], f"{words[2]} through {written(lens)}")
 
 
-def gaze_words(gaze_deg: tuple[float, float]) -> str:
+def gaze_text(gaze_deg: tuple[float, float]) -> str:
     """Return the gaze direction of an eye as text."""
     parts = [
         f"{abs(angle):.0f}° {names[angle < 0.0]}"
@@ -127,13 +127,13 @@ def _power(power_dpt: float) -> str:
     return text[:-1] if text.endswith("0") else text
 
 
-def subtitle_words(profile: EyeProfile) -> str:
+def subtitle_text(profile: EyeProfile) -> str:
     """Return the end of a report's subtitle."""
     lens = profile.correction
-    return "" if lens is None else f"; {short_words(lens)}"
+    return "" if lens is None else f"; {short_text(lens)}"
 
 
-def limits_words(lens: Prescription | None) -> tuple[str, ...]:
+def limits_text(lens: Prescription | None) -> tuple[str, ...]:
     """Return the limitations that a lens imposes on a report."""
     if isinstance(lens, ProgressiveLens):
         return (
@@ -157,4 +157,4 @@ def limits_words(lens: Prescription | None) -> tuple[str, ...]:
 
 
 def _of_gaze(gaze_deg: tuple[float, float]) -> str:
-    return f"an eye that is {gaze_words(gaze_deg)}"
+    return f"an eye that is {gaze_text(gaze_deg)}"

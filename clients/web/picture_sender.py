@@ -7,10 +7,10 @@ import asyncio
 from fastapi import WebSocket, WebSocketDisconnect
 from fastapi.websockets import WebSocketState
 
-from clients.web.wishes import Seen
+from clients.web.picture_requests import SentPicture
 
 
-class PicturesOut:
+class PictureSender:
     """Pictures of one page waiting to be sent; for the event loop's thread.
 
     A newer picture replaces a waiting one of the same place, so that a slow connection
@@ -18,16 +18,16 @@ class PicturesOut:
     """
 
     def __init__(self) -> None:
-        self._waiting: dict[str, Seen] = {}
-        self._last: dict[str, Seen] = {}
+        self._waiting: dict[str, SentPicture] = {}
+        self._last: dict[str, SentPicture] = {}
         self._came = asyncio.Event()
 
-    def put(self, seen: Seen) -> None:
+    def put(self, seen: SentPicture) -> None:
         """Queue a picture."""
         self._waiting[seen.place] = self._last[seen.place] = seen
         self._came.set()
 
-    def last(self, place: str) -> Seen | None:
+    def last(self, place: str) -> SentPicture | None:
         """Return the picture last shown at a place."""
         return self._last.get(place)
 

@@ -106,7 +106,7 @@ def looking(
 
 
 @dataclass
-class WornForm:
+class CorrectionForm:
     """The entries of one eye's correction.
 
     Attributes
@@ -160,7 +160,11 @@ class WornForm:
         if design == "trifocal" and values.pop("light_ratio", 0) == [*TRIFOCAL_LIGHT]:
             names = [entry.name for entry in OF_DESIGN["trifocal"]]
             values |= dict(zip(names, values.pop("adds_dpt", ()), strict=False))
-        known = WornForm(kind, design) if kind in KINDS and design in DESIGNS else None
+        known = (
+            CorrectionForm(kind, design)
+            if kind in KINDS and design in DESIGNS
+            else None
+        )
         names = {entry.name for entry in known.entries} if known else set()
         if known is None or not set(values) <= {"kind", "design"} | names:
             self.kind, self.file_body = "file", dict(body)
@@ -172,9 +176,9 @@ class WornForm:
             text = first_texts()[entry.name] if value is None else entry.show(value)
             self.texts[entry.name] = text
 
-    def copied(self) -> WornForm:
+    def copied(self) -> CorrectionForm:
         """Return a copy for the other eye."""
-        return WornForm(self.kind, self.design, dict(self.texts), self.file_body)
+        return CorrectionForm(self.kind, self.design, dict(self.texts), self.file_body)
 
 
 def read_numbers(

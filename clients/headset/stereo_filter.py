@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from clients.headset.look import LookingEye, RgbdPicture
 from clients.headset.runtime import DueFrame, Eye, EyeView
+from clients.headset.stereo_gaze import EyeAndGaze, RgbdPicture
 from filter_service import FilterSettings, RgbdView
 from filter_service.messages import ViewState
 
@@ -18,12 +18,12 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
-class LookedAt:
+class StereoFrame:
     """One frame to be filtered, with the state of both eyes."""
 
     due: DueFrame
     pictures: tuple[RgbdPicture, ...]
-    eyes: tuple[LookingEye, ...]
+    eyes: tuple[EyeAndGaze, ...]
     begun_s: float
 
     @property
@@ -47,7 +47,7 @@ class LookedAt:
 
 
 @dataclass(frozen=True)
-class Seen:
+class FilteredStereoFrame:
     """A filtered frame, with the views that it was rendered for.
 
     Attributes
@@ -61,7 +61,7 @@ class Seen:
     stages_ms : times of the filter, and of the way to it and back
     """
 
-    frame: LookedAt
+    frame: StereoFrame
     views: tuple[EyeView, ...]
     colors: tuple[NDArray[np.uint8], ...]
     used_focus_dpt: tuple[float | None, ...]
@@ -70,7 +70,7 @@ class Seen:
     stages_ms: Mapping[str, float] = field(default_factory=dict)
 
 
-class Seeing(Protocol):
+class StereoFilter(Protocol):
     """Interface of a filter of frames, each eye through its own profile.
 
     Attributes
@@ -84,7 +84,7 @@ class Seeing(Protocol):
     def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
         """Request another eye; frames use the previous one until it is ready."""
 
-    def see(self, frame: LookedAt) -> Seen | None:
+    def see(self, frame: StereoFrame) -> FilteredStereoFrame | None:
         """Submit a frame; return the newest result, or None if there is none yet."""
 
     def restart(self) -> None:
@@ -94,7 +94,7 @@ class Seeing(Protocol):
         """Release all resources."""
 
 
-def settings_ahead(settings: FilterSettings, eye: LookingEye) -> FilterSettings:
+def settings_for_gaze(settings: FilterSettings, eye: EyeAndGaze) -> FilterSettings:
     """Return settings whose gaze is straight ahead of the head in a canted view."""
     if settings.gaze_deg != (0.0, 0.0):
         return settings

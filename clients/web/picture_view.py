@@ -1,9 +1,9 @@
-"""Page element that shows the pictures; its browser part is seen_view.js."""
+"""Page element that shows the pictures; its browser part is picture_view.js."""
 
 from nicegui.element import Element
 
 
-class SeenView(Element, component="seen_view.js"):
+class PictureView(Element, component="picture_view.js"):
     """Scene and filtered pictures, with a split between them.
 
     The events ``point`` and ``look`` report the position of the pointer and of a click:

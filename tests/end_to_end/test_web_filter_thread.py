@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from clients.web.filter_thread import FilterThread
 from clients.web.picture import linear_from_srgb8
-from clients.web.seeing import Seeing
-from clients.web.wishes import Wish
+from clients.web.picture_requests import PictureRequest
 from filter_service import EyeFilter, FilterSettings
 from tests.unit.web_parts import a_picture
 
@@ -36,27 +36,27 @@ class Screen:
 
 
 @pytest.fixture(scope="module")
-def seeing():
-    seeing = Seeing()
-    yield seeing
-    seeing.close()
+def filter_thread():
+    filter_thread = FilterThread()
+    yield filter_thread
+    filter_thread.close()
 
 
 @pytest.fixture
-def screen(seeing):
+def screen(filter_thread):
     screen = Screen()
-    seeing.open("page", screen.seen.put)
+    filter_thread.open("page", screen.seen.put)
     yield screen
-    seeing.forget("page")
+    filter_thread.forget("page")
 
 
-def wish(number, sphere_dpt=-3.0, eyes=("OD",), pupil_mm=4.0, picture=None):
+def request(number, sphere_dpt=-3.0, eyes=("OD",), pupil_mm=4.0, picture=None):
     bodies = {
         eye: {"kind": "prescription", "sphere_dpt": sphere_dpt, "eye_side": eye}
         for eye in eyes
     }
     picture = picture or a_picture()
-    return Wish(number, picture, bodies, pupil_mm, 0.0, (0.0, 0.0))
+    return PictureRequest(number, picture, bodies, pupil_mm, 0.0, (0.0, 0.0))
 
 
 def pixels(seen):
@@ -69,13 +69,13 @@ def psnr_db(first, second):
     return -10.0 * np.log10(max(np.mean((first - second) ** 2), 1e-12))
 
 
-def test_small_then_full_and_the_full_one_is_the_filters_own(seeing, screen):
-    seeing.wish("page", wish(1))
+def test_small_then_full_and_the_full_one_is_the_filters_own(filter_thread, screen):
+    filter_thread.request("page", request(1))
     preview, full = screen.until("full", 1)
     assert preview.kind == "preview"
-    view = wish(1).picture.view
+    view = request(1).picture.view
     settings = FilterSettings(focus_range_dpt=(0.0, 8.0))
-    with EyeFilter(wish(1).bodies["OD"], view.camera, settings) as other:
+    with EyeFilter(request(1).bodies["OD"], view.camera, settings) as other:
         state = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0}
         other.filter([view], **state)
         other.wait()
@@ -85,25 +85,25 @@ def test_small_then_full_and_the_full_one_is_the_filters_own(seeing, screen):
     assert psnr_db(view.color, expected) < 15.0
 
 
-def test_of_wishes_that_wait_the_newest_is_seen(seeing, screen):
+def test_of_wishes_that_wait_the_newest_is_seen(filter_thread, screen):
     for number in range(1, 41):
-        seeing.wish("page", wish(number, sphere_dpt=-number / 8.0))
+        filter_thread.request("page", request(number, sphere_dpt=-number / 8.0))
     shown = screen.until("full", 40)
     assert [seen.number for seen in shown if seen.kind == "full"] == [40]
     assert len(shown) < 40  # most were never begun
 
 
-def test_both_eyes_are_seen_each_through_its_own(seeing, screen):
-    both = wish(1, eyes=("OD", "OS"))
+def test_both_eyes_are_seen_each_through_its_own(filter_thread, screen):
+    both = request(1, eyes=("OD", "OS"))
     both.bodies["OS"]["sphere_dpt"] = 0.0
-    seeing.wish("page", both)
+    filter_thread.request("page", both)
     shown = screen.until("full", 1, "OS")
     full = {seen.eye: pixels(seen) for seen in shown if seen.kind == "full"}
     assert full["OD"].std() < 0.8 * full["OS"].std()
 
 
-def test_a_header_and_a_file_travel_together(seeing, screen):
-    seeing.wish("page", wish(1))
+def test_a_header_and_a_file_travel_together(filter_thread, screen):
+    filter_thread.request("page", request(1))
     data = screen.until("preview", 1)[-1].packed()
     (length,) = struct.unpack_from("<I", data)
     header = json.loads(data[4 : 4 + length])
@@ -111,23 +111,23 @@ def test_a_header_and_a_file_travel_together(seeing, screen):
     assert Image.open(io.BytesIO(data[4 + length :])).size == (60, 40)
 
 
-def test_what_cannot_be_seen_is_told_and_the_next_is_seen(seeing, screen):
-    seeing.wish("page", wish(1, pupil_mm=40.0))
+def test_what_cannot_be_seen_is_told_and_the_next_is_seen(filter_thread, screen):
+    filter_thread.request("page", request(1, pupil_mm=40.0))
     (failed, *_) = screen.until("failed", 1)
     assert "pupil_diameter_mm: it is 40.0" in failed.facts["error"]
-    seeing.wish("page", wish(2))
+    filter_thread.request("page", request(2))
     screen.until("full", 2)
 
 
-def test_a_fault_of_one_page_does_not_end_the_others(seeing, screen):
+def test_a_fault_of_one_page_does_not_end_the_others(filter_thread, screen):
     other = Screen()
-    seeing.open("other", other.seen.put)
-    broken = dataclasses.replace(wish(1), gaze_deg=("far", 0.0))
-    seeing.wish("other", broken)
+    filter_thread.open("other", other.seen.put)
+    broken = dataclasses.replace(request(1), gaze_deg=("far", 0.0))
+    filter_thread.request("other", broken)
     failed = other.until("failed", 1)[-1]
     assert failed.facts["error"]
-    seeing.wish("page", wish(1))
+    filter_thread.request("page", request(1))
     screen.until("full", 1)
-    seeing.wish("other", wish(2))
+    filter_thread.request("other", request(2))
     other.until("full", 2)
-    seeing.forget("other")
+    filter_thread.forget("other")

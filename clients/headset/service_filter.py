@@ -10,7 +10,12 @@ from typing import Any
 
 from clients.filter_client import FilterClient, FilteredFrame
 from clients.headset.runtime import Eye, EyeView
-from clients.headset.seeing import LookedAt, Say, Seen, settings_ahead
+from clients.headset.stereo_filter import (
+    FilteredStereoFrame,
+    Say,
+    StereoFrame,
+    settings_for_gaze,
+)
 from filter_service import FilterSettings
 from filter_service.errors import FilterError
 from filter_service.messages import Dropped, ErrorReply, Ready, Result, ResultView
@@ -34,7 +39,7 @@ frequent."""
 _OWN_STAGES = ("decode_ms", "queue_ms", "copy_out_ms", "rests_ms", "other_ms")
 
 
-class SeeingByService:
+class ServiceFilter:
     """Filter that sends frames to a service and shows the newest result.
 
     Parameters
@@ -53,7 +58,7 @@ class SeeingByService:
         *,
         key_file: Path | None = None,
     ) -> None:
-        self._say_once = SayOnce(say)
+        self._say_once = LogOnce(say)
         self._say = say
         self.settings = settings
         self._endpoint = endpoint
@@ -63,8 +68,8 @@ class SeeingByService:
         self._wanted: dict[Eye, dict[str, Any]] = {}
         self._asked: dict[Eye, tuple[int, dict[str, Any]]] = {}
         self._retry_s = 0.0  # no profile is sent before this time
-        self._on_way: dict[int, LookedAt] = {}
-        self._newest: Seen | None = None
+        self._on_way: dict[int, StereoFrame] = {}
+        self._newest: FilteredStereoFrame | None = None
         self._is_there = True
         self._trip_s = math.inf  # round trip of the last result
         self.n_dropped: dict[str, int] = {}
@@ -83,7 +88,7 @@ class SeeingByService:
         """Request another eye, as soon as there is a service."""
         self._wanted[eye] = dict(profile)
 
-    def see(self, frame: LookedAt) -> Seen | None:
+    def see(self, frame: StereoFrame) -> FilteredStereoFrame | None:
         """Send a frame and return the newest result.
 
         None while there is no result, or none from the current service.
@@ -124,7 +129,7 @@ class SeeingByService:
             self._take_events(wait_s)
         return self._newest
 
-    def _send_profiles(self, frame: LookedAt) -> None:
+    def _send_profiles(self, frame: StereoFrame) -> None:
         if time.monotonic() < self._retry_s:
             return
         for picture, looking in zip(frame.pictures, frame.eyes, strict=True):
@@ -135,7 +140,7 @@ class SeeingByService:
             profile_id = self._client.request_profile(
                 profile,
                 eye=eye,
-                settings=settings_ahead(self.settings, looking),
+                settings=settings_for_gaze(self.settings, looking),
                 views=[picture.camera],
             )
             self._asked[eye] = profile_id, profile
@@ -180,7 +185,7 @@ class SeeingByService:
             for picture, view in zip(frame.pictures, header.views, strict=True)
         )
         filter_ms = header.total_ms
-        self._newest = Seen(
+        self._newest = FilteredStereoFrame(
             frame,
             views,
             answer.colors,
@@ -214,7 +219,7 @@ class SeeingByService:
         self._client.close()
 
 
-class SayOnce:
+class LogOnce:
     """Callable that suppresses a line repeated within `SAY_AGAIN_S`."""
 
     def __init__(self, say: Say) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clients.headset.poses import angles_of, direction_of, matrix_of
 from clients.headset.runtime import DueFrame, Eye, EyeView
-from clients.natural import (
+from clients.natural_eye import (
     USUAL_WHITE_CD_M2,
     EyeState,
     NaturalEye,
@@ -53,7 +53,7 @@ class RgbdPicture:
 
 
 @dataclass(frozen=True)
-class LookingEye:
+class EyeAndGaze:
     """State of one eye at a moment.
 
     Attributes
@@ -69,7 +69,7 @@ class LookingEye:
     ahead_deg: tuple[float, float] = STRAIGHT_AHEAD
 
 
-class StereoLook:
+class StereoGaze:
     """Model of both eyes, with equal pupils and equal focus as far as each eye can.
 
     Parameters
@@ -104,7 +104,7 @@ class StereoLook:
 
     def follow(
         self, due: DueFrame, pictures: Sequence[RgbdPicture]
-    ) -> tuple[LookingEye, ...]:
+    ) -> tuple[EyeAndGaze, ...]:
         """Return the state of both eyes at the time the pictures are shown."""
         at_s = due.now_s
         if due.gaze is not None:
@@ -130,7 +130,7 @@ class StereoLook:
             gaze_deg = angles_of(own[:3, :3].T @ (point - own[:3, 3]))
             ahead_deg = _rounded(angles_of(own[:3, :3].T @ -head[:3, 2]))
             gaze_deg = self._clamped(gaze_deg, ahead_deg)
-            found.append(LookingEye(state, gaze_deg, ahead_deg))
+            found.append(EyeAndGaze(state, gaze_deg, ahead_deg))
         return tuple(found)
 
     def restart(self) -> None:

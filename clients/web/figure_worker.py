@@ -23,7 +23,7 @@ class StudyFailed(Exception):
     """There is no answer; the message says why."""
 
 
-class Studying:
+class FigureWorker:
     """One worker process; of waiting requests per kind and page, the newest wins."""
 
     def __init__(self) -> None:

@@ -6,14 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clients.headset.look import EyeState, LookingEye, RgbdPicture
+from clients.headset.local_filter import LocalFilter
 from clients.headset.runtime import (
     EYES,
     DueFrame,
 )
-from clients.headset.seeing import LookedAt
-from clients.headset.seeing_by_service import SAY_AGAIN_S, SayOnce, SeeingByService
-from clients.headset.seeing_here import SeeingHere
+from clients.headset.service_filter import SAY_AGAIN_S, LogOnce, ServiceFilter
 from clients.headset.simulated_runtime import (
     Happening,
     SimulatedRuntime,
@@ -21,6 +19,8 @@ from clients.headset.simulated_runtime import (
     still,
     swaying,
 )
+from clients.headset.stereo_filter import StereoFrame
+from clients.headset.stereo_gaze import EyeAndGaze, EyeState, RgbdPicture
 from filter_service import FilterSettings
 from tests.end_to_end.conftest import TIMEOUT_S
 from tests.end_to_end.headset_doubles import (
@@ -32,7 +32,7 @@ from tests.end_to_end.headset_doubles import (
 
 def test_an_eye_learns_from_its_own_pictures_only():
     """The eye before serves until the new one is ready: what it can do is another's."""
-    seeing = SeeingHere(
+    seeing = LocalFilter(
         FilterSettings(
             pupil_range_mm=(4.0, 4.0),
             object_range_dpt=(0.0, 1.0),
@@ -47,10 +47,10 @@ def test_an_eye_learns_from_its_own_pictures_only():
     ]
     color = np.full((36, 40, 3), 90, np.uint8)
     depth_m = np.full((36, 40), 4.0, np.float32)
-    frame = LookedAt(
+    frame = StereoFrame(
         DueFrame(0, True, tuple(views)),
         tuple(RgbdPicture(view, color, depth_m) for view in views),
-        (LookingEye(EyeState(4.0, 0.0), (0.0, 0.0)),) * 2,
+        (EyeAndGaze(EyeState(4.0, 0.0), (0.0, 0.0)),) * 2,
         0.0,
     )
 
@@ -84,7 +84,7 @@ def test_in_this_process_each_eye_sees_its_own_profile():
         tolerance="loose",
         mode="on-axis",
     )
-    seeing = SeeingHere(settings, said.append)
+    seeing = LocalFilter(settings, said.append)
     try:
         seeing.change("left", {"kind": "prescription", "sphere_dpt": -8})
         seeing.change("right", {"kind": "prescription", "sphere_dpt": 0})
@@ -96,10 +96,10 @@ def test_in_this_process_each_eye_sees_its_own_profile():
         color = (255 * (rng.random((90, 100, 1)) > 0.5)).astype(np.uint8)
         color = np.repeat(color, 3, axis=2)
         depth_m = np.full((90, 100), 4.0, np.float32)
-        frame = LookedAt(
+        frame = StereoFrame(
             DueFrame(0, True, tuple(views)),
             tuple(RgbdPicture(view, color, depth_m) for view in views),
-            (LookingEye(EyeState(4.0, 0.25), (0.0, 0.0)),) * 2,
+            (EyeAndGaze(EyeState(4.0, 0.25), (0.0, 0.0)),) * 2,
             0.0,
         )
         seen = None
@@ -127,7 +127,7 @@ TWO_EYES = {
 def test_a_service_filters_both_eyes_and_gives_the_poses_back(start_service):
     service = start_service(filter_ms=8)
     said, shown_all = [], []
-    seeing = SeeingByService(service.endpoint, FilterSettings(), said.append)
+    seeing = ServiceFilter(service.endpoint, FilterSettings(), said.append)
     for eye, profile in TWO_EYES.items():
         seeing.change(eye, profile)
     runtime = SimulatedRuntime(
@@ -162,7 +162,7 @@ def test_nothing_of_a_lost_session_is_shown_in_the_next(start_service, monkeypat
     """Another session has another room: an old pose would be anywhere in it."""
     monkeypatch.setattr("clients.headset.viewer.RETRY_S", 0.01)
     service = start_service(filter_ms=30)
-    seeing = SeeingByService(service.endpoint, FilterSettings(), lambda line: None)
+    seeing = ServiceFilter(service.endpoint, FilterSettings(), lambda line: None)
     for eye, profile in TWO_EYES.items():
         seeing.change(eye, profile)
     first, shown_in = Happening(), [[], []]
@@ -202,7 +202,7 @@ def test_a_service_that_dies_and_comes_back_does_not_freeze_the_picture(
     bind = f"ipc://{tmp_path}/socket"
     services = [start_service(bind=bind)]
     said, plain_at = [], []
-    seeing = SeeingByService(bind, FilterSettings(), said.append)
+    seeing = ServiceFilter(bind, FilterSettings(), said.append)
     for eye, profile in TWO_EYES.items():
         seeing.change(eye, profile)
     wall, n_seen = Wall(), [0, 0]
@@ -242,7 +242,7 @@ def test_what_is_wrong_with_an_eye_is_said_once_and_it_is_asked_for_again(
 ):
     service = start_service()
     said = []
-    seeing = SeeingByService(service.endpoint, FilterSettings(), said.append)
+    seeing = ServiceFilter(service.endpoint, FilterSettings(), said.append)
     seeing.change("left", TWO_EYES["left"])
     seeing.change("right", {"kind": "double", "mark": 7, "crash": True})
     changed = []
@@ -266,7 +266,7 @@ def test_what_is_wrong_with_an_eye_is_said_once_and_it_is_asked_for_again(
 def test_a_line_is_said_again_after_a_while_only(monkeypatch):
     now_s, said = [0.0], []
     monkeypatch.setattr("time.monotonic", lambda: now_s[0])
-    say = SayOnce(said.append)
+    say = LogOnce(said.append)
     for now_s[0] in np.arange(0.0, 2.5 * SAY_AGAIN_S, 0.5):
         say("gone")
     assert len(said) == 3

@@ -38,7 +38,7 @@ _BOWL = np.where((EXPONENTS == [2, 0]).all(1) | (EXPONENTS == [0, 2]).all(1), -0
 
 
 @dataclass(frozen=True)
-class MeasuredRest:
+class MeasuredResidual:
     """Phase added to that of the ray-traced eye, in the plane of its entrance pupil.
 
     Attributes
@@ -65,7 +65,7 @@ class MeasuredRest:
         profile: EyeProfile,
         *,
         wavelengths_nm: ArrayLike,
-    ) -> "MeasuredRest":
+    ) -> "MeasuredResidual":
         """Return the residual of an estimated eye; zero for a given eye."""
         wavelengths_nm = np.unique(wavelengths_nm)
         radius_mm, measured_nm = profile.pupil_diameter_mm / 2.0, profile.wavelength_nm

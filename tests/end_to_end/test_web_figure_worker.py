@@ -6,8 +6,8 @@ import json
 import pytest
 
 from clients.web.eye_figures import eye_figure
+from clients.web.figure_worker import FigureWorker, StudyFailed
 from clients.web.point_spread import PointState, point_spread
-from clients.web.studying import StudyFailed, Studying
 
 MYOPE = json.dumps({"kind": "prescription", "sphere_dpt": -3.0, "eye_side": "OD"})
 PNG = b"\x89PNG"
@@ -17,11 +17,11 @@ def _of_a_study(questions):
     """Return what becomes of questions to one process."""
 
     async def ask():
-        studying = Studying()
+        figure_worker = FigureWorker()
         try:
-            return await questions(studying)
+            return await questions(figure_worker)
         finally:
-            studying.close()
+            figure_worker.close()
 
     return asyncio.run(ask())
 
@@ -31,23 +31,25 @@ def _seen(state, body=MYOPE):
 
 
 def test_answers_failures_and_newer_questions():
-    async def questions(studying):
+    async def questions(figure_worker):
         state = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0}
         pictures = [
-            await studying.ask("a", "figure", eye_figure, name, MYOPE, **state)
+            await figure_worker.ask("a", "figure", eye_figure, name, MYOPE, **state)
             for name in ("wavefront", "section")
         ]
         with pytest.raises(StudyFailed, match="'cat' is unknown"):
-            await studying.ask("a", "figure", point_spread, '{"kind": "cat"}', None)
+            await figure_worker.ask(
+                "a", "figure", point_spread, '{"kind": "cat"}', None
+            )
         waiting = [
-            asyncio.create_task(studying.ask("a", "n", divmod, 7 + k, 2))
+            asyncio.create_task(figure_worker.ask("a", "n", divmod, 7 + k, 2))
             for k in range(3)
         ]
         answers = await asyncio.gather(*waiting)
-        studying._process.kill()
+        figure_worker._process.kill()
         with pytest.raises(StudyFailed, match="started again"):
-            await studying.ask("a", "n", divmod, 7, 2)
-        return pictures, answers, await studying.ask("a", "n", divmod, 7, 2)
+            await figure_worker.ask("a", "n", divmod, 7, 2)
+        return pictures, answers, await figure_worker.ask("a", "n", divmod, 7, 2)
 
     pictures, answers, last = _of_a_study(questions)
     assert all(picture.startswith(PNG) for picture in pictures)

@@ -15,12 +15,12 @@ Kind = Literal["scene", "preview", "full", "failed"]
 
 
 @dataclass(frozen=True)
-class Wish:
+class PictureRequest:
     """One requested state of the page.
 
     Attributes
     ----------
-    number : increases with each wish
+    number : increases with each request
     bodies : profile of each eye shown
     """
 
@@ -33,13 +33,13 @@ class Wish:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SentPicture:
     """A picture to be sent to the browser.
 
     Attributes
     ----------
     kind : "scene" without the eye; "preview" or "full" through it; or "failed"
-    number : of the wish
+    number : of the request
     data : the encoded picture, empty on failure
     facts : further values for the page, plain types
     """

@@ -1,8 +1,8 @@
-"""Filter thread of the pages; the newest wish wins.
+"""Filter thread of the pages; the newest request wins.
 
-The page's event loop never filters; it submits a wish here and continues. A newer wish
-replaces one that has not been started. The preview comes at once; the full picture once
-the input has rested, and it is canceled by the next input.
+The page's event loop never filters; it submits a request here and continues. A newer
+request replaces one that has not been started. The preview comes at once; the full
+picture once the input has rested, and it is canceled by the next input.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from dataclasses import dataclass, field
 
 from clients.web.eye_form import EyeSide
 from clients.web.eye_view import EyeView
-from clients.web.wishes import Seen, Wish
+from clients.web.picture_requests import PictureRequest, SentPicture
 
 REST_S = 0.12
-"""Time without a newer wish after which the full picture is made."""
+"""Time without a newer request after which the full picture is made."""
 
 POLL_S = 0.002
 """Interval of polling an eye that is being prepared."""
 
 STALE_S = 0.5
-"""If the wish has changed, a preview is awaited no longer than this."""
+"""If the request has changed, a preview is awaited no longer than this."""
 
 
 _log = logging.getLogger(__name__)
@@ -32,75 +32,77 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class _Page:
-    """One page: its newest wish, the current one, and its eyes."""
+    """One page: its newest request, the current one, and its eyes."""
 
-    show: Callable[[Seen], None]
-    newest: Wish | None = None
+    show: Callable[[SentPicture], None]
+    newest: PictureRequest | None = None
     arrived_s: float = 0.0
-    in_hand: Wish | None = None
+    in_hand: PictureRequest | None = None
     begun_s: float = 0.0
     eyes: dict[EyeSide, EyeView] = field(default_factory=dict)
 
     def step(self) -> float | None:
         """Do a piece of work; return the time until the next step, in s, or None."""
         now_s = time.monotonic()
-        wish = self._next_wish(now_s)
-        if wish is None:
+        request = self._next_request(now_s)
+        if request is None:
             return None
-        for side in wish.bodies:
+        for side in request.bodies:
             self.eyes.setdefault(side, EyeView(side))
-        wanted = [self.eyes[side] for side in wish.bodies]
+        wanted = [self.eyes[side] for side in request.bodies]
         waits = False
         for eye in wanted:
-            if eye.seen["preview"] < wish.number:
-                waits |= not self._showed(eye.preview(wish))
+            if eye.seen["preview"] < request.number:
+                waits |= not self._showed(eye.preview(request))
         if waits:
             return POLL_S
-        if wish is not self.newest:
+        if request is not self.newest:
             return 0.0
-        if all(eye.seen["full"] >= wish.number for eye in wanted):
+        if all(eye.seen["full"] >= request.number for eye in wanted):
             return None
         rest_s = self.arrived_s + REST_S - now_s
         if rest_s > 0.0:
             return rest_s
         for eye in wanted:
-            if eye.seen["full"] < wish.number:
-                waits |= not self._showed(eye.full(wish))
-            if wish is not self.newest:
+            if eye.seen["full"] < request.number:
+                waits |= not self._showed(eye.full(request))
+            if request is not self.newest:
                 return 0.0
         return POLL_S if waits else None
 
-    def _next_wish(self, now_s: float) -> Wish | None:
-        """Return the current wish until its previews are shown, then the newest."""
+    def _next_request(self, now_s: float) -> PictureRequest | None:
+        """Return the current request until its previews are shown, then the newest."""
         is_new = self.in_hand is not self.newest
         if is_new and (self._is_previewed() or now_s > self.begun_s + STALE_S):
             self.in_hand, self.begun_s = self.newest, now_s
         return self.in_hand
 
     def _is_previewed(self) -> bool:
-        wish = self.in_hand
-        return wish is None or all(
-            side in self.eyes and self.eyes[side].seen["preview"] >= wish.number
-            for side in wish.bodies
+        request = self.in_hand
+        return request is None or all(
+            side in self.eyes and self.eyes[side].seen["preview"] >= request.number
+            for side in request.bodies
         )
 
-    def _showed(self, seen: Seen | None) -> bool:
+    def _showed(self, seen: SentPicture | None) -> bool:
         if seen is not None:
             self.show(seen)
         return seen is not None
 
     def give_up(self, reason: str) -> None:
-        """Drop the current wish and report why."""
-        wish, self.newest, self.in_hand = self.in_hand, None, None
-        for side in wish.bodies if wish else ():
-            self.show(Seen("failed", side, wish.number, b"", {"error": reason}))
+        """Drop the current request and report why."""
+        request, self.newest, self.in_hand = self.in_hand, None, None
+        for side in request.bodies if request else ():
+            self.show(
+                SentPicture("failed", side, request.number, b"", {"error": reason})
+            )
 
     def close(self) -> None:
         for eye in self.eyes.values():
             eye.close()
 
 
-class Seeing:
+class FilterThread:
     """Filters for all pages of a process, in a thread of its own."""
 
     def __init__(self) -> None:
@@ -111,15 +113,15 @@ class Seeing:
         self._thread = threading.Thread(target=self._run, name="seeing", daemon=True)
         self._thread.start()
 
-    def open(self, page: str, show: Callable[[Seen], None]) -> None:
+    def open(self, page: str, show: Callable[[SentPicture], None]) -> None:
         """Register a page; ``show`` gets its pictures, in the filter thread."""
         self._pages[page] = _Page(show)
 
-    def wish(self, page: str, wish: Wish) -> None:
-        """Request a picture; an older wish is dropped."""
+    def request(self, page: str, request: PictureRequest) -> None:
+        """Request a picture; an older request is dropped."""
         known = self._pages.get(page)
         if known is not None:
-            known.newest, known.arrived_s = wish, time.monotonic()
+            known.newest, known.arrived_s = request, time.monotonic()
             self._wake.set()
 
     def forget(self, page: str) -> None:

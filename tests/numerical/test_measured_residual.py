@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimator.estimate.estimation import estimate_eye
-from estimator.estimate.measured_rest import FADE_DEG, MeasuredRest
+from estimator.estimate.measured_residual import FADE_DEG, MeasuredResidual
 from estimator.field.traced_eye import TracedEye
 from estimator.optics.chromatic import chromatic_refraction_dpt
 from estimator.optics.zernike import remove_central_tilt
@@ -155,7 +155,7 @@ def test_a_wavefront_is_carried_to_another_plane_as_rays_go(depth_mm):
 
 def test_the_rest_of_a_narrow_pupil_is_the_measurement_there():
     profile = parse_profile(WILD)
-    rest = MeasuredRest.of(
+    rest = MeasuredResidual.of(
         estimate_eye(profile).parameters, profile, wavelengths_nm=[555.0]
     )
     narrow_um = rest.residues_um(np.array([1.5]), np.ones(1))[0]

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from clients.natural import (
+from clients.natural_eye import (
     NaturalEye,
     distance_at,
     field_area_deg2,

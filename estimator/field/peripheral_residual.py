@@ -39,7 +39,7 @@ WIDEST_RATIO = 1.5
 stretched: polynomials diverge beyond the measured pupil."""
 
 
-class PeripheralRest:
+class PeripheralResidual:
     """Phase (n, 28) in the plane of the entrance pupil, over a range of fields.
 
     Parameters

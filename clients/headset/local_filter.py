@@ -8,7 +8,12 @@ from functools import partial
 from typing import Any
 
 from clients.headset.runtime import EYES, Eye
-from clients.headset.seeing import LookedAt, Say, Seen, settings_ahead
+from clients.headset.stereo_filter import (
+    FilteredStereoFrame,
+    Say,
+    StereoFrame,
+    settings_for_gaze,
+)
 from filter_service import (
     BuildingEye,
     EyeFailed,
@@ -25,7 +30,7 @@ MS_PER_S = 1e3
 EyeEvent = BuildingEye | EyeReady | EyeFailed
 
 
-class SeeingHere:
+class LocalFilter:
     """Filter in this process; the result of a frame is returned at once.
 
     Parameters
@@ -57,7 +62,7 @@ class SeeingHere:
         """Request another eye; frames use the previous one until it is ready."""
         self._wanted[eye] = profile
 
-    def _set_profiles(self, frame: LookedAt) -> None:
+    def _set_profiles(self, frame: StereoFrame) -> None:
         for picture, looking in zip(frame.pictures, frame.eyes, strict=True):
             eye = picture.view.eye
             profile = self._wanted.pop(eye, None)
@@ -66,14 +71,14 @@ class SeeingHere:
             try:
                 accepted = self.filters[eye].set_profile(
                     body_of_eye(profile, eye),
-                    settings=settings_ahead(self.settings, looking),
+                    settings=settings_for_gaze(self.settings, looking),
                     cameras=[picture.camera],
                 )
                 self._generations[eye] = accepted.generation
             except ValueError as error:
                 self._say(f"{eye} eye: {error}")
 
-    def see(self, frame: LookedAt) -> Seen | None:
+    def see(self, frame: StereoFrame) -> FilteredStereoFrame | None:
         """Filter a frame; return None while an eye is being prepared for it.
 
         Raises
@@ -95,7 +100,7 @@ class SeeingHere:
         seen = planned.render()
         stages_ms = seen.stage_times_ms
         whole_ms = MS_PER_S * (time.monotonic() - begin_s)
-        return Seen(
+        return FilteredStereoFrame(
             frame,
             tuple(picture.view for picture in frame.pictures),
             tuple(view.color for view in seen.views),
