@@ -9,7 +9,8 @@ USUAL := -m "not clock and not slow and not gpu"
 ALONE := -m "clock and not slow and not gpu"
 BESIDE := -n auto --maxprocesses 4 --dist loadfile
 NONE := test $$? -eq 5 # ARGS may choose none of these tests
-BENCHES := estimate focus people media acuity corrections dynamics displays networks plan psf layers render live follow levels crops kernels field occlusion sequence cost peers switch headset host abuse files overload devices restart batch roundtrip web
+# soak takes 30 minutes; gpu needs a hardware GPU, witness a path tracer
+BENCHES := $(filter-out gpu soak witness,$(patsubst tests/benchmarks/bench_%.py,%,$(sort $(wildcard tests/benchmarks/bench_*.py))))
 
 .DEFAULT_GOAL := help
 .PHONY: demo docs web test test-training test-examples test-batch-ray test-headset test-web validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-witness

@@ -31,8 +31,8 @@ picture_files     pictures encoded in memory
 
 From slider to picture: `page` passes a request to `filter_thread`, which never runs on
 the page's event loop; its thread passes pictures to `picture_sender`. `EyeFilter` runs
-in this process: a service would add the transfer in both directions (for 1280 x 720 px, wire
-and queue: 1.1 ms through shared memory, 4.5 ms over ipc,
+in this process: a service would add the transfer in both directions (for 1280 x 720 px,
+wire and queue: 1.1 ms through shared memory, 4.5 ms over ipc,
 tests/benchmarks/results/roundtrip_*_mono.json) and gain nothing, as PSFs are built in
 a process of their own either way.
 """

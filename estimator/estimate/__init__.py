@@ -7,7 +7,6 @@ bounded_fit        least squares with bounds
 plausible          properties of an eye that are unusual in people
 measured_residual  residual of the estimate, kept as a phase
 table              start eyes of a fit
-make_table         program that computes the table
 eye_table.json  the table
 network_guess      start eye from the eye network
 pattern_search     pattern search of the earlier work

@@ -1,6 +1,6 @@
 """Small table of start eyes for fits; one of them is near any measured eye.
 
-`make_table` regenerates ``eye_table.json``.
+`training.first_guess_table` regenerates ``eye_table.json``.
 """
 
 import json

@@ -4,7 +4,6 @@ meridian         extension of the horizontal meridian to the visual field
 people           measured people, all as right eyes
 population       their mean and covariance
 change           change of one eye, conditioned on its axis and other measurements
-make_population  regenerates ``population.json``
 """
 
 import lazy_loader

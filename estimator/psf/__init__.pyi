@@ -3,5 +3,4 @@ from .compute import PsfTooLarge as PsfTooLarge
 from .compute import compute_psf_batch as compute_psf_batch
 from .compute import compute_psfs as compute_psfs
 from .kernel_types import Psf as Psf
-from .reference import reference_kernel as reference_kernel
 from .stiles_crawford import StilesCrawford as StilesCrawford

@@ -1,7 +1,7 @@
 """Point-spread functions of wavefronts, each by the method that is valid for it.
 
 Takes wavefronts of the eye (`zernike_um`) and returns pixel-integrated kernels for the
-PSF store.  `reference.py` is the slow float64 ground truth.
+PSF store.  `render_passes.py` is the slow float64 ground truth.
 """
 
 from concurrent.futures import ThreadPoolExecutor

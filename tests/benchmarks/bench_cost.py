@@ -29,7 +29,6 @@ from estimator.profiles.parse import parse_profile
 from filter_service.constants import TILE_SIZE_PX
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import build_psf_store
-from filter_service.rendering import reference
 from filter_service.rendering.srgb import srgb_from_linear
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.cost_law import AGAINST, CostRow, bounds, laws
@@ -49,6 +48,7 @@ from tests.benchmarks.view_sources import EyeState, linear_color
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import traced_eye
 from tests.numerical.scene_frames import scene_view
+from tests.reference import render_passes as reference
 
 SPHERE_DPT = -6.0
 PUPIL_MM = 7.0

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.psf.compute import PsfBatch
-from estimator.psf.reference import reference_kernel
 from estimator.threads import thread_count
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.plan import plan_axes
@@ -36,6 +35,7 @@ from tests.benchmarks.harness import Row, memory_mb, publish
 from tests.benchmarks.photograph import motorcycle
 from tests.benchmarks.view_sources import EyeState
 from tests.numerical.plan_cases import traced_eye
+from tests.reference.psf_integral import reference_kernel
 
 EYES = ("keratoconus", "post_lasik")
 PUPILS_MM = (3.0, 5.0)

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.optics.units import SPHERE_PER_C20
-from estimator.psf.reference import reference_kernel
 from filter_service.constants import RGB
 from filter_service.planning.node_wavefronts import NodeWavefronts
 from filter_service.planning.plan import plan_cache
@@ -32,6 +31,7 @@ from tests.benchmarks.harness import Row, memory_mb, publish
 from tests.benchmarks.psf_rates import FOCUSES_DPT, PUPILS_MM, traced_slices
 from tests.benchmarks.published_figures import CONDITIONS
 from tests.numerical.plan_cases import spec_for, traced_eye
+from tests.reference.psf_integral import reference_kernel
 
 COUNT = 3000
 CHUNK = 2048

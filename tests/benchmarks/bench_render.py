@@ -16,7 +16,6 @@ import numpy as np
 from estimator.profiles.parse import parse_profile
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import build_psf_store
-from filter_service.rendering import reference
 from tests.benchmarks.engines import ENGINES, open_renderer, working_memory_mb
 from tests.benchmarks.frame_runs import timed_frames
 from tests.benchmarks.harness import (
@@ -30,6 +29,7 @@ from tests.benchmarks.harness import (
 from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import scene_view
 from tests.numerical.synthetic import psnr_db
+from tests.reference import render_passes as reference
 
 REFERENCE = "float64 sorted gather, same layers"
 PUPIL_MM = 5.0

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from clients.filter_client import FilterClient, FilteredFrame
-from clients.latency import Settings, make_frames
 from clients.service_process import ServiceProcess
+from tests.benchmarks.bench_roundtrip import Settings, make_frames
 from tests.benchmarks.harness import Row, publish
 
 PROFILE = {"kind": "prescription", "eye_side": "OD", "sphere_dpt": -2}

@@ -83,12 +83,12 @@ def kinds(folder: Path) -> list[Kind]:
     from clients.batch.manifest import Manifest
     from clients.batch.states import read_states
     from clients.batch.video_reading import VideoReader
+    from clients.commands.display_file import display_of_file
+    from clients.commands.wavefront import explicit_body
     from clients.headset.gltf_scene import load_gltf
     from clients.web.eye_form import read_profile_file
     from clients.web.picture import photo_picture
     from estimator.profiles.files import load_profile
-    from filter_service.commands.display_file import display_of_file
-    from filter_service.commands.wavefront import explicit_body
     from filter_service.image_files import read_color, read_depth
     from filter_service.psfs.store_cache import StoreCache
 

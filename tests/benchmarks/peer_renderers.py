@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import build_psf_store
-from filter_service.rendering import reference
 from tests.benchmarks.peer_problem import KeptForState, Problem
 from tests.benchmarks.view_sources import EyeState
+from tests.reference import render_passes as reference
 
 
 @dataclass(frozen=True)

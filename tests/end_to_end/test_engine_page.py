@@ -11,7 +11,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from clients.headset.poses import angles_of, direction_of
 from clients.headset.projection import projection
-from clients.latency import parse_arguments, read_settings
 from estimator.profiles import parse_profile
 from filter_service import Camera
 from filter_service.errors import BadMessage
@@ -21,6 +20,7 @@ from filter_service.messages import (
     Ready,
     decode_request,
 )
+from tests.benchmarks.bench_roundtrip import parse_arguments, read_settings
 from tests.source_tree import ROOT
 
 FOLDER = ROOT / "clients"

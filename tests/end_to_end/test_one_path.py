@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from clients.commands.program import app
 from clients.filter_client import FilterClient
 from clients.service_process import ServiceProcess
 from filter_service import Camera, EyeFilter, FilterSettings, RgbdView
-from filter_service.__main__ import app
 from tests.batch_kills import start
 
 FOV_DEG = 50.0

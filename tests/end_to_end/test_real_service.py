@@ -303,7 +303,7 @@ def test_the_latency_benchmark_reports_stages_that_explain_the_age(
     plot = tmp_path / "latency.png"
     finished = subprocess.run(
         [
-            *(sys.executable, "-m", "clients.latency"),
+            *(sys.executable, "-m", "tests.benchmarks.bench_roundtrip"),
             *("--endpoint", real_service.endpoint, "--size", "96x54"),
             *("--rate-hz", "20", "--seconds", "1", "--plot", str(plot), "--json"),
             *("--settings", json.dumps(NARROW)),
@@ -328,7 +328,7 @@ def test_the_latency_benchmark_reports_stages_that_explain_the_age(
 
 def test_the_benchmark_refuses_nonsense_by_option():
     finished = subprocess.run(
-        [sys.executable, "-m", "clients.latency", "--size", "12"],
+        [sys.executable, "-m", "tests.benchmarks.bench_roundtrip", "--size", "12"],
         cwd=CHECKOUT,
         capture_output=True,
         text=True,

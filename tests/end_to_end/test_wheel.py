@@ -311,7 +311,9 @@ def test_a_benchmark_of_the_tests_needs_a_checkout(installed):
 def test_demo_and_the_round_trip_are_there(run, installed):
     finished = run("demo", "--help")
     assert finished.returncode == 0 and "--frames" in finished.stdout
-    finished = start(installed, installed.python, "-m", "clients.latency", "--help")
+    finished = start(
+        installed, installed.python, "-m", "tests.benchmarks.bench_roundtrip", "--help"
+    )
     assert finished.returncode == 0 and "--rate-hz" in finished.stdout
 
 

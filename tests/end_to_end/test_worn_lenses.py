@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
+from clients.commands.program import _exit_code
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
 from estimator.psf.compute import compute_psfs
 from filter_service import Camera, EyeFilter, FilterSettings
-from filter_service.__main__ import _exit_code
 from filter_service.image_files import write_image
 
 PUPIL_MM = 3.4

@@ -17,12 +17,12 @@ from PIL import Image, ImageDraw, ImageFont
 
 from estimator.optics.pinhole import pixel_from_mrad
 from estimator.optics.zernike import index_from_nm, remove_central_tilt, rescale_pupil
-from estimator.psf import reference as psf_reference
 from estimator.psf.arguments import checked_scale
 from estimator.psf.compute import plan_psfs
 from estimator.psf.kernel_types import disc_mask
-from estimator.psf.reference import reference_kernel
 from estimator.psf.survey import RADIUS_LIMIT_PX
+from tests.reference import psf_integral as psf_reference
+from tests.reference.psf_integral import reference_kernel
 
 CASES = json.loads(
     (Path(__file__).parents[1] / "data" / "psf_cases.json").read_text(encoding="utf-8")

@@ -11,7 +11,6 @@ from estimator.corrections.rings import DiffractiveRings, RefractiveZones
 from estimator.psf import fourier
 from estimator.psf.compute import compute_psf_batch
 from estimator.psf.kernel_types import PsfTooLarge
-from estimator.psf.reference import reference_kernel
 from estimator.psf.stiles_crawford import StilesCrawford
 from filter_service.native.library import Library, library_path
 from filter_service.planning.node_wavefronts import NodeWavefronts
@@ -25,6 +24,7 @@ from filter_service.psfs.native_psfs import (
 )
 from filter_service.psfs.pack import pack_kernels
 from tests.numerical.psf_cases import CASE_NAMES, case_zernike_um
+from tests.reference.psf_integral import reference_kernel
 
 RGB_NM = np.array([[610.0], [536.0], [460.0]])
 KEPT = 0.99

@@ -6,13 +6,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from filter_service.psfs.frame_layers import frame_layers
-from filter_service.rendering import reference
 from filter_service.rendering.native import frame_record
 from filter_service.rendering.perfect_eye import PUPIL_MM
 from filter_service.rgbd_view import RgbdView
 from tests.conftest import Engine
 from tests.numerical.one_kernel import OneKernelBench, disc
 from tests.numerical.synthetic import psnr_db, texture
+from tests.reference import render_passes as reference
 
 STATE = {"pupil_diameter_mm": PUPIL_MM, "focus_dpt": 0.0}
 

@@ -10,7 +10,6 @@ from estimator.psf.compute import (
     compute_psfs,
 )
 from estimator.psf.kernel_types import disc_mask
-from estimator.psf.reference import reference_kernel
 from tests.numerical.psf_cases import (
     DENSITIES_MRAD,
     case_zernike_um,
@@ -23,6 +22,7 @@ from tests.numerical.psf_cases import (
     truth,
     zernike_from_terms,
 )
+from tests.reference.psf_integral import reference_kernel
 
 PITCH_MRAD = 1.295
 MIXED = {"2,-2": 0.4, "2,0": 1.1, "3,-1": -0.5, "3,1": 0.3, "3,3": 0.2, "4,0": 0.15}

@@ -7,7 +7,6 @@ import pytest
 
 from estimator.optics.pinhole import pixel_from_mrad
 from estimator.psf.compute import compute_psfs
-from estimator.psf.reference import reference_kernel
 from estimator.psf.stiles_crawford import StilesCrawford
 from tests.numerical.psf_cases import (
     Window,
@@ -21,6 +20,7 @@ from tests.numerical.psf_cases import (
     physical_kernel,
     zernike_from_terms,
 )
+from tests.reference.psf_integral import reference_kernel
 
 PITCH_MRAD = 1.295
 SHEARED = np.array([[1.4, 0.3], [0.2, 1.1]]) / PITCH_MRAD

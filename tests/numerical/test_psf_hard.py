@@ -16,7 +16,6 @@ from estimator.psf.compute import PsfTooLarge, compute_psfs
 from estimator.psf.fourier import edge_response
 from estimator.psf.fourier_kernels import EDGE_HALF_WIDTH, fill_pupils
 from estimator.psf.pupil import pupil_frames
-from estimator.psf.reference import reference_kernel
 from estimator.wavefront.aberrations import wavefront_grid
 from tests.numerical.psf_cases import (
     case_zernike_um,
@@ -28,6 +27,7 @@ from tests.numerical.psf_cases import (
     physical_kernel,
     zernike_from_terms,
 )
+from tests.reference.psf_integral import reference_kernel
 
 PITCH_MRAD = 1.295
 COMMON = {"wavelength_nm": 549.0, "pixel_pitch_mrad": PITCH_MRAD}

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from estimator.psf.compute import compute_psfs
-from estimator.psf.reference import reference_kernel
 from tests.numerical.prysm_psf import (
     CASES,
     FROZEN,
@@ -20,6 +19,7 @@ from tests.numerical.psf_cases import (
     physical_kernel,
     zernike_from_terms,
 )
+from tests.reference.psf_integral import reference_kernel
 
 KEPT = json.loads(FROZEN.read_text(encoding="utf-8"))
 

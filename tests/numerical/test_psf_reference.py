@@ -7,8 +7,8 @@ import pytest
 from scipy.special import j0, j1
 
 from estimator.optics.zernike import zernike_values
-from estimator.psf.reference import reference_field, reference_kernel
 from tests.numerical.psf_cases import case_zernike_um
+from tests.reference.psf_integral import reference_field, reference_kernel
 
 DIRECTIONS_MRAD = np.linspace(-6.0, 6.0, 25)
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from filter_service.errors import BadMessage, CameraMismatch
-from filter_service.rendering import reference
 from filter_service.rendering.perfect_eye import PUPIL_MM
 from filter_service.rendering.srgb import srgb_from_linear
 from filter_service.rgbd_view import RgbdView
 from tests.numerical.made_fragments import made_fragments
 from tests.numerical.one_kernel import OneKernelBench, disc
 from tests.numerical.synthetic import Bench, depth_scene, psnr_db, tangents, texture
+from tests.reference import render_passes as reference
 
 MYOPIA = {"kind": "preset", "name": "myopia"}
 SIZE = {"width_px": 150, "height_px": 101, "vertical_fov_deg": 8.0}

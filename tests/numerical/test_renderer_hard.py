@@ -5,9 +5,9 @@ import pytest
 
 from filter_service.errors import GridTooLarge
 from filter_service.psfs.boxes import MAX_REACH_PX
-from filter_service.rendering import reference
 from tests.numerical.one_kernel import OneKernelBench, disc
 from tests.numerical.synthetic import Bench, psnr_db, texture
+from tests.reference import render_passes as reference
 
 MYOPIA = {"kind": "preset", "name": "myopia"}
 WIDTH, HEIGHT = 70, 45

@@ -7,11 +7,11 @@ import pytest
 from estimator.profiles.parse import parse_profile, preset_names
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import build_psf_store
-from filter_service.rendering import reference
 from filter_service.rendering.native import NativeRenderer
 from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import SCENES, scene_view
 from tests.numerical.synthetic import psnr_db
+from tests.reference import render_passes as reference
 
 SIZE = {"width_px": 320, "height_px": 180}
 STATE = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.5}

@@ -21,10 +21,10 @@ from filter_service.camera import Camera
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import build_psf_store
-from filter_service.rendering import reference
 from filter_service.rendering.frame_kernels import frame_kernels, interval_count
 from filter_service.rendering.image_cells import image_cells
 from tests.grid_specs import grid_spec
+from tests.reference import render_passes as reference
 
 PUPILS_MM = (3.0, 4.0, 5.0, 6.0)
 GREEN_NM = RGB_WAVELENGTHS_NM[1]

@@ -2,14 +2,14 @@
 
 import pytest
 
-from filter_service.commands import doctor_checks
-from filter_service.commands.doctor_checks import (
+from clients.commands import doctor_checks
+from clients.commands.doctor_checks import (
     check_engine,
     check_native,
     check_packages,
     check_shaders,
 )
-from filter_service.commands.doctor_probes import probe_native, probe_shaders
+from clients.commands.doctor_probes import probe_native, probe_shaders
 from filter_service.gl import shader_source
 from filter_service.gl.passes import Passes
 from filter_service.native import library

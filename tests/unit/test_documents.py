@@ -8,8 +8,8 @@ from functools import cache
 import pytest
 from typer.testing import CliRunner
 
+from clients.commands.program import app
 from estimator.profiles.parse import parse_profile, preset_names
-from filter_service.__main__ import app
 from tests.source_tree import ROOT
 
 DOCUMENTS = sorted(

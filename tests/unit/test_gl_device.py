@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from filter_service.commands.doctor_checks import gl_devices
+from clients.commands.doctor_checks import gl_devices
 from filter_service.errors import RenderFailed
 from filter_service.filtering import choose_engine
 from filter_service.gl import choose_device

@@ -17,6 +17,7 @@ from clients.batch.layout_nyu import KinectCounts
 from clients.batch.layout_tum import tum_frames
 from clients.batch.manifest import Manifest, below, records_of
 from clients.batch.states import read_states
+from clients.commands.display_file import display_of_file
 from clients.headset.gltf_scene import load_gltf
 from estimator.bounded_files import (
     InvalidFile,
@@ -33,7 +34,6 @@ from filter_service.bounded_images import MAX_PIXELS
 from filter_service.building import from_profile
 from filter_service.building.jobs import BuildJob
 from filter_service.camera import Camera
-from filter_service.commands.display_file import display_of_file
 from filter_service.errors import BuildFailed, GridTooLarge
 from filter_service.image_files import read_color, read_depth
 from filter_service.planning.defocus_nodes import _spread

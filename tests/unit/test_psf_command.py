@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from filter_service.__main__ import _exit_code
+from clients.commands.program import _exit_code
 from tests.unit.test_wavefront_command import eye_file
 
 VIEW = ["--pupil-mm", "3", "--wavelength-nm", "549", "--pixel-arcmin", "2"]

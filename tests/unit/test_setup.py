@@ -1,4 +1,4 @@
-"""What installs the project agrees with itself, and commands start what exists."""
+"""What installs the project agrees with itself."""
 
 import re
 import subprocess
@@ -7,9 +7,8 @@ import tomllib
 
 import pytest
 
+from clients.commands.doctor_checks import FIX_PYRENDER
 from clients.extra import INSTALL
-from filter_service.commands.doctor_checks import FIX_PYRENDER
-from filter_service.commands.programs import BENCH_MODULES
 from tests.source_tree import ROOT
 
 PINS = dict(
@@ -74,17 +73,6 @@ def test_loops_are_compiled_with_no_more_than_the_packages_that_come_first():
 @pytest.mark.parametrize("name", ["constraints.txt", "setup.sh", "Makefile", ".ci/run"])
 def test_set_up_names_no_host(name):
     assert "://" not in (ROOT / name).read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("module", ["clients.demo", *BENCH_MODULES.values()])
-def test_every_program_that_a_command_starts_exists(module):
-    assert (ROOT / (module.replace(".", "/") + ".py")).is_file()
-
-
-def test_the_makefile_makes_every_benchmark_of_the_program():
-    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    listed = re.search(r"^BENCHES := (.*)$", makefile, re.MULTILINE)[1].split()
-    assert listed == [bench.value for bench in BENCH_MODULES]
 
 
 def test_make_clean_removes_compiled_loops_and_leaves_results(tmp_path):

@@ -91,5 +91,5 @@ def test_the_twin_that_a_pass_names_exists(path):
         return
     module, _, name = place.rpartition(".")
     if module == "reference":
-        module = "filter_service.rendering.reference"
+        module = "tests.reference.render_passes"
     assert hasattr(importlib.import_module(module), name)

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from clients.commands.program import app
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
-from filter_service.__main__ import app
 from filter_service.errors import BuildCancelled
 from filter_service.messages import Camera
 from filter_service.planning.plan import plan_cache

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
+from clients.commands.program import _exit_code
 from estimator.optics.zernike import rescale_pupil
-from filter_service.__main__ import _exit_code
 from tests.numerical.schematic_eyes import reference
 
 CASE = next(

@@ -1,6 +1,6 @@
 """`ocufilter doctor`: check what works on this machine and what to install."""
 
-from filter_service.commands.console import CommandFailed, Json, print_json, say
+from clients.commands.console import CommandFailed, Json, print_json, say
 
 
 def doctor(json_output: Json = False) -> None:
@@ -10,7 +10,7 @@ def doctor(json_output: Json = False) -> None:
 
     ocufilter doctor --json
     """
-    from filter_service.commands.doctor_checks import examine
+    from clients.commands.doctor_checks import examine
 
     report = examine()
     if json_output:

@@ -1,6 +1,6 @@
 """Regenerate ``population.json`` from measured people.
 
-python -m estimator.periphery.make_population tests/data/peripheral_wavefronts.npz
+python -m training.population_table tests/data/peripheral_wavefronts.npz
 """
 
 import argparse

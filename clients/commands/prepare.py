@@ -1,6 +1,6 @@
 """`ocufilter prepare`: compile ahead what a machine compiles once."""
 
-from filter_service.commands.console import Json, print_json, say
+from clients.commands.console import Json, print_json, say
 from filter_service.progress import Progress
 
 

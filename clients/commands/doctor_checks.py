@@ -139,7 +139,7 @@ def run_probe(
     name: str, timeout_s: float = PROBE_TIMEOUT_S, *, gl_device: str = ""
 ) -> dict:
     """Run one probe in its own process; on failure, ``error`` gives the reason."""
-    command = [sys.executable, "-m", "filter_service.commands.doctor_probes", name]
+    command = [sys.executable, "-m", "clients.commands.doctor_probes", name]
     try:
         finished = subprocess.run(
             command,

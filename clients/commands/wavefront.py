@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from filter_service.commands.console import (
+from clients.commands.console import (
     CommandFailed,
     Json,
     check_range,

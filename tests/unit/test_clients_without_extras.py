@@ -1,14 +1,13 @@
-"""What `ocufilter demo` and `ocufilter bench` start, and how that ends."""
+"""Programs of the clients without the packages or the checkout that they need."""
 
-import importlib.util
 import subprocess
 import sys
 
 import pytest
 
+from clients.commands import checkout
+from clients.commands.console import CommandFailed
 from clients.extra import INSTALL
-from filter_service.commands import programs
-from filter_service.commands.console import CommandFailed
 from tests.source_tree import ROOT
 
 WITHOUT_PYRENDER = (
@@ -35,17 +34,7 @@ def test_without_pyrender_a_program_says_in_one_line_what_to_install(module):
     assert INSTALL in finished.stderr
 
 
-def test_a_program_that_is_found_starts_where_the_user_is():
-    assert programs._folder_to_start_in("clients.latency") is None
-
-
-def test_a_program_beside_the_packages_starts_in_the_checkout(monkeypatch):
-    """As the `ocufilter` of an editable install, which does not see tests/."""
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    folder = programs._folder_to_start_in("tests.benchmarks.bench_psf")
-    assert folder == ROOT
-
-
-def test_a_program_that_is_nowhere_needs_a_checkout():
-    with pytest.raises(CommandFailed, match=r"in nowhere/.*checkout"):
-        programs._folder_to_start_in("nowhere.bench")
+def test_an_installed_package_has_no_benchmarks(monkeypatch, tmp_path):
+    monkeypatch.setattr(checkout, "BENCHMARKS", tmp_path / "benchmarks")
+    with pytest.raises(CommandFailed, match=r"in tests/.*git clone"):
+        checkout._benchmarks()

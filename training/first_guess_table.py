@@ -1,6 +1,6 @@
 """Program that computes the table of start eyes.
 
-    python -m estimator.estimate.make_table
+    python -m training.first_guess_table
 
 writes ``eye_table.json``: the eyes that the estimator itself finds, from the mean eye,
 for a range of refractions and aberrations.
@@ -70,7 +70,7 @@ def main() -> None:
         rows.append({name: round(value, DECIMALS) for name, value in values.items()})
         print(f"{wanted['zernike_um']}: error {found.mean_abs_error_um:.2g} um")
     source = (
-        "python -m estimator.estimate.make_table; parameters by name, for a 5 mm pupil"
+        "python -m training.first_guess_table; parameters by name, for a 5 mm pupil"
     )
     lines = ",\n  ".join(json.dumps(row) for row in rows)
     TABLE_FILE.write_text(

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from filter_service.commands.console import (
+from clients.commands.console import (
     CommandFailed,
     Json,
     check_range,
     print_json,
     say,
 )
-from filter_service.commands.wavefront import (
+from clients.commands.wavefront import (
     FIELD_LIMITS_DEG,
     ellipse_facts,
     explicit_body,

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from filter_service.commands.console import Json, check_range, print_json, say
-from filter_service.commands.wavefront import (
+from clients.commands.console import Json, check_range, print_json, say
+from clients.commands.wavefront import (
     FOCUS_LIMITS_DPT,
     PUPIL_LIMITS_MM,
     WAVELENGTH_LIMITS_NM,
@@ -147,8 +147,8 @@ def _directions(found: "FieldTable") -> list[dict]:
 
 
 def _ellipse(x_mm, y_mm, major_mm, minor_mm, angle_rad) -> dict:
+    from clients.commands.wavefront import ellipse_facts
     from estimator.wavefront.results import PupilEllipse
-    from filter_service.commands.wavefront import ellipse_facts
 
     return ellipse_facts(
         PupilEllipse(x_mm, y_mm, major_mm, minor_mm, math.degrees(angle_rad))

@@ -1,10 +1,10 @@
 """Latency benchmark: pre-rendered frames on a fixed schedule through the service.
 
-    python -m clients.latency --spawn --size 1280x720 --rate-hz 30 --seconds 10
-    python -m clients.latency --endpoint tcp://127.0.0.1:5577 --json out.json
+    ocufilter bench roundtrip --spawn --size 1280x720 --rate-hz 30 --seconds 10
+    ocufilter bench roundtrip --endpoint tcp://127.0.0.1:5577 --json out.json
 
 The schedule is open-loop: a frame's due time does not depend on earlier replies, and
-ages count from it.  `ocufilter bench roundtrip` runs this program.
+ages count from it.
 """
 
 from __future__ import annotations
@@ -26,16 +26,7 @@ from rich.console import Console
 
 from clients.arguments import read_object, read_profile, read_size_px
 from clients.filter_client import FilterClient, FilteredFrame, RgbdView
-from clients.latency_report import (
-    SERVICE_STAGES,
-    LatencyRun,
-    as_json,
-    as_table,
-    save_plot,
-    summary,
-)
 from clients.service_process import ServiceProcess
-from clients.socket_floor import socket_floor_ms
 from filter_service import tangents_from_fov
 from filter_service.errors import FilterError
 from filter_service.keys import KeyRing
@@ -49,6 +40,15 @@ from filter_service.messages import (
     EyeName,
     ViewState,
 )
+from tests.benchmarks.roundtrip_report import (
+    SERVICE_STAGES,
+    LatencyRun,
+    as_json,
+    as_table,
+    save_plot,
+    summary,
+)
+from tests.benchmarks.socket_floor import socket_floor_ms
 
 N_FRAMES = 8  # in the loop of frames
 VERTICAL_FOV_DEG = 45.0
@@ -291,7 +291,8 @@ def connect(endpoint: str | None, settings: Settings) -> Iterator[tuple]:
 def parse_arguments(arguments: Sequence[str]) -> argparse.Namespace:
     """Parse the command line."""
     parser = argparse.ArgumentParser(
-        prog="python -m clients.latency", description=__doc__.splitlines()[0]
+        prog="ocufilter bench roundtrip",
+        description=__doc__.splitlines()[0],
     )
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--endpoint", help="a running service")

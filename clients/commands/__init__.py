@@ -3,7 +3,9 @@
 console          output, errors, progress
 setting_options  command-line options generated from `FilterSettings`
 display_file     measured spectra of a display
-programs         demo, bench and others: programs of the clients and the checkout
+program          the `ocufilter` program: dispatch and errors
+programs         demo, headset, report, batch, web
+checkout         bench and paper
 serve            the service
 status           state of a running service
 keys             client keys of the service

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from filter_service.camera import Camera, read_intrinsics
-from filter_service.commands.console import (
+from clients.commands.console import (
     Json,
     check_range,
     print_json,
     progress_bar,
     say,
 )
-from filter_service.commands.plan_text import say_plan
-from filter_service.commands.setting_options import with_setting_options
+from clients.commands.plan_text import say_plan
+from clients.commands.setting_options import with_setting_options
+from filter_service.camera import Camera, read_intrinsics
 from filter_service.settings import (
     MAX_PUPIL_MM,
     MAX_RENDER_TOLERANCE,

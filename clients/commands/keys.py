@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from filter_service.commands.console import Json, print_json, say
+from clients.commands.console import Json, print_json, say
 
 Folder = Annotated[
     Path | None,

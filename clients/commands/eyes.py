@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from filter_service.commands.console import Json, print_json, say
+from clients.commands.console import Json, print_json, say
 from filter_service.psfs.cache_folder import CACHE_VARIABLE
 
 MB = 1e6

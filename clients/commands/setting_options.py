@@ -13,7 +13,7 @@ from typing import Annotated, Any, get_args
 
 import typer
 
-from filter_service.commands.display_file import display_of_file
+from clients.commands.display_file import display_of_file
 from filter_service.errors import BadMessage
 from filter_service.settings import DEFAULTS, setting_help, setting_types
 from filter_service.validation import checked

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from filter_service.commands.console import print_json, say
+from clients.commands.console import print_json, say
 
 if TYPE_CHECKING:
     from filter_service.planning.nodes import CachePlan

@@ -2,7 +2,7 @@
 
 A broken driver may crash or hang instead of raising; then only the probe is lost.
 
-    python -m filter_service.commands.doctor_probes NAME
+    python -m clients.commands.doctor_probes NAME
 
 Names are those of `PROBES`.
 """

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from filter_service.commands.console import Json, print_json
+from clients.commands.console import Json, print_json
 
 Seconds = Annotated[
     float, typer.Option("--timeout", metavar="S", help="How long to wait for it.")

@@ -1,0 +1,92 @@
+"""`ocufilter bench` and `paper`, which need a checkout: its tests are not installed."""
+
+import runpy
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from clients.commands.console import CommandFailed, Json
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+BENCHMARKS = CHECKOUT / "tests" / "benchmarks"
+
+
+def bench(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="What to time, as psf or live.")],
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Fewer cases and repeats.")
+    ] = False,
+    json_output: Json = False,
+) -> None:
+    """Time one part of the program and report its error alongside.
+
+    ocufilter bench psf --quick
+
+    Other options are passed to the benchmark:
+
+    ocufilter bench roundtrip --transport shm --stereo
+    """
+    names = sorted(
+        path.stem.removeprefix("bench_") for path in _benchmarks().glob("bench_*.py")
+    )
+    if name not in names:
+        raise ValueError(f"bench: unknown name '{name}'; allowed: {', '.join(names)}")
+    _run_module(
+        f"tests.benchmarks.bench_{name}",
+        [*["--quick"] * quick, *["--json"] * json_output, *context.args],
+    )
+
+
+def paper(
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="FILE", help="The page, one file.")
+    ] = Path("paper.html"),
+    fresh: Annotated[
+        bool,
+        typer.Option("--fresh", help="Run the benchmarks first; it says how long."),
+    ] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="With --fresh: few cases, small frames.")
+    ] = False,
+    json_output: Json = False,
+) -> None:
+    """Compare the paper's tables and figures with ours in one HTML page.
+
+    Uses the committed results and takes seconds.  Shows published figures, ours, the
+    differences, and where the paper is better.  Requires a checkout.
+
+    ocufilter paper -o paper.html
+    """
+    if quick and not fresh:
+        raise ValueError("--quick: allowed with --fresh only")
+    _benchmarks()
+    arguments = ["--out", str(out.absolute())]
+    arguments += ["--fresh"] * fresh + ["--quick"] * quick + ["--json"] * json_output
+    _run_module("tests.benchmarks.paper_page.program", arguments)
+
+
+def _benchmarks() -> Path:
+    """Return the folder of the benchmarks.
+
+    Raises
+    ------
+    CommandFailed
+        If this is an installed package, which has none.
+    """
+    if not BENCHMARKS.is_dir():
+        raise CommandFailed(
+            "this command runs a program in tests/, which an installed package does "
+            "not have: run it in a checkout (git clone of the project, then make "
+            "setup-test)"
+        )
+    return BENCHMARKS
+
+
+def _run_module(module: str, arguments: list[str]) -> None:
+    """Run a module as ``python -m`` does; an editable install does not find tests/."""
+    sys.path.insert(0, str(CHECKOUT))
+    sys.argv = [module, *arguments]
+    runpy.run_module(module, run_name="__main__", alter_sys=True)

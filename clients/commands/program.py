@@ -1,0 +1,109 @@
+"""The `ocufilter` program: dispatch of commands, and one line for every error."""
+
+import sys
+
+import typer
+from typer.exceptions import Abort, TyperException
+
+from clients.commands.checkout import bench, paper
+from clients.commands.console import CommandFailed
+from clients.commands.doctor import doctor
+from clients.commands.estimate import estimate
+from clients.commands.eyes import eyes
+from clients.commands.field import field
+from clients.commands.filter_image import filter_image
+from clients.commands.keys import keys
+from clients.commands.prepare import prepare
+from clients.commands.programs import batch, demo, headset, report, web
+from clients.commands.psf import psf
+from clients.commands.serve import serve
+from clients.commands.status import status
+from clients.commands.wavefront import wavefront
+from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
+
+EXIT_FAILURE = 1
+EXIT_BAD_INPUT = 2
+EXIT_INTERRUPTED = 130
+
+app = typer.Typer(
+    name="ocufilter",
+    help="See through another person's eyes.  Start with `ocufilter demo`; "
+    "`ocufilter doctor` says what this machine lacks.",
+    epilog="Units end names: mm, nm, dpt (diopters; infinity is 0), deg.  "
+    "Exit codes: 0 done, 1 failure, 2 bad input.",
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+app.command()(demo)
+app.command()(serve)
+app.command()(status)
+app.add_typer(keys, name="keys")
+app.add_typer(eyes, name="eyes")
+app.command(name="filter")(filter_image)
+app.command()(estimate)
+app.command()(wavefront)
+app.command()(field)
+app.command()(psf)
+app.command(
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
+)(bench)
+for program in (headset, web, batch, report):
+    app.command(
+        context_settings={
+            "allow_extra_args": True,
+            "ignore_unknown_options": True,
+            "help_option_names": [],  # the program has its own help
+        }
+    )(program)
+app.command()(paper)
+app.command()(prepare)
+app.command()(doctor)
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    traceback: bool = typer.Option(False, help="Show where an error came from."),
+) -> None:
+    if context.invoked_subcommand is None:
+        sys.stdout.write(context.get_help() + "\n")
+
+
+def main() -> None:
+    """Run the program; errors become one line on stderr and an exit code."""
+    sys.exit(_exit_code(sys.argv[1:]))
+
+
+def _exit_code(arguments: list[str]) -> int:
+    try:
+        return app(arguments, prog_name="ocufilter", standalone_mode=False) or 0
+    except (Abort, KeyboardInterrupt):
+        return EXIT_INTERRUPTED
+    except Exception as error:
+        if "--traceback" in arguments[:1]:
+            raise
+        code, text = _code_and_text(error)
+        sys.stderr.write(f"ocufilter: {' '.join(text.split())}\n")
+        return code
+
+
+def _code_and_text(error: Exception) -> tuple[int, str]:
+    from filter_service.errors import FilterError
+
+    if isinstance(error, TyperException):
+        return error.exit_code, error.format_message()
+    if isinstance(error, FilterError):
+        return EXIT_BAD_INPUT if error.field else EXIT_FAILURE, str(error)
+    if isinstance(error, CommandFailed):
+        return EXIT_FAILURE, str(error)
+    if isinstance(error, ValueError):  # by convention invalid input
+        return EXIT_BAD_INPUT, str(error)
+    if isinstance(error, OSError):
+        return EXIT_FAILURE, str(error)
+    kind = type(error).__name__
+    return EXIT_FAILURE, f"{kind}: {error} (ocufilter --traceback ... shows where)"
+
+
+if __name__ == "__main__":
+    main()
