@@ -11,9 +11,9 @@
 #   sh setup.sh docs    the first, and what builds the documentation
 #   sh setup.sh witness   the first, and a path tracer in an environment of its own
 #
-# Running it again costs a fraction of a second: the environment is installed anew
-# only when this file, pyproject.toml, constraints.txt, the sources in C or the folder
-# has changed.
+# Running it again costs a fraction of a second: the environment is installed anew only
+# when this file, setup.py, pyproject.toml, constraints.txt, the sources in C or the
+# folder has changed.
 set -eu
 cd "$(dirname "$0")"
 
@@ -150,7 +150,7 @@ make_venv() {
 
 install_packages() {
     sources=$(echo filter_service/native/source/* filter_service/service/*.c)
-    wanted=$(pwd; cat setup.sh pyproject.toml constraints.txt $sources | cksum)
+    wanted=$(pwd; cat setup.sh setup.py pyproject.toml constraints.txt $sources | cksum)
     if [ "$(cat $STAMP 2>/dev/null || true)" = "$wanted" ]; then return; fi
     if ! $VENV/bin/python -m pip --version >/dev/null 2>&1; then make_venv; fi
     rm -f $STAMP $TRAINING_STAMP $PAGE_STAMP
@@ -247,7 +247,7 @@ install_witness() { # Mitsuba: a path tracer that the frames are compared with
 }
 
 install_examples() { # the package as users install it, apart from the checkout
-    wanted=$(pwd; cksum setup.sh pyproject.toml constraints.txt
+    wanted=$(pwd; cksum setup.sh setup.py pyproject.toml constraints.txt
         find estimator filter_service clients shaders -type f ! -name '*.so' \
             ! -path '*/__pycache__/*' ! -path '*/node_modules/*' -exec cksum {} +)
     wanted=$(echo "$wanted" | sort | cksum)

@@ -1,4 +1,4 @@
-"""The client library and programs built on it: scenes, a demo, benchmarks.
+"""The client library, the command line, and the programs of its commands.
 
 Importing this package loads nothing but names.
 
@@ -11,15 +11,14 @@ Importing this package loads nothing but names.
     hello            a minimal client
     batch/           `ocufilter batch`: data sets filtered offline
     headset/         a scene in an OpenXR headset, each eye with its own profile
-    natural          pupil and focus that follow light and distance
+    natural_eye      pupil and focus that follow light and distance
     frame_log        statistics of a stream's frames
     arguments        profiles, settings and sizes on command lines
     pyrender_stream  a scene streamed through a running service
     demo             two scenes through six eyes
-    latency          latency benchmark
-    socket_floor     round trip over a bare socket
     scenes/          two scenes and a letter chart
     report/          `ocufilter report`
+    commands/        the command line, `ocufilter`
     web/             `ocufilter web`: a page in a browser
     figures/         figures of an eye, for reports and web pages
 """

@@ -11,13 +11,13 @@ Importing this package loads no submodules, which keeps clients light.
     protocol_schema  JSON Schema of the message headers
     errors           exceptions
     keys             keys of clients on other machines
-    slots            shared memory
+    shared_memory    shared memory
     log_lines        log of the service
-    checked          validation against annotated types
+    validation       validation against annotated types
     progress         progress of long tasks on stderr
     constants        constants shared by Python and GLSL
     image_files      color and depth files
-    whole_files      atomic file writes
+    atomic_files     atomic file writes
     bounded_images   image decoders with memory limits
     gl_device        selection of the OpenGL device
     threads          numba's threading layer
@@ -31,7 +31,6 @@ Importing this package loads no submodules, which keeps clients light.
     filtering/       `EyeFilter`: streams of frames through eyes
     wire/            messages, field by field
     service/         sockets, sessions and the scheduler
-    commands/        command line
 """
 
 import lazy_loader

@@ -1,9 +1,13 @@
 """Builds the native engine's loops as the package does, or with other flags."""
 
+import contextlib
+import runpy
 import shutil
 import subprocess
-import tomllib
+import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from unittest import mock
 
 from tests.source_tree import ROOT
 
@@ -11,10 +15,16 @@ COMPILER = shutil.which("cc") or shutil.which("gcc")
 
 
 def extension():
-    """The extension module of the loops as pyproject.toml has it."""
-    content = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    modules = content["tool"]["setuptools"]["ext-modules"]
-    return next(module for module in modules if module["name"].endswith("_loops"))
+    """The extension module of the loops as setup.py has it."""
+    given = {}
+    stand_in = ModuleType("setuptools")  # a bare machine may not have it
+    stand_in.Extension = lambda name, **options: SimpleNamespace(name=name, **options)
+    stand_in.find_packages = lambda **_: []
+    stand_in.setup = given.update
+    with mock.patch.dict(sys.modules, setuptools=stand_in), contextlib.chdir(ROOT):
+        runpy.run_path("setup.py")
+    modules = given["ext_modules"]
+    return next(module for module in modules if module.name.endswith("_loops"))
 
 
 def build_library(folder: Path, *flags: str) -> Path:
@@ -23,9 +33,9 @@ def build_library(folder: Path, *flags: str) -> Path:
     out = folder / "loops.so"
     subprocess.run(
         [
-            *(COMPILER, "-shared", "-fPIC", *own["extra-compile-args"], *flags),
-            *("-o", str(out), *own["sources"], *own["extra-link-args"]),
-            *(f"-l{name}" for name in own["libraries"]),
+            *(COMPILER, "-shared", "-fPIC", *own.extra_compile_args, *flags),
+            *("-o", str(out), *own.sources, *own.extra_link_args),
+            *(f"-l{name}" for name in own.libraries),
         ],
         cwd=ROOT,
         check=True,

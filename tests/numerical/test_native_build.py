@@ -9,7 +9,7 @@ import pytest
 
 from filter_service import constants
 from filter_service.native import records
-from tests.native_build import COMPILER, build_library, extension, runtime_of
+from tests.native_build import COMPILER, build_library, runtime_of
 from tests.source_tree import ROOT
 
 SOURCE = ROOT / "filter_service" / "native" / "source"
@@ -65,11 +65,6 @@ def test_fields_of_records_are_those_of_the_source_in_order(file, name, record):
         for field in names.split(","):
             declared.append(re.sub(r"\[.*?\]", "", field).split("*")[-1].split()[-1])
     assert declared == [field for field, *_ in record._fields_]
-
-
-def test_the_package_lists_every_source():
-    listed = {*extension()["sources"], *extension()["depends"]}
-    assert listed == {path.relative_to(ROOT).as_posix() for path in SOURCE.iterdir()}
 
 
 @needs_compiler
