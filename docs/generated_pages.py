@@ -2,14 +2,16 @@
 
 ``reference/api.md`` documents the public names of three packages from their
 docstrings and types, ``reference/settings.md`` lists `FilterSettings` and
-`ServiceConfig`, and ``reference/command-line.md`` the help text of every command.
-Figures are taken from the results of the benchmarks.
+`ServiceConfig`, ``reference/command-line.md`` the help text of every command, and
+``reference/benchmarks.md`` the benchmarks with their results and pictures.
 """
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
+import json
 import re
 import subprocess
 import sys
@@ -31,7 +33,6 @@ PACKAGES = {
     "clients": "Talks to a service.",
     "estimator": "Turns a profile into an eye, its wavefronts and its PSFs.",
 }
-FIGURES = ("field.png", "live.png")
 RESULTS = "tests/benchmarks/results"
 
 
@@ -41,17 +42,18 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
         ("reference/api.md", _api_page()),
         ("reference/settings.md", _settings_page()),
         ("reference/command-line.md", _command_line_page()),
+        ("reference/benchmarks.md", _benchmarks_page()),
     ):
         files.append(File.generated(config, uri, content=text))
-    for name in FIGURES:
-        source = str(ROOT / RESULTS / name)
-        files.append(File.generated(config, f"images/{name}", abs_src_path=source))
+    for path in (ROOT / RESULTS).iterdir():
+        uri = f"results/{path.name}"
+        files.append(File.generated(config, uri, abs_src_path=str(path)))
     return files
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Point links of the checkout to the copies in the built pages."""
-    return markdown.replace(f"](../{RESULTS}/", "](images/")
+    return markdown.replace(f"](../{RESULTS}/", "](results/")
 
 
 def _api_page() -> str:
@@ -141,6 +143,35 @@ def _command_line_page() -> str:
     for name in names:
         lines += [f"## ocufilter {name}", "", "```text", _help(name), "```", ""]
     return "\n".join(lines)
+
+
+def _benchmarks_page() -> str:
+    lines = [
+        "# Benchmarks",
+        "",
+        "`ocufilter bench NAME` runs one of them in a clone; `--quick` runs fewer "
+        "cases. "
+        "Each prints speed and error in one row and writes JSON with hardware and "
+        "commit. [Speed and accuracy](../benchmarks.md) has the main figures.",
+        "",
+    ]
+    for path in sorted((ROOT / "tests" / "benchmarks").glob("bench_*.py")):
+        name = path.stem.removeprefix("bench_")
+        docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        lines += [f"## {name}", "", docstring.splitlines()[0].replace("``", "`"), ""]
+        results = sorted((ROOT / RESULTS).glob(f"{name}*.json"))
+        lines += [*map(_result_line, results), ""]
+        for suffix in ("png", "jpg"):
+            if (ROOT / RESULTS / f"{name}.{suffix}").exists():
+                lines += [f"![{name}](../results/{name}.{suffix})", ""]
+    return "\n".join(lines)
+
+
+def _result_line(path: Path) -> str:
+    content = json.loads(path.read_text(encoding="utf-8"))
+    facts = [f"commit {content['commit'].rstrip('+')}" if "commit" in content else ""]
+    facts += [content.get("date") or "", content.get("machine", {}).get("cpu", "")]
+    return f"- [{path.name}](../results/{path.name}) {', '.join(filter(None, facts))}"
 
 
 def _help(*command: str) -> str:

@@ -15,7 +15,10 @@ BENCHMARKS = CHECKOUT / "tests" / "benchmarks"
 
 def bench(
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="What to time, as psf or live.")],
+    name: Annotated[
+        str,
+        typer.Argument(help="What to time, as psf or live; another name lists all."),
+    ],
     quick: Annotated[
         bool, typer.Option("--quick", help="Fewer cases and repeats.")
     ] = False,

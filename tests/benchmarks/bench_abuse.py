@@ -1,4 +1,4 @@
-"""A service under hostile clients: what they get, and what others notice.
+"""Service under hostile clients: throughput, latency and memory of the other clients.
 
     python -m tests.benchmarks.bench_abuse [--quick] [--json]
 

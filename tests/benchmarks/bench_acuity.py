@@ -1,4 +1,4 @@
-"""Transfer functions and acuity against published tables and laws.
+"""Transfer functions and visual acuity, compared with published tables and formulas.
 
     python -m tests.benchmarks.bench_acuity [--quick] [--json]
 

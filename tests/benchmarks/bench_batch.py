@@ -1,4 +1,4 @@
-"""What a data set costs: frames per second and core, beside the pictures' error.
+"""Offline filtering of a data set: frames per second and core, with image error.
 
     python -m tests.benchmarks.bench_batch [--quick] [--json]
         [--sizes WxH ...] [--eyes NAME ...] [--frames N] [--no-kills]

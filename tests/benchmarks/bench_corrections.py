@@ -1,4 +1,4 @@
-"""Corrections that people wear against closed forms, diffraction and published lenses.
+"""Lenses compared with closed forms, diffraction theory and published designs.
 
     python -m tests.benchmarks.bench_corrections [--quick] [--json]
 

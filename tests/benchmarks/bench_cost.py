@@ -1,4 +1,4 @@
-"""What a frame costs: against blur radius, resolution and number of kernels.
+"""Frame time by blur radius, resolution and number of kernels.
 
     python -m tests.benchmarks.bench_cost [--quick] [--json] [--plot]
         [--sweeps NAME ...]

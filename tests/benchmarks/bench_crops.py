@@ -1,4 +1,4 @@
-"""Crops of a photograph against PSFs that share no code with the program's.
+"""Crops of a photograph, compared with PSFs computed by independent quadrature.
 
     python -m tests.benchmarks.bench_crops [--quick] [--json]
 

@@ -1,4 +1,4 @@
-"""Two engines of one thread behind one socket: throughput, fairness, one killed.
+"""Two engines of one thread behind one socket: throughput, fairness and failover.
 
     python -m tests.benchmarks.bench_devices [--quick] [--json]
 

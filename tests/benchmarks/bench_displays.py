@@ -1,4 +1,4 @@
-"""One or two wavelengths for each primary of a display, against its whole spectrum.
+"""Two wavelengths per primary of a display, compared with its whole spectrum.
 
     python -m tests.benchmarks.bench_displays [--json]
 

@@ -1,4 +1,4 @@
-"""Pupil and accommodation in time against published curves, and what a step costs.
+"""Pupil and accommodation over time, compared with published curves.
 
     python -m tests.benchmarks.bench_dynamics [--quick] [--json]
 

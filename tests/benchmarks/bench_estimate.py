@@ -1,4 +1,4 @@
-"""Time to estimate an eye against the error it leaves: network, refined, search.
+"""Time to estimate an eye, and its error: network, refinement and search.
 
     python -m tests.benchmarks.bench_estimate [--quick] [--json]
 

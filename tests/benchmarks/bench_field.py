@@ -1,4 +1,4 @@
-"""Every method against the dense reference: work, memory, and four measures of error.
+"""Every method against the dense reference: work, memory and four error measures.
 
     python -m tests.benchmarks.bench_field [--quick] [--json] [--plot] [--resume]
         [--images DIR] [--eyes NAME ...] [--sizes WxH ...] [--scenes NAME ...]

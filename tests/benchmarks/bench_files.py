@@ -1,4 +1,4 @@
-"""Hostile files: what reading them costs, and what is said of them.
+"""Malformed files: time and memory to read them, and the errors reported.
 
     python -m tests.benchmarks.bench_files [--quick] [--json]
 

@@ -1,4 +1,4 @@
-"""Where eyes are sharpest against the focus they were asked for, by forward rays.
+"""Best focus of eyes compared with the requested focus, by forward ray tracing.
 
     python -m tests.benchmarks.bench_focus [--quick] [--json]
 

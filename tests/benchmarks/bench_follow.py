@@ -1,4 +1,4 @@
-"""Streams whose pupil and focus change in every frame: how many frames are whole.
+"""Streams whose pupil and focus change in every frame: share of complete frames.
 
     python -m tests.benchmarks.bench_follow [--quick] [--json]
 

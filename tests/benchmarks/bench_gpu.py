@@ -1,4 +1,4 @@
-"""A frame on a hardware GPU: its passes, what surrounds them, and what it shows.
+"""Frame time on a hardware GPU: passes, transfers and planning, with image error.
 
     python -m tests.benchmarks.bench_gpu [--quick] [--json] [--views NAME ...]
 

@@ -1,4 +1,4 @@
-r"""What a headset's frame takes, stage by stage: in this process, and by a service.
+r"""Stages of a headset frame, filtered in process and by a service.
 
     python -m tests.benchmarks.bench_headset [--quick] [--json]
     sh tests/headset/run_in_root.sh env OCUFILTER_COMMIT=$(git rev-parse --short HEAD) \

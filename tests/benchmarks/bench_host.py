@@ -1,4 +1,4 @@
-"""What a frame of the engine gl costs the processor: all passes run on nothing.
+"""Processor time of a frame of the OpenGL engine, with all passes disabled.
 
     python -m tests.benchmarks.bench_host [--quick] [--json]
 

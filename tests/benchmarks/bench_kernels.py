@@ -1,4 +1,4 @@
-"""What a packed kernel costs, from the state to its words: the C engine, and its twin.
+"""Time per packed kernel: the C engine and its Python twin.
 
     python -m tests.benchmarks.bench_kernels [--quick] [--json]
 

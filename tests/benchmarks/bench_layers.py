@@ -1,4 +1,4 @@
-"""Layers, memory and times of the PSF cache, by eye: the paper's Tables 6 and 9.
+"""Layers, memory and times of the PSF cache by eye: Tables 6 and 9 of the paper.
 
 Usage: python -m tests.benchmarks.bench_layers [--quick] [--json] [--engine NAME]
 

@@ -1,4 +1,4 @@
-"""What the levels of the setting tolerance keep: percentiles over blocks of pictures.
+"""Image error at each level of the setting `tolerance`: percentiles over blocks.
 
     python -m tests.benchmarks.bench_levels [--quick] [--json]
 

@@ -1,4 +1,4 @@
-"""Is it live?  Streams whose pupil and focus change with every frame, eye by eye.
+"""Streams whose pupil and focus change in every frame: frame time and image error.
 
     python -m tests.benchmarks.bench_live [--quick] [--json] [--gl]
         [--eyes NAME ...] [--sizes WxH ...] [--threads N ...] [--tolerances X ...]

@@ -1,4 +1,4 @@
-"""Frames with haze and yellowing: what they cost, and how near scattered light is.
+"""Frames with straylight and yellowing: cost, and error of the scattered light.
 
     python -m tests.benchmarks.bench_media [--quick] [--json]
 

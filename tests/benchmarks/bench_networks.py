@@ -1,4 +1,4 @@
-"""Networks against tracing: every step of an eye, and its first guess.
+"""Networks compared with ray tracing, at every step of the preparation of an eye.
 
     python -m tests.benchmarks.bench_networks [--quick] [--json] [--plot]
 

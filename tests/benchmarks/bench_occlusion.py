@@ -1,4 +1,4 @@
-"""Occlusion: one layer and two, against what a lens sees of the same scene.
+"""Occlusion with one and two layers, compared with rays traced through a lens.
 
 Usage: python -m tests.benchmarks.bench_occlusion [--quick] [--json] [--engine NAME]
 

@@ -1,4 +1,4 @@
-"""More frames than can be filtered: their age, memory, and who gets how much time.
+"""More frames than can be filtered: frame age, memory and fairness.
 
     python -m tests.benchmarks.bench_overload [--quick] [--json]
 

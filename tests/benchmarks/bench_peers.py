@@ -1,4 +1,4 @@
-"""Ours beside what else one could take: time and error of one frame, method by method.
+"""Alternatives to this filter: time and error of one frame by method.
 
     python -m tests.benchmarks.bench_peers [--quick] [--json] [--engines NAME ...]
 

@@ -1,4 +1,4 @@
-"""The periphery of people left out: our eyes beside linear predictors.
+"""Peripheral aberrations of people who were held out: prediction error.
 
     python -m tests.benchmarks.bench_people [--quick] [--json] [--plot]
 

@@ -1,4 +1,4 @@
-"""Plans of PSF caches: what was predicted beside what was measured.
+"""Plans of PSF caches: predicted and measured size, time and error.
 
     python -m tests.benchmarks.bench_plan [--quick] [--json] [--calibrate]
 

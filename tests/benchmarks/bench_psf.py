@@ -1,4 +1,4 @@
-"""Time per PSF against its error, by every method; and how fast whole sets are built.
+"""Time per PSF and its error by method, and build rates of whole sets.
 
     python -m tests.benchmarks.bench_psf [--quick] [--json] [--plot FILE.png]
     python -m tests.benchmarks.bench_psf --switch 2000

@@ -1,4 +1,4 @@
-"""Frame time against PSNR, by pass, beside the sorted gather in the same run.
+"""Frame time and PSNR by pass, with a sorted gather in the same run.
 
 Usage: python -m tests.benchmarks.bench_render [--quick] [--json] [--engine NAME]
 

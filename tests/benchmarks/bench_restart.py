@@ -1,4 +1,4 @@
-"""From the end of the process that filters to the next picture, under a live stream.
+"""Time from the end of the render worker to the next picture of a live stream.
 
     python -m tests.benchmarks.bench_restart [--quick] [--json]
 

@@ -1,4 +1,4 @@
-"""Latency benchmark: pre-rendered frames on a fixed schedule through the service.
+"""Latency of pre-rendered frames through a service, on a fixed schedule.
 
     ocufilter bench roundtrip --spawn --size 1280x720 --rate-hz 30 --seconds 10
     ocufilter bench roundtrip --endpoint tcp://127.0.0.1:5577 --json out.json

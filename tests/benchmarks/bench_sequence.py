@@ -1,4 +1,4 @@
-"""Popping and flicker: how the error changes over paths of 120 frames.
+"""Flicker: change of the error over paths of 120 frames.
 
     python -m tests.benchmarks.bench_sequence [--quick] [--json] [--plot]
         [--motions NAME ...] [--modes NAME ...] [--engine NAME]

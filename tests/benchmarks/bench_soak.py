@@ -1,4 +1,4 @@
-"""Hours in minutes: a stream, a new eye every 20 s, and what grows meanwhile.
+"""Stream of 30 minutes with a new eye every 20 s: memory and lost frames.
 
     python -m tests.benchmarks.bench_soak [--minutes N] [--quick] [--json]
 

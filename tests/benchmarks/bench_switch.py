@@ -1,4 +1,4 @@
-"""From a profile message to the first frame through the new eye.
+"""Time from a new profile to the first frame through the new eye.
 
 Usage: python -m tests.benchmarks.bench_switch [--quick] [--json] [--mode MODE]
     [--eyes NAME ...]

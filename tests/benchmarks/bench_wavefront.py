@@ -1,4 +1,4 @@
-"""Time of ray tracing and wavefronts, each with its error.
+"""Time of ray tracing and of wavefronts, each with its error.
 
     python -m tests.benchmarks.bench_wavefront [--quick] [--json]
 

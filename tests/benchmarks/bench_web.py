@@ -1,4 +1,4 @@
-"""From a slider's move to a new picture on the page, seen in a browser.
+"""Time from a slider movement to a new picture on the web page, in a browser.
 
     python -m tests.benchmarks.bench_web [--quick] [--json]
 

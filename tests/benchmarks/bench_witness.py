@@ -1,4 +1,4 @@
-"""Our frames against a path tracer that sees through the same eye's surfaces.
+"""Frames compared with a path tracer through the surfaces of the same eye.
 
     make witness
     python -m tests.benchmarks.bench_witness [--quick] [--json] [--python PROGRAM]
@@ -11,7 +11,7 @@ the rest, by how far from the axis it lies.  Beside ours: the picture unfiltered
 tracer with half of its samples, the eye seen as if all directions were the axis, the
 frame without lateral colour, and ours of a picture that follows each direction's chief
 ray: off the axis these pass beside the pinhole, by which near things move.  Writes
-results/witness.json and witness.png.
+results/witness.json and witness.jpg.
 
 The tracer knows no diffraction (pupils here are 5 mm, their blur 0.14 mrad, a pixel
 1.8) and no wavefront: it shares with us the eye's radii, distances and indices, the
@@ -339,7 +339,7 @@ def panel(witnessed: Witnessed, ours: NDArray) -> NDArray[np.uint8]:
 
 
 def main() -> None:
-    """Run, print, and write results/witness.json and results/witness.png."""
+    """Run, print, and write results/witness.json and results/witness.jpg."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="small and noisy")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -363,7 +363,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     image = Image.fromarray(np.concatenate(panels))
     image.resize((1280, image.height * 1280 // image.width)).save(
-        folder / "witness.png"
+        folder / "witness.jpg", quality=82
     )
     content = report(rows, machine={**machine_info(), "tracer": rows[0].reference})
     if not options.quick:

@@ -1,10 +1,10 @@
-"""Threads and speed of the machine, as costs and pools take them."""
+"""Number of threads of this process."""
 
 import os
 
 import pytest
 
-from estimator import machine_speed, threads
+from estimator import threads
 
 
 @pytest.fixture(autouse=True)
@@ -51,8 +51,3 @@ def test_a_setting_says_another_number(monkeypatch):
         threads.thread_count.cache_clear()
         with pytest.raises(ValueError, match="1 to 256"):
             threads.thread_count()
-
-
-def test_the_probe_says_a_ratio_that_a_machine_may_have():
-    ratio = machine_speed.relative_core_time.__wrapped__()
-    assert 0.05 < ratio < 50.0
