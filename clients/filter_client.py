@@ -18,14 +18,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Unpack, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clients.frame_packer import FramePacker, check_limits
 from clients.link import Event, FilteredFrame, ServiceLink
-from filter_service import Accumulation, ColorImage, Output, RgbdView, as_views
+from filter_service import ColorImage, Output, RgbdView, as_views
 from filter_service.errors import BadMessage, FilterError, ServiceTimeout
 from filter_service.keys import load_client_key
 from filter_service.messages import (
@@ -56,7 +56,7 @@ from filter_service.messages import (
     encode,
     tangents_from_fov,
 )
-from filter_service.settings import DepthKind, as_settings
+from filter_service.settings import DepthKind, RenderOptionValues, as_settings
 
 __all__ = [
     "Event",
@@ -342,13 +342,11 @@ class FilterClient:
         focus_dpt: float,
         gaze_deg: tuple[float, float] | None = None,
         output: Output = "srgb8",
-        accumulation: Accumulation = "coverage",
-        merge: bool = True,
-        render_tolerance: float = 1.0,
         depth_encoding: DepthEncoding = "float32",
         states: Sequence[ViewState] = (),
         display_time_ns: int | None = None,
         timeout_s: float | None = None,
+        **options: Unpack[RenderOptionValues],
     ) -> FilteredFrame:
         """Send one frame and return it filtered; `submit` describes the arguments.
 
@@ -369,13 +367,11 @@ class FilterClient:
                 focus_dpt=focus_dpt,
                 gaze_deg=gaze_deg,
                 output=output,
-                accumulation=accumulation,
-                merge=merge,
-                render_tolerance=render_tolerance,
                 prepared_only=True,
                 depth_encoding=depth_encoding,
                 states=states,
                 display_time_ns=display_time_ns,
+                **options,
             )
             answer = self._await_frame(frame_id, deadline_s)
             if isinstance(answer, FilteredFrame):
@@ -424,13 +420,11 @@ class FilterClient:
         focus_dpt: float,
         gaze_deg: tuple[float, float] | None = None,
         output: Output = "srgb8",
-        accumulation: Accumulation = "coverage",
-        merge: bool = True,
-        render_tolerance: float = 1.0,
         prepared_only: bool = False,
         depth_encoding: DepthEncoding = "float32",
         states: Sequence[ViewState] = (),
         display_time_ns: int | None = None,
+        **options: Unpack[RenderOptionValues],
     ) -> int:
         """Submit a frame without waiting; return its frame_id.
 
@@ -451,9 +445,6 @@ class FilterClient:
             None uses the profile's settings.
         output : {"srgb8", "linear", "linear16"}
             8-bit sRGB, or linear light in float32 or float16.
-        render_tolerance : float, 0 to 8
-            Rendering errors relative to the default, which leaves no visible
-            difference; 0 is exact, more is faster.
         prepared_only : bool
             Whether to drop the frame with the reason ``extending`` if PSFs for this
             pupil, focus and scene are not ready, instead of using the nearest ones.
@@ -465,6 +456,8 @@ class FilterClient:
             pupil, focus and gaze; its pose is returned with the image.
         display_time_ns : int, optional
             Returned with the frame.
+        **options
+            Fields of `RenderOptions`, see `EyeFilter.filter`.
         """
         if depth_encoding not in DEPTH_ENCODINGS:
             raise ValueError(
@@ -490,9 +483,7 @@ class FilterClient:
             focus_dpt=float(focus_dpt),
             gaze_deg=None if gaze_deg is None else _floats(gaze_deg),
             output=FORMATS[output],
-            options=FrameOptions(
-                accumulation, merge, float(render_tolerance), prepared_only
-            ),
+            options=FrameOptions(prepared_only=prepared_only, **options),
             display_time_ns=display_time_ns,
         )
         self._next_frame_id += 1

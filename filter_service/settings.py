@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache
-from typing import Annotated, Any, Literal, get_args, get_type_hints
+from typing import Annotated, Any, Literal, TypedDict, get_args, get_type_hints
 
 from msgspec import Meta
 
@@ -50,6 +50,41 @@ TOLERANCES: tuple[str, ...] = get_args(Tolerance)
 ACCUMULATIONS: tuple[str, ...] = get_args(Accumulation)
 DEPTH_KINDS: tuple[str, ...] = get_args(DepthKind)
 OUTPUTS: tuple[str, ...] = get_args(Output)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions(Record):
+    """Options of one frame, in process and on the wire.
+
+    A new option needs a line here, one in `RenderOptionValues`, and the code of each
+    engine that reads it.
+
+    Attributes
+    ----------
+    accumulation : "coverage" or "paper"
+        Combination of light from several distances: nearer surfaces hide what they
+        cover, or the published sum.
+    merge : bool
+        Whether similar pixels share a splat; off is slower.
+    render_tolerance : float, 0 to 8
+        Rendering errors relative to the default, which leaves no visible difference; 0
+        is exact, more is faster.
+    """
+
+    accumulation: Accumulation = "coverage"
+    merge: bool = True
+    render_tolerance: RenderTolerance = 1.0
+
+
+class RenderOptionValues(TypedDict, total=False):
+    """`RenderOptions` as keyword arguments."""
+
+    accumulation: Accumulation
+    merge: bool
+    render_tolerance: float
+
+
+DEFAULT_OPTIONS = RenderOptions()
 
 
 def _doc(text: str, **more: Any) -> Meta:

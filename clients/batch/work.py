@@ -160,11 +160,11 @@ class UnitRunner:
 
     def _attempt(self, profile: str, frame: SourceFrame) -> FilteredPicture | Record:
         try:
-            return self._filter(profile, frame)
+            return self._filtered(profile, frame)
         except FAILURES as error:
             return _failed(profile, frame, error)
 
-    def _filter(self, profile: str, frame: SourceFrame) -> FilteredPicture:
+    def _filtered(self, profile: str, frame: SourceFrame) -> FilteredPicture:
         if frame.fault is not None:
             raise BadFrame(frame.fault)
         start_s = time.perf_counter()

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from clients.arguments import read_size_px
 from clients.commands.console import Json
 
 
@@ -32,7 +33,8 @@ def demo(
     if frames is not None:
         arguments += ["--frames", str(frames)]
     if size is not None:
-        arguments += ["--size", size]
+        width_px, height_px = read_size_px(size)
+        arguments += ["--size", f"{width_px}x{height_px}"]
     _run("clients.demo", [*arguments, *["--json"] * json_output])
 
 

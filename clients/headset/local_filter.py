@@ -105,9 +105,9 @@ class LocalFilter:
             tuple(picture.view for picture in frame.pictures),
             tuple(view.color for view in seen.views),
             tuple(
-                view.seen.focus_dpt
-                if view.seen.is_complete
-                and view.seen.generation == self._generations.get(picture.view.eye)
+                view.focus_dpt
+                if view.is_complete
+                and view.generation == self._generations.get(picture.view.eye)
                 else None
                 for view, picture in zip(seen.views, frame.pictures, strict=True)
             ),

@@ -52,7 +52,7 @@ class FilteredStereoFrame:
 
     Attributes
     ----------
-    frame : LookedAt
+    frame : StereoFrame
         Input frame.
     views : EyeView of each picture, with the pose that was returned with it
     colors : (h, w, 3) uint8 of each eye

@@ -102,7 +102,7 @@ class Viewer:
         Opens the headset's runtime; called again after a session is lost.
     scenery : Scenery
     seeing : Seeing
-    look : StereoLook
+    look : StereoGaze
     controls : Controls
     read_keys : callable
         Returns the keys pressed since the last call.

@@ -25,7 +25,7 @@ class FixedDefocus:
     ----------
     field, on_axis : (FieldInterpolation, FieldValues)
         Wavefronts over the field, and on the axis at the same wavelengths.
-    rest : MeasuredRest
+    rest : MeasuredResidual
         Residual of the estimated eye.
     left_share : (n,)
         Fraction of the residual to add.

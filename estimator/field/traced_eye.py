@@ -85,7 +85,7 @@ class TracedEye(FocusingEye):
         Fields that were traced; those beyond take the value at its edge.
     entrance_pupil_mm : float
         Depth of the entrance pupil behind the cornea.
-    periphery : PeripheralRest or None
+    periphery : PeripheralResidual or None
         Phase added off the axis; None if the eye model's own periphery is used.
     """
 

@@ -48,9 +48,9 @@ class TracedFields:
         Interpolation of the states, and one that contains the axis.
     correction_um : (28,) or (n, 28), um/mm^degree
         Wavefront of the correction, to subtract.
-    rest : MeasuredRest
+    rest : MeasuredResidual
         Residual of the estimate, to add.
-    periphery : PeripheralRest, optional
+    periphery : PeripheralResidual, optional
         Phase added off the axis.  The residual is then the same over the field, because
         people's wavefronts are given as changes from the axis.
     h_deg, v_deg, wavelength_nm : (n,)

@@ -15,7 +15,6 @@ enz_series         its coefficients
 tail               mean light far outside the spot
 stiles_crawford    the eye's apodization
 screens            rings in the pupil, of lenses with several foci
-reference          slow float64 ground truth
 """
 
 import lazy_loader

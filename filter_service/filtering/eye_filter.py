@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, Unpack
 
 from numpy.typing import NDArray
 
@@ -31,12 +31,13 @@ from filter_service.filtering.stream_eyes import StreamEyes
 from filter_service.rgbd_view import ColorImage, RgbdView, as_views
 from filter_service.settings import (
     DEFAULTS,
-    Accumulation,
     Engine,
     FilterSettings,
     GazeDeg,
     Output,
     PupilMm,
+    RenderOptions,
+    RenderOptionValues,
     VergenceDpt,
     as_settings,
 )
@@ -292,11 +293,9 @@ class EyeFilter:
         focus_dpt: float,
         gaze_deg: tuple[float, float] | None = None,
         output: Output = "srgb8",
-        accumulation: Accumulation = "coverage",
-        merge: bool = True,
-        render_tolerance: float = 1.0,
         whole: bool = False,
         timeout_s: float = 120.0,
+        **options: Unpack[RenderOptionValues],
     ) -> Filtered:
         """Filter one frame, computing the PSFs that it lacks.
 
@@ -314,19 +313,16 @@ class EyeFilter:
             Gaze direction in the image; by default that of the settings.
         output : "srgb8", "linear" or "linear16"
             8-bit sRGB, or linear light in float32 or float16.
-        accumulation : "coverage" or "paper"
-            Combination of light from several distances: nearer surfaces hide what they
-            cover, or the published sum.
-        merge : bool
-            Whether similar pixels share a splat; off is slower.
-        render_tolerance : float, 0 to 8
-            Rendering errors relative to the default, which leaves no visible
-            difference; 0 is exact, more is faster.
         whole : bool
             Whether to wait for the newest eye, for single pictures; a stream uses the
             previous eye until then.
         timeout_s : float
             Timeout for estimating the eye and computing its PSFs.
+        **options
+            Fields of `RenderOptions`: ``accumulation="coverage"`` or ``"paper"``
+            (nearer surfaces hide what they cover, or the published sum), ``merge=True``
+            (similar pixels share a splat; off is slower), and ``render_tolerance=1.0``
+            (0 is exact, 1 leaves no visible difference, up to 8 is faster).
 
         Returns
         -------
@@ -351,11 +347,9 @@ class EyeFilter:
                 focus_dpt=focus_dpt,
                 gaze_deg=gaze_deg,
                 output=output,
-                accumulation=accumulation,
-                merge=merge,
-                render_tolerance=render_tolerance,
                 newest_only=whole,
                 until_s=deadline_s,
+                **options,
             )
             self.builder.advance(ahead=False)  # after this frame's request
             if seen is not None:
@@ -370,12 +364,10 @@ class EyeFilter:
         focus_dpt: float,
         gaze_deg: tuple[float, float] | None = None,
         output: Output = "srgb8",
-        accumulation: Accumulation = "coverage",
-        merge: bool = True,
-        render_tolerance: float = 1.0,
         newest_only: bool = False,
         until_s: float | None = None,
         out: Sequence[NDArray[Any] | None] | None = None,
+        **options: Unpack[RenderOptionValues],
     ) -> Filtered | None:
         """Filter one frame like `filter`; return None while its eye is being prepared.
 
@@ -416,9 +408,7 @@ class EyeFilter:
             return planned.render(
                 gazes_deg=[gaze_deg] * len(views),
                 output=output,
-                accumulation=accumulation,
-                merge=merge,
-                render_tolerance=render_tolerance,
+                options=RenderOptions(**options),
                 out=out,
                 until_s=until_s,
             )

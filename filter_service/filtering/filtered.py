@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 from numpy.typing import NDArray
@@ -10,58 +11,140 @@ from numpy.typing import NDArray
 from filter_service.camera import Camera
 from filter_service.errors import FilterError
 from filter_service.filtering.accepted_profile import AcceptedProfile
+from filter_service.rendering.filtered_view import FrameCounts, summed_counts
+from filter_service.view_state import EyeName
 
 
 @dataclass(frozen=True)
-class Filtered:
-    """A filtered frame with everything that determines how it looks.
+class PictureOfEye:
+    """One picture, and the eye and state that it was filtered through.
 
     Attributes
     ----------
-    colors : tuple of (height, width, 3)
-        One picture for each view: uint8 sRGB, or float32 or float16 linear light.
+    color : (height, width, 3)
+        uint8 sRGB, or float32 or float16 linear light.
+    eye : "both", "left" or "right"
     profile_id : int
         The caller's number of the profile, by default the generation.
     generation : int
         Number of the profile, counted by the filter.
-    is_complete : bool
-        Always true: every frame shows the state that it asks for.
     pupil_diameter_mm, focus_dpt
         Values used: a profile may cap the pupil, and an eye can only add power.
-    gazes_deg : tuple of (h, v)
-        Gaze used, one for each view.
+    gaze_deg : (h, v)
+        Gaze used.
+    is_complete : bool
+        Always true: every frame shows the state that it asks for.
+    """
+
+    color: NDArray[Any]
+    eye: EyeName
+    profile_id: int
+    generation: int
+    pupil_diameter_mm: float
+    focus_dpt: float
+    gaze_deg: tuple[float, float]
+    is_complete: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Filtered(FrameCounts):
+    """A filtered frame with everything that determines how it looks.
+
+    `color`, `profile_id`, `generation`, `pupil_diameter_mm`, `focus_dpt` and `gaze_deg`
+    are those of the first view.
+
+    Attributes
+    ----------
+    views : tuple of PictureOfEye
+        One for each view of the frame.
     missing_depth_count, clamped_depth_count, bad_color_count, overflow_count : int
         Number of pixels whose depth was filled in, was outside the prepared distances,
         or whose color was not finite; number of light shares lost to full buffers.
     notes : tuple of str
-        Notes for the user, in sentences.
+        Notes for the user, in sentences; those of a left or right eye name it.
     stage_times_ms : dict
         Time of each stage of the frame.
     """
 
-    colors: tuple[NDArray[Any], ...]
-    profile_id: int
-    generation: int
-    is_complete: bool
-    pupil_diameter_mm: float
-    focus_dpt: float
-    gazes_deg: tuple[tuple[float, float], ...]
-    missing_depth_count: int
-    clamped_depth_count: int
-    bad_color_count: int
-    overflow_count: int
+    views: tuple[PictureOfEye, ...]
     notes: tuple[str, ...]
     stage_times_ms: dict[str, float]
+
+    @classmethod
+    def merged(
+        cls,
+        by_eye: Mapping[EyeName, Filtered],
+        indices: Mapping[EyeName, tuple[int, ...]],
+    ) -> Filtered:
+        """Return a frame of several eyes; ``indices`` are those of each eye's views."""
+        views: dict[int, PictureOfEye] = {}
+        for eye, seen in by_eye.items():
+            named = (replace(view, eye=eye) for view in seen.views)
+            views |= zip(indices[eye], named, strict=True)
+        return cls(
+            views=tuple(views[i] for i in sorted(views)),
+            notes=tuple(
+                note if eye == "both" else f"{eye} eye: {note}"
+                for eye, seen in by_eye.items()
+                for note in seen.notes
+            ),
+            stage_times_ms=summed_times([s.stage_times_ms for s in by_eye.values()]),
+            **summed_counts([*by_eye.values()]),
+        )
 
     @property
     def color(self) -> NDArray[Any]:
         """Return the first view's picture, (height, width, 3)."""
-        return self.colors[0]
+        return self.views[0].color
+
+    @property
+    def colors(self) -> tuple[NDArray[Any], ...]:
+        """Return the pictures of all views."""
+        return tuple(view.color for view in self.views)
 
     @property
     def gaze_deg(self) -> tuple[float, float]:
         """Return the first view's gaze."""
-        return self.gazes_deg[0]
+        return self.views[0].gaze_deg
+
+    @property
+    def gazes_deg(self) -> tuple[tuple[float, float], ...]:
+        """Return the gaze of each view."""
+        return tuple(view.gaze_deg for view in self.views)
+
+    @property
+    def profile_id(self) -> int:
+        """Return the number of the first view's profile."""
+        return self.views[0].profile_id
+
+    @property
+    def generation(self) -> int:
+        """Return the generation of the first view's profile."""
+        return self.views[0].generation
+
+    @property
+    def pupil_diameter_mm(self) -> float:
+        """Return the pupil used for the first view."""
+        return self.views[0].pupil_diameter_mm
+
+    @property
+    def focus_dpt(self) -> float:
+        """Return the focus used for the first view."""
+        return self.views[0].focus_dpt
+
+    @property
+    def is_complete(self) -> bool:
+        """Return true: every frame shows the state that it asks for."""
+        return all(view.is_complete for view in self.views)
+
+
+def summed_times(times_ms: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Return the sum of each stage's times."""
+    found: dict[str, float] = {}
+    for stages_ms in times_ms:
+        for name, value_ms in stages_ms.items():
+            found[name] = found.get(name, 0.0) + float(value_ms)
+    return found
 
 
 @dataclass(frozen=True)

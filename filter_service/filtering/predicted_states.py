@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
-from filter_service.rendering.frame_use import FrameUse, SeenView
+from filter_service.rendering.frame_use import FrameUse, SampledView
 from filter_service.rgbd_view import RgbdView
 
 SPEED_S = 0.25
@@ -37,7 +37,7 @@ class StreamUse:
         at_s: float,
     ) -> None:
         """Record a frame."""
-        seen = tuple(SeenView.of(view) for view in views)
+        seen = tuple(SampledView.of(view) for view in views)
         self.last = FrameUse(at_s, pupil_diameter_mm, focus_dpt, gaze_deg, seen)
         self._states.append((at_s, pupil_diameter_mm, focus_dpt))
         while self._states[0][0] < at_s - SPEED_S and len(self._states) > 2:

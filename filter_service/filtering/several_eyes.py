@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Unpack
 
 from numpy.typing import NDArray
 
@@ -19,53 +19,14 @@ from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.filtered import Filtered
 from filter_service.filtering.planned_frame import GazeDegrees, PlannedFrame
 from filter_service.rgbd_view import RgbdView
-from filter_service.settings import Accumulation, GazeDeg, Output
+from filter_service.settings import (
+    GazeDeg,
+    Output,
+    RenderOptions,
+    RenderOptionValues,
+)
 from filter_service.validation import checked
 from filter_service.view_state import EyeName, ViewState, check_states
-
-
-@dataclass(frozen=True)
-class SeenView:
-    """One picture and the eye that it was filtered through."""
-
-    color: NDArray[Any]
-    gaze_deg: tuple[float, float]
-    seen: Filtered  # with the other views of that eye
-
-
-@dataclass(frozen=True)
-class SeenViews:
-    """A frame through several eyes; `views` are in the order of the frame."""
-
-    views: tuple[SeenView, ...]
-    by_eye: Mapping[EyeName, Filtered]
-
-    @property
-    def is_complete(self) -> bool:
-        """Return true: every frame shows the state that it asks for."""
-        return all(seen.is_complete for seen in self.by_eye.values())
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Return the notes of all eyes; those of a left or right eye name it."""
-        return tuple(
-            note if eye == "both" else f"{eye} eye: {note}"
-            for eye, seen in self.by_eye.items()
-            for note in seen.notes
-        )
-
-    @property
-    def stage_times_ms(self) -> dict[str, float]:
-        """Return the time of each stage, summed over the eyes."""
-        stages_ms: dict[str, float] = {}
-        for seen in self.by_eye.values():
-            for name, value_ms in seen.stage_times_ms.items():
-                stages_ms[name] = stages_ms.get(name, 0.0) + value_ms
-        return stages_ms
-
-    def total(self, counter: str) -> int:
-        """Return a counter of `Filtered`, by name, summed over the eyes."""
-        return sum(int(getattr(seen, counter)) for seen in self.by_eye.values())
 
 
 @dataclass(frozen=True)
@@ -80,12 +41,10 @@ class PlannedViews:
         self,
         *,
         output: Output = "srgb8",
-        accumulation: Accumulation = "coverage",
-        merge: bool = True,
-        render_tolerance: float = 1.0,
         out: Sequence[NDArray[Any] | None] | None = None,
         until_s: float | None = None,
-    ) -> SeenViews:
+        **options: Unpack[RenderOptionValues],
+    ) -> Filtered:
         """Filter the frame; all eyes are begun before one is finished.
 
         See `EyeFilter.filter`.
@@ -95,28 +54,18 @@ class PlannedViews:
         NotPrepared
             If PSFs that the frame needs were not computed by ``until_s``.
         """
-        found: dict[EyeName, Filtered] = {}
-        views: dict[int, SeenView] = {}
         begun = {
             eye: planned.begin(
                 gazes_deg=[self.gazes_deg[i] for i in self.indices[eye]],
                 output=output,
-                accumulation=accumulation,
-                merge=merge,
-                render_tolerance=render_tolerance,
+                options=RenderOptions(**options),
                 out=None if out is None else [out[i] for i in self.indices[eye]],
                 until_s=until_s,
             )
             for eye, planned in self.by_eye.items()
         }
-        for eye, finish in begun.items():
-            indices = self.indices[eye]
-            found[eye] = seen = finish()
-            for i, color, gaze_deg in zip(
-                indices, seen.colors, seen.gazes_deg, strict=True
-            ):
-                views[i] = SeenView(color, gaze_deg, seen)
-        return SeenViews(tuple(views[i] for i in sorted(views)), found)
+        found = {eye: finish() for eye, finish in begun.items()}
+        return Filtered.merged(found, self.indices)
 
 
 def plan_views(

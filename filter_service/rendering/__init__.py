@@ -24,7 +24,6 @@ haze_loops     compiled loops of haze
 spectacles     spectacle magnification
 spectacle_loops  compiled loop of spectacles
 plan_once      warm-up of frame planning
-reference      NumPy twins of the passes
 gl/            engine of compute shaders
 native/        engine of compiled loops
 """

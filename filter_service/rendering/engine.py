@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, cast
+from dataclasses import dataclass, fields
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from filter_service.rendering.filtered_view import FilteredView
 from filter_service.rendering.frame_use import FrameUse
 from filter_service.rgbd_view import RgbdView
-from filter_service.settings import Accumulation, Output
+from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
 
 
 class LoadedStore(Protocol):
@@ -40,38 +42,36 @@ class LoadedStore(Protocol):
         """Free the engine's resources for this store; call it once."""
 
 
-class Rendered(Protocol):
-    """Result of an engine for one view.
+@dataclass(frozen=True)
+class ViewRequest:
+    """One view to filter: what is seen, through which eye in which state, and how.
 
     Attributes
     ----------
-    color : (height, width, 3)
-        float32 or float16 linear light, or uint8 sRGB.
-    stage_times_ms : dict
-        Time by stage; their sum is the time spent in the engine.
-    pupil_diameter_mm, focus_dpt, gaze_deg : as used
+    handle : LoadedStore
+        PSFs of the eye, loaded by the engine.
+    gaze_deg : (h, v), optional
+        Gaze in the image, clamped to the prepared range with a note; the store's by
+        default.
+    out : array, optional
+        Output array of the shape and type of the image; an engine may use it.
+    until_s : float, optional
+        Deadline on the clock of `time.monotonic`; no PSFs are computed after it.
     """
 
-    @property
-    def color(self) -> NDArray[Any]: ...  # noqa: D102
-    @property
-    def stage_times_ms(self) -> dict[str, float]: ...  # noqa: D102
-    @property
-    def missing_depth_count(self) -> int: ...  # noqa: D102
-    @property
-    def clamped_depth_count(self) -> int: ...  # noqa: D102
-    @property
-    def bad_color_count(self) -> int: ...  # noqa: D102
-    @property
-    def overflow_count(self) -> int: ...  # noqa: D102
-    @property
-    def pupil_diameter_mm(self) -> float: ...  # noqa: D102
-    @property
-    def focus_dpt(self) -> float: ...  # noqa: D102
-    @property
-    def gaze_deg(self) -> tuple[float, float]: ...  # noqa: D102
-    @property
-    def notes(self) -> list[str]: ...  # noqa: D102
+    view: RgbdView
+    handle: Any
+    pupil_diameter_mm: float
+    focus_dpt: float
+    gaze_deg: tuple[float, float] | None = None
+    output: Output = "linear"
+    options: RenderOptions = DEFAULT_OPTIONS
+    out: NDArray[Any] | None = None
+    until_s: float | None = None
+
+
+Pending = Callable[[], FilteredView]
+"""Waits for a view that was begun, and returns it."""
 
 
 class FrameEngine(Protocol):
@@ -95,51 +95,33 @@ class FrameEngine(Protocol):
     def load(self, store: Any) -> LoadedStore:
         """Load a store; its kernels may all be computed later."""
 
-    def render(
-        self,
-        view: RgbdView,
-        handle: Any,
-        *,
-        pupil_diameter_mm: float,
-        focus_dpt: float,
-        accumulation: Accumulation = "coverage",
-        merge: bool = True,
-        render_tolerance: float = 1.0,
-        output: Output = "linear",
-        gaze_deg: tuple[float, float] | None = None,
-        out: NDArray[Any] | None = None,
-        until_s: float | None = None,
-    ) -> Rendered:
-        """Filter one view through the eye of a loaded store.
+    def begin(self, request: ViewRequest) -> Pending:
+        """Start filtering a view; return a function that waits for the result.
 
-        Parameters
-        ----------
-        render_tolerance : float
-            0 is exact, 1 leaves no visible difference, more is faster.
-        out : array, optional
-            Output array of the shape and type of the image; an engine may use it.
-        until_s : float, optional
-            Deadline on the clock of `time.monotonic`; no PSFs are computed after it.
+        Other views may be begun in between, such as that of the other eye.  An engine
+        without concurrency filters the view at once.
 
         Raises
         ------
-        FilterError
-            `BadMessage`, `CameraMismatch` or another `RenderError`.
+        BadMessage
+            Arrays or options are invalid.
+        CameraMismatch
+            The store is for another camera, see `camera.is_same_camera`.
         NotPrepared
-            Some PSFs that the frame needs were not computed by ``until_s``.
+            Some PSFs that the frame needs were not computed by ``until_s``; the
+            returned function may raise it, too.
+        RenderError
         """
 
 
-def begin_view(
-    engine: FrameEngine, view: RgbdView, handle: Any, **options: Any
-) -> Callable[[], Rendered]:
-    """Start filtering a view; return a function that waits for the result.
+class OneView:
+    """Adds `render`, which takes the fields of a request by name, to an engine."""
 
-    If the engine has a ``begin`` method (with the arguments of `FrameEngine.render`),
-    other views may be started in between; otherwise the view is filtered at once.
-    """
-    begin = getattr(engine, "begin", None)
-    if begin is not None:
-        return cast(Callable[[], Rendered], begin(view, handle, **options))
-    seen = engine.render(view, handle, **options)
-    return lambda: seen
+    def render(
+        self: FrameEngine, view: RgbdView, handle: Any, **values: Any
+    ) -> FilteredView:
+        """Filter one view; options of `RenderOptions` are given by name, too."""
+        names = {option.name for option in fields(RenderOptions)}
+        options = {name: values.pop(name) for name in names & set(values)}
+        request = ViewRequest(view, handle, options=RenderOptions(**options), **values)
+        return self.begin(request)()

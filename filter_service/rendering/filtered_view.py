@@ -1,13 +1,42 @@
 """Result of a filtered view, for all engines."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 
-@dataclass(frozen=True)
-class FilteredView:
+@dataclass(frozen=True, kw_only=True)
+class FrameCounts:
+    """Counts that users receive with a frame.
+
+    A new counter needs a line here, a value from each engine, and a line in `Result`.
+
+    Attributes
+    ----------
+    missing_depth_count, clamped_depth_count, bad_color_count : int
+        Pixels whose depth was filled in, whose depth was outside the prepared
+        distances, and whose color was not finite (taken as black); the last two
+        include the pixels of a hidden layer that are not empty.
+    overflow_count : int
+        Entries dropped because their list was full; their light is missing.
+    """
+
+    missing_depth_count: int
+    clamped_depth_count: int
+    bad_color_count: int
+    overflow_count: int = 0
+
+
+def summed_counts(counts: Sequence[FrameCounts]) -> dict[str, int]:
+    """Return the sums of counts by name."""
+    names = [count.name for count in fields(FrameCounts)]
+    return {name: sum(int(getattr(c, name)) for c in counts) for name in names}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilteredView(FrameCounts):
     """A filtered view with the parameters and statistics of its rendering.
 
     Attributes
@@ -16,10 +45,6 @@ class FilteredView:
         float32 or float16 linear light, or uint8 sRGB.
     stage_times_ms : dict
         Time by stage; their sum is the time spent in the engine.
-    missing_depth_count, clamped_depth_count, bad_color_count : int
-        Pixels whose depth was filled in, whose depth was outside the prepared
-        distances, and whose color was not finite (taken as black); the last two
-        include the pixels of a hidden layer that are not empty.
     pupil_diameter_mm, focus_dpt : float
         As used.
     gaze_deg : (h, v)
@@ -28,17 +53,12 @@ class FilteredView:
         Fragments, pixels merged into fragments, and entries of the bins' lists; rows
         shared by two strips of a very large frame count twice, and with a hidden layer
         the repeated border counts.
-    overflow_count : int
-        Entries dropped because their list was full; their light is missing.
     kernel_count, kernel_texel_count : int
         Kernels in use, and texels of all their levels.
     """
 
     color: NDArray
     stage_times_ms: dict[str, float]
-    missing_depth_count: int
-    clamped_depth_count: int
-    bad_color_count: int
     pupil_diameter_mm: float
     focus_dpt: float
     gaze_deg: tuple[float, float]
@@ -49,7 +69,6 @@ class FilteredView:
     kernel_texel_count: int
     layer_count: int
     notes: list[str]
-    overflow_count: int = 0
 
 
 SAMPLED_EVERY = 16

@@ -1,6 +1,5 @@
-"""Checked options of one frame."""
+"""Checks of a request against the PSF store that it names."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -8,58 +7,18 @@ from numpy.typing import NDArray
 
 from filter_service.errors import BadMessage, CameraMismatch
 from filter_service.psfs.store import PsfStore
+from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.gaze import usable_gaze
-from filter_service.rgbd_view import RgbdView
-from filter_service.settings import ACCUMULATIONS, OUTPUTS, RenderTolerance
+from filter_service.settings import Output, RenderOptions
 from filter_service.validation import checked
 
 OUTPUT_DTYPES = {"linear": np.float32, "srgb8": np.uint8, "linear16": np.float16}
 
 
-@dataclass(frozen=True)
-class FrameOptions:
-    """Options of a frame.
-
-    Attributes
-    ----------
-    paper_rule : bool
-        Whether fragments are accumulated by the paper's rule.
-    merge : bool
-    tolerance : float
-        Errors of merging, coarse kernels and layers relative to the default; 0 is
-        exact.
-    output : str
-        One of `OUTPUT_DTYPES`.
-    gaze_deg : (h, v)
-        As used.
-    gaze_notes : tuple of str
-        Notes if it differs from the requested gaze.
-    """
-
-    paper_rule: bool
-    merge: bool
-    tolerance: float
-    output: str
-    gaze_deg: tuple[float, float]
-    gaze_notes: tuple[str, ...]
-
-    @property
-    def is_encoded(self) -> bool:
-        """Whether the output image is encoded for a display."""
-        return self.output == "srgb8"
-
-
-def frame_options(
-    view: RgbdView,
-    store: PsfStore,
-    *,
-    accumulation: str,
-    merge: bool,
-    render_tolerance: float,
-    output: str,
-    gaze_deg: tuple[float, float] | None,
-) -> FrameOptions:
-    """Check the options of a frame against its PSF store.
+def check_request(
+    request: ViewRequest, store: PsfStore
+) -> tuple[tuple[float, float], tuple[str, ...]]:
+    """Check a request; return the gaze to use, with notes if it differs.
 
     Raises
     ------
@@ -68,23 +27,17 @@ def frame_options(
     CameraMismatch
         The store is for another camera, see `camera.is_same_camera`.
     """
-    _check_choice("accumulation", accumulation, ACCUMULATIONS)
-    _check_choice("output", output, OUTPUTS)
-    if not store.spec.serves(view.camera):
+    checked(request.output, Output, "output")
+    checked(request.options.fields(), RenderOptions)
+    if not store.spec.serves(request.view.camera):
         raise CameraMismatch(
-            f"PSFs are for {store.spec.camera}, the view's is {view.camera}",
+            f"PSFs are for {store.spec.camera}, the view's is {request.view.camera}",
             field="tangents",
         )
-    tolerance = checked(render_tolerance, RenderTolerance, "render_tolerance")
-    used_deg, notes = usable_gaze(store.spec, gaze_deg)
-    return FrameOptions(
-        accumulation == "paper", merge, tolerance, output, used_deg, notes
-    )
+    return usable_gaze(store.spec, request.gaze_deg)
 
 
-def picture_room(
-    view: RgbdView, options: FrameOptions, out: NDArray[Any] | None
-) -> NDArray[Any]:
+def output_array(request: ViewRequest) -> NDArray[Any]:
     """Return the output array of a view: the caller's, or a new one.
 
     Raises
@@ -92,7 +45,8 @@ def picture_room(
     BadMessage
         The array has another shape or type, or is not contiguous and writeable.
     """
-    shape, dtype = view.color.shape, np.dtype(OUTPUT_DTYPES[options.output])
+    shape, dtype = request.view.color.shape, np.dtype(OUTPUT_DTYPES[request.output])
+    out = request.out
     if out is None:
         return np.empty(shape, dtype)
     if out.shape != shape or out.dtype != dtype or not out.flags.carray:
@@ -102,8 +56,3 @@ def picture_room(
             allowed=f"{shape} of {dtype}, contiguous and writeable",
         )
     return out
-
-
-def _check_choice(field: str, value: str, options: tuple[str, ...]) -> None:
-    if value not in options:
-        raise BadMessage(f"{value!r}", field=field, allowed=", ".join(options))

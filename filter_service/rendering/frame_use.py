@@ -29,7 +29,7 @@ ImageCellsOf = Callable[[tuple[float, float]], ImageCells]
 
 
 @dataclass(frozen=True)
-class SeenView:
+class SampledView:
     """Depths of a view at a sample of its pixels.
 
     Attributes
@@ -44,7 +44,7 @@ class SeenView:
     hidden_dpt: NDArray[np.float64] | None = None
 
     @classmethod
-    def of(cls, view: RgbdView) -> SeenView:
+    def of(cls, view: RgbdView) -> SampledView:
         """Sample a view; its memory may be reused afterwards."""
         depths_m = [m[::STEP_PX, ::STEP_PX] for m in view.surface_depths_m]
         filled_m, _ = fill_missing_depth(np.ascontiguousarray(depths_m[0]))
@@ -69,7 +69,7 @@ class FrameUse:
     pupil_diameter_mm: float
     focus_dpt: float
     gaze_deg: tuple[float, float] | None
-    views: tuple[SeenView, ...]
+    views: tuple[SampledView, ...]
 
 
 def first_frame(camera: Camera, settings: FilterSettings) -> FrameUse:
@@ -86,7 +86,7 @@ def first_frame(camera: Camera, settings: FilterSettings) -> FrameUse:
     # Every cell of the field contains every distance.
     column = np.linspace(low_dpt, high_dpt, FIRST_DISTANCES)
     every_dpt = np.resize(column, (rows, columns))
-    return FrameUse(0.0, pupil_mm, focus_dpt, None, (SeenView(camera, every_dpt),))
+    return FrameUse(0.0, pupil_mm, focus_dpt, None, (SampledView(camera, every_dpt),))
 
 
 def psfs_for(

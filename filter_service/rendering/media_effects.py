@@ -6,10 +6,9 @@ Spectacles resample the view before it is filtered; the media change its light a
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,7 @@ from estimator.media.absorption import channel_gains
 from estimator.media.straylight import Straylight
 from estimator.profiles.parse import EyeProfile
 from filter_service.displays import display_wavelengths_nm
-from filter_service.rendering.engine import FrameEngine, Rendered, begin_view
+from filter_service.rendering.engine import FrameEngine, Pending, ViewRequest
 from filter_service.rendering.filtered_view import FilteredView
 from filter_service.rendering.haze import add_haze, in_threads
 from filter_service.rendering.spectacles import (
@@ -72,44 +71,29 @@ class MediaEffects:
             color *= np.array(self.gain_ratio, np.float32)
 
 
-def render_through_media(*arguments: Any, **options: Any) -> FilteredView:
-    """Filter a view as `FrameEngine.render` does, with optional media effects.
-
-    Arguments are those of `begin_through_media`.
-    """
-    return begin_through_media(*arguments, **options)()
-
-
 def begin_through_media(
-    engine: FrameEngine,
-    view: RgbdView,
-    handle: Any,
-    effects: MediaEffects | None,
-    *,
-    output: str,
-    out: NDArray[Any] | None = None,
-    **options: Any,
-) -> Callable[[], FilteredView]:
-    """Start filtering a view as `begin_view` does, with optional media effects."""
+    engine: FrameEngine, request: ViewRequest, effects: MediaEffects | None
+) -> Pending:
+    """Start filtering a view as `FrameEngine.begin` does, with media effects if any."""
     if effects is None:
-        begun = begin_view(engine, view, handle, output=output, out=out, **options)
-        return cast(Callable[[], FilteredView], begun)
+        return engine.begin(request)
     started_s = time.perf_counter()
+    output, view = request.output, request.view
     if effects.magnification_ratio is not None:
         view = seen_through(view, effects.magnification_ratio)
     before_s = time.perf_counter() - started_s
-    begun = begin_view(engine, view, handle, output="linear", **options)
+    begun = engine.begin(replace(request, view=view, output="linear", out=None))
     return partial(_changed, begun, effects, view, output, before_s)
 
 
 def _changed(
-    begun: Callable[[], Rendered],
+    begun: Pending,
     effects: MediaEffects,
     view: RgbdView,
     output: str,
     before_s: float,
 ) -> FilteredView:
-    rendered = cast(FilteredView, begun())
+    rendered = begun()
     started_s = time.perf_counter()
     color = np.ascontiguousarray(rendered.color, dtype=np.float32)
     effects.change(color, view)

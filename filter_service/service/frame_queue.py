@@ -35,7 +35,7 @@ class FrameQueue:
     ----------
     sessions : callable
         Returns the sessions on this device that have a client.
-    render : RenderEnd
+    render : RenderClient
     send : callable
         ``send(peer, reply)`` returns the tracker of a large reply.
 

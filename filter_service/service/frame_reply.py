@@ -5,13 +5,15 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from typing import Any
 
 from numpy.typing import NDArray
 
 from filter_service.errors import FilterError, NotPrepared, RenderFailed
 from filter_service.filtering.eye_filter import EyeFilter
-from filter_service.filtering.several_eyes import SeenViews, plan_views
+from filter_service.filtering.filtered import Filtered
+from filter_service.filtering.several_eyes import plan_views
 from filter_service.messages import (
     Dropped,
     ErrorReply,
@@ -20,6 +22,7 @@ from filter_service.messages import (
     Result,
     ResultView,
 )
+from filter_service.rendering.filtered_view import summed_counts
 from filter_service.wire.images import OUTPUT_OF_FORMAT
 
 MS_PER_S = 1000.0
@@ -58,11 +61,9 @@ def frame_reply(
             return Dropped(frame.frame_id, "preparing")
         seen = planned.render(
             output=OUTPUT_OF_FORMAT[frame.output],
-            accumulation=frame.options.accumulation,
-            merge=frame.options.merge,
-            render_tolerance=frame.options.render_tolerance,
             out=out,
             until_s=started_s + PSF_BUDGET_S,
+            **frame.options.render_values,
         )
     except NotPrepared:
         return Dropped(frame.frame_id, "extending")
@@ -77,44 +78,41 @@ def frame_reply(
     return _result(frame, seen, total_ms)
 
 
-def _result(frame: Frame, seen: SeenViews, total_ms: float) -> Result:
-    stages_ms = seen.stage_times_ms
+def _result(frame: Frame, seen: Filtered, total_ms: float) -> Result:
+    stages_ms = dict(seen.stage_times_ms)
     stages_ms["filter_other_ms"] = total_ms - sum(stages_ms.values())
-    first = seen.views[0]
+    sent = {field.name for field in fields(Result)}
+    counts: dict[str, Any] = {
+        name: count for name, count in summed_counts([seen]).items() if name in sent
+    }
     return Result(
         frame_id=frame.frame_id,
-        profile_id=first.seen.profile_id,
-        generation=first.seen.generation,
-        views=_result_views(frame, seen),
-        pupil_diameter_mm=first.seen.pupil_diameter_mm,
-        focus_dpt=first.seen.focus_dpt,
-        missing_depth_count=seen.total("missing_depth_count"),
-        clamped_depth_count=seen.total("clamped_depth_count"),
-        gaze_deg=first.gaze_deg,
-        overflow_count=seen.total("overflow_count"),
+        profile_id=seen.profile_id,
+        generation=seen.generation,
+        views=tuple(
+            ResultView(
+                asked.width_px,
+                asked.height_px,
+                frame.output,
+                asked.eye,
+                profile_id=found.profile_id,
+                generation=found.generation,
+                is_complete=found.is_complete,
+                pupil_diameter_mm=found.pupil_diameter_mm,
+                focus_dpt=found.focus_dpt,
+                gaze_deg=found.gaze_deg,
+                pose=asked.pose,
+            )
+            for asked, found in zip(frame.views, seen.views, strict=True)
+        ),
+        pupil_diameter_mm=seen.pupil_diameter_mm,
+        focus_dpt=seen.focus_dpt,
+        gaze_deg=seen.gaze_deg,
         total_ms=0.0,
         stage_times_ms=stages_ms,
         notes=seen.notes,
         is_complete=seen.is_complete,
         display_time_ns=frame.display_time_ns,
-        colors=tuple(view.color for view in seen.views),
-    )
-
-
-def _result_views(frame: Frame, seen: SeenViews) -> tuple[ResultView, ...]:
-    return tuple(
-        ResultView(
-            asked.width_px,
-            asked.height_px,
-            frame.output,
-            asked.eye,
-            profile_id=found.seen.profile_id,
-            generation=found.seen.generation,
-            is_complete=found.seen.is_complete,
-            pupil_diameter_mm=found.seen.pupil_diameter_mm,
-            focus_dpt=found.seen.focus_dpt,
-            gaze_deg=found.gaze_deg,
-            pose=asked.pose,
-        )
-        for asked, found in zip(frame.views, seen.views, strict=True)
+        colors=seen.colors,
+        **counts,
     )

@@ -37,8 +37,8 @@ class ServedDevice:
 
     Attributes
     ----------
-    render : RenderEnd
-    frames : FrameDesk
+    render : RenderClient
+    frames : FrameQueue
         Frames of its sessions.
     server : dict, optional
         Description reported by its process; None until then.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, Any, ClassVar, Self
 
 from msgspec import Meta
@@ -13,11 +13,10 @@ from filter_service.camera import Camera
 from filter_service.errors import BadMessage
 from filter_service.settings import (
     DEFAULTS,
-    Accumulation,
     FilterSettings,
     GazeDeg,
     PupilMm,
-    RenderTolerance,
+    RenderOptions,
     VergenceDpt,
 )
 from filter_service.shared_memory import ALIGNMENT_BYTES
@@ -92,14 +91,16 @@ class ProfileRequest(Message):
         return self._with_payload(unpack_profile(parts[0], limits.max_profile_bytes))
 
 
-@dataclass(frozen=True)
-class FrameOptions(Record):
+@dataclass(frozen=True, kw_only=True)
+class FrameOptions(RenderOptions):
     """Options for creating and accumulating a frame's fragments."""
 
-    accumulation: Accumulation = "coverage"
-    merge: bool = True
-    render_tolerance: RenderTolerance = 1.0
     prepared_only: bool = False
+
+    @property
+    def render_values(self) -> dict[str, Any]:
+        """Return the options that an engine reads, by name."""
+        return {o.name: getattr(self, o.name) for o in fields(RenderOptions)}
 
 
 @dataclass(frozen=True)

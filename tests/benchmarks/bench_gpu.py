@@ -27,6 +27,7 @@ from filter_service.gl.gpu import Gpu
 from filter_service.planning.grid import GridSpec
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import build_psf_store
+from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.native import NativeRenderer
 from filter_service.rgbd_view import RgbdView
@@ -81,7 +82,9 @@ class Case:
         stages_ms: dict[str, float] = {}
         start_s = time.perf_counter()
         begun = [
-            self.renderer.begin(self.view, handle, output="srgb8", out=room, **state)
+            self.renderer.begin(
+                ViewRequest(self.view, handle, output="srgb8", out=room, **state)
+            )
             for handle, room in zip(self.handles, self.rooms, strict=True)
         ]
         for finish in begun:

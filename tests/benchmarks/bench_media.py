@@ -19,10 +19,11 @@ from estimator.profiles.parse import parse_profile
 from filter_service.camera import Camera
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import build_psf_store
+from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.haze import add_haze
 from filter_service.rendering.media_effects import (
     MediaEffects,
-    render_through_media,
+    begin_through_media,
 )
 from filter_service.rendering.native import NativeRenderer
 from tests.benchmarks.frame_runs import states_towards
@@ -97,17 +98,16 @@ def rows_of(size: tuple[int, int], count: int):
     for k, state in enumerate([states[0], states[0], *states]):
         for name in EYES:
             start_s = time.perf_counter()
-            seen = render_through_media(
-                engine, view, handle, effects[name], output="srgb8", **state
-            )
+            request = ViewRequest(view, handle, output="srgb8", **state)
+            seen = begin_through_media(engine, request, effects[name])()
             elapsed_ms = 1e3 * (time.perf_counter() - start_s)
             if k >= 2:
                 times_ms[name].append(elapsed_ms)
                 alone_ms[name].append(seen.stage_times_ms.get("media_ms", 0.0))
     for name in EYES:
-        colors[name] = render_through_media(
-            engine, view, handle, effects[name], output="linear", **states[0]
-        ).color.astype(np.float64)
+        request = ViewRequest(view, handle, output="linear", **states[0])
+        seen = begin_through_media(engine, request, effects[name])()
+        colors[name] = seen.color.astype(np.float64)
     engine.close()
     setting = f"{size[0]}x{size[1]}"
     for name in EYES:

@@ -26,7 +26,7 @@ class FrameRun:
 
     Attributes
     ----------
-    frames : list of Rendered
+    frames : list of FilteredView
         The last is of the very state that was asked for.
     times_ms : (n,)
     """

@@ -51,7 +51,7 @@ def splat_work(gpu: Gpu, size_px: tuple[int, int], entry_count: int) -> SplatWor
     ----------
     size_px : (width, height)
     entry_count : int
-        That of `Rendered`.
+        That of `FilteredView`.
 
     Raises
     ------

@@ -74,21 +74,10 @@ class EngineDouble:
         assert (store.ballast == store.mark).all()
         return store
 
-    def render(
-        self,
-        view,
-        handle,
-        *,
-        pupil_diameter_mm,
-        focus_dpt,
-        accumulation="coverage",
-        merge=True,
-        render_tolerance=1.0,
-        output="linear",
-        gaze_deg=None,
-        out=None,
-        until_s=None,
-    ):
+    def begin(self, request):
+        view, handle = request.view, request.handle
+        pupil_diameter_mm, output = request.pupil_diameter_mm, request.output
+        accumulation = request.options.accumulation
         assert handle.n_released == 0, "rendered with a store that was freed"
         height_px, width_px = view.depth_m.shape
         camera = Camera(width_px, height_px, view.tangents)
@@ -107,16 +96,17 @@ class EngineDouble:
             if output == "linear16":
                 color = color.astype(np.float16)
         color[0, 0] = handle.mark
-        return RenderedDouble(
+        found = RenderedDouble(
             color=color,
             stage_times_ms={"filter_ms": 1000 * (time.perf_counter() - start_s)},
             missing_depth_count=int(np.count_nonzero(~(view.depth_m > 0))),
             clamped_depth_count=0,
             pupil_diameter_mm=min(pupil_diameter_mm, 7.0),
-            focus_dpt=focus_dpt,
-            gaze_deg=gaze_deg or (0.0, 0.0),
+            focus_dpt=request.focus_dpt,
+            gaze_deg=request.gaze_deg or (0.0, 0.0),
             notes=[accumulation] if accumulation != "coverage" else [],
         )
+        return lambda: found
 
 
 def _as_bytes(color):

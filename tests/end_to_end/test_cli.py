@@ -541,14 +541,16 @@ def test_other_commands_refuse_bad_input_with_one_line(arguments, named):
 
 def test_benchmarks_say_that_they_need_a_checkout(tmp_path):
     (tmp_path / "estimator").symlink_to(ROOT / "estimator")
-    shutil.copytree(
-        ROOT / "filter_service",
-        tmp_path / "filter_service",
-        ignore=shutil.ignore_patterns("__pycache__"),
-    )
+    for package in ("filter_service", "clients"):
+        shutil.copytree(
+            ROOT / package,
+            tmp_path / package,
+            ignore=shutil.ignore_patterns("__pycache__", "node_modules"),
+        )
     finished = subprocess.run(
         [sys.executable, "-m", "filter_service", "bench", "psf"],
         cwd=tmp_path,
+        env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
         capture_output=True,
         text=True,
         timeout=TIMEOUT_S,

@@ -30,13 +30,13 @@ class RestingEngine(EngineDouble):
         self.between = function
         return True
 
-    def render(self, *arguments, **options):
+    def begin(self, request):
         job, self.in_the_middle = self.in_the_middle, None
         if job is not None:
             job()
             time.sleep(0.05)
             self.between()
-        return super().render(*arguments, **options)
+        return super().begin(request)
 
 
 class FrontEnd:

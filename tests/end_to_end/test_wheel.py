@@ -295,13 +295,9 @@ def test_a_benchmark_of_the_tests_needs_a_checkout(installed):
     assert "checkout" in one_line(start(installed, *module, "bench", "psf"), 1)
 
 
-def test_demo_and_the_round_trip_are_there(run, installed):
+def test_the_demo_is_there(run):
     finished = run("demo", "--help")
     assert finished.returncode == 0 and "--frames" in finished.stdout
-    finished = start(
-        installed, installed.python, "-m", "tests.benchmarks.bench_roundtrip", "--help"
-    )
-    assert finished.returncode == 0 and "--rate-hz" in finished.stdout
 
 
 EXTRAS = (

@@ -8,6 +8,7 @@ import pytest
 from filter_service.constants import RGB
 from filter_service.gl.gpu import Gpu
 from filter_service.psfs.store import build_psf_store
+from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.gl import list_bands
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rgbd_view import RgbdView
@@ -85,7 +86,7 @@ def test_eyes_in_flight_are_as_if_alone(hardware, stores, eye_count):
     handles = [loaded[id(store)] for store in used]
     for state, pair, expected in zip(STATES, pairs, wanted, strict=True):
         begun = [
-            renderer.begin(view, handle, **state)
+            renderer.begin(ViewRequest(view, handle, **state))
             for handle, view in zip(handles, itertools.cycle(pair), strict=False)
         ]
         for finish, one in zip(begun, expected, strict=True):
@@ -101,7 +102,7 @@ def test_finished_in_any_order(hardware, stores):
     handles = [renderer.load(store) for store in stores[:2]]
     for _ in range(2):
         begun = [
-            renderer.begin(view, handle, **STATES[0])
+            renderer.begin(ViewRequest(view, handle, **STATES[0]))
             for handle, view in zip(handles, views, strict=True)
         ]
         for k in (1, 0):
@@ -117,7 +118,10 @@ def test_missing_depth_beside_a_whole_view(hardware, stores):
     renderer = FilterRenderer(hardware)
     handle = renderer.load(stores[0])
     for _ in range(2):
-        begun = [renderer.begin(view, handle, **STATES[0]) for view in (torn, whole)]
+        begun = [
+            renderer.begin(ViewRequest(view, handle, **STATES[0]))
+            for view in (torn, whole)
+        ]
         for finish, one in zip(begun, wanted, strict=True):
             assert_same(finish(), one)
     assert wanted[0].missing_depth_count == 20 * 30
@@ -130,7 +134,7 @@ def test_lists_that_do_not_fit_are_made_again(hardware, stores, monkeypatch):
     monkeypatch.setattr(list_bands, "MAX_BAND_ENTRIES", wanted[0].entry_count // 3)
     renderer = FilterRenderer(hardware)
     handle = renderer.load(stores[0])
-    begun = [renderer.begin(view, handle, **STATES[0]) for view in views]
+    begun = [renderer.begin(ViewRequest(view, handle, **STATES[0])) for view in views]
     for finish, one in zip(begun, wanted, strict=True):
         assert_same(finish(), one)
 

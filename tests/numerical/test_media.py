@@ -7,11 +7,12 @@ from estimator.media.absorption import channel_gains, media_density
 from estimator.media.straylight import CATARACTS, Straylight, cie_glare_per_sr
 from estimator.profiles.parse import ProfileError, parse_profile
 from filter_service.camera import Camera
+from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.haze import add_haze
 from filter_service.rendering.media_effects import (
     MediaEffects,
+    begin_through_media,
     encoded,
-    render_through_media,
 )
 from filter_service.rgbd_view import RgbdView
 
@@ -210,14 +211,26 @@ def test_halves_never_become_infinite():
 class Glass:
     """An engine that leaves every picture as it is."""
 
-    def render(self, view, handle, *, output, **options):
+    def begin(self, request):
         from filter_service.rendering.filtered_view import FilteredView
 
-        assert output == "linear"
-        return FilteredView(
-            view.color.astype(np.float32),
-            {"splat_ms": 1.0},
-            *(0, 0, 0, 3.0, 0.0, (0.0, 0.0), 0, 0, 0, 0, 0, 1, []),
+        assert request.output == "linear"
+        none = dict.fromkeys(
+            (
+                *("missing_depth_count", "clamped_depth_count", "bad_color_count"),
+                *("fragment_count", "merged_count", "entry_count"),
+                *("kernel_count", "kernel_texel_count", "layer_count"),
+            ),
+            0,
+        )
+        return lambda: FilteredView(
+            color=request.view.color.astype(np.float32),
+            stage_times_ms={"splat_ms": 1.0},
+            pupil_diameter_mm=request.pupil_diameter_mm,
+            focus_dpt=request.focus_dpt,
+            gaze_deg=(0.0, 0.0),
+            notes=[],
+            **none,
         )
 
 
@@ -234,9 +247,9 @@ def test_the_filter_adds_what_the_profile_asks_for_and_tells_its_time():
     view = RgbdView(
         lamp(WIDE, 100, 100, 10.0), np.ones((360, 640), np.float32), WIDE.tangents
     )
-    found = render_through_media(
-        Glass(), view, None, MediaEffects.of(profile, "common"), output="linear"
-    )
+    request = ViewRequest(view, None, 4.0, 0.0)
+    effects = MediaEffects.of(profile, "common")
+    found = begin_through_media(Glass(), request, effects)()
     red, _, blue = found.color[100, 110]
     assert red > 1.5 * blue > 0.0
     assert found.stage_times_ms["media_ms"] > 0.0

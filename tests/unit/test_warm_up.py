@@ -5,7 +5,7 @@ import pytest
 
 from filter_service.camera import Camera
 from filter_service.filtering.predicted_states import LEAD_S, SPEED_S, StreamUse
-from filter_service.rendering.frame_use import STEP_PX, SeenView, first_frame
+from filter_service.rendering.frame_use import STEP_PX, SampledView, first_frame
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
 
@@ -60,7 +60,7 @@ def test_frames_at_the_same_time_tell_no_speed():
 def test_a_view_is_remembered_by_some_of_its_depths():
     depth_m = np.full((12, 16), 2.0)
     depth_m[0, 0] = np.nan
-    seen = SeenView.of(view_of(depth_m, depth_kind="radial"))
+    seen = SampledView.of(view_of(depth_m, depth_kind="radial"))
     assert seen.object_dpt.shape == (12 // STEP_PX, 16 // STEP_PX)
     np.testing.assert_allclose(seen.object_dpt, 0.5)
     assert seen.hidden_dpt is None
@@ -75,14 +75,14 @@ def test_what_is_hidden_is_remembered_too():
         hidden_color=np.zeros((12, 16, 3), np.uint8),
         hidden_depth_m=hidden_m,
     )
-    hidden_dpt = SeenView.of(view).hidden_dpt
+    hidden_dpt = SampledView.of(view).hidden_dpt
     assert np.isnan(hidden_dpt[:, :2]).all()
     np.testing.assert_allclose(hidden_dpt[:, 2:], 0.25)
 
 
 def test_a_memory_that_is_used_again_does_not_change_what_is_remembered():
     view = view_of(np.full((12, 16), 2.0), depth_kind="radial")
-    seen = SeenView.of(view)
+    seen = SampledView.of(view)
     view.depth_m[:] = 9.0
     np.testing.assert_allclose(seen.object_dpt, 0.5)
 

@@ -137,5 +137,5 @@ class FramePasses:
             )
 
     def counts(self) -> dict[str, int]:
-        """Return counts of `Rendered` by name."""
+        """Return counts of `FilteredView` by name."""
         return self.fragments.counts() | self.lists.counts()

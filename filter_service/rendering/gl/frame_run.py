@@ -14,13 +14,13 @@ from filter_service.gl.gpu import Gpu
 from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.store import PsfStore
+from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.frame import (
     border_px_of,
     extended,
     fill_missing_depth,
     reach_px_of,
 )
-from filter_service.rendering.frame_options import FrameOptions
 from filter_service.rendering.gl.expected_pairs import FrameState
 from filter_service.rendering.gl.eye_states import EyeState
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
@@ -54,7 +54,9 @@ class FrameRun:
 
     Parameters
     ----------
-    room : (height, width, 3) array
+    request : ViewRequest
+        With the gaze to use.
+    out : (height, width, 3) array
         Output array, of the type of the output.
     fill_depth : bool
         Whether to fill missing depth first, because the previous frame had some.
@@ -68,22 +70,22 @@ class FrameRun:
         self,
         gpu: Gpu,
         kept: EyeState,
-        view: RgbdView,
-        options: FrameOptions,
-        room: NDArray,
+        request: ViewRequest,
+        out: NDArray,
         *,
-        pupil_diameter_mm: float,
-        focus_dpt: float,
         fill_depth: bool,
-        until_s: float | None = None,
     ):
         self.timer = StageTimer(gpu)
-        self._gpu, self._kept, self._options = gpu, kept, options
-        self._room, self._until_s = room, until_s
+        self._gpu, self._kept, self._request = gpu, kept, request
+        self._out, view = out, request.view
         self._cell_px: int | None = None
         self._missing_count: int | None = None
         self.layers: FrameLayers = kept.states.layers(
-            self.timer, kept.handle, pupil_diameter_mm, focus_dpt, options.tolerance
+            self.timer,
+            kept.handle,
+            request.pupil_diameter_mm,
+            request.focus_dpt,
+            request.options.render_tolerance,
         )
         with self.timer.wall("prepare_ms"):
             if view.surface_count > 1 and not (view.hidden_depth_m > 0.0).any():
@@ -148,7 +150,7 @@ class FrameRun:
     def _plan(self) -> _Plan:
         kept, view = self._kept, self._view
         image = kept.states.cells(
-            self.timer, kept.handle, self._options.gaze_deg, self._cell_px
+            self.timer, kept.handle, self._request.gaze_deg, self._cell_px
         )
         border_px = border_px_of(view, self.layers, image)
         with self.timer.wall("prepare_ms"):
@@ -177,32 +179,32 @@ class FrameRun:
             counts.update(run.passes.counts())
             used_words |= run.passes.fragments.used_words
         self._kept.kernels.note(plan.state, used_words)
-        if self.room_of(plan) is None:
+        if self.out_of(plan) is None:
             picture = pictures[0] if len(pictures) == 1 else np.concatenate(pictures)
             rows, columns = (
                 slice(plan.border_px, plan.border_px + n)
                 for n in (self._view.height_px, self._view.width_px)
             )
-            np.copyto(self._room, picture[rows, columns])
-        return self._room, dict(counts)
+            np.copyto(self._out, picture[rows, columns])
+        return self._out, dict(counts)
 
     # ----- used by its strips
 
     def passes_of(self, plan: _Plan, rows: Rows) -> FramePasses:
         """Return the passes of a strip."""
-        image, options = plan.state.image, self._options
+        image, options = plan.state.image, self._request.options
         strip = Strip(
             self._gpu,
             rows.view,
             self.timer,
             layers=self.layers,
-            paper_rule=options.paper_rule,
+            paper_rule=options.accumulation == "paper",
         )
         fragments = FragmentPasses(
             strip,
             image=image,
             corner_change_dpt=plan.state.change_dpt,
-            tolerance=options.tolerance if options.merge else 0.0,
+            tolerance=options.render_tolerance if options.merge else 0.0,
             first_row=rows.first_row,
             frame_pixel_count=plan.whole.width_px * plan.whole.height_px,
             image_size_px=(self._view.width_px, self._view.height_px),
@@ -210,7 +212,7 @@ class FrameRun:
             counted_px=counted_px(rows, self._view, plan.border_px),
             object_range_dpt=_prepared_range_dpt(self._kept.handle.store),
             white_level=plan.white_level,
-            is_encoded=options.is_encoded,
+            is_encoded=self.output == "srgb8",
         )
         return FramePasses(strip, fragments)
 
@@ -229,16 +231,16 @@ class FrameRun:
     def _fill(self, psfs: NDArray[np.int64]) -> None:
         """Compute the missing PSFs of a frame, as one of its stages."""
         with self.timer.wall("psf_compute_ms"):
-            self._kept.handle.store.fill(psfs, until_s=self._until_s)
+            self._kept.handle.store.fill(psfs, until_s=self._request.until_s)
 
-    def room_of(self, plan: _Plan) -> NDArray | None:
+    def out_of(self, plan: _Plan) -> NDArray | None:
         """Return the output array if a strip's image is the whole image, else None."""
-        return None if plan.border_px or len(plan.strips) > 1 else self._room
+        return None if plan.border_px or len(plan.strips) > 1 else self._out
 
     @property
     def output(self) -> str:
         """Encoding of the output image."""
-        return self._options.output
+        return self._request.output
 
 
 class _StripRun:
@@ -252,7 +254,7 @@ class _StripRun:
     def begin(self) -> None:
         """Start the passes on the GPU and the readback of the image."""
         self._run(self.passes, expected=lambda: self._frame.expected(self.plan.state))
-        self.passes.begin_read(self._frame.output, self._room)
+        self.passes.begin_read(self._frame.output, self._out)
         self._is_begun = True
 
     def finish(self) -> NDArray:
@@ -264,12 +266,12 @@ class _StripRun:
             used = self.passes.fragments.used
             self.passes = self._frame.passes_of(self.plan, self.rows)
             self._run(self.passes, used=used)
-            picture = self.passes.read_back(self._frame.output, self._room)
+            picture = self.passes.read_back(self._frame.output, self._out)
         return picture
 
     @property
-    def _room(self) -> NDArray | None:
-        return self._frame.room_of(self.plan)
+    def _out(self) -> NDArray | None:
+        return self._frame.out_of(self.plan)
 
     def _run(self, passes: FramePasses, **options) -> None:
         image = self.plan.state.image

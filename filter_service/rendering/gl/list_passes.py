@@ -271,7 +271,7 @@ class ListPasses:
         return {**(SOFTWARE_SPLAT if software else HARDWARE_SPLAT), **self._rule}
 
     def counts(self) -> dict[str, int]:
-        """Return counts of `Rendered` by name."""
+        """Return counts of `FilteredView` by name."""
         return {
             "entry_count": self.lists.entry_count,
             "overflow_count": self.lists.overflow_count,

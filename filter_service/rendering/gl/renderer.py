@@ -1,8 +1,8 @@
 """The OpenGL frame engine: checks, stores on the GPU, start and result of frames."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,17 +11,13 @@ from filter_service.constants import STORE_SIDE
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.passes import Pages
 from filter_service.psfs.store import PsfStore
+from filter_service.rendering.engine import OneView, Pending, ViewRequest
 from filter_service.rendering.filtered_view import FilteredView, input_notes
-from filter_service.rendering.frame_options import (
-    FrameOptions,
-    frame_options,
-    picture_room,
-)
+from filter_service.rendering.frame_options import check_request, output_array
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.gl.eye_states import EyeStates
 from filter_service.rendering.gl.frame_run import FrameRun
 from filter_service.rendering.image_cells import image_cells
-from filter_service.rgbd_view import RgbdView
 
 FIRST_WORDS = 2**20
 """Initial size of a store's copy on the GPU, 2 MB; it grows by doubling."""
@@ -77,7 +73,7 @@ class GlStore(FrameStore):
         self.pages = None
 
 
-class FilterRenderer:
+class FilterRenderer(OneView):
     """Runs the passes on one view at a time; not thread-safe."""
 
     def __init__(self, gpu: Gpu):
@@ -105,77 +101,29 @@ class FilterRenderer:
         """Do nothing and return False: no frame occupies a GPU for long."""
         return False
 
-    def render(self, view: RgbdView, handle: GlStore, **options: Any) -> FilteredView:
-        """Filter one view through the eye of a loaded store; options as in `begin`."""
-        return self.begin(view, handle, **options)()
-
-    def begin(
-        self,
-        view: RgbdView,
-        handle: GlStore,
-        *,
-        pupil_diameter_mm: float,
-        focus_dpt: float,
-        accumulation: str = "coverage",
-        merge: bool = True,
-        render_tolerance: float = 1.0,
-        output: str = "linear",
-        gaze_deg: tuple[float, float] | None = None,
-        out: NDArray[Any] | None = None,
-        until_s: float | None = None,
-    ) -> Callable[[], FilteredView]:
-        """Start filtering a view; return a function that waits for the result.
-
-        Other views may be started in between, such as that of the other eye.
-
-        Parameters
-        ----------
-        gaze_deg : (h, v), optional
-            Gaze in the image, clamped to the prepared range with a note; the store's by
-            default.
-        render_tolerance : float
-            Errors of merging and layers relative to the default; 0 is exact.
-        out : array, optional
-            Output array of the shape and type of the image.
-        until_s : float, optional
-            Deadline on the clock of `time.monotonic`; no PSFs are computed after it.
+    def begin(self, request: ViewRequest) -> Pending:
+        """Start filtering a view; see `FrameEngine.begin`.
 
         Raises
         ------
-        BadMessage
-            Arrays or options are invalid.
-        CameraMismatch
-            The store is for another camera, see `camera.is_same_camera`.
-        NotPrepared
-            Some PSFs that the frame needs were not computed by ``until_s``; the
-            returned function may raise it, too.
         OutOfGpuMemory, RenderFailed
+            Besides those of `FrameEngine.begin`.
         """
-        options = frame_options(
-            view,
-            handle.store,
-            accumulation=accumulation,
-            merge=merge,
-            render_tolerance=render_tolerance,
-            output=output,
-            gaze_deg=gaze_deg,
-        )
+        gaze = check_request(request, request.handle.store)
         # Another library's context (that of the input's renderer) may be current.
         with self._gpu.context:
             run = FrameRun(
                 self._gpu,
-                self._kept.of(handle),
-                view,
-                options,
-                picture_room(view, options, out),
-                pupil_diameter_mm=pupil_diameter_mm,
-                focus_dpt=focus_dpt,
+                self._kept.of(request.handle),
+                replace(request, gaze_deg=gaze[0]),
+                output_array(request),
                 fill_depth=self._lacks_depth,
-                until_s=until_s,
             )
-        return partial(self._finish, run, options)
+        return partial(self._finish, run, *gaze)
 
-    def _finish(self, run: FrameRun, options: FrameOptions) -> FilteredView:
+    def _finish(
+        self, run: FrameRun, gaze_deg: tuple[float, float], gaze_notes: tuple[str, ...]
+    ) -> FilteredView:
         with self._gpu.context:
             picture, counts = run.finish()
             self._gpu.check("render")
@@ -188,12 +136,12 @@ class FilterRenderer:
             stage_times_ms=stages_ms,
             pupil_diameter_mm=layers.pupil_diameter_mm,
             focus_dpt=layers.focus_dpt,
-            gaze_deg=options.gaze_deg,
+            gaze_deg=gaze_deg,
             **counts,
             layer_count=len(layers.layer_dpt),
             notes=[
                 *layers.notes,
-                *options.gaze_notes,
+                *gaze_notes,
                 *input_notes(run.depth_m, *noted),
             ],
         )

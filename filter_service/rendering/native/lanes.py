@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 from filter_service.psfs.store import PsfStore
-from filter_service.rendering.filtered_view import FilteredView
+from filter_service.rendering.engine import OneView, Pending, ViewRequest
 from filter_service.rendering.native.native_store import NativeStore
 from filter_service.rendering.native.renderer import NativeRenderer
-from filter_service.rgbd_view import RgbdView
 
 
-class NativeLanes:
+class NativeLanes(OneView):
     """The native engine of a service; functions of `call_between` may reenter it.
 
     Everything runs in the caller's thread: while one renderer pauses, the other may
@@ -52,14 +50,12 @@ class NativeLanes:
         """Load a store; its kernels may all be computed later."""
         return self._other.load(store)
 
-    def render(
-        self, view: RgbdView, handle: NativeStore, **options: Any
-    ) -> FilteredView:
-        """Filter one view; see `NativeRenderer.render`."""
+    def begin(self, request: ViewRequest) -> Pending:
+        """Filter one view; see `FrameEngine.begin`."""
         if self._is_busy:
-            return self._other.render(view, handle, **options)
+            return self._other.begin(request)
         self._is_busy = True
         try:
-            return self._main.render(view, handle, **options)
+            return self._main.begin(request)
         finally:
             self._is_busy = False

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +15,11 @@ from filter_service.errors import RenderFailed
 from filter_service.native.library import Library, compiled_library
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.store import PsfStore
+from filter_service.rendering.engine import OneView, Pending, ViewRequest
 from filter_service.rendering.filtered_view import FilteredView, input_notes
 from filter_service.rendering.frame import border_px_of, extended, fill_missing_depth
 from filter_service.rendering.frame_kernels import Fill
-from filter_service.rendering.frame_options import (
-    FrameOptions,
-    frame_options,
-    picture_room,
-)
+from filter_service.rendering.frame_options import check_request, output_array
 from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
 from filter_service.rendering.native.arrays import Arrays
 from filter_service.rendering.native.eye_states import EyeState, EyeStates
@@ -31,10 +27,9 @@ from filter_service.rendering.native.frame_record import BlendSizes, FrameRecord
 from filter_service.rendering.native.kernel_plan import KernelPlan, plan_kernels
 from filter_service.rendering.native.native_store import NativeStore
 from filter_service.rendering.white_level import white_level
-from filter_service.rgbd_view import RgbdView
 
 
-class NativeRenderer:
+class NativeRenderer(OneView):
     """Runs the compiled loops on one view at a time; not thread-safe.
 
     The loops release Python's global interpreter lock.
@@ -106,83 +101,48 @@ class NativeRenderer:
         """Load a store; its kernels may all be computed later."""
         return NativeStore(store)
 
-    def render(
-        self,
-        view: RgbdView,
-        handle: NativeStore,
-        *,
-        pupil_diameter_mm: float,
-        focus_dpt: float,
-        accumulation: str = "coverage",
-        merge: bool = True,
-        render_tolerance: float = 1.0,
-        output: str = "linear",
-        gaze_deg: tuple[float, float] | None = None,
-        out: NDArray[Any] | None = None,
-        until_s: float | None = None,
-    ) -> FilteredView:
-        """Filter one view through the eye of a loaded store.
-
-        Parameters
-        ----------
-        gaze_deg : (h, v), optional
-            Gaze in the image, clamped to the prepared range with a note; the store's by
-            default.
-        render_tolerance : float
-            Errors of merging, coarse kernels and layers relative to the default; 0 is
-            exact.
-        out : array, optional
-            Output array of the shape and type of the image.
-        until_s : float, optional
-            Deadline on the clock of `time.monotonic`; no PSFs are computed after it.
+    def begin(self, request: ViewRequest) -> Pending:
+        """Filter one view; see `FrameEngine.begin`.
 
         Raises
         ------
-        BadMessage
-            Arrays or options are invalid.
-        CameraMismatch
-            The store is for another camera, see `camera.is_same_camera`.
-        NotPrepared
-            Some PSFs that the frame needs were not computed by ``until_s``.
         RenderFailed
-            Memory ran out.
+            Memory ran out; besides those of `FrameEngine.begin`.
         """
-        options = frame_options(
-            view,
-            handle.store,
-            accumulation=accumulation,
-            merge=merge,
-            render_tolerance=render_tolerance,
-            output=output,
-            gaze_deg=gaze_deg,
-        )
+        handle = request.handle
+        gaze_deg, gaze_notes = check_request(request, handle.store)
+        request = replace(request, gaze_deg=gaze_deg)
         timer = StageTimes(lambda: self._rested_s)
         kept = self._kept.of(handle)
         layers = kept.states.layers(
-            timer, handle, pupil_diameter_mm, focus_dpt, options.tolerance
+            timer,
+            handle,
+            request.pupil_diameter_mm,
+            request.focus_dpt,
+            request.options.render_tolerance,
         )
-        fill = partial(self._fill, timer, handle, until_s)
+        fill = partial(self._fill, timer, handle, request.until_s)
         cell_px = None
         while True:
-            image = kept.states.cells(timer, handle, options.gaze_deg, cell_px)
+            image = kept.states.cells(timer, handle, gaze_deg, cell_px)
             try:
-                return self._render(
-                    timer, view, kept, layers, image, options, out, fill
-                )
+                found = self._render(timer, request, kept, layers, image, fill)
+                notes = [*layers.notes, *gaze_notes, *found.notes]
+                found = replace(found, notes=notes)
+                return lambda: found
             except KernelsTooLarge:
                 cell_px = 2 * image.cell_px
 
     def _render(
         self,
         timer,
-        view,
+        request: ViewRequest,
         kept: EyeState,
         layers: FrameLayers,
         image,
-        options: FrameOptions,
-        out,
         fill: Fill,
     ) -> FilteredView:
+        view, options = request.view, request.options
         frame = FrameRecord.new(
             self._threads, self._n_threads, self._arrays, kept.arrays
         )
@@ -193,15 +153,15 @@ class NativeRenderer:
             frame.set_store(kept.handle)
         with timer.wall("merge_ms"):
             frame.set_merging(
-                tolerance=options.tolerance if options.merge else 0.0,
-                paper_rule=options.paper_rule,
+                tolerance=options.render_tolerance if options.merge else 0.0,
+                paper_rule=options.accumulation == "paper",
                 white_level=white_level(view.color),
-                is_encoded=options.is_encoded,
+                is_encoded=request.output == "srgb8",
             )
             self._loops.run("merge", frame.c)
         sizes = self._blend(timer, frame, plan, kept)
         with timer.wall("splat_ms"):
-            picture = picture_room(view, options, out)
+            picture = output_array(request)
             frame.set_picture(picture)
             self._loops.run("splat", frame.c)
         if frame.c.failed:
@@ -214,18 +174,14 @@ class NativeRenderer:
             bad_color_count=frame.c.bad_color_count,
             pupil_diameter_mm=layers.pupil_diameter_mm,
             focus_dpt=layers.focus_dpt,
-            gaze_deg=options.gaze_deg,
+            gaze_deg=request.gaze_deg,
             fragment_count=frame.c.fragment_count,
             merged_count=frame.c.merged_count,
             entry_count=frame.c.entry_count,
             kernel_count=plan.kernels.count,
             kernel_texel_count=sizes.kernel_texels,
             layer_count=len(layers.layer_dpt),
-            notes=[
-                *layers.notes,
-                *options.gaze_notes,
-                *input_notes(view.depth_m, missing_count, frame.c.bad_color_count),
-            ],
+            notes=input_notes(view.depth_m, missing_count, frame.c.bad_color_count),
         )
 
     def _pixels(
