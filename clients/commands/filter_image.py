@@ -406,8 +406,6 @@ def _summary(
     object_dpt: tuple[float, float],
     whole_ms: float,
 ) -> dict:
-    from filter_service.rendering.filtered_view import summed_counts
-
     seen = filtered.seen
     height_px, width_px = seen.color.shape[:2]
     render_ms = sum(seen.stage_times_ms.values())
@@ -418,7 +416,7 @@ def _summary(
         "profile": eye.name,
         "pupil_diameter_mm": seen.pupil_diameter_mm,
         "focus_dpt": seen.focus_dpt,
-        **summed_counts([seen]),
+        **seen.counts,
         "start_ms": filtered.start_ms,
         "build_ms": whole_ms - filtered.start_ms - render_ms,
         "render_ms": render_ms,

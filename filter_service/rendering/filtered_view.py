@@ -28,6 +28,11 @@ class FrameCounts:
     bad_color_count: int
     overflow_count: int = 0
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Return the counts by name."""
+        return summed_counts([self])
+
 
 def summed_counts(counts: Sequence[FrameCounts]) -> dict[str, int]:
     """Return the sums of counts by name."""

@@ -22,7 +22,6 @@ from filter_service.messages import (
     Result,
     ResultView,
 )
-from filter_service.rendering.filtered_view import summed_counts
 from filter_service.wire.images import OUTPUT_OF_FORMAT
 
 MS_PER_S = 1000.0
@@ -82,9 +81,7 @@ def _result(frame: Frame, seen: Filtered, total_ms: float) -> Result:
     stages_ms = dict(seen.stage_times_ms)
     stages_ms["filter_other_ms"] = total_ms - sum(stages_ms.values())
     sent = {field.name for field in fields(Result)}
-    counts: dict[str, Any] = {
-        name: count for name, count in summed_counts([seen]).items() if name in sent
-    }
+    counts: dict[str, Any] = {n: c for n, c in seen.counts.items() if n in sent}
     return Result(
         frame_id=frame.frame_id,
         profile_id=seen.profile_id,

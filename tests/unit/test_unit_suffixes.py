@@ -28,7 +28,6 @@ DIMENSIONLESS = {
     "uv": "texture position, 0 to 1",
     "srgb": "encoded light, 0 to 1",
     "background_srgb": "encoded light, 0 to 1",
-    "render_tolerance": "errors over the usual ones",
     "defocus_error": "mean square, of a white of 1",
     "near": "a pupil in mm and a focus in dpt",
     "render_tolerance": "errors over the usual ones",
