@@ -144,6 +144,6 @@ class LiveWindow:
             glfw.terminate()
 
 
-def _close_on_escape(window, key, scancode, action, mods) -> None:
+def _close_on_escape(window, key, _scancode, action, _mods) -> None:
     if key == glfw.KEY_ESCAPE and action == glfw.PRESS:
         glfw.set_window_should_close(window, True)

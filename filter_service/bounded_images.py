@@ -188,7 +188,7 @@ def _opened_picture(
         warnings.simplefilter("ignore")  # about sizes, which are checked here
         try:
             file = (
-                io.BytesIO(source) if isinstance(source, bytes) else open(source, "rb")
+                io.BytesIO(source) if isinstance(source, bytes) else open(source, "rb")  # noqa: SIM115
             )
             with file:
                 _check_container(file)

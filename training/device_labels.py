@@ -39,14 +39,14 @@ def label_on_device(
     return targets.cpu().numpy()
 
 
-def _on_axis(columns: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
+def _on_axis(columns: Tensor, _domain: Domain) -> tuple[Tensor, Tensor]:
     zernike_um, is_traced = zernike_of_eyes(
         columns[:, :N_EYE], columns[:, N_EYE], columns[:, N_EYE + 1]
     )
     return zernike_um[:, 1:], is_traced
 
 
-def _field(columns: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
+def _field(columns: Tensor, _domain: Domain) -> tuple[Tensor, Tensor]:
     found = field_aberrations_of_eyes(columns[:, :N_EYE], *columns[:, N_EYE:].T)
     parts = (
         found.zernike_um[:, 1:],
@@ -66,7 +66,7 @@ def _focus(columns: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
     return targets, torch.all(torch.isfinite(targets), dim=1)
 
 
-def _lens(columns: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
+def _lens(columns: Tensor, _domain: Domain) -> tuple[Tensor, Tensor]:
     eyes, pupil_mm = columns[:, :N_EYE], columns[:, N_EYE]
     widest, least = LENS_ROOM.ravel().tolist()
     widest_mm = widest * eyes[:, DIAMETER]

@@ -64,7 +64,9 @@ app.command()(doctor)
 @app.callback(invoke_without_command=True)
 def _root(
     context: typer.Context,
-    traceback: bool = typer.Option(False, help="Show where an error came from."),
+    traceback: bool = typer.Option(  # noqa: ARG001  (`_exit_code` reads it)
+        False, help="Show where an error came from."
+    ),
 ) -> None:
     if context.invoked_subcommand is None:
         sys.stdout.write(context.get_help() + "\n")

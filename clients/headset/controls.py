@@ -48,7 +48,7 @@ class Controls:
     is_on: bool = True
     is_split: bool = False
     is_over: bool = False
-    _numbers: dict[Eye, int] = field(default_factory=lambda: {e: -1 for e in EYES})
+    _numbers: dict[Eye, int] = field(default_factory=lambda: dict.fromkeys(EYES, -1))
 
     def press(self, keys: str, buttons: Sequence[str] = ()) -> None:
         """Handle pressed keys and controller buttons."""

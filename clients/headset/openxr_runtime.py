@@ -316,10 +316,9 @@ class OpenXrRuntime:
     def close(self) -> None:
         """End the session in the order that OpenXR requires, if it still exists."""
         if self._is_running and not self._is_over:
-            try:
+            # The session may be gone already.
+            with suppress(xr.XrException, SessionLost, SessionEnded):
                 self._leave()
-            except (xr.XrException, SessionLost, SessionEnded):
-                pass  # the session is gone already
         self._is_running = False
         self._closing.close()
 

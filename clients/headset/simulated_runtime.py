@@ -40,7 +40,7 @@ def swaying(at_s: float) -> Pose:
     return (side_m, EYE_LEVEL_M, 0.0, *turned(yaw_deg, pitch_deg))
 
 
-def still(at_s: float) -> Pose:
+def still(_at_s: float) -> Pose:
     """Return a head pose that does not move."""
     return (0.0, EYE_LEVEL_M, 0.0, 0.0, 0.0, 0.0, 1.0)
 

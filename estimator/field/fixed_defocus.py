@@ -86,7 +86,7 @@ class _Grid:
         whole = values.values
         sums, rims = sums_by_degree(whole[..., :N_TERMS]), whole[..., N_TERMS:]
         self._values = np.ascontiguousarray(np.concatenate([sums, rims], axis=-1))
-        of_degree = [float(POWER[:N_TERMS][DEGREE == degree][0]) for degree in DEGREES]
+        of_degree = [float(POWER[:N_TERMS][degree == DEGREE][0]) for degree in DEGREES]
         self._powers = np.array([*of_degree, *POWER[N_TERMS:]])
 
     def used_at(self, accommodation_dpt: float) -> tuple:
@@ -100,5 +100,5 @@ class _Grid:
 def sums_by_degree(polynomial_um: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the C(2,0) on a 1 mm circle from monomials (..., 28), by degree."""
     share = np.linalg.inv(monomial_matrix())[:, C20] * polynomial_um
-    sums = [share[..., DEGREE == degree].sum(axis=-1) for degree in DEGREES]
+    sums = [share[..., degree == DEGREE].sum(axis=-1) for degree in DEGREES]
     return np.stack(sums, axis=-1)

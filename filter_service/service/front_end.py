@@ -170,7 +170,8 @@ class FrontEnd:
         """Handle the supervisor's messages; return whether to go on."""
         with self._descriptors.reserve():  # may receive links to new processes
             messages = self._supervisor.receive()
-        return all([self.take_control(*message) for message in messages])
+        # A list: every message is handled, whatever the first ones return.
+        return all([self.take_control(*message) for message in messages])  # noqa: C419
 
     def take_control(self, message: tuple[Any, ...], descriptors: list[int]) -> bool:
         """Handle a message of the supervisor; return whether to go on."""

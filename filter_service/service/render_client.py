@@ -6,6 +6,7 @@ lost; the front end sends their content again to the next one.
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -152,10 +153,8 @@ class RenderClient:
     def tell(self, *message: Any) -> None:
         """Send a message; ignores a closed link, which `receive` reports."""
         if self._link is not None:
-            try:
+            with contextlib.suppress(LinkClosed):
                 self._link.send(message)
-            except LinkClosed:
-                pass
 
     # Memory
 

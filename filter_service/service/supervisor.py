@@ -213,10 +213,8 @@ class Supervisor:
                 if process.link is not None:
                     selector.register(process.link, selectors.EVENT_READ)
             selector.select(self._wait_s())
-        try:
+        with suppress(BlockingIOError):
             self._wake_reader.recv(4096)
-        except BlockingIOError:
-            pass
         if self._is_to_read_again:
             self._is_to_read_again = False
             self._change_settings()

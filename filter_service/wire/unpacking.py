@@ -166,7 +166,7 @@ def _unique_keys(pairs: list[tuple[object, object]]) -> dict[str, object]:
     return result
 
 
-def _refuse_extension(code: int, data: bytes) -> object:
+def _refuse_extension(code: int, _data: bytes) -> object:
     raise ValueError(f"extension type {code} is not used here")
 
 

@@ -108,7 +108,8 @@ def test_a_stimulus_shows_what_the_eye_sees(seen_stim, color, tmp_path):
     stimulus.setEye(pupilDiameter=5.0, focus=1.0)
     shown.append(stimulus.image)
     for image in shown:
-        assert image.min() >= -1.0 and image.max() <= 1.0
+        assert image.min() >= -1.0
+        assert image.max() <= 1.0
     blurs = [np.abs(np.diff(image, axis=1)).mean() for image in shown]
     assert blurs[1] < blurs[0], "a wider pupil blurs more"
     # PsychoPy draws the first row at the bottom.
@@ -178,7 +179,8 @@ def test_a_virtual_camera_is_sent_what_the_eye_sees(monkeypatch, video, color):
 
     camera_program(monkeypatch, Device, video, "--fov-deg", 10, "--frames", 3)
     assert len(sent) == 3  # the one frame of the video, again and again
-    assert sent[0].shape == color.shape and sent[0].dtype == np.uint8
+    assert sent[0].shape == color.shape
+    assert sent[0].dtype == np.uint8
     assert sent[0].std() < 0.9 * color.std(), "it is blurred"
     np.testing.assert_array_equal(sent[1], sent[0])
 

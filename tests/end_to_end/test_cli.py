@@ -76,14 +76,17 @@ IDENTITY = ("--no-diffraction", "--no-chromatic", "--pupil-mm", "3", *PLAIN)
 
 def test_doctor_reports_a_machine_that_can_serve():
     report = run_json("doctor")
-    assert report["ok"] and report["works"]["serve"]
+    assert report["ok"]
+    assert report["works"]["serve"]
     assert report["threading_layer"] in ("omp", "tbb")
     assert report["gl"]["renderer"]
     assert report["gl"]["limits"]["GL_MAX_COMPUTE_WORK_GROUP_INVOCATIONS"] >= 64
     works = [d for d in report["gl"]["devices"] if d["error"] is None]
     assert report["gl"]["renderer"] in [device["renderer"] for device in works]
     checks = {check["name"]: check["ok"] for check in report["checks"]}
-    assert checks["compute"] and checks["shaders"] and checks["networks"]
+    assert checks["compute"]
+    assert checks["shaders"]
+    assert checks["networks"]
     assert set(report["networks"]) == set(NETWORK_NAMES)
     assert all(card["n_parameters"] > 0 for card in report["networks"].values())
 
@@ -92,7 +95,8 @@ def test_doctor_without_opengl_says_that_the_service_works_and_the_demo_does_not
     finished = run("doctor", "--json", **NO_OPENGL)
     assert finished.returncode == 0
     report = json.loads(finished.stdout)
-    assert report["works"]["serve"] and not report["works"]["demo"]
+    assert report["works"]["serve"]
+    assert not report["works"]["demo"]
     engine = next(check for check in report["checks"] if check["name"] == "engine")
     assert engine["detail"].startswith("native: no OpenGL")
     assert any("apt-get install" in command for command in report["install"])
@@ -134,7 +138,8 @@ def test_an_unaberrated_eye_gives_the_image_back(scene):
     assert filtered.dtype == np.float32
     assert psnr_db(filtered, linear) >= 60.0
     assert summary["missing_depth_count"] == 0
-    assert summary["width_px"] == WIDTH_PX and summary["height_px"] == HEIGHT_PX
+    assert summary["width_px"] == WIDTH_PX
+    assert summary["height_px"] == HEIGHT_PX
 
 
 def test_exr_and_npy_outputs_hold_the_same_linear_light(scene):
@@ -405,7 +410,9 @@ def test_bad_options_end_with_one_line_that_names_them(scene, extra, named):
 def test_depth_of_another_size_is_refused_with_both_sizes(scene):
     np.save(scene[0] / "depth.npy", np.ones((4, 6), np.float32))
     line = refusal(*filter_arguments(scene[0]))
-    assert "--depth" in line and "6x4" in line and f"{WIDTH_PX}x{HEIGHT_PX}" in line
+    assert "--depth" in line
+    assert "6x4" in line
+    assert f"{WIDTH_PX}x{HEIGHT_PX}" in line
 
 
 def test_a_hidden_layer_is_seen_around_a_blurred_edge(scene):
@@ -556,7 +563,8 @@ def test_benchmarks_say_that_they_need_a_checkout(tmp_path):
         timeout=TIMEOUT_S,
     )
     assert finished.returncode == 1
-    assert finished.stderr.count("\n") == 1 and "checkout" in finished.stderr
+    assert finished.stderr.count("\n") == 1
+    assert "checkout" in finished.stderr
 
 
 def test_help_without_arguments_teaches_the_commands():

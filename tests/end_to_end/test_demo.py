@@ -116,7 +116,8 @@ def test_demo_reports_a_service_that_does_not_start(monkeypatch, capsys, tmp_pat
     monkeypatch.setattr(demo, "ServiceProcess", broken)
     assert demo.main(["--out", str(tmp_path), "--frames", "1"]) == 1
     error = capsys.readouterr().err
-    assert "code 3" in error and "no GL here" in error
+    assert "code 3" in error
+    assert "no GL here" in error
 
 
 def test_demo_reports_a_service_that_dies_on_the_way(monkeypatch, capsys, tmp_path):
@@ -152,7 +153,8 @@ def test_gif_stands_in_where_the_encoder_fails(encoder, monkeypatch, tmp_path):
     written = video.write_video(tmp_path / "film", lambda: iter(shades), 10)
     assert written == tmp_path / "film.gif"
     with Image.open(written) as gif:
-        assert gif.n_frames == 3 and gif.size == (40, 20)
+        assert gif.n_frames == 3
+        assert gif.size == (40, 20)
         gif.seek(2)
         assert np.asarray(gif.convert("RGB")).mean() == pytest.approx(250, abs=3)
 
@@ -193,9 +195,11 @@ def test_percentiles_of_a_known_series():
 def test_settings_cover_the_whole_path():
     settings = path_settings("courtyard", "primitives")
     low, high = settings["pupil_range_mm"]
-    assert low <= 3.0 and high >= 4.95
+    assert low <= 3.0
+    assert high >= 4.95
     low, high = settings["focus_range_dpt"]
-    assert low <= 1 / 14 and high >= 4.0
+    assert low <= 1 / 14
+    assert high >= 4.0
 
 
 def test_the_gaze_goes_round_the_image_as_far_as_was_asked(monkeypatch, capsys):
@@ -217,9 +221,8 @@ def test_the_gaze_goes_round_the_image_as_far_as_was_asked(monkeypatch, capsys):
         assert pyrender_stream.main([*arguments, "--look-around", "20"]) == 0
         assert pyrender_stream.main([*arguments, "--look-around", "31"]) == 2
     assert asked[0] == (0.0, 10.0)
-    assert len(asked) == 4 and all(
-        np.hypot(h, 2 * v) == pytest.approx(20) for h, v in asked
-    )
+    assert len(asked) == 4
+    assert all(np.hypot(h, 2 * v) == pytest.approx(20) for h, v in asked)
     assert "0 to 30" in capsys.readouterr().err
 
 

@@ -38,7 +38,8 @@ def test_plot_is_a_picture_with_a_report(tmp_path):
     path = tmp_path / "eye.png"
     finished = run("estimate", "myopia", "--plot", path)
     assert finished.returncode == 0, finished.stderr
-    assert "eye_length_mm" in finished.stdout and "refraction -6" in finished.stdout
+    assert "eye_length_mm" in finished.stdout
+    assert "refraction -6" in finished.stdout
     pixels = np.asarray(Image.open(path).convert("RGB"))
     assert min(pixels.shape[:2]) > 300
     assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 10

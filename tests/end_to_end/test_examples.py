@@ -63,7 +63,8 @@ def test_an_aberrometers_file_gives_points_and_a_curve(run, capsys):
     page = run("02_aberrometer_to_field")
     assert page.std() > 50.0
     said = capsys.readouterr().out
-    assert re.search(r"eye of 2\d\.\d mm", said) and "periphery: " in said
+    assert re.search(r"eye of 2\d\.\d mm", said)
+    assert "periphery: " in said
 
 
 def test_of_three_cards_the_one_looked_at_is_sharp(run):
@@ -109,7 +110,8 @@ def test_the_data_set_has_its_labels(run, tmp_path):
 def test_every_example_is_on_the_page_with_its_picture():
     named = re.findall(r"\[`(\d\d_\w+\.(?:py|ipynb))`\]\(\1\)", PAGE)
     files = sorted(p.name for p in EXAMPLES.glob("[0-9]*"))
-    assert named == files and len(SCRIPTS) == 7
+    assert named == files
+    assert len(SCRIPTS) == 7
     for name in files:
         assert f"](pictures/{Path(name).stem}.jpg)" in PAGE
     pictures = list((EXAMPLES / "pictures").glob("*.jpg"))

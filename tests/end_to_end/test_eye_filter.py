@@ -267,7 +267,8 @@ def test_psfs_of_the_eye_used_longest_ago_are_evicted(rng):
         assert stored.generation == 0
         own._limits = BuildLimits(max_stores_mb=0.5 * own.stores_mb)
         second.advance()
-        assert stored.generation == 1 and stored.memory_mb < 0.5 * own.stores_mb
+        assert stored.generation == 1
+        assert stored.memory_mb < 0.5 * own.stores_mb
         np.testing.assert_array_equal(first.filter(color, depth_m, **SEE).color, before)
     own.close()
 
@@ -328,12 +329,14 @@ def test_a_frame_stops_computing_psfs_when_its_time_is_over(rng):
         eye_filter.wait()
         state = {"pupil_diameter_mm": 6.0, "focus_dpt": 1.0}
         seen = eye_filter.try_filter([view], **state, until_s=time.monotonic())
-        assert seen is None and eye_filter.is_extending
+        assert seen is None
+        assert eye_filter.is_extending
         n_tries, end_s = 0, time.monotonic() + 60.0
         while seen is None and time.monotonic() < end_s:
             n_tries += 1
             seen = eye_filter.try_filter([view], **state, until_s=time.monotonic())
-        assert seen is not None and not eye_filter.is_extending
+        assert seen is not None
+        assert not eye_filter.is_extending
         whole = eye_filter.filter(view, **state)
     np.testing.assert_array_equal(seen.color, whole.color)
 

@@ -175,7 +175,8 @@ def test_path_moves_everything_smoothly(name):
     assert np.abs(turns.swapaxes(1, 2) @ turns - np.eye(3)).max() < 1e-12
     steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     assert 0 < steps_m.max() < 0.02
-    assert np.ptp(pupils_mm) > 1 and np.ptp(foci_dpt) > 1
+    assert np.ptp(pupils_mm) > 1
+    assert np.ptp(foci_dpt) > 1
     assert foci_dpt.min() >= 0
     assert np.abs(np.diff(foci_dpt)).max() < 0.6
 
@@ -223,7 +224,8 @@ def test_baked_sun_and_sky_are_shadowed_by_what_is_above():
     side = h / np.hypot(1, h)
     hidden = 4 * (2 / (2 * np.pi)) * side * np.arctan(side)
     assert below == pytest.approx((1 - hidden) * sky, rel=0.1)
-    assert (beside > 0.85 * (sun + sky)).all() and (beside <= sun + sky + 1e-6).all()
+    assert (beside > 0.85 * (sun + sky)).all()
+    assert (beside <= sun + sky + 1e-6).all()
 
 
 def test_sphere_normals_point_outwards():

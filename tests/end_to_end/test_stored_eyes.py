@@ -67,7 +67,8 @@ def built(folder, view):
 def test_every_frame_shows_one_of_the_two_eyes(built):
     events, last = built
     (ready,) = [e for e in events if isinstance(e, Ready)]
-    assert ready.is_complete and ready.psf_count > 0
+    assert ready.is_complete
+    assert ready.psf_count > 0
     assert not [e for e in events if isinstance(e, Dropped)]
     frames = [e for e in events if isinstance(e, FilteredFrame)]
     assert all(frame.header.is_complete for frame in frames)

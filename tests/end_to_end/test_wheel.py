@@ -229,11 +229,15 @@ def test_what_is_imported_is_the_wheel_s(installed):
 
 def test_doctor_finds_a_machine_that_can_serve(run_json):
     report = run_json("doctor")
-    assert report["ok"] and report["works"]["serve"]
+    assert report["ok"]
+    assert report["works"]["serve"]
     checks = {check["name"]: check["ok"] for check in report["checks"]}
-    assert checks["shaders"] and checks["native"] and checks["networks"]
+    assert checks["shaders"]
+    assert checks["native"]
+    assert checks["networks"]
     fixes = " ".join(report["install"])
-    assert "setup.sh" not in fixes and "git" not in fixes
+    assert "setup.sh" not in fixes
+    assert "git" not in fixes
 
 
 @pytest.fixture
@@ -268,7 +272,8 @@ def test_serve_answers_a_client(installed):
     finished = start(installed, installed.python, "-c", CLIENT, *serve)
     assert finished.returncode == 0, finished.stderr
     seen = json.loads(finished.stdout)
-    assert seen["shape"] == [36, 64, 3] and seen["code"] == 0
+    assert seen["shape"] == [36, 64, 3]
+    assert seen["code"] == 0
     assert 128 < seen["row"][32] < 255  # the edge is blurred
 
 
@@ -297,7 +302,8 @@ def test_a_benchmark_of_the_tests_needs_a_checkout(installed):
 
 def test_the_demo_is_there(run):
     finished = run("demo", "--help")
-    assert finished.returncode == 0 and "--frames" in finished.stdout
+    assert finished.returncode == 0
+    assert "--frames" in finished.stdout
 
 
 EXTRAS = (

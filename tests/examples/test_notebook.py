@@ -40,4 +40,5 @@ def test_the_notebook_runs_and_makes_its_pictures(folder, path):
     with Image.open(folder / "out" / "examples" / f"{path.stem}.png") as picture:
         assert min(picture.size) > 200
     imported = notebook.cells[1].source
-    assert "estimator" in imported and "filter_service" in imported
+    assert "estimator" in imported
+    assert "filter_service" in imported

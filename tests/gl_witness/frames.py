@@ -78,7 +78,7 @@ def save_views(path: Path, *, width_px: int, height_px: int) -> None:
 def load_views(path: Path) -> dict[str, RgbdView]:
     """Views that `save_views` wrote, by scene."""
     with np.load(path) as data:
-        parts = {name: dict() for name in SCENES}
+        parts = {name: {} for name in SCENES}
         for key in data.files:
             name, part = key.split()
             parts[name][part] = data[key]

@@ -48,7 +48,8 @@ def test_no_program_is_compiled_by_the_first_frames(rng):
     )
     color = texture(rng, 64, 96)
     loops = compiled_loops()
-    assert loops and all(loops.values())
+    assert loops
+    assert all(loops.values())
     for dtype in (np.uint8, np.float32, np.float16):
         view = bench.view(color.astype(dtype), 1.0)
         for accumulation in ("coverage", "paper"):

@@ -36,7 +36,8 @@ def test_the_steady_pupil_shrinks_with_light_and_age_and_stays_human():
     for age_years in (20, 45, 83):
         sizes_mm = [steady_pupil_mm(light, 2800, age_years) for light in lights]
         assert np.all(np.diff(sizes_mm) < 0)
-        assert 1.5 < min(sizes_mm) and max(sizes_mm) < 8.0
+        assert min(sizes_mm) > 1.5
+        assert max(sizes_mm) < 8.0
     assert steady_pupil_mm(1, 2800, 20) > steady_pupil_mm(1, 2800, 70)
     assert steady_pupil_mm(1, 2800, 30, n_eyes=1) > steady_pupil_mm(1, 2800, 30)
     assert steady_pupil_mm(1, 2800, 5) == steady_pupil_mm(1, 2800, 20)
@@ -155,7 +156,8 @@ def test_the_pupil_waits_less_in_more_light():
     lights = (0.1, 1.0, 10.0, 100.0)
     latencies_s = [reflex_latency_s(light) for light in lights]
     np.testing.assert_allclose(np.diff(latencies_s), -0.034, atol=1e-12)
-    assert 0.2 <= min(latencies_s) and max(latencies_s) <= 0.31
+    assert min(latencies_s) >= 0.2
+    assert max(latencies_s) <= 0.31
     assert reflex_latency_s(0.0) == LATENCY_RANGE_S[1]
 
 

@@ -54,7 +54,8 @@ def test_every_condition_is_met_below_the_stated_error(name):
     found = estimate_eye(profile)
     assert found.mean_abs_error_um <= PRESET_LIMIT_UM
     unusual = [note for note in found.notes if note.startswith("unusual")]
-    assert list(found.notes) == unusual and bool(unusual) == (name == "cataract")
+    assert list(found.notes) == unusual
+    assert bool(unusual) == (name == "cataract")
     vector = found.parameters.to_vector()
     low, high = allowed_ranges().T
     assert np.all((vector >= low) & (vector <= high))

@@ -28,7 +28,8 @@ def test_states_come_nearer_within_the_range_and_none_comes_twice(engine):
         )
         assert (pupils[-1], foci[-1]) == (pupil_mm, focus_dpt)
         for values, (low, high) in zip((pupils, foci), WIDE.values(), strict=True):
-            assert low <= values.min() and values.max() <= high
+            assert low <= values.min()
+            assert values.max() <= high
             assert np.all(np.diff(np.abs(values - values[-1])) < 0.0)
             assert np.abs(values - values[-1]).max() <= CHANGE
 
@@ -59,4 +60,5 @@ def test_kernels_are_made_anew_for_every_frame_but_frozen_ones(engine, rng, rang
         alone = bench.render(view, **STATE)
         assert np.array_equal(run.last.color, alone.color)
         assert run.last.pupil_diameter_mm == STATE["pupil_diameter_mm"]
-    assert all(blends[False]) and not any(blends[True])
+    assert all(blends[False])
+    assert not any(blends[True])

@@ -79,7 +79,8 @@ def test_hard_eyes_are_finite_and_smooth_through_sweeps(rng, name):
                 view, handle, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt
             )
             assert np.isfinite(seen.color).all()
-            assert seen.color.min() >= -1e-6 and seen.color.max() <= 1.0 + 1e-3
+            assert seen.color.min() >= -1e-6
+            assert seen.color.max() <= 1.0 + 1e-3
             pictures.append(seen.color.astype(np.float64))
         steps = np.array(
             [np.sqrt(np.mean((b - a) ** 2)) for a, b in pairwise(pictures)]

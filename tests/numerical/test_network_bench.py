@@ -143,12 +143,14 @@ def test_nodes_outside_of_the_training_are_counted(monkeypatch, few_nodes, vecto
     put_in_place(monkeypatch, aberration(ranges={"h_deg": (-30.0, 30.0)}))
     some, *_ = network_steps.aberration_rows("off-axis", "myopia", vector, repeats=2)
     assert (some.n_nodes, some.n_outside, some.error_name) == (6, 6, "mean_abs_um")
-    assert "h_deg -45" in some.setting and some.error < 1e-6
+    assert "h_deg -45" in some.setting
+    assert some.error < 1e-6
     put_in_place(monkeypatch, aberration(ranges={"eye_length_mm": (30.0, 31.0)}))
     rows = network_steps.aberration_rows("off-axis", "myopia", vector, repeats=2)
     none = rows[0]
     assert (none.n_nodes, none.error_name, none.error) == (0, "n_outside", 12.0)
-    assert none.median_ms == 0.0 and "eye_length_mm" in none.setting
+    assert none.median_ms == 0.0
+    assert "eye_length_mm" in none.setting
 
 
 def row(step, method, case, *, ms, error, n_nodes=10, **more):
@@ -211,7 +213,8 @@ def test_a_refinement_that_ends_badly_or_not_at_all_has_failed():
 def test_tables_and_plot_show_every_method(capsys, tmp_path):
     print_all(ROWS)
     text = capsys.readouterr().out
-    assert "Ryzen 7 1700" in text and "n_outside" in text
+    assert "Ryzen 7 1700" in text
+    assert "n_outside" in text
     plot_steps(ROWS, tmp_path / "networks.png")
     with Image.open(tmp_path / "networks.png") as picture:
         assert picture.size[0] > 300

@@ -228,7 +228,8 @@ def test_arguments_broadcast_and_a_single_eye_has_a_single_answer():
     one = network_aberrations(
         vector, pupil_diameter_mm=pupils_mm[2], h_deg=-2.0, **state
     )
-    assert one.zernike_um.shape == (28,) and one.zernike_radius_mm.shape == ()
+    assert one.zernike_um.shape == (28,)
+    assert one.zernike_radius_mm.shape == ()
     np.testing.assert_allclose(one.zernike_um, found.zernike_um[2, 0], atol=1e-4)
 
 
@@ -273,7 +274,8 @@ def test_of_several_measurements_the_axial_one_is_asked_of():
     )
     np.testing.assert_allclose(network_guess(several), network_guess(profile))
     found = estimate_eye(several, method="network")
-    assert found.method == "network" and found.mean_abs_error_um > 0.01
+    assert found.method == "network"
+    assert found.mean_abs_error_um > 0.01
 
 
 def test_refined_eyes_do_not_depend_on_where_they_start(rng):
@@ -308,7 +310,8 @@ def test_a_wavefront_out_of_the_domain_is_refined_with_a_note():
     )
     found = estimate_eye(profile, method="network")
     exact = estimate_eye(profile, starts=("table",))
-    assert found.method == "refined" and found.start == "table"
+    assert found.method == "refined"
+    assert found.start == "table"
     assert "pupil_diameter_mm" in found.notes[0]
     np.testing.assert_array_equal(
         found.parameters.to_vector(), exact.parameters.to_vector()
@@ -322,7 +325,8 @@ def test_without_weights_a_refined_eye_starts_at_the_table(monkeypatch):
     monkeypatch.setattr(networks, "load_network", missing)
     profile = parse_profile({"kind": "preset", "name": "myopia"})
     found = estimate_eye(profile, starts=("table", "network"))
-    assert found.start == "table" and "missing" in found.network_reason
+    assert found.start == "table"
+    assert "missing" in found.network_reason
     with pytest.raises(WeightsMissing):
         estimate_eye(profile, method="network")
 

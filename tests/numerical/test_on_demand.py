@@ -378,7 +378,8 @@ def test_a_plan_without_time_asks_for_what_it_lacks(known):
         store.fill(psfs)
 
     frame_kernels(store, layers, image, used, fill=fill)
-    assert len(asked) == 1 and asked[0].size == store.computed_count
+    assert len(asked) == 1
+    assert asked[0].size == store.computed_count
     frame_kernels(store, layers, image, used, fill=fill)
     assert len(asked) == 1
 
@@ -393,7 +394,8 @@ def test_what_a_computation_refuses_is_an_error_of_the_service(known, monkeypatc
     monkeypatch.setattr(compute_kernels, "computed_kernels", fail)
     with pytest.raises(BuildFailed, match="no light within 7 px") as caught:
         store.fill(np.arange(4))
-    assert caught.value.field == "settings" and caught.value.allowed
+    assert caught.value.field == "settings"
+    assert caught.value.allowed
     assert store.computed_count == 0
 
 

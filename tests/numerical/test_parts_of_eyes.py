@@ -60,7 +60,8 @@ def drawn(store, view, *, pupil_mm, focus_dpt):
         render_tolerance=0.0,
     )
     assert found.pupil_diameter_mm == pytest.approx(pupil_mm)
-    assert not found.notes and not found.clamped_depth_count
+    assert not found.notes
+    assert not found.clamped_depth_count
     return found.color[INNER]
 
 

@@ -44,7 +44,7 @@ def relative_refraction_dpt(name, retina):
 
 
 def at(angle_deg, relative_dpt):
-    return relative_dpt[np.flatnonzero(ANGLES_DEG == angle_deg)[0]]
+    return relative_dpt[np.flatnonzero(angle_deg == ANGLES_DEG)[0]]
 
 
 def test_a_prolate_retina_makes_a_myope_relatively_hyperopic():

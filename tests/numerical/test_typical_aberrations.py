@@ -108,7 +108,8 @@ def test_ages_without_figures_are_as_those_at_the_ends():
 def test_through_4_mm_the_refraction_is_the_prescription(body, age_years):
     given = profile(**body, age_years=age_years)
     typical = with_typical_aberrations(given)
-    assert typical.pupil_diameter_mm == 6.0 and typical.wavelength_nm == 555.0
+    assert typical.pupil_diameter_mm == 6.0
+    assert typical.wavelength_nm == 555.0
     ours, theirs = (
         rx.power_vector_from_zernike(
             rescale_pupil(eye.zernike_um, radius_ratio=4.0 / eye.pupil_diameter_mm),
@@ -169,7 +170,8 @@ def test_the_reply_says_it_with_its_size_and_how_to_switch_it_off():
     few = {"pupil_diameters_mm": (4.0,), "wavelengths_nm": (555.0,)}
     _, said = prepare_eye(profile(age_years=60), **few)
     (note,) = [note for note in said if NOTE in note]
-    assert "60 years of age" in note and "RMS 0.31 um at 6 mm" in note
+    assert "60 years of age" in note
+    assert "RMS 0.31 um at 6 mm" in note
     assert '"higher_order": "none"' in note
     assert "young adult" in typical_note(profile())
     assert len(typical_note(profile(age_years=33.25))) < 200  # a part of a header

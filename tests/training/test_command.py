@@ -22,7 +22,8 @@ def test_a_wrong_run_file_is_one_line_and_exit_code_2(command, tmp_path, capsys)
     assert command.main([str(file)]) == 2
     said = capsys.readouterr().err
     name = command.__name__.removeprefix("training.")
-    assert said.startswith(f"{name}: ") and said.count("\n") == 1
+    assert said.startswith(f"{name}: ")
+    assert said.count("\n") == 1
     assert "guess" in said
 
 

@@ -11,7 +11,8 @@ def test_copies_are_writable_and_contiguous(shape):
     values = np.arange(np.prod(shape), dtype=np.float64).reshape(shape)
     copy = broadcast_copy(values, (3, 2))
     np.testing.assert_array_equal(copy, np.broadcast_to(values, (3, 2)))
-    assert copy.flags.writeable and copy.flags.c_contiguous
+    assert copy.flags.writeable
+    assert copy.flags.c_contiguous
     assert not np.shares_memory(copy, values)
 
 

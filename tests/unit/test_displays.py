@@ -106,7 +106,8 @@ def test_a_display_may_have_widths():
 def test_what_is_no_display_is_refused_by_name(display):
     with pytest.raises(BadMessage, match="display") as caught:
         FilterSettings(display=display)
-    assert caught.value.field == "display" and "oled" in caught.value.allowed
+    assert caught.value.field == "display"
+    assert "oled" in caught.value.allowed
 
 
 @pytest.mark.parametrize("name", list(measured_displays()))
@@ -121,8 +122,10 @@ def test_one_wavelength_a_primary_stands_for_a_measured_display(name):
             DISPLAYS["paper"],
         )
     )
-    assert own[0] > 51.0 and own[1] > 48.0
-    assert common[0] > 50.5 and common[1] > 47.5
+    assert own[0] > 51.0
+    assert own[1] > 48.0
+    assert common[0] > 50.5
+    assert common[1] > 47.5
     assert common[1] > paper[1] + 1.0
 
 
@@ -134,8 +137,10 @@ def test_two_wavelengths_a_primary_stand_for_it_better(name):
     common = errors_db(
         wide_picture(DISPLAYS["common"], WIDTHS_NM["common"], 0.0), truth
     )
-    assert own[0] > 53.0 and own[1] > 51.0
-    assert common[0] > 51.0 and common[1] > 50.0
+    assert own[0] > 53.0
+    assert own[1] > 51.0
+    assert common[0] > 51.0
+    assert common[1] > 50.0
 
 
 def test_a_command_takes_spectra_from_a_file(tmp_path):

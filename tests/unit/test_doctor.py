@@ -62,12 +62,14 @@ def test_a_shader_that_does_not_compile_is_named_in_one_line(monkeypatch, tmp_pa
 def test_a_wrong_picture_fails(change):
     assert check_shaders({}, GOOD).ok
     check = check_shaders({}, GOOD | change)
-    assert not check.ok and "driver" in check.fix
+    assert not check.ok
+    assert "driver" in check.fix
 
 
 def test_without_opengl_shaders_are_not_tried():
     check = check_shaders({"error": "no context"}, {})
-    assert not check.ok and "not tried" in check.detail
+    assert not check.ok
+    assert "not tried" in check.detail
 
 
 CHECKS = (
@@ -81,7 +83,8 @@ def test_filter_and_serve_need_the_shaders_or_the_loops(lost):
     ok = dict.fromkeys(CHECKS, True)
     assert all(doctor_checks.what_works(ok).values())
     works = doctor_checks.what_works(ok | {lost: False})
-    assert works["filter"] and works["serve"]
+    assert works["filter"]
+    assert works["serve"]
     assert works["demo"] == (lost != "gl")  # its scenes are rendered with OpenGL
     works = doctor_checks.what_works(ok | {lost: False, "native": False})
     assert [name for name, it_works in works.items() if it_works] == ["psf"]
@@ -89,7 +92,9 @@ def test_filter_and_serve_need_the_shaders_or_the_loops(lost):
 
 def test_the_native_engine_s_probe_filters_a_perfect_eye():
     check = check_native(probe_native())
-    assert check.ok and not check.fix and "threads" in check.detail
+    assert check.ok
+    assert not check.fix
+    assert "threads" in check.detail
 
 
 def test_without_a_compiled_library_a_compiler_is_named(monkeypatch):
@@ -97,7 +102,9 @@ def test_without_a_compiled_library_a_compiler_is_named(monkeypatch):
     library.compiled_library.cache_clear()
     check = check_native(probe_native())
     library.compiled_library.cache_clear()
-    assert not check.ok and "gcc" in check.fix and "not built" in check.detail
+    assert not check.ok
+    assert "gcc" in check.fix
+    assert "not built" in check.detail
 
 
 LLVMPIPE = {"info": {"renderer": "llvmpipe (LLVM 15)"}}
@@ -123,9 +130,11 @@ def test_the_engine_that_will_be_chosen_is_named_with_the_reason(gl, native, say
 def test_a_named_device_asks_for_gl(monkeypatch):
     monkeypatch.setenv("OCUFILTER_GL_DEVICE", "0")
     check = check_engine(LLVMPIPE, NATIVE)
-    assert check.ok and check.detail.startswith("gl: OCUFILTER_GL_DEVICE")
+    assert check.ok
+    assert check.detail.startswith("gl: OCUFILTER_GL_DEVICE")
     check = check_engine({"error": "no such device"}, NATIVE)
-    assert not check.ok and check.fix == "unset OCUFILTER_GL_DEVICE"
+    assert not check.ok
+    assert check.fix == "unset OCUFILTER_GL_DEVICE"
 
 
 def test_a_wheel_s_missing_packages_are_installed_with_pip(monkeypatch):

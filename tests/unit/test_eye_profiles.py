@@ -70,7 +70,8 @@ def test_an_eye_keeps_its_parameters_and_traces_its_wavefront():
     assert profile.age_years == 30
     assert profile.measurements == ()
     # the mean eye is about 0.7 dpt hyperopic with negative spherical aberration
-    assert profile.zernike_um[4] < 0.0 and profile.zernike_um[12] < 0.0
+    assert profile.zernike_um[4] < 0.0
+    assert profile.zernike_um[12] < 0.0
 
 
 def test_every_kind_takes_a_retina():

@@ -125,11 +125,14 @@ def test_a_file_may_name_it_as_a_number(tmp_path):
 def test_the_environment_names_it(monkeypatch):
     monkeypatch.delenv(GL_DEVICE_VARIABLE, raising=False)
     monkeypatch.delenv(BACKEND_VARIABLE, raising=False)
-    assert wanted_gl_device() == "auto" and not is_device_named()
+    assert wanted_gl_device() == "auto"
+    assert not is_device_named()
     monkeypatch.setenv(BACKEND_VARIABLE, "1")
-    assert wanted_gl_device() == "1" and not is_device_named()
+    assert wanted_gl_device() == "1"
+    assert not is_device_named()
     monkeypatch.setenv(GL_DEVICE_VARIABLE, "0")
-    assert wanted_gl_device() == "0" and is_device_named()
+    assert wanted_gl_device() == "0"
+    assert is_device_named()
     monkeypatch.setenv(GL_DEVICE_VARIABLE, "x")
     with pytest.raises(ValueError, match=f"{GL_DEVICE_VARIABLE} is 'x'"):
         wanted_gl_device()

@@ -86,7 +86,8 @@ def test_what_was_filtered_comes_back_from_its_file(tmp_path):
     sent = filtered(np.arange(12, dtype=np.uint8).reshape(2, 2, 3), entry_count=3)
     sent.save(tmp_path / "frames.npz")
     found = Filtered.load(tmp_path / "frames.npz")
-    assert found.counts == sent.counts and found.stores == sent.stores
+    assert found.counts == sent.counts
+    assert found.stores == sent.stores
     assert np.array_equal(found.arrays["frame"], sent.arrays["frame"])
     assert all(difference.is_none for difference in differences(found, sent))
 

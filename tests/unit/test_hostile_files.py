@@ -298,7 +298,8 @@ def test_a_profile_with_a_wrong_field_names_file_and_field(tmp_path):
     path = tmp_path / "eye.json"
     path.write_text('{"kind": "preset", "name": "nobody"}')
     error = refused(load_profile, path, "name")
-    assert error.field == "name" and "myopia" in error.allowed
+    assert error.field == "name"
+    assert "myopia" in error.allowed
 
 
 @pytest.mark.parametrize(
@@ -653,7 +654,8 @@ def test_an_eye_that_is_out_of_focus_as_none_is(mode):
     spec = grid_spec(camera, mode=mode, pupil_range_mm=(0.5, 0.5))
     with pytest.raises(ProfileError, match="out of focus by") as caught:
         plan_cache(eye, spec)
-    assert caught.value.field == "profile" and "1000 dpt" in caught.value.allowed
+    assert caught.value.field == "profile"
+    assert "1000 dpt" in caught.value.allowed
 
 
 def spread(low_dpt, high_dpt, needed):
@@ -686,4 +688,5 @@ def test_what_a_computation_says_reaches_a_client_with_a_field(monkeypatch):
     )
     with pytest.raises(BuildFailed) as caught:
         from_profile.build(job, progress=lambda *_: None, cancelled=lambda: False)
-    assert caught.value.field == "settings" and caught.value.allowed
+    assert caught.value.field == "settings"
+    assert caught.value.allowed

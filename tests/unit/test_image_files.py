@@ -101,7 +101,8 @@ def test_unfit_color_is_refused_with_what_was_found(tmp_path, array, said):
     np.save(tmp_path / "color.npy", array)
     with pytest.raises(ValueError, match=said) as caught:
         read_color(tmp_path / "color.npy")
-    assert "--color" in str(caught.value) and "allowed" in str(caught.value)
+    assert "--color" in str(caught.value)
+    assert "allowed" in str(caught.value)
 
 
 def test_light_below_zero_and_not_finite_is_left_to_the_filter(tmp_path):

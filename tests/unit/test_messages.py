@@ -86,7 +86,8 @@ def test_a_hidden_layer_arrives_with_the_view_that_it_belongs_to(dtype):
         np.testing.assert_array_equal(
             getattr(first, name), getattr(sent.images[0], name)
         )
-    assert second.hidden_color is None and second.hidden_depth_m is None
+    assert second.hidden_color is None
+    assert second.hidden_depth_m is None
     np.testing.assert_array_equal(second.color, sent.images[1].color)
 
 

@@ -255,10 +255,12 @@ def test_html_is_one_file_that_names_what_its_pictures_show(myope):
     found = _Balance()
     found.feed(text)
     assert not found.open
-    assert found.links and all(link.startswith("data:image/") for link in found.links)
+    assert found.links
+    assert all(link.startswith("data:image/") for link in found.links)
     assert all(image["alt"] for image in found.images)
     assert not re.search(r"url\(|@import|<script|<link", text)
-    assert "A. Myope" in text and "left eye (OS), 60 years" in text
+    assert "A. Myope" in text
+    assert "left eye (OS), 60 years" in text
     sphere = f"{AT_CORNEA[0]:.2f}".replace("-", "−")
     assert text.count(f"<td>{sphere}</td>") >= 2
     assert "No letter charts: not asked for." in text
@@ -270,14 +272,15 @@ def test_what_a_profile_is_called_cannot_break_the_page():
     table = Table("<b>", (("<b>&</b>",),), note="<b>")
     section = Section("<b>", (Row((table, Words(("<b>",)))),))
     text = html_of(Document("<b>", "<b>", (section,), "<b>"))
-    assert "<b>" not in text and "&lt;b&gt;&amp;&lt;/b&gt;" in text
+    assert "<b>" not in text
+    assert "&lt;b&gt;&amp;&lt;/b&gt;" in text
 
 
 def test_two_eyes_make_one_document(myope, corrected, tmp_path):
     document = document_of([myope, corrected])
     assert document.title == "Eye report: A. Myope → worn"
     table = document.sections[0].rows[0].blocks[0]
-    m_row = dict((row[0], row) for row in table.rows)["M as worn, dpt"]
+    m_row = {row[0]: row for row in table.rows}["M as worn, dpt"]
     assert float(m_row[3].replace("−", "-")) == pytest.approx(
         -sum(AT_CORNEA) / 2, abs=0.15
     )
@@ -289,7 +292,8 @@ def test_lines_fit_and_keep_all_words():
     text = "the quick brown fox jumps over the lazy dog and then some more"
     lines = lines_of(text, 30.0, 8.0)
     assert " ".join(lines) == text
-    assert len(lines) > 2 and all(width_mm(line, 8.0) <= 30.0 for line in lines)
+    assert len(lines) > 2
+    assert all(width_mm(line, 8.0) <= 30.0 for line in lines)
 
 
 def test_columns_fill_the_width_and_the_widest_gives_way():
@@ -361,7 +365,8 @@ def test_bad_input_is_one_line_and_no_file(
     assert main(arguments) == 2
     written = capsys.readouterr()
     assert written.out == ""
-    assert said in written.err and written.err.count("\n") == 1
+    assert said in written.err
+    assert written.err.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 

@@ -148,13 +148,15 @@ def test_the_old_eye_serves_until_a_first_frame_through_the_new_one_is_prepared(
     (old_store,) = build_all(stream)
     new = add(stream, 2)
     eye, prepared = load_one(stream)
-    assert eye is new and stream.next_build() is None
+    assert eye is new
+    assert stream.next_build() is None
     assert stream.warming() == (new, prepared)
     assert stream.unfinished_eye() is new
     plan = planned(stream, SMALL)
     assert (plan.eye, plan.stores) == (old, (old_store,))
     stream.set_ready(new, prepared)
-    assert stream.warming() is None and stream.unfinished_eye() is None
+    assert stream.warming() is None
+    assert stream.unfinished_eye() is None
     plan = planned(stream, SMALL)
     assert (plan.eye, plan.stores) == (new, (prepared.store,))
     assert stream.retired == [old_store]

@@ -129,7 +129,18 @@ def test_options_become_settings():
 
 
 def test_an_option_out_of_range_is_named_as_an_option():
-    arguments = "--color a --depth b --fov-deg 5 --profile myopia -o c.png".split()
+    arguments = [
+        "--color",
+        "a",
+        "--depth",
+        "b",
+        "--fov-deg",
+        "5",
+        "--profile",
+        "myopia",
+        "-o",
+        "c.png",
+    ]
     result = CliRunner().invoke(app, ["filter", *arguments, "--gaze-v-deg", "80"])
     assert "--gaze-v-deg: it is 80.0" in str(result.exception)
     choices = Literal["a", "b"]

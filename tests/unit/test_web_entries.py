@@ -102,7 +102,9 @@ def test_a_lens_that_the_page_has_no_entries_for_stays_as_it_is():
     zones["zone_diameters_mm"] = [1.5, 6]
     form = CorrectionForm()
     form.take(zones)
-    assert form.body() == zones and "file" in form.kinds and form.entries == ()
+    assert form.body() == zones
+    assert "file" in form.kinds
+    assert form.entries == ()
     assert "file" not in CorrectionForm(texts=first_texts()).kinds
 
 

@@ -135,8 +135,10 @@ def test_a_place_has_a_direction_for_the_eye_that_looks():
 def test_the_chart_is_as_large_at_every_distance():
     near, far = chart_picture(4.0), chart_picture(0.0)
     np.testing.assert_array_equal(near.view.color, far.view.color)
-    assert np.all(near.view.depth_m == 0.25) and np.all(far.view.depth_m == np.inf)
-    assert near.view.color.min() == 0 and near.view.color.max() == 255
+    assert np.all(near.view.depth_m == 0.25)
+    assert np.all(far.view.depth_m == np.inf)
+    assert near.view.color.min() == 0
+    assert near.view.color.max() == 255
 
 
 def test_a_scene_of_another_kind_is_refused():

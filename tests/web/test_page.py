@@ -31,7 +31,8 @@ def test_another_prescription_changes_the_picture(page):
     assert _change(before, after) > 2.0
     assert _detail(after) < 0.8 * _detail(before)
     kinds = [entry["kind"] for entry in page.drawn() if entry["number"] > number]
-    assert kinds[0] == "preview" and kinds[-1] == "full"
+    assert kinds[0] == "preview"
+    assert kinds[-1] == "full"
     assert told["width_px"] == 960
     np.testing.assert_array_equal(page.seen(layer="before"), scene)
 
@@ -201,7 +202,9 @@ def test_a_report_is_downloaded(page):
     with open(download.value.path(), encoding="utf-8") as file:
         text = file.read()
     assert download.value.suggested_filename == "ocufilter_OD.html"
-    assert "<html" in text and "Right eye" in text and "data:image/" in text
+    assert "<html" in text
+    assert "Right eye" in text
+    assert "data:image/" in text
 
 
 def test_a_profile_file_is_taken_and_a_wrong_one_explained(page):
@@ -293,7 +296,8 @@ def test_a_3d_file_of_ones_own_is_looked_at(page):
     page.settle(after=number)
     scene = page.seen(layer="before")
     is_red = scene[..., 0] > 1.5 * scene[..., 1]
-    assert is_red[scene.shape[0] // 2, scene.shape[1] // 2] and not is_red[2, 2]
+    assert is_red[scene.shape[0] // 2, scene.shape[1] // 2]
+    assert not is_red[2, 2]
     assert 0.05 < is_red.mean() < 0.8
     assert page.page.evaluate("window.ocufilter.drawn.at(-1).width_px") == 960
 
