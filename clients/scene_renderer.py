@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,7 +103,9 @@ class SceneRenderer:
         """Return color (h, w, 3) and planar depth (h, w) seen from a pose (4, 4)."""
         return self._render(pose, with_hidden=False)[0]
 
-    def render_layers(self, pose: Array) -> tuple[tuple[NDArray, NDArray], ...]:
+    def render_layers(
+        self, pose: Array
+    ) -> tuple[tuple[NDArray[Any], NDArray[Any]], ...]:
         """Return color and depth of the visible surface and of the hidden layer.
 
         Depth of the hidden layer is 0 where nothing is hidden.  Its color is the mean
@@ -230,7 +233,7 @@ def _hidden_pixels(color, depth_m, shows, seen_m, samples: int):
     return _SRGB8_FROM_LINEAR[steps], depth
 
 
-def _blocks(image, samples: int) -> NDArray:
+def _blocks(image, samples: int) -> NDArray[Any]:
     """Return the samples (h, w, n, ...) of each pixel."""
     height, width = image.shape[0] // samples, image.shape[1] // samples
     split = image.reshape(height, samples, width, samples, *image.shape[2:])

@@ -147,7 +147,9 @@ def read_picture_rgb(
         return _rows_as_rgb(picture)
 
 
-def read_picture_values(source: Source, *, name: str = "", option: str = "") -> NDArray:
+def read_picture_values(
+    source: Source, *, name: str = "", option: str = ""
+) -> NDArray[Any]:
     """Return the stored values of an image, upright, as needed for depth files.
 
     Raises
@@ -386,7 +388,7 @@ def _count(file: BinaryIO, marker: bytes) -> int:
 # --- .npy ---------------------------------------------------------------------
 
 
-def read_npy(path: Path, *, option: str = "") -> NDArray:
+def read_npy(path: Path, *, option: str = "") -> NDArray[Any]:
     """Return the array of a ``.npy`` file of bool, integers or floats.
 
     The shape in the header is compared with the file's size and the limits before any
@@ -406,7 +408,7 @@ def read_npy(path: Path, *, option: str = "") -> NDArray:
         raise InvalidFile(path, found, "an intact .npy file", option) from None
 
 
-def _npy_array(file: BinaryIO, size_bytes: int) -> NDArray:
+def _npy_array(file: BinaryIO, size_bytes: int) -> NDArray[Any]:
     dtype, shape, is_fortran = _npy_header(file)
     n_values = math.prod(shape)
     n_bytes = n_values * dtype.itemsize
@@ -467,7 +469,7 @@ def _npy_header(file: BinaryIO) -> tuple[np.dtype, tuple[int, ...], bool]:
 
 def read_exr_channels(
     path: Path, choose: Callable[[set[str]], tuple[str, ...]], *, option: str = ""
-) -> dict[str, NDArray]:
+) -> dict[str, NDArray[Any]]:
     """Return channels of the first part of an OpenEXR file, as float32.
 
     Parameters

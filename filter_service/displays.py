@@ -10,6 +10,8 @@ standard deviation of its light to both sides, reach 50.1 to 52.1 dB encoded wit
 "common" and 51.2 to 53.4 with a display's own (tests/benchmarks/bench_displays.py).
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -154,7 +156,7 @@ def matching_functions(wavelengths_nm: NDArray[np.float64]) -> NDArray[np.float6
     Fit of Wyman, Sloan & Shirley 2013, JCGT 2(2).
     """
 
-    def lobe(center_nm: float, below_nm: float, above_nm: float) -> NDArray:
+    def lobe(center_nm: float, below_nm: float, above_nm: float) -> NDArray[Any]:
         width_nm = np.where(wavelengths_nm < center_nm, below_nm, above_nm)
         return np.exp(-0.5 * ((wavelengths_nm - center_nm) / width_nm) ** 2)
 

@@ -8,7 +8,7 @@ reads and writes the rest, including 32-bit float TIFF and PFM.
 
 import math
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ ROW_VALUES = 1 << 20
 """Values converted at a time, so that no float64 copy of a large image is held."""
 
 
-def read_color(path: Path, *, option: str = "color") -> NDArray:
+def read_color(path: Path, *, option: str = "color") -> NDArray[Any]:
     """Read a color image.
 
     Parameters
@@ -111,7 +111,7 @@ def read_depth(
     return _scaled(stored, depth_scale)
 
 
-def _scaled(stored: NDArray, depth_scale: float) -> NDArray[np.float32]:
+def _scaled(stored: NDArray[Any], depth_scale: float) -> NDArray[np.float32]:
     """Return stored values times the scale, multiplied in float64, some rows at a time.
 
     Values beyond float32 become infinity.
@@ -140,7 +140,7 @@ def check_output(path: Path, suffixes: tuple[str, ...] = OUTPUT_SUFFIXES) -> Non
         _refuse("out", path, "its folder does not exist", "an existing folder")
 
 
-def write_image(path: Path, image: NDArray, *, png_level: int = 6) -> None:
+def write_image(path: Path, image: NDArray[Any], *, png_level: int = 6) -> None:
     """Write uint8 sRGB to ``.png``, or linear floats to ``.npy`` or ``.exr``.
 
     Parameters
@@ -217,7 +217,7 @@ def _exr_depth(path: Path, option: str) -> NDArray[np.float32]:
     return read_exr_channels(path, choose, option=option).popitem()[1]
 
 
-def _write_exr(path: Path, linear_rgb: NDArray) -> None:
+def _write_exr(path: Path, linear_rgb: NDArray[Any]) -> None:
     import OpenEXR
 
     header = {
@@ -229,7 +229,7 @@ def _write_exr(path: Path, linear_rgb: NDArray) -> None:
         file.write(str(path))
 
 
-def _checked_color(pixels: NDArray, path: Path, option: str) -> NDArray:
+def _checked_color(pixels: NDArray[Any], path: Path, option: str) -> NDArray[Any]:
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or pixels.size == 0:
         _refuse(option, path, f"shape {pixels.shape}", "(height, width, 3 or 4)")
     pixels = np.ascontiguousarray(pixels[:, :, :3])

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,7 +118,9 @@ def draw(recipe: Recipe, shard: int) -> NDArray[np.float64]:
     return rows[:n]
 
 
-def _populate(recipe: Recipe, domain: Domain, rows: NDArray, unit: NDArray) -> None:
+def _populate(
+    recipe: Recipe, domain: Domain, rows: NDArray[Any], unit: NDArray[Any]
+) -> None:
     """Replace a share of the eyes of rows (n, n_inputs) by population eyes."""
     choice, refraction, used = unit[:, -N_MORE_AXES:].T
     chosen = choice < recipe.population_ratio
@@ -137,7 +140,7 @@ def input_ranges(domain: Domain, population_ratio: float) -> NDArray[np.float64]
     return ranges
 
 
-def _unit_points(recipe: Recipe, first: int, n: int, n_axes: int) -> NDArray:
+def _unit_points(recipe: Recipe, first: int, n: int, n_axes: int) -> NDArray[Any]:
     if recipe.sampling == "random":
         # One stream per block of rows: any shard can be drawn without the others.
         rng = np.random.default_rng(np.random.SeedSequence([recipe.seed, first]))
@@ -274,7 +277,7 @@ def load(folder: Path) -> Shard:
 
 def split(
     inputs: NDArray[np.float32], *, share: float, seed: int
-) -> tuple[NDArray, NDArray]:
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return indices of training rows and, with probability ``share``, validation rows.
 
     Rows (n, n_inputs) of one eye are consecutive and go to the same set: in a product

@@ -16,6 +16,7 @@ import sys
 import warnings
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -157,7 +158,7 @@ def _write_both(file: Path, written: bytes, card: dict) -> None:
 
 def fresh_rows(
     task: Task, n_rows: int, *, population_ratio: float = 0.0
-) -> tuple[NDArray, NDArray]:
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return float32 inputs and targets that no training saw.
 
     They are drawn from the box of Table 2, with a share of population eyes.
@@ -174,7 +175,7 @@ def fresh_rows(
     return x.numpy(), y.numpy()
 
 
-def column_ranges(run: Run, x: NDArray) -> list[dict]:
+def column_ranges(run: Run, x: NDArray[Any]) -> list[dict]:
     """Return the range of every input: as sampled or, for coefficients, as observed."""
     task = TASKS[run.task]
     domain = task.judged_domain
@@ -202,7 +203,7 @@ def evaluate(session, x: NDArray[np.float32]) -> NDArray[np.float32]:
     return session.run(None, {"features": x})[0]
 
 
-def _parity(task: Task, network: Network, session, x: NDArray) -> dict:
+def _parity(task: Task, network: Network, session, x: NDArray[Any]) -> dict:
     """Return largest and mean difference between written and trained network."""
     with torch.no_grad():
         wanted = network(torch.from_numpy(x)).numpy()
@@ -216,7 +217,7 @@ def _parity(task: Task, network: Network, session, x: NDArray) -> dict:
     }
 
 
-def judged(task: Task, found: NDArray, x: NDArray, y: NDArray) -> dict:
+def judged(task: Task, found: NDArray[Any], x: NDArray[Any], y: NDArray[Any]) -> dict:
     """Return errors against ray tracing, in the form of a card."""
     if task.name == "eye":
         error = misfit_of_eyes(found.astype(np.float64), x.astype(np.float64))

@@ -13,6 +13,7 @@ import json
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +48,7 @@ class Line:
     statistics: dict[str, float]
 
 
-def _lines(name: str, chain: str, targets: NDArray) -> list[Line]:
+def _lines(name: str, chain: str, targets: NDArray[Any]) -> list[Line]:
     good = targets[np.all(np.isfinite(targets), axis=1)]
     found = group_statistics(DOMAINS[name], good)
     return [_line(name, chain, *item) for item in found.items()]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,7 +168,7 @@ class BadFrame(ValueError):
 
 
 def check_sizes(
-    frame: SourceFrame, color: NDArray, depth_m: NDArray[np.float32]
+    frame: SourceFrame, color: NDArray[Any], depth_m: NDArray[np.float32]
 ) -> None:
     """Reject color and depth of different sizes.
 

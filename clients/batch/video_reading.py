@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -213,7 +214,7 @@ class VideoReader:
                 found = f"{n_without:,} packets without a picture"
                 raise InvalidFile(self._path, found, "an intact video")
 
-    def _array(self, frame: av.VideoFrame, **how: str) -> NDArray:
+    def _array(self, frame: av.VideoFrame, **how: str) -> NDArray[Any]:
         if frame.width * frame.height > MAX_VIDEO_PIXELS:
             found = f"a frame of {frame.width}x{frame.height} px"
             raise InvalidFile(self._path, found, f"at most {MAX_VIDEO_PIXELS:,} pixels")

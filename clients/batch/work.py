@@ -195,7 +195,7 @@ class UnitRunner:
             record["ms"]["build"] = 1e3 * (self._filter.build_s - built_s)
         return FilteredPicture(seen, record)
 
-    def _read(self, frame: SourceFrame) -> tuple[NDArray, NDArray[np.float32]]:
+    def _read(self, frame: SourceFrame) -> tuple[NDArray[Any], NDArray[np.float32]]:
         if frame.color_index is None:
             color = read_color(frame.color, option="")
         else:

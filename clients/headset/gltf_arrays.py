@@ -19,7 +19,7 @@ def accessor_count(file: Container, index: object) -> int:
     return file.whole(accessor, "count", f"accessors[{index}]")
 
 
-def accessor_array(file: Container, index: object, *, kinds: str) -> NDArray:
+def accessor_array(file: Container, index: object, *, kinds: str) -> NDArray[Any]:
     """Return the elements (n, columns) of an accessor, as stored.
 
     Parameters
@@ -64,7 +64,7 @@ def _strided(
     stride: object,
     shape: tuple[int, int],
     dtype: np.dtype,
-) -> NDArray:
+) -> NDArray[Any]:
     """Return elements of a view without a copy."""
     count, columns = shape
     element = columns * dtype.itemsize
@@ -81,8 +81,8 @@ def _strided(
 
 
 def _with_sparse(
-    file: Container, sparse: object, where: str, array: NDArray
-) -> NDArray:
+    file: Container, sparse: object, where: str, array: NDArray[Any]
+) -> NDArray[Any]:
     """Return the array with some elements replaced."""
     if not isinstance(sparse, dict):
         file.refuse(f"damaged: {where}.sparse")

@@ -214,7 +214,7 @@ def _columns(
     *,
     kinds: str,
     count: int | None = None,
-) -> NDArray:
+) -> NDArray[Any]:
     """Return a vertex attribute; integers as fractions of their largest value."""
     array = accessor_array(file, attributes.get(name), kinds=kinds)
     if array.shape[1] < columns or count not in (None, len(array)):

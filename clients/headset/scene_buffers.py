@@ -1,6 +1,7 @@
 """OpenGL objects of a scene view: render targets, programs and triangles."""
 
 from pathlib import Path
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -132,7 +133,7 @@ class SceneBuffers:
         indices = self._buffer(batch.faces, np.uint32)
         return self._own(self._context.vertex_array(self.program, content, indices))
 
-    def _buffer(self, values: NDArray, dtype):
+    def _buffer(self, values: NDArray[Any], dtype):
         return self._own(self._context.buffer(np.ascontiguousarray(values, dtype)))
 
     def _surface(self, texels: NDArray[np.uint8]):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from html import escape
+from typing import Any
 
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -141,7 +142,7 @@ def _svg(figure: Figure) -> str:
     return "data:image/svg+xml;base64," + base64.b64encode(written.getvalue()).decode()
 
 
-def _jpeg(image: NDArray) -> str:
+def _jpeg(image: NDArray[Any]) -> str:
     written = io.BytesIO()
     Image.fromarray(image).save(written, "JPEG", quality=JPEG_QUALITY, subsampling=0)
     return "data:image/jpeg;base64," + base64.b64encode(written.getvalue()).decode()

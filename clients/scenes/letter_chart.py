@@ -9,6 +9,7 @@ faces the camera at one distance; its angular size is the same at every distance
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -145,7 +146,7 @@ def _row(camera: Camera, text, log_mar, size, middle) -> ChartRow:
     return ChartRow(text, log_mar, size / per_px, (up - middle) / per_px)
 
 
-def _draw(ink: NDArray, camera: Camera, letter: str, size, left, bottom) -> None:
+def _draw(ink: NDArray[Any], camera: Camera, letter: str, size, left, bottom) -> None:
     """Add a letter's ink coverage to the pixels; positions are tangents, y up."""
     pitch_x, pitch_y = (pitch / 1000.0 for pitch in camera.pixel_pitch_mrad)
     edge_left, _, edge_up, _ = camera.tangents
@@ -166,7 +167,7 @@ def _pixels(start: float, size: float, pitch: float, count: int) -> NDArray[np.i
     return np.arange(max(first, 0), min(last + 1, count))
 
 
-def _view(camera: Camera, ink: NDArray, distance_m: float) -> RgbdView:
+def _view(camera: Camera, ink: NDArray[Any], distance_m: float) -> RgbdView:
     gray = np.round(255.0 * srgb_from_linear(1.0 - ink)).astype(np.uint8)
     return RgbdView(
         color=np.repeat(gray[..., None], 3, axis=2),

@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,7 +157,7 @@ def _kernel(
 
 
 def _side_arcmin(
-    zernike_um: NDArray, diameter_mm: NDArray, *, more_mrad: float
+    zernike_um: NDArray[Any], diameter_mm: NDArray[Any], *, more_mrad: float
 ) -> float:
     """Return the picture's side for the widest color, rounded up to a fixed scale.
 

@@ -11,6 +11,7 @@ would read 0.3 to 0.4 logMAR better out of focus than people do (Smith, Optom. V
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,7 +104,7 @@ def predict_acuity(
 def log_mar_of(transfer: Transfer) -> float:
     """Return the acuity of a transfer function."""
 
-    def modulation(x_cpd: NDArray, y_cpd: NDArray) -> NDArray[np.float64]:
+    def modulation(x_cpd: NDArray[Any], y_cpd: NDArray[Any]) -> NDArray[np.float64]:
         step_cpd = transfer.frequency_cpd[1] - transfer.frequency_cpd[0]
         middle = (transfer.frequency_cpd.size - 1) / 2
         places = middle + np.stack([y_cpd, x_cpd]) / step_cpd
@@ -118,7 +119,7 @@ def log_mar_of(transfer: Transfer) -> float:
 def _noise() -> float:
     """Return the noise at which the mean eye has the acuity of young adults."""
 
-    def modulation(x_cpd: NDArray, y_cpd: NDArray) -> NDArray[np.float64]:
+    def modulation(x_cpd: NDArray[Any], y_cpd: NDArray[Any]) -> NDArray[np.float64]:
         radial_cpd = np.hypot(x_cpd, y_cpd)
         return mean_eye_transfer(radial_cpd, pupil_diameter_mm=YOUNG_PUPIL_MM)
 
@@ -165,7 +166,7 @@ def _correct_ratio(modulation, gap_arcmin: float, noise: float) -> float:
     return right / DIRECTIONS
 
 
-def _root(products: NDArray) -> NDArray[np.float64]:
+def _root(products: NDArray[Any]) -> NDArray[np.float64]:
     """Return a matrix whose square is the products of the rings."""
     values, vectors = np.linalg.eigh(products)
     return vectors * np.sqrt(np.maximum(values, 0.0))
@@ -177,7 +178,7 @@ def _trials() -> NDArray[np.float64]:
 
 
 @cache
-def _rings() -> tuple[NDArray, NDArray, NDArray]:
+def _rings() -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return frequencies in cycles per gap, and spectra (8, n, n) of the rings."""
     count = int(RASTER_PER_GAP * (RING_GAPS + 1))
     along = (np.arange(count) + 0.5) / RASTER_PER_GAP - 0.5 * (RING_GAPS + 1)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -59,7 +60,7 @@ class Transfer:
         """
         return self._mean(self.transfer_ratio.real, at_cpd)
 
-    def _mean(self, values: NDArray, at_cpd: ArrayLike) -> NDArray[np.float64]:
+    def _mean(self, values: NDArray[Any], at_cpd: ArrayLike) -> NDArray[np.float64]:
         """Return the mean (m,) of values (n, n) over all directions.
 
         Parameters
@@ -139,7 +140,7 @@ def optical_transfer(
     )
 
 
-def _wavefront_um(zernike_um: NDArray, along: NDArray) -> NDArray[np.float64]:
+def _wavefront_um(zernike_um: NDArray[Any], along: NDArray[Any]) -> NDArray[np.float64]:
     """Return the wavefront (n, n), y then x, on coordinates (n,) of the unit square."""
     by_powers = np.zeros((MAX_RADIAL_ORDER + 1,) * 2)
     by_powers[EXPONENTS[:, 1], EXPONENTS[:, 0]] = wavefront_polynomial(zernike_um)
@@ -148,7 +149,7 @@ def _wavefront_um(zernike_um: NDArray, along: NDArray) -> NDArray[np.float64]:
 
 
 def _samples(
-    zernike_um: NDArray,
+    zernike_um: NDArray[Any],
     wavelength_nm: float,
     screen: PupilScreen | None,
     radius_mm: float,

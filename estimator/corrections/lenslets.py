@@ -8,6 +8,7 @@ corrections` measures the error of ignoring the 15 mm between.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -72,11 +73,13 @@ class Lenslets:
         """Return the powers of sharp foci; lenslets make no focus of their own."""
         return np.zeros(1)
 
-    def main_light_ratio(self, radius_mm: ArrayLike, wavelength_nm: float) -> NDArray:
+    def main_light_ratio(
+        self, radius_mm: ArrayLike, wavelength_nm: float
+    ) -> NDArray[Any]:
         """Return the share (1, ...) of a pupil's light there, lenslets' included."""
         return np.ones((1, *np.shape(radius_mm)))
 
-    def reach_mrad(self, radius_mm: ArrayLike, wavelength_nm: float) -> NDArray:
+    def reach_mrad(self, radius_mm: ArrayLike, wavelength_nm: float) -> NDArray[Any]:
         """Return the largest deflection of light by the lenslets and their edges."""
         by_lens = abs(self.power_dpt) * self.diameter_mm / 2.0
         by_edge = EDGE_ORDERS * wavelength_nm / NM_PER_UM / self.diameter_mm

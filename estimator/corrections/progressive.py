@@ -14,6 +14,7 @@ ends.
 """
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -96,7 +97,7 @@ class ProgressiveLens(rx.Prescription):
             h_deg, v_deg, vertex_mm=self.vertex_mm, gaze_deg=self.gaze_deg
         )
 
-    def power_matrices_dpt(self, x_mm: ArrayLike, y_mm: ArrayLike) -> NDArray:
+    def power_matrices_dpt(self, x_mm: ArrayLike, y_mm: ArrayLike) -> NDArray[Any]:
         """Return the power (..., 2, 2) at points of the lens, x to the right, y up."""
         # Imported here so that the service starts without loading scipy.
         from scipy.special import ndtr
@@ -111,7 +112,7 @@ class ProgressiveLens(rx.Prescription):
         m, j0, j45 = rx.power_vector(replace(self.distance, vertex_mm=0.0))
         return found + np.array([[m + j0, j45], [j45, m - j0]])
 
-    def uneven_polynomial(self, x_mm: ArrayLike, y_mm: ArrayLike) -> NDArray:
+    def uneven_polynomial(self, x_mm: ArrayLike, y_mm: ArrayLike) -> NDArray[Any]:
         """Return monomials (..., 28) subtracted by the power's change over the pupil.
 
         Uses the third derivatives of the surface at the point on the line of sight.
@@ -129,7 +130,7 @@ class ProgressiveLens(rx.Prescription):
             found[..., place] = -slope_dpt_mm * times * third / 6.0
         return found
 
-    def _places(self, x_mm: ArrayLike, y_mm: ArrayLike) -> tuple[NDArray, ...]:
+    def _places(self, x_mm: ArrayLike, y_mm: ArrayLike) -> tuple[NDArray[Any], ...]:
         """Return positions along and beside the corridor over its width; the width."""
         x, y = np.broadcast_arrays(*(np.asarray(c, float) for c in (x_mm, y_mm)))
         wide_mm = np.hypot(self.corridor_mm / 4.0, x)

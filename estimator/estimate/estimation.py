@@ -9,6 +9,7 @@ trace.  ``search``: the pattern search of the earlier work.
 import time
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -351,7 +352,7 @@ def _refined(
 
 
 def _best_fit(
-    problem: EstimationProblem, vectors: NDArray[np.float64], labels: NDArray
+    problem: EstimationProblem, vectors: NDArray[np.float64], labels: NDArray[Any]
 ) -> tuple[BoundedFit, str]:
     """Fit from the nearest start, and from the other kind of start if that fits poorly.
 

@@ -8,6 +8,7 @@ beyond.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -120,7 +121,7 @@ class MeasuredResidual:
 
 
 def _traced_um(
-    parameters: EyeParameters, profile: EyeProfile, wavelengths_nm: NDArray
+    parameters: EyeParameters, profile: EyeProfile, wavelengths_nm: NDArray[Any]
 ) -> tuple[NDArray[np.float64], float]:
     """Return the eye's monomials (n, 28) in the measured pupil, and its depth."""
     surfaces = eye_surfaces(parameters, retina=profile.retina)

@@ -5,6 +5,8 @@ the lens; over the pupil by a polynomial in its square, in which a wavefront's s
 terms are a short series.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,14 +35,17 @@ class FocusTable:
     """
 
     def __init__(
-        self, pupils_mm: NDArray, accommodations_dpt: NDArray, refractions_dpt: NDArray
+        self,
+        pupils_mm: NDArray[Any],
+        accommodations_dpt: NDArray[Any],
+        refractions_dpt: NDArray[Any],
     ):
         self._accommodations_dpt = accommodations_dpt
         self._refractions_dpt = refractions_dpt
         self._squares_mm2 = np.square(pupils_mm)
         self._pupil_shares = _barycentric_shares(self._squares_mm2)
         self._used_shares = _barycentric_shares(accommodations_dpt)
-        self._last: tuple[float, NDArray] = (0.0, np.zeros(0))
+        self._last: tuple[float, NDArray[Any]] = (0.0, np.zeros(0))
 
     def _at_pupil(self, pupil_mm: float) -> NDArray[np.float64]:
         """Return refractions (m,) at a pupil; cache those of the last pupil."""
@@ -70,7 +75,7 @@ class FocusTable:
         inverse = _through(found_dpt, used_dpt, shares, wanted_dpt)
         return float(np.clip(inverse, used_dpt[0], used_dpt[-1]))
 
-    def _falling(self, pupil_mm: float) -> tuple[NDArray, NDArray]:
+    def _falling(self, pupil_mm: float) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return refractions at a pupil while they fall, and their accommodations."""
         found_dpt = self._at_pupil(pupil_mm)
         rises = np.flatnonzero(np.diff(found_dpt) >= 0.0)
@@ -78,7 +83,7 @@ class FocusTable:
         return found_dpt[:count], self._accommodations_dpt[:count]
 
 
-def _barycentric_shares(nodes: NDArray) -> NDArray[np.float64]:
+def _barycentric_shares(nodes: NDArray[Any]) -> NDArray[np.float64]:
     """Return weights (n,) of the barycentric formula for nodes (n,)."""
     span = np.ptp(nodes) or 1.0  # so that many nodes do not overflow
     away = (nodes[:, None] - nodes[None]) * (4.0 / span)
@@ -86,7 +91,9 @@ def _barycentric_shares(nodes: NDArray) -> NDArray[np.float64]:
     return 1.0 / away.prod(axis=1)
 
 
-def _through(nodes: NDArray, values: NDArray, shares: NDArray, at: float):
+def _through(
+    nodes: NDArray[Any], values: NDArray[Any], shares: NDArray[Any], at: float
+):
     """Evaluate the polynomial through values (n, ...) at nodes (n,)."""
     away = at - nodes
     is_hit = np.abs(away) < 1e-12

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -116,7 +117,7 @@ def aberration_grid(
         if progress is not None:
             progress((k + 1) / len(used_dpt))
 
-    def stacked(name: str) -> NDArray:
+    def stacked(name: str) -> NDArray[Any]:
         # from (accommodation, field, wavelength, pupil, ...) to the order of the axes
         values = np.stack([getattr(part, name) for part in parts])
         values = np.moveaxis(values, (1, 3, 0, 2), (0, 1, 2, 3))

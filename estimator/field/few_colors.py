@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -81,7 +82,10 @@ def few_colors_grid(
     known = eye.accommodating.states_at(used_dpt) if states is None else states
 
     def traced(
-        of_nm: NDArray, at: dict[str, NDArray], some: NDArray, *shares: float
+        of_nm: NDArray[Any],
+        at: dict[str, NDArray[Any]],
+        some: NDArray[Any],
+        *shares: float,
     ) -> AberrationGrid:
         return aberration_grid(
             eye,

@@ -1,6 +1,7 @@
 """Wavefronts of a profile's eye in many directions, as an instrument reports them."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -109,14 +110,16 @@ def field_table(
     )
 
 
-def _around_axis(angles_deg: NDArray) -> tuple[float, float]:
+def _around_axis(angles_deg: NDArray[Any]) -> tuple[float, float]:
     return (
         min(float(angles_deg.min()), -LEAST_EXTENT_DEG),
         max(float(angles_deg.max()), LEAST_EXTENT_DEG),
     )
 
 
-def _edge_notes(eye: TracedEye, h_deg: NDArray, v_deg: NDArray) -> tuple[str, ...]:
+def _edge_notes(
+    eye: TracedEye, h_deg: NDArray[Any], v_deg: NDArray[Any]
+) -> tuple[str, ...]:
     (h_low, h_high), (v_low, v_high) = eye.traced_range_deg
     inside = (h_deg >= h_low) & (h_deg <= h_high) & (v_deg >= v_low) & (v_deg <= v_high)
     if inside.all():

@@ -9,6 +9,7 @@ the interpolation follows the terms that a sixth-order fit leaves out, see `POWE
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -102,12 +103,12 @@ def lagrange_weights(
     return all_weights(np.asarray(nodes, np.float64), np.asarray(at, np.float64))
 
 
-def _linear(nodes: NDArray, at: NDArray) -> NDArray[np.float64]:
+def _linear(nodes: NDArray[Any], at: NDArray[Any]) -> NDArray[np.float64]:
     """Return weights (n, n_nodes) of linear interpolation, constant beyond the ends."""
     return np.stack([np.interp(at, nodes, row) for row in np.eye(nodes.size)], axis=-1)
 
 
-def _for_distinct(function: Callable, values: NDArray):
+def _for_distinct(function: Callable, values: NDArray[Any]):
     """Evaluate a function at values (n,), once for each distinct value."""
     distinct, place = np.unique(values, return_inverse=True)
     found = function(distinct)
@@ -188,7 +189,7 @@ class FieldInterpolation:
         return is_finite & (grid.open_ratio > OPEN_RATIO)
 
     def open_pupils_mm(
-        self, h_deg: NDArray, v_deg: NDArray
+        self, h_deg: NDArray[Any], v_deg: NDArray[Any]
     ) -> NDArray[np.float64] | None:
         """Return the open pupils (n,) at fields, or None if all are open."""
         if self.all_open:
@@ -312,7 +313,11 @@ class FieldInterpolation:
         return found
 
     def _over_field(
-        self, h_deg: NDArray, v_deg: NDArray, channels: NDArray, pupils: slice
+        self,
+        h_deg: NDArray[Any],
+        v_deg: NDArray[Any],
+        channels: NDArray[Any],
+        pupils: slice,
     ) -> NDArray[np.float64]:
         """Return values (n, n_channels, n_pupils, n_accommodations, 33) at fields."""
         over_h = lagrange_weights(stretched(self.grid.h_deg), stretched(h_deg))
@@ -322,7 +327,9 @@ class FieldInterpolation:
         found = weights @ values.reshape(weights.shape[1], -1)
         return found.reshape(h_deg.size, *values.shape[2:])
 
-    def _pupil_shares(self, pupil_mm: NDArray) -> tuple[NDArray, NDArray]:
+    def _pupil_shares(
+        self, pupil_mm: NDArray[Any]
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the index (n,) of the lower pupil, and the next one's weight (n, 33).
 
         Below the smallest traced pupil the first two are extrapolated.
@@ -336,13 +343,13 @@ class FieldInterpolation:
         share = ((pupil_mm / high_mm)[:, None] ** POWER - lowest) / (1.0 - lowest)
         return lower, share
 
-    def _lower_pupils(self, pupil_mm: NDArray) -> NDArray[np.int64]:
+    def _lower_pupils(self, pupil_mm: NDArray[Any]) -> NDArray[np.int64]:
         """Return the index (n,) of the next smaller traced pupil."""
         nodes_mm = self.grid.pupil_diameters_mm
         lower = np.searchsorted(nodes_mm, pupil_mm, side="right") - 1
         return np.clip(lower, 0, max(nodes_mm.size - 2, 0))
 
-    def _channels(self, wavelength_nm: NDArray) -> NDArray[np.int64]:
+    def _channels(self, wavelength_nm: NDArray[Any]) -> NDArray[np.int64]:
         nodes_nm = self.grid.wavelengths_nm
         index = np.abs(wavelength_nm[:, None] - nodes_nm).argmin(axis=1)
         if not np.allclose(nodes_nm[index], wavelength_nm, rtol=1e-6, atol=0.0):

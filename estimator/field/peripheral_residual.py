@@ -10,6 +10,7 @@ the nearest usual eye; its own departure from that eye is traced.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +87,9 @@ class PeripheralResidual:
         """Return monomials (n, 28), um/mm^degree, at fields (n,) within the range."""
         return self._difference_um(h_deg, v_deg) - self._on_axis_um
 
-    def _difference_um(self, h_deg: NDArray, v_deg: NDArray) -> NDArray[np.float64]:
+    def _difference_um(
+        self, h_deg: NDArray[Any], v_deg: NDArray[Any]
+    ) -> NDArray[np.float64]:
         people_um = self._at_cornea_um + self.change.zernike_um(h_deg, v_deg)
         people_um = moved_polynomial(
             polynomial_in_mm(remove_central_tilt(people_um), CIRCLE_MM),
@@ -122,7 +125,7 @@ def usual_eye(change: PeripheralChange, eye: EstimatedEye) -> EstimatedEye:
     return estimate_eye(_with_axis(eye.profile, zernike_um))
 
 
-def _with_axis(profile: EyeProfile, zernike_um: NDArray) -> EyeProfile:
+def _with_axis(profile: EyeProfile, zernike_um: NDArray[Any]) -> EyeProfile:
     measurement = Measurement(zernike_um, 2.0 * CIRCLE_MM, profile.wavelength_nm)
     return replace(
         profile,

@@ -1,7 +1,7 @@
 """Plots of an eye's wavefronts over its visual field."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +46,7 @@ def blur_arcmin(table: "FieldTable") -> NDArray[np.float64]:
     return ARCMIN_PER_MRAD * power_dpt * table.zernike_radius_mm / np.sqrt(2.0)
 
 
-def _draw(figure, axes, table: "FieldTable", values: NDArray) -> None:
+def _draw(figure, axes, table: "FieldTable", values: NDArray[Any]) -> None:
     h_deg, v_deg = np.unique(table.h_deg), np.unique(table.v_deg)
     axes.set_xlabel("h, deg")
     if h_deg.size < 2 or v_deg.size < 2:

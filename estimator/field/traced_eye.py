@@ -7,6 +7,7 @@ the lens and with it all aberrations; and every field has its own wavefront.
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -285,7 +286,7 @@ class TracedEye(FocusingEye):
     def _defocus_dpt(
         self,
         fields: FixedDefocus,
-        number: NDArray,
+        number: NDArray[Any],
         *,
         pupil_diameter_mm: float,
         accommodation_dpt: float,
@@ -396,7 +397,7 @@ class TracedEye(FocusingEye):
         )
         return found[number].reshape(*states[0].shape, 2)
 
-    def _distinct(self, states: list[NDArray]) -> tuple[NDArray, ...]:
+    def _distinct(self, states: list[NDArray[Any]]) -> tuple[NDArray[Any], ...]:
         """Return coefficients, rims and radii of distinct states, and each's index."""
         columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]
         first, number = distinct_rows(*columns)
@@ -426,7 +427,9 @@ class TracedEye(FocusingEye):
             pupil_diameter_mm=pupil_diameter_mm,
         )
 
-    def _correction_at(self, h_deg: NDArray, v_deg: NDArray) -> NDArray[np.float64]:
+    def _correction_at(
+        self, h_deg: NDArray[Any], v_deg: NDArray[Any]
+    ) -> NDArray[np.float64]:
         """Return the correction's wavefront to subtract, (28,) or (n, 28) at fields."""
         if not isinstance(self._worn, ProgressiveLens):
             return self._correction

@@ -5,6 +5,7 @@ frames requests the same fields repeatedly.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ MARGIN = 1e-3
 """Degrees, mm or dpt beyond the traced range that are extrapolated, not rejected."""
 
 
-def check_limits(name: str, values: NDArray, low: float, high: float) -> None:
+def check_limits(name: str, values: NDArray[Any], low: float, high: float) -> None:
     """Reject values outside the traced range.
 
     Raises
@@ -129,7 +130,9 @@ class TracedFields:
             open_mm=self._open_mm,
         )
 
-    def _rim_scale(self, pupil_mm: NDArray, used_dpt: NDArray) -> NDArray[np.float64]:
+    def _rim_scale(
+        self, pupil_mm: NDArray[Any], used_dpt: NDArray[Any]
+    ) -> NDArray[np.float64]:
         """Return ratios (n,) of the requested pupils to the traced ones, on axis."""
         channel = self._axis_states.channel
         first, number = distinct_rows(channel, pupil_mm, used_dpt)
@@ -141,7 +144,7 @@ class TracedFields:
         scale = pupil_mm[first] / 2.0 / circumscribed_radius_mm(rim_mm)
         return scale[number]
 
-    def _usable_mm(self, pupil_mm: NDArray) -> NDArray[np.float64]:
+    def _usable_mm(self, pupil_mm: NDArray[Any]) -> NDArray[np.float64]:
         """Return pupils (n,), reduced at fields where they are vignetted."""
         if self._open_mm is None:
             return pupil_mm
@@ -149,7 +152,7 @@ class TracedFields:
 
 
 def _of_distinct(
-    function: Callable[..., NDArray], h_deg: NDArray, v_deg: NDArray
+    function: Callable[..., NDArray[Any]], h_deg: NDArray[Any], v_deg: NDArray[Any]
 ) -> NDArray[np.float64]:
     """Evaluate a function of directions (n,), once for each distinct direction."""
     first, number = distinct_rows(h_deg, v_deg)

@@ -4,6 +4,8 @@ Van de Kraats & van Norren, J. Opt. Soc. Am. A 24, 1842 (2007), as in CIE 203:20
 density of all media for large fields, fitted to ages of 0 to 90 years.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -36,7 +38,7 @@ def media_density(
     return scattered + tryptophan + young + old_ultraviolet + old + 0.111
 
 
-def _bell(nm: NDArray, center_nm: float, slope: float) -> NDArray[np.float64]:
+def _bell(nm: NDArray[Any], center_nm: float, slope: float) -> NDArray[np.float64]:
     return np.exp(-np.square(slope * (nm - center_nm)))
 
 

@@ -206,7 +206,7 @@ def _features(first: ArrayLike, *columns: ArrayLike) -> NDArray[np.float64]:
     return features
 
 
-def _shaped(network: Network, features: NDArray) -> NDArray[np.float64]:
+def _shaped(network: Network, features: NDArray[Any]) -> NDArray[np.float64]:
     n_inputs = len(INPUTS[network.card.network])
     found = network(features.reshape(-1, n_inputs))
     return found.reshape(*features.shape[:-1], found.shape[-1])

@@ -6,6 +6,7 @@ curvature and height at the vertex.  Lengths are mm from the corneal apex, power
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,25 +68,27 @@ class CardinalPoints:
     refraction_dpt: float
 
 
-def _offset_part(packed: NDArray, *exponents: tuple[int, int]) -> NDArray[np.float64]:
+def _offset_part(
+    packed: NDArray[Any], *exponents: tuple[int, int]
+) -> NDArray[np.float64]:
     """Sum some monomial coefficients of the offsets; zero where there are none."""
     order = [tuple(e) for e in EXPONENTS[horner_order()].tolist()]
     total = sum(packed[:, OFFSET + order.index(e)] for e in exponents)
     return np.where(packed[:, FORM] == WITH_OFFSET, total, 0.0)
 
 
-def _mean_curvatures(packed: NDArray) -> NDArray[np.float64]:
+def _mean_curvatures(packed: NDArray[Any]) -> NDArray[np.float64]:
     curvature = 0.5 * (packed[:, CURVATURE_X] + packed[:, CURVATURE_Y])
     return curvature + _offset_part(packed, (2, 0), (0, 2))
 
 
-def _vertices_mm(packed: NDArray) -> NDArray[np.float64]:
+def _vertices_mm(packed: NDArray[Any]) -> NDArray[np.float64]:
     """Return the surfaces' axial positions; an offset may shift its surface there."""
     return packed[:, VERTEX + 2] + _offset_part(packed, (0, 0))
 
 
 def system_matrix(
-    packed: NDArray, indices: NDArray, *, first: int, last: int
+    packed: NDArray[Any], indices: NDArray[Any], *, first: int, last: int
 ) -> NDArray[np.float64]:
     """Return the matrix (2, 2) on (height, index * slope), surfaces [first, last)."""
     curvature, z_mm = _mean_curvatures(packed), _vertices_mm(packed)
@@ -100,7 +103,7 @@ def system_matrix(
 
 
 def _entrance_pupil(
-    packed: NDArray, indices: NDArray, stop_z_mm: float
+    packed: NDArray[Any], indices: NDArray[Any], stop_z_mm: float
 ) -> tuple[float, float]:
     """Return position and magnification of the stop's image in air."""
     n_before = int(packed[-1, N_BEFORE_STOP])

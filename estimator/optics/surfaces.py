@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -145,7 +146,9 @@ def _unnormalized_monomials() -> NDArray[np.float64]:
     return monomial_matrix() / np.array(norms)[:, None]
 
 
-def offset_monomials(offset_mm: ArrayLike, *, offset_radius_mm: ArrayLike) -> NDArray:
+def offset_monomials(
+    offset_mm: ArrayLike, *, offset_radius_mm: ArrayLike
+) -> NDArray[Any]:
     """Return coefficients (..., 28) of x^a y^b, mm, in Horner's order, of offset terms.
 
     Parameters
@@ -160,7 +163,9 @@ def offset_monomials(offset_mm: ArrayLike, *, offset_radius_mm: ArrayLike) -> ND
     return (monomials / radius_mm**degree)[..., horner_order()]
 
 
-def rotation_matrix(*, rotation_deg: float, tilt_deg: tuple[float, float]) -> NDArray:
+def rotation_matrix(
+    *, rotation_deg: float, tilt_deg: tuple[float, float]
+) -> NDArray[Any]:
     """Return the rotation (3, 3) from surface to eye axes: about z, then x, then y."""
 
     def turn(angle_deg, i, j):
@@ -177,7 +182,9 @@ def rotation_matrix(*, rotation_deg: float, tilt_deg: tuple[float, float]) -> ND
     return turn(tilt_deg[1], 2, 0) @ turn(tilt_deg[0], 1, 2) @ about_z
 
 
-def _pack_shape(row: NDArray, radius_mm: tuple[float, float], conic: float) -> None:
+def _pack_shape(
+    row: NDArray[Any], radius_mm: tuple[float, float], conic: float
+) -> None:
     row[CURVATURE_X], row[CURVATURE_Y] = (1.0 / r for r in radius_mm)
     row[CONIC] = conic
     row[ROTATION : ROTATION + 9] = np.eye(3).ravel()
@@ -185,7 +192,7 @@ def _pack_shape(row: NDArray, radius_mm: tuple[float, float], conic: float) -> N
     row[CLEAR_SQUARED] = math.inf
 
 
-def _pack_surface(surface: Surface, row: NDArray) -> None:
+def _pack_surface(surface: Surface, row: NDArray[Any]) -> None:
     _pack_shape(row, surface.radius_mm, surface.conic_constant)
     row[VERTEX : VERTEX + 3] = (*surface.decentration_mm, surface.z_mm)
     row[CLEAR_SQUARED] = surface.clear_radius_mm**2

@@ -6,7 +6,7 @@ distance d fills the same pupil and adds the vergence d to the eye's refraction.
 """
 
 from dataclasses import dataclass
-from typing import overload
+from typing import Any, overload
 
 from numpy.typing import NDArray
 
@@ -61,7 +61,7 @@ class ObjectVergence:
     @overload
     def vergence_dpt(self, object_dpt: float) -> float: ...
     @overload
-    def vergence_dpt(self, object_dpt: NDArray) -> NDArray: ...
+    def vergence_dpt(self, object_dpt: NDArray[Any]) -> NDArray[Any]: ...
     def vergence_dpt(self, object_dpt):
         """Return the vergence of light from an object's distance."""
         return self.scale_ratio * object_dpt / (1.0 + self.offset_m * object_dpt)
@@ -69,7 +69,7 @@ class ObjectVergence:
     @overload
     def object_dpt(self, vergence_dpt: float) -> float: ...
     @overload
-    def object_dpt(self, vergence_dpt: NDArray) -> NDArray: ...
+    def object_dpt(self, vergence_dpt: NDArray[Any]) -> NDArray[Any]: ...
     def object_dpt(self, vergence_dpt):
         """Return the distance whose light has the given vergence."""
         return vergence_dpt / (self.scale_ratio - self.offset_m * vergence_dpt)

@@ -7,6 +7,7 @@ pupil rescaling are exact and share one table.
 
 import math
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -98,7 +99,7 @@ def wavefront_polynomial(zernike_um: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(zernike_um, dtype=np.float64) @ monomial_matrix()
 
 
-def _powers(x: NDArray, highest: int) -> NDArray:
+def _powers(x: NDArray[Any], highest: int) -> NDArray[Any]:
     return np.stack([x**k for k in range(highest + 1)])
 
 
@@ -138,7 +139,7 @@ def zernike_gradient(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
     return monomials @ monomial_matrix().T
 
 
-def rescale_pupil(zernike_um: ArrayLike, *, radius_ratio: ArrayLike) -> NDArray:
+def rescale_pupil(zernike_um: ArrayLike, *, radius_ratio: ArrayLike) -> NDArray[Any]:
     """Return coefficients of the same wavefront on a concentric circle.
 
     Parameters

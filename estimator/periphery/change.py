@@ -8,6 +8,7 @@ represents this departure.
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -133,7 +134,7 @@ def peripheral_change(
 
 
 def usual_axis_um(
-    axis_um: NDArray, noise_um: NDArray, population: Population
+    axis_um: NDArray[Any], noise_um: NDArray[Any], population: Population
 ) -> NDArray[np.float64]:
     """Return the wavefront (12,) on the axis, limited to the range of measured people.
 
@@ -149,7 +150,7 @@ def usual_axis_um(
     return mean_um + USUAL_DISTANCE / distance * away
 
 
-def _axis_distribution(population: Population) -> tuple[NDArray, NDArray]:
+def _axis_distribution(population: Population) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return mean (12,) and covariance (12, 12) on the axis."""
     deviation_um = population.deviation_um
     places = deviation_um.shape[1]
@@ -227,7 +228,7 @@ def _conditioned(
     )
 
 
-def _sphere_deviation_dpt(variances_um2: NDArray) -> NDArray[np.float64]:
+def _sphere_deviation_dpt(variances_um2: NDArray[Any]) -> NDArray[np.float64]:
     """Return the deviation (8,) of M from variances (96,) at the knots."""
     sphere_um2 = variances_um2.reshape(len(TERMS), -1)[TERMS.index(4)]
     return SPHERE_PER_C20 * np.sqrt(np.maximum(sphere_um2, 0.0)) / CIRCLE_MM**2

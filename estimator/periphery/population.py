@@ -11,6 +11,7 @@ import json
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,7 +163,9 @@ def _fitted(units: NDArray[np.float64]) -> NDArray[np.float64]:
     return covariance
 
 
-def _expected(units: NDArray, covariance: NDArray) -> tuple[NDArray, NDArray]:
+def _expected(
+    units: NDArray[Any], covariance: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return rows with their gaps filled in, and the filled values' covariance."""
     filled, spread = units.copy(), np.zeros_like(covariance)
     for row in filled:

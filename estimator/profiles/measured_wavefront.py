@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -293,12 +294,12 @@ class MeasuredWavefront(FocusingEye):
             self.wavefronts, h_deg=h_deg, v_deg=v_deg, wavelength_nm=wavelength_nm
         )
 
-    def _on_circles(self, radius_mm: NDArray) -> NDArray[np.float64]:
+    def _on_circles(self, radius_mm: NDArray[Any]) -> NDArray[np.float64]:
         """Return measured coefficients (P, 28) on circles (P,), piston zero."""
         polynomial_um = polynomial_in_mm(self.zernike_um, self.zernike_radius_mm)
         return zernike_from_polynomial(polynomial_um, radius_mm)
 
-    def _radius_mm(self, pupil_mm: NDArray) -> NDArray[np.float64]:
+    def _radius_mm(self, pupil_mm: NDArray[Any]) -> NDArray[np.float64]:
         """Return flat pupil radii; reject pupils larger than the measured one."""
         largest_mm = self.max_pupil_diameter_mm
         if pupil_mm.size and not (

@@ -6,6 +6,7 @@ coefficients of a pupil function.  `enz.py` computes PSFs from them.
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -90,7 +91,7 @@ def hankel_table(r, rho, weighted, out):
                 out[q, m + top] += weighted[g, m + top] * bessel[abs(m)]
 
 
-def enz_function(n: int, m: int, r: ArrayLike, defocus_rad: float) -> NDArray:
+def enz_function(n: int, m: int, r: ArrayLike, defocus_rad: float) -> NDArray[Any]:
     """Evaluate V_n^|m|(r, f), the image of a Zernike function.
 
     V_n^|m|(r, f) = int_0^1 exp(i f rho²) R_n^|m|(rho) J_|m|(2 pi r rho) rho drho.

@@ -10,6 +10,7 @@ import threading
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -180,7 +181,7 @@ def _filter_table(samples_per_px: NDArray[np.int64], half_width: int):
     return table.astype(np.float32), length, which.reshape(samples_per_px.shape)
 
 
-def _chunks(plan: FourierPlan, shear: NDArray) -> list[NDArray[np.int64]]:
+def _chunks(plan: FourierPlan, shear: NDArray[Any]) -> list[NDArray[np.int64]]:
     """Return members (indices into the plan) in batches of equal FFT lengths.
 
     Equal pupils are adjacent, because they share their mask.

@@ -8,6 +8,7 @@ t (um/px), given by its bounding box and one shear; nothing is stretched or resa
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -57,7 +58,7 @@ def _bos_nodes() -> NDArray[np.float64]:
     return np.array(points)
 
 
-def _monomials(points: NDArray) -> NDArray[np.float64]:
+def _monomials(points: NDArray[Any]) -> NDArray[np.float64]:
     return points[:, :1] ** EXPONENTS[:, 0] * points[:, 1:] ** EXPONENTS[:, 1]
 
 

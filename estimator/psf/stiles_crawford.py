@@ -5,6 +5,7 @@ perceived images, not for photographic ones.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,7 +52,7 @@ class StilesCrawford:
         rho = np.interp(wavelength_nm, WAVELENGTHS_NM, SLOPES_PER_MM2)
         return self.slope_ratio * rho
 
-    def amplitude(self, wavelength_nm: ArrayLike) -> tuple[NDArray, NDArray]:
+    def amplitude(self, wavelength_nm: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return k (P,) per mm² and u0 (P, 2) mm of the factor exp(-k |u - u0|²).
 
         The field is the root of the sensitivity: k = rho ln(10) / 2.

@@ -6,6 +6,7 @@ The slopes determine the method, the sampling and the kernel size of the PSF eng
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -88,7 +89,7 @@ class PupilSurvey:
         return (self.extent_px / self.unit_px).max(axis=1)
 
 
-def _sample_points() -> tuple[NDArray, NDArray]:
+def _sample_points() -> tuple[NDArray[Any], NDArray[Any]]:
     edge = 2.0 * math.pi * np.arange(N_EDGE) / N_EDGE
     ring = 2.0 * math.pi * np.arange(N_RING) / N_RING
     x = [np.cos(edge)] + [r * np.cos(ring) for r in _RING_RADII] + [np.zeros(1)]
@@ -96,7 +97,7 @@ def _sample_points() -> tuple[NDArray, NDArray]:
     return np.concatenate(x), np.concatenate(y)
 
 
-def _monomial_slopes() -> tuple[NDArray, NDArray, NDArray]:
+def _monomial_slopes() -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return sample points (2, n) and the slopes (28, n) of every monomial there."""
     x, y = _sample_points()
     a, b = EXPONENTS[:, :1], EXPONENTS[:, 1:]
@@ -157,7 +158,7 @@ def _survey(disc, half, shear, tables, low, high, edge, normal, blur, narrow):
 _N_RADIAL = 8
 
 
-def _passed_points() -> tuple[NDArray, NDArray]:
+def _passed_points() -> tuple[NDArray[Any], NDArray[Any]]:
     """Return powers (6, n) of unit-disc points, ring by ring, and ring weights (8,).
 
     The last ring is the edge and has no weight.
@@ -181,7 +182,7 @@ def _disc_log_amplitude(frames: PupilFrames) -> NDArray[np.float64]:
     return np.stack([*columns, s * s * yy], axis=1)
 
 
-def _passed_light(frames: PupilFrames) -> tuple[NDArray, NDArray]:
+def _passed_light(frames: PupilFrames) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the mean intensity (P,) over each apodized pupil and over its edge."""
     count = frames.shear_ratio.size
     if not frames.log_amplitude.any():

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -64,7 +65,7 @@ def _stop_diameters_mm(
     return given / ratio
 
 
-def _check_view(fields_deg: NDArray, object_dpt: float, fit: str) -> None:
+def _check_view(fields_deg: NDArray[Any], object_dpt: float, fit: str) -> None:
     if fit not in FITS:
         raise ValueError(f"fit '{fit}': allowed are {', '.join(FITS)}")
     if not np.all(np.abs(fields_deg) <= TRACED_FIELD_LIMIT_DEG):

@@ -6,6 +6,7 @@ matrix, which vary smoothly where the axes of an ellipse jump.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -168,7 +169,7 @@ def with_tilt(
     return zernike_um
 
 
-def distinct_rows(*columns: NDArray) -> tuple[NDArray, NDArray]:
+def distinct_rows(*columns: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the first index of each distinct row of columns (n,), and row numbers."""
     number = np.zeros(columns[0].size, dtype=np.int64)
     for column in columns:

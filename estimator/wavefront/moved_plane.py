@@ -8,6 +8,7 @@ sixth order where the chief ray has no slope.
 
 from collections import Counter
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -44,7 +45,7 @@ def _add_products(polynomial_um, terms, factors, out):
             out[n, k] += factors[m] * polynomial_um[n, i] * polynomial_um[n, j]
 
 
-def _squared_slopes(polynomial_um: NDArray) -> NDArray[np.float64]:
+def _squared_slopes(polynomial_um: NDArray[Any]) -> NDArray[np.float64]:
     found = np.zeros_like(polynomial_um)
     flat = np.ascontiguousarray(polynomial_um).reshape(-1, N_TERMS)
     _add_products(flat, *_slope_products(), found.reshape(-1, N_TERMS))

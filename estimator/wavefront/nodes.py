@@ -8,6 +8,7 @@ with the number of rings.
 """
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ N_REFERENCE_RINGS = 14
 Nodes = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
-def _gauss_nodes(atoms: NDArray, weights: NDArray, n: int) -> NDArray:
+def _gauss_nodes(atoms: NDArray[Any], weights: NDArray[Any], n: int) -> NDArray[Any]:
     """Return the nodes of a discrete measure's n-point Gauss rule (Golub-Welsch)."""
     before, current = np.zeros_like(atoms), np.ones_like(atoms)
     diagonal, squares, last_norm = [], [], 1.0
@@ -42,7 +43,7 @@ def _gauss_nodes(atoms: NDArray, weights: NDArray, n: int) -> NDArray:
     return np.linalg.eigvalsh(np.diag(diagonal) + np.diag(off, 1) + np.diag(off, -1))
 
 
-def _rule(atoms: NDArray, weights: NDArray, n: int, *, with_rim: bool):
+def _rule(atoms: NDArray[Any], weights: NDArray[Any], n: int, *, with_rim: bool):
     """Return a unit-sum Gauss rule, or Gauss-Radau with a node at 1, on [0, 1]."""
     weights = weights / weights.sum()
     if with_rim:
@@ -85,7 +86,7 @@ def stop_nodes(n_rings: int = N_RINGS, n_azimuths: int = N_AZIMUTHS) -> Nodes:
 @cache
 def circle_nodes(
     n_rings: int = N_CIRCLE_RINGS, n_azimuths: int = N_CIRCLE_AZIMUTHS
-) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return nodes of a uniformly weighted circle and the projection (28, n) of W."""
     legendre_nodes, legendre_weights = np.polynomial.legendre.leggauss(n_rings)
     rings, weights = np.sqrt((legendre_nodes + 1.0) / 2.0), legendre_weights / 2.0

@@ -1,6 +1,7 @@
 """Result types for wavefronts and the pupils that they fill."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +67,7 @@ class FieldResults:
     pupil_point_mm: NDArray[np.float64]
 
     @classmethod
-    def from_rows(cls, rows: NDArray) -> "FieldResults":
+    def from_rows(cls, rows: NDArray[Any]) -> "FieldResults":
         """Unpack the rows (..., N_RESULT) that the compiled code wrote."""
         ellipse, retina, plane = bundle.ELLIPSE, bundle.RETINA_POINT, bundle.PLANE_POINT
         return cls(

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import moderngl
 import numpy as np
@@ -130,7 +130,7 @@ class Gpu:
         self._buffers[name] = created
         return created
 
-    def upload(self, name: str, *arrays: NDArray) -> Buffer:
+    def upload(self, name: str, *arrays: NDArray[Any]) -> Buffer:
         """Copy arrays to the start of a named buffer, one after the other."""
         buffer = self.storage(name, sum(data.nbytes for data in arrays))
         start = 0
@@ -139,7 +139,7 @@ class Gpu:
             start += data.nbytes
         return buffer
 
-    def write(self, buffer: Buffer, data: NDArray, *, offset: int = 0) -> None:
+    def write(self, buffer: Buffer, data: NDArray[Any], *, offset: int = 0) -> None:
         """Copy an array into a buffer."""
         if not data.nbytes:
             return
@@ -183,7 +183,7 @@ class Gpu:
             "object range, or use a smaller image"
         )
 
-    def write_pages(self, pages: Pages, first_line: int, lines: NDArray) -> None:
+    def write_pages(self, pages: Pages, first_line: int, lines: NDArray[Any]) -> None:
         """Copy whole lines (n, STORE_SIDE) of words to pages from a line on."""
         side = constants.STORE_SIDE
         while len(lines):
@@ -231,17 +231,19 @@ class Gpu:
         """Return whether no other owner has filled the memory since."""
         return self._owners.get(name) is owner
 
-    def read(self, buffer: Buffer, shape: tuple, dtype) -> NDArray:
+    def read(self, buffer: Buffer, shape: tuple, dtype) -> NDArray[Any]:
         """Read the start of a buffer as an array; waits for the GPU."""
         out = np.empty(shape, dtype=dtype)
         self.read_into((buffer, 0, out))
         return out
 
-    def read_into(self, *parts: tuple[Buffer, int, NDArray]) -> None:
+    def read_into(self, *parts: tuple[Buffer, int, NDArray[Any]]) -> None:
         """Fill arrays from (buffer, byte offset) each; waits for the GPU once."""
         self.begin_read(*parts)()
 
-    def begin_read(self, *parts: tuple[Buffer, int, NDArray]) -> Callable[[], None]:
+    def begin_read(
+        self, *parts: tuple[Buffer, int, NDArray[Any]]
+    ) -> Callable[[], None]:
         """Start a readback; return a function that waits for it and fills the arrays.
 
         Later dispatches may change the buffers.  Without mapped memory the arrays are
@@ -317,5 +319,5 @@ def _context_on(index: int) -> moderngl.Context:
     )
 
 
-def _bytes_of(array: NDArray) -> NDArray[np.uint8]:
+def _bytes_of(array: NDArray[Any]) -> NDArray[np.uint8]:
     return array.reshape(-1).view(np.uint8)

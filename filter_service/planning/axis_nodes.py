@@ -6,6 +6,7 @@ same power of the number of nodes on each axis, equal shares minimize the produc
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,7 +89,7 @@ def axis_nodes(
 
 
 def _needed_over_ladder(
-    use: Use, axis: str, ladder: NDArray, allowed_error: float
+    use: Use, axis: str, ladder: NDArray[Any], allowed_error: float
 ) -> NDArray[np.float64]:
     """Return the number of intervals needed up to each step of a ladder."""
     count = min(_STATES_ON_LADDER, use.vergence_dpt.size)

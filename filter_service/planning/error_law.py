@@ -9,6 +9,8 @@ to the blur.  Where rays do not move in proportion, the blend is displaced from 
 exact PSF, which counts at first order.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,12 +51,12 @@ MEAN_OF_HALF_WAY = 8.0 / 15.0
 """Mean square over an interval of an error that is 4 f (1 - f) of its middle value."""
 
 
-def mean_square(vectors_px: NDArray) -> NDArray[np.float64]:
+def mean_square(vectors_px: NDArray[Any]) -> NDArray[np.float64]:
     """Return the mean (P,) over the pupil of squared vectors (P, n, 2)."""
     return (WEIGHTS[:, None] * np.square(vectors_px)).sum(axis=(-2, -1))
 
 
-def spot_covariance(slopes_px: NDArray) -> NDArray[np.float64]:
+def spot_covariance(slopes_px: NDArray[Any]) -> NDArray[np.float64]:
     """Return the covariance (P, 3) xx, yy, xy of landing points of rays, px²."""
     centered = slopes_px - (WEIGHTS[:, None] * slopes_px).sum(axis=-2, keepdims=True)
     x, y = centered[..., 0], centered[..., 1]
@@ -62,7 +64,7 @@ def spot_covariance(slopes_px: NDArray) -> NDArray[np.float64]:
 
 
 def _blur_px2(
-    covariance_px2: NDArray, difference_px2: NDArray, unit_px: NDArray
+    covariance_px2: NDArray[Any], difference_px2: NDArray[Any], unit_px: NDArray[Any]
 ) -> NDArray[np.float64]:
     """Return the blur (P,), px²: the geometric mean of the two principal variances."""
     xx, yy, xy = np.moveaxis(covariance_px2, -1, 0)
@@ -75,12 +77,12 @@ def _blur_px2(
 
 
 def blend_error(
-    lower_px: NDArray,
-    upper_px: NDArray,
-    exact_px: NDArray,
+    lower_px: NDArray[Any],
+    upper_px: NDArray[Any],
+    exact_px: NDArray[Any],
     *,
-    share_ratio: NDArray,
-    unit_px: NDArray,
+    share_ratio: NDArray[Any],
+    unit_px: NDArray[Any],
 ) -> NDArray[np.float64]:
     """Return the mean square error (P,) of images filtered with blends of two PSFs.
 
@@ -107,7 +109,10 @@ def blend_error(
 
 
 def allowed_difference_px(
-    covariance_px2: NDArray, *, unit_px: NDArray, half_way_error: float | NDArray
+    covariance_px2: NDArray[Any],
+    *,
+    unit_px: NDArray[Any],
+    half_way_error: float | NDArray[Any],
 ) -> NDArray[np.float64]:
     """Return the RMS difference (P,) of neighbors for a given RMS error half-way.
 

@@ -5,6 +5,8 @@ it.  Field directions (h, v) are the eye's (CONVENTIONS.md), so the PSFs of a fi
 direction move over the image with the gaze.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -27,7 +29,7 @@ def unit_direction(h_deg: ArrayLike, v_deg: ArrayLike) -> NDArray[np.float64]:
     )
 
 
-def angles_deg(direction: NDArray) -> tuple[NDArray, NDArray]:
+def angles_deg(direction: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return azimuths and elevations (...) of vectors (..., 3)."""
     x, y, z = np.moveaxis(np.asarray(direction, float), -1, 0)
     return (
@@ -134,7 +136,7 @@ def pixel_from_mrad(
     return scale @ roll
 
 
-def _pupil_axes(direction: NDArray) -> tuple[NDArray, NDArray]:
+def _pupil_axes(direction: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return ex = u x y, normalized, and ey = ex x u, each (..., 3)."""
     ex = np.cross(direction, np.array([0.0, 1.0, 0.0]))
     ex /= np.linalg.norm(ex, axis=-1, keepdims=True)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -178,7 +179,7 @@ class NodeWavefronts:
 
 
 def node_evaluator(
-    eye: EyeOptics, spec: GridSpec, h_deg: NDArray, v_deg: NDArray
+    eye: EyeOptics, spec: GridSpec, h_deg: NDArray[Any], v_deg: NDArray[Any]
 ) -> WavefrontsOf:
     """Return a function that evaluates wavefronts at field nodes (n,), node by node."""
     per_node = spec.primary_wavelengths_nm.size

@@ -1,6 +1,7 @@
 """Sampled states of the frames of a cache, and the errors of blended PSFs there."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,7 +125,9 @@ def sample_use(eye: EyeOptics, spec: GridSpec, count: int) -> Use:
     return Use(eye, spec, states, vergence_dpt, scale, exact_px)
 
 
-def _nearest_object_dpt(spec: GridSpec, focused_dpt: NDArray) -> NDArray[np.float64]:
+def _nearest_object_dpt(
+    spec: GridSpec, focused_dpt: NDArray[Any]
+) -> NDArray[np.float64]:
     """Return the object distances (P,) nearest to the eye's focus."""
     ranges_dpt = np.array(spec.object_ranges_dpt)
     found = np.clip(focused_dpt[:, None], ranges_dpt[:, 0], ranges_dpt[:, 1])
@@ -132,7 +135,7 @@ def _nearest_object_dpt(spec: GridSpec, focused_dpt: NDArray) -> NDArray[np.floa
     return found[np.arange(best.size), best]
 
 
-def _objects_dpt(spec: GridSpec, share: NDArray) -> NDArray[np.float64]:
+def _objects_dpt(spec: GridSpec, share: NDArray[Any]) -> NDArray[np.float64]:
     """Return the object distances (P,) at shares of the concatenated ranges."""
     ranges_dpt = np.array(spec.object_ranges_dpt)
     steps = share * len(ranges_dpt)
@@ -142,8 +145,8 @@ def _objects_dpt(spec: GridSpec, share: NDArray) -> NDArray[np.float64]:
 
 
 def _seen_directions(
-    spec: GridSpec, x: NDArray, y: NDArray
-) -> tuple[NDArray, NDArray, NDArray]:
+    spec: GridSpec, x: NDArray[Any], y: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return field directions (P,) and scales at image positions in 0..1.
 
     The positions cycle through the gaze directions that frames may have.
@@ -185,19 +188,19 @@ def moved(use: Use, axis: str, to: NDArray[np.float64]) -> PupilStates:
     return PupilStates(**columns, total_defocus_dpt=total_dpt)
 
 
-def _blur_scale(use: Use, pupils_mm: NDArray) -> NDArray[np.float64]:
+def _blur_scale(use: Use, pupils_mm: NDArray[Any]) -> NDArray[np.float64]:
     """Return the ratio (P,) of the defocus at which pupils are read to the states'."""
     if use.eye.rings is not None:  # foci are the same in any pupil
         return np.ones(pupils_mm.shape)
     return use.states.pupil_diameter_mm / pupils_mm
 
 
-def axis_error(use: Use, axis: str, nodes: NDArray) -> float:
+def axis_error(use: Use, axis: str, nodes: NDArray[Any]) -> float:
     """Return the mean square error when one axis is interpolated between nodes."""
     return axis_errors(use, axis, [nodes])[0]
 
 
-def axis_errors(use: Use, axis: str, choices: list[NDArray]) -> list[float]:
+def axis_errors(use: Use, axis: str, choices: list[NDArray[Any]]) -> list[float]:
     """Return `axis_error` of several choices of nodes, evaluating the eye once."""
     found = [
         bracket_axis(nodes, vars(use.states)[FIELD_OF_AXIS[axis]]) for nodes in choices
@@ -261,12 +264,14 @@ def _at_infinity_dpt(use: Use, states: PupilStates) -> NDArray[np.float64]:
     return use.eye.total_defocus_dpt(**columns)
 
 
-def _error(use: Use, neighbors: PupilStates, share: NDArray) -> float:
+def _error(use: Use, neighbors: PupilStates, share: NDArray[Any]) -> float:
     """Return the mean square error; neighbors are all lower, then all upper ones."""
     return float(_errors_of(use, neighbors, share).mean())
 
 
-def _errors_of(use: Use, neighbors: PupilStates, share: NDArray) -> NDArray[np.float64]:
+def _errors_of(
+    use: Use, neighbors: PupilStates, share: NDArray[Any]
+) -> NDArray[np.float64]:
     """Return square errors (P,); neighbors are all lower, then all upper ones."""
     found = np.zeros(share.size)
     for light_ratio, added_dpt in light_of_foci(use):
@@ -307,7 +312,7 @@ def light_of_foci(use: Use) -> list[tuple[NDArray[np.float64], NDArray[np.float6
 
 
 def focus_slopes_px(
-    use: Use, states: PupilStates, added_dpt: NDArray
+    use: Use, states: PupilStates, added_dpt: NDArray[Any]
 ) -> NDArray[np.float64]:
     """Return slopes (m P, n, 2), px, of light for a focus, in pixels of the states."""
     count = states.h_deg.size // use.states.h_deg.size

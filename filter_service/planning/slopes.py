@@ -4,6 +4,8 @@ The landing point of a ray is the slope of its wavefront; the difference of two 
 the distance between their rays at the same points of the pupil.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,7 +33,7 @@ def state_frames(
     spec: GridSpec,
     states: PupilStates,
     *,
-    pixel_from_mrad: NDArray | None = None,
+    pixel_from_mrad: NDArray[Any] | None = None,
 ) -> PupilFrames:
     """Return pupils and wavefronts of states (P,), in pixel coordinates.
 
@@ -83,7 +85,7 @@ def main_foci_dpt(eye: EyeOptics, spec: GridSpec) -> NDArray[np.float64]:
 
 
 def main_light_ratio(
-    eye: EyeOptics, spec: GridSpec, radius_mm: NDArray
+    eye: EyeOptics, spec: GridSpec, radius_mm: NDArray[Any]
 ) -> NDArray[np.float64]:
     """Return each focus's share (n, P) of its channel's light, in pupils (P,)."""
     if eye.rings is None:
@@ -93,7 +95,7 @@ def main_light_ratio(
     return np.maximum(np.concatenate(ratios), LEAST_LIGHT)
 
 
-def _sample_slopes() -> tuple[NDArray, NDArray, NDArray]:
+def _sample_slopes() -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return weights (n,) and slopes (28, n) of every monomial over the unit disc."""
     node, weight = np.polynomial.legendre.leggauss(N_RINGS)
     radius = np.sqrt((node + 1.0) / 2.0)[:, None]

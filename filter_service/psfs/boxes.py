@@ -1,5 +1,7 @@
 """Boxes that kernels are cropped to: sizes, packed reaches, unpacking of kernels."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,13 +11,13 @@ MAX_REACH_PX = 255
 SIDES = 4
 
 
-def box_sizes(reach_px: NDArray) -> tuple[NDArray, NDArray]:
+def box_sizes(reach_px: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return widths and heights (...) of kernels with reaches (..., 4)."""
     left, right, up, down = np.moveaxis(np.asarray(reach_px), -1, 0)
     return left + right + 1, up + down + 1
 
 
-def pack_reach(reach_px: NDArray) -> NDArray[np.uint32]:
+def pack_reach(reach_px: NDArray[Any]) -> NDArray[np.uint32]:
     """Pack four reaches (..., 4) into the bytes of a word, left in the lowest."""
     return (np.asarray(reach_px, np.uint32) << np.array([0, 8, 16, 24], np.uint32)).sum(
         axis=-1, dtype=np.uint32
@@ -29,7 +31,7 @@ def unpack_reach(words: NDArray[np.uint32]) -> NDArray[np.uint8]:
 
 
 def square_kernel(
-    weights: NDArray[np.uint16], offset: int, reach_px: NDArray, radius_px: int
+    weights: NDArray[np.uint16], offset: int, reach_px: NDArray[Any], radius_px: int
 ) -> NDArray[np.float64]:
     """Return a centered kernel (2 R + 1, 2 R + 1), in its quantization steps."""
     left, right, up, down = (int(r) for r in reach_px)

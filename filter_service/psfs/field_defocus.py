@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -90,7 +90,9 @@ class FieldDefocus:
         """Return the change (...), dpt, at field directions, clamped to the range."""
         return self.of_weights(self.axes.weights(h_deg, v_deg))
 
-    def of_weights(self, weights: tuple[NDArray, NDArray]) -> NDArray[np.float64]:
+    def of_weights(
+        self, weights: tuple[NDArray[Any], NDArray[Any]]
+    ) -> NDArray[np.float64]:
         """Return the change (...) for weights of `FieldAxes.weights`."""
         of_rows, of_columns = weights
         return ((of_rows @ self.change_dpt) * of_columns).sum(axis=-1)
@@ -106,7 +108,12 @@ class EyeDefocus:
     """
 
     def __init__(
-        self, eye: EyeOptics, spec: GridSpec, *, h_deg: NDArray, v_deg: NDArray
+        self,
+        eye: EyeOptics,
+        spec: GridSpec,
+        *,
+        h_deg: NDArray[Any],
+        v_deg: NDArray[Any],
     ):
         wavelengths_nm = spec.channel_wavelengths_nm
         h, v, nm = (
@@ -153,7 +160,9 @@ class EyeDefocus:
         return change.of_weights(self._node_weights)[:, None]
 
 
-def _directions(h_deg: NDArray, v_deg: NDArray) -> tuple[NDArray, NDArray]:
+def _directions(
+    h_deg: NDArray[Any], v_deg: NDArray[Any]
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return azimuths and elevations of a grid, by rows, and of the gaze direction.
 
     The gaze direction is included because it may lie outside the camera's image.
@@ -164,5 +173,5 @@ def _directions(h_deg: NDArray, v_deg: NDArray) -> tuple[NDArray, NDArray]:
     )
 
 
-def _nearest(range_deg: NDArray) -> float:
+def _nearest(range_deg: NDArray[Any]) -> float:
     return float(np.clip(0.0, range_deg[0], range_deg[-1]))

@@ -2,6 +2,7 @@
 
 from bisect import bisect_left
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -208,7 +209,7 @@ def _corners(
     return tuple(corner for corner in corners if corner[-1] > 0.0)
 
 
-def _bracket(nodes: NDArray, value: float) -> tuple[int, int, float]:
+def _bracket(nodes: NDArray[Any], value: float) -> tuple[int, int, float]:
     """Return the nodes on both sides of a value and the share of the upper one."""
     axis = nodes.tolist()
     upper = min(bisect_left(axis, value), len(axis) - 1)

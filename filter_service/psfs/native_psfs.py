@@ -10,6 +10,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from functools import cache
 from threading import Lock
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -241,7 +242,7 @@ def native_psfs() -> NativePsfs | None:
     return NativePsfs(library, library.new_threads(thread_count()))
 
 
-def _with_changes(table: NDArray) -> NDArray[np.float32]:
+def _with_changes(table: NDArray[Any]) -> NDArray[np.float32]:
     """Return entries (n, 2) of a table (n,): values, and differences to the next."""
     return np.stack([table, np.diff(table, append=table[-1])], axis=1).astype(
         np.float32
@@ -249,7 +250,7 @@ def _with_changes(table: NDArray) -> NDArray[np.float32]:
 
 
 @cache
-def _tables() -> tuple[PsfTables, dict[str, NDArray]]:
+def _tables() -> tuple[PsfTables, dict[str, NDArray[Any]]]:
     """Return the tables of `estimator.psf`, and the arrays that they point to."""
     half_width = ACCURACY["normal"].filter_half_width
     filters = [fourier.pixel_filter(k + 1, half_width) for k in range(FILTER_COUNT)]

@@ -404,7 +404,9 @@ class PsfStore:
         self._added = [kept.ravel()]
         self.generation += 1
 
-    def box_sizes_of(self, psfs: NDArray[np.int64]) -> tuple[NDArray, NDArray]:
+    def box_sizes_of(
+        self, psfs: NDArray[np.int64]
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return widths and heights (n,) of kernels."""
         left, right, up, down = np.moveaxis(
             unpack_reach(self.tables.reach_words[psfs]).astype(np.int64), -1, 0

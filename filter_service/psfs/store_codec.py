@@ -26,7 +26,7 @@ class NotStorable(TypeError):
     """An object contains a value that is not plain data."""
 
 
-def pack(value: object) -> tuple[Any, dict[str, NDArray]]:
+def pack(value: object) -> tuple[Any, dict[str, NDArray[Any]]]:
     """Return the JSON tree of an object and its arrays by name.
 
     Raises
@@ -34,11 +34,11 @@ def pack(value: object) -> tuple[Any, dict[str, NDArray]]:
     NotStorable
         If a value cannot be written; the message has its path in the object.
     """
-    arrays: dict[str, NDArray] = {}
+    arrays: dict[str, NDArray[Any]] = {}
     return _packed(value, "", arrays, {}), arrays
 
 
-def unpack(tree: Any, arrays: Mapping[str, NDArray]) -> Any:
+def unpack(tree: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
     """Return the object of a tree; its arrays are those given, not copies.
 
     Raises
@@ -67,7 +67,7 @@ def unpack(tree: Any, arrays: Mapping[str, NDArray]) -> Any:
 
 
 def _packed(
-    value: object, path: str, arrays: dict[str, NDArray], known: dict[int, str]
+    value: object, path: str, arrays: dict[str, NDArray[Any]], known: dict[int, str]
 ) -> Any:
     if isinstance(value, np.ndarray):
         return {"array": _array_name(value, path, arrays, known)}
@@ -106,7 +106,10 @@ def _is_key(key: object, path: str) -> bool:
 
 
 def _array_name(
-    array: NDArray, path: str, arrays: dict[str, NDArray], known: dict[int, str]
+    array: NDArray[Any],
+    path: str,
+    arrays: dict[str, NDArray[Any]],
+    known: dict[int, str],
 ) -> str:
     """Return the name of an array; an array that occurs repeatedly is stored once."""
     if array.dtype.hasobject:

@@ -145,7 +145,7 @@ def _round_up(size: int, step: int) -> int:
     return -(-size // step) * step
 
 
-def _places(arrays: dict[str, NDArray]) -> tuple[dict[str, list], int]:
+def _places(arrays: dict[str, NDArray[Any]]) -> tuple[dict[str, list], int]:
     """Return [dtype, shape, start] of each array, and their total size."""
     places, end = {}, 0
     for key, array in arrays.items():
@@ -154,7 +154,7 @@ def _places(arrays: dict[str, NDArray]) -> tuple[dict[str, list], int]:
     return places, end
 
 
-def _blocks(arrays: dict[str, NDArray]) -> Iterator[bytes | memoryview]:
+def _blocks(arrays: dict[str, NDArray[Any]]) -> Iterator[bytes | memoryview]:
     for array in arrays.values():
         if array.nbytes:
             plain = memoryview(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
@@ -163,7 +163,7 @@ def _blocks(arrays: dict[str, NDArray]) -> Iterator[bytes | memoryview]:
         yield bytes(_round_up(array.nbytes, ALIGNMENT_BYTES) - array.nbytes)
 
 
-def _array(data: NDArray[np.uint8], place: list) -> NDArray:
+def _array(data: NDArray[np.uint8], place: list) -> NDArray[Any]:
     name, shape, start = place
     dtype = np.dtype(name)
     n_bytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize

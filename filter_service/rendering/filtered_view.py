@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +63,7 @@ class FilteredView(FrameCounts):
         Kernels in use, and texels of all their levels.
     """
 
-    color: NDArray
+    color: NDArray[Any]
     stage_times_ms: dict[str, float]
     pupil_diameter_mm: float
     focus_dpt: float

@@ -9,6 +9,7 @@ compiled loops are imported when a frame first needs them: numba takes 0.3 s to 
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,8 +191,8 @@ def _node_kernels(
     tables: StoreTables,
     fill: Fill,
     layers: FrameLayers,
-    fields: NDArray,
-    intervals: NDArray,
+    fields: NDArray[Any],
+    intervals: NDArray[Any],
 ) -> NodeKernels:
     from filter_service.rendering.kernel_loops import fill_recipes, used_recipes
 

@@ -121,7 +121,7 @@ class FrameStates:
         self._handle = handle
         self._layers: tuple[tuple[float, float, float], FrameLayers] | None = None
         self._image: tuple[tuple, ImageCells] | None = None
-        self._change: tuple[FrameLayers, ImageCells, NDArray] | None = None
+        self._change: tuple[FrameLayers, ImageCells, NDArray[Any]] | None = None
         self._corner_weights: tuple[FieldAxes, ImageCells, tuple] | None = None
 
     def _forget_others(self, handle: FrameStore) -> None:

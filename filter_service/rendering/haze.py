@@ -117,7 +117,7 @@ class HazeGrid:
         beyond = self._outside * _edge_light(coarse)
         return (self._spread(coarse) + beyond).astype(np.float32)
 
-    def _spread(self, coarse: NDArray) -> NDArray:
+    def _spread(self, coarse: NDArray[Any]) -> NDArray[Any]:
         from scipy import fft
 
         n, m = coarse.shape[:2]
@@ -213,7 +213,7 @@ def _edge_light(coarse: NDArray[np.float32]) -> NDArray[np.float64]:
     return np.concatenate(edges).mean(axis=0, dtype=np.float64)
 
 
-def _wrapped(kernel: NDArray, shape: tuple[int, ...]) -> NDArray[np.float32]:
+def _wrapped(kernel: NDArray[Any], shape: tuple[int, ...]) -> NDArray[np.float32]:
     """Return a kernel with its center at the first element, as an FFT expects."""
     n, m = (kernel.shape[0] + 1) // 2, (kernel.shape[1] + 1) // 2
     found = np.zeros((max(shape[0], 2 * n - 1), max(shape[1], 2 * m - 1)))

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +60,7 @@ def seen_through(view: RgbdView, magnification: Matrix) -> RgbdView:
     return replace(view, **images)
 
 
-def _linear(color: NDArray) -> NDArray[np.float32]:
+def _linear(color: NDArray[Any]) -> NDArray[np.float32]:
     if color.dtype == np.uint8:
         return _decoding()[color]
     return color.astype(np.float32)

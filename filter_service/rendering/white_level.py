@@ -1,5 +1,7 @@
 """White level: the reference light for the contrast of pixels that may merge."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +14,7 @@ times the 90th percentile of its lit pixels, so that a lamp or a window in a roo
 not set it."""
 
 
-def white_level(color: NDArray) -> float:
+def white_level(color: NDArray[Any]) -> float:
     """Return the white level of an image: 1 for 8-bit input.
 
     Linear light may have any unit, so merging, and with it the whole filter, must scale

@@ -1,6 +1,7 @@
 """All passes of a frame, or a strip of it, in order, and the output image."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,12 +81,12 @@ class FramePasses:
         )
         self.lists.run()
 
-    def read_back(self, output: str, room: NDArray | None = None) -> NDArray:
+    def read_back(self, output: str, room: NDArray[Any] | None = None) -> NDArray[Any]:
         """Fetch the filtered image in the requested encoding, and all counters."""
         self.begin_read(output, room)
         return self.end_read()
 
-    def begin_read(self, output: str, room: NDArray | None = None) -> None:
+    def begin_read(self, output: str, room: NDArray[Any] | None = None) -> None:
         """Start the readback of the image (into ``room`` if given) and the counts."""
         self._output = output
         name, pixels_per_thread, dtype = ENCODERS[output]
@@ -103,7 +104,7 @@ class FramePasses:
                 (self.strip.buffers["USED"], 0, self.fragments.used_words),
             )
 
-    def end_read(self) -> NDArray | None:
+    def end_read(self) -> NDArray[Any] | None:
         """Return the image, or None if the strip must be filtered again.
 
         That is the case if a kernel was missing, or if the lists did not fit and other

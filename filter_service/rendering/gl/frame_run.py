@@ -6,6 +6,7 @@ In between, the processor is free for another view.
 from collections import Counter
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +72,7 @@ class FrameRun:
         gpu: Gpu,
         kept: EyeState,
         request: ViewRequest,
-        out: NDArray,
+        out: NDArray[Any],
         *,
         fill_depth: bool,
     ):
@@ -100,7 +101,7 @@ class FrameRun:
         """Depth of the view, with missing pixels filled."""
         return self._view.depth_m
 
-    def finish(self) -> tuple[NDArray, Counts]:
+    def finish(self) -> tuple[NDArray[Any], Counts]:
         """Return the image and the counts."""
         picture, counts = self._begun_or_whole()
         if self._missing_count is None and counts["missing_depth_count"]:
@@ -128,7 +129,7 @@ class FrameRun:
             return None
         return begun
 
-    def _begun_or_whole(self) -> tuple[NDArray, Counts]:
+    def _begun_or_whole(self) -> tuple[NDArray[Any], Counts]:
         begun, self._begun = self._begun, None
         if begun is not None:
             try:
@@ -137,7 +138,7 @@ class FrameRun:
                 self._cell_px = 2 * begun.plan.state.image.cell_px
         return self._whole()
 
-    def _whole(self) -> tuple[NDArray, Counts]:
+    def _whole(self) -> tuple[NDArray[Any], Counts]:
         """Filter the frame, with larger cells if its kernels take too much memory."""
         while True:
             plan = self._plan()
@@ -168,7 +169,9 @@ class FrameRun:
             ),
         )
 
-    def _joined(self, plan: _Plan, runs: "list[_StripRun]") -> tuple[NDArray, Counts]:
+    def _joined(
+        self, plan: _Plan, runs: "list[_StripRun]"
+    ) -> tuple[NDArray[Any], Counts]:
         """Finish the strips and join their images."""
         counts = Counter[str]()
         shape = (plan.state.image.count, words_per_cell(self.layers))
@@ -233,7 +236,7 @@ class FrameRun:
         with self.timer.wall("psf_compute_ms"):
             self._kept.handle.store.fill(psfs, until_s=self._request.until_s)
 
-    def out_of(self, plan: _Plan) -> NDArray | None:
+    def out_of(self, plan: _Plan) -> NDArray[Any] | None:
         """Return the output array if a strip's image is the whole image, else None."""
         return None if plan.border_px or len(plan.strips) > 1 else self._out
 
@@ -257,7 +260,7 @@ class _StripRun:
         self.passes.begin_read(self._frame.output, self._out)
         self._is_begun = True
 
-    def finish(self) -> NDArray:
+    def finish(self) -> NDArray[Any]:
         """Return the image."""
         if not self._is_begun:
             self.begin()
@@ -270,7 +273,7 @@ class _StripRun:
         return picture
 
     @property
-    def _out(self) -> NDArray | None:
+    def _out(self) -> NDArray[Any] | None:
         return self._frame.out_of(self.plan)
 
     def _run(self, passes: FramePasses, **options) -> None:

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +65,7 @@ class FrameRecord:
     n_threads: int
     arrays: Arrays
     eye_arrays: Arrays  # may be reused by the next frame of this eye
-    kept: list[NDArray]
+    kept: list[NDArray[Any]]
 
     @classmethod
     def new(
@@ -74,7 +74,7 @@ class FrameRecord:
         """Return an empty record for loops on the given threads."""
         return cls(Frame(threads=threads), n_threads, arrays, eye_arrays, [])
 
-    def _keep(self, array: NDArray) -> int:
+    def _keep(self, array: NDArray[Any]) -> int:
         """Keep an array alive as long as the record; return its address."""
         self.kept.append(array)
         return int(array.ctypes.data)
@@ -203,7 +203,7 @@ class FrameRecord:
         n_floats = self.n_threads * sizes.scratch_floats
         c.blend_scratch = self._room("blend_scratch", n_floats, np.float32)
 
-    def set_picture(self, picture: NDArray) -> None:
+    def set_picture(self, picture: NDArray[Any]) -> None:
         """Set the pointer to the output image."""
         self.c.picture = self._keep(picture)
         self.c.output_kind = COLOR_KINDS[picture.dtype.name]

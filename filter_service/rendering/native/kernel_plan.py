@@ -1,6 +1,7 @@
 """Plan of a frame's kernels for the compiled loops, kept between frames."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,7 @@ class KernelPlan:
     kernels: FrameKernels
     kernel_of: NDArray[np.uint32]
     shapes: NDArray[np.void]
-    sources: tuple[NDArray, ...]
+    sources: tuple[NDArray[Any], ...]
 
     def serves(self, state: tuple, used: NDArray[np.bool_]) -> bool:
         """Return whether the plan has all kernels of a frame's state and pairs."""
