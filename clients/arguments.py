@@ -45,7 +45,7 @@ def read_object(option: str, text: str) -> dict[str, Any]:
         data = text.encode("utf-8", "surrogateescape")
         value = loads_bounded(data, max_bytes=MAX_ARGUMENT_BYTES)
     except ValueError as error:
-        raise ValueError(f"{option} is no JSON: {error}") from None
+        raise ValueError(f"{option} is not JSON: {error}") from None
     if not isinstance(value, dict):
         raise ValueError(f"{option} is {value!r:.60}; allowed: a JSON object")
     return value

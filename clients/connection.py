@@ -95,7 +95,7 @@ class SendBufferPool:
                 except zmq.NotDone:
                     raise ServiceTimeout(
                         f"{len(buffers)} images of {buffer.memory.nbytes} bytes were "
-                        f"not taken by the service within {self._timeout_s:g} s"
+                        f"not accepted by the service within {self._timeout_s:g} s"
                     ) from None
                 return buffer
         return None
@@ -176,7 +176,7 @@ class Connection:
                 self.n_connections += 1
                 changes.append(True)
             elif kind & _DOWN:
-                self.is_up, self.state = False, "connection lost, trying again"
+                self.is_up, self.state = False, "connection lost, reconnecting"
                 changes.append(False)
             else:
                 # A failure without a reason means a wrong key, or a service under

@@ -201,8 +201,8 @@ class ServiceLink:
         self.pump(min(remaining_s, 0.5))
         if self._connection.has_failed_handshake:
             raise AuthenticationFailed(
-                f"{self._connection.endpoint} and this client do not know each other's "
-                "keys: it wants the key file of a client that its owner has added "
+                f"{self._connection.endpoint} and this client do not accept each "
+                "other's keys: it needs the key file of a client that was added "
                 "(`ocufilter keys add NAME`), and no other"
             )
         if self._refusal is not None:

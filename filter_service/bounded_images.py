@@ -206,7 +206,7 @@ def _opened_picture(
         except FileNotFoundError:
             _refuse(named, "no such file", "a file that exists", option)
         except Image.UnidentifiedImageError:
-            found = "cannot be read (no known kind of picture)"
+            found = "cannot be read (unknown image format)"
             _refuse(named, found, "PNG, JPEG, PPM, TIFF or WebP", option)
         except Exception as error:  # Pillow's decoders raise nearly anything
             found = f"cannot be read ({_text_of(error)})"

@@ -164,7 +164,7 @@ class KeyRing:
         """
         file = self._file_of(name)
         if file.exists():
-            raise ValueError(f"there is a client {name!r} already: remove it first")
+            raise ValueError(f"client {name!r} already exists: remove it first")
         key = ClientKey(name, _new_pair(), self.create().public)
         _write(
             client_file,
@@ -189,7 +189,7 @@ class KeyRing:
         file = self._file_of(name)
         if not file.exists():
             names = ", ".join(self.names()) or "nobody"
-            raise ValueError(f"there is no client {name!r}; allowed in: {names}")
+            raise ValueError(f"unknown client {name!r}; existing clients: {names}")
         file.unlink()
 
     def names(self) -> list[str]:
@@ -242,7 +242,7 @@ class KeyRing:
                 if isinstance(error, FileNotFoundError) and not path.is_symlink():
                     continue  # removed meanwhile
                 if (self._keys.get(name) or (None,))[0] != (identity := _stamp(path)):
-                    log.warning("a key file is skipped: %s", error)
+                    log.warning("skipped a key file: %s", error)
                 found[name] = identity, None
         self._keys = found
         keys = (key for _, key in found.values())
@@ -281,7 +281,7 @@ def _read(path: Path, wanted: tuple[str, ...]) -> dict[str, str]:
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise ValueError(f"{path} is no regular file; expected a key file")
+            raise ValueError(f"{path} is not a regular file; expected a key file")
         content = os.read(descriptor, MAX_FILE_BYTES + 1)
     finally:
         os.close(descriptor)
@@ -295,7 +295,7 @@ def _read(path: Path, wanted: tuple[str, ...]) -> dict[str, str]:
         raise ValueError(f"{path} is no key file: {error}") from None
     for name in wanted:
         if not isinstance(values.get(name), str) or not KEY.fullmatch(values[name]):
-            raise ValueError(f"{path}: {name!r} is no key of 40 characters (Z85)")
+            raise ValueError(f"{path}: {name!r} is not a key of 40 characters (Z85)")
     return values
 
 

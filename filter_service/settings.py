@@ -140,8 +140,8 @@ class FilterSettings(Record):
     object_planes_dpt: Annotated[
         tuple[VergenceDpt, ...],
         _doc(
-            "Flat surfaces that face the camera, dpt, where a scene has nothing else, "
-            "as screens have: PSFs for these alone instead of the range.",
+            "Distances of flat surfaces that face the camera, dpt, if a scene consists "
+            "of these alone, as on a screen; replaces the range.",
             max_length=MAX_PLANES,
             extra=RISING,
         ),
@@ -152,12 +152,12 @@ class FilterSettings(Record):
     ] = (0.0, 0.0)
     gaze_range_deg: Annotated[
         tuple[TurnDeg, TurnDeg],
-        _doc("How far frames may turn the gaze from there, to either side, deg."),
+        _doc("Range of the gaze of frames around it, to either side, deg."),
     ] = (0.0, 0.0)
     display: Annotated[
         str,
         _doc(
-            "What shows the picture: common, lcd, oled, crt, paper, or wavelengths of "
+            "Display: common, lcd, oled, crt, paper, or wavelengths of "
             "red, green and blue in nm as 620,530,455, with standard deviations as "
             "620:13,530:19,455:13.  A command also takes a .csv of spectra: nm, red, "
             "green, blue."
@@ -174,7 +174,10 @@ class FilterSettings(Record):
     chromatic: Annotated[bool, _doc("Off: all colors are focused alike.")] = True
     lateral_color: Annotated[
         bool,
-        _doc("Displace red and blue against green off the axis; a traced eye only."),
+        _doc(
+            "Lateral color: displace red and blue against green off the axis; traced "
+            "eyes only."
+        ),
     ] = False
     stiles_crawford: Annotated[
         bool,
@@ -269,7 +272,7 @@ def as_settings(settings: FilterSettings | Mapping[str, Any]) -> FilterSettings:
     for name in settings:
         if name not in setting_types():
             raise BadMessage(
-                f"{name!r} is none",
+                f"{name!r} is unknown",
                 field="settings",
                 allowed=", ".join(setting_types()),
             )

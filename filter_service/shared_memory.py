@@ -80,7 +80,7 @@ class Slot:
             if descriptor >= 0:
                 os.close(descriptor)
             raise OutOfMemory(
-                f"{size_bytes / 1e6:.0f} MB of shared memory are not to be had: "
+                f"{size_bytes / 1e6:.0f} MB of shared memory are not available: "
                 f"{error.strerror}"
             ) from None
 
@@ -204,7 +204,7 @@ class SlotPool:
             )
         if len(self._slots) >= self.max_count:
             raise OutOfMemory(
-                f"{len(self._slots)} pieces of shared memory are in use",
+                f"{len(self._slots)} blocks of shared memory are in use",
                 allowed=f"{self.max_count} in all",
             )
         with self._reserve():

@@ -80,7 +80,7 @@ def read_calibration(path: Path) -> tuple[Pinhole, Disparity]:
         raise InvalidFile(path, found, "[f 0 cx; 0 f cy; 0 0 1]")
     offset_px, baseline_mm = _number(fields["doffs"]), _number(fields["baseline"])
     if not (math.isfinite(offset_px) and math.isfinite(baseline_mm)):
-        found = "doffs or baseline is no number"
+        found = "doffs or baseline is not a number"
         raise InvalidFile(path, found, f"up to {LARGEST_NUMBER:g} px or mm")
     return (
         Pinhole(matrix[0], matrix[4], matrix[2], matrix[5], _size_px(fields)),

@@ -74,7 +74,7 @@ class KinectCounts:
             found = f"{stored.shape[1]}x{stored.shape[0]} px"
             raise InvalidFile(path, found, f"{width_px}x{height_px}, as the Kinect's")
         if not ((stored >= 0.0) & (stored <= MAX_COUNT)).all():
-            raise InvalidFile(path, "numbers that are no counts", f"0 to {MAX_COUNT}")
+            raise InvalidFile(path, "numbers that are not counts", f"0 to {MAX_COUNT}")
         return self.of_integers(stored.astype(np.uint16))
 
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:

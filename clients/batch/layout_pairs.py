@@ -80,7 +80,7 @@ def _colors_and_depths(
         colors = [path for path in files if path.suffix.lower() in _PICTURES]
         if len(depths) != len(colors):
             raise ValueError(
-                f"'{source}': which files are depth cannot be told; allowed: folders "
+                f"'{source}': cannot tell which files are depth; allowed: folders "
                 f"such as color/ and depth/, names that end in _depth, or --depth DIR"
             )
     return _named(colors, _COLOR_WORD), _named(depths, _DEPTH_WORD)

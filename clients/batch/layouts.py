@@ -92,7 +92,7 @@ def _layout_of(source: Path, layout: str) -> str:
     is_video = source.is_file()
     if is_video and source.suffix.lower() not in VIDEO_SUFFIXES:
         raise ValueError(
-            f"'{source}': '{source.suffix}' is no video; allowed: a folder, or "
+            f"'{source}': '{source.suffix}' is not a video; allowed: a folder, or "
             f"{', '.join(VIDEO_SUFFIXES)}"
         )
     if is_video != (layout == "video") and layout != "auto":

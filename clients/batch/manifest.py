@@ -181,7 +181,7 @@ def _parsed(line: bytes, path: Path) -> Record:
     except ValueError:
         record = None
     if not isinstance(record, dict):
-        found = f"a line is no JSON object: {line[:60]!r}"
+        found = f"a line is not a JSON object: {line[:60]!r}"
         raise InvalidFile(path, found, "the lines of a batch")
     return record
 

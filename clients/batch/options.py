@@ -30,7 +30,7 @@ from filter_service.settings import (
 
 DESCRIPTION = """\
 Folders and videos of color and depth, as people see them: each frame through each
-profile, on all cores.  Started again after whatever happened, it does what is missing.
+profile, on all cores.  Run the same command again to continue an interrupted batch.
 
   ocufilter batch rgbd_dataset_freiburg1_desk -p myopia -p keratoconus -o seen
   ocufilter batch room/ -p me.json --fov-deg 50 --focus-dpt center -o seen
@@ -127,7 +127,7 @@ def _add_eye(group) -> None:
         "--render-tolerance",
         type=float,
         default=1.0,
-        help="errors of rendering against the usual; 0 is exact (default: 1)",
+        help="rendering error relative to the default; 0 is exact (default: 1)",
     )
 
 
@@ -145,12 +145,12 @@ def _add_results(group) -> None:
     group.add_argument(
         "--overwrite",
         action="store_true",
-        help="remove what another job left in the folder",
+        help="delete the output of another job in the folder",
     )
     group.add_argument(
         "--dry-run",
         action="store_true",
-        help="say what would be done, how long it would take, what it would cost",
+        help="print the work, the time and the cost, and stop",
     )
     group.add_argument(
         "--price-per-core-hour", type=float, metavar="X", help="for --dry-run"

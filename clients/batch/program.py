@@ -107,7 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         summary = run(options)
     except KeyboardInterrupt:
-        print("batch: stopped; the same command goes on with it", file=sys.stderr)
+        print("batch: stopped; run the same command to continue", file=sys.stderr)
         return 130
     except ModuleNotFoundError as error:
         if error.name not in ("av", "ray"):

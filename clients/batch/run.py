@@ -146,7 +146,7 @@ def only_one(out: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ValueError(f"--out '{out}': another batch is at work there") from None
+            raise ValueError(f"--out '{out}': another batch is running there") from None
         yield
 
 

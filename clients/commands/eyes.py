@@ -23,7 +23,7 @@ Folder = Annotated[
 ]
 
 eyes = typer.Typer(
-    help="List and erase the eyes that are kept on disk (`serve --keep-eyes DIR`).",
+    help="List and delete the eyes that are cached on disk (`serve --keep-eyes DIR`).",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -33,8 +33,8 @@ def _folder(given: Path | None) -> Path:
     named = given or os.environ.get(CACHE_VARIABLE)
     if not named:
         raise ValueError(
-            f"no folder: give --dir DIR or set {CACHE_VARIABLE}; eyes are kept only "
-            "where a service was told to (store_cache_dir, or serve --keep-eyes)"
+            f"no folder: give --dir DIR or set {CACHE_VARIABLE}; eyes are cached only "
+            "if a service is configured to (store_cache_dir, or serve --keep-eyes)"
         )
     return Path(named).expanduser()
 
@@ -83,7 +83,9 @@ def erase(
     from filter_service.psfs.cached_eyes import erase_eyes
 
     if (profile is not None) + (name is not None) + every != 1:
-        raise ValueError("whose? one of PROFILE, --name HASH and --all")
+        raise ValueError(
+            "nothing selected; expected one of PROFILE, --name HASH and --all"
+        )
     begin = name or ""
     if profile is not None:
         from estimator.profiles.files import load_profile

@@ -90,9 +90,12 @@ def field(
         plot_field(found, plot, title=f"{eye.name}, {pupil_mm:g} mm")
     notes = list(found.notes)
     if eye.correction is not None:
-        notes.append("seen through the worn correction")
+        notes.append("through the correction")
     if rings_of(eye.correction) is not None:
-        notes.append("rings or lenslets of it are in no coefficient: it is for far")
+        notes.append(
+            "coefficients cannot represent its rings or lenslets: they "
+            "describe its distance power"
+        )
     if json_output:
         print_json({"directions": _directions(found), "notes": notes})
     else:

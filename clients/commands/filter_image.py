@@ -82,7 +82,9 @@ def filter_image(
     ] = None,
     distance_m: Annotated[
         float | None,
-        typer.Option(help="Of all that is seen, without --depth; inf is infinity."),
+        typer.Option(
+            help="Distance of the whole image, instead of --depth; inf is infinity."
+        ),
     ] = None,
     fov_deg: Annotated[
         float | None, typer.Option(help="Vertical field of view, deg.")
@@ -98,14 +100,16 @@ def filter_image(
         Path | None,
         typer.Option(
             metavar="IMG",
-            help="What the camera sees hides this; of the size and kind of --color.",
+            help="Color of the surface behind the visible one, in the size and format "
+            "of --color.",
         ),
     ] = None,
     hidden_depth: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Its depth, as --depth; 0, negative and NaN: nothing is hidden here.",
+            help="Its depth, as --depth; 0, negative and NaN mean that nothing is "
+            "hidden.",
         ),
     ] = None,
     pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")] = 4.0,
@@ -124,11 +128,13 @@ def filter_image(
         typer.Option(help="Meters per unit of the depth file [integers: 0.001]."),
     ] = None,
     no_merge: Annotated[
-        bool, typer.Option("--no-merge", help="Keep every pixel a fragment.")
+        bool, typer.Option("--no-merge", help="Do not merge similar pixels.")
     ] = False,
     render_tolerance: Annotated[
         float,
-        typer.Option(help="Errors of rendering against the usual, 0 to 8: 0 is exact."),
+        typer.Option(
+            help="Rendering error relative to the default, 0 to 8; 0 is exact."
+        ),
     ] = 1.0,
     engine: Annotated[
         Engine,
@@ -141,7 +147,7 @@ def filter_image(
     ] = False,
     plan: Annotated[
         bool,
-        typer.Option("--plan", help="Say which PSFs would be computed, and stop."),
+        typer.Option("--plan", help="Print which PSFs would be computed, and stop."),
     ] = False,
     json_output: Json = False,
     *,

@@ -19,7 +19,7 @@ Folder = Annotated[
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Of the client.")]
 
 keys = typer.Typer(
-    help="Make and take back keys of clients, for a service beyond this machine.",
+    help="Create and revoke client keys, for a service that other machines reach.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -72,7 +72,7 @@ def remove(name: Name, folder: Folder = None, json_output: Json = False) -> None
     if json_output:
         print_json({"removed": name})
     else:
-        say(f"{name} may not connect any more")
+        say(f"{name} can no longer connect")
 
 
 @keys.command(name="list")

@@ -93,13 +93,13 @@ def psf(
     method: Annotated[
         Method,
         typer.Option(
-            help="auto takes the one valid for this wavefront; enz refuses where its "
-            "series does not hold."
+            help="auto selects the valid one for this wavefront; enz fails outside the "
+            "domain of its series."
         ),
     ] = Method.AUTO,
     stiles_crawford: Annotated[
         bool,
-        typer.Option("--stiles-crawford", help="Cones see the pupil's rim dimmer."),
+        typer.Option("--stiles-crawford", help="Apply the Stiles-Crawford effect."),
     ] = False,
     json_output: Json = False,
 ) -> None:

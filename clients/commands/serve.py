@@ -14,7 +14,7 @@ def serve(
         str | None,
         typer.Option(
             metavar="ENDPOINT",
-            help="Where to listen: tcp://127.0.0.1:5577 or ipc:///tmp/ocufilter.",
+            help="Endpoint to listen on: tcp://127.0.0.1:5577 or ipc:///tmp/ocufilter.",
         ),
     ] = None,
     config: Annotated[
@@ -44,13 +44,15 @@ def serve(
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Keep finished eyes there, for the next start; see `ocufilter eyes`.",
+            help="Folder in which finished eyes are cached for the next start; see "
+            "`ocufilter eyes`.",
         ),
     ] = None,
     ready_file: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Written with the endpoint once frames may come."
+            metavar="FILE",
+            help="File that receives the endpoint once the service is ready.",
         ),
     ] = None,
 ) -> None:

@@ -7,9 +7,7 @@ import typer
 
 from clients.commands.console import Json, print_json
 
-Seconds = Annotated[
-    float, typer.Option("--timeout", metavar="S", help="How long to wait for it.")
-]
+Seconds = Annotated[float, typer.Option("--timeout", metavar="S", help="Timeout, s.")]
 
 
 def status(
@@ -37,7 +35,7 @@ def status(
         return
     state = "ready" if found["is_ready"] else "alive, not ready"
     if found["is_degraded"]:
-        state += ", degraded: a process does not stay up, see the service's log"
+        state += ", degraded: a process keeps ending, see the service's log"
     print(f"{endpoint} is {state}")
     for name in ("n_connections", "n_sessions", "n_rendered", "n_dropped", "memory_mb"):
         print(f"  {name:<16} {found[name]:g}")

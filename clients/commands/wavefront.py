@@ -173,7 +173,7 @@ def load_surfaces(
     found = estimate_eye(profile)
     notes = found.notes
     if profile.correction is not None:
-        notes = (*notes, "the worn correction is not in these coefficients")
+        notes = (*notes, "these coefficients do not include the correction")
     relaxed = eye_surfaces(found.parameters, retina=found.retina)
     if focus_dpt is None:
         return profile.name, relaxed, notes

@@ -44,7 +44,7 @@ _TRACKED = (
 _WORDS = {
     xr.SessionState.FOCUSED: "the headset shows this program",
     xr.SessionState.VISIBLE: "the headset shows this program, another has the input",
-    xr.SessionState.SYNCHRONIZED: "nobody looks: the headset is taken off or covered",
+    xr.SessionState.SYNCHRONIZED: "the headset is not worn",
     xr.SessionState.STOPPING: "the headset's session stops",
 }
 
@@ -59,7 +59,7 @@ def _or_lost(method: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return method(self, *arguments)
         except (xr.InstanceLostError, xr.SessionLostError, xr.SessionLossPending):
-            raise SessionLost("the OpenXR runtime is gone") from None
+            raise SessionLost("lost the OpenXR runtime") from None
         except xr.RuntimeFailureError as error:
             raise SessionLost(f"the OpenXR runtime failed: {error}") from None
         except xr.TimeoutExpired:

@@ -89,7 +89,7 @@ class StereoImages:
             )
         )
         if not self._color:
-            raise RuntimeError(f"no color format that is known, only {offered}")
+            raise RuntimeError(f"no supported color format, only {offered}")
         self._context = context
         self._framebuffers = Framebuffers(context)
         self._presenter = Presenter(context, size_px)

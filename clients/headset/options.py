@@ -77,7 +77,7 @@ def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Names
         metavar="JSON",
         help='of the filter, as {"tolerance": "loose"}',
     )
-    where = parser.add_argument_group("where it is filtered and shown")
+    where = parser.add_argument_group("where frames are filtered")
     where.add_argument(
         "--service",
         metavar="ENDPOINT",

@@ -31,7 +31,7 @@ def _unit(quaternion) -> Array:
     values = np.asarray(quaternion, float)
     length = float(np.linalg.norm(values))
     if not 0.5 < length < 2.0:
-        raise ValueError(f"the orientation {tuple(values)} is no unit quaternion")
+        raise ValueError(f"the orientation {tuple(values)} is not a unit quaternion")
     return values / length
 
 

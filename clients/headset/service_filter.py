@@ -98,13 +98,13 @@ class ServiceFilter:
         if client.welcome is None:
             if self._is_there:
                 self._say(
-                    f"no filter service at {self._endpoint}: the scene is shown "
-                    "unfiltered; still trying"
+                    f"no filter service at {self._endpoint}: showing the scene "
+                    "unfiltered and retrying"
                 )
             self._is_there, self._newest = False, None
             return None
         if not self._is_there:
-            self._say("the filter service is there")
+            self._say("connected to the filter service")
             self._is_there = True
         self._send_profiles(frame)
         try:

@@ -236,7 +236,7 @@ class Viewer:
         seen = self._seeing.see(frame)
         is_stale = seen is not None and begun_s - seen.frame.begun_s > STALE_S
         if is_stale and not self._was_stale:
-            self._say("the filter is late: the scene is shown as it is")
+            self._say("the filter is late: showing the scene unfiltered")
         self._was_stale = is_stale
         times_ms = {
             "scene_ms": MS_PER_S * (rendered_s - begun_s),

@@ -66,7 +66,7 @@ class FigureWorker:
             if not self._is_over:
                 self._start()
             raise StudyFailed(
-                "The process that draws figures ended; it was started again"
+                "The process that draws figures ended and was restarted"
             ) from None
         if failure is not None:
             raise StudyFailed(failure)

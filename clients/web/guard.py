@@ -27,7 +27,7 @@ padding:.1em .35em;border-radius:4px}}</style>
 {text}
 """
 FORBIDDEN_PAGE = PAGE.format(
-    title="This page wants its token",
+    title="This page needs its token",
     text="<p>Open the whole address that <code>ocufilter web</code> printed when it "
     "started; it ends with <code>?token=...</code>.  After a restart the token is "
     "another one.</p>",

@@ -239,7 +239,7 @@ def _photo_depth(
     suffix = Path(name).suffix.lower()
     if suffix not in DEPTH_SUFFIXES:
         allowed = ", ".join(DEPTH_SUFFIXES)
-        raise ValueError(f"“{name:.60}” is no depth; allowed: {allowed}")
+        raise ValueError(f"“{name:.60}” is not depth; allowed: {allowed}")
     with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
         path = Path(folder) / f"depth{suffix}"
         path.write_bytes(content)

@@ -27,8 +27,8 @@ from clients.extra import WEB_INSTALL
 DEFAULT_PORT = 8765
 TOKEN_BYTES = 24
 EXPOSED = (
-    "web: other machines can reach this page over unencrypted HTTP; whoever reads the "
-    "traffic has the token"
+    "web: other machines can reach this page over unencrypted HTTP; anyone who can "
+    "read the traffic can use the token"
 )
 
 

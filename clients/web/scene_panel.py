@@ -82,7 +82,7 @@ class ScenePanel:
                 ui.select(
                     PHOTO_WIDTHS_DEG, value=self._width_deg, on_change=self._set_width
                 ).props("outlined dense options-dense").tooltip(
-                    "How wide the photo is seen"
+                    "Horizontal field of view of the photo"
                 )
                 ui.label(
                     f"Depth: {DEPTH_HELP}.  Without depth the photo stands flat at a "
@@ -126,7 +126,7 @@ class ScenePanel:
     async def _take_depth(self, name: str, content: bytes) -> None:
         if self._photo is None:
             self._depth = name, content
-            ui.notify("Now the photo that this is the depth of", type="info")
+            ui.notify("Now upload the photo of this depth", type="info")
             self._in_use()
             return
         await self._show_photo(self._photo, (name, content))
@@ -156,7 +156,7 @@ class ScenePanel:
     async def _make(self, make: Callable[..., Picture], *args: Any, **options) -> bool:
         """Show the picture that a function makes, or report its error."""
         if self._n_waiting >= MAX_WAITING:
-            ui.notify("Still busy with the last pictures; try again", type="warning")
+            ui.notify("Still rendering; try again", type="warning")
             return False
         kind = self._kind
         self._busy.set_visibility(True)

@@ -122,7 +122,8 @@ class Focusing(ABC):
         reached = (
             f"is nearer than the near point ({max(0.0, round(near_dpt, 3)):.3g} dpt)"
             if near_dpt > -OUT_OF_REACH_DPT
-            else f"is out of reach, as all distances are by {-near_dpt:.3g} dpt or more"
+            else f"is out of reach, as are all distances, by {-near_dpt:.3g} dpt or "
+            "more"
         )
         added_dpt = self.vergence.vergence_dpt(near_dpt) - self.vergence.vergence_dpt(
             far_dpt

@@ -222,7 +222,8 @@ def read_card(name: str) -> Card:
         return parse_card(name, json.loads(path.read_text(encoding="utf-8")))
     except (KeyError, TypeError, ValueError) as error:
         raise DamagedWeights(
-            f"{path.name} is no card of the network '{name}' ({error!r}): restore it "
+            f"{path.name} is not a card of the network '{name}' ({error!r}): restore "
+            "it "
             "from the repository, or make it anew with python -m training.export"
         ) from error
 

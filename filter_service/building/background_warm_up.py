@@ -37,14 +37,14 @@ class BackgroundWarmUp:
         try:
             self._work()
         except Exception:
-            log.exception("could not prepare for builds")
+            log.exception("the warm-up for builds failed")
         finally:
             late.cancel()
             self._done.set()
 
     @staticmethod
     def _say_why() -> None:
-        log.info("compiling, which takes up to a minute; it is kept for the next time")
+        log.info("compiling, which takes up to a minute; the result is cached")
 
     def before(self, progress: Progress, cancelled: Callable[[], bool]) -> Progress:
         """Return a ``progress`` function that first waits for the warm-up.
@@ -69,5 +69,5 @@ class BackgroundWarmUp:
             return
         while not self._done.wait(POLL_S):
             if cancelled():
-                raise BuildCancelled("a newer profile took over")
+                raise BuildCancelled("replaced by a newer profile")
             progress(0.0, COMPILING_STAGE)

@@ -73,7 +73,7 @@ def _built(
 
     def go_on() -> None:
         if cancelled():
-            raise BuildCancelled("a newer profile took over")
+            raise BuildCancelled("replaced by a newer profile")
 
     stored = cache.load(key, go_on=go_on)
     if stored is not None:

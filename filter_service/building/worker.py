@@ -136,7 +136,7 @@ def _is_cancelled(pipe: Connection, ticket: int) -> bool:
 
 def _send_failure(pipe: Connection, ticket: int, error: Exception) -> None:
     if not isinstance(error, FilterError):
-        log.exception("a build failed in a way that is not foreseen")
+        log.exception("a build failed unexpectedly")
         error = BuildFailed(f"{type(error).__name__}: {error}")
     if not isinstance(error, BuildCancelled):
         log.info("build %d failed: %s", ticket, error)

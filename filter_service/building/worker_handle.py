@@ -200,7 +200,7 @@ class WorkerHandle:
                 self.start()
             return events
         if self._kill_at_s is not None and now_s > self._kill_at_s:
-            log.warning("a cancelled build did not stop; its process is ended")
+            log.warning("a cancelled build did not stop; ending its process")
             worker.process.kill()
         self._watch(worker, now_s)
         try:
@@ -219,14 +219,14 @@ class WorkerHandle:
             return
         self._next_watch_s = now_s + WATCH_INTERVAL_S
         if self._running is not None and now_s - self._began_s > self.build_limit_s:
-            log.error("a build took longer than %g s; it is ended", self.build_limit_s)
+            log.error("a build took longer than %g s; ending it", self.build_limit_s)
             worker.process.kill()
         if not is_stopped(worker.process.pid):
             self._stopped_since_s = None
         elif self._stopped_since_s is None:
             self._stopped_since_s = now_s
         elif now_s - self._stopped_since_s > STOPPED_LIMIT_S:
-            log.error("the process that computes PSFs stands still; it is ended")
+            log.error("the build worker does not respond; ending it")
             worker.process.kill()
 
     def _receive(self, pipe: Connection, events: list[BuildEvent]) -> None:
@@ -265,7 +265,7 @@ class WorkerHandle:
         try:
             self._worker.pipe.send(message)
         except OSError:
-            log.debug("the worker is gone; poll will find out")
+            log.debug("the worker ended; poll will report it")
 
     def _after_crash(self, worker: _Worker) -> list[BuildEvent]:
         """Start a new process; the running build is lost, queued ones are not."""
@@ -279,10 +279,10 @@ class WorkerHandle:
         self._end_running()
         self.n_restarts += 1
         if was_cancelled:
-            error: FilterError = BuildCancelled("the build was stopped by force")
+            error: FilterError = BuildCancelled("the build was terminated")
         else:
             error = WorkerCrashed(f"the process that computes PSFs {how}")
-            log.error("%s; a new one is started", error.message)
+            log.error("%s; starting a new one", error.message)
         if not was_ready:
             # No job was the cause, so queued ones would wait forever.
             tickets += [ticket for ticket, _ in self._queue]

@@ -178,8 +178,8 @@ class EyeFilter:
             raise ValueError("this EyeFilter is closed")
         if self._pid != os.getpid():
             raise ValueError(
-                f"this EyeFilter was made in process {self._pid}, whose threads and "
-                "worker it needs; expected one made in this process"
+                f"this EyeFilter belongs to process {self._pid}; create one in this "
+                "process"
             )
         return self._builder
 

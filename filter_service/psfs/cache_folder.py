@@ -25,6 +25,6 @@ def check_is_private(folder: Path) -> None:
     """
     if folder.stat().st_mode & 0o077:
         raise PermissionError(
-            f"others may look into {folder}, and eyes are nobody's business: "
-            f"chmod 700 {folder}"
+            f"other users can read {folder}, which holds medical data: chmod 700 "
+            f"{folder}"
         )

@@ -17,8 +17,8 @@ NO_LATERAL_COLOR = "a measured wavefront holds no lateral color: it needs a trac
 
 
 ONE_GAZE = (
-    "the lens is seen through as in the middle of settings.gaze_range_deg: "
-    "another gaze sees the world through the same part of it"
+    "the lens is that of the middle of settings.gaze_range_deg: "
+    "other gazes use the same part of it"
 )
 
 
@@ -45,7 +45,7 @@ def eye_for_spec(
 
     def report(fraction: float, stage: str) -> None:
         if cancelled is not None and cancelled():
-            raise BuildCancelled("a newer profile took over")
+            raise BuildCancelled("replaced by a newer profile")
         if progress is not None:
             progress(fraction, stage)
 
@@ -79,7 +79,7 @@ def _check_diffracts(diffraction: bool) -> None:
     if not diffraction:
         raise ValueError(
             "settings.diffraction is false beside a lens with several foci: its rings "
-            "are known to diffraction alone; allowed is true"
+            "need diffraction; allowed: true"
         )
 
 

@@ -183,7 +183,7 @@ class StoreCache:
             _log_once(self._path(key), f"cannot be kept: {reason}")
             return
         log.info(
-            "a store of %.0f MB is kept for the next time, written in %.1f s",
+            "cached a store of %.0f MB, written in %.1f s",
             n_bytes / MB,
             time.monotonic() - started_s,
         )
@@ -195,7 +195,7 @@ class StoreCache:
         would fill up with stores that wait for a slow disk.
         """
         if not _WRITING.acquire(blocking=False):
-            log.info("a store is not kept: the disk is busy with the last one")
+            log.info("a store was not cached: the previous one is still being written")
             return
 
         def save() -> None:
@@ -230,4 +230,4 @@ class StoreCache:
                 return
             path.unlink(missing_ok=True)
             n_bytes -= size
-            log.info("%s is removed: the cache is full", path.name)
+            log.info("removed %s: the cache is full", path.name)

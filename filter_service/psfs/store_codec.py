@@ -101,7 +101,7 @@ def _packed(
 
 def _is_key(key: object, path: str) -> bool:
     if not isinstance(key, str | int):
-        raise NotStorable(f"{path} has the key {key!r}: no text or number")
+        raise NotStorable(f"{path} has the key {key!r}: neither text nor a number")
     return True
 
 
@@ -122,11 +122,11 @@ def _array_name(
 
 def _class_of(name: str) -> type:
     if not name.startswith(PACKAGES):
-        raise ValueError(f"{name!r} is no class of this project")
+        raise ValueError(f"{name!r} is not a class of this project")
     module, _, path = name.partition(":")
     found: Any = importlib.import_module(module)
     for part in path.split("."):
         found = getattr(found, part)
     if not isinstance(found, type) or found.__module__ != module:
-        raise ValueError(f"{name!r} is no class of this project")
+        raise ValueError(f"{name!r} is not a class of this project")
     return found

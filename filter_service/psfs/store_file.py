@@ -108,7 +108,7 @@ def read_file(path: Path, *, go_on: Look = lambda: None) -> Any:
         )
         n_there = os.fstat(file.fileno()).st_size
         if magic != MAGIC or not PREAMBLE.size + n_header <= start <= n_there:
-            raise DamagedFile("it begins otherwise than was written")
+            raise DamagedFile("its beginning was changed")
         if n_there != start + n_bytes:
             raise DamagedFile(f"it has {n_there} bytes, {start + n_bytes} were written")
         header = file.read(n_header)

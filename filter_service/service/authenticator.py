@@ -78,9 +78,7 @@ class Authenticator:
         if self._keys is not None:
             key = z85.encode(credentials[0]).decode() if credentials else ""
             if mechanism != b"CURVE" or not self.accepts(key):
-                log.warning(
-                    "a client at %s has no key that is allowed", address.decode()
-                )
+                log.warning("a client at %s has no allowed key", address.decode())
                 return [
                     *(VERSION, request_id, b"400", b"no key that is allowed", b"", b"")
                 ]

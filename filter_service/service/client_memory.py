@@ -45,7 +45,9 @@ class ClientMemory:
         limits = self._limits
         most = MAX_PARTS_PER_VIEW * limits.max_views * limits.max_part_bytes
         if not self.is_offered:
-            return Shared(reason="this service shares no memory over this transport")
+            return Shared(
+                reason="this service does not offer shared memory over this transport"
+            )
         if len(session.shared) >= MAX_SHARED_SLOTS:
             return Shared(reason=f"{MAX_SHARED_SLOTS} slots are in use")
         if request.size_bytes > most:

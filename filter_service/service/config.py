@@ -281,10 +281,11 @@ def _check_bind(bind: object, *, has_keys: bool) -> None:
         )
     if host not in LOOPBACK_HOSTS and not has_keys:
         raise ValueError(
-            f"bind is {bind!r}, which other machines can reach: whoever connects would "
-            "read and use what is not his, and could use up this machine's memory. "
-            "Listen on tcp://127.0.0.1:PORT and let clients come through an SSH "
-            "tunnel, or make keys (`ocufilter keys add NAME`) and set keys_dir in the "
+            f"bind is {bind!r}, which other machines can reach: anyone who connects "
+            "could use other people's sessions and exhaust this machine's memory. "
+            "Listen on tcp://127.0.0.1:PORT and let clients connect through an SSH "
+            "tunnel, or create keys (`ocufilter keys add NAME`) and set keys_dir in "
+            "the "
             "configuration file"
         )
 

@@ -208,7 +208,7 @@ class FrameQueue:
         """Answer a session's waiting frame with an error: its device is gone."""
         waiting, session.waiting = session.waiting, None
         if waiting is not None:
-            error = RenderFailed("the device that filtered frames is gone")
+            error = RenderFailed("the device that filtered these frames failed")
             frame = waiting.frame
             failed = ErrorReply.from_exception(error, frame_id=frame.frame_id)
             self.answer(session, frame, failed)
@@ -216,8 +216,6 @@ class FrameQueue:
     def lose_held(self) -> None:
         """Answer the frames that were lost with a render worker."""
         for lost in self._render.lose():
-            error = RenderFailed(
-                "the process that filters frames ended; it starts again"
-            )
+            error = RenderFailed("the render worker ended and is being restarted")
             frame_id = lost.waiting.frame.frame_id
             self._answer_held(lost, ErrorReply.from_exception(error, frame_id=frame_id))

@@ -162,7 +162,7 @@ class FrontEnd:
             while self._run_once():
                 pass
         except LinkClosed:
-            log.error("the process that owns this one is gone")
+            log.error("the parent process ended")
         finally:
             self._close()
 
@@ -248,7 +248,7 @@ class FrontEnd:
     def _end_if_stuck(self, device: ServedDevice) -> None:
         limit_s = self.config.frame_limit_s
         if device.render.is_up and device.render.stuck_s > limit_s:
-            log.error("the process that filters frames is stuck for %g s", limit_s)
+            log.error("the render worker has not responded for %g s", limit_s)
             device.render.excuse()
             self._supervisor.send(("hung", device.index))
 
@@ -319,7 +319,9 @@ class FrontEnd:
                 self._take_in(received, superseded)
             except Exception:  # must not affect other clients
                 self._n_faults += 1
-                log.exception("fault %d: a refusal failed", self._n_faults)
+                log.exception(
+                    "internal error %d: could not send an error reply", self._n_faults
+                )
                 self._session_manager.end_session(received.peer)
         for session, frame in superseded:
             dropped = Dropped(frame.frame_id, "superseded")
@@ -406,7 +408,7 @@ class FrontEnd:
 
     def _disconnect(self, refused: Refused) -> None:
         """End the session of a client whose key was removed."""
-        log.warning("a client's key is not allowed any more")
+        log.warning("a client's key was removed")
         self._session_manager.end_session(refused.peer)
         error = NotAllowed(str(refused))
         self._send(refused.peer, ErrorReply.from_exception(error))

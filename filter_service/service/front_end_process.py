@@ -24,7 +24,7 @@ def main() -> None:
     try:
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     except (OSError, ValueError) as error:
-        log.warning("max_socket_mb is not kept to on this system: %s", error)
+        log.warning("max_socket_mb has no effect on this system: %s", error)
     try:
         front_end = FrontEnd(config, supervisor)
     except (OSError, NoMetrics) as error:

@@ -27,7 +27,7 @@ def check_path_is_free(bind: str) -> None:
     if not path.exists():
         return
     if not path.is_socket():
-        raise FileExistsError(f"{path} is there already and is no socket")
+        raise FileExistsError(f"{path} exists and is not a socket")
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         try:
             probe.connect(str(path))

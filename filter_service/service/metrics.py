@@ -12,19 +12,20 @@ REQUEST_LIMIT_S = 1.0
 METRICS = {
     # name: description; a suffix _total marks a counter
     "ocufilter_ready": "1 while frames can be filtered",
-    "ocufilter_degraded": "1 while a process does not stay up, or a device is missing",
+    "ocufilter_degraded": "1 while a process keeps ending or a device is unavailable",
     "ocufilter_connections": "open connections, with a session or without",
     "ocufilter_connections_evicted_total": "closed because too many were open",
     "ocufilter_sessions": "sessions with a client",
-    "ocufilter_sessions_away": "sessions whose client is gone and may come back",
+    "ocufilter_sessions_away": "sessions whose client disconnected and may reconnect",
     "ocufilter_frames_filtered_total": "frames answered with a picture",
     "ocufilter_frames_dropped_total": "frames answered without",
     "ocufilter_filter_seconds_total": "time in which frames were filtered",
-    "ocufilter_messages_unheard_total": "messages of clients that sent too many wrong",
-    "ocufilter_faults_total": "faults of the service that nobody foresaw",
+    "ocufilter_messages_unheard_total": "messages ignored from clients that sent too "
+    "many invalid ones",
+    "ocufilter_faults_total": "unexpected errors of the service",
     "ocufilter_memory_bytes": "memory of the door and the process that filters",
     "ocufilter_psfs_bytes": "of that, the PSFs of all clients",
-    "ocufilter_render_silent_seconds": "since the last sign of life of what filters",
+    "ocufilter_render_silent_seconds": "since the last heartbeat of the render worker",
 }
 
 

@@ -124,16 +124,16 @@ class Link:
         Raises
         ------
         LinkClosed
-            If the other end is closed and all its messages have been returned.
+            If the other end closed the connection and all its messages were returned.
         """
         is_closed = self._read()
         messages = self._complete()
         if is_closed and not messages:
-            raise LinkClosed("the other end is closed")
+            raise LinkClosed("the other end closed the connection")
         return messages
 
     def _read(self) -> bool:
-        """Read available data; return whether the other end is closed."""
+        """Read available data; return whether the other end closed the connection."""
         while True:
             try:
                 data, descriptors, _, _ = socket.recv_fds(

@@ -181,7 +181,7 @@ class RenderClient:
                 allowed=f"{most_bytes / MB:.0f} MB in all",
             )
         if len(held) >= self._slots.max_count * SHARED_QUOTA:
-            raise OutOfMemory(f"{len(held)} pieces of memory are shared already")
+            raise OutOfMemory(f"{len(held)} blocks of memory are already shared")
         slot = self._slots.create(size_bytes)
         self._shared.add(slot.number)
         self._send_slot(slot)

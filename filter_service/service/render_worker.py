@@ -120,7 +120,7 @@ class RenderWorker:
                 listen()
                 self._run_once()
         except LinkClosed:
-            log.error("the process that owns this one is gone")
+            log.error("the parent process ended")
         finally:
             self._close()
 
@@ -213,7 +213,7 @@ class RenderWorker:
         except LinkClosed:
             self._is_over = True
         except Exception:  # must not propagate through the compiled loops
-            log.exception("what came between the parts of a frame failed")
+            log.exception("a task between the stages of a frame failed")
         end_s = time.monotonic()
         self._rested_s += end_s - begin_s
         self._next_rest_s = end_s + (end_s - begin_s)
@@ -335,6 +335,6 @@ class RenderWorker:
             return reply_in_slots(session.filter_of, frame, slots, places, sizes_bytes)
         except Exception as error:
             if not isinstance(error, FilterError):
-                log.exception("a frame could not be answered")
+                log.exception("no reply could be made for a frame")
                 error = RenderFailed(f"{type(error).__name__}: {error}")
             return ErrorReply.from_exception(error, frame_id=frame.frame_id), []

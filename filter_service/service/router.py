@@ -62,7 +62,7 @@ class Refused(Exception):
     """A message from a client whose key is no longer allowed."""
 
     def __init__(self, peer: Peer) -> None:
-        super().__init__("the key is not allowed any more")
+        super().__init__("the key was removed")
         self.peer = peer
 
 

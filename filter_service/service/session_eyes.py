@@ -121,7 +121,7 @@ class SessionEyes:
             )
         except Exception as error:
             if not isinstance(error, FilterError):
-                log.exception("a profile could not be taken in")
+                log.exception("a profile could not be processed")
                 error = FilterError(f"{type(error).__name__}: {error}")
             return ErrorReply.from_exception(error, profile_id=request.profile_id)
         eye.profile_id, eye.generation = request.profile_id, accepted.generation

@@ -100,7 +100,9 @@ class SessionManager:
         """
         session = self._sessions.at(peer)
         if session is None:
-            raise NoSession("hello was not said", allowed="hello before anything else")
+            raise NoSession(
+                "no hello was received", allowed="hello as the first message"
+            )
         return session
 
     def greet(self, peer: Peer, hello: Hello) -> None:
@@ -125,7 +127,7 @@ class SessionManager:
             else:
                 self._free_client_memory(session)
                 self._sessions.reconnect(session, peer, hello.client)
-                log.info("session %d goes on (%r)", session.session_id, hello.client)
+                log.info("session %d resumed (%r)", session.session_id, hello.client)
         transports = [self._endpoint.split("://", 1)[0]]
         if self._client_memory.is_offered:
             transports.append("shm")
@@ -172,7 +174,7 @@ class SessionManager:
         self._record(session.key, session.record())
         self._open(session)
         where = f" on device {device.index}" if len(self._devices) > 1 else ""
-        log.info("session %d begins (%r)%s", session.session_id, hello.client, where)
+        log.info("session %d started (%r)%s", session.session_id, hello.client, where)
         return session
 
     def restore(self, records: Sequence[SessionRecord]) -> None:
@@ -280,7 +282,7 @@ class SessionManager:
         self._ask_due_profiles(now_s)
         for session in self._sessions.away:
             if now_s - (session.away_since_s or 0.0) > self.config.session_keep_s:
-                self._forget(session, "its client did not come back")
+                self._forget(session, "its client did not reconnect")
 
     def give_up(self, device: ServedDevice) -> None:
         """End the sessions of a lost device; new ones start on other devices."""
@@ -309,7 +311,7 @@ class SessionManager:
         if session is not None and session.peer is not None:
             self._free_client_memory(session)
             self._sessions.leave(session, time.monotonic())
-            log.info("session %d: its client is gone", session.session_id)
+            log.info("session %d: its client disconnected", session.session_id)
 
     def end_session(self, peer: Peer, outcome: Outcome | None = None) -> None:
         """End the session of a client, if it has one."""

@@ -37,7 +37,7 @@ def query_status(
         pong = decode_reply(socket.recv_multipart())
     except zmq.Again:
         raise ServiceTimeout(
-            f"no answer from {endpoint} within {timeout_s:g} s"
+            f"no reply from {endpoint} within {timeout_s:g} s"
             + (" (a service with keys answers only with --key FILE)" if not key else "")
         ) from None
     except zmq.ZMQError as error:

@@ -203,7 +203,7 @@ class Supervisor:
         """
         if not self._was_ready:
             raise ServiceFailed(str(error)) from None
-        log.error("the system refused something (%s)", error)
+        log.error("the system refused a request (%s)", error)
         time.sleep(CHECK_INTERVAL_S)
 
     def _run_once(self) -> None:
@@ -292,7 +292,7 @@ class Supervisor:
             self._check_stopped("standby", standby)
         except LinkClosed:
             del self._standbys[name]
-            log.error("the standby process %s; a new one is started", standby.end())
+            log.error("the standby process %s; starting a new one", standby.end())
 
     def _change_settings(self) -> None:
         """Apply changed settings; warn about those that require a restart."""
@@ -301,13 +301,15 @@ class Supervisor:
         try:
             wanted = self._read_again()
         except (ValueError, OSError) as error:
-            log.error("the settings stay as they are: %s", error)
+            log.error("the settings are unchanged: %s", error)
             return
         self._config, changed, others = changed_while_running(self._config, wanted)
         for name in changed:
             log.info("%s is %s now", name, getattr(self._config, name))
         if others:
-            log.warning("for %s the service has to be started again", ", ".join(others))
+            log.warning(
+                "%s: takes effect after a restart of the service", ", ".join(others)
+            )
         if changed:
             self._processes[FRONT_END].send(("config", self._config))
 
@@ -361,7 +363,7 @@ class Supervisor:
         if index in self._lost:
             self._lost.discard(index)
             self._processes[FRONT_END].send(("found", index))
-            log.info("the %s process is there again", name)
+            log.info("the %s process is running again", name)
         self._report_degraded()
         self._announce()
 
@@ -389,7 +391,7 @@ class Supervisor:
         """Clean up after a process that has ended, and schedule its restart."""
         how = process.end()
         if name in self._standbys:
-            log.error("the %s process %s; the one that stood by takes over", name, how)
+            log.error("the %s process %s; the standby process takes over", name, how)
             self._restarts[name].due_s = time.monotonic()
             self._processes[name] = _Process()
             return
@@ -416,7 +418,7 @@ class Supervisor:
                 f"(give_up_after_s is {limit_s:g})"
             )
         when = f"in {pause_s:g} s" if pause_s else "now"
-        log.error("the %s process %s; a new one is started %s", name, how, when)
+        log.error("the %s process %s; starting a new one %s", name, how, when)
         if pause_s and self._is_announced:
             self._is_announced = False
             self._when_not_ready()
@@ -429,7 +431,7 @@ class Supervisor:
         """Move the sessions of a device to other devices, if there are any."""
         if index in self._lost or len(self._lost) + 1 >= len(self._devices):
             return
-        log.error("the %s process is given up until it stays", name)
+        log.error("the %s process is disabled until it stays up", name)
         self._lost.add(index)
         self._processes[FRONT_END].send(("lost", index))
 
@@ -458,7 +460,7 @@ class Supervisor:
         if process.stopped_since_s is None:
             process.stopped_since_s = now_s
         elif now_s - process.stopped_since_s > STOPPED_LIMIT_S:
-            log.error("the %s process stands still", name)
+            log.error("the %s process does not respond", name)
             process.process.kill()
 
     def _kill_device(self, index: int) -> None:

@@ -51,7 +51,9 @@ def unpacked(
         data = block.decompress(part.data, uncompressed_size=size_bytes)
     except block.LZ4BlockError as error:
         raise BadMessage(
-            f"it is no LZ4 block ({error})", field=path, allowed=f"{size_bytes} bytes"
+            f"it is not an LZ4 block ({error})",
+            field=path,
+            allowed=f"{size_bytes} bytes",
         ) from None
     if len(data) != size_bytes:
         raise BadMessage(

@@ -183,7 +183,7 @@ class Frame(Message):
             raise BadMessage(
                 f"it is {self.compression!r}",
                 field="compression",
-                allowed="none beside memory, where nothing is gained by it",
+                allowed="none with shared memory",
             )
         for name, starts, count in (
             ("starts", self.memory.starts, sum(v.part_count for v in self.views)),

@@ -199,7 +199,7 @@ def _refuse_strange_values(root: object, name: str, *, finite: bool = False) -> 
         path, value, depth = waiting.pop()
         if depth > MAX_DEPTH:
             raise BadMessage(
-                f"lists and maps lie {depth} deep in each other",
+                f"lists and maps are nested {depth} deep",
                 field=name,
                 allowed=f"at most {MAX_DEPTH}",
             )

@@ -182,7 +182,7 @@ def test_a_batch_that_is_interrupted_says_how_to_go_on(long_room, tmp_path):
     process.send_signal(signal.SIGTERM)
     _, error = process.communicate(timeout=20)
     assert process.returncode == 130
-    assert error.endswith("batch: stopped; the same command goes on with it\n")
+    assert error.endswith("batch: stopped; run the same command to continue\n")
     assert "Traceback" not in error
 
 

@@ -227,7 +227,7 @@ def test_a_session_ends_when_its_client_stays_away(start_service, raw_client):
     first, second = raw_client(service), raw_client(service)
     key = first.begin().session_key
     first.close()
-    wait_until(lambda: "its client did not come back" in service.log)
+    wait_until(lambda: "its client did not reconnect" in service.log)
     assert not second.ask(Hello("late", key)).is_resumed
 
 

@@ -148,7 +148,7 @@ def test_a_client_that_is_killed_leaves_no_session(start_service):
         other.kill()
         wait_until(lambda: client.ping()[1].n_sessions == 1)
         # It might have come back, but not for ever.
-        wait_until(lambda: "ends: its client did not come back" in service.log)
+        wait_until(lambda: "ends: its client did not reconnect" in service.log)
 
 
 @pytest.mark.slow

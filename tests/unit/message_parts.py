@@ -80,7 +80,7 @@ REPLIES = [
     messages.Alive(),
     messages.Closing(),
     messages.Shared(7, 4096, "/proc/1/fd/9"),
-    messages.Shared(reason="there is none"),
+    messages.Shared(reason="there is unknown"),
 ]
 
 

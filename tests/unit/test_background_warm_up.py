@@ -65,5 +65,5 @@ def test_a_head_start_that_fails_stops_no_build(caplog):
         raise OSError("disk full")
 
     BackgroundWarmUp(fail).wait(lambda *_: None, lambda: False)
-    assert "could not prepare for builds" in caplog.text
+    assert "the warm-up for builds failed" in caplog.text
     assert "disk full" in caplog.text

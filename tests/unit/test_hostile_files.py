@@ -118,7 +118,7 @@ def test_a_truncated_picture(tmp_path, rng):
 def test_another_format_under_a_known_name(tmp_path):
     path = tmp_path / "a.png"
     Image.new("RGB", (8, 8)).save(path, "GIF")
-    refused(read_color, path, "no known kind of picture")
+    refused(read_color, path, "unknown image format")
 
 
 def test_a_jpeg_of_many_scans(tmp_path):

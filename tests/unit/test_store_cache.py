@@ -167,7 +167,7 @@ def test_a_crash_while_writing_leaves_nothing_that_is_read(cache, tmp_path, stor
 
 def test_a_cancelled_load_stops_and_leaves_the_file(cache, path):
     def cancel():
-        raise BuildCancelled("a newer profile took over")
+        raise BuildCancelled("replaced by a newer profile")
 
     with pytest.raises(BuildCancelled):
         cache.load(key_of(1), go_on=cancel)

@@ -172,7 +172,7 @@ def test_a_photo_of_few_bytes_and_many_pixels_is_not_read():
 
 @pytest.mark.parametrize("name", ["d.png\0.npy\0", "d." + 300 * "x", "d", "d./../x"])
 def test_a_depth_of_another_name_is_not_written(color, name):
-    with pytest.raises(ValueError, match=r"is no depth; allowed: \.npy, \.png"):
+    with pytest.raises(ValueError, match=r"is not depth; allowed: \.npy, \.png"):
         photo_picture("p.png", _png(color), depth=(name, b"1"), **FLAT)
 
 

@@ -315,7 +315,7 @@ def test_without_the_token_nobody_comes_in(address, query):
         with pytest.raises(urllib.error.HTTPError) as refused:
             urllib.request.urlopen(root + path + query)
         assert refused.value.code == 403
-        assert b"This page wants its token" in refused.value.read()
+        assert b"This page needs its token" in refused.value.read()
 
 
 def test_a_page_of_another_origin_gets_no_websocket(browser, address):
