@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from filter_service import constants
-from filter_service.rendering import frame_kernels, reference
+from filter_service.rendering import frame_kernels
 from filter_service.rendering.frame import fill_missing_depth
 from filter_service.rendering.gl import kernel_passes
 from filter_service.rendering.image_cells import image_cells
 from filter_service.rendering.kernel_tables import kernel_levels
 from filter_service.rendering.pair_loops import used_pairs
 from tests.numerical.synthetic import Bench, depth_scene, texture
+from tests.reference import render_passes as reference
 
 MYOPIA = {"kind": "preset", "name": "myopia"}
 SIZE = {"width_px": 150, "height_px": 101, "vertical_fov_deg": 8.0}
