@@ -7,7 +7,8 @@ from typing import Annotated
 import typer
 
 from clients.arguments import read_size_px
-from clients.commands.console import Json
+from clients.commands.console import CommandFailed, Json
+from clients.extra import what_to_install
 
 
 def demo(
@@ -35,7 +36,10 @@ def demo(
     if size is not None:
         width_px, height_px = read_size_px(size)
         arguments += ["--size", f"{width_px}x{height_px}"]
-    _run("clients.demo", [*arguments, *["--json"] * json_output])
+    try:
+        _run("clients.demo", [*arguments, *["--json"] * json_output])
+    except ModuleNotFoundError as error:
+        raise CommandFailed(what_to_install(error)) from None
 
 
 def headset(context: typer.Context) -> None:

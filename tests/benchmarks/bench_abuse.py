@@ -217,7 +217,7 @@ def assertion_rows() -> list[Row]:
             gap_s = max([*gaps_s, guest.watch(3.0)[1]])
             rate_hz = guest.rate_hz(1.0)
             is_ended = service.pids().get("front-end") != before
-            n_begun = service.log.count("begins ('filter_client')")
+            n_begun = service.log.count("started ('filter_client')")
     finally:
         del os.environ[SEED_VARIABLE]
     return [

@@ -174,7 +174,7 @@ def test_what_hangs_is_ended_alone(start_service, raw_client):
     second.begin(mark=4)
     before = service.pids()
     os.kill(before["render 1"], signal.SIGSTOP)
-    wait_until(lambda: "stuck for 1 s" in service.log)
+    wait_until(lambda: "has not responded for 1 s" in service.log)
     wait_until(lambda: service.pids().get("render 1") not in (None, before["render 1"]))
     assert first.ask(small_frame(1)).colors[0][0, 0, 0] == 3
     assert service.pids()["render 0"] == before["render 0"]
@@ -238,7 +238,7 @@ def test_a_device_that_does_not_come_again_is_given_up(
     first, second = Stream(service, 3), Stream(service, 4)
     gone.touch()
     os.kill(service.pids()["render 1"], signal.SIGKILL)
-    wait_until(lambda: "the render 1 process is given up" in service.log)
+    wait_until(lambda: "the render 1 process is disabled" in service.log)
     assert "no such device" in service.log
     for _ in range(100):
         first.turn()
@@ -261,7 +261,7 @@ def test_a_device_that_does_not_come_again_is_given_up(
     assert fresh.ask(small_frame(1)).colors[0][0, 0, 0] == 9
     # And it is used again once it can be started.
     gone.unlink()
-    wait_until(lambda: "the render 1 process is there again" in service.log, 20.0)
+    wait_until(lambda: "the render 1 process is running again" in service.log, 20.0)
     wait_until(lambda: [d["is_lost"] for d in devices_of(service)] == [False, False])
     other = raw_client(service)
     other.begin(mark=8)
@@ -284,7 +284,7 @@ def test_each_device_has_one_that_stands_by(start_service, monkeypatch):
     time.sleep(1.0)  # until they are ready
     before = service.pids()
     os.kill(before["render 1"], signal.SIGKILL)
-    wait_until(lambda: "the one that stood by takes over" in service.log)
+    wait_until(lambda: "the standby process takes over" in service.log)
     after = service.pids()
     assert after["render 1"] == before["standby 1"]
     assert after["render 0"] == before["render 0"]

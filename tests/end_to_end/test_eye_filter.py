@@ -375,4 +375,4 @@ def see(sender, settings, of_parent):
 def test_a_forked_process_has_a_worker_and_threads_of_its_own(settings):
     (picture, refusal), expected = seen_in_child(settings)
     np.testing.assert_array_equal(picture, expected)
-    assert "expected one made in this process" in refusal
+    assert "create one in this process" in refusal

@@ -144,7 +144,7 @@ def test_a_program_of_ones_own_renders(tmp_path):
         (("--settings", '{"nonsense": 1}'), "nonsense"),
         (("--scale", "0.5"), "--scale is for a headset"),
         (("--white-cd-m2", "-1"), "white_cd_m2"),
-        (("--profile", "{broken"), "no JSON"),
+        (("--profile", "{broken"), "not JSON"),
         (("--left", "{broken"), "--left"),
         (("--right", "missing.json"), "--right missing.json"),
         (("--frames", "0"), "--frames is 0"),

@@ -145,7 +145,7 @@ def test_a_routing_id_opens_no_session(start_service, named):
     victim = named(service, b"camera")
     welcome = victim.begin(mark=7)
     victim.socket.close(linger=0)  # without a word
-    wait_until(lambda: "its client is gone" in service.log)
+    wait_until(lambda: "its client disconnected" in service.log)
     thief = named(service, b"camera")
     refused = thief.ask(small_frame(1))
     assert (refused.code, refused.frame_id) == ("no_session", 1)
@@ -192,7 +192,7 @@ def test_a_session_key_is_worth_nothing_with_another_client_s_key(
     victim = named(service, b"one", tmp_path / "lab.toml")
     key = victim.begin(mark=7).session_key
     victim.socket.close(linger=0)
-    wait_until(lambda: "its client is gone" in service.log)
+    wait_until(lambda: "its client disconnected" in service.log)
     thief = named(service, b"one", tmp_path / "other.toml")
     assert not thief.ask(Hello("thief", key)).is_resumed
     assert thief.ask(small_frame(1)).code == "no_profile"
@@ -403,7 +403,7 @@ def test_a_session_survives_one_process_after_the_other(start_service):
                 time.sleep(0.02)
         assert seen.color[0, 0, 0] == 5
         assert client.hello().session_id == welcome.session_id
-        assert "session 2 begins" not in service.log
+        assert "session 2 started" not in service.log
 
 
 def ended_again(service, name, count):
@@ -418,7 +418,7 @@ def test_a_process_that_never_stays_does_not_end_the_service(start_service, raw_
     ready_file = service.config_file.parent / "ready"
     raw = raw_client(service)
     ended_again(service, "render", 3)
-    wait_until(lambda: "a new one is started in 1 s" in service.log)
+    wait_until(lambda: "starting a new one in 1 s" in service.log)
     wait_until(lambda: not ready_file.exists())
     pong = raw.ask(Ping(1.0))
     assert (pong.is_ready, pong.is_degraded) == (False, True)

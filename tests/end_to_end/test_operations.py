@@ -108,7 +108,7 @@ def test_what_cannot_change_is_said_and_a_wrong_file_changes_nothing(start_servi
     service = start_service(max_sessions=1, threads=1)
     hang_up(
         *(service, "threads = 1", "threads = 2"),
-        "for threads the service has to be started again",
+        "threads: takes effect after a restart of the service",
     )
     hang_up(
         *(service, "max_sessions = 1", "max_sessions = 1000"),

@@ -50,7 +50,7 @@ def test_each_engine_has_one_thread_and_gives_the_same_picture(two_engines, pair
 
 def device_of(service, client):
     """Return the index of a client's device, as the log has it."""
-    begins = f"session {client.hello().session_id} begins"
+    begins = f"session {client.hello().session_id} started"
     line = next(line for line in service.log.splitlines() if begins in line)
     return int(line.rpartition(" ")[2])
 

@@ -47,7 +47,7 @@ def test_answers_failures_and_newer_questions():
         ]
         answers = await asyncio.gather(*waiting)
         figure_worker._process.kill()
-        with pytest.raises(StudyFailed, match="started again"):
+        with pytest.raises(StudyFailed, match="was restarted"):
             await figure_worker.ask("a", "n", divmod, 7, 2)
         return pictures, answers, await figure_worker.ask("a", "n", divmod, 7, 2)
 

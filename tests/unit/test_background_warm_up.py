@@ -32,7 +32,7 @@ def test_a_build_waits_and_says_why(release, caplog):
 
     start.wait(progress, lambda: False)
     assert said[0] == (0.0, COMPILING_STAGE)
-    assert "kept for the next time" in caplog.text
+    assert "the result is cached" in caplog.text
 
 
 def test_what_takes_no_progress_waits_for_nothing(release):

@@ -177,7 +177,7 @@ def test_log_lines_that_repeat_are_left_out_and_counted():
     assert len(records) == 11
     time.sleep(1.05)
     log.warning("session %d begins", 50)
-    assert records[-1].getMessage() == "session 50 begins (40 like it left out)"
+    assert records[-1].getMessage() == "session 50 started (40 similar lines omitted)"
 
 
 # Fairness
@@ -278,7 +278,7 @@ def test_slots_have_a_limit_to_their_number():
     pool = SlotPool(10**6, 3)
     for _ in range(3):
         pool.create(10)
-    with pytest.raises(OutOfMemory, match="3 pieces of shared memory are in use"):
+    with pytest.raises(OutOfMemory, match="3 blocks of shared memory are in use"):
         pool.create(10)
 
 

@@ -521,7 +521,7 @@ def test_a_list_of_thousands_of_times_within_a_moment_is_read_at_once(tmp_path):
         ("", "'cam0' is missing"),
         ("cam0=[1.2.3 0 1; 0 1 1; 0 0 1]\ndoffs=0\nbaseline=1", "cam0 is"),
         ("cam0=[1e300 0 1; 0 1 1; 0 0 1]\ndoffs=0\nbaseline=1", "cam0 is"),
-        ("cam0=[9 0 1; 0 9 1; 0 0 1]\ndoffs=nan\nbaseline=1", "no number"),
+        ("cam0=[9 0 1; 0 9 1; 0 0 1]\ndoffs=nan\nbaseline=1", "not a number"),
         ("cam0=" + " 1" * 50_000, "bytes"),
     ],
 )
