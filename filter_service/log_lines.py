@@ -62,7 +62,8 @@ class RepeatFilter(logging.Filter):
         n_left_out = self._left_out.pop(wording, 0)
         if n_left_out:
             text = record.getMessage()
-            record.msg, record.args = f"{text} ({n_left_out} similar lines omitted)", None
+            record.msg = f"{text} ({n_left_out} similar lines omitted)"
+            record.args = None
         return True
 
 

@@ -121,7 +121,7 @@ def _remove(path: Path, reason: Exception) -> None:
     except OSError:  # a folder, or no permission
         _log_once(path, f"is passed over: {reason}")
     else:
-        log.warning("%s is removed: %s", path, reason)
+        log.warning("removed %s: %s", path, reason)
 
 
 class StoreCache:

@@ -117,4 +117,4 @@ def test_a_damaged_file_costs_a_build_and_a_word(built, folder, view):
         assert FROM_DISK not in ready.notes
         again = client.filter(view, **SEE).color
         np.testing.assert_array_equal(again, last.color)
-        assert "the cache is full" in service.log
+        assert "removed" in service.log

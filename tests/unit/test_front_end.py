@@ -177,7 +177,7 @@ def test_log_lines_that_repeat_are_left_out_and_counted():
     assert len(records) == 11
     time.sleep(1.05)
     log.warning("session %d begins", 50)
-    assert records[-1].getMessage() == "session 50 started (40 similar lines omitted)"
+    assert records[-1].getMessage() == "session 50 begins (40 similar lines omitted)"
 
 
 # Fairness
