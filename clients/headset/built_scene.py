@@ -8,7 +8,9 @@ import pickle
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 from clients.batch.atomic_files import write_whole
 from clients.extra import what_to_install
@@ -67,7 +69,10 @@ def main(name: str, file: str) -> None:
     except ModuleNotFoundError as error:
         sys.exit(what_to_install(error))
     content = pickle.dumps(build_scene(name))
-    write_whole(Path(file), lambda part: part.write_bytes(content))
+    write_whole(
+        Path(file),
+        cast("Callable[[Path], None]", lambda part: part.write_bytes(content)),
+    )
 
 
 if __name__ == "__main__":

@@ -57,7 +57,7 @@ class Controls:
                 for eye in EYES:
                     self._set(eye, int(key) - 1)
             elif key in ("l", "r"):
-                eye: Eye = "left" if key == "l" else "right"
+                eye = "left" if key == "l" else "right"
                 self._set(eye, (self._numbers[eye] + 1) % len(PRESETS))
             elif key == "f":
                 self._switch()

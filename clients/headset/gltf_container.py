@@ -52,7 +52,7 @@ class Container:
         content = self._read(path)
         text, self._binary = _split(path, content)
         self.header = _parsed(path, text)
-        self._buffers: dict[int, memoryview] = {}
+        self._buffers: dict[object, memoryview] = {}
         self._lists: dict[str, list[dict[str, Any]]] = {}
 
     def list_of(self, name: str) -> list[dict[str, Any]]:

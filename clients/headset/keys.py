@@ -5,19 +5,20 @@ from __future__ import annotations
 import os
 import select
 import sys
+from typing import Any, cast
 
 try:  # not on every system
     import termios
     import tty
 except ImportError:
-    termios = tty = None
+    termios = tty = cast("Any", None)
 
 
 class TerminalKeys:
     """Keys pressed while this is open; none if stdin is not a terminal."""
 
     def __init__(self) -> None:
-        self._before = None
+        self._before: list[Any] | None = None
         self._descriptor: int | None = None
 
     def __enter__(self) -> TerminalKeys:
@@ -31,6 +32,7 @@ class TerminalKeys:
     def __exit__(self, *exc_info: object) -> None:
         """Restore the terminal's settings."""
         if self._before is not None and termios is not None:
+            assert self._descriptor is not None
             termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
 
     def pressed(self) -> str:

@@ -23,7 +23,7 @@ from filter_service import (
     plan_views,
 )
 from filter_service.errors import BuildCancelled
-from filter_service.messages import body_of_eye
+from filter_service.messages import EyeName, body_of_eye
 
 MS_PER_S = 1e3
 
@@ -43,7 +43,7 @@ class LocalFilter:
     def __init__(self, settings: FilterSettings, say: Say) -> None:
         self._say = say
         self.settings = settings
-        self.filters = {
+        self.filters: dict[EyeName, EyeFilter] = {
             eye: EyeFilter(settings=settings, on_event=partial(self._tell, eye))
             for eye in EYES
         }

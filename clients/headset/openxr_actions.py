@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 
 import xr
 
@@ -36,7 +37,9 @@ class Actions:
         The system tracks eyes, and the extension is enabled.
     """
 
-    def __init__(self, instance, session, *, with_gaze: bool) -> None:
+    def __init__(
+        self, instance: xr.Instance, session: xr.Session, *, with_gaze: bool
+    ) -> None:
         self._session = session
         self._set = xr.create_action_set(
             instance, xr.ActionSetCreateInfo("viewer", "Viewer", 0)
@@ -58,7 +61,7 @@ class Actions:
                 session, xr.ActionSpaceCreateInfo(action=self._gaze)
             )
 
-    def _action(self, name: str, kind):
+    def _action(self, name: str, kind: xr.ActionType) -> xr.Action:
         info = xr.ActionCreateInfo(
             action_name=name,
             action_type=kind,
@@ -85,7 +88,7 @@ class Actions:
                     pressed.append(name)
         return tuple(pressed)
 
-    def gaze(self, head_space, time_ns: int) -> GazeSample | None:
+    def gaze(self, head_space: xr.Space, time_ns: int) -> GazeSample | None:
         """Return the gaze relative to the head; None if unknown.
 
         Trackers that cannot predict return their nearest sample and its time. If a
@@ -115,7 +118,9 @@ class Actions:
         return GazeSample(h_deg, v_deg, 1e-9 * at_ns)
 
 
-def _suggest(instance, profile: str, bound: list) -> None:
+def _suggest(
+    instance: xr.Instance, profile: str, bound: Sequence[tuple[xr.Action, str]]
+) -> None:
     bindings = [
         xr.ActionSuggestedBinding(action, xr.string_to_path(instance, path))
         for action, path in bound
@@ -129,7 +134,7 @@ def _suggest(instance, profile: str, bound: list) -> None:
     )
 
 
-def raise_failure(result) -> None:
+def raise_failure(result: int) -> None:
     """Raise the exception of a raw OpenXR call's result, if it is a failure."""
     found = xr.exception.check_result(xr.Result(result))
     if found.is_exception():

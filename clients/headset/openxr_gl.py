@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from ctypes import POINTER, byref, c_int, c_uint, c_ulong, c_void_p
-from typing import Any
+from typing import Any, cast
 
 import moderngl
 import xr
@@ -78,7 +78,9 @@ def _wanted() -> str:
 
 @contextmanager
 def _egl_context() -> Iterator[moderngl.Context]:
-    context = moderngl.create_context(standalone=True, backend="egl", require=_VERSION)
+    context = moderngl.create_context(
+        standalone=True, backend=cast("Any", "egl"), require=_VERSION
+    )
     try:
         yield context
     finally:
@@ -96,7 +98,9 @@ def _glx_context() -> Iterator[moderngl.Context]:
     except ImportError as error:
         raise NoRuntime(f"this OpenXR runtime needs glfw: {error}") from None
     errors: list[str] = []
-    glfw.set_error_callback(lambda code, text: errors.append(text.decode()))
+    glfw.set_error_callback(
+        lambda code, text: errors.append(cast("bytes", text).decode())
+    )
     try:
         window = _hidden_window(glfw)
         if window is None:
@@ -104,16 +108,18 @@ def _glx_context() -> Iterator[moderngl.Context]:
         glfw.make_context_current(window)
         # With explicit libraries this is a separate context, not moderngl's default.
         context = moderngl.create_context(
-            require=_VERSION, libgl="libGL.so.1", libx11="libX11.so.6"
+            require=_VERSION,
+            libgl=cast("Any", "libGL.so.1"),
+            libx11=cast("Any", "libX11.so.6"),
         )
-        glfw.make_context_current(None)
+        glfw.make_context_current(cast("Any", None))
         yield context
         context.release()
     finally:
         glfw.terminate()
 
 
-def _hidden_window(glfw: Any):
+def _hidden_window(glfw: Any) -> Any:
     """Create a hidden window; return None if that fails."""
     glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
     if not glfw.init():
@@ -193,7 +199,7 @@ class Glx:
         glx.glXGetCurrentDrawable.restype = c_ulong
         glx.glXGetProcAddressARB.restype = c_void_p
         glx.glXGetProcAddressARB.argtypes = [ctypes.c_char_p]
-        asking = [c_void_p, c_void_p, c_int, POINTER(c_int)]
+        asking: list[Any] = [c_void_p, c_void_p, c_int, POINTER(c_int)]
         glx.glXQueryContext.argtypes = glx.glXGetFBConfigAttrib.argtypes = asking
         glx.glXChooseFBConfig.argtypes = [
             *(c_void_p, c_int, POINTER(c_int), POINTER(c_int))
@@ -243,7 +249,7 @@ def current_platform() -> Egl | Glx:
     return egl if egl.is_current() else Glx()
 
 
-def _filled(structure: Any, **fields: Any):
+def _filled(structure: Any, **fields: Any) -> Any:
     """Return a structure with its pointers cast to the PyOpenGL types of its fields."""
     kinds = dict(structure._fields_)
     return structure(
@@ -268,7 +274,7 @@ class Framebuffers:
         self._context = context
         load = current_platform().load
 
-        def function(name: str, *types) -> Callable[..., None]:
+        def function(name: str, *types: type[Any]) -> Callable[..., None]:
             return ctypes.CFUNCTYPE(None, *types)(load(name))
 
         self._make = function("glGenFramebuffers", c_int, POINTER(c_uint))

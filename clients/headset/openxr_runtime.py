@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from functools import wraps
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import moderngl
 import xr
@@ -34,6 +34,9 @@ from clients.headset.runtime import (
     ShownView,
 )
 
+if TYPE_CHECKING:
+    from filter_service.messages import Pose
+
 _DEPTH = "XR_KHR_composition_layer_depth"
 _STEREO = xr.ViewConfigurationType.PRIMARY_STEREO
 _IDLE_S = 0.02
@@ -55,7 +58,7 @@ def _or_lost(method: Callable[..., Any]) -> Callable[..., Any]:
     """Raise `SessionLost` if OpenXR reports that the runtime is gone."""
 
     @wraps(method)
-    def wrapped(self, *arguments):
+    def wrapped(self: OpenXrRuntime, *arguments: Any) -> Any:
         try:
             return method(self, *arguments)
         except (xr.InstanceLostError, xr.SessionLostError, xr.SessionLossPending):
@@ -179,7 +182,7 @@ class OpenXrRuntime:
         ]
         return opaque if opaque in offered else offered[0]
 
-    def _new_session(self):
+    def _new_session(self) -> xr.Session:
         # The standard requires this call, whatever it returns.
         ask = ctypes.cast(
             xr.get_instance_proc_addr(
@@ -197,7 +200,7 @@ class OpenXrRuntime:
             )
             return xr.create_session(self._instance, info)
 
-    def _space(self, kind):
+    def _space(self, kind: xr.ReferenceSpaceType) -> xr.Space:
         space = xr.create_reference_space(
             self._session, xr.ReferenceSpaceCreateInfo(reference_space_type=kind)
         )
@@ -252,6 +255,7 @@ class OpenXrRuntime:
     def end_frame(self, due: DueFrame, shown: Sequence[ShownView]) -> None:
         """Show a frame; nothing if ``shown`` is empty."""
         with self._context:
+            kept: list[xr.CompositionLayerDepthInfoKHR]
             layers, kept = [], []
             if shown:
                 layer, kept = self._images.layer(self._room, shown)
@@ -271,7 +275,7 @@ class OpenXrRuntime:
             for eye, view in zip(EYES, views, strict=True)
         )
 
-    def _head_pose(self, time_ns: int):
+    def _head_pose(self, time_ns: int) -> Pose | None:
         location = xr.locate_space(self._head, self._room, time_ns)
         flags = xr.SpaceLocationFlags
         wanted = int(flags.POSITION_VALID_BIT | flags.ORIENTATION_VALID_BIT)
@@ -296,7 +300,7 @@ class OpenXrRuntime:
                 )
                 self._enter(xr.SessionState(changed.contents.state))
 
-    def _enter(self, state) -> None:
+    def _enter(self, state: xr.SessionState) -> None:
         self.state = state.name
         if state in _WORDS:
             log.info("%s (%s)", _WORDS[state], state.name)

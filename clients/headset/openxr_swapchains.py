@@ -22,7 +22,13 @@ _WAIT_NS = 2_000_000_000
 class _Swapchain:
     """One swapchain and the names of its textures."""
 
-    def __init__(self, session, image_format: int, usage, size_px: tuple[int, int]):
+    def __init__(
+        self,
+        session: xr.Session,
+        image_format: int,
+        usage: xr.SwapchainUsageFlags,
+        size_px: tuple[int, int],
+    ):
         width, height = size_px
         self.handle = xr.create_swapchain(
             session,
@@ -69,7 +75,7 @@ class StereoImages:
 
     def __init__(
         self,
-        session,
+        session: xr.Session,
         context: moderngl.Context,
         size_px: tuple[int, int],
         *,
@@ -106,7 +112,9 @@ class StereoImages:
         for swapchain in (*self._color, *self._depth):
             xr.destroy_swapchain(swapchain.handle)
 
-    def layer(self, space, shown: Sequence[ShownView]):
+    def layer(
+        self, space: xr.Space, shown: Sequence[ShownView]
+    ) -> tuple[xr.CompositionLayerProjection, list[xr.CompositionLayerDepthInfoKHR]]:
         """Draw a frame; return the projection layer and the structures it points to."""
         kept, views = [], []
         for i, view in enumerate(shown):

@@ -1,5 +1,7 @@
 """Poses as in OpenXR: x, y, z in meters, then the quaternion x, y, z, w."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,7 +29,7 @@ def matrix_of(pose: Pose) -> Array:
     return matrix
 
 
-def _unit(quaternion) -> Array:
+def _unit(quaternion: Sequence[float]) -> Array:
     values = np.asarray(quaternion, float)
     length = float(np.linalg.norm(values))
     if not 0.5 < length < 2.0:
@@ -35,7 +37,7 @@ def _unit(quaternion) -> Array:
     return values / length
 
 
-def turned(yaw_deg: float, pitch_deg: float = 0.0) -> tuple[float, ...]:
+def turned(yaw_deg: float, pitch_deg: float = 0.0) -> tuple[float, float, float, float]:
     """Return the quaternion of a head turned left by yaw, then up by pitch."""
     yaw, pitch = np.radians(yaw_deg) / 2, np.radians(pitch_deg) / 2
     # q = q_yaw q_pitch

@@ -1,6 +1,7 @@
 """Draw pictures from memory into the headset's images with OpenGL."""
 
 from pathlib import Path
+from typing import cast
 
 import moderngl
 import numpy as np
@@ -34,9 +35,9 @@ class Presenter:
         self._plain = context.texture(size_px, 3, alignment=1)
         self._depth_m = context.texture(size_px, 1, dtype="f4")
         for unit, name in enumerate(("seen", "plain", "depth_m")):
-            self._program[name].value = unit
-        self._program["near_m"].value = NEAR_M
-        self._program["size_px"].value = size_px
+            cast("moderngl.Uniform", self._program[name]).value = unit
+        cast("moderngl.Uniform", self._program["near_m"]).value = NEAR_M
+        cast("moderngl.Uniform", self._program["size_px"]).value = size_px
 
     def release(self) -> None:
         """Free everything."""
@@ -53,7 +54,7 @@ class Presenter:
         ratio = 0.0 if shown.plain is None else shown.plain_ratio
         if shown.plain is not None and ratio > 0.0:
             self._plain.write(np.ascontiguousarray(shown.plain), alignment=1)
-        self._program["plain_ratio"].value = ratio
+        cast("moderngl.Uniform", self._program["plain_ratio"]).value = ratio
         context = self._context
         with context.scope(target, moderngl.DEPTH_TEST):
             context.depth_func = "1"  # always: depth is written only if it is tested

@@ -23,7 +23,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from clients.arguments import read_size_px
 from clients.extra import HEADSET_INSTALL
@@ -44,6 +44,12 @@ from clients.headset.stereo_gaze import StereoGaze
 from clients.headset.viewer import Viewer, ViewerLog
 from filter_service import FilterSettings
 from filter_service.errors import FilterError
+
+if TYPE_CHECKING:
+    import moderngl
+
+    from clients.scenes.geometry import Array
+    from clients.scenes.scene import Scene
 
 TRACKED_RANGE_DEG = (15.0, 10.0)
 WARM_UP_S = 60.0
@@ -66,7 +72,7 @@ def gaze_range_of(
     return settings.gaze_range_deg
 
 
-def scenery_of(options: argparse.Namespace, context) -> Any:
+def scenery_of(options: argparse.Namespace, context: moderngl.Context) -> Any:
     """Return the renderer of both eyes' pictures: ours, or the user's.
 
     Raises
@@ -94,7 +100,7 @@ def scenery_of(options: argparse.Namespace, context) -> Any:
     return SceneScenery(context, scene, stand, supersampling=options.supersampling)
 
 
-def scene_of(name: str):
+def scene_of(name: str) -> tuple[Scene, Array]:
     """Return a built-in scene or that of a file, and the viewer's pose in it."""
     from clients.headset.gltf_scene import load_gltf
     from clients.headset.viewpoint import viewpoint
@@ -233,12 +239,14 @@ def _context(options: argparse.Namespace, stack: ExitStack) -> Any:
         return stack.enter_context(_openxr("openxr_gl").open_context())
     import moderngl
 
-    context = moderngl.create_context(standalone=True, backend="egl", require=430)
+    context = moderngl.create_context(
+        standalone=True, backend=cast("Any", "egl"), require=430
+    )
     stack.callback(context.release)
     return context
 
 
-def _open_xr(context, options: argparse.Namespace) -> Runtime:
+def _open_xr(context: moderngl.Context, options: argparse.Namespace) -> Runtime:
     layers = [CORE_VALIDATION] if options.validate else []
     runtime = _openxr("openxr_runtime").OpenXrRuntime(
         context, layers=layers, scale=options.scale

@@ -1,13 +1,16 @@
 """OpenGL objects of a scene view: render targets, programs and triangles."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import moderngl
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from clients.scenes.scene import Batch, Scene
+
+_Made = TypeVar("_Made")
 
 _ASSETS = Path(__file__).resolve().parents[1] / "assets"
 _SRGB8_ALPHA8 = 0x8C43  # GL_SRGB8_ALPHA8
@@ -52,7 +55,7 @@ class SceneBuffers:
         supersampling: int,
     ):
         self._context = context
-        self._owned: list = []
+        self._owned: list[Any] = []
         try:
             samples_px = (supersampling * size_px[0], supersampling * size_px[1])
             # Samples hold sRGB values, which OpenGL decodes to linear light on reading:
@@ -71,12 +74,14 @@ class SceneBuffers:
         while self._owned:
             self._owned.pop().release()
 
-    def _own(self, made):
+    def _own(self, made: _Made) -> _Made:
         """Register an object for release and return it."""
         self._owned.append(made)
         return made
 
-    def _target(self, size_px, color_format: int | None, *, with_depth: bool):
+    def _target(
+        self, size_px: tuple[int, int], color_format: int | None, *, with_depth: bool
+    ) -> moderngl.Framebuffer:
         """Return a framebuffer for color and a float."""
         context, own = self._context, self._own
         color = own(context.texture(size_px, 4, internal_format=color_format))
@@ -86,7 +91,9 @@ class SceneBuffers:
         depth = own(context.depth_renderbuffer(size_px)) if with_depth else None
         return own(context.framebuffer([color, values], depth))
 
-    def _program(self, vertex: str, fragment: str, defines: dict):
+    def _program(
+        self, vertex: str, fragment: str, defines: Mapping[str, object]
+    ) -> moderngl.Program:
         """Build the program of two files in assets/."""
         texts = [(_ASSETS / name).read_text("utf-8") for name in (vertex, fragment)]
         version, _, rest = texts[1].partition("\n")
@@ -97,29 +104,40 @@ class SceneBuffers:
             self._context.program(vertex_shader=texts[0], fragment_shader=texts[1])
         )
 
-    def _resolving(self, scene: Scene, height_px: int, supersampling: int):
+    def _resolving(
+        self, scene: Scene, height_px: int, supersampling: int
+    ) -> moderngl.VertexArray:
         count = supersampling**2
-        defines = {"SAMPLES": supersampling, "COUNT": count, "RANK": count // 4}
+        defines: dict[str, object] = {
+            "SAMPLES": supersampling,
+            "COUNT": count,
+            "RANK": count // 4,
+        }
         defines |= _RESOLVE_CONSTANTS
-        program = self._program("resolve.vert", "resolve.frag", defines)
+        program: Any = self._program("resolve.vert", "resolve.frag", defines)
         program["samples_light"].value, program["samples_per_m"].value = 0, 1
         program["infinite_to_per_m"].value = 1.0 / scene.infinite_from_m
         program["last_row"].value = height_px - 1
         return self._own(self._context.vertex_array(program, []))
 
-    def _all_draw_calls(self, scene: Scene) -> list:
+    def _all_draw_calls(
+        self, scene: Scene
+    ) -> list[tuple[moderngl.VertexArray, moderngl.Texture]]:
         """Return each batch's triangles and texture; batches may share a texture."""
         # A surface without a texture is its color times white.
-        textures = {None: self._own(self._context.texture((1, 1), 3, b"\xff" * 3))}
+        textures: dict[int | None, moderngl.Texture] = {
+            None: self._own(self._context.texture((1, 1), 3, b"\xff" * 3))
+        }
         calls = []
         for batch in scene.batches:
             key = None if batch.texture is None else id(batch.texture)
             if key not in textures:
+                assert batch.texture is not None
                 textures[key] = self._surface(batch.texture)
             calls.append((self._triangles(batch), textures[key]))
         return calls
 
-    def _triangles(self, batch: Batch):
+    def _triangles(self, batch: Batch) -> moderngl.VertexArray:
         """Return a batch's vertices and indices in the program's layout."""
         columns = (
             (batch.vertices_m, "3f", "vertex_m"),
@@ -133,10 +151,10 @@ class SceneBuffers:
         indices = self._buffer(batch.faces, np.uint32)
         return self._own(self._context.vertex_array(self.program, content, indices))
 
-    def _buffer(self, values: NDArray[Any], dtype):
+    def _buffer(self, values: NDArray[Any], dtype: DTypeLike) -> moderngl.Buffer:
         return self._own(self._context.buffer(np.ascontiguousarray(values, dtype)))
 
-    def _surface(self, texels: NDArray[np.uint8]):
+    def _surface(self, texels: NDArray[np.uint8]) -> moderngl.Texture:
         """Return a texture with mipmaps, filtered and repeated as in pyrender."""
         height, width = texels.shape[:2]
         upright = np.ascontiguousarray(texels[::-1])

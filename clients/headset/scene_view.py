@@ -4,6 +4,8 @@ It renders the scenes of `clients.scene_renderer` with the same look, without py
 which requires a different PyOpenGL platform than the one that OpenXR selects.
 """
 
+from typing import Any, cast
+
 import moderngl
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +69,7 @@ class SceneView:
     def __enter__(self) -> "SceneView":
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -115,13 +117,13 @@ class SceneView:
             # Vertices hold sRGB values already. Code that draws to a headset may have
             # enabled the conversion.
             self._context.disable_direct(_FRAMEBUFFER_SRGB)
-            samples.color_mask = (_WRITE, _KEEP)
+            samples.color_mask = cast("Any", (_WRITE, _KEEP))
             samples.clear(*self.scene.background_srgb, 1.0)
-            samples.color_mask = (_KEEP, _WRITE)
+            samples.color_mask = cast("Any", (_KEEP, _WRITE))
             samples.clear()
-            samples.color_mask = (_WRITE, _WRITE)
+            samples.color_mask = cast("Any", (_WRITE, _WRITE))
             for name, value in uniforms.items():
-                held.program[name].value = value
+                cast("moderngl.Uniform", held.program[name]).value = value
             for triangles, texture in held.draw_calls:
                 texture.use(0)
                 triangles.render(moderngl.TRIANGLES)
@@ -130,10 +132,12 @@ class SceneView:
         """Resolve samples to pixels."""
         with self._context.scope(self._held.pixels, moderngl.NOTHING):
             for unit, texture in enumerate(self._held.samples.color_attachments):
-                texture.use(unit)
+                cast("moderngl.Texture", texture).use(unit)
             self._held.resolving.render(moderngl.TRIANGLES, vertices=3)
 
-    def _read_into(self, color, depth_m) -> None:
+    def _read_into(
+        self, color: NDArray[np.uint8], depth_m: NDArray[np.float32]
+    ) -> None:
         """Copy the pixels to the output arrays; waits for the GPU."""
         pixels = self._held.pixels
         # The size of a row of three-byte pixels need not be a multiple of four.
@@ -145,8 +149,11 @@ class SceneView:
         width, height = self.size_px
         wanted = (((height, width, 3), np.uint8), ((height, width), np.float32))
         if out is None:
-            return tuple(np.empty(shape, dtype) for shape, dtype in wanted)
-        for array, (shape, dtype) in zip(out, wanted, strict=True):
+            return cast(
+                "Picture", tuple(np.empty(shape, dtype) for shape, dtype in wanted)
+            )
+        arrays: tuple[NDArray[Any], ...] = out
+        for array, (shape, dtype) in zip(arrays, wanted, strict=True):
             fits = array.shape == shape and array.dtype == dtype
             if not (fits and array.flags.c_contiguous and array.flags.writeable):
                 raise ValueError(

@@ -18,7 +18,14 @@ from clients.headset.stereo_filter import (
 )
 from filter_service import FilterSettings
 from filter_service.errors import FilterError
-from filter_service.messages import Dropped, ErrorReply, Ready, Result, ResultView
+from filter_service.messages import (
+    Dropped,
+    ErrorReply,
+    EyeName,
+    Ready,
+    Result,
+    ResultView,
+)
 
 RETRY_S = 1.0
 SAY_AGAIN_S = 10.0
@@ -65,10 +72,10 @@ class ServiceFilter:
         self._client = FilterClient(
             endpoint, client_name="headset", key_file=key_file, timeout_s=5.0
         )
-        self._wanted: dict[Eye, dict[str, Any]] = {}
-        self._asked: dict[Eye, tuple[int, dict[str, Any]]] = {}
+        self._wanted: dict[EyeName, dict[str, Any]] = {}
+        self._asked: dict[EyeName, tuple[int, dict[str, Any]]] = {}
         self._retry_s = 0.0  # no profile is sent before this time
-        self._on_way: dict[int, StereoFrame] = {}
+        self._on_way: dict[int | None, StereoFrame] = {}
         self._newest: FilteredStereoFrame | None = None
         self._is_there = True
         self._trip_s = math.inf  # round trip of the last result

@@ -22,6 +22,8 @@ from clients.natural_eye import (
 from estimator.dynamics import GazeFollower
 from filter_service.messages import Camera
 
+Array = NDArray[np.float64]
+
 STRAIGHT_AHEAD = (0.0, 0.0)
 FAR_M = 1e6
 """Points farther than this are seen in the same direction by both eyes."""
@@ -160,7 +162,9 @@ class StereoGaze:
             )
         return self._eyes[eye]
 
-    def _distance(self, origin, direction, pictures: Sequence[RgbdPicture]) -> float:
+    def _distance(
+        self, origin: Array, direction: Array, pictures: Sequence[RgbdPicture]
+    ) -> float:
         """Return the distance of the point of fixation from between the eyes.
 
         Where nothing has depth it is the last distance, or infinity at first.
@@ -185,7 +189,9 @@ class StereoGaze:
         return h, v
 
 
-def _along(origin, direction, picture: RgbdPicture, distance_m: float) -> float | None:
+def _along(
+    origin: Array, direction: Array, picture: RgbdPicture, distance_m: float
+) -> float | None:
     """Return the distance at which a ray meets a picture's surface; None without depth.
 
     The picture is that of one eye and the ray starts elsewhere: iterate from a first
@@ -207,7 +213,7 @@ def _along(origin, direction, picture: RgbdPicture, distance_m: float) -> float 
     return distance_m
 
 
-def _head(due: DueFrame, pictures: Sequence[RgbdPicture]):
+def _head(due: DueFrame, pictures: Sequence[RgbdPicture]) -> Array:
     """Return the head's matrix; the mean of the eyes' poses if it is not known."""
     if due.head is not None:
         return matrix_of(due.head)

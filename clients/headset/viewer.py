@@ -200,6 +200,9 @@ class Viewer:
         return self.log
 
     def _run_session(self, runtime: Runtime, is_done: Callable[[], bool]) -> None:
+        seen: FilteredStereoFrame | None
+        shown: tuple[ShownView, ...]
+        times_ms: dict[str, float]
         while not is_done():
             due = runtime.begin_frame()
             begun_s = time.monotonic()

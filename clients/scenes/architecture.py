@@ -1,10 +1,14 @@
 """Walls, arches, columns, roofs, windows, awnings, a fountain and a lattice."""
 
 from itertools import pairwise
+from typing import Unpack
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from clients.scenes.geometry import (
+    Array,
+    Look,
     Mesh,
     box,
     lathe,
@@ -19,7 +23,7 @@ from clients.scenes.geometry import (
 )
 
 
-def column(height_m: float, *, radius_m=0.16, color="#d9c7a5") -> Mesh:
+def column(height_m: float, *, radius_m: float = 0.16, color: str = "#d9c7a5") -> Mesh:
     """Return a round column with base and capital, its foot at the origin."""
     r, h = radius_m, height_m
     shaft = np.linspace(0.24, h - 0.32, 9)
@@ -34,7 +38,14 @@ def column(height_m: float, *, radius_m=0.16, color="#d9c7a5") -> Mesh:
 
 
 def arch_wall(
-    *, bay_m, bays, springing_m, height_m, opening_ratio=0.78, depth_m=0.45, **look
+    *,
+    bay_m: float,
+    bays: int,
+    springing_m: float,
+    height_m: float,
+    opening_ratio: float = 0.78,
+    depth_m: float = 0.45,
+    **look: Unpack[Look],
 ) -> Mesh:
     """Return a wall of round arches along x from 0, its front facing +z at z = 0.
 
@@ -58,7 +69,7 @@ def arch_wall(
     return merged(parts)
 
 
-def _arch_edge(center, radius, springing_m):
+def _arch_edge(center: float, radius: float, springing_m: float) -> Array:
     """Return the outline (n, 3) of one opening, foot to foot."""
     angle = np.linspace(np.pi, 0, 17)
     curve = np.stack(
@@ -71,7 +82,9 @@ def _arch_edge(center, radius, springing_m):
     return np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
 
 
-def _face_over_arch(edge, start_m, bay_m, height_m, look) -> list[Mesh]:
+def _face_over_arch(
+    edge: Array, start_m: float, bay_m: float, height_m: float, look: Look
+) -> list[Mesh]:
     """Return the front of one bay: two piers and the sheet above the curve."""
     left_pier = edge[:9]
     right_pier = edge[-9:]
@@ -97,14 +110,14 @@ def _face_over_arch(edge, start_m, bay_m, height_m, look) -> list[Mesh]:
     ]
 
 
-def _corner_fill(side, x):
+def _corner_fill(side: Array, x: float) -> Array:
     """Return the block between a sheet's slanted side and the vertical at x."""
     straight = side.copy()
     straight[:, 0] = x
     return np.stack([side, straight], axis=0)
 
 
-def _sheet(points, *, inward, **look) -> Mesh:
+def _sheet(points: Array, *, inward: Array, **look: Unpack[Look]) -> Mesh:
     """Return a grid of points (a, b, 3) as a sheet that faces `inward`."""
     a, b = points.shape[:2]
     i, j = np.meshgrid(np.arange(a - 1), np.arange(b - 1), indexing="ij")
@@ -124,7 +137,15 @@ def _sheet(points, *, inward, **look) -> Mesh:
     return new_mesh(flat, faces, normals=sign * mesh.normals, uv=uv, **look)
 
 
-def wall(origin_m, along_m, height_m, *, cell_m=0.25, texture="", color="#ffffff"):
+def wall(
+    origin_m: ArrayLike,
+    along_m: ArrayLike,
+    height_m: float,
+    *,
+    cell_m: float = 0.25,
+    texture: str = "",
+    color: str = "#ffffff",
+) -> Mesh:
     """Return a plain upright wall whose front faces along × up."""
     length_m = float(np.linalg.norm(along_m))
     cells = (max(1, round(length_m / cell_m)), max(1, round(height_m / cell_m)))
@@ -139,7 +160,9 @@ def wall(origin_m, along_m, height_m, *, cell_m=0.25, texture="", color="#ffffff
     )
 
 
-def tiled_roof(width_m, slope_m, *, pitch_deg=24.0, rows=5) -> Mesh:
+def tiled_roof(
+    width_m: float, slope_m: float, *, pitch_deg: float = 24.0, rows: int = 5
+) -> Mesh:
     """Return rows of clay tiles that slope toward +z; the ridge is on the x axis."""
     rng = np.random.default_rng(12)
     tiles = []
@@ -164,7 +187,9 @@ def tiled_roof(width_m, slope_m, *, pitch_deg=24.0, rows=5) -> Mesh:
     return transformed(merged(tiles), rotation("x", pitch_deg))
 
 
-def window(*, width_m=0.9, height_m=1.4, shutter="#2f6f73") -> list[Mesh]:
+def window(
+    *, width_m: float = 0.9, height_m: float = 1.4, shutter: str = "#2f6f73"
+) -> list[Mesh]:
     """Return a shuttered window for a wall that faces +z, its foot at the origin."""
     w, h = width_m, height_m
     glass = patch((-w / 2, 0, 0.02), (w, 0, 0), (0, h, 0), color="#28343d")
@@ -184,7 +209,9 @@ def window(*, width_m=0.9, height_m=1.4, shutter="#2f6f73") -> list[Mesh]:
     return parts
 
 
-def awning(width_m, reach_m, drop_m, *, texture: str) -> list[Mesh]:
+def awning(
+    width_m: float, reach_m: float, drop_m: float, *, texture: str
+) -> list[Mesh]:
     """Return a striped awning that hangs from (0..width, 0, 0) toward +z."""
     cloth = patch(
         (0, -drop_m, reach_m),
@@ -237,7 +264,9 @@ def fountain() -> list[Mesh]:
     return [basin, water, stem, top, *jets]
 
 
-def lattice(width_m, height_m, *, spacing_m=0.2, color="#e8dfc8") -> list[Mesh]:
+def lattice(
+    width_m: float, height_m: float, *, spacing_m: float = 0.2, color: str = "#e8dfc8"
+) -> list[Mesh]:
     """Return a diagonal wooden lattice in the plane z = 0, from the origin."""
     parts = []
     for sign in (-1, 1):

@@ -7,10 +7,13 @@ foliage, furniture, text of several sizes, repeated arches, small lamps.
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clients.scenes import architecture as build_
 from clients.scenes import foliage, furniture
 from clients.scenes.geometry import (
+    Array,
+    Look,
     Mesh,
     by_texture,
     new_mesh,
@@ -76,7 +79,7 @@ def build() -> Scene:
 
 def _architecture() -> list[Mesh]:
     """Return the walls, arcades and the fountain."""
-    wall_look = {"texture": "plaster_warm"}
+    wall_look: Look = {"texture": "plaster_warm"}
     back = build_.arch_wall(
         bay_m=2.6, bays=5, springing_m=1.7, height_m=3.75, **wall_look
     )
@@ -124,7 +127,7 @@ def _side(x_m: float, height_m: float, texture: str, *, turn_deg: float) -> list
     return parts
 
 
-def _furniture(rng) -> list[Mesh]:
+def _furniture(rng: np.random.Generator) -> list[Mesh]:
     """Return tables, chairs, boards, railing and the objects on the near table."""
     parts = []
     spots = ((-1.75, -3.4, 20), (1.9, -4.9, -35), (-2.9, -6.6, 60), (2.7, -8.6, 10))
@@ -138,7 +141,9 @@ def _furniture(rng) -> list[Mesh]:
     return parts
 
 
-def _table_group(x, z, turn, frame, rng) -> list[Mesh]:
+def _table_group(
+    x: float, z: float, turn: float, frame: str, rng: np.random.Generator
+) -> list[Mesh]:
     """Return a table with two or three chairs, a lantern and cups."""
     group = list(furniture.bistro_table(top="table"))
     for angle in (15, 140, 255)[: 2 + int(rng.random() < 0.6)]:
@@ -154,7 +159,7 @@ def _table_group(x, z, turn, frame, rng) -> list[Mesh]:
     return [placed(p, (x, 0, z), turn_deg=turn) for p in group]
 
 
-def _near_table(rng) -> list[Mesh]:
+def _near_table(rng: np.random.Generator) -> list[Mesh]:
     """Return the viewer's own table, with objects at 0.6 to 1.1 m."""
     things = list(furniture.bistro_table(radius_m=0.46, top="table"))
     top = 0.74
@@ -167,7 +172,7 @@ def _near_table(rng) -> list[Mesh]:
     return [placed(p, (0.02, 0, -0.80)) for p in things]
 
 
-def _plants(rng) -> list[Mesh]:
+def _plants(rng: np.random.Generator) -> list[Mesh]:
     """Return the near branch, the climbing plant, potted trees and shrubs."""
     parts = [
         foliage.branch(path, rng=rng, n_leaves=n, leaf_m=0.062)
@@ -244,7 +249,7 @@ def _floor_batch(bake: Baker) -> Batch:
     return finished(floor, ones, {"floor": texture})
 
 
-def _resized(image, width: int, height: int):
+def _resized(image: Array, width: int, height: int) -> NDArray[np.float32]:
     """Average a linear image (h, w, 3) down to a smaller size."""
     from PIL import Image
 
@@ -300,7 +305,7 @@ def _sky() -> Mesh:
     return replace(mesh, albedo=evening_sky(np.sin(tt).ravel()))
 
 
-def _textures() -> dict:
+def _textures() -> dict[str, NDArray[np.uint8]]:
     """Draw all textures of the scene; other meshes have vertex colors."""
     linear = {
         "plaster_warm": plaster("#c99a5e", "#ecd09a"),
@@ -315,13 +320,13 @@ def _textures() -> dict:
     return {name: uint8_srgb(image) for name, image in linear.items()}
 
 
-def _sign():
+def _sign() -> Array:
     lines = [("CAFE DEL SOL", 0.5, 100, "")]
     image = board((1024, 144), lines, paper="#1f4d4a", ink="#f5dfa3", grain=0.06)
     return framed(image, color="#d9b45a", border_px=5, inset_px=8)
 
 
-def _chalk_board():
+def _chalk_board() -> Array:
     lines = [
         ("TODAY", 0.10, 120, "#f7e27a"),
         ("SOUP", 0.26, 100, ""),
@@ -336,7 +341,7 @@ def _chalk_board():
     return framed(image, color="#c9d2cc", border_px=3, inset_px=18)
 
 
-def _menu_card():
+def _menu_card() -> Array:
     lines = [
         ("MENU", 0.12, 92, "#8c2f24"),
         ("Coffee  2.40", 0.30, 56, ""),

@@ -1,8 +1,10 @@
 """Leaves, flowers, branches and plants: many small triangles at all distances."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from clients.scenes.geometry import (
     Array,
@@ -21,7 +23,15 @@ BLOSSOMS = ("#d63a7e", "#e85d9a", "#c22a6a", "#f08ab8")
 
 
 def leaves(
-    base_m, along, facing, *, length_m, width_m, colors, rng, segments=0
+    base_m: Array,
+    along: Array,
+    facing: Array,
+    *,
+    length_m: float,
+    width_m: float,
+    colors: Sequence[str],
+    rng: np.random.Generator,
+    segments: int = 0,
 ) -> Mesh:
     """Return folded, translucent leaves.
 
@@ -65,7 +75,7 @@ def leaves(
     return replace(mesh, albedo=albedo, translucency=np.full(len(albedo), 0.55))
 
 
-def _leaf_faces(segments: int):
+def _leaf_faces(segments: int) -> NDArray[np.int64]:
     """Return the triangles of one leaf: rows of left, midrib, right vertices."""
     if segments == 0:
         return np.array([(1, 5, 7), (1, 7, 3)])
@@ -81,12 +91,18 @@ def _leaf_faces(segments: int):
     return np.array(faces)
 
 
-def _unit(vectors) -> Array:
+def _unit(vectors: Array) -> Array:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
 
 
 def branch(
-    path_m, *, radius_m=0.006, leaf_m=0.07, n_leaves=40, rng, colors=GREENS
+    path_m: ArrayLike,
+    *,
+    radius_m: float = 0.006,
+    leaf_m: float = 0.07,
+    n_leaves: int = 40,
+    rng: np.random.Generator,
+    colors: Sequence[str] = GREENS,
 ) -> Mesh:
     """Return a twig with leaves on two sides, detailed enough for 0.3 m distance."""
     path_m = np.asarray(path_m, float)
@@ -114,7 +130,14 @@ def branch(
 
 
 def cloud(
-    center_m, size_m, *, n_leaves, leaf_m, rng, colors=GREENS, width_ratio=0.55
+    center_m: ArrayLike,
+    size_m: ArrayLike,
+    *,
+    n_leaves: int,
+    leaf_m: float,
+    rng: np.random.Generator,
+    colors: Sequence[str] = GREENS,
+    width_ratio: float = 0.55,
 ) -> Mesh:
     """Return leaves on the shell of a rough ball, as a bush or the crown of a tree."""
     direction = _unit(rng.normal(0, 1, (n_leaves, 3)))
@@ -134,17 +157,27 @@ def cloud(
     )
 
 
-def climber(path_m, *, spread_m, n_leaves, n_blossoms, rng, leaf_m=0.07) -> Mesh:
+def climber(
+    path_m: ArrayLike,
+    *,
+    spread_m: ArrayLike,
+    n_leaves: int,
+    n_blossoms: int,
+    rng: np.random.Generator,
+    leaf_m: float = 0.07,
+) -> Mesh:
     """Return a plant that climbs along a path: leaves and bunches of blossom."""
     path_m = np.asarray(path_m, float)
 
-    def along_path(n, spread):
+    def along_path(n: int, spread: Array) -> Array:
         t = rng.uniform(0, len(path_m) - 1.001, n)
         i = t.astype(int)
         base = path_m[i] + (t - i)[:, None] * (path_m[i + 1] - path_m[i])
         return base + rng.normal(0, 1, (n, 3)) * spread
 
-    def spray(n, spread, length_m, colors, ratio):
+    def spray(
+        n: int, spread: float, length_m: float, colors: Sequence[str], ratio: float
+    ) -> Mesh:
         base = along_path(n, np.asarray(spread_m) * spread)
         direction = rng.normal(0, 1, (n, 3)) + np.array([0, -0.3, 0.5])
         return leaves(
@@ -165,7 +198,13 @@ def climber(path_m, *, spread_m, n_leaves, n_blossoms, rng, leaf_m=0.07) -> Mesh
     )
 
 
-def potted_tree(*, rng, height_m=1.9, crown_m=0.95, fruit="") -> list[Mesh]:
+def potted_tree(
+    *,
+    rng: np.random.Generator,
+    height_m: float = 1.9,
+    crown_m: float = 0.95,
+    fruit: str = "",
+) -> list[Mesh]:
     """Return a small tree in a clay pot, its foot at the origin."""
     pot = lathe(
         [(0.0, 0.0), (0.17, 0.0), (0.25, 0.36), (0.28, 0.38), (0.28, 0.44),
@@ -190,7 +229,7 @@ def potted_tree(*, rng, height_m=1.9, crown_m=0.95, fruit="") -> list[Mesh]:
     return parts
 
 
-def cypress(*, rng, height_m=7.0) -> Mesh:
+def cypress(*, rng: np.random.Generator, height_m: float = 7.0) -> Mesh:
     """Return a tall dark tree, its foot at the origin."""
     return cloud(
         [0, height_m / 2, 0],

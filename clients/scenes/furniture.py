@@ -3,10 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from clients.scenes.foliage import BLOSSOMS, GREENS, cloud
 from clients.scenes.geometry import (
     Array,
+    Line,
     Mesh,
     box,
     lathe,
@@ -24,7 +26,9 @@ from clients.scenes.geometry import (
 _IRON = "#2b2f33"
 
 
-def bistro_table(*, radius_m=0.36, height_m=0.74, top="") -> list[Mesh]:
+def bistro_table(
+    *, radius_m: float = 0.36, height_m: float = 0.74, top: str = ""
+) -> list[Mesh]:
     """Return a round table; `top` names the texture of its plate."""
     leg = lathe(
         [(0.0, 0.0), (0.20, 0.0), (0.20, 0.02), (0.05, 0.05), (0.022, 0.10),
@@ -42,7 +46,15 @@ def bistro_table(*, radius_m=0.36, height_m=0.74, top="") -> list[Mesh]:
     return [leg, plate, rim]
 
 
-def _disc(radius_m, height_m, *, rings=8, sides=36, texture="", color="#ffffff"):
+def _disc(
+    radius_m: float,
+    height_m: float,
+    *,
+    rings: int = 8,
+    sides: int = 36,
+    texture: str = "",
+    color: str = "#ffffff",
+) -> Mesh:
     """Return a horizontal disc, finely divided to show small shadows."""
     r = np.linspace(0, radius_m, rings + 1)
     mesh = lathe(np.stack([r, np.full_like(r, height_m)], axis=1)[::-1], sides=sides)
@@ -54,11 +66,11 @@ def _disc(radius_m, height_m, *, rings=8, sides=36, texture="", color="#ffffff")
     )  # fmt: skip
 
 
-def chair(*, frame=_IRON, seat="#b0703c") -> list[Mesh]:
+def chair(*, frame: str = _IRON, seat: str = "#b0703c") -> list[Mesh]:
     """Return a bent-wire chair that faces -z: thin legs, slats in its back."""
     parts = [painted(_disc(0.20, 0.46, rings=4, sides=20), seat)]
     parts.append(lathe([(0.20, 0.44), (0.205, 0.45), (0.20, 0.46)], color=frame))
-    bars = []
+    bars: list[Line] = []
     for x in (-0.16, 0.16):
         bars.append([(0.75 * x, 0.45, -0.12), (1.15 * x, 0.0, -0.19)])
         back = [(0.75 * x, 0.0, 0.22), (x, 0.45, 0.17), (1.05 * x, 0.85, 0.24)]
@@ -78,7 +90,9 @@ def chair(*, frame=_IRON, seat="#b0703c") -> list[Mesh]:
     return parts
 
 
-def cup(*, color="#f4efe6", coffee="#5a3218", sides=28) -> list[Mesh]:
+def cup(
+    *, color: str = "#f4efe6", coffee: str = "#5a3218", sides: int = 28
+) -> list[Mesh]:
     """Return a cup of coffee on a saucer, its foot at the origin."""
     saucer = lathe(
         [(0.0, 0.004), (0.035, 0.003), (0.075, 0.014), (0.076, 0.016), (0.034, 0.008)],
@@ -115,7 +129,7 @@ def _upward(mesh: Mesh) -> Mesh:
     return replace(mesh, normals=normals)
 
 
-def lantern(*, glow=1.6) -> list[Mesh]:
+def lantern(*, glow: float = 1.6) -> list[Mesh]:
     """Return a candle lantern 0.24 m high: a cage of thin bars around a flame."""
     parts = [placed(box((0.10, 0.012, 0.10), color=_IRON), (0, 0.006, 0))]
     parts.append(placed(box((0.10, 0.010, 0.10), color=_IRON), (0, 0.170, 0)))
@@ -136,7 +150,13 @@ def lantern(*, glow=1.6) -> list[Mesh]:
     return [*parts, candle, painted(flame, "#ffd27a", emission=glow)]
 
 
-def railing(start_m, end_m, *, height_m=1.0, spacing_m=0.11) -> list[Mesh]:
+def railing(
+    start_m: ArrayLike,
+    end_m: ArrayLike,
+    *,
+    height_m: float = 1.0,
+    spacing_m: float = 0.11,
+) -> list[Mesh]:
     """Return an iron railing of thin bars with a ring between neighbors."""
     start_m, end_m = np.asarray(start_m, float), np.asarray(end_m, float)
     length_m = np.linalg.norm(end_m - start_m)
@@ -160,13 +180,18 @@ def railing(start_m, end_m, *, height_m=1.0, spacing_m=0.11) -> list[Mesh]:
 
 
 def string_lights(
-    start_m, end_m, *, sag_m, count, bulb_m=0.035
+    start_m: ArrayLike,
+    end_m: ArrayLike,
+    *,
+    sag_m: float,
+    count: int,
+    bulb_m: float = 0.035,
 ) -> tuple[list[Mesh], Array]:
     """Return a hanging cable with glowing bulbs, and the bulbs' positions (n, 3)."""
     t = np.linspace(0, 1, 25)[:, None]
     start_m, end_m = np.asarray(start_m, float), np.asarray(end_m, float)
 
-    def point(s):
+    def point(s: Array) -> Array:
         drop = np.array([0.0, 4 * sag_m, 0.0])
         return (1 - s) * start_m + s * end_m - s * (1 - s) * drop
 
@@ -183,7 +208,9 @@ def string_lights(
     return parts, below
 
 
-def standing_board(size_m, *, texture: str, lean_deg=12.0) -> list[Mesh]:
+def standing_board(
+    size_m: tuple[float, float], *, texture: str, lean_deg: float = 12.0
+) -> list[Mesh]:
     """Return a board on two legs that leans back, its front facing +z."""
     width, height = size_m
     front = patch(
@@ -209,7 +236,7 @@ def standing_board(size_m, *, texture: str, lean_deg=12.0) -> list[Mesh]:
     return [transformed(part, tilt) for part in (front, *frame)] + legs
 
 
-def table_card(size_m, *, texture: str) -> list[Mesh]:
+def table_card(size_m: tuple[float, float], *, texture: str) -> list[Mesh]:
     """Return a folded menu card that stands on a table, its front facing +z."""
     width, height = size_m
     tilt = rotation("x", -14)
@@ -224,7 +251,7 @@ def table_card(size_m, *, texture: str) -> list[Mesh]:
     return [transformed(front, tilt), transformed(back, away)]
 
 
-def vase(*, rng, height_m=0.13) -> list[Mesh]:
+def vase(*, rng: np.random.Generator, height_m: float = 0.13) -> list[Mesh]:
     """Return a small glass-blue vase with three stems of blossom."""
     body = lathe(
         [(0.0, 0.0), (0.024, 0.0), (0.034, 0.03), (0.028, 0.065), (0.013, 0.1),

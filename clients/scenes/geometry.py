@@ -5,11 +5,20 @@ Frame of every scene: meters, x right, y up, z toward the viewer (OpenGL).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypedDict, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Line = Array | Sequence[Array | Sequence[float]]  # points (n, 3)
+
+
+class Look(TypedDict, total=False):
+    """Texture and color of a shape, as for `new_mesh`."""
+
+    color: str
+    texture: str
 
 
 @dataclass(frozen=True)
@@ -53,7 +62,13 @@ def srgb_from_linear(linear: Array) -> Array:
 
 
 def new_mesh(
-    vertices_m, faces, *, normals=None, uv=None, color="#ffffff", texture=""
+    vertices_m: ArrayLike,
+    faces: ArrayLike,
+    *,
+    normals: ArrayLike | None = None,
+    uv: ArrayLike | None = None,
+    color: str = "#ffffff",
+    texture: str = "",
 ) -> Mesh:
     """Return a mesh of one color, with normals from the faces if none are given."""
     vertices_m = np.asarray(vertices_m, float).reshape(-1, 3)
@@ -100,7 +115,13 @@ def transformed(mesh: Mesh, matrix: Array) -> Mesh:
     )
 
 
-def placed(mesh: Mesh, position_m=(0, 0, 0), *, turn_deg=0.0, scale=1.0) -> Mesh:
+def placed(
+    mesh: Mesh,
+    position_m: ArrayLike = (0, 0, 0),
+    *,
+    turn_deg: float = 0.0,
+    scale: float = 1.0,
+) -> Mesh:
     """Scale a mesh, rotate it about the vertical axis and move it."""
     matrix = rotation("y", turn_deg)
     matrix[:3, :3] *= scale
@@ -144,9 +165,19 @@ def by_texture(meshes: Sequence[Mesh]) -> list[Mesh]:
     return [merged([m for m in meshes if m.texture == name]) for name in names]
 
 
-def patch(origin_m, side_u_m, side_v_m, *, cells=(1, 1), uv_scale=(1, 1), **look):
+def patch(
+    origin_m: ArrayLike,
+    side_u_m: ArrayLike,
+    side_v_m: ArrayLike,
+    *,
+    cells: tuple[int, int] = (1, 1),
+    uv_scale: tuple[float, float] = (1, 1),
+    **look: Unpack[Look],
+) -> Mesh:
     """Return a flat parallelogram whose front faces side_u × side_v."""
     nu, nv = cells
+    u: Array
+    v: Array
     u, v = np.meshgrid(np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1))
     u, v = u.ravel(), v.ravel()
     side_u_m, side_v_m = np.asarray(side_u_m, float), np.asarray(side_v_m, float)
@@ -167,7 +198,7 @@ def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
     return np.concatenate([lower, np.stack([first, up + 1, up], axis=1)])
 
 
-def box(size_m, *, cells=1, **look) -> Mesh:
+def box(size_m: ArrayLike, *, cells: int = 1, **look: Unpack[Look]) -> Mesh:
     """Return a box centered on the origin, its faces split into cells × cells."""
     sides = []
     half = np.asarray(size_m, float) / 2
@@ -183,7 +214,7 @@ def box(size_m, *, cells=1, **look) -> Mesh:
     return merged(sides)
 
 
-def lathe(profile_m, *, sides=20, **look) -> Mesh:
+def lathe(profile_m: ArrayLike, *, sides: int = 20, **look: Unpack[Look]) -> Mesh:
     """Revolve a profile of (radius, height) points, bottom first, about the y axis."""
     profile_m = np.asarray(profile_m, float)
     angle = np.linspace(0, 2 * np.pi, sides + 1)
@@ -199,14 +230,16 @@ def lathe(profile_m, *, sides=20, **look) -> Mesh:
     return new_mesh(vertices, faces, normals=normals, uv=uv, **look)
 
 
-def sphere(radius_m, *, sides=12, **look) -> Mesh:
+def sphere(radius_m: float, *, sides: int = 12, **look: Unpack[Look]) -> Mesh:
     """Return a sphere about the origin."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, sides // 2 + 1)
     profile = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return lathe(profile, sides=sides, **look)
 
 
-def tube(path_m, radius_m, *, sides=6, **look) -> Mesh:
+def tube(
+    path_m: Line, radius_m: ArrayLike, *, sides: int = 6, **look: Unpack[Look]
+) -> Mesh:
     """Return a round bar along a path (n, 3); radius_m is one number or (n,)."""
     path_m = np.asarray(path_m, float)
     radius_m = np.broadcast_to(np.asarray(radius_m, float), len(path_m))

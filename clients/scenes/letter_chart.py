@@ -105,7 +105,7 @@ def letter_chart(
     )
 
 
-def _check(distance_m, log_mar, letters) -> None:
+def _check(distance_m: float, log_mar: Sequence[float], letters: Sequence[str]) -> None:
     if not distance_m > 0.0:
         raise ValueError(f"distance_m {distance_m:g}: allowed is above 0")
     low, high = LOG_MAR_LIMITS
@@ -128,7 +128,12 @@ def _middles(sizes: Sequence[float]) -> list[float]:
     ]
 
 
-def _check_fits(camera: Camera, texts, sizes, middles) -> None:
+def _check_fits(
+    camera: Camera,
+    texts: Sequence[str],
+    sizes: Sequence[float],
+    middles: Sequence[float],
+) -> None:
     left, right, up, down = camera.tangents
     widths = [(len(t) - 0.5) * s for t, s in zip(texts, sizes, strict=True)]
     above, below = middles[0] + sizes[0] / 2.0, middles[-1] - sizes[-1] / 2.0
@@ -140,13 +145,22 @@ def _check_fits(camera: Camera, texts, sizes, middles) -> None:
         )
 
 
-def _row(camera: Camera, text, log_mar, size, middle) -> ChartRow:
+def _row(
+    camera: Camera, text: str, log_mar: float, size: float, middle: float
+) -> ChartRow:
     up = camera.tangents[2]
     per_px = camera.pixel_pitch_mrad[1] / 1000.0
     return ChartRow(text, log_mar, size / per_px, (up - middle) / per_px)
 
 
-def _draw(ink: NDArray[Any], camera: Camera, letter: str, size, left, bottom) -> None:
+def _draw(
+    ink: NDArray[Any],
+    camera: Camera,
+    letter: str,
+    size: float,
+    left: float,
+    bottom: float,
+) -> None:
     """Add a letter's ink coverage to the pixels; positions are tangents, y up."""
     pitch_x, pitch_y = (pitch / 1000.0 for pitch in camera.pixel_pitch_mrad)
     edge_left, _, edge_up, _ = camera.tangents

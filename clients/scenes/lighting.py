@@ -4,14 +4,18 @@ Shadows come from depth maps that pyrender renders along parallel rays: one fine
 for the sun, many coarse ones for the sky (ambient occlusion).
 """
 
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from PIL import Image
 
 from clients.pyrender_setup import delete_renderer, pyrender
 from clients.scenes.geometry import Array, Mesh, merged
+
+Place = tuple[float, float, float]
 
 _NEAR_M = 1.0
 _DEPTH_FLAGS = pyrender.RenderFlags.DEPTH_ONLY | pyrender.RenderFlags.SKIP_CULL_FACES
@@ -41,7 +45,7 @@ class Lights:
 class DepthMaps:
     """Depth maps of fixed occluders along parallel rays."""
 
-    def __init__(self, occluders: list[Mesh], *, center_m, radius_m: float):
+    def __init__(self, occluders: list[Mesh], *, center_m: ArrayLike, radius_m: float):
         whole = merged([replace(mesh, texture="") for mesh in occluders])
         triangles = pyrender.Primitive(
             positions=whole.vertices_m.astype(np.float32),
@@ -128,7 +132,9 @@ class Baker:
         self._sun_map = maps.toward(lights.sun_direction, 2048)
         self._sky = [(d, maps.toward(d, 384)) for d in hemisphere(sky_directions)]
 
-    def light(self, points_m: Array, normals: Array, translucency=0.0) -> Array:
+    def light(
+        self, points_m: Array, normals: Array, translucency: ArrayLike = 0.0
+    ) -> Array:
         """Return the light (n, 3) on surfaces at points (n, 3) with normals (n, 3)."""
         off_surface = points_m + 0.02 * normals
         through = np.broadcast_to(np.asarray(translucency, float), len(points_m))
@@ -138,7 +144,14 @@ class Baker:
             + self._lamp_light(points_m, normals, through)
         )
 
-    def light_map(self, origin_m, side_u_m, side_v_m, *, size) -> Array:
+    def light_map(
+        self,
+        origin_m: Place,
+        side_u_m: Place,
+        side_v_m: Place,
+        *,
+        size: tuple[int, int],
+    ) -> Array:
         """Return the light (h, w, 3) over a parallelogram that faces up.
 
         The sun is computed at every texel; sky and lamps, which change slowly, at every
@@ -156,12 +169,12 @@ class Baker:
         sun = self._sun_light(points, up, np.zeros(len(points)))
         return _enlarged(slow, size) + sun.reshape(height, width, 3)
 
-    def _sun_light(self, points_m, normals, through) -> Array:
+    def _sun_light(self, points_m: Array, normals: Array, through: Array) -> Array:
         sun = self._lights.sun_direction / np.linalg.norm(self._lights.sun_direction)
         seen = self._sun_map.seen(points_m, bias_m=0.035, soft=True)
         return (seen * _facing(normals @ sun, through))[:, None] * self._lights.sun
 
-    def _sky_light(self, points_m, normals, through) -> Array:
+    def _sky_light(self, points_m: Array, normals: Array, through: Array) -> Array:
         total = np.zeros((len(points_m), 3))
         openness = np.zeros(len(points_m))
         for direction, depth_map in self._sky:
@@ -178,7 +191,7 @@ class Baker:
         from_below = 0.55 - 0.45 * normals[:, 1]
         return total + (openness * from_below)[:, None] * self._lights.bounce
 
-    def _lamp_light(self, points_m, normals, through) -> Array:
+    def _lamp_light(self, points_m: Array, normals: Array, through: Array) -> Array:
         total = np.zeros(len(points_m))
         for lamp_m in self._lights.lamps_m:
             away = lamp_m - points_m
@@ -189,7 +202,9 @@ class Baker:
         return total[:, None] * self._lights.lamp
 
 
-def _grid_points(origin_m, side_u_m, side_v_m, size) -> Array:
+def _grid_points(
+    origin_m: Place, side_u_m: Place, side_v_m: Place, size: tuple[int, int]
+) -> Array:
     """Return the texel centers (h·w, 3) of a parallelogram, row by row."""
     width, height = size
     u, v = np.meshgrid(
@@ -199,7 +214,7 @@ def _grid_points(origin_m, side_u_m, side_v_m, size) -> Array:
     return np.asarray(origin_m, float) + sides
 
 
-def _enlarged(image: Array, size) -> Array:
+def _enlarged(image: Array, size: tuple[int, int]) -> Array:
     """Enlarge a linear image (h, w, 3) smoothly to (width, height)."""
     channels = [
         Image.fromarray(image[..., k].astype(np.float32)).resize(
@@ -216,7 +231,9 @@ def _facing(cosine: Array, through: Array) -> Array:
 
 
 @contextmanager
-def baker(lights: Lights, occluders: list[Mesh], *, center_m, radius_m: float):
+def baker(
+    lights: Lights, occluders: list[Mesh], *, center_m: ArrayLike, radius_m: float
+) -> Iterator[Baker]:
     """Open a Baker for a scene; its GL context exists only inside the block."""
     maps = DepthMaps(occluders, center_m=center_m, radius_m=radius_m)
     try:

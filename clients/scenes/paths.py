@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from clients.scenes.geometry import Array
 
@@ -101,7 +102,7 @@ def _catmull_rom(values: Array, t: float) -> Array:
     )
 
 
-def look_at(position_m, target_m) -> Array:
+def look_at(position_m: ArrayLike, target_m: ArrayLike) -> Array:
     """Return the pose (4, 4), camera to world, of an upright camera."""
     position_m = np.asarray(position_m, float)
     back = position_m - np.asarray(target_m, float)

@@ -15,14 +15,15 @@ UNITS = 5.0
 
 Ink = NDArray[np.bool_]
 Places = NDArray[np.float64]
+Pair = tuple[float, float]
 
 
-def _box(x: Places, y: Places, x_range, y_range) -> Ink:
+def _box(x: Places, y: Places, x_range: Pair, y_range: Pair) -> Ink:
     inside_x = (x >= x_range[0]) & (x <= x_range[1])
     return inside_x & (y >= y_range[0]) & (y <= y_range[1])
 
 
-def _ring(x: Places, y: Places, center, outer: float) -> Ink:
+def _ring(x: Places, y: Places, center: Pair, outer: float) -> Ink:
     radius = np.hypot(x - center[0], y - center[1])
     return (radius <= outer) & (radius >= outer - 1.0)
 

@@ -1,6 +1,9 @@
 """Textures drawn with NumPy and Pillow: linear float images (h, w, 3) in 0..1."""
 
+from collections.abc import Iterable
+
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from clients.scenes.geometry import Array, linear_from_hex, srgb_from_linear
@@ -75,7 +78,14 @@ def stripes(first: str, second: str, *, count: int, size: int = 256) -> Array:
     )
 
 
-def board(size_px, lines, *, paper: str, ink: str, grain: float = 0.1) -> Array:
+def board(
+    size_px: tuple[int, int],
+    lines: Iterable[tuple[str, float, float, str]],
+    *,
+    paper: str,
+    ink: str,
+    grain: float = 0.1,
+) -> Array:
     """Draw centered lines of text on a board.
 
     Parameters
@@ -134,7 +144,9 @@ def squares(*, size: int = 256) -> Array:
     return np.repeat(value[..., None], 3, axis=-1)
 
 
-def checks(first: str, second: str, *, columns: int, rows: int, size: int = 512):
+def checks(
+    first: str, second: str, *, columns: int, rows: int, size: int = 512
+) -> Array:
     """Return a checkerboard of two colors (size, size, 3)."""
     y, x = np.mgrid[0:size, 0:size] / size
     odd = ((x * columns).astype(int) + (y * rows).astype(int)) % 2 == 0
@@ -147,7 +159,14 @@ def evening_sky(sine: Array) -> Array:
     return (1 - t) * linear_from_hex("#fbe3bf") + t * linear_from_hex("#74aee6")
 
 
-def hills(bottom_m, height_m, distance_m, *, width=1024, height=512) -> Array:
+def hills(
+    bottom_m: float,
+    height_m: float,
+    distance_m: float,
+    *,
+    width: int = 1024,
+    height: int = 512,
+) -> Array:
     """Return an evening view: sky, ridges of hills and fields.
 
     The lengths give the position of the image (foot above the eye, height, distance),
@@ -172,12 +191,12 @@ def hills(bottom_m, height_m, distance_m, *, width=1024, height=512) -> Array:
     return image
 
 
-def _linear(srgb8) -> Array:
+def _linear(srgb8: NDArray[np.uint8]) -> Array:
     """Decode sRGB bytes of any shape."""
     value = srgb8 / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
-def uint8_srgb(linear: Array):
+def uint8_srgb(linear: Array) -> NDArray[np.uint8]:
     """Encode linear light as sRGB bytes."""
     return np.round(255 * srgb_from_linear(linear)).astype(np.uint8)
