@@ -103,7 +103,7 @@ def _glx_context() -> Iterator[moderngl.Context]:
     )
     try:
         window = _hidden_window(glfw)
-        if window is None:
+        if not window:  # glfw returns a null pointer, which is not None
             raise _no_display("; ".join(errors))
         glfw.make_context_current(window)
         # With explicit libraries this is a separate context, not moderngl's default.
@@ -113,8 +113,10 @@ def _glx_context() -> Iterator[moderngl.Context]:
             libx11=cast("Any", "libX11.so.6"),
         )
         glfw.make_context_current(cast("Any", None))
-        yield context
-        context.release()
+        try:
+            yield context
+        finally:
+            context.release()
     finally:
         glfw.terminate()
 
