@@ -446,8 +446,7 @@ class FilterClient:
         output : {"srgb8", "linear", "linear16"}
             8-bit sRGB, or linear light in float32 or float16.
         prepared_only : bool
-            Whether to drop the frame with the reason ``extending`` if PSFs for this
-            pupil, focus and scene are not ready, instead of using the nearest ones.
+            Deprecated, without effect: every frame shows the state that it asks for.
         depth_encoding : {"float32", "float16", "dpt16", "mm16"}
             Encoding of depth on the wire: meters; or, in half the bytes for a slow
             network, meters or diopters in half precision, or whole millimeters.

@@ -282,7 +282,7 @@ def as_settings(settings: FilterSettings | Mapping[str, Any]) -> FilterSettings:
 def setting_help(name: str) -> str:
     """Return the description of a setting."""
     metas = [m for m in setting_types()[name].__metadata__ if isinstance(m, Meta)]
-    return str(metas[0].description)
+    return next(str(meta.description) for meta in metas if meta.description)
 
 
 DEFAULTS = FilterSettings()

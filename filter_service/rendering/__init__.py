@@ -1,7 +1,7 @@
 """Rendering: filter a frame with the PSFs of the cache.
 
 engine         interface of the frame engines
-frame_options  checked options of a frame
+request_checks checks of a request against its store
 filtered_view  result of a frame, for all engines
 white_level    reference light for contrast
 perfect_eye    store that changes nothing, for testing engines

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 class FrameCounts:
     """Counts that users receive with a frame.
 
-    A new counter needs a line here, a value from each engine, and a line in `Result`.
+    A new counter needs a line here, with the default 0, and a value from each engine.
+    A field of the same name in `Result` is filled with it and sent.
 
     Attributes
     ----------

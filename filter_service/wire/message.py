@@ -28,6 +28,7 @@ Notes = Annotated[tuple[Text, ...], Meta(max_length=MAX_NOTES)]
 Milliseconds = Annotated[float, Meta(ge=0.0, le=1e12)]
 Moment = Annotated[float, Meta(ge=-1e18, le=1e18)]
 Megabytes = Annotated[float, Meta(ge=0.0, le=1e9)]
+Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Size = Annotated[int, Meta(ge=1, le=2**40)]
 
 

@@ -32,6 +32,7 @@ from filter_service.wire.message import (
     Message,
     Milliseconds,
     Moment,
+    Nanoseconds,
     Notes,
     Part,
     Size,
@@ -199,7 +200,7 @@ class Result(Message):
     is_complete: bool = True
     in_memory: bool = False
     compression: Compression = "none"
-    display_time_ns: Annotated[int, Meta(ge=0, le=2**63 - 1)] | None = None
+    display_time_ns: Nanoseconds | None = None
     colors: Pictures = field(default=(), compare=False, repr=False)
 
     type_name: ClassVar[str] = "result"

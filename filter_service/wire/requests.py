@@ -39,6 +39,7 @@ from filter_service.wire.message import (
     Limits,
     Message,
     Moment,
+    Nanoseconds,
     Part,
     Size,
     Word,
@@ -47,8 +48,6 @@ from filter_service.wire.message import (
 from filter_service.wire.unpacking import unpack_profile
 
 MAX_VIEWS = 8
-
-Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,7 @@ class ProfileRequest(Message):
 
 @dataclass(frozen=True, kw_only=True)
 class FrameOptions(RenderOptions):
-    """Options for creating and accumulating a frame's fragments."""
+    """Options of a frame on the wire: those of rendering, and deprecated ones."""
 
     prepared_only: bool = False
 

@@ -15,6 +15,7 @@ from filter_service.building.jobs import BuiltStore
 from filter_service.camera import is_same_camera
 from filter_service.errors import BuildCancelled, CameraMismatch, UnknownProfile
 from filter_service.messages import Camera
+from filter_service.rendering.filtered_view import FrameCounts
 
 
 @dataclass
@@ -40,16 +41,13 @@ class StoreDouble:
         """Nothing goes."""
 
 
-@dataclass
-class RenderedDouble:
+@dataclass(frozen=True, kw_only=True)
+class RenderedDouble(FrameCounts):
     color: np.ndarray
     stage_times_ms: dict
-    missing_depth_count: int
-    clamped_depth_count: int
     pupil_diameter_mm: float
     focus_dpt: float
     gaze_deg: tuple[float, float]
-    overflow_count: int = 0
     bad_color_count: int = 0
     notes: list = field(default_factory=list)
 

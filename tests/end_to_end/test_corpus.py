@@ -14,6 +14,7 @@ from estimator.profiles.files import load_profile
 from filter_service import messages
 from filter_service.protocol_schema import protocol_schema
 from filter_service.service.config import load_config
+from filter_service.settings import DEFAULTS
 from tests.corpus.freeze import (
     FOLDER,
     commands,
@@ -103,6 +104,8 @@ def test_a_batch_that_was_begun_is_finished(begun):
     """As if this version had begun it: all else is read as it was written."""
     lines = (begun / "seen/manifest.jsonl").read_text().splitlines(keepends=True)
     job = json.loads(lines[0]) | {"made_by": code_version()}
+    # Settings that were added since have their defaults.
+    job["settings"] = DEFAULTS.fields() | job["settings"]
     del job["kind"], job["fingerprint"]
     first = {"kind": "job", "fingerprint": fingerprint(job), **job}
     lines[0] = json.dumps(first) + "\n"

@@ -151,7 +151,7 @@ def test_a_frame_without_an_end_is_ended(start_service):
     view = make_view()
     with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
         client.set_profile(EYE, views=[view])
-        with pytest.raises(FilterError, match="the process that filters frames ended"):
+        with pytest.raises(FilterError, match="the render worker ended"):
             client.filter(view, **SEE)
     assert "has not responded for 1 s" in service.log
 
@@ -463,6 +463,6 @@ def test_the_log_has_time_stamps_and_nothing_of_a_profile(start_service):
         client.set_profile(EYE | {"mark": 77, "secret": "patient 12"}, views=[view])
         client.filter(view, **SEE)
     lines = service.log.splitlines()
-    begins = [line for line in lines if "session 1 begins" in line]
+    begins = [line for line in lines if "session 1 started" in line]
     assert re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d", begins[0])
     assert "patient" not in service.log

@@ -57,7 +57,7 @@ def test_names_and_files_that_are_wrong_are_said(ring, tmp_path):
         ring.remove("nobody")
     bad = tmp_path / "bad.toml"
     bad.write_text("public = 'short'")
-    with pytest.raises(ValueError, match="'public' is no key"):
+    with pytest.raises(ValueError, match="'public' is not a key"):
         load_client_key(bad)
 
 

@@ -112,7 +112,7 @@ def test_what_cannot_change_is_said_and_a_wrong_file_changes_nothing(start_servi
     )
     hang_up(
         *(service, "max_sessions = 1", "max_sessions = 1000"),
-        "stay as they are: max_sessions is 1000; allowed: 1 to 64",
+        "settings are unchanged: max_sessions is 1000; allowed: 1 to 64",
     )
     with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
         assert client.ping()[1].is_ready

@@ -13,11 +13,11 @@ from filter_service.gl.passes import Pages
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import OneView, Pending, ViewRequest
 from filter_service.rendering.filtered_view import FilteredView, input_notes
-from filter_service.rendering.frame_options import check_request, output_array
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.gl.eye_states import EyeStates
 from filter_service.rendering.gl.frame_run import FrameRun
 from filter_service.rendering.image_cells import image_cells
+from filter_service.rendering.request_checks import check_request, output_array
 
 FIRST_WORDS = 2**20
 """Initial size of a store's copy on the GPU, 2 MB; it grows by doubling."""

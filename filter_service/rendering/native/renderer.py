@@ -19,13 +19,13 @@ from filter_service.rendering.engine import OneView, Pending, ViewRequest
 from filter_service.rendering.filtered_view import FilteredView, input_notes
 from filter_service.rendering.frame import border_px_of, extended, fill_missing_depth
 from filter_service.rendering.frame_kernels import Fill
-from filter_service.rendering.frame_options import check_request, output_array
 from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
 from filter_service.rendering.native.arrays import Arrays
 from filter_service.rendering.native.eye_states import EyeState, EyeStates
 from filter_service.rendering.native.frame_record import BlendSizes, FrameRecord
 from filter_service.rendering.native.kernel_plan import KernelPlan, plan_kernels
 from filter_service.rendering.native.native_store import NativeStore
+from filter_service.rendering.request_checks import check_request, output_array
 from filter_service.rendering.white_level import white_level
 
 
