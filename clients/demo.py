@@ -12,9 +12,10 @@ import platform
 import sys
 import textwrap
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,9 @@ from clients.sheet import (
 )
 from filter_service.errors import FilterError, RenderFailed
 from filter_service.progress import Progress
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 try:
     from clients.frame_log import FrameLog
@@ -155,10 +159,16 @@ def _await_ready(service: ServiceProcess) -> None:
         raise DemoFailed(str(error)) from None
 
 
-def _through(service: ServiceProcess, shots: list[Shot], size_px, progress: Progress):
+def _through(
+    service: ServiceProcess,
+    shots: list[Shot],
+    size_px: tuple[int, int],
+    progress: Progress,
+) -> tuple[dict[str, Any], list[EyeFilm]]:
     """Stream through every eye; return the service's description and the films."""
     try:
         with FilterClient(service.endpoint, client_name="demo", timeout_s=30) as client:
+            assert client.welcome is not None
             server = dict(client.welcome.server)
             return server, _filmed(client, shots, size_px, progress)
     except FilterError as error:
@@ -188,7 +198,12 @@ def _rendered(options: argparse.Namespace, progress: Progress) -> list[Shot]:
     return shots
 
 
-def _filmed(client, shots: list[Shot], size_px, progress: Progress) -> list[EyeFilm]:
+def _filmed(
+    client: FilterClient,
+    shots: list[Shot],
+    size_px: tuple[int, int],
+    progress: Progress,
+) -> list[EyeFilm]:
     """Stream every frame through every eye, continuing while the eye changes."""
     frames = [frame for shot in shots for frame in shot.frames]
     settings = path_settings(*(shot.scene for shot in shots))
@@ -232,7 +247,10 @@ def _sheet_positions(shots: list[Shot]) -> list[int]:
 
 
 def _written(
-    options, shots: list[Shot], films: list[EyeFilm], progress: Progress
+    options: argparse.Namespace,
+    shots: list[Shot],
+    films: list[EyeFilm],
+    progress: Progress,
 ) -> Path:
     """Write the contact sheet and the video; return the video's path."""
     progress.task("Writing the contact sheet")
@@ -240,7 +258,7 @@ def _written(
     n_frames = sum(len(shot.frames) for shot in shots)
     task = progress.task("Writing the video", total=n_frames)
 
-    def pages():
+    def pages() -> Iterator[NDArray[np.uint8]]:
         for page in _video_pages(shots, films, options.size):
             yield page
             task.advance()
@@ -248,7 +266,9 @@ def _written(
     return write_video(options.out / "demo", pages, FRAMES_PER_SECOND)
 
 
-def _video_pages(shots: list[Shot], films: list[EyeFilm], size_px):
+def _video_pages(
+    shots: list[Shot], films: list[EyeFilm], size_px: tuple[int, int]
+) -> Iterator[NDArray[np.uint8]]:
     cell_px = cell_size_px(size_px)
     position = 0
     for shot in shots:
@@ -264,7 +284,9 @@ def _state(shot: Shot, frame: SceneFrame) -> EyeState:
     return EyeState(shot.scene.title(), frame.pupil_diameter_mm, frame.focus_dpt)
 
 
-def _contact_sheet(shots: list[Shot], films: list[EyeFilm], size_px):
+def _contact_sheet(
+    shots: list[Shot], films: list[EyeFilm], size_px: tuple[int, int]
+) -> Image.Image:
     blocks = []
     for shot, position in zip(shots, _sheet_positions(shots), strict=True):
         frame = shot.frames[shot.sheet_index]

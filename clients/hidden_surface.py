@@ -6,6 +6,7 @@ cache is replaced during the second rendering.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,13 +94,15 @@ class _Programs(pyrender.shader_program.ShaderProgramCache):
         super().__init__()
         self._depth_range_m = np.array(depth_range_m)
 
-    def get_program(self, vertex_shader, fragment_shader, *others, **options):
+    def get_program(
+        self, vertex_shader: str, fragment_shader: str, *others: Any, **options: Any
+    ) -> Any:
         """Return the program of one kind of mesh, which sets its own uniforms."""
         program = super().get_program(vertex_shader, str(_SHADER), *others, **options)
         if "_bind" not in vars(program):
             bind = program._bind
 
-            def bind_and_set():
+            def bind_and_set() -> None:
                 bind()
                 program.set_uniform("seen_per_m", _UNIT)
                 program.set_uniform("least_gap_dpt", LEAST_GAP_DPT)

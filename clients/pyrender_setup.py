@@ -14,7 +14,7 @@ os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
 # pyrender imports its viewer window, for which pyglet otherwise requires a display.
 pyglet.options["headless"] = True
 # Removed from numpy 2; pyrender's Scene.bounds still reads it.
-np.infty = np.inf  # noqa: NPY201
+np.infty = np.inf  # type: ignore[attr-defined]  # noqa: NPY201
 
 with warnings.catch_warnings():
     # Old syntax in third-party files, which we cannot fix here.

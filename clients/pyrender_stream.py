@@ -13,13 +13,14 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from itertools import chain
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clients.arguments import read_profile, size_px_argument
 from clients.extra import what_to_install
@@ -57,6 +58,9 @@ MAX_LOOK_AROUND_DEG = 30.0
 STRAIGHT_AHEAD = (0.0, 0.0)
 NATURAL_RANGES = {"pupil_range_mm": (2.0, 8.0), "focus_range_dpt": (0.0, 8.5)}
 
+Show = Callable[[NDArray[np.uint8], NDArray[np.uint8], str], bool]
+Learn = Callable[[float, float], None]
+
 
 def path_settings(*scene_names: str) -> dict[str, tuple[float, float]]:
     """Return the settings that cover the pupils and foci of the scenes' own paths."""
@@ -73,7 +77,7 @@ def path_settings(*scene_names: str) -> dict[str, tuple[float, float]]:
 
 def _looped_frames(
     scene: Scene, size_px: tuple[int, int], n_frames: int, *, with_hidden: bool
-) -> Iterator[SceneFrame]:
+) -> Generator[SceneFrame, None, None]:
     """Follow the scene's path back and forth, endlessly."""
     moments = path_moments(PATHS[scene.name], n_frames)
     moments = moments + moments[-2:0:-1]
@@ -85,7 +89,7 @@ def _looped_frames(
 
 def looking_around(
     frames: Iterator[SceneFrame], reach_deg: float
-) -> Iterator[SceneFrame]:
+) -> Generator[SceneFrame, None, None]:
     """Move the gaze around the image, twice as far to the sides as up and down."""
     for number, frame in enumerate(frames):
         turn = 2 * np.pi * number / FRAMES_PER_ROUND
@@ -99,7 +103,7 @@ def looking_naturally(
     *,
     white_cd_m2: float = USUAL_WHITE_CD_M2,
     clock: Callable[[], float] = time.monotonic,
-) -> Iterator[SceneFrame]:
+) -> Generator[SceneFrame, None, None]:
     """Let the focus follow the fixated object, and the pupil the light."""
     for frame in frames:
         height_px, width_px = frame.depth_m.shape
@@ -121,8 +125,8 @@ def stream(
     client: FilterClient,
     frames: Iterator[SceneFrame],
     log: FrameLog,
-    show=None,
-    learn: Callable[[float, float], None] = lambda asked_dpt, used_dpt: None,
+    show: Show | None = None,
+    learn: Learn = lambda asked_dpt, used_dpt: None,
 ) -> int:
     """Submit frames as they are rendered until they end or the window closes.
 
@@ -159,7 +163,15 @@ def stream(
     return n_sent
 
 
-def _take_answers(client, sent, log, show, learn, *, timeout_s: float) -> bool:
+def _take_answers(
+    client: FilterClient,
+    sent: dict[int, SceneFrame],
+    log: FrameLog,
+    show: Show | None,
+    learn: Learn,
+    *,
+    timeout_s: float,
+) -> bool:
     """Handle the replies; return whether to continue."""
     events = client.poll(timeout_s)
     if not events and timeout_s:
@@ -267,7 +279,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         if reach_deg:
             frames = looking_around(frames, reach_deg)
             settings["gaze_range_deg"] = (reach_deg, 0.5 * reach_deg)
-        learn = {}
+        learn: dict[str, Learn] = {}
         if options.natural:
             eye = NaturalEye(age_years=options.age)
             frames = looking_naturally(frames, eye)

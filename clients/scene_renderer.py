@@ -1,6 +1,6 @@
 """Off-screen rendering of a scene's color and depth with pyrender."""
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,7 @@ from clients.hidden_surface import LEAST_GAP_DPT, HiddenSurface
 from clients.pyrender_setup import delete_renderer, pyrender, release_context
 from clients.scenes.geometry import Array
 from clients.scenes.paths import PATHS, Key, Moment, path_moments
-from clients.scenes.scene import Scene
+from clients.scenes.scene import Batch, Scene
 
 _FLAGS = pyrender.RenderFlags.FLAT | pyrender.RenderFlags.SKIP_CULL_FACES
 
@@ -64,7 +64,9 @@ class SceneRenderer:
     unlike at the mean across an edge.
     """
 
-    def __init__(self, scene: Scene, size_px: tuple[int, int], *, supersampling=2):
+    def __init__(
+        self, scene: Scene, size_px: tuple[int, int], *, supersampling: int = 2
+    ):
         width, height = size_px
         if min(width, height, supersampling) < 1:
             raise ValueError(f"size {width}x{height} px, {supersampling} samples: >= 1")
@@ -91,7 +93,7 @@ class SceneRenderer:
     def __enter__(self) -> "SceneRenderer":
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -113,7 +115,9 @@ class SceneRenderer:
         """
         return self._render(pose, with_hidden=True)
 
-    def _render(self, pose: Array, *, with_hidden: bool):
+    def _render(
+        self, pose: Array, *, with_hidden: bool
+    ) -> tuple[tuple[NDArray[Any], NDArray[Any]], ...]:
         self._world.set_pose(self._camera, pose)
         color, raw_m = self._renderer.render(self._world, _FLAGS)
         layers = [(color, self._with_infinity(raw_m))]
@@ -131,7 +135,9 @@ class SceneRenderer:
         nothing = (depth_m == 0) | (depth_m >= self.scene.infinite_from_m)
         return np.where(nothing, np.float32(np.inf), depth_m)
 
-    def _pixels(self, color, depth_m) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    def _pixels(
+        self, color: NDArray[np.uint8], depth_m: NDArray[np.float32]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         if self._samples == 1:
             return np.ascontiguousarray(color), depth_m
         return _mean_color(color, self._samples), _sample_depth(depth_m, self._samples)
@@ -144,7 +150,7 @@ def scene_frames(
     size_px: tuple[int, int],
     *,
     with_hidden: bool = False,
-) -> Iterator[SceneFrame]:
+) -> Generator[SceneFrame, None, None]:
     """Render a scene along a camera path; `path` None is the scene's own."""
     moments = path_moments(path or PATHS[scene.name], n_frames)
     with SceneRenderer(scene, size_px) as renderer:
@@ -156,7 +162,7 @@ def frame_at(
     renderer: SceneRenderer, moment: Moment, *, with_hidden: bool = False
 ) -> SceneFrame:
     """Render one moment of a path."""
-    hidden = (None, None)
+    hidden: tuple[NDArray[Any] | None, NDArray[Any] | None] = (None, None)
     if with_hidden:
         seen, hidden = renderer.render_layers(moment.pose)
     else:
@@ -173,7 +179,7 @@ def frame_at(
     )
 
 
-def _primitive(batch) -> "pyrender.Primitive":
+def _primitive(batch: Batch) -> "pyrender.Primitive":
     """Convert one batch to an unlit, two-sided draw call of pyrender."""
     alpha = np.ones((len(batch.srgb), 1), np.float32)
     return pyrender.Primitive(
@@ -206,12 +212,20 @@ _SRGB8_FROM_LINEAR = np.round(
 ).astype(np.uint8)
 
 
-def _is_behind(seen_m, hidden_m) -> NDArray[np.bool_]:
+def _is_behind(
+    seen_m: NDArray[np.float32], hidden_m: NDArray[np.float32]
+) -> NDArray[np.bool_]:
     """Return where the hidden surface is far enough behind to matter."""
     return 1.0 / seen_m - 1.0 / hidden_m >= LEAST_GAP_DPT
 
 
-def _hidden_pixels(color, depth_m, shows, seen_m, samples: int):
+def _hidden_pixels(
+    color: NDArray[np.uint8],
+    depth_m: NDArray[np.float32],
+    shows: NDArray[np.bool_],
+    seen_m: NDArray[np.float32],
+    samples: int,
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Return color and depth of hidden pixels from the samples that have a surface.
 
     Depth is 0 unless it lies behind the pixel's visible depth: a surface behind a
@@ -233,14 +247,14 @@ def _hidden_pixels(color, depth_m, shows, seen_m, samples: int):
     return _SRGB8_FROM_LINEAR[steps], depth
 
 
-def _blocks(image, samples: int) -> NDArray[Any]:
+def _blocks(image: NDArray[Any], samples: int) -> NDArray[Any]:
     """Return the samples (h, w, n, ...) of each pixel."""
     height, width = image.shape[0] // samples, image.shape[1] // samples
     split = image.reshape(height, samples, width, samples, *image.shape[2:])
     return split.swapaxes(1, 2).reshape(height, width, -1, *image.shape[2:])
 
 
-def _mean_color(color, samples: int) -> NDArray[np.uint8]:
+def _mean_color(color: NDArray[np.uint8], samples: int) -> NDArray[np.uint8]:
     """Average blocks of sRGB samples in linear light, with tables for speed."""
     linear = _LINEAR_FROM_SRGB8[color]
     # Strided sums are several times faster than mean() over a five-axis view.
@@ -253,7 +267,7 @@ def _mean_color(color, samples: int) -> NDArray[np.uint8]:
     return _SRGB8_FROM_LINEAR[steps.astype(np.int32)]
 
 
-def _sample_depth(depth_m, samples: int) -> NDArray[np.float32]:
+def _sample_depth(depth_m: NDArray[np.float32], samples: int) -> NDArray[np.float32]:
     """Pick from each block the sample a quarter of the way from the nearest."""
     h, w = depth_m.shape[0] // samples, depth_m.shape[1] // samples
     blocks = depth_m.reshape(h, samples, w, samples).swapaxes(1, 2).reshape(h, w, -1)

@@ -152,7 +152,13 @@ def _grid(cells: Sequence[Cell], *, title: str, line_px: int) -> Image.Image:
     return page
 
 
-def _caption(draw, cell: Cell, corner, size, line_px: int) -> None:
+def _caption(
+    draw: ImageDraw.ImageDraw,
+    cell: Cell,
+    corner: tuple[int, int],
+    size: tuple[int, int],
+    line_px: int,
+) -> None:
     """Draw a cell's title and lines into the bar below its image."""
     left, top = corner
     draw.rectangle((left, top, left + size[0] - 1, top + size[1] - 1), fill=_BAR)
@@ -163,7 +169,9 @@ def _caption(draw, cell: Cell, corner, size, line_px: int) -> None:
         draw.text(position, line, fill=_SOFT, font=font, anchor="lm")
 
 
-def state_panel(size_px, state: EyeState, depth_m) -> NDArray[np.uint8]:
+def state_panel(
+    size_px: tuple[int, int], state: EyeState, depth_m: NDArray[np.float32]
+) -> NDArray[np.uint8]:
     """Draw the pupil at its current size, the focus on a scale, and the depth map."""
     width, height = size_px
     panel = Image.new("RGB", size_px, "#0d1013")
@@ -191,11 +199,15 @@ def state_panel(size_px, state: EyeState, depth_m) -> NDArray[np.uint8]:
     return np.asarray(panel)
 
 
-def _disc(draw, x: float, y: float, radius: float, color: str) -> None:
+def _disc(
+    draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, color: str
+) -> None:
     draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=color)
 
 
-def _focus_scale(draw, size_px, state: EyeState, small: int) -> None:
+def _focus_scale(
+    draw: ImageDraw.ImageDraw, size_px: tuple[int, int], state: EyeState, small: int
+) -> None:
     """Draw a scale of diopters with a mark at the requested focus."""
     width, height = size_px
     left, right, y = 0.08 * width, 0.92 * width, 0.82 * height
@@ -220,17 +232,21 @@ def _focus_scale(draw, size_px, state: EyeState, small: int) -> None:
     )  # fmt: skip
 
 
-def _depth_picture(depth_m, size_px) -> Image.Image:
+def _depth_picture(
+    depth_m: NDArray[np.float32], size_px: tuple[int, int]
+) -> Image.Image:
     """Return depth as brightness, on a logarithmic scale from 0.15 to 30 m."""
     log = np.log(np.clip(depth_m, 0.15, 30.0) / 30.0) / np.log(0.15 / 30.0)
     return Image.fromarray(np.round(255 * log).astype(np.uint8)).resize(size_px)
 
 
-def _font(size_px: int):
+def _font(size_px: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size=size_px)
 
 
-def _fitting_font(draw, text: str, size_px: int, width_px: int):
+def _fitting_font(
+    draw: ImageDraw.ImageDraw, text: str, size_px: int, width_px: int
+) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     """Return the largest font up to size_px in which a line fits the width."""
     while size_px > 9 and draw.textlength(text, font=_font(size_px)) > width_px:
         size_px -= 1

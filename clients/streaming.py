@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from clients.filter_client import FilterClient, FilteredFrame, RgbdView
+from clients.filter_client import Event, FilterClient, FilteredFrame, RgbdView
 from clients.frame_log import FrameLog
 from clients.scene_renderer import SceneFrame
 from filter_service.errors import ConnectionLost, ServiceTimeout
@@ -58,7 +58,7 @@ def filter_in_order(
         yield frame, answer
 
 
-def _check_connection(event) -> None:
+def _check_connection(event: Event) -> None:
     """Raise if a frame was dropped because the service disconnected."""
     if isinstance(event, Dropped) and event.reason == "connection_lost":
         raise ConnectionLost(_LOST)
@@ -172,13 +172,15 @@ def change_eye(
 class _ChangeWatch:
     """Collects events while an eye is prepared."""
 
-    def __init__(self, accepted: Accepted, on_progress) -> None:
+    def __init__(
+        self, accepted: Accepted, on_progress: Callable[[float, str], None]
+    ) -> None:
         self._accepted, self._on_progress = accepted, on_progress
         self.ready: Ready | None = None
         self.old_generation: int | None = None
         self.n_through_old = 0
 
-    def take(self, event) -> None:
+    def take(self, event: Event) -> None:
         """Count frames, report progress and keep Ready; raise on errors."""
         if isinstance(event, ErrorReply):
             raise event.exception()

@@ -42,7 +42,9 @@ def write_video(
     return target
 
 
-def _write_mp4(target: Path, frames, frames_per_second: int) -> None:
+def _write_mp4(
+    target: Path, frames: Iterable[NDArray[np.uint8]], frames_per_second: int
+) -> None:
     """Pipe raw frames through ffmpeg's H.264 encoder."""
     frames = iter(frames)
     first = next(frames)
@@ -60,13 +62,16 @@ def _write_mp4(target: Path, frames, frames_per_second: int) -> None:
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     ) as encoder:
+        assert encoder.stdin is not None
         for frame in chain([first], frames):
             encoder.stdin.write(np.ascontiguousarray(frame).data)
     if encoder.returncode != 0:
         raise RuntimeError(f"ffmpeg ended with code {encoder.returncode}")
 
 
-def _write_gif(target: Path, frames, frames_per_second: int) -> Path:
+def _write_gif(
+    target: Path, frames: Iterable[NDArray[np.uint8]], frames_per_second: int
+) -> Path:
     pictures = []
     for frame in frames:
         picture = Image.fromarray(frame)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import glfw
 import moderngl
 import numpy as np
@@ -51,14 +53,16 @@ class LiveWindow:
 
     def __init__(self, size_px: tuple[int, int], title: str) -> None:
         self._errors: list[str] = []
-        glfw.set_error_callback(lambda code, text: self._errors.append(text.decode()))
+        glfw.set_error_callback(
+            lambda code, text: self._errors.append(cast(bytes, text).decode())
+        )
         if not glfw.init():
             raise NoDisplay(f"no window can be opened: {self._reason()}")
         glfw.window_hint(glfw.CONTEXT_VERSION_MAJOR, 4)
         glfw.window_hint(glfw.CONTEXT_VERSION_MINOR, 3)
         glfw.window_hint(glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE)
         width, height = size_px
-        self._window = glfw.create_window(2 * width, height, title, None, None)
+        self._window: Any = glfw.create_window(2 * width, height, title, None, None)
         if not self._window:
             glfw.terminate()
             raise NoDisplay(f"no window can be opened: {self._reason()}")
@@ -72,7 +76,7 @@ class LiveWindow:
         self._textures = [self._context.texture(size_px, 3) for _ in range(2)]
         for texture in self._textures:
             texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
-        glfw.make_context_current(None)
+        glfw.make_context_current(cast(Any, None))
 
     def __enter__(self) -> LiveWindow:
         return self
@@ -118,7 +122,7 @@ class LiveWindow:
                 self._triangle.render(moderngl.TRIANGLES, vertices=3)
             glfw.swap_buffers(self._window)
         finally:
-            glfw.make_context_current(None)
+            glfw.make_context_current(cast(Any, None))
         if title is not None:
             glfw.set_window_title(self._window, title)
         glfw.poll_events()
@@ -131,7 +135,7 @@ class LiveWindow:
             width, height = glfw.get_framebuffer_size(self._window)
             raw = self._context.screen.read((0, 0, width, height), 3, alignment=1)
         finally:
-            glfw.make_context_current(None)
+            glfw.make_context_current(cast(Any, None))
         return np.frombuffer(raw, np.uint8).reshape(height, width, 3)[::-1]
 
     def close(self) -> None:
@@ -144,6 +148,8 @@ class LiveWindow:
             glfw.terminate()
 
 
-def _close_on_escape(window, key, _scancode, action, _mods) -> None:
+def _close_on_escape(
+    window: Any, key: int, _scancode: int, action: int, _mods: int
+) -> None:
     if key == glfw.KEY_ESCAPE and action == glfw.PRESS:
         glfw.set_window_should_close(window, True)

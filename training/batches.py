@@ -1,6 +1,6 @@
 """Rows of a data set as a task's inputs and targets, and the batches of a training."""
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -124,7 +124,9 @@ class Batches:
         A step takes more rows than there are.
     """
 
-    def __init__(self, rows: Rows, run: Run, *, rank: int, n_ranks: int, device):
+    def __init__(
+        self, rows: Rows, run: Run, *, rank: int, n_ranks: int, device: torch.device
+    ) -> None:
         settings = run.training
         self._rows, self._run, self._device = rows, run, device
         self._rank, self._n_ranks = rank, n_ranks
@@ -140,7 +142,7 @@ class Batches:
         self.n_steps = max(1, round(settings.n_epochs * self.steps_per_epoch))
         self._order = (-1, rows.training_index)
         self._pool = ThreadPoolExecutor(1) if settings.is_fresh else None
-        self._coming: dict = {}
+        self._coming: dict[int, Future[tuple[Tensor, Tensor]]] = {}
 
     def at(self, step: int) -> tuple[Tensor, Tensor]:
         """Return inputs and targets of a step, on the device."""
@@ -161,6 +163,7 @@ class Batches:
 
     def _fresh(self, step: int) -> tuple[Tensor, Tensor]:
         """Return the step's rows; trace blocks of steps, the next one in a thread."""
+        assert self._pool is not None
         block, place = divmod(step, FRESH_STEPS)
         for number in (block, block + 1):
             if number not in self._coming:

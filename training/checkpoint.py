@@ -2,6 +2,7 @@
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -23,7 +24,9 @@ def make_network(task: str, settings: ModelSettings) -> Network:
     )
 
 
-def save_checkpoint(file: Path, network: Network, run: Run, state: dict) -> None:
+def save_checkpoint(
+    file: Path, network: Network, run: Run, state: dict[str, Any]
+) -> None:
     """Write a network and the state needed to resume, atomically."""
     partial = file.with_suffix(".partial")
     torch.save(
@@ -38,7 +41,7 @@ def save_checkpoint(file: Path, network: Network, run: Run, state: dict) -> None
     partial.replace(file)
 
 
-def load_finished(file: Path) -> tuple[Network, dict]:
+def load_finished(file: Path) -> tuple[Network, dict[str, Any]]:
     """Load a checkpoint whose training is finished, as `load_checkpoint`.
 
     Raises
@@ -55,7 +58,7 @@ def load_finished(file: Path) -> tuple[Network, dict]:
     return network, state
 
 
-def load_checkpoint(file: Path) -> tuple[Network, dict]:
+def load_checkpoint(file: Path) -> tuple[Network, dict[str, Any]]:
     """Load a network and the rest of a checkpoint, on the CPU.
 
     Raises

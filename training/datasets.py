@@ -56,7 +56,7 @@ class Recipe:
     sampling: str = "sobol"
     population_ratio: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.domain not in DOMAINS:
             raise DataError(f"domain '{self.domain}': allowed are {', '.join(DOMAINS)}")
         if self.sampling not in SAMPLINGS:
@@ -190,7 +190,7 @@ def write_shard(folder: Path, number: int, shard: Shard) -> None:
     partial.replace(target)
 
 
-def write_manifest(folder: Path, recipe: Recipe, *, commit: str) -> dict:
+def write_manifest(folder: Path, recipe: Recipe, *, commit: str) -> dict[str, Any]:
     """Write the manifest of a folder: settings, ranges, counts of rejected rows."""
     domain = DOMAINS[recipe.domain]
     done = [k for k in range(recipe.n_shards) if shard_file(folder, k).exists()]
@@ -222,7 +222,7 @@ def write_manifest(folder: Path, recipe: Recipe, *, commit: str) -> dict:
     return manifest
 
 
-def read_manifest(folder: Path) -> dict:
+def read_manifest(folder: Path) -> dict[str, Any]:
     """Read the manifest of a data set.
 
     Raises
@@ -239,7 +239,7 @@ def read_manifest(folder: Path) -> dict:
     return manifest
 
 
-def recipe_of(manifest: dict) -> Recipe:
+def recipe_of(manifest: dict[str, Any]) -> Recipe:
     """Return the recipe that a manifest was written for."""
     known = Recipe.__dataclass_fields__
     return Recipe(**{name: manifest[name] for name in known if name in manifest})

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -24,6 +25,9 @@ from training.tasks import TASKS
 from training.train import CHECKPOINT
 from training.validation import predict
 from training.versions import commit_id
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 PUBLISHED = {
     # Table 3: validation MAE, um or mm
@@ -58,11 +62,11 @@ class Judged:
     n_parameters: int
     rows_seen: int
     time_s: float
-    error: dict
+    error: dict[str, Any]
     published_mae: str
 
 
-def judge(run: Run, x, y) -> Judged:
+def judge(run: Run, x: "NDArray[Any]", y: "NDArray[Any]") -> Judged:
     """Evaluate the checkpoint of a run on rows (n, n_inputs), (n, n_targets).
 
     Raises

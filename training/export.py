@@ -76,7 +76,9 @@ def _work(options: argparse.Namespace) -> None:
     print(json.dumps({k: card[k] for k in ("network", "bytes", "parity", "error")}))
 
 
-def export(run: Run, folder: Path, *, is_half: bool, n_rows: int = JUDGED_ROWS) -> dict:
+def export(
+    run: Run, folder: Path, *, is_half: bool, n_rows: int = JUDGED_ROWS
+) -> dict[str, Any]:
     """Write ``<task>.onnx`` and its card; return the card.
 
     Raises
@@ -132,7 +134,7 @@ def export(run: Run, folder: Path, *, is_half: bool, n_rows: int = JUDGED_ROWS) 
     return card
 
 
-def _check_parity(card: dict) -> None:
+def _check_parity(card: dict[str, Any]) -> None:
     unit, error = card["error"]["unit"], card["error"]["mean_abs"]
     gap = card["parity"]["mean_abs"].get(unit, 0.0)  # none for the light of an eye
     if gap > LARGEST_PARITY_RATIO * error:
@@ -143,7 +145,7 @@ def _check_parity(card: dict) -> None:
         )
 
 
-def _write_both(file: Path, written: bytes, card: dict) -> None:
+def _write_both(file: Path, written: bytes, card: dict[str, Any]) -> None:
     """Write network and card; the previous ones stay until both are complete."""
     text = json.dumps(card, indent=1) + "\n"
     contents = {file: written, file.with_suffix(".json"): text.encode()}
@@ -175,7 +177,7 @@ def fresh_rows(
     return x.numpy(), y.numpy()
 
 
-def column_ranges(run: Run, x: NDArray[Any]) -> list[dict]:
+def column_ranges(run: Run, x: NDArray[Any]) -> list[dict[str, Any]]:
     """Return the range of every input: as sampled or, for coefficients, as observed."""
     task = TASKS[run.task]
     domain = task.judged_domain
@@ -189,7 +191,7 @@ def column_ranges(run: Run, x: NDArray[Any]) -> list[dict]:
     return rows
 
 
-def _data(run: Run) -> dict:
+def _data(run: Run) -> dict[str, Any]:
     try:
         manifest = read_manifest(run.data_folder)
     except DataError:
@@ -198,12 +200,16 @@ def _data(run: Run) -> dict:
     return asdict(run.recipe) | {name: manifest[name] for name in kept}
 
 
-def evaluate(session, x: NDArray[np.float32]) -> NDArray[np.float32]:
+def evaluate(
+    session: onnxruntime.InferenceSession, x: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """Return the outputs of a written network, in physical units."""
     return session.run(None, {"features": x})[0]
 
 
-def _parity(task: Task, network: Network, session, x: NDArray[Any]) -> dict:
+def _parity(
+    task: Task, network: Network, session: onnxruntime.InferenceSession, x: NDArray[Any]
+) -> dict[str, Any]:
     """Return largest and mean difference between written and trained network."""
     with torch.no_grad():
         wanted = network(torch.from_numpy(x)).numpy()
@@ -217,7 +223,9 @@ def _parity(task: Task, network: Network, session, x: NDArray[Any]) -> dict:
     }
 
 
-def judged(task: Task, found: NDArray[Any], x: NDArray[Any], y: NDArray[Any]) -> dict:
+def judged(
+    task: Task, found: NDArray[Any], x: NDArray[Any], y: NDArray[Any]
+) -> dict[str, Any]:
     """Return errors against ray tracing, in the form of a card."""
     if task.name == "eye":
         error = misfit_of_eyes(found.astype(np.float64), x.astype(np.float64))
@@ -312,7 +320,7 @@ def with_one_exponential(network: Network) -> Network:
     return network
 
 
-def _halve_weights(graph) -> None:
+def _halve_weights(graph: onnx.GraphProto) -> None:
     """Store the layers' weights in 16 bits, cast back when the file is loaded.
 
     Optics and quadratic form keep 32 bits: no layer compensates for their loss.

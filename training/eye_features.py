@@ -4,7 +4,7 @@ Rotated and shifted offsets, curvatures, paraxial vergence. Used by `features`.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 
 import numpy as np
@@ -52,7 +52,7 @@ class Turn(nn.Module):
     the same norm, so the rule holds for normalized and for plain polynomials.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__()
         orders = _orders()
         partner = [orders.index((n, -m)) for n, m in orders]
@@ -92,7 +92,7 @@ class Shift(nn.Module):
 
     DEGREE = MAX_RADIAL_ORDER
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__()
         n, n_terms = self.DEGREE + 1, len(EXPONENTS)
         powers_of = torch.as_tensor(EXPONENTS)
@@ -143,7 +143,7 @@ class EyeFeatures(nn.Module):
 
     N_FEATURES = 8 + 11 + 3 + 27
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__()
         self.turn, self.shift, self.scale = Turn(), Shift(), PupilPowers()
 
@@ -170,7 +170,9 @@ class EyeFeatures(nn.Module):
         columns = torch.stack([*cornea.values(), *lens.values(), *vergence], dim=1)
         return torch.cat([columns, met / self.scale(pupil_mm)], dim=1)
 
-    def vergence_of(self, eye: Tensor, pupil_mm: Tensor, wavelength_nm: Tensor):
+    def vergence_of(
+        self, eye: Tensor, pupil_mm: Tensor, wavelength_nm: Tensor
+    ) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
         """Return functions that give eyes with other lenses their vergence, 1/mm.
 
         Both return the mean (N,) for light from the retina, outside of the eye. The
@@ -208,7 +210,9 @@ def named(eye: Tensor, name: str) -> Tensor:
     return eye[:, column(name)]
 
 
-def _turn_of_offsets(eye: Tensor, cosine: Tensor, sine: Tensor):
+def _turn_of_offsets(
+    eye: Tensor, cosine: Tensor, sine: Tensor
+) -> tuple[Tensor, Tensor]:
     angle_rad = torch.deg2rad(named(eye, "cornea_anterior_rotation_deg"))
     c, s = torch.cos(angle_rad), torch.sin(angle_rad)
     return c * cosine + s * sine, s * cosine - c * sine
@@ -283,7 +287,12 @@ def _transferred(vergence: Tensor3, reduced_mm: Tensor) -> Tensor3:
     return kept * scale, along * scale, across * scale
 
 
-def _vergence(cornea: dict, lens: dict, apex: Sequence, indices: Sequence) -> Tensor3:
+def _vergence(
+    cornea: dict[str, Tensor],
+    lens: dict[str, Tensor],
+    apex: Sequence[Tensor],
+    indices: Sequence[Tensor],
+) -> Tensor3:
     """Return the paraxial vergence, 1/mm, of light from the retina outside the eye."""
     n_cornea, n_aqueous, n_lens, n_vitreous = indices
     zero = torch.zeros_like(n_lens)
@@ -316,7 +325,12 @@ def _apex_matrix() -> np.ndarray:
     return np.stack([xx + yy, xx - yy, xy, one], axis=1)
 
 
-def _centered(eye: Tensor, cornea: dict, lens: dict, offset_curvature: Tensor):
+def _centered(
+    eye: Tensor,
+    cornea: dict[str, Tensor],
+    lens: dict[str, Tensor],
+    offset_curvature: Tensor,
+) -> list[Conic]:
     """Return the surfaces without tilts and offsets, from the retina outward."""
     before_mm = cornea["thickness"] + lens["aqueous"]
     surfaces = (
@@ -331,7 +345,7 @@ def _centered(eye: Tensor, cornea: dict, lens: dict, offset_curvature: Tensor):
     ]
 
 
-def _pupil_depth_mm(cornea: dict, lens: dict) -> Tensor:
+def _pupil_depth_mm(cornea: dict[str, Tensor], lens: dict[str, Tensor]) -> Tensor:
     return ENTRANCE_PUPIL_RATIO * (cornea["thickness"] + lens["aqueous"])
 
 
@@ -351,7 +365,9 @@ def _index_coefficients() -> list[list[float]]:
     ]
 
 
-def _footprint(cornea: dict, lens: dict, tangent: Tensor) -> tuple[Tensor, Tensor]:
+def _footprint(
+    cornea: dict[str, Tensor], lens: dict[str, Tensor], tangent: Tensor
+) -> tuple[Tensor, Tensor]:
     """Return where a field's chief ray meets the cornea, mm, and the pupil's stretch.
 
     The ray aims at the entrance pupil; where the cornea is inclined, the light of a

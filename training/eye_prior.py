@@ -26,7 +26,9 @@ def mean_eyes(x: Tensor) -> Tensor:
 
 
 @cache
-def _constants(dtype, device) -> tuple[Tensor, Tensor, Tensor]:
+def _constants(
+    dtype: torch.dtype, device: torch.device
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return the mean eye at 0 dpt, its change per dpt, and the deviations (45,)."""
     start, one = estimation_prior.mean_eyes(np.array([0.0, 1.0]))
     values = (start, one - start, estimation_prior.deviations())

@@ -37,7 +37,7 @@ class OnAxisFeatures(nn.Module):
     n_features = EyeFeatures.N_FEATURES + 4
     n_encoded = 27
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__()
         self.eye, self.scale = EyeFeatures(), PupilPowers()
 
@@ -68,12 +68,12 @@ class FieldFeatures(nn.Module):
     n_features = EyeFeatures.N_FEATURES + 4 + 3
     n_encoded = 33
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__()
         self.eye, self.turn, self.scale = EyeFeatures(), Turn(), PupilPowers()
 
     @staticmethod
-    def _field(x: Tensor):
+    def _field(x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         h_rad, v_rad = torch.deg2rad(x[:, 47]), torch.deg2rad(x[:, 48])
         ux, uy = torch.sin(h_rad) * torch.cos(v_rad), torch.sin(v_rad)
         sine = torch.sqrt(ux * ux + uy * uy)
@@ -84,7 +84,9 @@ class FieldFeatures(nn.Module):
         return sine, cosine, cos_alpha, sin_alpha
 
     @staticmethod
-    def _beta(cosine: Tensor, cos_alpha: Tensor, sin_alpha: Tensor):
+    def _beta(
+        cosine: Tensor, cos_alpha: Tensor, sin_alpha: Tensor
+    ) -> tuple[Tensor, Tensor]:
         length = torch.sqrt(cos_alpha**2 + (cosine * sin_alpha) ** 2)
         return cos_alpha / length, cosine * sin_alpha / length
 
@@ -130,7 +132,7 @@ class MeasurementFeatures(nn.Module):
     n_features = 25 + 25 + 4
     n_encoded = 45
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__()
         self.scale = PupilPowers(first=3)
         for name, bound in zip(("low", "high"), allowed_ranges().T, strict=True):

@@ -7,6 +7,7 @@ for a range of refractions and aberrations.
 """
 
 import json
+from typing import Any
 
 from estimator.estimate.estimation import estimate_eye
 from estimator.estimate.table import TABLE_FILE
@@ -32,10 +33,15 @@ ABERRATIONS_UM = (
 ABERRATED_REFRACTION_DPT = -3.0
 
 
-def _wanted_bodies() -> list[dict]:
+def _wanted_bodies() -> list[dict[str, Any]]:
     """Return the profiles of the eyes in the table."""
 
-    def body(m_dpt, j0_dpt=0.0, j45_dpt=0.0, extra=None) -> dict:
+    def body(
+        m_dpt: float,
+        j0_dpt: float = 0.0,
+        j45_dpt: float = 0.0,
+        extra: dict[int, float] | None = None,
+    ) -> dict[str, Any]:
         zernike_um = zernike_from_power_vector(
             m_dpt, j0_dpt, j45_dpt, zernike_radius_mm=TABLE_PUPIL_MM / 2.0
         )

@@ -40,7 +40,7 @@ class FocusFeatures(nn.Module):
     n_features = EyeFeatures.N_FEATURES + 5
     n_encoded = 1
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__()
         self.eye = EyeFeatures()
         for name, place in (("diameter", DIAMETER), ("aqueous", AQUEOUS)):

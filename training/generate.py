@@ -13,6 +13,7 @@ import os
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -112,7 +113,9 @@ def _commits(recipe: Recipe, folder: Path) -> str:
     return ", ".join(dict.fromkeys(before + now))
 
 
-def _finish(manifest: dict, folder: Path, console, started_s: float) -> None:
+def _finish(
+    manifest: dict[str, Any], folder: Path, console: Console, started_s: float
+) -> None:
     console.print(
         f"{manifest['n_rows_kept']} rows, {manifest['n_rows_rejected']} rejected, "
         f"{time.perf_counter() - started_s:.0f} s, in {folder}"

@@ -27,7 +27,9 @@ LOSSES = {"discriminator": "physical", "aberration": "physical", "focus": "stand
 largest."""
 
 
-def sizes(rows: tuple[int, ...] = ROWS, widths: tuple[int, ...] = WIDTHS):
+def sizes(
+    rows: tuple[int, ...] = ROWS, widths: tuple[int, ...] = WIDTHS
+) -> list[tuple[int, int]]:
     """Return width and rows seen of every point, each once."""
     points = [(WIDTH, n) for n in rows] + [(width, ROWS_SEEN) for width in widths]
     return list(dict.fromkeys(points))

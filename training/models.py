@@ -49,7 +49,7 @@ class ModelSettings:
     features: str = "raw"
     baseline: str = "none"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise ValueError(f"kind '{self.kind}': allowed are {', '.join(KINDS)}")
         if self.width < 1 or self.n_stacks < 1:
@@ -82,7 +82,7 @@ class MishBlock(nn.Module):
     def __init__(self, n_in: int, width: int, *, is_dense: bool):
         super().__init__()
 
-        def norm():
+        def norm() -> nn.Module:
             return nn.LayerNorm(width, eps=LAYER_NORM_EPSILON)
 
         self.body = nn.Sequential(
@@ -121,7 +121,9 @@ class ReluBlock(nn.Module):
         return torch.relu(self.body(x) + self.shortcut(x))
 
 
-def _residual(block, n_in: int, width: int, n_stacks: int) -> list[nn.Module]:
+def _residual(
+    block: type[MishBlock] | type[ReluBlock], n_in: int, width: int, n_stacks: int
+) -> list[nn.Module]:
     """Return stacks of a block with a dense shortcut and two with an identity."""
     return [
         block(width if stack or k else n_in, width, is_dense=k == 0)

@@ -1,5 +1,8 @@
 """Rectified Adam with decoupled weight decay and lookahead, and its schedule."""
 
+from collections.abc import Iterable
+from typing import Any
+
 import torch
 from torch.optim import Optimizer, RAdam
 
@@ -51,7 +54,7 @@ class Lookahead:
         for group in self.fast.param_groups:
             group["lr"], group["weight_decay"] = learning_rate, weight_decay
 
-    def state_dict(self) -> dict:
+    def state_dict(self) -> dict[str, Any]:
         """Return the state needed to resume exactly."""
         return {
             "fast": self.fast.state_dict(),
@@ -59,7 +62,7 @@ class Lookahead:
             "n_done": self.n_done,
         }
 
-    def load_state_dict(self, state: dict) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume from `state_dict`."""
         self.fast.load_state_dict(state["fast"])
         for mine, saved in zip(self._slow, state["slow"], strict=True):
@@ -67,7 +70,12 @@ class Lookahead:
         self.n_done = state["n_done"]
 
 
-def make_optimizer(parameters, *, learning_rate: float, weight_decay: float):
+def make_optimizer(
+    parameters: Iterable[torch.nn.Parameter],
+    *,
+    learning_rate: float,
+    weight_decay: float,
+) -> Lookahead:
     """Return RAdam (Liu et al. 2020) in a `Lookahead`, as in the paper's 7.1.2."""
     fast = RAdam(
         list(parameters),

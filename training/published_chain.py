@@ -118,7 +118,9 @@ def stretched(
     v = (ring[:, None] * np.sin(azimuth)).ravel()
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
 
-    def turned(along, across):
+    def turned(
+        along: NDArray[np.float64], across: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return along * cosine - across * sine, along * sine + across * cosine
 
     px, py = turned(major_mm * u, minor_mm * v)

@@ -3,6 +3,7 @@
 import tomllib
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any, TypeVar
 
 from training.datasets import Recipe
 from training.models import ModelSettings
@@ -11,6 +12,8 @@ from training.tasks import TASKS
 LOSSES = ("standard", "physical")
 EYE_LOSSES = ("parameters", "discriminator", "tracer")
 DEFAULT_FOLDER = Path("out/training")
+
+_FROM_FILE: Any = None
 
 
 class RunFileError(ValueError):
@@ -68,12 +71,15 @@ class Run:
     name: str
     task: str
     seed: int = 548
-    recipe: Recipe = None
-    data_folder: Path = None
-    output_folder: Path = None
+    recipe: Recipe = _FROM_FILE
+    data_folder: Path = _FROM_FILE
+    output_folder: Path = _FROM_FILE
     model: ModelSettings = field(default_factory=ModelSettings)
     training: TrainingSettings = field(default_factory=TrainingSettings)
     text: str = ""
+
+
+_Settings = TypeVar("_Settings", Recipe, ModelSettings, TrainingSettings)
 
 
 def read_run(file: Path) -> Run:
@@ -129,17 +135,17 @@ def default_data_folder(recipe: Recipe) -> Path:
     return DEFAULT_FOLDER / "data" / (recipe.domain + kind)
 
 
-def _only(body: dict, allowed: tuple[str, ...], table: str) -> None:
+def _only(body: dict[str, Any], allowed: tuple[str, ...], table: str) -> None:
     for key in body:
         if key not in allowed:
             raise RunFileError(f"{table}{key}: allowed are {', '.join(allowed)}")
 
 
-def _table(kind, body: dict, table: str):
+def _table(kind: type[_Settings], body: dict[str, Any], table: str) -> _Settings:
     known = {f.name: f for f in fields(kind)}
     _only(body, tuple(known), f"{table}.")
     for key, value in body.items():
-        wanted = known[key].type
+        wanted: Any = known[key].type
         good = (int, float) if wanted is float else wanted
         if not isinstance(value, good) or (wanted is not bool and value is True):
             raise RunFileError(

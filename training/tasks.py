@@ -22,7 +22,8 @@ from estimator.eye.lens_change import (
 )
 from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters, sampled_ranges
 from estimator.eye.tracing import MEDIA_INWARDS, TraceFailed, eye_indices
-from estimator.networks.card import INPUTS, OUTPUTS, ZERNIKE_NAMES
+from estimator.networks.card import INPUTS, OUTPUTS
+from estimator.networks.card import ZERNIKE_NAMES as ZERNIKE_NAMES
 from estimator.optics.media import refractive_index
 from estimator.optics.prescription import C20
 from estimator.optics.raytrace import RayStatus
@@ -197,7 +198,9 @@ def label_lens(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.column_stack([focus_dpt, changes_mm])
 
 
-def _ranges(*others: tuple[float, float], lens_mm=None) -> NDArray[np.float64]:
+def _ranges(
+    *others: tuple[float, float], lens_mm: tuple[float, float] | None = None
+) -> NDArray[np.float64]:
     eye = sampled_ranges()
     if lens_mm is not None:
         eye[PARAMETER_NAMES.index("lens_diameter_mm")] = lens_mm

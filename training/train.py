@@ -12,7 +12,9 @@ import json
 import os
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import torch
 import torch.distributed as dist
@@ -30,9 +32,14 @@ from training.losses import (
     physical_loss,
     standard_loss,
 )
-from training.optimizer import make_optimizer, pace
+from training.optimizer import Lookahead, make_optimizer, pace
 from training.run_file import Run, RunFileError, read_run
 from training.validation import validation_error
+
+if TYPE_CHECKING:
+    from training.models import Network
+
+    Loss = Callable[[Network, torch.Tensor, torch.Tensor], torch.Tensor]
 
 CHECKPOINT = "checkpoint.pt"
 LOG = "log.jsonl"
@@ -51,8 +58,8 @@ def _work(options: argparse.Namespace) -> None:
     train(read_run(options.run), data_folder=options.folder)
 
 
-def _loss(run: Run, device: torch.device):
-    named = {
+def _loss(run: Run, device: torch.device) -> "Loss":
+    named: dict[str, Callable[[], Loss]] = {
         "standard": lambda: standard_loss,
         "physical": lambda: physical_loss,
         "parameters": lambda: parameter_loss,
@@ -66,7 +73,7 @@ def _loss(run: Run, device: torch.device):
     return DiscriminatorLoss(judge.to(device), prior_weight=run.training.prior_weight)
 
 
-def train(run: Run, *, data_folder: Path | None = None) -> dict:
+def train(run: Run, *, data_folder: Path | None = None) -> dict[str, Any]:
     """Train the network of a run to the end; return the last entry of its log.
 
     Raises
@@ -170,7 +177,7 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict:
     return entry
 
 
-def _finished_log(run: Run) -> dict:
+def _finished_log(run: Run) -> dict[str, Any]:
     """Return the last log entry of a finished run, or an empty dict."""
     file = run.output_folder / CHECKPOINT
     if not file.exists():
@@ -180,7 +187,9 @@ def _finished_log(run: Run) -> dict:
     return state["log"] if is_done else {}
 
 
-def _resumed(run: Run, batches: Batches, network, optimizer) -> tuple:
+def _resumed(
+    run: Run, batches: Batches, network: "Network", optimizer: Lookahead
+) -> tuple[int, float, float | None, dict[str, Any]]:
     """Restore a checkpoint; return step, seconds spent, loss and last entry."""
     file = run.output_folder / CHECKPOINT
     if not file.exists():
@@ -211,11 +220,11 @@ def _cut_log(file: Path, step: int) -> None:
 class _Whole(torch.nn.Module):
     """Network and loss as one module, so that processes share gradients."""
 
-    def __init__(self, network, loss_of):
+    def __init__(self, network: "Network", loss_of: "Loss") -> None:
         super().__init__()
         self.network, self.loss_of = network, loss_of
 
-    def forward(self, x, y):
+    def forward(self, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         return self.loss_of(self.network, x, y)
 
 
@@ -237,7 +246,7 @@ def _join() -> tuple[int, int, torch.device]:
     return rank, n_ranks, device
 
 
-def _line(entry: dict) -> str:
+def _line(entry: dict[str, Any]) -> str:
     errors = ", ".join(
         f"{name} {value:.5f}"
         for name, value in entry.items()

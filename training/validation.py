@@ -19,7 +19,9 @@ CHUNK = 8192
 
 
 @torch.no_grad()
-def predict(network: Network, x: torch.Tensor, device) -> NDArray[np.float64]:
+def predict(
+    network: Network, x: torch.Tensor, device: torch.device
+) -> NDArray[np.float64]:
     """Return outputs (n, n_outputs) in physical units."""
     network.eval()
     parts = [network(part.to(device)).cpu() for part in x.split(CHUNK)]
@@ -37,7 +39,9 @@ def misfit_of_eyes(
     return label_on_axis(inputs)[:, 2:] - measured[:, :25]
 
 
-def errors(task: str, network: Network, x, y, device) -> NDArray[np.float64]:
+def errors(
+    task: str, network: Network, x: torch.Tensor, y: torch.Tensor, device: torch.device
+) -> NDArray[np.float64]:
     """Return errors (n, n_columns) of outputs or, for the eye, of its traced light."""
     found = predict(network, x, device)
     if task == "eye":
@@ -65,7 +69,9 @@ def summary(task: str, error: NDArray[np.float64]) -> dict[str, float]:
     return found
 
 
-def validation_error(network: Network, run: Run, rows: Rows, device) -> dict:
+def validation_error(
+    network: Network, run: Run, rows: Rows, device: torch.device
+) -> dict[str, float]:
     """Return the `summary` on the validation rows of a run."""
     limit = TRACED_ROWS if run.task == "eye" else VALIDATION_ROWS
     x, y = rows.validation

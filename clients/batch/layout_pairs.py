@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import cast
 
 from clients.batch.source import Optics, Scaled, SourceFrame
 from filter_service.image_files import COLOR_SUFFIXES, DEPTH_SUFFIXES
@@ -19,7 +20,7 @@ COLOR_WORDS = ("colors", "color", "colour", "rgb", "image", "img")
 DEPTH_WORDS = ("sync_depth", "depth", "z")
 
 
-def _at_an_end(words: tuple[str, ...]) -> re.Pattern:
+def _at_an_end(words: tuple[str, ...]) -> re.Pattern[str]:
     any_of = "|".join(words)
     return re.compile(rf"^({any_of})[-_.]|[-_.]({any_of})$")
 
@@ -50,8 +51,8 @@ def pair_frames(
         frames.append(
             SourceFrame(
                 name,
-                color or depth_file,
-                depth_file or color,
+                cast(Path, color or depth_file),
+                cast(Path, depth_file or color),
                 optics,
                 scaled,
                 fault=fault,
@@ -102,7 +103,7 @@ def _sub_folder(source: Path, names: tuple[str, ...]) -> Path | None:
     return next((source / name for name in names if (source / name).is_dir()), None)
 
 
-def _named(paths: list[Path], word: re.Pattern) -> dict[str, Path]:
+def _named(paths: list[Path], word: re.Pattern[str]) -> dict[str, Path]:
     """Return files by name, without the word for color or depth."""
     found: dict[str, Path] = {}
     for path in paths:

@@ -39,6 +39,7 @@ def video_frames(
             "a folder of depth images"
         )
     count = frame_count(source)
+    depths: list[tuple[Path, int | None]]
     if depth.is_dir():
         files = images_in(depth, DEPTH_SUFFIXES)
         depths = [(path, None) for path in files]

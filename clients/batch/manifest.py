@@ -128,7 +128,7 @@ class Manifest:
         return None if place is None else self._at(place)
 
     def _at(self, place: int) -> Record:
-        parts = []
+        parts: list[bytes] = []
         while not parts or b"\n" not in parts[-1]:
             size = sum(map(len, parts))
             parts.append(os.pread(self._file, 4096, place + size))
@@ -235,7 +235,9 @@ def _check_same(found: Record, job: Mapping[str, Any], path: Path) -> None:
     raise ManifestDiffers(path, "the folder's manifest is of another job", RESTART)
 
 
-def _first_difference(name: str, before: Any, now: Any) -> tuple:
+def _first_difference(
+    name: str, before: Any, now: Any
+) -> tuple[tuple[str, Any], tuple[str, Any]]:
     """Descend to the field that differs."""
     if isinstance(before, dict) and isinstance(now, dict):
         for key in sorted({*before, *now}):

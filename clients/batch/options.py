@@ -84,7 +84,7 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(argv)
 
 
-def _add_source(group) -> None:
+def _add_source(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--layout", default="auto", choices=LAYOUTS, help="default: what is found"
     )
@@ -101,7 +101,7 @@ def _add_source(group) -> None:
     group.add_argument("--limit", type=int, metavar="N", help="the first N frames only")
 
 
-def _add_eye(group) -> None:
+def _add_eye(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--pupil-mm", type=float, default=4.0, help="entrance pupil (default: 4)"
     )
@@ -131,7 +131,7 @@ def _add_eye(group) -> None:
     )
 
 
-def _add_results(group) -> None:
+def _add_results(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--format",
         default="png",
@@ -158,7 +158,7 @@ def _add_results(group) -> None:
     group.add_argument("--json", action="store_true", help="print one JSON object")
 
 
-def _add_machines(group) -> None:
+def _add_machines(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--workers", type=int, help="processes (default: one for each core)"
     )

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from typing import cast
 
 from clients.batch.exact_filter import EngineUnusable
 from clients.batch.job import Job
@@ -58,7 +59,7 @@ class ProcessPool:
                 if not busy:
                     return
                 for pipe in wait(list(busy)):
-                    yield from self._receive(busy[pipe], waiting)
+                    yield from self._receive(busy[cast(Connection, pipe)], waiting)
         finally:
             self.close()
 

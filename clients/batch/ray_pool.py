@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import ray
 
@@ -105,8 +105,13 @@ class RayPool:
     def _worker(self) -> Any:
         variables = {"env_vars": {THREADS_VARIABLE: str(self._n_threads)}}
         options = {"num_cpus": self._n_threads, "runtime_env": variables}
-        return _RayWorker.options(**options).remote(*self._setup)
+        return cast(Any, _RayWorker).options(**options).remote(*self._setup)
 
-    def _begin(self, worker, waiting, running) -> None:
+    def _begin(
+        self,
+        worker: Any,
+        waiting: deque[tuple[Unit, int]],
+        running: dict[Any, tuple[Any, Unit, int]],
+    ) -> None:
         unit, n_deaths = waiting.popleft()
         running[worker.run.remote(unit)] = worker, unit, n_deaths

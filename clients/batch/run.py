@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 from clients.batch.atomic_files import content_of, remove_parts, write_whole
 from clients.batch.job import Job, code_version
@@ -251,14 +251,14 @@ def _join_videos(batch: Batch, manifest: Manifest) -> None:
         if target.is_file():
             continue
         segments = [
-            (number * SEGMENT_FRAMES, batch.out / segment)
+            (number * SEGMENT_FRAMES, batch.out / cast(Path, segment))
             for number, (segment, frames) in enumerate(_parts(batch, profile))
             if any(_is_ok(manifest, profile, frame) for frame in frames)
         ]
         if not segments:
             continue
 
-        def join(path: Path, segments=segments) -> None:
+        def join(path: Path, segments: list[tuple[int, Path]] = segments) -> None:
             join_segments(path, segments, kind=kind, rate_hz=rate_hz)
 
         write_whole(target, join)

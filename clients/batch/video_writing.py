@@ -76,7 +76,12 @@ def write_segment(
             container.mux(stream.encode(None))
 
 
-def _add_stream(container, shape: Sequence[int], kind: VideoKind, rate: Fraction):
+def _add_stream(
+    container: av.container.OutputContainer,
+    shape: Sequence[int],
+    kind: VideoKind,
+    rate: Fraction,
+) -> av.VideoStream:
     height_px, width_px = shape[:2]
     check_sides(width_px, height_px, kind)
     stream = container.add_stream(kind.codec, rate=rate, options=dict(kind.options))

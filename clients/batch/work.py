@@ -79,7 +79,9 @@ class UnitRunner:
         """Return the total build time of eyes so far."""
         return self._filter.build_s
 
-    def run(self, unit: Unit, is_wanted: Callable[[], bool] = lambda: True) -> Iterator:
+    def run(
+        self, unit: Unit, is_wanted: Callable[[], bool] = lambda: True
+    ) -> Iterator[Record]:
         """Yield a record for each frame once its file is written.
 
         Parameters
@@ -119,6 +121,7 @@ class UnitRunner:
         """Write a video segment; yield its records once it is complete."""
         from clients.batch.video_writing import VIDEO_KINDS, write_segment
 
+        assert unit.segment is not None
         records: list[Record] = []
 
         def images() -> Iterator[tuple[int, NDArray[np.uint8]]]:
@@ -177,7 +180,7 @@ class UnitRunner:
         built_s = self._filter.build_s
         seen = self._filter.see(profile, view, pupil_mm=pupil_mm, focus_dpt=focus_dpt)
         built_now = self._filter.build_s > built_s
-        record = {
+        record: Record = {
             "kind": "frame",
             "profile": profile,
             "frame": frame.name,

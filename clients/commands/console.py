@@ -4,7 +4,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -24,7 +24,7 @@ def say(line: str = "") -> None:
     sys.stdout.write(line + "\n")
 
 
-def print_json(data: dict) -> None:
+def print_json(data: dict[str, Any]) -> None:
     """Print the one JSON object of a ``--json`` run."""
     say(json.dumps(data, allow_nan=False))
 

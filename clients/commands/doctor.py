@@ -1,5 +1,7 @@
 """`ocufilter doctor`: check what works on this machine and what to install."""
 
+from typing import Any
+
 from clients.commands.console import CommandFailed, Json, print_json, say
 
 
@@ -22,7 +24,7 @@ def doctor(json_output: Json = False) -> None:
         raise CommandFailed(f"the service cannot run here; what fails: {fails}")
 
 
-def _print_report(report: dict) -> None:
+def _print_report(report: dict[str, Any]) -> None:
     machine = report["machine"]
     say(f"{machine['system']}, {machine['processor']}, {machine['n_cores']} cores")
     for check in report["checks"]:

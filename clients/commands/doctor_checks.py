@@ -10,6 +10,7 @@ import sys
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 from estimator.threads import thread_count
 from filter_service.gl.hardware import is_software_renderer
@@ -74,7 +75,7 @@ class Check:
     fix: str = ""
 
 
-def examine() -> dict:
+def examine() -> dict[str, Any]:
     """Run every check once.
 
     Returns
@@ -122,7 +123,7 @@ def examine() -> dict:
     }
 
 
-def gl_devices() -> list[dict]:
+def gl_devices() -> list[dict[str, Any]]:
     """Return the EGL devices, each with its ``renderer`` or its ``error``.
 
     Each device is probed in its own process, because a broken driver may crash it.
@@ -137,7 +138,7 @@ def gl_devices() -> list[dict]:
 
 def run_probe(
     name: str, timeout_s: float = PROBE_TIMEOUT_S, *, gl_device: str = ""
-) -> dict:
+) -> dict[str, Any]:
     """Run one probe in its own process; on failure, ``error`` gives the reason."""
     command = [sys.executable, "-m", "clients.commands.doctor_probes", name]
     try:
@@ -159,7 +160,7 @@ def run_probe(
     return {"error": last_lines[0] if last_lines else "ended without a word"}
 
 
-def machine() -> dict:
+def machine() -> dict[str, Any]:
     """Return processor, system and Python version, as benchmark files record them."""
     try:
         system = platform.freedesktop_os_release().get("PRETTY_NAME", "unknown")
@@ -235,7 +236,7 @@ def check_libraries() -> list[Check]:
     return checks
 
 
-def check_gl(gl: dict) -> Check:
+def check_gl(gl: dict[str, Any]) -> Check:
     """Report the headless OpenGL context."""
     if "error" in gl:
         return Check("gl", False, gl["error"], FIX_MESA)
@@ -243,7 +244,7 @@ def check_gl(gl: dict) -> Check:
     return Check("gl", True, f"{info['renderer']}; OpenGL {info['version']}")
 
 
-def check_compute(gl: dict) -> Check:
+def check_compute(gl: dict[str, Any]) -> Check:
     """Report whether a compute shader ran and its result was read back."""
     if "error" in gl:
         return Check("compute", False, "not tried: no OpenGL context")
@@ -252,7 +253,7 @@ def check_compute(gl: dict) -> Check:
     return Check("compute", ok, detail, "" if ok else FIX_DRIVER)
 
 
-def check_shaders(gl: dict, shaders: dict) -> Check:
+def check_shaders(gl: dict[str, Any], shaders: dict[str, Any]) -> Check:
     """Report whether the rendering passes compile, run and are correct."""
     if "error" in gl:
         return Check("shaders", False, "not tried: no OpenGL context")
@@ -269,7 +270,7 @@ def check_shaders(gl: dict, shaders: dict) -> Check:
     return Check("shaders", ok, detail, "" if ok else FIX_DRIVER)
 
 
-def check_native(native: dict) -> Check:
+def check_native(native: dict[str, Any]) -> Check:
     """Report whether the compiled loops are available and correct."""
     if "error" in native:
         return Check("native", False, native["error"], FIX_COMPILER)
@@ -279,7 +280,7 @@ def check_native(native: dict) -> Check:
     return Check("native", ok, detail, "" if ok else FIX_COMPILER)
 
 
-def check_engine(gl: dict, native: dict) -> Check:
+def check_engine(gl: dict[str, Any], native: dict[str, Any]) -> Check:
     """Report which engine filters frames by default, and why."""
     renderer = gl.get("info", {}).get("renderer", "")
     if is_device_named():
@@ -296,7 +297,7 @@ def check_engine(gl: dict, native: dict) -> Check:
     return Check("engine", False, "neither OpenGL nor compiled loops", FIX_COMPILER)
 
 
-def check_threads(threads: dict) -> Check:
+def check_threads(threads: dict[str, Any]) -> Check:
     """Check that two threads may call Numba at once."""
     if "error" in threads:
         return Check("threads", False, threads["error"], install_command(["numba"]))
@@ -307,7 +308,7 @@ def check_threads(threads: dict) -> Check:
     return Check("threads", threads["sum_correct"], layer)
 
 
-def check_networks(networks: dict) -> Check:
+def check_networks(networks: dict[str, Any]) -> Check:
     """Report the trained networks; without them, all wavefronts are ray-traced."""
     if "error" in networks:
         fix = install_command(["onnxruntime"])

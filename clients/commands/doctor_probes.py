@@ -9,11 +9,15 @@ Names are those of `PROBES`.
 
 import json
 import sys
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numba import njit, prange, threading_layer
 
 from filter_service.errors import FilterError
+
+if TYPE_CHECKING:
+    from filter_service.rendering.engine import FrameEngine
 
 PROBE_COUNT = 1000
 """Number of values that the compute shader and the parallel loop process."""
@@ -39,7 +43,7 @@ void main() {
 """
 
 
-def probe_gl() -> dict:
+def probe_gl() -> dict[str, Any]:
     """Open a context, run a compute shader and read back its result."""
     from filter_service.gl.gpu import Gpu
 
@@ -61,7 +65,7 @@ def probe_gl() -> dict:
     }
 
 
-def probe_devices() -> dict:
+def probe_devices() -> dict[str, Any]:
     """List the EGL devices; `probe_gl` checks whether they provide contexts."""
     from filter_service.gl.egl_devices import egl_devices
 
@@ -78,7 +82,7 @@ def probe_devices() -> dict:
     }
 
 
-def probe_shaders() -> dict:
+def probe_shaders() -> dict[str, Any]:
     """Compile and run the passes; a perfect eye must leave a frame unchanged."""
     from filter_service.gl.gpu import Gpu
     from filter_service.rendering.gl.compile_passes import compile_passes
@@ -95,7 +99,7 @@ def probe_shaders() -> dict:
         gpu.close()
 
 
-def probe_native() -> dict:
+def probe_native() -> dict[str, Any]:
     """Filter a perfect eye's frames with the compiled loops."""
     from filter_service.rendering.native import NativeRenderer
     from filter_service.rendering.perfect_eye import change_by_perfect_eye
@@ -104,7 +108,10 @@ def probe_native() -> dict:
         renderer = NativeRenderer()
     except FilterError as error:
         return {"error": str(error)}
-    return {"name": renderer.name, "frame_error": change_by_perfect_eye(renderer)}
+    return {
+        "name": renderer.name,
+        "frame_error": change_by_perfect_eye(cast("FrameEngine", renderer)),
+    }
 
 
 @njit(parallel=True)
@@ -115,14 +122,14 @@ def _sum_of_squares(count: int) -> float:
     return total
 
 
-def probe_threads() -> dict:
+def probe_threads() -> dict[str, Any]:
     """Run one parallel loop and return the threading layer that ran it."""
     total = _sum_of_squares(PROBE_COUNT)
     expected = (PROBE_COUNT - 1) * PROBE_COUNT * (2 * PROBE_COUNT - 1) / 6
     return {"layer": threading_layer(), "sum_correct": bool(total == expected)}
 
 
-def probe_networks() -> dict:
+def probe_networks() -> dict[str, Any]:
     """Load every trained network and evaluate it once."""
     from estimator.networks.card import NETWORK_NAMES, NetworkUnavailable
     from estimator.networks.inference import load_network

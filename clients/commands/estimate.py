@@ -2,7 +2,7 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -82,7 +82,7 @@ def estimate(
         _report(summary, plot)
 
 
-def _summary(found: "EstimatedEye") -> dict:
+def _summary(found: "EstimatedEye") -> dict[str, Any]:
     profile = found.profile
     return {
         "profile": found.name,
@@ -106,7 +106,7 @@ def _summary(found: "EstimatedEye") -> dict:
     }
 
 
-def _report(summary: dict, plot: Path | None) -> None:
+def _report(summary: dict[str, Any], plot: Path | None) -> None:
     for note in summary["notes"]:
         say(f"note: {note}")
     say(f"{'parameter':<38}{'value':>11}  determined")

@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -125,7 +125,7 @@ def _angles(option: str, text: str) -> list[float]:
     return angles
 
 
-def _directions(found: "FieldTable") -> list[dict]:
+def _directions(found: "FieldTable") -> list[dict[str, Any]]:
     return [
         {
             "h_deg": float(h),
@@ -149,7 +149,9 @@ def _directions(found: "FieldTable") -> list[dict]:
     ]
 
 
-def _ellipse(x_mm, y_mm, major_mm, minor_mm, angle_rad) -> dict:
+def _ellipse(
+    x_mm: float, y_mm: float, major_mm: float, minor_mm: float, angle_rad: float
+) -> dict[str, Any]:
     from clients.commands.wavefront import ellipse_facts
     from estimator.wavefront.results import PupilEllipse
 

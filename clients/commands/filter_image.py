@@ -367,9 +367,9 @@ def _read_hidden(
     color_path: Path | None,
     depth_path: Path | None,
     *,
-    color: "NDArray",
+    color: "NDArray[Any]",
     depth_scale: float | None,
-) -> tuple["NDArray | None", "NDArray | None"]:
+) -> tuple["NDArray[Any] | None", "NDArray[Any] | None"]:
     """Return color and depth of the hidden layer, or None for both."""
     from filter_service.image_files import read_color, read_depth
 
@@ -390,7 +390,9 @@ def _read_hidden(
     return hidden, depth_m
 
 
-def _check_size(option: str, path: Path, image: "NDArray", color: "NDArray") -> None:
+def _check_size(
+    option: str, path: Path, image: "NDArray[Any]", color: "NDArray[Any]"
+) -> None:
     if image.shape[:2] == color.shape[:2]:
         return
     text = (
@@ -411,7 +413,7 @@ def _summary(
     view: "RgbdView",
     object_dpt: tuple[float, float],
     whole_ms: float,
-) -> dict:
+) -> dict[str, Any]:
     seen = filtered.seen
     height_px, width_px = seen.color.shape[:2]
     render_ms = sum(seen.stage_times_ms.values())
@@ -437,7 +439,7 @@ def _summary(
     }
 
 
-def _depth_words(depth_m: "NDArray", missing_count: int) -> str:
+def _depth_words(depth_m: "NDArray[Any]", missing_count: int) -> str:
     """Return the depth range and the share of filled-in pixels, as text."""
     from filter_service.rgbd_view import LEAST_DEPTH_M
 
@@ -455,7 +457,7 @@ def _depth_words(depth_m: "NDArray", missing_count: int) -> str:
     return f"{words}, {share:.2g} % missing, filled from neighbors"
 
 
-def _report(summary: dict) -> None:
+def _report(summary: dict[str, Any]) -> None:
     for note in summary["notes"]:
         say(f"note: {note}")
     if count := summary["clamped_depth_count"]:

@@ -2,11 +2,14 @@
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from clients.commands.console import Json, print_json, say
+
+if TYPE_CHECKING:
+    from filter_service.keys import KeyRing
 
 Folder = Annotated[
     Path | None,
@@ -31,7 +34,7 @@ def default_folder() -> Path:
     return Path(home) / "ocufilter" / "keys"
 
 
-def _ring(folder: Path | None):
+def _ring(folder: Path | None) -> "KeyRing":
     from filter_service.keys import KeyRing
 
     return KeyRing(folder or default_folder())

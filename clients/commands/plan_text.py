@@ -1,6 +1,6 @@
 """A PSF plan as text and as JSON."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from clients.commands.console import print_json, say
 
@@ -10,8 +10,9 @@ if TYPE_CHECKING:
 AXIS_WORDS = {"h": "azimuth", "v": "elevation"}
 
 
-def plan_summary(plan: "CachePlan") -> dict:
+def plan_summary(plan: "CachePlan") -> dict[str, Any]:
     """Return the plan's nodes and prediction, ready for JSON."""
+    assert plan.nodes is not None
     predicted, defocus = plan.prediction, plan.nodes.defocus
     return {
         "h_deg": plan.h_deg.tolist(),

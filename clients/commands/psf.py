@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -61,7 +61,7 @@ class _State:
     zernike_um: "np.ndarray"
     zernike_radius_mm: float
     pupil_diameter_mm: float
-    ellipse: dict | None
+    ellipse: dict[str, Any] | None
     eye_side: str | None
     notes: tuple[str, ...]
     rings: "Rings | None" = None
@@ -159,7 +159,7 @@ def psf(
         _report(summary)
 
 
-def _measured(source: str, focus_dpt: float | None, **view) -> _State:
+def _measured(source: str, focus_dpt: float | None, **view: Any) -> _State:
     from estimator.profiles.files import load_profile
     from estimator.profiles.measured_wavefront import MeasuredWavefront
 
@@ -181,7 +181,7 @@ def _measured(source: str, focus_dpt: float | None, **view) -> _State:
     )
 
 
-def _traced(source: str, focus_dpt: float | None, **view) -> _State:
+def _traced(source: str, focus_dpt: float | None, **view: Any) -> _State:
     from estimator.profiles.files import load_profile
     from estimator.wavefront.aberrations import wavefront_aberrations
 
@@ -216,7 +216,9 @@ def _apodization(state: _State) -> "StilesCrawford":
     return StilesCrawford()
 
 
-def _compute(state: _State, *, pixel_arcmin, method, **options) -> tuple["Psf", float]:
+def _compute(
+    state: _State, *, pixel_arcmin: float, method: str, **options: Any
+) -> tuple["Psf", float]:
     """Return the PSF and the PSNR that images filtered with it should exceed."""
     from estimator.optics.units import MRAD_PER_RAD
     from estimator.psf.compute import compute_psfs, plan_psfs
@@ -242,7 +244,7 @@ def _compute(state: _State, *, pixel_arcmin, method, **options) -> tuple["Psf", 
     return computed, float(predicted_db[0])
 
 
-def _facts(computed: "Psf", state: _State) -> dict:
+def _facts(computed: "Psf", state: _State) -> dict[str, Any]:
     from filter_service.psfs.picture import half_light_radius_px
 
     return {
@@ -271,7 +273,7 @@ def _write(out: Path, computed: "Psf", *, pixel_arcmin: float) -> None:
         write_image(out, draw_psf(computed.kernel, pixel_arcmin=pixel_arcmin))
 
 
-def _report(summary: dict) -> None:
+def _report(summary: dict[str, Any]) -> None:
     for note in summary["notes"]:
         say(f"note: {note}")
     arcmin = summary["pixel_arcmin"]

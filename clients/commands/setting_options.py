@@ -9,7 +9,7 @@ image.
 import functools
 import inspect
 from collections.abc import Callable
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, cast, get_args
 
 import typer
 
@@ -21,7 +21,9 @@ from filter_service.validation import checked
 HELP_OF_SIDE = {"h": "to the right", "v": "upwards"}
 
 
-def with_setting_options(**defaults: Any) -> Callable[[Callable], Callable]:
+def with_setting_options(
+    **defaults: Any,
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Add an option for each setting to a command, which receives ``settings``.
 
     Parameters
@@ -30,7 +32,7 @@ def with_setting_options(**defaults: Any) -> Callable[[Callable], Callable]:
         Settings whose default differs from the service's.
     """
 
-    def decorated(command: Callable) -> Callable:
+    def decorated(command: Callable[..., Any]) -> Callable[..., Any]:
         own = inspect.signature(command).parameters
         options = [
             option
@@ -48,7 +50,7 @@ def with_setting_options(**defaults: Any) -> Callable[[Callable], Callable]:
         everything = [
             p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (*kept, *options)
         ]
-        run.__signature__ = inspect.Signature(everything)
+        cast(Any, run).__signature__ = inspect.Signature(everything)
         run.__annotations__ = {p.name: p.annotation for p in everything}
         return run
 

@@ -2,7 +2,7 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -108,7 +108,15 @@ def wavefront(
         _report(summary)
 
 
-def _check(stop_mm, pupil_mm, wavelength_nm, h_deg, v_deg, focus_dpt, object_dpt):
+def _check(
+    stop_mm: float | None,
+    pupil_mm: float | None,
+    wavelength_nm: float,
+    h_deg: float,
+    v_deg: float,
+    focus_dpt: float | None,
+    object_dpt: float,
+) -> None:
     if (stop_mm is None) == (pupil_mm is None):
         raise ValueError("give either --stop-mm or --pupil-mm")
     if stop_mm is not None:
@@ -123,7 +131,7 @@ def _check(stop_mm, pupil_mm, wavelength_nm, h_deg, v_deg, focus_dpt, object_dpt
     check_range("--object-dpt", object_dpt, OBJECT_LIMITS_DPT)
 
 
-def explicit_body(source: str) -> dict | None:
+def explicit_body(source: str) -> dict[str, Any] | None:
     """Return the content of a JSON file of surfaces; None for any other source."""
     from estimator.bounded_files import InvalidFile, read_json
     from estimator.eye.explicit import is_explicit_eye
@@ -183,7 +191,7 @@ def load_surfaces(
     return profile.name, focused.surfaces, (*notes, *focused.notes)
 
 
-def ellipse_facts(ellipse: "PupilEllipse") -> dict:
+def ellipse_facts(ellipse: "PupilEllipse") -> dict[str, Any]:
     """Return the pupil of a traced wavefront in the form of the JSON output."""
     return {
         "centre_x_mm": ellipse.centre_x_mm,
@@ -195,7 +203,7 @@ def ellipse_facts(ellipse: "PupilEllipse") -> dict:
     }
 
 
-def _facts(found: "Aberrations") -> dict:
+def _facts(found: "Aberrations") -> dict[str, Any]:
     from estimator.optics.raytrace import STATUS_WORDS
 
     return {
@@ -211,7 +219,7 @@ def _facts(found: "Aberrations") -> dict:
     }
 
 
-def _report(summary: dict) -> None:
+def _report(summary: dict[str, Any]) -> None:
     from estimator.optics.zernike import nm_from_index
 
     for note in summary["notes"]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -25,8 +26,8 @@ from clients.figures.style import (
 )
 
 WORST_LOG_MAR, BEST_LOG_MAR = 1.6, -0.3
-ACCOMMODATING: dict = {"linestyle": "-", "linewidth": LINE_PT}
-LOOKING_FAR: dict = {"linestyle": "--", "linewidth": LINE_PT}
+ACCOMMODATING: dict[str, Any] = {"linestyle": "-", "linewidth": LINE_PT}
+LOOKING_FAR: dict[str, Any] = {"linestyle": "--", "linewidth": LINE_PT}
 MARKS = {0.0: " far", 1.0: "1 m", 2.5: "40 cm", 5.0: "20 cm", 10.0: "10 cm"}
 
 
@@ -65,7 +66,7 @@ def draw_acuity_of_several(
         raise_unknown(axes)
 
 
-def _finish(axes: Axes, nearest_dpt: float, looks: dict, title: str) -> None:
+def _finish(axes: Axes, nearest_dpt: float, looks: dict[str, Any], title: str) -> None:
     dress(axes, title=title, x="distance of the chart, dpt", y="acuity, logMAR")
     axes.set_xlim(0.0, nearest_dpt)
     axes.set_ylim(WORST_LOG_MAR, BEST_LOG_MAR)  # better is higher, as on charts

@@ -36,7 +36,12 @@ def blur_arcmin(study: EyeStudy) -> NDArray[np.float64]:
 
 
 def draw_field_map(
-    axes: Axes, values: NDArray[np.float64], *, title: str, label: str, middle=None
+    axes: Axes,
+    values: NDArray[np.float64],
+    *,
+    title: str,
+    label: str,
+    middle: float | None = None,
 ) -> None:
     """Draw a map of values (n,) of the field's directions.
 
@@ -46,6 +51,7 @@ def draw_field_map(
         Value at which the diverging colors are white; sequential colors if None.
     """
     grid = values.reshape(FIELD_V_DEG.size, FIELD_H_DEG.size)
+    levels: int | NDArray[np.float64]
     levels, colors = LEVEL_COUNT, SEQUENTIAL
     if middle is not None:
         reach = max(float(np.abs(grid - middle).max()), LEAST_RANGE_DPT)

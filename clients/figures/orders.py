@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -93,7 +94,7 @@ def draw_rms_by_order(
         legend(axes, loc="upper left")
 
 
-def rms_by_order_figure(studies: Sequence[EyeStudy], **options) -> Figure:
+def rms_by_order_figure(studies: Sequence[EyeStudy], **options: Any) -> Figure:
     """Return `draw_rms_by_order` as a figure."""
     figure = new_figure(62.0, 56.0)
     draw_rms_by_order(figure.subplots(), studies, **options)

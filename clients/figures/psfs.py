@@ -66,7 +66,7 @@ def main_reach_mrad(wavefront: PupilWavefront) -> float:
 
 def psf_picture(
     wavefront: PupilWavefront, *, side_arcmin: float
-) -> NDArray[np.float64]:
+) -> NDArray[np.float32]:
     """Return the PSF (161, 161), top row first, with unit sum."""
     state: dict[str, Any] = {
         "pupil_diameter_mm": wavefront.circle_diameter_mm,

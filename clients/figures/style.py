@@ -6,13 +6,16 @@ Figures are made without pyplot, which is not thread-safe.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import ScaledTranslation
+
+if TYPE_CHECKING:
+    from matplotlib.cm import ScalarMappable
 
 INK, SOFT, GRID = "#1b2430", "#5b6775", "#d9dee4"
 BLUE, ORANGE, GREEN, RED = "#1f5fa8", "#d9731a", "#2c8a57", "#b3262e"
@@ -52,12 +55,12 @@ def with_grid(axes: Axes) -> None:
     axes.grid(color=GRID, linewidth=0.5)
 
 
-def legend(axes: Axes, **options) -> None:
+def legend(axes: Axes, **options: Any) -> None:
     """Draw a legend inside the axes."""
     axes.legend(fontsize=SMALL_PT, labelcolor=INK, frameon=False, **options)
 
 
-def legend_below(axes: Axes, entries: Mapping[str, Mapping[str, Any]]) -> None:
+def legend_below(axes: Axes, entries: Mapping[str, dict[str, Any]]) -> None:
     """Draw a legend below the axes, clear of the curves; maps labels to line styles."""
     lines = [
         Line2D([], [], **({"linewidth": LINE_PT} | looks)) for looks in entries.values()
@@ -89,7 +92,7 @@ def bare(axes: Axes, *, title: str = "") -> None:
         spine.set_visible(False)
 
 
-def color_bar(axes: Axes, drawn, *, label: str) -> None:
+def color_bar(axes: Axes, drawn: ScalarMappable, *, label: str) -> None:
     """Draw a color bar beside axes."""
     bar = axes.figure.colorbar(drawn, ax=axes, fraction=0.05, pad=0.02, aspect=18)
     bar.set_label(label, fontsize=SMALL_PT, color=INK)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,9 +27,9 @@ from clients.figures.style import (
 from estimator import perfect_transfer
 
 FREQUENCY_CPD = np.linspace(0.0, 60.0, 121)
-CORRECTED: dict = {"linestyle": "-", "linewidth": LINE_PT}
-AS_IT_IS: dict = {"linestyle": "--", "linewidth": LINE_PT}
-PERFECT: dict = {"linestyle": ":", "linewidth": 0.8}
+CORRECTED: dict[str, Any] = {"linestyle": "-", "linewidth": LINE_PT}
+AS_IT_IS: dict[str, Any] = {"linestyle": "--", "linewidth": LINE_PT}
+PERFECT: dict[str, Any] = {"linestyle": ":", "linewidth": 0.8}
 
 
 def modulation(
@@ -93,7 +94,7 @@ def _perfect(pupil_mm: float) -> NDArray[np.float64]:
     )
 
 
-def _finish(axes: Axes, looks: dict, title: str) -> None:
+def _finish(axes: Axes, looks: dict[str, Any], title: str) -> None:
     dress(axes, title=title, x="cycles per degree", y="modulation")
     axes.set_xlim(0.0, FREQUENCY_CPD[-1])
     axes.set_ylim(0.0, 1.0)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, cast
+
 from matplotlib.figure import FigureBase
 
 from clients.figures import (
@@ -197,11 +200,14 @@ def _charts(before: EyeFacts, after: EyeFacts, pupil_mm: float) -> Row:
 def _curves(before: EyeFacts, after: EyeFacts) -> Section:
     studies, labels = (before.study, after.study), (before.label, after.label)
 
-    def by_pupil(draw, told: str) -> tuple:
+    def by_pupil(draw: Callable[..., None], told: str) -> tuple[Plot, ...]:
         return tuple(
             on_axes(
-                lambda axes, mm=pupil_mm: draw(
-                    axes, studies, labels=labels, pupil_mm=mm
+                cast(
+                    "Callable[[Any], None]",
+                    lambda axes, mm=pupil_mm: draw(
+                        axes, studies, labels=labels, pupil_mm=mm
+                    ),
                 ),
                 CURVES_MM,
                 f"{told}, {pupil_mm:g} mm",

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from matplotlib.backends.backend_pdf import PdfPages
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.gridspec import GridSpec
 from matplotlib.lines import Line2D
 
@@ -137,7 +137,9 @@ class _Pages:
         else:
             block.draw(_panel(page, left_mm, top_mm, width_mm, block.height_mm))
 
-    def _table(self, page, table: Table, left_mm, top_mm, width_mm) -> None:
+    def _table(
+        self, page: Figure, table: Table, left_mm: float, top_mm: float, width_mm: float
+    ) -> None:
         y_mm = top_mm + line_mm(BLOCK_PT)
         self._text(page, left_mm, y_mm - 0.8, table.title, BLOCK_PT, bold=True)
         widths = _widths_mm(table, width_mm)
@@ -159,7 +161,9 @@ class _Pages:
             y_mm += line_mm(NOTE_PT)
             self._text(page, left_mm, y_mm, line, NOTE_PT, color=SOFT)
 
-    def _words(self, page, words: Words, left_mm, top_mm, width_mm) -> None:
+    def _words(
+        self, page: Figure, words: Words, left_mm: float, top_mm: float, width_mm: float
+    ) -> None:
         y_mm = top_mm
         if words.title:
             y_mm += line_mm(BLOCK_PT)
@@ -175,7 +179,14 @@ class _Pages:
                 self._text(page, left_mm + indent_mm, y_mm, line, NOTE_PT, color=SOFT)
             y_mm += 0.8
 
-    def _picture(self, page, picture: Picture, left_mm, top_mm, width_mm) -> None:
+    def _picture(
+        self,
+        page: Figure,
+        picture: Picture,
+        left_mm: float,
+        top_mm: float,
+        width_mm: float,
+    ) -> None:
         height_mm = width_mm * picture.image.shape[0] / picture.image.shape[1]
         box = (
             left_mm / PAGE_WIDTH_MM,
@@ -196,7 +207,15 @@ class _Pages:
 
     @staticmethod
     def _text(
-        page, x_mm, y_mm, text, size_pt, *, bold=False, color=INK, ha="left"
+        page: Figure,
+        x_mm: float,
+        y_mm: float,
+        text: str,
+        size_pt: float,
+        *,
+        bold: bool = False,
+        color: str = INK,
+        ha: str = "left",
     ) -> None:
         page.text(
             x_mm / PAGE_WIDTH_MM, 1.0 - y_mm / PAGE_HEIGHT_MM, text, fontsize=size_pt,
@@ -204,13 +223,22 @@ class _Pages:
         )  # fmt: skip
 
     @staticmethod
-    def _rule(page, x_mm, width_mm, y_mm, color, line_pt=0.6) -> None:
+    def _rule(
+        page: Figure,
+        x_mm: float,
+        width_mm: float,
+        y_mm: float,
+        color: str,
+        line_pt: float = 0.6,
+    ) -> None:
         along = [x_mm / PAGE_WIDTH_MM, (x_mm + width_mm) / PAGE_WIDTH_MM]
         at = 1.0 - y_mm / PAGE_HEIGHT_MM
         page.add_artist(Line2D(along, [at, at], color=color, linewidth=line_pt))
 
 
-def _panel(page: Figure, left_mm, top_mm, width_mm, height_mm):
+def _panel(
+    page: Figure, left_mm: float, top_mm: float, width_mm: float, height_mm: float
+) -> SubFigure:
     """Return a subfigure of a page with its own layout."""
     page.set_layout_engine("constrained")
     grid = GridSpec(

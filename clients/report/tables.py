@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from clients.figures.study import WAVELENGTH_NM
 from clients.report.blocks import Table
@@ -23,7 +24,7 @@ REFRACTION_ROWS = {
 }
 
 
-def refraction_text(refraction: dict, name: str) -> str:
+def refraction_text(refraction: dict[str, Any], name: str) -> str:
     """Return one number of a refraction as text."""
     if name != "axis_deg":
         return signed(refraction[name])
@@ -105,7 +106,7 @@ def distance_text(distance_dpt: float) -> str:
     return f"{distance_dpt:.2f} ({where})"
 
 
-VISION_ROWS: dict[str, Callable[[dict], str]] = {
+VISION_ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     "higher orders, RMS, µm": lambda p: f"{p['higher_order_rms_um']:.2f}",
     "acuity as it is": lambda p: acuity_text(p["as_it_is"]),
     "acuity best corrected": lambda p: acuity_text(p["best_corrected"]),
@@ -121,7 +122,7 @@ VISION_ROWS: dict[str, Callable[[dict], str]] = {
 }
 
 
-def pupil_text(pupil: dict) -> str:
+def pupil_text(pupil: dict[str, Any]) -> str:
     """Return a pupil, with a star if it is wider than the measured one."""
     star = "*" if pupil["is_beyond_measured"] else ""
     return f"{pupil['pupil_diameter_mm']:.3g} mm{star}"
@@ -131,13 +132,13 @@ def _ratio(value: float | None) -> str:
     return "–" if value is None else f"{max(value, 0.0):.3f}"
 
 
-def _modulations(values: dict | None) -> str:
+def _modulations(values: dict[str, Any] | None) -> str:
     if values is None:
         return "–"
     return f"{values['10_cpd']:.2f} / {values['30_cpd']:.2f}"
 
 
-def acuity_text(state: dict) -> str:
+def acuity_text(state: dict[str, Any]) -> str:
     """Return the acuity of a state, or that it is not known."""
     return acuity_range_text(state["log_mar"]) if state["is_told"] else THROUGH_LENSLETS
 

@@ -157,6 +157,7 @@ class CorrectionForm:
         """Set the entries from a correction, or keep it as a file if they cannot."""
         kind, design = body.get("kind", "spectacles"), body.get("design", "monofocal")
         values = dict(body)
+        names: list[str] | set[str]
         if design == "trifocal" and values.pop("light_ratio", 0) == [*TRIFOCAL_LIGHT]:
             names = [entry.name for entry in OF_DESIGN["trifocal"]]
             values |= dict(zip(names, values.pop("adds_dpt", ()), strict=False))

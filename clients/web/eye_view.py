@@ -35,7 +35,9 @@ class _ProfiledFilter:
     filter: EyeFilter
     given: Any = None
 
-    def give(self, body: Mapping[str, Any], settings: FilterSettings, view) -> None:
+    def give(
+        self, body: Mapping[str, Any], settings: FilterSettings, view: RgbdView
+    ) -> None:
         """Set the profile if it has changed."""
         given = (body, settings, view.camera)
         if given != self.given:
@@ -43,10 +45,10 @@ class _ProfiledFilter:
             self.filter.set_profile(body, settings=settings, cameras=[view.camera])
 
     def see(
-        self, view: RgbdView, request: PictureRequest, *, gaze_deg
+        self, view: RgbdView, request: PictureRequest, *, gaze_deg: tuple[float, float]
     ) -> Filtered | None:
         """Return the picture through the newest eye; None while the eye is prepared."""
-        state = {
+        state: dict[str, Any] = {
             "pupil_diameter_mm": request.pupil_diameter_mm,
             "focus_dpt": request.focus_dpt,
         }
@@ -115,7 +117,7 @@ class EyeView:
         through: _ProfiledFilter,
         kind: Kind,
         request: PictureRequest,
-        settings,
+        settings: FilterSettings,
         view: RgbdView,
     ) -> SentPicture | None:
         began_s = time.monotonic()

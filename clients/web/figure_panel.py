@@ -68,7 +68,9 @@ class FigurePanel:
         self._figure = event.value
         await self._show_figure()
 
-    async def _ask(self, kind: str, function: Callable, *args, **options) -> Any:
+    async def _ask(
+        self, kind: str, function: Callable[..., Any], *args: Any, **options: Any
+    ) -> Any:
         """Ask the worker process; return None if it failed or a newer request came."""
         try:
             return await self._studying.ask(

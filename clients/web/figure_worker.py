@@ -41,7 +41,12 @@ class FigureWorker:
         theirs.close()
 
     async def ask(
-        self, page: str, kind: str, function: Callable[..., Any], *args, **options
+        self,
+        page: str,
+        kind: str,
+        function: Callable[..., Any],
+        *args: Any,
+        **options: Any,
     ) -> Any:
         """Return the function's result; None if a newer request came.
 
@@ -58,7 +63,9 @@ class FigureWorker:
                 return None
             return await asyncio.to_thread(self._answer, (function, args, options))
 
-    def _answer(self, question: tuple) -> Any:
+    def _answer(
+        self, question: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
+    ) -> Any:
         try:
             self._line.send(question)
             answer, failure = self._line.recv()
@@ -97,7 +104,9 @@ def _answer_all(line: Connection) -> None:
             return
 
 
-def _answer_to(function, args, options) -> tuple[Any, str | None]:
+def _answer_to(
+    function: Callable[..., Any], args: tuple[Any, ...], options: dict[str, Any]
+) -> tuple[Any, str | None]:
     """Return a result, or an error message, as some exceptions cannot be pickled."""
     try:
         return function(*args, **options), None

@@ -93,6 +93,7 @@ class _Page:
         """Drop the current request and report why."""
         request, self.newest, self.in_hand = self.in_hand, None, None
         for side in request.bodies if request else ():
+            assert request is not None
             self.show(
                 SentPicture("failed", side, request.number, b"", {"error": reason})
             )

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 import secrets
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from nicegui import Client, app, events, ui
 
@@ -26,6 +26,10 @@ from clients.web.picture_sender import PictureSender
 from clients.web.picture_view import PictureView
 from clients.web.scene_panel import ScenePanel
 from clients.web.slider_row import SliderRow
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 STYLE = (Path(__file__).parent / "style.css").read_text(encoding="utf-8")
 SHOWN = {"OD": "Right eye", "OS": "Left eye", "both": "Both"}
@@ -71,7 +75,7 @@ class Page:
             self._set_profile(*profile)
         self.out = resources.out[self.name] = PictureSender()
         self._loop = asyncio.get_running_loop()
-        self._renewal: asyncio.Task | None = None
+        self._renewal: asyncio.Task[None] | None = None
         resources.filter_thread.open(self.name, self._from_thread)
         self._build()
 
@@ -131,7 +135,10 @@ class Page:
                 number.name: SliderRow(
                     number,
                     values[number.name],
-                    lambda value, name=number.name: self._slide(name, value),
+                    cast(
+                        "Callable[[float], None]",
+                        lambda value, name=number.name: self._slide(name, value),
+                    ),
                     words=distance_text if number in (FOCUS, DISTANCE) else None,
                 )
                 for number in LOOKS
@@ -197,7 +204,14 @@ class Page:
         )
         self.view.show_aspect(picture.aspect_ratio)
         number = self.state.number + 1
-        self.out.put(SentPicture("scene", None, number, png_of(picture.view.color)))
+        self.out.put(
+            SentPicture(
+                "scene",
+                None,
+                number,
+                png_of(cast("NDArray[np.uint8]", picture.view.color)),
+            )
+        )
         self.request()
 
     def _show(self, event: events.ValueChangeEventArguments) -> None:
@@ -236,6 +250,7 @@ class Page:
     def _show_picture(self, seen: SentPicture) -> None:
         self.out.put(seen)
         if seen.kind in ("full", "failed"):
+            assert seen.eye is not None
             notes = seen.facts.get("notes") or [seen.facts.get("error", "")]
             self._notes[seen.eye] = " ".join(_sentence(note) for note in notes if note)
             self._show_notes()
@@ -255,7 +270,9 @@ class Page:
         if not sides:
             ui.notify("The full picture is not ready yet", type="warning")
         for side in sides:
-            ui.download(self._full(side).data, f"ocufilter_{side}.png")
+            ui.download(
+                cast(SentPicture, self._full(side)).data, f"ocufilter_{side}.png"
+            )
 
     async def _download_report(self) -> None:
         for side in self.state.sides:

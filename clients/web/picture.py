@@ -6,6 +6,7 @@ import math
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,7 +108,7 @@ class Place:
         return math.degrees(math.atan2(x, -z)), math.degrees(math.asin(y / length))
 
 
-def picture_of(title: str, view: RgbdView, **more) -> Picture:
+def picture_of(title: str, view: RgbdView, **more: float | None) -> Picture:
     """Return a picture with its preview."""
     n = math.ceil(view.width_px / SMALL_WIDTH_PX)
     return Picture(title, view, coarser(view, n), **more)
@@ -121,7 +122,7 @@ def coarser(view: RgbdView, n: int) -> RgbdView:
     height_px, width_px = view.height_px // n, view.width_px // n
     blocks = (height_px, n, width_px, n)
     cut = (slice(height_px * n), slice(width_px * n))
-    light = linear_from_srgb8(view.color[cut])
+    light = linear_from_srgb8(cast("NDArray[np.uint8]", view.color)[cut])
     mean = light.reshape(*blocks, 3).mean(axis=(1, 3))
     depth_m = view.depth_m[cut].reshape(blocks)
     valid_m = np.where(depth_m > 0.0, depth_m, np.inf)

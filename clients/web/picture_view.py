@@ -3,7 +3,8 @@
 from nicegui.element import Element
 
 
-class PictureView(Element, component="picture_view.js"):
+# nicegui, which takes the name of the component, has no types here
+class PictureView(Element, component="picture_view.js"):  # type: ignore[call-arg]
     """Scene and filtered pictures, with a split between them.
 
     The events ``point`` and ``look`` report the position of the pointer and of a click:

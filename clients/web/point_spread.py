@@ -68,7 +68,7 @@ def _eye(body: str) -> EyeOptics:
     return eye
 
 
-def point_spread(body: str, state: PointState) -> tuple[bytes, dict]:
+def point_spread(body: str, state: PointState) -> tuple[bytes, dict[str, Any]]:
     """Return a picture (PNG) of the point's light, and its figures.
 
     Parameters
@@ -93,13 +93,13 @@ def point_spread(body: str, state: PointState) -> tuple[bytes, dict]:
 
 def _kernels(
     eye: EyeOptics, state: PointState
-) -> tuple[list[NDArray[np.float64]], float]:
+) -> tuple[list[NDArray[np.float32]], float]:
     pupil_mm = eye.usable_pupil_mm(state.pupil_diameter_mm)
     h_deg, v_deg = (
         min(max(angle, low), high)
         for angle, (low, high) in zip(state.direction_deg, FIELD_DEG, strict=True)
     )
-    place = {
+    place: dict[str, Any] = {
         "h_deg": h_deg,
         "v_deg": v_deg,
         "pupil_diameter_mm": pupil_mm,
@@ -141,8 +141,8 @@ def _rings_reach_mrad(rings: Rings | None, radius_mm: float) -> float:
 
 
 def _kernel(
-    zernike_um: NDArray[np.float64], rings: Rings | None, **state
-) -> NDArray[np.float64]:
+    zernike_um: NDArray[np.float64], rings: Rings | None, **state: Any
+) -> NDArray[np.float32]:
     """Return one PSF, by the wave method where possible.
 
     A mix of waves and rays has visible seams where light is faint.
@@ -173,7 +173,7 @@ def _side_arcmin(
     return 2.0 ** (steps / 4.0)
 
 
-def half_light_px(kernel: NDArray[np.float64]) -> float:
+def half_light_px(kernel: NDArray[np.float32]) -> float:
     """Return the radius about the centroid that holds half of the light, px."""
     y, x = np.indices(kernel.shape)
     total = kernel.sum()
@@ -184,7 +184,7 @@ def half_light_px(kernel: NDArray[np.float64]) -> float:
     return float(radius[order][np.searchsorted(within, 0.5)])
 
 
-def _picture(light: NDArray[np.float64], side_arcmin: float) -> NDArray[np.uint8]:
+def _picture(light: NDArray[np.floating[Any]], side_arcmin: float) -> NDArray[np.uint8]:
     """Return light (n, n, 3), 0 to 1, enlarged, with a scale bar."""
     shown = np.round(255.0 * np.clip(light, 0.0, 1.0) ** GAMMA).astype(np.uint8)
     image = Image.fromarray(shown).resize(

@@ -20,7 +20,7 @@ import threading
 import webbrowser
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from clients.extra import WEB_INSTALL
 
@@ -154,7 +154,7 @@ def serve(options: argparse.Namespace) -> int:
         profile,
         opening=None if options.no_browser else opening,
         hosts=hosts,
-        on_ready=lambda: _tell(*addresses, options),
+        on_ready=lambda: _tell(*cast(tuple[str, str], addresses), options),
     )
     # the server shuts down by itself and raises the signal again: exit cleanly
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))

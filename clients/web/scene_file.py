@@ -15,6 +15,7 @@ import sys
 import tempfile
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -161,13 +162,13 @@ def main(source: str, file: str, size: str) -> int:
     except ValueError as error:
         sys.stderr.write(f"{error}\n")
         return 2
-    state = ()
+    state: tuple[float, ...] = ()
     if is_ours:
         (moment,) = path_moments(PATHS[source], 1)
         state = (moment.pupil_diameter_mm, moment.focus_dpt)
     with SceneRenderer(scene, read_size_px(size)) as renderer:
         seen, hidden = renderer.render_layers(viewpoint(scene))
-        arrays = {
+        arrays: dict[str, Any] = {
             "color": seen[0],
             "depth_m": seen[1],
             "hidden_color": hidden[0],

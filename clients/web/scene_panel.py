@@ -153,7 +153,9 @@ class ScenePanel:
         self._in_use()
         return is_shown
 
-    async def _make(self, make: Callable[..., Picture], *args: Any, **options) -> bool:
+    async def _make(
+        self, make: Callable[..., Picture], *args: Any, **options: Any
+    ) -> bool:
         """Show the picture that a function makes, or report its error."""
         if self._n_waiting >= MAX_WAITING:
             ui.notify("Still rendering; try again", type="warning")

@@ -6,6 +6,7 @@ focus; an eye that cannot reach it stays relaxed, or goes as far as its lens all
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -80,7 +81,9 @@ class _Table(NamedTuple):
     last: Tensor
 
 
-def _tabulate(vectors: Tensor, refractions) -> _Table:
+def _tabulate(
+    vectors: Tensor, refractions: Callable[[Tensor, Tensor], Tensor]
+) -> _Table:
     relaxed_mm = vectors[:, DIAMETER, None]
     share = torch.linspace(0.0, 1.0, N_TABLE, dtype=vectors.dtype)
     shrunk_mm = smallest_diameters_mm(vectors)[:, None] - relaxed_mm
@@ -170,7 +173,7 @@ def focus_of_eyes(
     flat = wanted_dpt.ndim == 1
     wanted_dpt = wanted_dpt[:, None] if flat else wanted_dpt
 
-    def refractions(eyes, rows):
+    def refractions(eyes: Tensor, rows: Tensor) -> Tensor:
         pupil_mm = pupil_diameter_mm.to(torch.float64)[rows]
         found, _ = refraction_of_eyes(eyes, pupil_mm, ray_dtype=dtype, chunk=chunk)
         return found.to(torch.float64)
@@ -195,7 +198,14 @@ def focus_of_eyes(
     return Focused(*(part[:, 0] for part in found)) if flat else found
 
 
-def _refine(vectors, table, refractions, state, inside, tolerance_dpt) -> Tensor:
+def _refine(
+    vectors: Tensor,
+    table: _Table,
+    refractions: Callable[[Tensor, Tensor], Tensor],
+    state: tuple[Tensor, ...],
+    inside: Tensor,
+    tolerance_dpt: float,
+) -> Tensor:
     """Refine inside diameters in place by secant steps; return where all converged."""
     diameter_mm, slope, wanted_dpt, relaxed_mm, nearest_mm = state
     met = ~inside

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import cache
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -9,7 +10,10 @@ from torch import Tensor
 CPU_CHUNK, GPU_CHUNK = 512, 8192
 
 
-def constant(function: Callable) -> Callable:
+_Result = TypeVar("_Result")
+
+
+def constant(function: Callable[..., _Result]) -> Callable[..., _Result]:
     """Cache a function's result, as tensors that any later graph may hold.
 
     Tensors created within ``torch.inference_mode`` could not be.

@@ -23,7 +23,7 @@ def into_cornea(
     direction: Tensor,
     starts: tuple[Tensor | None, Tensor | None] = (None, None),
     steps: int = NEWTON_STEPS,
-):
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Trace from the anterior cornea's axes to behind the posterior one, in its axes.
 
     ``starts`` are initial distances (B, R) of Newton's steps to both surfaces. Returns
@@ -40,7 +40,9 @@ def into_cornea(
     return first, second, direction, reach, gap
 
 
-def into_lens(eye: Eye, point: Tensor, direction: Tensor):
+def into_lens(
+    eye: Eye, point: Tensor, direction: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Trace from the stop's axes to behind the lens, in its posterior surface's axes.
 
     Returns points on both surfaces, direction behind and both distances.
@@ -53,7 +55,9 @@ def into_lens(eye: Eye, point: Tensor, direction: Tensor):
     return third, fourth, direction, reach, depth
 
 
-def out_of_lens(eye: Eye, point: Tensor, direction: Tensor):
+def out_of_lens(
+    eye: Eye, point: Tensor, direction: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
     """Trace from the posterior lens axes out to the stop plane.
 
     Returns points on the anterior and posterior surface, at the stop, direction there,
@@ -72,7 +76,9 @@ def out_of_lens(eye: Eye, point: Tensor, direction: Tensor):
     return third, fourth, stop, direction, (rest, depth, reach)
 
 
-def out_of_cornea(eye: Eye, point: Tensor, direction: Tensor):
+def out_of_cornea(
+    eye: Eye, point: Tensor, direction: Tensor
+) -> tuple[Tensor, Tensor, Tensor, tuple[Tensor, Tensor]]:
     """Trace from the stop out into the air, in the axes of the anterior cornea.
 
     Returns points on the anterior and posterior surface, direction, and both distances.

@@ -75,6 +75,8 @@ def field_axes(h_deg: Tensor, v_deg: Tensor) -> Axes:
 def _entrance_pupil_z(eye: Eye) -> Tensor:
     """Return the paraxial image of the stop in air, (B, 1) mm; where aiming starts."""
     n = eye.indices
+    assert eye.to_posterior.shift is not None
+    assert eye.to_stop.shift is not None
     gaps = (-eye.to_posterior.shift[:, 2], -eye.to_stop.shift[:, 2])
     z, height, slope = gaps[0] + gaps[1], torch.zeros_like(gaps[0]), 1.0 / n[:, 2:3]
     for i in (1, 0):
@@ -86,7 +88,9 @@ def _entrance_pupil_z(eye: Eye) -> Tensor:
     return z - height / slope
 
 
-def _shoot(eye: Eye, axes: Axes, base_z: Tensor, start: Tensor):
+def _shoot(
+    eye: Eye, axes: Axes, base_z: Tensor, start: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, tuple[Tensor, Tensor]]:
     """Trace parallel rays at ``start`` (B, 2, R) of the pupil plane to the stop.
 
     Returns points on both corneal surfaces, at the stop, the direction there, and the

@@ -6,6 +6,8 @@ the stop. Here rays start at the nodes of that circle and are aimed at the retin
 point; their miss has little effect (see `paths`).
 """
 
+from typing import Any, cast
+
 import torch
 from torch import Tensor
 
@@ -38,6 +40,9 @@ _STEPS = 10
 _FIRST_STEPS, _WARM_STEPS = 5, 2
 _DIFFERENCE_COSINE = 1e-3
 _C20 = index_from_nm(2, 0)
+
+_Rows = tuple[Tensor, Tensor, Tensor]
+_Starts = tuple[Tensor | None, Tensor | None]
 
 
 @constant
@@ -88,13 +93,15 @@ def zernike_of_eyes(
     """
     dtype = ray_dtype or vectors.dtype
     return in_chunks(
-        lambda *part: _zernike(*part, dtype),
+        lambda *part: _zernike(*cast(_Rows, part), dtype),
         (vectors, pupil_diameter_mm, wavelength_nm),
         chunk,
     )
 
 
-def _zernike(vectors, pupil_mm, wavelength_nm, dtype):
+def _zernike(
+    vectors: Tensor, pupil_mm: Tensor, wavelength_nm: Tensor, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
     with_gradient = torch.is_grad_enabled()
     with torch.no_grad():
         eye = eyes.pack_eyes(vectors, wavelength_nm)
@@ -118,12 +125,19 @@ def _zernike(vectors, pupil_mm, wavelength_nm, dtype):
     return zernike_um.index_copy(0, rows, wave_um @ projection), ok
 
 
-def _plane(eye: Eye, axes: chiefs.Axes, dtype) -> tuple[Tensor, ...]:
+def _plane(eye: Eye, axes: chiefs.Axes, dtype: torch.dtype) -> tuple[Tensor, ...]:
     """Return the pupil plane's axes in those of the anterior cornea, (B, 3, 1) each."""
     return tuple(torch.bmm(eye.to_cornea.turn, axis).to(dtype) for axis in axes)
 
 
-def _aim(eye: Eye, axes, chief, radius_mm: Tensor, dtype, with_gradient: bool):
+def _aim(
+    eye: Eye,
+    axes: chiefs.Axes,
+    chief: chiefs.Chief,
+    radius_mm: Tensor,
+    dtype: torch.dtype,
+    with_gradient: bool,
+) -> tuple[tuple[Tensor, ...], Tensor, Tensor]:
     """Aim rays from the nodes at the retinal point.
 
     Returns points on the four surfaces, the outward direction in the anterior cornea's
@@ -133,11 +147,14 @@ def _aim(eye: Eye, axes, chief, radius_mm: Tensor, dtype, with_gradient: bool):
     frame = across(chief.direction).to(dtype)
     nodes = _nodes(radius_mm.device, dtype)[0] * radius_mm.to(dtype)[:, None, None]
     narrow, light = eyes.mapped(lambda t: t.to(dtype), (eye, chief[:3]))
+    last: dict[str, Any]
     last, tolerance = {}, _TOLERANCE_WITHOUT_GRADIENT_MM
     if with_gradient:
         tolerance = _TOLERANCE_MM[dtype]
 
-    def miss_of(cosines, positions, starts=(None, None)):
+    def miss_of(
+        cosines: Tensor, positions: Tensor, starts: _Starts = (None, None)
+    ) -> Tensor:
         p, q = cosines[:, :1], cosines[:, 1:]
         outwards = p * x_axis + q * y_axis + (1.0 - p * p - q * q).sqrt() * source
         here = positions[:, :1] * x_axis + positions[:, 1:] * y_axis + light[0][0]
@@ -147,7 +164,7 @@ def _aim(eye: Eye, axes, chief, radius_mm: Tensor, dtype, with_gradient: bool):
         last["outwards"] = outwards
         return miss
 
-    def warm(cosines):
+    def warm(cosines: Tensor) -> Tensor:
         # A bundle's second guess meets the cornea nearly where the first did.
         starts = last["legs"][:2] if "legs" in last else (None, None)
         return miss_of(cosines, nodes, starts)
@@ -168,7 +185,14 @@ def _aim(eye: Eye, axes, chief, radius_mm: Tensor, dtype, with_gradient: bool):
     return last["points"], last["outwards"], ok
 
 
-def _to_origin(eye: Eye, light, frame, point, direction, starts):
+def _to_origin(
+    eye: Eye,
+    light: tuple[tuple[Tensor, ...], Tensor, Tensor],
+    frame: Tensor,
+    point: Tensor,
+    direction: Tensor,
+    starts: _Starts,
+) -> tuple[Tensor, tuple[Tensor, ...], tuple[Tensor, ...]]:
     """Trace rays (B, 3, R) from the pupil plane to that of the retinal point.
 
     Returns the miss there (B, 2, R), points on the four surfaces, and the legs.
@@ -186,7 +210,14 @@ def _to_origin(eye: Eye, light, frame, point, direction, starts):
     return miss, (first, second, third, fourth), (reach, gap, on, depth, rest)
 
 
-def _wavefront(eye: Eye, axes, chief, points, outwards, radius_mm: Tensor) -> Tensor:
+def _wavefront(
+    eye: Eye,
+    axes: chiefs.Axes,
+    chief: chiefs.Chief,
+    points: tuple[Tensor, ...],
+    outwards: Tensor,
+    radius_mm: Tensor,
+) -> Tensor:
     """Return W (B, R), um, at the nodes of the circle; differentiable."""
     dtype = outwards.dtype
     x_axis, y_axis, _ = _plane(eye, axes, dtype)
@@ -204,7 +235,7 @@ def refraction_of_eyes(
     vectors: Tensor,
     pupil_diameter_mm: Tensor,
     wavelength_nm: Tensor | None = None,
-    **options,
+    **options: Any,
 ) -> tuple[Tensor, Tensor]:
     """Return least-squares M (B,), dpt, from C(2,0) on the pupil's circle, and ok (B,).
 

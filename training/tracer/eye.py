@@ -6,7 +6,8 @@ stop (axes of the eye, origin at its center), the two surfaces of the lens, the 
 (axes of the eye, origin at its pole).
 """
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -60,7 +61,7 @@ class Eye(NamedTuple):
     indices: Tensor
 
 
-def mapped(function, tree):
+def mapped(function: Callable[[Tensor], Tensor], tree: Any) -> Any:
     """Apply ``function`` to every tensor of nested tuples."""
     if tree is None or isinstance(tree, Tensor):
         return None if tree is None else function(tree)
@@ -155,10 +156,22 @@ def pack_eyes(vectors: Tensor, wavelength_nm: Tensor) -> Eye:
     )
 
 
-def _shapes(given, vectors, lens_anterior_mm, lens_posterior_mm) -> tuple[Shape, ...]:
-    def shape(radius_x_mm, radius_y_mm, conic, offset=None):
+def _shapes(
+    given: dict[str, Tensor],
+    vectors: Tensor,
+    lens_anterior_mm: Tensor,
+    lens_posterior_mm: Tensor,
+) -> tuple[Shape, ...]:
+    def shape(
+        radius_x_mm: Tensor,
+        radius_y_mm: Tensor,
+        conic: Tensor,
+        offset: Tensor | None = None,
+    ) -> Shape:
         columns = (1.0 / radius_x_mm, 1.0 / radius_y_mm, conic)
-        return Shape(*(c[:, None] for c in columns), offset)
+        return Shape(
+            *cast(tuple[Tensor, Tensor, Tensor], (c[:, None] for c in columns)), offset
+        )
 
     front_mm = given["cornea_anterior_radius_mm"]
     back_mm = front_mm * given["cornea_posterior_radius_ratio"]

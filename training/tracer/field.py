@@ -5,7 +5,7 @@ point are aimed at the nodes of the stop and traced out of the eye; the wavefron
 fitted on the circle about their rim. Eye, field, wavelength and pupil are per row.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -34,6 +34,8 @@ _ACCEPTED_MM = {torch.float64: 1e-8, torch.float32: 2e-5}
 
 _STEPS = 20
 _DIFFERENCE_COSINE = {torch.float64: 1e-6, torch.float32: 1e-3}
+
+_Rows = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 class FieldAberrations(NamedTuple):
@@ -104,7 +106,7 @@ def field_aberrations_of_eyes(
     """
     dtype = ray_dtype or vectors.dtype
     parts = in_chunks(
-        lambda *part: _aberrations(*part, dtype),
+        lambda *part: _aberrations(*cast(_Rows, part), dtype),
         (vectors, pupil_diameter_mm, wavelength_nm, h_deg, v_deg),
         chunk,
     )
@@ -117,7 +119,14 @@ def _stop_radius(eye: Eye, pupil_mm: Tensor) -> Tensor:
     return pupil_mm.to(torch.float64) / 2.0 / chiefs.magnification(reference)
 
 
-def _aberrations(vectors, pupil_mm, wavelength_nm, h_deg, v_deg, dtype):
+def _aberrations(
+    vectors: Tensor,
+    pupil_mm: Tensor,
+    wavelength_nm: Tensor,
+    h_deg: Tensor,
+    v_deg: Tensor,
+    dtype: torch.dtype,
+) -> tuple[Tensor, ...]:
     axes = chiefs.field_axes(h_deg.to(torch.float64), v_deg.to(torch.float64))
     axes = chiefs.Axes(*(axis.detach() for axis in axes))
     with torch.no_grad():
@@ -159,7 +168,7 @@ def _launched(bundle: _Launch, cosines: Tensor) -> Tensor:
     return torch.bmm(frame.mT, cosines) - along * chief
 
 
-def _at_stop(eye: Eye, origin: Tensor, bundle: _Launch, cosines: Tensor):
+def _at_stop(eye: Eye, origin: Tensor, bundle: _Launch, cosines: Tensor) -> Tensor:
     """Return the points (B, 2, R) where rays from the retinal point cross the stop."""
     direction = _launched(bundle, cosines)
     out = out_of_lens(eye, origin.expand_as(direction), direction)
@@ -167,7 +176,9 @@ def _at_stop(eye: Eye, origin: Tensor, bundle: _Launch, cosines: Tensor):
     return torch.where(failed, torch.nan, out[2][:, :2])
 
 
-def _aim(eye: Eye, chief, frame, radius_mm: Tensor, dtype):
+def _aim(
+    eye: Eye, chief: chiefs.Chief, frame: Tensor, radius_mm: Tensor, dtype: torch.dtype
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return direction cosines (B, 2, R) to the nodes, their response, and ok (B,)."""
     nodes = (_nodes(radius_mm.device)[0] * radius_mm[:, None, None]).to(dtype)
     narrow, origin = eyes.mapped(lambda t: t.to(dtype), (eye, chief.origin))
@@ -175,7 +186,7 @@ def _aim(eye: Eye, chief, frame, radius_mm: Tensor, dtype):
     h = _DIFFERENCE_COSINE[dtype]
     around = nodes.new_tensor([[h, -h, 0.0, 0.0], [0.0, 0.0, h, -h]])
 
-    def response(cosines):
+    def response(cosines: Tensor) -> Tensor:
         ends = [
             _at_stop(narrow, origin, bundle, cosines + around[:, i, None])
             for i in range(4)
@@ -194,7 +205,13 @@ def _aim(eye: Eye, chief, frame, radius_mm: Tensor, dtype):
     return cosines, response(cosines), (left < _ACCEPTED_MM[dtype]).all(1)
 
 
-def _attached(eye: Eye, chief, bundle: _Launch, radius_mm: Tensor, dtype) -> _Launch:
+def _attached(
+    eye: Eye,
+    chief: chiefs.Chief,
+    bundle: _Launch,
+    radius_mm: Tensor,
+    dtype: torch.dtype,
+) -> _Launch:
     """Return the bundle with its gradient: one Newton step from the solution."""
     nodes = (_nodes(radius_mm.device)[0] * radius_mm[:, None, None]).to(dtype)
     narrow, origin = eyes.mapped(lambda t: t.to(dtype), (eye, chief.origin))
@@ -203,7 +220,13 @@ def _attached(eye: Eye, chief, bundle: _Launch, radius_mm: Tensor, dtype) -> _La
     return bundle._replace(cosines=bundle.cosines - step)
 
 
-def _samples(eye: Eye, axes, chief, bundle: _Launch, dtype) -> Tensor:
+def _samples(
+    eye: Eye,
+    axes: chiefs.Axes,
+    chief: chiefs.Chief,
+    bundle: _Launch,
+    dtype: torch.dtype,
+) -> Tensor:
     """Return X, Y (mm) and W (um) of every ray on the pupil plane, (B, 3, R)."""
     plane = [torch.bmm(eye.to_cornea.turn, axis).to(dtype) for axis in axes]
     eye, (points, origin) = eyes.mapped(
@@ -227,14 +250,14 @@ def _samples(eye: Eye, axes, chief, bundle: _Launch, dtype) -> Tensor:
     return torch.where(in_order[:, None], samples, torch.nan)
 
 
-def _read(samples: Tensor, dtype) -> tuple[Tensor, ...]:
+def _read(samples: Tensor, dtype: torch.dtype) -> tuple[Tensor, ...]:
     """Return coefficients, radius and ellipse of whole pupils."""
     x_mm, y_mm, wave_um = samples.to(torch.float64).unbind(1)
     _, weights, n_rings = _nodes(samples.device)
     rim = [part[:, n_rings - 1 :: n_rings] for part in (x_mm, y_mm)]
     radius_mm = rim_radius(*rim)
     zernike_um = fit_zernike(x_mm, y_mm, wave_um, weights, radius_mm)
-    ellipse_mm = rim_ellipse(*rim, radius_mm)
+    ellipse_mm = rim_ellipse(*cast(tuple[Tensor, Tensor], rim), radius_mm)
     return tuple(part.to(dtype) for part in (zernike_um, radius_mm, ellipse_mm))
 
 

@@ -63,7 +63,9 @@ def _fourier(n: int, device: torch.device) -> tuple[Tensor, Tensor]:
     return torch.cat(rows).to(device), order.to(device)
 
 
-def _series(coefficients: Tensor, order: Tensor, angle: Tensor):
+def _series(
+    coefficients: Tensor, order: Tensor, angle: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return value, slope and bend (B, A) of series (B, 2 K + 1) at angles (B, A)."""
     mean, even, odd = coefficients.split([1, len(order), len(order)], dim=-1)
     turned = angle[..., None] * order

@@ -9,15 +9,17 @@ change, to first order, when a point slides along its surface: an error of the p
 enters squared, and points without gradient still give the exact gradient.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from training.tracer import eye as eyes
-from training.tracer.eye import Eye
+from training.tracer.eye import Eye, Shape
 from training.tracer.surfaces import sag
 
 
-def _from_chief(shape, points: Tensor, chief: Tensor) -> tuple[Tensor, Tensor]:
+def _from_chief(shape: Shape, points: Tensor, chief: Tensor) -> tuple[Tensor, Tensor]:
     """Return ray points minus the chief's (B, 3, R), and the latter (B, 3, 1)."""
     z = sag(shape, points[:, 0], points[:, 1])[0]
     chief_z = sag(shape, chief[:, 0], chief[:, 1])[0]
@@ -36,7 +38,7 @@ def _longer(away: Tensor, chief_leg: Tensor) -> Tensor:
 
 
 def extra_path(
-    eye: Eye, points: list[Tensor], chief_points: list[Tensor], origin: Tensor
+    eye: Eye, points: Sequence[Tensor], chief_points: Sequence[Tensor], origin: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return the path from ``origin`` to the anterior cornea minus the chief ray's.
 
