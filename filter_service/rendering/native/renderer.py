@@ -81,7 +81,7 @@ class NativeRenderer(OneView):
         """Stop the threads; the renderer cannot be used afterwards."""
         self._end()
 
-    def call_between(self, function: Callable[[], None], interval_s: float) -> None:
+    def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
         """Register a function to be called during frames, at most every ``interval_s``.
 
         It must neither raise nor use this renderer.
@@ -96,6 +96,7 @@ class NativeRenderer(OneView):
 
         self._between = self._loops.call_between(self._threads, rest, interval_s)
         self._rest_between = rest
+        return True
 
     def load(self, store: PsfStore) -> NativeStore:
         """Load a store; its kernels may all be computed later."""
