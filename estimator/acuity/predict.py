@@ -9,6 +9,7 @@ would read 0.3 to 0.4 logMAR better out of focus than people do (Smith, Optom. V
 68, 1991), one who needs detail in phase up to the limit 0.3 worse.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -43,6 +44,10 @@ LOG_MAR_LIMITS = (-0.7, 2.5)
 TRIALS, SEED = 4000, 7
 HIGHEST_CPD = 60.0
 """Highest frequency that receptors of the fovea sample."""
+
+
+Modulation = Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
+"""Transfer, real or complex, at frequencies x and y in cycles per degree."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +90,7 @@ def predict_acuity(
     ValueError
         A wavefront too steep to be resolved.
     """
-    pupil = {
+    pupil: dict[str, Any] = {
         "zernike_radius_mm": zernike_radius_mm,
         "wavelength_nm": wavelength_nm,
         "pupil_ellipse": pupil_ellipse,
@@ -104,13 +109,14 @@ def predict_acuity(
 def log_mar_of(transfer: Transfer) -> float:
     """Return the acuity of a transfer function."""
 
-    def modulation(x_cpd: NDArray[Any], y_cpd: NDArray[Any]) -> NDArray[np.float64]:
+    def modulation(x_cpd: NDArray[Any], y_cpd: NDArray[Any]) -> NDArray[np.complex128]:
         step_cpd = transfer.frequency_cpd[1] - transfer.frequency_cpd[0]
         middle = (transfer.frequency_cpd.size - 1) / 2
         places = middle + np.stack([y_cpd, x_cpd]) / step_cpd
         parts = (transfer.transfer_ratio.real, transfer.transfer_ratio.imag)
         real, imaginary = (map_coordinates(part, places, order=1) for part in parts)
-        return real + 1j * imaginary
+        found: NDArray[np.complex128] = real + 1j * imaginary
+        return found
 
     return _limit(modulation, _noise())
 
@@ -130,10 +136,11 @@ def _noise() -> float:
             low = middle
         else:
             high = middle
-    return 10.0 ** (0.5 * (low + high))
+    noise: float = 10.0 ** (0.5 * (low + high))
+    return noise
 
 
-def _limit(modulation, noise: float) -> float:
+def _limit(modulation: Modulation, noise: float) -> float:
     """Return the logarithm of the smallest gap, minutes of arc, read often enough."""
     low, high = LOG_MAR_LIMITS
     for _ in range(14):
@@ -145,7 +152,7 @@ def _limit(modulation, noise: float) -> float:
     return 0.5 * (low + high)
 
 
-def _correct_ratio(modulation, gap_arcmin: float, noise: float) -> float:
+def _correct_ratio(modulation: Modulation, gap_arcmin: float, noise: float) -> float:
     """Return the share of correct answers for rings with the given gap."""
     x, y, spectra = _rings()
     per_degree = 60.0 / gap_arcmin
@@ -169,7 +176,8 @@ def _correct_ratio(modulation, gap_arcmin: float, noise: float) -> float:
 def _root(products: NDArray[Any]) -> NDArray[np.float64]:
     """Return a matrix whose square is the products of the rings."""
     values, vectors = np.linalg.eigh(products)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
+    root: NDArray[np.float64] = vectors * np.sqrt(np.maximum(values, 0.0))
+    return root
 
 
 @cache

@@ -78,7 +78,8 @@ def retina_nyquist_cpd(
     away = np.maximum(radius_deg, 1e-9)
     along = np.hypot(h * across_deg, v * up_deg) / away
     spacing_deg = np.where(radius_deg < 1e-9, _spacing_deg(0.0, "temporal"), along)
-    return 1.0 / (np.sqrt(3.0) * spacing_deg)
+    nyquist_cpd: NDArray[np.float64] = 1.0 / (np.sqrt(3.0) * spacing_deg)
+    return nyquist_cpd
 
 
 def retina_log_mar(
@@ -95,4 +96,5 @@ def retina_log_mar(
 def _spacing_deg(eccentricity_deg: ArrayLike, meridian: str) -> NDArray[np.float64]:
     """Return the spacing of neighbors of one kind in a hexagonal lattice."""
     one_kind = midget_density_per_deg2(eccentricity_deg, meridian) / 2.0
-    return np.sqrt(2.0 / (np.sqrt(3.0) * one_kind))
+    spacing_deg: NDArray[np.float64] = np.sqrt(2.0 / (np.sqrt(3.0) * one_kind))
+    return spacing_deg

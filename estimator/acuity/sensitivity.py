@@ -35,7 +35,10 @@ def perfect_transfer(
     """Return the modulation transfer (...) of a round pupil without aberrations."""
     cutoff_cpd = math.radians(1.0) * pupil_diameter_mm * 1e6 / wavelength_nm
     ratio = np.clip(np.abs(np.asarray(frequency_cpd)) / cutoff_cpd, 0.0, 1.0)
-    return 2.0 / np.pi * (np.arccos(ratio) - ratio * np.sqrt(1.0 - ratio**2))
+    transfer: NDArray[np.float64] = (
+        2.0 / np.pi * (np.arccos(ratio) - ratio * np.sqrt(1.0 - ratio**2))
+    )
+    return transfer
 
 
 def mean_eye_transfer(

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -80,7 +80,8 @@ class Transfer:
             * np.stack([np.sin(angles), np.cos(angles)])[:, None]
         )
         found = map_coordinates(values, places, order=1)
-        return found.mean(axis=-1)
+        mean: NDArray[np.float64] = found.mean(axis=-1)
+        return mean
 
 
 def optical_transfer(
@@ -127,7 +128,7 @@ def optical_transfer(
     phase = 2.0 * np.pi * wavefront_um * UM_PER_MM / wavelength_nm
     pupil = inside * np.exp(1j * phase)
     if pupil_screen is not None:
-        cx, cy = pupil_screen.centre_mm
+        cx, cy = cast("tuple[float, float]", pupil_screen.centre_mm)  # one center
         square_mm2 = (x_mm - cx) ** 2 + (y_mm - cy) ** 2
         pupil = pupil * pupil_screen.transmission(square_mm2, wavelength_nm)
     padded = 2 * count
@@ -178,17 +179,29 @@ def _samples(
             f"functions are for up to "
             f"{MOST_SAMPLES * STEP_WAVES * wavelength_nm / 2.0 / UM_PER_MM:.0f}"
         )
-    return fft.next_fast_len(wanted)
+    count: int = fft.next_fast_len(wanted)
+    return count
 
 
-def _inside(x_mm, y_mm, radius_mm, ellipse, step_mm) -> NDArray[np.float64]:
+def _inside(
+    x_mm: NDArray[np.float64],
+    y_mm: NDArray[np.float64],
+    radius_mm: float,
+    ellipse: NDArray[np.float64] | None,
+    step_mm: float,
+) -> NDArray[np.float64]:
     """Return the part of each sample within the pupil; its edge is a sample wide."""
     circle = np.hypot(x_mm, y_mm) / radius_mm
-    found = np.clip(0.5 + (1.0 - circle) * radius_mm / step_mm, 0.0, 1.0)
+    found: NDArray[np.float64] = np.clip(
+        0.5 + (1.0 - circle) * radius_mm / step_mm, 0.0, 1.0
+    )
     if ellipse is None:
         return found
     cx, cy, major_mm, minor_mm, angle = ellipse
     along = (x_mm - cx) * np.cos(angle) + (y_mm - cy) * np.sin(angle)
     across = (y_mm - cy) * np.cos(angle) - (x_mm - cx) * np.sin(angle)
     from_rim = 1.0 - np.hypot(along / major_mm, across / minor_mm)
-    return np.minimum(found, np.clip(0.5 + from_rim * minor_mm / step_mm, 0.0, 1.0))
+    within: NDArray[np.float64] = np.minimum(
+        found, np.clip(0.5 + from_rim * minor_mm / step_mm, 0.0, 1.0)
+    )
+    return within

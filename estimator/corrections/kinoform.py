@@ -80,7 +80,10 @@ class Kinoform:
         """
         field = np.exp(2j * np.pi * color_ratio * np.array(self.path_ratio))
         middle = np.exp(-1j * np.pi * orders / N_SAMPLES)  # samples at half steps
-        return (np.fft.fft(field) / N_SAMPLES)[orders % N_SAMPLES] * middle
+        found: NDArray[np.complex128] = (np.fft.fft(field) / N_SAMPLES)[
+            orders % N_SAMPLES
+        ] * middle
+        return found
 
 
 def _places() -> NDArray[np.float64]:

@@ -110,7 +110,8 @@ class ProgressiveLens(rx.Prescription):
         found[..., 1, 1] = power_dpt
         found[..., 0, 1] = found[..., 1, 0] = -bell_dpt * aside
         m, j0, j45 = rx.power_vector(replace(self.distance, vertex_mm=0.0))
-        return found + np.array([[m + j0, j45], [j45, m - j0]])
+        far_dpt: NDArray[np.float64] = np.array([[m + j0, j45], [j45, m - j0]])
+        return found + far_dpt
 
     def uneven_polynomial(self, x_mm: ArrayLike, y_mm: ArrayLike) -> NDArray[Any]:
         """Return monomials (..., 28) subtracted by the power's change over the pupil.
@@ -162,8 +163,12 @@ def progressive_polynomial(
         ]
     )
     parts = np.stack([m, j0, at_pupil[..., 0, 1]], axis=-1)
-    return parts @ polynomial_in_mm(unit, 1.0) + lens.uneven_polynomial(*place_mm)
+    found: NDArray[np.float64] = parts @ polynomial_in_mm(
+        unit, 1.0
+    ) + lens.uneven_polynomial(*place_mm)
+    return found
 
 
 def _bell(z: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.exp(-z * z / 2.0) / np.sqrt(2.0 * np.pi)
+    bell: NDArray[np.float64] = np.exp(-z * z / 2.0) / np.sqrt(2.0 * np.pi)
+    return bell

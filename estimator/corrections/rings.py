@@ -5,6 +5,7 @@ extends the depth of focus of weak additions.
 """
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,7 +71,8 @@ class DiffractiveRings:
     def added_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
         """Return the power (K,) of each order relative to the far focus."""
         color = wavelength_nm / self.design_nm
-        return self.spacing_dpt * (self.followed_orders * color - self.far_order)
+        added_dpt = self.spacing_dpt * (self.followed_orders * color - self.far_order)
+        return cast("NDArray[np.float64]", added_dpt)
 
     @property
     def lattice_mm(self) -> None:
@@ -92,9 +94,10 @@ class DiffractiveRings:
         light = np.abs(self.amplitudes(wavelength_nm)[is_main]) ** 2
         is_far = self.followed_orders[is_main] == self.far_order
         by_rings = np.minimum(self.diameter_mm / 2.0 / np.asarray(radius_mm), 1.0) ** 2
-        return np.multiply.outer(light, by_rings) + np.multiply.outer(
-            is_far, 1.0 - by_rings
-        )
+        shares: NDArray[np.float64] = np.multiply.outer(
+            light, by_rings
+        ) + np.multiply.outer(is_far, 1.0 - by_rings)
+        return shares
 
     def _is_main(self, wavelength_nm: float) -> NDArray[np.bool_]:
         return np.abs(self.amplitudes(wavelength_nm)) ** 2 >= MAIN_SHARE
@@ -103,7 +106,10 @@ class DiffractiveRings:
         self, radius_mm: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.float64]:
         """Return the largest deflection of light at distances from the center."""
-        return np.abs(self.added_dpt(wavelength_nm)).max() * np.asarray(radius_mm)
+        reach_mrad: NDArray[np.float64] = np.abs(
+            self.added_dpt(wavelength_nm)
+        ).max() * np.asarray(radius_mm)
+        return reach_mrad
 
     def transmission(
         self, square_mm2: ArrayLike, wavelength_nm: float
@@ -163,7 +169,10 @@ class RefractiveZones:
         self, radius_mm: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.float64]:
         """Return the largest deflection of light at distances from the center."""
-        return np.abs(self.powers_dpt).max() * np.asarray(radius_mm)
+        reach_mrad: NDArray[np.float64] = np.abs(self.powers_dpt).max() * np.asarray(
+            radius_mm
+        )
+        return reach_mrad
 
     def transmission(
         self, square_mm2: ArrayLike, wavelength_nm: float
@@ -176,7 +185,10 @@ class RefractiveZones:
             path_um += power_dpt / 2.0 * np.clip(square - before, 0.0, end - before)
             before = end
         path_um += self.powers_dpt[-1] / 2.0 * np.maximum(square - before, 0.0)
-        return np.exp(2j * np.pi * NM_PER_UM / wavelength_nm * path_um)
+        field: NDArray[np.complex128] = np.exp(
+            2j * np.pi * NM_PER_UM / wavelength_nm * path_um
+        )
+        return field
 
 
 Rings = DiffractiveRings | RefractiveZones | Lenslets

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import cast
 
 from estimator.dynamics.delayed_approach import DelayedApproach
 from estimator.dynamics.pupil_size import steady_pupil_mm
@@ -57,8 +59,11 @@ class PupilReflex:
             DelayedApproach(
                 begin_mm,
                 LATENCY_AT_1_CD_M2_S,
-                lambda value, target, part=part: (
-                    CONSTRICTING_S[part] if target < value else DILATING_S[part]
+                cast(
+                    "Callable[[float, float], float]",
+                    lambda value, target, part=part: (
+                        CONSTRICTING_S[part] if target < value else DILATING_S[part]
+                    ),
                 ),
             )
             for part in range(2)

@@ -43,7 +43,7 @@ def steady_pupil_mm(
         raise ValueError(f"n_eyes is {n_eyes}; allowed: 1 or 2")
     age_years = min(max(age_years, AGE_RANGE_YEARS[0]), AGE_RANGE_YEARS[1])
     eyes_ratio = 1.0 if n_eyes == 2 else ONE_EYE_RATIO
-    flux = (luminance_cd_m2 * field_area_deg2 * eyes_ratio / 846.0) ** 0.41
+    flux: float = (luminance_cd_m2 * field_area_deg2 * eyes_ratio / 846.0) ** 0.41
     young_mm = 7.75 - 5.75 * flux / (flux + 2.0)
     years = age_years - REFERENCE_AGE_YEARS
     return young_mm + years * (0.02132 - 0.009562 * young_mm)

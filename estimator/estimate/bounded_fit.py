@@ -86,22 +86,28 @@ def difference_jacobian_um(
 class _Descent:
     """State of one fit: position, Jacobian and trust region."""
 
-    def __init__(self, model: Model, target_um, bounds, noise_um: float):
+    def __init__(
+        self,
+        model: Model,
+        target_um: NDArray[np.float64],
+        bounds: tuple[NDArray[np.float64], NDArray[np.float64]],
+        noise_um: float,
+    ):
         self.model, self.target_um, self.noise_um = model, target_um, noise_um
         self.low, self.high = bounds
         self.n_evaluations, self.reach = 0, FIRST_REACH
 
-    def start(self, position) -> None:
+    def start(self, position: NDArray[np.float64]) -> None:
         self.state = self.state_at(position)
         if not np.isfinite(self.state.cost):
             raise FitFailed("light does not pass the start eye at this pupil")
         self.differentiate()
 
-    def values_um(self, positions):
+    def values_um(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
         self.n_evaluations += len(positions)
         return self.model(positions)
 
-    def state_at(self, position):
+    def state_at(self, position: NDArray[np.float64]) -> _State:
         position = np.clip(position, self.low, self.high)
         value_um = self.values_um(position[None])[0]
         misfit = (value_um - self.target_um) / self.noise_um
@@ -110,14 +116,15 @@ class _Descent:
 
     @property
     def is_met(self) -> bool:
-        return np.max(np.abs(self.state.value_um - self.target_um)) < MET_UM
+        met: bool = np.max(np.abs(self.state.value_um - self.target_um)) < MET_UM
+        return met
 
     def differentiate(self) -> None:
         self.jacobian_um = difference_jacobian_um(
             self.values_um, self.state.position, self.state.value_um, high=self.high
         )
 
-    def learn(self, old, new) -> None:
+    def learn(self, old: _State, new: _State) -> None:
         """Update the Jacobian with the result of a step (Broyden)."""
         step = new.position - old.position
         length = step @ step
@@ -126,7 +133,7 @@ class _Descent:
             surprise_um = change_um - self.jacobian_um @ step
             self.jacobian_um = self.jacobian_um + np.outer(surprise_um, step / length)
 
-    def linear_step(self, state):
+    def linear_step(self, state: _State) -> tuple[NDArray[np.float64], float]:
         """Return the linearized problem's step in bounds and reach, and its cost."""
         scaled = self.jacobian_um / self.noise_um
         misfit = (state.value_um - self.target_um) / self.noise_um
@@ -221,7 +228,7 @@ def box_minimum(
     `scipy.optimize.lsq_linear`, which decomposes the whole matrix on every pass.
     """
     low, high = room
-    step = dposv(hessian, downhill)[1]
+    step: NDArray[np.float64] = dposv(hessian, downhill)[1]
     side = np.where(step >= high, 1, np.where(step <= low, -1, 0))
     if not side.any():
         return step
@@ -237,7 +244,13 @@ def box_minimum(
     return step
 
 
-def _descend_free(hessian, downhill, step, side, room):
+def _descend_free(
+    hessian: NDArray[np.float64],
+    downhill: NDArray[np.float64],
+    step: NDArray[np.float64],
+    side: NDArray[np.int64],
+    room: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Go to the minimum over the free unknowns, fixing each that reaches a bound."""
     low, high = room
     while True:

@@ -9,7 +9,7 @@ trace.  ``search``: the pattern search of the earlier work.
 import time
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -42,6 +42,9 @@ from estimator.profiles.typical_aberrations import (
     typical_note,
     with_typical_aberrations,
 )
+
+if TYPE_CHECKING:
+    from estimator.optics.surfaces import EyeSurfaces
 
 METHODS = ("network", "refined", "search")
 STARTS = ("table", "network")
@@ -164,7 +167,7 @@ class EstimatedEye:
 
     def surfaces(
         self, focus_dpt: float = 0.0, *, pupil_diameter_mm: float | None = None
-    ):
+    ) -> "EyeSurfaces":
         """Return the surfaces of `focused`."""
         return self.focused(focus_dpt, pupil_diameter_mm=pupil_diameter_mm).surfaces
 
@@ -318,6 +321,7 @@ def _start_vectors(
     profile: EyeProfile, starts: tuple[str, ...]
 ) -> tuple[NDArray[np.float64], tuple[str, ...], str]:
     """Return eyes (P, 45), their origins, and why the network has none."""
+    labels: tuple[str, ...]
     vectors, labels, reason = np.empty((0, len(PARAMETER_NAMES))), (), ""
     if "network" in starts:
         try:
@@ -374,7 +378,7 @@ def _best_fit(
         if problem.error_um(best) <= GOOD_FIT_UM:
             break
         vectors, labels = vectors[labels != label], labels[labels != label]
-    return best, used
+    return cast(BoundedFit, best), used  # there is a start
 
 
 def _guessed(problem: EstimationProblem, start_s: float) -> EstimatedEye:
@@ -419,6 +423,7 @@ def _searched(
 
 
 def _given(profile: EyeProfile, start_s: float) -> EstimatedEye:
+    assert profile.eye is not None
     return EstimatedEye(
         name=profile.name,
         method="given",

@@ -133,6 +133,7 @@ def _traced_um(
         pupil_diameters_mm=[profile.pupil_diameter_mm],
         plane="pupil",
     )
+    radius_mm: float | NDArray[np.float64]
     if (found.open_ratio > OPEN_RATIO).all():
         zernike_um, radius_mm = found.zernike_um, found.zernike_radius_mm
         return polynomial_in_mm(zernike_um, radius_mm)[0, :, 0], depth_mm

@@ -130,7 +130,8 @@ def pattern_search(
     def losses(units: NDArray[np.float64]) -> NDArray[np.float64]:
         outside = np.maximum(np.abs(units) - dead_zone / half_range, 0.0)
         zernike_um = zernike_of(mean + units * half_range)
-        return search_loss(zernike_um, target_um) + np.sum(outside**2, axis=-1)
+        penalty: NDArray[np.float64] = np.sum(outside**2, axis=-1)
+        return search_loss(zernike_um, target_um) + penalty
 
     start_s = time.perf_counter()
     position, mesh = np.zeros(N_PARAMETERS), FIRST_MESH

@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,9 @@ from estimator.estimate.estimation import EstimatedEye
 from estimator.optics.raytrace import RayStatus, trace_rays
 from estimator.optics.surfaces import EyeSurfaces, Surface, rotation_matrix
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 HALF_HEIGHTS_MM = (5.5, 5.2, 4.5, 4.5)
 """Height above the axis up to which each surface is drawn."""
@@ -84,7 +88,7 @@ def plot_eye(found: EstimatedEye, path: Path, *, focus_dpt: float = 0.0) -> None
     figure.savefig(path, dpi=130)
 
 
-def draw_section(axes, eye: EyeSurfaces, *, pupil_diameter_mm: float) -> None:
+def draw_section(axes: "Axes", eye: EyeSurfaces, *, pupil_diameter_mm: float) -> None:
     """Draw the vertical section of an eye and rays from infinity into matplotlib axes.
 
     Parameters
@@ -106,7 +110,7 @@ def draw_section(axes, eye: EyeSurfaces, *, pupil_diameter_mm: float) -> None:
     axes.set_ylabel("y, mm (up)")
 
 
-def _draw_retina(axes, eye: EyeSurfaces) -> None:
+def _draw_retina(axes: "Axes", eye: EyeSurfaces) -> None:
     retina = eye.retina
     radius_mm = abs(float(np.ravel(retina.radius_mm)[-1]))
     stretch = 1.0 + retina.conic_constant
@@ -122,7 +126,7 @@ def _draw_retina(axes, eye: EyeSurfaces) -> None:
     axes.plot(z_mm, y_mm, color="0.2", lw=1.3)
 
 
-def _draw_coefficients(axes, found: EstimatedEye) -> None:
+def _draw_coefficients(axes: "Axes", found: EstimatedEye) -> None:
     from estimator.optics.zernike import N_TERMS, nm_from_index
 
     index = np.arange(3, N_TERMS)

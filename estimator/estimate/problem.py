@@ -61,7 +61,9 @@ class EstimationProblem:
         )
         self.prior: Prior = prior_for_refraction(refraction_dpt)
 
-    def zernike_of(self, measurement: Measurement) -> Callable:
+    def zernike_of(
+        self, measurement: Measurement
+    ) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
         """Return a function from vectors (P, 45) to a measurement's coefficients."""
 
         def coefficients(vectors: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -19,6 +19,7 @@ TABLE_FILE = Path(__file__).parent / "eye_table.json"
 def table_vectors() -> NDArray[np.float64]:
     """Return the vectors (P, 45) of the table; the first is the mean eye."""
     rows = json.loads(TABLE_FILE.read_text(encoding="utf-8"))["eyes"]
+    vectors: list[list[float]] | NDArray[np.float64]
     vectors = [[row[name] for name in PARAMETER_NAMES] for row in rows]
     vectors = np.array([mean_vector().tolist(), *vectors])
     vectors.setflags(write=False)

@@ -158,7 +158,8 @@ class AccommodatingEye(Focusing):
         radius_mm = pupil_diameter_mm / 2.0
         rest_um = self._rest.on_axis_um(pupil_diameter_mm)
         zernike_um = zernike_from_polynomial(rest_um, radius_mm)
-        return total_defocus_dpt(zernike_um, radius_mm)[0]
+        rest_dpt: NDArray[np.float64] = total_defocus_dpt(zernike_um, radius_mm)[0]
+        return rest_dpt
 
     @property
     def _focus_table(self) -> FocusTable:
@@ -263,9 +264,10 @@ class AccommodatingEye(Focusing):
         """
         used_dpt = np.atleast_1d(np.asarray(accommodations_dpt, dtype=np.float64))
         known_dpt, refractions_dpt = self._cornea_table()
-        return BarycentricInterpolator(known_dpt, refractions_dpt)(
-            np.minimum(used_dpt, known_dpt[-1])
-        )
+        found_dpt: NDArray[np.float64] = BarycentricInterpolator(
+            known_dpt, refractions_dpt
+        )(np.minimum(used_dpt, known_dpt[-1]))
+        return found_dpt
 
     def accommodations_at_cornea_dpt(
         self, refractions_dpt: NDArray[np.float64]
@@ -276,9 +278,10 @@ class AccommodatingEye(Focusing):
             return np.zeros(np.shape(refractions_dpt))
         wanted_dpt = np.clip(refractions_dpt, at_cornea_dpt[-1], at_cornea_dpt[0])
         used_dpt = BarycentricInterpolator(at_cornea_dpt, known_dpt)(wanted_dpt)
-        return np.clip(used_dpt, 0.0, self.amplitude_dpt)
+        within_dpt: NDArray[np.float64] = np.clip(used_dpt, 0.0, self.amplitude_dpt)
+        return within_dpt
 
-    def _refraction_table(self):
+    def _refraction_table(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return falling lens diameters and refractions, as far as those fall."""
         relaxed_mm = self._vector[DIAMETER]
         smallest_mm = smallest_diameter_mm(self._vector)
@@ -314,7 +317,9 @@ class AccommodatingEye(Focusing):
         # The table is smooth and short: linear interpolation would be 1e-2 dpt off,
         # and every further step costs a trace for each focus.
         curve = BarycentricInterpolator(known_dpt, known_mm)
-        diameters_mm = np.clip(curve(wanted_dpt), known_mm[-1], known_mm[0])
+        diameters_mm: NDArray[np.float64] = np.clip(
+            curve(wanted_dpt), known_mm[-1], known_mm[0]
+        )
         slopes = np.gradient(known_mm, known_dpt)
         slope_mm_dpt = np.interp(wanted_dpt, known_dpt, slopes)
         for _ in range(MAX_REFINEMENTS):

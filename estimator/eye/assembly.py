@@ -1,6 +1,8 @@
 """Conversion of the 45 parameters to surfaces, for one eye or packed batches."""
 
 import math
+from collections.abc import Callable
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +20,9 @@ from estimator.optics.surfaces import EyeSurfaces, Retina, Surface, offset_monom
 
 N_SURFACES = 4
 CORNEA_ANTERIOR, CORNEA_POSTERIOR, LENS_ANTERIOR, LENS_POSTERIOR, RETINA = range(5)
+
+_Numbers = float | NDArray[np.float64]
+"""One number, or one for each eye (P,)."""
 
 
 def eye_surfaces(
@@ -175,7 +180,11 @@ def pack_eyes(
     return packed
 
 
-def _set_shape(rows, radii_mm, conic_constant):
+def _set_shape(
+    rows: NDArray[np.float64],
+    radii_mm: tuple[_Numbers, _Numbers],
+    conic_constant: _Numbers,
+) -> None:
     rows[:, packing.CURVATURE_X] = 1.0 / radii_mm[0]
     rows[:, packing.CURVATURE_Y] = 1.0 / radii_mm[1]
     rows[:, packing.CONIC] = conic_constant
@@ -184,7 +193,7 @@ def _set_shape(rows, radii_mm, conic_constant):
     )
 
 
-def _set_offsets(rows, offsets_mm):
+def _set_offsets(rows: NDArray[np.float64], offsets_mm: NDArray[np.float64]) -> None:
     terms_mm = np.concatenate([np.zeros((len(rows), 1)), offsets_mm], axis=1)
     rows[:, packing.OFFSET : packing.OFFSET + terms_mm.shape[1]] = offset_monomials(
         terms_mm, offset_radius_mm=OFFSET_RADIUS_MM
@@ -194,7 +203,7 @@ def _set_offsets(rows, offsets_mm):
     )
 
 
-def _turn_about_z(angles_deg):
+def _turn_about_z(angles_deg: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return row-major rotation matrices (P, 9)."""
     cosine, sine = np.cos(np.radians(angles_deg)), np.sin(np.radians(angles_deg))
     zero, one = np.zeros_like(cosine), np.ones_like(cosine)
@@ -202,7 +211,9 @@ def _turn_about_z(angles_deg):
     return np.stack(rows, axis=-1)
 
 
-def _lens_turns(about_x_deg, about_y_deg):
+def _lens_turns(
+    about_x_deg: NDArray[np.float64], about_y_deg: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return row-major matrices (P, 9) of a rotation about x, then about y."""
     cx, sx = np.cos(np.radians(about_x_deg)), np.sin(np.radians(about_x_deg))
     cy, sy = np.cos(np.radians(about_y_deg)), np.sin(np.radians(about_y_deg))
@@ -211,7 +222,11 @@ def _lens_turns(about_x_deg, about_y_deg):
     return np.stack(rows, axis=-1)
 
 
-def _set_lens(packed, given, stop_z_mm):
+def _set_lens(
+    packed: NDArray[np.float64],
+    given: Callable[[str], NDArray[np.float64]],
+    stop_z_mm: NDArray[np.float64],
+) -> None:
     shape = lens_shape(
         diameter_mm=given("lens_diameter_mm"), volume_mm3=given("lens_volume_mm3")
     )
@@ -235,7 +250,7 @@ def _set_lens(packed, given, stop_z_mm):
             LENS_POSTERIOR,
             shape.posterior_radius_mm,
             "lens_posterior_conic_constant",
-            shape.thickness_mm[:, None],
+            cast("NDArray[np.float64]", shape.thickness_mm)[:, None],
         ),
     ):
         rows = packed[:, surface]
@@ -245,7 +260,12 @@ def _set_lens(packed, given, stop_z_mm):
         rows[:, packing.IS_TURNED] = (about_x_deg != 0.0) | (about_y_deg != 0.0)
 
 
-def _set_retina(rows, eye_length_mm, stop_z_mm, retina):
+def _set_retina(
+    rows: NDArray[np.float64],
+    eye_length_mm: NDArray[np.float64],
+    stop_z_mm: NDArray[np.float64],
+    retina: RetinaShape | None,
+) -> None:
     shape = retina or RetinaShape(radius_mm=math.nan)
     radius_mm = -(eye_length_mm / 2.0 if retina is None else shape.radius_mm)
     radius_mm = np.broadcast_to(radius_mm, eye_length_mm.shape)

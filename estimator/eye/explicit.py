@@ -15,6 +15,7 @@ of the media follows Herzberger's formula (`media`).
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +92,7 @@ def parse_explicit_eye(data: object) -> EyeSurfaces:
     return eye
 
 
-def _is_list(value: object) -> bool:
+def _is_list(value: object) -> TypeGuard[Sequence[Any]]:
     return isinstance(value, Sequence) and not isinstance(value, (str, bytes))
 
 
@@ -143,7 +144,7 @@ def _radius(value: object, name: str) -> float:
     return float(value)
 
 
-def _radii(data: Mapping, path: str) -> tuple[float, float]:
+def _radii(data: Mapping[str, Any], path: str) -> tuple[float, float]:
     name = f"{path}radius_mm"
     if "radius_mm" not in data:
         raise ProfileError(name, "is missing", "a number, [Rx, Ry] or null (plane)")
@@ -155,7 +156,9 @@ def _radii(data: Mapping, path: str) -> tuple[float, float]:
     return _radius(value[0], f"{name}[0]"), _radius(value[1], f"{name}[1]")
 
 
-def _pair(data: Mapping, field: str, limit: float, path: str) -> tuple[float, float]:
+def _pair(
+    data: Mapping[str, Any], field: str, limit: float, path: str
+) -> tuple[float, float]:
     value = data.get(field)
     if value is None:
         return 0.0, 0.0
@@ -166,7 +169,7 @@ def _pair(data: Mapping, field: str, limit: float, path: str) -> tuple[float, fl
     return x, y
 
 
-def _offsets(data: Mapping, path: str) -> NDArray[np.float64] | None:
+def _offsets(data: Mapping[str, Any], path: str) -> NDArray[np.float64] | None:
     value = data.get("offset_mm")
     if value is None:
         return None

@@ -88,16 +88,19 @@ def _barycentric_shares(nodes: NDArray[Any]) -> NDArray[np.float64]:
     span = np.ptp(nodes) or 1.0  # so that many nodes do not overflow
     away = (nodes[:, None] - nodes[None]) * (4.0 / span)
     np.fill_diagonal(away, 1.0)
-    return 1.0 / away.prod(axis=1)
+    shares: NDArray[np.float64] = 1.0 / away.prod(axis=1)
+    return shares
 
 
 def _through(
     nodes: NDArray[Any], values: NDArray[Any], shares: NDArray[Any], at: float
-):
+) -> NDArray[np.float64]:
     """Evaluate the polynomial through values (n, ...) at nodes (n,)."""
     away = at - nodes
     is_hit = np.abs(away) < 1e-12
     if is_hit.any():
-        return values[is_hit.argmax()]
+        hit: NDArray[np.float64] = values[is_hit.argmax()]
+        return hit
     terms = shares / away
-    return terms @ values / terms.sum()
+    found: NDArray[np.float64] = terms @ values / terms.sum()
+    return found

@@ -52,7 +52,9 @@ def accommodated_eyes(
     return focused
 
 
-def accommodated(parameters: EyeParameters, *, lens_diameter_mm: float):
+def accommodated(
+    parameters: EyeParameters, *, lens_diameter_mm: float
+) -> EyeParameters:
     """Return the same eye with another lens diameter at constant volume.
 
     Raises

@@ -134,6 +134,7 @@ def _compat_cap_height_mm(
 
     # the bracket's pole bounds the root for a hyperboloid; an ellipsoid's h is below D
     highest_mm = diameter_mm / math.sqrt(-8.0 * b) if b < 0.0 else diameter_mm
-    return brentq(
+    height_mm: float = brentq(
         volume_error_mm3, 1e-12, highest_mm * (1.0 - 1e-12), xtol=1e-14, rtol=1e-15
     )
+    return height_mm

@@ -8,7 +8,7 @@ person's right, y up, z into the eye; the paper's y and z are our x and y.
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -260,7 +260,7 @@ class RetinaShape:
     conic_constant: float = 0.0
 
 
-def parse_retina(data: Mapping) -> RetinaShape | None:
+def parse_retina(data: Mapping[str, Any]) -> RetinaShape | None:
     """Parse the optional ``retina`` of a profile."""
     if data.get("retina") is None:
         return None

@@ -161,7 +161,7 @@ def on_axis_zernike_um(
     TraceFailed
         Light does not pass this eye at this pupil.
     """
-    zernike_um = zernike_of_vectors(
+    zernike_um: NDArray[np.float64] = zernike_of_vectors(
         parameters.to_vector()[None],
         pupil_diameter_mm=pupil_diameter_mm,
         wavelength_nm=wavelength_nm,

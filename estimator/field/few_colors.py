@@ -50,7 +50,7 @@ def few_colors_grid(
     wavelengths_nm: ArrayLike,
     states: Sequence[FocusedEye] | None = None,
     progress: Callable[[float], None] | None = None,
-    **sampling: ArrayLike,
+    **sampling: Any,
 ) -> AberrationGrid:
     """Return the grid of `aberration_grid` in about half the time.
 
@@ -83,7 +83,7 @@ def few_colors_grid(
 
     def traced(
         of_nm: NDArray[Any],
-        at: dict[str, NDArray[Any]],
+        at: dict[str, Any],
         some: NDArray[Any],
         *shares: float,
     ) -> AberrationGrid:
@@ -165,6 +165,7 @@ def _joined(first: AberrationGrid, rest: AberrationGrid, middle: int) -> Aberrat
     """Return the first color's grid with the others around it."""
 
     def of(name: str) -> NDArray[np.float64]:
+        own: NDArray[np.float64]
         own, others = getattr(first, name), getattr(rest, name)
         if own.ndim == 1:
             return own

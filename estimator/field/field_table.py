@@ -1,7 +1,7 @@
 """Wavefronts of a profile's eye in many directions, as an instrument reports them."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -79,12 +79,13 @@ def field_table(
         wavelengths_nm=[wavelength_nm],
         field_range_deg=(_around_axis(h_deg), _around_axis(v_deg)),
     )
+    eye = cast(TracedEye, eye)  # the default of `prepare_eye`
     if eye.usable_pupil_mm(pupil_diameter_mm) < pupil_diameter_mm:
         raise ValueError(
             f"pupil {pupil_diameter_mm:g} mm: light passes this eye up to "
             f"{eye.max_pupil_diameter_mm:.3g} mm"
         )
-    states = {
+    states: dict[str, Any] = {
         "h_deg": h_deg,
         "v_deg": v_deg,
         "pupil_diameter_mm": pupil_diameter_mm,

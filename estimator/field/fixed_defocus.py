@@ -89,7 +89,7 @@ class _Grid:
         of_degree = [float(POWER[:N_TERMS][degree == DEGREE][0]) for degree in DEGREES]
         self._powers = np.array([*of_degree, *POWER[N_TERMS:]])
 
-    def used_at(self, accommodation_dpt: float) -> tuple:
+    def used_at(self, accommodation_dpt: float) -> tuple[NDArray[np.float64], ...]:
         """Return the loop's inputs from this grid at an accommodation."""
         from estimator.field.defocus_loops import weights_at
 

@@ -9,7 +9,7 @@ the interpolation follows the terms that a sixth-order fit leaves out, see `POWE
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -100,7 +100,10 @@ def lagrange_weights(
     nodes: NDArray[np.float64], at: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return Lagrange weights (n, n_nodes), exact at a node."""
-    return all_weights(np.asarray(nodes, np.float64), np.asarray(at, np.float64))
+    weights: NDArray[np.float64] = all_weights(
+        np.asarray(nodes, np.float64), np.asarray(at, np.float64)
+    )
+    return weights
 
 
 def _linear(nodes: NDArray[Any], at: NDArray[Any]) -> NDArray[np.float64]:
@@ -108,7 +111,12 @@ def _linear(nodes: NDArray[Any], at: NDArray[Any]) -> NDArray[np.float64]:
     return np.stack([np.interp(at, nodes, row) for row in np.eye(nodes.size)], axis=-1)
 
 
-def _for_distinct(function: Callable, values: NDArray[Any]):
+_Found = TypeVar("_Found", NDArray[Any], tuple[NDArray[Any], ...])
+
+
+def _for_distinct(
+    function: Callable[[NDArray[Any]], _Found], values: NDArray[Any]
+) -> _Found:
     """Evaluate a function at values (n,), once for each distinct value."""
     distinct, place = np.unique(values, return_inverse=True)
     found = function(distinct)
@@ -194,12 +202,13 @@ class FieldInterpolation:
         """Return the open pupils (n,) at fields, or None if all are open."""
         if self.all_open:
             return None
-        return np.einsum(
+        open_mm: NDArray[np.float64] = np.einsum(
             "nh,nv,hv->n",
             _linear(self.grid.h_deg, h_deg),
             _linear(self.grid.v_deg, v_deg),
             self.open_pupil_mm,
         )
+        return open_mm
 
     def at(
         self,
@@ -324,7 +333,7 @@ class FieldInterpolation:
         over_v = lagrange_weights(stretched(self.grid.v_deg), stretched(v_deg))
         weights = (over_h[:, :, None] * over_v[:, None, :]).reshape(h_deg.size, -1)
         values = self._values[:, :, channels, pupils]
-        found = weights @ values.reshape(weights.shape[1], -1)
+        found: NDArray[np.float64] = weights @ values.reshape(weights.shape[1], -1)
         return found.reshape(h_deg.size, *values.shape[2:])
 
     def _pupil_shares(
@@ -351,7 +360,9 @@ class FieldInterpolation:
 
     def _channels(self, wavelength_nm: NDArray[Any]) -> NDArray[np.int64]:
         nodes_nm = self.grid.wavelengths_nm
-        index = np.abs(wavelength_nm[:, None] - nodes_nm).argmin(axis=1)
+        index: NDArray[np.int64] = np.abs(wavelength_nm[:, None] - nodes_nm).argmin(
+            axis=1
+        )
         if not np.allclose(nodes_nm[index], wavelength_nm, rtol=1e-6, atol=0.0):
             raise ValueError(
                 f"wavelength_nm {np.unique(wavelength_nm).tolist()}: traced are "

@@ -7,6 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from estimator.field.field_table import FieldTable
 
 ARCMIN_PER_MRAD = 3.4377
@@ -43,10 +46,15 @@ def blur_arcmin(table: "FieldTable") -> NDArray[np.float64]:
     m_dpt, j0_dpt, j45_dpt = table.power_dpt.T
     # Light at r mm is deflected by r times the power, in mrad; mean r² is R² / 2.
     power_dpt = np.sqrt(m_dpt**2 + j0_dpt**2 + j45_dpt**2)
-    return ARCMIN_PER_MRAD * power_dpt * table.zernike_radius_mm / np.sqrt(2.0)
+    blur: NDArray[np.float64] = (
+        ARCMIN_PER_MRAD * power_dpt * table.zernike_radius_mm / np.sqrt(2.0)
+    )
+    return blur
 
 
-def _draw(figure, axes, table: "FieldTable", values: NDArray[Any]) -> None:
+def _draw(
+    figure: "Figure", axes: "Axes", table: "FieldTable", values: NDArray[Any]
+) -> None:
     h_deg, v_deg = np.unique(table.h_deg), np.unique(table.v_deg)
     axes.set_xlabel("h, deg")
     if h_deg.size < 2 or v_deg.size < 2:

@@ -1,6 +1,7 @@
 """Traced part of an eye's visual field, and the pupils traced there."""
 
 from collections.abc import Callable
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +61,7 @@ def trace_field(
     axis: FieldInterpolation,
     field_range_deg: FieldRange,
     field_grid: Callable[..., AberrationGrid],
-    **axes,
+    **axes: Any,
 ) -> tuple[FieldInterpolation, FieldRange]:
     """Trace a range of fields, shrunk toward the axis until light passes all of it."""
     limited = np.clip(field_range_deg, -TRACED_FIELD_LIMIT_DEG, TRACED_FIELD_LIMIT_DEG)
@@ -78,7 +79,7 @@ def trace_field(
             )
         )
         if field.passes:
-            return field, tuple(map(tuple, traced))
+            return field, cast(FieldRange, tuple(map(tuple, traced)))
         share *= SHRINK_RATIO
     return axis, ON_AXIS_DEG
 

@@ -5,7 +5,7 @@ pupils larger than the measured one are traced, not extrapolated; accommodation 
 the lens and with it all aberrations; and every field has its own wavefront.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -162,7 +162,7 @@ class TracedEye(FocusingEye):
         used_dpt = eye.accommodating.accommodation_range_dpt(
             focus_range_dpt, pupil_range_mm=(pupils_mm[0], pupils_mm[-1])
         )
-        states = {
+        states: dict[str, Any] = {
             "accommodations_dpt": accommodation_nodes_dpt(*used_dpt),
             "wavelengths_nm": np.unique(wavelengths_nm),
         }
@@ -213,7 +213,8 @@ class TracedEye(FocusingEye):
             refraction_dpt, pupil_diameter_mm=pupil_diameter_mm
         )
         low_dpt, high_dpt = self.grid.accommodations_dpt[[0, -1]].tolist()
-        return min(max(used_dpt, low_dpt), high_dpt)
+        traced_dpt: float = min(max(used_dpt, low_dpt), high_dpt)
+        return traced_dpt
 
     def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
         """Return the accommodation for the near point through a pupil."""
@@ -286,7 +287,7 @@ class TracedEye(FocusingEye):
     def _defocus_dpt(
         self,
         fields: FixedDefocus,
-        number: NDArray[Any],
+        number: NDArray[np.int64],
         *,
         pupil_diameter_mm: float,
         accommodation_dpt: float,
@@ -397,7 +398,11 @@ class TracedEye(FocusingEye):
         )
         return found[number].reshape(*states[0].shape, 2)
 
-    def _distinct(self, states: list[NDArray[Any]]) -> tuple[NDArray[Any], ...]:
+    def _distinct(
+        self, states: Sequence[NDArray[Any]]
+    ) -> tuple[
+        NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]
+    ]:
         """Return coefficients, rims and radii of distinct states, and each's index."""
         columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]
         first, number = distinct_rows(*columns)
@@ -409,7 +414,12 @@ class TracedEye(FocusingEye):
         return *fields.wavefronts(**rest), number
 
     def _fields(
-        self, h_deg, v_deg, wavelength_nm, *, pupil_diameter_mm=None
+        self,
+        h_deg: NDArray[np.float64],
+        v_deg: NDArray[np.float64],
+        wavelength_nm: NDArray[np.float64],
+        *,
+        pupil_diameter_mm: NDArray[np.float64] | None = None,
     ) -> TracedFields:
         h_deg, v_deg = (
             np.clip(angle, *limits)
@@ -437,11 +447,18 @@ class TracedEye(FocusingEye):
             self._worn, h_deg, v_deg, entrance_pupil_mm=self.entrance_pupil_mm
         )
 
-    def _check_fields(self, h_deg, v_deg) -> None:
+    def _check_fields(
+        self, h_deg: NDArray[np.float64], v_deg: NDArray[np.float64]
+    ) -> None:
         check_limits("h_deg", h_deg, *self.field_range_deg[0])
         check_limits("v_deg", v_deg, *self.field_range_deg[1])
 
-    def _check_states(self, *, pupil_diameter_mm, accommodation_dpt) -> None:
+    def _check_states(
+        self,
+        *,
+        pupil_diameter_mm: NDArray[np.float64] | np.float64,
+        accommodation_dpt: NDArray[np.float64] | np.float64,
+    ) -> None:
         largest_mm = self.max_pupil_diameter_mm
         check_limits("pupil_diameter_mm", pupil_diameter_mm, 0.1, largest_mm)
         low_dpt, high_dpt = self.grid.accommodations_dpt[[0, -1]]

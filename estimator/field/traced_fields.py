@@ -24,7 +24,9 @@ MARGIN = 1e-3
 """Degrees, mm or dpt beyond the traced range that are extrapolated, not rejected."""
 
 
-def check_limits(name: str, values: NDArray[Any], low: float, high: float) -> None:
+def check_limits(
+    name: str, values: NDArray[Any] | np.float64, low: float, high: float
+) -> None:
     """Reject values outside the traced range.
 
     Raises
@@ -141,18 +143,23 @@ class TracedFields:
             pupil_diameter_mm=pupil_mm[first],
             accommodation_dpt=used_dpt[first],
         )
-        scale = pupil_mm[first] / 2.0 / circumscribed_radius_mm(rim_mm)
+        scale: NDArray[np.float64] = (
+            pupil_mm[first] / 2.0 / circumscribed_radius_mm(rim_mm)
+        )
         return scale[number]
 
     def _usable_mm(self, pupil_mm: NDArray[Any]) -> NDArray[np.float64]:
         """Return pupils (n,), reduced at fields where they are vignetted."""
         if self._open_mm is None:
             return pupil_mm
-        return np.minimum(pupil_mm, self._open_mm)
+        usable_mm: NDArray[np.float64] = np.minimum(pupil_mm, self._open_mm)
+        return usable_mm
 
 
 def _of_distinct(
-    function: Callable[..., NDArray[Any]], h_deg: NDArray[Any], v_deg: NDArray[Any]
+    function: Callable[..., NDArray[np.float64]],
+    h_deg: NDArray[Any],
+    v_deg: NDArray[Any],
 ) -> NDArray[np.float64]:
     """Evaluate a function of directions (n,), once for each distinct direction."""
     first, number = distinct_rows(h_deg, v_deg)

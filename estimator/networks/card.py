@@ -8,6 +8,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -237,7 +238,7 @@ def missing_text(path: Path) -> str:
     )
 
 
-def parse_card(name: str, data: Mapping) -> Card:
+def parse_card(name: str, data: Mapping[str, Any]) -> Card:
     """Parse a card's JSON.
 
     Raises
@@ -275,7 +276,7 @@ def parse_card(name: str, data: Mapping) -> Card:
     )
 
 
-def _parse_error(error: Mapping) -> ExpectedError:
+def _parse_error(error: Mapping[str, Any]) -> ExpectedError:
     return ExpectedError(
         mean_abs=float(error["mean_abs"]),
         p95_abs=float(error["p95_abs"]),

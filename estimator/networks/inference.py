@@ -196,12 +196,12 @@ def network_aberrations(
 def _features(first: ArrayLike, *columns: ArrayLike) -> NDArray[np.float64]:
     """Join (..., n) and columns that broadcast with it to (..., n + n_columns)."""
     first = np.asarray(first, dtype=np.float64)
-    columns = [np.asarray(column, dtype=np.float64) for column in columns]
-    shape = np.broadcast_shapes(first.shape[:-1], *(c.shape for c in columns))
+    others = [np.asarray(column, dtype=np.float64) for column in columns]
+    shape = np.broadcast_shapes(first.shape[:-1], *(c.shape for c in others))
     n = first.shape[-1]
-    features = np.empty((*shape, n + len(columns)))
+    features = np.empty((*shape, n + len(others)))
     features[..., :n] = first
-    for i, column in enumerate(columns):
+    for i, column in enumerate(others):
         features[..., n + i] = column
     return features
 

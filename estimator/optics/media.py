@@ -83,4 +83,5 @@ def refractive_index(
     squared = (wavelength_nm / NM_PER_UM) ** 2
     inverse = 1.0 / (squared - _POLE_UM2)
     terms = np.stack([np.ones_like(squared), squared, inverse, inverse**2], axis=-1)
-    return terms @ (_WEIGHTS.T @ np.array(_KNOT_INDICES[medium]))
+    found: NDArray[np.float64] = terms @ (_WEIGHTS.T @ np.array(_KNOT_INDICES[medium]))
+    return found

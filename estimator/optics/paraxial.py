@@ -69,7 +69,7 @@ class CardinalPoints:
 
 
 def _offset_part(
-    packed: NDArray[Any], *exponents: tuple[int, int]
+    packed: NDArray[np.float64], *exponents: tuple[int, int]
 ) -> NDArray[np.float64]:
     """Sum some monomial coefficients of the offsets; zero where there are none."""
     order = [tuple(e) for e in EXPONENTS[horner_order()].tolist()]
@@ -77,7 +77,7 @@ def _offset_part(
     return np.where(packed[:, FORM] == WITH_OFFSET, total, 0.0)
 
 
-def _mean_curvatures(packed: NDArray[Any]) -> NDArray[np.float64]:
+def _mean_curvatures(packed: NDArray[np.float64]) -> NDArray[np.float64]:
     curvature = 0.5 * (packed[:, CURVATURE_X] + packed[:, CURVATURE_Y])
     return curvature + _offset_part(packed, (2, 0), (0, 2))
 
@@ -141,7 +141,8 @@ def entrance_pupils_mm(
         z_mm = vertex_mm[:, i]
         power = (indices[i + 1] - indices[i]) * curvature[:, i]
         slope = (indices[i + 1] * slope + power * height) / indices[i]
-    return z_mm - height / slope
+    pupil_mm: NDArray[np.float64] = z_mm - height / slope
+    return pupil_mm
 
 
 def cardinal_points(eye: EyeSurfaces, *, wavelength_nm: float) -> CardinalPoints:

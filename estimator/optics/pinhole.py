@@ -83,5 +83,7 @@ def pixel_from_mrad(
     jacobian[..., 0, 0] = 1.0 / (cos_v * cos_h**2)
     jacobian[..., 1, 0] = np.tan(v) * np.sin(h) / (cos_v * cos_h**2)
     jacobian[..., 1, 1] = 1.0 / (cos_v**2 * cos_h)
-    per_tangent = np.array([width / (right - left), height / (up - down)])
+    per_tangent: NDArray[np.float64] = np.array(
+        [width / (right - left), height / (up - down)]
+    )
     return jacobian * per_tangent[:, None] / 1000.0

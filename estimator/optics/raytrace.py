@@ -7,7 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.optics import raytrace_kernels as kernels
-from estimator.optics.surfaces import EyeSurfaces, check_eye, media_indices, pack_eye
+from estimator.optics.surfaces import (
+    N_BEFORE_STOP,
+    EyeSurfaces,
+    check_eye,
+    media_indices,
+    pack_eye,
+)
 
 
 class RayStatus(IntEnum):
@@ -111,5 +117,5 @@ def trace_rays(
         path_mm,
         status,
     )
-    stop_index = int(packed[-1, kernels.N_BEFORE_STOP])
+    stop_index = int(packed[-1, N_BEFORE_STOP])
     return TracedRays(points_mm, cosines, path_mm, status, stop_index)

@@ -143,7 +143,8 @@ def _unnormalized_monomials() -> NDArray[np.float64]:
         math.sqrt((2 - (m == 0)) * (n + 1))
         for n, m in (nm_from_index(j) for j in range(N_TERMS))
     ]
-    return monomial_matrix() / np.array(norms)[:, None]
+    matrix: NDArray[np.float64] = monomial_matrix() / np.array(norms)[:, None]
+    return matrix
 
 
 def offset_monomials(
@@ -157,7 +158,7 @@ def offset_monomials(
         Unnormalized Zernike terms, index = j.
     offset_radius_mm : (...), mm
     """
-    degree = EXPONENTS.sum(axis=1)
+    degree: NDArray[np.int64] = EXPONENTS.sum(axis=1)
     radius_mm = np.asarray(offset_radius_mm, dtype=np.float64)[..., None]
     monomials = np.asarray(offset_mm, dtype=np.float64) @ _unnormalized_monomials()
     return (monomials / radius_mm**degree)[..., horner_order()]
@@ -168,7 +169,7 @@ def rotation_matrix(
 ) -> NDArray[Any]:
     """Return the rotation (3, 3) from surface to eye axes: about z, then x, then y."""
 
-    def turn(angle_deg, i, j):
+    def turn(angle_deg: float, i: int, j: int) -> NDArray[np.float64]:
         matrix = np.eye(3)
         cosine, sine = (
             math.cos(math.radians(angle_deg)),

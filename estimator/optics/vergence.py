@@ -62,7 +62,7 @@ class ObjectVergence:
     def vergence_dpt(self, object_dpt: float) -> float: ...
     @overload
     def vergence_dpt(self, object_dpt: NDArray[Any]) -> NDArray[Any]: ...
-    def vergence_dpt(self, object_dpt):
+    def vergence_dpt(self, object_dpt: float | NDArray[Any]) -> float | NDArray[Any]:
         """Return the vergence of light from an object's distance."""
         return self.scale_ratio * object_dpt / (1.0 + self.offset_m * object_dpt)
 
@@ -70,7 +70,7 @@ class ObjectVergence:
     def object_dpt(self, vergence_dpt: float) -> float: ...
     @overload
     def object_dpt(self, vergence_dpt: NDArray[Any]) -> NDArray[Any]: ...
-    def object_dpt(self, vergence_dpt):
+    def object_dpt(self, vergence_dpt: float | NDArray[Any]) -> float | NDArray[Any]:
         """Return the distance whose light has the given vergence."""
         return vergence_dpt / (self.scale_ratio - self.offset_m * vergence_dpt)
 

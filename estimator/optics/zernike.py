@@ -40,8 +40,14 @@ def index_from_nm(n: int, m: int) -> int:
     return (n * (n + 2) + m) // 2
 
 
-def _solid_harmonic(m: int) -> tuple[dict, dict]:
+_Terms = dict[tuple[int, int], int]
+"""Coefficients of monomials by their exponents."""
+
+
+def _solid_harmonic(m: int) -> tuple[_Terms, _Terms]:
     """Return real and imaginary part of (x + iy)^m as {(a, b): coefficient}."""
+    real: _Terms
+    imaginary: _Terms
     real, imaginary = {}, {}
     for k in range(m + 1):
         sign = (1, 1, -1, -1)[k % 4]
@@ -99,7 +105,7 @@ def wavefront_polynomial(zernike_um: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(zernike_um, dtype=np.float64) @ monomial_matrix()
 
 
-def _powers(x: NDArray[Any], highest: int) -> NDArray[Any]:
+def _powers(x: NDArray[np.float64], highest: int) -> NDArray[np.float64]:
     return np.stack([x**k for k in range(highest + 1)])
 
 
@@ -159,7 +165,7 @@ def rescale_pupil(zernike_um: ArrayLike, *, radius_ratio: ArrayLike) -> NDArray[
     """
     ratio = np.asarray(radius_ratio, dtype=np.float64)
     if not np.all(ratio > 0):
-        raise ValueError(f"pupil radius ratio {radius_ratio}: must be positive")
+        raise ValueError(f"pupil radius ratio {radius_ratio!s}: must be positive")
     degree = EXPONENTS.sum(axis=1)
     scaled = wavefront_polynomial(zernike_um) * ratio[..., None] ** degree
     return np.linalg.solve(monomial_matrix().T, scaled[..., None])[..., 0]

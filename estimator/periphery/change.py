@@ -7,13 +7,14 @@ represents this departure.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.optics.prescription import SPHERE_PER_C20
+from estimator.optics.units import SPHERE_PER_C20
 from estimator.optics.zernike import (
     N_TERMS,
     flip_horizontal,
@@ -134,7 +135,7 @@ def peripheral_change(
 
 
 def usual_axis_um(
-    axis_um: NDArray[Any], noise_um: NDArray[Any], population: Population
+    axis_um: NDArray[np.float64], noise_um: NDArray[np.float64], population: Population
 ) -> NDArray[np.float64]:
     """Return the wavefront (12,) on the axis, limited to the range of measured people.
 
@@ -147,7 +148,8 @@ def usual_axis_um(
     distance = math.sqrt(float(away @ np.linalg.solve(spread, away)))
     if distance <= USUAL_DISTANCE:
         return axis_um
-    return mean_um + USUAL_DISTANCE / distance * away
+    usual_um: NDArray[np.float64] = mean_um + USUAL_DISTANCE / distance * away
+    return usual_um
 
 
 def _axis_distribution(population: Population) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -186,7 +188,12 @@ def _as_right_eye(
 
 
 def _conditioned(
-    population: Population, eye_side: str, *, axis, others, measured_axis_um
+    population: Population,
+    eye_side: str,
+    *,
+    axis: tuple[NDArray[np.float64], NDArray[np.float64]],
+    others: Sequence[tuple[float, float, NDArray[np.float64], NDArray[np.float64]]],
+    measured_axis_um: NDArray[np.float64],
 ) -> PeripheralChange:
     """Condition the population on the axis and all other directions at once."""
     axis_um, axis_noise_um = axis
@@ -196,6 +203,7 @@ def _conditioned(
     covariance = population.correlation_ratio * np.outer(scale, scale)
     is_axis = np.arange(scale.size) % places == 0
     h_deg, v_deg = (np.array([m[k] for m in others]) for k in (0, 1))
+    seen: list[NDArray[np.float64]] | NDArray[np.float64]
     seen = [np.eye(scale.size)[is_axis]]
     if others:
         rows = np.zeros((len(others) * len(TERMS), scale.size))
@@ -210,7 +218,7 @@ def _conditioned(
     total = seen @ covariance @ seen.T + np.diag(noise_um2)
     total[len(TERMS) :, len(TERMS) :] += free_um2
     surprise_um = told_um - seen @ mean_um.ravel()
-    weights = np.linalg.solve(total, surprise_um)
+    weights: NDArray[Any] = np.linalg.solve(total, surprise_um)
     gain = np.linalg.solve(total, seen @ covariance)
     found_um = mean_um.ravel() + weights @ (seen @ covariance)
     left_um2 = np.diag(covariance - (seen @ covariance).T @ gain)
@@ -231,7 +239,10 @@ def _conditioned(
 def _sphere_deviation_dpt(variances_um2: NDArray[Any]) -> NDArray[np.float64]:
     """Return the deviation (8,) of M from variances (96,) at the knots."""
     sphere_um2 = variances_um2.reshape(len(TERMS), -1)[TERMS.index(4)]
-    return SPHERE_PER_C20 * np.sqrt(np.maximum(sphere_um2, 0.0)) / CIRCLE_MM**2
+    deviation_dpt: NDArray[np.float64] = (
+        SPHERE_PER_C20 * np.sqrt(np.maximum(sphere_um2, 0.0)) / CIRCLE_MM**2
+    )
+    return deviation_dpt
 
 
 def _free_variances() -> NDArray[np.float64]:
@@ -239,9 +250,13 @@ def _free_variances() -> NDArray[np.float64]:
     return np.square(list(FREE_UM.values()))
 
 
-def _free_products(at_deg: tuple, measured_deg: tuple) -> NDArray[np.float64]:
+def _free_products(
+    at_deg: tuple[NDArray[Any], NDArray[Any]],
+    measured_deg: tuple[NDArray[Any], NDArray[Any]],
+) -> NDArray[np.float64]:
     """Return the smooth field's covariance (n, m) between directions, unit variance."""
     (h, v), (h0, v0) = at_deg, measured_deg
     square = (h[:, None] - h0) ** 2 + (v[:, None] - v0) ** 2
     near = np.exp(-0.5 * square / FREE_REACH_DEG**2)
-    return near * v[:, None] * v0 / FREE_AT_DEG**2
+    products: NDArray[np.float64] = near * v[:, None] * v0 / FREE_AT_DEG**2
+    return products

@@ -49,7 +49,8 @@ def meridian_weights(h_deg: ArrayLike) -> NDArray[np.float64]:
     inside = np.clip(h_deg, -MEASURED_DEG, MEASURED_DEG)
     beyond = h_deg - inside
     faded = np.sign(beyond) * FADE_DEG * -np.expm1(-np.abs(beyond) / FADE_DEG)
-    return spline(inside) + faded[..., None] * spline(inside, 1)
+    weights: NDArray[np.float64] = spline(inside) + faded[..., None] * spline(inside, 1)
+    return weights
 
 
 @cache

@@ -11,7 +11,7 @@ import json
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,7 +55,8 @@ class Population:
     @classmethod
     def of(cls, people: People) -> "Population":
         """Fit the population of measured people; omit those without an axis."""
-        people = people.of(np.isfinite(people.axis_um).all(axis=-1))
+        has_axis = np.isfinite(people.axis_um).all(axis=-1)
+        people = people.of(cast("NDArray[np.bool_]", has_axis))
         axis_um = people.axis_um
         away_um = axis_um - axis_um.mean(axis=0)
         changes_um = knots_um(people).reshape(len(axis_um), -1)
@@ -80,7 +81,7 @@ class Population:
             covariance_um2 / np.outer(deviation_um, deviation_um),
         )
 
-    def to_json(self) -> dict:
+    def to_json(self) -> dict[str, Any]:
         """Return the content of ``population.json``."""
         rows = [row[: k + 1] for k, row in enumerate(self.correlation_ratio)]
         return {
@@ -92,7 +93,7 @@ class Population:
         }
 
     @classmethod
-    def from_json(cls, data: dict) -> "Population":
+    def from_json(cls, data: dict[str, Any]) -> "Population":
         """Build from the result of `to_json`."""
         size = len(TERMS) * PLACES
         correlation = np.zeros((size, size))
@@ -110,8 +111,9 @@ def measured_population() -> Population:
     return Population.from_json(json.loads(text))
 
 
-def _rounded(values: NDArray[np.float64]) -> list:
-    return np.vectorize(lambda v: float(f"{v:.5g}"))(values).tolist()
+def _rounded(values: NDArray[np.float64]) -> list[Any]:
+    rounded: list[Any] = np.vectorize(lambda v: float(f"{v:.5g}"))(values).tolist()
+    return rounded
 
 
 def _by_terms() -> NDArray[np.int64]:

@@ -218,7 +218,10 @@ class MeasuredWavefront(FocusingEye):
             self.wavelength_nm
         )
         relaxed_dpt = total_defocus_dpt(self._on_circles(radius_mm), radius_mm)
-        return relaxed_dpt.reshape(pupil_mm.shape) + shift_dpt - used_dpt
+        found_dpt: NDArray[np.float64] = (
+            relaxed_dpt.reshape(pupil_mm.shape) + shift_dpt - used_dpt
+        )
+        return found_dpt
 
     def defocus_at(
         self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
@@ -235,7 +238,7 @@ class MeasuredWavefront(FocusingEye):
         return partial(self._defocus_dpt, wavelength_nm, shape)
 
     def _defocus_dpt(
-        self, wavelength_nm: ArrayLike, shape: tuple, **state: float
+        self, wavelength_nm: ArrayLike, shape: tuple[int, ...], **state: float
     ) -> NDArray[np.float64]:
         found_dpt = self.total_defocus_dpt(wavelength_nm=wavelength_nm, **state)
         return np.broadcast_to(found_dpt, shape)

@@ -1,6 +1,7 @@
 """Argument checks of the PSF engines; each returns one canonical form."""
 
 import math
+from collections.abc import Collection
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,11 +29,11 @@ def checked_positive(name: str, values: ArrayLike, count: int) -> NDArray[np.flo
             f"{name} has shape {array.shape}: must be scalar or ({count},)"
         )
     if not (np.all(np.isfinite(array)) and np.all(array > 0)):
-        raise ValueError(f"{name} {values}: must be positive and finite")
+        raise ValueError(f"{name} {values!s}: must be positive and finite")
     return broadcast_copy(array, (count,))
 
 
-def checked_choice(name: str, value: str, allowed) -> None:
+def checked_choice(name: str, value: str, allowed: Collection[str]) -> None:
     """Raise unless the value is one of the allowed ones."""
     if value not in allowed:
         raise ValueError(f"{name} {value!r}: must be one of {', '.join(allowed)}")
@@ -49,10 +50,10 @@ def checked_scale(
             pitch = np.broadcast_to(np.asarray(pixel_pitch_mrad, np.float64), (2,))
         except ValueError:
             raise ValueError(
-                f"pixel_pitch_mrad {pixel_pitch_mrad}: must be scalar or (x, y)"
+                f"pixel_pitch_mrad {pixel_pitch_mrad!s}: must be scalar or (x, y)"
             ) from None
         if not (np.all(np.isfinite(pitch)) and np.all(pitch > 0)):
-            raise ValueError(f"pixel_pitch_mrad {pixel_pitch_mrad}: must be positive")
+            raise ValueError(f"pixel_pitch_mrad {pixel_pitch_mrad!s}: must be positive")
         return broadcast_copy(np.diag(1.0 / pitch), (count, 2, 2))
     array = np.asarray(pixel_from_mrad, dtype=np.float64)
     if array.shape not in ((2, 2), (count, 2, 2)):

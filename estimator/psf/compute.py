@@ -4,8 +4,10 @@ Takes wavefronts of the eye (`zernike_um`) and returns pixel-integrated kernels 
 PSF store.  `render_passes.py` is the slow float64 ground truth.
 """
 
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -369,7 +371,7 @@ def compute_psf_batch(
     shares = plan.geometric_ratio
     output = empty_buffer(plan.radius_px, shares)
     with ThreadPoolExecutor(workers or thread_count()) as pool:
-        common = {"output": output, "pool": pool}
+        common: dict[str, Any] = {"output": output, "pool": pool}
         if method.startswith("enz"):
             enz_kernels(
                 plan.survey,
@@ -386,6 +388,7 @@ def compute_psf_batch(
     return finished_batch(plan.survey, output, diffraction, method)
 
 
-def compute_psfs(zernike_um: ArrayLike, **options) -> list[Psf]:
+def compute_psfs(zernike_um: ArrayLike, **options: Any) -> list[Psf]:
     """Return point-spread functions of many wavefronts, see `compute_psf_batch`."""
-    return list(compute_psf_batch(zernike_um, **options))
+    batch = compute_psf_batch(zernike_um, **options)
+    return list(cast("Iterable[Psf]", batch))  # by its indices

@@ -9,6 +9,7 @@ aberrations, so it suits good eyes and small pupils and raises an error elsewher
 
 import math
 from concurrent.futures import Executor
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from estimator.optics.zernike import monomial_matrix, zernike_values
 from estimator.psf.enz_series import (
+    LogAmplitude,
     hankel_table,
     radial_nodes,
     radial_polynomial,
@@ -25,6 +27,9 @@ from estimator.psf.fourier import FourierAccuracy, pixel_filter, plan_grids
 from estimator.psf.kernel_types import KernelBuffer, finish_kernel
 from estimator.psf.survey import PupilSurvey
 from estimator.psf.tail import add_tail
+
+if TYPE_CHECKING:
+    from estimator.psf.pupil import PupilFrames
 
 RELEASED_DEGREE = 30
 """Zernike degree of the paper's released program: 4.5 waves of non-defocus PV."""
@@ -63,8 +68,16 @@ class EnzOutsideDomain(ValueError):
         self.needed_degree_count = needed
 
 
-@njit(cache=True, nogil=True)
-def _intensities(qx, qy, step_x, step_y, table, per_r, out):
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
+def _intensities(
+    qx: NDArray[np.float64],
+    qy: NDArray[np.float64],
+    step_x: NDArray[np.float64],
+    step_y: NDArray[np.float64],
+    table: NDArray[np.complex128],
+    per_r: int,
+    out: NDArray[np.float64],
+) -> None:
     """Compute |U|² on a grid of pixel samples by cubic interpolation of the table.
 
     U = sum_m table_m(r) exp(i m phi) at q = qx (2,) x + qy (2,) y.
@@ -121,19 +134,21 @@ class _Series:
         self.residual_um[[0, 1, 2, 4]] = 0.0
         self.betas = self._expand(frames, is_checked)
 
-    def _log_amplitude(self, log_amplitude):
+    def _log_amplitude(self, log_amplitude: NDArray[np.float64]) -> LogAmplitude | None:
         if not log_amplitude.any():
             return None
         room = math.sqrt(1.0 - self.shear**2)
 
-        def at(x, y):
+        def at(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
             y = self.shear * x + room * y
             powers = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
             return powers @ log_amplitude
 
         return at
 
-    def _expand(self, frames, is_checked):
+    def _expand(
+        self, frames: "PupilFrames", is_checked: bool
+    ) -> dict[int, NDArray[np.complex128]]:
         rho, angle = np.meshgrid(np.linspace(0, 1, 25), np.linspace(0, 2 * np.pi, 73))
         x, y = rho * np.cos(angle), rho * np.sin(angle)
         waves = zernike_values(x, y) @ self.residual_um / self.wavelength_um
@@ -154,7 +169,7 @@ class _Series:
             raise EnzOutsideDomain(**far, captured=held)
         return betas
 
-    def _radial_table(self, reach: float):
+    def _radial_table(self, reach: float) -> NDArray[np.complex128]:
         """Return 2 (-i)^|m| sum_n beta sqrt(n+1) V_n^m at radii -1, 0, 1 ... steps."""
         rho, weight = radial_nodes(self.degree, abs(self.defocus_rad), reach)
         weight = weight * rho * np.exp(1j * self.defocus_rad * rho**2)
@@ -204,7 +219,9 @@ class _Series:
         add_tail(kernel, window, 0.0, edge, half, shear, edge_um)
         return kernel
 
-    def _intensity(self, x_px, y_px):
+    def _intensity(
+        self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """Return the share of the light per sample-pixel area on a grid of points."""
         room = math.sqrt(1.0 - self.shear**2)
         # q = T^T p / lambda, t = T w with T lower triangular.
@@ -219,7 +236,8 @@ class _Series:
         _intensities(qx, qy, x, y, self._radial_table(float(far)), _RADIAL_STEPS, out)
         area = math.pi * self.half[0] * self.half[1] * room
         passed = float(self.survey.passed_ratio[self.index])
-        return out * area / self.wavelength_um**2 / passed
+        light: NDArray[np.float64] = out * area / self.wavelength_um**2 / passed
+        return light
 
 
 _FILTER_REACH = 8

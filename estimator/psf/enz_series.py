@@ -5,6 +5,7 @@ coefficients of a pupil function.  `enz.py` computes PSFs from them.
 """
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -15,19 +16,25 @@ from scipy.special import eval_jacobi
 
 from estimator.optics.zernike import zernike_values
 
+LogAmplitude = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
+"""Logarithm of an apodization at points (x, y) of the unit disc."""
+
 
 def radial_polynomial(n: int, m: int, rho: ArrayLike) -> NDArray[np.float64]:
     """Return Zernike's R_n^|m| by the Jacobi recurrence, which is stable at any n."""
     m, rho = abs(m), np.asarray(rho, np.float64)
-    return rho**m * eval_jacobi((n - m) // 2, 0, m, 2.0 * rho**2 - 1.0)
+    values: NDArray[np.float64] = rho**m * eval_jacobi(
+        (n - m) // 2, 0, m, 2.0 * rho**2 - 1.0
+    )
+    return values
 
 
 _UPWARD_FROM = 50.0
 """Argument from which J_0 and J_1 are computed by Hankel's expansion, to 1e-15."""
 
 
-@njit(cache=True, nogil=True)
-def _hankel_asymptotic(order, x):
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
+def _hankel_asymptotic(order: int, x: float) -> float:
     """Return J_order(x) for order 0 or 1 and large x."""
     term, even, odd = 1.0, 1.0, 0.0
     for k in range(1, 13):
@@ -42,8 +49,8 @@ def _hankel_asymptotic(order, x):
     )
 
 
-@njit(cache=True, nogil=True)
-def _bessel_orders(x, count, out):
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
+def _bessel_orders(x: float, count: int, out: NDArray[np.float64]) -> None:
     """Compute J_0 .. J_(count-1) at x >= 0 by the stable recurrence.
 
     Upward for orders below the argument, Miller's downward recurrence elsewhere.
@@ -75,8 +82,13 @@ def _bessel_orders(x, count, out):
         out[k] /= norm
 
 
-@njit(cache=True, nogil=True)
-def hankel_table(r, rho, weighted, out):
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
+def hankel_table(
+    r: NDArray[np.float64],
+    rho: NDArray[np.float64],
+    weighted: NDArray[np.complex128],
+    out: NDArray[np.complex128],
+) -> None:
     """Compute out[q, m] = sum_g weighted[g, |m|] J_|m|(2 pi r_q rho_g).
 
     ``weighted`` is (nodes, 2 M + 1) for m = -M .. M.
@@ -124,7 +136,9 @@ def enz_function(n: int, m: int, r: ArrayLike, defocus_rad: float) -> NDArray[An
     return out[:, -1]
 
 
-def radial_nodes(degree: int, defocus_rad: float, r: float):
+def radial_nodes(
+    degree: int, defocus_rad: float, r: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return Gauss-Legendre nodes, weights on 0..1 for degree, defocus and radius."""
     swing = defocus_rad + (degree + 2.0 * math.pi * r) / 2.0
     count = math.ceil(swing / 2.0 + 3.0 * swing ** (1.0 / 3.0)) + 8
@@ -134,12 +148,14 @@ def radial_nodes(degree: int, defocus_rad: float, r: float):
 
 
 @lru_cache(maxsize=64)
-def _legendre(count: int):
+def _legendre(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return np.polynomial.legendre.leggauss(count)
 
 
 @lru_cache(maxsize=8)
-def _basis(degree: int, n_nodes: int):
+def _basis(
+    degree: int, n_nodes: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], dict[int, NDArray[np.float64]]]:
     """Return nodes, weights and sqrt(n+1) R_n^m as {m: (n, nodes)}, m = 0 .. degree."""
     node, weight = _legendre(n_nodes)
     rho, weight = (node + 1.0) / 2.0, weight / 2.0
@@ -160,7 +176,7 @@ def zernike_betas(
     *,
     wavelength_um: float,
     degree: int,
-    log_amplitude=None,
+    log_amplitude: LogAmplitude | None = None,
 ) -> dict[int, NDArray[np.complex128]]:
     """Return beta_n^m of the pupil function as {m: values for n = |m|, |m|+2 ...}.
 

@@ -141,14 +141,19 @@ def edge_response() -> NDArray[np.float32]:
     window and 40 dB down from 0.57 on, so hardly any aliases into the window.
     Wider or less tapered edges measured no better.
     """
-    t = np.arange(-EDGE_HALF_WIDTH * EDGE_STEPS, EDGE_HALF_WIDTH * EDGE_STEPS + 1)
+    t: NDArray[Any] = np.arange(
+        -EDGE_HALF_WIDTH * EDGE_STEPS, EDGE_HALF_WIDTH * EDGE_STEPS + 1
+    )
     t = t / EDGE_STEPS
     window = i0(
         _EDGE_TAPER * np.sqrt(np.maximum(0.0, 1.0 - (t / EDGE_HALF_WIDTH) ** 2))
     )
     impulse = np.sinc(t) * window
-    steps = np.concatenate([[0.0], np.cumsum((impulse[1:] + impulse[:-1]) / 2.0)])
-    return (steps / steps[-1]).astype(np.float32)
+    steps: NDArray[np.float64] = np.concatenate(
+        [[0.0], np.cumsum((impulse[1:] + impulse[:-1]) / 2.0)]
+    )
+    ratio: NDArray[np.float32] = (steps / steps[-1]).astype(np.float32)
+    return ratio
 
 
 @lru_cache(maxsize=256)
@@ -163,14 +168,18 @@ def pixel_filter(samples_per_px: int, half_width: int) -> NDArray[np.float32]:
     reach = (samples_per_px + 1) // 2 + half_width
     t = np.arange(-reach, reach + 1)
     half = samples_per_px / 2.0
-    weights = (sici(np.pi * (t + half))[0] - sici(np.pi * (t - half))[0]) / np.pi
+    weights: NDArray[np.float64] = (
+        sici(np.pi * (t + half))[0] - sici(np.pi * (t - half))[0]
+    ) / np.pi
     beyond = np.clip((np.abs(t) - half) / (half_width + 1.0), 0.0, 1.0)
     weights *= np.cos(np.pi / 2.0 * beyond) ** 2
     weights *= samples_per_px / weights.sum()
     return weights.astype(np.float32)
 
 
-def _filter_table(samples_per_px: NDArray[np.int64], half_width: int):
+def _filter_table(
+    samples_per_px: NDArray[np.int64], half_width: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
     """Return a plan's pixel filters: (n, longest) table, lengths and index (M, 2)."""
     counts, which = np.unique(samples_per_px, return_inverse=True)
     filters = [pixel_filter(int(k), half_width) for k in counts]
@@ -201,7 +210,13 @@ def _chunks(plan: FourierPlan, shear: NDArray[Any]) -> list[NDArray[np.int64]]:
 class _Work:
     """State shared by the threads of one call."""
 
-    def __init__(self, survey, members, accuracy, output):
+    def __init__(
+        self,
+        survey: PupilSurvey,
+        members: NDArray[np.int64],
+        accuracy: FourierAccuracy,
+        output: KernelBuffer,
+    ):
         self.survey, self.members, self.output = survey, members, output
         self.local = threading.local()
         unit_px = survey.unit_px[members]
@@ -236,7 +251,7 @@ class _Work:
         count = math.prod(shape)
         if getattr(self.local, "field", np.empty(0)).size < count:
             self.local.field = np.empty(max(count, _CHUNK_SAMPLES), np.complex64)
-        field = self.local.field[:count].reshape(shape)
+        field: NDArray[np.complex64] = self.local.field[:count].reshape(shape)
         field[...] = 0.0
         return field
 

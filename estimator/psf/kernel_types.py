@@ -1,6 +1,7 @@
 """Types shared by the PSF engines: result, size error, buffer and kernel disc."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -60,7 +61,9 @@ class PsfTooLarge(ValueError):
         self.max_radius_px = max_radius_px
         self.index = index
 
-    def __reduce__(self):
+    def __reduce__(
+        self,
+    ) -> tuple[Callable[[int, int, int], "PsfTooLarge"], tuple[int, int, int]]:
         """Pickle by keyword, because builds run in worker processes."""
         return _rebuild_psf_too_large, (
             self.radius_px,
@@ -69,7 +72,9 @@ class PsfTooLarge(ValueError):
         )
 
 
-def _rebuild_psf_too_large(radius_px, max_radius_px, index):
+def _rebuild_psf_too_large(
+    radius_px: int, max_radius_px: int, index: int
+) -> PsfTooLarge:
     return PsfTooLarge(radius_px=radius_px, max_radius_px=max_radius_px, index=index)
 
 
@@ -120,8 +125,10 @@ def empty_buffer(
     )
 
 
-@njit(cache=True, nogil=True)
-def finish_kernel(kernel, share, flat):
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
+def finish_kernel(
+    kernel: NDArray[np.float32], share: float, flat: NDArray[np.float32]
+) -> float:
     """Crop a kernel to its disc and add it, scaled to a sum of ``share``.
 
     Returns ``share`` times the light in the disc; adds nothing where there is none.

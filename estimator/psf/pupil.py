@@ -68,8 +68,17 @@ _POWER_X = np.ascontiguousarray(EXPONENTS[:, 0])
 _POWER_Y = np.ascontiguousarray(EXPONENTS[:, 1])
 
 
-@njit(cache=True, nogil=True)
-def _substitute(source, matrix, shift, nodes, from_nodes, power_x, power_y, out):
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
+def _substitute(
+    source: NDArray[np.float64],
+    matrix: NDArray[np.float64],
+    shift: NDArray[np.float64],
+    nodes: NDArray[np.float64],
+    from_nodes: NDArray[np.float64],
+    power_x: NDArray[np.int64],
+    power_y: NDArray[np.int64],
+    out: NDArray[np.float64],
+) -> None:
     """Write coefficients of source(shift + matrix w) to ``out``, from node values."""
     values = np.zeros(source.size)
     xs, ys = np.empty(7), np.empty(7)
@@ -89,8 +98,18 @@ def _substitute(source, matrix, shift, nodes, from_nodes, power_x, power_y, out)
     out[0] = 0.0
 
 
-@njit(cache=True, nogil=True)
-def _frames(polynomial, radius, jacobian, ellipse, tables, box, disc, half, shear):
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
+def _frames(
+    polynomial: NDArray[np.float64],
+    radius: NDArray[np.float64],
+    jacobian: NDArray[np.float64],
+    ellipse: NDArray[np.float64],
+    tables: tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]],
+    box: NDArray[np.float64],
+    disc: NDArray[np.float64],
+    half: NDArray[np.float64],
+    shear: NDArray[np.float64],
+) -> None:
     """Fill the arrays of `PupilFrames`, pupil by pupil."""
     nodes, from_nodes, power_x, power_y = tables
     matrix, shift, lower = np.empty((2, 2)), np.empty(2), np.zeros((2, 2))
@@ -145,7 +164,12 @@ def _frames(polynomial, radius, jacobian, ellipse, tables, box, disc, half, shea
             )
 
 
-def _log_amplitudes(apodization, jacobian, ellipse, half) -> NDArray[np.float64]:
+def _log_amplitudes(
+    apodization: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
+    jacobian: NDArray[np.float64],
+    ellipse: NDArray[np.float64],
+    half: NDArray[np.float64],
+) -> NDArray[np.float64]:
     """Expand -k |u - u0|² (log amplitude) over boxes; k (P,) per mm², u0 (P, 2) mm."""
     log_amplitude = np.zeros((ellipse.shape[0], 6))
     if apodization is None:

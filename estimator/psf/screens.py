@@ -104,8 +104,8 @@ class ScreenTables:
         )
 
 
-@njit(cache=True, nogil=True)
-def _square_mm2(u, v, lattice):
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
+def _square_mm2(u: float, v: float, lattice: tuple[float, float, float]) -> float:
     """Return the squared distance from the nearest center; infinite if none is near."""
     pitch, inner, outer = lattice
     if pitch == 0.0:
@@ -122,8 +122,17 @@ def _square_mm2(u, v, lattice):
     return square
 
 
-@njit(cache=True, nogil=True)
-def _apply(from_box, tables, which, steps_per_mm2, lattice, samples, size, field):
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
+def _apply(
+    from_box: NDArray[np.float64],
+    tables: NDArray[np.complex64],
+    which: NDArray[np.int64],
+    steps_per_mm2: float,
+    lattice: tuple[float, float, float],
+    samples: NDArray[np.float64],
+    size: NDArray[np.int64],
+    field: NDArray[np.complex64],
+) -> None:
     last = tables.shape[1] - 1
     for b in range(field.shape[0]):
         m, table = from_box[b], tables[which[b]]

@@ -5,7 +5,7 @@ perceived images, not for photographic ones.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,7 +49,8 @@ class StilesCrawford:
 
     def slope_per_mm2(self, wavelength_nm: ArrayLike) -> NDArray[np.float64]:
         """Return rho at a wavelength; constant beyond the table's ends."""
-        rho = np.interp(wavelength_nm, WAVELENGTHS_NM, SLOPES_PER_MM2)
+        at_nm = cast("NDArray[np.float64]", wavelength_nm)  # or what `interp` converts
+        rho = np.interp(at_nm, WAVELENGTHS_NM, SLOPES_PER_MM2)
         return self.slope_ratio * rho
 
     def amplitude(self, wavelength_nm: ArrayLike) -> tuple[NDArray[Any], NDArray[Any]]:

@@ -86,7 +86,8 @@ class PupilSurvey:
     @property
     def wave_number(self) -> NDArray[np.float64]:
         """Larger side of the spot in units of lambda/D, n = 2 g D / lambda, (P,)."""
-        return (self.extent_px / self.unit_px).max(axis=1)
+        larger: NDArray[np.float64] = (self.extent_px / self.unit_px).max(axis=1)
+        return larger
 
 
 def _sample_points() -> tuple[NDArray[Any], NDArray[Any]]:
@@ -109,14 +110,27 @@ def _monomial_slopes() -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
 POINTS, *SLOPES = _monomial_slopes()
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _add_scaled(factor, source, out):
+@njit(cache=True, nogil=True, fastmath=True)  # type: ignore[untyped-decorator]  # numba
+def _add_scaled(
+    factor: float, source: NDArray[np.float64], out: NDArray[np.float64]
+) -> None:
     for i in range(out.shape[0]):
         out[i] += factor * source[i]
 
 
-@njit(cache=True, nogil=True)
-def _survey(disc, half, shear, tables, low, high, edge, normal, blur, narrow):
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
+def _survey(
+    disc: NDArray[np.float64],
+    half: NDArray[np.float64],
+    shear: NDArray[np.float64],
+    tables: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    edge: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    blur: NDArray[np.float64],
+    narrow: NDArray[np.float64],
+) -> None:
     points, slope_x, slope_y = tables
     gx, gy = np.empty(points.shape[1]), np.empty(points.shape[1])
     for p in range(disc.shape[0]):
@@ -224,8 +238,13 @@ def survey_pupils(frames: PupilFrames) -> PupilSurvey:
     )
 
 
-@njit(cache=True, nogil=True)
-def _edge_light_outside(edge_px, normal, edge_um, radius_px):
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
+def _edge_light_outside(
+    edge_px: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    edge_um: float,
+    radius_px: float,
+) -> float:
     """Return the share of the light that the pupil's edge sends beyond a disc."""
     total = 0.0
     for i in range(edge_px.shape[0]):
@@ -238,11 +257,19 @@ def _edge_light_outside(edge_px, normal, edge_um, radius_px):
             return math.inf
         root = math.sqrt(b * b - a * c)
         total += a / (root - b) + a / (root + b)
-    return edge_um / (2.0 * math.pi**2) * total / edge_px.shape[0]
+    strength_um: float = edge_um / (2.0 * math.pi**2) * total / edge_px.shape[0]
+    return strength_um
 
 
-@njit(cache=True, nogil=True)
-def _smallest_radii(edge_px, normal, edge_um, blur_px, budget, limit):
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
+def _smallest_radii(
+    edge_px: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    edge_um: NDArray[np.float64],
+    blur_px: NDArray[np.float64],
+    budget: float,
+    limit: int,
+) -> NDArray[np.int64]:
     radii = np.empty(edge_px.shape[0], np.int64)
     for p in range(edge_px.shape[0]):
         low = math.ceil(blur_px[p] + 0.21) - 1
@@ -264,8 +291,13 @@ def _smallest_radii(edge_px, normal, edge_um, blur_px, budget, limit):
     return radii
 
 
-@njit(cache=True, nogil=True)
-def _edge_light_outside_all(edge_px, normal, edge_um, radius_px):
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
+def _edge_light_outside_all(
+    edge_px: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    edge_um: NDArray[np.float64],
+    radius_px: NDArray[np.float64],
+) -> NDArray[np.float64]:
     outside = np.empty(edge_px.shape[0])
     for p in range(edge_px.shape[0]):
         outside[p] = _edge_light_outside(
@@ -274,7 +306,9 @@ def _edge_light_outside_all(edge_px, normal, edge_um, radius_px):
     return outside
 
 
-def _edge_geometry(survey: PupilSurvey):
+def _edge_geometry(
+    survey: PupilSurvey,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return edge slopes, normals and strengths in the form of the compiled loops."""
     return survey.edge_slope_px, survey.edge_normal_px_per_um, survey.edge_light_um
 
@@ -311,7 +345,7 @@ def needed_radius_px(
     a circle this is the mean Airy tail, 2 lambda / (pi² D theta) outside theta; for
     defocus lambda / (pi² D) [1/(theta-g) + 1/(theta+g)].
     """
-    radii = _smallest_radii(
+    radii: NDArray[np.int64] = _smallest_radii(
         *_edge_geometry(survey),
         survey.blur_radius_px,
         float(lost_energy_ratio),
@@ -320,4 +354,7 @@ def needed_radius_px(
     if tail_end_px is None:
         return radii
     lands_within = np.ceil(survey.blur_radius_px + PIXEL_CORNER_PX) <= tail_end_px
-    return np.where(lands_within, np.minimum(radii, tail_end_px), radii)
+    bounded: NDArray[np.int64] = np.where(
+        lands_within, np.minimum(radii, tail_end_px), radii
+    )
+    return bounded

@@ -39,7 +39,7 @@ _N_PLANE = 3
 def rms_waves_ratio(survey: PupilSurvey) -> NDArray[np.float64]:
     """Return the tilt-free RMS (P,) of wavefronts over their pupils, in wavelengths."""
     zernike_um = survey.frames.disc_polynomial_um @ np.linalg.inv(monomial_matrix())
-    rms_um = np.sqrt((zernike_um[:, _N_PLANE:] ** 2).sum(axis=1))
+    rms_um: NDArray[np.float64] = np.sqrt((zernike_um[:, _N_PLANE:] ** 2).sum(axis=1))
     return rms_um / (survey.frames.wavelength_nm / 1000.0)
 
 
@@ -47,12 +47,13 @@ def predicted_psnr_db(survey: PupilSurvey) -> NDArray[np.float64]:
     """Return the PSNR (P,) that ray-optical images exceed in 98 of 100 cases."""
     pixel_ratio = 1.0 / survey.unit_px.max(axis=1)
     rms = np.maximum(rms_waves_ratio(survey), 1e-6)
-    return (
+    psnr_db: NDArray[np.float64] = (
         BASE_DB
         + PER_RMS_DB * np.log10(rms)
         + PER_PIXEL_DB * np.log10(pixel_ratio)
         + PER_NARROW_DB * np.log10(1.0 + survey.narrow_ratio)
     )
+    return psnr_db
 
 
 def geometric_shares(survey: PupilSurvey) -> NDArray[np.float64]:

@@ -9,13 +9,21 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 EDGE_STRIDE = 4
 """Every fourth edge sample is used; distances to the edge need no more."""
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _distances(x, y, edge_x, edge_y, near, far):
+@njit(cache=True, nogil=True, fastmath=True)  # type: ignore[untyped-decorator]  # numba
+def _distances(
+    x: NDArray[np.float32],
+    y: int,
+    edge_x: NDArray[np.float32],
+    edge_y: NDArray[np.float32],
+    near: NDArray[np.float32],
+    far: NDArray[np.float32],
+) -> None:
     """Write squared distances of a pixel row to the nearest and farthest edge slope."""
     for i in range(near.shape[0]):
         near[i] = np.float32(1e30)
@@ -31,8 +39,19 @@ def _distances(x, y, edge_x, edge_y, near, far):
             far[i] = max(far[i], square)
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
-def _densities(x, center, half, shear, strength, near, far, light):
+@njit(  # type: ignore[untyped-decorator]  # numba
+    cache=True, nogil=True, fastmath=True, error_model="numpy"
+)
+def _densities(
+    x: NDArray[np.float32],
+    center: tuple[float, float],
+    half: NDArray[np.float64],
+    shear: float,
+    strength: float,
+    near: NDArray[np.float32],
+    far: NDArray[np.float32],
+    light: NDArray[np.float32],
+) -> None:
     """Compute the light of a row of pixels from their squared distances.
 
     ``center`` holds x of the spot's center and the row's height above it.
@@ -57,8 +76,16 @@ def _densities(x, center, half, shear, strength, near, far, light):
         )
 
 
-@njit(cache=True, nogil=True)
-def add_tail(kernel, window, border_px, edge, half, shear, wavelength_um):
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
+def add_tail(
+    kernel: NDArray[np.float32],
+    window: NDArray[np.int64],
+    border_px: float,
+    edge: NDArray[np.float64],
+    half: NDArray[np.float64],
+    shear: float,
+    wavelength_um: float,
+) -> None:
     """Raise pixels that no engine reaches to the mean edge-diffracted light.
 
     Parameters

@@ -230,7 +230,13 @@ def wavefront_aberrations(
     return Aberrations(
         zernike_um=found.zernike_um[one],
         zernike_radius_mm=float(found.zernike_radius_mm[one]),
-        pupil_ellipse=PupilEllipse(*lengths_mm, math.degrees(axis_rad)),
+        pupil_ellipse=PupilEllipse(
+            lengths_mm[0],
+            lengths_mm[1],
+            lengths_mm[2],
+            lengths_mm[3],
+            math.degrees(axis_rad),
+        ),
         rms_residual_um=float(found.rms_residual_um[one]),
         stop_diameter_mm=float(stops_mm[0]),
         open_ratio=float(found.open_ratio[one]),

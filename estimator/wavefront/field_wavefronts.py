@@ -15,7 +15,7 @@ from estimator.optics import prescription as rx
 from estimator.optics.units import SPHERE_PER_C20
 from estimator.optics.zernike import EXPONENTS, monomial_matrix, wavefront_polynomial
 
-DEGREE = EXPONENTS.sum(axis=1)
+DEGREE: NDArray[np.int64] = EXPONENTS.sum(axis=1)
 """Degree of each monomial, (28,)."""
 
 TILT_Y, TILT_X = 1, 2
@@ -70,15 +70,19 @@ def circumscribed_radius_mm(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the radius (...) of the circle about the chief ray that holds a rim."""
     x, y, xx, xy, yy = np.moveaxis(rim_mm[..., None], -2, 0)
 
-    def rim_point(cosine, sine):
+    def rim_point(
+        cosine: NDArray[np.float64], sine: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return x + xx * cosine + xy * sine, y + xy * cosine + yy * sine
 
-    def half_square(angle):
+    def half_square(angle: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return half the squared distance of a rim point."""
         px, py = rim_point(np.cos(angle), np.sin(angle))
         return 0.5 * (px * px + py * py)
 
-    def derivatives(angle):
+    def derivatives(
+        angle: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the first two derivatives of that."""
         cosine, sine = np.cos(angle), np.sin(angle)
         px, py = rim_point(cosine, sine)
@@ -94,7 +98,8 @@ def circumscribed_radius_mm(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         step = np.where(bends_down, -first / np.where(bends_down, second, 1.0), 0.0)
         angle = angle + np.clip(step, -NEWTON_STEP_RAD, NEWTON_STEP_RAD)
     highest = np.maximum(half_square(angle)[..., 0], sampled.max(axis=-1))
-    return np.sqrt(2.0 * highest)
+    radius_mm: NDArray[np.float64] = np.sqrt(2.0 * highest)
+    return radius_mm
 
 
 def polynomial_in_mm(
@@ -157,7 +162,9 @@ def with_defocus(
 
 
 def with_tilt(
-    zernike_um: NDArray[np.float64], radius_mm: ArrayLike, shift_mrad: ArrayLike
+    zernike_um: NDArray[np.float64],
+    radius_mm: ArrayLike,
+    shift_mrad: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return wavefronts (P, 28) on circles (P,) with PSFs shifted by (P, 2), x and y.
 
@@ -169,7 +176,9 @@ def with_tilt(
     return zernike_um
 
 
-def distinct_rows(*columns: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+def distinct_rows(
+    *columns: NDArray[Any],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the first index of each distinct row of columns (n,), and row numbers."""
     number = np.zeros(columns[0].size, dtype=np.int64)
     for column in columns:

@@ -37,8 +37,13 @@ def _slope_products() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     return np.array(list(found)), np.array(list(found.values()), np.float64)
 
 
-@njit(cache=True, nogil=True)
-def _add_products(polynomial_um, terms, factors, out):
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
+def _add_products(
+    polynomial_um: NDArray[np.float64],
+    terms: NDArray[np.int64],
+    factors: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
     for n in range(polynomial_um.shape[0]):
         for m in range(terms.shape[0]):
             i, j, k = terms[m]

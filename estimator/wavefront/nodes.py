@@ -43,7 +43,9 @@ def _gauss_nodes(atoms: NDArray[Any], weights: NDArray[Any], n: int) -> NDArray[
     return np.linalg.eigvalsh(np.diag(diagonal) + np.diag(off, 1) + np.diag(off, -1))
 
 
-def _rule(atoms: NDArray[Any], weights: NDArray[Any], n: int, *, with_rim: bool):
+def _rule(
+    atoms: NDArray[Any], weights: NDArray[Any], n: int, *, with_rim: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return a unit-sum Gauss rule, or Gauss-Radau with a node at 1, on [0, 1]."""
     weights = weights / weights.sum()
     if with_rim:

@@ -50,4 +50,5 @@ def pupil_refraction_dpt(
     bowl = px**2 + py**2
     bowl = bowl - (bowl * shares) @ plane.T @ plane
     flat = 2.0 * (wave_um * shares * bowl).sum(axis=-1)
-    return -flat / (bowl**2 * shares).sum(axis=-1)
+    found_dpt: NDArray[np.float64] = -flat / (bowl**2 * shares).sum(axis=-1)
+    return found_dpt
