@@ -234,7 +234,7 @@ def test_a_service_that_dies_and_comes_back_does_not_freeze_the_picture(
     assert all(gone), "an old picture stood while there was no service"
     assert n_seen[0] > 60
     assert any("no filter service" in line for line in said)
-    assert any("is there" in line for line in said)
+    assert any("connected to the filter service" in line for line in said)
 
 
 def test_what_is_wrong_with_an_eye_is_said_once_and_it_is_asked_for_again(
