@@ -1,5 +1,7 @@
 """The PSF store of a perfect eye, which leaves every image unchanged."""
 
+from typing import Any
+
 import numpy as np
 
 from estimator.profiles.measured_wavefront import MeasuredWavefront
@@ -11,15 +13,15 @@ from filter_service.planning.node_wavefronts import NodeWavefronts, PupilStates
 from filter_service.planning.nodes import CachePlan, PlanNodes, RaggedNodes
 from filter_service.psfs.pack import PackedKernels
 from filter_service.psfs.store import PsfStore
-from filter_service.rendering.engine import FrameEngine
+from filter_service.rendering.engine import FrameEngine, ViewRequest
 from filter_service.rgbd_view import RgbdView
-from filter_service.settings import FilterSettings
+from filter_service.settings import Accumulation, FilterSettings, Output, RenderOptions
 
 PUPIL_MM = 3.0
 SIDE_PX = 16
 TANGENTS = (-0.01, 0.01, 0.01, -0.01)
 
-VARIANTS = (
+VARIANTS: tuple[tuple[type[Any], Output, Accumulation], ...] = (
     (np.uint8, "srgb8", "coverage"),
     (np.uint8, "srgb8", "paper"),
     (np.float32, "linear", "coverage"),
@@ -41,14 +43,11 @@ def change_by_perfect_eye(engine: FrameEngine) -> float:
     changes = []
     for dtype, output, accumulation in VARIANTS:
         view = RgbdView(np.ones((SIDE_PX, SIDE_PX, RGB), dtype), depth_m, TANGENTS)
-        rendered = engine.render(
-            view,
-            handle,
-            pupil_diameter_mm=PUPIL_MM,
-            focus_dpt=0.0,
-            accumulation=accumulation,
-            output=output,
+        options = RenderOptions(accumulation=accumulation)
+        request = ViewRequest(
+            view, handle, PUPIL_MM, 0.0, output=output, options=options
         )
+        rendered = engine.begin(request)()
         changes.append(np.abs(rendered.color.astype(np.float32) - view.color))
     handle.release()
     return float(np.max(changes))
