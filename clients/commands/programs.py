@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-from clients.arguments import read_size_px
 from clients.commands.console import CommandFailed, Json
 from clients.extra import what_to_install
 
@@ -34,6 +33,8 @@ def demo(
     if frames is not None:
         arguments += ["--frames", str(frames)]
     if size is not None:
+        from clients.arguments import read_size_px  # reads profiles, too: 60 ms
+
         width_px, height_px = read_size_px(size)
         arguments += ["--size", f"{width_px}x{height_px}"]
     try:
