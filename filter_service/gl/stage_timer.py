@@ -1,7 +1,9 @@
 """Times of a frame's stages, on the GPU and on the processor."""
 
 import time
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
+from typing import Any
 
 from filter_service.gl.gpu import Gpu, Query
 
@@ -17,7 +19,7 @@ class StageTimer:
         self._ms: dict[str, float] = {}
         self._queries: list[tuple[str, Query]] = []
 
-    def stage(self, name: str) -> AbstractContextManager:
+    def stage(self, name: str) -> AbstractContextManager[Any]:
         """Time a GPU stage; times of the same name add up."""
         if self._gpu.is_software:
             return self._finished(name)
@@ -26,12 +28,12 @@ class StageTimer:
         return query
 
     @contextmanager
-    def _finished(self, name: str):
+    def _finished(self, name: str) -> Iterator[None]:
         with self.wall(name):
             yield
             self._gpu.context.finish()
 
-    def wall(self, name: str) -> AbstractContextManager:
+    def wall(self, name: str) -> AbstractContextManager[Any]:
         """Time a CPU stage."""
         return _Wall(self._ms, name)
 
@@ -53,6 +55,6 @@ class _Wall:
     def __enter__(self) -> None:
         self._started_s = time.perf_counter()
 
-    def __exit__(self, *raised) -> None:
+    def __exit__(self, *raised: object) -> None:
         elapsed_ms = 1e3 * (time.perf_counter() - self._started_s)
         self._times_ms[self._name] = self._times_ms.get(self._name, 0.0) + elapsed_ms

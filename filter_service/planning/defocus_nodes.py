@@ -9,6 +9,7 @@ group uses the variant that needs fewer nodes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +95,9 @@ def defocus_nodes(
     shift_dpt = np.zeros((len(split), RGB))
     free = np.flatnonzero(~is_limited)
 
-    def try_others(index: NDArray[np.int64], ranges: Ranges, shifts_dpt=None) -> None:
+    def try_others(
+        index: NDArray[np.int64], ranges: Ranges, shifts_dpt: Any = None
+    ) -> None:
         nonlocal nodes
         if not index.size:
             return

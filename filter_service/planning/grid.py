@@ -14,7 +14,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from filter_service.camera import Camera, is_same_camera
@@ -236,7 +236,11 @@ class GridSpec:
         ]
 
     def pixel_from_mrad(
-        self, h_deg, v_deg, *, gaze_deg: tuple[float, float] | None = None
+        self,
+        h_deg: ArrayLike,
+        v_deg: ArrayLike,
+        *,
+        gaze_deg: tuple[float, float] | None = None,
     ) -> NDArray[np.float64]:
         """Return the local scale (..., 2, 2) of the image at field directions.
 
@@ -248,7 +252,9 @@ class GridSpec:
         gaze_deg = self.settings.gaze_deg if gaze_deg is None else gaze_deg
         return pixel_from_mrad(self.camera, h_deg, v_deg, gaze_deg=gaze_deg)
 
-    def node_pixel_from_mrad(self, h_deg, v_deg) -> NDArray[np.float64]:
+    def node_pixel_from_mrad(
+        self, h_deg: ArrayLike, v_deg: ArrayLike
+    ) -> NDArray[np.float64]:
         """Return the pixel scale (..., 2, 2) of the stored kernels of a field node.
 
         It is that of the image where the node is seen.  A node that the gaze moves over

@@ -174,7 +174,9 @@ def _limit_notes(store: PsfStore, groups: NDArray[np.int64]) -> tuple[str, ...]:
     )
 
 
-def _usable_pupil(store: PsfStore, pupil_diameter_mm: float) -> tuple[float, tuple]:
+def _usable_pupil(
+    store: PsfStore, pupil_diameter_mm: float
+) -> tuple[float, tuple[str, ...]]:
     usable_mm = store.eye.usable_pupil_mm(pupil_diameter_mm)
     low_mm, high_mm = store.plan.pupils_mm[0], store.plan.pupils_mm[-1]
     if low_mm == high_mm:  # one node for a range
@@ -234,7 +236,9 @@ def _in_focus_dpt(
     )
 
 
-def _state_reads(store: PsfStore, pupil_mm: float, corners: tuple) -> StateReads:
+def _state_reads(
+    store: PsfStore, pupil_mm: float, corners: tuple[Any, ...]
+) -> StateReads:
     plan = store.plan
     scales = np.array([pupil_mm / plan.pupils_mm[pupil] for pupil, _, _ in corners])
     if store.eye.rings is not None:  # foci are the same in any pupil

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -93,7 +94,7 @@ def pack_kernels(
     cut_ratio = np.empty(count)
     tasks = [slice(k, k + PSFS_PER_TASK) for k in range(0, count, PSFS_PER_TASK)]
 
-    def shared(work, *arrays) -> None:
+    def shared(work: Any, *arrays: Any) -> None:
         list(pool.map(lambda part: work(*(a[part] for a in arrays)), tasks))
 
     shared(

@@ -60,7 +60,7 @@ def unpack(tree: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
     name, state = content
     if kind != "object":
         raise ValueError(f"{kind!r} is no kind of data")
-    made = object.__new__(_class_of(name))
+    made: Any = object.__new__(_class_of(name))
     for field, item in state.items():
         object.__setattr__(made, field, unpack(item, arrays))
     return made

@@ -145,7 +145,7 @@ def _round_up(size: int, step: int) -> int:
     return -(-size // step) * step
 
 
-def _places(arrays: dict[str, NDArray[Any]]) -> tuple[dict[str, list], int]:
+def _places(arrays: dict[str, NDArray[Any]]) -> tuple[dict[str, list[Any]], int]:
     """Return [dtype, shape, start] of each array, and their total size."""
     places, end = {}, 0
     for key, array in arrays.items():
@@ -163,7 +163,7 @@ def _blocks(arrays: dict[str, NDArray[Any]]) -> Iterator[bytes | memoryview]:
         yield bytes(_round_up(array.nbytes, ALIGNMENT_BYTES) - array.nbytes)
 
 
-def _array(data: NDArray[np.uint8], place: list) -> NDArray[Any]:
+def _array(data: NDArray[np.uint8], place: list[Any]) -> NDArray[Any]:
     name, shape, start = place
     dtype = np.dtype(name)
     n_bytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize

@@ -48,7 +48,7 @@ def seen_through(view: RgbdView, magnification: Matrix) -> RgbdView:
     steps = (right - left) / view.width_px, (down - up) / view.height_px
     place = np.array([left, up, *steps])
     to_source = np.linalg.inv(np.array(magnification))
-    images = {}
+    images: dict[str, Any] = {}
     for color, depth in (("color", "depth_m"), ("hidden_color", "hidden_depth_m")):
         light, meters = getattr(view, color), getattr(view, depth)
         if light is None:

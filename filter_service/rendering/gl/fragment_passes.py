@@ -1,5 +1,7 @@
 """Passes that turn a frame, or a strip of it, into fragments."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -168,7 +170,7 @@ class FragmentPasses:
         return used_pairs(self.used_words, interval_count(self.strip.layers))
 
     @property
-    def _common(self) -> dict:
+    def _common(self) -> dict[str, Any]:
         return {
             "frame_size_px": self.strip.size,
             "layer_count": len(self.strip.layers.layer_dpt),

@@ -1,7 +1,7 @@
 """Passes that blend a frame's kernels from the cache, and keep them between frames."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +98,7 @@ class KernelMaker:
 
     def forget(self) -> None:
         """Discard the last frame's kernels and the prediction."""
-        self._made_for: tuple | None = None
+        self._made_for: tuple[Any, ...] | None = None
         self._set: KernelSet | None = None
         self._pairs.forget()
 
@@ -182,7 +182,7 @@ class KernelMaker:
             for name, (first, count) in tables.parts.items()
         }
 
-        def run(name: str, work: str, *bindings: str, **options) -> None:
+        def run(name: str, work: str, *bindings: str, **options: Any) -> None:
             count = tables.parts[work][1] // 2
             if not count:
                 return
@@ -248,7 +248,7 @@ def _plan(
     return _Plan(used, kernels, levels)
 
 
-def _plan_if_they_fit(*arguments) -> _Plan | None:
+def _plan_if_they_fit(*arguments: Any) -> _Plan | None:
     try:
         return _plan(*arguments)
     except KernelsTooLarge:

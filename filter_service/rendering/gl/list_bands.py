@@ -1,6 +1,7 @@
 """Division of a frame's lists into bands of bins that fit their buffer; CPU only."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,7 @@ def read_totals(whole: NDArray[np.uint32]) -> ListTotals:
     )
 
 
-def split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], list]:
+def split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], list[Any]]:
     """Divide lists into bands of at most ``limit`` entries and MAX_GROUPS bins.
 
     Returns

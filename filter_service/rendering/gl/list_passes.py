@@ -1,5 +1,7 @@
 """Passes that build the lists of fragments, sort them and splat them."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -139,7 +141,7 @@ class ListPasses:
             )
 
     @property
-    def _walk(self) -> dict:
+    def _walk(self) -> dict[str, Any]:
         """Uniforms of common/binning.glsl, and the capacity of a list."""
         return {
             "tile_grid": self.strip.grid,

@@ -1,5 +1,7 @@
 """Size and buffers of a frame, or a strip of it, in the passes."""
 
+from typing import Any
+
 from filter_service.constants import BIN_TILES, TILE_SIZE_PX
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.passes import Buffer
@@ -67,7 +69,9 @@ class Strip:
         for name, size in n_bytes.items():
             self.buffers[name] = self.gpu.storage(name, size)
 
-    def run(self, name: str, groups: tuple[int, ...], *bindings: str, **uniforms):
+    def run(
+        self, name: str, groups: tuple[int, ...], *bindings: str, **uniforms: Any
+    ) -> None:
         """Dispatch a pass on buffers given by name."""
         defines = uniforms.pop("defines", None)
         textures = uniforms.pop("textures", None)

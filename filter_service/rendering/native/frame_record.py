@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from filter_service.constants import MAX_LEVEL, MIN_BLUR_RANGE, TILE_SIZE_PX
 from filter_service.native.records import (
@@ -79,7 +79,7 @@ class FrameRecord:
         self.kept.append(array)
         return int(array.ctypes.data)
 
-    def _room(self, name: str, count: int, dtype=np.uint8) -> int:
+    def _room(self, name: str, count: int, dtype: DTypeLike = np.uint8) -> int:
         return self.arrays.address(name, count, dtype)
 
     def set_view(self, view: RgbdView, border_px: int) -> None:

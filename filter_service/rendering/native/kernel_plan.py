@@ -48,7 +48,7 @@ class KernelPlan:
     shapes: NDArray[np.void]
     sources: tuple[NDArray[Any], ...]
 
-    def serves(self, state: tuple, used: NDArray[np.bool_]) -> bool:
+    def serves(self, state: tuple[object, ...], used: NDArray[np.bool_]) -> bool:
         """Return whether the plan has all kernels of a frame's state and pairs."""
         if any(own is not other for own, other in zip(self.state, state, strict=True)):
             return False
