@@ -1,4 +1,4 @@
-"""Entries of the correction that is worn, and the resulting correction."""
+"""Entries of a correction, and the profile fields that they give."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ DESIGNS = {
     "edof": "Extended depth of focus",
 }
 HINTS: dict[WornKind, str] = {
-    "progressive": "The gaze sliders look through other parts of it.",
-    "lenslets": "396 lenslets around a clear middle; the gaze sliders look through "
-    "other parts of it.",
-    "iol": "It takes the place of the eye's own lens: what is entered above is what is "
-    "left after the operation, and neither accommodation nor aberrations of the age "
-    "count. Powers are those of the lens.",
+    "progressive": "Use the gaze sliders to look through other parts of the lens.",
+    "lenslets": "396 lenslets around a clear center; use the gaze sliders to look "
+    "through other parts.",
+    "iol": "Replaces the eye's own lens: enter the refraction that remains after surgery "
+    "above. Accommodation and age-typical aberrations are not applied. Powers are those "
+    "of the lens.",
 }
 
 SPHERE = NumberField("sphere_dpt", "Sphere", "dpt", -30.0, 30.0, 0.25, is_signed=True)
@@ -69,7 +69,7 @@ OF_DESIGN: dict[str, tuple[NumberField, ...]] = {
     "edof": (EDOF_ADD,),
 }
 TRIFOCAL_LIGHT = (0.43, 0.17, 0.26)
-"""Far, intermediate, near of a usual trifocal lens: 50:20:30 of 86 %."""
+"""Light shares of a typical trifocal lens, far, intermediate and near: 50:20:30 of 86 %."""
 
 
 def first_texts() -> dict[str, str]:
