@@ -30,8 +30,10 @@ HINTS: dict[WornKind, str] = {
     "progressive": "Use the gaze sliders to look through other parts of the lens.",
     "lenslets": "396 lenslets around a clear center; use the gaze sliders to look "
     "through other parts.",
-    "iol": "Replaces the eye's own lens: enter the refraction that remains after surgery "
-    "above. Accommodation and age-typical aberrations are not applied. Powers are those "
+    "iol": "Replaces the eye's own lens: enter the refraction that remains after "
+    "surgery "
+    "above. Accommodation and age-typical aberrations are not applied. Powers are "
+    "those "
     "of the lens.",
 }
 
@@ -69,7 +71,7 @@ OF_DESIGN: dict[str, tuple[NumberField, ...]] = {
     "edof": (EDOF_ADD,),
 }
 TRIFOCAL_LIGHT = (0.43, 0.17, 0.26)
-"""Light shares of a typical trifocal lens, far, intermediate and near: 50:20:30 of 86 %."""
+"""Light shares of a typical trifocal lens: far, intermediate, near; 50:20:30 of 86 %."""
 
 
 def first_texts() -> dict[str, str]:
