@@ -71,7 +71,7 @@ OF_DESIGN: dict[str, tuple[NumberField, ...]] = {
     "edof": (EDOF_ADD,),
 }
 TRIFOCAL_LIGHT = (0.43, 0.17, 0.26)
-"""Light shares of a typical trifocal lens: far, intermediate, near; 50:20:30 of 86 %."""
+"""Light shares of a trifocal lens, far, intermediate, near: 50:20:30 of 86 %."""
 
 
 def first_texts() -> dict[str, str]:
