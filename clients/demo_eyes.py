@@ -61,7 +61,7 @@ EYES = (
         {
             "courtyard": (
                 "Words stay readable but throw a ghost",
-                "downwards; lamps have tails.",
+                "downward; lamps have tails.",
             ),
             "primitives": (
                 "The bars fade above and below, their ends",
@@ -74,7 +74,7 @@ EYES = (
         "Cataract (wavefront only)",
         {
             "courtyard": (
-                "Letters smear downwards. The haze of a",
+                "Letters smear downward. The haze of a",
                 "cataract is not part of a wavefront.",
             ),
             "primitives": (

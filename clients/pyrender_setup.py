@@ -41,7 +41,7 @@ def release_context(renderer: "pyrender.OffscreenRenderer") -> None:
 
 
 def delete_renderer(renderer: "pyrender.OffscreenRenderer") -> None:
-    """Delete an off-screen renderer; afterwards no context is current."""
+    """Delete an off-screen renderer; afterward no context is current."""
     platform = renderer._platform
     platform.make_current()
     renderer._renderer.delete()

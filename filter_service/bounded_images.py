@@ -215,7 +215,7 @@ def _opened_picture(
 
 @contextmanager
 def _quiet_library() -> Iterator[list[str]]:
-    """Capture a library's output on stdout and stderr; the list holds it afterwards.
+    """Capture a library's output on stdout and stderr; the list holds it afterward.
 
     Both streams are global to the process, so the caller holds the lock `_WARNINGS`.
     """

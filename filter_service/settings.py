@@ -148,7 +148,7 @@ class FilterSettings(Record):
     ] = ()
     gaze_deg: Annotated[
         tuple[GazeDeg, GazeDeg],
-        _doc("Gaze from the image's axis to the right and upwards, deg."),
+        _doc("Gaze from the image's axis to the right and upward, deg."),
     ] = (0.0, 0.0)
     gaze_range_deg: Annotated[
         tuple[TurnDeg, TurnDeg],

@@ -67,8 +67,8 @@ def kernel_transfer(eye: MeasuredWavefront, pupil_mm: float) -> Transfer:
     places = np.arange(-psf.radius_px, psf.radius_px + 1)
     wave = np.exp(-2j * np.pi * np.outer(cycles_per_px, places))
     pixel = np.sinc(cycles_per_px)
-    upwards = psf.kernel[::-1].astype(float) * (1.0 - psf.lost_energy_ratio)
-    return Transfer(FREQUENCIES_CPD, wave @ upwards @ wave.T / np.outer(pixel, pixel))
+    upward = psf.kernel[::-1].astype(float) * (1.0 - psf.lost_energy_ratio)
+    return Transfer(FREQUENCIES_CPD, wave @ upward @ wave.T / np.outer(pixel, pixel))
 
 
 def corridor_width_mm() -> float:

@@ -18,7 +18,7 @@ from filter_service.errors import BadMessage
 from filter_service.settings import DEFAULTS, setting_help, setting_types
 from filter_service.validation import checked
 
-HELP_OF_SIDE = {"h": "to the right", "v": "upwards"}
+HELP_OF_SIDE = {"h": "to the right", "v": "upward"}
 
 
 def with_setting_options(

@@ -44,7 +44,7 @@ class SceneView:
     which there is no surface.
 
     Every call makes the context current. If moderngl obtained the context through EGL,
-    no context is current afterwards: other drawing in the same thread must be in a
+    no context is current afterward: other drawing in the same thread must be in a
     `with context:` of its own, which must not be open around a call.
     GL_FRAMEBUFFER_SRGB is left off.
     """

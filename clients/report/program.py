@@ -43,13 +43,13 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("profile", help="preset's name, or .json, .abp or .csv file")
     parser.add_argument(
-        "after", nargs="?", help="the eye afterwards: after surgery, with spectacles"
+        "after", nargs="?", help="the eye afterward: after surgery, with spectacles"
     )
     parser.add_argument(
         "-o", "--out", type=Path, metavar="OUT", help="file to write: .html or .pdf"
     )
     parser.add_argument("--name", default="", help="what the eye is called")
-    parser.add_argument("--after-name", default="", help="and the eye afterwards")
+    parser.add_argument("--after-name", default="", help="and the eye afterward")
     parser.add_argument(
         "--no-charts", action="store_true", help="leave out the letter charts (faster)"
     )

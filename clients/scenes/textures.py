@@ -17,7 +17,7 @@ def noise(height: int, width: int, *, cells: int, seed: int, octaves: int = 4) -
         n = cells * 2**octave
         grid = np.pad(rng.uniform(-1, 1, (n, n)), 2, mode="wrap")
         image = Image.fromarray(grid.astype(np.float32))
-        # The padding makes the cubic filter wrap around; it is cropped afterwards.
+        # The padding makes the cubic filter wrap around; it is cropped afterward.
         step_x, step_y = width / n, height / n
         size = (round(width + 4 * step_x), round(height + 4 * step_y))
         big = np.asarray(image.resize(size, Image.Resampling.BICUBIC))

@@ -76,8 +76,8 @@ def difference_jacobian_um(
     The model is ``value_um`` there.  Differences point inward at the upper bounds
     ``high``: beyond them the model may be undefined.
     """
-    inwards = position + DIFFERENCE_STEP > high
-    steps = np.where(inwards, -DIFFERENCE_STEP, DIFFERENCE_STEP)
+    inward = position + DIFFERENCE_STEP > high
+    steps = np.where(inward, -DIFFERENCE_STEP, DIFFERENCE_STEP)
     values_um = model(position + np.diag(steps))
     jacobian_um = ((values_um - value_um) / steps[:, None]).T
     return np.where(np.isfinite(jacobian_um), jacobian_um, 0.0)

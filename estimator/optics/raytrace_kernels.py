@@ -232,7 +232,7 @@ def to_stop(packed, ray, n):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def inwards(packed, indices, ray, first, last, sag):
+def inward(packed, indices, ray, first, last, sag):
     """Trace a ray forward through surfaces first to last - 1; return its status."""
     for i in range(first, last):
         status = cross_surface(packed, i, ray, indices[i], indices[i + 1], sag)
@@ -242,7 +242,7 @@ def inwards(packed, indices, ray, first, last, sag):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def outwards(packed, indices, ray, first, last, sag):
+def outward(packed, indices, ray, first, last, sag):
     """Trace a ray in reverse through surfaces last - 1 to first; return its status."""
     for i in range(last - 1, first - 1, -1):
         status = cross_surface(packed, i, ray, indices[i + 1], indices[i], sag)

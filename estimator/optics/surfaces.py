@@ -267,7 +267,7 @@ def check_eye(eye: EyeSurfaces) -> None:
         if surface.offset_radius_mm <= 0.0 or surface.clear_radius_mm <= 0.0:
             raise ValueError(f"surfaces[{i}]: radii of circles must be positive")
     if depths_mm != sorted(depths_mm):
-        raise ValueError(f"surfaces at z {depths_mm} mm: must go inwards in order")
+        raise ValueError(f"surfaces at z {depths_mm} mm: must go inward in order")
     if not depths_mm[0] + STOP_TOLERANCE_MM < eye.stop_z_mm < eye.retina.z_mm:
         raise ValueError(
             f"stop at {eye.stop_z_mm:g} mm: must lie behind the first surface "

@@ -15,8 +15,8 @@ from estimator.optics.raytrace_kernels import (
     NOT_CONVERGED,
     RAY_SIZE,
     TRACED,
-    inwards,
-    outwards,
+    inward,
+    outward,
     put,
     to_retina,
     to_stop,
@@ -87,7 +87,7 @@ def _chief_shot(packed, indices, axes, base_z, a, b, ray, sag):
     ray[2] += base_z
     ray[6], ray[7] = 0.0, 0.0
     n_before = int(packed[-1, N_BEFORE_STOP])
-    status = inwards(packed, indices, ray, _FIRST, n_before, sag)
+    status = inward(packed, indices, ray, _FIRST, n_before, sag)
     if status == TRACED:
         to_stop(packed, ray, indices[n_before])
     return status
@@ -158,7 +158,7 @@ def chief_ray(packed, indices, h_rad, v_rad, axes, start, ray, sag):
     if status != TRACED:
         return status
     n_before, n_surfaces = int(packed[-1, N_BEFORE_STOP]), packed.shape[0] - 1
-    status = inwards(packed, indices, ray, n_before, n_surfaces, sag)
+    status = inward(packed, indices, ray, n_before, n_surfaces, sag)
     if status != TRACED:
         return status
     return to_retina(packed, indices, ray, sag)
@@ -242,7 +242,7 @@ def launch(chief, frame, a, b, ray):
 def leave_eye(packed, indices, chief, axes, chief_path, ray, sample, sag):
     """Trace from the stop to the plane through ``chief[1]`` and write the sample."""
     n_before = int(packed[-1, N_BEFORE_STOP])
-    status = outwards(packed, indices, ray, _FIRST, n_before, sag)
+    status = outward(packed, indices, ray, _FIRST, n_before, sag)
     if status != TRACED:
         return status
     x, y, z = ray[0] - chief[1, 0], ray[1] - chief[1, 1], ray[2] - chief[1, 2]
@@ -269,7 +269,7 @@ def back_to_stop(packed, indices, chief, frame, a, b, ray, sag):
     if not launch(chief, frame, a, b, ray):
         return NOT_CONVERGED
     n_before, n_surfaces = int(packed[-1, N_BEFORE_STOP]), packed.shape[0] - 1
-    status = outwards(packed, indices, ray, n_before, n_surfaces, sag)
+    status = outward(packed, indices, ray, n_before, n_surfaces, sag)
     if status == TRACED:
         to_stop(packed, ray, indices[n_before])
     return status

@@ -88,7 +88,7 @@ class Gpu:
         )
 
     def close(self) -> None:
-        """Free everything; the object cannot be used afterwards."""
+        """Free everything; the object cannot be used afterward."""
         with self.context:  # without a context, the driver frees nothing
             for memory in (*self._buffers.values(), *self._atlases.values()):
                 memory.release()

@@ -98,7 +98,7 @@ class Staging:
         return self._bytes.size
 
     def release(self) -> None:
-        """Free the block; allocated parts must not be accessed afterwards."""
+        """Free the block; allocated parts must not be accessed afterward."""
         if self._name.value:
             self._calls["glDeleteBuffers"](1, ctypes.byref(self._name))
         self._name, self._bytes, self._used = _uint(0), np.zeros(0, np.uint8), 0

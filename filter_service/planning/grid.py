@@ -77,7 +77,7 @@ class GridSpec:
         Largest blur, where diffraction tails end; more is refused.
     kept_energy_ratio : float
         Share of light within a kernel's box; kernels are normalized to unit sum
-        afterwards.  With 0.99, filtered images have a PSNR of 60 dB or more against
+        afterward.  With 0.99, filtered images have a PSNR of 60 dB or more against
         uncropped kernels, with 0.995 65 dB, with 0.998 67 dB (240 kernels over the
         field, 2.5 to 6 mm).
 
@@ -328,7 +328,7 @@ def defocus_nodes_dpt(
     interpolation.
     """
 
-    def outwards(limit_dpt: float) -> list[float]:
+    def outward(limit_dpt: float) -> list[float]:
         nodes = [0.0]
         while nodes[-1] < limit_dpt:
             blur_px = nodes[-1] * blur_px_per_dpt
@@ -337,8 +337,8 @@ def defocus_nodes_dpt(
             )
         return nodes
 
-    negative = [-t for t in outwards(max(-low_dpt, 0.0))]
-    nodes = np.unique(np.array(negative + outwards(max(high_dpt, 0.0))))
+    negative = [-t for t in outward(max(-low_dpt, 0.0))]
+    nodes = np.unique(np.array(negative + outward(max(high_dpt, 0.0))))
     first = max(int(np.searchsorted(nodes, low_dpt, side="right")) - 1, 0)
     last = min(int(np.searchsorted(nodes, high_dpt, side="left")), len(nodes) - 1)
     return nodes[first : last + 1]

@@ -87,7 +87,7 @@ def generic_kernels(
     channels: NDArray[np.int64],
     total_dpt: NDArray[np.float64],
 ) -> tuple[PackedKernels, Counter[str]]:
-    """Compute PSFs (n,) in batches of whole kernels, and crop those afterwards."""
+    """Compute PSFs (n,) in batches of whole kernels, and crop those afterward."""
     n_primaries = wavefronts.wavelength_nm.shape[1]
     each = np.repeat(groups, n_primaries)
     found = wavefronts.at(groups, channels, total_dpt)

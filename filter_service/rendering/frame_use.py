@@ -45,7 +45,7 @@ class SampledView:
 
     @classmethod
     def of(cls, view: RgbdView) -> SampledView:
-        """Sample a view; its memory may be reused afterwards."""
+        """Sample a view; its memory may be reused afterward."""
         depths_m = [m[::STEP_PX, ::STEP_PX] for m in view.surface_depths_m]
         filled_m, _ = fill_missing_depth(np.ascontiguousarray(depths_m[0]))
         few = RgbdView(

@@ -189,8 +189,8 @@ def _node_from_cell(
     node_scale: NDArray[np.float64], cell_scale: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return maps (n_cells, 3, 2, 2) of offsets in pixels, y down."""
-    upwards = node_scale @ np.linalg.inv(cell_scale)[:, None]
-    return upwards * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    upward = node_scale @ np.linalg.inv(cell_scale)[:, None]
+    return upward * np.array([[1.0, -1.0], [-1.0, 1.0]])
 
 
 def usual_cell_px(spec: GridSpec) -> int:

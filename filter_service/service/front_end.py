@@ -301,7 +301,7 @@ class FrontEnd:
     def _take_in_messages(self) -> None:
         """Handle pending messages.
 
-        Superseded frames are answered only afterwards.  A client that keeps to its
+        Superseded frames are answered only afterward.  A client that keeps to its
         credit then never appears to exceed it, however fast it reacts to a reply.
         """
         superseded: list[tuple[Session, Frame]] = []

@@ -271,7 +271,7 @@ class Router:
 
         Another client may have taken the routing id of one that has just gone.  libzmq
         chooses the connection when it gets the routing id.  By then its monitor has
-        reported the end of the previous connection, so the monitor is read afterwards.
+        reported the end of the previous connection, so the monitor is read afterward.
         In that case the reply is not sent; the other client receives one empty part.
 
         Returns

@@ -122,7 +122,7 @@ def test_the_far_point_is_learnt_from_what_the_filter_says():
 
 @pytest.mark.parametrize("with_head", [True, False])
 def test_straight_ahead_is_the_heads_own_in_canted_views(with_head):
-    """Displays that look 10 deg outwards: ahead is 10 deg inwards in each."""
+    """Displays that look 10 deg outward: ahead is 10 deg inward in each."""
     head = still(0.0)
     views = tuple(
         replace(view, pose=(*view.pose[:3], *turned(yaw_deg)))

@@ -23,7 +23,7 @@ UNITS_PER_M = 180.0
 
 
 def test_a_renderer_lets_go_of_its_context_before_its_display_ends(monkeypatch):
-    # NVIDIA's EGL refuses it afterwards
+    # NVIDIA's EGL refuses it afterward
     from OpenGL import EGL
 
     released = []

@@ -49,7 +49,7 @@ def test_chief_rays_of_another_program_lie_apart_alike():
         pack_eye(own),
         np.atleast_2d(media_indices(other, 543.0)),
         media_indices(own, 555.0),
-        np.radians([[0.0, -20.0], [0.0, -40.0]]),  # its light travels upwards
+        np.radians([[0.0, -20.0], [0.0, -40.0]]),  # its light travels upward
         shifts,
     )
     for (field, low, high), shift in zip(
@@ -123,7 +123,7 @@ def landing(eye, direction, wavelength_nm):
 @pytest.mark.parametrize("field", [(18.0, -11.0), (-25.0, 6.0), (0.0, 0.0)])
 @pytest.mark.parametrize("wavelength_nm", [RED, BLUE])
 def test_light_seen_there_lands_where_the_color_does(field, wavelength_nm):
-    """An eye without symmetry: both directions traced inwards, by a solver."""
+    """An eye without symmetry: both directions traced inward, by a solver."""
     eye = irregular_eye()
     shift = chief_shift_mrad(eye, fields_deg=[field], wavelengths_nm=[wavelength_nm])
     ex, ey, u = field_axes(*field)

@@ -271,12 +271,12 @@ def test_kernels_do_not_depend_on_the_batch_or_on_threads():
     whole, *_ = computed(wavefronts_of(zernike_um))
     library = native_psfs().library
     alone = NativePsfs(library, library.new_threads(1))
-    backwards, *_ = computed(wavefronts_of(zernike_um[::-1]), engine=alone)
+    backward, *_ = computed(wavefronts_of(zernike_um[::-1]), engine=alone)
     library.end_threads(alone.threads)
     for k in range(90):
         other = 3 * (29 - k // 3) + k % 3
-        np.testing.assert_array_equal(whole.reach_px[k], backwards.reach_px[other])
-        np.testing.assert_array_equal(kernel(whole, k), kernel(backwards, other))
+        np.testing.assert_array_equal(whole.reach_px[k], backward.reach_px[other])
+        np.testing.assert_array_equal(kernel(whole, k), kernel(backward, other))
 
 
 def test_processors_without_vectors_have_the_same_kernels():

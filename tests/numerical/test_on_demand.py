@@ -98,8 +98,8 @@ def test_a_frame_is_the_same_after_any_others(streamed, views, alone):
     store = PsfStore(*streamed)
     assert pictures(NativeRenderer(), store, asked) == alone
     assert pictures(NativeRenderer(), store, asked[::-1]) == alone[::-1]
-    backwards = pictures(NativeRenderer(), PsfStore(*streamed), asked[::-1])
-    assert backwards == alone[::-1]
+    backward = pictures(NativeRenderer(), PsfStore(*streamed), asked[::-1])
+    assert backward == alone[::-1]
 
 
 def test_nodes_do_not_depend_on_what_was_planned_before(known, streamed):
@@ -227,8 +227,8 @@ def test_the_gl_engine_shows_the_same_after_any_others(streamed, views, gpu):
         handle.release()
         return found
 
-    forwards, backwards = colors(asked), colors(asked[::-1])[::-1]
-    for one, other in zip(forwards, backwards, strict=True):
+    forward, backward = colors(asked), colors(asked[::-1])[::-1]
+    for one, other in zip(forward, backward, strict=True):
         assert psnr_db(one, other) >= 100.0
 
 

@@ -33,7 +33,7 @@ def into_cornea(
     first, direction, reach = cross_iterated(
         eye.shapes[0], point, direction, n[0], 1.0, start=starts[0], steps=steps
     )
-    point, direction = eyes.inwards(eye.to_posterior, first, direction)
+    point, direction = eyes.inward(eye.to_posterior, first, direction)
     second, direction, gap = cross_iterated(
         eye.shapes[1], point, direction, n[1], 1.0, start=starts[1], steps=steps
     )
@@ -48,9 +48,9 @@ def into_lens(
     Returns points on both surfaces, direction behind and both distances.
     """
     n = ratios(eye)
-    point, direction = eyes.inwards(eye.to_lens, point, direction)
+    point, direction = eyes.inward(eye.to_lens, point, direction)
     third, direction, reach = cross_conic(eye.shapes[2], point, direction, n[2], 1.0)
-    point, direction = eyes.inwards(eye.to_lens_posterior, third, direction)
+    point, direction = eyes.inward(eye.to_lens_posterior, third, direction)
     fourth, direction, depth = cross_conic(eye.shapes[3], point, direction, n[3], 1.0)
     return third, fourth, direction, reach, depth
 
@@ -67,11 +67,11 @@ def out_of_lens(
     fourth, direction, rest = cross_conic(
         eye.shapes[3], point, direction, 1.0 / n[3], -1.0
     )
-    point, direction = eyes.outwards(eye.to_lens_posterior, fourth, direction)
+    point, direction = eyes.outward(eye.to_lens_posterior, fourth, direction)
     third, direction, depth = cross_conic(
         eye.shapes[2], point, direction, 1.0 / n[2], -1.0
     )
-    point, direction = eyes.outwards(eye.to_lens, third, direction)
+    point, direction = eyes.outward(eye.to_lens, third, direction)
     stop, reach = to_stop(point, direction)
     return third, fourth, stop, direction, (rest, depth, reach)
 
@@ -84,11 +84,11 @@ def out_of_cornea(
     Returns points on the anterior and posterior surface, direction, and both distances.
     """
     n = ratios(eye)
-    point, direction = eyes.outwards(eye.to_stop, point, direction)
+    point, direction = eyes.outward(eye.to_stop, point, direction)
     second, direction, gap = cross_iterated(
         eye.shapes[1], point, direction, 1.0 / n[1], -1.0
     )
-    point, direction = eyes.outwards(eye.to_posterior, second, direction)
+    point, direction = eyes.outward(eye.to_posterior, second, direction)
     first, direction, thickness = cross_iterated(
         eye.shapes[0], point, direction, 1.0 / n[0], -1.0
     )

@@ -99,9 +99,9 @@ def _shoot(
     point = start[:, :1] * axes.x + start[:, 1:] * axes.y + _START_MM * axes.source
     point = torch.cat([point[:, :2], point[:, 2:] + base_z[:, None]], 1)
     direction = (-axes.source).expand_as(point)
-    point, direction = eyes.inwards(eye.to_cornea, point, direction)
+    point, direction = eyes.inward(eye.to_cornea, point, direction)
     first, second, direction, reach, gap = into_cornea(eye, point, direction)
-    point, direction = eyes.inwards(eye.to_stop, second, direction)
+    point, direction = eyes.inward(eye.to_stop, second, direction)
     stop, depth = to_stop(point, direction)
     failed = torch.isnan(reach + gap)[:, None]
     return (
@@ -151,7 +151,7 @@ def trace_chief(eye: Eye, axes: Axes, solved: Solved) -> Chief:
         eye, axes, solved.base_z, start
     )
     third, fourth, direction, reach, depth = into_lens(eye, stop, direction)
-    point, onwards = eyes.inwards(eye.to_retina, fourth, direction)
+    point, onwards = eyes.inward(eye.to_retina, fourth, direction)
     _, _, rest = cross_conic(eye.shapes[4], point, onwards, None, 1.0)
     origin = fourth + rest[:, None] * direction
     legs = torch.stack([gap, deep + reach, depth, rest])

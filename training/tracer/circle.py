@@ -109,17 +109,17 @@ def _zernike(
         axes = chiefs.field_axes(zero, zero)
         solved = chiefs.solve_chief(eye, axes)
         chief = chiefs.trace_chief(eye, axes, solved)
-        points, outwards, ok = _aim(
+        points, outward, ok = _aim(
             eye, axes, chief, pupil_mm / 2.0, dtype, with_gradient
         )
     # Only rows that passed go on: a nan would spoil the gradients of the others.
     rows = ok.nonzero()[:, 0]
-    axes, solved, points, outwards = eyes.mapped(
-        lambda t: t[rows], (axes, solved, points, outwards)
+    axes, solved, points, outward = eyes.mapped(
+        lambda t: t[rows], (axes, solved, points, outward)
     )
     eye = eyes.pack_eyes(vectors[rows], wavelength_nm[rows])
     chief = chiefs.trace_chief(eye, axes, solved)
-    wave_um = _wavefront(eye, axes, chief, points, outwards, pupil_mm[rows] / 2.0)
+    wave_um = _wavefront(eye, axes, chief, points, outward, pupil_mm[rows] / 2.0)
     zernike_um = wave_um.new_full((len(ok), N_TERMS), torch.nan)
     projection = _nodes(vectors.device, dtype)[1]
     return zernike_um.index_copy(0, rows, wave_um @ projection), ok
@@ -156,12 +156,12 @@ def _aim(
         cosines: Tensor, positions: Tensor, starts: _Starts = (None, None)
     ) -> Tensor:
         p, q = cosines[:, :1], cosines[:, 1:]
-        outwards = p * x_axis + q * y_axis + (1.0 - p * p - q * q).sqrt() * source
+        outward = p * x_axis + q * y_axis + (1.0 - p * p - q * q).sqrt() * source
         here = positions[:, :1] * x_axis + positions[:, 1:] * y_axis + light[0][0]
         miss, last["points"], last["legs"] = _to_origin(
-            narrow, light, frame, here, -outwards, starts
+            narrow, light, frame, here, -outward, starts
         )
-        last["outwards"] = outwards
+        last["outward"] = outward
         return miss
 
     def warm(cosines: Tensor) -> Tensor:
@@ -182,7 +182,7 @@ def _aim(
     )
     onwards = torch.stack(last["legs"][1:]).amin(0) > -ORDER_TOLERANCE_MM
     ok = chief.ok & ((left < _ACCEPTED_MM) & onwards).all(1)
-    return last["points"], last["outwards"], ok
+    return last["points"], last["outward"], ok
 
 
 def _to_origin(
@@ -202,7 +202,7 @@ def _to_origin(
     first, second, direction, reach, gap = into_cornea(
         eye, point, direction, starts, steps
     )
-    point, direction = eyes.inwards(eye.to_stop, second, direction)
+    point, direction = eyes.inward(eye.to_stop, second, direction)
     third, fourth, direction, on, depth = into_lens(eye, point, direction)
     away = origin - fourth
     rest = (away * chief_direction).sum(1) / (direction * chief_direction).sum(1)
@@ -215,11 +215,11 @@ def _wavefront(
     axes: chiefs.Axes,
     chief: chiefs.Chief,
     points: tuple[Tensor, ...],
-    outwards: Tensor,
+    outward: Tensor,
     radius_mm: Tensor,
 ) -> Tensor:
     """Return W (B, R), um, at the nodes of the circle; differentiable."""
-    dtype = outwards.dtype
+    dtype = outward.dtype
     x_axis, y_axis, _ = _plane(eye, axes, dtype)
     nodes = _nodes(radius_mm.device, dtype)[0] * radius_mm.to(dtype)[:, None, None]
     eye, (chief_points, origin) = eyes.mapped(
@@ -227,7 +227,7 @@ def _wavefront(
     )
     path_mm, away_mm = extra_path(eye, points, chief_points, origin)
     there_mm = nodes[:, :1] * x_axis + nodes[:, 1:] * y_axis
-    last_mm = ((there_mm - away_mm) * outwards).sum(1)
+    last_mm = ((there_mm - away_mm) * outward).sum(1)
     return -UM_PER_MM * (path_mm + eye.indices[:, :1] * last_mm)
 
 

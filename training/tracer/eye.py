@@ -204,7 +204,7 @@ def turned(turn: Tensor, vector: Tensor) -> Tensor:
     return torch.addcmul(torch.addcmul(first, turn[:, :, 1:2], y), turn[:, :, 2:], z)
 
 
-def inwards(step: Step, *vectors: Tensor) -> tuple[Tensor, ...]:
+def inward(step: Step, *vectors: Tensor) -> tuple[Tensor, ...]:
     """Transform a point, and then directions, (B, 3, R) into the next frame."""
     point, *directions = vectors
     if step.turn is not None:
@@ -215,7 +215,7 @@ def inwards(step: Step, *vectors: Tensor) -> tuple[Tensor, ...]:
     return point, *directions
 
 
-def outwards(step: Step, *vectors: Tensor) -> tuple[Tensor, ...]:
+def outward(step: Step, *vectors: Tensor) -> tuple[Tensor, ...]:
     """Transform a point, and then directions, (B, 3, R) back from the next frame."""
     point, *directions = vectors
     if step.shift is not None:

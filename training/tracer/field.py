@@ -236,11 +236,11 @@ def _samples(
     third, fourth, stop, direction, legs = out_of_lens(
         eye, origin.expand_as(direction), direction
     )
-    first, second, outwards, corneal = out_of_cornea(eye, stop, direction)
+    first, second, outward, corneal = out_of_cornea(eye, stop, direction)
     path_mm, away_mm = extra_path(eye, (first, second, third, fourth), points, origin)
-    cosine = (outwards * plane[2]).sum(1)
+    cosine = (outward * plane[2]).sum(1)
     last_mm = -(away_mm * plane[2]).sum(1) / cosine
-    there_mm = away_mm + last_mm[:, None] * outwards
+    there_mm = away_mm + last_mm[:, None] * outward
     wave_um = -UM_PER_MM * (path_mm + eye.indices[:, :1] * last_mm)
     rest, depth, reach = legs
     in_order = torch.stack([rest, depth, reach + corneal[0], corneal[1]])

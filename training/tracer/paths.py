@@ -66,7 +66,7 @@ def extra_path(
     for i, link in enumerate(links):
         (away, here), (next_away, there) = placed[i], placed[i + 1]
         for step in link:
-            here, away = eyes.inwards(step, here, away)
+            here, away = eyes.inward(step, here, away)
         leg = _longer(next_away - away, there - here)
         path = path + eye.indices[:, i + 1 : i + 2] * leg
     away, here = placed[3]

@@ -37,7 +37,7 @@ class NativeLanes(OneView):
         self._other.trim()
 
     def close(self) -> None:
-        """Stop the threads; the engine cannot be used afterwards."""
+        """Stop the threads; the engine cannot be used afterward."""
         self._main.close()
         self._other.close()
 

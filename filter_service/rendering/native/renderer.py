@@ -78,7 +78,7 @@ class NativeRenderer(OneView):
         self._kept = EyeStates()
 
     def close(self) -> None:
-        """Stop the threads; the renderer cannot be used afterwards."""
+        """Stop the threads; the renderer cannot be used afterward."""
         self._end()
 
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
