@@ -1,37 +1,27 @@
 """Refractive indices of the ocular media by Herzberger's formula, 365 to 1014 nm."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.optics.units import NM_PER_UM
+from estimator.optics.dispersion import Dispersion
+from estimator.optics.dispersion.formulas import OcularHerzberger
 
 WAVELENGTH_LIMITS_NM = (365.0, 1014.0)
 
 AIR = "air"
 
-_KNOT_INDICES = {
+OCULAR_MEDIA = {
     # n at 365.0, 486.1, 656.3 and 1014.0 nm (Navarro, Santamaria & Bescos 1985)
-    "cornea": (1.3975, 1.3807, 1.37405, 1.3668),
-    "aqueous": (1.3593, 1.3422, 1.3354, 1.3278),
-    "lens": (1.4492, 1.42625, 1.4175, 1.4097),
-    "vitreous": (1.3565, 1.3407, 1.3341, 1.3273),
+    "cornea": OcularHerzberger((1.3975, 1.3807, 1.37405, 1.3668)),
+    "aqueous": OcularHerzberger((1.3593, 1.3422, 1.3354, 1.3278)),
+    "lens": OcularHerzberger((1.4492, 1.42625, 1.4175, 1.4097)),
+    "vitreous": OcularHerzberger((1.3565, 1.3407, 1.3341, 1.3273)),
 }
 
-_POLE_UM2 = 0.028
-
-_WEIGHTS = np.array(
-    # rows: a1 to a4; columns: 1, L², 1/(L² - 0.028), 1/(L² - 0.028)², L in um
-    [
-        [0.66147196, -0.40352796, -0.28046790, 0.03385979],
-        [-4.20146383, 2.73508956, 1.50543784, -0.11593235],
-        [6.29834237, -4.69409935, -1.57508650, 0.10293038],
-        [-1.75835059, 2.36253794, 0.35011657, -0.02085782],
-    ]
-)
-
-MEDIA = (AIR, *_KNOT_INDICES)
+MEDIA = (AIR, *OCULAR_MEDIA)
 
 
 def refractive_index(
@@ -39,17 +29,20 @@ def refractive_index(
     wavelength_nm: ArrayLike,
     *,
     indices: Mapping[str, float] | None = None,
+    media: Mapping[str, Any] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the refractive index of one medium.
+    """Return the refractive index of one homogeneous medium.
 
     Parameters
     ----------
     medium : str
         ``cornea``, ``aqueous``, ``lens``, ``vitreous`` or ``air``, or any name in
-        ``indices``.
+        ``indices`` or ``media``.
     wavelength_nm : (...), nm
     indices : mapping, optional
         Constant indices by medium; they replace the dispersion formula.
+    media : mapping, optional
+        Dispersions by medium; they, too, replace the formula.
 
     Returns
     -------
@@ -58,7 +51,8 @@ def refractive_index(
     Raises
     ------
     ValueError
-        An unknown medium, or a wavelength outside 365 to 1014 nm.
+        An unknown medium, or a wavelength outside the range of the medium: 365 to
+        1014 nm for the formula.
 
     Notes
     -----
@@ -71,17 +65,13 @@ def refractive_index(
         return np.full(wavelength_nm.shape, float(indices[medium]))
     if medium == AIR:
         return np.ones(wavelength_nm.shape)
-    if medium not in _KNOT_INDICES:
-        given = [] if indices is None else [m for m in indices if m not in MEDIA]
-        names = ", ".join((*MEDIA, *given))
-        raise ValueError(f"medium '{medium}' has no refractive index; known: {names}")
-    low, high = WAVELENGTH_LIMITS_NM
-    if not np.all((wavelength_nm >= low) & (wavelength_nm <= high)):
-        raise ValueError(
-            f"wavelength {wavelength_nm} nm: allowed is {low:g} to {high:g} nm"
-        )
-    squared = (wavelength_nm / NM_PER_UM) ** 2
-    inverse = 1.0 / (squared - _POLE_UM2)
-    terms = np.stack([np.ones_like(squared), squared, inverse, inverse**2], axis=-1)
-    found: NDArray[np.float64] = terms @ (_WEIGHTS.T @ np.array(_KNOT_INDICES[medium]))
-    return found
+    dispersion: Dispersion | None = media.get(medium) if media else None
+    dispersion = dispersion or OCULAR_MEDIA.get(medium)
+    if dispersion is not None:
+        try:
+            return dispersion.refractive_index(wavelength_nm)
+        except ValueError as error:
+            raise ValueError(f"medium '{medium}': {error}") from None
+    given = [m for m in (*(indices or {}), *(media or {})) if m not in MEDIA]
+    names = ", ".join((*MEDIA, *given))
+    raise ValueError(f"medium '{medium}' has no refractive index; known: {names}")

@@ -11,15 +11,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.optics.surfaces import (
+from estimator.optics.gradient_kernels import axial_index, paraxial_gap
+from estimator.optics.packed import (
+    ADDED_CURVATURE,
     CURVATURE_X,
     CURVATURE_Y,
     FORM,
+    GRADIENT,
+    HAS_OFFSET,
     N_BEFORE_STOP,
     OFFSET,
     STOP_Z,
     VERTEX,
     WITH_OFFSET,
+)
+from estimator.optics.surfaces import (
     EyeSurfaces,
     check_eye,
     horner_order,
@@ -74,17 +80,43 @@ def _offset_part(
     """Sum some monomial coefficients of the offsets; zero where there are none."""
     order = [tuple(e) for e in EXPONENTS[horner_order()].tolist()]
     total = sum(packed[:, OFFSET + order.index(e)] for e in exponents)
-    return np.where(packed[:, FORM] == WITH_OFFSET, total, 0.0)
+    has_offset = (packed[:, FORM] == WITH_OFFSET) | (packed[:, HAS_OFFSET] != 0.0)
+    return np.where(has_offset, total, 0.0)
 
 
 def _mean_curvatures(packed: NDArray[np.float64]) -> NDArray[np.float64]:
     curvature = 0.5 * (packed[:, CURVATURE_X] + packed[:, CURVATURE_Y])
+    curvature = curvature + packed[:, ADDED_CURVATURE]
     return curvature + _offset_part(packed, (2, 0), (0, 2))
 
 
 def _vertices_mm(packed: NDArray[Any]) -> NDArray[np.float64]:
     """Return the surfaces' axial positions; an offset may shift its surface there."""
     return packed[:, VERTEX + 2] + _offset_part(packed, (0, 0))
+
+
+def _gap(
+    packed: NDArray[Any], indices: NDArray[Any], i: int, z_mm: tuple[float, float]
+) -> NDArray[np.float64]:
+    """Return the matrix (2, 2) through the medium behind surface ``i``."""
+    from_mm, to_mm = z_mm
+    if packed[i, GRADIENT] == 0.0:
+        reduced_mm = (to_mm - from_mm) / indices[i + 1]
+        return np.array([[1.0, reduced_mm], [0.0, 1.0]])
+    matrix = np.eye(2)
+    start, origin_mm = int(packed[i, GRADIENT]), packed[i, VERTEX + 2]
+    paraxial_gap(indices, start, from_mm - origin_mm, to_mm - origin_mm, matrix)
+    return matrix
+
+
+def _index_behind(
+    packed: NDArray[Any], indices: NDArray[Any], i: int, z_mm: float
+) -> float:
+    """Return the index on the axis behind surface ``i`` (-1: in front), at ``z_mm``."""
+    if i < 0 or packed[i, GRADIENT] == 0.0:
+        return float(indices[i + 1])
+    depth_mm = z_mm - packed[i, VERTEX + 2]
+    return float(axial_index(indices, int(packed[i, GRADIENT]), depth_mm))
 
 
 def system_matrix(
@@ -95,9 +127,10 @@ def system_matrix(
     matrix = np.eye(2)
     for i in range(first, last):
         if i > first:
-            gap = (z_mm[i] - z_mm[i - 1]) / indices[i]
-            matrix = np.array([[1.0, gap], [0.0, 1.0]]) @ matrix
-        power = (indices[i + 1] - indices[i]) * curvature[i]
+            matrix = _gap(packed, indices, i - 1, (z_mm[i - 1], z_mm[i])) @ matrix
+        outer = _index_behind(packed, indices, i - 1, z_mm[i])
+        inner = _index_behind(packed, indices, i, z_mm[i])
+        power = (inner - outer) * curvature[i]
         matrix = np.array([[1.0, 0.0], [-power, 1.0]]) @ matrix
     return matrix
 
@@ -109,8 +142,8 @@ def _entrance_pupil(
     n_before = int(packed[-1, N_BEFORE_STOP])
     matrix = system_matrix(packed, indices, first=0, last=n_before)
     z_mm = _vertices_mm(packed)
-    gap = (stop_z_mm - z_mm[n_before - 1]) / indices[n_before]
-    to_stop = np.array([[1.0, gap], [0.0, 1.0]]) @ matrix
+    gap = _gap(packed, indices, n_before - 1, (z_mm[n_before - 1], stop_z_mm))
+    to_stop = gap @ matrix
     # Object plane at z: height at the stop must not depend on the slope there.
     back_mm = -indices[0] * to_stop[0, 1] / to_stop[0, 0]
     return float(z_mm[0] - back_mm), float(1.0 / to_stop[0, 0])
@@ -123,8 +156,8 @@ def entrance_pupils_mm(
 
     Parameters
     ----------
-    packed : (n_eyes, n_surfaces + 1, 48)
-        Stacked `surfaces.pack_eye`.
+    packed : (n_eyes, n_surfaces + 1, N_COLUMNS)
+        Stacked `surfaces.pack_eye`, homogeneous in front of the stop.
     indices : (n_surfaces + 1,)
         From `surfaces.media_indices`.
     """

@@ -6,14 +6,26 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.optics import raytrace_kernels as kernels
-from estimator.optics.surfaces import (
+from estimator.optics import surface_kernels as kernels
+from estimator.optics.packed import (
+    CLEAR_SQUARED,
+    GRADIENT,
     N_BEFORE_STOP,
+    NEAR_GRADIENT,
+    VERTEX,
+)
+from estimator.optics.raytrace_kernels import trace_bundle
+from estimator.optics.surfaces import (
     EyeSurfaces,
     check_eye,
     media_indices,
     pack_eye,
 )
+
+ORDER_RADIUS_MM = 1.0
+"""Distance from the axis up to which surfaces must not cross: a 2 mm pupil."""
+
+START_MM = 20.0
 
 
 class RayStatus(IntEnum):
@@ -107,7 +119,7 @@ def trace_rays(
     shape = (len(start_mm), len(packed) + 1)
     points_mm, cosines = np.empty((*shape, 3)), np.empty((*shape, 3))
     path_mm, status = np.empty(shape), np.empty(len(start_mm), np.int64)
-    kernels.trace_bundle(
+    trace_bundle(
         packed,
         media_indices(eye, wavelength_nm),
         np.concatenate([start_mm, direction / length], axis=1),
@@ -119,3 +131,38 @@ def trace_rays(
     )
     stop_index = int(packed[-1, N_BEFORE_STOP])
     return TracedRays(points_mm, cosines, path_mm, status, stop_index)
+
+
+def check_order(eye: EyeSurfaces) -> None:
+    """Raise if surfaces cross within `ORDER_RADIUS_MM` of the axis.
+
+    Raises
+    ------
+    ValueError
+        Names the surface that lies in front of the one before it, and where.
+    """
+    packed = pack_eye(eye)
+    angle = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
+    rays = np.zeros((len(angle), 6))
+    rays[:, 0] = ORDER_RADIUS_MM * np.cos(angle)
+    rays[:, 1] = ORDER_RADIUS_MM * np.sin(angle)
+    rays[:, 2], rays[:, 5] = packed[:, VERTEX + 2].min() - START_MM, 1.0
+    packed[:, NEAR_GRADIENT] = packed[:, GRADIENT] = 0.0  # straight lines everywhere
+    packed[:, CLEAR_SQUARED] = np.inf
+    shape = (len(rays), len(packed) + 1)
+    points_mm, status = np.empty((*shape, 3)), np.empty(len(rays), np.int64)
+    cosines, path_mm = np.empty((*shape, 3)), np.empty(shape)
+    trace_bundle(
+        packed, np.ones(len(packed)), rays, False, points_mm, cosines, path_mm, status
+    )
+    crossed = np.flatnonzero(status == kernels.OUT_OF_ORDER)
+    if not len(crossed):
+        return
+    element = int(np.isnan(points_mm[crossed[0], :, 2]).argmax())
+    i = element - (element > packed[-1, N_BEFORE_STOP])
+    name = f"surfaces[{i}]" if i < len(eye.surfaces) else "retina"
+    x_mm, y_mm = rays[crossed[0], :2]
+    raise ValueError(
+        f"{name} crosses surfaces[{i - 1}] before ({x_mm:.2g}, {y_mm:.2g}) mm: it must "
+        f"lie behind it at least up to {ORDER_RADIUS_MM:g} mm from the axis"
+    )

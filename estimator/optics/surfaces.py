@@ -14,7 +14,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.optics.dispersion import Dispersion
+from estimator.optics.forms import FORMS, Form
+from estimator.optics.gradients import GRADIENTS, INDEX_FUNCTIONS, Gradient
 from estimator.optics.media import refractive_index
+from estimator.optics.packed import (
+    ADDED_CURVATURE,
+    BICONIC,
+    CLEAR_SQUARED,
+    CONIC,
+    CURVATURE_X,
+    CURVATURE_Y,
+    FIRST_FORM,
+    FORM,
+    FORM_NUMBERS,
+    GRADIENT,
+    HAS_OFFSET,
+    IS_TURNED,
+    N_BEFORE_STOP,
+    N_COLUMNS,
+    N_FORM_NUMBERS,
+    NEAR_GRADIENT,
+    OFFSET,
+    REVOLVED,
+    ROTATION,
+    STOP_Z,
+    VERTEX,
+    WITH_OFFSET,
+)
 from estimator.optics.zernike import (
     EXPONENTS,
     MAX_RADIAL_ORDER,
@@ -28,19 +55,9 @@ OFFSET_RADIUS_MM = 6.2
 
 MAX_SURFACES = 20
 
-# --- the packed form: one row per refracting surface, the retina last --------------
-CURVATURE_X, CURVATURE_Y, CONIC = 0, 1, 2
-VERTEX = 3  # x, y, z of the vertex, mm
-ROTATION = 6  # 3 x 3, row-major: surface axes to eye axes
-FORM = 15  # 0 conic of revolution, 1 biconic, 2 with offset terms
-IS_TURNED = 16  # 1 where ROTATION is not the identity
-CLEAR_SQUARED = 17  # square of the clear radius, mm²
-OFFSET = 18  # 28 monomial coefficients, mm, in the order of `horner_order`
-STOP_Z = 46  # last row only: the stop plane, mm
-N_BEFORE_STOP = 47  # last row only: number of surfaces in front of the stop
-N_COLUMNS = 48
+MAX_STEPS = 1000
 
-REVOLVED, BICONIC, WITH_OFFSET = 0, 1, 2
+INDEX_LIMITS = (1.0, 5.0)
 
 STOP_TOLERANCE_MM = 1e-6
 """A surface whose vertex lies in the stop plane comes after the stop."""
@@ -73,6 +90,8 @@ class Surface:
         Circle of the offset terms.
     clear_radius_mm : float
         Distance from the surface's axis beyond which rays are clipped.
+    form : Form or None
+        A form of `forms` that replaces the biconic; offset terms still add to it.
     """
 
     radius_mm: tuple[float, float]
@@ -85,19 +104,25 @@ class Surface:
     offset_mm: NDArray[np.float64] | None = None
     offset_radius_mm: float = OFFSET_RADIUS_MM
     clear_radius_mm: float = math.inf
+    form: Form | None = None
 
 
 @dataclass(frozen=True)
 class Retina:
-    """The retina: a conic about the eye's axis, concave toward the lens.
+    """The retina: a conic, concave toward the lens.
 
     ``radius_mm`` is one radius or (Rx, Ry); its sign is ignored, because no retina
-    bulges inward.  ``z_mm`` is the position of its pole.
+    bulges inward.  ``z_mm`` is the position of its pole.  The other attributes are
+    those of `Surface`.
     """
 
     radius_mm: float | tuple[float, float]
     conic_constant: float
     z_mm: float
+    rotation_deg: float = 0.0
+    decentration_mm: tuple[float, float] = (0.0, 0.0)
+    tilt_deg: tuple[float, float] = (0.0, 0.0)
+    form: Form | None = None
 
 
 @dataclass(frozen=True)
@@ -113,12 +138,16 @@ class EyeSurfaces:
     retina : Retina
     indices : mapping or None
         Constant refractive indices by medium; None uses the dispersion of `media`.
+    media : mapping or None
+        Dispersions and gradients by medium; other media have the dispersion of
+        `media`.
     """
 
     surfaces: tuple[Surface, ...]
     stop_z_mm: float
     retina: Retina
     indices: Mapping[str, float] | None = field(default=None)
+    media: Mapping[str, Dispersion | Gradient] | None = field(default=None)
 
 
 @cache
@@ -184,30 +213,49 @@ def rotation_matrix(
 
 
 def _pack_shape(
-    row: NDArray[Any], radius_mm: tuple[float, float], conic: float
+    row: NDArray[Any],
+    radius_mm: tuple[float, float],
+    conic: float,
+    form: Form | None,
 ) -> None:
     row[CURVATURE_X], row[CURVATURE_Y] = (1.0 / r for r in radius_mm)
     row[CONIC] = conic
     row[ROTATION : ROTATION + 9] = np.eye(3).ravel()
     row[FORM] = REVOLVED if radius_mm[0] == radius_mm[1] else BICONIC
     row[CLEAR_SQUARED] = math.inf
+    if form is not None:
+        numbers = form.numbers()
+        row[FORM] = FIRST_FORM + FORMS.index(type(form))
+        row[FORM_NUMBERS : FORM_NUMBERS + len(numbers)] = numbers
+        row[ADDED_CURVATURE] = form.added_curvature(
+            (float(row[CURVATURE_X]), float(row[CURVATURE_Y]))
+        )
+
+
+def _pack_axes(
+    row: NDArray[Any], rotation_deg: float, tilt_deg: tuple[float, float]
+) -> None:
+    plain = row[FORM] == REVOLVED and tilt_deg == (0.0, 0.0)
+    if not plain and (rotation_deg != 0.0 or tilt_deg != (0.0, 0.0)):
+        row[IS_TURNED] = 1.0
+        row[ROTATION : ROTATION + 9] = rotation_matrix(
+            rotation_deg=rotation_deg, tilt_deg=tilt_deg
+        ).ravel()
 
 
 def _pack_surface(surface: Surface, row: NDArray[Any]) -> None:
-    _pack_shape(row, surface.radius_mm, surface.conic_constant)
+    _pack_shape(row, surface.radius_mm, surface.conic_constant, surface.form)
     row[VERTEX : VERTEX + 3] = (*surface.decentration_mm, surface.z_mm)
     row[CLEAR_SQUARED] = surface.clear_radius_mm**2
     if surface.offset_mm is not None and np.any(surface.offset_mm):
-        row[FORM] = WITH_OFFSET
+        if surface.form is None:
+            row[FORM] = WITH_OFFSET
+        else:
+            row[HAS_OFFSET] = 1.0
         row[OFFSET : OFFSET + N_TERMS] = offset_monomials(
             surface.offset_mm, offset_radius_mm=surface.offset_radius_mm
         )
-    plain = row[FORM] == REVOLVED and surface.tilt_deg == (0.0, 0.0)
-    if not plain and (surface.rotation_deg != 0.0 or surface.tilt_deg != (0.0, 0.0)):
-        row[IS_TURNED] = 1.0
-        row[ROTATION : ROTATION + 9] = rotation_matrix(
-            rotation_deg=surface.rotation_deg, tilt_deg=surface.tilt_deg
-        ).ravel()
+    _pack_axes(row, surface.rotation_deg, surface.tilt_deg)
 
 
 def pack_eye(eye: EyeSurfaces) -> NDArray[np.float64]:
@@ -215,11 +263,11 @@ def pack_eye(eye: EyeSurfaces) -> NDArray[np.float64]:
 
     Returns
     -------
-    packed : (n_surfaces + 1, 48)
-        One row per refracting surface, then the retina; columns as named at the top
-        of this file.  Refractive indices are passed separately (`media_indices`),
-        because one geometry serves many wavelengths.  Eyes with the same number of
-        surfaces stack to (n_eyes, n_surfaces + 1, 48).
+    packed : (n_surfaces + 1, N_COLUMNS)
+        One row per refracting surface, then the retina; the columns are those of
+        `packed`.  Refractive indices are passed separately (`media_indices`), because
+        one geometry serves many wavelengths.  Eyes with the same number of surfaces
+        and the same gradients stack to (n_eyes, n_surfaces + 1, N_COLUMNS).
     """
     packed = np.zeros((len(eye.surfaces) + 1, N_COLUMNS))
     for surface, row in zip(eye.surfaces, packed, strict=False):
@@ -227,22 +275,96 @@ def pack_eye(eye: EyeSurfaces) -> NDArray[np.float64]:
     retina = eye.retina
     radii = np.broadcast_to(np.asarray(retina.radius_mm, dtype=np.float64), (2,))
     last = packed[-1]
-    _pack_shape(last, tuple(-np.abs(radii)), retina.conic_constant)
-    last[VERTEX + 2] = retina.z_mm
+    _pack_shape(last, tuple(-np.abs(radii)), retina.conic_constant, retina.form)
+    last[VERTEX : VERTEX + 3] = (*retina.decentration_mm, retina.z_mm)
+    _pack_axes(last, retina.rotation_deg, retina.tilt_deg)
     last[STOP_Z] = eye.stop_z_mm
     last[N_BEFORE_STOP] = sum(
         s.z_mm < eye.stop_z_mm - STOP_TOLERANCE_MM for s in eye.surfaces
     )
+    column = len(eye.surfaces) + 1
+    for i, gradient in _gradients(eye):
+        packed[i, GRADIENT] = column
+        packed[i : i + 2, NEAR_GRADIENT] = 1.0
+        column += len(_gradient_columns(gradient, GRADIENT_LAYOUT_NM))
     return packed
 
 
+GRADIENT_LAYOUT_NM = 555.0
+"""A wavelength to count the numbers of a gradient, the same at every wavelength."""
+
+
+def _gradients(eye: EyeSurfaces) -> list[tuple[int, Gradient]]:
+    """Return the gradients behind surfaces, with the surface's number."""
+    media = eye.media
+    if not media:
+        return []
+    found = []
+    for i, surface in enumerate(eye.surfaces):
+        medium = media.get(surface.medium_after)
+        if isinstance(medium, GRADIENTS):
+            found.append((i, medium))
+    return found
+
+
+def _gradient_columns(gradient: Gradient, wavelength_nm: float) -> NDArray[np.float64]:
+    form = INDEX_FUNCTIONS.index(gradient.index)
+    return np.array([form, gradient.steps, *gradient.numbers(wavelength_nm)])
+
+
+def _check_indices(indices: NDArray[np.float64], names: list[str]) -> None:
+    low, high = INDEX_LIMITS
+    if low <= indices.min() and indices.max() <= high:
+        return
+    for i, name in enumerate(names[1:]):
+        behind = indices[..., i + 1]
+        if not (low <= behind.min() and behind.max() <= high):
+            raise ValueError(
+                f"surfaces[{i}].medium_after '{name}': index {behind}, allowed is "
+                f"{low:g} to {high:g}"
+            )
+
+
 def media_indices(eye: EyeSurfaces, wavelength_nm: ArrayLike) -> NDArray[np.float64]:
-    """Return indices (..., n_surfaces + 1): air first, then behind each surface."""
+    """Return the index rows (..., n) of an eye at wavelengths (...).
+
+    The first n_surfaces + 1 numbers are indices: air, then behind each surface, of a
+    gradient at the vertex of the surface.  The numbers of the gradients follow.
+
+    Raises
+    ------
+    ValueError
+        An unknown medium, a wavelength outside its range, or an index below 1.
+    """
     wavelength_nm = np.asarray(wavelength_nm, dtype=np.float64)
+    gradients = _gradients(eye)
+    behind = dict(gradients)
+    homogeneous = eye.media and {
+        name: medium
+        for name, medium in eye.media.items()
+        if not isinstance(medium, GRADIENTS)
+    }
     names = ["air", *(s.medium_after for s in eye.surfaces)]
-    return np.stack(
-        [refractive_index(n, wavelength_nm, indices=eye.indices) for n in names],
+    indices = np.stack(
+        [
+            np.vectorize(behind[i].vertex_index, otypes=[float])(wavelength_nm)
+            if i in behind
+            else refractive_index(
+                name, wavelength_nm, indices=eye.indices, media=homogeneous
+            )
+            for i, name in enumerate(names, start=-1)
+        ],
         axis=-1,
+    )
+    _check_indices(indices, names)
+    if not gradients:
+        return indices
+    numbers = [
+        np.concatenate([_gradient_columns(g, nm) for _, g in gradients])
+        for nm in wavelength_nm.ravel().tolist()
+    ]
+    return np.concatenate(
+        [indices, np.reshape(numbers, (*wavelength_nm.shape, -1))], axis=-1
     )
 
 
@@ -266,8 +388,12 @@ def check_eye(eye: EyeSurfaces) -> None:
             raise ValueError(f"surfaces[{i}]: conic constant and z must be finite")
         if surface.offset_radius_mm <= 0.0 or surface.clear_radius_mm <= 0.0:
             raise ValueError(f"surfaces[{i}]: radii of circles must be positive")
-    if depths_mm != sorted(depths_mm):
-        raise ValueError(f"surfaces at z {depths_mm} mm: must go inward in order")
+        _check_form(surface.form, f"surfaces[{i}].form")
+        if i and surface.z_mm < depths_mm[i - 1]:
+            raise ValueError(
+                f"surfaces[{i}].z_mm {surface.z_mm:g}: must not lie in front of "
+                f"surfaces[{i - 1}] ({depths_mm[i - 1]:g} mm)"
+            )
     if not depths_mm[0] + STOP_TOLERANCE_MM < eye.stop_z_mm < eye.retina.z_mm:
         raise ValueError(
             f"stop at {eye.stop_z_mm:g} mm: must lie behind the first surface "
@@ -280,3 +406,47 @@ def check_eye(eye: EyeSurfaces) -> None:
         )
     if not np.all(np.asarray(eye.retina.radius_mm, dtype=float)):
         raise ValueError(f"retina.radius_mm {eye.retina.radius_mm}: not 0")
+    _check_form(eye.retina.form, "retina.form")
+    if eye.media:
+        _check_gradients(eye)
+
+
+def _check_form(form: Form | None, name: str) -> None:
+    if form is None:
+        return
+    if not isinstance(form, FORMS):
+        kinds = ", ".join(f.__name__ for f in FORMS)
+        raise ValueError(f"{name} {form!r:.60}: allowed are {kinds}")
+    numbers = form.numbers()
+    if len(numbers) > N_FORM_NUMBERS or not all(map(math.isfinite, numbers)):
+        raise ValueError(
+            f"{name} {numbers}: allowed are at most {N_FORM_NUMBERS} finite numbers"
+        )
+
+
+def _check_gradients(eye: EyeSurfaces) -> None:
+    """Raise where the stop lies in a gradient, or an index is out of range."""
+    depths_mm = [*(s.z_mm for s in eye.surfaces), eye.retina.z_mm]
+    n_before = sum(z < eye.stop_z_mm - STOP_TOLERANCE_MM for z in depths_mm[:-1])
+    for i, gradient in _gradients(eye):
+        name = f"surfaces[{i}].medium_after '{eye.surfaces[i].medium_after}'"
+        if i == n_before - 1:
+            raise ValueError(
+                f"{name}: the stop at {eye.stop_z_mm:g} mm lies in this gradient; the "
+                "medium around the stop must be homogeneous"
+            )
+        if i == len(eye.surfaces) - 1:
+            raise ValueError(f"{name}: the medium at the retina must be homogeneous")
+        if not 1 <= gradient.steps <= MAX_STEPS:
+            raise ValueError(
+                f"{name}: {gradient.steps} steps, allowed are 1 to {MAX_STEPS}"
+            )
+        numbers = np.array(gradient.numbers(GRADIENT_LAYOUT_NM))
+        for z_mm in np.linspace(0.0, depths_mm[i + 1] - depths_mm[i], 5).tolist():
+            squared = gradient.index(numbers, 0, 0.0, 0.0, z_mm)[0]
+            low, high = INDEX_LIMITS
+            if not low**2 <= squared <= high**2:
+                raise ValueError(
+                    f"{name}: squared index {squared:.4g} on the axis at depth "
+                    f"{z_mm:.3g} mm; the index must be {low:g} to {high:g}"
+                )

@@ -1,6 +1,7 @@
-"""A random rotationally symmetric eye traced by optiland, an independent package.
+"""Random eyes traced by optiland, an independent package.
 
-    python -m tests.numerical.optiland_eye     writes tests/data/optiland_eye.json
+    python -m tests.numerical.optiland_eye     writes tests/data/optiland_eye.json and
+                                               tests/data/optiland_forms.json
 
 optiland brings VTK and 0.5 GB with it, so it is an extra of its own
 (`pip install -c constraints.txt -e .[crosscheck]`): its rays are kept in that file, and
@@ -13,8 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from estimator.eye.explicit import parse_explicit_eye
+from estimator.optics.forms import EvenAsphere, SeparateProfiles, Toroid
+from estimator.optics.surfaces import rotation_matrix
+from estimator.optics.zernike import N_TERMS, nm_from_index
 
 FROZEN = Path(__file__).parents[1] / "data" / "optiland_eye.json"
+FROZEN_FORMS = FROZEN.with_name("optiland_forms.json")
 SEED = 20231
 WAVELENGTH_NM = 555.0
 
@@ -61,6 +66,66 @@ def random_eye(rng):
     }
 
 
+def formed_eye(rng, form, *, conic_constant=None, radii_mm=None, turned=True):
+    """A random eye whose cornea and lens have one form, turned and decentered.
+
+    ``form`` is a function of a scale, 1 in front and smaller behind.
+    """
+    body = random_eye(rng)
+    lens = {
+        "decentration_mm": rng.uniform(-0.3, 0.3, 2).tolist(),
+        "tilt_deg": rng.uniform(-4.0, 4.0, 2).tolist(),
+    }
+    for i, surface in enumerate(body["surfaces"]):
+        surface |= lens if turned and i >= 2 else {}
+        if i in (0, 3):
+            surface["form"] = form(1.0 if i == 0 else 0.3)
+        if conic_constant is not None:
+            surface["conic_constant"] = conic_constant
+        if turned:
+            surface["rotation_deg"] = rng.uniform(-60.0, 60.0)
+        if radii_mm and i in (0, 3):
+            ratio = rng.uniform(*radii_mm)
+            surface["radius_mm"] = [surface["radius_mm"], surface["radius_mm"] * ratio]
+        if surface.get("form") is None:
+            surface.pop("form", None)
+    return body
+
+
+def formed_eyes(rng):
+    """Bodies of eyes with every form that optiland has, by name."""
+
+    def asphere(scale):
+        powers = np.array([2e-3, -3e-4, 2e-5, -1e-6, 4e-8, -1e-9, 2e-11, -3e-13])
+        return {"kind": "even_asphere", "coefficients": (scale * powers).tolist()}
+
+    def profiles(_):
+        return {"kind": "separate_profiles", "conic_constants": [-0.4, 0.2]}
+
+    return {
+        "tilted conic": formed_eye(rng, lambda _: None),
+        "even asphere": formed_eye(rng, asphere),
+        "even asphere, centered": formed_eye(rng, asphere, turned=False),
+        "toroid": formed_eye(rng, lambda _: {"kind": "toroid"}, radii_mm=(0.9, 1.1)),
+        "separate profiles": formed_eye(rng, profiles, radii_mm=(0.9, 1.1)),
+        # for paraboloids optiland's biconic is that of OpticStudio
+        "toric paraboloid": formed_eye(
+            rng, lambda _: None, conic_constant=-1.0, radii_mm=(0.9, 1.1)
+        ),
+        "offset": _offset_eye(rng),
+    }
+
+
+def _offset_eye(rng):
+    body = formed_eye(rng, lambda _: None)
+    terms = np.repeat([0.0, 0.02, 0.02, 0.01, 0.01], range(1, 6))
+    body["surfaces"][0]["offset_mm"] = [
+        *(terms * rng.uniform(-1.0, 1.0, 15)),
+        *([0.0] * 13),
+    ]
+    return body
+
+
 def random_rays(rng, count=60):
     """Skew rays (count, 6) from 5 mm before the eye, up to 35 deg and 2.5 mm off."""
     angle, turn = rng.uniform(0.0, 35.0, count), rng.uniform(0.0, 2 * np.pi, count)
@@ -73,6 +138,49 @@ def random_rays(rng, count=60):
     aim[:, 2] = 3.0
     start = aim - direction * (8.0 / direction[:, 2:])
     return np.concatenate([start, direction], axis=1)
+
+
+def _optiland_angles(surface):
+    """Angles about x, y and z of optiland, which turns about x, then y, then z."""
+    matrix = rotation_matrix(
+        rotation_deg=surface.rotation_deg, tilt_deg=surface.tilt_deg
+    )
+    return {
+        "rx": np.arctan2(matrix[2, 1], matrix[2, 2]),
+        "ry": -np.arcsin(matrix[2, 0]),
+        "rz": np.arctan2(matrix[1, 0], matrix[0, 0]),
+    }
+
+
+def _optiland_shape(surface):
+    """Arguments of a surface's shape, and its type."""
+    rx_mm, ry_mm = surface.radius_mm
+    conic, form = surface.conic_constant, surface.form
+    exact = {"tol": 1e-14, "max_iter": 200}
+    if isinstance(form, EvenAsphere):
+        coefficients = list(form.coefficients)
+        shape = {"radius": rx_mm, "conic": conic, "coefficients": coefficients}
+        return {"surface_type": "even_asphere", **shape, **exact}
+    radii = {"radius_x": rx_mm, "radius_y": ry_mm}
+    if isinstance(form, Toroid):
+        return {"surface_type": "toroidal", "conic": conic, **radii, **exact}
+    if isinstance(form, SeparateProfiles) or rx_mm != ry_mm:
+        kx, ky = form.conic_constants if form else (conic, conic)
+        assert form or conic == -1.0, "a biconic of optiland is another surface"
+        conics = {"conic_x": kx, "conic_y": ky}
+        return {"surface_type": "biconic", **radii, **conics, **exact}
+    if surface.offset_mm is not None:
+        # optiland's terms have the OSA order and its normalization
+        order = [nm_from_index(j) for j in range(N_TERMS)]
+        norms = [np.sqrt((2 - (m == 0)) * (n + 1)) for n, m in order]
+        terms = {
+            "coefficients": list(surface.offset_mm / norms),
+            "norm_radius": surface.offset_radius_mm,
+            "zernike_type": "standard",
+        }
+        shape = {"radius": rx_mm, "conic": conic}
+        return {"surface_type": "zernike", **shape, **terms, **exact}
+    return {"radius": rx_mm, "conic": conic}
 
 
 def trace_with_optiland(body, rays):
@@ -99,10 +207,12 @@ def trace_with_optiland(body, rays):
             index += 1
         optic.surfaces.add(
             index=index,
+            x=surface.decentration_mm[0],
+            y=surface.decentration_mm[1],
             z=surface.z_mm,
-            radius=surface.radius_mm[0],
-            conic=surface.conic_constant,
             material=IdealMaterial(n=eye.indices[surface.medium_after]),
+            **_optiland_angles(surface),
+            **_optiland_shape(surface),
         )
         index += 1
     optic.surfaces.add(
@@ -123,21 +233,32 @@ def trace_with_optiland(body, rays):
     return points, directions, np.array(group.opd)[-n_elements:].T
 
 
-def main():
-    """Write the frozen eye, rays and optiland's answer."""
-    rng = np.random.default_rng(SEED)
-    body, rays = random_eye(rng), random_rays(rng, 24)
+def _traced(body, rays):
     points, directions, paths = trace_with_optiland(body, rays)
-    content = {
-        "source": "optiland 0.6.3, by python -m tests.numerical.optiland_eye",
-        "wavelength_nm": WAVELENGTH_NM,
+    return {
         "eye": body,
         "rays": rays.tolist(),
         "points_mm": points.tolist(),
         "directions": directions.tolist(),
         "paths_mm": paths.tolist(),
     }
+
+
+def main():
+    """Write the frozen eyes, rays and optiland's answer."""
+    head = {
+        "source": "optiland 0.6.3, by python -m tests.numerical.optiland_eye",
+        "wavelength_nm": WAVELENGTH_NM,
+    }
+    rng = np.random.default_rng(SEED)
+    body, rays = random_eye(rng), random_rays(rng, 24)
+    content = {**head, **_traced(body, rays)}
     FROZEN.write_text(json.dumps(content) + "\n", encoding="utf-8")
+    rng = np.random.default_rng(SEED + 1)
+    bodies = formed_eyes(rng)
+    eyes = {name: _traced(body, random_rays(rng, 12)) for name, body in bodies.items()}
+    text = json.dumps({**head, "eyes": eyes})
+    FROZEN_FORMS.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

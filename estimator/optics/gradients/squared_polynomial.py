@@ -1,0 +1,50 @@
+"""Gradient whose squared index is a polynomial, as in rods and Luneburg's lens."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from numba import njit
+
+from estimator.optics.gradients.polynomial import (
+    DEFAULT_STEPS,
+    polynomial,
+    polynomial_numbers,
+)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _index(media, start, x, y, z):
+    squared, sx, sy, sz = polynomial(media, start, x, y, z)
+    return squared, 0.5 * sx, 0.5 * sy, 0.5 * sz
+
+
+@dataclass(frozen=True)
+class SquaredPolynomialGradient:
+    """n²(r, z) = sum over i, j of m_ij r^(2i) z^j, at every wavelength.
+
+    r and z as for `PolynomialGradient`.
+
+    Attributes
+    ----------
+    coefficients : tuple of tuples, mm^-(2i+j)
+        Row i holds m_i0, m_i1, ...
+    steps : int
+        Steps of the integration (see `gradient_kernels`).
+    """
+
+    kind: ClassVar[str] = "squared_polynomial_gradient"
+    index: ClassVar[Any] = staticmethod(_index)
+
+    coefficients: tuple[tuple[float, ...], ...]
+    steps: int = DEFAULT_STEPS
+
+    def vertex_index(self, wavelength_nm: float) -> float:
+        """Return the index at r = z = 0."""
+        del wavelength_nm
+        return math.sqrt(self.coefficients[0][0])
+
+    def numbers(self, wavelength_nm: float) -> tuple[float, ...]:
+        """Return the numbers of the index row."""
+        del wavelength_nm
+        return polynomial_numbers(self.coefficients, first=self.coefficients[0][0])
