@@ -1,9 +1,11 @@
-"""The headers of all messages as JSON Schema, for clients in other languages.
+"""JSON Schema of messages and profiles, and the tables of profiles in PROTOCOL.md.
 
     python -m filter_service.protocol_schema
 
-writes ``filter_service/protocol.schema.json``.  Rules that a schema cannot express (an
-edge on the wrong side, the size of a part) are in PROTOCOL.md.
+writes ``protocol.schema.json`` (headers of all messages) and ``profile.schema.json``
+(bodies of profiles) for clients in other languages, and the tables in section 10 of
+``PROTOCOL.md``.  Rules that a schema cannot express (an edge on the wrong side, the
+size of a part) are in PROTOCOL.md.
 """
 
 from __future__ import annotations
@@ -16,9 +18,17 @@ from typing import Any
 
 import msgspec
 
+from estimator.profiles.reference import profile_schema, profile_tables
 from filter_service.messages import PROTOCOL_VERSION, REPLIES, REQUESTS
 
-SCHEMA_FILE = Path(__file__).resolve().parent / "protocol.schema.json"
+FOLDER = Path(__file__).resolve().parent
+SCHEMA_FILE = FOLDER / "protocol.schema.json"
+PROFILE_SCHEMA_FILE = FOLDER / "profile.schema.json"
+DOCUMENT = FOLDER / "PROTOCOL.md"
+TABLES_START, TABLES_END = (
+    "<!-- profile tables: start -->",
+    "<!-- profile tables: end -->",
+)
 SECTION = re.compile(r"\n\n\w+\n-{3,}\n")
 """Start of a docstring's numpydoc sections, which concern Python only."""
 
@@ -50,10 +60,23 @@ def protocol_schema() -> dict[str, Any]:
     }
 
 
-def schema_text() -> str:
-    """Return the schema as the text of its file."""
-    return json.dumps(protocol_schema(), indent=1, ensure_ascii=False) + "\n"
+def generated_files() -> dict[Path, str]:
+    """Return the text of every generated file; of PROTOCOL.md, all of it."""
+    document = DOCUMENT.read_text(encoding="utf-8")
+    before, rest = document.split(TABLES_START)
+    after = rest.split(TABLES_END)[1]
+    tables = f"{TABLES_START}\n{profile_tables()}{TABLES_END}"
+    return {
+        SCHEMA_FILE: _as_text(protocol_schema()),
+        PROFILE_SCHEMA_FILE: _as_text(profile_schema()),
+        DOCUMENT: f"{before}{tables}{after}",
+    }
+
+
+def _as_text(schema: dict[str, Any]) -> str:
+    return json.dumps(schema, indent=1, ensure_ascii=False) + "\n"
 
 
 if __name__ == "__main__":
-    SCHEMA_FILE.write_text(schema_text(), encoding="utf-8")
+    for path, text in generated_files().items():
+        path.write_text(text, encoding="utf-8")

@@ -1,8 +1,11 @@
 """Eye profiles: prescriptions, measurements and eye models.
 
-parse                validation of a profile object, returned as an `EyeProfile`
-correction           the correction in a profile
-options              options of any kind of profile
+bodies               types of the profile object: fields, ranges, defaults
+correction_bodies    the same for corrections
+validation           conversion of plain data to these types, and its errors
+parse                from a typed profile to an `EyeProfile`
+correction           from a typed correction to a lens
+reference            JSON Schema, tables and limits of the typed profiles
 files                .json, .abp and .csv profiles, and presets by name
 presets.json         the six presets
 measured_wavefront   a measurement used in closed form, without an eye model

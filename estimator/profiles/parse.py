@@ -5,27 +5,21 @@ a CSV file of coefficients.  It is parsed to an `EyeProfile` in the eye frame (x
 person's right, y up).
 """
 
-import json
+import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache, cached_property
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, cast, get_args
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.corrections.worn_lens import replaces_lens
-from estimator.eye import checked_fields as fields
 from estimator.eye.checked_fields import ProfileError
-from estimator.eye.parameters import (
-    EyeParameters,
-    RetinaShape,
-    parse_parameters,
-    parse_retina,
-)
-from estimator.media.straylight import Straylight
+from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters, RetinaShape
+from estimator.media.straylight import CATARACTS, DEFAULT_AGE_YEARS, Straylight
 from estimator.optics import prescription as rx
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import (
@@ -34,7 +28,9 @@ from estimator.optics.zernike import (
     flip_horizontal,
     index_from_nm,
 )
-from estimator.profiles import correction, options
+from estimator.profiles import bodies
+from estimator.profiles.correction import parse_correction, prescription, vertex_notes
+from estimator.profiles.validation import convert
 
 __all__ = [
     "EyeProfile",
@@ -44,31 +40,10 @@ __all__ = [
     "preset_names",
 ]
 
-COMMON_FIELDS = (
-    "kind",
-    "eye_side",
-    "age_years",
-    "correction",
-    "name",
-    "retina",
-    *options.FIELDS,
-)
-PRESCRIPTION_FIELDS = (*correction.SPECTACLE_FIELDS, "add_dpt", "higher_order")
-HIGHER_ORDERS = ("typical", "none")
-"""Aberrations that a traced eye adds to its prescription: those of its age, or none."""
-
-ZERNIKE_FIELDS = ("frame", "pupil_diameter_mm", "wavelength_nm", "zernike_um")
-SET_FIELDS = ("frame", "measurements")
-MEASURED_FIELD_LIMIT_DEG = 50.0
-"""Largest field angle accepted: instruments measure to 40 deg or so."""
-
-MAX_MEASUREMENTS = 100
-KINDS = ("prescription", "zernike", "zernike_set", "eye", "preset")
-MAX_COEFFICIENT_UM = 200.0
+KINDS = tuple(str(kind.__struct_config__.tag) for kind in get_args(bodies.ProfileBody))
 
 PRESCRIPTION_RADIUS_MM = 3.0
 """Circle on which a prescription is represented; it is exact on every other."""
-
 
 EYE_PUPIL_MM = 6.0
 """Entrance pupil at which the wavefront of a given eye is represented."""
@@ -165,6 +140,18 @@ class EyeProfile:
         return tuple(m for m in self.measurements if m.is_on_axis)
 
     @cached_property
+    def digest(self) -> str:
+        """Return the SHA-256 of the profile's content, apart from its name and notes.
+
+        Profiles that describe the same eye in different formats have the same digest.
+        """
+        content = replace(self, name="", notes=())
+        encoded = msgspec.json.encode(
+            content, order="deterministic", enc_hook=lambda array: array.tolist()
+        )
+        return hashlib.sha256(encoded).hexdigest()
+
+    @cached_property
     def zernike_um(self) -> NDArray[np.float64]:
         """Return the leading wavefront (28,), um; a given eye is traced once for it.
 
@@ -189,65 +176,96 @@ def parse_profile(data: object) -> EyeProfile:
     ProfileError
         A field is invalid; the error names it, its value and the accepted values.
     """
-    data = fields.mapping(data, "profile")
-    kind = fields.choice(data, "kind", KINDS)
-    if kind == "preset":
-        return _parse_preset(data)
-    if kind == "prescription":
-        return _parse_prescription_profile(data)
-    if kind == "zernike_set":
-        return _parse_zernike_set(data)
-    if kind == "eye":
-        return _parse_eye(data)
-    return _parse_zernike_profile(data)
-
-
-@cache
-def _presets() -> dict[str, dict[str, Any]]:
-    text = (Path(__file__).parent / "presets.json").read_text(encoding="utf-8")
-    presets: dict[str, dict[str, Any]] = json.loads(text)["presets"]
-    return presets
+    body = convert(data, bodies.ProfileBody)
+    if isinstance(body, bodies.PresetBody):
+        return _preset(body, cast(Mapping[str, Any], data))
+    if isinstance(body, bodies.PrescriptionBody):
+        return _prescription(body)
+    if isinstance(body, bodies.ZernikeSetBody):
+        return _zernike_set(body)
+    if isinstance(body, bodies.EyeBody):
+        return _eye(body)
+    return _zernike(body)
 
 
 def preset_names() -> tuple[str, ...]:
     """Return the names accepted by ``{"kind": "preset", "name": ...}``."""
-    return tuple(_presets())
+    return tuple(bodies.PRESETS)
 
 
-def _parse_preset(data: Mapping[str, Any]) -> EyeProfile:
-    fields.only_known(data, COMMON_FIELDS)
-    name = fields.choice(data, "name", preset_names())
-    merged = {**_presets()[name], **{k: v for k, v in data.items() if k != "kind"}}
-    return _parse_zernike_profile(merged)
+def _preset(body: bodies.PresetBody, data: Mapping[str, Any]) -> EyeProfile:
+    own = {name: value for name, value in data.items() if name != "kind"}
+    return _zernike(convert({**bodies.PRESETS[body.name], **own}, bodies.ZernikeBody))
 
 
-def _common(data: Mapping[str, Any]) -> dict[str, Any]:
-    age_years = None
-    if "age_years" in data:
-        age_years = fields.number(data, "age_years", 3.0, 120.0)
-    retina = parse_retina(data)
+def _common(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
+    age_years = None if body.age_years is msgspec.UNSET else body.age_years
+    if body.yellowing is not None and age_years is None:
+        raise ProfileError("age_years", "is required with yellowing", "3 to 120")
+    if body.spectacle_magnification and body.correction is None:
+        raise ProfileError(
+            "correction", "is required with spectacle_magnification", "an object"
+        )
+    retina = body.retina and RetinaShape(
+        radius_mm=body.retina.radius_mm, conic_constant=body.retina.conic_constant
+    )
+    is_prescription = isinstance(body, bodies.PrescriptionBody)
     return {
-        "eye_side": fields.choice(data, "eye_side", ("OD", "OS"), default="OD"),
+        "name": kind if body.name is msgspec.UNSET else str(body.name),
+        "eye_side": body.eye_side,
         "age_years": age_years,
-        "correction": correction.correction(data),
+        "correction": parse_correction(body.correction, has_cornea=not is_prescription),
         "retina": retina,
-        "periphery": options.periphery(data, has_own=retina is not None),
-        "straylight": options.straylight(data, age_years),
-        "yellowing": options.yellowing(data),
-        "spectacle_magnification": options.spectacle_magnification(data),
-        "notes": correction.vertex_notes(data),
+        "periphery": _periphery(body),
+        "straylight": _straylight(body.straylight, age_years),
+        "yellowing": body.yellowing,
+        "spectacle_magnification": body.spectacle_magnification,
+        "notes": vertex_notes(
+            body if isinstance(body, bodies.PrescriptionBody) else None,
+            body.correction,
+        ),
     }
 
 
-def _parse_prescription_profile(data: Mapping[str, Any]) -> EyeProfile:
-    fields.only_known(data, COMMON_FIELDS + PRESCRIPTION_FIELDS)
-    prescription = correction.prescription(data)
-    common = _common(data)
-    zernike_um = rx.zernike_from_power_vector(
-        *rx.power_vector(prescription), zernike_radius_mm=PRESCRIPTION_RADIUS_MM
+def _periphery(body: bodies.CommonBody) -> str:
+    is_model = body.retina is not None or isinstance(body, bodies.EyeBody)
+    if body.periphery is msgspec.UNSET:
+        return "model" if is_model else "people"
+    if is_model and body.periphery != "model":
+        raise ProfileError(
+            "periphery",
+            "is 'people', but the profile defines the eye's surfaces",
+            "model, for kind 'eye' and with 'retina'",
+        )
+    return body.periphery
+
+
+def _straylight(
+    body: bodies.StraylightBody | None, age_years: float | None
+) -> Straylight | None:
+    if body is None:
+        return None
+    log_s = None if body.log_s is msgspec.UNSET else body.log_s
+    if body.cataract is not msgspec.UNSET:
+        if log_s is not None:
+            raise ProfileError(
+                "straylight.log_s", "cannot be combined with cataract", "one of the two"
+            )
+        log_s = CATARACTS[body.cataract]
+    return Straylight(
+        age_years=DEFAULT_AGE_YEARS if age_years is None else age_years,
+        pigment_ratio=body.pigmentation,
+        log_s=log_s,
     )
+
+
+def _prescription(body: bodies.PrescriptionBody) -> EyeProfile:
+    zernike_um = rx.zernike_from_power_vector(
+        *rx.power_vector(prescription(body, path="")),
+        zernike_radius_mm=PRESCRIPTION_RADIUS_MM,
+    )
+    common = _common(body, "prescription")
     return EyeProfile(
-        name=str(data.get("name", "prescription")),
         kind="prescription",
         **_primary(
             Measurement(
@@ -255,25 +273,26 @@ def _parse_prescription_profile(data: Mapping[str, Any]) -> EyeProfile:
             )
         ),
         max_pupil_diameter_mm=math.inf,
-        add_dpt=fields.number(data, "add_dpt", 0.0, 4.0, default=0.0),
-        higher_order=_higher_order(data, common["correction"]),
+        add_dpt=body.add_dpt,
+        higher_order=_higher_order(body, common["correction"]),
         **common,
     )
 
 
-def _higher_order(data: Mapping[str, Any], correction: rx.Prescription | None) -> str:
-    """Return one of `HIGHER_ORDERS`; "none" with an intraocular lens."""
+def _higher_order(
+    body: bodies.PrescriptionBody, correction: rx.Prescription | None
+) -> str:
+    """Return "typical" or "none"; "none" with an intraocular lens."""
     is_gone = replaces_lens(correction)
-    found = fields.choice(
-        data, "higher_order", HIGHER_ORDERS, default="none" if is_gone else "typical"
-    )
-    if is_gone and found != "none":
+    if body.higher_order is msgspec.UNSET:
+        return "none" if is_gone else "typical"
+    if is_gone and body.higher_order != "none":
         raise ProfileError(
             "higher_order",
-            "is 'typical', which are the aberrations of eyes with their own lens",
+            "is 'typical', which describes eyes with their natural lens",
             "none, with an intraocular lens",
         )
-    return found
+    return body.higher_order
 
 
 def _primary(first: Measurement, *others: Measurement) -> dict[str, Any]:
@@ -284,75 +303,61 @@ def _primary(first: Measurement, *others: Measurement) -> dict[str, Any]:
     }
 
 
-def _parse_zernike_profile(data: Mapping[str, Any]) -> EyeProfile:
-    fields.only_known(data, COMMON_FIELDS + ZERNIKE_FIELDS)
-    measurement = _measurement(data)
+def _zernike(body: bodies.ZernikeBody) -> EyeProfile:
+    measurement = Measurement(
+        _coefficients(body.zernike_um, body.frame, path=""),
+        body.pupil_diameter_mm,
+        body.wavelength_nm,
+    )
     return EyeProfile(
-        name=str(data.get("name", "zernike")),
         kind="zernike",
         **_primary(measurement),
         max_pupil_diameter_mm=measurement.pupil_diameter_mm,
-        **_common(data),
+        **_common(body, "zernike"),
     )
 
 
-def _measurement(data: Mapping[str, Any], *, path: str = "") -> Measurement:
-    zernike_um = _coefficients(data, path=path)
-    frame = fields.choice(data, "frame", ("eye", "examiner"), default="eye", path=path)
-    if frame == "examiner":
-        zernike_um = flip_horizontal(zernike_um)
-    limit = MEASURED_FIELD_LIMIT_DEG
-    return Measurement(
-        zernike_um=zernike_um,
-        pupil_diameter_mm=fields.number(data, "pupil_diameter_mm", 1.0, 9.0, path=path),
-        wavelength_nm=fields.number(data, "wavelength_nm", 365.0, 1014.0, path=path),
-        h_deg=fields.number(data, "h_deg", -limit, limit, default=0.0, path=path),
-        v_deg=fields.number(data, "v_deg", -limit, limit, default=0.0, path=path),
-    )
-
-
-def _parse_zernike_set(data: Mapping[str, Any]) -> EyeProfile:
-    """Parse several measurements of one eye; the widest on-axis one leads."""
-    fields.only_known(data, COMMON_FIELDS + SET_FIELDS)
-    entries = data.get("measurements")
-    allowed = f"a list of 1 to {MAX_MEASUREMENTS} measurements, one at h = v = 0"
-    if not isinstance(entries, list) or not 1 <= len(entries) <= MAX_MEASUREMENTS:
-        raise ProfileError("measurements", f"{entries!r:.60} is not one", allowed)
-    measurements = []
-    for number, entry in enumerate(entries):
-        path = f"measurements.{number}."
-        entry = fields.mapping(entry, path.rstrip("."))
-        fields.only_known(entry, ("kind", *ZERNIKE_FIELDS, "h_deg", "v_deg"), path=path)
-        fields.choice(entry, "kind", ("zernike",), default="zernike", path=path)
-        common = {"frame": data["frame"]} if "frame" in data else {}
-        measurements.append(_measurement({**common, **entry}, path=path))
+def _zernike_set(body: bodies.ZernikeSetBody) -> EyeProfile:
+    """Return the profile of a set; its widest on-axis measurement leads."""
+    frame = "eye" if body.frame is msgspec.UNSET else body.frame
+    measurements = [
+        Measurement(
+            _coefficients(
+                entry.zernike_um,
+                frame if entry.frame is msgspec.UNSET else entry.frame,
+                path=f"measurements.{number}.",
+            ),
+            entry.pupil_diameter_mm,
+            entry.wavelength_nm,
+            entry.h_deg,
+            entry.v_deg,
+        )
+        for number, entry in enumerate(body.measurements)
+    ]
     on_axis = [m for m in measurements if m.is_on_axis]
     if not on_axis:
-        raise ProfileError("measurements", "none is on the axis", allowed)
+        raise ProfileError(
+            "measurements", "none is on-axis", bodies.MEASUREMENTS_ALLOWED
+        )
     first = max(on_axis, key=lambda m: m.pupil_diameter_mm)
     others = [m for m in measurements if m is not first]
     return EyeProfile(
-        name=str(data.get("name", "zernike set")),
         kind="zernike_set",
         **_primary(first, *others),
         max_pupil_diameter_mm=first.pupil_diameter_mm,
-        **_common(data),
+        **_common(body, "zernike set"),
     )
 
 
-def _parse_eye(data: Mapping[str, Any]) -> EyeProfile:
-    fields.only_known(data, (*COMMON_FIELDS, "parameters"))
-    if "parameters" not in data:
-        raise ProfileError("parameters", "is missing", "an object of the 45 by name")
-    eye = parse_parameters(data["parameters"])
+def _eye(body: bodies.EyeBody) -> EyeProfile:
+    vector = [getattr(body.parameters, name) for name in PARAMETER_NAMES]
     return EyeProfile(
-        name=str(data.get("name", "eye")),
         kind="eye",
         pupil_diameter_mm=EYE_PUPIL_MM,
         wavelength_nm=REFERENCE_WAVELENGTH_NM,
         max_pupil_diameter_mm=EYE_PUPIL_MM,
-        eye=eye,
-        **_common(data),
+        eye=EyeParameters.from_vector(vector),
+        **_common(body, "eye"),
     )
 
 
@@ -379,36 +384,32 @@ def _traced_zernike_um(
         ) from None
 
 
-def _coefficients(data: Mapping[str, Any], *, path: str = "") -> NDArray[np.float64]:
-    allowed = f"an object of 'n,m': um with n from 0 to {MAX_RADIAL_ORDER}"
-    if "zernike_um" not in data:
-        raise ProfileError(path + "zernike_um", "is missing", allowed)
-    entries = fields.mapping(data["zernike_um"], path + "zernike_um")
+def _coefficients(
+    entries: Mapping[str, float], frame: str, *, path: str
+) -> NDArray[np.float64]:
+    """Return coefficients (28,) in the eye frame."""
     zernike_um = np.zeros(N_TERMS)
     named: dict[int, str] = {}
-    limit = MAX_COEFFICIENT_UM
-    for key in entries:
-        j = _term_index(key, allowed, path=path)
+    for key, value_um in entries.items():
+        j = _term_index(key, path=path)
         if j in named:
             problem = f"names the same term as {named[j]!r}"
             raise ProfileError(f"{path}zernike_um.{key}", problem, "each term once")
         named[j] = key
-        zernike_um[j] = fields.number(
-            entries, key, -limit, limit, path=path + "zernike_um."
-        )
-    return zernike_um
+        zernike_um[j] = value_um
+    return flip_horizontal(zernike_um) if frame == "examiner" else zernike_um
 
 
-def _term_index(key: str, allowed: str, *, path: str) -> int:
+def _term_index(key: str, *, path: str) -> int:
+    name, allowed = f"{path}zernike_um.{key}", bodies.COEFFICIENTS_ALLOWED
     try:
         n, m = (int(part) for part in key.split(","))
     except ValueError:
-        problem = "is not of the form 'n,m'"
-        raise ProfileError(f"{path}zernike_um.{key}", problem, allowed) from None
+        raise ProfileError(name, "is not of the form 'n,m'", allowed) from None
     try:
         j = index_from_nm(n, m)
     except ValueError as error:
-        raise ProfileError(f"{path}zernike_um.{key}", str(error), allowed) from None
-    if j >= N_TERMS:
-        raise ProfileError(f"{path}zernike_um.{key}", f"radial order {n}", allowed)
+        raise ProfileError(name, str(error), allowed) from None
+    if n > MAX_RADIAL_ORDER:
+        raise ProfileError(name, f"radial order {n}", allowed)
     return j

@@ -3,16 +3,21 @@
 import json
 import re
 from pathlib import Path
+from typing import get_args
 
+import jsonschema
 import msgpack
 import pytest
 
 from estimator.eye.checked_fields import ProfileError
-from estimator.eye.parameters import PARAMETERS, EyeParameters, offset_name
+from estimator.eye.parameters import PARAMETERS, EyeParameters
+from estimator.profiles import bodies, reference
+from estimator.profiles.correction_bodies import CorrectionBody
 from estimator.profiles.parse import KINDS, parse_profile, preset_names
 from filter_service import errors, messages
 from filter_service import protocol_schema as schema
 from filter_service.wire import replies
+from tests.unit.test_profile_bodies import WRONG
 
 IN_ORDER = ("preset", "prescription", "zernike", "zernike_set", "eye")
 
@@ -33,7 +38,7 @@ def examples():
 EXAMPLES = examples()
 
 
-def bodies():
+def shown():
     """Return the profiles that the page shows; the eye's parameters are written out."""
     eye = json.dumps(EyeParameters.mean_eye().to_mapping())
     found = []
@@ -118,8 +123,9 @@ def test_the_page_states_the_version():
     assert f"**Version {messages.PROTOCOL_VERSION}.**" in PAGE
 
 
-def test_the_schema_beside_the_page_is_that_of_the_code():
-    assert schema.SCHEMA_FILE.read_text(encoding="utf-8") == schema.schema_text()
+def test_schemas_and_tables_are_those_of_the_code():
+    for path, text in schema.generated_files().items():
+        assert path.read_text(encoding="utf-8") == text, path.name
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
@@ -131,9 +137,9 @@ def test_the_schema_has_the_fields_that_the_page_shows(name):
 
 
 def test_every_kind_of_profile_is_shown_and_can_be_read():
-    shown = bodies()
-    assert [body["kind"] for body in shown] == sorted(KINDS, key=IN_ORDER.index)
-    for body in shown:
+    found = shown()
+    assert [body["kind"] for body in found] == sorted(KINDS, key=IN_ORDER.index)
+    for body in found:
         assert parse_profile(body).kind in KINDS
 
 
@@ -142,51 +148,58 @@ def test_the_presets_are_named():
         assert f"`{name}`" in PAGE
 
 
-def _rows(title):
-    """The rows of a table of section 10: first cell, last cell."""
-    table = PAGE.split(f"| of {title}")[1].split("\n\n")[0].splitlines()[2:]
-    return [(row.split("|")[1].strip(), row.split("|")[-2].strip()) for row in table]
+def test_the_tables_list_every_field_of_a_profile():
+    tables = reference.profile_tables()
+    for kind in (*get_args(bodies.ProfileBody), *get_args(CorrectionBody)):
+        for name in kind.__struct_fields__:
+            assert f"| `{name}` |" in tables
+
+
+@pytest.mark.parametrize(
+    ("body", "kind", "name"),
+    [
+        (body, kind, name)
+        for body, kind in (
+            (
+                {"kind": "prescription", "sphere_dpt": -1, "axis_deg": 10},
+                bodies.PrescriptionBody,
+            ),
+            (
+                {
+                    "kind": "zernike",
+                    "pupil_diameter_mm": 5,
+                    "wavelength_nm": 555,
+                    "zernike_um": {"2,0": 1},
+                },
+                bodies.ZernikeBody,
+            ),
+        )
+        for name in kind.__struct_fields__
+        if name.endswith(("_dpt", "_mm", "_nm", "_deg", "_years"))
+    ],
+)
+def test_the_limits_of_a_number_are_those_that_are_kept(body, kind, name):
+    low, high = reference.field_limits(kind, name)
+    for inside in (low, high):
+        parse_profile({**body, name: inside})
+    for outside in (low - 0.01, high + 0.01):
+        with pytest.raises(ProfileError) as caught:
+            parse_profile({**body, name: outside})
+        assert caught.value.field == name
 
 
 def test_the_parameters_of_an_eye_are_listed_with_their_ranges():
-    found = {}
-    for cell, text in _rows("`parameters`"):
-        low, high = (float(number) for number in text.split(" to "))
-        names = re.findall(r"`(\w+)`", cell)
-        if "..." in cell:
-            first, last = (int(re.search(r"j(\d+)_", name)[1]) for name in names)
-            names = [offset_name(index) for index in range(first, last + 1)]
-        found |= dict.fromkeys(names, (low, high))
-    assert found == {row.name: row.allowed for row in PARAMETERS}
+    for row in PARAMETERS:
+        limits = reference.field_limits(bodies.ParametersBody, row.name)
+        assert limits == row.allowed
 
 
-BODIES = {
-    "a prescription": {"kind": "prescription", "sphere_dpt": -1, "cylinder_dpt": -1},
-    "a measurement": {
-        "kind": "zernike",
-        "pupil_diameter_mm": 5,
-        "wavelength_nm": 555,
-        "zernike_um": {"2,0": 1},
-    },
-}
-
-
-@pytest.mark.parametrize("title", BODIES)
-def test_the_ranges_of_a_body_s_numbers_are_those_that_are_kept(title):
-    body, n_checked = {"axis_deg": 10, **BODIES[title]}, 0
-    if title == "a measurement":
-        del body["axis_deg"]
-    for cell, text in _rows(title):
-        limits = re.match(r"(-?[\d.]+) to (-?[\d.]+)", text)
-        if limits is None or "zernike" in cell or "in a set" in cell:
-            continue
-        low, high = map(float, limits.groups())
-        for name in re.findall(r"`(\w+)`", cell):
-            for inside in (low, high):
-                parse_profile({**body, name: inside})
-            for outside in (low - 0.01, high + 0.01):
-                with pytest.raises(ProfileError) as caught:
-                    parse_profile({**body, name: outside})
-                assert caught.value.field == name
-            n_checked += 1
-    assert n_checked >= 2
+def test_the_schema_of_profiles_accepts_and_refuses_as_the_parser_does():
+    """The standard's own keywords, read by an independent validator."""
+    validator = jsonschema.Draft202012Validator(reference.profile_schema())
+    for body in shown():
+        assert validator.is_valid(body)
+    for body in bodies.PRESETS.values():
+        assert validator.is_valid(body)
+    for row in WRONG:
+        assert validator.is_valid(row["profile"]) != row["is_in_schema"], row

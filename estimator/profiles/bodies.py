@@ -1,0 +1,242 @@
+"""Types of profile bodies: fields, ranges, defaults and descriptions.
+
+A profile body is a JSON object whose ``kind`` selects a member of `ProfileBody`.
+The parser, the JSON Schema, the tables of the protocol document and the entries of the
+web page all read these types, so that a range is stated once.  Rules that concern
+several fields, such as an axis that a cylinder requires, are checked in `parse` and
+`correction`.
+"""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import UNSET, Meta, UnsetType
+
+from estimator.eye.parameters import PARAMETERS, Parameter
+from estimator.media.straylight import BROWN
+from estimator.optics.zernike import MAX_RADIAL_ORDER
+from estimator.profiles.correction_bodies import (
+    AxisDeg,
+    Body,
+    CorrectionBody,
+    CylinderDpt,
+    SphereDpt,
+    VertexMm,
+)
+from estimator.profiles.validation import ALLOWED
+
+PRESETS: dict[str, dict[str, Any]] = json.loads(
+    (Path(__file__).parent / "presets.json").read_text(encoding="utf-8")
+)["presets"]
+"""Bodies of the preset eyes, of kind ``zernike``, by name."""
+
+MAX_MEASUREMENTS = 100
+MAX_COEFFICIENT_UM = 200.0
+
+MEASUREMENTS_ALLOWED = (
+    f"a list of 1 to {MAX_MEASUREMENTS} measurements, one at h = v = 0"
+)
+COEFFICIENTS_ALLOWED = f"an object of 'n,m': um with n from 0 to {MAX_RADIAL_ORDER}"
+
+FieldAngleDeg = Annotated[float, Meta(ge=-50.0, le=50.0)]
+"""Field angle of a measurement; instruments measure to 40 deg or so."""
+
+Frame = Annotated[
+    Literal["eye", "examiner"],
+    Meta(description="`eye`: x to the person's right; `examiner`: facing the eye"),
+]
+CoefficientsUm = Annotated[
+    dict[str, Annotated[float, Meta(ge=-MAX_COEFFICIENT_UM, le=MAX_COEFFICIENT_UM)]],
+    Meta(
+        description=f'`"n,m"`: µm, n from 0 to {MAX_RADIAL_ORDER}, each term at most '
+        "once; other terms are 0",
+        extra={ALLOWED: COEFFICIENTS_ALLOWED},
+    ),
+]
+WavelengthNm = Annotated[float, Meta(ge=365.0, le=1014.0)]
+PupilDiameterMm = Annotated[
+    float, Meta(ge=1.0, le=9.0, description="diameter of the circle of the terms")
+]
+
+
+class RetinaBody(Body, kw_only=True):
+    """A conicoid that replaces the model's retina."""
+
+    radius_mm: Annotated[float, Meta(ge=8.0, le=25.0, description="vertex radius")]
+    conic_constant: Annotated[float, Meta(ge=-1.0, le=2.0)] = 0.0
+
+
+class StraylightBody(Body, kw_only=True):
+    """Light that the eye scatters over wide angles."""
+
+    pigmentation: Annotated[
+        float, Meta(ge=0.0, le=1.2, description="0 black to 1.2 light blue")
+    ] = BROWN
+    log_s: (
+        Annotated[
+            float,
+            Meta(ge=0.5, le=2.5, description="measured at 7 deg; not with `cataract`"),
+        ]
+        | UnsetType
+    ) = UNSET
+    cataract: (
+        Annotated[
+            Literal["nuclear", "cortical", "posterior_subcapsular"],
+            Meta(description="kind of cataract; not with `log_s`"),
+        ]
+        | UnsetType
+    ) = UNSET
+
+
+class CommonBody(Body, kw_only=True):
+    """Fields of every kind of profile."""
+
+    name: Annotated[Any, Meta(description="text that notes repeat")] = UNSET
+    eye_side: Annotated[Literal["OD", "OS"], Meta(description="right or left eye")] = (
+        "OD"
+    )
+    age_years: (
+        Annotated[
+            float,
+            Meta(
+                ge=3.0,
+                le=120.0,
+                description="limits accommodation; `settings.age_years` overrides it",
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
+    correction: Annotated[
+        CorrectionBody | None,
+        Meta(description="spectacles, a contact lens or an intraocular lens"),
+    ] = None
+    retina: Annotated[
+        RetinaBody | None, Meta(description="shape that replaces the model's retina")
+    ] = None
+    periphery: (
+        Annotated[
+            Literal["people", "model"],
+            Meta(
+                description="`people` (default): off-axis wavefronts of the measured "
+                "population; `model`: those of the surfaces. Kind `eye` and profiles "
+                "with a `retina` always use `model`"
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
+    straylight: Annotated[
+        StraylightBody | None, Meta(description="scatter in the ocular media")
+    ] = None
+    yellowing: Annotated[
+        Literal["seen", "adapted"] | None,
+        Meta(
+            description="absorption of the aging lens; `adapted` keeps the luminance "
+            "of white. Requires `age_years`"
+        ),
+    ] = None
+    spectacle_magnification: Annotated[
+        bool,
+        Meta(
+            description="apply the magnification of the `correction`, which it requires"
+        ),
+    ] = False
+
+
+class PresetBody(CommonBody, kw_only=True, tag_field="kind", tag="preset"):
+    """A preset eye by its name."""
+
+    name: Literal[tuple(PRESETS)]  # type: ignore[valid-type]  # read from a file
+
+
+class PrescriptionBody(CommonBody, kw_only=True, tag_field="kind", tag="prescription"):
+    """An eye that a prescription corrects."""
+
+    sphere_dpt: SphereDpt
+    cylinder_dpt: CylinderDpt = 0.0
+    axis_deg: AxisDeg | UnsetType = UNSET
+    vertex_mm: VertexMm | UnsetType = UNSET
+    add_dpt: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=4.0,
+            description="near addition, by which accommodation is reduced",
+        ),
+    ] = 0.0
+    higher_order: (
+        Annotated[
+            Literal["typical", "none"],
+            Meta(
+                description="higher-order aberrations of a traced eye: those typical "
+                "of its age (default), or none (default with an intraocular lens)"
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
+
+
+class ZernikeBody(CommonBody, kw_only=True, tag_field="kind", tag="zernike"):
+    """A measured wavefront on the axis."""
+
+    zernike_um: CoefficientsUm
+    pupil_diameter_mm: PupilDiameterMm
+    wavelength_nm: WavelengthNm
+    frame: Frame = "eye"
+
+
+class MeasurementBody(Body, kw_only=True):
+    """One wavefront of a set."""
+
+    zernike_um: CoefficientsUm
+    pupil_diameter_mm: PupilDiameterMm
+    wavelength_nm: WavelengthNm
+    kind: Literal["zernike"] = "zernike"
+    frame: Frame | UnsetType = UNSET
+    h_deg: FieldAngleDeg = 0.0
+    v_deg: FieldAngleDeg = 0.0
+
+
+class ZernikeSetBody(CommonBody, kw_only=True, tag_field="kind", tag="zernike_set"):
+    """Wavefronts of one eye in several directions or through several pupils."""
+
+    measurements: Annotated[
+        list[MeasurementBody],
+        Meta(
+            min_length=1,
+            max_length=MAX_MEASUREMENTS,
+            extra={ALLOWED: MEASUREMENTS_ALLOWED},
+        ),
+    ]
+    frame: Frame | UnsetType = UNSET
+
+
+def _parameter_field(row: Parameter) -> tuple[str, Any] | tuple[str, Any, float]:
+    low, high = row.allowed
+    kind = Annotated[float, Meta(ge=low, le=high, description=row.means)]
+    if row.name.startswith("cornea_offset_"):
+        return row.name, kind, 0.0
+    return row.name, kind
+
+
+ParametersBody = msgspec.defstruct(
+    "ParametersBody",
+    # required fields come first; the parser reads them by name
+    [_parameter_field(row) for row in PARAMETERS],
+    bases=(Body,),
+    namespace={"__doc__": "The parameters of the eye model."},
+    kw_only=True,
+)
+
+
+class EyeBody(CommonBody, kw_only=True, tag_field="kind", tag="eye"):
+    """An eye by the 45 parameters of the eye model."""
+
+    parameters: Annotated[
+        ParametersBody,  # type: ignore[valid-type]  # built from a table
+        Meta(extra={ALLOWED: "an object of the 45 by name"}),
+    ]
+
+
+ProfileBody = PresetBody | PrescriptionBody | ZernikeBody | ZernikeSetBody | EyeBody

@@ -1,0 +1,247 @@
+"""Conversion of plain data to the types of `bodies`, with errors that name the field.
+
+msgspec validates.  Its messages contain neither the value nor the keys of an object;
+where it rejects a profile, `_check` locates the first invalid field by the same types.
+"""
+
+import math
+import reprlib
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+import numpy as np
+from msgspec import inspect
+
+from estimator.eye.checked_fields import ProfileError, did_you_mean
+
+KIND, DESIGN = "kind", "design"
+DEFAULT_KINDS = {"correction": "spectacles"}
+"""Kind of an object that states none, by the field that holds it."""
+
+DEFAULT_DESIGNS = {"iol": "monofocal"}
+"""Kinds whose tag contains a design, and the design of an object that states none."""
+
+ALLOWED = "allowed"
+"""Key of `msgspec.Meta.extra`: the allowed values in words, for error messages."""
+
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel = 4
+_SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 60
+
+
+def convert(data: object, kind: Any) -> Any:
+    """Convert plain data to a type of `bodies`.
+
+    Parameters
+    ----------
+    data : object
+        Mappings, sequences, text, booleans and numbers, those of NumPy included.
+    kind : type
+        A `Body`, or a union of them.
+
+    Raises
+    ------
+    ProfileError
+        A field is invalid; the error names it, its value and the allowed values.
+    """
+    plain = _tagged(data, "")
+    try:
+        return msgspec.convert(plain, kind)
+    except msgspec.ValidationError as error:
+        _check(plain, inspect.type_info(kind), "")
+        # msgspec rejects what the walk accepts, for example an integer beyond 64 bits
+        raise ProfileError("profile", str(error), "see the JSON Schema") from None
+
+
+def _tagged(data: object, field: str) -> object:
+    """Return ``data`` as dict, list and plain numbers, objects with complete tags."""
+    if isinstance(data, np.generic):
+        return data.item()
+    if isinstance(data, Mapping):
+        found = {key: _tagged(value, str(key)) for key, value in data.items()}
+        if field not in DEFAULT_KINDS:
+            return found
+        kind = found.get(KIND, DEFAULT_KINDS[field])
+        if isinstance(kind, str) and kind in DEFAULT_DESIGNS:
+            design = found.get(DESIGN, DEFAULT_DESIGNS[kind])
+            if isinstance(design, str):  # anything else is reported as it is
+                kind = f"{kind}/{design}"
+                found.pop(DESIGN, None)
+        return {**found, KIND: kind}
+    if isinstance(data, list | tuple):
+        return [_tagged(value, "") for value in data]
+    return data
+
+
+def _check(value: object, kind: inspect.Type, path: str) -> None:
+    """Raise an error at the first field of ``value`` that is not of type ``kind``."""
+    if isinstance(kind, inspect.Metadata):
+        allowed = (kind.extra or {}).get(ALLOWED)
+        if allowed is not None and not _is_container(value, kind.type):
+            raise ProfileError(path, _mismatch(value, kind.type), allowed)
+        _check(value, kind.type, path)
+    elif isinstance(kind, inspect.UnionType):
+        _check_union(value, kind, path)
+    elif isinstance(kind, inspect.StructType):
+        _check_object(value, kind, path)
+    elif isinstance(kind, inspect.FloatType):
+        _check_number(value, kind, path)
+    elif isinstance(kind, inspect.BoolType):
+        if not isinstance(value, bool):
+            raise ProfileError(
+                path, f"{_shown(value)} is not a boolean", "true or false"
+            )
+    elif isinstance(kind, inspect.LiteralType):
+        _check_choice(value, sorted(map(str, kind.values)), path)
+    elif isinstance(kind, inspect.StrType):
+        if not isinstance(value, str):
+            raise ProfileError(path, f"{_shown(value)} is not text", "text")
+    elif isinstance(kind, inspect.DictType):
+        for key, item in _object(value, path).items():
+            _check(item, kind.value_type, f"{path}.{key}")
+    elif isinstance(kind, inspect.ListType | inspect.TupleType | inspect.VarTupleType):
+        _check_list(value, kind, path)
+
+
+def _check_union(value: object, kind: inspect.UnionType, path: str) -> None:
+    if value is None and kind.includes_none:
+        return
+    members = {m.tag: m for m in kind.types if isinstance(m, inspect.StructType)}
+    if None in members or not members:
+        for member in kind.types:
+            if not isinstance(member, inspect.NoneType):
+                _check(value, member, path)
+        return
+    data = _object(value, path)
+    prefix = f"{path}." if path else ""
+    kinds = list(dict.fromkeys(str(tag).partition("/")[0] for tag in members))
+    if KIND not in data:
+        raise ProfileError(prefix + KIND, "is missing", "one of " + ", ".join(kinds))
+    tag = data[KIND]
+    if isinstance(tag, str) and tag in members:
+        _check_object(data, members[tag], path)
+        return
+    head, _, design = tag.partition("/") if isinstance(tag, str) else (tag, "", "")
+    _check_choice(head, kinds, prefix + KIND)
+    designs = [str(t).partition("/")[2] for t in members if str(t).startswith(head)]
+    _check_choice(data.get(DESIGN, design), designs, prefix + DESIGN)
+
+
+def _check_object(value: object, kind: inspect.StructType, path: str) -> None:
+    data = _object(value, path)
+    prefix = f"{path}." if path else ""
+    names = [field.encode_name for field in kind.fields]
+    if kind.tag is not None:
+        names = [KIND, *names]
+        if "/" in str(kind.tag):
+            names = [*names, DESIGN]
+    for name in data:
+        if name not in names:
+            problem = "is not a field of this kind" + did_you_mean(name, names)
+            raise ProfileError(prefix + name, problem, "the fields " + ", ".join(names))
+    for field in kind.fields:
+        if field.encode_name in data:
+            _check(data[field.encode_name], field.type, prefix + field.encode_name)
+        elif field.required:
+            raise ProfileError(
+                prefix + field.encode_name, "is missing", allowed_values(field.type)
+            )
+
+
+def _check_number(value: object, kind: inspect.FloatType, path: str) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ProfileError(
+            path, f"{_shown(value)} is not a number", allowed_values(kind)
+        )
+    low = -math.inf if kind.ge is None else kind.ge
+    high = math.inf if kind.le is None else kind.le
+    if not low <= value <= high:  # nor is NaN; integers may exceed every float
+        raise ProfileError(
+            path, f"{_shown(value)} is out of range", allowed_values(kind)
+        )
+
+
+def _check_choice(value: object, options: list[str], path: str) -> None:
+    if not isinstance(value, str) or value not in options:
+        problem = f"{_shown(value)} is unknown{did_you_mean(value, options)}"
+        raise ProfileError(path, problem, "one of " + ", ".join(options))
+
+
+def _check_list(
+    value: object,
+    kind: inspect.ListType | inspect.TupleType | inspect.VarTupleType,
+    path: str,
+) -> None:
+    if not _is_container(value, kind):
+        raise ProfileError(path, _mismatch(value, kind), allowed_values(kind))
+    assert isinstance(value, list)
+    for index, item in enumerate(value):
+        item_type = (
+            kind.item_types[index]
+            if isinstance(kind, inspect.TupleType)
+            else kind.item_type
+        )
+        _check(item, item_type, f"{path}.{index}")
+
+
+def _is_container(value: object, kind: inspect.Type) -> bool:
+    """Return whether ``value`` is an object or a list of an allowed length."""
+    if isinstance(kind, inspect.StructType | inspect.DictType):
+        return isinstance(value, dict)
+    low, high = _lengths(kind)
+    return isinstance(value, list) and low <= len(value) <= high
+
+
+def _mismatch(value: object, kind: inspect.Type) -> str:
+    if isinstance(kind, inspect.StructType | inspect.DictType):
+        return f"{_shown(value)} is not an object"
+    if isinstance(value, list):
+        return f"{_shown(value)} has {len(value)} elements"
+    return f"{_shown(value)} is not a list"
+
+
+def _lengths(kind: inspect.Type) -> tuple[int, int]:
+    if isinstance(kind, inspect.TupleType):
+        return (len(kind.item_types),) * 2
+    assert isinstance(kind, inspect.ListType | inspect.VarTupleType)
+    return kind.min_length or 0, kind.max_length or 0
+
+
+def _object(value: object, path: str) -> dict[str, Any]:
+    if not isinstance(value, dict) or not all(isinstance(k, str) for k in value):
+        problem = f"{_shown(value)} is not an object"
+        raise ProfileError(path or "profile", problem, "a JSON object")
+    return value
+
+
+def allowed_values(kind: inspect.Type) -> str:
+    """Return the allowed values of a type in words."""
+    if isinstance(kind, inspect.Metadata):
+        return (kind.extra or {}).get(ALLOWED) or allowed_values(kind.type)
+    if isinstance(kind, inspect.FloatType):
+        return f"a number from {kind.ge:g} to {kind.le:g}"
+    if isinstance(kind, inspect.LiteralType):
+        return "one of " + ", ".join(sorted(map(str, kind.values)))
+    if isinstance(kind, inspect.TupleType | inspect.VarTupleType):
+        low, high = _lengths(kind)
+        count = f"{low}" if low == high else f"{low} to {high}"
+        item = (
+            kind.item_types[0]
+            if isinstance(kind, inspect.TupleType)
+            else kind.item_type
+        )
+        return (
+            f"a list of {count} numbers{allowed_values(item).removeprefix('a number')}"
+        )
+    return "a JSON object" if isinstance(kind, inspect.StructType) else "text"
+
+
+def _shown(value: object) -> str:
+    """Return an untrusted value as JSON writes it, shortened."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    try:
+        return _SHORT.repr(value)
+    except ValueError:  # an integer of more digits than Python prints
+        return "an integer"
