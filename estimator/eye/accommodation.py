@@ -82,6 +82,18 @@ def _falling_count(refractions_dpt: NDArray[np.float64]) -> int:
     return int(np.argmin(usable)) if not usable.all() else usable.size
 
 
+def _polynomial(
+    x: NDArray[np.float64], y: NDArray[np.float64]
+) -> BarycentricInterpolator:
+    """Return the polynomial through points, with the same rounding in every process.
+
+    SciPy computes the weights in a random order.  With a generator of its own, two
+    processes prepared one eye with wavefronts that differed by the last bits, and
+    images by 1e-7.
+    """
+    return BarycentricInterpolator(x, y, rng=np.random.default_rng(0))
+
+
 class AccommodatingEye(Focusing):
     """An eye that can focus, at any pupil.
 
@@ -264,9 +276,9 @@ class AccommodatingEye(Focusing):
         """
         used_dpt = np.atleast_1d(np.asarray(accommodations_dpt, dtype=np.float64))
         known_dpt, refractions_dpt = self._cornea_table()
-        found_dpt: NDArray[np.float64] = BarycentricInterpolator(
-            known_dpt, refractions_dpt
-        )(np.minimum(used_dpt, known_dpt[-1]))
+        found_dpt: NDArray[np.float64] = _polynomial(known_dpt, refractions_dpt)(
+            np.minimum(used_dpt, known_dpt[-1])
+        )
         return found_dpt
 
     def accommodations_at_cornea_dpt(
@@ -277,7 +289,7 @@ class AccommodatingEye(Focusing):
         if known_dpt.size == 1:
             return np.zeros(np.shape(refractions_dpt))
         wanted_dpt = np.clip(refractions_dpt, at_cornea_dpt[-1], at_cornea_dpt[0])
-        used_dpt = BarycentricInterpolator(at_cornea_dpt, known_dpt)(wanted_dpt)
+        used_dpt = _polynomial(at_cornea_dpt, known_dpt)(wanted_dpt)
         within_dpt: NDArray[np.float64] = np.clip(used_dpt, 0.0, self.amplitude_dpt)
         return within_dpt
 
@@ -316,7 +328,7 @@ class AccommodatingEye(Focusing):
             return np.full(wanted_dpt.shape, known_mm[0])
         # The table is smooth and short: linear interpolation would be 1e-2 dpt off,
         # and every further step costs a trace for each focus.
-        curve = BarycentricInterpolator(known_dpt, known_mm)
+        curve = _polynomial(known_dpt, known_mm)
         diameters_mm: NDArray[np.float64] = np.clip(
             curve(wanted_dpt), known_mm[-1], known_mm[0]
         )

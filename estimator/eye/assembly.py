@@ -15,8 +15,14 @@ from estimator.eye.parameters import (
     RetinaShape,
     column,
 )
-from estimator.optics import surfaces as packing
-from estimator.optics.surfaces import EyeSurfaces, Retina, Surface, offset_monomials
+from estimator.optics import packed as packing
+from estimator.optics.surfaces import (
+    EyeSurfaces,
+    Retina,
+    Surface,
+    offset_monomials,
+    rotation_matrix,
+)
 
 N_SURFACES = 4
 CORNEA_ANTERIOR, CORNEA_POSTERIOR, LENS_ANTERIOR, LENS_POSTERIOR, RETINA = range(5)
@@ -105,7 +111,7 @@ def _lens_surfaces(
     else:
         raise ValueError(f"lens rule '{lens_rule}': allowed are C and compat")
     tilt_deg = (p.lens_tilt_about_x_deg, p.lens_tilt_about_y_deg)
-    axis = packing.rotation_matrix(rotation_deg=0.0, tilt_deg=tilt_deg)[:, 2]
+    axis = rotation_matrix(rotation_deg=0.0, tilt_deg=tilt_deg)[:, 2]
     vertex_mm = np.array(
         [p.lens_decentration_x_mm, p.lens_decentration_y_mm, pole_z_mm]
     )
@@ -141,7 +147,7 @@ def pack_eyes(
 
     Returns
     -------
-    packed : (P, 5, 48)
+    packed : (P, 5, N_COLUMNS)
         Surfaces in the layout of `estimator.optics.surfaces.pack_eye`.
     """
 

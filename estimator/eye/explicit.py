@@ -4,13 +4,17 @@
                    "z_mm": 0, "medium_after": "cornea",
                    optional: "offset_mm": [27 or 28 terms], "offset_radius_mm",
                    "rotation_deg", "decentration_mm": [x, y], "tilt_deg": [x, y],
-                   "clear_radius_mm"}, ...],
+                   "clear_radius_mm", "form": {"kind": "even_asphere", ...}}, ...],
      "stop_z_mm": 3.6,
-     "retina": {"radius_mm": 12, "conic_constant": 0, "z_mm": 24},
-     "indices": {"cornea": 1.376, ...} or null}
+     "retina": {"radius_mm": 12, "conic_constant": 0, "z_mm": 24,
+                optional: "rotation_deg", "decentration_mm", "tilt_deg", "form"},
+     "indices": {"cornea": 1.376, ...} or null,
+     "media": {"lens": {"kind": "cauchy", "coefficients": [1.4, 0.006]}, ...} or null}
 
-27 offset terms are j = 1 to 27, 28 are j = 0 to 27.  Without ``indices`` the dispersion
-of the media follows Herzberger's formula (`media`).
+27 offset terms are j = 1 to 27, 28 are j = 0 to 27.  The kinds of a form are those of
+`estimator.optics.forms`, those of a medium are those of `estimator.optics.dispersion`
+and `estimator.optics.gradients`; their fields are the attributes of the classes.  Media
+in neither ``indices`` nor ``media`` follow Herzberger's formula (`media`).
 """
 
 import math
@@ -22,7 +26,12 @@ from numpy.typing import NDArray
 
 from estimator.eye import checked_fields as fields
 from estimator.eye.checked_fields import ProfileError
+from estimator.eye.tagged import tagged
+from estimator.optics.dispersion import DISPERSIONS, Dispersion
+from estimator.optics.forms import FORMS, Form
+from estimator.optics.gradients import GRADIENTS, Gradient
 from estimator.optics.media import MEDIA
+from estimator.optics.raytrace import check_order
 from estimator.optics.surfaces import (
     MAX_SURFACES,
     OFFSET_RADIUS_MM,
@@ -30,10 +39,15 @@ from estimator.optics.surfaces import (
     Retina,
     Surface,
     check_eye,
+    media_indices,
 )
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import N_TERMS
 
-EYE_FIELDS = ("surfaces", "stop_z_mm", "retina", "indices", "name", "eye_side")
+EYE_FIELDS = (
+    *("surfaces", "stop_z_mm", "retina", "indices", "media"),
+    *("name", "eye_side"),
+)
 SURFACE_FIELDS = (
     "name",
     "radius_mm",
@@ -46,8 +60,12 @@ SURFACE_FIELDS = (
     "decentration_mm",
     "tilt_deg",
     "clear_radius_mm",
+    "form",
 )
-RETINA_FIELDS = ("radius_mm", "conic_constant", "z_mm", "name")
+RETINA_FIELDS = (
+    *("radius_mm", "conic_constant", "z_mm", "rotation_deg"),
+    *("decentration_mm", "tilt_deg", "form", "name"),
+)
 
 RADIUS_LIMITS_MM = (0.5, 1e9)
 CONIC_LIMITS = (-1000.0, 1000.0)
@@ -76,7 +94,8 @@ def parse_explicit_eye(data: object) -> EyeSurfaces:
         allowed = f"a list of 1 to {MAX_SURFACES} surfaces"
         raise ProfileError("surfaces", "is no such list", allowed)
     indices = _indices(data.get("indices"))
-    known = (*MEDIA, *(indices or {}))
+    media = _media(data.get("media"))
+    known = (*MEDIA, *(indices or {}), *(media or {}))
     eye = EyeSurfaces(
         surfaces=tuple(
             _surface(entry, f"surfaces[{i}]", known) for i, entry in enumerate(entries)
@@ -84,9 +103,13 @@ def parse_explicit_eye(data: object) -> EyeSurfaces:
         stop_z_mm=fields.number(data, "stop_z_mm", *DEPTH_LIMITS_MM),
         retina=_retina(data.get("retina")),
         indices=indices,
+        media=media,
     )
     try:
         check_eye(eye)
+        check_order(eye)
+        if media:
+            media_indices(eye, REFERENCE_WAVELENGTH_NM)
     except ValueError as error:
         raise ProfileError("surfaces", str(error), "surfaces in order") from None
     return eye
@@ -104,6 +127,21 @@ def _indices(data: object) -> dict[str, float] | None:
         medium: fields.number(data, medium, *INDEX_LIMITS, path="indices.")
         for medium in data
     }
+
+
+def _media(data: object) -> dict[str, Dispersion | Gradient] | None:
+    if data is None:
+        return None
+    data = fields.mapping(data, "media")
+    table = (*DISPERSIONS, *GRADIENTS)
+    return {name: tagged(data[name], table, f"media.{name}") for name in data}
+
+
+def _form(data: Mapping[str, Any], path: str) -> Form | None:
+    if data.get("form") is None:
+        return None
+    form: Form = tagged(data["form"], FORMS, f"{path}form")
+    return form
 
 
 def _surface(data: object, name: str, media: Sequence[str]) -> Surface:
@@ -128,6 +166,7 @@ def _surface(data: object, name: str, media: Sequence[str]) -> Surface:
         clear_radius_mm=(
             math.inf if clear_mm is None else number("clear_radius_mm", 0.1, 50.0, 0.0)
         ),
+        form=_form(data, path),
     )
 
 
@@ -193,4 +232,10 @@ def _retina(data: object) -> Retina:
             data, "conic_constant", *CONIC_LIMITS, default=0.0, path=path
         ),
         z_mm=fields.number(data, "z_mm", *DEPTH_LIMITS_MM, path=path),
+        rotation_deg=fields.number(
+            data, "rotation_deg", -360.0, 360.0, default=0.0, path=path
+        ),
+        decentration_mm=_pair(data, "decentration_mm", 5.0, path),
+        tilt_deg=_pair(data, "tilt_deg", 45.0, path),
+        form=_form(data, path),
     )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 STANDARD_PUPILS_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
 NEAREST_PUPIL_MM = 0.6
-"""Standard pupils nearer than this to the eye's own are omitted."""
+"""Standard pupils closer than this to the eye's own pupil are omitted."""
 
 
 def table_pupils_mm(own_mm: float) -> list[float]:

@@ -2,7 +2,7 @@
 
 Distances and refraction refer to the plane of the entrance pupil.  Focus depends on the
 pupil too: spherical aberration moves the sharpest distance as the pupil opens, so every
-method takes the pupil.
+method requires the pupil diameter.
 """
 
 from abc import ABC, abstractmethod
@@ -52,14 +52,14 @@ class Focusing(ABC):
     def accommodation_for_dpt(
         self, refraction_dpt: float, *, pupil_diameter_mm: float
     ) -> float:
-        """Return the accommodation in reach whose M at a pupil is nearest to this."""
+        """Return the reachable accommodation whose M at a pupil is closest to this."""
 
     @abstractmethod
     def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
         """Return the accommodation for the near point through a pupil."""
 
     def accommodation_dpt(self, focus_dpt: float, *, pupil_diameter_mm: float) -> float:
-        """Return the accommodation in reach that makes a distance sharpest."""
+        """Return the reachable accommodation that focuses a distance best."""
         return self.accommodation_for_dpt(
             -self.vergence.vergence_dpt(focus_dpt),
             pupil_diameter_mm=pupil_diameter_mm,
@@ -99,7 +99,7 @@ class Focusing(ABC):
         *,
         pupil_range_mm: tuple[float, float],
     ) -> tuple[float, float]:
-        """Return smallest and largest accommodation for ranges of focus and pupil."""
+        """Return smallest and largest accommodation over ranges of focus and pupil."""
         used_dpt = [
             self.accommodation_dpt(focus_dpt, pupil_diameter_mm=float(pupil_mm))
             for pupil_mm in np.linspace(*pupil_range_mm, RANGE_PUPIL_COUNT)

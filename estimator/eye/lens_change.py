@@ -2,7 +2,7 @@
 
 The lens shrinks at constant volume, which steepens both surfaces (rule C).  Its
 anterior pole, and the stop with it, moves forward by the growth of the thickness before
-the equator, so the aqueous thins.  The eye length stays.
+the equator, so the aqueous thins.  The eye length does not change.
 """
 
 import math

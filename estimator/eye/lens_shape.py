@@ -1,7 +1,8 @@
 """Shape of the lens from its diameter and volume.
 
 Two conic caps that meet at the equator cannot represent a real lens, which has a thick
-rounded rim.  Both rules give the caps part of the volume and the rim a thickness.
+rounded rim.  Both rules assign part of the volume to the caps and a thickness to the
+rim.
 """
 
 import math
@@ -84,7 +85,7 @@ def compat_lens_shape(
     Raises
     ------
     ValueError
-        No pair of caps holds the volume.
+        No pair of caps has this volume.
     """
     rim_mm = 10.0 / (diameter_mm - 4.0)
     cap_volume_mm3 = 0.3 * rim_mm * volume_mm3

@@ -5,16 +5,13 @@ array of 45 parameters in this project has this order.  Axes are the project's: 
 person's right, y up, z into the eye; the paper's y and z are our x and y.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.eye import checked_fields as profile_fields
-from estimator.eye.checked_fields import ProfileError
 from estimator.optics.zernike import N_TERMS, nm_from_index
 
 N_PARAMETERS = 45
@@ -210,35 +207,8 @@ class EyeParameters:
         return np.array(values)
 
     def to_mapping(self) -> dict[str, float]:
-        """Return the parameters by name, as a profile of kind ``eye`` holds them."""
+        """Return the parameters by name, as in a profile of kind ``eye``."""
         return dict(zip(PARAMETER_NAMES, self.to_vector().tolist(), strict=True))
-
-
-def parse_parameters(data: object, *, path: str = "parameters.") -> EyeParameters:
-    """Parse parameters by name; omitted offsets are zero.
-
-    Raises
-    ------
-    ProfileError
-        A parameter is invalid; the error names it, its value and the allowed range.
-    """
-    data = profile_fields.mapping(data, path.rstrip("."))
-    for name in data:
-        if name not in PARAMETER_NAMES:
-            raise ProfileError(
-                path + name, "is no parameter", ", ".join(PARAMETER_NAMES)
-            )
-    vector = [
-        profile_fields.number(
-            data,
-            row.name,
-            *row.allowed,
-            default=0.0 if row.name.startswith("cornea_offset_") else None,
-            path=path,
-        )
-        for row in PARAMETERS
-    ]
-    return EyeParameters.from_vector(vector)
 
 
 def random_vectors(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -258,17 +228,3 @@ class RetinaShape:
 
     radius_mm: float
     conic_constant: float = 0.0
-
-
-def parse_retina(data: Mapping[str, Any]) -> RetinaShape | None:
-    """Parse the optional ``retina`` of a profile."""
-    if data.get("retina") is None:
-        return None
-    body = profile_fields.mapping(data["retina"], "retina")
-    profile_fields.only_known(body, ("radius_mm", "conic_constant"), path="retina.")
-    return RetinaShape(
-        radius_mm=profile_fields.number(body, "radius_mm", 8.0, 25.0, path="retina."),
-        conic_constant=profile_fields.number(
-            body, "conic_constant", -1.0, 2.0, default=0.0, path="retina."
-        ),
-    )

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from estimator.optics.dispersion import WavelengthPolynomial
+from estimator.optics.gradients import PolynomialGradient
 from estimator.optics.surfaces import EyeSurfaces, Retina, Surface, rotation_matrix
 from estimator.optics.zernike import (
     N_TERMS,
@@ -182,3 +184,33 @@ def field_axes(h_deg, v_deg):
 def field_of(u):
     """(h, v) in degrees of a unit vector to the source."""
     return math.degrees(math.atan2(u[0], -u[2])), math.degrees(math.asin(u[1]))
+
+
+def liou_brennan(*, steps=4, **lens):
+    """The eye of Liou & Brennan (1997); ``lens`` displaces its three lens surfaces."""
+    shift = WavelengthPolynomial((0.0512, -0.1455, 0.0961))
+
+    def homogeneous(index):
+        return WavelengthPolynomial((index + 0.0512, -0.1455, 0.0961))
+
+    def gradient(*rows):
+        return PolynomialGradient(rows, dispersion=shift, steps=steps)
+
+    return EyeSurfaces(
+        surfaces=(
+            _sphere(7.77, -0.18, 0.0, "cornea"),
+            _sphere(6.40, -0.60, 0.50, "aqueous"),
+            replace(_sphere(12.40, -0.94, 3.66, "anterior lens"), **lens),
+            replace(_sphere(math.inf, 0.0, 5.25, "posterior lens"), **lens),
+            replace(_sphere(-8.10, 0.96, 7.68, "vitreous"), **lens),
+        ),
+        stop_z_mm=3.66,
+        retina=Retina(12.0, 0.0, 23.95),
+        media={
+            "cornea": homogeneous(1.376),
+            "aqueous": homogeneous(1.336),
+            "anterior lens": gradient((1.368, 0.049057, -0.015427), (-0.001978,)),
+            "posterior lens": gradient((1.407, 0.0, -0.006605), (-0.001978,)),
+            "vitreous": homogeneous(1.336),
+        },
+    )
