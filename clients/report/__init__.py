@@ -8,13 +8,12 @@ correction_text  descriptions of corrections
 charts           filtered letter charts, near and far
 provenance       measured, entered and assumed data
 sources          literature references
-blocks           building blocks of a report
+origin           reference, date, version and digest of the profile
+blocks           sections, rows, tables and figures
 tables           tables of a report
 content          the report of one eye
 comparison       the report of two eyes
-html_page        HTML output
-pdf_pages        PDF output
-pdf_text         text layout of the PDF
+html_page        HTML output, which a PDF is printed from
 """
 
 import lazy_loader

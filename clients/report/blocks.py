@@ -1,4 +1,4 @@
-"""Building blocks of a report, independent of its format: titled rows of blocks."""
+"""Content of a report, independent of its format: sections of rows of blocks."""
 
 from __future__ import annotations
 
@@ -9,21 +9,32 @@ import numpy as np
 from matplotlib.figure import FigureBase
 from numpy.typing import NDArray
 
-PAGE_WIDTH_MM, PAGE_HEIGHT_MM = 210.0, 297.0
 MARGIN_MM = 12.0
-CONTENT_WIDTH_MM = PAGE_WIDTH_MM - 2.0 * MARGIN_MM
+CONTENT_WIDTH_MM = 210.0 - 2.0 * MARGIN_MM
+"""Width of A4 without its margins."""
+
 GAP_MM = 5.0
 """Gap between the blocks of a row."""
 
 
 @dataclass(frozen=True)
 class Table:
-    """Cells of text; the first column labels the rows."""
+    """Cells of text; the first column labels the rows.
+
+    Attributes
+    ----------
+    groups : tuple of (str, int)
+        Headings above the head, each with the number of columns that it spans.
+    has_prose : bool
+        Whether cells contain sentences, which break over lines.
+    """
 
     title: str
     rows: tuple[tuple[str, ...], ...]
     head: tuple[str, ...] = ()
     note: str = ""
+    groups: tuple[tuple[str, int], ...] = ()
+    has_prose: bool = False
 
 
 @dataclass(frozen=True)
@@ -45,11 +56,12 @@ class Picture:
 
 @dataclass(frozen=True)
 class Words:
-    """Paragraphs, or the items of a list."""
+    """Paragraphs, or the items of a list, in one or more columns."""
 
     paragraphs: tuple[str, ...]
     title: str = ""
     is_list: bool = False
+    n_columns: int = 1
 
 
 Block = Table | Plot | Picture | Words
@@ -76,14 +88,20 @@ class Section:
 
     title: str
     rows: tuple[Row, ...]
-    starts_page: bool = False
 
 
 @dataclass(frozen=True)
 class Document:
-    """A report: title, subtitle, sections and footer."""
+    """A report.
+
+    Attributes
+    ----------
+    origin : tuple of (str, str)
+        Name and value of what identifies the report: reference, date, version, profile.
+    """
 
     title: str
     subtitle: str
     sections: tuple[Section, ...]
     footer: str
+    origin: tuple[tuple[str, str], ...] = ()

@@ -16,6 +16,7 @@ from clients.figures import (
     draw_wavefront_map,
 )
 from clients.figures.orders import FIRST_HIGHER, on_circle_um
+from clients.figures.psfs import psf_sides_arcmin
 from clients.figures.study import PUPILS_MM
 from clients.figures.style import TITLE_PT
 from clients.report.blocks import (
@@ -52,8 +53,7 @@ from clients.report.tables import (
 )
 
 NEAR_M, FAR_M = DISTANCES_M[0], DISTANCES_M[-1]
-MAP_MM, PSF_MM = 46.0, 58.0
-"""Heights at which all content of the first page fits on it."""
+MAP_MM, PSF_MM = 52.0, 54.0
 
 CURVES_MM = 64.0
 """Height of curves of both eyes."""
@@ -63,18 +63,14 @@ def comparison_document(before: EyeFacts, after: EyeFacts) -> Document:
     """Return the report of two eyes: first the differences, then each eye."""
     cite = Citations()
     cite("csoba", "osa", "vectors")
-    of_each = [
-        section
-        for facts in (before, after)
-        for section in details(facts, cite, name=facts.label)
-    ]
+    of_each = [details(facts, cite, name=facts.label) for facts in (before, after)]
     return Document(
         title=f"Eye report: {before.label} → {after.label}",
         subtitle=f"{subtitle(before.study)} → {subtitle(after.study)}",
         sections=(
             _difference(before, after),
             _curves(before, after),
-            *of_each,
+            *(section for pair in zip(*of_each, strict=True) for section in pair),
             sources(cite),
         ),
         footer=NOT_A_DEVICE,
@@ -93,9 +89,9 @@ def _difference(before: EyeFacts, after: EyeFacts) -> Section:
     return Section(
         "Before and after",
         (
-            Row(tables, (1.0, 1.9)),
+            *(Row((table,)) for table in tables),
             Row((*(_map(*pair, studies) for pair in pairs), bars)),
-            Row(tuple(_psfs(*pair) for pair in pairs)),
+            Row(tuple(_psfs(*pair, psf_sides_arcmin(studies)) for pair in pairs)),
             _charts(before, after, DAY_MM),
             *(Row((Words(limits),)) for limits in _limits(before, after)),
         ),
@@ -108,9 +104,11 @@ def _limits(before: EyeFacts, after: EyeFacts) -> tuple[tuple[str, ...], ...]:
     return tuple(dict.fromkeys(limits for limits in of_all if limits))
 
 
-def _psfs(study: EyeStudy, label: str) -> Plot:
+def _psfs(study: EyeStudy, label: str, sides_arcmin: tuple[float, float]) -> Plot:
+    """Return the PSFs of one eye, at the scale of both."""
+
     def draw(panel: FigureBase) -> None:
-        draw_psfs(panel, study)
+        draw_psfs(panel, study, sides_arcmin=sides_arcmin)
         panel.suptitle(label, fontsize=TITLE_PT)
 
     return Plot(draw, PSF_MM, f"Point-spread functions: {label}")
@@ -126,7 +124,7 @@ def _map(study: EyeStudy, label: str, studies: tuple[EyeStudy, ...]) -> Plot:
             radius_mm=radius_mm,
             eye_side=study.profile.eye_side,
             from_order=FIRST_HIGHER,
-            title=f"{label}, orders 3 to 6",
+            title=f"{label}\norders 3 to 6{study.assumed_suffix}",
         ),
         MAP_MM,
         f"Map of the higher orders: {label}",
@@ -134,26 +132,34 @@ def _map(study: EyeStudy, label: str, studies: tuple[EyeStudy, ...]) -> Plot:
 
 
 def _refraction_table(before: EyeFacts, after: EyeFacts) -> Table:
-    pairs = [facts.numbers["eye"]["refraction"] for facts in (before, after)]
+    eyes = [facts.numbers["eye"] for facts in (before, after)]
     rows = [
         (
-            word,
-            *(refraction_text(pair, name) for pair in pairs),
-            "" if name == "axis_deg" else signed(pairs[1][name] - pairs[0][name]),
+            when,
+            *(refraction_text(eye["refraction"], n) for n in REFRACTION_ROWS.values()),
         )
-        for word, name in REFRACTION_ROWS.items()
+        for when, eye in zip(("before", "after"), eyes, strict=True)
     ]
-    worn_dpt = [
-        facts.numbers["eye"]["refraction_through_correction_dpt"]
-        for facts in (before, after)
-    ]
+    first, last = (eye["refraction"] for eye in eyes)
+    rows.append(
+        (
+            "change",
+            *(
+                "" if name == "axis_deg" else signed(last[name] - first[name])
+                for name in REFRACTION_ROWS.values()
+            ),
+        )
+    )
+    head = ("at the cornea", *REFRACTION_ROWS)
     if any(facts.study.profile.correction for facts in (before, after)):
-        change = signed(worn_dpt[1] - worn_dpt[0])
-        rows.append(("M as worn, dpt", *map(signed, worn_dpt), change))
+        worn_dpt = [eye["refraction_through_correction_dpt"] for eye in eyes]
+        through_dpt = (*worn_dpt, worn_dpt[1] - worn_dpt[0])
+        rows = [(*row, signed(dpt)) for row, dpt in zip(rows, through_dpt, strict=True)]
+        head = (*head, "M as worn")
     return Table(
-        "Refraction of the eyes found",
+        "Refraction of the estimated eyes, dpt",
         tuple(rows),
-        head=("at the cornea", "before", "after", "change"),
+        head=tuple(cell.removesuffix(", dpt") for cell in head),
         note=f"Before: {before.label}; after: {after.label}. Relaxed, 555 nm.",
     )
 
@@ -162,12 +168,8 @@ def _vision_table(before: EyeFacts, after: EyeFacts) -> Table:
     of_pupils = list(
         zip(before.numbers["pupils"], after.numbers["pupils"], strict=True)
     )
-    pupils = [
-        f"{pupil_text(numbers)} {when}"
-        for pair in of_pupils
-        for when, numbers in zip(("before", "after"), pair, strict=True)
-    ]
-    head = ("far object, 555 nm", *pupils)
+    groups = tuple((f"{pupil_text(pair[0])} pupil", 2) for pair in of_pupils)
+    head = ("far object, 555 nm", *("before", "after") * len(of_pupils))
     rows = tuple(
         (word, *(words(numbers) for pair in of_pupils for numbers in pair))
         for word, words in VISION_ROWS.items()
@@ -176,6 +178,7 @@ def _vision_table(before: EyeFacts, after: EyeFacts) -> Table:
         "Vision on the axis",
         rows,
         head=head,
+        groups=(("", 1), *groups),
         note="Acuity in logMAR, and as a decimal. * wider than the pupil measured.",
     )
 
@@ -224,5 +227,4 @@ def _curves(before: EyeFacts, after: EyeFacts) -> Section:
             Row(acuities),
             _charts(before, after, DUSK_MM),
         ),
-        starts_page=True,
     )

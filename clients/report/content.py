@@ -43,10 +43,8 @@ from clients.report.tables import (
 
 DAY_MM, DUSK_MM = PUPILS_MM
 
-MAP_MM, PSF_MM = 47.0, 57.0
-"""Heights at which all content of the first page fits on it."""
-
-FIELD_MM, CURVE_MM, TERMS_MM = 84.0, 68.0, 42.0
+MAP_MM, PSF_MM = 42.0, 48.0
+FIELD_MM, CURVE_MM, TERMS_MM = 76.0, 60.0, 40.0
 SIDES = {"OD": "right eye (OD)", "OS": "left eye (OS)"}
 NOT_A_DEVICE = (
     "A simulation for research and explanation, not a medical device: no diagnosis or "
@@ -110,7 +108,7 @@ def summary(facts: EyeFacts) -> Section:
     return Section(
         "Summary",
         (
-            Row((refraction_table(facts), vision_table(facts))),
+            Row((refraction_table(facts), vision_table(facts)), (1.0, 1.15)),
             Row((maps, orders), (2.0, 1.0)),
             Row((points, contrast), (1.0, 1.4)),
             chart_row(facts, DAY_MM),
@@ -188,7 +186,6 @@ def _field_section(facts: EyeFacts, of_whom: str) -> Section:
             chart_row(facts, DUSK_MM),
             Row((Words(study.field.notes, "How it was computed", is_list=True),)),
         ),
-        starts_page=True,
     )
 
 
@@ -206,10 +203,9 @@ def _known_section(facts: EyeFacts, cite: Citations, of_whom: str) -> Section:
             Row((terms,)),
             Row((coefficient_table(facts),)),
         ),
-        starts_page=True,
     )
 
 
 def sources(cite: Citations) -> Section:
     """Return the section of cited papers."""
-    return Section("Sources", (Row((Words(cite.listed()),)),))
+    return Section("Sources", (Row((Words((" ".join(cite.listed()),), n_columns=2),)),))

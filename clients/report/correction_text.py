@@ -26,6 +26,13 @@ DESIGNS = {
 }
 STRAIGHT_DEG = 0.5
 
+IMPLANT_LIMITS = (
+    "Intraocular lens: it acts as a phase in the pupil. Wavefront maps and "
+    "coefficients exclude it and the cornea's spherical aberration, and the section "
+    "shows the eye model with its natural lens; point images, contrast, acuity and "
+    "charts include both."
+)
+
 
 def short_text(lens: Prescription) -> str:
     """Return the type of a correction, in two or three words."""
@@ -140,6 +147,12 @@ def limits_text(lens: Prescription | None) -> tuple[str, ...]:
             f"Progressive lens: all of this report is for {_of_gaze(lens.gaze_deg)}; "
             "elsewhere the lens has another power.",
         )
+    if isinstance(lens, WornLens) and lens.replaces_lens:
+        return (IMPLANT_LIMITS, *_rings_limits(lens))
+    return _rings_limits(lens)
+
+
+def _rings_limits(lens: Prescription | None) -> tuple[str, ...]:
     if not isinstance(lens, WornLens) or lens.rings is None:
         return ()
     if isinstance(lens.rings, Lenslets):

@@ -1,4 +1,4 @@
-"""HTML output of a report: one self-contained file that prints on A4."""
+"""HTML output of a report: one self-contained file, also the source of the PDF."""
 
 from __future__ import annotations
 
@@ -26,55 +26,72 @@ from clients.report.blocks import (
 JPEG_QUALITY = 88
 
 STYLE = """
-@page { size: A4; margin: 12mm; }
+@page { size: A4; margin: 11mm 12mm 13mm;
+  @bottom-left { content: string(footer); font: 7.5pt "DejaVu Sans", sans-serif;
+    color: #4c5866; width: 160mm; }
+  @bottom-right { content: counter(page) " / " counter(pages);
+    font: 7.5pt "DejaVu Sans", sans-serif; color: #4c5866; } }
 * { box-sizing: border-box; }
 body { font: 9.5pt/1.35 "DejaVu Sans", Verdana, system-ui, sans-serif; color: #1b2430;
   background: #eef1f4; margin: 0; }
 main { background: #fff; max-width: 210mm; margin: 0 auto; padding: 12mm; }
 header { border-bottom: 1.5pt solid #1f5fa8; margin-bottom: 4mm; }
 h1 { font-size: 16pt; margin: 0; }
-header p { margin: 1mm 0 2mm; color: #4c5866; }
-h2 { font-size: 12pt; color: #1f5fa8; margin: 4mm 0 1.5mm; }
-h3 { font-size: 9.5pt; margin: 0 0 1mm; }
+header p { margin: 1mm 0; color: #4c5866; }
+header .origin { font-size: 9pt; }
+.origin span { white-space: nowrap; margin-right: 4mm; }
+h2 { font-size: 12pt; color: #1f5fa8; margin: 5mm 0 2mm; }
+h3 { font-size: 10pt; margin: 0 0 1mm; }
 section:first-of-type h2 { display: none; }
+
 .row { display: grid; gap: 5mm; margin-bottom: 3mm; align-items: start; }
-table { border-collapse: collapse; width: 100%; font-size: 8pt; }
-th, td { text-align: left; vertical-align: top; padding: .5mm 1.5mm .5mm 0;
+table { border-collapse: collapse; width: 100%; font-size: 9pt; }
+th, td { text-align: left; vertical-align: top; padding: .4mm 2mm .4mm 0;
   border-bottom: .4pt solid #d9dee4; font-variant-numeric: tabular-nums; }
-th { color: #4c5866; font-weight: 600; border-bottom-color: #4c5866; }
-.note, figcaption, .plain { font-size: 7.5pt; color: #4c5866; margin: 1mm 0 0; }
-ul { margin: 0; padding-left: 4mm; font-size: 8pt; }
+thead th { color: #4c5866; font-weight: 600; }
+thead tr:last-child th { border-bottom-color: #4c5866; }
+tbody th { font-weight: normal; }
+table.short td, table.short th { white-space: nowrap; }
+.note, figcaption, .plain { font-size: 9pt; color: #4c5866; margin: 1mm 0 0; }
+ul { margin: 0; padding-left: 4mm; font-size: 9pt; }
 figure { margin: 0; }
 figure img { display: block; width: 100%; height: auto; }
-figure.picture img { border: .4pt solid #d9dee4; }
+figure.picture img { border: .6pt solid #d9dee4; }
 footer { border-top: .4pt solid #4c5866; margin-top: 4mm; padding-top: 1.5mm;
-  font-size: 7.5pt; color: #4c5866; }
-@media (max-width: 700px) { .row { grid-template-columns: 1fr !important; }
+  font-size: 9pt; color: #4c5866; string-set: footer content(); }
+@media screen and (max-width: 700px) { .row { grid-template-columns: 1fr !important; }
   main { padding: 5mm; } }
 @media print { body { background: #fff; } main { padding: 0; max-width: none; }
-  section.page { break-before: page; } section.page h2 { margin-top: 0; }
-  .row, table, figure { break-inside: avoid; } .row { margin-bottom: 2mm; }
-  table { font-size: 7.5pt; } .note, .plain, figcaption { font-size: 7pt; } }
+  h2, h3 { break-after: avoid; } .row, tr, figure { break-inside: avoid; }
+  .row.text { break-inside: auto; }
+  footer { border: 0; margin: 0; padding: 0; font-size: 0; height: 0;
+    overflow: hidden; } }
 """
+"""Style of screen and paper; the margins of a page repeat the footer."""
 
 
 def html_of(document: Document) -> str:
     """Return a document as the text of an HTML file."""
     sections = "\n".join(_section(section) for section in document.sections)
+    origin = " ".join(
+        f"<span>{escape(name)} {escape(value)}</span>"
+        for name, value in document.origin
+    )
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(document.title)}</title>\n<style>{STYLE}</style>\n</head>\n"
-        f"<body>\n<main>\n<header><h1>{escape(document.title)}</h1>"
-        f"<p>{escape(document.subtitle)}</p></header>\n{sections}\n"
-        f"<footer>{escape(document.footer)}</footer>\n</main>\n</body>\n</html>\n"
+        f"<body>\n<main>\n<footer>{escape(document.footer)}</footer>\n"
+        f"<header><h1>{escape(document.title)}</h1>"
+        f"<p>{escape(document.subtitle)}</p>"
+        f'<p class="origin">{origin}</p></header>\n{sections}\n'
+        "</main>\n</body>\n</html>\n"
     )
 
 
 def _section(section: Section) -> str:
     rows = "\n".join(_row(row) for row in section.rows)
-    kind = ' class="page"' if section.starts_page else ""
-    return f"<section{kind}>\n<h2>{escape(section.title)}</h2>\n{rows}\n</section>"
+    return f"<section>\n<h2>{escape(section.title)}</h2>\n{rows}\n</section>"
 
 
 def _row(row: Row) -> str:
@@ -83,9 +100,10 @@ def _row(row: Row) -> str:
         _block(block, width_mm)
         for block, width_mm in zip(row.blocks, row.widths_mm, strict=True)
     )
-    return (
-        f'<div class="row" style="grid-template-columns:{columns}">\n{blocks}\n</div>'
-    )
+    is_text = all(isinstance(block, Words) for block in row.blocks)
+    kind = "row text" if is_text else "row"
+    style = f"grid-template-columns:{columns}"
+    return f'<div class="{kind}" style="{style}">\n{blocks}\n</div>'
 
 
 def _block(block: Block, width_mm: float) -> str:
@@ -99,15 +117,28 @@ def _block(block: Block, width_mm: float) -> str:
 
 
 def _table(table: Table) -> str:
-    head = "".join(f"<th>{escape(cell)}</th>" for cell in table.head)
+    heads = []
+    if table.groups:
+        cells = (
+            f'<th colspan="{span}" scope="colgroup">{escape(text)}</th>'
+            for text, span in table.groups
+        )
+        heads.append("".join(cells))
+    if table.head:
+        heads.append("".join(f'<th scope="col">{escape(t)}</th>' for t in table.head))
+    top = "".join(f"<tr>{cells}</tr>" for cells in heads)
     rows = "\n".join(
-        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>"
+        f'<tr><th scope="row">{escape(row[0])}</th>'
+        + "".join(f"<td>{escape(cell)}</td>" for cell in row[1:])
+        + "</tr>"
         for row in table.rows
     )
     note = f'<p class="note">{escape(table.note)}</p>' if table.note else ""
-    top = f"<thead><tr>{head}</tr></thead>" if head else ""
+    kind = "" if table.has_prose else ' class="short"'
     return (
-        f"<div><h3>{escape(table.title)}</h3><table>{top}<tbody>\n{rows}\n</tbody>"
+        f"<div><h3>{escape(table.title)}</h3>"
+        f"<table{kind}>"
+        f"{f'<thead>{top}</thead>' if top else ''}<tbody>\n{rows}\n</tbody>"
         f"</table>{note}</div>"
     )
 
@@ -118,7 +149,10 @@ def _words(words: Words) -> str:
         items = "".join(f"<li>{escape(text)}</li>" for text in words.paragraphs)
         return f"<div>{title}<ul>{items}</ul></div>"
     texts = "".join(f'<p class="plain">{escape(text)}</p>' for text in words.paragraphs)
-    return f"<div>{title}{texts}</div>"
+    columns = ""
+    if words.n_columns > 1:
+        columns = f' style="columns:{words.n_columns};column-gap:5mm"'
+    return f"<div{columns}>{title}{texts}</div>"
 
 
 def _picture(picture: Picture) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,18 @@ from clients.report.comparison import comparison_document
 from clients.report.content import eye_document
 from clients.report.facts import EyeFacts, facts_of
 from clients.report.html_page import html_of
-from clients.report.pdf_pages import write_pdf
+from clients.report.origin import origin_of
 
 SUFFIXES = (".html", ".pdf")
+PANGO_PACKAGES = ("libpango-1.0-0", "libpangoft2-1.0-0", "libharfbuzz-subset0")
+"""Debian packages of the system libraries that WeasyPrint loads."""
+
 WRITING_AT = 0.85
 """Progress at which the eyes are computed and writing begins."""
+
+
+class ReportError(RuntimeError):
+    """A report that cannot be written here."""
 
 
 def report_html(
@@ -24,6 +32,7 @@ def report_html(
     *,
     label: str = "",
     after_label: str = "",
+    reference: str = "",
     has_charts: bool = True,
     progress: Report | None = None,
 ) -> str:
@@ -38,6 +47,8 @@ def report_html(
         With ``after``, the report starts with the differences.
     label, after_label : str
         Names of the eyes, instead of their profiles' names.
+    reference : str
+        Identifier of a record or an order, shown in the header.
     has_charts : bool
         Whether to filter letter charts, which takes a quarter of the time.
     progress : callable, optional
@@ -54,7 +65,7 @@ def report_html(
         has_charts=has_charts,
         progress=progress,
     )
-    text = html_of(document_of(eyes))
+    text = html_of(document_of(eyes, reference=reference))
     if progress is not None:
         progress(1.0, "writing")
     return text
@@ -84,24 +95,57 @@ def eyes_of(
     return eyes
 
 
-def document_of(eyes: list[EyeFacts]) -> Document:
+def document_of(eyes: list[EyeFacts], *, reference: str = "") -> Document:
     """Return the document of one eye, or of the comparison of two."""
-    return eye_document(*eyes) if len(eyes) == 1 else comparison_document(*eyes)
+    document = eye_document(*eyes) if len(eyes) == 1 else comparison_document(*eyes)
+    return replace(document, origin=origin_of(eyes, reference))
 
 
-def write_report(eyes: list[EyeFacts], path: Path) -> None:
-    """Write a report as ``.html`` or ``.pdf``.
+def write_report(eyes: list[EyeFacts], path: Path, *, reference: str = "") -> None:
+    """Write a report as ``.html``, or as ``.pdf`` tagged for screen readers.
 
     Raises
     ------
+    ReportError
+        If WeasyPrint, or the system library Pango that it needs, is missing.
     OSError
         If the file cannot be written.
     """
-    document = document_of(eyes)
+    text = html_of(document_of(eyes, reference=reference))
     if path.suffix.lower() == ".pdf":
-        write_pdf(document, path)
+        path.write_bytes(_pdf_of(text))
     else:
-        path.write_text(html_of(document), encoding="utf-8")
+        path.write_text(text, encoding="utf-8")
+
+
+def check_pdf() -> None:
+    """Raise an error if PDFs cannot be written here.
+
+    Raises
+    ------
+    ReportError
+        If WeasyPrint, or the system library Pango that it needs, is missing.
+    """
+    try:
+        import weasyprint  # noqa: F401
+    except ImportError:
+        raise ReportError(
+            "PDF needs WeasyPrint: pip install 'ocufilter[report]'; "
+            "an .html report needs nothing more"
+        ) from None
+    except OSError as error:
+        raise ReportError(
+            f"PDF needs the system library Pango ({error}): apt-get install "
+            f"{' '.join(PANGO_PACKAGES)}; an .html report needs nothing more"
+        ) from None
+
+
+def _pdf_of(text: str) -> bytes:
+    check_pdf()
+    from weasyprint import HTML
+
+    written: bytes = HTML(string=text).write_pdf(pdf_variant="pdf/ua-1")
+    return written
 
 
 def report_numbers(eyes: list[EyeFacts]) -> dict[str, Any]:

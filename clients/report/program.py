@@ -4,11 +4,12 @@
     ocufilter report eye.json -o eye.pdf
     ocufilter report before.json after.json -o surgery.pdf
 
-A profile is a preset's name, or a .json, .abp or .csv file.  The first page is the
-summary: refraction, acuity, wavefront, point images, contrast, a letter chart near and
-far.  The following pages show the visual field, acuity by distance, the estimated eye,
-which data were measured or assumed, and the literature references.  The HTML file is
-self-contained and prints on A4.
+A profile is a preset's name, a .json, .abp or .csv file, or a JSON object.  The report
+begins with a summary: refraction, acuity, wavefront, point images, contrast, a letter
+chart near and far.  Then it shows the visual field, acuity by distance, the estimated
+eye, which data were measured or assumed, and the literature references.  The HTML file
+is self-contained and prints on A4.  The PDF is tagged for screen readers; it needs the
+packages of ocufilter[report].
 """
 
 from __future__ import annotations
@@ -22,7 +23,14 @@ from pathlib import Path
 from typing import NoReturn
 
 from clients.figures.study import profile_of
-from clients.report.make import SUFFIXES, eyes_of, report_numbers, write_report
+from clients.report.make import (
+    SUFFIXES,
+    ReportError,
+    check_pdf,
+    eyes_of,
+    report_numbers,
+    write_report,
+)
 from filter_service.errors import FilterError
 from filter_service.progress import Progress
 
@@ -38,18 +46,29 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line."""
     parser = _Parser(
         prog="ocufilter report",
+        allow_abbrev=False,
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("profile", help="preset's name, or .json, .abp or .csv file")
+    parser.add_argument(
+        "profile", help="preset's name, .json, .abp or .csv file, or JSON object"
+    )
     parser.add_argument(
         "after", nargs="?", help="the eye afterward: after surgery, with spectacles"
     )
     parser.add_argument(
         "-o", "--out", type=Path, metavar="OUT", help="file to write: .html or .pdf"
     )
-    parser.add_argument("--name", default="", help="what the eye is called")
-    parser.add_argument("--after-name", default="", help="and the eye afterward")
+    parser.add_argument("--name", default="", help="name of the eye in the report")
+    parser.add_argument(
+        "--after-name", default="", help="name of the eye afterward in the report"
+    )
+    parser.add_argument(
+        "--reference",
+        default="",
+        metavar="TEXT",
+        help="identifier of a record or an order, shown in the header",
+    )
     parser.add_argument(
         "--no-charts", action="store_true", help="leave out the letter charts (faster)"
     )
@@ -66,8 +85,12 @@ def run(options: argparse.Namespace) -> str:
     ------
     ValueError
         If a profile or file name cannot be used.
+    ReportError
+        If PDFs cannot be written here.
     """
     _check_out(options)
+    if options.out is not None and options.out.suffix.lower() == ".pdf":
+        check_pdf()
     sources = [options.profile] + ([options.after] if options.after else [])
     profiles = [profile_of(source) for source in sources]  # fail before any work
     labels = tuple(
@@ -86,7 +109,7 @@ def run(options: argparse.Namespace) -> str:
             progress=task.update,
         )
         if options.out is not None:
-            write_report(eyes, options.out)
+            write_report(eyes, options.out, reference=options.reference)
         task.update(1.0, "written")
     if options.json:
         return json.dumps(report_numbers(eyes), allow_nan=False)
@@ -109,7 +132,9 @@ def _check_out(options: argparse.Namespace) -> None:
 
 
 def _called(source: str) -> str:
-    """Return a file's name without its suffix, or a preset's name."""
+    """Return a file's name without its suffix, a preset's name, or "eye" for JSON."""
+    if source.lstrip().startswith("{"):
+        return "eye"
     return Path(source).stem if Path(source).suffix else source
 
 
@@ -123,7 +148,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         bad_input = isinstance(error, ValueError)
         print(f"report: {' '.join(str(error).split())}", file=sys.stderr)
         return 2 if bad_input else 1
-    except OSError as error:
+    except (OSError, ReportError) as error:
         print(f"report: {error}", file=sys.stderr)
         return 1
     return 0

@@ -34,6 +34,7 @@ def provenance_table(study: EyeStudy, cite: Citations) -> Table:
         "What is known of this eye, and what is assumed",
         tuple(row for row in rows if row),
         head=("part", "", "where it comes from"),
+        has_prose=True,
     )
 
 

@@ -11,6 +11,9 @@ from clients.report.correction_text import correction_text
 from clients.report.facts import EyeFacts
 from clients.report.numbers import SPECTACLE_VERTEX_MM, spectacles_for, written
 
+N_COLUMNS = 4
+"""Columns of the coefficients."""
+
 THROUGH_LENSLETS = "not known"
 """Text in place of an acuity; the summary gives the reason."""
 
@@ -46,7 +49,7 @@ def refraction_table(facts: EyeFacts) -> Table:
         head=(
             "at the cornea, 555 nm",
             "entered" if is_entered else "measured",
-            "eye found",
+            "estimated",
         ),
         note=_refraction_note(facts),
     )
@@ -56,7 +59,7 @@ def _refraction_note(facts: EyeFacts) -> str:
     numbers, fit = facts.numbers, facts.numbers["eye"]
     note = (
         f"{numbers['measured']['refraction_pupil_mm']:.3g} mm pupil, relaxed, without "
-        f"correction. The eye found is {fit['eye_length_mm']:.2f} mm long, "
+        f"correction. The estimated eye is {fit['eye_length_mm']:.2f} mm long, "
         f"accommodates {fit['amplitude_dpt']:.1f} dpt, and misses the wavefront by "
         f"{fit['rms_error_um']:.1g} µm RMS. As spectacles at "
         f"{SPECTACLE_VERTEX_MM:g} mm: "
@@ -152,7 +155,7 @@ def acuity_range_text(log_mar: float | None) -> str:
 
 
 def coefficient_table(facts: EyeFacts) -> Table:
-    """Return all coefficients in three columns."""
+    """Return all coefficients in four columns."""
     measured = facts.numbers["measured"]
     cells = [
         (
@@ -161,15 +164,15 @@ def coefficient_table(facts: EyeFacts) -> Table:
         )
         for name, value in measured["zernike_um"].items()
     ]
-    third = -(-len(cells) // 3)
+    n_rows = -(-len(cells) // N_COLUMNS)
     rows = tuple(
-        tuple(text for cell in cells[k::third] for text in cell) for k in range(third)
+        tuple(text for cell in cells[k::n_rows] for text in cell) for k in range(n_rows)
     )
     radius_mm, light_nm = measured["zernike_radius_mm"], measured["wavelength_nm"]
     return Table(
         "Coefficients, µm (OSA; x to the person's right, y up)",
         rows,
-        head=("n, m", "µm") * 3,
+        head=("n, m", "µm") * N_COLUMNS,
         note=f"At the cornea, on a circle of {2 * radius_mm:.3g} mm, {light_nm:g} nm; "
         f"higher orders {measured['higher_order_rms_um']:.3f} µm RMS.",
     )

@@ -3,15 +3,24 @@
 import json
 import math
 import re
+import sys
 from html.parser import HTMLParser
+from importlib.metadata import version
 
 import numpy as np
 import pytest
+from pypdf import PdfReader
 
-from clients.figures import EyeStudy
+from clients.figures import (
+    EyeStudy,
+    draw_psfs,
+    field_maps_figure,
+    wavefront_map_figure,
+)
+from clients.figures.psfs import psf_sides_arcmin
+from clients.figures.style import new_figure
 from clients.report import report_numbers
 from clients.report.blocks import (
-    MARGIN_MM,
     Document,
     Picture,
     Row,
@@ -22,21 +31,13 @@ from clients.report.blocks import (
 from clients.report.charts import picture_side_px
 from clients.report.correction_text import correction_text
 from clients.report.facts import EyeFacts, facts_of
-from clients.report.html_page import html_of
-from clients.report.make import document_of
+from clients.report.html_page import STYLE, html_of
+from clients.report.make import document_of, write_report
 from clients.report.numbers import Refraction, measured_numbers, spectacles_for
-from clients.report.pdf_pages import (
-    BOTTOM_MM,
-    HEAD_MM,
-    NOTE_PT,
-    ROW_GAP_MM,
-    row_height_mm,
-)
-from clients.report.pdf_text import column_widths_mm, line_mm, lines_of, width_mm
 from clients.report.program import main
 from clients.report.provenance import provenance_table
 from clients.report.sources import SOURCES, Citations
-from estimator import parse_profile
+from estimator import load_profile, parse_profile
 
 SPECTACLES = {"sphere_dpt": -4.0, "cylinder_dpt": -1.0, "axis_deg": 20.0}
 MYOPE = {
@@ -280,28 +281,12 @@ def test_two_eyes_make_one_document(myope, corrected, tmp_path):
     document = document_of([myope, corrected])
     assert document.title == "Eye report: A. Myope → worn"
     table = document.sections[0].rows[0].blocks[0]
-    m_row = {row[0]: row for row in table.rows}["M as worn, dpt"]
-    assert float(m_row[3].replace("−", "-")) == pytest.approx(
+    change = {row[0]: row for row in table.rows}["change"]
+    assert float(change[-1].replace("−", "-")) == pytest.approx(
         -sum(AT_CORNEA) / 2, abs=0.15
     )
     both = report_numbers([myope, corrected])
     assert json.loads(json.dumps(both, allow_nan=False))["after"]["correction"]
-
-
-def test_lines_fit_and_keep_all_words():
-    text = "the quick brown fox jumps over the lazy dog and then some more"
-    lines = lines_of(text, 30.0, 8.0)
-    assert " ".join(lines) == text
-    assert len(lines) > 2
-    assert all(width_mm(line, 8.0) <= 30.0 for line in lines)
-
-
-def test_columns_fill_the_width_and_the_widest_gives_way():
-    narrow = column_widths_mm((("a", "bb"),), 60.0, 8.0, 3.0)
-    assert sum(narrow) == pytest.approx(60.0)
-    wide = column_widths_mm((("short", "long words " * 20),), 60.0, 8.0, 3.0)
-    assert sum(wide) == pytest.approx(60.0)
-    assert wide[0] == pytest.approx(width_mm("short", 8.0) + 3.0)
 
 
 def test_blocks_share_a_row_by_their_widths():
@@ -333,14 +318,82 @@ def test_charts_that_exist_are_shown_with_what_is_read(myope):
     )
 
 
-def test_the_summary_fits_on_the_first_page(corrected):
+def test_a_pdf_is_tagged_and_starts_with_the_whole_summary(corrected, tmp_path):
     gray = np.full((8, 8, 3), 128, np.uint8)
     charts = {(p, d): gray for p in (3.0, 5.0) for d in (0.4, 1.0, 6.0)}
     shown = EyeFacts(corrected.study, "x", corrected.numbers, charts)
-    rows = document_of([shown]).sections[0].rows
-    used_mm = HEAD_MM + sum(row_height_mm(row) + ROW_GAP_MM for row in rows)
-    two_notes_mm = 2 * line_mm(NOTE_PT)  # of another color, of a wider pupil
-    assert used_mm + two_notes_mm < BOTTOM_MM - MARGIN_MM
+    out = tmp_path / "eye.pdf"
+    write_report([shown], out, reference="A-1047")
+    read = PdfReader(out)
+    assert read.root_object["/MarkInfo"]["/Marked"]
+    assert "/StructTreeRoot" in read.root_object
+    assert read.root_object["/Lang"] == "en"
+    first = read.pages[0].extract_text()
+    assert "Reference A-1047" in first
+    assert "6 m, 3 mm: logMAR" in first  # caption of the summary's last chart
+    assert "1 / 3" in first
+    assert len(read.pages) == 3
+
+
+def test_body_text_is_at_least_9_pt():
+    rules = re.sub(r"@bottom-\w+ \{.*?\}", "", STYLE, flags=re.DOTALL)  # page numbers
+    sizes_pt = [float(v) for v in re.findall(r"font(?:-size)?: ([\d.]+)pt", rules)]
+    assert len(sizes_pt) > 6
+    assert min(sizes_pt) >= 9.0
+
+
+def test_a_report_says_what_when_and_of_which_profile_it_is(myope, corrected):
+    text = html_of(document_of([myope], reference="<A-1047>"))
+    digest = myope.study.profile.digest[:16]
+    assert "<span>Reference &lt;A-1047&gt;</span>" in text
+    assert f"<span>Profile {digest}</span>" in text
+    assert f"<span>Version ocufilter {version('ocufilter')}</span>" in text
+    assert re.search(r"<span>Date \d{4}-\d\d-\d\d \d\d:\d\d ", text)
+    assert "Reference" not in html_of(document_of([myope]))
+    assert corrected.study.profile.digest[:16] != digest
+
+
+def test_a_digest_is_that_of_the_eye_and_not_of_its_name_or_format(tmp_path):
+    file = tmp_path / "eye.json"
+    file.write_text(json.dumps(MYOPE | {"sphere_dpt": -4, "name": "x"}))
+    assert load_profile(file).digest == parse_profile(MYOPE).digest
+    assert (
+        parse_profile(MYOPE | {"age_years": 61}).digest != parse_profile(MYOPE).digest
+    )
+
+
+def test_figures_of_assumed_aberrations_say_so(myope):
+    def titles(figure):
+        return [axes.get_title("left") for axes in figure.axes]
+
+    assert "Higher orders (3 to 6), assumed" in titles(
+        wavefront_map_figure(myope.study)
+    )
+    measured = EyeStudy.of("keratoconus")
+    assert "Higher orders (3 to 6)" in titles(wavefront_map_figure(measured))
+    assert "Assumed" in field_maps_figure(measured).get_suptitle()
+    own = EyeStudy.of({"kind": "preset", "name": "keratoconus", "periphery": "model"})
+    assert field_maps_figure(own).get_suptitle() == ""
+
+
+def test_psfs_before_and_after_have_one_scale(myope, corrected):
+    studies = (myope.study, corrected.study)
+    both = psf_sides_arcmin(studies)
+    alone = [psf_sides_arcmin([study]) for study in studies]
+    assert both == tuple(np.max(alone, axis=0))
+    assert alone[0][0] > 3 * alone[1][0]
+    figures = [new_figure(80, 80) for _ in studies]
+    for figure, study in zip(figures, studies, strict=True):
+        draw_psfs(figure, study, sides_arcmin=both)
+    extents = [[a.images[0].get_extent() for a in f.axes] for f in figures]
+    assert extents[0] == extents[1]
+
+
+def test_a_missing_pdf_library_is_named_before_any_work(monkeypatch, capsys, tmp_path):
+    monkeypatch.setitem(sys.modules, "weasyprint", None)
+    assert main(["myopia", "-o", str(tmp_path / "eye.pdf")]) == 1
+    assert "pip install 'ocufilter[report]'" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -378,6 +431,4 @@ def test_the_command_writes_a_pdf_and_prints_the_numbers_alone(capsys, tmp_path)
     assert written.err == ""
     found = json.loads(written.out)["eye"]["refraction"]
     assert found["M_dpt"] == pytest.approx(sum(AT_CORNEA) / 2, abs=0.01)
-    content = out.read_bytes()
-    assert content.startswith(b"%PDF")
-    assert len(re.findall(rb"/Type /Page\b", content)) == 3
+    assert len(PdfReader(out).pages) == 3
