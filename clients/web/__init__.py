@@ -11,7 +11,8 @@ eye_panel         the entries of one eye
 eye_form          their values, and the resulting profile
 correction_form   the entries of a correction, and the resulting correction
 numbers           numeric entries with their limits
-slider_row        a slider with its name and value
+slider_row        a slider with its name and value, with range_slider.js
+shared_entries    the entries as the fragment of an address
 upload_entry      a file upload
 file_names        sanitized file names
 scene_panel       selection of the scene

@@ -45,12 +45,18 @@ AXIS = NumberField("axis_deg", "Axis", "°", 0.0, 180.0, 1.0, digits=0)
 VERTEX = NumberField("vertex_mm", "Vertex", "mm", 0.0, 25.0, 1.0, digits=0)
 PRESCRIPTION = (SPHERE, CYLINDER, AXIS, VERTEX)
 
-PROGRESSIVE_ADD = NumberField("add_dpt", "Addition", "dpt", 0.25, 4.0, 0.25)
+PROGRESSIVE_ADD = NumberField(
+    "add_dpt", "Addition", "dpt", 0.25, 4.0, 0.25, is_signed=True
+)
 CORRIDOR = NumberField("corridor_mm", "Corridor", "mm", 8.0, 24.0, 1.0, digits=0)
-BIFOCAL_ADD = NumberField("add_dpt", "Addition", "dpt", 0.5, 6.0, 0.25)
-EDOF_ADD = NumberField("add_dpt", "Addition", "dpt", 0.25, 3.0, 0.25)
-MIDDLE_ADD = NumberField("middle_add_dpt", "Middle add", "dpt", 0.5, 6.0, 0.01)
-NEAR_ADD = NumberField("near_add_dpt", "Near add", "dpt", 0.5, 6.0, 0.01)
+BIFOCAL_ADD = NumberField("add_dpt", "Addition", "dpt", 0.5, 6.0, 0.25, is_signed=True)
+EDOF_ADD = NumberField("add_dpt", "Addition", "dpt", 0.25, 3.0, 0.25, is_signed=True)
+MIDDLE_ADD = NumberField(
+    "middle_add_dpt", "Middle add", "dpt", 0.5, 6.0, 0.01, is_signed=True
+)
+NEAR_ADD = NumberField(
+    "near_add_dpt", "Near add", "dpt", 0.5, 6.0, 0.01, is_signed=True
+)
 ABERRATION = NumberField(
     *("spherical_aberration_um", "C(4,0), 6 mm", "µm", -2.0, 2.0, 0.01),
     is_signed=True,
@@ -81,10 +87,10 @@ def first_texts() -> dict[str, str]:
         "cylinder_dpt": "0.00",
         "axis_deg": "0",
         "vertex_mm": "12",
-        "add_dpt": "2.00",
+        "add_dpt": "+2.00",
         "corridor_mm": "14",
-        "middle_add_dpt": "1.66",
-        "near_add_dpt": "3.32",
+        "middle_add_dpt": "+1.66",
+        "near_add_dpt": "+3.32",
         "spherical_aberration_um": "0.00",
     }
 

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from clients.figures import (
     EyeStudy,
+    acuity_log_mar,
     cross_section_figure,
     draw_through_focus_acuity,
     draw_wavefront_map,
@@ -55,6 +56,16 @@ def eye_figure(
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=DOTS_PER_INCH)
     return file.getvalue()
+
+
+def predicted_log_mar(
+    body: str, *, pupil_diameter_mm: float, focus_dpt: float, object_dpt: float
+) -> float:
+    """Return the acuity of an eye at a distance; not finite if it is not known."""
+    seen = _study(body).wavefront(
+        pupil_diameter_mm, object_dpt=object_dpt, focus_dpt=focus_dpt
+    )
+    return acuity_log_mar(seen)
 
 
 def _field_figure(study: EyeStudy) -> Figure:

@@ -45,6 +45,10 @@ def preset_titles() -> dict[str, str]:
     }
 
 
+class NoFile(ValueError):
+    """The entries are those of a file, and none was chosen yet."""
+
+
 @dataclass
 class EyeForm:
     """The entries of one eye.
@@ -92,7 +96,7 @@ class EyeForm:
             return {"kind": "preset", "name": self.preset}
         if self.source == "file":
             if self.file_body is None:
-                raise ValueError(f"No file yet; allowed: {', '.join(PROFILE_SUFFIXES)}")
+                raise NoFile(f"no file yet; allowed: {', '.join(PROFILE_SUFFIXES)}")
             return dict(self.file_body)
         return {
             "kind": "prescription",

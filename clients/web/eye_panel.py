@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from nicegui import events, ui
 
@@ -14,12 +15,16 @@ from clients.web.eye_form import (
     preset_titles,
 )
 from clients.web.numbers import NumberField
-from clients.web.slider_row import THROTTLE_S
+from clients.web.slider_row import SliderRow
 from clients.web.upload_entry import upload_entry
 
 SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
 SLIDER_REACH_DPT = 10.0
-"""Range of the slider below the sphere; typed values may go further."""
+"""Range of the slider beside the sphere; typed values may go further."""
+
+SPHERE_SLIDER = replace(
+    SPHERE, name="sphere_slider_dpt", low=-SLIDER_REACH_DPT, high=SLIDER_REACH_DPT
+)
 
 TYPING_MS = 400
 """Pause after which a typed number counts: half of one is another eye."""
@@ -50,13 +55,16 @@ class EyePanel:
     def _build(self) -> None:
         form = self.form
         ui.toggle(SOURCES, value=form.source, on_change=self._choose_source).props(
-            "no-caps unelevated spread dense"
+            'no-caps unelevated spread dense role=group aria-label="Kind of entries"'
         ).classes("oc-toggle")
         if form.source == "prescription":
             self._prescription()
         elif form.source == "preset":
             ui.select(
-                preset_titles(), value=form.preset, on_change=self._choose_preset
+                preset_titles(),
+                value=form.preset,
+                on_change=self._choose_preset,
+                label="Preset",
             ).props("outlined dense options-dense").classes("oc-wide").mark("preset")
         else:
             self._file()
@@ -78,23 +86,13 @@ class EyePanel:
 
     def _sphere_slider(self, entry: ui.input) -> None:
         """Show a slider that is linked with an entry in both directions."""
-        slider = (
-            ui.slider(
-                min=-SLIDER_REACH_DPT,
-                max=SLIDER_REACH_DPT,
-                step=SPHERE.step,
-                value=_within(entry.value),
-            )
-            .props('dense aria-label="Sphere"')
-            .classes("oc-sphere")
-        )
-        slider.props["data-name"] = SPHERE.name
-        slider.on(
-            "update:model-value",
-            lambda event: entry.set_value(SPHERE.show(float(event.args))),
-            throttle=THROTTLE_S,
-        )
-        entry.on_value_change(lambda event: slider.set_value(_within(event.value)))
+        slider = SliderRow(
+            SPHERE_SLIDER,
+            _within(entry.value),
+            lambda value: entry.set_value(SPHERE.show(value)),
+            is_titled=False,
+        ).classes("oc-sphere")
+        entry.on_value_change(lambda event: slider.show(_within(event.value)))
 
     def _entry(self, number: NumberField, texts: dict[str, str]) -> ui.input:
         """Return an entry for one number, with validation."""
@@ -114,6 +112,7 @@ class EyePanel:
             f'autocomplete="off" debounce={TYPING_MS}'
         ).classes("oc-entry")
         entry.props["data-name"] = number.name
+        entry.on("blur", lambda: entry.set_value(number.normalized(entry.value or "")))
         for key, steps in (("up", 1), ("down", -1)):
             entry.on(
                 f"keydown.{key}.prevent",
@@ -151,13 +150,16 @@ class EyePanel:
 
     def _worn(self) -> None:
         worn = self.form.worn
-        ui.select(worn.kinds, value=worn.kind, on_change=self._choose_worn).props(
-            "outlined dense options-dense"
-        ).classes("oc-wide oc-worn-kind")
+        ui.select(
+            worn.kinds, value=worn.kind, on_change=self._choose_worn, label="Correction"
+        ).props("outlined dense options-dense").classes("oc-wide oc-worn-kind")
         if worn.kind == "iol":
-            ui.select(DESIGNS, value=worn.design, on_change=self._choose_design).props(
-                "outlined dense options-dense"
-            ).classes("oc-wide oc-worn-design")
+            ui.select(
+                DESIGNS,
+                value=worn.design,
+                on_change=self._choose_design,
+                label="Design",
+            ).props("outlined dense options-dense").classes("oc-wide oc-worn-design")
         with ui.element("div").classes("oc-fields oc-worn"):
             for number in worn.entries:
                 self._entry(number, worn.texts).props["data-worn"] = ""
@@ -205,14 +207,14 @@ class EyePanel:
         self._changed()
 
     async def _take_file(self, name: str, content: bytes) -> None:
-        try:
-            age_years = self.form.take_file(name, content)
-        except ValueError as error:
-            ui.notify(str(error), type="negative", multi_line=True, timeout=10_000)
-            return
+        age_years = self.form.take_file(name, content)
         if age_years is not None:
             self._on_age(age_years)
         self._changed()
+
+    def show(self) -> None:
+        """Show the entries of the form again."""
+        self._build.refresh()
 
     def _changed(self) -> None:
         """Rebuild the panel after a change of the visible entries."""

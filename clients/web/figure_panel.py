@@ -4,17 +4,31 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 from collections.abc import Callable
 from typing import Any
 
 from nicegui import events, ui
 
-from clients.web.eye_figures import FIGURE_TITLES, eye_figure
+from clients.web.chart import smallest_row
+from clients.web.eye_figures import FIGURE_TITLES, eye_figure, predicted_log_mar
 from clients.web.eye_form import SIDES, EyeSide
 from clients.web.figure_worker import FigureWorker, StudyFailed
 from clients.web.numbers import distance_text
-from clients.web.page_state import FOCUS, PUPIL, PageState
+from clients.web.page_state import DISTANCE, FOCUS, PUPIL, PageState
 from clients.web.point_spread import PointState, point_spread
+
+WIDTHS_ARCMIN = {
+    "a stroke of the 1.0 (20/20) line": 1.0,
+    "a letter of the 1.0 (20/20) line": 5.0,
+    "a letter of the 0.5 (20/40) line": 10.0,
+    "the full moon": 31.0,
+    "a little finger at arm's length": 60.0,
+    "a thumb at arm's length": 120.0,
+    "three fingers at arm's length": 300.0,
+    "a fist at arm's length": 600.0,
+}
+"""Visual angles of familiar things."""
 
 
 def data_url(png: bytes) -> str:
@@ -39,18 +53,51 @@ class FigurePanel:
         self._at = (0.5, 0.5)
         self._figure = next(iter(FIGURE_TITLES))
         self._drawn: Any = None
-        with ui.element("section").classes("oc-card"):
-            ui.label("A point of light here").classes("oc-title")
-            self._psf = ui.html("", sanitize=False).classes("oc-psf")
+        self._enlarged = ui.dialog().props('aria-label="Figure"')
+        with self._enlarged, ui.card().classes("oc-enlarged"):
+            self._large = ui.html("", sanitize=False)
+            ui.button("Close", on_click=self._enlarged.close).props("flat no-caps")
+
+    def build_point(self) -> None:
+        """Build the card of the point-spread function."""
+        with (
+            ui.element("section")
+            .classes("oc-card")
+            .props("aria-label='Point of light'")
+        ):
+            ui.html("A point of light here", tag="h2", sanitize=False).classes(
+                "oc-title"
+            )
+            self._psf = self._picture_button("oc-psf", "the point of light")
             self._told = ui.label("Move the pointer over the picture.").classes(
                 "oc-hint"
             )
-        with ui.element("section").classes("oc-card"):
-            self._title = ui.label("").classes("oc-title")
+
+    def build_figure(self) -> None:
+        """Build the card of the figures."""
+        with ui.element("section").classes("oc-card").props("aria-label=Figures"):
+            self._title = ui.html("Figures", tag="h2", sanitize=False).classes(
+                "oc-title"
+            )
             ui.toggle(FIGURE_TITLES, value=self._figure, on_change=self._choose).props(
-                "no-caps unelevated spread dense"
-            ).classes("oc-toggle")
-            self._image = ui.html("", sanitize=False).classes("oc-figure")
+                "no-caps unelevated spread dense role=group aria-label=Figure"
+            ).classes("oc-toggle oc-figures")
+            self._image = self._picture_button("oc-figure", "the figure")
+
+    def _picture_button(self, kind: str, what: str) -> ui.html:
+        """Return the place of an image, which enlarges on a click."""
+        with ui.element("div").classes(kind):
+            with ui.element("button").classes("oc-enlarge") as button:
+                button.props(f'type=button aria-label="Enlarge {what}"')
+                place = ui.html("", sanitize=False)
+            ui.label("computing …").classes("oc-hint oc-computing")
+        button.on("click", lambda: self._enlarge(place))
+        return place
+
+    def _enlarge(self, place: ui.html) -> None:
+        if place.content:
+            self._large.content = place.content
+            self._enlarged.open()
 
     async def point(self, side: EyeSide, x: float, y: float) -> None:
         """Show the point-spread function at a position in the picture."""
@@ -102,8 +149,35 @@ class FigurePanel:
         self._psf.content = f'<img src="{data_url(png)}" alt="Light of the point">'
         self._told.text = point_words(facts)
 
+    async def smallest_rows(self) -> dict[int, list[EyeSide]] | None:
+        """Return the eyes that read each row of the chart as their smallest line.
+
+        None if the worker is behind.  An eye that reads no row is in none.
+        """
+        picture, values = self._state.picture, self._state.values
+        rows = [row for row, _ in picture.chart_rows] if picture else []
+        found: dict[int, list[EyeSide]] = {}
+        for side in self._state.sides if rows else ():
+            body = self._state.looking_body(side)
+            if body is None:
+                continue
+            log_mar = await self._ask(
+                f"acuity {side}",
+                predicted_log_mar,
+                json.dumps(body, sort_keys=True),
+                pupil_diameter_mm=values[PUPIL.name],
+                focus_dpt=values[FOCUS.name],
+                object_dpt=values[DISTANCE.name],
+            )
+            if log_mar is None:
+                return None
+            row = smallest_row(rows, log_mar)
+            if row is not None:
+                found.setdefault(row, []).append(side)
+        return found
+
     async def _show_figure(self) -> None:
-        self._title.text = SIDES[self._side]
+        self._title.content = f"Figures: {SIDES[self._side].lower()}"
         body, values = self._body(), self._state.values
         state = {name: values[name] for name in (PUPIL.name, FOCUS.name)}
         wanted = (self._figure, body, *(state.values() if self._is_of_state else ()))
@@ -126,5 +200,15 @@ def point_words(facts: dict[str, float]) -> str:
     along = f"{abs(facts['v_deg']):.1f}° {'up' if facts['v_deg'] >= 0 else 'down'}"
     return (
         f"{across}, {along} of the gaze, at {distance_text(facts['object_dpt'])}. "
-        f"Half of its light lies within {facts['half_light_arcmin']:.1f} arcmin."
+        f"Half of its light lies within {facts['half_light_arcmin']:.1f} arcmin of its "
+        f"center: a spot about as wide as {width_words(facts['half_light_arcmin'])}."
     )
+
+
+def width_words(radius_arcmin: float) -> str:
+    """Return the familiar thing whose width is nearest to a spot's, by ratio."""
+    diameter_arcmin = 2.0 * radius_arcmin
+    return min(
+        WIDTHS_ARCMIN.items(),
+        key=lambda item: abs(math.log(item[1] / max(diameter_arcmin, 1e-3))),
+    )[0]

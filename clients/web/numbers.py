@@ -84,6 +84,13 @@ class NumberField:
         sign = "+" if self.is_signed and value > 0 else ""
         return f"{sign}{value:.{self.digits}f}"
 
+    def normalized(self, text: str) -> str:
+        """Return a valid text as displayed, "-4" as "-4.00"; others unchanged."""
+        try:
+            return self.show(self.read(text))
+        except ValueError:
+            return text
+
     def with_unit(self, text: str) -> str:
         """Return a number's text followed by its unit."""
         return f"{text}{'' if self.unit == DEGREE else ' '}{self.unit}"

@@ -6,7 +6,7 @@ import math
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,13 @@ FAR_DPT = 0.0
 DEPTH_HELP = ".npy or .exr in meters, 16-bit .png in millimeters, float .tif"
 
 
+class ChartRow(NamedTuple):
+    """One row of a letter chart: its size, and its height from 0 (top) to 1."""
+
+    log_mar: float
+    y_ratio: float
+
+
 @dataclass(frozen=True)
 class Picture:
     """A picture with depth.
@@ -48,6 +55,7 @@ class Picture:
     small : the same with fewer pixels
     distance_dpt : distance of a flat picture; None if it has its own depth
     focus_dpt, pupil_diameter_mm : an initial state, or None
+    chart_rows : the rows of a chart, from the top
     """
 
     title: str
@@ -56,6 +64,7 @@ class Picture:
     distance_dpt: float | None = None
     focus_dpt: float | None = None
     pupil_diameter_mm: float | None = None
+    chart_rows: tuple[ChartRow, ...] = ()
 
     @property
     def aspect_ratio(self) -> float:
@@ -108,10 +117,19 @@ class Place:
         return math.degrees(math.atan2(x, -z)), math.degrees(math.asin(y / length))
 
 
-def picture_of(title: str, view: RgbdView, **more: float | None) -> Picture:
+def picture_of(
+    title: str,
+    view: RgbdView,
+    *,
+    distance_dpt: float | None = None,
+    focus_dpt: float | None = None,
+    pupil_diameter_mm: float | None = None,
+) -> Picture:
     """Return a picture with its preview."""
     n = math.ceil(view.width_px / SMALL_WIDTH_PX)
-    return Picture(title, view, coarser(view, n), **more)
+    return Picture(
+        title, view, coarser(view, n), distance_dpt, focus_dpt, pupil_diameter_mm
+    )
 
 
 def coarser(view: RgbdView, n: int) -> RgbdView:

@@ -3,42 +3,64 @@
 // They come over a websocket of their own, as bytes: a JSON header and a picture's file.
 // Drawn is what came last; `window.ocufilter.drawn` says what was drawn, and when.
 const LABELS = { OD: "Right eye", OS: "Left eye" };
-const KEY_STEP = 2; // percent
-const TALLEST = "64vh"; // of a picture, so that it is seen whole
+const SPLIT_STEPS = { ArrowLeft: -2, ArrowDown: -2, ArrowRight: 2, ArrowUp: 2,
+  PageDown: -20, PageUp: 20, Home: -100, End: 100 }; // percent
 const POINT_MS = 90; // between two reports of where the pointer is
 const RECONNECT_MS = 1000;
+const MARK_PX = 16; // height of a label beside a row of the chart
 
 export default {
   template: `
-    <div class="oc-views" :class="{ 'oc-two': eyes.length > 1 }">
-      <div v-for="eye in eyes" :key="eye" class="oc-view" :data-eye="eye"
-           :style="frame"
-           @pointermove="onMove($event, eye)" @pointerdown="onDown($event, eye)"
-           @pointerup="onUp($event, eye)" @pointercancel="dragging = false">
-        <canvas :ref="'before' + eye" class="oc-before"></canvas>
-        <canvas :ref="'after' + eye" class="oc-after" :style="clip"></canvas>
-        <span class="oc-tag oc-tag-left" :style="{ opacity: split > 12 ? 1 : 0 }">Scene</span>
-        <span class="oc-tag oc-tag-right" :style="{ opacity: split < 88 ? 1 : 0 }">
-          {{ label(eye) }}</span>
-        <span class="oc-state" :class="'oc-' + state(eye).kind" :key="state(eye).text">{{ state(eye).text }}</span>
-        <span v-if="point && point.eye === eye" class="oc-cross"
-              :style="{ left: 100 * point.x + '%', top: 100 * point.y + '%' }"></span>
-        <div class="oc-split" :style="{ left: split + '%' }" role="slider" tabindex="0"
-             aria-label="Split between the scene and what the eye sees"
-             aria-valuemin="0" aria-valuemax="100" :aria-valuenow="Math.round(split)"
-             @keydown="onKey"><i></i></div>
+    <div class="oc-stage" ref="stage">
+      <div class="oc-views" :class="{ 'oc-two': eyes.length > 1 }">
+        <div v-for="eye in eyes" :key="eye" class="oc-view" :class="{ 'oc-empty': !hasScene }" :data-eye="eye"
+             :style="frame"
+             @pointermove="onMove($event, eye)" @pointerdown="onDown($event, eye)"
+             @pointerup="onUp($event, eye)" @pointercancel="dragging = false">
+          <canvas :ref="'before' + eye" class="oc-before" role="img"
+                  :aria-label="'Scene: ' + scene"></canvas>
+          <canvas :ref="'after' + eye" class="oc-after" :style="clip" role="img"
+                  :aria-label="alts[eye] || label(eye)"></canvas>
+          <ol v-if="marks.length" class="oc-marks" :style="clip">
+            <li v-for="mark in shownMarks(eye)" :style="{ top: 100 * mark.y + '%' }"
+                :class="{ 'oc-read': mark.eyes.includes(eye) }">{{ mark.text }}<span
+                v-if="mark.eyes.includes(eye)"> smallest line read</span></li>
+          </ol>
+          <span class="oc-tag oc-tag-left" :style="{ opacity: shownSplit > 12 ? 1 : 0 }">Scene</span>
+          <span class="oc-tag oc-tag-right" :style="{ opacity: shownSplit < 88 ? 1 : 0 }">
+            {{ label(eye) }}</span>
+          <span class="oc-state" :class="'oc-' + state(eye).kind" :key="state(eye).text">{{ state(eye).text }}</span>
+          <span v-if="point && point.eye === eye" class="oc-cross"
+                :style="{ left: 100 * point.x + '%', top: 100 * point.y + '%' }"></span>
+          <div class="oc-split" :style="{ left: shownSplit + '%' }" role="slider" tabindex="0"
+               :aria-label="'Split between the scene and the ' + label(eye).toLowerCase()"
+               aria-valuemin="0" aria-valuemax="100" :aria-valuenow="Math.round(split)"
+               :aria-valuetext="Math.round(split) + ' % scene'"
+               @keydown="onKey"><i></i></div>
+        </div>
+      </div>
+      <div class="oc-view-tools">
+        <button type="button" class="oc-tool" @pointerdown="hold(true)" @pointerup="hold(false)"
+                @pointerleave="hold(false)" @keydown.space.prevent="hold(true)"
+                @keyup.space="hold(false)" @keydown.enter.prevent="hold(true)"
+                @keyup.enter="hold(false)" @blur="hold(false)" :aria-pressed="held"
+                >Hold to see the scene</button>
+        <button type="button" class="oc-tool" @click="fill">Full screen</button>
       </div>
     </div>`,
-  props: { address: String, eyes: Array, aspect: Number },
+  props: { address: String, eyes: Array, aspect: Number, scene: String, alts: Object, marks: Array },
   data() {
-    return { split: 50, dragging: false, point: null, states: {}, down: null };
+    return { hasScene: false, height: 0, split: 50, held: false, dragging: false, point: null, states: {}, down: null };
   },
   computed: {
     frame() {
-      return { aspectRatio: this.aspect, maxWidth: `calc(${TALLEST} * ${this.aspect})` };
+      return { aspectRatio: this.aspect, maxWidth: `calc(var(--tallest) * ${this.aspect})` };
+    },
+    shownSplit() {
+      return this.held ? 100 : this.split;
     },
     clip() {
-      return { clipPath: `inset(0 0 0 ${this.split}%)` };
+      return { clipPath: `inset(0 0 0 ${this.shownSplit}%)` };
     },
   },
   created() {
@@ -48,9 +70,12 @@ export default {
   },
   mounted() {
     this.connect();
+    this.sizes = new ResizeObserver(() => this.measure());
+    this.sizes.observe(this.$el);
   },
   beforeUnmount() {
     this.ended = true;
+    this.sizes.disconnect();
     this.socket?.close();
   },
   watch: {
@@ -62,8 +87,23 @@ export default {
     label(eye) {
       return LABELS[eye];
     },
+    shownMarks(eye) {
+      // of rows that are closer than their labels, the larger one has its own
+      const height = this.height || 500;
+      let last = -Infinity;
+      return this.marks.filter((mark) => {
+        const y = mark.y * height;
+        if (y - last < MARK_PX && !mark.eyes.includes(eye)) return false;
+        last = y;
+        return true;
+      });
+    },
+    measure() {
+      this.height = this.$el.querySelector(".oc-view")?.clientHeight;
+    },
     state(eye) {
-      return this.states[eye] ?? { kind: "wait", text: "preparing …" };
+      const waiting = this.hasScene ? "preparing …" : "rendering the scene …";
+      return this.states[eye] ?? { kind: "wait", text: waiting };
     },
     connect() {
       const scheme = location.protocol === "https:" ? "wss:" : "ws:";
@@ -104,7 +144,10 @@ export default {
         canvas.getContext("2d").drawImage(bitmap, 0, 0);
       }
       bitmap.close();
-      if (!header.eye) return this.clear();
+      if (!header.eye) {
+        this.hasScene = true;
+        return this.clear();
+      }
       const text = header.kind === "full" ? `full picture · ${header.width_px} × ${header.height_px}` : "preview";
       this.states[place] = { kind: header.kind, text };
       const drawn = window.ocufilter.drawn;
@@ -153,10 +196,17 @@ export default {
       this.down = null;
     },
     onKey(event) {
-      const step = { ArrowLeft: -KEY_STEP, ArrowRight: KEY_STEP }[event.key];
+      const step = SPLIT_STEPS[event.key];
       if (!step) return;
       this.split = Math.min(Math.max(this.split + step, 0), 100);
       event.preventDefault();
+    },
+    hold(isHeld) {
+      this.held = isHeld;
+    },
+    fill() {
+      if (document.fullscreenElement) document.exitFullscreen();
+      else this.$refs.stage.requestFullscreen();
     },
     report(eye, x, y) {
       this.point = { eye, x, y };

@@ -1,6 +1,11 @@
 """Page element that shows the pictures; its browser part is picture_view.js."""
 
+from collections.abc import Mapping, Sequence
+from typing import Any
+
 from nicegui.element import Element
+
+from clients.web.eye_form import EyeSide
 
 
 # nicegui, which takes the name of the component, has no types here
@@ -18,14 +23,40 @@ class PictureView(Element, component="picture_view.js"):  # type: ignore[call-ar
 
     def __init__(self, address: str, eyes: list[str], aspect: float) -> None:
         super().__init__()
-        self._props["address"] = address
-        self._props["eyes"] = eyes
-        self._props["aspect"] = aspect
+        self._props.update(
+            {
+                "address": address,
+                "eyes": eyes,
+                "aspect": aspect,
+                "scene": "",
+                "alts": {},
+                "marks": [],
+            }
+        )
 
     def show_eyes(self, eyes: list[str]) -> None:
         """Show these eyes."""
         self._props["eyes"] = eyes
+        self.update()
 
-    def show_aspect(self, ratio: float) -> None:
-        """Set the aspect ratio of the pictures, width over height."""
-        self._props["aspect"] = ratio
+    def show_scene(self, title: str, ratio: float) -> None:
+        """Set the scene's title and the ratio of its width to its height."""
+        self._props["scene"], self._props["aspect"] = title, ratio
+        self.update()
+
+    def describe(self, alts: Mapping[EyeSide, str]) -> None:
+        """Set the text alternative of each eye's image."""
+        self._props["alts"] = dict(alts)
+        self.update()
+
+    def mark_rows(self, marks: Sequence[Mapping[str, Any]]) -> None:
+        """Set the labels beside rows of a chart.
+
+        Parameters
+        ----------
+        marks : sequence of mapping
+            ``y`` from 0 to 1, ``text``, and ``eyes``: the eyes whose smallest line this
+            is.
+        """
+        self._props["marks"] = [dict(mark) for mark in marks]
+        self.update()

@@ -1,9 +1,8 @@
-"""A scene rendered in a child process, as the page's process must not load pyrender.
+"""Rendering of a scene in a child process.
 
     python -m clients.web.scene_file courtyard out.npz 960x540
 
-pyrender's OpenGL and that of GPU filters do not share a process well, and building a
-scene takes seconds, during which the page must stay responsive.
+Building a scene takes seconds, during which the page must stay responsive.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ import struct
 import subprocess
 import sys
 import tempfile
+import threading
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ import numpy as np
 
 from clients.arguments import read_size_px
 from clients.batch.atomic_files import write_whole
-from clients.extra import what_to_install
 from clients.web.picture import Picture, picture_of
 from estimator import InvalidFile
 from filter_service import RgbdView
@@ -37,20 +36,27 @@ _CHECKOUT = Path(__file__).resolve().parents[2]
 _FOLDER = _CHECKOUT if (_CHECKOUT / "pyproject.toml").is_file() else None
 
 
+_SCENES: dict[str, Picture] = {}
+_SCENES_LOCK = threading.Lock()
+
+
 class SceneNotRendered(Exception):
     """A scene could not be rendered; the message says why."""
 
 
 @cache
 def scene_picture(name: str) -> Picture:
-    """Return a built-in scene as a picture; takes seconds the first time.
+    """Return a built-in scene as a picture; only the first call takes seconds.
 
     Raises
     ------
     SceneNotRendered
     """
-    with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
-        return _rendered(name, TITLES[name], Path(folder))
+    with _SCENES_LOCK:
+        if name not in _SCENES:
+            with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
+                _SCENES[name] = _rendered(name, TITLES[name], Path(folder))
+        return _SCENES[name]
 
 
 def gltf_picture(name: str, content: bytes) -> Picture:
@@ -146,14 +152,10 @@ def _rendered(source: str, title: str, folder: Path) -> Picture:
 
 def main(source: str, file: str, size: str) -> int:
     """Render a scene and write it to a file, in the child process."""
-    try:
-        from clients.scene_renderer import SceneRenderer
-        from clients.scenes.catalog import build_scene
-    except ModuleNotFoundError as error:
-        sys.stderr.write(what_to_install(error) + "\n")
-        return 1
     from clients.headset.gltf_scene import load_gltf
     from clients.headset.viewpoint import viewpoint
+    from clients.scene_renderer import SceneRenderer
+    from clients.scenes.catalog import build_scene
     from clients.scenes.paths import PATHS, path_moments
 
     try:

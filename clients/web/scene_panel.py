@@ -47,20 +47,27 @@ class ScenePanel:
     Parameters
     ----------
     on_picture : called with each new picture
+    kind : first scene, one of `KINDS`
     """
 
-    def __init__(self, state: PageState, on_picture: Callable[[Picture], None]) -> None:
+    def __init__(
+        self, state: PageState, on_picture: Callable[[Picture], None], kind: str
+    ) -> None:
         self._state, self._on_picture = state, on_picture
-        self._kind = FIRST
+        self._kind = kind
         self._n_waiting = 0
         self._photo: NamedFile | None = None
         self._depth: NamedFile | None = None
         self._width_deg = 35
         with ui.element("div").classes("oc-scene"):
-            ui.toggle(KINDS, value=FIRST, on_change=self._choose).props(
-                "no-caps unelevated dense"
-            ).classes("oc-toggle oc-kinds")
+            self._kinds = (
+                ui.toggle(KINDS, value=kind, on_change=self._choose)
+                .props("no-caps unelevated dense role=group aria-label=Scene")
+                .classes("oc-toggle oc-kinds")
+            )
             self._busy = ui.spinner(size="1.4em").classes("oc-busy")
+            self._busy.set_visibility(False)
+        self._problem = ui.label("").classes("oc-problem").props("role=alert")
         self._uploads()
 
     @ui.refreshable_method
@@ -80,10 +87,11 @@ class ScenePanel:
             )
             with ui.element("div").classes("oc-photo-width"):
                 ui.select(
-                    PHOTO_WIDTHS_DEG, value=self._width_deg, on_change=self._set_width
-                ).props("outlined dense options-dense").tooltip(
-                    "Horizontal field of view of the photo"
-                )
+                    PHOTO_WIDTHS_DEG,
+                    value=self._width_deg,
+                    on_change=self._set_width,
+                    label="Field of view of the photo",
+                ).props("outlined dense options-dense")
                 ui.label(
                     f"Depth: {DEPTH_HELP}.  Without depth the photo stands flat at a "
                     "distance."
@@ -97,21 +105,33 @@ class ScenePanel:
     def _in_use(self) -> None:
         """Show the names of the files in use."""
         names = [file[0] for file in (self._photo, self._depth) if file is not None]
-        self._used.text = f"In use: {', '.join(names)}" if names else ""
+        text = f"In use: {', '.join(names)}" if names else ""
+        if names and self._photo is None:
+            text += ". Now upload the photo of this depth."
+        self._used.text = text
 
-    async def first(self) -> None:
-        """Show the first scene."""
-        await self._make(scene_picture, FIRST)
+    @property
+    def kind(self) -> str:
+        """Return the chosen scene."""
+        return self._kind
+
+    def choose(self, kind: str) -> None:
+        """Show another scene, as a press on its button does."""
+        self._kinds.value = kind
 
     async def _choose(self, event: events.ValueChangeEventArguments) -> None:
         self._kind = event.value
+        self._problem.text = ""
         self._uploads.refresh()
-        if self._kind in TITLES:
-            await self._make(scene_picture, self._kind)
-        elif self._kind == "chart":
-            await self._make(chart_picture, self._state.values[DISTANCE.name])
-        elif self._kind == "photo":
-            await self._show_again()
+        try:
+            if self._kind in TITLES:
+                await self._make(scene_picture, self._kind)
+            elif self._kind == "chart":
+                await self._make(chart_picture, self._state.values[DISTANCE.name])
+            elif self._kind == "photo":
+                await self._show_again()
+        except ValueError as error:
+            self._problem.text = str(error)
 
     async def _take_gltf(self, name: str, content: bytes) -> None:
         await self._make(gltf_picture, name, content)
@@ -119,59 +139,67 @@ class ScenePanel:
     async def _take_photo(self, name: str, content: bytes) -> None:
         # A depth file uploaded first belongs to this photo, any other to the last one.
         depth = self._depth if self._photo is None else None
-        if not await self._show_photo((name, content), depth) and self._photo is None:
-            self._depth = None  # it may be the file that was refused
-            self._in_use()
+        try:
+            await self._show_photo((name, content), depth)
+        except ValueError:
+            if self._photo is None:
+                self._depth = None  # it may be the file that was refused
+                self._in_use()
+            raise
 
     async def _take_depth(self, name: str, content: bytes) -> None:
         if self._photo is None:
             self._depth = name, content
-            ui.notify("Now upload the photo of this depth", type="info")
             self._in_use()
             return
         await self._show_photo(self._photo, (name, content))
 
     async def _set_width(self, event: events.ValueChangeEventArguments) -> None:
         self._width_deg = event.value
-        await self._show_again()
+        try:
+            await self._show_again()
+        except ValueError as error:
+            self._problem.text = str(error)
 
     async def _show_again(self) -> None:
         if self._photo is not None:
             await self._show_photo(self._photo, self._depth)
 
-    async def _show_photo(self, photo: NamedFile, depth: NamedFile | None) -> bool:
+    async def _show_photo(self, photo: NamedFile, depth: NamedFile | None) -> None:
         """Show a photo; if one of its files is refused, keep the previous ones."""
-        is_shown = await self._make(
+        await self._make(
             photo_picture,
             *photo,
             width_deg=self._width_deg,
             distance_dpt=self._state.values[DISTANCE.name],
             depth=depth,
         )
-        if is_shown:
-            self._photo, self._depth = photo, depth
+        self._photo, self._depth = photo, depth
         self._in_use()
-        return is_shown
 
     async def _make(
         self, make: Callable[..., Picture], *args: Any, **options: Any
-    ) -> bool:
-        """Show the picture that a function makes, or report its error."""
+    ) -> None:
+        """Show the picture that a function makes.
+
+        Raises
+        ------
+        ValueError
+            The picture cannot be made.
+        """
         if self._n_waiting >= MAX_WAITING:
-            ui.notify("Still rendering; try again", type="warning")
-            return False
+            raise ValueError("Still rendering; try again")
         kind = self._kind
+        self._problem.text = ""
         self._busy.set_visibility(True)
         self._n_waiting += 1
         try:
             async with _turns:
                 picture = await run.io_bound(make, *args, **options)
-        except (ValueError, SceneNotRendered) as error:
-            ui.notify(str(error), type="negative", multi_line=True, timeout=10_000)
-            return False
+        except SceneNotRendered as error:
+            raise ValueError(str(error)) from None
         finally:
             self._n_waiting -= 1
             self._busy.set_visibility(self._n_waiting > 0)
         if picture is not None and kind == self._kind:  # else another was chosen
             self._on_picture(picture)
-        return True

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import AsyncIterator, Callable, Collection, Mapping
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 import uvicorn
@@ -15,11 +16,18 @@ from clients.web.bounds import MAX_MESSAGE_BYTES, MAX_PAGES, Bounds
 from clients.web.connections import MAX_HEAD_BYTES, BoundedConnection
 from clients.web.guard import POLICY_VIOLATION, Guard
 from clients.web.page import PICTURES_PATH, SharedResources, add_page
+from clients.web.scene_file import SceneNotRendered, scene_picture
+from clients.web.scene_panel import FIRST
 
 MESSAGE_HISTORY = 50
 """Messages kept for a browser that reconnects; figures are large."""
 
 FAREWELL_S = 2
+
+
+def _render_first() -> None:
+    with suppress(SceneNotRendered):  # the page says what is missing
+        scene_picture(FIRST)
 
 
 def make_server(
@@ -41,6 +49,8 @@ def make_server(
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        # rendered before somebody opens the page, which then opens with it
+        threading.Thread(target=_render_first, daemon=True).start()
         on_ready()
         yield
 
@@ -61,6 +71,7 @@ def make_server(
     ui.run_with(
         application,
         title="ocufilter",
+        language="en-US",
         favicon="👁",
         tailwind=False,
         binding_refresh_interval=None,  # there are no bindings

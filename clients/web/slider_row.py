@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from nicegui import ui
+from nicegui.element import Element
 
 from clients.web.numbers import NumberField
 
-THROTTLE_S = 0.03
-"""Least time between two values reported while a slider is dragged."""
 
-
-class SliderRow:
-    """A slider for one number.
+# nicegui, which takes the name of the component, has no types here
+class SliderRow(Element, component="range_slider.js"):  # type: ignore[call-arg]
+    """A slider for one number, as a native range input.
 
     Parameters
     ----------
+    number : its name, label, range and step
+    value : initial value
     on_move : called with each value
     words : formats a value; by default the number with its unit
+    is_titled : whether label and value are shown; assistive technology has them anyway
     """
 
     def __init__(
@@ -28,43 +29,43 @@ class SliderRow:
         on_move: Callable[[float], None],
         *,
         words: Callable[[float], str] | None = None,
+        is_titled: bool = True,
     ) -> None:
+        super().__init__()
         self.number = number
         self._words = words or (lambda v: number.with_unit(number.show(v)))
         self._on_move = on_move
-        with ui.element("div").classes("oc-slider") as self.row:
-            with ui.element("div").classes("oc-slider-head"):
-                ui.label(number.label)
-                self._told = ui.label(self._words(value)).classes("oc-value")
-            self._slider = (
-                ui.slider(
-                    min=number.low, max=number.high, step=number.step, value=value
-                )
-                .props(f'aria-label="{number.label}" dense')
-                .mark(number.name)
-            )
-            self._slider.props["data-name"] = number.name
-            self._slider.on(
-                "update:model-value",
-                lambda event: self._moved(event.args),
-                throttle=THROTTLE_S,
-            )
+        self._is_titled = is_titled
+        self._why_not: str | None = None
+        self._props.update(
+            {
+                "name": number.name,
+                "label": number.label,
+                "min": number.low,
+                "max": number.high,
+                "step": number.step,
+                "disabled": False,
+            }
+        )
+        self.show(value)
+        self.on("move", lambda event: self._moved(event.args))
 
     def _moved(self, sent: object) -> None:
         value = self.number.within(sent)
         if value is not None:
-            self._told.text = self._words(value)
+            self.show(value)
             self._on_move(value)
 
     def show(self, value: float) -> None:
-        """Show a value that was set elsewhere."""
-        self._slider.value = value
-        self._told.text = self._words(value)
+        """Show a value."""
+        self._value = value
+        self._props["value"] = value
+        text = self._words(value) if self._why_not is None else self._why_not
+        self._props["text"] = text if self._is_titled else ""
+        self.update()
 
     def enable(self, is_on: bool, why_not: str = "") -> None:
         """Enable the slider, or disable it and show why."""
-        self._slider.set_enabled(is_on)
-        self._told.text = self._words(self._slider.value) if is_on else why_not
-        self.row.classes(
-            remove="oc-off" if is_on else "", add="" if is_on else "oc-off"
-        )
+        self._props["disabled"] = not is_on
+        self._why_not = None if is_on else why_not
+        self.show(self._value)

@@ -49,10 +49,11 @@ class PageUnderTest:
 
     def press(self, slider, key, count) -> None:
         """Move a slider by keys."""
-        thumb = self.slider(slider).locator("[tabindex='0']")
+        thumb = self.slider(slider)
         thumb.focus()
         for _ in range(count):
             thumb.press(key)
+        self.page.wait_for_timeout(100)  # a slider reports every 30 ms
 
     def drawn(self):
         """Return what was drawn, in order."""
@@ -93,7 +94,7 @@ class PageUnderTest:
 
     def slider(self, name, index=0):
         """Return the part of a slider that takes keys."""
-        return self.page.locator(f".q-slider[data-name={name}]").nth(index)
+        return self.page.locator(f".oc-slider input[data-name={name}]").nth(index)
 
     def box(self, eye: str = "OD"):
         """Return where the pictures of an eye are."""

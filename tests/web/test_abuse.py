@@ -265,7 +265,7 @@ def _png(width_px, height_px):
 
 
 def _said(upload, pattern):
-    words = upload.page.locator(".q-notification").filter(has_text=re.compile(pattern))
+    words = upload.page.locator(".oc-problem").filter(has_text=re.compile(pattern))
     words.first.wait_for(timeout=1000 * TIMEOUT_S)
     return words.first.inner_text()
 

@@ -1,0 +1,55 @@
+// A native range input: its role, its keys and touch come from the browser.
+//
+// It keeps its own value while it is dragged: an answer of the page to an older value
+// must not move it back.
+const THROTTLE_MS = 30; // between two reported values
+const PAGE_STEPS = 10; // steps of a Page key
+
+export default {
+  template: `
+    <div class="oc-slider" :class="{ 'oc-off': disabled }">
+      <div v-if="text" class="oc-slider-head">
+        <label :for="id">{{ label }}</label>
+        <span class="oc-value" aria-hidden="true">{{ text }}</span>
+      </div>
+      <input type="range" :id="id" :data-name="name" :min="min" :max="max" :step="step"
+             :value="current" :disabled="disabled" :aria-label="text ? null : label"
+             :aria-valuetext="text || null" @input="onInput" @keydown="onKey">
+    </div>`,
+  props: {
+    name: String, label: String, text: String, min: Number, max: Number,
+    step: Number, value: Number, disabled: Boolean,
+  },
+  data() {
+    return { current: this.value, id: `oc-range-${Math.random().toString(36).slice(2)}` };
+  },
+  watch: {
+    value(value) {
+      if (!this.waiting) this.current = value;
+    },
+  },
+  methods: {
+    onInput(event) {
+      this.current = Number(event.target.value);
+      this.report();
+    },
+    onKey(event) {
+      const steps = { PageUp: PAGE_STEPS, PageDown: -PAGE_STEPS }[event.key];
+      if (!steps) return;
+      event.preventDefault();
+      const next = this.current + steps * this.step;
+      const rounded = this.min + Math.round((next - this.min) / this.step) * this.step;
+      this.current = Math.min(Math.max(rounded, this.min), this.max);
+      this.report();
+    },
+    report() {
+      if (this.waiting) return;
+      this.$emit("move", this.current);
+      const reported = this.current;
+      this.waiting = setTimeout(() => {
+        this.waiting = null;
+        if (this.current !== reported) this.report();
+      }, THROTTLE_MS);
+    },
+  },
+};
