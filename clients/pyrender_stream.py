@@ -1,10 +1,10 @@
-"""Stream a scene through a running filter service, like a game or a viewer.
+"""Stream a scene through a running filter service, as a game or a viewer would.
 
     ocufilter serve &
     python -m clients.pyrender_stream --scene courtyard --profile keratoconus --window
 
-Frames are rendered and sent without waiting for replies; the newest frame replaces one
-that waits to be sent.
+The program renders and sends frames without waiting for replies.  The newest frame
+replaces one that waits to be sent.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from clients.arguments import read_profile, size_px_argument
 from clients.extra import what_to_install
 from clients.filter_client import FilterClient, FilteredFrame
+from clients.frame_log import FrameLog
 from clients.natural_eye import (
     USUAL_AGE_YEARS,
     USUAL_WHITE_CD_M2,
@@ -32,21 +33,14 @@ from clients.natural_eye import (
     distance_at,
     luminance_cd_m2,
 )
+from clients.scene_renderer import SceneFrame, scene_frames
+from clients.scenes.catalog import SCENE_BUILDERS, build_scene
+from clients.scenes.paths import PATHS, path_moments
+from clients.streaming import submit
 from filter_service.errors import FilterError, ServiceTimeout
 from filter_service.messages import DEFAULT_ENDPOINT, Camera, Dropped, ErrorReply
 
 try:
-    from clients.frame_log import FrameLog
-    from clients.scene_renderer import (
-        SceneFrame,
-        SceneRenderer,
-        frame_at,
-        scene_frames,
-    )
-    from clients.scenes.catalog import SCENE_BUILDERS, build_scene
-    from clients.scenes.paths import PATHS, path_moments
-    from clients.scenes.scene import Scene
-    from clients.streaming import view_of
     from clients.window import LiveWindow, NoDisplay
 except ModuleNotFoundError as error:
     if __name__ != "__main__":
@@ -63,7 +57,7 @@ Learn = Callable[[float, float], None]
 
 
 def path_settings(*scene_names: str) -> dict[str, tuple[float, float]]:
-    """Return the settings that cover the pupils and foci of the scenes' own paths."""
+    """Return settings that cover the pupils and foci on the paths of scenes."""
     moments = [m for name in scene_names for m in path_moments(PATHS[name], 200)]
     pupils_mm = [moment.pupil_diameter_mm for moment in moments]
     foci_dpt = [moment.focus_dpt for moment in moments]
@@ -75,22 +69,10 @@ def path_settings(*scene_names: str) -> dict[str, tuple[float, float]]:
     }
 
 
-def _looped_frames(
-    scene: Scene, size_px: tuple[int, int], n_frames: int, *, with_hidden: bool
-) -> Generator[SceneFrame, None, None]:
-    """Follow the scene's path back and forth, endlessly."""
-    moments = path_moments(PATHS[scene.name], n_frames)
-    moments = moments + moments[-2:0:-1]
-    with SceneRenderer(scene, size_px) as renderer:
-        while True:
-            for moment in moments:
-                yield frame_at(renderer, moment, with_hidden=with_hidden)
-
-
 def looking_around(
     frames: Iterator[SceneFrame], reach_deg: float
 ) -> Generator[SceneFrame, None, None]:
-    """Move the gaze around the image, twice as far to the sides as up and down."""
+    """Move the gaze on an ellipse, twice as far to the sides as up and down."""
     for number, frame in enumerate(frames):
         turn = 2 * np.pi * number / FRAMES_PER_ROUND
         h_deg, v_deg = reach_deg * np.sin(turn), 0.5 * reach_deg * np.cos(turn)
@@ -104,7 +86,7 @@ def looking_naturally(
     white_cd_m2: float = USUAL_WHITE_CD_M2,
     clock: Callable[[], float] = time.monotonic,
 ) -> Generator[SceneFrame, None, None]:
-    """Let the focus follow the fixated object, and the pupil the light."""
+    """Make the focus follow the fixated object, and the pupil follow the light."""
     for frame in frames:
         height_px, width_px = frame.depth_m.shape
         camera = Camera(width_px, height_px, frame.tangents)
@@ -132,38 +114,42 @@ def stream(
 
     Parameters
     ----------
-    show : called with (input, filtered, title) for each reply; false ends the stream.
-    learn : called with the focus that a frame requested and the focus that was used.
+    client : FilterClient
+        Connected client with a profile.
+    frames : iterator of SceneFrame
+        Frames to submit.
+    log : FrameLog
+        Receives the statistics of the frames.
+    show : callable, optional
+        Called with (input, filtered, title) for each result; False ends the stream.
+    learn : callable
+        Called with the focus that a frame requested and the focus that was used.
 
     Returns
     -------
-    Number of frames submitted.
+    int
+        Number of frames submitted.
 
     Raises
     ------
     FilterError
-        If the service rejects a frame or stops answering.
+        If the service rejects a frame or stops responding.
     """
     sent: dict[int, SceneFrame] = {}
     n_sent = 0
     for frame in frames:
-        frame_id = client.submit(
-            view_of(frame),
-            pupil_diameter_mm=frame.pupil_diameter_mm,
-            focus_dpt=frame.focus_dpt,
-            gaze_deg=frame.gaze_deg,
-        )
-        sent[frame_id], n_sent = frame, n_sent + 1
-        if not _take_answers(client, sent, log, show, learn, timeout_s=0.0):
+        sent[submit(client, frame)] = frame
+        n_sent += 1
+        if not _handle_replies(client, sent, log, show, learn, timeout_s=0.0):
             return n_sent
-    go_on = True
-    while go_on and client.n_unanswered:
+    while client.n_unanswered:
         timeout_s = client.timeout_s
-        go_on = _take_answers(client, sent, log, show, learn, timeout_s=timeout_s)
+        if not _handle_replies(client, sent, log, show, learn, timeout_s=timeout_s):
+            break
     return n_sent
 
 
-def _take_answers(
+def _handle_replies(
     client: FilterClient,
     sent: dict[int, SceneFrame],
     log: FrameLog,
@@ -172,25 +158,24 @@ def _take_answers(
     *,
     timeout_s: float,
 ) -> bool:
-    """Handle the replies; return whether to continue."""
+    """Handle the replies so far; return whether the window is still open."""
     events = client.poll(timeout_s)
     if not events and timeout_s:
-        raise ServiceTimeout(f"no answer to a frame within {timeout_s:g} s")
-    go_on = True
+        raise ServiceTimeout(f"no reply to a frame within {timeout_s:g} s")
+    is_open = True
     for event in events:
         if isinstance(event, ErrorReply):
             raise event.exception()
         if isinstance(event, Dropped):
-            log.add_drop(event.reason)
+            log.drops[event.reason] += 1
             sent.pop(event.frame_id, None)
         elif isinstance(event, FilteredFrame):
             log.add(event)
             frame = sent.pop(event.frame_id)
-            if event.header.is_complete:  # a preview has a focus of its own
-                learn(frame.focus_dpt, event.header.focus_dpt)
+            learn(frame.focus_dpt, event.header.focus_dpt)
             if show is not None:
-                go_on = show(frame.color, event.color, _title(event)) and go_on
-    return go_on
+                is_open = show(frame.color, event.color, _title(event)) and is_open
+    return is_open
 
 
 def _title(answer: FilteredFrame) -> str:
@@ -199,7 +184,7 @@ def _title(answer: FilteredFrame) -> str:
         f"ocufilter   pupil {header.pupil_diameter_mm:.1f} mm   "
         f"focus {header.focus_dpt:.2f} dpt   "
         f"gaze {header.gaze_deg[0]:+.0f} {header.gaze_deg[1]:+.0f} deg   "
-        f"{answer.age_ms:.0f} ms   (Esc ends)"
+        f"{answer.age_ms:.0f} ms   (Esc to quit)"
     )
 
 
@@ -212,65 +197,69 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--profile",
         default="myopia",
-        help="a preset's name, JSON, or a .json, .abp or .csv file",
+        help="preset name, JSON, or a .json, .abp or .csv file",
     )
     parser.add_argument(
         "--size", default="480x270", type=size_px_argument, metavar="WxH"
     )
-    parser.add_argument("--frames", default=96, type=int, help="frames of the path")
+    parser.add_argument(
+        "--frames", default=96, type=int, help="number of frames along the path"
+    )
     parser.add_argument(
         "--hidden",
         action="store_true",
-        help="send what is behind the surfaces seen, too",
+        help="also send the hidden layer, the surface behind the visible one",
     )
     parser.add_argument(
-        "--window", action="store_true", help="show it live; the path repeats until Esc"
+        "--window",
+        action="store_true",
+        help="show a live window; the path repeats until Esc",
     )
     parser.add_argument(
         "--look-around",
         default=0.0,
         type=float,
         metavar="DEG",
-        help=f"how far the gaze goes round the image, 0 to {MAX_LOOK_AROUND_DEG:g}",
+        help=f"radius of a circular gaze movement, 0 to {MAX_LOOK_AROUND_DEG:g}",
     )
     parser.add_argument(
         "--natural",
         action="store_true",
-        help="focus follows what is looked at, and the pupil the light, as people's "
-        "do; else both are the path's own",
+        help="make the focus follow the fixated object and the pupil the light "
+        "(default: both follow the path)",
     )
     parser.add_argument(
         "--age",
         default=USUAL_AGE_YEARS,
         type=float,
         metavar="YEARS",
-        help=f"of the person, with --natural (default: {USUAL_AGE_YEARS:g})",
+        help=f"age of the person, for --natural (default: {USUAL_AGE_YEARS:g})",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     return parser.parse_args(argv)
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
-    """Connect and stream; return the summary of the log."""
+    """Connect and stream; return a summary of the frames."""
     reach_deg = options.look_around
     if not 0.0 <= reach_deg <= MAX_LOOK_AROUND_DEG:
         raise ValueError(
-            f"look-around {reach_deg:g}; allowed: 0 to {MAX_LOOK_AROUND_DEG:g} deg"
+            f"--look-around is {reach_deg:g}; allowed: 0 to {MAX_LOOK_AROUND_DEG:g} deg"
         )
     scene = build_scene(options.scene)
     log = FrameLog()
     with ExitStack() as stack:
         show = None
         if options.window:
-            window = stack.enter_context(LiveWindow(options.size, "ocufilter"))
-            show = window.show
-            frames = _looped_frames(
-                scene, options.size, options.frames, with_hidden=options.hidden
-            )
-        else:
-            frames = scene_frames(
-                scene, None, options.frames, options.size, with_hidden=options.hidden
-            )
+            show = stack.enter_context(LiveWindow(options.size, "ocufilter")).show
+        frames = scene_frames(
+            scene,
+            None,
+            options.frames,
+            options.size,
+            with_hidden=options.hidden,
+            repeats=options.window,
+        )
         client = stack.enter_context(
             FilterClient(options.endpoint, client_name="pyrender_stream")
         )
@@ -291,7 +280,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         client.set_profile(
             read_profile(options.profile),
             settings=settings,
-            views=[view_of(first)],
+            views=[first.view],
         )
         n_sent = stream(client, chain([first], frames), log, show, **learn)
     return {"sent": n_sent, **log.summary()}

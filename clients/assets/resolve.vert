@@ -1,5 +1,5 @@
 #version 330 core
-// One triangle that covers the picture.
+// One triangle that covers the image.
 
 void main()
 {

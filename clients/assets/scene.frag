@@ -1,8 +1,13 @@
 #version 330 core
-// Flat shading: the light is in the vertices.  They and the texture are multiplied as
-// sRGB values, as pyrender does, so that both show the same.
+// Flat shading: the light is baked into the vertices.  It is multiplied by the texture in
+// sRGB values.  With LEAST_GAP_DPT defined, the shader renders the hidden layer: it discards
+// fragments that are less than that behind the visible surface, and back faces that are less
+// than twice as far away, because these are the far side of the visible object.
 
 uniform sampler2D surface;
+#ifdef LEAST_GAP_DPT
+uniform sampler2D seen_per_m;     // 1 / planar depth of the visible surface
+#endif
 
 in vec3 vertex_srgb;
 in vec2 vertex_uv;
@@ -13,7 +18,12 @@ layout(location = 1) out float per_m;
 
 void main()
 {
+    per_m = 1.0 / vertex_depth_m;
+#ifdef LEAST_GAP_DPT
+    float seen = texelFetch(seen_per_m, ivec2(gl_FragCoord.xy), 0).r;
+    bool is_far_side = !gl_FrontFacing && 2.0 * per_m > seen;
+    if (is_far_side || seen - per_m < LEAST_GAP_DPT) discard;
+#endif
     vec3 product = vertex_srgb * texture(surface, vertex_uv).rgb;
     srgb = vec4(clamp(product, 0.0, 1.0), 1.0);
-    per_m = 1.0 / vertex_depth_m;
 }

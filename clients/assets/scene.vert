@@ -1,8 +1,8 @@
 #version 330 core
-// A scene's triangles as a camera sees them.
+// Projects the triangles of a scene.
 
 uniform mat4 clip_from_world;
-uniform vec4 planar_depth;        // planar depth is its product with (x, y, z, 1)
+uniform vec4 planar_depth;        // its product with (x, y, z, 1) is the planar depth
 
 in vec3 vertex_m;
 in vec3 srgb;

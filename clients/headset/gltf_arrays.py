@@ -1,4 +1,4 @@
-"""Arrays of glTF accessors: element counts without reading, and elements."""
+"""Arrays of glTF accessors: their elements, and counts without reading them."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def accessor_array(file: Container, index: object, *, kinds: str) -> NDArray[Any
     Parameters
     ----------
     kinds : str
-        Allowed kinds of numbers: of ``u``, ``i`` and ``f``.
+        Allowed kinds of numbers, any of ``u``, ``i`` and ``f``.
     """
     accessor = file.entry("accessors", index)
     where = f"accessors[{index}]"
     count = accessor_count(file, index)
     dtype, columns = _dtype(file, accessor, where)
     if dtype.kind not in kinds:
-        file.refuse(f"damaged: {where} holds {dtype}")
+        file.refuse(f"damaged: {where} has elements of {dtype}")
     if "bufferView" in accessor:
         start = file.whole(accessor, "byteOffset", where, default=0)
         stride = file.entry("bufferViews", accessor["bufferView"]).get("byteStride")
@@ -65,7 +65,7 @@ def _strided(
     shape: tuple[int, int],
     dtype: np.dtype,
 ) -> NDArray[Any]:
-    """Return elements of a view without a copy."""
+    """Return the elements of a buffer view without copying them."""
     count, columns = shape
     element = columns * dtype.itemsize
     step = element if stride is None else stride

@@ -1,6 +1,6 @@
 """Header and buffers of a glTF file, within limits.
 
-A file may reference other files. They must be in its folder or below, also after
+A file may reference other files. These must be in its folder or below, even after
 symbolic links are resolved, and count toward the same limit.
 """
 
@@ -16,19 +16,19 @@ from urllib.parse import unquote
 from estimator.bounded_files import InvalidFile, loads_bounded, read_bytes
 
 MAX_FILE_MB = 256.0
-"""Total of a file and the files that it references, all held in memory while
+"""Total size of a file and the files that it references, which are all in memory during
 reading."""
 
 MAX_HEADER_BYTES = 64_000_000
-"""Size of the JSON, in which a .gltf may hold its buffers as text; held in memory four
-times."""
+"""Size of the JSON, which may contain the buffers as text; parsing takes four times as
+much memory."""
 
 MAX_HEADER_ITEMS = 1_000_000
-"""Number of values in the JSON: 50,000 nodes, meshes and accessors. A second to
-parse."""
+"""Number of values in the JSON, which take a second to parse: enough for 50,000 nodes,
+meshes and accessors."""
 
 MAX_HEADER_DEPTH = 64
-"""Nesting depth of the JSON: extras may hold anything."""
+"""Nesting depth of the JSON, whose extras may contain anything."""
 
 MAGIC = b"glTF"
 _JSON_CHUNK, _BINARY_CHUNK = b"JSON", b"BIN\0"
@@ -42,8 +42,9 @@ class Container:
     Attributes
     ----------
     path : Path
+        Path of the file.
     header : dict
-        Its JSON; checked only to be an object.
+        JSON of the file, of which nothing is checked but that it is an object.
     """
 
     def __init__(self, path: Path) -> None:
@@ -62,12 +63,14 @@ class Container:
             if not isinstance(found, list):
                 self.refuse(f"damaged: '{name}' is not a list", "a list of objects")
             if not all(isinstance(entry, dict) for entry in found):
-                self.refuse(f"damaged: '{name}' holds other than objects", "objects")
+                self.refuse(
+                    f"damaged: '{name}' has entries that are not objects", "objects"
+                )
             self._lists[name] = found
         return self._lists[name]
 
     def entry(self, name: str, index: object) -> dict[str, Any]:
-        """Return an entry of such a list."""
+        """Return an entry of a list of the header."""
         entries = self.list_of(name)
         if type(index) is not int or not 0 <= index < len(entries):
             self.refuse(f"'{name}' {index!r:.20}", f"0 to {len(entries) - 1}")
@@ -143,7 +146,7 @@ class Container:
                 if not error.allowed.startswith("at most"):
                     raise
                 self.refuse(error.found, f"at most {MAX_FILE_MB:g} MB")
-            self.refuse(f"the file '{path.name}' beside it: {error.found}")
+            self.refuse(f"it references '{path.name}': {error.found}")
         self._left -= len(content)
         return content
 
@@ -167,7 +170,7 @@ def _split(path: Path, content: bytes) -> tuple[bytes, memoryview]:
         chunks.setdefault(name, whole[at : at + length])
         at += length
     if _JSON_CHUNK not in chunks:
-        raise InvalidFile(path, "not a glTF file: no header", "glTF 2")
+        raise InvalidFile(path, "not a glTF file: it has no header", "glTF 2")
     return bytes(chunks[_JSON_CHUNK]), chunks.get(_BINARY_CHUNK, whole[:0])
 
 
@@ -187,5 +190,5 @@ def _parsed(path: Path, text: bytes) -> dict[str, Any]:
     if not isinstance(version, str | int | float):
         raise InvalidFile(path, "not a glTF file: it has no version", "glTF 2")
     if not str(version).startswith("2."):
-        raise InvalidFile(path, f"glTF {version!s:.20}; needs glTF 2")
+        raise InvalidFile(path, f"glTF {version!s:.20}", "glTF 2")
     return header

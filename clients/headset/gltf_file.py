@@ -1,7 +1,7 @@
-"""Read a glTF file as triangles with the appearance of each part.
+"""Reader of glTF files: triangles and the appearance of each part.
 
-Everything that a file places is counted before anything is copied: a file may place one
-mesh a thousand times, or contain a gigabyte image.
+The reader counts the contents of a file before it copies any, because a file may place
+one mesh a thousand times, or contain an image of a gigabyte.
 """
 
 from __future__ import annotations
@@ -22,42 +22,50 @@ from filter_service.bounded_images import check_picture, read_picture_rgb
 
 MAX_TRIANGLES = 2_000_000
 MAX_VERTICES = 6_000_000
-"""Placed vertices, three for each triangle without normals: 32 bytes of each are kept,
-and two million triangles take 3 to 5 s."""
+"""Placed vertices, three for each triangle without normals. Each takes 32 bytes; two
+million triangles take 3 to 5 s."""
 
 MAX_DRAWS = 15_000
 """Parts placed by nodes; each takes 0.25 ms."""
 
 MAX_TEXTURE_PIXELS = 1 << 26
-"""Pixels of all textures; each takes three bytes."""
+"""Total pixels of all textures; each takes three bytes."""
 
 LEAST_VOLUME_RATIO = 1e-30
-"""A node that scales volumes by less is not invertible."""
+"""A node that scales volumes by less is treated as not invertible."""
 
 LEAST_WEIGHT_RATIO = 0.5
-"""Parts blended with less opacity are left out."""
+"""Parts that are blended with less opacity are left out."""
 
 _TRIANGLES, _STRIP = 4, 5
 _KNOWN_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")
-"""Prefixes of extensions that a file may require and is shown without."""
+"""Prefixes of required extensions that this reader ignores."""
 
 _PICTURES = ("", "image/png", "image/jpeg", "image/webp")
 
 
 @dataclass(frozen=True)
 class Part:
-    """One primitive of a mesh, as one node of the file places it.
+    """A primitive of a mesh, placed by a node of the file.
 
     Attributes
     ----------
-    world_from_part : (4, 4)
-    vertices_m : (n, 3), as stored, and so are normals
-    faces : (m, 3)
-    normals : (n, 3), or None if the file has none
-    uv : (n, 2), v up, or None
-    reflectance_ratio : (n, 3), linear, without the texture
-    texture : (h, w, 3) uint8 sRGB, or None; parts may share one
-    is_unlit : whether its color is independent of the light
+    world_from_part : (4, 4) array
+        Transformation to the world frame.
+    vertices_m : (n, 3) array
+        Positions as stored.
+    faces : (m, 3) array
+        Vertex indices of the triangles.
+    normals : (n, 3) array or None
+        Normals as stored, if the file has any.
+    uv : (n, 2) array or None
+        Texture coordinates, v up.
+    reflectance_ratio : (n, 3) array
+        Linear color factor, without the texture.
+    texture : (h, w, 3) uint8 or None
+        sRGB; parts may share a texture.
+    is_unlit : bool
+        Whether the color is independent of the light.
     """
 
     world_from_part: Array
@@ -71,25 +79,25 @@ class Part:
 
 
 def read_parts(path: Path) -> Iterator[Part]:
-    """Yield all triangles of a .glb or .gltf file, part by part.
+    """Yield the triangles of a .glb or .gltf file, part by part.
 
     Raises
     ------
     InvalidFile
-        The file does not exist, is not glTF 2, requires unknown extensions, is damaged,
-        has no triangles, or is too large.
+        If the file does not exist, is not glTF 2, requires unknown extensions, is
+        damaged, has no triangles, or is too large.
 
     Notes
     -----
-    There is no transparency: parts that the file blends with less than
-    `LEAST_WEIGHT_RATIO` are left out, all others are opaque. Skins, shape keys and
-    animations are ignored.
+    Transparency is not supported: parts that are blended with an opacity below
+    `LEAST_WEIGHT_RATIO` are left out, and all others are opaque. Skins, morph targets
+    and animations are ignored.
     """
     file = Container(path)
     required = file.header.get("extensionsRequired", [])
     for name in required if isinstance(required, list) else [required]:
         if not isinstance(name, str) or not name.startswith(_KNOWN_EXTENSIONS):
-            file.refuse(f"needs the extension {name!s:.60}, not known here")
+            file.refuse(f"requires the extension {name!s:.60}, which is not supported")
     placed = []
     for matrix, mesh in placed_meshes(file):
         if abs(np.linalg.det(matrix[:3, :3])) > LEAST_VOLUME_RATIO:
@@ -111,7 +119,7 @@ def read_parts(path: Path) -> Iterator[Part]:
 
 
 def _primitives(file: Container, mesh: int) -> list[dict[str, Any]]:
-    """Return a mesh's primitives that are triangles, without lines and points."""
+    """Return the triangles among a mesh's primitives, without lines and points."""
     primitives = file.entry("meshes", mesh).get("primitives")
     if not isinstance(primitives, list):
         file.refuse(f"damaged: meshes[{mesh}].primitives is not a list")
@@ -134,7 +142,7 @@ def _triangle_count(file: Container, primitive: dict[str, Any]) -> int:
 
 
 def _check_counts(file: Container, primitives: list[dict[str, Any]]) -> None:
-    """Reject counts above the limits; a primitive counts each time it is placed."""
+    """Reject counts above the limits; a primitive counts once per placement."""
     counts = {id(p): _triangle_count(file, p) for p in primitives}
     n_triangles = sum(counts[id(p)] for p in primitives)
     if n_triangles > MAX_TRIANGLES:
@@ -215,7 +223,7 @@ def _columns(
     kinds: str,
     count: int | None = None,
 ) -> NDArray[Any]:
-    """Return a vertex attribute; integers as fractions of their largest value."""
+    """Return a vertex attribute; integers become fractions of their largest value."""
     array = accessor_array(file, attributes.get(name), kinds=kinds)
     if array.shape[1] < columns or count not in (None, len(array)):
         found = f"damaged: {name} has {len(array):,} entries of {array.shape[1]}"
@@ -247,26 +255,28 @@ def _faces(
         stored = accessor_array(file, primitive["indices"], kinds="u")
         corners = stored[:, 0].astype(np.int64)
         if len(corners) and int(corners.max()) >= n_vertices:
-            found = f"damaged: a triangle of vertex {int(corners.max()):,}"
+            found = f"damaged: a triangle with vertex {int(corners.max()):,}"
             file.refuse(found, f"0 to {n_vertices - 1:,}")
     if primitive.get("mode", _TRIANGLES) == _STRIP:
         faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
         faces[1::2] = faces[1::2, ::-1]  # consistent winding
         return faces
     if len(corners) % 3:
-        file.refuse(f"damaged: {len(corners):,} corners of triangles", "three of each")
+        file.refuse(
+            f"damaged: {len(corners):,} triangle corners", "a multiple of three"
+        )
     return corners.reshape(-1, 3)
 
 
 class _Textures:
-    """Images of a file: all headers are checked; images are decoded when used."""
+    """Images of a file: headers are checked at once, images are decoded when used."""
 
     def __init__(self, file: Container) -> None:
         self._file = file
         self._decoded: dict[int, NDArray[np.uint8]] = {}
 
     def check(self, materials: list[dict[str, Any]]) -> None:
-        """Reject more pixels than allowed, from the image headers alone."""
+        """Reject images with too many pixels, from their headers alone."""
         distinct = {id(m): m for m in materials}.values()
         images = sorted({i for m in distinct if (i := self._image_of(m)) is not None})
         n_pixels = 0

@@ -1,4 +1,4 @@
-"""Placement of a glTF file's meshes: its node tree, traversed without recursion."""
+"""Placement of the meshes of a glTF file, by its tree of nodes."""
 
 from __future__ import annotations
 
@@ -8,22 +8,25 @@ from typing import Any
 import numpy as np
 
 from clients.headset.gltf_container import Container
+from clients.headset.poses import rotation_of
 from clients.scenes.geometry import Array
 
 MAX_NODE_DEPTH = 1000
-"""Nesting depth of nodes. A skeleton has 20, a chain of links some 100."""
+"""Nesting depth of nodes: a skeleton has about 20, and a chain of links about 100."""
 
 _SIZES = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
 
 
 def placed_meshes(file: Container) -> Iterator[tuple[Array, int]]:
-    """Yield (world_from_mesh (4, 4), mesh index) for the file's scene.
+    """Yield (world_from_mesh, mesh index) for each placed mesh of the default scene.
+
+    The matrices are (4, 4). The traversal is not recursive.
 
     Raises
     ------
     InvalidFile
-        Nodes that do not form a tree, are nested too deep, or are placed by values that
-        are not finite numbers.
+        If the nodes do not form a tree, are nested too deep, or have transformations
+        that are not finite.
     """
     if not file.list_of("scenes"):
         return
@@ -37,7 +40,7 @@ def placed_meshes(file: Container) -> Iterator[tuple[Array, int]]:
         if not 0 <= k < len(nodes):
             file.refuse(f"damaged: node {k}", f"0 to {len(nodes) - 1}")
         if k in seen:
-            file.refuse(f"damaged: node {k} stands twice in the tree", "once")
+            file.refuse(f"damaged: node {k} occurs twice in the tree", "once")
         if depth > MAX_NODE_DEPTH:
             found_text = f"nodes more than {MAX_NODE_DEPTH} deep"
             file.refuse(found_text, f"at most {MAX_NODE_DEPTH}")
@@ -46,7 +49,9 @@ def placed_meshes(file: Container) -> Iterator[tuple[Array, int]]:
         with np.errstate(all="ignore"):
             world_from_node = world_from_parent @ _local(file, node, k)
         if not np.isfinite(world_from_node).all():
-            file.refuse(f"damaged: node {k} is placed by {np.inf}", "finite numbers")
+            file.refuse(
+                f"damaged: the transformation of node {k} is not finite", "finite"
+            )
         if "mesh" in node:
             file.entry("meshes", node["mesh"])
             yield world_from_node, node["mesh"]
@@ -57,7 +62,7 @@ def placed_meshes(file: Container) -> Iterator[tuple[Array, int]]:
 def _numbers(file: Container, entry: dict[str, Any], field: str) -> list[int]:
     found = entry.get(field, [])
     if not isinstance(found, list) or not all(type(k) is int for k in found):
-        file.refuse(f"damaged: '{field}' is not a list of whole numbers")
+        file.refuse(f"damaged: '{field}' is not a list of integers")
     return found
 
 
@@ -80,22 +85,9 @@ def _local(file: Container, node: dict[str, Any], k: int) -> Array:
         moved[:3, 3] = values["translation"]
         matrix = matrix @ moved
     if "rotation" in values:
-        matrix = matrix @ _turned(values["rotation"])
+        length = np.linalg.norm(values["rotation"])
+        if length > np.finfo(float).tiny:
+            matrix[:3, :3] = matrix[:3, :3] @ rotation_of(values["rotation"] / length)
     if "scale" in values:
         matrix = matrix @ np.diag([*values["scale"], 1.0])
     return matrix
-
-
-def _turned(quaternion: Array) -> Array:
-    """Return the rotation (4, 4) of a quaternion x, y, z, w of any nonzero length."""
-    length = np.linalg.norm(quaternion)
-    if not length > np.finfo(float).tiny:
-        return np.eye(4)
-    x, y, z, w = quaternion / length
-    turned = np.eye(4)
-    turned[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return turned

@@ -1,4 +1,4 @@
-"""Any glTF file as a scene; its light is simple, fixed and baked into the vertices."""
+"""glTF files as scenes, with simple, fixed light baked into the vertices."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,10 +12,10 @@ from clients.scenes.scene import Batch, Scene, finished
 from estimator import InvalidFile
 
 MAX_EXTENT_M = 10_000.0
-"""A larger scene is not in meters, the unit of glTF, or is a landscape."""
+"""A larger scene is a landscape, or is not in meters, the unit of glTF."""
 
 PIECE_TRIANGLES = 250_000
-"""Triangles of a part converted at once; each takes 0.4 kB meanwhile."""
+"""Triangles of a part that are converted at a time; each takes 0.4 kB of memory."""
 
 NEAR_M = 0.05
 LEAST_FAR_M = 10.0
@@ -25,7 +25,7 @@ _SKY = np.array([0.42, 0.45, 0.50])
 _GROUND = np.array([0.22, 0.20, 0.18])
 _SUN = np.array([0.55, 0.53, 0.48])
 _TO_SUN = np.array([0.40, 0.80, 0.45]) / np.linalg.norm([0.40, 0.80, 0.45])
-"""Light on white, linear; at most 1 in total on any surface."""
+"""Linear light on a white surface; the total is at most 1."""
 
 
 def load_gltf(path: str | Path) -> Scene:
@@ -34,13 +34,15 @@ def load_gltf(path: str | Path) -> Scene:
     Raises
     ------
     InvalidFile
-        The file is invalid, see `read_parts`; or it has a position that is
-        not a number, or an extent of more than `MAX_EXTENT_M`.
+        If the file is invalid (see `read_parts`), has positions that are not finite, or
+        is larger than `MAX_EXTENT_M`.
     """
     path = Path(path)
     batches, corners_m = [], []
     with np.errstate(over="ignore", invalid="ignore"):  # positions that are not finite
-        for part in read_parts(path):  # one at a time: a batch takes a sixth of it
+        for part in read_parts(
+            path
+        ):  # one at a time: a batch takes a sixth of a part's memory
             for mesh in _meshes(part):
                 low_m, high_m = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
                 corners_m += [low_m, high_m]
@@ -50,7 +52,7 @@ def load_gltf(path: str | Path) -> Scene:
     if not extent_m <= MAX_EXTENT_M:
         allowed = f"at most {MAX_EXTENT_M:g} m"
         raise InvalidFile(path, f"{extent_m:.3g} m across", allowed)
-    # Twice the extent: the viewer may stand outside, see `viewpoint`, and walk.
+    # The viewer may stand outside (see `viewpoint`) and walk.
     far_m = max(LEAST_FAR_M, 4.0 * extent_m)
     return Scene(
         name=path.name,
@@ -63,13 +65,13 @@ def load_gltf(path: str | Path) -> Scene:
 
 
 def light_on(normals: Array) -> Array:
-    """Return the light (n, 3) on surfaces with these normals (n, 3).
+    """Return the light (n, 3) on surfaces with normals (n, 3).
 
     Notes
     -----
-    A uniform sky and a uniform ground fill (1 + cos t) / 2 and (1 - cos t) / 2 of the
-    view of a surface tilted by t (Liu and Jordan 1963, Solar Energy 7, 53-74). The sun
-    adds its cosine. There are no shadows.
+    A surface tilted by t receives (1 + cos t) / 2 of the light of a uniform sky and
+    (1 - cos t) / 2 of the light of a uniform ground (Liu and Jordan 1963, Solar Energy
+    7, 53-74), and the light of the sun by its cosine. There are no shadows.
     """
     cosine = normals[:, 1:2]
     around = _SKY * (1.0 + cosine) / 2.0 + _GROUND * (1.0 - cosine) / 2.0
@@ -77,7 +79,7 @@ def light_on(normals: Array) -> Array:
 
 
 def _by_texture(batches: list[Batch]) -> list[Batch]:
-    """Merge batches into one per texture, so that a frame takes few draw calls."""
+    """Merge the batches of each texture, so that a frame takes few draw calls."""
     groups: dict[int, list[Batch]] = {}
     while batches:  # each is freed once its group is merged
         batch = batches.pop(0)
@@ -100,12 +102,12 @@ def _merged(batches: list[Batch]) -> Batch:
 
 
 def _meshes(part: Part) -> Iterator[Mesh]:
-    """Yield a part in the world frame, in pieces, with normals as glTF specifies."""
+    """Yield a part as meshes in the world frame, with normals as glTF specifies."""
     for start in range(0, len(part.faces), PIECE_TRIANGLES):
         faces = part.faces[start : start + PIECE_TRIANGLES]
         is_whole = len(faces) == len(part.faces)
         used = np.arange(len(part.vertices_m))
-        if part.normals is None:  # faces are flat and share no vertices
+        if part.normals is None:  # flat faces share no vertices
             used, faces = faces.ravel(), np.arange(faces.size).reshape(-1, 3)
         elif not is_whole:
             is_used = np.zeros(len(used), bool)
@@ -115,7 +117,7 @@ def _meshes(part: Part) -> Iterator[Mesh]:
 
 
 def _mesh(part: Part, used: NDArray[np.int64], faces: NDArray[np.int64]) -> Mesh:
-    """Return triangles with only the vertices that they use."""
+    """Return a mesh of some triangles and the vertices that they use."""
     vertices_m = part.vertices_m[used].astype(float)
     albedo = part.reflectance_ratio[used]
     uv = np.zeros((len(used), 2)) if part.uv is None else part.uv[used].astype(float)

@@ -31,11 +31,12 @@ EyeEvent = BuildingEye | EyeReady | EyeFailed
 
 
 class LocalFilter:
-    """Filter in this process; the result of a frame is returned at once.
+    """Filter of headset frames in this process, which returns each result at once.
 
     Parameters
     ----------
     settings : FilterSettings
+        Settings of the filters.
     say : callable
         Called with each message about the eyes, one line.
     """
@@ -84,7 +85,7 @@ class LocalFilter:
         Raises
         ------
         FilterError
-            An eye cannot be prepared, and there is no previous one.
+            If an eye cannot be prepared and there is no previous one.
         """
         begin_s = time.monotonic()
         self._set_profiles(frame)
@@ -106,8 +107,7 @@ class LocalFilter:
             tuple(view.color for view in seen.views),
             tuple(
                 view.focus_dpt
-                if view.is_complete
-                and view.generation == self._generations.get(picture.view.eye)
+                if view.generation == self._generations.get(picture.view.eye)
                 else None
                 for view, picture in zip(seen.views, frame.pictures, strict=True)
             ),
@@ -120,7 +120,7 @@ class LocalFilter:
         )
 
     def restart(self) -> None:
-        """Do nothing: there is no state between frames."""
+        """Do nothing: the filter keeps no state between frames."""
 
     def close(self) -> None:
         """Close the filters."""

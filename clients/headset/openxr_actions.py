@@ -13,7 +13,7 @@ from clients.headset.runtime import GazeSample
 
 EYE_GAZE = "XR_EXT_eye_gaze_interaction"
 _BUTTONS = {
-    # name: its path on the simple controller that every runtime supports
+    # Paths on the simple controller, which every runtime supports.
     "next_eye": "/user/hand/right/input/select/click",
     "on_off": "/user/hand/left/input/select/click",
 }
@@ -21,20 +21,21 @@ _CONTROLLER = "/interaction_profiles/khr/simple_controller"
 _TRACKER = "/interaction_profiles/ext/eye_gaze_interaction"
 _GAZE = "/user/eyes_ext/input/gaze_ext/pose"
 _SEEN = (
-    # VALID alone means the last known pose, for example while the eyes are shut
+    # VALID alone marks the last known pose, for example while the eyes are closed.
     xr.SpaceLocationFlags.ORIENTATION_VALID_BIT
     | xr.SpaceLocationFlags.ORIENTATION_TRACKED_BIT
 )
 
 
 class Actions:
-    """Actions of one session, attached on construction.
+    """Actions of one session, which are attached on construction.
 
     Parameters
     ----------
-    instance, session : OpenXR handles
+    instance, session
+        OpenXR handles.
     with_gaze : bool
-        The system tracks eyes, and the extension is enabled.
+        Whether the system tracks eyes and the extension is enabled.
     """
 
     def __init__(
@@ -91,8 +92,8 @@ class Actions:
     def gaze(self, head_space: xr.Space, time_ns: int) -> GazeSample | None:
         """Return the gaze relative to the head; None if unknown.
 
-        Trackers that cannot predict return their nearest sample and its time. If a
-        tracker does not know that time it returns 0, and the requested time is used.
+        A tracker that cannot predict returns its nearest sample in time. If it does not
+        report the time of the sample (0), the requested time is used.
         """
         if self._gaze_space is None:
             return None
@@ -104,7 +105,7 @@ class Actions:
         sampled = xr.EyeGazeSampleTimeEXT()
         chained = ctypes.cast(ctypes.pointer(sampled), ctypes.c_void_p)
         found = xr.SpaceLocation(next=chained)
-        # pyopenxr's own wrapper cannot return the time of the sample.
+        # The wrapper of pyopenxr cannot return the time of the sample.
         raise_failure(
             xr.raw_functions.xrLocateSpace(
                 self._gaze_space, head_space, time_ns, ctypes.byref(found)
@@ -135,7 +136,7 @@ def _suggest(
 
 
 def raise_failure(result: int) -> None:
-    """Raise the exception of a raw OpenXR call's result, if it is a failure."""
+    """Raise an exception if the result of a raw OpenXR call is a failure."""
     found = xr.exception.check_result(xr.Result(result))
     if found.is_exception():
         raise found

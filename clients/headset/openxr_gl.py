@@ -3,7 +3,7 @@
 open_context       EGL context without a window, or GLX context of a hidden window
 current_platform   platform of the current context: required extensions and binding
 
-pyopenxr makes PyOpenGL use GLX when it is imported, so functions are loaded here.
+OpenGL functions are loaded here, because importing pyopenxr makes PyOpenGL use GLX.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _COLOR, _DEPTH = 0x8CE0, 0x8D00  # GL_COLOR_ATTACHMENT0, GL_DEPTH_ATTACHMENT
 
 
 def offered_extensions() -> set[str]:
-    """Return the runtime's extensions; raise OpenXR's exception if there is none."""
+    """Return the runtime's extensions; raise `xr.XrException` without a runtime."""
     return {
         properties.extension_name.decode()
         for properties in xr.enumerate_instance_extension_properties()
@@ -40,24 +40,24 @@ def offered_extensions() -> set[str]:
 
 @contextmanager
 def open_context() -> Iterator[moderngl.Context]:
-    """Open a context that the runtime supports; on entry no context is current.
+    """Open a context that the runtime supports; on entry, no context is current.
 
-    If the runtime supports it, or if there is no runtime yet, the context is EGL's,
-    without window and display; otherwise it is GLX's, of a hidden window under X. The
-    environment variable ``OCUFILTER_HEADSET_GRAPHICS`` selects ``egl`` or ``glx``
-    whatever the runtime offers.
+    The context comes from EGL, without a window or display, if the runtime supports
+    that or if there is no runtime yet. Otherwise it comes from GLX, with a hidden
+    window under X. The environment variable ``OCUFILTER_HEADSET_GRAPHICS`` overrides
+    the choice with ``egl`` or ``glx``.
 
     Raises
     ------
     NoRuntime
-        The runtime needs an X display with OpenGL 4.3, and there is none.
+        If the runtime requires an X display with OpenGL 4.3 and there is none.
     ValueError
-        The variable has another value.
+        If the variable has another value.
     """
     opened = _egl_context() if _wanted() == "egl" else _glx_context()
     with opened as context:
-        # An EGL context is current once created. In a thread with a current EGL context
-        # no GLX context can be current, nor vice versa; the filter uses EGL.
+        # A new EGL context is current. A thread with a current EGL context cannot have
+        # a current GLX context, or the reverse, and the filter uses EGL.
         with context:
             pass
         yield context
@@ -91,22 +91,24 @@ def _egl_context() -> Iterator[moderngl.Context]:
 def _glx_context() -> Iterator[moderngl.Context]:
     if not os.environ.get("DISPLAY"):
         raise _no_display("DISPLAY is not set")
-    # Under Wayland glfw would load a library without GLX.
+    # Under Wayland, glfw would load a library without GLX.
     os.environ.setdefault("PYGLFW_LIBRARY_VARIANT", "x11")
     try:
         import glfw
     except ImportError as error:
-        raise NoRuntime(f"this OpenXR runtime needs glfw: {error}") from None
+        raise NoRuntime(
+            f"this OpenXR runtime requires the package glfw: {error}"
+        ) from None
     errors: list[str] = []
     glfw.set_error_callback(
         lambda code, text: errors.append(cast("bytes", text).decode())
     )
     try:
         window = _hidden_window(glfw)
-        if not window:  # glfw returns a null pointer, which is not None
+        if not window:  # a null pointer, which is not None
             raise _no_display("; ".join(errors))
         glfw.make_context_current(window)
-        # With explicit libraries this is a separate context, not moderngl's default.
+        # Explicit libraries make moderngl create a separate context, not its default.
         context = moderngl.create_context(
             require=_VERSION,
             libgl=cast("Any", "libGL.so.1"),
@@ -138,7 +140,9 @@ def _hidden_window(glfw: Any) -> Any:
 
 
 def _no_display(why: str) -> NoRuntime:
-    return NoRuntime(f"this OpenXR runtime needs an X display with OpenGL 4.3: {why}")
+    return NoRuntime(
+        f"this OpenXR runtime requires an X display with OpenGL 4.3: {why}"
+    )
 
 
 class Egl:
@@ -147,7 +151,9 @@ class Egl:
     Attributes
     ----------
     name : str
-    extensions : OpenXR extensions that a session with such a context requires
+        Name of the platform.
+    extensions : tuple of str
+        OpenXR extensions that a session with such a context requires.
     """
 
     name = "EGL"
@@ -189,7 +195,7 @@ class Egl:
 
 
 class Glx:
-    """GLX, which provides contexts of windows under X; otherwise as `Egl`."""
+    """GLX, which provides contexts of windows under X; see `Egl`."""
 
     name = "GLX"
     extensions = (OPENGL,)
@@ -252,7 +258,7 @@ def current_platform() -> Egl | Glx:
 
 
 def _filled(structure: Any, **fields: Any) -> Any:
-    """Return a structure with its pointers cast to the PyOpenGL types of its fields."""
+    """Create a structure; cast pointers to the PyOpenGL types of its fields."""
     kinds = dict(structure._fields_)
     return structure(
         **{
@@ -265,11 +271,12 @@ def _filled(structure: Any, **fields: Any) -> Any:
 
 
 class Framebuffers:
-    """Framebuffers of a runtime's images, created once per pair.
+    """Framebuffers of a runtime's images, one for each pair of color and depth.
 
     Parameters
     ----------
-    context : moderngl.Context, current
+    context : moderngl.Context
+        Context to draw in, which must be current.
     """
 
     def __init__(self, context: moderngl.Context) -> None:
@@ -287,7 +294,7 @@ class Framebuffers:
         self._found: dict[tuple[int, int], moderngl.Framebuffer] = {}
 
     def of(self, color: int, depth: int) -> moderngl.Framebuffer:
-        """Return the framebuffer of two textures; depth 0 means none."""
+        """Return the framebuffer of a color and a depth texture; depth 0 means none."""
         found = self._found.get((color, depth))
         if found is None:
             name = c_uint()
@@ -301,7 +308,7 @@ class Framebuffers:
         return found
 
     def release(self) -> None:
-        """Free all framebuffers; a later session's textures reuse the same names."""
+        """Free all framebuffers: textures of a later session reuse their names."""
         for framebuffer in self._found.values():
             self._delete(1, byref(c_uint(framebuffer.glo)))
         self._found = {}

@@ -1,6 +1,7 @@
-"""OpenXR runtime: a real headset, or Monado's simulated one.
+"""OpenXR runtime: a real headset, or the one that Monado simulates.
 
-Import this module only if nothing else needs PyOpenGL: pyopenxr makes it use GLX.
+Import this module only in a process that does not use PyOpenGL otherwise: pyopenxr
+makes it use GLX.
 """
 
 from __future__ import annotations
@@ -46,16 +47,16 @@ _TRACKED = (
 )
 _WORDS = {
     xr.SessionState.FOCUSED: "the headset shows this program",
-    xr.SessionState.VISIBLE: "the headset shows this program, another has the input",
+    xr.SessionState.VISIBLE: "the headset shows this program without input",
     xr.SessionState.SYNCHRONIZED: "the headset is not worn",
-    xr.SessionState.STOPPING: "the headset's session stops",
+    xr.SessionState.STOPPING: "the headset is ending the session",
 }
 
 log = logging.getLogger("ocufilter.headset")
 
 
 def _or_lost(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Raise `SessionLost` if OpenXR reports that the runtime is gone."""
+    """Convert errors of a lost OpenXR runtime to `SessionLost`."""
 
     @wraps(method)
     def wrapped(self: OpenXrRuntime, *arguments: Any) -> Any:
@@ -66,27 +67,27 @@ def _or_lost(method: Callable[..., Any]) -> Callable[..., Any]:
         except xr.RuntimeFailureError as error:
             raise SessionLost(f"the OpenXR runtime failed: {error}") from None
         except xr.TimeoutExpired:
-            raise SessionLost("the OpenXR runtime gave no image to draw in") from None
+            raise SessionLost("the OpenXR runtime provided no image in time") from None
 
     return wrapped
 
 
 class OpenXrRuntime:
-    """One session with the runtime that the system's OpenXR loader finds.
+    """A session with the runtime that the OpenXR loader of the system finds.
 
     Parameters
     ----------
     context : moderngl.Context
-        Context that frames are drawn in, from `openxr_gl.open_context`.
+        Context to draw in, from `openxr_gl.open_context`.
     layers : sequence of str
         OpenXR API layers to load, such as ``XR_APILAYER_LUNARG_core_validation``.
     scale : float
-        Factor on the picture size that the runtime recommends.
+        Factor on the image size that the runtime recommends.
 
     Raises
     ------
     NoRuntime
-        No runtime is installed, it is not running, or it lacks a required extension.
+        If no runtime is installed, or it is not running or lacks an extension.
     """
 
     def __init__(
@@ -149,7 +150,7 @@ class OpenXrRuntime:
         )
         self.notes = []
         if not self.tracks_eyes:
-            self.notes.append("no eye tracker: gaze is straight ahead")
+            self.notes.append("no eye tracker; gaze is straight ahead")
         with self._context:
             self._images = StereoImages(
                 self._session,
@@ -160,7 +161,7 @@ class OpenXrRuntime:
         self._closing.callback(self._release_images)
 
     def _size(self) -> tuple[int, int]:
-        """Return a picture's (width, height): as recommended, up to the maximum."""
+        """Return the image size (width, height): as recommended, up to the maximum."""
         view = xr.enumerate_view_configuration_views(
             self._instance, self._system, _STEREO
         )[0]
@@ -172,7 +173,7 @@ class OpenXrRuntime:
         )
 
     def _blend_mode(self) -> xr.EnvironmentBlendMode:
-        """Return the opaque blend mode, or the runtime's preferred one."""
+        """Return the opaque blend mode if supported, otherwise the first one."""
         opaque = xr.EnvironmentBlendMode.OPAQUE
         offered = [
             xr.EnvironmentBlendMode(mode)
@@ -183,7 +184,7 @@ class OpenXrRuntime:
         return opaque if opaque in offered else offered[0]
 
     def _new_session(self) -> xr.Session:
-        # The standard requires this call, whatever it returns.
+        # The standard requires this call, whose result is not used.
         ask = ctypes.cast(
             xr.get_instance_proc_addr(
                 self._instance, "xrGetOpenGLGraphicsRequirementsKHR"
@@ -227,7 +228,7 @@ class OpenXrRuntime:
 
     @_or_lost
     def begin_frame(self) -> DueFrame | None:
-        """Wait for the next frame; return None if there is none at the moment."""
+        """Wait for the next frame; return None if no frame is due."""
         with self._context:
             self._take_events()
             if self._is_over:
@@ -236,7 +237,9 @@ class OpenXrRuntime:
                 time.sleep(_IDLE_S)
                 return None
             state = xr.wait_frame(self._session, xr.FrameWaitInfo())
-            with suppress(xr.FrameDiscarded):  # begun, and replaces the previous one
+            with suppress(
+                xr.FrameDiscarded
+            ):  # the frame has begun and replaces the previous one
                 xr.begin_frame(self._session, xr.FrameBeginInfo())
             time_ns = int(state.predicted_display_time)
             pressed = self._actions.sync()
@@ -253,7 +256,7 @@ class OpenXrRuntime:
 
     @_or_lost
     def end_frame(self, due: DueFrame, shown: Sequence[ShownView]) -> None:
-        """Show a frame; nothing if ``shown`` is empty."""
+        """Show a frame; show nothing if ``shown`` is empty."""
         with self._context:
             kept: list[xr.CompositionLayerDepthInfoKHR]
             layers, kept = [], []
@@ -262,7 +265,7 @@ class OpenXrRuntime:
                 layers = [ctypes.byref(layer)]
             info = xr.FrameEndInfo(due.display_time_ns, self._blend, layers=layers)
             xr.end_frame(self._session, info)
-            del kept  # the layer pointed to it until here
+            del kept  # the layer points to it until here
 
     def _views(self, time_ns: int) -> tuple[EyeView, ...]:
         state, views = xr.locate_views(
@@ -293,7 +296,7 @@ class OpenXrRuntime:
                 return
             kind = xr.StructureType(event.type)
             if kind == xr.StructureType.EVENT_DATA_INSTANCE_LOSS_PENDING:
-                raise SessionLost("the OpenXR runtime is about to end")
+                raise SessionLost("the OpenXR runtime is shutting down")
             if kind == xr.StructureType.EVENT_DATA_SESSION_STATE_CHANGED:
                 changed = ctypes.cast(
                     ctypes.byref(event), ctypes.POINTER(xr.EventDataSessionStateChanged)
@@ -313,14 +316,14 @@ class OpenXrRuntime:
         elif state in (xr.SessionState.EXITING, xr.SessionState.LOSS_PENDING):
             self._is_over, self._is_running = True, False
             if state == xr.SessionState.EXITING:
-                self._ending = SessionEnded("the session was ended in the headset")
+                self._ending = SessionEnded("the user ended the session in the headset")
 
     # Closing
 
     def close(self) -> None:
-        """End the session in the order that OpenXR requires, if it still exists."""
+        """End the session, if it still exists, in the order that OpenXR requires."""
         if self._is_running and not self._is_over:
-            # The session may be gone already.
+            # The session may have been lost.
             with suppress(xr.XrException, SessionLost, SessionEnded):
                 self._leave()
         self._is_running = False
@@ -340,7 +343,7 @@ class OpenXrRuntime:
 
 
 def _quietly(release: Callable[..., Any], *arguments: Any) -> None:
-    """Release a resource that may be gone already."""
+    """Release a resource that may have been lost."""
     try:
         release(*arguments)
     except xr.XrException as error:
@@ -348,11 +351,11 @@ def _quietly(release: Callable[..., Any], *arguments: Any) -> None:
 
 
 def _lacks(missing: Sequence[str]) -> str:
-    words = f"the OpenXR runtime does not offer {', '.join(missing)}"
+    words = f"the OpenXR runtime does not support {', '.join(missing)}"
     if missing == [EGL_ENABLE]:
         words += (
-            ": start it before this program, or set "
-            f"{GRAPHICS_VARIABLE}=glx, which needs an X display"
+            "; start it before this program, or set "
+            f"{GRAPHICS_VARIABLE}=glx, which requires an X display"
         )
     return words
 
@@ -360,11 +363,11 @@ def _lacks(missing: Sequence[str]) -> str:
 def _explained(error: Exception) -> str:
     if isinstance(error, xr.RuntimeUnavailableError):
         return (
-            "no OpenXR runtime is set up here: install one (Monado, SteamVR), or name "
-            "its file in XR_RUNTIME_JSON"
+            "no OpenXR runtime is set up here: install one, such as Monado or SteamVR, "
+            "or set XR_RUNTIME_JSON to its file"
         )
     if isinstance(error, xr.RuntimeFailureError):
-        return "the OpenXR runtime does not answer: is its service running?"
+        return "the OpenXR runtime does not respond; is its service running?"
     if isinstance(error, xr.FormFactorUnavailableError):
-        return "the OpenXR runtime has no headset: is it plugged in and on?"
+        return "the OpenXR runtime found no headset; is it connected and switched on?"
     return f"{type(error).__name__}: {error}"

@@ -1,4 +1,4 @@
-"""A session's swapchains: color and depth of both eyes, and their projection layers."""
+"""Swapchains of a session: color and depth of both eyes, and projection layers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _WAIT_NS = 2_000_000_000
 
 
 class _Swapchain:
-    """One swapchain and the names of its textures."""
+    """A swapchain and the names of its textures."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class _Swapchain:
         return self._textures[index]
 
     def release(self) -> None:
-        """Release the texture to the runtime."""
+        """Return the texture to the runtime."""
         xr.release_swapchain_image(self.handle, xr.SwapchainImageReleaseInfo())
 
 
@@ -67,10 +67,13 @@ class StereoImages:
     Parameters
     ----------
     session : xr.Session
-    context : moderngl.Context, current for every call
-    size_px : (width, height)
+        Session that owns the swapchains.
+    context : moderngl.Context
+        Context to draw in, which must be current for every call.
+    size_px : (int, int)
+        Width and height of an image.
     with_depth : bool
-        Submit depth as well; the runtime must support it.
+        Whether to submit depth, which the runtime must support.
     """
 
     def __init__(
@@ -95,7 +98,10 @@ class StereoImages:
             )
         )
         if not self._color:
-            raise RuntimeError(f"no supported color format, only {offered}")
+            raise RuntimeError(
+                f"the runtime offers the color formats {offered}; expected one of "
+                f"{_COLOR_FORMATS}"
+            )
         self._context = context
         self._framebuffers = Framebuffers(context)
         self._presenter = Presenter(context, size_px)
@@ -106,7 +112,7 @@ class StereoImages:
         return bool(self._depth)
 
     def release(self) -> None:
-        """Free our objects; the session frees its images."""
+        """Free the OpenGL objects and the swapchains."""
         self._framebuffers.release()
         self._presenter.release()
         for swapchain in (*self._color, *self._depth):
@@ -115,7 +121,7 @@ class StereoImages:
     def layer(
         self, space: xr.Space, shown: Sequence[ShownView]
     ) -> tuple[xr.CompositionLayerProjection, list[xr.CompositionLayerDepthInfoKHR]]:
-        """Draw a frame; return the projection layer and the structures it points to."""
+        """Draw a frame; return its projection layer, and structures it points to."""
         kept, views = [], []
         for i, view in enumerate(shown):
             used = [self._color[i], *self._depth[i : i + 1]]
@@ -166,12 +172,12 @@ def pose_of(posef: xr.Posef) -> Pose:
 
 
 def fov(tangents: tuple[float, float, float, float]) -> xr.Fovf:
-    """Return the angles of the edges."""
+    """Convert the tangents of the image edges to OpenXR's angles."""
     return xr.Fovf(*(math.atan(tangent) for tangent in tangents))
 
 
 def tangents_of(fov: xr.Fovf) -> tuple[float, float, float, float]:
-    """Return the tangents of the edges: left, right, up, down."""
+    """Convert OpenXR's angles to the tangents left, right, up and down."""
     return (
         math.tan(fov.angle_left),
         math.tan(fov.angle_right),

@@ -29,87 +29,98 @@ def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Names
         default="courtyard",
         metavar="NAME|FILE|MODULE:FUNCTION",
         help="courtyard, primitives, or a .glb or .gltf file (default: courtyard); or "
-        "a function of yours, which is given the OpenGL context and gives what "
-        "renders: an object whose pictures(views, size_px) returns an RgbdPicture for "
-        "each view, see clients/headset/scenery.py",
+        "a function that receives the OpenGL context and returns a renderer, an object "
+        "whose method pictures(views, size_px) returns an RgbdPicture for each view "
+        "(see clients/headset/scenery.py)",
     )
     scene.add_argument(
-        "--supersampling", type=int, default=2, help="samples per pixel and axis"
+        "--supersampling", type=int, default=2, help="samples per pixel along each axis"
     )
     eyes = parser.add_argument_group("the eyes")
-    what = "a preset's name, JSON, or a .json, .abp or .csv file"
+    what = "preset name, JSON, or a .json, .abp or .csv file"
     eyes.add_argument(
-        "--profile", default="myopia", help=f"of both eyes: {what} (default: myopia)"
+        "--profile",
+        default="myopia",
+        help=f"profile of both eyes: {what} (default: myopia)",
     )
-    eyes.add_argument("--left", metavar="PROFILE", help="of the left eye, instead")
-    eyes.add_argument("--right", metavar="PROFILE", help="of the right eye, instead")
+    eyes.add_argument("--left", metavar="PROFILE", help="profile of the left eye")
+    eyes.add_argument("--right", metavar="PROFILE", help="profile of the right eye")
     eyes.add_argument(
         "--age",
         type=float,
         default=USUAL_AGE_YEARS,
         metavar="YEARS",
-        help=f"of the person (default: {USUAL_AGE_YEARS:g})",
+        help=f"age of the person (default: {USUAL_AGE_YEARS:g})",
     )
     eyes.add_argument(
         "--pupil-mm",
         type=float,
         metavar="MM",
-        help="a fixed pupil, instead of one that follows the light",
+        help="fixed pupil diameter (default: the pupil follows the light)",
     )
     eyes.add_argument(
         "--white-cd-m2",
         type=float,
         default=USUAL_WHITE_CD_M2,
         metavar="L",
-        help="luminance of the display's white, which the pupil goes by "
+        help="luminance of the display's white, which drives the pupil "
         f"(default: {USUAL_WHITE_CD_M2:g})",
     )
     eyes.add_argument(
         "--gaze-range",
         default=None,
         metavar="H,V",
-        help="how far eyes turn, in deg: default 15,10 with a tracker, else 0,0; a "
+        help="range of gaze, deg (default: 15,10 with a tracker, otherwise 0,0); a "
         "larger range takes longer to prepare",
     )
     eyes.add_argument(
         "--settings",
         default="{}",
         metavar="JSON",
-        help='of the filter, as {"tolerance": "loose"}',
+        help='settings of the filter, such as {"tolerance": "loose"}',
     )
     where = parser.add_argument_group("where frames are filtered")
     where.add_argument(
         "--service",
         metavar="ENDPOINT",
-        help="a running service, as tcp://127.0.0.1:5577; else in this process",
+        help="filter in a running service, such as tcp://127.0.0.1:5577 (default: in "
+        "this process)",
     )
     where.add_argument(
-        "--key", type=Path, metavar="FILE", help="the client's key file, for --service"
+        "--key", type=Path, metavar="FILE", help="key file of the client, for --service"
     )
     where.add_argument(
         "--simulated",
         action="store_true",
-        help="no headset: a head that looks around, and pictures for --out",
+        help="simulate a headset and a person who looks around; see --out",
     )
     where.add_argument(
-        "--size", metavar="WxH", help="with --simulated: of each eye (default: 448x504)"
+        "--size",
+        metavar="WxH",
+        help="with --simulated: image size of each eye (default: 448x504)",
     )
     where.add_argument(
         "--rate-hz",
         type=float,
-        help="with --simulated: frames a second (default: 72)",
+        help="with --simulated: frame rate (default: 72)",
     )
     where.add_argument(
-        "--scale", type=float, help="of the headset's own picture size, 0.1 to 2"
+        "--scale",
+        type=float,
+        help="image size relative to the headset's, 0.1 to 2 (default: 1)",
     )
     where.add_argument(
         "--validate", action="store_true", help="load OpenXR's core validation layer"
     )
-    end = parser.add_argument_group("until when")
-    end.add_argument("--frames", type=int, metavar="N", help="filtered ones")
-    end.add_argument("--seconds", type=float, help="from the first filtered frame on")
+    end = parser.add_argument_group("when to stop, and results")
     end.add_argument(
-        "--out", type=Path, metavar="DIR", help="for the last filtered pictures"
+        "--frames", type=int, metavar="N", help="stop after N filtered frames"
+    )
+    end.add_argument(
+        "--seconds", type=float, help="stop this long after the first filtered frame"
+    )
+    end.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for the last filtered images"
     )
     end.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
@@ -123,7 +134,9 @@ def _settle_where(parser: argparse.ArgumentParser, options: argparse.Namespace) 
     elsewhere = ("scale", "validate") if options.simulated else ("size", "rate_hz")
     for name in elsewhere:
         if getattr(options, name) not in (None, False):
-            which = "is for a headset" if options.simulated else "needs --simulated"
+            which = (
+                "requires a headset" if options.simulated else "requires --simulated"
+            )
             parser.error(f"--{name.replace('_', '-')} {which}")
     for name, value in defaults.items():
         if getattr(options, name) is None:
@@ -131,12 +144,12 @@ def _settle_where(parser: argparse.ArgumentParser, options: argparse.Namespace) 
 
 
 def settings_of(options: argparse.Namespace) -> FilterSettings:
-    """Return the filter's settings.
+    """Return the settings of the filter.
 
     Raises
     ------
     ValueError
-        The message names the option or the setting.
+        If a value is invalid.  The message names the option or the setting.
     """
     given = read_object("--settings", options.settings)
     if options.gaze_range is not None:

@@ -1,13 +1,11 @@
-"""Poses as in OpenXR: x, y, z in meters, then the quaternion x, y, z, w."""
+"""Poses as in OpenXR: position x, y, z in meters, then a quaternion x, y, z, w."""
 
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from clients.scenes.geometry import Array, rotation
 from filter_service.messages import Pose
-
-Array = NDArray[np.float64]
 
 
 def matrix_of(pose: Pose) -> Array:
@@ -16,29 +14,38 @@ def matrix_of(pose: Pose) -> Array:
     Raises
     ------
     ValueError
-        The quaternion's length is not near 1.
+        If the length of the quaternion is not between 0.5 and 2.
     """
-    x, y, z, w = _unit(pose[3:])
     matrix = np.eye(4)
-    matrix[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    matrix[:3, :3] = rotation_of(_unit(pose[3:]))
     matrix[:3, 3] = pose[:3]
     return matrix
+
+
+def rotation_of(quaternion: Array) -> Array:
+    """Return the rotation (3, 3) of a unit quaternion x, y, z, w."""
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def _unit(quaternion: Sequence[float]) -> Array:
     values = np.asarray(quaternion, float)
     length = float(np.linalg.norm(values))
     if not 0.5 < length < 2.0:
-        raise ValueError(f"the orientation {tuple(values)} is not a unit quaternion")
+        raise ValueError(
+            f"orientation is {values.tolist()}; allowed: a unit quaternion"
+        )
     return values / length
 
 
 def turned(yaw_deg: float, pitch_deg: float = 0.0) -> tuple[float, float, float, float]:
-    """Return the quaternion of a head turned left by yaw, then up by pitch."""
+    """Return the quaternion of a head that turns left by yaw, then up by pitch."""
     yaw, pitch = np.radians(yaw_deg) / 2, np.radians(pitch_deg) / 2
     # q = q_yaw q_pitch
     return (
@@ -50,7 +57,7 @@ def turned(yaw_deg: float, pitch_deg: float = 0.0) -> tuple[float, float, float,
 
 
 def direction_of(h_deg: float, v_deg: float) -> Array:
-    """Return the unit vector (3,) of a direction to the right and up."""
+    """Return the unit vector (3,) at h degrees to the right and v degrees up."""
     h, v = np.radians(h_deg), np.radians(v_deg)
     return np.array([np.sin(h) * np.cos(v), np.sin(v), -np.cos(h) * np.cos(v)])
 
@@ -65,12 +72,6 @@ def angles_of(direction: Array) -> tuple[float, float]:
 def upright(pose: Array) -> Array:
     """Return a level pose (4, 4) with the same position and heading."""
     ahead = -pose[:3, 2]
-    h = np.arctan2(ahead[0], -ahead[2])
-    level = np.eye(4)
-    level[:3, :3] = [
-        [np.cos(h), 0.0, -np.sin(h)],
-        [0.0, 1.0, 0.0],
-        [np.sin(h), 0.0, np.cos(h)],
-    ]
+    level = rotation("y", -np.degrees(np.arctan2(ahead[0], -ahead[2])))
     level[:3, 3] = pose[:3, 3]
     return level

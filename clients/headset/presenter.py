@@ -1,4 +1,4 @@
-"""Draw pictures from memory into the headset's images with OpenGL."""
+"""Drawing of images from memory into the headset's images, with OpenGL."""
 
 from pathlib import Path
 from typing import cast
@@ -9,19 +9,20 @@ import numpy as np
 from clients.headset.runtime import ShownView
 
 NEAR_M = 0.05
-"""Depths below this are clamped to it."""
+"""Smaller depths are clamped to this one."""
 
 _ASSETS = Path(__file__).resolve().parents[1] / "assets"
 
 
 class Presenter:
-    """Draws pictures of one size into the caller's framebuffers.
+    """Draws images of one size into framebuffers of the caller.
 
     Parameters
     ----------
     context : moderngl.Context
-        Must be current for every call.
-    size_px : (width, height)
+        Context to draw in, which must be current for every call.
+    size_px : (int, int)
+        Width and height of an image.
     """
 
     def __init__(self, context: moderngl.Context, size_px: tuple[int, int]) -> None:
@@ -40,7 +41,7 @@ class Presenter:
         cast("moderngl.Uniform", self._program["size_px"]).value = size_px
 
     def release(self) -> None:
-        """Free everything."""
+        """Free the OpenGL objects."""
         for made in (
             *(self._triangle, self._program),
             *(self._seen, self._plain, self._depth_m),
@@ -48,7 +49,7 @@ class Presenter:
             made.release()
 
     def draw(self, shown: ShownView, target: moderngl.Framebuffer) -> None:
-        """Fill color and depth of a framebuffer."""
+        """Draw color and depth of a view into a framebuffer."""
         self._seen.write(np.ascontiguousarray(shown.color), alignment=1)
         self._depth_m.write(np.ascontiguousarray(shown.depth_m))
         ratio = 0.0 if shown.plain is None else shown.plain_ratio
@@ -57,7 +58,9 @@ class Presenter:
         cast("moderngl.Uniform", self._program["plain_ratio"]).value = ratio
         context = self._context
         with context.scope(target, moderngl.DEPTH_TEST):
-            context.depth_func = "1"  # always: depth is written only if it is tested
+            context.depth_func = (
+                "1"  # always pass: depth is written only if the test is on
+            )
             for unit, texture in enumerate((self._seen, self._plain, self._depth_m)):
                 texture.use(unit)
             target.viewport = (0, 0, *self._size_px)

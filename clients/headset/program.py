@@ -1,11 +1,11 @@
-"""View a scene through one or two people's eyes in an OpenXR headset.
+"""View a scene through other people's eyes in an OpenXR headset.
 
     ocufilter headset --left myopia --right keratoconus
     ocufilter headset --scene kitchen.glb --service tcp://127.0.0.1:5577
     ocufilter headset --simulated --seconds 10 --out out/headset
 
 Each eye is filtered through its own profile, pupil, focus and gaze, in this process or
-by a running service. Gaze comes from the headset's eye tracker if it has one; focus
+by a running service. The headset's eye tracker, if it has one, provides the gaze. Focus
 follows the point of fixation, and pupils adapt to the light of the scene.
 """
 
@@ -23,12 +23,11 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from clients.arguments import read_size_px
 from clients.extra import HEADSET_INSTALL
-from clients.headset.built_scene import SceneNotBuilt, built_scene
-from clients.headset.controls import HELP, Controls
+from clients.headset.controls import HELP, Controls, TerminalKeys
 from clients.headset.local_filter import LocalFilter
 from clients.headset.options import (
     arguments_of,
@@ -53,7 +52,7 @@ if TYPE_CHECKING:
 
 TRACKED_RANGE_DEG = (15.0, 10.0)
 WARM_UP_S = 60.0
-"""Longest time until the first filtered frame; `--seconds` counts from that one."""
+"""Longest wait for the first filtered frame; `--seconds` counts from that frame."""
 
 CORE_VALIDATION = "XR_APILAYER_LUNARG_core_validation"
 
@@ -64,21 +63,21 @@ def say(line: str) -> None:
 
 
 def gaze_range_of(
-    settings: FilterSettings, runtime: Runtime, *, is_told: bool
+    settings: FilterSettings, runtime: Runtime, *, is_given: bool
 ) -> tuple[float, float]:
-    """Return the gaze range in deg: as set, otherwise the range of a tracker."""
-    if runtime.tracks_eyes and not is_told and not any(settings.gaze_range_deg):
+    """Return the gaze range in deg: as given, or a default for eye trackers."""
+    if runtime.tracks_eyes and not is_given and not any(settings.gaze_range_deg):
         return TRACKED_RANGE_DEG
     return settings.gaze_range_deg
 
 
 def scenery_of(options: argparse.Namespace, context: moderngl.Context) -> Any:
-    """Return the renderer of both eyes' pictures: ours, or the user's.
+    """Return the renderer of both eyes' images: the built-in one or the user's.
 
     Raises
     ------
     ValueError
-        There is no such scene, file or function.
+        If there is no such scene, file or function.
     """
     module, colon, function = options.scene.partition(":")
     if colon and not Path(options.scene).exists():
@@ -90,7 +89,7 @@ def scenery_of(options: argparse.Namespace, context: moderngl.Context) -> Any:
         try:
             with context:
                 return make(context)
-        except Exception as error:  # it is the user's own
+        except Exception as error:  # in the user's own code
             raise ValueError(
                 f"--scene {options.scene}: {type(error).__name__}: {error}"
             ) from error
@@ -101,21 +100,22 @@ def scenery_of(options: argparse.Namespace, context: moderngl.Context) -> Any:
 
 
 def scene_of(name: str) -> tuple[Scene, Array]:
-    """Return a built-in scene or that of a file, and the viewer's pose in it."""
+    """Return a built-in scene or the scene of a file, and the viewer's pose in it."""
     from clients.headset.gltf_scene import load_gltf
     from clients.headset.viewpoint import viewpoint
+    from clients.scenes.catalog import build_scene
 
     is_file = Path(name).suffix.lower() in (".glb", ".gltf")
-    scene = load_gltf(name) if is_file else built_scene(name)
+    scene = load_gltf(name) if is_file else build_scene(name)
     return scene, upright(viewpoint(scene))
 
 
 @dataclass
 class _Eyes:
-    """Both eyes: requested profiles, and where they look."""
+    """Requested profiles and gaze of both eyes."""
 
     settings: FilterSettings
-    is_range_told: bool
+    is_range_given: bool
     look: StereoGaze
     seeing: StereoFilter
     profiles: dict[Eye, Mapping[str, Any]]
@@ -129,7 +129,7 @@ class _Eyes:
 
     def begin(self, runtime: Runtime) -> None:
         """Request both eyes once the gaze range is known, and when it changes."""
-        reach_deg = gaze_range_of(self.settings, runtime, is_told=self.is_range_told)
+        reach_deg = gaze_range_of(self.settings, runtime, is_given=self.is_range_given)
         if self.is_begun and reach_deg == self.look.gaze_range_deg:
             return
         self.is_begun = True
@@ -140,9 +140,7 @@ class _Eyes:
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
-    """Show the scene until the end; return a report on the frames."""
-    from clients.headset.keys import TerminalKeys
-
+    """Show the scene until the user or a limit ends it; return a report."""
     settings, profiles = settings_of(options), profiles_of(options)
     size_px = read_size_px(options.size)
     look = StereoGaze(
@@ -159,8 +157,8 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         stack.callback(getattr(scenery, "close", lambda: None))
         seeing = _seeing(options, settings)
         stack.callback(seeing.close)
-        is_told = options.gaze_range is not None
-        eyes = _Eyes(settings, is_told, look, seeing, profiles)
+        is_range_given = options.gaze_range is not None
+        eyes = _Eyes(settings, is_range_given, look, seeing, profiles)
         controls = Controls(profiles, eyes.change, say)
         viewer = Viewer(
             lambda: _runtime(options, context, size_px, pictures),
@@ -179,19 +177,24 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _view(viewer: Viewer, controls: Controls, options: argparse.Namespace) -> float:
-    """Show frames until the end, or until a signal.
+    """Show frames until a limit, the user or a signal ends the viewer.
 
-    Return the time since the first filtered frame, in s.
+    Returns
+    -------
+    float
+        Time since the first filtered frame, s.
     """
     if sys.stdin is not None and sys.stdin.isatty():
         say(HELP)
     started_s = time.monotonic()
 
     def end(*_: object) -> None:
-        # No exception here: one that is raised in a callback from C is lost.
+        # An exception would be lost if C code called this handler.
         controls.is_over = True
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.default_int_handler)  # again: at once
+            signal.signal(
+                number, signal.default_int_handler
+            )  # a second signal ends at once
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
@@ -222,14 +225,14 @@ def _runtime(
 
 def _openxr(name: str) -> Any:
     """Import and return a module that needs pyopenxr."""
-    # Without a runtime the loader repeats messages on stderr; we print one.
+    # Without a runtime, the loader repeats messages on stderr; we print one.
     os.environ.setdefault("XR_LOADER_DEBUG", "none")
     try:
         return importlib.import_module(f"clients.headset.{name}")
     except ModuleNotFoundError:
         raise ValueError(
-            f"pyopenxr is not installed: {HEADSET_INSTALL}; or see what a headset "
-            "would show with --simulated"
+            f"pyopenxr is not installed: {HEADSET_INSTALL}; or use --simulated, "
+            "which requires no headset"
         ) from None
 
 
@@ -237,11 +240,9 @@ def _context(options: argparse.Namespace, stack: ExitStack) -> Any:
     """Return the OpenGL context for all drawing."""
     if not options.simulated:
         return stack.enter_context(_openxr("openxr_gl").open_context())
-    import moderngl
+    from clients.scenes.scene_view import open_context
 
-    context = moderngl.create_context(
-        standalone=True, backend=cast("Any", "egl"), require=430
-    )
+    context = open_context(430)
     stack.callback(context.release)
     return context
 
@@ -260,13 +261,13 @@ def _seeing(options: argparse.Namespace, settings: FilterSettings) -> StereoFilt
     if options.service is not None:
         seeing = ServiceFilter(options.service, settings, say, key_file=options.key)
         if options.frames is not None or options.seconds is not None:
-            seeing.wait_for_service()  # a run that counts frames needs one
+            seeing.wait_for_service()  # a run that counts frames requires one
         return seeing
     return LocalFilter(settings, say)
 
 
 class _Pictures:
-    """The last filtered pictures shown."""
+    """The last filtered images shown."""
 
     def __init__(self) -> None:
         self._shown: Sequence[ShownView] = ()
@@ -281,7 +282,7 @@ class _Pictures:
         from PIL import Image
 
         if not self._shown:
-            say(f"no frame was filtered; nothing is written to {folder}")
+            say(f"no frame was filtered, so nothing is written to {folder}")
         for shown in self._shown:
             path = folder / f"{shown.view.eye}.png"
             Image.fromarray(shown.color).save(path)
@@ -305,8 +306,8 @@ def _lines(report: Mapping[str, Any]) -> str:
     lines = [
         f"{report['filtered']} frames filtered in {report['seconds']:.1f} s "
         f"({report['where']}), {report['repeated']} shown again, "
-        f"{report['plain']} plain, {report['not_rendered']} not rendered, "
-        f"{report['incomplete']} through an eye that was not whole yet"
+        f"{report['plain']} shown unfiltered, {report['not_rendered']} not rendered, "
+        f"{report['incomplete']} filtered with an incomplete eye"
     ]
     for name, values in report["stages_ms"].items():
         words = ", ".join(f"{p} {value:g}" for p, value in values.items())
@@ -323,12 +324,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.getLogger("OpenGL").setLevel(logging.WARNING)  # pyopenxr imports it
     try:
         report = run(options)
-    except KeyboardInterrupt:  # before there was anything to show
+    except KeyboardInterrupt:  # before the first frame
         return 130
     except ValueError as error:
         print(f"headset: {error}", file=sys.stderr)
         return 2
-    except (FilterError, NoRuntime, SceneNotBuilt, OSError, RuntimeError) as error:
+    except (FilterError, NoRuntime, OSError, RuntimeError) as error:
         print(f"headset: {error}", file=sys.stderr)
         return 1
     sys.stdout.write((json.dumps(report) if options.json else _lines(report)) + "\n")

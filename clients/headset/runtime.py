@@ -20,7 +20,7 @@ class NoRuntime(Exception):
 
 
 class SessionLost(Exception):
-    """The headset was disconnected during the session; it may come back."""
+    """The headset was disconnected during the session, and may reconnect."""
 
 
 class SessionEnded(Exception):
@@ -29,13 +29,16 @@ class SessionEnded(Exception):
 
 @dataclass(frozen=True)
 class EyeView:
-    """Pose of one eye at the time a frame is shown, and the extent of its display.
+    """Pose of an eye at the time when a frame is shown, and the extent of its display.
 
     Attributes
     ----------
+    eye : "left" or "right"
+        Eye of the view.
     pose : seven floats
-        Pose of the eye in the room, as in `poses`.
-    tangents : (left, right, up, down) of the display's edges
+        Pose of the eye in the room; see `poses`.
+    tangents : (left, right, up, down)
+        Tangents of the angles to the edges of the display.
     """
 
     eye: Eye
@@ -45,9 +48,14 @@ class EyeView:
 
 @dataclass(frozen=True)
 class GazeSample:
-    """Gaze that a tracker measured from between the eyes: right and up of the head.
+    """Gaze measured by an eye tracker, relative to the head.
 
-    ``at_s`` is on the clock of `DueFrame.now_s`.
+    Attributes
+    ----------
+    h_deg, v_deg : float
+        Direction to the right and up, as seen from between the eyes.
+    at_s : float
+        Time of the sample, on the clock of `DueFrame.now_s`.
     """
 
     h_deg: float
@@ -57,22 +65,26 @@ class GazeSample:
 
 @dataclass(frozen=True)
 class DueFrame:
-    """One frame that the runtime requests.
+    """A frame that the runtime requests.
 
     Attributes
     ----------
     display_time_ns : int
-        Time at which it will be shown, on the runtime's clock.
+        Time when the frame will be shown, on the runtime's clock.
     should_render : bool
-        False if the frame will not be visible.
-    views : the left eye's and the right eye's; empty without tracking
-    head : the pose between the eyes, if known
+        Whether the frame will be visible.
+    views : tuple of EyeView
+        Views of the left and the right eye; empty without head tracking.
+    head : pose, optional
+        Pose of the point between the eyes, if known.
     gaze : GazeSample, optional
-    pressed : names of the controller buttons pressed since the last frame
-    pupil_diameter_mm : float, optional
-        Pupil measured by a tracker.
+        Gaze, if an eye tracker reports it.
+    pressed : tuple of str
+        Names of the controller buttons pressed since the last frame.
     period_s : float
         Time between frames if the runtime reports it, otherwise 0.
+    pupil_diameter_mm : float, optional
+        Pupil, if an eye tracker reports it.
     """
 
     display_time_ns: int
@@ -97,13 +109,15 @@ class ShownView:
     Attributes
     ----------
     view : EyeView
-        View that the picture was rendered for, which may be that of an earlier frame.
-    color : (h, w, 3) uint8 sRGB, top row first
-    depth_m : (h, w) float32, planar
+        View that the image was rendered for, possibly that of an earlier frame.
+    color : (h, w, 3) uint8
+        sRGB, top row first.
+    depth_m : (h, w) float32
+        Planar depth.
     plain : (h, w, 3) uint8, optional
-        Unfiltered picture for the left part of the display.
+        Unfiltered image for the left part of the display.
     plain_ratio : float
-        Fraction of the width that the unfiltered picture covers.
+        Fraction of the width that the unfiltered image covers.
     """
 
     view: EyeView
@@ -114,13 +128,16 @@ class ShownView:
 
 
 class Runtime(Protocol):
-    """Interface of a headset's runtime, which runs one frame after the other.
+    """Interface of a headset runtime, which runs one frame after the other.
 
     Attributes
     ----------
     name : str
-    size_px : (width, height) of each eye's picture
+        Name of the runtime.
+    size_px : (int, int)
+        Width and height of each eye's image.
     tracks_eyes : bool
+        Whether there is an eye tracker.
     """
 
     name: str
@@ -128,18 +145,18 @@ class Runtime(Protocol):
     tracks_eyes: bool
 
     def begin_frame(self) -> DueFrame | None:
-        """Wait for the next frame; return None if there is none at the moment.
+        """Wait for the next frame; return None if no frame is due.
 
         Raises
         ------
         SessionLost
-            The session is lost; it may come back.
+            If the session is lost; another one may be possible later.
         SessionEnded
-            The user ended the session.
+            If the user ended the session.
         """
 
     def end_frame(self, due: DueFrame, shown: Sequence[ShownView]) -> None:
-        """Show a frame; nothing if ``shown`` is empty.
+        """Show a frame; show nothing if ``shown`` is empty.
 
         Raises
         ------

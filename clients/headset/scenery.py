@@ -9,23 +9,25 @@ import numpy as np
 
 from clients.headset.poses import matrix_of
 from clients.headset.runtime import EyeView
-from clients.headset.scene_view import SceneView
 from clients.headset.stereo_gaze import RgbdPicture
 from clients.scenes.geometry import Array
 from clients.scenes.scene import Scene
+from clients.scenes.scene_view import SceneView
 
 
 class SceneScenery:
-    """Renders a scene for both eyes.
+    """Renderer of a scene for both eyes.
 
     Parameters
     ----------
     context : moderngl.Context
+        Context to render in; see `SceneView`.
     scene : Scene
-    stand : (4, 4)
-        Pose in the scene of the room's origin, at eye height.
+        Scene to render.
+    stand : (4, 4) array
+        Pose of the room's origin, at eye height, in the scene.
     supersampling : int
-        Samples per pixel and axis.
+        Samples per pixel along each axis.
     """
 
     def __init__(
@@ -44,7 +46,7 @@ class SceneScenery:
     def pictures(
         self, views: Sequence[EyeView], size_px: tuple[int, int]
     ) -> tuple[RgbdPicture, ...]:
-        """Render the picture of each eye."""
+        """Render the image of each eye."""
         found = []
         for view in views:
             pose = self._stand @ matrix_of(view.pose)

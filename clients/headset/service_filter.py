@@ -30,31 +30,33 @@ from filter_service.messages import (
 RETRY_S = 1.0
 SAY_AGAIN_S = 10.0
 ASK_AGAIN = ("worker_crashed", "no_profile")
-"""Errors after which a profile is sent again."""
+"""Codes of errors after which a profile is sent again."""
 
 WAIT_SHARE = 0.6
-"""Part of a frame's period for which the viewer waits for the result of the newest
-frame, so that a fast filter's picture is shown in the frame that it was rendered
-for."""
+"""Fraction of a frame's period for which the viewer waits for the newest result, so
+that a fast filter's image is shown in the frame that it was rendered for."""
 
 PATIENCE_S = 0.4
 """If the previous frame took no longer than this, the viewer always waits for the
-filter: where frames are late anyway, half the age is worth more than a few more frames.
-On two shared cores, frames of 896x1007 were 0.8 s old without it, and no more
-frequent."""
+filter. Frames that are late in any case are then half as old. On two shared cores,
+frames of 896x1007 were 0.8 s old without this wait, and not more frequent."""
 
 _OWN_STAGES = ("decode_ms", "queue_ms", "copy_out_ms", "rests_ms", "other_ms")
 
 
 class ServiceFilter:
-    """Filter that sends frames to a service and shows the newest result.
+    """Filter that sends frames to a service and returns the newest result.
 
     Parameters
     ----------
     endpoint : str
+        Address of the service.
     settings : FilterSettings
+        Settings of the filters.
     say : callable
         Called with each message for the user, one line.
+    key_file : Path, optional
+        Key file of the client, for a service that requires one.
     """
 
     def __init__(
@@ -74,7 +76,7 @@ class ServiceFilter:
         )
         self._wanted: dict[EyeName, dict[str, Any]] = {}
         self._asked: dict[EyeName, tuple[int, dict[str, Any]]] = {}
-        self._retry_s = 0.0  # no profile is sent before this time
+        self._retry_s = 0.0  # time before which no profile is sent
         self._on_way: dict[int | None, StereoFrame] = {}
         self._newest: FilteredStereoFrame | None = None
         self._is_there = True
@@ -82,23 +84,26 @@ class ServiceFilter:
         self.n_dropped: dict[str, int] = {}
 
     def wait_for_service(self) -> None:
-        """Wait until the service answers.
+        """Wait until the service responds.
 
         Raises
         ------
         FilterError
-            It does not answer, or refuses this client.
+            If the service does not respond or rejects this client.
         """
         self._client.hello()
 
     def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
-        """Request another eye, as soon as there is a service."""
+        """Request another eye as soon as the service is connected."""
         self._wanted[eye] = dict(profile)
 
     def see(self, frame: StereoFrame) -> FilteredStereoFrame | None:
         """Send a frame and return the newest result.
 
-        None while there is no result, or none from the current service.
+        Returns
+        -------
+        FilteredStereoFrame or None
+            None until the connected service has returned a result.
         """
         client = self._client
         self._take_events()
@@ -106,7 +111,7 @@ class ServiceFilter:
             if self._is_there:
                 self._say(
                     f"no filter service at {self._endpoint}: showing the scene "
-                    "unfiltered and retrying"
+                    "unfiltered and trying again"
                 )
             self._is_there, self._newest = False, None
             return None
@@ -124,7 +129,7 @@ class ServiceFilter:
             )
             self._on_way[frame_id] = frame
         except FilterError as error:
-            self._say(f"a frame was not sent: {error}")
+            self._say(f"a frame could not be sent: {error}")
         end_s = frame.begun_s + WAIT_SHARE * frame.due.period_s
         if self._trip_s <= PATIENCE_S:
             end_s = max(end_s, time.monotonic() + PATIENCE_S)
@@ -167,14 +172,14 @@ class ServiceFilter:
                 self._say(f"{event.eye} eye: ready after {event.build_ms:.0f} ms")
 
     def _take_error(self, reply: ErrorReply) -> None:
-        """Report an error once; request again the profiles that the service lost."""
+        """Report an error once; send profiles again that the service has lost."""
         if reply.code == "build_cancelled":
             return
         self._say_once(str(reply.exception()))
         if reply.code not in ASK_AGAIN:
             return
         for eye, (profile_id, profile) in self._asked.items():
-            # The service repeats an eye's error for each of its frames.
+            # The service repeats the error of an eye for each frame.
             if eye not in self._wanted and reply.profile_id in (None, profile_id):
                 self._wanted[eye] = profile
                 self._retry_s = time.monotonic() + RETRY_S
@@ -208,8 +213,8 @@ class ServiceFilter:
         )
 
     def _used_focus_dpt(self, header: Result, view: ResultView) -> float | None:
-        """Return a view's focus if the requested eye was used, otherwise None."""
-        if view.profile_id is None:  # a service with one eye only
+        """Return the focus of a view; None if the requested eye was not used."""
+        if view.profile_id is None:  # a service that supports one eye only
             return header.focus_dpt if header.is_complete else None
         asked = self._asked.get(view.eye)
         if asked is None or asked[0] != view.profile_id or not view.is_complete:
@@ -227,14 +232,14 @@ class ServiceFilter:
 
 
 class LogOnce:
-    """Callable that suppresses a line repeated within `SAY_AGAIN_S`."""
+    """Callable that suppresses lines repeated within `SAY_AGAIN_S`."""
 
     def __init__(self, say: Say) -> None:
         self._say = say
         self._said_s: dict[str, float] = {}
 
     def __call__(self, line: str) -> None:
-        """Say a line, unless it was said a moment ago."""
+        """Report a line unless it was reported within `SAY_AGAIN_S`."""
         now_s = time.monotonic()
         self._said_s = {
             said: at_s
@@ -247,5 +252,5 @@ class LogOnce:
 
 
 def _added_ms(stages_ms: Mapping[str, float]) -> float:
-    """Return the time of the service's own stages, without the filter."""
+    """Return the time of the stages that the service adds to the filter."""
     return sum(stages_ms.get(name, 0.0) for name in _OWN_STAGES)

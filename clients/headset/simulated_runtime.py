@@ -1,7 +1,7 @@
 """Simulated headset runtime with a scripted head, for tests and previews.
 
-It enforces OpenXR's frame rules as far as they matter here: frames begin and end in
-turn, and each view shown has a pose.
+It enforces the rules of OpenXR that matter here: each frame ends before the next one
+begins, and each view that is shown has a pose.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from filter_service.messages import Pose
 EYE_DISTANCE_M = 0.063
 EYE_LEVEL_M = 0.0
 LEFT_EDGES_DEG = (-50.0, 42.0, 43.0, -48.0)
-"""Edges of the left eye's display: left, right, up, down. The right eye's are
-mirrored."""
+"""Edges of the left eye's display (left, right, up, down), which are mirrored for the
+right eye."""
 
 NS_PER_S = 1e9
 
 
 def swaying(at_s: float) -> Pose:
-    """Return the head pose of a standing person who looks around a little."""
+    """Return the head pose of a standing person who looks around."""
     yaw_deg = 8.0 * math.sin(2.0 * math.pi * at_s / 6.0)
     pitch_deg = 3.0 * math.sin(2.0 * math.pi * at_s / 4.0)
     side_m = 0.03 * math.sin(2.0 * math.pi * at_s / 5.0)
@@ -47,23 +47,24 @@ def still(_at_s: float) -> Pose:
 
 @dataclass
 class Happening:
-    """Simulated events and sensor values; a test changes them while frames run.
+    """Simulated events and sensor values, which tests change between frames.
 
     Attributes
     ----------
     should_render : bool
-        False: the headset is taken off.
+        Whether the person wears the headset.
     is_lost : bool
-        The next call raises `SessionLost`.
+        Whether the next call raises `SessionLost`.
     is_ended : bool
-        The next frame raises `SessionEnded`.
+        Whether the next frame raises `SessionEnded`.
     is_paused : bool
-        No frames for the moment.
+        Whether no frame is due.
     gaze_deg : (h, v), optional
-        Gaze measured by a tracker; None means no tracker.
+        Gaze measured by an eye tracker; None simulates no tracker.
     pupil_diameter_mm : float, optional
-        Pupil measured by a tracker.
-    pressed : names of buttons that the next frame reports
+        Pupil measured by an eye tracker.
+    pressed : list of str
+        Names of the buttons that the next frame reports.
     """
 
     should_render: bool = True
@@ -80,14 +81,16 @@ class SimulatedRuntime:
 
     Parameters
     ----------
-    size_px : (width, height) of each eye's picture
+    size_px : (int, int)
+        Width and height of each eye's image.
     rate_hz : float
         Maximum number of frames per second.
     head_at : callable
-        ``head_at(seconds)`` returns the head's pose.
-    happening : Happening
+        Function that returns the head pose at a time in seconds.
+    happening : Happening, optional
+        Simulated events and sensor values.
     on_shown : callable, optional
-        ``on_shown(due, shown)`` is called for each frame that ends.
+        Called with (due, shown) for each frame that ends.
     """
 
     name = "simulated headset"
@@ -125,7 +128,7 @@ class SimulatedRuntime:
         if happening.is_ended:
             raise SessionEnded("the simulated session was ended")
         if self._begun is not None:
-            raise RuntimeError("a frame begins before the last one has ended")
+            raise RuntimeError("a frame begins before the previous one has ended")
         if happening.is_paused:
             time.sleep(self._period_s)
             return None
@@ -147,7 +150,7 @@ class SimulatedRuntime:
         return self._begun
 
     def _wait(self) -> None:
-        """Sleep until the display's next frame that is still ahead."""
+        """Sleep until the next frame of the display; skip missed frames."""
         now_s = time.monotonic() - self._start_s
         missed = math.floor((now_s - self._next_s) / self._period_s)
         self._next_s += self._period_s * (1 + max(0, missed))
@@ -156,25 +159,29 @@ class SimulatedRuntime:
     def end_frame(self, due: DueFrame, shown: Sequence[ShownView]) -> None:
         """Show a frame."""
         if due is not self._begun:
-            raise RuntimeError("a frame ends that was not begun")
+            raise RuntimeError("a frame ends that has not begun")
         self._begun = None
         if self.happening.is_lost:
             raise SessionLost("the simulated session is lost")
         for view in shown:
             width, height = self.size_px
             if view.color.shape != (height, width, 3):
-                raise ValueError(f"a picture of shape {view.color.shape}")
+                raise ValueError(
+                    f"color of shape {view.color.shape}; expected {(height, width, 3)}"
+                )
             if view.depth_m.shape != (height, width):
-                raise ValueError(f"depth of shape {view.depth_m.shape}")
+                raise ValueError(
+                    f"depth of shape {view.depth_m.shape}; expected {(height, width)}"
+                )
         if self._on_shown is not None:
             self._on_shown(due, shown)
 
     def close(self) -> None:
-        """Do nothing: there are no resources."""
+        """Do nothing: there are no resources to release."""
 
 
 def eye_views(head: Pose) -> tuple[EyeView, EyeView]:
-    """Return both eyes' views for a head pose."""
+    """Return the views of both eyes for a head pose."""
     matrix = matrix_of(head)
     left, right, up, down = (math.tan(math.radians(e)) for e in LEFT_EDGES_DEG)
     found = []

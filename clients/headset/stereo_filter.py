@@ -1,4 +1,4 @@
-"""Frames before and after the filter, and the interface of the filters between."""
+"""Frames before and after filtering, and the interface of filters."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class StereoFrame:
-    """One frame to be filtered, with the state of both eyes."""
+    """Frame to filter, with the state of both eyes."""
 
     due: DueFrame
     pictures: tuple[RgbdPicture, ...]
@@ -33,7 +33,7 @@ class StereoFrame:
 
     @property
     def states(self) -> tuple[ViewState, ...]:
-        """Return eye, pupil, focus, gaze and pose of each view."""
+        """Return the eye, pupil, focus, gaze and pose of each view."""
         return tuple(
             ViewState(
                 picture.view.eye,
@@ -48,17 +48,25 @@ class StereoFrame:
 
 @dataclass(frozen=True)
 class FilteredStereoFrame:
-    """A filtered frame, with the views that it was rendered for.
+    """Filtered frame, with the views that it was rendered for.
 
     Attributes
     ----------
     frame : StereoFrame
         Input frame.
-    views : EyeView of each picture, with the pose that was returned with it
-    colors : (h, w, 3) uint8 of each eye
-    used_focus_dpt : of each eye; None where it says nothing about the requested eye,
-        because the view shows the previous eye or a preview
-    stages_ms : times of the filter, and of the way to it and back
+    views : tuple of EyeView
+        View of each image, with the pose that was returned with it.
+    colors : tuple of (h, w, 3) uint8
+        Filtered image of each eye, sRGB.
+    used_focus_dpt : tuple of float or None
+        Focus of each eye; None if the previous eye was used, whose focus does not apply
+        to the requested eye.
+    is_complete : bool
+        Whether complete eyes were used.
+    notes : tuple of str
+        Notes of the filter.
+    stages_ms : mapping
+        Times of the filter, and of transport to and from it.
     """
 
     frame: StereoFrame
@@ -71,12 +79,12 @@ class FilteredStereoFrame:
 
 
 class StereoFilter(Protocol):
-    """Interface of a filter of frames, each eye through its own profile.
+    """Interface of filters, which filter each eye through its own profile.
 
     Attributes
     ----------
     settings : FilterSettings
-        Settings of eyes from the next change on; straight ahead is that of each view.
+        Settings of the eyes, from the next change on.
     """
 
     settings: FilterSettings
@@ -85,17 +93,17 @@ class StereoFilter(Protocol):
         """Request another eye; frames use the previous one until it is ready."""
 
     def see(self, frame: StereoFrame) -> FilteredStereoFrame | None:
-        """Submit a frame; return the newest result, or None if there is none yet."""
+        """Submit a frame; return the newest result, or None before the first one."""
 
     def restart(self) -> None:
-        """Discard results: their poses refer to a previous session."""
+        """Discard results, whose poses refer to the previous session."""
 
     def close(self) -> None:
         """Release all resources."""
 
 
 def settings_for_gaze(settings: FilterSettings, eye: EyeAndGaze) -> FilterSettings:
-    """Return settings whose gaze is straight ahead of the head in a canted view."""
+    """Return settings with the gaze straight ahead of the head, for canted views."""
     if settings.gaze_deg != (0.0, 0.0):
         return settings
     return settings.changed(gaze_deg=eye.ahead_deg)

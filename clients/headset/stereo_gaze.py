@@ -1,4 +1,4 @@
-"""Gaze, focus and pupils of both eyes as a person looks at a scene."""
+"""Gaze, focus and pupils of the two eyes of a person who looks at a scene."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 STRAIGHT_AHEAD = (0.0, 0.0)
 FAR_M = 1e6
-"""Points farther than this are seen in the same direction by both eyes."""
+"""Both eyes see points at this distance or farther in the same direction."""
 
 _N_STEPS = 3
 _SAME_RATIO = 1e-3
@@ -34,13 +34,16 @@ _SAME_RATIO = 1e-3
 
 @dataclass(frozen=True)
 class RgbdPicture:
-    """Unfiltered picture of one eye.
+    """Unfiltered image of one eye.
 
     Attributes
     ----------
     view : EyeView
-    color : (h, w, 3) uint8 sRGB
-    depth_m : (h, w) float32, planar
+        View that the image was rendered for.
+    color : (h, w, 3) uint8
+        sRGB.
+    depth_m : (h, w) float32
+        Planar depth.
     """
 
     view: EyeView
@@ -49,21 +52,24 @@ class RgbdPicture:
 
     @property
     def camera(self) -> Camera:
-        """Return the camera of the picture."""
+        """Return the camera of the image."""
         height_px, width_px = self.depth_m.shape
         return Camera(width_px, height_px, self.view.tangents)
 
 
 @dataclass(frozen=True)
 class EyeAndGaze:
-    """State of one eye at a moment.
+    """State and gaze of one eye.
 
     Attributes
     ----------
     state : EyeState
-    gaze_deg, ahead_deg : (h, v)
-        Its gaze, and straight ahead of the head, in its own picture: displays may be
-        canted.
+        Pupil and focus.
+    gaze_deg : (h, v)
+        Gaze direction in the eye's image.
+    ahead_deg : (h, v)
+        Direction straight ahead of the head in the eye's image, which differs from the
+        image center if displays are canted.
     """
 
     state: EyeState
@@ -72,7 +78,7 @@ class EyeAndGaze:
 
 
 class StereoGaze:
-    """Model of both eyes, with equal pupils and equal focus as far as each eye can.
+    """Model of two eyes with equal pupils, and with equal focus if both can reach it.
 
     Parameters
     ----------
@@ -81,7 +87,7 @@ class StereoGaze:
     white_cd_m2 : float
         Luminance of the display's white.
     gaze_range_deg : (h, v)
-        Range of gaze in the pictures; gaze beyond it is clamped.
+        Largest gaze angles in the images; the gaze is clamped to them.
     """
 
     def __init__(
@@ -94,7 +100,7 @@ class StereoGaze:
     ) -> None:
         if not 0.0 < white_cd_m2 <= 1e5:
             raise ValueError(
-                f"white_cd_m2 is {white_cd_m2}; allowed: above 0, to 100000"
+                f"white_cd_m2 is {white_cd_m2}; allowed: above 0, up to 100000"
             )
         self._age_years, self._pupil_mm = age_years, pupil_diameter_mm
         self._white_cd_m2 = white_cd_m2
@@ -107,7 +113,7 @@ class StereoGaze:
     def follow(
         self, due: DueFrame, pictures: Sequence[RgbdPicture]
     ) -> tuple[EyeAndGaze, ...]:
-        """Return the state of both eyes at the time the pictures are shown."""
+        """Return the state of both eyes at the time when the images are shown."""
         at_s = due.now_s
         if due.gaze is not None:
             seen = due.gaze
@@ -136,19 +142,19 @@ class StereoGaze:
         return tuple(found)
 
     def restart(self) -> None:
-        """Reset all state: a new runtime may start its clock again."""
+        """Reset all state: the clock of a new runtime may start again."""
         self._follower = GazeFollower()
         self._eyes = {}
         self._distance_m = None
         self.is_tracked = False
 
     def learn(self, eye: Eye, asked_dpt: float, used_dpt: float) -> None:
-        """Take in the focus that the filter used for an eye."""
+        """Learn an eye's far and near point from the focus that the filter used."""
         if eye in self._eyes:
             self._eyes[eye].learn(asked_dpt, used_dpt)
 
     def change(self, eye: Eye) -> None:
-        """Replace an eye by another one."""
+        """Forget the far and near point of an eye that is replaced."""
         if eye in self._eyes:
             self._eyes[eye].change()
 
@@ -167,7 +173,8 @@ class StereoGaze:
     ) -> float:
         """Return the distance of the point of fixation from between the eyes.
 
-        Where nothing has depth it is the last distance, or infinity at first.
+        If the images have no depth there, it is the previous distance, or infinity
+        before the first one.
         """
         before_m = self._distance_m or math.inf
         for picture in reversed(pictures):
@@ -192,10 +199,11 @@ class StereoGaze:
 def _along(
     origin: Array, direction: Array, picture: RgbdPicture, distance_m: float
 ) -> float | None:
-    """Return the distance at which a ray meets a picture's surface; None without depth.
+    """Return the distance at which a ray meets a visible surface; None without depth.
 
-    The picture is that of one eye and the ray starts elsewhere: iterate from a first
-    guess, each time with the depth where the ray is seen, until the distance is stable.
+    The ray does not start at the eye of the image.  The distance is found by iteration:
+    the point at the current distance is projected into the image, and the depth there
+    gives the next distance.
     """
     own = matrix_of(picture.view.pose)
     turn = own[:3, :3].T
@@ -214,11 +222,11 @@ def _along(
 
 
 def _head(due: DueFrame, pictures: Sequence[RgbdPicture]) -> Array:
-    """Return the head's matrix; the mean of the eyes' poses if it is not known."""
+    """Return the matrix of the head; if unknown, that of the eyes' mean pose."""
     if due.head is not None:
         return matrix_of(due.head)
     poses = np.array([picture.view.pose for picture in pictures])
-    # q and -q are the same rotation
+    # The quaternions q and -q are the same rotation.
     signs = np.sign(poses[:, 3:] @ poses[0, 3:])
     poses[:, 3:] *= np.where(signs == 0.0, 1.0, signs)[:, None]
     between = poses.mean(axis=0)
@@ -227,6 +235,6 @@ def _head(due: DueFrame, pictures: Sequence[RgbdPicture]) -> Array:
 
 
 def _rounded(angles_deg: tuple[float, float]) -> tuple[float, float]:
-    """Return angles without noise: PSFs are prepared for them."""
+    """Round angles, for which PSFs are prepared, to remove noise."""
     h, v = (round(angle_deg, 2) + 0.0 for angle_deg in angles_deg)
     return h, v

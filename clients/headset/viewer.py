@@ -1,4 +1,4 @@
-"""The viewer's main loop: render, follow the eyes, filter, show."""
+"""Main loop of the viewer: render, follow the eyes, filter and show."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from clients.frame_log import NUMBER, percentiles
+from clients.frame_log import Notes, add_notes, percentiles
 from clients.headset.controls import Controls
 from clients.headset.runtime import (
     DueFrame,
@@ -23,41 +23,52 @@ from clients.headset.stereo_gaze import RgbdPicture, StereoGaze
 
 MS_PER_S = 1e3
 STALE_S = 1.0
-"""A result older than this is not shown; the unfiltered scene is shown instead."""
+"""If a result is older than this, the unfiltered scene is shown instead."""
 
 RETRY_S = 1.0
 SPLIT_RATIO = 0.5
 
 
 class Scenery(Protocol):
-    """Interface of a renderer of both eyes' pictures."""
+    """Interface of renderers of a scene for both eyes."""
 
     def pictures(
         self, views: Sequence[EyeView], size_px: tuple[int, int]
     ) -> tuple[RgbdPicture, ...]:
-        """Render the picture of each eye."""
+        """Render the image of each eye."""
 
 
 @dataclass
 class ViewerLog:
-    """Counts and times of the frames.
+    """Counts and times of frames.
 
     Attributes
     ----------
-    n_filtered, n_plain, n_hidden : frames shown filtered, shown plain, and not rendered
-    first_filtered_s : time of the first filtered frame, of `time.monotonic`
-    stages_ms : times of each stage of filtered frames
+    n_filtered, n_plain, n_hidden : int
+        Numbers of frames shown filtered, shown unfiltered, and not rendered.
+    n_repeated : int
+        Number of filtered images that were shown again.
+    n_incomplete : int
+        Number of frames filtered with an incomplete eye.
+    n_sessions : int
+        Number of sessions with a headset.
+    first_filtered_s : float or None
+        Time of the first filtered frame, on the clock of `time.monotonic`.
+    stages_ms : dict
+        Times of each stage of the filtered frames.
+    notes : Notes
+        Notes of the filter.
     """
 
     n_filtered: int = 0
     first_filtered_s: float | None = None
-    n_repeated: int = 0  # filtered pictures that were shown again
+    n_repeated: int = 0
     n_plain: int = 0
     n_hidden: int = 0
     n_sessions: int = 0
     stages_ms: dict[str, list[float]] = field(default_factory=dict)
     n_incomplete: int = 0
-    notes: dict[str, tuple[int, str]] = field(default_factory=dict)
+    notes: Notes = field(default_factory=dict)
 
     def add(self, **times_ms: float) -> None:
         """Record a filtered frame's times."""
@@ -66,13 +77,6 @@ class ViewerLog:
             self.first_filtered_s = time.monotonic()
         for name, value_ms in times_ms.items():
             self.stages_ms.setdefault(name, []).append(value_ms)
-
-    def add_notes(self, notes: Sequence[str]) -> None:
-        """Count the filter's notes by kind, ignoring the numbers in them."""
-        for note in notes:
-            kind = NUMBER.sub("#", note)
-            count, example = self.notes.get(kind, (0, note))
-            self.notes[kind] = count + 1, example
 
     def summary(self) -> dict[str, Any]:
         """Return counts and percentiles."""
@@ -86,26 +90,27 @@ class ViewerLog:
                 name: percentiles(values) for name, values in self.stages_ms.items()
             },
             "incomplete": self.n_incomplete,
-            "notes": [
-                {"frames": count, "example": example}
-                for count, example in self.notes.values()
-            ],
+            "notes": list(self.notes.values()),
         }
 
 
 class Viewer:
-    """Shows a scene as seen through two eyes.
+    """Viewer of a scene as seen through two eyes.
 
     Parameters
     ----------
     open_runtime : callable
-        Opens the headset's runtime; called again after a session is lost.
+        Function that opens the headset's runtime, called again after a lost session.
     scenery : Scenery
-    seeing : Seeing
+        Renderer of the scene.
+    seeing : StereoFilter
+        Filter of the frames.
     look : StereoGaze
+        Model of the person's gaze, focus and pupils.
     controls : Controls
+        Run-time switches.
     read_keys : callable
-        Returns the keys pressed since the last call.
+        Function that returns the keys pressed since the last call.
     say : callable
         Called with each message for the user, one line.
     on_session : callable
@@ -144,17 +149,18 @@ class Viewer:
         limit_s: float | None = None,
         warm_up_s: float = 0.0,
     ) -> ViewerLog:
-        """Show frames until the user ends the program; wait for a lost headset.
+        """Show frames until the user or a limit ends the viewer.
+
+        If the headset is lost, the viewer waits for it.
 
         Parameters
         ----------
         max_frames : int, optional
             Number of filtered frames after which to stop.
         limit_s : float, optional
-            Time after which to stop.
+            Time after the first filtered frame when to stop.
         warm_up_s : float
-            Longest wait for the first filtered frame; the time limit counts from that
-            frame.
+            Longest wait for the first filtered frame, before the time limit starts.
         """
         started_s = time.monotonic()
 
@@ -215,7 +221,7 @@ class Viewer:
                 if due.should_render:
                     seen, shown, times_ms = self._frame(due, begun_s, runtime.size_px)
             except BaseException:
-                # A frame that was begun must be ended, whatever happened to it.
+                # OpenXR requires that every frame that has begun also ends.
                 runtime.end_frame(due, ())
                 raise
             show_s = time.monotonic()
@@ -239,7 +245,7 @@ class Viewer:
         seen = self._seeing.see(frame)
         is_stale = seen is not None and begun_s - seen.frame.begun_s > STALE_S
         if is_stale and not self._was_stale:
-            self._say("the filter is late: showing the scene unfiltered")
+            self._say("the filter is late; showing the scene unfiltered")
         self._was_stale = is_stale
         times_ms = {
             "scene_ms": MS_PER_S * (rendered_s - begun_s),
@@ -251,7 +257,7 @@ class Viewer:
     def _shown(
         self, frame: StereoFrame, seen: FilteredStereoFrame | None
     ) -> tuple[ShownView, ...]:
-        """Return the views to show: each picture with the view it was rendered for."""
+        """Return the views to show, each with the pose that it was rendered for."""
         if seen is None or not self._controls.is_on:
             return tuple(
                 ShownView(picture.view, picture.color, picture.depth_m)
@@ -280,7 +286,7 @@ class Viewer:
         ):
             if used_dpt is not None:
                 self._look.learn(picture.view.eye, eye.state.focus_dpt, used_dpt)
-        self.log.add_notes(seen.notes)
+        add_notes(self.log.notes, seen.notes)
         self.log.n_incomplete += not seen.is_complete
         age_s = time.monotonic() - seen.frame.begun_s
         scene_ms, look_ms, show_ms = times_ms.values()

@@ -1,4 +1,4 @@
-"""The viewer's initial position, with the scene in front of them."""
+"""Initial position of the viewer in a scene."""
 
 import numpy as np
 
@@ -8,24 +8,24 @@ from clients.scenes.scene import Scene
 
 EYE_HEIGHT_M = 1.6
 _FLOOR_M = 0.3
-"""A scene whose lowest point is no further from 0 than this stands on the floor."""
+"""A scene whose lowest point is at most this far from 0 has its floor at 0."""
 
 _HEADROOM_M = 0.1
 _STEP_BACK_RATIO = 0.25
-"""Distance of the viewer from the near end of an interior, as a part of its depth."""
+"""Distance from the near end of an interior, as a fraction of its depth."""
 
 _LEAST_DISTANCE_M = 0.4
 _DISTANCE_RADII = 2.2
-"""At this distance a sphere around the scene is 54 degrees wide."""
+"""Distance in radii of the scene's bounding sphere, which is then 54 degrees wide."""
 
 
 def viewpoint(scene: Scene) -> Array:
     """Return the pose (4, 4), camera to world, of an upright viewer.
 
-    In a built-in scene, the viewer stands where the scene's path begins. In an
-    interior, that is a scene with its floor at 0 that is higher than a person, the
-    viewer stands inside, `EYE_HEIGHT_M` above the floor. Any other scene is viewed from
-    outside, along -z, at the height of its center.
+    In a built-in scene, the viewer stands at the beginning of the scene's path. A scene
+    that has its floor at 0 and is taller than a person is an interior; the viewer
+    stands inside, with eyes `EYE_HEIGHT_M` above the floor. Any other scene is viewed
+    from outside, along -z, at the height of its center.
     """
     if scene.name in PATHS:
         return path_moments(PATHS[scene.name], 1)[0].pose

@@ -1,1 +1,1 @@
-"""Two test scenes and a letter chart, built in code without files or downloads."""
+"""Two test scenes and a letter chart, built without files, and their rendering."""

@@ -24,7 +24,7 @@ from clients.scenes.geometry import (
 
 
 def column(height_m: float, *, radius_m: float = 0.16, color: str = "#d9c7a5") -> Mesh:
-    """Return a round column with base and capital, its foot at the origin."""
+    """Return a round column with base and capital, standing on the origin."""
     r, h = radius_m, height_m
     shaft = np.linspace(0.24, h - 0.32, 9)
     swelling = r * (1 - 0.10 * (shaft / h) ** 2)
@@ -47,14 +47,20 @@ def arch_wall(
     depth_m: float = 0.45,
     **look: Unpack[Look],
 ) -> Mesh:
-    """Return a wall of round arches along x from 0, its front facing +z at z = 0.
+    """Return a wall of round arches along x from 0, with its front at z = 0 facing +z.
 
     Parameters
     ----------
-    bay_m, height_m, depth_m : width of one bay, height and thickness, meters
-    springing_m : height at which the arches start, meters
-    opening_ratio : ratio of the width of an opening to `bay_m`
-    look : texture and color for `new_mesh`; uv repeats once every two meters.
+    bay_m, height_m, depth_m : float
+        Width of a bay, height and thickness of the wall.
+    bays : int
+        Number of bays.
+    springing_m : float
+        Height at which the arches start.
+    opening_ratio : float
+        Width of an opening relative to `bay_m`.
+    **look
+        Texture and color for `new_mesh`; the texture repeats every two meters.
     """
     radius = opening_ratio * bay_m / 2
     parts = []
@@ -62,7 +68,7 @@ def arch_wall(
         center = (bay + 0.5) * bay_m
         edge = _arch_edge(center, radius, springing_m)
         parts += _face_over_arch(edge, bay * bay_m, bay_m, height_m, look)
-        # Underside of the arch and the inner faces of the piers.
+        # The underside of the arch and the inner faces of the piers.
         back = edge - [0, 0, depth_m]
         strip = np.stack([edge, back], axis=1)
         parts.append(_sheet(strip, inward=np.array([center, springing_m, 0]), **look))
@@ -70,7 +76,7 @@ def arch_wall(
 
 
 def _arch_edge(center: float, radius: float, springing_m: float) -> Array:
-    """Return the outline (n, 3) of one opening, foot to foot."""
+    """Return the outline (n, 3) of an opening, from foot to foot."""
     angle = np.linspace(np.pi, 0, 17)
     curve = np.stack(
         [center + radius * np.cos(angle), springing_m + radius * np.sin(angle)], axis=1
@@ -85,7 +91,7 @@ def _arch_edge(center: float, radius: float, springing_m: float) -> Array:
 def _face_over_arch(
     edge: Array, start_m: float, bay_m: float, height_m: float, look: Look
 ) -> list[Mesh]:
-    """Return the front of one bay: two piers and the sheet above the curve."""
+    """Return the front of a bay: two piers and the surface above the arch."""
     left_pier = edge[:9]
     right_pier = edge[-9:]
     curve = edge[8:-8]
@@ -100,7 +106,8 @@ def _face_over_arch(
     above = np.linspace(start_m, start_m + bay_m, len(curve))
     crown = np.column_stack([above, np.full(len(curve), height_m), 0 * above])
     sheet = (1 - top) * curve[None] + top * crown[None]
-    # The sheet's sides run from the springing to the corners: fill the gaps they leave.
+    # The sides of that surface run from the springing to the corners, which leaves
+    # gaps.
     corner_l = _corner_fill(sheet[:, 0], start_m)
     corner_r = _corner_fill(sheet[:, -1], start_m + bay_m)
     front = np.array([0, 0, 1e3])
@@ -111,14 +118,14 @@ def _face_over_arch(
 
 
 def _corner_fill(side: Array, x: float) -> Array:
-    """Return the block between a sheet's slanted side and the vertical at x."""
+    """Return the surface between a slanted side and the vertical at x."""
     straight = side.copy()
     straight[:, 0] = x
     return np.stack([side, straight], axis=0)
 
 
 def _sheet(points: Array, *, inward: Array, **look: Unpack[Look]) -> Mesh:
-    """Return a grid of points (a, b, 3) as a sheet that faces `inward`."""
+    """Return a grid of points (a, b, 3) as a surface that faces `inward`."""
     a, b = points.shape[:2]
     i, j = np.meshgrid(np.arange(a - 1), np.arange(b - 1), indexing="ij")
     first = (i * b + j).ravel()
@@ -146,7 +153,7 @@ def wall(
     texture: str = "",
     color: str = "#ffffff",
 ) -> Mesh:
-    """Return a plain upright wall whose front faces along × up."""
+    """Return a plain vertical wall whose front faces along × up."""
     length_m = float(np.linalg.norm(along_m))
     cells = (max(1, round(length_m / cell_m)), max(1, round(height_m / cell_m)))
     return patch(
@@ -163,7 +170,7 @@ def wall(
 def tiled_roof(
     width_m: float, slope_m: float, *, pitch_deg: float = 24.0, rows: int = 5
 ) -> Mesh:
-    """Return rows of clay tiles that slope toward +z; the ridge is on the x axis."""
+    """Return a roof of clay tiles that slopes toward +z from a ridge on the x axis."""
     rng = np.random.default_rng(12)
     tiles = []
     step = slope_m / rows
@@ -190,7 +197,7 @@ def tiled_roof(
 def window(
     *, width_m: float = 0.9, height_m: float = 1.4, shutter: str = "#2f6f73"
 ) -> list[Mesh]:
-    """Return a shuttered window for a wall that faces +z, its foot at the origin."""
+    """Return a window with shutters for a wall facing +z, standing on the origin."""
     w, h = width_m, height_m
     glass = patch((-w / 2, 0, 0.02), (w, 0, 0), (0, h, 0), color="#28343d")
     parts = [glass]
@@ -212,7 +219,7 @@ def window(
 def awning(
     width_m: float, reach_m: float, drop_m: float, *, texture: str
 ) -> list[Mesh]:
-    """Return a striped awning that hangs from (0..width, 0, 0) toward +z."""
+    """Return an awning that extends toward +z from the line (0..width, 0, 0)."""
     cloth = patch(
         (0, -drop_m, reach_m),
         (width_m, 0, 0),
@@ -233,7 +240,7 @@ def awning(
 
 
 def fountain() -> list[Mesh]:
-    """Return a round fountain with two bowls, its foot at the origin."""
+    """Return a round fountain with two bowls, standing on the origin."""
     stone = "#c9bda6"
     basin = lathe(
         [(1.15, 0.0), (1.15, 0.38), (1.22, 0.40), (1.22, 0.48), (1.02, 0.48),

@@ -13,7 +13,7 @@ SCENE_BUILDERS: dict[str, Callable[[], Scene]] = {
 
 
 def build_scene(name: str) -> Scene:
-    """Build a scene.
+    """Build a scene by its name.
 
     Raises
     ------
@@ -21,7 +21,6 @@ def build_scene(name: str) -> Scene:
         If no scene has that name.
     """
     if name not in SCENE_BUILDERS:
-        raise ValueError(
-            f"scene {name!r} is unknown; choose from {sorted(SCENE_BUILDERS)}"
-        )
+        names = ", ".join(sorted(SCENE_BUILDERS))
+        raise ValueError(f"unknown scene {name!r}; expected one of: {names}")
     return SCENE_BUILDERS[name]()

@@ -1,7 +1,8 @@
-"""Courtyard: a café garden in the evening sun, 0.3 to 30 m deep.
+"""Courtyard: a café garden in the evening sun, with depths from 0.3 to 30 m.
 
-It replaces San Miguel, the usual scene of the literature: thin occluders, nearby
-foliage, furniture, text of several sizes, repeated arches, small lamps.
+It takes the place of San Miguel, the scene used in the literature, and has similar
+content: thin occluders, nearby foliage, furniture, text of several sizes, repeated
+arches and small lamps.
 """
 
 from dataclasses import replace
@@ -78,7 +79,7 @@ def build() -> Scene:
 
 
 def _architecture() -> list[Mesh]:
-    """Return the walls, arcades and the fountain."""
+    """Return the walls, the arcades and the fountain."""
     wall_look: Look = {"texture": "plaster_warm"}
     back = build_.arch_wall(
         bay_m=2.6, bays=5, springing_m=1.7, height_m=3.75, **wall_look
@@ -92,7 +93,7 @@ def _architecture() -> list[Mesh]:
     roof = build_.tiled_roof(13.4, 1.5)
     parts.append(placed(roof, (-6.7, 6.1, -14.9)))
     parts += _side(-6.5, 5.2, "plaster_rose", turn_deg=90)
-    # A low garden wall on this side lets the evening sun in.
+    # The wall on this side is low and lets in the evening sun.
     parts += _side(6.5, 2.3, "plaster_warm", turn_deg=-90)
     parts += [placed(p, (0.4, 0, -7.6)) for p in build_.fountain()]
     awning = build_.awning(4.6, 1.3, 0.7, texture="stripes")
@@ -104,7 +105,7 @@ def _architecture() -> list[Mesh]:
 
 
 def _side(x_m: float, height_m: float, texture: str, *, turn_deg: float) -> list[Mesh]:
-    """Return one side of the court: columns in front of a wall, beams above."""
+    """Return a side of the courtyard: a wall, and an arcade in front of it."""
     inward = -np.sign(x_m)
     parts = []
     for z in np.arange(-13.2, -1.0, 2.4):
@@ -113,7 +114,7 @@ def _side(x_m: float, height_m: float, texture: str, *, turn_deg: float) -> list
         bay_m=2.4, bays=5, springing_m=3.0 - 0.02, height_m=4.3, opening_ratio=0.86,
         depth_m=0.3, texture=texture,
     )  # fmt: skip
-    # Keep only the part above the columns: lift the feet of the piers.
+    # Raise the feet of the piers to keep only the part above the columns.
     lifted = arcade.vertices_m.copy()
     lifted[:, 1] = np.maximum(lifted[:, 1], 2.98)
     arcade = replace(arcade, vertices_m=lifted)
@@ -128,7 +129,7 @@ def _side(x_m: float, height_m: float, texture: str, *, turn_deg: float) -> list
 
 
 def _furniture(rng: np.random.Generator) -> list[Mesh]:
-    """Return tables, chairs, boards, railing and the objects on the near table."""
+    """Return tables, chairs, a board, a railing and the objects on the near table."""
     parts = []
     spots = ((-1.75, -3.4, 20), (1.9, -4.9, -35), (-2.9, -6.6, 60), (2.7, -8.6, 10))
     frames = ("#1f6f78", "#2b2f33", "#a23b2a", "#1f6f78")
@@ -160,7 +161,7 @@ def _table_group(
 
 
 def _near_table(rng: np.random.Generator) -> list[Mesh]:
-    """Return the viewer's own table, with objects at 0.6 to 1.1 m."""
+    """Return the viewer's table, with objects at distances of 0.6 to 1.1 m."""
     things = list(furniture.bistro_table(radius_m=0.46, top="table"))
     top = 0.74
     cup = furniture.cup()
@@ -173,7 +174,7 @@ def _near_table(rng: np.random.Generator) -> list[Mesh]:
 
 
 def _plants(rng: np.random.Generator) -> list[Mesh]:
-    """Return the near branch, the climbing plant, potted trees and shrubs."""
+    """Return the nearby branches, climbing plants and potted trees."""
     parts = [
         foliage.branch(path, rng=rng, n_leaves=n, leaf_m=0.062)
         for path, n in (
@@ -212,7 +213,7 @@ def _plants(rng: np.random.Generator) -> list[Mesh]:
 
 
 def _lamps() -> tuple[list[Mesh], np.ndarray]:
-    """Return the string lights and the positions of their bulbs (n, 3)."""
+    """Return the string lights, and the positions (n, 3) of their bulbs."""
     parts, positions = [], []
     lines = (
         ((-5.2, 3.3, -1.4), (4.0, 3.5, -5.2), 0.45, 13),
@@ -233,14 +234,14 @@ def _floor() -> Mesh:
 
 
 def _floor_batch(bake: Baker) -> Batch:
-    """Return the floor with its light in the texture: shadows finer than vertices."""
+    """Return the floor, whose light is baked into the texture for fine shadows."""
     left, far, width, length = _FLOOR_M
     texel_m = 0.0125
     columns, rows = round(width / texel_m), round(length / texel_m)
     image = bake.light_map(
         (left, 0, far), (width, 0, 0), (0, 0, length), size=(columns, rows)
     )
-    tile_px = round(4.0 / texel_m)  # one repeat of the pattern is four meters
+    tile_px = round(4.0 / texel_m)  # the pattern repeats every four meters
     tiles = _resized(stone_tiles(), tile_px, tile_px)
     repeat = np.tile(tiles, (rows // tile_px + 1, columns // tile_px + 1, 1))
     texture = uint8_srgb(image * repeat[:rows, :columns])
@@ -250,7 +251,7 @@ def _floor_batch(bake: Baker) -> Batch:
 
 
 def _resized(image: Array, width: int, height: int) -> NDArray[np.float32]:
-    """Average a linear image (h, w, 3) down to a smaller size."""
+    """Reduce a linear image (h, w, 3) to a smaller size by averaging."""
     from PIL import Image
 
     channels = [
@@ -263,7 +264,7 @@ def _resized(image: Array, width: int, height: int) -> NDArray[np.float32]:
 
 
 def _backdrop() -> list[Mesh]:
-    """Return the view behind the arches and the sky, without shadows."""
+    """Return the landscape behind the arches and the sky, without shadows."""
     rng = np.random.default_rng(31)
     lawn = patch((-30, -0.01, -14.4), (60, 0, 0), (0, 0, -15.6), color="#77853d")
     view = patch(
@@ -276,7 +277,7 @@ def _backdrop() -> list[Mesh]:
         (6.2, -18.5, 5.2), (-7.6, -24, 7.0),
     ):  # fmt: skip
         trees.append(placed(foliage.cypress(rng=rng, height_m=height), (x, 0, z)))
-    # Leaves that face the sun are brighter: plain cosine shading.
+    # Cosine shading: leaves that face the sun are brighter.
     shaded = []
     for tree in trees:
         facing = np.maximum(tree.normals @ _SUN / np.linalg.norm(_SUN), 0)
@@ -306,7 +307,7 @@ def _sky() -> Mesh:
 
 
 def _textures() -> dict[str, NDArray[np.uint8]]:
-    """Draw all textures of the scene; other meshes have vertex colors."""
+    """Draw the textures of the scene; the other meshes have vertex colors."""
     linear = {
         "plaster_warm": plaster("#c99a5e", "#ecd09a"),
         "plaster_rose": plaster("#b87862", "#dca58c", seed=6),

@@ -1,4 +1,4 @@
-"""Leaves, flowers, branches and plants: many small triangles at all distances."""
+"""Leaves, flowers, branches and plants, made of many small triangles."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -37,12 +37,17 @@ def leaves(
 
     Parameters
     ----------
-    base_m, along, facing : (n, 3)
-        Foot, direction and upper side of each leaf (the last two need no unit length).
-    length_m, width_m : mean size, meters
-    colors : sRGB codes to choose from
-    rng : numpy Generator
-    segments : rows of a leaf's triangles; 0 omits the midrib: two triangles.
+    base_m, along, facing : (n, 3) arrays
+        Foot, direction and upward normal of each leaf; the last two need not be unit
+        vectors.
+    length_m, width_m : float
+        Mean size.
+    colors : sequence of str
+        sRGB codes to choose from.
+    rng : numpy.random.Generator
+        Source of the variation.
+    segments : int
+        Rows of triangles per leaf; with 0, a leaf has two triangles and no midrib.
     """
     n = len(base_m)
     along = _unit(along)
@@ -68,7 +73,7 @@ def leaves(
     mesh = new_mesh(vertices, all_faces, normals=np.repeat(up, per_leaf, axis=0))
     palette = np.array([linear_from_hex(color) for color in colors])
     tint = palette[rng.integers(len(palette), size=n)] * rng.uniform(0.75, 1.2, (n, 1))
-    # A pale midrib and a darker foot make a single leaf recognizable at close range.
+    # A pale midrib and a darker foot make leaves recognizable at close range.
     shade = np.ones((len(s), 3, 1)) * np.array([1.0, 1.25, 1.0])[None, :, None]
     shade = shade * (0.75 + 0.35 * s)[:, None, None]
     albedo = np.clip(tint[:, None, None] * shade, 0, 1).reshape(-1, 3)
@@ -76,13 +81,13 @@ def leaves(
 
 
 def _leaf_faces(segments: int) -> NDArray[np.int64]:
-    """Return the triangles of one leaf: rows of left, midrib, right vertices."""
+    """Return the triangles of a leaf; rows have a left, midrib and right vertex."""
     if segments == 0:
         return np.array([(1, 5, 7), (1, 7, 3)])
     faces = []
     for row in range(segments + 1):
         left, middle, right = 3 * row, 3 * row + 1, 3 * row + 2
-        # The first and the last row are points: half of their triangles are empty.
+        # The first and the last row are points, so half of their triangles are empty.
         if row > 0:
             faces += [(left, middle, middle + 3), (middle, right, middle + 3)]
         if row < segments:
@@ -104,7 +109,7 @@ def branch(
     rng: np.random.Generator,
     colors: Sequence[str] = GREENS,
 ) -> Mesh:
-    """Return a twig with leaves on two sides, detailed enough for 0.3 m distance."""
+    """Return a twig with leaves on two sides, with details for a distance of 0.3 m."""
     path_m = np.asarray(path_m, float)
     taper = np.linspace(radius_m, 0.3 * radius_m, len(path_m))
     bark = tube(path_m, taper, sides=6, color="#5b4632")
@@ -139,7 +144,7 @@ def cloud(
     colors: Sequence[str] = GREENS,
     width_ratio: float = 0.55,
 ) -> Mesh:
-    """Return leaves on the shell of a rough ball, as a bush or the crown of a tree."""
+    """Return leaves around a rough ball, such as a bush or the crown of a tree."""
     direction = _unit(rng.normal(0, 1, (n_leaves, 3)))
     depth = rng.uniform(0.55, 1.0, (n_leaves, 1)) ** 0.5
     lumps = 1 + 0.18 * np.sin(direction @ rng.normal(0, 4, (3, 1)) + 1)
@@ -166,7 +171,7 @@ def climber(
     rng: np.random.Generator,
     leaf_m: float = 0.07,
 ) -> Mesh:
-    """Return a plant that climbs along a path: leaves and bunches of blossom."""
+    """Return leaves and blossoms of a plant that climbs along a path."""
     path_m = np.asarray(path_m, float)
 
     def along_path(n: int, spread: Array) -> Array:
@@ -205,7 +210,7 @@ def potted_tree(
     crown_m: float = 0.95,
     fruit: str = "",
 ) -> list[Mesh]:
-    """Return a small tree in a clay pot, its foot at the origin."""
+    """Return a small tree in a clay pot, standing on the origin."""
     pot = lathe(
         [(0.0, 0.0), (0.17, 0.0), (0.25, 0.36), (0.28, 0.38), (0.28, 0.44),
          (0.24, 0.44), (0.0, 0.40)],
@@ -230,7 +235,7 @@ def potted_tree(
 
 
 def cypress(*, rng: np.random.Generator, height_m: float = 7.0) -> Mesh:
-    """Return a tall dark tree, its foot at the origin."""
+    """Return a tall dark tree, standing on the origin."""
     return cloud(
         [0, height_m / 2, 0],
         [1.5, height_m, 1.5],

@@ -29,7 +29,7 @@ _IRON = "#2b2f33"
 def bistro_table(
     *, radius_m: float = 0.36, height_m: float = 0.74, top: str = ""
 ) -> list[Mesh]:
-    """Return a round table; `top` names the texture of its plate."""
+    """Return a round table; `top` is the name of the texture of its top."""
     leg = lathe(
         [(0.0, 0.0), (0.20, 0.0), (0.20, 0.02), (0.05, 0.05), (0.022, 0.10),
          (0.022, 0.4), (0.022, height_m - 0.06), (0.10, height_m - 0.025)],
@@ -55,7 +55,7 @@ def _disc(
     texture: str = "",
     color: str = "#ffffff",
 ) -> Mesh:
-    """Return a horizontal disc, finely divided to show small shadows."""
+    """Return a horizontal disc, finely divided for small shadows."""
     r = np.linspace(0, radius_m, rings + 1)
     mesh = lathe(np.stack([r, np.full_like(r, height_m)], axis=1)[::-1], sides=sides)
     uv = mesh.vertices_m[:, [0, 2]] / (2 * radius_m) * [1, -1] + 0.5
@@ -67,7 +67,7 @@ def _disc(
 
 
 def chair(*, frame: str = _IRON, seat: str = "#b0703c") -> list[Mesh]:
-    """Return a bent-wire chair that faces -z: thin legs, slats in its back."""
+    """Return a bent-wire chair that faces -z, with thin legs and bars in its back."""
     parts = [painted(_disc(0.20, 0.46, rings=4, sides=20), seat)]
     parts.append(lathe([(0.20, 0.44), (0.205, 0.45), (0.20, 0.46)], color=frame))
     bars: list[Line] = []
@@ -93,7 +93,7 @@ def chair(*, frame: str = _IRON, seat: str = "#b0703c") -> list[Mesh]:
 def cup(
     *, color: str = "#f4efe6", coffee: str = "#5a3218", sides: int = 28
 ) -> list[Mesh]:
-    """Return a cup of coffee on a saucer, its foot at the origin."""
+    """Return a cup of coffee on a saucer, standing on the origin."""
     saucer = lathe(
         [(0.0, 0.004), (0.035, 0.003), (0.075, 0.014), (0.076, 0.016), (0.034, 0.008)],
         sides=sides,
@@ -106,7 +106,7 @@ def cup(
         color=color,
     )  # fmt: skip
     drink = lathe([(0.038, 0.058), (0.02, 0.058), (0.0, 0.0581)], sides=sides)
-    # Milk foam in the middle of the drink.
+    # Milk foam at the center of the drink.
     foam = lathe(
         [(0.024, 0.0585), (0.01, 0.0587), (0.0, 0.0588)], sides=sides, color="#e9cfa4"
     )
@@ -124,13 +124,13 @@ def cup(
 
 
 def _upward(mesh: Mesh) -> Mesh:
-    """Return a horizontal sheet with all normals pointing up."""
+    """Return a horizontal surface with all normals pointing up."""
     normals = np.tile([0.0, 1.0, 0.0], (len(mesh.vertices_m), 1))
     return replace(mesh, normals=normals)
 
 
 def lantern(*, glow: float = 1.6) -> list[Mesh]:
-    """Return a candle lantern 0.24 m high: a cage of thin bars around a flame."""
+    """Return a candle lantern, 0.24 m high, with thin bars around a flame."""
     parts = [placed(box((0.10, 0.012, 0.10), color=_IRON), (0, 0.006, 0))]
     parts.append(placed(box((0.10, 0.010, 0.10), color=_IRON), (0, 0.170, 0)))
     roof = lathe([(0.068, 0.175), (0.02, 0.215), (0.008, 0.222)], sides=4, color=_IRON)
@@ -157,7 +157,7 @@ def railing(
     height_m: float = 1.0,
     spacing_m: float = 0.11,
 ) -> list[Mesh]:
-    """Return an iron railing of thin bars with a ring between neighbors."""
+    """Return an iron railing of thin bars, with a ring between neighboring bars."""
     start_m, end_m = np.asarray(start_m, float), np.asarray(end_m, float)
     length_m = np.linalg.norm(end_m - start_m)
     count = max(2, round(length_m / spacing_m))
@@ -187,7 +187,7 @@ def string_lights(
     count: int,
     bulb_m: float = 0.035,
 ) -> tuple[list[Mesh], Array]:
-    """Return a hanging cable with glowing bulbs, and the bulbs' positions (n, 3)."""
+    """Return a hanging cable with glowing bulbs, and their positions (n, 3)."""
     t = np.linspace(0, 1, 25)[:, None]
     start_m, end_m = np.asarray(start_m, float), np.asarray(end_m, float)
 
@@ -211,7 +211,7 @@ def string_lights(
 def standing_board(
     size_m: tuple[float, float], *, texture: str, lean_deg: float = 12.0
 ) -> list[Mesh]:
-    """Return a board on two legs that leans back, its front facing +z."""
+    """Return a board on two legs that leans back and faces +z."""
     width, height = size_m
     front = patch(
         (-width / 2, 0.08, 0.0),
@@ -237,7 +237,7 @@ def standing_board(
 
 
 def table_card(size_m: tuple[float, float], *, texture: str) -> list[Mesh]:
-    """Return a folded menu card that stands on a table, its front facing +z."""
+    """Return a folded menu card that stands on a table and faces +z."""
     width, height = size_m
     tilt = rotation("x", -14)
     front = patch(
@@ -252,7 +252,7 @@ def table_card(size_m: tuple[float, float], *, texture: str) -> list[Mesh]:
 
 
 def vase(*, rng: np.random.Generator, height_m: float = 0.13) -> list[Mesh]:
-    """Return a small glass-blue vase with three stems of blossom."""
+    """Return a small blue vase with three flowering stems."""
     body = lathe(
         [(0.0, 0.0), (0.024, 0.0), (0.034, 0.03), (0.028, 0.065), (0.013, 0.1),
          (0.018, height_m)],

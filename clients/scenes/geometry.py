@@ -1,6 +1,6 @@
 """Triangle meshes as plain arrays, and the basic shapes of the scenes.
 
-Frame of every scene: meters, x right, y up, z toward the viewer (OpenGL).
+The frame of every scene is that of OpenGL: meters, x right, y up, z toward the viewer.
 """
 
 from collections.abc import Sequence
@@ -27,14 +27,22 @@ class Mesh:
 
     Attributes
     ----------
-    vertices_m : (n, 3), meters
-    normals : (n, 3), unit vectors
-    faces : (m, 3), int
-    albedo : (n, 3), linear reflectance 0..1; multiplies the texture
-    emission : (n, 3), linear light added regardless of the lighting
-    translucency : (n,), fraction of light transmitted from behind (leaves)
-    uv : (n, 2), texture position, v up
-    texture : name of the texture; empty for none
+    vertices_m : (n, 3) array
+        Positions, in meters.
+    normals : (n, 3) array
+        Unit vectors.
+    faces : (m, 3) array of int
+        Vertex indices of the triangles.
+    albedo : (n, 3) array
+        Linear reflectance, 0 to 1, which multiplies the texture.
+    emission : (n, 3) array
+        Linear light that is added regardless of the lighting.
+    translucency : (n,) array
+        Fraction of light transmitted from behind, for leaves.
+    uv : (n, 2) array
+        Texture coordinates, v up.
+    texture : str
+        Name of the texture; empty for none.
     """
 
     vertices_m: Array
@@ -49,12 +57,18 @@ class Mesh:
 
 def linear_from_hex(code: str) -> Array:
     """Return the linear RGB (3,) of an sRGB color written as "#rrggbb"."""
-    srgb = np.array([int(code[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
+    return linear_from_srgb(
+        np.array([int(code[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
+    )
+
+
+def linear_from_srgb(srgb: Array) -> Array:
+    """Decode sRGB values 0..1 of any shape to linear light (IEC 61966-2-1)."""
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def srgb_from_linear(linear: Array) -> Array:
-    """Encode linear light, any shape, clipped to 0..1, as sRGB 0..1 (IEC 61966-2-1)."""
+    """Encode linear light of any shape, clipped to 0..1, as sRGB (IEC 61966-2-1)."""
     value = np.clip(linear, 0.0, 1.0)
     return np.where(
         value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055
@@ -70,7 +84,7 @@ def new_mesh(
     color: str = "#ffffff",
     texture: str = "",
 ) -> Mesh:
-    """Return a mesh of one color, with normals from the faces if none are given."""
+    """Return a mesh of one color; compute its normals if none are given."""
     vertices_m = np.asarray(vertices_m, float).reshape(-1, 3)
     faces = np.asarray(faces, int).reshape(-1, 3)
     n = len(vertices_m)
@@ -100,13 +114,13 @@ def vertex_normals(vertices_m: Array, faces: NDArray[np.int64]) -> Array:
 
 
 def painted(mesh: Mesh, color: str, *, emission: float = 0.0) -> Mesh:
-    """Return the mesh in one color, with an emission of `emission` times that color."""
+    """Return the mesh in one color, which also emits `emission` times that color."""
     rgb = np.tile(linear_from_hex(color), (len(mesh.vertices_m), 1))
     return replace(mesh, albedo=rgb, emission=rgb * emission)
 
 
 def transformed(mesh: Mesh, matrix: Array) -> Mesh:
-    """Apply a (4, 4) matrix to a mesh; normals stay correct at non-uniform scales."""
+    """Apply a (4, 4) matrix to a mesh, which may scale its axes differently."""
     linear = matrix[:3, :3]
     normals = mesh.normals @ np.linalg.inv(linear)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
@@ -140,10 +154,12 @@ def rotation(axis: str, angle_deg: float) -> Array:
 
 
 def merged(meshes: Sequence[Mesh]) -> Mesh:
-    """Join meshes that share a texture into one."""
+    """Join meshes with one texture into one mesh."""
     names = {mesh.texture for mesh in meshes}
     if len(names) != 1:
-        raise ValueError(f"meshes to merge carry {sorted(names)}; need one texture")
+        raise ValueError(
+            f"meshes have the textures {sorted(names)}; expected exactly one"
+        )
     offsets = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes[:-1])])
     joined = {
         name: np.concatenate([getattr(mesh, name) for mesh in meshes])
@@ -160,7 +176,7 @@ def merged(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def by_texture(meshes: Sequence[Mesh]) -> list[Mesh]:
-    """Merge meshes into one per texture, so that a frame needs few draw calls."""
+    """Merge the meshes of each texture, so that a frame takes few draw calls."""
     names = sorted({mesh.texture for mesh in meshes})
     return [merged([m for m in meshes if m.texture == name]) for name in names]
 
@@ -199,7 +215,7 @@ def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
 
 
 def box(size_m: ArrayLike, *, cells: int = 1, **look: Unpack[Look]) -> Mesh:
-    """Return a box centered on the origin, its faces split into cells × cells."""
+    """Return a box centered on the origin, with cells × cells squares per face."""
     sides = []
     half = np.asarray(size_m, float) / 2
     for axis in range(3):
@@ -240,12 +256,12 @@ def sphere(radius_m: float, *, sides: int = 12, **look: Unpack[Look]) -> Mesh:
 def tube(
     path_m: Line, radius_m: ArrayLike, *, sides: int = 6, **look: Unpack[Look]
 ) -> Mesh:
-    """Return a round bar along a path (n, 3); radius_m is one number or (n,)."""
+    """Return a round bar along a path (n, 3); its radius is one number or (n,)."""
     path_m = np.asarray(path_m, float)
     radius_m = np.broadcast_to(np.asarray(radius_m, float), len(path_m))
     along = np.gradient(path_m, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    # A single helper direction for the whole bar keeps its rings from twisting.
+    # A single helper direction keeps the rings of the bar from twisting.
     helper = np.eye(3)[np.argmin(np.abs(along).mean(axis=0))]
     across = np.cross(along, helper)
     across /= np.linalg.norm(across, axis=1, keepdims=True)

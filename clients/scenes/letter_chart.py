@@ -1,9 +1,10 @@
-"""A letter chart for visual acuity: five Sloan letters per row, in logMAR.
+"""A chart of visual acuity: five Sloan letters per row, with sizes in logMAR.
 
-A letter of logMAR L is 5 · 10^L minutes of arc high, its strokes a fifth of that.
-Letters are one letter apart, and rows are apart by the height of the lower one (Ferris
-et al., Am. J. Ophthalmol. 94:91, 1982).  The chart is a white plane with black ink that
-faces the camera at one distance; its angular size is the same at every distance.
+A letter of logMAR L is 5 · 10^L minutes of arc high, and its strokes are a fifth of
+that wide.  The gap between letters is the width of one letter, and the gap between rows
+is the height of the lower row (Ferris et al., Am. J. Ophthalmol. 94:91, 1982).  The
+chart is a white plane with black ink that faces the camera; its angular size does not
+depend on its distance.
 """
 
 import math
@@ -19,7 +20,7 @@ from clients.scenes.sloan_letters import SLOAN_LETTERS, UNITS
 from filter_service import Camera, RgbdView
 
 LOG_MAR_ROWS = tuple(round(1.0 - 0.1 * k, 1) for k in range(14))
-"""Rows of usual charts, 1.0 to -0.3."""
+"""Rows of common charts, 1.0 to -0.3."""
 
 ROWS_OF_LETTERS = (
     *("NCKZO", "RHSDK", "DOVHR", "CZRHS", "ONHRC", "DKSNV", "ZSOKN"),
@@ -29,17 +30,23 @@ ARCMIN_PER_DEG = 60.0
 LOG_MAR_LIMITS = (-1.0, 2.5)
 
 SAMPLES = 6
-"""Samples of a letter per pixel and axis."""
+"""Samples of a letter per pixel along each axis."""
 
 
 @dataclass(frozen=True)
 class ChartRow:
-    """One row of letters in the image.
+    """A row of letters in the image.
 
     Attributes
     ----------
+    letters : str
+        Letters of the row.
+    log_mar : float
+        Size of the letters, logMAR.
+    height_px : float
+        Height of the letters.
     y_px : float
-        Distance of the row's middle from the image's top.
+        Distance of the row's center from the top of the image.
     """
 
     letters: str
@@ -50,14 +57,14 @@ class ChartRow:
 
 @dataclass(frozen=True)
 class LetterChart:
-    """A chart as seen by a camera, and its rows."""
+    """A chart as a camera sees it, and its rows."""
 
     view: RgbdView
     rows: tuple[ChartRow, ...]
 
 
 def letter_height(log_mar: float) -> float:
-    """Return the height of a letter on a plane one unit away: twice a tangent."""
+    """Return the height of a letter on a plane at unit distance."""
     half_deg = UNITS * 10.0**log_mar / ARCMIN_PER_DEG / 2.0
     return 2.0 * math.tan(math.radians(half_deg))
 
@@ -69,22 +76,24 @@ def letter_chart(
     log_mar: Sequence[float] = LOG_MAR_ROWS,
     letters: Sequence[str] = ROWS_OF_LETTERS,
 ) -> LetterChart:
-    """Draw a chart in the middle of a camera's image.
+    """Draw a chart at the center of a camera's image.
 
     Parameters
     ----------
+    camera : Camera
+        Camera that sees the chart.
     distance_m : float
-        Distance from the eye to the chart's plane; inf is allowed.
+        Distance from the eye to the plane of the chart; may be inf.
     log_mar : sequence of float
         Size of each row, from the top.
     letters : sequence of str
-        Sloan letters of each row; repeated if there are more rows.
+        Sloan letters of each row, repeated if there are more rows.
 
     Raises
     ------
     ValueError
         If the distance is not positive, a letter is unknown, a size is out of range, or
-        the camera does not see all rows completely.
+        a row extends beyond the image.
     """
     _check(distance_m, log_mar, letters)
     texts = [letters[k % len(letters)] for k in range(len(log_mar))]
@@ -107,19 +116,21 @@ def letter_chart(
 
 def _check(distance_m: float, log_mar: Sequence[float], letters: Sequence[str]) -> None:
     if not distance_m > 0.0:
-        raise ValueError(f"distance_m {distance_m:g}: allowed is above 0")
+        raise ValueError(f"distance_m is {distance_m:g}; allowed: above 0")
     low, high = LOG_MAR_LIMITS
     for value in log_mar:
         if not low <= value <= high:
-            raise ValueError(f"log_mar {value:g}: allowed is {low:g} to {high:g}")
+            raise ValueError(f"log_mar is {value:g}; allowed: {low:g} to {high:g}")
     unknown = sorted(set("".join(letters)) - set(SLOAN_LETTERS))
     if unknown or not letters or not len(log_mar):
         allowed = "".join(SLOAN_LETTERS)
-        raise ValueError(f"letters {''.join(unknown)!r}: allowed are rows of {allowed}")
+        raise ValueError(
+            f"letters are {''.join(unknown)!r}; allowed: rows of {allowed}"
+        )
 
 
 def _middles(sizes: Sequence[float]) -> list[float]:
-    """Return the height of each row's middle above the chart's middle."""
+    """Return the height of each row's center above the center of the chart."""
     gaps = [*sizes[1:], 0.0]
     whole = sum(sizes) + sum(gaps)
     tops = np.concatenate([[0.0], np.cumsum(np.add(sizes, gaps))[:-1]])
@@ -140,8 +151,8 @@ def _check_fits(
     if max(widths) > min(-left, right) or above > up or below < down:
         wanted = (2 * math.degrees(math.atan(t)) for t in (max(widths), above))
         raise ValueError(
-            "the chart takes {:.1f} x {:.1f} deg, more than the camera sees: allowed "
-            "are fewer or smaller rows".format(*wanted)
+            "the chart takes {:.1f} x {:.1f} deg, more than the field of view; "
+            "allowed: fewer or smaller rows".format(*wanted)
         )
 
 
@@ -161,7 +172,7 @@ def _draw(
     left: float,
     bottom: float,
 ) -> None:
-    """Add a letter's ink coverage to the pixels; positions are tangents, y up."""
+    """Add the ink of a letter to the pixels; positions are tangents, y up."""
     pitch_x, pitch_y = (pitch / 1000.0 for pitch in camera.pixel_pitch_mrad)
     edge_left, _, edge_up, _ = camera.tangents
     columns = _pixels(left - edge_left, size, pitch_x, camera.width_px)

@@ -1,10 +1,10 @@
-"""Baking of sun, sky and lamps into a static scene, so that frames need no lights.
+"""Baking of sun, sky and lamps into a static scene.
 
-Shadows come from depth maps that pyrender renders along parallel rays: one fine map
-for the sun, many coarse ones for the sky (ambient occlusion).
+Shadows come from depth maps along parallel rays: one fine map for the sun, and many
+coarse ones for the sky (ambient occlusion).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -12,25 +12,29 @@ import numpy as np
 from numpy.typing import ArrayLike
 from PIL import Image
 
-from clients.pyrender_setup import delete_renderer, pyrender
 from clients.scenes.geometry import Array, Mesh, merged
+from clients.scenes.scene import Batch, Scene
+from clients.scenes.scene_view import SceneView, open_context
 
 Place = tuple[float, float, float]
 
 _NEAR_M = 1.0
-_DEPTH_FLAGS = pyrender.RenderFlags.DEPTH_ONLY | pyrender.RenderFlags.SKIP_CULL_FACES
 
 
 @dataclass(frozen=True)
 class Lights:
-    """The lights of a scene; colors are linear, and 1 renders a white sheet white.
+    """Lights of a scene; in light of 1, a white surface is rendered white.
 
     Attributes
     ----------
-    sun_direction : (3,), toward the sun
-    sun, sky_zenith, sky_horizon, bounce : (3,), linear RGB
-    lamps_m : (n, 3), positions of small lamps
-    lamp : (3,), light of one lamp on a sheet one meter away
+    sun_direction : (3,) array
+        Direction toward the sun.
+    sun, sky_zenith, sky_horizon, bounce : (3,) arrays
+        Linear RGB; `bounce` is the light that the surroundings reflect.
+    lamps_m : (n, 3) array
+        Positions of small lamps.
+    lamp : (3,) array
+        Light of a lamp on a surface one meter away, linear RGB.
     """
 
     sun_direction: Array
@@ -43,48 +47,56 @@ class Lights:
 
 
 class DepthMaps:
-    """Depth maps of fixed occluders along parallel rays."""
+    """Depth maps of fixed occluders along parallel rays.
+
+    Back faces cast no shadows, so that walls around a scene do not hide the sky behind
+    them.
+    """
 
     def __init__(self, occluders: list[Mesh], *, center_m: ArrayLike, radius_m: float):
         whole = merged([replace(mesh, texture="") for mesh in occluders])
-        triangles = pyrender.Primitive(
-            positions=whole.vertices_m.astype(np.float32),
-            indices=whole.faces.astype(np.uint32),
-            material=pyrender.MetallicRoughnessMaterial(doubleSided=True),
+        far_m = _NEAR_M + 2 * radius_m
+        batch = Batch(
+            vertices_m=whole.vertices_m.astype(np.float32),
+            faces=whole.faces.astype(np.uint32),
+            uv=whole.uv.astype(np.float32),
+            srgb=np.zeros_like(whole.vertices_m, np.float32),
+            texture=None,
+        )
+        self._scene = Scene(
+            name="occluders",
+            batches=(batch,),
+            background_srgb=(0.0, 0.0, 0.0),
+            near_m=_NEAR_M,
+            far_m=far_m,
+            infinite_from_m=far_m,
         )
         self._center_m = np.asarray(center_m, float)
         self._radius_m = radius_m
-        self._scene = pyrender.Scene()
-        self._scene.add(pyrender.Mesh([triangles]))
-        camera = pyrender.OrthographicCamera(
-            xmag=radius_m, ymag=radius_m, znear=_NEAR_M, zfar=_NEAR_M + 2 * radius_m
-        )
-        self._camera = self._scene.add(camera)
-        self._renderer = pyrender.OffscreenRenderer(64, 64)
+        self._context = open_context()
 
     def close(self) -> None:
-        """Release the GL context."""
-        delete_renderer(self._renderer)
+        """Release the OpenGL context."""
+        self._context.release()
 
-    def toward(self, direction: Array, size_px: int) -> "ParallelMap":
-        """Render the depth map of a distant source in `direction`."""
-        axes = _axes_along(direction)
-        pose = np.eye(4)
-        pose[:3, :3] = axes.T
-        pose[:3, 3] = self._center_m + axes[2] * (self._radius_m + _NEAR_M)
-        self._scene.set_pose(self._camera, pose)
-        self._renderer.viewport_width = self._renderer.viewport_height = size_px
-        read = self._renderer.render(self._scene, _DEPTH_FLAGS)
-        near_m, far_m = _NEAR_M, _NEAR_M + 2 * self._radius_m
-        with np.errstate(divide="ignore"):
-            # pyrender inverts a perspective even for this camera; undo that.
-            depth_m = np.where(read > 0, near_m + far_m - near_m * far_m / read, np.inf)
-        return ParallelMap(depth_m, pose[:3, 3], axes, self._radius_m)
+    def toward(self, directions: Iterable[Array], size_px: int) -> list["ParallelMap"]:
+        """Render the depth map (size_px, size_px) of each distant source."""
+        found = []
+        size = (size_px, size_px)
+        with SceneView(self._context, self._scene, size, supersampling=1) as view:
+            for direction in directions:
+                axes = _axes_along(direction)
+                pose = np.eye(4)
+                pose[:3, :3] = axes.T
+                pose[:3, 3] = self._center_m + axes[2] * (self._radius_m + _NEAR_M)
+                depth_m = view.parallel_depth_m(pose, self._radius_m).astype(float)
+                found.append(ParallelMap(depth_m, pose[:3, 3], axes, self._radius_m))
+        return found
 
 
 @dataclass(frozen=True)
 class ParallelMap:
-    """One depth map along parallel rays, with visibility lookup of points."""
+    """Depth map along parallel rays, in which points are looked up."""
 
     depth_m: Array
     origin_m: Array
@@ -92,7 +104,7 @@ class ParallelMap:
     radius_m: float
 
     def seen(self, points_m: Array, *, bias_m: float, soft: bool = False) -> Array:
-        """Return the visibility of points (n, 3) from the source, 0..1 per point."""
+        """Return the visibility (n,) of points (n, 3) from the source, 0 to 1."""
         local = (points_m - self.origin_m) @ self.axes.T
         size = len(self.depth_m)
         column = (local[:, 0] / self.radius_m + 1) * size / 2
@@ -107,7 +119,7 @@ class ParallelMap:
 
 
 def _axes_along(direction: Array) -> Array:
-    """Return axes right, up, back (rows) of a camera that looks against `direction`."""
+    """Return the axes right, up and back (rows) of a camera facing `-direction`."""
     back = np.asarray(direction, float) / np.linalg.norm(direction)
     helper = np.eye(3)[2 if abs(back[1]) > 0.9 else 1]
     right = np.cross(helper, back)
@@ -116,7 +128,7 @@ def _axes_along(direction: Array) -> Array:
 
 
 def hemisphere(count: int) -> Array:
-    """Return `count` directions (n, 3) spread evenly over the upper half sphere."""
+    """Return `count` directions (n, 3) spread evenly over the upper hemisphere."""
     index = np.arange(count) + 0.5
     height = index / count
     angle = index * np.pi * (3 - np.sqrt(5))
@@ -125,12 +137,13 @@ def hemisphere(count: int) -> Array:
 
 
 class Baker:
-    """Computes the light that arrives at points of a scene."""
+    """Light that arrives at the points of a scene."""
 
     def __init__(self, lights: Lights, maps: DepthMaps, *, sky_directions: int = 40):
         self._lights = lights
-        self._sun_map = maps.toward(lights.sun_direction, 2048)
-        self._sky = [(d, maps.toward(d, 384)) for d in hemisphere(sky_directions)]
+        (self._sun_map,) = maps.toward([lights.sun_direction], 2048)
+        sky = hemisphere(sky_directions)
+        self._sky = list(zip(sky, maps.toward(sky, 384), strict=True))
 
     def light(
         self, points_m: Array, normals: Array, translucency: ArrayLike = 0.0
@@ -152,10 +165,10 @@ class Baker:
         *,
         size: tuple[int, int],
     ) -> Array:
-        """Return the light (h, w, 3) over a parallelogram that faces up.
+        """Return the light (h, w, 3) on a parallelogram that faces up.
 
-        The sun is computed at every texel; sky and lamps, which change slowly, at every
-        eighth.
+        The sun is computed for every texel; sky and lamps, which vary slowly, for every
+        eighth row and column.
         """
         width, height = size
         coarse = (max(2, width // 8), max(2, height // 8))
@@ -197,7 +210,7 @@ class Baker:
             away = lamp_m - points_m
             square = np.einsum("ij,ij->i", away, away)
             cosine = np.einsum("ij,ij->i", away, normals) / np.sqrt(square + 1e-9)
-            # The constant models the lamp's own size and keeps the result finite.
+            # The constant stands for the size of the lamp and keeps the result finite.
             total += _facing(cosine, through) / (square + 0.03)
         return total[:, None] * self._lights.lamp
 
@@ -215,7 +228,7 @@ def _grid_points(
 
 
 def _enlarged(image: Array, size: tuple[int, int]) -> Array:
-    """Enlarge a linear image (h, w, 3) smoothly to (width, height)."""
+    """Enlarge a linear image (h, w, 3) to (width, height) by interpolation."""
     channels = [
         Image.fromarray(image[..., k].astype(np.float32)).resize(
             size, Image.Resampling.BILINEAR
@@ -226,7 +239,7 @@ def _enlarged(image: Array, size: tuple[int, int]) -> Array:
 
 
 def _facing(cosine: Array, through: Array) -> Array:
-    """Return the cosine law, with transmitted light from behind."""
+    """Return the cosine law, including light transmitted from behind."""
     return np.maximum(cosine, 0.0) + through * np.maximum(-cosine, 0.0)
 
 
@@ -234,7 +247,7 @@ def _facing(cosine: Array, through: Array) -> Array:
 def baker(
     lights: Lights, occluders: list[Mesh], *, center_m: ArrayLike, radius_m: float
 ) -> Iterator[Baker]:
-    """Open a Baker for a scene; its GL context exists only inside the block."""
+    """Open a `Baker` for a scene, with an OpenGL context that the block closes."""
     maps = DepthMaps(occluders, center_m=center_m, radius_m=radius_m)
     try:
         yield Baker(lights, maps)

@@ -1,4 +1,4 @@
-"""Camera paths: position, target, focus and pupil of the eye over time."""
+"""Camera paths: position, target, focus and pupil of an eye over time."""
 
 from dataclasses import dataclass
 
@@ -10,12 +10,16 @@ from clients.scenes.geometry import Array
 
 @dataclass(frozen=True)
 class Key:
-    """One key frame of a path.
+    """Key frame of a path.
 
     Attributes
     ----------
-    position_m, target_m : (3,), position of the eye and of the fixated point
-    focus_m : focus distance, meters; inf for far
+    position_m, target_m : (float, float, float)
+        Positions of the eye and of the point in the image center.
+    pupil_diameter_mm : float
+        Pupil of the eye.
+    focus_m : float
+        Focus distance, meters; may be inf.
     """
 
     position_m: tuple[float, float, float]
@@ -26,7 +30,7 @@ class Key:
 
 @dataclass(frozen=True)
 class Moment:
-    """The state of eye and camera for one frame; pose is camera to world (4, 4)."""
+    """State of the eye, and pose of the camera (4, 4, camera to world), in a frame."""
 
     pose: Array
     pupil_diameter_mm: float
@@ -52,12 +56,14 @@ PATHS = {
 
 
 def path_moments(path: tuple[Key, ...], n_frames: int) -> list[Moment]:
-    """Interpolate a path smoothly from its first key to its last.
+    """Interpolate a path from its first key to its last.
 
     Parameters
     ----------
-    path : at least two keys, evenly spread over the frames
-    n_frames : at least 1
+    path : tuple of Key
+        At least two keys, spread evenly over the frames.
+    n_frames : int
+        Number of frames, at least 1.
 
     Raises
     ------
@@ -66,11 +72,14 @@ def path_moments(path: tuple[Key, ...], n_frames: int) -> list[Moment]:
 
     Notes
     -----
-    Catmull-Rom through the keys; focus is interpolated in diopters, in which an eye's
-    effort is uniform.
+    The path is a Catmull-Rom spline through the keys.  Focus is interpolated in
+    diopters, which measure the effort of the eye.
     """
     if len(path) < 2 or n_frames < 1:
-        raise ValueError(f"{len(path)} keys, {n_frames} frames; need 2 and 1 or more")
+        raise ValueError(
+            f"path has {len(path)} keys and n_frames is {n_frames}; allowed: 2 keys or "
+            "more, 1 frame or more"
+        )
     values = np.array(
         [
             (*key.position_m, *key.target_m, key.pupil_diameter_mm, 1 / key.focus_m)
@@ -87,7 +96,7 @@ def path_moments(path: tuple[Key, ...], n_frames: int) -> list[Moment]:
 
 
 def _catmull_rom(values: Array, t: float) -> Array:
-    """Return the curve through the rows of `values` at t, 0 to rows - 1."""
+    """Return the spline through the rows of `values` at t, from 0 to rows - 1."""
     i = min(int(t), len(values) - 2)
     s = t - i
     before = values[max(i - 1, 0)]

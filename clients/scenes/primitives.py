@@ -1,7 +1,8 @@
 """Primitives: a letter plane, a cube and a sphere under one directional light.
 
 The layout is that of the published test scene: the letter E at 4.17 m, a rotated cube
-at 0.39 m, a sphere at 0.19 m, 180 scene units per meter, seen at 50° from the origin.
+at 0.39 m and a sphere at 0.19 m, with 180 scene units per meter, seen from the origin
+with a field of view of 50°.
 """
 
 from dataclasses import replace
@@ -32,7 +33,7 @@ def at_units(x: float, y: float, z: float) -> Array:
 
 
 def build() -> Scene:
-    """Build the scene; its camera is near the origin and looks along -z."""
+    """Build the scene, whose camera is near the origin and looks along -z."""
     parts = [_letter_plane(), _cube(), _sphere(), *_room()]
     textures = {
         "letter": uint8_srgb(optotype_e()),
@@ -52,7 +53,7 @@ def build() -> Scene:
 
 
 def _letter_plane() -> Mesh:
-    """Return the optotype: a sheet of 2 × 1.22 m, centered above the line of sight."""
+    """Return the optotype, a square of 2 × 1.22 m centered above the line of sight."""
     center = at_units(0, 100, -750)
     half = 1.22
     return patch(
@@ -64,7 +65,7 @@ def _letter_plane() -> Mesh:
 
 
 def _cube() -> Mesh:
-    """Return the rotated cube: each face in its own color, with squares on it."""
+    """Return the rotated cube, with a color and a pattern on each face."""
     mesh = box([2 * 11.5 / UNITS_PER_M] * 3, texture="squares")
     palette = ("#c8553d", "#e07a3f", "#3d6f9e", "#5b9bd0", "#c89b3c", "#e8c25a")
     per_face = len(mesh.vertices_m) // 6
@@ -75,18 +76,18 @@ def _cube() -> Mesh:
 
 
 def _sphere() -> Mesh:
-    """Return the nearest object: a ball in two colors."""
+    """Return the nearest object, a ball in two colors."""
     turn = rotation("z", 25)
     turn[:3, 3] = at_units(14, -3.5, -30)
     return transformed(sphere(8 / UNITS_PER_M, sides=64, texture="ball"), turn)
 
 
 def _room() -> list[Mesh]:
-    """Return a floor of squares and a back wall, which extend the depth to 9 m."""
+    """Return a floor of squares and a back wall at 9 m."""
     floor = patch((-6, -1.25, 0.5), (12, 0, 0), (0, 0, -9.5), cells=(24, 19))
     tile = np.floor(floor.vertices_m[floor.faces].mean(axis=1) * 2)
     dark = (tile[:, 0] + tile[:, 2]) % 2 == 0
-    # One vertex set per triangle, so that a square keeps one color up to its edge.
+    # Triangles share no vertices, so that a square has one color up to its edge.
     flat = replace(
         floor,
         vertices_m=floor.vertices_m[floor.faces].reshape(-1, 3),

@@ -1,4 +1,4 @@
-"""A finished scene: triangles with baked light, ready for flat rendering."""
+"""Scenes for rendering: triangles with baked light."""
 
 from dataclasses import dataclass
 
@@ -14,12 +14,16 @@ class Batch:
 
     Attributes
     ----------
-    vertices_m : (n, 3) float32, meters
-    faces : (m, 3) uint32, counterclockwise as seen from the side of their normals
+    vertices_m : (n, 3) float32
+        Positions, in meters.
+    faces : (m, 3) uint32
+        Vertex indices, counterclockwise as seen from the side of the normals.
     uv : (n, 2) float32
-    srgb : (n, 3) float32, sRGB-encoded light that leaves the vertex; with a texture,
-        the factor on its sRGB values
-    texture : (h, w, 3) uint8 sRGB, or None
+        Texture coordinates.
+    srgb : (n, 3) float32
+        sRGB-encoded light of the vertices; with a texture, the factor on its values.
+    texture : (h, w, 3) uint8 or None
+        sRGB.
     """
 
     vertices_m: NDArray[np.float32]
@@ -31,11 +35,22 @@ class Batch:
 
 @dataclass(frozen=True)
 class Scene:
-    """Named batches, the background color and the camera's depth limits.
+    """Triangles, background color and depth limits of a scene.
 
     Attributes
     ----------
-    infinite_from_m : planar depth from which a surface counts as background (+inf)
+    name : str
+        Name of the scene.
+    batches : tuple of Batch
+        Draw calls.
+    background_srgb : (float, float, float)
+        Background color, 0 to 1.
+    near_m, far_m : float
+        Near and far plane of the camera.
+    infinite_from_m : float
+        Planar depth from which a surface counts as background, at infinity.
+    fov_deg : float
+        Vertical field of view.
     """
 
     name: str
@@ -55,7 +70,7 @@ class Scene:
 def finished(mesh: Mesh, light: Array, textures: dict[str, NDArray[np.uint8]]) -> Batch:
     """Convert a mesh and the light (n, 3) on its vertices to a draw call."""
     if mesh.texture:
-        # A power law factors a product exactly; sRGB itself does not.
+        # The product of two powers is the power of the product, unlike with sRGB.
         srgb = np.maximum(mesh.albedo * light + mesh.emission, 0.0) ** (1 / 2.2)
     else:
         srgb = srgb_from_linear(mesh.albedo * light + mesh.emission)
@@ -69,7 +84,7 @@ def finished(mesh: Mesh, light: Array, textures: dict[str, NDArray[np.uint8]]) -
 
 
 def _wound(mesh: Mesh) -> NDArray[np.int64]:
-    """Return faces (m, 3), reversing those of mirrored parts to match their normals."""
+    """Return faces (m, 3) whose winding matches their normals after mirroring."""
     a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
     normals = mesh.normals[mesh.faces].sum(axis=1)
     against = (np.cross(b - a, c - a) * normals).sum(axis=1) < 0.0

@@ -1,8 +1,8 @@
-"""The ten Sloan letters as shapes: five units high and wide, strokes one unit wide.
+"""The ten Sloan letters as shapes, five units high and wide.
 
 A shape is a function of positions x, y (arrays, 0 to 5 units, y up) that returns a mask
-of the ink.  The width of straight strokes is that of charts; slanted ones match it to a
-tenth of a unit.
+of the ink.  Straight strokes are one unit wide, as on charts; slanted strokes match
+that to a tenth of a unit.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 UNITS = 5.0
-"""Height and width of a letter, in strokes."""
+"""Height and width of a letter, in stroke widths."""
 
 Ink = NDArray[np.bool_]
 Places = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Textures drawn with NumPy and Pillow: linear float images (h, w, 3) in 0..1."""
+"""Textures drawn with NumPy and Pillow, as linear images (h, w, 3) from 0 to 1."""
 
 from collections.abc import Iterable
 
@@ -6,18 +6,23 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from clients.scenes.geometry import Array, linear_from_hex, srgb_from_linear
+from clients.scenes.geometry import (
+    Array,
+    linear_from_hex,
+    linear_from_srgb,
+    srgb_from_linear,
+)
 
 
 def noise(height: int, width: int, *, cells: int, seed: int, octaves: int = 4) -> Array:
-    """Return smooth tiling noise (h, w), mean 0, about -1..1."""
+    """Return smooth noise (h, w) that tiles, with mean 0 and a range of about -1..1."""
     rng = np.random.default_rng(seed)
     total = np.zeros((height, width))
     for octave in range(octaves):
         n = cells * 2**octave
         grid = np.pad(rng.uniform(-1, 1, (n, n)), 2, mode="wrap")
         image = Image.fromarray(grid.astype(np.float32))
-        # The padding makes the cubic filter wrap around; it is cropped afterward.
+        # The padding makes the cubic filter wrap around, and is cropped afterward.
         step_x, step_y = width / n, height / n
         size = (round(width + 4 * step_x), round(height + 4 * step_y))
         big = np.asarray(image.resize(size, Image.Resampling.BICUBIC))
@@ -90,11 +95,15 @@ def board(
 
     Parameters
     ----------
-    size_px : (width, height)
-    lines : iterable of (text, center height 0..1 from the top, font size px, color)
-        An empty color means `ink`.
-    paper, ink : "#rrggbb"
-    grain : strength of the paper's texture
+    size_px : (int, int)
+        Width and height of the image.
+    lines : iterable of (text, center, font size, color)
+        Lines, with the center as a fraction of the height from the top and the font
+        size in px.  An empty color selects `ink`.
+    paper, ink : str
+        Colors as "#rrggbb".
+    grain : float
+        Strength of the paper's texture.
     """
     width, height = size_px
     image = Image.new("RGB", size_px, paper)
@@ -107,7 +116,7 @@ def board(
             font=ImageFont.load_default(size=font_px),
             anchor="mm",
         )
-    linear = _linear(np.asarray(image))
+    linear = linear_from_srgb(np.asarray(image) / 255.0)
     value = noise(height, width, cells=8, seed=11)
     return np.clip(linear * (1 + grain * value[..., None]), 0, 1)
 
@@ -125,7 +134,7 @@ def framed(image: Array, *, color: str, border_px: int, inset_px: int = 0) -> Ar
 
 
 def optotype_e(*, size: int = 640) -> Array:
-    """Return a Snellen E on white: five units high, bars of one unit, margin of 1.5."""
+    """Return a black E on white, five units high, with bars of one unit."""
     unit = size // 8
     image = np.full((size, size, 3), 0.9)
     low, high = round(1.5 * unit), round(6.5 * unit)
@@ -137,7 +146,7 @@ def optotype_e(*, size: int = 640) -> Array:
 
 
 def squares(*, size: int = 256) -> Array:
-    """Return white with a gray frame and a gray square, to be tinted by the vertex."""
+    """Return a gray frame and a gray square on white, to be tinted by vertex colors."""
     y, x = np.abs(np.mgrid[0:size, 0:size] / (size - 1) * 2 - 1)
     ring = np.maximum(x, y)
     value = np.where((ring > 0.9) | (ring < 0.4), 0.35, 1.0)
@@ -169,8 +178,14 @@ def hills(
 ) -> Array:
     """Return an evening view: sky, ridges of hills and fields.
 
-    The lengths give the position of the image (foot above the eye, height, distance),
-    so that its sky blends into `evening_sky` behind it.
+    The sky blends into `evening_sky` behind the image.
+
+    Parameters
+    ----------
+    bottom_m, height_m, distance_m : float
+        Lower edge above the eye, height, and distance of the image in the scene.
+    width, height : int
+        Size of the texture, px.
     """
     x = np.linspace(0, 1, width)
     y = np.linspace(1, 0, height)[:, None]
@@ -189,12 +204,6 @@ def hills(
         line = line + 0.4 * swing * np.sin(2 * np.pi * 2.7 * frequency * x + 2 * phase)
         image = np.where((y < line)[..., None], tinted(field, dark, light), image)
     return image
-
-
-def _linear(srgb8: NDArray[np.uint8]) -> Array:
-    """Decode sRGB bytes of any shape."""
-    value = srgb8 / 255.0
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
 def uint8_srgb(linear: Array) -> NDArray[np.uint8]:

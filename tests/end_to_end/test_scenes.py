@@ -1,44 +1,20 @@
 """The two test scenes: where things are, how frames look, that light is baked right."""
 
+import ctypes
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
-from clients.hidden_surface import LEAST_GAP_DPT
-from clients.pyrender_setup import delete_renderer, pyrender
-from clients.scene_renderer import (
-    SceneRenderer,
-    _hidden_pixels,
-    _mean_color,
-    _sample_depth,
-)
+from clients.scene_renderer import SceneRenderer
 from clients.scenes.catalog import build_scene
 from clients.scenes.geometry import box, patch, placed, sphere
 from clients.scenes.lighting import Lights, baker
 from clients.scenes.paths import PATHS, look_at, path_moments
+from clients.scenes.scene_buffers import LEAST_GAP_DPT
 
 UNITS_PER_M = 180.0
-
-
-def test_a_renderer_lets_go_of_its_context_before_its_display_ends(monkeypatch):
-    # NVIDIA's EGL refuses it afterward
-    from OpenGL import EGL
-
-    released = []
-    make_current = EGL.eglMakeCurrent
-
-    def noted(display, draw, read, context):
-        if not context:
-            released.append(EGL.eglQueryString(display, EGL.EGL_VENDOR))
-        return make_current(display, draw, read, context)
-
-    monkeypatch.setattr(EGL, "eglMakeCurrent", noted)
-    delete_renderer(pyrender.OffscreenRenderer(8, 8))
-    assert len(released) == 1
-    assert released[0]
-    assert not EGL.eglGetCurrentContext()
 
 
 @pytest.fixture(scope="module")
@@ -190,17 +166,6 @@ def test_path_goes_through_its_keys():
         assert moment.focus_dpt == pytest.approx(1 / key.focus_m)
 
 
-def test_pixel_color_is_the_mean_light_and_depth_a_sample():
-    black_and_white = np.zeros((2, 2, 3), np.uint8)
-    black_and_white[0] = 255
-    # Half the light is sRGB 188, not 128.
-    assert (_mean_color(black_and_white, 2) == 188).all()
-    edge = np.array([[1, 1], [9, np.inf]], np.float32)
-    corner = np.array([[1, 9], [9, np.inf]], np.float32)
-    assert _sample_depth(edge, 2) == 1
-    assert _sample_depth(corner, 2) == 9
-
-
 def test_baked_sun_and_sky_are_shadowed_by_what_is_above():
     floor = patch((-2, 0, 2), (4, 0, 0), (0, 0, -4))
     plate = placed(box((1, 0.02, 1)), (0, 0.8, 0))
@@ -263,19 +228,17 @@ def _is_near(batch):
     return -batch.vertices_m[:, 2].min() < 1.0
 
 
-def test_hidden_pixels_are_the_samples_that_show_something():
-    shows = np.array([[True, True], [False, False]])
-    color = np.zeros((2, 2, 3), np.uint8)
-    color[0, 0], color[0, 1], color[1] = 255, 188, 7
-    depth_m = np.array([[9.0, 5.0], [1.0, 1.0]], np.float32)
-    seen_m = np.array([[2.0]], np.float32)
-    mean, picked_m = _hidden_pixels(color, depth_m, shows, seen_m, 2)
-    assert (mean == 225).all()  # 0.75 in linear light, of 1 and 0.5
-    assert picked_m == 5.0
-    for nearest_m, none in ((5.0, shows), (2.0, ~shows & shows)):
-        seen_m = np.array([[nearest_m]], np.float32)
-        _, picked_m = _hidden_pixels(color, depth_m, none, seen_m, 2)
-        assert picked_m == 0.0
+def test_a_renderer_leaves_no_context_current(primitives):
+    with SceneRenderer(primitives, (8, 8)) as renderer:
+        renderer.render(np.eye(4))
+        assert not current_context()
+    assert not current_context()
+
+
+def current_context():
+    egl = ctypes.CDLL("libEGL.so.1")
+    egl.eglGetCurrentContext.restype = ctypes.c_void_p
+    return egl.eglGetCurrentContext()
 
 
 def test_unknown_scene_is_refused_with_the_known_ones():

@@ -1,8 +1,9 @@
 """OpenGL objects of a scene view: render targets, programs and triangles."""
 
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import moderngl
 import numpy as np
@@ -10,15 +11,19 @@ from numpy.typing import DTypeLike, NDArray
 
 from clients.scenes.scene import Batch, Scene
 
+LEAST_GAP_DPT = 0.05
+"""Smallest distance of the hidden layer behind the visible surface; closer surfaces
+have nearly the same blur."""
+
 _Made = TypeVar("_Made")
 
 _ASSETS = Path(__file__).resolve().parents[1] / "assets"
 _SRGB8_ALPHA8 = 0x8C43  # GL_SRGB8_ALPHA8
 
 _RESOLVE_CONSTANTS = {
-    # the float with these bits; a division by zero need not give infinity
+    # Bits of the float: a division by zero need not give infinity.
     "INFINITY_BITS": "0x7F800000u",
-    # IEC 61966-2-1, as in `clients.scenes.geometry`
+    # IEC 61966-2-1, as in `clients.scenes.geometry`.
     "SRGB_GAIN": 1.055,
     "SRGB_POWER": 2.4,
     "SRGB_SLOPE": 12.92,
@@ -26,25 +31,48 @@ _RESOLVE_CONSTANTS = {
 }
 
 
+class Layer(NamedTuple):
+    """OpenGL objects that render one layer, visible or hidden.
+
+    Attributes
+    ----------
+    samples : moderngl.Framebuffer
+        Target of the samples: color, and the inverse of planar depth as a float, 1/m.
+        A depth buffer is too coarse at large distances.
+    program : moderngl.Program
+        Draws the scene.
+    draw_calls : list of (moderngl.VertexArray, moderngl.Texture)
+        Triangles of the program, each with its texture.
+    resolving : moderngl.VertexArray
+        One triangle that resolves samples to pixels.
+    """
+
+    samples: moderngl.Framebuffer
+    program: moderngl.Program
+    draw_calls: list[tuple[moderngl.VertexArray, moderngl.Texture]]
+    resolving: moderngl.VertexArray
+
+
 class SceneBuffers:
     """OpenGL objects of one view; their context must be current for every call.
 
     Parameters
     ----------
-    size_px : (width, height) of a picture
-    supersampling : samples per pixel and axis
+    context : moderngl.Context
+        Context that owns the objects.
+    scene : Scene
+        Scene to upload.
+    size_px : (int, int)
+        Width and height of an image.
+    supersampling : int
+        Samples per pixel along each axis.
 
     Attributes
     ----------
-    samples, pixels : moderngl.Framebuffer
-        Targets of the samples and of the pixels resolved from them: color, then a float
-        for depth, 1/m for samples and m for pixels. A depth buffer is too coarse far
-        away.
-    program : moderngl.Program
-        Draws the scene.
-    draw_calls : list of (moderngl.VertexArray, moderngl.Texture)
-    resolving : moderngl.VertexArray
-        One triangle that resolves samples to pixels.
+    pixels : moderngl.Framebuffer
+        Target of the pixels resolved from samples: color, and planar depth in meters.
+    visible, hidden : Layer
+        Objects of each layer; those of the hidden layer are created at first use.
     """
 
     def __init__(
@@ -54,23 +82,24 @@ class SceneBuffers:
         size_px: tuple[int, int],
         supersampling: int,
     ):
-        self._context = context
+        self._context, self._scene = context, scene
+        self._size_px, self._supersampling = size_px, supersampling
         self._owned: list[Any] = []
         try:
-            samples_px = (supersampling * size_px[0], supersampling * size_px[1])
-            # Samples hold sRGB values, which OpenGL decodes to linear light on reading:
-            # faster than a power law in the shader.
-            self.samples = self._target(samples_px, _SRGB8_ALPHA8, with_depth=True)
             self.pixels = self._target(size_px, None, with_depth=False)
-            self.program = self._program("scene.vert", "scene.frag", {})
-            self.draw_calls = self._all_draw_calls(scene)
-            self.resolving = self._resolving(scene, size_px[1], supersampling)
+            self._content = self._uploaded(scene)
+            self.visible = self._layer({})
         except BaseException:
             self.release()
             raise
 
+    @cached_property
+    def hidden(self) -> Layer:
+        """Objects that render the hidden layer."""
+        return self._layer({"LEAST_GAP_DPT": LEAST_GAP_DPT})
+
     def release(self) -> None:
-        """Free everything."""
+        """Free all objects."""
         while self._owned:
             self._owned.pop().release()
 
@@ -79,10 +108,32 @@ class SceneBuffers:
         self._owned.append(made)
         return made
 
+    def _layer(self, defines: Mapping[str, object]) -> Layer:
+        width_px, height_px = self._size_px
+        samples_px = (self._supersampling * width_px, self._supersampling * height_px)
+        # Samples hold sRGB values, which OpenGL decodes to linear light on reading:
+        # faster than a power law in the shader.
+        samples = self._target(samples_px, _SRGB8_ALPHA8, with_depth=True)
+        program: Any = self._program("scene.vert", "scene.frag", defines)
+        program["surface"].value = 0
+        calls = [
+            (self._own(self._context.vertex_array(program, *content)), texture)
+            for content, texture in self._content
+        ]
+        constants = {"SAMPLES": self._supersampling, **_RESOLVE_CONSTANTS, **defines}
+        resolving: Any = self._program("resolve.vert", "resolve.frag", constants)
+        resolving["samples_light"].value, resolving["samples_per_m"].value = 0, 1
+        resolving["infinite_to_per_m"].value = 1.0 / self._scene.infinite_from_m
+        resolving["last_row"].value = height_px - 1
+        if defines:
+            program["seen_per_m"].value, resolving["seen_per_m"].value = 1, 2
+        triangle = self._own(self._context.vertex_array(resolving, []))
+        return Layer(samples, program, calls, triangle)
+
     def _target(
         self, size_px: tuple[int, int], color_format: int | None, *, with_depth: bool
     ) -> moderngl.Framebuffer:
-        """Return a framebuffer for color and a float."""
+        """Return a framebuffer for a color and a float."""
         context, own = self._context, self._own
         color = own(context.texture(size_px, 4, internal_format=color_format))
         values = own(context.texture(size_px, 1, dtype="f4"))
@@ -104,41 +155,26 @@ class SceneBuffers:
             self._context.program(vertex_shader=texts[0], fragment_shader=texts[1])
         )
 
-    def _resolving(
-        self, scene: Scene, height_px: int, supersampling: int
-    ) -> moderngl.VertexArray:
-        count = supersampling**2
-        defines: dict[str, object] = {
-            "SAMPLES": supersampling,
-            "COUNT": count,
-            "RANK": count // 4,
-        }
-        defines |= _RESOLVE_CONSTANTS
-        program: Any = self._program("resolve.vert", "resolve.frag", defines)
-        program["samples_light"].value, program["samples_per_m"].value = 0, 1
-        program["infinite_to_per_m"].value = 1.0 / scene.infinite_from_m
-        program["last_row"].value = height_px - 1
-        return self._own(self._context.vertex_array(program, []))
+    def _uploaded(self, scene: Scene) -> list[tuple[tuple[Any, ...], moderngl.Texture]]:
+        """Return each batch's vertices, indices and texture.
 
-    def _all_draw_calls(
-        self, scene: Scene
-    ) -> list[tuple[moderngl.VertexArray, moderngl.Texture]]:
-        """Return each batch's triangles and texture; batches may share a texture."""
+        Batches may share a texture.
+        """
         # A surface without a texture is its color times white.
         textures: dict[int | None, moderngl.Texture] = {
             None: self._own(self._context.texture((1, 1), 3, b"\xff" * 3))
         }
-        calls = []
+        found = []
         for batch in scene.batches:
             key = None if batch.texture is None else id(batch.texture)
             if key not in textures:
                 assert batch.texture is not None
                 textures[key] = self._surface(batch.texture)
-            calls.append((self._triangles(batch), textures[key]))
-        return calls
+            found.append((self._triangles(batch), textures[key]))
+        return found
 
-    def _triangles(self, batch: Batch) -> moderngl.VertexArray:
-        """Return a batch's vertices and indices in the program's layout."""
+    def _triangles(self, batch: Batch) -> tuple[list[tuple[Any, str, str]], Any]:
+        """Return a batch's vertices and indices in the layout of the scene shader."""
         columns = (
             (batch.vertices_m, "3f", "vertex_m"),
             (batch.srgb, "3f", "srgb"),
@@ -148,14 +184,13 @@ class SceneBuffers:
             (self._buffer(values, np.float32), kind, name)
             for values, kind, name in columns
         ]
-        indices = self._buffer(batch.faces, np.uint32)
-        return self._own(self._context.vertex_array(self.program, content, indices))
+        return content, self._buffer(batch.faces, np.uint32)
 
     def _buffer(self, values: NDArray[Any], dtype: DTypeLike) -> moderngl.Buffer:
         return self._own(self._context.buffer(np.ascontiguousarray(values, dtype)))
 
     def _surface(self, texels: NDArray[np.uint8]) -> moderngl.Texture:
-        """Return a texture with mipmaps, filtered and repeated as in pyrender."""
+        """Return a repeating texture with mipmaps and linear filtering."""
         height, width = texels.shape[:2]
         upright = np.ascontiguousarray(texels[::-1])
         texture = self._own(self._context.texture((width, height), 3, upright))

@@ -1,0 +1,326 @@
+"""Rendering of a scene's color and depth in an OpenGL context of the caller.
+
+The renderers of this project all draw with `SceneView`: `clients.scene_renderer` for
+streams, `clients.headset.scenery` for both eyes of a headset, and
+`clients.scenes.lighting` for shadow maps.
+"""
+
+from typing import Any, cast
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from clients.scenes.geometry import Array
+from clients.scenes.scene import Scene
+from clients.scenes.scene_buffers import Layer, SceneBuffers
+from filter_service.errors import RenderFailed
+
+Tangents = tuple[float, float, float, float]
+Picture = tuple[NDArray[np.uint8], NDArray[np.float32]]
+
+_FRAMEBUFFER_SRGB = 0x8DB9  # GL_FRAMEBUFFER_SRGB
+_WRITE, _KEEP = (True,) * 4, (False,) * 4
+
+
+def open_context(version: int = 330) -> moderngl.Context:
+    """Open an OpenGL context through EGL, without a window; it is not current.
+
+    Parameters
+    ----------
+    version : int
+        Least OpenGL version, such as 330 for 3.3.
+
+    Raises
+    ------
+    RenderFailed
+        If this machine offers no such context.
+    """
+    try:
+        context = moderngl.create_context(
+            standalone=True, backend=cast("Any", "egl"), require=version
+        )
+    except Exception as error:  # moderngl raises no narrower type
+        raise RenderFailed(
+            f"scenes require OpenGL {version / 100:.1f} through EGL: {error}"
+        ) from error
+    # A new EGL context is current; leaving the block releases it.
+    with context:
+        return context
+
+
+class SceneView:
+    """Renderer of one scene, in an OpenGL context that may be shared.
+
+    Parameters
+    ----------
+    context : moderngl.Context
+        Context to render in; OpenGL 3.3 or later.
+    scene : Scene
+        Scene to render.
+    size_px : (int, int)
+        Width and height of an image.
+    supersampling : int
+        Samples per pixel along each axis.
+
+    Raises
+    ------
+    ValueError
+        If a size is below 1 px or larger than the context can render.
+
+    Notes
+    -----
+    A pixel's color is the mean of its samples in linear light.  Its depth is that of
+    one sample, a quarter of the way from the nearest to the farthest.  The mean across
+    an edge would be a depth at which there is no surface.
+
+    Every call makes the context current.  If moderngl obtained the context through EGL,
+    no context is current afterward: other drawing in the same thread must be in a
+    ``with context:`` block of its own, which must not be open around a call.
+    Calls leave GL_FRAMEBUFFER_SRGB disabled.
+    """
+
+    def __init__(
+        self,
+        context: moderngl.Context,
+        scene: Scene,
+        size_px: tuple[int, int],
+        *,
+        supersampling: int = 2,
+    ):
+        width, height = size_px
+        if min(width, height, supersampling) < 1:
+            raise ValueError(
+                f"size_px is {width}x{height} and supersampling {supersampling}; "
+                "allowed: 1 or more each"
+            )
+        self.scene, self.size_px = scene, size_px
+        self._context = context
+        with context:
+            self._check_size(supersampling)
+            self._buffers = SceneBuffers(context, scene, size_px, supersampling)
+
+    def __enter__(self) -> "SceneView":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free the OpenGL objects; closing twice is allowed."""
+        with self._context:
+            self._buffers.release()
+
+    def render(
+        self, pose: Array, tangents: Tangents, *, out: Picture | None = None
+    ) -> Picture:
+        """Render the scene from a pose.
+
+        Parameters
+        ----------
+        pose : (4, 4) array
+            Camera to world; x right, y up, looking along -z.
+        tangents : (left, right, up, down)
+            Tangents of the angles to the image edges.
+        out : (color, depth_m), optional
+            Output arrays, contiguous, of the shapes and types below.
+
+        Returns
+        -------
+        color : (h, w, 3) uint8
+            sRGB, top row first.
+        depth_m : (h, w) float32
+            Planar depth; +inf for the background and from `scene.infinite_from_m` on.
+
+        Raises
+        ------
+        ValueError
+            If the pose or the tangents do not describe a camera, or an output array
+            does not fit.
+        """
+        uniforms = _uniforms(pose, self._projection(tangents))
+        picture = self._output(out)
+        with self._context:
+            self._draw(self._buffers.visible, uniforms)
+            self._resolve(self._buffers.visible, picture)
+        return picture
+
+    def render_layers(self, pose: Array, tangents: Tangents) -> tuple[Picture, Picture]:
+        """Render the visible surface and the hidden layer behind it.
+
+        The scene is rendered a second time, without every fragment less than
+        `LEAST_GAP_DPT` behind the visible surface (depth peeling).  The hidden color is
+        the mean of the pixel's samples that have a hidden surface.
+
+        Parameters
+        ----------
+        pose, tangents
+            As for `render`.
+
+        Returns
+        -------
+        visible, hidden : (color, depth_m)
+            As for `render`; the hidden depth is 0 where nothing is hidden.
+        """
+        uniforms = _uniforms(pose, self._projection(tangents))
+        visible, hidden = self._output(None), self._output(None)
+        with self._context:
+            self._draw(self._buffers.visible, uniforms)
+            self._resolve(self._buffers.visible, visible)
+            seen = self._buffers.visible.samples.color_attachments[1]
+            self._draw(self._buffers.hidden, uniforms, seen)
+            self._resolve(self._buffers.hidden, hidden, seen)
+        return visible, hidden
+
+    def parallel_depth_m(self, pose: Array, half_width_m: float) -> NDArray[np.float32]:
+        """Return the depth (h, w) of front faces along parallel rays.
+
+        Depth is +inf for the background.
+
+        Parameters
+        ----------
+        pose : (4, 4) array
+            Camera to world.
+        half_width_m : float
+            Half the width and height of the bundle of rays.
+        """
+        near_m, far_m = self.scene.near_m, self.scene.far_m
+        clip_from_view = np.diag([1.0 / half_width_m] * 2 + [2 / (near_m - far_m), 1.0])
+        clip_from_view[2, 3] = (near_m + far_m) / (near_m - far_m)
+        picture = self._output(None)
+        with self._context:
+            uniforms = _uniforms(pose, clip_from_view)
+            self._draw(self._buffers.visible, uniforms, culls=True)
+            self._resolve(self._buffers.visible, picture)
+        return picture[1]
+
+    def _projection(self, tangents: Tangents) -> Array:
+        return projection(tangents, self.scene.near_m, self.scene.far_m)
+
+    def _draw(
+        self,
+        layer: Layer,
+        uniforms: dict[str, tuple[float, ...]],
+        seen: Any = None,
+        *,
+        culls: bool = False,
+    ) -> None:
+        """Draw all samples of a layer.
+
+        Parameters
+        ----------
+        seen : moderngl.Texture, optional
+            Samples of the visible depth, for the hidden layer.
+        culls : bool
+            Whether to leave out back faces.
+        """
+        samples = layer.samples
+        flags = moderngl.DEPTH_TEST | (moderngl.CULL_FACE if culls else 0)
+        with self._context.scope(samples, flags):
+            # Vertices hold sRGB values already.  Code that draws to a headset may have
+            # enabled the conversion.
+            self._context.disable_direct(_FRAMEBUFFER_SRGB)
+            samples.color_mask = cast("Any", (_WRITE, _KEEP))
+            samples.clear(*self.scene.background_srgb, 1.0)
+            samples.color_mask = cast("Any", (_KEEP, _WRITE))
+            samples.clear()
+            samples.color_mask = cast("Any", (_WRITE, _WRITE))
+            for name, value in uniforms.items():
+                cast("moderngl.Uniform", layer.program[name]).value = value
+            if seen is not None:
+                seen.use(1)
+            for triangles, texture in layer.draw_calls:
+                texture.use(0)
+                triangles.render(moderngl.TRIANGLES)
+
+    def _resolve(self, layer: Layer, out: Picture, seen: Any = None) -> None:
+        """Resolve samples to pixels and copy these; waits for the GPU."""
+        pixels = self._buffers.pixels
+        with self._context.scope(pixels, moderngl.NOTHING):
+            for unit, texture in enumerate((*layer.samples.color_attachments, seen)):
+                if texture is not None:
+                    cast("moderngl.Texture", texture).use(unit)
+            layer.resolving.render(moderngl.TRIANGLES, vertices=3)
+        # The size of a row of three-byte pixels need not be a multiple of four.
+        pixels.read_into(out[0], components=3, attachment=0, alignment=1)
+        pixels.read_into(out[1], components=1, attachment=1, dtype="f4")
+
+    def _output(self, out: Picture | None) -> Picture:
+        """Return the caller's output arrays after a check, or new ones."""
+        width, height = self.size_px
+        wanted = (((height, width, 3), np.uint8), ((height, width), np.float32))
+        if out is None:
+            return cast(
+                "Picture", tuple(np.empty(shape, dtype) for shape, dtype in wanted)
+            )
+        arrays: tuple[NDArray[Any], ...] = out
+        for array, (shape, dtype) in zip(arrays, wanted, strict=True):
+            fits = array.shape == shape and array.dtype == dtype
+            if not (fits and array.flags.c_contiguous and array.flags.writeable):
+                raise ValueError(
+                    f"output array of {array.dtype} {array.shape}; expected "
+                    f"{np.dtype(dtype)} {shape}, contiguous and writable"
+                )
+        return out
+
+    def _check_size(self, supersampling: int) -> None:
+        info = self._context.info
+        largest = min(info["GL_MAX_TEXTURE_SIZE"], *info["GL_MAX_VIEWPORT_DIMS"])
+        if supersampling * max(self.size_px) > largest:
+            width, height = self.size_px
+            raise ValueError(
+                f"{width}x{height} px with {supersampling} samples per axis; this "
+                f"OpenGL renders up to {largest} samples along a side"
+            )
+
+
+def _uniforms(pose: Array, clip_from_view: Array) -> dict[str, tuple[float, ...]]:
+    """Return the camera's uniforms of the scene shader, by name.
+
+    Raises
+    ------
+    ValueError
+        If the pose does not describe a camera.
+    """
+    pose = np.asarray(pose, float)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError(f"pose of shape {pose.shape}; expected 4x4 finite numbers")
+    turned = pose[:3, :3].T @ pose[:3, :3]
+    if not np.allclose(turned, np.eye(3), atol=1e-3):
+        raise ValueError("pose is not rigid; its axes must be orthogonal unit vectors")
+    view_from_world = np.linalg.inv(pose)
+    # GLSL matrices are column-major.
+    clip_from_world = (clip_from_view @ view_from_world).T
+    return {
+        "clip_from_world": tuple(clip_from_world.ravel()),
+        "planar_depth": tuple(-view_from_world[2]),
+    }
+
+
+def projection(tangents: Tangents, near_m: float, far_m: float) -> Array:
+    """Return OpenGL's projection matrix (4, 4) for an asymmetric frustum.
+
+    Parameters
+    ----------
+    tangents : (left, right, up, down)
+        Tangents of the angles to the image edges.
+    near_m, far_m : float
+        Distances of the near and the far plane.
+
+    Raises
+    ------
+    ValueError
+        If tangents are not finite, or not left < right and down < up.
+    """
+    left, right, up, down = tangents
+    if not (np.isfinite(tangents).all() and left < right and down < up):
+        raise ValueError(
+            f"tangents are {tangents}; allowed: finite, left < right and down < up"
+        )
+    matrix = np.zeros((4, 4))
+    matrix[0, 0], matrix[0, 2] = 2 / (right - left), (right + left) / (right - left)
+    matrix[1, 1], matrix[1, 2] = 2 / (up - down), (up + down) / (up - down)
+    matrix[2, 2] = (near_m + far_m) / (near_m - far_m)
+    matrix[2, 3] = 2 * near_m * far_m / (near_m - far_m)
+    matrix[3, 2] = -1.0
+    return matrix
