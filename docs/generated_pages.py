@@ -1,9 +1,9 @@
-"""MkDocs hook: pages generated from the code that they describe.
+"""MkDocs hook that generates reference pages from the code.
 
-``reference/api.md`` documents the public names of three packages from their
-docstrings and types, ``reference/settings.md`` lists `FilterSettings` and
-`ServiceConfig`, ``reference/command-line.md`` the help text of every command, and
-``reference/benchmarks.md`` the benchmarks with their results and pictures.
+``reference/api.md`` contains the docstrings and types of the public names of three
+packages.  ``reference/settings.md`` contains the fields of `FilterSettings` and
+`ServiceConfig`.  ``reference/command-line.md`` contains the help text of every command.
+``reference/benchmarks.md`` contains the benchmarks with their results and figures.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from filter_service.validation import allowed_values
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {
-    "filter_service": "Filters frames in your process.",
-    "clients": "Talks to a service.",
-    "estimator": "Turns a profile into an eye, its wavefronts and its PSFs.",
+    "filter_service": "Filter frames in your own process.",
+    "clients": "Connect to a service.",
+    "estimator": "Estimate an eye from a profile and compute its wavefronts and PSFs.",
 }
 RESULTS = "tests/benchmarks/results"
 
 
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
-    """Add the generated pages and the figures of the benchmarks."""
+    """Return `files` with the generated pages and the benchmark results added."""
     for uri, text in (
         ("reference/api.md", _api_page()),
         ("reference/settings.md", _settings_page()),
@@ -52,7 +52,7 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Point links of the checkout to the copies in the built pages."""
+    """Return the Markdown with links to benchmark results adapted to the built site."""
     return markdown.replace(f"](../{RESULTS}/", "](results/")
 
 
@@ -60,7 +60,8 @@ def _api_page() -> str:
     lines = [
         "# Python API",
         "",
-        "Three packages have public names. Everything else may change without notice.",
+        "The public API consists of the names below, from three packages. Everything "
+        "else may change without notice.",
         "",
     ]
     for package, purpose in PACKAGES.items():
@@ -81,8 +82,8 @@ def _settings_page() -> str:
         "",
         "## Filter",
         "",
-        "Fields of `FilterSettings`, of `settings` on the wire, and options "
-        "of `ocufilter filter`.",
+        "These are the fields of `FilterSettings` and of `settings` in the wire "
+        "protocol, and options of `ocufilter filter`.",
         "",
         "| setting | default | allowed | meaning |",
         "|---|---|---|---|",
@@ -96,7 +97,7 @@ def _settings_page() -> str:
         "",
         "## Service",
         "",
-        "Fields of the file that `ocufilter serve --config FILE.toml` reads.",
+        "These are the fields of the file for `ocufilter serve --config FILE.toml`.",
         "",
         "| setting | default | allowed | meaning |",
         "|---|---|---|---|",
@@ -119,7 +120,7 @@ def _shown(value: object) -> str:
 
 
 def _attributes_of(docstring: str) -> dict[str, str]:
-    """Return the meaning of each attribute that a numpydoc docstring lists."""
+    """Return the descriptions in the Attributes section of a numpydoc docstring."""
     meanings: dict[str, str] = {}
     section = docstring.partition("Attributes")[2]
     for names, text in re.findall(
@@ -134,8 +135,9 @@ def _command_line_page() -> str:
     lines = [
         "# Command line",
         "",
-        "Every command explains itself with `--help`; `--json` makes it print one JSON "
-        "object.  Exit codes: 0 done, 1 failure, 2 bad input.",
+        "Every command has a `--help` option. With `--json`, a command prints one JSON "
+        "object. The exit code is 0 for success, 1 for a failure and 2 for invalid "
+        "input.",
         "",
     ]
     main = _help()
@@ -149,10 +151,10 @@ def _benchmarks_page() -> str:
     lines = [
         "# Benchmarks",
         "",
-        "`ocufilter bench NAME` runs one of them in a clone; `--quick` runs fewer "
-        "cases. "
-        "Each prints speed and error in one row and writes JSON with hardware and "
-        "commit. [Speed and accuracy](../benchmarks.md) has the main figures.",
+        "In a clone, `ocufilter bench NAME` runs one benchmark; `--quick` runs fewer "
+        "cases. Each benchmark reports speed together with error and writes JSON that "
+        "includes hardware and commit. [Speed and accuracy](../benchmarks.md) lists "
+        "the main results.",
         "",
     ]
     for path in sorted((ROOT / "tests" / "benchmarks").glob("bench_*.py")):

@@ -1,9 +1,9 @@
-"""First picture: what a person with -6 diopters sees of a courtyard without glasses.
+"""First image: a courtyard as a person with -6 diopters sees it without glasses.
 
     python examples/01_first_picture.py
 
-Five lines do it: a scene, an eye, a frame.  Distances are in meters, pupils in
-millimeters, focus in diopters (1 / meters; 0 is far away).
+The example loads a scene, creates an eye and filters one frame.  Distances are in
+meters, pupils in millimeters and focus in diopters (1 / meters; 0 is infinity).
 """
 
 from common import load_courtyard, save_pictures

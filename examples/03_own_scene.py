@@ -1,10 +1,11 @@
-"""A scene of your own: any picture will do, if each pixel's distance is known.
+"""Your own scene: filter any image for which you know the distance of each pixel.
 
     python examples/03_own_scene.py
 
-Here three cards hang before a wall, at 25 cm, 1 m and 5 m.  Color is an array of 8-bit
-sRGB, distance one of 32-bit floats in meters: what a renderer or a depth camera gives.
-A person of 40, who cannot focus quite as near as 25 cm, looks at each card in turn.
+The scene consists of three cards in front of a wall, at 25 cm, 1 m and 5 m.  Color is
+an 8-bit sRGB array, and distance is a 32-bit float array in meters, as produced by a
+renderer or a depth camera.  A 40-year-old, who cannot quite focus at 25 cm, looks at
+one card after the other.
 """
 
 import numpy as np
@@ -35,7 +36,7 @@ for text, (distance_m, left) in CARDS.items():
     depth_m[box[1] : box[3] + 1, box[0] : box[2] + 1] = distance_m
 color = np.array(scene)
 
-# 12 degrees high: as if one looked at it through a window.
+# The image covers a vertical angle of 12 degrees.
 camera = Camera.from_fov(12.0, width_px=WIDTH_PX, height_px=HEIGHT_PX)
 person = {"kind": "preset", "name": "emmetropia", "age_years": 40}
 

@@ -1,10 +1,11 @@
-"""Two eyes: a person whose right eye sees well and whose left one is short-sighted.
+"""Stereo: a person whose left eye is myopic and whose right eye is emmetropic.
 
     python examples/04_stereo.py
 
-Each eye has a filter of its own; `plan_views` takes a frame for both.  The two pictures
-are rendered 63 mm apart; here by shifting cards by hand, in a headset by its renderer.
-Look at the pair with crossed eyes: the brain mostly takes the sharper one.
+Each eye has its own filter, and `plan_views` filters a frame through both.  The two
+views are rendered from positions 63 mm apart.  This example shifts the cards; in a
+headset, the renderer provides the views.  Fuse the pair by crossing your eyes: the
+sharper view usually dominates.
 """
 
 import numpy as np
@@ -16,7 +17,7 @@ from filter_service import Camera, EyeFilter, RgbdView, ViewState, plan_views
 WIDTH_PX, HEIGHT_PX = 360, 270
 EYES_APART_M = 0.063
 WALL_M = 6.0
-CARDS = (  # text, distance m, middle of the card m to the right and up, its side m
+CARDS = (  # text, distance m, center x and y m, side m
     ("far", 4.0, -0.40, 0.20, 0.70),
     ("mid", 1.5, 0.20, -0.10, 0.30),
     ("near", 0.5, -0.03, -0.07, 0.10),
@@ -31,7 +32,7 @@ px_per_tangent = HEIGHT_PX / (camera.tangents[2] - camera.tangents[3])
 
 
 def rendered(eye_x_m):
-    """Color and distance of the cards, for an eye so far to the right."""
+    """Return color and depth of the cards for an eye at `eye_x_m` (right: positive)."""
     picture = Image.new("RGB", (WIDTH_PX, HEIGHT_PX), "#9db0a5")
     draw = ImageDraw.Draw(picture)
     depth_m = np.full((HEIGHT_PX, WIDTH_PX), WALL_M, np.float32)

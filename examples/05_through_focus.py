@@ -1,9 +1,9 @@
-"""Through focus: what is sharp when, for three eyes that read a card 50 cm away.
+"""Through focus: three eyes look at a card at 50 cm and focus at five distances.
 
     python examples/05_through_focus.py
 
-Each row is an eye, each column a distance that it tries to focus on.  A short-sighted
-eye cannot focus far away: it only adds power, so its focus stays at its far point.
+Each row shows an eye, and each column a requested focus distance.  Accommodation can
+only add power, so a myopic eye cannot focus beyond its far point.
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ for text, size_px, y in (
 color = np.array(card)
 depth_m = np.full((SIDE_PX, SIDE_PX), 1.0 / CARD_DPT, np.float32)
 camera = Camera.from_fov(2.5, width_px=SIDE_PX, height_px=SIDE_PX)
-settings = FilterSettings(  # no more is prepared than what is asked for
+settings = FilterSettings(  # limits the PSFs to the states that are used
     pupil_range_mm=(4.0, 4.0),
     focus_range_dpt=(FOCI_DPT[0], FOCI_DPT[-1]),
     object_range_dpt=(CARD_DPT, CARD_DPT),

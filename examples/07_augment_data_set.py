@@ -1,10 +1,10 @@
-"""A data set as many eyes see it: for training what has to cope with human vision.
+"""Data augmentation: filter a data set through many eyes.
 
     python examples/07_augment_data_set.py
 
-Pictures of letters, 4 m away, each through people drawn at random: refraction, age and
-pupil.  The labels say which eye saw each picture, so that a model can learn from that,
-too.  Writes out/examples/letters/ with PNGs and labels.csv.
+Images of letters at 4 m are filtered through eyes with random refraction, age and
+pupil.  The labels describe the eye of each image, so that a model can be trained on
+them too.  The example writes PNG files and labels.csv to out/examples/letters/.
 """
 
 import csv
@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw
 from filter_service import Camera, EyeFilter, FilterSettings
 
 SIDE_PX = 64
-FIELD_DEG = 1.1  # of the whole picture; its letter is 20/200 on a chart
+FIELD_DEG = 1.1  # height of the image; the letter corresponds to 20/200
 DISTANCE_DPT = 0.25  # 4 m
 LETTER_COUNT, PEOPLE_COUNT = 4, 6
 
@@ -26,7 +26,7 @@ letters = rng.choice(list(string.ascii_uppercase), LETTER_COUNT, replace=False)
 
 
 def drawn(letter):
-    """Return a picture of a letter, (height, width, 3)."""
+    """Return an image of a letter, (height, width, 3) uint8."""
     picture = Image.new("RGB", (SIDE_PX, SIDE_PX), "white")
     place = (SIDE_PX / 2, SIDE_PX / 2)
     ImageDraw.Draw(picture).text(
@@ -36,7 +36,7 @@ def drawn(letter):
 
 
 def person():
-    """Draw the eye of somebody: what an optician would write down."""
+    """Return a random prescription profile."""
     return {
         "kind": "prescription",
         "sphere_dpt": round(float(rng.normal(-0.6, 0.7)), 2),
@@ -51,8 +51,8 @@ folder.mkdir(parents=True, exist_ok=True)
 camera = Camera.from_fov(FIELD_DEG, width_px=SIDE_PX, height_px=SIDE_PX)
 depth_m = np.full((SIDE_PX, SIDE_PX), 1.0 / DISTANCE_DPT, np.float32)
 settings = FilterSettings(
-    mode="on-axis",  # a picture of half a degree has one PSF everywhere
-    object_planes_dpt=(DISTANCE_DPT,),  # and one distance
+    mode="on-axis",  # an image of one degree has the same PSF everywhere
+    object_planes_dpt=(DISTANCE_DPT,),  # and a single distance
 )
 rows, pictures = [], []
 with EyeFilter("emmetropia", camera, settings) as eye:
@@ -76,6 +76,6 @@ with (folder / "labels.csv").open("w", newline="", encoding="utf-8") as file:
     writer = csv.DictWriter(file, rows[0].keys())
     writer.writeheader()
     writer.writerows(rows)
-print(f"{len(rows)} pictures of {PEOPLE_COUNT} people in {folder}")
+print(f"{len(rows)} images, seen by {PEOPLE_COUNT} people, in {folder}")
 enlarged = [(text, picture.repeat(2, 0).repeat(2, 1)) for text, picture in pictures]
 save_pictures("07_augment_data_set.png", enlarged, columns=2 * LETTER_COUNT)

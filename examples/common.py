@@ -1,7 +1,7 @@
-"""What the examples share: a scene to look at, and pictures in a row.
+"""Scene and contact sheet that the examples share.
 
-The scene is a courtyard of 480 x 270 pixels: color in a JPEG, distance in a 16-bit PNG
-of millimeters, in which 65535 stands for the sky.
+The scene is a courtyard of 480 x 270 pixels.  Its color is a JPEG file, and its depth a
+16-bit PNG file in millimeters, in which 65535 is the sky.
 """
 
 from pathlib import Path
@@ -13,7 +13,7 @@ from filter_service import Camera
 
 DATA = Path(__file__).parent / "data"
 OUT = Path("out/examples")
-FIELD_OF_VIEW_DEG = 50.0  # from the scene's lower to its upper edge
+FIELD_OF_VIEW_DEG = 50.0  # vertical
 SKY_MM = 65535
 
 CAPTION_PX = 26
@@ -21,7 +21,7 @@ GAP_PX = 6
 
 
 def load_courtyard():
-    """Return color (sRGB, 8 bits), distance in meters, and the camera."""
+    """Return color (8-bit sRGB), depth in meters, and the camera."""
     color = np.array(Image.open(DATA / "courtyard.jpg"))
     millimeters = np.array(Image.open(DATA / "courtyard_depth.png"))
     depth_m = np.where(millimeters == SKY_MM, np.inf, millimeters / 1000.0)
@@ -31,12 +31,12 @@ def load_courtyard():
 
 
 def font(size_px):
-    """Return the font that comes with Pillow."""
+    """Return Pillow's default font."""
     return ImageFont.load_default(size=size_px)
 
 
 def save_pictures(name, pictures, *, columns=2):
-    """Write pairs of caption and picture as one file, and say where it is."""
+    """Write (caption, image) pairs as one image file, and print its path."""
     height_px, width_px = pictures[0][1].shape[:2]
     columns = min(columns, len(pictures))
     rows = -(-len(pictures) // columns)

@@ -1,13 +1,13 @@
-"""A transform for PyTorch data sets: pictures as a person sees them.
+"""Transform for PyTorch data sets that filters images through an eye.
 
     transform = SeenThrough("myopia", vertical_fov_deg=40.0, distance_m=2.0)
     data_set = torchvision.datasets.ImageFolder("letters", transform=transform)
 
-A picture may be a PIL image, an array [row, column, channel] or a tensor [channel, row,
-column] of bytes or of floats from 0 to 1, sRGB as torchvision has them; what comes out
-is of the same kind.  A tuple of picture and depth in meters replaces the distance.
-Each worker of a `DataLoader` makes an eye of its own for its first picture, which takes
-a second or two.  PyTorch is imported only where a tensor comes in.
+The transform accepts a PIL image, an array [row, column, channel] or a tensor [channel,
+row, column], with sRGB values as bytes or as floats from 0 to 1, and returns the same
+kind.  Pass a tuple (image, depth in meters) to replace the constant distance.  Each
+`DataLoader` worker creates its own eye for its first image, which takes a second or
+two.  PyTorch is imported only for tensors.
 """
 
 import os
@@ -18,19 +18,20 @@ from filter_service import Camera, EyeFilter
 
 
 class SeenThrough:
-    """Filters pictures through one eye.
+    """Filter images through one eye.
 
     Parameters
     ----------
     profile : str, dict or Path
-        As `EyeFilter` takes it.
+        Profile, as for `EyeFilter`.
     vertical_fov_deg : float
-        How high the pictures are seen.
+        Vertical field of view of the images, deg.
     distance_m : float
-        Of pictures that come without depth; infinity is far away.
+        Distance of images without depth, m; may be infinite.
     pupil_diameter_mm, focus_dpt : float
-        State of the eye.
+        Entrance pupil, mm, and focus, dpt.
     settings : FilterSettings or dict, optional
+        Settings of the filter.
     """
 
     def __init__(
@@ -49,7 +50,7 @@ class SeenThrough:
         self._filters, self._pid = {}, None
 
     def __call__(self, picture):
-        """Return the picture, seen."""
+        """Return the filtered image, of the same type as the input."""
         picture, depth_m = picture if isinstance(picture, tuple) else (picture, None)
         is_tensor = type(picture).__module__.partition(".")[0] == "torch"
         color = np.asarray(picture)
@@ -79,7 +80,7 @@ class SeenThrough:
         return seen.color if is_bytes else encoded(seen.color)
 
     def _filter_of(self, width_px, height_px):
-        """Return the filter for a size; those of another process do not work here."""
+        """Return the filter for an image size; a forked process creates its own."""
         if self._pid != os.getpid():
             self._filters, self._pid = {}, os.getpid()
         size = width_px, height_px
@@ -91,17 +92,17 @@ class SeenThrough:
         return self._filters[size]
 
     def __getstate__(self):
-        """Return what goes to a worker: all but the filters."""
+        """Return the state to pickle, without the filters."""
         return {**vars(self), "_filters": {}, "_pid": None}
 
 
 def decoded(srgb):
-    """Return linear light of sRGB floats (IEC 61966-2-1)."""
+    """Return linear light for sRGB floats (IEC 61966-2-1)."""
     curve = ((np.maximum(srgb, 0.0) + 0.055) / 1.055) ** 2.4
     return np.where(srgb <= 0.04045, srgb / 12.92, curve).astype(np.float32)
 
 
 def encoded(linear):
-    """Return sRGB floats of linear light."""
+    """Return sRGB floats for linear light."""
     curve = 1.055 * np.clip(linear, 0.0, 1.0) ** (1.0 / 2.4) - 0.055
     return np.where(linear <= 0.0031308, 12.92 * linear, curve).astype(np.float32)

@@ -1,17 +1,17 @@
-"""A stimulus for PsychoPy: a picture as a person sees it.
+"""PsychoPy stimulus that shows an image filtered through an eye.
 
     stimulus = visual.SeenImageStim(
         window, image="room.png", profile="keratoconus", verticalFov=20, distance=0.57
     )
     stimulus.setEye(pupilDiameter=5, focus=1.75)
 
-It is an `ImageStim` whose picture goes through an eye first.  Depth in meters, as an
-array or a file, replaces the distance.  Shown at its vertical field of view, it gives
-an observer without refractive error the retinal image of the other eye, as far as
-diffraction and the observer's own aberrations allow.
+`SeenImageStim` is an `ImageStim` that filters its image first.  Pass depth in meters,
+as an array or a file, instead of a constant distance.  If the stimulus is shown at its
+vertical field of view, an observer without refractive error receives the retinal image
+of the simulated eye, limited by diffraction and the observer's own aberrations.
 
-`pip install examples/adapters` registers it with PsychoPy, as `visual.SeenImageStim`.
-The filter is imported with the first stimulus: an unused plugin costs nothing.
+`pip install examples/adapters` registers the class as `psychopy.visual.SeenImageStim`.
+The filter is imported with the first stimulus, so an unused plugin costs nothing.
 """
 
 from pathlib import Path
@@ -21,22 +21,31 @@ from psychopy.visual import ImageStim
 
 
 class SeenImageStim(ImageStim):
-    """A picture seen through an eye.
+    """Image filtered through an eye.
 
     Parameters
     ----------
     win : psychopy.visual.Window
+        Window to draw in.
     image : str, Path or (height, width, 3) uint8 sRGB
+        Image to filter.
     profile : str, dict or Path
-        As `filter_service.EyeFilter` takes it.
+        Profile, as for `filter_service.EyeFilter`.
     verticalFov : float
-        Of the picture, deg.
-    distance, depth : float, or (height, width) or a file
-        Meters; one of them.
+        Vertical field of view of the image, deg.
+    distance : float, optional
+        Distance of the image, m.
+    depth : (height, width), str or Path, optional
+        Depth, m, instead of the distance.
     pupilDiameter, focus : float
-        Millimeters and diopters.
+        Entrance pupil, mm, and focus, dpt.
     kwargs
-        As `ImageStim` has them.
+        Further arguments of `ImageStim`.
+
+    Raises
+    ------
+    ValueError
+        Neither or both of `distance` and `depth` are given.
     """
 
     def __init__(
@@ -69,16 +78,16 @@ class SeenImageStim(ImageStim):
         super().__init__(win, image=self._seen(pupilDiameter, focus), **kwargs)
 
     def setEye(self, pupilDiameter, focus):
-        """Show the picture in another state of the eye."""
+        """Filter the image again, with another pupil and focus."""
         self.setImage(self._seen(pupilDiameter, focus), log=False)
 
     def setProfile(self, profile, pupilDiameter, focus):
-        """Show the picture through another eye."""
+        """Filter the image again, through another eye."""
         self._eye.set_profile(profile)
         self.setEye(pupilDiameter, focus)
 
     def _seen(self, pupil_diameter_mm, focus_dpt):
-        """Return the picture as PsychoPy has arrays: -1 to 1, bottom row first."""
+        """Return the filtered image as a PsychoPy array: -1 to 1, bottom row first."""
         seen = self._eye.filter(
             self._color,
             self._depth_m,

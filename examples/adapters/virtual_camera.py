@@ -1,10 +1,11 @@
-"""A virtual camera: video as a person sees it, for any program that shows a webcam.
+"""Virtual camera that shows a video through an eye in any program that uses a webcam.
 
     python examples/adapters/virtual_camera.py walk.mp4 --profile cataract
 
-Reads a video in a loop, without depth at `--distance-m`, and sends each frame on as a
-camera's.  Wants `pip install av pyvirtualcam`; on Linux also the kernel module, once
-with `sudo modprobe v4l2loopback`; on Windows and macOS the virtual camera of OBS.
+The program reads a video in a loop, filters each frame at the distance `--distance-m`
+and sends it to a virtual camera.  It requires `pip install av pyvirtualcam`.  On Linux
+it also requires the kernel module v4l2loopback (`sudo modprobe v4l2loopback`), and on
+Windows and macOS the OBS virtual camera.
 """
 
 import argparse
@@ -23,16 +24,23 @@ except ModuleNotFoundError as error:
 parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
 parser.add_argument("video")
 parser.add_argument("--profile", default="myopia")
-parser.add_argument("--fov-deg", type=float, default=50.0, help="vertical (50)")
-parser.add_argument("--distance-m", type=float, default=2.0, help="of the scene (2)")
+parser.add_argument(
+    "--fov-deg",
+    type=float,
+    default=50.0,
+    help="vertical field of view, deg (default: 50)",
+)
+parser.add_argument(
+    "--distance-m", type=float, default=2.0, help="distance of the scene (default: 2)"
+)
 parser.add_argument("--pupil-mm", type=float, default=4.0)
 parser.add_argument("--focus-dpt", type=float, default=0.0)
-parser.add_argument("--frames", type=int, help="how many; endless if not given")
+parser.add_argument("--frames", type=int, help="number of frames (default: unlimited)")
 options = parser.parse_args()
 
 
 def frames():
-    """Yield the video's frames, (height, width, 3), again and again."""
+    """Yield the frames of the video, (height, width, 3), in an endless loop."""
     while True:
         with av.open(options.video) as container:
             for frame in container.decode(video=0):
@@ -54,7 +62,7 @@ try:
 except RuntimeError as error:
     sys.exit(f"virtual_camera: {' '.join(str(error).split())}")
 with device, EyeFilter(options.profile, lens) as eye:
-    print(f"{device.device}: {size[0]}x{size[1]}, {rate_hz:g} frames/s; Ctrl-C ends it")
+    print(f"{device.device}: {size[0]}x{size[1]}, {rate_hz:g} frames/s; Ctrl-C to stop")
     try:
         for n, frame in enumerate(frames()):
             if n == options.frames:
@@ -62,4 +70,4 @@ with device, EyeFilter(options.profile, lens) as eye:
             device.send(eye.filter(frame, depth_m, **state, whole=n == 0).color)
             device.sleep_until_next_frame()
     except KeyboardInterrupt:
-        print("ended")
+        print("stopped")
