@@ -1,4 +1,4 @@
-"""Packages and compiled parts; pyproject.toml has everything else."""
+"""Packages and C extensions; pyproject.toml contains all other metadata."""
 
 from glob import glob
 
@@ -10,14 +10,15 @@ FLAGS = ["-std=gnu11", "-g0", "-fvisibility=hidden"]
 setup(
     packages=[
         *find_packages(include=["clients*", "estimator*", "filter_service*"]),
-        # inside the package in a wheel, beside it in a checkout
+        # part of filter_service in a wheel, but a top-level folder in a checkout
         "filter_service.shaders",
         "filter_service.shaders.common",
         "filter_service.shaders.passes",
     ],
     package_dir={"filter_service.shaders": "shaders"},
-    # Both are loaded by ctypes and optional: without a C compiler the engine is gl, and
-    # dropping messages of millions of parts takes ten times as long.
+    # Both libraries are optional and loaded with ctypes.  Without a C compiler, the
+    # engine is gl, and dropping messages with millions of parts takes ten times as
+    # long.
     ext_modules=[
         Extension(
             "filter_service.native._loops",

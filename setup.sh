@@ -1,38 +1,40 @@
 #!/bin/sh
-# Makes a bare Debian or Ubuntu machine ready; the Makefile calls it first.
+# Set up a bare Debian or Ubuntu machine.  The Makefile targets run this script first.
 #
-#   sh setup.sh         the Python environment in .venv and the system libraries
-#   sh setup.sh test    the same, a virtual screen for the window test, and Node
-#   sh setup.sh training  the first, and what training the networks needs (torch)
-#   sh setup.sh batch-ray the first, and Ray in an environment of its own
-#   sh setup.sh examples  an environment of its own that has the package and Jupyter
-#   sh setup.sh page    the first, and what `ocufilter web` needs
-#   sh setup.sh web     the same, and a browser for its tests
-#   sh setup.sh docs    the first, and what builds the documentation
-#   sh setup.sh witness   the first, and a path tracer in an environment of its own
+#   sh setup.sh            the Python environment in .venv and the system libraries
+#   sh setup.sh test       also a virtual display for the window test, and Node
+#   sh setup.sh training   also the packages for training the networks (torch)
+#   sh setup.sh batch-ray  also a separate environment with Ray
+#   sh setup.sh page       also the packages for `ocufilter web`
+#   sh setup.sh web        also those packages and a browser for the web tests
+#   sh setup.sh docs       also a separate environment with MkDocs
+#   sh setup.sh witness    also a separate environment with a path tracer
+#   sh setup.sh examples   only a separate environment with the package and Jupyter
 #
-# Running it again costs a fraction of a second: the environment is installed anew only
-# when this file, setup.py, pyproject.toml, constraints.txt, the sources in C or the
-# folder has changed.
+# Running the script again takes a fraction of a second: it reinstalls the environment
+# only if this file, setup.py, pyproject.toml, constraints.txt, the C sources or the
+# path of the clone has changed.
 set -eu
 cd "$(dirname "$0")"
 
 SYSTEM_PACKAGES="libegl1 libgl1 libgl1-mesa-dri libgomp1"
+# for reports as PDF; the service does not need them
+REPORT_PACKAGES="libpango-1.0-0 libpangoft2-1.0-0 libharfbuzz-subset0"
 C_PACKAGES="gcc libc6-dev"
 TEST_PACKAGES="xvfb"
 NODE_PACKAGES="nodejs npm"
-# what the modules with compiled loops import
+# imported by the modules with compiled loops
 COMPILER_PACKAGES="numpy scipy numba msgspec lazy-loader moderngl"
-# of `make witness`: nothing of the project imports it
+# for `make witness`; the project itself does not import them
 WITNESS_PACKAGES="mitsuba==3.9.1 numpy"
 WITNESS_LLVM_PACKAGES="libllvm19 libllvm18 libllvm17 libllvm16"
 WITNESS_VENV=.witness
 RAY_VENV=.batch_ray
 DOCS_VENV=.docs
 EXAMPLES_VENV=.examples
-# of `make docs`
+# for `make docs`
 DOCS_PACKAGES="mkdocs-material mkdocstrings[python]"
-# of `make test-web`
+# for `make test-web`
 BROWSER_PACKAGES="chromium fonts-dejavu-core"
 VENV=.venv
 STAMP=$VENV/.ocufilter-installed
@@ -48,10 +50,10 @@ missing_packages() {
     for package in "$@"; do
         status=$(dpkg-query -W -f '${Status}' "$package" 2>/dev/null || true)
         case $status in *"ok installed") ;; *) echo "$package" ;; esac
-    done | xargs # on one line
+    done | xargs # join the lines
 }
 
-apt_prefix() { # what to put before apt-get, or failure when we may not run it
+apt_prefix() { # print the prefix for apt-get; fail if this user may not run it
     if [ "$(id -u)" = 0 ]; then
         echo env
     elif command -v sudo >/dev/null && sudo -n true 2>/dev/null; then
@@ -80,54 +82,54 @@ install_command() { echo "sudo apt-get update && sudo apt-get install -y $*"; }
 
 install_system_libraries() {
     if ! command -v dpkg-query >/dev/null; then
-        say "not a Debian system: EGL, OpenGL (Mesa) and libgomp must be there already"
+        say "not a Debian system: EGL, OpenGL (Mesa) and libgomp must be installed"
         return
     fi
-    missing=$(missing_packages $SYSTEM_PACKAGES)
+    missing=$(missing_packages $SYSTEM_PACKAGES $REPORT_PACKAGES)
     if [ -n "$missing" ] && ! apt_install $missing; then
-        say "these system packages are missing: $missing"
-        say "install them, then start again:  $(install_command "$missing")"
+        say "missing system packages: $missing"
+        say "install them and run this again:  $(install_command "$missing")"
         exit 1
     fi
 }
 
 can_compile() { echo 'int main(void) { return 0; }' | cc -x c -o /dev/null - 2>/dev/null; }
 
-install_c_compiler() { # for the native engine; without it Mesa filters, 20 times slower
+install_c_compiler() { # for the native engine; Mesa is 20 times slower
     if can_compile; then return; fi
     if command -v dpkg-query >/dev/null && apt_install $C_PACKAGES; then return; fi
-    say "without a C compiler frames go through OpenGL alone, slowly where there is no" \
-        "GPU; to have one:  $(install_command "$C_PACKAGES")"
+    say "no C compiler: frames will be filtered with OpenGL, which is slow without a" \
+        "GPU; to install one:  $(install_command "$C_PACKAGES")"
 }
 
-install_test_packages() { # worth having, but the tests run without
+install_test_packages() { # optional: the tests also run without them
     command -v dpkg-query >/dev/null || return 0
     missing=$(missing_packages $TEST_PACKAGES)
     if [ -n "$missing" ] && ! apt_install $missing; then
-        say "without $missing the window test is skipped;" \
-            "to run it:  $(install_command "$missing")"
+        say "the window test will be skipped because $missing is missing;" \
+            "to install it:  $(install_command "$missing")"
     fi
 }
 
-install_javascript_client() { # its packages, for its test
+install_node_packages() { # of a folder, for a purpose
     if ! command -v npm >/dev/null; then
         apt_install $NODE_PACKAGES || true
     fi
     if ! command -v npm >/dev/null; then
-        say "without Node the test of the JavaScript client is skipped;" \
-            "to run it:  $(install_command "$NODE_PACKAGES")"
+        say "Node is missing, which $2 need;" \
+            "to install it:  $(install_command "$NODE_PACKAGES")"
         return
     fi
-    stamp=clients/js/node_modules/.ocufilter-installed
-    if cmp -s clients/js/package.json $stamp; then return; fi
-    say "installing the packages of the JavaScript client"
-    (cd clients/js && npm install --no-package-lock --silent --no-fund --no-audit)
-    cp clients/js/package.json $stamp
+    stamp=$1/node_modules/.ocufilter-installed
+    if cmp -s "$1/package.json" "$stamp"; then return; fi
+    say "installing the Node packages for $2"
+    (cd "$1" && npm install --no-package-lock --silent --no-fund --no-audit)
+    cp "$1/package.json" "$stamp"
 }
 
 # --- Python environment ------------------------------------------------------
 
-find_python() { # the first Python 3.11 or newer; asked, as a name alone may lie
+find_python() { # print the first Python 3.11 or newer; names may be wrong, so run it
     for name in python3 python3.13 python3.12 python3.11; do
         if "$name" -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
             2>/dev/null; then
@@ -135,14 +137,14 @@ find_python() { # the first Python 3.11 or newer; asked, as a name alone may lie
             return
         fi
     done
-    say "Python 3.11 or newer is needed:  $(install_command python3 python3-venv)"
+    say "Python 3.11 or newer is required:  $(install_command python3 python3-venv)"
     exit 1
 }
 
 make_venv() {
     python=$(find_python)
     if ! "$python" -c 'import ensurepip, venv' 2>/dev/null; then
-        say "$python has no venv module:  $(install_command python3-venv)"
+        say "$python has no venv module; run:  $(install_command python3-venv)"
         exit 1
     fi
     "$python" -m venv --clear $VENV
@@ -157,50 +159,48 @@ install_packages() {
     say "installing the pinned Python packages into $VENV (a minute or two)"
     pip="$VENV/bin/python -m pip -qq --disable-pip-version-check"
     $pip install -c constraints.txt $COMPILER_PACKAGES
-    compile_beside
-    say "installing the other packages meanwhile"
+    start_compiling
+    say "installing the other packages while the loops compile"
     $pip install -c constraints.txt setuptools
-    $pip install -c constraints.txt --no-build-isolation -e '.[clients,batch,dev]'
-    # apart and without its dependencies: it pins a PyOpenGL that is too old
-    $pip install --no-deps pyrender==0.1.45
+    $pip install -c constraints.txt --no-build-isolation -e '.[clients,batch,report,dev]'
     say "the packages are installed"
     trap - EXIT
-    wait "$compiling" || say "compiling failed: the service will do it when it starts"
+    wait "$compiling" || say "compiling failed; the service will compile when it starts"
     echo "$wanted" >$STAMP
 }
 
-compile_beside() { # numba's loops, a minute of two cores, while packages come
+start_compiling() { # numba's loops take a minute on two cores; run in parallel
     $VENV/bin/python -m filter_service.filtering.compile_loops &
     compiling=$!
     trap 'kill "$compiling" 2>/dev/null || true' EXIT
 }
 
-install_training_packages() { # on top of the others; the service never needs them
+install_training_packages() { # only for training; the service does not need them
     if [ "$(cat $TRAINING_STAMP 2>/dev/null || true)" = "$(cat $STAMP)" ]; then return; fi
-    say "installing torch and what exports networks (a few minutes)"
+    say "installing torch and the packages that export networks (a few minutes)"
     $VENV/bin/python -m pip -qq --disable-pip-version-check \
         install -c constraints.txt --no-build-isolation -e '.[training]'
     cp $STAMP $TRAINING_STAMP
 }
 
-install_ray() { # in an environment of its own that sees the first
+install_ray() { # in a separate environment that can import from .venv
     if [ -x $RAY_VENV/bin/python ] &&
         $RAY_VENV/bin/python -c 'import ray, clients' 2>/dev/null; then return; fi
     say "installing Ray into $RAY_VENV (half a minute)"
-    beside_venv $RAY_VENV
+    derive_venv $RAY_VENV
     $RAY_VENV/bin/python -m pip -qq --disable-pip-version-check \
         install -c constraints.txt ray
 }
 
-install_page() { # what `ocufilter web` needs; make test does not
+install_page() { # for `ocufilter web`; `make test` does not need it
     if [ "$(cat $PAGE_STAMP 2>/dev/null || true)" = "$(cat $STAMP)" ]; then return; fi
-    say "installing the packages of the page"
+    say "installing the packages for the web page"
     $VENV/bin/python -m pip -qq --disable-pip-version-check \
         install -c constraints.txt --no-build-isolation -e '.[web]'
     cp $STAMP $PAGE_STAMP
 }
 
-beside_venv() { # an environment of its own that sees the packages of the first
+derive_venv() { # create an environment that can also import from .venv
     $VENV/bin/python -m venv --clear "$1"
     where='import sysconfig; print(sysconfig.get_path("purelib"))'
     echo "import site; site.addsitedir('$($VENV/bin/python -c "$where")')" \
@@ -210,16 +210,16 @@ beside_venv() { # an environment of its own that sees the packages of the first
 install_docs() { # MkDocs
     if cmp -s constraints.txt $DOCS_VENV/constraints.txt; then return; fi
     say "installing MkDocs into $DOCS_VENV"
-    beside_venv $DOCS_VENV
+    derive_venv $DOCS_VENV
     $DOCS_VENV/bin/python -m pip -qq --disable-pip-version-check \
         install -c constraints.txt $DOCS_PACKAGES
     cp constraints.txt $DOCS_VENV/constraints.txt
 }
 
-install_browser() { # and what drives it
+install_browser() { # and the package that controls it
     missing=$(missing_packages $BROWSER_PACKAGES)
     if [ -n "$missing" ] && ! apt_install $missing; then
-        say "the browser's tests need one:  $(install_command "$missing")"
+        say "the web tests require a browser:  $(install_command "$missing")"
     fi
     $VENV/bin/python -c 'import playwright' 2>/dev/null ||
         $VENV/bin/python -m pip -qq --disable-pip-version-check \
@@ -230,12 +230,12 @@ has_new_llvm() { # Dr.Jit compiles with LLVM 16 or newer
     PATH="$PATH:/sbin:/usr/sbin" ldconfig -p | grep -Eq 'libLLVM(-|\.so\.)(1[6-9]|[2-9][0-9])'
 }
 
-install_witness() { # Mitsuba: a path tracer that the frames are compared with
+install_witness() { # Mitsuba, the path tracer that frames are compared with
     if ! has_new_llvm; then
         for package in $WITNESS_LLVM_PACKAGES; do
             if apt_install "$package"; then break; fi
         done
-        has_new_llvm || say "the path tracer needs LLVM 16 or newer:" \
+        has_new_llvm || say "the path tracer requires LLVM 16 or newer:" \
             "$(install_command "${WITNESS_LLVM_PACKAGES%% *}")"
     fi
     if [ -x $WITNESS_VENV/bin/python ] &&
@@ -246,7 +246,7 @@ install_witness() { # Mitsuba: a path tracer that the frames are compared with
         install $WITNESS_PACKAGES
 }
 
-install_examples() { # the package as users install it, apart from the checkout
+install_examples() { # the package as users install it, without the checkout
     wanted=$(pwd; cksum setup.sh setup.py pyproject.toml constraints.txt
         find estimator filter_service clients shaders -type f ! -name '*.so' \
             ! -path '*/__pycache__/*' ! -path '*/node_modules/*' -exec cksum {} +)
@@ -270,7 +270,7 @@ install_packages
 if [ "${1:-}" = training ]; then install_training_packages; fi
 if [ "${1:-}" = test ]; then
     install_test_packages
-    install_javascript_client
+    install_node_packages clients/js "the tests of the JavaScript client"
 fi
 if [ "${1:-}" = batch-ray ]; then install_ray; fi
 if [ "${1:-}" = page ]; then install_page; fi
@@ -278,5 +278,6 @@ if [ "${1:-}" = docs ]; then install_docs; fi
 if [ "${1:-}" = web ]; then
     install_page
     install_browser
+    install_node_packages tests/web "the accessibility checks of the web tests"
 fi
 if [ "${1:-}" = witness ]; then install_witness; fi

@@ -1,24 +1,24 @@
-"""The client library, the command line, and the programs of its commands.
+"""Client library, command line, and the programs behind its commands.
 
-Importing this package loads nothing but names.
+The package imports its modules only when their names are used.
 
     filter_client    `FilterClient`: the client library
     frame_packer     packing of frames for the wire
-    link             the client's side of the protocol
-    connection       the client's socket
-    shared_memory    memory shared with a service on the same machine
-    service_process  a service in a child process
-    hello            a minimal client
-    batch/           `ocufilter batch`: data sets filtered offline
-    headset/         a scene in an OpenXR headset, each eye with its own profile
-    natural_eye      pupil and focus that follow light and distance
-    frame_log        statistics of a stream's frames
-    arguments        profiles, settings and sizes on command lines
-    pyrender_stream  a scene streamed through a running service
-    demo             two scenes through six eyes
-    scenes/          two scenes and a letter chart
+    link             client side of the protocol
+    connection       socket of the client
+    shared_memory    images in memory shared with a service on the same machine
+    service_process  service in a child process
+    hello            minimal client
+    batch/           `ocufilter batch`: offline filtering of data sets
+    headset/         `ocufilter headset`: a scene in an OpenXR headset
+    natural_eye      eye whose pupil and focus follow light and distance
+    frame_log        statistics of streams
+    arguments        parsers of profiles, settings and sizes on command lines
+    pyrender_stream  streaming of a scene through a running service
+    demo             `ocufilter demo`: two scenes through six eyes
+    scenes/          two scenes, a letter chart, and their rendering
     report/          `ocufilter report`
-    commands/        the command line, `ocufilter`
+    commands/        command line `ocufilter`
     web/             `ocufilter web`: a page in a browser
     figures/         figures of an eye, for reports and web pages
 """

@@ -1,4 +1,4 @@
-"""Parsers of command-line values shared by several programs."""
+"""Parsers of command-line values that several programs share."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ MAX_ARGUMENT_BYTES = 1_000_000
 def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
     """Return a profile from JSON text, a file, or the name of a preset.
 
-    A file is one of ``.json``, ``.abp`` and ``.csv``.  The service resolves names.
+    A file has the suffix ``.json``, ``.abp`` or ``.csv``.  The service resolves preset
+    names.
 
     Raises
     ------
     ValueError
-        If the profile cannot be read; the message names the option and the file.
+        If the profile cannot be read.  The message names the option and the file.
     """
     if text.lstrip().startswith("{"):
         return read_object(option, text)
@@ -57,7 +58,7 @@ def read_size_px(text: str, option: str = "--size") -> tuple[int, int]:
     Raises
     ------
     ValueError
-        If these are not two whole numbers of at least 16; the message names the option.
+        If these are not two integers of at least 16.  The message names the option.
     """
     parts = text.lower().split("x")
     if len(parts) != 2 or not all(p.isdigit() and int(p) >= 16 for p in parts):
@@ -68,7 +69,7 @@ def read_size_px(text: str, option: str = "--size") -> tuple[int, int]:
 
 
 def size_px_argument(text: str) -> tuple[int, int]:
-    """Call `read_size_px` as an argparse type, so that argparse shows its error."""
+    """Call `read_size_px` as an argparse type, whose errors argparse prints."""
     try:
         return read_size_px(text)
     except ValueError as error:

@@ -1,6 +1,6 @@
-"""A DEALER socket to the service, with connection state and zero-copy sends.
+"""DEALER socket to the service, with connection state and zero-copy sends.
 
-`filter_client` speaks the protocol over it; this module handles message parts only.
+This module handles message parts; `link` implements the protocol.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from zmq.utils.monitor import recv_monitor_message
 from filter_service.errors import ServiceTimeout
 from filter_service.keys import ClientKey
 
-COPY_BELOW_BYTES = 65536  # pyzmq copies smaller parts in any case
+COPY_BELOW_BYTES = 65536  # pyzmq always copies smaller parts
 MAX_BUFFERS_PER_SIZE = 8
 HEARTBEAT_INTERVAL_MS = 500
 HEARTBEAT_TIMEOUT_MS = 2000
@@ -26,8 +26,8 @@ RECONNECT_MAX_MS = 1000
 CLOSE_LINGER_MS = 200
 MAX_BROKEN_HANDSHAKES = 5
 SEND_HIGH_WATER_MARK = 64
-# The credit bounds results.  Only heartbeats, one every 5 s, add up while a program
-# does not read; beyond the mark the connection counts as dead.
+# The credit limits the number of results.  While a program does not read, only
+# heartbeats accumulate, one every 5 s; beyond the mark the connection counts as lost.
 RECEIVE_HIGH_WATER_MARK = 100_000
 
 _UP = zmq.EVENT_HANDSHAKE_SUCCEEDED
@@ -40,10 +40,10 @@ _HANDSHAKE_FAILED = (
 
 
 class SendBuffer:
-    """A buffer that one image is copied into and sent from.
+    """Buffer that an image is copied to and sent from.
 
-    Reusing an array right after a zero-copy send tears frames at the receiver
-    (2 of 100 measured), so a buffer is free again only when its tracker is done.
+    A buffer is free again only when its tracker is done.  Writing to an array right
+    after a zero-copy send corrupted 2 of 100 frames at the receiver.
     """
 
     def __init__(self, size_bytes: int) -> None:
@@ -53,21 +53,21 @@ class SendBuffer:
 
     @property
     def is_free(self) -> bool:
-        """Return whether the buffer is no longer read and can be reused."""
+        """Return whether the buffer can be reused."""
         if self.is_held:
             return False
         return self.tracker is None or self.tracker.done
 
 
 class SendBufferPool:
-    """A pool of send buffers by size; sizes that are no longer used are released."""
+    """Pool of send buffers by size, which releases sizes that are no longer used."""
 
     def __init__(self, timeout_s: float) -> None:
         self._timeout_s = timeout_s
         self._buffers: dict[int, list[SendBuffer]] = {}
 
     def copy_in(self, image: NDArray[Any]) -> tuple[SendBuffer, NDArray[Any]]:
-        """Return a held buffer and the image as an array inside it."""
+        """Copy an image to a buffer; return the buffer and the array in it."""
         buffer = self._take(image.nbytes)
         copy = buffer.memory.view(image.dtype).reshape(image.shape)
         np.copyto(copy, image)
@@ -87,7 +87,7 @@ class SendBufferPool:
         return buffer
 
     def _wait_for_one(self, buffers: list[SendBuffer]) -> SendBuffer | None:
-        """Wait until the oldest sent buffer is free; return None if all are held."""
+        """Wait for the oldest sent buffer; return None if none has been sent."""
         for buffer in buffers:
             if not buffer.is_held and buffer.tracker is not None:
                 try:
@@ -101,14 +101,14 @@ class SendBufferPool:
         return None
 
     def _forget_other_sizes(self, size_bytes: int) -> None:
-        """Release unused sizes once there are many: the camera has changed."""
+        """Release unused sizes if there are many, after changes of the camera."""
         for other in [size for size in self._buffers if size != size_bytes]:
             if len(self._buffers) > 8 and all(b.is_free for b in self._buffers[other]):
                 del self._buffers[other]
 
 
 class Connection:
-    """A DEALER socket that tracks whether the service is connected.
+    """DEALER socket that tracks whether the service is connected.
 
     Parameters
     ----------
@@ -142,20 +142,20 @@ class Connection:
         except zmq.ZMQError as error:
             self.close()
             raise ValueError(
-                f"endpoint is {endpoint!r} ({error}); a form that works is "
+                f"endpoint is {endpoint!r} ({error}); expected a form such as "
                 "tcp://127.0.0.1:5577"
             ) from None
 
     def _set_options(self) -> None:
         socket = self._socket
         socket.linger = 0
-        # Queue nothing for an absent service: frames would be stale.
+        # Frames queued for an absent service would be outdated.
         socket.immediate = True
         socket.sndhwm = SEND_HIGH_WATER_MARK
         socket.rcvhwm = RECEIVE_HIGH_WATER_MARK
         socket.reconnect_ivl = RECONNECT_INTERVAL_MS
         socket.reconnect_ivl_max = RECONNECT_MAX_MS
-        # Heartbeats detect a stopped service, but not a hung render loop (see ping).
+        # Heartbeats detect a stopped service, but not a hung render worker (see ping).
         socket.heartbeat_ivl = HEARTBEAT_INTERVAL_MS
         socket.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS
 
@@ -164,7 +164,7 @@ class Connection:
         self._poller.poll(max(0, round(timeout_s * 1000)))
 
     def changes(self) -> list[bool]:
-        """Return connection changes since the last call: True is up, False down."""
+        """Return the connection changes since the last call; True means connected."""
         changes = []
         while self._monitor.poll(0):
             event = recv_monitor_message(self._monitor)
@@ -179,8 +179,8 @@ class Connection:
                 self.is_up, self.state = False, "connection lost, reconnecting"
                 changes.append(False)
             else:
-                # A failure without a reason means a wrong key, or a service under
-                # attack that had to close connections.
+                # A failure without a reason means a wrong key, or that a service under
+                # attack closed the connection.
                 self._n_broken_handshakes += (
                     kind == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
                 )
@@ -188,7 +188,7 @@ class Connection:
                     kind != zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
                     or self._n_broken_handshakes >= MAX_BROKEN_HANDSHAKES
                 )
-                self.state = f"the service refused the handshake ({event['value']})"
+                self.state = f"the service rejected the handshake ({event['value']})"
         return changes
 
     def receive(self) -> list[zmq.Frame] | None:
@@ -202,10 +202,14 @@ class Connection:
         return parts
 
     def send(self, parts: Sequence[Any], buffers: Sequence[SendBuffer] = ()) -> bool:
-        """Send parts; return False if the connection cannot accept them now.
+        """Send a message; return False if the connection cannot accept it now.
 
-        ``buffers`` hold the memory of ``parts[1:]``, in order, and receive the
-        trackers.
+        Parameters
+        ----------
+        parts : sequence
+            Parts of the message.
+        buffers : sequence of SendBuffer
+            Buffers of ``parts[1:]``, in order, which receive the trackers.
         """
         last = len(parts) - 1
         for i, part in enumerate(parts):
@@ -219,8 +223,8 @@ class Connection:
             except zmq.Again:
                 if i == 0:
                     return False
-                # The connection broke inside the message.  libzmq discards everything
-                # up to the last part, so the remaining parts must still be sent; the
+                # The connection was lost within the message.  libzmq discards the rest
+                # up to the last part, so the remaining parts must still be sent.  The
                 # message counts as sent and is lost with the connection.
                 continue
             self.n_bytes_sent += n_bytes
@@ -229,14 +233,14 @@ class Connection:
         return True
 
     def describe(self) -> str:
-        """Return a phrase about the connection, for error messages."""
+        """Describe the state of the connection, for error messages."""
         if self.last_message_s is None:
-            return f"{self.state}; nothing was ever received"
+            return f"{self.state}; no message was received"
         silent_s = time.monotonic() - self.last_message_s
-        return f"{self.state}; the last message came {silent_s:.1f} s ago"
+        return f"{self.state}; the last message arrived {silent_s:.1f} s ago"
 
     def close(self) -> None:
-        """Close both sockets, with a linger of 0.2 s for a final bye."""
+        """Close the sockets; wait up to 0.2 s for the final bye to be sent."""
         self._socket.disable_monitor()
         self._monitor.close(linger=0)
         self._socket.close(linger=CLOSE_LINGER_MS if self.is_up else 0)

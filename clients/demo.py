@@ -1,4 +1,4 @@
-"""The demo: two scenes streamed through six eyes by its own service.
+"""Demo: two scenes streamed through six eyes by a service of its own.
 
 `ocufilter demo` runs it.  It writes a video, a contact sheet and latency.json.
 """
@@ -12,8 +12,9 @@ import platform
 import sys
 import textwrap
 import time
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,10 @@ from clients.arguments import size_px_argument
 from clients.demo_eyes import EYES
 from clients.extra import what_to_install
 from clients.filter_client import FilterClient, FilteredFrame
+from clients.frame_log import FrameLog
+from clients.pyrender_stream import path_settings
+from clients.scene_renderer import SceneFrame, scene_frames
+from clients.scenes.catalog import build_scene
 from clients.service_process import ServiceProcess
 from clients.sheet import (
     Cell,
@@ -35,6 +40,7 @@ from clients.sheet import (
     state_panel,
     video_frame,
 )
+from clients.streaming import change_eye, filter_in_order
 from filter_service.errors import FilterError, RenderFailed
 from filter_service.progress import Progress
 
@@ -42,11 +48,6 @@ if TYPE_CHECKING:
     from PIL import Image
 
 try:
-    from clients.frame_log import FrameLog
-    from clients.pyrender_stream import path_settings
-    from clients.scene_renderer import SceneFrame, scene_frames
-    from clients.scenes.catalog import build_scene
-    from clients.streaming import change_eye, filter_in_order
     from clients.video import write_video
 except ModuleNotFoundError as error:
     if __name__ != "__main__":
@@ -54,28 +55,48 @@ except ModuleNotFoundError as error:
     sys.exit(f"demo: {what_to_install(error)}")
 
 FRAMES_PER_SECOND = 12
-# Upper left corner of the detail that the sheet magnifies, in parts of width, height.
 DETAIL_CORNERS = {"courtyard": (0.32, 0.19), "primitives": (0.42, 0.30)}
+"""Upper left corner of the detail that the contact sheet magnifies, as fractions of the
+image's width and height."""
+
 LOG_TAIL_LINES = 12
-START_TIMEOUT_S = 180.0  # a slow machine's first start compiles
+START_TIMEOUT_S = 180.0  # the first start compiles, which is slow on some machines
 
 
 class DemoFailed(Exception):
-    """The service failed; the message gives the reason and the last output."""
+    """The demo could not run; the message gives the reason."""
 
 
 @dataclass(frozen=True)
-class Shot:
-    """The rendered frames of one scene, and the index of the one on the sheet."""
+class DemoFrame:
+    """A rendered frame, the name of its scene, and whether the sheet shows it."""
 
     scene: str
-    frames: list[SceneFrame]
-    sheet_index: int
+    rendered: SceneFrame
+    is_on_sheet: bool
+
+    @property
+    def state(self) -> EyeState:
+        """Return the state of the eye, for captions."""
+        pupil_mm, focus_dpt = self.rendered.pupil_diameter_mm, self.rendered.focus_dpt
+        return EyeState(self.scene.title(), pupil_mm, focus_dpt)
 
 
 @dataclass
 class EyeFilm:
-    """Frames filtered through one eye: small images, and the sheet's in full size."""
+    """Frames filtered through one eye.
+
+    Attributes
+    ----------
+    small : list of arrays
+        All frames in the size of the video's cells.
+    full : dict
+        The contact sheet's frames by their positions, in full size.
+    log : FrameLog
+        Statistics of the frames.
+    change : dict
+        Figures of the change to this eye.
+    """
 
     small: list[NDArray[np.uint8]]
     full: dict[int, FilteredFrame]
@@ -89,7 +110,7 @@ def main(argv: list[str] | None = None) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     try:
         report = run(options)
-    except DemoFailed as error:
+    except (DemoFailed, FilterError) as error:
         sys.stderr.write(f"demo: {error}\n")
         return 1
     sys.stdout.write(json.dumps(report) + "\n" if options.json else _summary(report))
@@ -100,10 +121,20 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m clients.demo", description=__doc__.split("\n")[0]
     )
-    parser.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/demo"),
+        metavar="DIR",
+        help="output folder",
+    )
     parser.add_argument("--frames", type=int, default=60, help="frames for each eye")
     parser.add_argument(
-        "--size", type=size_px_argument, default="480x270", metavar="WxH"
+        "--size",
+        type=size_px_argument,
+        default="480x270",
+        metavar="WxH",
+        help="frame size in px",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
@@ -118,22 +149,23 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     Raises
     ------
     DemoFailed
-        If the service does not start, fails during the run or does not answer.
+        If the service does not start, fails during the run or does not reply.
+    FilterError
+        If the scenes cannot be rendered.
     """
     start_s = time.monotonic()
     with Progress("demo", quiet=options.json) as progress:
-        with _service() as service:  # starts while the scenes are rendered
-            shots = _rendered(options, progress)
+        with ServiceProcess(wait=False) as service:  # starts while scenes are rendered
+            frames = _rendered(options, progress)
             progress.task("Waiting for the service")
-            _await_ready(service)
-            server, films = _through(service, shots, options.size, progress)
-        video = _written(options, shots, films, progress)
+            server, films = _through(service, frames, options.size, progress)
+        video = _written(options, frames, films, progress)
     report = {
         "machine": {"cpu_count": os.cpu_count(), "platform": platform.platform()},
         "server": server,
         "size_px": list(options.size),
         "frames_per_eye": options.frames,
-        "scenes": {shot.scene: len(shot.frames) for shot in shots},
+        "scenes": Counter(frame.scene for frame in frames),
         "eyes": {
             eye.preset: film.log.summary() | {"eye_change": film.change}
             for eye, film in zip(EYES, films, strict=True)
@@ -147,196 +179,144 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     return report
 
 
-def _service() -> ServiceProcess:
-    """Start a service on a free port of this machine."""
-    return ServiceProcess(wait=False)
-
-
-def _await_ready(service: ServiceProcess) -> None:
-    try:
-        service.await_ready(START_TIMEOUT_S)
-    except RuntimeError as error:  # the message ends with the service's output
-        raise DemoFailed(str(error)) from None
-
-
 def _through(
     service: ServiceProcess,
-    shots: list[Shot],
+    frames: list[DemoFrame],
     size_px: tuple[int, int],
     progress: Progress,
 ) -> tuple[dict[str, Any], list[EyeFilm]]:
     """Stream through every eye; return the service's description and the films."""
     try:
+        service.await_ready(START_TIMEOUT_S)
         with FilterClient(service.endpoint, client_name="demo", timeout_s=30) as client:
             assert client.welcome is not None
             server = dict(client.welcome.server)
-            return server, _filmed(client, shots, size_px, progress)
+            return server, _filmed(client, frames, size_px, progress)
     except FilterError as error:
         tail = "\n".join(service.log.splitlines()[-LOG_TAIL_LINES:])
         text = textwrap.shorten(str(error), 300, placeholder=" ...")
-        raise DemoFailed(f"{text}\nThe service's last lines:\n{tail}") from None
+        raise DemoFailed(f"{text}\nThe last lines of the service:\n{tail}") from None
+    except RuntimeError as error:  # it did not start; the message ends with its output
+        raise DemoFailed(str(error)) from None
 
 
-def _rendered(options: argparse.Namespace, progress: Progress) -> list[Shot]:
+def _rendered(options: argparse.Namespace, progress: Progress) -> list[DemoFrame]:
     """Render both scenes: two thirds of the frames Courtyard, one third Primitives."""
     n_courtyard = max(1, round(options.frames * 2 / 3))
     task = progress.task("Rendering the scenes", total=options.frames)
-    shots = []
-    # The sheet shows the courtyard with a wide pupil and far focus (middle of the path)
-    # and the primitives focused on the letter.
-    for name, count, share in (
-        ("courtyard", n_courtyard, 0.5),
-        ("primitives", options.frames - n_courtyard, 0.0),
+    frames = []
+    # The sheet shows Courtyard with a wide pupil and far focus (the middle of the path)
+    # and Primitives focused on the letter (its beginning).
+    for name, count, sheet_index in (
+        ("courtyard", n_courtyard, (n_courtyard - 1) // 2),
+        ("primitives", options.frames - n_courtyard, 0),
     ):
-        if count == 0:
-            continue
-        frames = []
-        for frame in scene_frames(build_scene(name), None, count, options.size):
-            frames.append(frame)
-            task.advance()
-        shots.append(Shot(name, frames, int(share * (count - 1))))
-    return shots
+        if count:
+            rendered = scene_frames(build_scene(name), None, count, options.size)
+            for index, frame in enumerate(rendered):
+                frames.append(DemoFrame(name, frame, index == sheet_index))
+                task.advance()
+    return frames
 
 
 def _filmed(
     client: FilterClient,
-    shots: list[Shot],
+    frames: list[DemoFrame],
     size_px: tuple[int, int],
     progress: Progress,
 ) -> list[EyeFilm]:
     """Stream every frame through every eye, continuing while the eye changes."""
-    frames = [frame for shot in shots for frame in shot.frames]
-    settings = path_settings(*(shot.scene for shot in shots))
+    rendered = [frame.rendered for frame in frames]
+    settings = path_settings(*{frame.scene for frame in frames})
     films: list[EyeFilm] = []
     for eye in EYES:
-        task = progress.task(eye.title, total=1.0, unit="%")
         change = change_eye(
             client,
             {"kind": "preset", "name": eye.preset},
             settings=settings,
-            frames=frames,
+            frames=rendered,
             has_eye=bool(films),
-            on_progress=task.update,
+            on_progress=progress.task(eye.title, total=1.0, unit="%").update,
         )
         task = progress.task(eye.title, total=len(frames))
-        film = EyeFilm([], {}, FrameLog(), change.summary())
-        wanted = _sheet_positions(shots)
-        cell_px = cell_size_px(size_px)
-        stream = filter_in_order(client, frames, film.log)
-        for position, (_, answer) in enumerate(stream):
-            if answer.header.generation != change.generation:
+        film = EyeFilm([], {}, FrameLog(), change)
+        answers = filter_in_order(client, rendered, film.log)
+        for position, (frame, answer) in enumerate(zip(frames, answers, strict=True)):
+            if answer.header.generation != change["generation"]:
                 raise RenderFailed(
-                    f"a frame came back with generation {answer.header.generation} "
-                    f"after {change.generation} was ready"
+                    f"a frame was filtered with generation {answer.header.generation} "
+                    f"after {change['generation']} was ready"
                 )
-            film.small.append(fitted(answer.color, cell_px).copy())
-            if position in wanted:
+            film.small.append(fitted(answer.color, cell_size_px(size_px)).copy())
+            if frame.is_on_sheet:
                 film.full[position] = answer
             task.advance()
         films.append(film)
     return films
 
 
-def _sheet_positions(shots: list[Shot]) -> list[int]:
-    """Return the positions of the sheet's frames among all frames."""
-    starts = np.cumsum([0, *(len(shot.frames) for shot in shots)])
-    return [
-        int(start) + shot.sheet_index
-        for start, shot in zip(starts, shots, strict=False)
-    ]
-
-
 def _written(
     options: argparse.Namespace,
-    shots: list[Shot],
+    frames: list[DemoFrame],
     films: list[EyeFilm],
     progress: Progress,
 ) -> Path:
     """Write the contact sheet and the video; return the video's path."""
     progress.task("Writing the contact sheet")
-    _contact_sheet(shots, films, options.size).save(options.out / "contact_sheet.png")
-    n_frames = sum(len(shot.frames) for shot in shots)
-    task = progress.task("Writing the video", total=n_frames)
+    cell_px = cell_size_px(options.size)
+    _contact_sheet(frames, films, cell_px).save(options.out / "contact_sheet.png")
+    task = progress.task("Writing the video", total=len(frames))
 
     def pages() -> Iterator[NDArray[np.uint8]]:
-        for page in _video_pages(shots, films, options.size):
-            yield page
+        for position, frame in enumerate(frames):
+            cells = [Cell(fitted(frame.rendered.color, cell_px), "Input")]
+            for eye, film in zip(EYES, films, strict=True):
+                cells.append(Cell(film.small[position], eye.title))
+            yield video_frame(cells, frame.state, frame.rendered.depth_m)
             task.advance()
 
     return write_video(options.out / "demo", pages, FRAMES_PER_SECOND)
 
 
-def _video_pages(
-    shots: list[Shot], films: list[EyeFilm], size_px: tuple[int, int]
-) -> Iterator[NDArray[np.uint8]]:
-    cell_px = cell_size_px(size_px)
-    position = 0
-    for shot in shots:
-        for frame in shot.frames:
-            cells = [Cell(fitted(frame.color, cell_px), "Input")]
-            for eye, film in zip(EYES, films, strict=True):
-                cells.append(Cell(film.small[position], eye.title))
-            yield video_frame(cells, _state(shot, frame), frame.depth_m)
-            position += 1
-
-
-def _state(shot: Shot, frame: SceneFrame) -> EyeState:
-    return EyeState(shot.scene.title(), frame.pupil_diameter_mm, frame.focus_dpt)
-
-
 def _contact_sheet(
-    shots: list[Shot], films: list[EyeFilm], size_px: tuple[int, int]
+    frames: list[DemoFrame], films: list[EyeFilm], cell_px: tuple[int, int]
 ) -> Image.Image:
     blocks = []
-    for shot, position in zip(shots, _sheet_positions(shots), strict=True):
-        frame = shot.frames[shot.sheet_index]
-        state = _state(shot, frame)
-        cells = [
-            Cell(
-                frame.color,
-                "Input",
-                ("The picture as rendered:", "sharp at every distance."),
-            )
-        ]
+    for position, frame in enumerate(frames):
+        if not frame.is_on_sheet:
+            continue
+        corner = DETAIL_CORNERS[frame.scene]
+        lines: tuple[str, ...] = ("The image as rendered:", "sharp at every distance.")
+        cells = [_cell(frame.rendered.color, "Input", lines, corner, cell_px)]
         for eye, film in zip(EYES, films, strict=True):
-            answer = film.full[position]
-            used = replace(
-                state,
-                pupil_diameter_mm=answer.header.pupil_diameter_mm,
-                focus_dpt=answer.header.focus_dpt,
-            )
-            cells.append(
-                Cell(
-                    answer.color,
-                    eye.title,
-                    (_used(state, used), *eye.look_for[shot.scene]),
-                )
-            )
-        cell_px = cell_size_px(size_px)
-        cells = [
-            replace(
-                cell,
-                image=fitted(cell.image, cell_px),
-                detail=magnified(cell.image, DETAIL_CORNERS[shot.scene], cell_px),
-            )
-            for cell in cells
-        ]
-        panel = state_panel(cell_px, state, frame.depth_m)
-        cells.append(
-            Cell(
-                panel, "Pupil, focus, depth", ("Below each picture: a part, enlarged.",)
-            )
-        )
-        blocks.append((f"{state.scene}: {state.text()}", cells))
-    return contact_sheet(blocks, "What six eyes see of the same frame")
+            seen = film.full[position]
+            lines = (_used(frame.state, seen), *eye.look_for[frame.scene])
+            cells.append(_cell(seen.color, eye.title, lines, corner, cell_px))
+        panel = state_panel(cell_px, frame.state, frame.rendered.depth_m)
+        lines = ("Below each image: a detail, enlarged.",)
+        cells.append(Cell(panel, "Pupil, focus, depth", lines))
+        blocks.append((f"{frame.state.scene}: {frame.state.text()}", cells))
+    return contact_sheet(blocks, "One frame through six eyes")
 
 
-def _used(asked: EyeState, used: EyeState) -> str:
+def _cell(
+    image: NDArray[np.uint8],
+    title: str,
+    lines: tuple[str, ...],
+    corner: tuple[float, float],
+    cell_px: tuple[int, int],
+) -> Cell:
+    detail = magnified(image, corner, cell_px)
+    return Cell(fitted(image, cell_px), title, lines, detail)
+
+
+def _used(requested: EyeState, seen: FilteredFrame) -> str:
     """Describe the state used, which far point and measured pupil may limit."""
-    text = used.text()
-    if used.focus_dpt > asked.focus_dpt + 0.05:
-        text += " at the farthest"
-    if used.pupil_diameter_mm < asked.pupil_diameter_mm - 0.05:
+    pupil_mm, focus_dpt = seen.header.pupil_diameter_mm, seen.header.focus_dpt
+    text = EyeState("", pupil_mm, focus_dpt).text()
+    if focus_dpt > requested.focus_dpt + 0.05:
+        text += " (far point)"
+    if pupil_mm < requested.pupil_diameter_mm - 0.05:
         text += " (measured pupil)"
     return text
 

@@ -1,11 +1,11 @@
-"""The eyes of the demo, with captions on what to look for in each."""
+"""The demo's eyes, with captions that say what to look for in each."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class DemoEye:
-    """A preset, its title, and two lines of caption for each scene."""
+    """A preset, its title, and two caption lines for each scene."""
 
     preset: str
     title: str
@@ -15,14 +15,14 @@ class DemoEye:
 EYES = (
     DemoEye(
         "emmetropia",
-        "Emmetropia: no error",
+        "Emmetropia: no refractive error",
         {
             "courtyard": (
-                "Sharp where it looks; the sides of the view,",
-                "and leaves and cup close by, are softer.",
+                "Sharp at the fixated distance; the periphery",
+                "and the leaves and cup close by are softer.",
             ),
             "primitives": (
-                "It looks at the letter: that is sharp.",
+                "Focused on the letter, which is sharp.",
                 "The ball, 12 to 19 cm away, is soft.",
             ),
         },
@@ -33,11 +33,11 @@ EYES = (
         {
             "courtyard": (
                 "Nothing beyond 16 cm can be sharp: sign and",
-                "menus are gone, lamps are faint discs.",
+                "menus are unreadable, lamps are faint discs.",
             ),
             "primitives": (
-                "The ball is sharp, the cube nearly,",
-                "the letter is lost in blur.",
+                "The ball is sharp, the cube nearly so,",
+                "and the letter is lost in blur.",
             ),
         },
     ),
@@ -46,12 +46,12 @@ EYES = (
         "Astigmatism, with myopia",
         {
             "courtyard": (
-                "More blur than myopia, and wider across than",
-                "up and down: upright window bars vanish.",
+                "More blur than myopia, and more across than",
+                "up and down: vertical window bars vanish.",
             ),
             "primitives": (
-                "Upright edges and the bars' ends blur more",
-                "than the bars' upper and lower edges.",
+                "Vertical edges and the ends of the bars blur",
+                "more than their upper and lower edges.",
             ),
         },
     ),
@@ -60,12 +60,12 @@ EYES = (
         "Keratoconus",
         {
             "courtyard": (
-                "Words stay readable but throw a ghost",
-                "downward; lamps have tails.",
+                "Words stay readable but have a ghost image",
+                "below; lamps have tails.",
             ),
             "primitives": (
                 "The bars fade above and below, their ends",
-                "hardly: the blur is lopsided.",
+                "hardly: the blur is asymmetric.",
             ),
         },
     ),
@@ -79,7 +79,7 @@ EYES = (
             ),
             "primitives": (
                 "Upper and lower edges of the bars fade,",
-                "upright edges stay crisp.",
+                "vertical edges stay crisp.",
             ),
         },
     ),
@@ -88,12 +88,12 @@ EYES = (
         "After presbyopic LASIK",
         {
             "courtyard": (
-                "Near menu and far sign are both readable,",
-                "each a little softer than without error.",
+                "The near menu and the far sign are both",
+                "readable, a little softer than in emmetropia.",
             ),
             "primitives": (
-                "The letter is nearly sharp; the ball,",
-                "close by, is soft and ringed.",
+                "The letter is nearly sharp; the ball close by",
+                "is soft, with rings.",
             ),
         },
     ),

@@ -1,16 +1,16 @@
-"""The client library: connect, send a profile and stream RGB-D frames.
+"""Client library: connect, send a profile and stream RGB-D frames.
 
     with FilterClient("tcp://127.0.0.1:5577") as client:
         client.set_profile("keratoconus", views=[camera])
         reply = client.filter(color, depth_m, pupil_diameter_mm=4.0, focus_dpt=0.0)
 
 `filter` sends one frame and waits for the result.  `submit` and `poll` are for live
-streams: at most ``max_in_flight`` frames are in flight, and the client queues only the
-newest of the others.  `poll` returns every submitted frame once, as a `FilteredFrame`,
+streams: at most ``max_in_flight`` frames are in flight, and of the others the client
+keeps only the newest.  `poll` returns each submitted frame once, as a `FilteredFrame`,
 a `Dropped` or an `ErrorReply`.
 
-After a restart of the service, the client reconnects and sends its profile again
-automatically.  Every wait has a timeout, whose error says what was awaited.
+After a restart of the service, the client reconnects and sends its profile again.
+Every wait has a timeout, whose error says what the client waited for.
 """
 
 from __future__ import annotations
@@ -72,21 +72,21 @@ DEFAULT_SETTINGS = FilterSettings()
 
 
 def _floats(pair: tuple[float, float]) -> tuple[float, float]:
-    """Convert numpy numbers to Python's; the service rejects anything but a pair."""
+    """Convert a pair of numbers, of NumPy for example, to floats."""
     try:
         return cast("tuple[float, float]", tuple(map(float, pair)))
     except (TypeError, ValueError):
         raise BadMessage(
-            f"it is {pair!r}", field="gaze_deg", allowed="two numbers"
+            f"is {pair!r}", field="gaze_deg", allowed="two numbers"
         ) from None
 
 
 EXTENDING_S = 0.03
-"""Delay between two tries of a frame whose state is being prepared."""
+"""Delay before a frame is sent again whose state is being prepared."""
 
 
 class FilterClient:
-    """A session with the filter service.  One thread at a time may use it.
+    """A session with the filter service, for use by one thread at a time.
 
     Parameters
     ----------
@@ -95,9 +95,9 @@ class FilterClient:
     timeout_s : float
         Default timeout of a reply.
     max_in_flight : int
-        Maximum number of frames in flight.  1 keeps a live stream freshest (the age of
-        a frame is 1.2 filter periods instead of 2.2); the service's credit, 2 by
-        default, gives the highest rate.
+        Maximum number of frames in flight.  With 1, frames of a live stream are the
+        most recent (an age of 1.2 filter periods instead of 2.2).  The highest frame
+        rate requires as many as the service's credit, 2 by default.
     client_name : str
         Name that appears in the service's log.
     shared_memory : bool
@@ -105,8 +105,8 @@ class FilterClient:
     key_file : Path or str, optional
         Key file written by ``ocufilter keys add``, for a service that requires keys.
     compression : "none" or "lz4"
-        Lossless compression of images and results without shared memory, for networks
-        slower than about a gigabit a second.
+        Lossless compression of images that are not in shared memory, for networks
+        slower than about 1 Gbit/s.
 
     Raises
     ------
@@ -148,7 +148,7 @@ class FilterClient:
         self._next_profile_id = 0
 
     def __enter__(self) -> FilterClient:
-        """Connect and wait until the service has answered hello."""
+        """Connect and wait until the service replies to hello."""
         try:
             self.hello()
         except BaseException:
@@ -161,7 +161,7 @@ class FilterClient:
         self.close()
 
     def hello(self, timeout_s: float | None = None) -> Welcome:
-        """Wait until the service answers hello; return its welcome.
+        """Wait until the service replies to hello; return its welcome message.
 
         Raises
         ------
@@ -169,12 +169,12 @@ class FilterClient:
         """
         limit_s = self.timeout_s if timeout_s is None else timeout_s
         return self._link.wait_until(
-            lambda: self._link.welcome, limit_s, "an answer to hello"
+            lambda: self._link.welcome, limit_s, "a reply to hello"
         )
 
     @property
     def welcome(self) -> Welcome | None:
-        """Return the service's welcome message; None while not connected."""
+        """Return the welcome message of the service; None if not connected."""
         return self._link.welcome
 
     def close(self) -> None:
@@ -202,46 +202,47 @@ class FilterClient:
         on_progress: Callable[[Progress], None] | None = None,
         timeout_s: float = 120.0,
     ) -> Ready | Accepted:
-        """Change the eye; the previous one filters frames until the new one is ready.
+        """Change the eye; the service uses the previous eye until the new one is ready.
 
         Parameters
         ----------
         body : mapping or str
-            The profile, such as ``{"kind": "prescription", "sphere_dpt": -6}``, or the
-            name of a preset.
+            Profile, such as ``{"kind": "prescription", "sphere_dpt": -6}``, or the name
+            of a preset.
         eye : "both", "left" or "right"
-            Eye of the session to change: "both" is used for all views unless their
-            `ViewState` selects another; or the left or the right eye.
+            Eye of the session to change.  "both" applies to all views whose `ViewState`
+            does not select an eye.
         settings : FilterSettings or mapping, optional
             Settings, or the fields that differ from the defaults.
         views : camera or view, or several, optional
-            Cameras to prepare for.  Without them the service prepares for those of the
-            last frame; before the first frame there is nothing to prepare, and Accepted
-            is returned with ``is_building`` false.
+            Cameras to prepare for; by default, those of the last frame.  Before the
+            first frame there is nothing to prepare by default, and Accepted is returned
+            with ``is_building`` false.
         wait : bool or "first"
-            With True, return when the eye is complete; with "first", as soon as frames
-            can be filtered with the new eye, possibly by a preview; with False, as soon
-            as the profile is accepted.  `poll` returns each Progress and Ready that
-            follows.
+            With True, return when the eye is ready for all cameras; with "first", when
+            it is ready for one of them; with False, when the profile is accepted.
+            `poll` returns each later Progress and Ready.
         on_progress : callable, optional
             Called with each Progress while waiting.
+        timeout_s : float
+            Timeout of the wait.
 
         Raises
         ------
         UnknownProfile, GridTooLarge, BuildFailed, WorkerCrashed, ServiceTimeout
-            After any of them the previous eye stays in use.
+            The previous eye then remains in use.
         """
         if wait not in (True, False, "first"):
             raise ValueError(f"wait is {wait!r}; allowed: True, False or 'first'")
         previous = self._link.profiles.get(eye)
         request = self._request(body, eye, settings, views)
-        parts = encode(request)  # before any state changes: it may raise
+        parts = encode(request)  # may raise, so it precedes any change of state
         self.hello()
         self._ask(request, parts)
         try:
             return self._await_profile(request, wait, on_progress, timeout_s)
         except FilterError:
-            # A restart of the service sends the last good profile again.
+            # After a restart of the service, the last accepted profile is sent again.
             if previous is None:
                 self._link.profiles.pop(eye, None)
             else:
@@ -261,8 +262,8 @@ class FilterClient:
         Returns
         -------
         int
-            Profile id of the Accepted, Progress, Ready or ErrorReply that `poll`
-            returns.
+            Profile id of the events Accepted, Progress, Ready and ErrorReply that
+            `poll` returns.
         """
         request = self._request(body, eye, settings, views)
         self._ask(request, encode(request))
@@ -282,9 +283,9 @@ class FilterClient:
             body = {"kind": "preset", "name": body}
         if not isinstance(body, Mapping):
             raise BadMessage(
-                f"a {type(body).__name__}",
+                f"is a {type(body).__name__}",
                 field="profile",
-                allowed="a mapping, or a preset's name",
+                allowed="a mapping, or the name of a preset",
             )
         if eye not in EYE_NAMES:
             raise ValueError(f"eye is {eye!r}; allowed: {', '.join(EYE_NAMES)}")
@@ -296,7 +297,7 @@ class FilterClient:
         self._camera = next(iter(request.views), self._camera)
         self._next_profile_id += 1
         self._link.profiles[request.eye] = request
-        if self.welcome is not None:  # otherwise it is sent after hello
+        if self.welcome is not None:  # otherwise `_begin` sends it after hello
             self._link.say(parts)
 
     def _await_profile(
@@ -310,7 +311,7 @@ class FilterClient:
         deadline_s = time.monotonic() + timeout_s
         n_awaited = n_ready = 0
         while True:
-            # One at a time: events after the awaited one are left for the caller.
+            # One at a time, because later events are left for the caller.
             event = self._link.take_event(
                 lambda e: getattr(e, "profile_id", None) == profile_id
             )
@@ -348,10 +349,10 @@ class FilterClient:
         timeout_s: float | None = None,
         **options: Unpack[RenderOptionValues],
     ) -> FilteredFrame:
-        """Send one frame and return it filtered; `submit` describes the arguments.
+        """Send one frame and return it filtered; see `submit` for the parameters.
 
-        While the service prepares the eye for this camera or this state, or has just
-        restarted, the frame is sent again until the timeout.
+        The frame is sent again, until the timeout, while the service prepares the eye
+        for its camera or state, and after a restart of the service.
 
         Raises
         ------
@@ -382,7 +383,7 @@ class FilterClient:
                 self._await_ready(deadline_s)
             elif answer.reason == "extending":
                 if time.monotonic() > deadline_s:
-                    raise ServiceTimeout("waited in vain for PSFs of this state")
+                    raise ServiceTimeout("timed out waiting for PSFs of this state")
                 self._link.pump(EXTENDING_S)
 
     def _await_frame(
@@ -394,10 +395,10 @@ class FilterClient:
             )
             if isinstance(answer, FilteredFrame | Dropped | ErrorReply):
                 return answer
-            self._link.pump_before(deadline_s, f"frame {frame_id} to be answered")
+            self._link.pump_before(deadline_s, f"a reply to frame {frame_id}")
 
     def _await_ready(self, deadline_s: float) -> None:
-        """Wait for an eye that is being prepared; raise if its build fails."""
+        """Wait for an eye that is being prepared; raise if its preparation fails."""
         profile_ids = {p.profile_id for p in self._link.profiles.values()}
         while True:
             event = self._link.take_event(
@@ -429,34 +430,35 @@ class FilterClient:
         """Submit a frame without waiting; return its frame_id.
 
         The images are copied, so the caller may reuse its arrays at once, except those
-        of `lend_view`.  If the service is busy, the frame waits at the client and
-        replaces a frame that already waits, which is dropped with the reason
-        ``superseded``.
+        of `lend_view`.  If the service is busy, the client queues the frame in place of
+        one that is already queued, which is dropped with the reason ``superseded``.
 
         Parameters
         ----------
         color : (height, width, 3) array, RgbdView, or several views
             uint8 sRGB, or float32 or float16 linear light.
         depth_m : (height, width) float32, optional
-            View-space z in meters, required with an array of color, which is then
-            seen by the first camera of the profile; views include their depth.
+            View-space z in meters, required if ``color`` is an array.  The camera is
+            then the first one of the profile.
+        pupil_diameter_mm, focus_dpt : float
+            Entrance pupil, and focus in diopters.
         gaze_deg : (h, v), optional
             Gaze direction in the image, to the right and up from the camera's axis;
-            None uses the profile's settings.
+            None selects the profile's setting.
         output : {"srgb8", "linear", "linear16"}
             8-bit sRGB, or linear light in float32 or float16.
         prepared_only : bool
-            Deprecated, without effect: every frame shows the state that it asks for.
+            Deprecated, without effect: every frame shows the state that it requests.
         depth_encoding : {"float32", "float16", "dpt16", "mm16"}
-            Encoding of depth on the wire: meters; or, in half the bytes for a slow
-            network, meters or diopters in half precision, or whole millimeters.
+            Encoding of depth on the wire: meters as float32; or, in half the bytes for
+            slow networks, meters or diopters as float16, or integer millimeters.
         states : sequence of ViewState, optional
-            One for each view: the eye that sees it, and what differs from the frame's
-            pupil, focus and gaze; its pose is returned with the image.
+            One per view: the eye that sees it, and values that differ from the frame's
+            pupil, focus and gaze.  Its pose is returned with the image.
         display_time_ns : int, optional
-            Returned with the frame.
+            Value that is returned with the frame.
         **options
-            Fields of `RenderOptions`, see `EyeFilter.filter`.
+            Fields of `RenderOptions`; see `EyeFilter.filter`.
         """
         if depth_encoding not in DEPTH_ENCODINGS:
             raise ValueError(
@@ -468,7 +470,9 @@ class FilterClient:
         items = as_views(color, depth_m, self._camera)
         states = tuple(states) or (ViewState(),) * len(items)
         if len(states) != len(items):
-            raise ValueError(f"{len(states)} states; allowed: {len(items)}, as views")
+            raise ValueError(
+                f"{len(states)} states; allowed: {len(items)}, one per view"
+            )
         check_states(states, pupil_diameter_mm, focus_dpt)
         if self.welcome is not None:
             check_limits(items, self.welcome)
@@ -496,26 +500,28 @@ class FilterClient:
         dtype: str = "uint8",
         depth_kind: DepthKind = "planar",
     ) -> RgbdView:
-        """Return an empty view to render into, which `submit` need not copy.
+        """Return an empty view to render into, which `submit` does not copy.
 
-        Its arrays lie in shared memory if available; otherwise they are ordinary
-        arrays.  Do not modify the view between `submit` and the frame's reply: a live
-        stream alternates between two.
+        Its arrays are in shared memory if that is available, and ordinary arrays
+        otherwise.  Do not modify the view between `submit` and the reply; a live stream
+        alternates between two views.
 
         Parameters
         ----------
         camera : Camera
+            Camera of the view.
         dtype : "uint8", "float32" or "float16"
             Data type of the color.
         depth_kind : "planar" or "radial"
+            Meaning of the depth.
         """
         _ = self._link  # raises if closed
         return self._packer.lend_view(camera, dtype=dtype, depth_kind=depth_kind)
 
     def poll(self, timeout_s: float = 0.0) -> list[Event]:
-        """Return new events; wait up to ``timeout_s`` if there are none.
+        """Return the new events; wait up to ``timeout_s`` if there are none.
 
-        The list includes messages about profiles.
+        They include messages about profiles.
         """
         deadline_s = time.monotonic() + timeout_s
         self._link.pump(0.0)
@@ -528,27 +534,27 @@ class FilterClient:
 
     @property
     def n_unanswered(self) -> int:
-        """Return the number of submitted frames that wait or are in flight."""
+        """Return the number of submitted frames that are queued or in flight."""
         return len(self._link.in_flight) + (self._link.pending is not None)
 
     @property
     def n_bytes(self) -> tuple[int, int]:
-        """Return the total bytes of messages sent and received."""
+        """Return the total size in bytes of messages sent and received."""
         return self._link.n_bytes
 
     @property
     def n_superseded(self) -> int:
-        """Return the number of frames dropped at the client for a newer one."""
+        """Return the number of queued frames that newer ones replaced."""
         return self._link.n_superseded
 
     def ping(self, timeout_s: float | None = None) -> tuple[float, Pong]:
-        """Return (round trip in ms, state of the service's render worker)."""
+        """Return the round trip in ms, and the state of the service's render worker."""
         limit_s = self.timeout_s if timeout_s is None else timeout_s
         self.hello(limit_s)
         self._link.pongs.clear()
         start_s = time.monotonic()
         self._link.say(encode(Ping(start_s)))
         self._link.wait_until(
-            lambda: bool(self._link.pongs), limit_s, "an answer to ping"
+            lambda: bool(self._link.pongs), limit_s, "a reply to ping"
         )
         return 1000 * (time.monotonic() - start_s), self._link.pongs[-1]

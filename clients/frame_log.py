@@ -1,17 +1,29 @@
-"""Statistics of a stream's frames: times, drops, notes."""
+"""Statistics of a stream's frames: times, drops and notes."""
 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clients.filter_client import FilteredFrame
+if TYPE_CHECKING:
+    from clients.filter_client import FilteredFrame
 
-NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?")
+Notes = dict[str, dict[str, Any]]
+"""Number of frames and one example of each kind of note."""
+
+_NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?")
+
+
+def add_notes(notes: Notes, new: Sequence[str]) -> None:
+    """Count a frame's notes; notes that differ only in numbers are of one kind."""
+    for note in new:
+        kind = _NUMBER.sub("#", note)
+        notes.setdefault(kind, {"frames": 0, "example": note})["frames"] += 1
 
 
 @dataclass
@@ -21,8 +33,8 @@ class FrameLog:
     ages_ms: list[float] = field(default_factory=list)
     round_trips_ms: list[float] = field(default_factory=list)
     stages_ms: dict[str, list[float]] = field(default_factory=dict)
-    drops: dict[str, int] = field(default_factory=dict)
-    notes: dict[str, tuple[int, str]] = field(default_factory=dict)
+    drops: Counter[str] = field(default_factory=Counter)
+    notes: Notes = field(default_factory=dict)
 
     def add(self, answer: FilteredFrame) -> None:
         """Record a filtered frame."""
@@ -30,15 +42,7 @@ class FrameLog:
         self.round_trips_ms.append(answer.round_trip_ms)
         for stage, time_ms in answer.header.stage_times_ms.items():
             self.stages_ms.setdefault(stage, []).append(time_ms)
-        for note in answer.header.notes:
-            # The numbers in a note change with every frame: count notes by kind.
-            kind = NUMBER.sub("#", note)
-            count, example = self.notes.get(kind, (0, note))
-            self.notes[kind] = (count + 1, example)
-
-    def add_drop(self, reason: str) -> None:
-        """Record a dropped frame."""
-        self.drops[reason] = self.drops.get(reason, 0) + 1
+        add_notes(self.notes, answer.header.notes)
 
     def summary(self) -> dict[str, Any]:
         """Return counts, and p50, p95 and p99 of each stage, age and round trip."""
@@ -50,10 +54,7 @@ class FrameLog:
             "stages_ms": {
                 stage: percentiles(times) for stage, times in self.stages_ms.items()
             },
-            "notes": [
-                {"frames": count, "example": example}
-                for count, example in self.notes.values()
-            ],
+            "notes": list(self.notes.values()),
         }
 
 

@@ -1,7 +1,4 @@
-"""Packing of frames for the wire.
-
-Images go into shared memory, send buffers or compressed blocks.
-"""
+"""Packing of frames for the wire, into shared memory, buffers or compressed blocks."""
 
 from __future__ import annotations
 
@@ -39,9 +36,9 @@ class FramePacker:
     Parameters
     ----------
     link : ServiceLink
-        Link whose shared memory is used if available.
+        Connection whose shared memory is used if available.
     compression : "none" or "lz4"
-        Compression used without shared memory.
+        Compression of frames that are not in shared memory.
     timeout_s : float
         Timeout of a wait for a buffer.
     """
@@ -54,7 +51,7 @@ class FramePacker:
         self._pool = SendBufferPool(timeout_s)
 
     def packed(self, frame: Frame, items: Sequence[RgbdView]) -> Outgoing:
-        """Copy the images to shared memory or send buffers; return the message."""
+        """Copy images to shared memory or send buffers; return the message."""
         now_s = time.monotonic()
         per_view = [
             _as_sent(item, header.depth.encoding)
@@ -81,7 +78,7 @@ class FramePacker:
     def _in_shared_memory(
         self, frame: Frame, images: Sequence[NDArray[Any]]
     ) -> tuple[Frame, list[ClientSlot]] | None:
-        """Return a frame with its images in shared memory, and its slots."""
+        """Copy images to shared memory; return the frame and its slots, or None."""
         memory = self._link.memory
         if not memory.is_offered:
             return None
@@ -140,7 +137,7 @@ class FramePacker:
 
 
 def _as_sent(view: RgbdView, depth_encoding: str) -> list[NDArray[Any]]:
-    """Return the images of a view, with encoded depth."""
+    """Return the images of a view, with depth encoded for the wire."""
     if depth_encoding == "float32":
         return list(view.images)
     return [
@@ -150,12 +147,14 @@ def _as_sent(view: RgbdView, depth_encoding: str) -> list[NDArray[Any]]:
 
 
 def check_limits(views: Sequence[RgbdView], welcome: Welcome) -> None:
-    """Reject views for which the service would close the connection.
+    """Check views against the limits of the service.
+
+    The service would close the connection on receiving other views.
 
     Raises
     ------
     ValueError
-        If there are too many views or one is too large.
+        If there are too many views, or one is too large.
     """
     limits = welcome.limits
     if not 1 <= len(views) <= limits.max_views:

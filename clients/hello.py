@@ -1,4 +1,4 @@
-"""A minimal client: one image filtered by a running service.
+"""Minimal client: one image, filtered by a running service.
 
 ocufilter serve &
 python -m clients.hello blurred.png
@@ -16,7 +16,7 @@ WIDTH_PX, HEIGHT_PX = 480, 270
 
 
 def main(out: str = "hello.png", endpoint: str = "tcp://127.0.0.1:5577") -> None:
-    """Show a myopic eye a checkered wall: near on the left, far on the right."""
+    """Filter a checkered wall, near on the left and far on the right, for a myope."""
     rows, columns = np.indices((HEIGHT_PX, WIDTH_PX))
     squares = 255 * ((rows // 15 + columns // 15) % 2)
     color = np.repeat(squares[..., None], 3, axis=2).astype(np.uint8)  # sRGB

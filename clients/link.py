@@ -1,7 +1,7 @@
-"""The client's side of the protocol: handshake, frames in flight, events.
+"""Client side of the protocol: handshake, frames in flight and events.
 
-`filter_client` is the public interface; this module holds its state.  There is no
-thread: everything happens inside `ServiceLink.pump`.
+`filter_client` is the public interface to this module.  There are no threads: all work
+happens in `ServiceLink.pump`.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from filter_service.messages import (
 )
 
 MAX_KEPT_PROGRESS = 1000
-RETRY_SEND_S = 0.002  # a new connection accepts messages shortly after its event
+RETRY_SEND_S = 0.002  # a connection accepts messages shortly after its event
 
 _Found = TypeVar("_Found")
 
@@ -54,8 +54,18 @@ _Found = TypeVar("_Found")
 class FilteredFrame:
     """A filtered frame.
 
-    ``colors`` holds one image per view, and ``header`` the service's reply.
-    ``age_ms`` counts from `submit`, ``round_trip_ms`` from the send.
+    Attributes
+    ----------
+    frame_id : int
+        Id that `FilterClient.submit` returned.
+    colors : tuple of (h, w, 3) arrays
+        One image per view.
+    header : Result
+        Reply of the service.
+    age_ms : float
+        Time since `FilterClient.submit`.
+    round_trip_ms : float
+        Time since the frame was sent.
     """
 
     frame_id: int
@@ -66,7 +76,7 @@ class FilteredFrame:
 
     @property
     def color(self) -> NDArray[Any]:
-        """Return the first view's image, (height, width, 3)."""
+        """Return the image of the first view, (height, width, 3)."""
         return self.colors[0]
 
 
@@ -75,7 +85,7 @@ Event = FilteredFrame | Dropped | ErrorReply | Ready | Progress | Accepted
 
 @dataclass
 class Outgoing:
-    """A packed frame that waits to be sent or answered."""
+    """A packed frame that waits to be sent, or that is in flight."""
 
     frame_id: int
     parts: list[Any]
@@ -92,7 +102,7 @@ class Outgoing:
         self.parts, self.buffers = [], []
 
     def end(self) -> None:
-        """Release all resources: the frame is answered or lost."""
+        """Release all resources, after a reply or a lost connection."""
         self.release()
         for slot in self.slots:
             slot.release()
@@ -100,19 +110,21 @@ class Outgoing:
 
 
 class ServiceLink:
-    """State of a client's session.
+    """Session of a client.
 
     Parameters
     ----------
     endpoint : str
         Address that the service listens on.
     max_in_flight : int
-        Maximum number of frames in flight; the service's credit is a limit too.
+        Maximum number of frames in flight, which the service's credit may limit
+        further.
     client_name : str
         Name sent with hello.
     shared_memory : bool
-        Whether to use shared memory if offered.
+        Whether to use shared memory if the service offers it.
     key : ClientKey, optional
+        Key of the client, for a service that requires one.
     """
 
     def __init__(
@@ -141,17 +153,17 @@ class ServiceLink:
         self._refusal: FilterError | None = None
 
     def close(self) -> None:
-        """Send bye if connected, and close the socket."""
+        """Send bye if connected, then close the socket."""
         if self._connection.is_up:
             self._connection.send(encode(Bye()))
         self._connection.close()
 
     def say(self, parts: list[Any]) -> None:
-        """Send a control message as soon as the connection accepts it, in order."""
+        """Queue a control message; the queue is sent in order."""
         self._outbox.append(parts)
 
     def submit(self, outgoing: Outgoing) -> None:
-        """Queue a frame as the next to send; it supersedes one that still waits."""
+        """Queue a frame as the next to send, in place of one that is still queued."""
         if self.pending is not None:
             self.n_superseded += 1
             self._drop(self.pending, "superseded")
@@ -160,7 +172,7 @@ class ServiceLink:
 
     @property
     def n_bytes(self) -> tuple[int, int]:
-        """Return the total bytes of messages sent and received."""
+        """Return the total size in bytes of messages sent and received."""
         return self._connection.n_bytes_sent, self._connection.n_bytes_received
 
     def take_events(self) -> list[Event]:
@@ -176,13 +188,19 @@ class ServiceLink:
 
     @property
     def has_events(self) -> bool:
-        """Return whether there are events left to take."""
+        """Return whether there are events."""
         return bool(self._events)
 
     def wait_until(
         self, find: Callable[[], _Found | None], timeout_s: float, what: str
     ) -> _Found:
-        """Pump until ``find`` returns a true value; ServiceTimeout names ``what``."""
+        """Pump until ``find`` returns a true value, and return that value.
+
+        Raises
+        ------
+        ServiceTimeout
+            After ``timeout_s``; the message says that it waited for ``what``.
+        """
         deadline_s = time.monotonic() + timeout_s
         self.pump(0.0)
         while not (found := find()):
@@ -190,27 +208,27 @@ class ServiceLink:
         return found
 
     def pump_before(self, deadline_s: float, what: str) -> None:
-        """Pump once; raise on timeout or if the service refused hello."""
+        """Pump once; raise after the deadline or if the service rejected hello."""
         remaining_s = deadline_s - time.monotonic()
         if remaining_s <= 0:
             raise ServiceTimeout(
-                f"waited in vain for {what}: {self._connection.endpoint} is "
-                f"{self._connection.describe()}. Is the service running there? "
-                f"`ocufilter serve --bind {self._connection.endpoint}` starts it"
+                f"timed out waiting for {what}: {self._connection.endpoint} is "
+                f"{self._connection.describe()}. Is the service running there? Start "
+                f"it with `ocufilter serve --bind {self._connection.endpoint}`"
             )
         self.pump(min(remaining_s, 0.5))
         if self._connection.has_failed_handshake:
             raise AuthenticationFailed(
                 f"{self._connection.endpoint} and this client do not accept each "
-                "other's keys: it needs the key file of a client that was added "
-                "(`ocufilter keys add NAME`), and no other"
+                "other's keys; expected the key file of an added client "
+                "(`ocufilter keys add NAME`)"
             )
         if self._refusal is not None:
             refusal, self._refusal = self._refusal, None
             raise refusal
 
     def pump(self, timeout_s: float) -> None:
-        """Wait once for messages or changes, handle them and send what is queued."""
+        """Wait for messages and connection changes, handle them, and send the queue."""
         is_due = bool(self._outbox) and self._connection.is_up
         self._connection.wait(min(timeout_s, RETRY_SEND_S) if is_due else timeout_s)
         for is_up in self._connection.changes():
@@ -223,10 +241,10 @@ class ServiceLink:
         self._send_waiting()
 
     def greet(self) -> None:
-        """Send hello, on the first connection and on every later one.
+        """Send hello, on every new connection.
 
-        The session key resumes the client's session; `_begin` sends the profiles that
-        are missing there.
+        The session key resumes the client's session.  `_begin` then sends the profiles
+        that the session lacks.
         """
         self.welcome = None
         self._refusal = None
@@ -239,7 +257,7 @@ class ServiceLink:
             self._drop(outgoing, "connection_lost")
         self.in_flight.clear()
         if self.pending is not None and self.pending.frame.memory is not None:
-            self._drop(self.pending, "connection_lost")  # its memory is lost too
+            self._drop(self.pending, "connection_lost")  # its memory is lost, too
             self.pending = None
         self.memory.begin(is_offered=False)
 
@@ -281,7 +299,7 @@ class ServiceLink:
             self._bound_progress()
 
     def _begin(self, welcome: Welcome) -> None:
-        """Start or resume a session; send the profiles that it lacks."""
+        """Start or resume a session, and send the profiles that it lacks."""
         self.welcome = welcome
         self._session_key = welcome.session_key
         if not self.in_flight:
@@ -294,7 +312,7 @@ class ServiceLink:
                 self.say(encode(profile))
 
     def _bound_progress(self) -> None:
-        """Discard the oldest progress event if a program never polls for it."""
+        """Discard the oldest progress event if the program does not poll."""
         if len(self._events) > MAX_KEPT_PROGRESS:
             progress = (e for e in self._events if isinstance(e, Progress))
             oldest = next(progress, None)
@@ -304,7 +322,7 @@ class ServiceLink:
     def _finish_frame(self, reply: Result | Dropped) -> None:
         outgoing = self.in_flight.pop(reply.frame_id, None)
         if outgoing is None:
-            return  # already reported as lost with an earlier connection
+            return  # already reported as lost with the previous connection
         if isinstance(reply, Dropped):
             outgoing.end()
             self._events.append(reply)
@@ -323,7 +341,7 @@ class ServiceLink:
         )
 
     def _colors_in_memory(self, outgoing: Outgoing) -> tuple[NDArray[Any], ...]:
-        """Return the images that the service has written to a slot."""
+        """Return the images that the service wrote to a slot."""
         frame, (_, slot) = outgoing.frame, outgoing.slots
         assert frame.memory is not None
         return tuple(
@@ -352,7 +370,7 @@ class ServiceLink:
         self._events.append(reply)
 
     def _restart_session(self, reply: ErrorReply) -> None:
-        """Send hello again: the service ended this session on a live connection."""
+        """Send hello again: the service ended the session on a live connection."""
         frame_id = reply.frame_id
         if frame_id is not None and frame_id in self.in_flight:
             self._drop(self.in_flight.pop(frame_id), "connection_lost")

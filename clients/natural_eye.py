@@ -1,7 +1,7 @@
-"""An eye whose pupil follows the light and whose focus follows the viewed distance.
+"""Eye whose pupil follows the light and whose focus follows the viewed distance.
 
     eye = NaturalEye(age_years=35)
-    pupil_diameter_mm, focus_dpt = eye.look(luminance_cd_m2, distance_dpt, at_s)
+    state = eye.look(luminance_cd_m2, distance_dpt, at_s)
 
 The dynamics are those of `estimator.dynamics`, which lists their sources.
 """
@@ -14,39 +14,34 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clients.scenes.geometry import linear_from_srgb
 from estimator.dynamics import AccommodationResponse, PupilReflex
 from filter_service.messages import Camera
 
 MAX_VERGENCE_DPT = 20.0
 USUAL_WHITE_CD_M2 = 100.0
-"""Luminance of white on a headset's display."""
+"""Luminance of white on the display of a headset."""
 
 USUAL_AGE_YEARS = 35.0
 PUPIL_RANGE_MM = (0.5, 9.0)
 WINDOW_DEG = 0.5
-"""Half the extent of the fovea's center, which contains the fixated object."""
+"""Half the width of the center of the fovea, which contains the fixated object."""
 
 LIMIT_STEP_DPT = 0.01
 _STRIDE = 8
-_LINEAR_OF_SRGB8 = np.array(
-    [
-        v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4
-        for v in np.arange(256) / 255.0
-    ],
-    np.float32,
-)
+_LINEAR_OF_SRGB8 = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of sRGB's primaries
 
 
 @dataclass(frozen=True)
 class EyeState:
-    """State of an eye that is sent with a frame."""
+    """Pupil and focus of an eye, as sent with a frame."""
 
     pupil_diameter_mm: float
     focus_dpt: float
 
     def with_pupil(self, diameter_mm: float) -> EyeState:
-        """Return the state with a measured pupil, clipped to the range of eyes."""
+        """Return the state with a measured pupil, clipped to `PUPIL_RANGE_MM`."""
         low_mm, high_mm = PUPIL_RANGE_MM
         return EyeState(min(max(diameter_mm, low_mm), high_mm), self.focus_dpt)
 
@@ -57,15 +52,16 @@ class NaturalEye:
     Parameters
     ----------
     age_years : float
-        Age of the person; the pupil shrinks with age.
+        Age of the person, with which the pupil shrinks.
     field_area_deg2 : float
-        Area of the display in the visual field, deg2.
+        Area that the display covers in the visual field, deg2.
     pupil_diameter_mm : float, optional
-        Fixed pupil, instead of one that follows the light.
+        Fixed pupil; by default, the pupil follows the light.
 
     Raises
     ------
     ValueError
+        If a value is out of range.
     """
 
     def __init__(
@@ -95,16 +91,16 @@ class NaturalEye:
     def look(
         self, luminance_cd_m2: float, distance_dpt: float, at_s: float
     ) -> EyeState:
-        """Set the luminance and distance from now on; return the current state.
+        """Set the luminance and the distance from now on; return the current state.
 
         Parameters
         ----------
         luminance_cd_m2 : float
-            Mean luminance of the image; see the function of this name.
+            Mean luminance of the image; see the function `luminance_cd_m2`.
         distance_dpt : float
-            Inverse distance, 1/m, clipped to 0 to `MAX_VERGENCE_DPT`.
+            Inverse of the viewed distance, 1/m, clipped to `MAX_VERGENCE_DPT`.
         at_s : float
-            Time of any monotonic clock.
+            Time on any monotonic clock.
 
         Raises
         ------
@@ -114,7 +110,7 @@ class NaturalEye:
         if self._fixed_mm is not None:
             pupil_mm = self._fixed_mm
         else:
-            if self._pupil is None:  # starts in the steady state
+            if self._pupil is None:  # starts in its steady state
                 self._pupil = PupilReflex(
                     self._age_years, self._field_area_deg2, luminance_cd_m2
                 )
@@ -123,7 +119,7 @@ class NaturalEye:
         focus_dpt = self._focus.follow(wanted_dpt, at_s)
         far_dpt, near_dpt = self._far_dpt, self._near_dpt
         self._focus.hold(far_dpt, near_dpt)
-        # At its limit the eye keeps requesting more, to detect a limit that has moved.
+        # At its limit, the eye keeps requesting more, to detect a limit that has moved.
         if focus_dpt <= far_dpt:
             focus_dpt = min(wanted_dpt, far_dpt)
         elif focus_dpt >= near_dpt:
@@ -133,13 +129,13 @@ class NaturalEye:
     def learn(self, asked_dpt: float, used_dpt: float) -> None:
         """Learn the far and near point from the focus that a filter used.
 
-        The focus does not go beyond the far or near point, and moves back from there.
-        Both points change with the pupil, so an eye at its limit keeps requesting more.
+        The focus stops at the far or near point and moves back from there.  Both points
+        change with the pupil.
 
         Parameters
         ----------
         asked_dpt, used_dpt : float
-            Focus that a frame was sent with, and focus returned with the result.
+            Focus that a frame requested, and focus returned with its result.
         """
         if used_dpt > asked_dpt + LIMIT_STEP_DPT:
             self._far_dpt = used_dpt
@@ -149,7 +145,7 @@ class NaturalEye:
         self._near_dpt = max(self._near_dpt, used_dpt)
 
     def change(self) -> None:
-        """Reset the far and near point, after a change of the eye."""
+        """Forget the far and near point after a change of the eye."""
         self._far_dpt, self._near_dpt = 0.0, MAX_VERGENCE_DPT
 
 
@@ -158,7 +154,8 @@ def luminance_cd_m2(color: NDArray[np.uint8], white_cd_m2: float) -> float:
 
     Parameters
     ----------
-    color : (h, w, 3) uint8 sRGB
+    color : (h, w, 3) uint8
+        sRGB.
     white_cd_m2 : float
         Luminance of the display's white.
     """
@@ -167,7 +164,7 @@ def luminance_cd_m2(color: NDArray[np.uint8], white_cd_m2: float) -> float:
 
 
 def field_area_deg2(camera: Camera) -> float:
-    """Return the area of a camera's field of view, the product of its two angles."""
+    """Return the product of the two angles of a camera's field of view, deg2."""
     left, right, up, down = (math.degrees(math.atan(t)) for t in camera.tangents)
     return (right - left) * (up - down)
 
@@ -175,9 +172,9 @@ def field_area_deg2(camera: Camera) -> float:
 def distance_at(
     depth_m: NDArray[np.float32], camera: Camera, gaze_deg: tuple[float, float]
 ) -> float | None:
-    """Return the distance along the gaze, in meters; None if unknown.
+    """Return the distance along the gaze in meters; None if unknown.
 
-    See `planar_depth_at`.
+    See `planar_depth_at` for the parameters.
     """
     middle_m = planar_depth_at(depth_m, camera, gaze_deg)
     if middle_m is None:
@@ -195,14 +192,17 @@ def _on_image(gaze_deg: tuple[float, float]) -> tuple[float, float]:
 def planar_depth_at(
     depth_m: NDArray[np.float32], camera: Camera, gaze_deg: tuple[float, float]
 ) -> float | None:
-    """Return the planar depth at the gaze, in meters; None if unknown.
+    """Return the planar depth at the gaze in meters; None if unknown.
 
-    The median over `WINDOW_DEG` to every side is robust against a thin object in front
+    It is the median within `WINDOW_DEG`, which is robust against thin objects in front
     and pixels without depth.
 
     Parameters
     ----------
-    depth_m : (h, w) float32, planar
+    depth_m : (h, w) float32
+        Planar depth.
+    camera : Camera
+        Camera of the image.
     gaze_deg : (h, v)
         Angles to the right and up from the camera's axis.
     """
@@ -223,5 +223,5 @@ def planar_depth_at(
     seen = window[window > 0]  # without missing depth
     if seen.size == 0:
         return None
-    # The lower of the two middle values: their mean would lie between two objects.
+    # The lower of the two middle values, because their mean may be between two objects.
     return float(np.partition(seen, (seen.size - 1) // 2)[(seen.size - 1) // 2])

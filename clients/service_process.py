@@ -1,7 +1,8 @@
-"""A filter service in a child process, for demos, benchmarks and tests."""
+"""Filter service in a child process, for the demo, benchmarks and tests."""
 
 from __future__ import annotations
 
+import json
 import signal
 import subprocess
 import sys
@@ -13,25 +14,25 @@ from typing import Any
 
 SERVE_COMMAND = (sys.executable, "-m", "filter_service", "serve")
 CHECKOUT = Path(__file__).resolve().parents[1]
-# From there, `-m` finds our packages; installed packages are found from any folder.
+# `-m` finds our packages in a checkout, and installed packages from any folder.
 SERVICE_FOLDER = CHECKOUT if (CHECKOUT / "pyproject.toml").is_file() else None
 POLL_S = 0.02
 LOG_TAIL_CHARACTERS = 2000
 
 
 class ServiceProcess:
-    """`ocufilter serve` on a free local port, from start to clean shutdown.
+    """`ocufilter serve` on a free local port.
 
     Parameters
     ----------
     settings : mapping, optional
-        Fields of the service's configuration file.
+        Fields of the configuration file of the service.
     command : sequence of str
         Command to start; ``--config FILE`` is appended.
     start_timeout_s : float
         Timeout for the service to become ready.
     wait : bool
-        Whether to wait until it is ready; otherwise call `await_ready` later.
+        Whether to wait until the service is ready; otherwise call `await_ready`.
 
     Examples
     --------
@@ -81,10 +82,10 @@ class ServiceProcess:
         return self._log_file.read_text(encoding="utf-8", errors="replace")
 
     def pids(self) -> dict[str, int]:
-        """Return process ids by name: supervisor, front-end, render (Linux only).
+        """Return process ids by name: supervisor, front-end and render (Linux only).
 
-        If there is a second render process, the spare one is `standby`; the render
-        processes of several devices are `render 0` and so on.
+        A spare render process is named `standby`.  The render processes of several
+        devices are named `render 0` and so on.
         """
         supervisor = self.process.pid
         found = {"supervisor": supervisor}
@@ -100,16 +101,16 @@ class ServiceProcess:
             if b"filter_service.service.front_end_process" in words:
                 name = "front-end"
             elif b"filter_service.service.render_worker_process" in words:
-                name = words[-2].decode()  # its last argument; an empty word follows
+                name = words[-2].decode()  # the last argument; an empty word follows
             if name in found:
-                name = name.replace("render", "standby")  # the older one filters
+                name = name.replace("render", "standby")  # the older process filters
             if name:
                 found[name] = child
         return found
 
     @property
     def memory_mb(self) -> float:
-        """Return the memory in use by the service, without its worker (Linux)."""
+        """Return the memory in use by the processes of `pids` (Linux)."""
         kilobytes = 0
         for pid in self.pids().values():
             status = Path(f"/proc/{pid}/status").read_text().splitlines()
@@ -132,18 +133,19 @@ class ServiceProcess:
         return code
 
     def kill(self) -> None:
-        """Kill the service, like a crash."""
+        """Kill the service, as a crash would."""
         self.process.kill()
         self.process.wait()
         self._folder.cleanup()
 
     def await_ready(self, timeout_s: float = 60.0) -> None:
-        """Wait until the service accepts frames; kill it if it fails to start.
+        """Wait until the service accepts frames; kill it if it does not start.
 
         Raises
         ------
         RuntimeError
-            If it has ended or takes too long; the message includes its output.
+            If the service has ended or takes too long.  The message includes its
+            output.
         """
         try:
             self._await_ready(timeout_s)
@@ -170,13 +172,5 @@ class ServiceProcess:
 
 
 def _as_toml(settings: Mapping[str, Any]) -> str:
-    lines = []
-    for name, value in settings.items():
-        if isinstance(value, bool):
-            text = str(value).lower()
-        elif isinstance(value, str):
-            text = '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
-        else:
-            text = repr(value)
-        lines.append(f"{name} = {text}\n")
-    return "".join(lines)
+    # JSON of text, numbers, switches and lists is also TOML.
+    return "".join(f"{name} = {json.dumps(v)}\n" for name, v in settings.items())

@@ -1,8 +1,9 @@
-"""Images in memory that the service shares with its clients on the same machine.
+"""Images in memory that the service shares with clients on the same machine.
 
-A client requests slots as it needs them.  Until they arrive, or if they are not
-available, its images are sent as parts of messages.  Results in a slot are returned
-without a copy: the slot is free again when the array is no longer referenced.
+A client requests slots (regions of shared memory) when it needs them.  Until they
+arrive, or if there are none, it sends images as parts of messages.  Results in a slot
+are returned without a copy; the slot is free again when the array is no longer
+referenced.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ log = logging.getLogger("ocufilter")
 
 @dataclass(eq=False)
 class ClientSlot:
-    """A slot and its number of users: frames in flight and returned arrays."""
+    """A slot and the number of its users, which are frames in flight and results."""
 
     slot: Slot
     n_users: int = 0
@@ -40,7 +41,7 @@ class ClientSlot:
 
 
 class SharedMemory:
-    """The shared memory slots of one session.
+    """Shared-memory slots of one session.
 
     Parameters
     ----------
@@ -55,14 +56,14 @@ class SharedMemory:
         self.is_offered = False
 
     def begin(self, *, is_offered: bool) -> None:
-        """Discard the slots of an earlier connection; arrays in them stay valid."""
+        """Discard the slots of the previous connection; arrays in them stay valid."""
         for held in self._slots:
             held.slot.close()
         self._slots, self._n_asked = [], 0
         self.is_offered = is_offered
 
     def take_in(self, reply: Shared) -> None:
-        """Map a slot that the service provides."""
+        """Map a slot that the service has created."""
         self._n_asked -= 1
         if reply.slot is None or reply.size_bytes is None:
             log.info("no shared memory: %s", reply.reason)
@@ -78,7 +79,7 @@ class SharedMemory:
         self._slots.append(ClientSlot(slot))
 
     def take(self, size_bytes: int) -> ClientSlot | None:
-        """Return a free slot of at least this size; if there is none, request one."""
+        """Return a free slot of at least this size; request one if there is none."""
         if not self.is_offered:
             return None
         most = KEPT_RATIO * max(size_bytes, PAGE_BYTES)
@@ -99,7 +100,7 @@ class SharedMemory:
         return None
 
     def holding(self, images: Sequence[NDArray[Any]]) -> ClientSlot | None:
-        """Return the slot that already holds the images at the expected offsets."""
+        """Return the slot that already contains the images at the expected offsets."""
         starts, _ = starts_of([image.nbytes for image in images])
         for held in self._slots:
             base = held.slot.array(0, (1,), np.dtype(np.uint8)).ctypes.data
@@ -113,7 +114,7 @@ class SharedMemory:
     def array(
         self, held: ClientSlot, start: int, shape: tuple[int, ...], dtype: Any
     ) -> NDArray[Any]:
-        """Return an array in a slot; it counts as a user while it is referenced."""
+        """Return an array in a slot, which it uses while it is referenced."""
         array = held.slot.array(start, shape, np.dtype(dtype))
         held.n_users += 1
         # Views of the array keep a reference to its base.
@@ -121,7 +122,7 @@ class SharedMemory:
         return array
 
     def _drop_one(self) -> None:
-        """Return the largest free slot to the service: the image size has changed."""
+        """Return the largest free slot to the service: image sizes have changed."""
         free = [held for held in self._slots if not held.n_users]
         if free:
             largest = max(free, key=lambda held: held.slot.size_bytes)

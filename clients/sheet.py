@@ -1,4 +1,4 @@
-"""Layout of images with captions: frames of the demo's video and its contact sheet."""
+"""Layout of images with captions, for the demo's video and contact sheet."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-_PAPER, _BAR, _INK, _SOFT, _ACCENT = (
-    "#14181c",
-    "#1f262d",
-    "#f2f4f5",
-    "#a9b4bd",
-    "#ffc46b",
-)
+_PAPER, _BAR, _INK = "#14181c", "#1f262d", "#f2f4f5"
+_SOFT, _ACCENT = "#a9b4bd", "#ffc46b"
 _GAP_PX = 10
 MIN_CELL_WIDTH_PX = 320
 MAX_CELL_WIDTH_PX = 480
+_MAX_SCALE_DPT = 4.5
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One image and its caption.
+    """An image and its caption.
 
     Attributes
     ----------
-    image : (h, w, 3) uint8, sRGB
-    title : one line
-    lines : smaller lines below the title
-    detail : a magnified part, drawn below the image; optional
+    image : (h, w, 3) uint8
+        sRGB.
+    title : str
+        First line of the caption.
+    lines : tuple of str
+        Smaller lines below the title.
+    detail : array, optional
+        A magnified part of the image, drawn below it.
     """
 
     image: NDArray[np.uint8]
@@ -69,22 +69,26 @@ def cell_size_px(image_size_px: tuple[int, int]) -> tuple[int, int]:
 
 
 def fitted(image: NDArray[np.uint8], size_px: tuple[int, int]) -> NDArray[np.uint8]:
-    """Resize an image (h, w, 3) to (width, height), unless it has that size."""
+    """Resize an image (h, w, 3) to (width, height) if it has another size."""
     if image.shape[1::-1] == size_px:
         return image
-    picture = Image.fromarray(image)
-    return np.asarray(picture.resize(size_px, Image.Resampling.LANCZOS))
+    resized = Image.fromarray(image).resize(size_px, Image.Resampling.LANCZOS)
+    return np.asarray(resized)
 
 
 def magnified(
     image: NDArray[np.uint8], corner: tuple[float, float], size_px: tuple[int, int]
 ) -> NDArray[np.uint8]:
-    """Return a third of the width and a sixth of the height, enlarged to a strip.
+    """Enlarge a third of the width and a sixth of the height of an image to a strip.
 
     Parameters
     ----------
-    corner : upper left corner in parts of the image's width and height
-    size_px : (width, height) of a cell; the strip has its width and half its height.
+    image : (h, w, 3) uint8
+        Image to enlarge a part of.
+    corner : (float, float)
+        Upper left corner, as fractions of the image's width and height.
+    size_px : (int, int)
+        Width and height of a cell; the strip has its width and half its height.
     """
     height, width = image.shape[:2]
     left, top = round(corner[0] * width), round(corner[1] * height)
@@ -95,7 +99,7 @@ def magnified(
 def video_frame(
     cells: Sequence[Cell], state: EyeState, depth_m: NDArray[np.float32]
 ) -> NDArray[np.uint8]:
-    """Return one video frame: every image, and a panel with the state of the eye.
+    """Return a frame of the video: every image, and a panel with the eye's state.
 
     Width and height are even, as video encoders require.
     """
@@ -108,7 +112,7 @@ def video_frame(
 def contact_sheet(
     blocks: Sequence[tuple[str, Sequence[Cell]]], heading: str
 ) -> Image.Image:
-    """Return a page of titled blocks of images, one below the other."""
+    """Return a page of blocks of images, each with a title, one below the other."""
     pages = [_grid(cells, title=title, line_px=22) for title, cells in blocks]
     width = max(page.width for page in pages)
     top = 58
@@ -122,7 +126,7 @@ def contact_sheet(
 
 
 def _grid(cells: Sequence[Cell], *, title: str, line_px: int) -> Image.Image:
-    """Return cells in two rows (one if there are few) below a title."""
+    """Arrange cells below a title, in one row of up to three, otherwise in two."""
     columns = len(cells) if len(cells) <= 3 else (len(cells) + 1) // 2
     rows = -(-len(cells) // columns)
     height_px, width_px = cells[0].image.shape[:2]
@@ -159,7 +163,7 @@ def _caption(
     size: tuple[int, int],
     line_px: int,
 ) -> None:
-    """Draw a cell's title and lines into the bar below its image."""
+    """Draw a cell's title and lines in the bar below its image."""
     left, top = corner
     draw.rectangle((left, top, left + size[0] - 1, top + size[1] - 1), fill=_BAR)
     draw.text((left + 10, top + 16), cell.title, fill=_INK, font=_font(20), anchor="lm")
@@ -177,67 +181,32 @@ def state_panel(
     panel = Image.new("RGB", size_px, "#0d1013")
     draw = ImageDraw.Draw(panel)
     small = max(10, round(height / 17))
-    radius = 0.21 * height
-    cx, cy = 0.21 * width, 0.30 * height
-    _disc(draw, cx, cy, radius, "#4c7a8c")
-    _disc(draw, cx, cy, radius * state.pupil_diameter_mm / 8.0, "#050607")
-    draw.text(
-        (cx, cy + radius + small),
-        f"pupil {state.pupil_diameter_mm:.1f} mm",
-        fill=_INK, font=_font(small), anchor="mm",
-    )  # fmt: skip
-    shown = (round(0.46 * width), round(0.46 * height))
-    panel.paste(
-        _depth_picture(depth_m, shown), (round(0.48 * width), round(0.08 * height))
-    )
-    draw.text(
-        (0.71 * width, cy + radius + small),
-        "depth: near is bright",
-        fill=_INK, font=_font(small), anchor="mm",
-    )  # fmt: skip
-    _focus_scale(draw, size_px, state, small)
-    return np.asarray(panel)
 
+    def label(x: float, y: float, text: str, color: str) -> None:
+        draw.text((x, y), text, fill=color, font=_font(small), anchor="mm")
 
-def _disc(
-    draw: ImageDraw.ImageDraw, x: float, y: float, radius: float, color: str
-) -> None:
-    draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=color)
-
-
-def _focus_scale(
-    draw: ImageDraw.ImageDraw, size_px: tuple[int, int], state: EyeState, small: int
-) -> None:
-    """Draw a scale of diopters with a mark at the requested focus."""
-    width, height = size_px
-    left, right, y = 0.08 * width, 0.92 * width, 0.82 * height
-    top_dpt = 4.5
-    draw.line((left, y, right, y), fill=_SOFT, width=2)
-    for dpt, label in (
-        (0, "far"),
-        (1, "1 m"),
-        (2, "50 cm"),
-        (3, "33 cm"),
-        (4, "25 cm"),
-    ):
-        x = left + (right - left) * dpt / top_dpt
-        draw.line((x, y - 4, x, y + 4), fill=_SOFT, width=2)
-        draw.text((x, y + small), label, fill=_SOFT, font=_font(small), anchor="mm")
-    x = left + (right - left) * min(state.focus_dpt, top_dpt) / top_dpt
-    draw.polygon([(x, y - 3), (x - 7, y - 15), (x + 7, y - 15)], fill=_ACCENT)
-    draw.text(
-        ((left + right) / 2, y - 1.9 * small),
-        f"focus {state.distance()}",
-        fill=_ACCENT, font=_font(small), anchor="mm",
-    )  # fmt: skip
-
-
-def _depth_picture(
-    depth_m: NDArray[np.float32], size_px: tuple[int, int]
-) -> Image.Image:
-    """Return depth as brightness, on a logarithmic scale from 0.15 to 30 m."""
+    radius, x, y = 0.21 * height, 0.21 * width, 0.30 * height
+    draw.circle((x, y), radius, fill="#4c7a8c")
+    draw.circle((x, y), radius * state.pupil_diameter_mm / 8.0, fill="#050607")
+    label(x, y + radius + small, f"pupil {state.pupil_diameter_mm:.1f} mm", _INK)
+    # Depth as brightness, on a logarithmic scale from 0.15 to 30 m.
     log = np.log(np.clip(depth_m, 0.15, 30.0) / 30.0) / np.log(0.15 / 30.0)
-    return Image.fromarray(np.round(255 * log).astype(np.uint8)).resize(size_px)
+    depth = Image.fromarray(np.round(255 * log).astype(np.uint8))
+    depth = depth.resize((round(0.46 * width), round(0.46 * height)))
+    panel.paste(depth, (round(0.48 * width), round(0.08 * height)))
+    label(0.71 * width, y + radius + small, "depth: near is bright", _INK)
+    # A scale of diopters with a mark at the requested focus.
+    left, right, y = 0.08 * width, 0.92 * width, 0.82 * height
+    pitch = (right - left) / _MAX_SCALE_DPT
+    draw.line((left, y, right, y), fill=_SOFT, width=2)
+    for dpt, text in enumerate(("far", "1 m", "50 cm", "33 cm", "25 cm")):
+        x = left + pitch * dpt
+        draw.line((x, y - 4, x, y + 4), fill=_SOFT, width=2)
+        label(x, y + small, text, _SOFT)
+    x = left + pitch * min(state.focus_dpt, _MAX_SCALE_DPT)
+    draw.polygon([(x, y - 3), (x - 7, y - 15), (x + 7, y - 15)], fill=_ACCENT)
+    label((left + right) / 2, y - 1.9 * small, f"focus {state.distance()}", _ACCENT)
+    return np.asarray(panel)
 
 
 def _font(size_px: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:

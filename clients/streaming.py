@@ -1,43 +1,39 @@
-"""Streaming of rendered frames through a service: in order, and while an eye changes.
-
-`pyrender_stream` and `demo` use it to pass rendered frames to the client library.
-"""
+"""Streaming of rendered frames in order, and while an eye is prepared."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
-from clients.filter_client import Event, FilterClient, FilteredFrame, RgbdView
+from clients.filter_client import Event, FilterClient, FilteredFrame
 from clients.frame_log import FrameLog
 from clients.scene_renderer import SceneFrame
 from filter_service.errors import ConnectionLost, ServiceTimeout
 from filter_service.messages import Accepted, Dropped, ErrorReply, Progress, Ready
 
-# Frames per second while an eye is being prepared: enough to show that the stream
-# continues, few enough to leave the processor to the preparation.
-_PREVIEW_HZ = 4.0
+_BUILDING_HZ = 4.0
+"""Frame rate while an eye is being prepared: enough to show that the stream continues,
+and low enough to leave the processor to the preparation."""
+
 _BUILD_LIMIT_S = 180.0
-_LOST = "the connection to the service broke off"
+_POLL_S = 0.05
 
 
-def view_of(frame: SceneFrame) -> RgbdView:
-    """Convert a rendered frame to the view type of the client library."""
-    return RgbdView(
-        frame.color,
-        frame.depth_m,
-        frame.tangents,
-        hidden_color=frame.hidden_color,
-        hidden_depth_m=frame.hidden_depth_m,
+def submit(client: FilterClient, frame: SceneFrame) -> int:
+    """Submit a frame with its state; return its frame_id."""
+    return client.submit(
+        frame.view,
+        pupil_diameter_mm=frame.pupil_diameter_mm,
+        focus_dpt=frame.focus_dpt,
+        gaze_deg=frame.gaze_deg,
     )
 
 
 def filter_in_order(
     client: FilterClient, frames: Iterable[SceneFrame], log: FrameLog
-) -> Iterator[tuple[SceneFrame, FilteredFrame]]:
-    """Send frames one by one and yield each with its filtered image.
+) -> Iterator[FilteredFrame]:
+    """Send frames one by one and yield each filtered.
 
     A frame that the service drops is counted and sent again.
 
@@ -47,74 +43,21 @@ def filter_in_order(
         If the service rejects a frame, does not answer in time or disconnects.
     """
     for frame in frames:
-        while True:
-            _submit(client, frame)
-            answer = _next_answer(client)
-            if isinstance(answer, FilteredFrame):
-                break
-            log.add_drop(answer.reason)
-            _check_connection(answer)
+        while isinstance(answer := _filtered(client, frame), Dropped):
+            log.drops[answer.reason] += 1
         log.add(answer)
-        yield frame, answer
+        yield answer
 
 
-def _check_connection(event: Event) -> None:
-    """Raise if a frame was dropped because the service disconnected."""
-    if isinstance(event, Dropped) and event.reason == "connection_lost":
-        raise ConnectionLost(_LOST)
-
-
-def _submit(client: FilterClient, frame: SceneFrame) -> int:
-    return client.submit(
-        view_of(frame),
-        pupil_diameter_mm=frame.pupil_diameter_mm,
-        focus_dpt=frame.focus_dpt,
-        gaze_deg=frame.gaze_deg,
-    )
-
-
-def _next_answer(client: FilterClient) -> FilteredFrame | Dropped:
-    """Wait for the reply to the one frame in flight."""
+def _filtered(client: FilterClient, frame: SceneFrame) -> FilteredFrame | Dropped:
+    """Send a frame and wait for its result."""
+    submit(client, frame)
     deadline_s = time.monotonic() + client.timeout_s
     while time.monotonic() < deadline_s:
-        for event in client.poll(0.2):
-            if isinstance(event, ErrorReply):
-                raise event.exception()
+        for event in _events(client):
             if isinstance(event, FilteredFrame | Dropped):
                 return event
-        # A frame that was not sent yet would wait for the next connection.
-        if client.welcome is None:
-            raise ConnectionLost(_LOST)
-    raise ServiceTimeout(f"no answer to a frame within {client.timeout_s:g} s")
-
-
-@dataclass(frozen=True)
-class EyeChange:
-    """Record of a change of the eye during a stream.
-
-    Attributes
-    ----------
-    generation, previous_generation : the service's eye counter; None before any eye
-    frames_through_previous : frames filtered with the old eye during preparation
-    ready : the service's Ready message of the new eye
-    """
-
-    generation: int
-    previous_generation: int | None
-    frames_through_previous: int
-    ready: Ready
-
-    def summary(self) -> dict[str, Any]:
-        """Return the change as plain numbers."""
-        return {
-            "generation": self.generation,
-            "previous_generation": self.previous_generation,
-            "frames_through_previous_eye": self.frames_through_previous,
-            "build_ms": round(self.ready.build_ms, 1),
-            "psf_count": self.ready.psf_count,
-            "memory_mb": round(self.ready.memory_mb, 2),
-            "notes": list(self.ready.notes),
-        }
+    raise ServiceTimeout(f"no reply to a frame within {client.timeout_s:g} s")
 
 
 def change_eye(
@@ -125,72 +68,83 @@ def change_eye(
     frames: Sequence[SceneFrame],
     has_eye: bool,
     on_progress: Callable[[float, str], None] = lambda fraction, stage: None,
-) -> EyeChange:
+) -> dict[str, Any]:
     """Request another eye and continue the stream until it is ready.
 
     Parameters
     ----------
-    body : profile, such as ``{"kind": "preset", "name": "myopia"}``
-    settings : fields of `FilterSettings`
-    frames : sent in a loop meanwhile; the eye is prepared for the first one's camera
-    has_eye : whether an earlier eye can filter them
-    on_progress : called with (fraction 0..1, stage)
+    client : FilterClient
+        Connected client.
+    body : mapping
+        Profile, such as ``{"kind": "preset", "name": "myopia"}``.
+    settings : mapping
+        Fields of `FilterSettings`.
+    frames : sequence of SceneFrame
+        Frames to send in a loop meanwhile; the eye is prepared for the first one's
+        camera.
+    has_eye : bool
+        Whether an earlier eye can filter the frames.
+    on_progress : callable
+        Called with the completed fraction, 0 to 1, and the stage.
+
+    Returns
+    -------
+    dict
+        Generations of the new and the previous eye, the number of frames filtered with
+        the previous one, and the figures of the service's Ready message.
 
     Raises
     ------
     FilterError
         If the profile is rejected, or its preparation fails or takes too long.
     """
+    views = [frames[0].view]
     accepted = client.set_profile(
-        body,
-        settings=settings,
-        views=[view_of(frames[0])],
-        wait=False,
-        timeout_s=client.timeout_s,
+        body, settings=settings, views=views, wait=False, timeout_s=client.timeout_s
     )
     assert isinstance(accepted, Accepted)
-    watch = _ChangeWatch(accepted, on_progress)
-    deadline_s = time.monotonic() + _BUILD_LIMIT_S
+    ready: Ready | None = None
+    previous_generation, n_through_previous = None, 0
     next_send_s, index = time.monotonic(), 0
-    while watch.ready is None or client.n_unanswered:
+    deadline_s = next_send_s + _BUILD_LIMIT_S
+    while ready is None or client.n_unanswered:
         now_s = time.monotonic()
         if now_s > deadline_s:
             raise ServiceTimeout(f"the eye was not ready within {_BUILD_LIMIT_S:g} s")
-        is_due = has_eye and watch.ready is None and now_s >= next_send_s
+        is_due = has_eye and ready is None and now_s >= next_send_s
         if is_due and not client.n_unanswered:
-            _submit(client, frames[index % len(frames)])
-            index, next_send_s = index + 1, now_s + 1 / _PREVIEW_HZ
-        for event in client.poll(0.05):
-            watch.take(event)
-        if client.welcome is None:
-            raise ConnectionLost(_LOST)
-    return EyeChange(
-        accepted.generation, watch.old_generation, watch.n_through_old, watch.ready
-    )
+            submit(client, frames[index % len(frames)])
+            index, next_send_s = index + 1, now_s + 1 / _BUILDING_HZ
+        for event in _events(client):
+            if isinstance(event, FilteredFrame):
+                if event.header.generation != accepted.generation:
+                    n_through_previous += 1
+                    previous_generation = event.header.generation
+            elif getattr(event, "profile_id", None) != accepted.profile_id:
+                continue
+            elif isinstance(event, Progress):
+                on_progress(event.fraction, event.stage)
+            elif isinstance(event, Ready):
+                ready = event
+    return {
+        "generation": accepted.generation,
+        "previous_generation": previous_generation,
+        "frames_through_previous_eye": n_through_previous,
+        "build_ms": round(ready.build_ms, 1),
+        "psf_count": ready.psf_count,
+        "memory_mb": round(ready.memory_mb, 2),
+        "notes": list(ready.notes),
+    }
 
 
-class _ChangeWatch:
-    """Collects events while an eye is prepared."""
-
-    def __init__(
-        self, accepted: Accepted, on_progress: Callable[[float, str], None]
-    ) -> None:
-        self._accepted, self._on_progress = accepted, on_progress
-        self.ready: Ready | None = None
-        self.old_generation: int | None = None
-        self.n_through_old = 0
-
-    def take(self, event: Event) -> None:
-        """Count frames, report progress and keep Ready; raise on errors."""
+def _events(client: FilterClient) -> list[Event]:
+    """Poll; raise the errors of the service, and ConnectionLost if it disconnects."""
+    events = client.poll(_POLL_S)
+    for event in events:
         if isinstance(event, ErrorReply):
             raise event.exception()
-        _check_connection(event)
-        if isinstance(event, FilteredFrame):
-            if event.header.generation != self._accepted.generation:
-                self.n_through_old += 1
-                self.old_generation = event.header.generation
-        elif getattr(event, "profile_id", None) == self._accepted.profile_id:
-            if isinstance(event, Progress):
-                self._on_progress(event.fraction, event.stage)
-            elif isinstance(event, Ready) and event.is_complete:
-                self.ready = event
+    is_lost = any(getattr(e, "reason", None) == "connection_lost" for e in events)
+    # Without a connection, a frame that was not sent yet would wait for the next one.
+    if is_lost or client.welcome is None:
+        raise ConnectionLost("the service closed the connection")
+    return events

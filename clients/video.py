@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Callable, Iterable
-from itertools import chain
 from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+
+from clients.batch.video_writing import (
+    VIDEO_KINDS,
+    EncodingFailed,
+    join_segments,
+    write_segment,
+)
 
 _GIF_WIDTH_PX = 1200
 
@@ -24,64 +28,44 @@ def write_video(
 
     Parameters
     ----------
-    stem : path without its suffix
-    frames : function that returns the frames (h, w, 3) uint8 from the start at each
-        call; width and height must be even.
+    stem : Path
+        Path without its suffix.
+    frames : callable
+        Function that returns the frames (h, w, 3), uint8 sRGB, from the start at each
+        call.  Width and height must be even.
+    frames_per_second : int
+        Frame rate.
 
     Returns
     -------
-    Path of the written file.
+    Path
+        The file written.
     """
-    target = stem.with_suffix(".mp4")
+    target, segment = stem.with_suffix(".mp4"), stem.with_suffix(".mkv")
+    kind, rate_hz = VIDEO_KINDS["h264"], frames_per_second
     try:
-        _write_mp4(target, frames(), frames_per_second)
-    except (OSError, RuntimeError):
-        # No ffmpeg on this machine, or it crashed and broke the pipe.
+        write_segment(segment, enumerate(frames()), kind=kind, rate_hz=rate_hz)
+        join_segments(target, [(0, segment)], kind=kind, rate_hz=rate_hz)
+    except (OSError, ValueError, EncodingFailed):  # libx264 is missing or fails
         target.unlink(missing_ok=True)
-        return _write_gif(stem.with_suffix(".gif"), frames(), frames_per_second)
+        target = stem.with_suffix(".gif")
+        _write_gif(target, frames(), frames_per_second)
+    segment.unlink(missing_ok=True)
     return target
-
-
-def _write_mp4(
-    target: Path, frames: Iterable[NDArray[np.uint8]], frames_per_second: int
-) -> None:
-    """Pipe raw frames through ffmpeg's H.264 encoder."""
-    frames = iter(frames)
-    first = next(frames)
-    height, width = first.shape[:2]
-    command = [
-        imageio_ffmpeg.get_ffmpeg_exe(),
-        *("-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"),
-        *("-s", f"{width}x{height}", "-r", str(frames_per_second), "-i", "-"),
-        *("-c:v", "libx264", "-preset", "fast", "-crf", "18", "-pix_fmt", "yuv420p"),
-        *("-movflags", "+faststart", str(target)),
-    ]
-    with subprocess.Popen(
-        command,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    ) as encoder:
-        assert encoder.stdin is not None
-        for frame in chain([first], frames):
-            encoder.stdin.write(np.ascontiguousarray(frame).data)
-    if encoder.returncode != 0:
-        raise RuntimeError(f"ffmpeg ended with code {encoder.returncode}")
 
 
 def _write_gif(
     target: Path, frames: Iterable[NDArray[np.uint8]], frames_per_second: int
-) -> Path:
-    pictures = []
+) -> None:
+    images = []
     for frame in frames:
-        picture = Image.fromarray(frame)
-        picture.thumbnail((_GIF_WIDTH_PX, _GIF_WIDTH_PX))
-        pictures.append(picture.quantize(128))
-    pictures[0].save(
+        image = Image.fromarray(frame)
+        image.thumbnail((_GIF_WIDTH_PX, _GIF_WIDTH_PX))
+        images.append(image.quantize(128))
+    images[0].save(
         target,
         save_all=True,
-        append_images=pictures[1:],
+        append_images=images[1:],
         duration=round(1000 / frames_per_second),
         loop=0,
     )
-    return target

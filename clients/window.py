@@ -1,4 +1,4 @@
-"""A live window: the scene on the left, the filtered image on the right."""
+"""Live window with the scene on the left and the filtered image on the right."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ void main() { color = vec4(texture(image, uv).rgb, 1.0); }
 
 
 class NoDisplay(Exception):
-    """No display is available for a window."""
+    """No window can be opened."""
 
 
 class LiveWindow:
@@ -37,8 +37,10 @@ class LiveWindow:
 
     Parameters
     ----------
-    size_px : (width, height) of one image
-    title : text of the title bar
+    size_px : (int, int)
+        Width and height of one image.
+    title : str
+        Text of the title bar.
 
     Raises
     ------
@@ -47,8 +49,9 @@ class LiveWindow:
 
     Notes
     -----
-    pyrender draws through EGL and this window, on X11, through GLX.  One thread cannot
-    hold a context of each, so the window's context is current only during `show`.
+    Scenes are rendered through EGL, and on X11 this window draws through GLX.  A thread
+    cannot have a current context of each, so the window's context is current only
+    during a call.
     """
 
     def __init__(self, size_px: tuple[int, int], title: str) -> None:
@@ -89,7 +92,7 @@ class LiveWindow:
 
     @property
     def is_open(self) -> bool:
-        """Return whether the window is open (Esc or the close button closes it)."""
+        """Return whether the window is open; Esc or the close button closes it."""
         return self._window is not None and not glfw.window_should_close(self._window)
 
     def show(
@@ -112,10 +115,10 @@ class LiveWindow:
                 texture = self._textures[i]
                 if image.shape != (texture.height, texture.width, 3):
                     raise ValueError(
-                        f"picture of shape {image.shape}; the window shows "
+                        f"image of shape {image.shape}; expected "
                         f"{(texture.height, texture.width, 3)}"
                     )
-                # Rows of three bytes per pixel are not always a multiple of four.
+                # The size of a row of three-byte pixels need not be a multiple of four.
                 texture.write(np.ascontiguousarray(image), alignment=1)
                 texture.use()
                 self._context.viewport = (i * width // 2, 0, width // 2, height)
@@ -129,7 +132,7 @@ class LiveWindow:
         return self.is_open
 
     def shown(self) -> NDArray[np.uint8]:
-        """Read back the window's last image, (h, 2w, 3), top row first."""
+        """Read back the content (h, 2w, 3) of the window, top row first."""
         glfw.make_context_current(self._window)
         try:
             width, height = glfw.get_framebuffer_size(self._window)

@@ -37,6 +37,7 @@ from PIL import (
     PngImagePlugin,
     PpmImagePlugin,
     TiffImagePlugin,
+    UnidentifiedImageError,
     WebPImagePlugin,
 )
 
@@ -195,7 +196,7 @@ def _opened_picture(
             with file:
                 _check_container(file)
                 file.seek(0)
-                with Image.open(file, formats=formats) as image:
+                with Image.open(file, formats=tuple(formats)) as image:
                     _check_picture(image, file)
                     with _quiet_library() if image.format == "TIFF" else nullcontext():
                         yield image
@@ -205,7 +206,7 @@ def _opened_picture(
             raise InvalidFile(named, error.found, error.allowed, option) from None
         except FileNotFoundError:
             _refuse(named, "no such file", "a file that exists", option)
-        except Image.UnidentifiedImageError:
+        except UnidentifiedImageError:
             found = "cannot be read (unknown image format)"
             _refuse(named, found, "PNG, JPEG, PPM, TIFF or WebP", option)
         except Exception as error:  # Pillow's decoders raise nearly anything
@@ -354,8 +355,8 @@ def _check_picture(image: Image.Image, file: BinaryIO) -> None:
             raise _Refused(f"{width}x{height} px in {n_scans} scans", allowed)
     elif image.format == "TIFF":
         _check_tiles(image)
-    elif image.format == "PPM" and image.tile:
-        is_slow = image.tile[0][0] in ("ppm", "ppm_plain")
+    elif image.format == "PPM" and (tiles := getattr(image, "tile", None)):
+        is_slow = tiles[0][0] in ("ppm", "ppm_plain")
         n_samples = n_pixels * len(image.getbands())
         if is_slow and n_samples > MAX_SLOW_SAMPLES:
             allowed = (
@@ -509,8 +510,8 @@ def read_exr_channels(
     except _Refused as error:
         raise InvalidFile(path, error.found, error.allowed, option) from None
     except Exception as error:  # bindings raise nearly anything on damaged files
-        found = f"cannot be read ({_text_of(error)})"
-        raise InvalidFile(path, found, "an intact OpenEXR file", option) from None
+        problem = f"cannot be read ({_text_of(error)})"
+        raise InvalidFile(path, problem, "an intact OpenEXR file", option) from None
 
 
 def _exr_chunk_rows(header: dict[str, Any]) -> int:
@@ -522,7 +523,7 @@ def _exr_chunk_rows(header: dict[str, Any]) -> int:
     return EXR_CHUNK_ROWS.get(name.partition(":")[0].strip("> "), 256)
 
 
-def _check_exr(parts: list) -> None:
+def _check_exr(parts: list[Any]) -> None:
     """Reject files that would need too much memory, by the headers of all parts."""
     n_bytes = 0
     if not parts:

@@ -54,6 +54,7 @@ def read_color(path: Path, *, option: str = "color") -> NDArray[Any]:
         unsuitable.
     """
     suffix = _known_suffix(option, path, COLOR_SUFFIXES)
+    pixels: NDArray[Any]
     if suffix == ".exr":
         pixels = _exr_color(path, option)
     elif suffix == ".npy":

@@ -56,7 +56,7 @@ def workers_of(out):
                 ours = f"{MARK}={out}".encode() in file.read().split(b"\0")
         except OSError:
             continue
-        if ours and b"clients.batch.worker" in words:
+        if ours and b"clients.batch.process_pool" in words:
             found.append(int(folder))
     return found
 

@@ -122,7 +122,7 @@ def uses_gl(item):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Make the context current before any fixture: pyrender's tests leave theirs."""
+    """Make the context current before any fixture: other tests leave none."""
     if uses_gl(item) and SESSION_GPU in item.config.stash:
         item.config.stash[SESSION_GPU].context.__enter__()
 

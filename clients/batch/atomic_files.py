@@ -11,37 +11,46 @@ from typing import Any
 
 PART = ".part"
 MAX_STEM = 180
-"""Of a name, so that the name with its additions is valid in a file system."""
+"""Length limit of a stem, so that the temporary name is valid in a file system."""
 
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _BLOCK_BYTES = 1 << 20
 
 
 def write_whole(path: Path, write: Callable[[Path], None]) -> dict[str, Any]:
-    """Write a file under a temporary name beside the target, then rename it.
+    """Write a file under a temporary name in the same folder, then rename it.
 
-    A process that is killed leaves a file ``.NAME.RANDOM.part.SUFFIX`` at most, which
-    `remove_parts` finds.
+    A killed process leaves at most a file ``.NAME.RANDOM.part.SUFFIX``, which
+    `remove_parts` removes.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    write : callable
+        Function that writes the content to a path.
 
     Returns
     -------
     dict
-        bytes and sha256 of the file.
+        Size in ``bytes`` and ``sha256`` of the file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     random = secrets.token_hex(8)
     part = path.with_name(f".{path.stem[:MAX_STEM]}.{random}{PART}{path.suffix}")
-    os.close(os.open(part, _NEW_FILE, 0o666))  # follows no existing link
+    os.close(os.open(part, _NEW_FILE, 0o666))  # does not follow a link
     try:
         write(part)
         with part.open("rb") as file:
-            os.fsync(file.fileno())  # content before name, even in a power failure
-        told = content_of(part)
+            os.fsync(
+                file.fileno()
+            )  # the content precedes the rename, even in a power failure
+        content = content_of(part)
         os.replace(part, path)
     except BaseException:
         part.unlink(missing_ok=True)
         raise
-    return told
+    return content
 
 
 def content_of(path: Path) -> dict[str, Any]:
@@ -55,7 +64,7 @@ def content_of(path: Path) -> dict[str, Any]:
 
 
 def remove_parts(folder: Path) -> int:
-    """Remove the temporary files of killed processes; return their number."""
+    """Remove temporary files of killed processes; return their number."""
     parts = [path for path in folder.rglob(".*") if PART in path.suffixes]
     for path in parts:
         path.unlink(missing_ok=True)
@@ -63,7 +72,7 @@ def remove_parts(folder: Path) -> int:
 
 
 def input_of(path: Path) -> dict[str, Any]:
-    """Return name, size, time and hash of an input file."""
+    """Return the name, size, time and hash of an input file."""
     status = path.stat()
     return {
         "name": path.name,
@@ -72,14 +81,14 @@ def input_of(path: Path) -> dict[str, Any]:
     }
 
 
-def is_unchanged(path: Path, told: dict[str, Any]) -> bool:
-    """Return whether a file is unchanged; it is read only if its time differs."""
+def is_unchanged(path: Path, recorded: dict[str, Any]) -> bool:
+    """Return whether a file matches its record; read it only if its time differs."""
     try:
         status = path.stat()
     except OSError:
         return False
-    if status.st_size != told["bytes"]:
+    if status.st_size != recorded["bytes"]:
         return False
-    if status.st_mtime_ns == told["mtime_ns"]:
+    if status.st_mtime_ns == recorded["mtime_ns"]:
         return True
-    return content_of(path)["sha256"] == told["sha256"]
+    return content_of(path)["sha256"] == recorded["sha256"]

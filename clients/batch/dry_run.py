@@ -1,6 +1,6 @@
-"""Estimate of a batch's work, its time, and the cost of a million frames.
+"""Estimate of a batch's time, and of the cost of a million images.
 
-The first frames are filtered on one core, and their pictures are discarded.
+The estimate filters the first frames on one core and discards the images.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from clients.batch.manifest import LINES, Manifest, Notes, add_notes, note_line
+from clients.batch.manifest import LINES, Manifest, note_line
 from clients.batch.run import Batch, missing_units
 from clients.batch.work import Unit, UnitRunner
+from clients.frame_log import Notes, add_notes
 
 MEASURED_FRAMES = 6
-"""Frames per profile; the first one is a warm-up."""
+"""Frames per profile, of which the first one is a warm-up."""
 
 SECONDS_PER_HOUR = 3600.0
 MILLION = 1_000_000
@@ -39,7 +40,7 @@ def dry_run(
     ms = [one["ms_per_frame"] for one in measured if one["ms_per_frame"] is not None]
     mean_ms = float(np.mean(ms)) if ms else math.nan
     sizes = [one["bytes_per_frame"] for one in measured if one["bytes_per_frame"]]
-    # a helper process of each worker builds the PSFs, once per profile
+    # A helper process of each worker computes the PSFs, once per profile.
     builds_s = sum(one["build_s"] for one in measured) if n_missing else 0.0
     core_hours = mean_ms * MILLION / 1e3 / SECONDS_PER_HOUR
     report = {
@@ -66,7 +67,7 @@ def _known(value: float, digits: int) -> float | None:
 
 
 def _measured(batch: Batch, profile: str) -> dict[str, Any]:
-    """Filter the first frames through a profile, on this process's only thread."""
+    """Filter the first frames through a profile, on one thread."""
     frames = batch.frames[:MEASURED_FRAMES]
     times_ms, sizes, errors = [], [], []
     notes: Notes = {}
@@ -105,15 +106,15 @@ def lines_of(report: dict[str, Any], price_per_core_hour: float | None) -> list[
     """Format the report as lines of text."""
     lines = [
         f"{report['frames']} frames of the layout {report['layout']}, "
-        f"{len(report['profiles'])} profiles: {report['pictures']} pictures, "
-        f"{report['pictures_missing']} of them to be made"
+        f"{len(report['profiles'])} profiles: {report['pictures']} images, "
+        f"{report['pictures_missing']} of them missing"
     ]
     for one in report["profiles"]:
         took = one["ms_per_frame"]
         measured = (
-            "no frame measured"
+            "no frame was measured"
             if took is None
-            else f"{took:.1f} ms a frame on one core ({one['measured_frames']} "
+            else f"{took:.1f} ms per frame on one core ({one['measured_frames']} "
             f"measured), {one['bytes_per_frame'] / 1e6:.2f} MB"
         )
         lines.append(f"  {one['profile']}: {measured}; PSFs {one['build_s']:.1f} s")
@@ -126,7 +127,7 @@ def lines_of(report: dict[str, Any], price_per_core_hour: float | None) -> list[
             f"about {_duration(report['seconds'])} on {report['cores']} cores, "
             f"{report['output_mb']:g} MB"
         )
-        cost = f"a million pictures: {report['core_hours_per_million']:g} core-hours"
+        cost = f"a million images: {report['core_hours_per_million']:g} core-hours"
         if price_per_core_hour is not None:
             cost += f", {report['price_per_million']:g} at {price_per_core_hour:g} each"
         lines.append(cost)

@@ -1,4 +1,4 @@
-"""Filter whose pictures depend on frame, eye and settings, not on previous frames."""
+"""Filter whose images do not depend on previous frames."""
 
 from __future__ import annotations
 
@@ -14,33 +14,32 @@ BUILD_LIMIT_S = 600.0
 
 
 class EngineUnusable(RuntimeError):
-    """No frame can be filtered on this machine; the message says what to install."""
+    """The engine does not work on this machine; the message says what to install."""
 
 
 class ExactFilter:
-    """Filters frames through a job's eyes; keeps one eye and camera at a time.
+    """Filter of a job's frames, which keeps one eye and camera at a time.
 
-    It requires exactly the camera of the frame, not the nearest one: a cache that
-    serves a slightly different camera would make pictures depend on which of them came
-    first.
+    PSFs are prepared for exactly the camera of the frame.  With a cache that accepts
+    similar cameras, images would depend on which camera came first.
     """
 
     def __init__(self, job: Job) -> None:
         self._job = job
         self._key: tuple[str, Camera] | None = None
-        self._open: EyeFilter | None = None  # keeps engine and builder alive
+        self._open: EyeFilter | None = None  # keeps the engine and the builder alive
         self._filter: EyeFilter | None = None
         self._failure: FilterError | None = None
         self.build_s = 0.0
 
     def close(self) -> None:
         """Release the eye, the engine and the builder."""
-        self._give_up_eye()
+        self._release_eye()
         if self._open is not None:
             self._open.close()
         self._open = None
 
-    def _give_up_eye(self) -> None:
+    def _release_eye(self) -> None:
         if self._filter is not None:
             self._filter.close()
         self._filter = self._key = self._failure = None
@@ -48,12 +47,13 @@ class ExactFilter:
     def see(
         self, profile: str, view: RgbdView, *, pupil_mm: float, focus_dpt: float
     ) -> Filtered:
-        """Return a frame as seen through a profile.
+        """Filter a frame through a profile.
 
         Raises
         ------
         FilterError
-            The eye cannot be prepared for this camera, or the frame cannot be filtered.
+            If the eye cannot be prepared for this camera, or the frame cannot be
+            filtered.
         """
         if self._key != (profile, view.camera):
             self._prepare(profile, view.camera)
@@ -73,7 +73,7 @@ class ExactFilter:
         except FilterError as error:
             raise EngineUnusable(str(error)) from None
         for _ in range(ATTEMPTS):
-            self._give_up_eye()
+            self._release_eye()
             self._key = profile, camera
             body: Mapping[str, Any] = self._job.profiles[profile]
             settings, engine = self._job.settings, self._job.engine
@@ -82,7 +82,7 @@ class ExactFilter:
                 ready = self._filter.wait(BUILD_LIMIT_S)
                 self.build_s += ready.build_ms / 1e3
                 return
-            except WorkerCrashed as error:  # possibly out of memory
+            except WorkerCrashed as error:  # possibly for lack of memory
                 self._failure = error
             except FilterError as error:
                 self._failure = error

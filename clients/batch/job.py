@@ -1,4 +1,4 @@
-"""Parameters that determine a batch's pictures."""
+"""Parameters that determine the images of a batch."""
 
 from __future__ import annotations
 
@@ -25,20 +25,26 @@ Format = Literal["png", "npy", "exr", "ffv1", "h264"]
 
 @dataclass(frozen=True)
 class Job:
-    """Parameters that determine the pictures, independent of workers and order.
+    """Parameters that determine the images, whatever the workers and the order.
 
     Attributes
     ----------
-    profiles : mapping of names to profiles as JSON objects
+    profiles : mapping
+        Profiles, as JSON objects, by name.
     settings : FilterSettings
+        Settings of the filter.
     states : States
-    format : one of `FORMATS`
+        Pupil and focus of each frame.
+    format : str
+        Output format, one of `FORMATS`.
     half : bool
-        Half floats instead of floats.
+        Whether to write half floats instead of floats.
     engine : "native" or "gl"
+        Engine that filters.
     render_tolerance : float
+        Rendering error relative to the default.
     rate_hz : float
-        Frame rate of video outputs.
+        Frame rate of output videos.
     """
 
     profiles: Mapping[str, Mapping[str, Any]]
@@ -52,14 +58,14 @@ class Job:
 
     @property
     def output(self) -> Output:
-        """Return the kind of light stored in files of the format."""
+        """Return the output kind of the filter for this format."""
         if self.format not in LINEAR_FORMATS:
             return "srgb8"
         return "linear16" if self.half else "linear"
 
     @property
     def is_video(self) -> bool:
-        """Return whether each profile's pictures become one video."""
+        """Return whether the output is one video per profile."""
         return self.format in VIDEO_FORMATS
 
     def described(self) -> dict[str, Any]:
@@ -82,13 +88,15 @@ def batch_settings(given: Mapping[str, Any], states: States) -> FilterSettings:
     Parameters
     ----------
     given : mapping
-        Fields of `FilterSettings`; ranges that are not given are the defaults, widened
+        Fields of `FilterSettings`.  Ranges that are not given are the defaults, widened
         to include the states.
+    states : States
+        Pupil and focus of each frame.
 
     Raises
     ------
     ValueError
-        A setting is unknown or out of range.
+        If a setting is unknown or out of range.
     """
     try:
         settings = FilterSettings(**given)
@@ -101,7 +109,7 @@ def batch_settings(given: Mapping[str, Any], states: States) -> FilterSettings:
 
 
 def code_version() -> dict[str, str | None]:
-    """Return the version of the package, and the commit of a checkout if known."""
+    """Return the version of the package and, in a checkout, its commit."""
     try:
         package = version("ocufilter")
     except PackageNotFoundError:
@@ -123,6 +131,6 @@ def _commit() -> str | None:
 
 
 def fingerprint(plain: Mapping[str, Any]) -> str:
-    """Return a hash of plain values."""
+    """Return a hash of JSON-compatible values."""
     text = json.dumps(plain, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

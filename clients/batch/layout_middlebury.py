@@ -1,10 +1,10 @@
 """Middlebury stereo (2014 and later): im0.png, disp0.pfm and calib.txt of each scene.
 
     calib.txt    cam0=[f 0 cx; 0 f cy; 0 0 1], doffs (px), baseline (mm)
-    disp0.pfm    disparity of the left view, px; infinity where it is unknown
+    disp0.pfm    disparity of the left view, px; infinity if unknown
 
-depth = f baseline / (disparity + doffs). The folder is that of one scene, or contains
-the folders of many.
+depth = f baseline / (disparity + doffs). The folder is a scene, or contains the folders
+of several scenes.
 
 References
 ----------
@@ -30,17 +30,17 @@ _NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
 
 
 def is_middlebury(source: Path) -> bool:
-    """Return whether a folder is a scene, or contains scenes."""
+    """Return whether a folder is a scene or contains scenes."""
     return bool(_scenes(source))
 
 
 def middlebury_frames(source: Path) -> list[SourceFrame]:
-    """Return one frame per scene, named by its folder.
+    """Return one frame per scene, named after its folder.
 
     Raises
     ------
     InvalidFile
-        A calibration cannot be read; names the file and the missing field.
+        If a calibration cannot be read.  The message names the file and the field.
     """
     frames = []
     for folder in _scenes(source):
@@ -66,6 +66,7 @@ def read_calibration(path: Path) -> tuple[Pinhole, Disparity]:
     Raises
     ------
     InvalidFile
+        If the calibration is incomplete or invalid.
     """
     text = read_text(path, max_bytes=MAX_CALIBRATION_BYTES)
     fields = dict(re.findall(r"^[ \t]*(\w+)[ \t]*=[ \t]*(.*)$", text, re.MULTILINE))
@@ -89,7 +90,7 @@ def read_calibration(path: Path) -> tuple[Pinhole, Disparity]:
 
 
 def _number(text: str) -> float:
-    """Return a number; NaN for other text and for numbers that are too large."""
+    """Return a number, or NaN for other text and numbers that are too large."""
     try:
         value = float(text)
     except ValueError:

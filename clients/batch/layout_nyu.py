@@ -1,14 +1,15 @@
-"""NYU depth v2: extracted pairs, or the raw dumps of its Kinect.
+"""NYU depth v2: extracted pairs, or raw dumps of the Kinect.
 
     00001_colors.png, 00001_depth.png      16-bit depth in mm, registered to color
-    rgb_00001.jpg, sync_depth_00001.png    the same, by other names
-    r-TIME-ID.ppm, d-TIME-ID.pgm           raw: color and depth with separate times
+    rgb_00001.jpg, sync_depth_00001.png    other names of such pairs
+    r-TIME-ID.ppm, d-TIME-ID.pgm           raw color and depth, with separate times
 
-Raw depth is the Kinect's count n with swapped bytes: 351.3 / (1092.5 - n) m, unknown
-beyond 10 m. It is registered to the color camera with the calibration of the data
-set's toolbox; pixels that it does not reach are missing. Lens distortion is left in
-both images: some pixels in the corners. Each color image is paired with the depth
-nearest in time. The .mat file of labeled frames is not supported: extract it first.
+Raw depth is a count n of the Kinect with swapped bytes, which means 351.3 / (1092.5 -
+n) m, and is unknown beyond 10 m. It is registered to the color camera with the
+calibration from the toolbox of the data set; pixels without a registered value are
+missing. Lens distortion, some pixels in the corners, is not corrected. Each color image
+is paired with the depth image that is closest in time. The .mat file of labeled frames
+is not supported; extract it first.
 
 References
 ----------
@@ -50,8 +51,8 @@ TO_COLOR = np.linalg.inv(
         ]
     )
 )
-"""Maps directions from the depth camera's frame to the color camera's; it also reverses
-them, which the projection cancels."""
+"""Matrix from the frame of the depth camera to that of the color camera. It also
+reverses directions, which the projection cancels."""
 SHIFT_M = np.array(
     [2.5031875059141302e-02, -2.9342312935846411e-04, 6.6238747008330102e-04]
 )
@@ -64,33 +65,35 @@ _EXTRACTED = re.compile(r"^(\d+_colors|sync_depth_\d+)\.(?:png|jpg)$")
 
 @dataclass(frozen=True)
 class KinectCounts:
-    """Raw counts of the Kinect, in the view of its depth camera."""
+    """Depth format of the raw counts of the Kinect's depth camera."""
 
     def read(self, path: Path) -> NDArray[np.float32]:
-        """Return the depth in the color camera's view, m; 0 where unknown."""
+        """Return the depth in the view of the color camera, m; 0 if unknown."""
         stored = read_depth(path, depth_scale=1.0, option="")
         width_px, height_px = COLOR_CAMERA.size_px or (0, 0)
         if stored.shape != (height_px, width_px):
             found = f"{stored.shape[1]}x{stored.shape[0]} px"
-            raise InvalidFile(path, found, f"{width_px}x{height_px}, as the Kinect's")
+            raise InvalidFile(
+                path, found, f"{width_px}x{height_px}, as from the Kinect"
+            )
         if not ((stored >= 0.0) & (stored <= MAX_COUNT)).all():
             raise InvalidFile(path, "numbers that are not counts", f"0 to {MAX_COUNT}")
         return self.of_integers(stored.astype(np.uint16))
 
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
-        """Return the depth for the numbers as stored, with bytes still swapped."""
+        """Return the depth for the numbers as stored, with swapped bytes."""
         return registered_m(counted_depth_m(stored.byteswap()))
 
 
 def counted_depth_m(counts: NDArray[np.uint16]) -> NDArray[np.float64]:
-    """Return the depth for counts of the depth camera, m; 0 where unknown."""
+    """Return the depth for counts of the depth camera, m; 0 if unknown."""
     left = COUNT_AT_INFINITY - counts.astype(np.float64)
     depth_m = COUNT_SCALE_M / left  # never 0: the constant is not an integer
     return np.where((left > 0.0) & (depth_m <= MAX_DEPTH_M), depth_m, 0.0)
 
 
 def registered_m(depth_m: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return depth in the color camera's view; of two points the nearer one."""
+    """Return depth in the view of the color camera, of the nearest point per pixel."""
     y, x = np.nonzero(depth_m > 0.0)
     known_m = depth_m[y, x]
     camera = DEPTH_CAMERA
@@ -121,7 +124,7 @@ def is_nyu(source: Path) -> bool:
 
 
 def nyu_frames(source: Path) -> list[SourceFrame]:
-    """Return the frames of a folder; those of raw dumps are named by their times."""
+    """Return the frames of a folder; frames of raw dumps are named by their times."""
     times: dict[str, dict[float, Path]] = {"r": {}, "d": {}}
     for path in sorted(source.iterdir()):
         if match := _RAW.match(path.name):

@@ -1,8 +1,8 @@
 """Folders of color and depth images, paired by their names.
 
-color/0001.png      depth/0001.exr       any of the known subfolder names
-0001_color.png      0001_depth.npy       in one folder, with a word in the name
-0001.jpg            0001.npy             or distinguished by file type
+color/0001.png      depth/0001.exr       two folders with known names
+0001_color.png      0001_depth.npy       one folder, names with a known word
+0001.jpg            0001.npy             one folder, distinguished by file type
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ _COLOR_WORD, _DEPTH_WORD = _at_an_end(COLOR_WORDS), _at_an_end(DEPTH_WORDS)
 def pair_frames(
     source: Path, depth: Path | None, optics: Optics, scaled: Scaled
 ) -> list[SourceFrame]:
-    """Return the pairs in a folder, or in it and a folder of depth.
+    """Return the pairs in a folder, or in a folder of color and one of depth.
 
-    A file without a partner becomes a frame with a fault.
+    A file without a counterpart becomes a frame with a fault.
 
     Raises
     ------
     ValueError
-        Depth files cannot be identified, or two files have the same name.
+        If depth files cannot be identified, or two files have the same name.
     """
     colors, depths = _colors_and_depths(source, depth)
     frames = []
@@ -46,8 +46,8 @@ def pair_frames(
         color, depth_file = colors.get(name), depths.get(name)
         fault = None
         if color is None or depth_file is None:
-            lacking = "colour" if color is None else "depth"
-            fault = f"'{color or depth_file}': no {lacking} of the name '{name}'"
+            lacking = "color" if color is None else "depth"
+            fault = f"'{color or depth_file}': no {lacking} with the name '{name}'"
         frames.append(
             SourceFrame(
                 name,
@@ -81,8 +81,8 @@ def _colors_and_depths(
         colors = [path for path in files if path.suffix.lower() in _PICTURES]
         if len(depths) != len(colors):
             raise ValueError(
-                f"'{source}': cannot tell which files are depth; allowed: folders "
-                f"such as color/ and depth/, names that end in _depth, or --depth DIR"
+                f"'{source}': cannot identify the depth files; allowed: folders such "
+                f"as color/ and depth/, names that end in _depth, or --depth DIR"
             )
     return _named(colors, _COLOR_WORD), _named(depths, _DEPTH_WORD)
 
@@ -91,7 +91,7 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".ppm")
 
 
 def images_in(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """Return the files of a folder with these suffixes, by name."""
+    """Return the files of a folder with these suffixes, sorted by name."""
     return sorted(
         path
         for path in folder.iterdir()
@@ -104,7 +104,7 @@ def _sub_folder(source: Path, names: tuple[str, ...]) -> Path | None:
 
 
 def _named(paths: list[Path], word: re.Pattern[str]) -> dict[str, Path]:
-    """Return files by name, without the word for color or depth."""
+    """Return files by their names without the word for color or depth."""
     found: dict[str, Path] = {}
     for path in paths:
         match = word.search(path.stem.lower())
@@ -112,6 +112,8 @@ def _named(paths: list[Path], word: re.Pattern[str]) -> dict[str, Path]:
         if match is not None:
             name = (name[: match.start()] + name[match.end() :]) or path.stem
         if name in found:
-            raise ValueError(f"'{path}' and '{found[name]}': both are called '{name}'")
+            raise ValueError(
+                f"'{path}' and '{found[name]}' have the same name '{name}'"
+            )
         found[name] = path
     return found

@@ -1,12 +1,12 @@
-"""TUM RGB-D: color and depth of a Kinect with separate times, each with a list.
+"""TUM RGB-D: color and depth of a Kinect, each with a list of times.
 
     rgb.txt, depth.txt        lines "time path"; "#" begins a comment
-    associations.txt          used instead if present, lines "time path time path"
+    associations.txt          used instead if present; lines "time path time path"
 
-Depth is 16-bit PNG, 5000 units per meter, 0 where missing. Color and depth are paired
-by nearest time, within 20 ms, each used once, as in the data set's own
-`associate.py`. The recorder registers depth to color; the data set's authors recommend
-the driver's camera for it: 525 px, center (319.5, 239.5).
+Depth is 16-bit PNG with 5000 units per meter, 0 if missing. As in the data set's
+`associate.py`, color and depth are paired by the closest time, within 20 ms, and each
+is used once. The depth is registered to color. The authors recommend the camera of the
+driver: a focal length of 525 px and the center (319.5, 239.5).
 
 References
 ----------
@@ -26,10 +26,10 @@ DEPTH_SCALE_M = 1.0 / 5000.0
 CAMERA = Pinhole(525.0, 525.0, 319.5, 239.5, (640, 480))
 MAX_APART_S = 0.02
 MAX_LINES = 100_000
-"""Of a list: an hour at 30 Hz. 20 us each."""
+"""Length of a list: an hour at 30 Hz. Each line takes 20 us."""
 
 MAX_NEAR = 50
-"""Depth images compared on each side: a camera of 30 Hz has one."""
+"""Depth images compared on each side in time; a camera of 30 Hz has one."""
 
 ASSOCIATIONS = ("associations.txt", "associate.txt", "assoc.txt")
 
@@ -47,7 +47,7 @@ def tum_frames(source: Path) -> list[SourceFrame]:
     Raises
     ------
     InvalidFile
-        A list cannot be read; names its line.
+        If a list cannot be read.  The message names the line.
     """
     lists = next((source / n for n in ASSOCIATIONS if (source / n).is_file()), None)
     pairs = _associated(source) if lists is None else _listed(lists)
@@ -64,18 +64,18 @@ def tum_frames(source: Path) -> list[SourceFrame]:
 
 
 def _listed(path: Path) -> list[tuple[str, str]]:
-    """Return color and depth of each line, in whichever order they are."""
+    """Return color and depth of each line, which may have either order."""
     pairs: list[tuple[str, str]] = []
     seen: set[str] = set()
     for number, fields in _lines(path, 4):
         first, second = fields[1], fields[3]
         if first.startswith("depth/") == second.startswith("depth/"):
             found = f"line {number}: '{first:.60}' and '{second:.60}'"
-            raise InvalidFile(path, found, "one of them in depth/")
+            raise InvalidFile(path, found, "exactly one of them in depth/")
         color, depth = (second, first) if first.startswith("depth/") else fields[1::2]
         if color in seen:
-            found = f"line {number}: '{color:.60}' again"
-            raise InvalidFile(path, found, "each image of color once")
+            found = f"line {number}: '{color:.60}' occurs again"
+            raise InvalidFile(path, found, "each color image once")
         seen.add(color)
         pairs.append((color, depth))
     return pairs
@@ -98,7 +98,7 @@ def _associated(source: Path) -> list[tuple[str, str]]:
 
 
 def _near(times_s: list[float], at_s: float) -> list[float]:
-    """Return the ascending times that are near; if there are many, the nearest."""
+    """Return the times within `MAX_APART_S`, up to `MAX_NEAR` on each side."""
     first = bisect_left(times_s, at_s - MAX_APART_S)
     end = bisect_right(times_s, at_s + MAX_APART_S)
     middle = bisect_left(times_s, at_s)
@@ -131,7 +131,7 @@ def _lines(path: Path, count: int) -> list[tuple[int, list[str]]]:
             raise InvalidFile(path, found, f"{count} or more")
         for name in fields[1:count:2]:
             if name.startswith("/") or ".." in name.split("/"):
-                found = f"line {number}: '{name:.60}' leads out of the data set"
+                found = f"line {number}: '{name:.60}' is outside the data set"
                 raise InvalidFile(path, found, "a path below its folder")
         lines.append((number, fields[:count]))
     return lines

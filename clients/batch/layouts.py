@@ -1,10 +1,10 @@
-"""Detection of a data set's layout, and its frames.
+"""Detection of the layout of a data set, and listing of its frames.
 
-pairs       folders of color and of depth, or one folder with both
+pairs       folders of color and depth, or one folder with both
 tum         TUM RGB-D: rgb/, depth/ and their lists
 nyu         NYU depth v2: extracted pairs, or raw dumps
 middlebury  im0.png, disp0.pfm and calib.txt, of one scene or many
-video       a color video, with a video or a folder of depth
+video       a color video, with depth as a 16-bit gray video or a folder of images
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from clients.batch import layout_middlebury, layout_nyu, layout_pairs, layout_tum
-from clients.batch.layout_video import VIDEO_SUFFIXES, video_frames
+from clients.batch.layout_pairs import images_in
 from clients.batch.source import (
     FieldOfView,
     Optics,
@@ -23,16 +23,22 @@ from clients.batch.source import (
     SourceFrame,
 )
 from filter_service.camera import read_intrinsics
+from filter_service.image_files import DEPTH_SUFFIXES
+
+VIDEO_SUFFIXES = (
+    *(".mkv", ".mp4", ".mov", ".avi", ".webm"),
+    *(".m4v", ".mpg", ".mpeg", ".ts"),
+)
 
 
 @dataclass(frozen=True)
 class LayoutOptions:
-    """Options of the command line that complement or override the data set.
+    """Command-line options that complement or override the data set.
 
     Attributes
     ----------
     depth : Path, optional
-        Folder or video of depth, if it is not beside the color.
+        Folder or video of depth, if it is not in the folder of color.
     optics : Optics, optional
         Overrides the layout's camera.
     depth_scale_m : float, optional
@@ -58,32 +64,34 @@ LAYOUTS = ("auto", *DETECTED, "pairs", "video")
 
 
 def list_frames(
-    source: Path, layout: str, told: LayoutOptions
+    source: Path, layout: str, options: LayoutOptions
 ) -> tuple[str, list[SourceFrame]]:
-    """Return the layout of a data set and its frames, in the order of their names.
+    """Return the layout of a data set, and its frames sorted by name.
 
     Raises
     ------
     ValueError
-        No such folder or file, no frames in it, or no known camera.
+        If the folder or file does not exist, or has no frames or no known camera.
     """
     if not source.exists():
         raise ValueError(f"'{source}': no such file; allowed: a folder or a video")
     layout = _layout_of(source, layout)
     if layout in DETECTED:
-        if told.depth is not None:
+        if options.depth is not None:
             raise ValueError(f"--depth: the layout {layout} has its own depth")
         frames = DETECTED[layout][1](source)
     elif layout == "video":
-        frames = video_frames(source, told.depth, _optics(told), _scaled(told))
+        frames = _video_frames(
+            source, options.depth, _optics(options), _scaled(options)
+        )
     else:
         frames = layout_pairs.pair_frames(
-            source, told.depth, _optics(told), _scaled(told)
+            source, options.depth, _optics(options), _scaled(options)
         )
     if not frames:
         raise ValueError(f"'{source}': no frames of the layout {layout}")
     _check_names(frames)
-    return layout, [_with_options(frame, told) for frame in frames]
+    return layout, [_with_options(frame, options) for frame in frames]
 
 
 def _layout_of(source: Path, layout: str) -> str:
@@ -96,8 +104,8 @@ def _layout_of(source: Path, layout: str) -> str:
             f"{', '.join(VIDEO_SUFFIXES)}"
         )
     if is_video != (layout == "video") and layout != "auto":
-        allowed = "video" if is_video else "auto, or one of a folder"
-        raise ValueError(f"--layout '{layout}' of '{source}'; allowed: {allowed}")
+        allowed = "video" if is_video else "auto, or the layout of a folder"
+        raise ValueError(f"--layout '{layout}' for '{source}'; allowed: {allowed}")
     if layout != "auto":
         return layout
     if is_video:
@@ -107,28 +115,59 @@ def _layout_of(source: Path, layout: str) -> str:
     )
 
 
-def _optics(told: LayoutOptions) -> Optics:
-    if told.optics is None:
+def _video_frames(
+    source: Path, depth: Path | None, optics: Optics, scaled: Scaled
+) -> list[SourceFrame]:
+    """Return the frames of a video, named by their numbers."""
+    from clients.batch.video_reading import frame_count
+
+    if depth is None:
         raise ValueError(
-            "--fov-deg: not given, and the data has no calibration; allowed: the "
+            f"--depth is not given; allowed for '{source}': a 16-bit gray video, or a "
+            "folder of depth images"
+        )
+    count = frame_count(source)
+    depths: list[tuple[Path, int | None]]
+    if depth.is_dir():
+        files = images_in(depth, DEPTH_SUFFIXES)
+        depths = [(path, None) for path in files]
+    elif depth.is_file():
+        depths = [(depth, k) for k in range(frame_count(depth))]
+    else:
+        raise ValueError(f"--depth '{depth}': no such file or folder")
+    if len(depths) != count:
+        raise ValueError(
+            f"--depth '{depth}': {len(depths)} frames; allowed: {count}, as in "
+            f"'{source}'"
+        )
+    return [
+        SourceFrame(f"{k:06d}", source, path, optics, scaled, k, depth_index)
+        for k, (path, depth_index) in enumerate(depths)
+    ]
+
+
+def _optics(options: LayoutOptions) -> Optics:
+    if options.optics is None:
+        raise ValueError(
+            "--fov-deg is not given, and the data set has no calibration; allowed: the "
             "vertical field of view in deg, or --intrinsics FX,FY,CX,CY in px"
         )
-    return told.optics
+    return options.optics
 
 
-def _scaled(told: LayoutOptions) -> Scaled:
-    return Scaled(told.depth_scale_m)
+def _scaled(options: LayoutOptions) -> Scaled:
+    return Scaled(options.depth_scale_m)
 
 
-def _with_options(frame: SourceFrame, told: LayoutOptions) -> SourceFrame:
-    """Return a frame with the overrides of the command line."""
-    if told.optics is not None:
-        frame = replace(frame, optics=told.optics)
-    if told.depth_scale_m is not None:
+def _with_options(frame: SourceFrame, options: LayoutOptions) -> SourceFrame:
+    """Apply the options of the command line to a frame."""
+    if options.optics is not None:
+        frame = replace(frame, optics=options.optics)
+    if options.depth_scale_m is not None:
         if not isinstance(frame.depth_form, Scaled):
             kind = type(frame.depth_form).__name__
-            raise ValueError(f"--depth-scale: this depth is of the kind {kind}")
-        frame = replace(frame, depth_form=Scaled(told.depth_scale_m))
+            raise ValueError(f"--depth-scale: not allowed for depth of the kind {kind}")
+        frame = replace(frame, depth_form=Scaled(options.depth_scale_m))
     return frame
 
 
@@ -137,25 +176,25 @@ def _check_names(frames: Sequence[SourceFrame]) -> None:
     for frame in frames:
         if frame.name in seen:
             raise ValueError(
-                f"'{frame.color}' and '{seen[frame.name]}' would both be called "
+                f"'{frame.color}' and '{seen[frame.name]}' have the same name "
                 f"'{frame.name}'"
             )
         seen[frame.name] = frame.color
 
 
 def optics_of(fov_deg: float | None, intrinsics: str | None) -> Optics | None:
-    """Return the camera given on the command line, or None.
+    """Return the camera that the command line specifies, or None.
 
     Raises
     ------
     ValueError
-        Both are given, or the numbers are not those of a camera; names the option.
+        If both are given or the numbers are invalid.  The message names the option.
     """
     if fov_deg is not None and intrinsics is not None:
-        raise ValueError("--fov-deg and --intrinsics: allowed is one of them")
+        raise ValueError("--fov-deg and --intrinsics are given; allowed: one of them")
     if fov_deg is not None:
         if not 1.0 <= fov_deg <= 150.0:
-            raise ValueError(f"--fov-deg {fov_deg:g}: allowed is 1 to 150")
+            raise ValueError(f"--fov-deg is {fov_deg:g}; allowed: 1 to 150")
         return FieldOfView(fov_deg)
     if intrinsics is None:
         return None

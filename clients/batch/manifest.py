@@ -1,40 +1,38 @@
-"""Record of a batch: a line per frame while it runs, and a summary at the end.
+"""Record of a batch: a line per frame during the run, and a summary at the end.
 
-    manifest.jsonl   the job; then a line for each frame, and again where it was redone:
-                     the last one counts
+    manifest.jsonl   the job, then a line for each frame; if a frame was processed
+    again,
+                     its last line counts
     manifest.json    the job, counts, failures and notes
 
-Lines are appended whole by one process; a line left unfinished by a power failure is
-cut off. A frame without a line is redone, whatever files of it exist.
+One process appends complete lines; a partial line after a power failure is removed. A
+frame without a line is processed again even if its files exist.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import re
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
 from clients.batch.atomic_files import is_unchanged, write_whole
 from clients.batch.job import fingerprint
 from clients.batch.work import Record
+from clients.frame_log import Notes, add_notes
 from estimator import InvalidFile
 from estimator.bounded_files import loads_bounded
 
 LINES, SUMMARY = "manifest.jsonl", "manifest.json"
-RESTART = "the same, another folder, or --overwrite"
-_NUMBER = re.compile(r"\d+(\.\d+)?")
+RESTART = "the same value, another folder, or --overwrite"
 MAX_LINE_BYTES, MAX_LINE_ITEMS = 16_000_000, 2_000_000
-"""Of a line: a job with states of 200,000 frames, the maximum, takes half of it."""
-
-Notes = dict[str, dict[str, Any]]
+"""Limits of a line; a job with states of 200,000 frames, the maximum, takes half."""
 
 SYNC_S = 2.0
-"""A power failure undoes at most this much work."""
+"""Interval of writes to disk: a power failure loses at most this much work."""
 
 
 class ManifestDiffers(InvalidFile):
@@ -42,21 +40,21 @@ class ManifestDiffers(InvalidFile):
 
 
 class Manifest:
-    """The manifest of an output folder, read and appended to.
+    """Manifest of an output folder, which is read and then appended to.
 
     Parameters
     ----------
     out : Path
-        An existing folder.
+        Existing folder.
     job : mapping
-        Parameters that determine the pictures, as plain values.
+        Parameters that determine the images, as JSON-compatible values.
 
     Raises
     ------
     ManifestDiffers
-        The folder's manifest is of another job; names what differs.
+        If the manifest belongs to another job.  The message names the difference.
     ValueError
-        The file is not a manifest.
+        If the file is not a manifest.
     """
 
     def __init__(self, out: Path, job: Mapping[str, Any]) -> None:
@@ -81,7 +79,7 @@ class Manifest:
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        """Close its file."""
+        """Close the file."""
         os.fsync(self._file)
         os.close(self._file)
 
@@ -97,8 +95,8 @@ class Manifest:
                     self._places[record["profile"], record["frame"]] = end
                 end += len(line)
         if len(line) > MAX_LINE_BYTES:
-            found = f"a line of more than {MAX_LINE_BYTES:,} bytes"
-            raise InvalidFile(self._path, found, "at most that many")
+            found = f"a line has more than {MAX_LINE_BYTES:,} bytes"
+            raise InvalidFile(self._path, found, "fewer")
         os.ftruncate(self._file, end)
         if end == 0:
             self._write({"kind": "job", "fingerprint": fingerprint(job), **job})
@@ -123,7 +121,7 @@ class Manifest:
         return place
 
     def record(self, profile: str, frame: str) -> Record | None:
-        """Return the last line of a frame, or None."""
+        """Return the last record of a frame, or None."""
         place = self._places.get((profile, frame))
         return None if place is None else self._at(place)
 
@@ -135,12 +133,12 @@ class Manifest:
         return json.loads(b"".join(parts).split(b"\n", 1)[0])
 
     def records(self) -> Iterator[Record]:
-        """Yield the last line of each frame, by profile and name."""
+        """Yield the last record of each frame, sorted by profile and name."""
         for key in sorted(self._places):
             yield self._at(self._places[key])
 
     def is_done(self, profile: str, frame: str, files: tuple[Path, ...]) -> bool:
-        """Return whether a frame's picture exists and its input files are unchanged."""
+        """Return whether a frame's output exists and its inputs are unchanged."""
         record = self.record(profile, frame)
         if record is None or not record["ok"]:
             return False
@@ -148,13 +146,13 @@ class Manifest:
         if path is None or not path.is_file() or path.stat().st_size != record["bytes"]:
             return False
         return len(files) == len(record["inputs"]) and all(
-            is_unchanged(path, told)
-            for path, told in zip(files, record["inputs"], strict=True)
+            is_unchanged(path, recorded)
+            for path, recorded in zip(files, record["inputs"], strict=True)
         )
 
 
 def records_of(path: Path) -> Iterator[Record]:
-    """Yield the readable lines of a manifest."""
+    """Yield the readable records of a manifest."""
     with path.open("rb") as file:
         while line := file.readline(MAX_LINE_BYTES + 1):
             try:
@@ -164,7 +162,7 @@ def records_of(path: Path) -> Iterator[Record]:
 
 
 def below(folder: Path, name: object) -> Path | None:
-    """Return the path of a manifest's file name; None if it is outside the folder."""
+    """Return the path of a file that a manifest names; None if outside the folder."""
     if not isinstance(name, str) or not name or "\0" in name:
         return None
     inner = Path(name)
@@ -182,7 +180,7 @@ def _parsed(line: bytes, path: Path) -> Record:
         record = None
     if not isinstance(record, dict):
         found = f"a line is not a JSON object: {line[:60]!r}"
-        raise InvalidFile(path, found, "the lines of a batch")
+        raise InvalidFile(path, found, "the manifest of a batch")
     return record
 
 
@@ -204,20 +202,20 @@ _INPUT_FIELDS = {"bytes": int, "mtime_ns": int, "sha256": str}
 
 
 def _check_frame(record: Record, path: Path) -> None:
-    """Reject a frame's line that lacks a required field."""
+    """Check that a frame's record has all required fields."""
     wanted = _FRAME_FIELDS | (_DONE_FIELDS if record.get("ok") else {"error": str})
     wrong = [k for k, kind in wanted.items() if not isinstance(record.get(k), kind)]
     if not wrong and record["ok"]:
         if not all(isinstance(note, str) for note in record["notes"]):
             wrong.append("notes")
-        for told in record["inputs"]:
-            if not isinstance(told, dict) or not all(
-                isinstance(told.get(k), kind) for k, kind in _INPUT_FIELDS.items()
+        for recorded in record["inputs"]:
+            if not isinstance(recorded, dict) or not all(
+                isinstance(recorded.get(k), kind) for k, kind in _INPUT_FIELDS.items()
             ):
                 wrong.append("inputs")
     if wrong:
-        found = f"a frame's line with a wrong '{wrong[0]}'"
-        raise InvalidFile(path, found, "the lines of a batch, or --overwrite")
+        found = f"the record of a frame has an invalid '{wrong[0]}'"
+        raise InvalidFile(path, found, "the manifest of a batch, or --overwrite")
 
 
 def _check_same(found: Record, job: Mapping[str, Any], path: Path) -> None:
@@ -228,17 +226,17 @@ def _check_same(found: Record, job: Mapping[str, Any], path: Path) -> None:
         if found.get(name) != wanted.get(name):
             before, now = _first_difference(name, found.get(name), wanted.get(name))
             found_text = (
-                f"{now[0]} is {_short(now[1])}, and was {_short(before[1])} when this "
-                "folder was begun"
+                f"{now[0]} is {_short(now[1])}, but was {_short(before[1])} when the "
+                "batch in this folder started"
             )
             raise ManifestDiffers(path, found_text, RESTART)
-    raise ManifestDiffers(path, "the folder's manifest is of another job", RESTART)
+    raise ManifestDiffers(path, "the manifest belongs to another job", RESTART)
 
 
 def _first_difference(
     name: str, before: Any, now: Any
 ) -> tuple[tuple[str, Any], tuple[str, Any]]:
-    """Descend to the field that differs."""
+    """Return name and value of the first field that differs, before and now."""
     if isinstance(before, dict) and isinstance(now, dict):
         for key in sorted({*before, *now}):
             if before.get(key) != now.get(key):
@@ -263,7 +261,7 @@ def write_summary(out: Path, summary: Mapping[str, Any]) -> None:
 
 
 def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, Any]:
-    """Return counts, failures and notes of the requested frames."""
+    """Return the counts, failures and notes of the requested frames."""
     n_done, failures = Counter[str](), []
     notes: Notes = {}
     pixels = Counter[str]()
@@ -285,13 +283,6 @@ def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, An
     }
 
 
-def add_notes(notes: Notes, of_frame: Sequence[str]) -> None:
-    """Count the notes of a frame; notes that differ only in numbers count as one."""
-    for note in of_frame:
-        kind = _NUMBER.sub("#", note)
-        notes.setdefault(kind, {"frames": 0, "example": note})["frames"] += 1
-
-
 def note_line(note: Mapping[str, Any]) -> str:
-    """Format a note and the number of its frames."""
-    return f"{note['frames']} frames, as: {note['example']}"
+    """Format a note with its number of frames."""
+    return f"{note['frames']} frames: {note['example']}"

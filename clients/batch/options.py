@@ -29,8 +29,8 @@ from filter_service.settings import (
 )
 
 DESCRIPTION = """\
-Folders and videos of color and depth, as people see them: each frame through each
-profile, on all cores.  Run the same command again to continue an interrupted batch.
+Filter folders and videos of color and depth on all cores, each frame through each
+profile.  Run the same command again to continue an interrupted batch.
 
   ocufilter batch rgbd_dataset_freiburg1_desk -p myopia -p keratoconus -o seen
   ocufilter batch room/ -p me.json --fov-deg 50 --focus-dpt center -o seen
@@ -39,18 +39,18 @@ profile, on all cores.  Run the same command again to continue an interrupted ba
 """
 
 LAYOUT_HELP = """\
-layouts, found by what is in the folder:
-  tum         TUM RGB-D: rgb/, depth/, their lists; depth / 5000, camera of the driver
+layouts, detected from the content of the folder:
+  tum         TUM RGB-D: rgb/, depth/ and their lists; depth / 5000, driver's camera
   nyu         NYU depth v2: N_colors.png with N_depth.png, rgb_N.jpg with
               sync_depth_N.png (mm), or raw dumps r-*.ppm with d-*.pgm
   middlebury  im0.png, disp0.pfm, calib.txt of one scene or of a folder of scenes
-  pairs       color/ and depth/, or NAME_color with NAME_depth; depth as PNG of 16 bits,
-              float TIFF, NPY, EXR, PFM; wants --fov-deg or --intrinsics
-  video       color in a video, depth in another of 16-bit gray, or in a folder
+  pairs       color/ and depth/, or NAME_color with NAME_depth; depth as 16-bit PNG,
+              float TIFF, NPY, EXR or PFM; requires --fov-deg or --intrinsics
+  video       a color video, with depth as a 16-bit gray video or a folder of images
 
-results: OUT/PROFILE/FRAME.png, or OUT/PROFILE.mkv; OUT/manifest.jsonl has a line for
-each frame, OUT/manifest.json the whole.  Exit codes: 0 done, 1 some frames failed,
-2 bad input.
+results: OUT/PROFILE/FRAME.png or OUT/PROFILE.mkv; a line for each frame in
+OUT/manifest.jsonl, and a summary in OUT/manifest.json.  Exit codes: 0 success, 1 some
+frames failed, 2 invalid input.
 """
 
 FPS_LIMITS_HZ = (0.1, 1000.0)
@@ -74,54 +74,55 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
         action="append",
         required=True,
         metavar="P",
-        help="a preset's name, a .json, .abp or .csv file, or JSON; again for more. "
-        "NAME=P gives its folder another name",
+        help="preset name, a .json, .abp or .csv file, or JSON; repeatable; NAME=P "
+        "sets the name of its folder",
     )
-    _add_source(parser.add_argument_group("what is read"))
-    _add_eye(parser.add_argument_group("the eye"))
-    _add_results(parser.add_argument_group("what is written"))
-    _add_machines(parser.add_argument_group("on what"))
+    _add_source(parser.add_argument_group("input"))
+    _add_eye(parser.add_argument_group("eye and filter"))
+    _add_results(parser.add_argument_group("output"))
+    _add_machines(parser.add_argument_group("workers"))
     return parser.parse_args(argv)
 
 
 def _add_source(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
-        "--layout", default="auto", choices=LAYOUTS, help="default: what is found"
+        "--layout", default="auto", choices=LAYOUTS, help="default: detected"
     )
     group.add_argument(
         "--depth", type=Path, metavar="PATH", help="folder or video of depth"
     )
     group.add_argument(
-        "--depth-scale", type=float, metavar="M", help="meters per unit of its numbers"
+        "--depth-scale", type=float, metavar="M", help="meters per unit of depth"
     )
     group.add_argument("--fov-deg", type=float, help="vertical field of view, deg")
+    group.add_argument("--intrinsics", metavar="FX,FY,CX,CY", help="camera in px")
     group.add_argument(
-        "--intrinsics", metavar="FX,FY,CX,CY", help="camera in px, instead"
+        "--limit", type=int, metavar="N", help="use the first N frames only"
     )
-    group.add_argument("--limit", type=int, metavar="N", help="the first N frames only")
 
 
 def _add_eye(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
-        "--pupil-mm", type=float, default=4.0, help="entrance pupil (default: 4)"
+        "--pupil-mm", type=float, default=4.0, help="entrance pupil, mm (default: 4)"
     )
     group.add_argument(
         "--focus-dpt",
         default="0",
         metavar="DPT|center",
-        help="distance looked at, or the depth of the frame's middle (default: 0, far)",
+        help="focus distance, or the depth at the center of each frame (default: 0, "
+        "infinity)",
     )
     group.add_argument(
         "--states",
         type=Path,
         metavar="CSV",
-        help="columns frame, pupil_mm, focus_dpt: a line for each frame",
+        help="a line for each frame, with the columns frame, pupil_mm and focus_dpt",
     )
     group.add_argument(
         "--settings",
         default="{}",
         metavar="JSON",
-        help='of the filter, as {"mode": "quality", "object_range_dpt": [0, 5]}',
+        help='settings such as {"mode": "quality", "object_range_dpt": [0, 5]}',
     )
     group.add_argument(
         "--render-tolerance",
@@ -136,11 +137,15 @@ def _add_results(group: argparse._ArgumentGroup) -> None:
         "--format",
         default="png",
         choices=FORMATS,
-        help="png: sRGB; npy, exr: linear light; ffv1: video without loss; h264",
+        help="png: sRGB; npy, exr: linear light; ffv1: lossless video; h264: video",
     )
-    group.add_argument("--half", action="store_true", help="half floats in npy or exr")
     group.add_argument(
-        "--fps", type=float, help="of videos (default: as the input, else 30)"
+        "--half", action="store_true", help="write half floats to npy or exr"
+    )
+    group.add_argument(
+        "--fps",
+        type=float,
+        help="frame rate of videos (default: that of the input video, or 30)",
     )
     group.add_argument(
         "--overwrite",
@@ -150,33 +155,33 @@ def _add_results(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--dry-run",
         action="store_true",
-        help="print the work, the time and the cost, and stop",
+        help="estimate time and cost, and stop",
     )
     group.add_argument(
-        "--price-per-core-hour", type=float, metavar="X", help="for --dry-run"
+        "--price-per-core-hour", type=float, metavar="X", help="price for --dry-run"
     )
     group.add_argument("--json", action="store_true", help="print one JSON object")
 
 
 def _add_machines(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
-        "--workers", type=int, help="processes (default: one for each core)"
+        "--workers", type=int, help="number of processes (default: one per core)"
     )
     group.add_argument(
-        "--threads", type=int, help="of each worker (default: cores / workers)"
+        "--threads", type=int, help="threads per worker (default: cores / workers)"
     )
     group.add_argument(
         "--engine",
         default="native",
         choices=("native", "gl"),
-        help="native: the processor, the same bytes everywhere; gl: a GPU, with one "
-        "worker unless told otherwise",
+        help="native: CPU, with the same results on all machines; gl: GPU, with one "
+        "worker by default",
     )
     group.add_argument(
         "--ray",
         metavar="ADDRESS",
-        help="workers of a Ray cluster that share INPUT and OUT: auto, an address, or "
-        "local (extra batch-ray)",
+        help="use a Ray cluster that shares INPUT and OUT: auto, an address, or local "
+        "(requires the extra batch-ray)",
     )
 
 
@@ -186,15 +191,15 @@ def batch_of(options: argparse.Namespace) -> Batch:
     Raises
     ------
     ValueError
-        Names the option, the value and what is allowed.
+        If an option is invalid.  The message names the option, the value and the range.
     """
     _check(options)
-    told = LayoutOptions(
+    layout_options = LayoutOptions(
         options.depth,
         optics_of(options.fov_deg, options.intrinsics),
         options.depth_scale,
     )
-    layout, frames = list_frames(options.input, options.layout, told)
+    layout, frames = list_frames(options.input, options.layout, layout_options)
     frames = frames[: options.limit]
     states = _states(options, [frame.name for frame in frames])
     job = Job(
@@ -214,7 +219,8 @@ def workers_and_threads(options: argparse.Namespace) -> tuple[int, int]:
     """Return the number of processes, and of threads in each.
 
     One process per core filters more frames than one process with as many threads
-    (`ocufilter bench batch`), because all of a frame's work runs beside that of others.
+    (`ocufilter bench batch`), because all work on a frame, including the serial parts,
+    then overlaps with work on other frames.
     """
     n_cores = thread_count()
     n_workers = options.workers or (1 if options.engine == "gl" else n_cores)
@@ -236,13 +242,13 @@ def _check(options: argparse.Namespace) -> None:
         value = getattr(options, name)
         if value is not None and not low <= value <= high:
             option = name.replace("_", "-")
-            raise ValueError(f"--{option} {value:g}: allowed is {low:g} to {high:g}")
+            raise ValueError(f"--{option} is {value:g}; allowed: {low:g} to {high:g}")
     if options.format in VIDEO_FORMATS:
-        import clients.batch.video_writing  # noqa: F401  (that it is installed)
+        import clients.batch.video_writing  # noqa: F401  (raises if it is not installed)
     if options.half and options.format not in LINEAR_FORMATS:
         raise ValueError("--half: allowed with --format npy or exr")
     if options.out.exists() and not options.out.is_dir():
-        raise ValueError(f"--out '{options.out}': allowed is a folder")
+        raise ValueError(f"--out '{options.out}' is a file; allowed: a folder")
 
 
 def _states(options: argparse.Namespace, names: Sequence[str]) -> States:
@@ -254,7 +260,7 @@ def _states(options: argparse.Namespace, names: Sequence[str]) -> States:
             focus_dpt = float("nan")
         if not 0.0 <= focus_dpt <= MAX_VERGENCE_DPT:
             raise ValueError(
-                f"--focus-dpt '{options.focus_dpt}': allowed is 0 to "
+                f"--focus-dpt is '{options.focus_dpt}'; allowed: 0 to "
                 f"{MAX_VERGENCE_DPT:g}, or {CENTER}"
             )
     listed = None
@@ -273,13 +279,13 @@ def read_profiles(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
     Raises
     ------
     ValueError
-        A profile is invalid, or two have the same name.
+        If a profile is invalid or two have the same name.
     """
     found: dict[str, dict[str, Any]] = {}
     for text in texts:
         name, _, what = text.rpartition("=")
         body = profile_body(what)
-        load_profile(what)  # checks its fields, and names the file
+        load_profile(what)  # raises if the profile is invalid
         if what.lstrip().startswith("{"):  # JSON
             own_name = str(body.get("name", "profile"))
         else:
@@ -288,8 +294,8 @@ def read_profiles(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
         name = _NAME.sub("_", name).lstrip(".")
         if not name or name in found:
             raise ValueError(
-                f"--profile '{text}': the name '{name}' is taken or empty; allowed: "
-                "NAME=PROFILE with another"
+                f"--profile '{text}': the name '{name}' is empty or already used; "
+                "allowed: NAME=PROFILE with another name"
             )
         found[name] = body
     return found
@@ -306,5 +312,5 @@ def _rate_hz(options: argparse.Namespace, frames: Sequence[SourceFrame]) -> floa
     low_hz, high_hz = FPS_LIMITS_HZ
     if not low_hz <= rate_hz <= high_hz:
         allowed = f"{low_hz:g} to {high_hz:g}, or --fps"
-        raise InvalidFile(frames[0].color, f"{rate_hz:g} frames a second", allowed)
+        raise InvalidFile(frames[0].color, f"{rate_hz:g} frames per second", allowed)
     return rate_hz

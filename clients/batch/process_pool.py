@@ -1,4 +1,10 @@
-"""Worker processes on this machine; one that dies is replaced."""
+"""Worker processes on this machine; one that dies is replaced.
+
+    python -m clients.batch.process_pool DESCRIPTOR
+
+runs a worker, which receives units through a pipe and returns records.  It exits when
+the pipe closes, at the latest between two frames.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +22,7 @@ from typing import cast
 
 from clients.batch.exact_filter import EngineUnusable
 from clients.batch.job import Job
-from clients.batch.work import Record, Unit, failed_records
+from clients.batch.work import Record, Unit, UnitRunner, failed_records
 
 THREADS_VARIABLE = "OCUFILTER_THREADS"
 MAX_DEATHS = 2
@@ -27,7 +33,7 @@ END_LIMIT_S = 5.0
 
 @dataclass(eq=False)
 class _Worker:
-    """A worker process, its pipe, and its current work."""
+    """A worker process, its pipe and its current work."""
 
     process: subprocess.Popen[bytes]
     pipe: Connection
@@ -36,7 +42,7 @@ class _Worker:
 
 
 class ProcessPool:
-    """Runs units in processes, each with a given number of engine threads."""
+    """Pool of processes that run units, each with a given number of engine threads."""
 
     def __init__(self, job: Job, out: Path, *, n_workers: int, n_threads: int) -> None:
         self._setup = job, out
@@ -45,16 +51,17 @@ class ProcessPool:
         self._deaths: Counter[tuple[str, str]] = Counter()
 
     def run(self, units: Sequence[Unit]) -> Iterator[Record]:
-        """Yield the records of units as frames are done, in any order.
+        """Yield the records of units as frames are finished, in any order.
 
         Raises
         ------
         EngineUnusable
+            If the engine does not work on this machine.
         """
         waiting = deque(units)
         try:
             while True:
-                self._give_out(waiting)
+                self._assign(waiting)
                 busy = {w.pipe: w for w in self._workers if w.unit is not None}
                 if not busy:
                     return
@@ -64,7 +71,7 @@ class ProcessPool:
             self.close()
 
     def close(self) -> None:
-        """Stop the workers between two frames, or kill them after some seconds."""
+        """Stop the workers after their current frame; kill them after `END_LIMIT_S`."""
         for worker in self._workers:
             worker.pipe.close()
         for worker in self._workers:
@@ -75,7 +82,7 @@ class ProcessPool:
                 worker.process.wait()
         self._workers = []
 
-    def _give_out(self, waiting: deque[Unit]) -> None:
+    def _assign(self, waiting: deque[Unit]) -> None:
         while waiting:
             worker = next((w for w in self._workers if w.unit is None), None)
             if worker is None:
@@ -86,16 +93,17 @@ class ProcessPool:
             worker.unit, worker.pending = unit, [frame.name for frame in unit.frames]
             try:
                 worker.pipe.send(unit)
-            except OSError:  # it died meanwhile: the next read reports it
+            except OSError:  # it has died, which the next read reports
                 return
 
     def _start(self) -> _Worker:
         ours, theirs = socket.socketpair()
+        descriptor = str(theirs.fileno())
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "clients.batch.worker", str(theirs.fileno())],
+            [sys.executable, "-P", "-m", "clients.batch.process_pool", descriptor],
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C reaches only us, and we stop them
+            start_new_session=True,  # Ctrl-C reaches only this process, which stops it
             env={
                 **os.environ,
                 THREADS_VARIABLE: str(self._n_threads),
@@ -123,7 +131,7 @@ class ProcessPool:
             worker.unit, worker.pending = None, []
 
     def _after_death(self, worker: _Worker, waiting: deque[Unit]) -> Iterator[Record]:
-        """Queue the rest of a unit again; fail a frame that keeps killing workers."""
+        """Queue the rest of a unit; fail a frame that repeatedly kills workers."""
         worker.pipe.close()
         how = _how_it_ended(worker.process.wait())
         self._workers.remove(worker)
@@ -133,9 +141,9 @@ class ProcessPool:
         key = unit.profile, pending[0]
         self._deaths[key] += 1
         if self._deaths[key] >= MAX_DEATHS:
-            # a segment fails with all of its frames
+            # A segment fails with all of its frames.
             names = pending if unit.segment is not None else pending[:1]
-            reason = f"the process that filtered it {how}, {MAX_DEATHS} times"
+            reason = f"its worker process {how}, {MAX_DEATHS} times"
             yield from failed_records(unit, names, reason)
             pending = pending[len(names) :]
         if pending:
@@ -147,6 +155,27 @@ def _how_it_ended(code: int) -> str:
     if code >= 0:
         return f"ended with code {code}"
     try:
-        return f"was ended by {signal.Signals(-code).name}"
+        return f"was killed by {signal.Signals(-code).name}"
     except ValueError:
-        return f"was ended by signal {-code}"
+        return f"was killed by signal {-code}"
+
+
+def serve(descriptor: int) -> None:
+    """Run the units that arrive through a pipe until it closes."""
+    pipe = Connection(descriptor)
+    try:
+        runner = UnitRunner(*pipe.recv())
+        while True:
+            unit = pipe.recv()
+            # While a unit runs, nothing is sent: a readable pipe has been closed.
+            for record in runner.run(unit, lambda: not pipe.poll()):
+                pipe.send(("record", record))
+            pipe.send(("done", unit.number))
+    except EngineUnusable as error:
+        pipe.send(("unusable", str(error)))
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        return
+
+
+if __name__ == "__main__":
+    serve(int(sys.argv[1]))

@@ -1,4 +1,4 @@
-"""Filtering of color and depth data sets: `ocufilter batch`."""
+"""`ocufilter batch`: offline filtering of data sets of color and depth."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        Invalid input; the message names it.
+        If an input is invalid.  The message names it.
     EngineUnusable
-        The engine does not work here.
+        If the engine does not work on this machine.
     """
     n_workers, n_threads = workers_and_threads(options)
     batch = batch_of(options)
@@ -78,7 +78,7 @@ def report_lines(summary: dict[str, Any], options: argparse.Namespace) -> list[s
     this_run = summary["this_run"]
     n_all, n_failed = summary["frames"], len(summary["failures"])
     lines = [
-        f"{options.out}: {n_all - n_failed} of {n_all} pictures, "
+        f"{options.out}: {n_all - n_failed} of {n_all} images, "
         f"{this_run['frames'] - this_run['failed']} of them in this run, in "
         f"{this_run['seconds']:.1f} s"
     ]
@@ -89,14 +89,14 @@ def report_lines(summary: dict[str, Any], options: argparse.Namespace) -> list[s
 
 
 def failure_lines(summary: dict[str, Any]) -> list[str]:
-    """Format the first failures, and their number."""
+    """Format the first failures and the number of all."""
     failures = summary.get("failures", [])
     lines = [
         f"batch: {one['profile']}, {one['frame']}: {one['error']}"
         for one in failures[:SHOWN_FAILURES]
     ]
     if failures:
-        lines.append(f"batch: {len(failures)} pictures failed; the manifest names them")
+        lines.append(f"batch: {len(failures)} images failed; the manifest lists them")
     return lines
 
 
@@ -107,7 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         summary = run(options)
     except KeyboardInterrupt:
-        print("batch: stopped; run the same command to continue", file=sys.stderr)
+        print("batch: stopped; run the same command again to continue", file=sys.stderr)
         return 130
     except ModuleNotFoundError as error:
         if error.name not in ("av", "ray"):

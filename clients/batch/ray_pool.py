@@ -1,4 +1,4 @@
-"""Workers on many machines with Ray; input and output folders are shared."""
+"""Workers on many machines with Ray, which share the input and output folders."""
 
 from __future__ import annotations
 
@@ -20,25 +20,30 @@ LOCAL = "local"
 
 @ray.remote
 class _RayWorker:
-    """A Ray process that runs units."""
+    """Ray actor that runs units."""
 
     def __init__(self, job: Job, out: Path) -> None:
         self._runner = UnitRunner(job, out)
 
     def run(self, unit: Unit) -> list[Record]:
-        """Run a unit, write its files and return its records."""
+        """Run a unit, which writes its files, and return its records."""
         return list(self._runner.run(unit))
 
 
 class RayPool:
-    """Runs units on a Ray cluster.
+    """Pool of Ray actors that run units.
 
     Parameters
     ----------
+    job : Job
+        Parameters of the batch.
+    out : Path
+        Output folder.
     address : str
-        Cluster address: ``auto`` for Ray's default, or ``local`` for a new one here.
+        Address of the cluster; ``auto`` for Ray's default, or ``local`` for a new
+        cluster on this machine.
     n_workers : int, optional
-        Number of actors; None: as many as the cluster has cores for.
+        Number of actors; by default, as many as the cluster has cores for.
     n_threads : int
         Threads of each actor, and cores that it requests.
     """
@@ -57,7 +62,7 @@ class RayPool:
         self._n_threads = n_threads
 
     def run(self, units: Sequence[Unit]) -> Iterator[Record]:
-        """Yield the records of units as units are done, in any order."""
+        """Yield the records of units as units are finished, in any order."""
         if not units:
             return
         started = not ray.is_initialized()
@@ -96,7 +101,7 @@ class RayPool:
                     waiting.appendleft((unit, n_deaths + 1))
                 else:
                     names = [frame.name for frame in unit.frames]
-                    reason = f"its worker died {MAX_DEATHS} times: {error}"
+                    reason = f"its worker process died {MAX_DEATHS} times: {error}"
                     yield from failed_records(unit, names, reason)
                 worker = self._worker() if waiting else None
             if waiting:

@@ -1,4 +1,4 @@
-"""Run a batch: process the missing frames and report on them."""
+"""Run of a batch: processes the missing frames and returns a summary."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from clients.batch.work import Record, Unit
 from estimator import InvalidFile
 
 UNIT_FRAMES = 16
-"""Frames given to a worker at once: few enough that all workers finish together, and
-enough that distribution takes no time."""
+"""Frames per unit of work: few enough that all workers finish at about the same time,
+and enough that distribution takes no time."""
 
 SEGMENT_FRAMES = 48
-"""Frames of a video segment; independent of the number of workers, as it determines the
-video's bytes."""
+"""Frames per video segment. The number does not depend on the workers, because it
+determines the bytes of the video."""
 
 SEGMENTS = ".segments"
 VIDEO_SUFFIXES = (".mkv", ".mp4")
@@ -41,24 +41,28 @@ LOCK = ".lock"
 
 
 class Pool(Protocol):
-    """Interface of a pool that runs units."""
+    """Interface of pools that run units."""
 
     def run(self, units: Sequence[Unit]) -> Iterator[Record]:
-        """Yield the records of units as frames are done, in any order."""
+        """Yield the records of units as frames are finished, in any order."""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Frames to filter, and the output folder.
+    """Frames to filter, parameters and output folder.
 
     Attributes
     ----------
     job : Job
+        Parameters that determine the images.
     layout : str
+        Layout of the data set.
     source : Path
         Folder or video of the frames.
     frames : sequence of SourceFrame
+        Frames to filter.
     out : Path
+        Output folder.
     """
 
     job: Job
@@ -68,7 +72,7 @@ class Batch:
     out: Path
 
     def described(self) -> dict[str, Any]:
-        """Return the parameters that determine the pictures, as plain values."""
+        """Return the parameters that determine the images, for JSON."""
         return {
             "made_by": code_version(),
             "source": {
@@ -96,7 +100,7 @@ def prepare_folder(batch: Batch, *, overwrite: bool) -> None:
     Raises
     ------
     ValueError
-        It contains other files.
+        If it contains other files.
     """
     out = batch.out
     out.mkdir(parents=True, exist_ok=True)
@@ -104,15 +108,15 @@ def prepare_folder(batch: Batch, *, overwrite: bool) -> None:
         others = [path.name for path in out.iterdir() if path.name != LOCK]
         if others:
             raise ValueError(
-                f"--out '{out}': holds '{min(others)}' and no {LINES}; allowed: an "
-                "empty folder, or one of an earlier batch"
+                f"--out '{out}' contains '{min(others)}' and no {LINES}; allowed: an "
+                "empty folder, or the folder of an earlier batch"
             )
     elif overwrite:
         _remove_results(batch)
 
 
 def _remove_results(batch: Batch) -> None:
-    """Remove the results of an earlier batch, as listed in its manifest."""
+    """Remove the results of an earlier batch that its manifest lists."""
     for record in records_of(batch.out / LINES):
         names = [record.get("file")]
         profiles = record.get("profiles", ())
@@ -134,7 +138,7 @@ def only_one(out: Path) -> Iterator[None]:
     Raises
     ------
     ValueError
-        Another batch is running there.
+        If another batch is running there.
     """
     flags = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
     try:
@@ -151,7 +155,7 @@ def only_one(out: Path) -> Iterator[None]:
 
 
 def missing_units(batch: Batch, manifest: Manifest) -> list[Unit]:
-    """Return the missing work, profile by profile."""
+    """Return the missing work as units, profile by profile."""
     units: list[Unit] = []
     for profile in batch.job.profiles:
         for segment, frames in _parts(batch, profile):
@@ -161,7 +165,7 @@ def missing_units(batch: Batch, manifest: Manifest) -> list[Unit]:
                 if not manifest.is_done(profile, frame.name, frame.files)
             ]
             if missing and segment is not None:
-                missing = list(frames)  # segments are redone completely
+                missing = list(frames)  # a segment is always written completely
             step = SEGMENT_FRAMES if segment is not None else UNIT_FRAMES
             for start in range(0, len(missing), step):
                 some = tuple(missing[start : start + step])
@@ -172,7 +176,7 @@ def missing_units(batch: Batch, manifest: Manifest) -> list[Unit]:
 def _parts(
     batch: Batch, profile: str
 ) -> list[tuple[Path | None, Sequence[SourceFrame]]]:
-    """Return the frames of a profile, grouped into segments for a video."""
+    """Return the frames of a profile, divided into segments for a video."""
     if not batch.job.is_video:
         return [(None, batch.frames)]
     return [
@@ -191,10 +195,16 @@ def run_batch(
     *,
     on_done: Callable[[int, int], None] = lambda n_done, n_all: None,
 ) -> dict[str, Any]:
-    """Process the missing frames; return the summary, which is also written.
+    """Process the missing frames; write and return the summary.
 
     Parameters
     ----------
+    batch : Batch
+        Batch to run.
+    manifest : Manifest
+        Record of the finished frames.
+    pool : Pool
+        Workers.
     on_done : callable
         Called with the number of finished frames and the total.
     """
@@ -206,7 +216,7 @@ def run_batch(
     n_done = len(wanted) - n_missing
     on_done(n_done, len(wanted))
     for profile in {unit.profile for unit in units}:
-        video_of(batch, profile).unlink(missing_ok=True)  # it will be rewritten
+        video_of(batch, profile).unlink(missing_ok=True)  # it will be written again
     cpu_s, n_failed = 0.0, 0
     for record in pool.run(units):
         manifest.append(record)
@@ -214,7 +224,7 @@ def run_batch(
         cpu_s += record.get("cpu_ms", 0.0) / 1e3
         n_done += 1
         on_done(n_done, len(wanted))
-    remove_parts(batch.out)  # left by workers that were killed
+    remove_parts(batch.out)  # of killed workers
     if batch.job.is_video:
         _join_videos(batch, manifest)
     took_s = time.monotonic() - started_s
@@ -241,7 +251,8 @@ def video_of(batch: Batch, profile: str) -> Path:
 def _join_videos(batch: Batch, manifest: Manifest) -> None:
     """Join the segments of each profile whose video is missing.
 
-    Segments are kept: after a bad frame is fixed, only its segment is redone.
+    Segments are kept, so that after an input file is repaired, only its segment is
+    written again.
     """
     from clients.batch.video_writing import VIDEO_KINDS, join_segments
 

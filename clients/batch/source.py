@@ -1,6 +1,6 @@
-"""One frame of a data set: its files, camera and depth format.
+"""Frames of a data set: files, camera and depth format.
 
-Layouts list frames; nothing is read before a worker needs it.
+Layouts list frames; workers read their files.
 """
 
 from __future__ import annotations
@@ -20,28 +20,28 @@ Tangents = tuple[float, float, float, float]
 
 
 class Optics(Protocol):
-    """Interface of a camera model."""
+    """Interface of camera models."""
 
     def tangents(self, width_px: int, height_px: int) -> Tangents:
-        """Return the tangents to the left, right, upper and lower edge of an image."""
+        """Return the tangents of the left, right, upper and lower edge of an image."""
 
 
 @dataclass(frozen=True)
 class FieldOfView:
-    """A symmetric camera with square pixels, given by its vertical field of view."""
+    """Symmetric camera with square pixels, given by its vertical field of view."""
 
     fov_deg: float
 
     def tangents(self, width_px: int, height_px: int) -> Tangents:
-        """Return the tangents to the edges."""
+        """Return the tangents of the image edges."""
         return tangents_from_fov(self.fov_deg, width_px, height_px)
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A calibrated camera; the center of pixel (0, 0) is at (0, 0).
+    """Calibrated camera; the center of pixel (0, 0) is at (0, 0).
 
-    If the size of its images is known, other sizes are rejected.
+    If the image size is known, images of other sizes are rejected.
     """
 
     focal_x_px: float
@@ -51,17 +51,17 @@ class Pinhole:
     size_px: tuple[int, int] | None = None
 
     def tangents(self, width_px: int, height_px: int) -> Tangents:
-        """Return the tangents to the edges, half a pixel beyond the outermost centers.
+        """Return the tangents of the image edges, half a pixel beyond pixel centers.
 
         Raises
         ------
         ValueError
-            The camera is for images of another size.
+            If the camera is for images of another size.
         """
         if self.size_px not in (None, (width_px, height_px)):
             raise ValueError(
-                f"{width_px}x{height_px} px, and the camera of this layout is for "
-                f"{self.size_px[0]}x{self.size_px[1]}; allowed: that size, or "
+                f"{width_px}x{height_px} px, but the camera of this layout is for "
+                f"{self.size_px[0]}x{self.size_px[1]}; allowed: that size, "
                 "--intrinsics or --fov-deg"
             )
         return Camera.from_intrinsics(
@@ -75,10 +75,10 @@ class Pinhole:
 
 
 class DepthForm(Protocol):
-    """Interface of a depth format."""
+    """Interface of depth formats."""
 
     def read(self, path: Path) -> NDArray[np.float32]:
-        """Return the depth in a file, m; 0, negative and NaN mean missing."""
+        """Return the depth in a file, m; 0, negative and NaN are missing."""
 
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
         """Return the depth in a video frame, m."""
@@ -86,7 +86,7 @@ class DepthForm(Protocol):
 
 @dataclass(frozen=True)
 class Scaled:
-    """Multiples of a unit; without a scale, integers are in mm and floats in m."""
+    """Depth in multiples of a unit; by default, integers are mm and floats are m."""
 
     depth_scale_m: float | None = None
 
@@ -103,7 +103,7 @@ class Scaled:
 
 @dataclass(frozen=True)
 class Disparity:
-    """Disparities of a stereo pair in px; infinity means unknown.
+    """Depth as disparity of a stereo pair, in px; infinity is unknown.
 
     depth = focal length x baseline / (disparity + offset), as in Middlebury.
     """
@@ -113,7 +113,7 @@ class Disparity:
     offset_px: float
 
     def read(self, path: Path) -> NDArray[np.float32]:
-        """Return the depth in a file, m; 0 where the disparity is unknown."""
+        """Return the depth in a file, m; 0 if the disparity is unknown."""
         return self._depth_m(read_depth(path, depth_scale=1.0, option=""))
 
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
@@ -131,20 +131,22 @@ class Disparity:
 
 @dataclass(frozen=True)
 class SourceFrame:
-    """One frame of a data set.
+    """A frame of a data set.
 
     Attributes
     ----------
     name : str
-        Its name in the results: unique, a relative path without a suffix.
+        Unique name of the results, a relative path without a suffix.
     color, depth : Path
-        Files of one image, or videos.
-    optics, depth_form
-        Camera and depth format.
+        Files of the images, or videos.
+    optics : Optics
+        Camera.
+    depth_form : DepthForm
+        Depth format.
     color_index, depth_index : int, optional
         Frame numbers in videos.
     fault : str, optional
-        Why it cannot be used, if that is known before it is read.
+        Reason why the frame cannot be used, if known before it is read.
     """
 
     name: str
@@ -158,23 +160,24 @@ class SourceFrame:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Return its image files, without videos."""
+        """Return the image files of the frame, without videos."""
         parts = ((self.color, self.color_index), (self.depth, self.depth_index))
         return tuple(path for path, index in parts if index is None)
 
 
 class BadFrame(ValueError):
-    """A frame that cannot be used; the message names its file."""
+    """The frame cannot be used; the message names its file."""
 
 
 def check_sizes(
     frame: SourceFrame, color: NDArray[Any], depth_m: NDArray[np.float32]
 ) -> None:
-    """Reject color and depth of different sizes.
+    """Check that color and depth have the same size.
 
     Raises
     ------
     BadFrame
+        If they differ.
     """
     if color.shape[:2] != depth_m.shape:
         raise BadFrame(
@@ -186,8 +189,8 @@ def check_sizes(
 def center_depth_m(depth_m: NDArray[np.float32]) -> float:
     """Return the median depth at the center of an image.
 
-    The center covers a tenth of the image's sides; if it has no known depth, twice and
-    again twice as much; infinity if there is none at all.
+    The center is a tenth of the image's width and height.  It is enlarged until it
+    contains known depth.  If the image has none, return infinity.
     """
     height_px, width_px = depth_m.shape
     for part in (0.1, 0.2, 0.4, 0.8, 1.0):
@@ -200,6 +203,7 @@ def center_depth_m(depth_m: NDArray[np.float32]) -> float:
         ]
         known_m = middle_m[middle_m > 0.0]
         if known_m.size:
-            # the lower of two medians: never between a wall and the sky
+            # The lower of two middle values, because the mean of a wall and the sky is
+            # neither.
             return float(np.sort(known_m, axis=None)[(known_m.size - 1) // 2])
     return math.inf

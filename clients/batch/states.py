@@ -18,22 +18,23 @@ from filter_service.settings import MAX_PUPIL_MM, MAX_VERGENCE_DPT, MIN_PUPIL_MM
 
 CENTER = "center"
 CENTER_RANGE_DPT = (0.0, 10.0)
-"""Range of a focus chosen by depth: nobody focuses closer than 10 cm."""
+"""Range of a focus that follows depth: few eyes focus closer than 10 cm."""
 
 COLUMNS = ("frame", "pupil_mm", "focus_dpt")
 
 
 @dataclass(frozen=True)
 class States:
-    """The eye's state in each frame.
+    """State of the eye in each frame.
 
     Attributes
     ----------
     pupil_mm : float
-    focus_dpt : float, optional
-        None: focus at the depth of the frame's center.
-    listed : mapping of frame names to (pupil_mm, focus_dpt)
-        From a list; None where a column is missing, for which the two above are used.
+        Pupil of frames whose pupil is not listed.
+    focus_dpt : float or None
+        Focus of frames whose focus is not listed; None is the depth at the center.
+    listed : dict, optional
+        (pupil_mm, focus_dpt) by frame name; a missing column is None.
     """
 
     pupil_mm: float
@@ -41,13 +42,13 @@ class States:
     listed: dict[str, tuple[float | None, float | None]] | None = None
 
     def of(self, name: str, depth_m: NDArray[np.float32]) -> tuple[float, float]:
-        """Return a frame's pupil in mm and focus in dpt."""
+        """Return the pupil in mm and the focus in dpt of a frame."""
         pupil_mm, focus_dpt = (self.listed or {}).get(name, (None, None))
         if focus_dpt is None:
             focus_dpt = self.focus_dpt
         if focus_dpt is None:
             low_dpt, high_dpt = CENTER_RANGE_DPT
-            nearest_m = 1.0 / high_dpt  # avoids a division by a tiny depth
+            nearest_m = 1.0 / high_dpt  # avoids division by a tiny depth
             focus_dpt = max(1.0 / max(center_depth_m(depth_m), nearest_m), low_dpt)
         return self.pupil_mm if pupil_mm is None else pupil_mm, focus_dpt
 
@@ -69,17 +70,17 @@ class States:
         return (min(known), max(known)) if known else usual
 
     def described(self) -> dict[str, Any]:
-        """Return the parameters that determine the states, as plain values."""
+        """Return the parameters that determine the states, for JSON."""
         focus = CENTER if self.focus_dpt is None else self.focus_dpt
         return {"pupil_mm": self.pupil_mm, "focus_dpt": focus, "listed": self.listed}
 
     def check(self, names: Sequence[str]) -> None:
-        """Reject a list that lacks frames.
+        """Check that the list contains all frames.
 
         Raises
         ------
         ValueError
-            Names the first missing frame.
+            If it does not.  The message names the first missing frame.
         """
         if self.listed is None:
             return
@@ -87,7 +88,7 @@ class States:
         if lacking:
             raise ValueError(
                 f"--states: no line for frame '{lacking[0]}' ({len(lacking)} of "
-                f"{len(names)} frames have none)"
+                f"{len(names)} frames are missing)"
             )
 
 
@@ -96,13 +97,12 @@ def read_states(
 ) -> dict[str, tuple[float | None, float | None]]:
     """Read a list of states: CSV with the columns frame, pupil_mm and focus_dpt.
 
-    One of the last two may be omitted. A frame of a video may be given by its number
-    alone.
+    One of the last two may be omitted. A frame of a video may be named by its number.
 
     Raises
     ------
     InvalidFile
-        Names the line, the value and what is allowed.
+        If a value is invalid.  The message names the line, the value and the range.
     """
     text = read_text(path, option="states")
     try:
@@ -126,7 +126,7 @@ def _states_of(
         where = f"line {rows.line_num}"
         name = row["frame"]
         if name is None:
-            raise InvalidFile(path, f"{where}: no frame", "its name", "states")
+            raise InvalidFile(path, f"{where}: no frame", "a name", "states")
         if name not in known and _is_number(name):
             name = by_number.get(int(name), name)
         state = []
@@ -149,7 +149,7 @@ def _is_number(name: str) -> bool:
 
 
 def _number(text: str | None) -> float:
-    """Return a number; NaN for other text."""
+    """Return a number, or NaN for other text."""
     try:
         return float(text or "")
     except ValueError:

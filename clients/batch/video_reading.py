@@ -1,7 +1,7 @@
-"""Exact random access to video frames, independent of previous reads.
+"""Exact random access to video frames, whatever was read before.
 
-A frame is found by its time: the times of all packets are listed first, without
-decoding; then the decoder seeks to the preceding key frame and decodes from there.
+A frame is found by its time.  The reader lists the times of all packets without
+decoding them, then seeks to the key frame that precedes a frame and decodes from there.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from estimator.bounded_files import InvalidFile, reason_of
 GRAY = ("gray16le", "gray16be")
 
 MAX_VIDEO_PIXELS = 1 << 25
-"""Pixels of a frame, as in 8K: a decoder holds up to 17 frames, and one more in
-sRGB."""
+"""Pixels of a frame, as in 8K. A decoder keeps up to 17 frames, and the reader one more
+in sRGB."""
 
 MAX_VIDEO_FRAMES = 1_000_000
-"""Nine hours at 30 Hz; all times are kept in memory, 40 bytes each."""
+"""Nine hours at 30 Hz; the time of a frame takes 40 bytes of memory."""
 
 MAX_PACKETS_AHEAD = 10_000
-"""Packets without a requested picture: a key frame is some hundred back."""
+"""Packets decoded without a frame; key frames are some hundred packets apart."""
 
 FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi,mpeg,mpegts,mpegvideo"
-"""Allowed formats, whatever the file name: no playlists, which reference other
-files."""
+"""Allowed formats, whatever the file name. Playlists are excluded, because they
+reference other files."""
 
 OPTIONS = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
 
@@ -41,31 +41,31 @@ def frame_count(path: Path) -> int:
     Raises
     ------
     InvalidFile
-        It cannot be read, or has no pictures.
+        If it cannot be read or has no frames.
     """
     with VideoReader(path) as reader:
         return reader.count
 
 
 def frames_per_second(path: Path) -> float:
-    """Return the mean rate of a video.
+    """Return the mean frame rate of a video.
 
     Raises
     ------
     InvalidFile
-        It cannot be read.
+        If it cannot be read.
     """
     with VideoReader(path) as reader:
         return reader.rate_hz
 
 
 class VideoReader:
-    """Reader of one video; frames in order cost no more than their decoding.
+    """Reader of a video, which decodes each frame once if frames are read in order.
 
     Raises
     ------
     InvalidFile
-        It cannot be read, has no pictures, too many, or pictures that are too large.
+        If the file cannot be read, or has no frames, too many or too large ones.
     """
 
     def __init__(self, path: Path) -> None:
@@ -74,7 +74,7 @@ class VideoReader:
             self._container = av.open(
                 str(path), options=OPTIONS, metadata_errors="replace"
             )
-        except Exception as error:  # the bindings raise nearly anything
+        except Exception as error:  # PyAV raises many types of exceptions
             raise self._unreadable("cannot be read", error) from None
         try:
             self._stream = self._opened_stream()
@@ -83,7 +83,7 @@ class VideoReader:
             self.close()
             raise
         self._decoded: Iterator[av.VideoFrame] = iter(())
-        self._next = -1  # number of the next frame to be decoded
+        self._next = -1  # index of the next frame to decode
 
     def __enter__(self) -> VideoReader:
         """Return the reader."""
@@ -104,7 +104,7 @@ class VideoReader:
 
     @property
     def rate_hz(self) -> float:
-        """Return the mean rate, or 30 if the file does not state it."""
+        """Return the mean frame rate, or 30 if the file does not contain it."""
         try:
             return float(self._stream.average_rate or 30)
         except (ZeroDivisionError, OverflowError):
@@ -116,6 +116,7 @@ class VideoReader:
         Raises
         ------
         InvalidFile
+            If the frame cannot be read.
         """
         return self._array(self._frame(index), format="rgb24")
 
@@ -125,14 +126,14 @@ class VideoReader:
         Raises
         ------
         InvalidFile
-            The video is of another kind.
+            If the frame cannot be read, or has other pixels.
         """
         frame = self._frame(index)
         if frame.format.name not in GRAY:
             raise InvalidFile(
                 self._path,
                 f"pixels are {frame.format.name}",
-                "16-bit gray without loss, as `ffmpeg -pix_fmt gray16le -c:v ffv1`",
+                "lossless 16-bit gray, as from `ffmpeg -pix_fmt gray16le -c:v ffv1`",
             )
         return self._array(frame).astype(np.uint16)
 
@@ -142,14 +143,15 @@ class VideoReader:
 
     def _opened_stream(self) -> av.VideoStream:
         if not self._container.streams.video:
-            raise InvalidFile(self._path, "no pictures in it", "a video")
+            raise InvalidFile(self._path, "has no frames", "a video")
         stream = self._container.streams.video[0]
         context = stream.codec_context
         if context is None:
-            raise InvalidFile(self._path, "no decoder for it", "a known codec")
-        # One thread: the other cores process other frames.
+            raise InvalidFile(self._path, "has an unknown codec", "a known codec")
+        # One thread, because the other cores process other frames.
         context.thread_count = 1
-        # Frames of another size may follow; the decoder itself rejects larger ones.
+        # Later frames may have another size; the decoder rejects those that are too
+        # large.
         context.options = {"max_pixels": str(MAX_VIDEO_PIXELS)}
         if context.width * context.height > MAX_VIDEO_PIXELS:
             found = f"frames of {context.width}x{context.height} px"
@@ -169,18 +171,18 @@ class VideoReader:
                     )
         except InvalidFile:
             raise
-        except Exception as error:  # the bindings raise nearly anything
+        except Exception as error:  # PyAV raises many types of exceptions
             raise self._unreadable("cannot be read", error) from None
         if not known or len(set(known)) < len(known):
-            found = "its frames have no times of their own"
-            raise InvalidFile(self._path, found, "a time for each")
+            found = "frames have no times or share them"
+            raise InvalidFile(self._path, found, "a time for each frame")
         known.sort()
         return known
 
     def _frame(self, index: int) -> av.VideoFrame:
         if not 0 <= index < self.count:
             found = f"frame {index} of {self.count}"
-            raise InvalidFile(self._path, found, "one that there is")
+            raise InvalidFile(self._path, found, f"0 to {self.count - 1}")
         wanted = self._times[index]
         try:
             if index != self._next:
@@ -191,8 +193,8 @@ class VideoReader:
                 if frame.pts == wanted:
                     return frame
                 if frame.pts is not None and frame.pts > wanted:
-                    break  # frames come in the order of their times
-        except Exception as error:  # the bindings raise nearly anything
+                    break  # frames arrive in the order of their times
+        except Exception as error:  # PyAV raises many types of exceptions
             self._next = -1
             if isinstance(error, InvalidFile):
                 raise
@@ -203,7 +205,7 @@ class VideoReader:
         )
 
     def _decoded_frames(self) -> Iterator[av.VideoFrame]:
-        """Yield frames from here on, until too many packets yield none."""
+        """Yield the frames from here on; raise after too many packets without any."""
         n_without = 0
         for packet in self._container.demux(self._stream):
             for frame in packet.decode():
@@ -211,7 +213,7 @@ class VideoReader:
                 yield frame
             n_without += 1
             if n_without > MAX_PACKETS_AHEAD:
-                found = f"{n_without:,} packets without a picture"
+                found = f"{n_without:,} packets without a frame"
                 raise InvalidFile(self._path, found, "an intact video")
 
     def _array(self, frame: av.VideoFrame, **how: str) -> NDArray[Any]:
@@ -220,5 +222,5 @@ class VideoReader:
             raise InvalidFile(self._path, found, f"at most {MAX_VIDEO_PIXELS:,} pixels")
         try:
             return frame.to_ndarray(**how)
-        except Exception as error:  # the bindings raise nearly anything
+        except Exception as error:  # PyAV raises many types of exceptions
             raise self._unreadable("pixels cannot be read", error) from None

@@ -1,4 +1,4 @@
-"""Videos in segments, each written by one worker and then joined."""
+"""Video segments, which workers write and `join_segments` joins."""
 
 from __future__ import annotations
 
@@ -11,16 +11,19 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
+EncodingFailed = av.FFmpegError
+"""Base class of the errors of the encoder and the file formats."""
+
 MAX_DENOMINATOR = 1001
-"""Of a frame rate, so that NTSC's, 30000/1001, is exact."""
+"""Largest denominator of a frame rate; that of NTSC, 30000/1001, is exact."""
 
 BIT_EXACT = {"fflags": "+bitexact"}
-"""No version names and no random numbers in the file."""
+"""Options that keep version names and random numbers out of files."""
 
 
 @dataclass(frozen=True)
 class VideoKind:
-    """Encoding of a video; uses one thread, so that its bytes are always the same."""
+    """Encoding of a video, with one thread so that its bytes are reproducible."""
 
     codec: str
     pixels: str
@@ -51,17 +54,24 @@ def write_segment(
     kind: VideoKind,
     rate_hz: float,
 ) -> None:
-    """Write frames as a separate Matroska file.
+    """Write frames to a Matroska file.
 
     Parameters
     ----------
-    frames : pairs of (number in the segment, sRGB image)
-        A missing number extends the previous frame.
+    path : Path
+        File to write.
+    frames : iterable of (int, (h, w, 3) uint8)
+        Number in the segment and sRGB image of each frame.  If a number is missing, the
+        previous frame is shown longer.
+    kind : VideoKind
+        Encoding.
+    rate_hz : float
+        Frame rate.
 
     Raises
     ------
     ValueError
-        The kind of video does not support the size.
+        If the encoding does not support the image size.
     """
     rate = Fraction(rate_hz).limit_denominator(MAX_DENOMINATOR)
     with av.open(str(path), "w", format="matroska", options=BIT_EXACT) as container:
@@ -92,28 +102,36 @@ def _add_stream(
 
 
 def check_sides(width_px: int, height_px: int, kind: VideoKind) -> None:
-    """Reject a size that a kind of video does not support.
+    """Check an image size against the requirements of an encoding.
 
     Raises
     ------
     ValueError
+        If the encoding does not support the size.
     """
     if kind.even_sides and (width_px % 2 or height_px % 2):
         raise ValueError(
-            f"{width_px}x{height_px} px; allowed with h264: even sides, or --format "
-            "ffv1"
+            f"{width_px}x{height_px} px; allowed: even width and height, or "
+            "--format ffv1"
         )
 
 
 def join_segments(
     path: Path, segments: Sequence[tuple[int, Path]], *, kind: VideoKind, rate_hz: float
 ) -> None:
-    """Join segments, packet by packet.
+    """Join segments to a video without decoding them.
 
     Parameters
     ----------
-    segments : pairs of (number of the first frame, file)
-        In order; a segment without frames is skipped.
+    path : Path
+        File to write.
+    segments : sequence of (int, Path)
+        Number of the first frame and file of each segment, in order.  A segment without
+        frames is skipped.
+    kind : VideoKind
+        Encoding of the segments.
+    rate_hz : float
+        Frame rate.
     """
     rate = Fraction(rate_hz).limit_denominator(MAX_DENOMINATOR)
     container_format = {".mkv": "matroska", ".mp4": "mp4"}[kind.suffix]

@@ -1,4 +1,4 @@
-"""Work of one worker: frames in, files and records out."""
+"""Work of a worker: reads and filters frames, writes files and returns records."""
 
 from __future__ import annotations
 
@@ -25,22 +25,24 @@ Record = dict[str, Any]
 """A line of the manifest."""
 
 PNG_LEVEL = 1
-"""Files are a fifth larger than usual and take a quarter of the time to compress."""
+"""Files are a fifth larger than by default and take a quarter of the time."""
 
 FAILURES = (ValueError, FilterError, OSError, MemoryError)
-"""Exceptions that fail a frame but not the batch."""
+"""Exceptions that make a frame fail, but not the batch."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """Consecutive frames through one profile.
+    """Unit of work: consecutive frames through one profile.
 
     Attributes
     ----------
     number : int
         Number of the unit in the run.
     profile : str
+        Name of the profile.
     frames : tuple of SourceFrame
+        Frames to filter.
     segment : Path, optional
         Video segment to write, relative to the output folder.
     """
@@ -53,14 +55,14 @@ class Unit:
 
 @dataclass
 class FilteredPicture:
-    """A filtered frame to be written to its file."""
+    """A filtered frame, and its record without the file."""
 
     filtered: Filtered
     record: Record
 
 
 class UnitRunner:
-    """Reads, filters and writes the frames of units, for one job."""
+    """Runner of units, which reads, filters and writes the frames of one job."""
 
     def __init__(self, job: Job, out: Path) -> None:
         self._job, self._out = job, out
@@ -76,16 +78,18 @@ class UnitRunner:
 
     @property
     def build_s(self) -> float:
-        """Return the total build time of eyes so far."""
+        """Return the total preparation time of eyes so far."""
         return self._filter.build_s
 
     def run(
         self, unit: Unit, is_wanted: Callable[[], bool] = lambda: True
     ) -> Iterator[Record]:
-        """Yield a record for each frame once its file is written.
+        """Yield the record of each frame once its file is written.
 
         Parameters
         ----------
+        unit : Unit
+            Frames to process.
         is_wanted : callable
             Called before each frame; the unit stops if it returns False.
         """
@@ -111,14 +115,14 @@ class UnitRunner:
             write_image(path, color, png_level=PNG_LEVEL)
 
         try:
-            told = write_whole(self._out / file, write)
+            written = write_whole(self._out / file, write)
         except FAILURES as error:
             return _failed(profile, frame, error)
         seen.record["ms"]["write"] = _ms_since(start_s)
-        return {**seen.record, "file": file.as_posix(), **told}
+        return {**seen.record, "file": file.as_posix(), **written}
 
     def _segment(self, unit: Unit, is_wanted: Callable[[], bool]) -> Iterator[Record]:
-        """Write a video segment; yield its records once it is complete."""
+        """Write a video segment; yield its records when it is complete."""
         from clients.batch.video_writing import VIDEO_KINDS, write_segment
 
         assert unit.segment is not None
@@ -135,19 +139,19 @@ class UnitRunner:
                     image = seen.filtered.color
                     shape = shape or image.shape
                     if image.shape == shape:
-                        yield number, image  # encoded before the next line
+                        yield number, image  # encoded before the next line runs
                         records.append(seen.record | {"cpu_ms": _cpu_ms_since(cpu_s)})
                         continue
-                    seen = _failed(unit.profile, frame, BadFrame("another size"))
+                    seen = _failed(unit.profile, frame, BadFrame("its size differs"))
                 records.append(seen | {"cpu_ms": _cpu_ms_since(cpu_s)})
 
         def write(path: Path) -> None:
             kind, rate_hz = VIDEO_KINDS[self._job.format], self._job.rate_hz
             write_segment(path, images(), kind=kind, rate_hz=rate_hz)
-            path.touch()  # if there was no frame to write
+            path.touch()  # exists even without frames
 
         try:
-            told = write_whole(self._out / unit.segment, write)
+            written = write_whole(self._out / unit.segment, write)
         except Cancelled:
             return
         except FAILURES as error:
@@ -158,7 +162,7 @@ class UnitRunner:
             (self._out / unit.segment).unlink()
         for record in records:
             if record["ok"]:
-                record = {**record, "file": unit.segment.as_posix(), **told}
+                record = {**record, "file": unit.segment.as_posix(), **written}
             yield record
 
     def _attempt(self, profile: str, frame: SourceFrame) -> FilteredPicture | Record:
@@ -221,7 +225,7 @@ class Cancelled(Exception):
 
 
 def failed_records(unit: Unit, names: Sequence[str], reason: str) -> list[Record]:
-    """Return records of frames that failed, with the reason."""
+    """Return the records of frames that failed for a reason."""
     return [
         _failed(unit.profile, frame, BadFrame(reason))
         for frame in unit.frames
@@ -246,5 +250,5 @@ def _ms_since(start_s: float) -> float:
 
 
 def _cpu_ms_since(start_s: float) -> float:
-    """Return the time of all threads of this process; PSFs are built in another."""
+    """Return the CPU time of this process, without that of building PSFs."""
     return round(1e3 * (time.process_time() - start_s), 2)

@@ -1,4 +1,4 @@
-"""`ocufilter bench` and `paper`, which need a checkout: its tests are not installed."""
+"""`ocufilter bench` and `paper`, which run programs of a checkout's tests."""
 
 import runpy
 import sys
@@ -17,7 +17,9 @@ def bench(
     context: typer.Context,
     name: Annotated[
         str,
-        typer.Argument(help="What to time, as psf or live; another name lists all."),
+        typer.Argument(
+            help="Benchmark to run, such as psf or live; any unknown name lists all."
+        ),
     ],
     quick: Annotated[
         bool, typer.Option("--quick", help="Fewer cases and repeats.")
@@ -45,21 +47,24 @@ def bench(
 
 def paper(
     out: Annotated[
-        Path, typer.Option("-o", "--out", metavar="FILE", help="The page, one file.")
+        Path, typer.Option("-o", "--out", metavar="FILE", help="Output page.")
     ] = Path("paper.html"),
     fresh: Annotated[
         bool,
-        typer.Option("--fresh", help="Run the benchmarks first; it says how long."),
+        typer.Option(
+            "--fresh", help="Run the benchmarks first; prints how long that takes."
+        ),
     ] = False,
     quick: Annotated[
-        bool, typer.Option("--quick", help="With --fresh: few cases, small frames.")
+        bool,
+        typer.Option("--quick", help="With --fresh: run few cases with small frames."),
     ] = False,
     json_output: Json = False,
 ) -> None:
     """Compare the paper's tables and figures with ours in one HTML page.
 
-    Uses the committed results and takes seconds.  Shows published figures, ours, the
-    differences, and where the paper is better.  Requires a checkout.
+    Uses the committed results and takes seconds.  Shows the published figures, ours,
+    the differences, and where the paper is better.  Requires a checkout.
 
     ocufilter paper -o paper.html
     """
@@ -72,24 +77,24 @@ def paper(
 
 
 def _benchmarks() -> Path:
-    """Return the folder of the benchmarks.
+    """Return the benchmarks folder.
 
     Raises
     ------
     CommandFailed
-        If this is an installed package, which has none.
+        If this is an installed package, which lacks that folder.
     """
     if not BENCHMARKS.is_dir():
         raise CommandFailed(
-            "this command runs a program in tests/, which an installed package does "
-            "not have: run it in a checkout (git clone of the project, then make "
-            "setup-test)"
+            "this command runs a program in tests/, which is not installed with the "
+            "package: run it in a checkout (git clone, then make setup-test)"
         )
     return BENCHMARKS
 
 
 def _run_module(module: str, arguments: list[str]) -> None:
-    """Run a module as ``python -m`` does; an editable install does not find tests/."""
+    """Run a module as ``python -m`` does."""
+    # An editable install does not put tests/ on the path.
     sys.path.insert(0, str(CHECKOUT))
     sys.argv = [module, *arguments]
     runpy.run_module(module, run_name="__main__", alter_sys=True)

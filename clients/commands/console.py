@@ -16,7 +16,7 @@ Json = Annotated[
 
 
 class CommandFailed(Exception):
-    """A failure reported to the user: one line on stderr, exit code 1."""
+    """A failure that is reported in one line on stderr, with exit code 1."""
 
 
 def say(line: str = "") -> None:
@@ -25,7 +25,7 @@ def say(line: str = "") -> None:
 
 
 def print_json(data: dict[str, Any]) -> None:
-    """Print the one JSON object of a ``--json`` run."""
+    """Print the JSON object of a ``--json`` run."""
     say(json.dumps(data, allow_nan=False))
 
 
@@ -35,19 +35,28 @@ def check_range(option: str, value: float, limits: tuple[float, float]) -> None:
     Raises
     ------
     ValueError
-        If it is not; the message names the option, the value and the range.
+        If it is not.  The message names the option, the value and the range.
     """
     low, high = limits
     if not low <= value <= high:
-        raise ValueError(f"{option} {value:g}: allowed is {low:g} to {high:g}")
+        raise ValueError(f"{option} is {value:g}; allowed: {low:g} to {high:g}")
 
 
 @contextmanager
 def progress_bar(title: str, *, quiet: bool) -> Iterator[Callable[[float, str], None]]:
-    """Yield a function (fraction, stage) that reports progress on stderr.
+    """Report progress on stderr: a bar on a terminal, occasional lines elsewhere.
 
-    It draws a bar on a terminal and prints occasional lines elsewhere; with ``quiet``
-    it prints nothing.
+    Parameters
+    ----------
+    title : str
+        Name of the task.
+    quiet : bool
+        Whether to print nothing.
+
+    Yields
+    ------
+    callable
+        Function of the completed fraction, 0 to 1, and the stage.
     """
     with Progress(quiet=quiet) as progress:
         task = progress.task(title, total=1.0, unit="%")

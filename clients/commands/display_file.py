@@ -12,18 +12,22 @@ MAX_DISPLAY_BYTES = 1_000_000
 """Size limit of a file of spectra; steps of 0.1 nm from 300 to 1100 nm take 0.4 MB."""
 
 MAX_VALUE = 1e30
-"""Largest number in it, so that sums and products stay within float64."""
+"""Largest number in such a file; sums and products stay within float64."""
 
 
 def display_of_file(name: str) -> str:
-    """Return the setting `display` for a .csv of nm, red, green and blue.
+    """Return the setting `display` for a file of measured spectra.
 
-    A header line is skipped; wavelengths must be evenly spaced.
+    Parameters
+    ----------
+    name : str
+        Path of a .csv file with the columns wavelength in nm, red, green and blue.  A
+        header line is skipped; wavelengths must be evenly spaced.
 
     Raises
     ------
     InvalidFile
-        If the file is invalid; the message names the file and the problem.
+        If the file is invalid.  The message names the file and the problem.
     """
     text = read_text(Path(name), max_bytes=MAX_DISPLAY_BYTES, option="display")
     lines = text.split("\n")
@@ -39,10 +43,10 @@ def display_of_file(name: str) -> str:
     except (ValueError, IndexError):
         _refuse(name, "a line without four numbers", "nm, red, green, blue")
     if not np.abs(table).max() <= MAX_VALUE:
-        _refuse(name, "a number out of range", f"at most {MAX_VALUE:g}")
+        _refuse(name, "a number is too large", f"at most {MAX_VALUE:g}")
     steps_nm = np.diff(columns[0])
     if not (steps_nm.size and np.allclose(steps_nm, steps_nm[0]) and steps_nm[0] > 0):
-        _refuse(name, "nm do not rise in even steps", "even steps")
+        _refuse(name, "wavelengths are not evenly spaced", "even steps")
     try:
         with np.errstate(all="ignore"):  # primaries_of_spectra rejects zeros
             primaries = primaries_of_spectra(*columns)

@@ -1,9 +1,10 @@
-"""Checks of this machine: what works, what is missing and how to install it."""
+"""Checks of this machine: what works, what is missing, and how to install it."""
 
 import ctypes.util
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -33,27 +34,25 @@ SERVICE_PACKAGES = (
     "onnxruntime",
     "typer",
 )
-CLIENT_PACKAGES = ("pyrender", "trimesh", "PyOpenGL", "imageio", "imageio-ffmpeg")
+CLIENT_PACKAGES = ("av",)
 WINDOW_PACKAGES = ("glfw",)
+FORMER_PACKAGES = ("pyrender", "trimesh", "PyOpenGL", "imageio", "imageio-ffmpeg")
+"""Packages that the clients no longer require; ``packages`` keeps their keys."""
 
 SYSTEM_LIBRARIES = {"EGL": "libegl1", "GL": "libgl1", "gomp": "libgomp1"}
-"""Libraries that are loaded by name, and the Debian packages that provide them."""
+"""Libraries that are loaded by name, and Debian packages that contain them."""
 
 PROBE_TIMEOUT_S = 60.0
 SHADERS_TIMEOUT_S = 180.0
-"""The first use compiles loops, which takes half a minute on two idle cores."""
+"""The first run compiles loops, which takes half a minute on two idle cores."""
 
 FRAME_ERROR_MAX = 2e-3
-"""Largest pixel change in a perfect eye's image; a half float's step is 1e-3."""
-PSF_ERROR_MAX = 0.1
-"""Fraction of light that wave and ray optics may place differently; 0.04 is usual."""
+"""Largest change of a pixel by a perfect eye; the step of a half float is 1e-3."""
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 IN_CHECKOUT = (CHECKOUT / "setup.sh").is_file()
 
-FIX_SETUP = "make demo, or: sh setup.sh"
-FIX_PYRENDER = "pip install --no-deps pyrender==0.1.45"
-"""Installed separately and without dependencies: it pins a PyOpenGL that is too old."""
+FIX_SETUP = "make demo, or sh setup.sh"
 FIX_WHEEL = "pip install --force-reinstall --no-deps ocufilter-*.whl"
 APT_INSTALL = "sudo apt-get update && sudo apt-get install -y"
 FIX_DRIVER = "update the graphics driver"
@@ -67,7 +66,7 @@ FIX_MESA = f"{APT_INSTALL} libgl1-mesa-dri"
 
 @dataclass(frozen=True)
 class Check:
-    """The result of one check: whether it passed, what was found, how to fix it."""
+    """Result of a check: whether it passed, what was found, and how to fix it."""
 
     name: str
     ok: bool
@@ -81,10 +80,11 @@ def examine() -> dict[str, Any]:
     Returns
     -------
     report : dict
-        JSON-compatible: ``ok`` (the service can run), ``works`` by purpose,
-        ``checks``, ``install`` (commands), ``machine``, ``gl`` (with the EGL
-        ``devices``), ``native`` (the compiled loops), ``threading_layer``,
-        ``networks`` (each with its weights' size and expected error), ``packages``.
+        JSON-compatible, with the keys ``ok`` (whether the service can run), ``works``
+        (by purpose), ``checks``, ``install`` (commands), ``machine``, ``gl`` (with the
+        EGL ``devices``), ``native`` (the compiled loops), ``threading_layer``,
+        ``networks`` (each with the size of its weights and its expected error) and
+        ``packages`` (versions).
     """
     gl = run_probe("gl")
     shaders = {} if "error" in gl else run_probe("shaders", SHADERS_TIMEOUT_S)
@@ -124,9 +124,9 @@ def examine() -> dict[str, Any]:
 
 
 def gl_devices() -> list[dict[str, Any]]:
-    """Return the EGL devices, each with its ``renderer`` or its ``error``.
+    """Return the EGL devices, each with its ``renderer`` or ``error``.
 
-    Each device is probed in its own process, because a broken driver may crash it.
+    Each device is probed in a process of its own, which a broken driver may crash.
     """
     devices = run_probe("devices").get("devices", [])
     for device in devices:
@@ -139,7 +139,7 @@ def gl_devices() -> list[dict[str, Any]]:
 def run_probe(
     name: str, timeout_s: float = PROBE_TIMEOUT_S, *, gl_device: str = ""
 ) -> dict[str, Any]:
-    """Run one probe in its own process; on failure, ``error`` gives the reason."""
+    """Run a probe in a process of its own; on failure, return the ``error``."""
     command = [sys.executable, "-m", "clients.commands.doctor_probes", name]
     try:
         finished = subprocess.run(
@@ -151,17 +151,17 @@ def run_probe(
             env=os.environ | ({GL_DEVICE_VARIABLE: gl_device} if gl_device else {}),
         )
     except subprocess.TimeoutExpired:
-        return {"error": f"no answer within {timeout_s:g} s"}
+        return {"error": f"no result within {timeout_s:g} s"}
     if finished.returncode == 0:
         return json.loads(finished.stdout.splitlines()[-1])
     if finished.returncode < 0:
         return {"error": f"ended by signal {-finished.returncode}"}
     last_lines = finished.stderr.strip().splitlines()[-1:]
-    return {"error": last_lines[0] if last_lines else "ended without a word"}
+    return {"error": last_lines[0] if last_lines else "ended without output"}
 
 
 def machine() -> dict[str, Any]:
-    """Return processor, system and Python version, as benchmark files record them."""
+    """Return the processor, the system and the Python version."""
     try:
         system = platform.freedesktop_os_release().get("PRETTY_NAME", "unknown")
     except OSError:
@@ -175,21 +175,18 @@ def machine() -> dict[str, Any]:
 
 
 def processor_name() -> str:
-    """Return the model name reported by the kernel, or else the architecture."""
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            for line in file:
-                if line.startswith("model name"):
-                    return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.machine()
+    """Return the model name reported by the kernel, otherwise the architecture."""
+    file = Path("/proc/cpuinfo")
+    text = file.read_text(encoding="utf-8") if file.is_file() else ""
+    found = re.search(r"^model name\s*:\s*(.+)$", text, re.MULTILINE)
+    return found[1] if found else platform.machine()
 
 
 def package_versions() -> dict[str, str | None]:
-    """Return the version of each package the project may use; None if missing."""
+    """Return the version of each package that ocufilter may use; None if missing."""
     versions: dict[str, str | None] = {}
-    for name in SERVICE_PACKAGES + CLIENT_PACKAGES + WINDOW_PACKAGES:
+    names = SERVICE_PACKAGES + CLIENT_PACKAGES + WINDOW_PACKAGES + FORMER_PACKAGES
+    for name in names:
         try:
             versions[name] = version(name)
         except PackageNotFoundError:
@@ -206,7 +203,7 @@ def check_python() -> Check:
 def check_packages(
     name: str, wanted: tuple[str, ...], versions: dict[str, str | None]
 ) -> Check:
-    """Check that every package of one purpose is installed."""
+    """Check that all packages for one purpose are installed."""
     missing = [package for package in wanted if versions[package] is None]
     if missing:
         return Check(
@@ -216,18 +213,14 @@ def check_packages(
 
 
 def install_command(missing: list[str]) -> str:
-    """Return the command that installs packages; a checkout installs all at once."""
+    """Return the command that installs packages; in a checkout, it installs all."""
     if IN_CHECKOUT:
         return FIX_SETUP
-    others = " ".join(package for package in missing if package != "pyrender")
-    commands = [f"pip install {others}"] if others else []
-    if "pyrender" in missing:
-        commands.append(FIX_PYRENDER)
-    return " && ".join(commands)
+    return f"pip install {' '.join(missing)}"
 
 
 def check_libraries() -> list[Check]:
-    """Look for the system libraries that Python packages load by name."""
+    """Find the system libraries that Python packages load by name."""
     checks = []
     for library, package in SYSTEM_LIBRARIES.items():
         found = ctypes.util.find_library(library)
@@ -237,7 +230,7 @@ def check_libraries() -> list[Check]:
 
 
 def check_gl(gl: dict[str, Any]) -> Check:
-    """Report the headless OpenGL context."""
+    """Report whether there is an OpenGL context without a display."""
     if "error" in gl:
         return Check("gl", False, gl["error"], FIX_MESA)
     info = gl["info"]
@@ -245,18 +238,18 @@ def check_gl(gl: dict[str, Any]) -> Check:
 
 
 def check_compute(gl: dict[str, Any]) -> Check:
-    """Report whether a compute shader ran and its result was read back."""
+    """Report whether a compute shader ran and returned the right result."""
     if "error" in gl:
-        return Check("compute", False, "not tried: no OpenGL context")
+        return Check("compute", False, "not run: no OpenGL context")
     ok = gl["compute_correct"] and gl["gl_error"] == "GL_NO_ERROR"
-    detail = "ran and read back" if ok else f"wrong result ({gl['gl_error']})"
+    detail = "right result" if ok else f"wrong result ({gl['gl_error']})"
     return Check("compute", ok, detail, "" if ok else FIX_DRIVER)
 
 
 def check_shaders(gl: dict[str, Any], shaders: dict[str, Any]) -> Check:
-    """Report whether the rendering passes compile, run and are correct."""
+    """Report whether the rendering passes compile and return the right image."""
     if "error" in gl:
-        return Check("shaders", False, "not tried: no OpenGL context")
+        return Check("shaders", False, "not run: no OpenGL context")
     if "error" in shaders:
         is_missing = "does not exist" in shaders["error"]
         fix = FIX_SHADERS if is_missing else FIX_DRIVER
@@ -264,19 +257,19 @@ def check_shaders(gl: dict[str, Any], shaders: dict[str, Any]) -> Check:
     frame_error = shaders["frame_error"]
     detail = (
         f"{shaders['program_count']} programs compiled and run; "
-        f"a perfect eye changes a picture by {frame_error:.1g}"
+        f"a perfect eye changes an image by {frame_error:.1g}"
     )
     ok = frame_error <= FRAME_ERROR_MAX
     return Check("shaders", ok, detail, "" if ok else FIX_DRIVER)
 
 
 def check_native(native: dict[str, Any]) -> Check:
-    """Report whether the compiled loops are available and correct."""
+    """Report whether the compiled loops exist and return the right image."""
     if "error" in native:
         return Check("native", False, native["error"], FIX_COMPILER)
-    detail = f"{native['name']}; a perfect eye changes a picture by "
-    detail += f"{native['frame_error']:.1g}"
-    ok = native["frame_error"] <= FRAME_ERROR_MAX
+    change = native["frame_error"]
+    detail = f"{native['name']}; a perfect eye changes an image by {change:.1g}"
+    ok = change <= FRAME_ERROR_MAX
     return Check("native", ok, detail, "" if ok else FIX_COMPILER)
 
 
@@ -284,27 +277,36 @@ def check_engine(gl: dict[str, Any], native: dict[str, Any]) -> Check:
     """Report which engine filters frames by default, and why."""
     renderer = gl.get("info", {}).get("renderer", "")
     if is_device_named():
-        said = f"{GL_DEVICE_VARIABLE} names its device"
         fix = "" if renderer else f"unset {GL_DEVICE_VARIABLE}"
-        return Check("engine", bool(renderer), f"gl: {said}", fix)
+        detail = f"gl: {GL_DEVICE_VARIABLE} selects its device"
+        return Check("engine", bool(renderer), detail, fix)
     if renderer and not is_software_renderer(renderer):
         return Check("engine", True, f"gl: {renderer} is a hardware GPU")
-    lacks = f"{renderer} is software" if renderer else "no OpenGL"
+    lacks = f"{renderer} is a software renderer" if renderer else "no OpenGL"
     if "error" not in native:
         return Check("engine", True, f"native: {lacks}")
     if renderer:
-        return Check("engine", True, f"gl, slowly: {lacks}, and no compiled loops")
-    return Check("engine", False, "neither OpenGL nor compiled loops", FIX_COMPILER)
+        return Check(
+            "engine", True, f"gl, slow: {lacks}, and there are no compiled loops"
+        )
+    return Check(
+        "engine", False, "none: neither OpenGL nor compiled loops", FIX_COMPILER
+    )
 
 
 def check_threads(threads: dict[str, Any]) -> Check:
-    """Check that two threads may call Numba at once."""
+    """Check that two threads may call Numba at the same time."""
     if "error" in threads:
         return Check("threads", False, threads["error"], install_command(["numba"]))
     layer = threads["layer"]
     if layer == UNSAFE_THREADING_LAYER:
         fix = f"{APT_INSTALL} libgomp1"
-        return Check("threads", False, f"{layer}: not safe for the service", fix)
+        return Check(
+            "threads",
+            False,
+            f"{layer} is not thread-safe, which the service requires",
+            fix,
+        )
     return Check("threads", threads["sum_correct"], layer)
 
 
@@ -322,22 +324,22 @@ def check_networks(networks: dict[str, Any]) -> Check:
 
 
 def check_display() -> Check:
-    """Look for a screen; only the live window needs one."""
+    """Find a display; only the live window requires one."""
     display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if display:
         return Check("display", True, display)
     if shutil.which("Xvfb"):
-        return Check("display", False, "no screen; Xvfb can stand in for one")
-    return Check("display", False, "no screen", f"{APT_INSTALL} xvfb")
+        return Check("display", False, "no display; Xvfb can provide a virtual one")
+    return Check("display", False, "no display", f"{APT_INSTALL} xvfb")
 
 
 def what_works(ok: dict[str, bool]) -> dict[str, bool]:
-    """Return which purposes work, from the checks that each one needs."""
+    """Return which purposes work, from the checks that each of them requires."""
     psf = ok["python"] and ok["service packages"]
     shaders = ok["gl"] and ok["compute"] and ok["shaders"]
     filters = psf and (ok["native"] or shaders)
     serve = filters and ok["threads"]
-    demo = serve and ok["client packages"] and ok["gl"]  # it renders its scenes
+    demo = serve and ok["client packages"] and ok["gl"]  # which renders its scenes
     return {
         "psf": psf,
         "filter": filters,
@@ -348,5 +350,5 @@ def what_works(ok: dict[str, bool]) -> dict[str, bool]:
 
 
 def install_commands(checks: list[Check]) -> list[str]:
-    """List the fixes of the checks that failed, each once."""
+    """Return the fixes of the checks that failed, each once."""
     return list(dict.fromkeys(c.fix for c in checks if not c.ok and c.fix))

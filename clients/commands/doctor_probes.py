@@ -1,10 +1,11 @@
-"""Probes that `ocufilter doctor` runs in their own processes, one JSON line each.
+"""Probes that `ocufilter doctor` runs, each in a process of its own.
 
-A broken driver may crash or hang instead of raising; then only the probe is lost.
+A broken driver may crash or hang instead of raising, which then ends only the probe.
+Each probe prints one line of JSON.
 
     python -m clients.commands.doctor_probes NAME
 
-Names are those of `PROBES`.
+The names are the keys of `PROBES`.
 """
 
 import json
@@ -44,7 +45,7 @@ void main() {
 
 
 def probe_gl() -> dict[str, Any]:
-    """Open a context, run a compute shader and read back its result."""
+    """Open a context, run a compute shader and check its result."""
     from filter_service.gl.gpu import Gpu
 
     gpu = Gpu()
@@ -66,7 +67,7 @@ def probe_gl() -> dict[str, Any]:
 
 
 def probe_devices() -> dict[str, Any]:
-    """List the EGL devices; `probe_gl` checks whether they provide contexts."""
+    """List the EGL devices; `probe_gl` checks whether they work."""
     from filter_service.gl.egl_devices import egl_devices
 
     return {
@@ -123,7 +124,7 @@ def _sum_of_squares(count: int) -> float:
 
 
 def probe_threads() -> dict[str, Any]:
-    """Run one parallel loop and return the threading layer that ran it."""
+    """Run a parallel loop and return the threading layer that ran it."""
     total = _sum_of_squares(PROBE_COUNT)
     expected = (PROBE_COUNT - 1) * PROBE_COUNT * (2 * PROBE_COUNT - 1) / 6
     return {"layer": threading_layer(), "sum_correct": bool(total == expected)}
@@ -143,7 +144,7 @@ def probe_networks() -> dict[str, Any]:
             continue
         middle = 0.5 * (network.card.low + network.card.high)
         if not np.all(np.isfinite(network(middle[None]))):
-            missing[name] = f"{name}.onnx answers with numbers that are not finite"
+            missing[name] = f"{name}.onnx returns numbers that are not finite"
             continue
         cards[name] = {
             "n_parameters": network.card.n_parameters,

@@ -1,4 +1,4 @@
-"""`ocufilter estimate`: estimate the eye model of a profile, with fit and plot."""
+"""`ocufilter estimate`: estimate the parameters of an eye from its profile."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -36,24 +36,24 @@ def estimate(
     method: Annotated[
         Method,
         typer.Option(
-            help="network: the eye network alone, judged by tracing; refined: least "
-            "squares on traced coefficients, from its guess or a table's; search: the "
-            "pattern search of the earlier work."
+            help="network: the eye network alone, checked by ray tracing; refined: "
+            "least squares on traced coefficients, from the network's or a table's "
+            "first guess; search: the pattern search of the paper."
         ),
     ] = Method.REFINED,
     max_time_s: Annotated[
-        float, typer.Option(help="Time given to --method search, s.")
+        float, typer.Option(help="Time limit of --method search, s.")
     ] = 60.0,
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="OUT.png", help="Cross-section with traced rays."),
+        typer.Option(metavar="OUT.png", help="Plot a cross-section with traced rays."),
     ] = None,
     json_output: Json = False,
 ) -> None:
     """Estimate the 45-parameter eye that reproduces a measured wavefront.
 
-    Coefficients are compared on the measured circle without tilt, because the chief
-    ray ties tilt to coma.
+    Coefficients are compared on the measured circle, without tilt: the chief ray makes
+    tilt a function of coma.
 
     ocufilter estimate keratoconus --plot eye.png
     """
@@ -69,7 +69,7 @@ def estimate(
     eye = load_profile(profile)
     try:
         found = estimate_eye(eye, method=method.value, max_time_s=max_time_s)
-    except (WeightsMissing, DamagedWeights) as error:  # not an input error
+    except (WeightsMissing, DamagedWeights) as error:  # not the user's input
         raise CommandFailed(str(error)) from error
     if plot is not None:
         from estimator.estimate.plot import plot_eye
@@ -113,14 +113,14 @@ def _report(summary: dict[str, Any], plot: Path | None) -> None:
     for name, value in summary["parameters"].items():
         ratio = summary["determined_ratio"].get(name)
         known = "" if ratio is None else f"{100.0 * ratio:5.0f} %"
-        bound = "  on its bound" if name in summary["on_bound"] else ""
+        bound = "  at its bound" if name in summary["on_bound"] else ""
         say(f"{name:<38}{value:>11.5g}  {known}{bound}")
     say(
         f"{summary['profile']}, {summary['method']}: mean error "
         f"{summary['mean_abs_error_um']:.2g} um over 25 terms, "
         f"{summary['time_ms']:.0f} ms, {summary['n_evaluations']} eyes traced; "
-        f"refraction {summary['refraction_dpt']:.2f} dpt, accommodates "
-        f"{summary['amplitude_dpt']:.1f} dpt"
+        f"refraction {summary['refraction_dpt']:.2f} dpt, amplitude of "
+        f"accommodation {summary['amplitude_dpt']:.1f} dpt"
     )
     if plot is not None:
-        say(f"{plot}: cross-section")
+        say(f"wrote the cross-section to {plot}")

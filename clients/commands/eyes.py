@@ -1,4 +1,4 @@
-"""`ocufilter eyes`: list and erase the eyes in a service's on-disk cache."""
+"""`ocufilter eyes`: list and erase the eyes in the on-disk cache of a service."""
 
 import os
 import time
@@ -18,12 +18,12 @@ Folder = Annotated[
     typer.Option(
         "--dir",
         metavar="DIR",
-        help=f"The service's store_cache_dir; by default ${CACHE_VARIABLE}.",
+        help=f"Cache folder (store_cache_dir of the service) [${CACHE_VARIABLE}].",
     ),
 ]
 
 eyes = typer.Typer(
-    help="List and delete the eyes that are cached on disk (`serve --keep-eyes DIR`).",
+    help="List and erase the eyes cached on disk (`serve --keep-eyes DIR`).",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
@@ -33,8 +33,8 @@ def _folder(given: Path | None) -> Path:
     named = given or os.environ.get(CACHE_VARIABLE)
     if not named:
         raise ValueError(
-            f"no folder: give --dir DIR or set {CACHE_VARIABLE}; eyes are cached only "
-            "if a service is configured to (store_cache_dir, or serve --keep-eyes)"
+            f"no cache folder; allowed: --dir DIR, or the variable {CACHE_VARIABLE}. A "
+            "service caches eyes only with store_cache_dir or serve --keep-eyes"
         )
     return Path(named).expanduser()
 
@@ -58,7 +58,7 @@ def list_kept(folder: Folder = None, json_output: Json = False) -> None:
             f"{eye.size_bytes / MB:8.1f} MB  used {used}"
         )
     if not found:
-        print("no eye is kept")
+        print("no eye is cached")
 
 
 @eyes.command()
@@ -66,13 +66,13 @@ def erase(
     profile: Annotated[
         str | None,
         typer.Argument(
-            metavar="[PROFILE]", help="A preset or a file, as for `ocufilter filter`."
+            metavar="[PROFILE]", help="Preset or file, as for `ocufilter filter`."
         ),
     ] = None,
     name: Annotated[
-        str | None, typer.Option(metavar="HASH", help="As `eyes list` names it.")
+        str | None, typer.Option(metavar="HASH", help="Hash printed by `eyes list`.")
     ] = None,
-    every: Annotated[bool, typer.Option("--all", help="All of them.")] = False,
+    every: Annotated[bool, typer.Option("--all", help="Erase all eyes.")] = False,
     folder: Folder = None,
     json_output: Json = False,
 ) -> None:
@@ -84,7 +84,7 @@ def erase(
 
     if (profile is not None) + (name is not None) + every != 1:
         raise ValueError(
-            "nothing selected; expected one of PROFILE, --name HASH and --all"
+            "no eye or several selected; allowed: one of PROFILE, --name HASH and --all"
         )
     begin = name or ""
     if profile is not None:
@@ -93,9 +93,9 @@ def erase(
 
         begin = eye_name(load_profile(profile))
     elif name is not None and (not name or name.strip("0123456789abcdef")):
-        raise ValueError(f"--name is {name!r}; allowed: as `eyes list` prints it")
+        raise ValueError(f"--name is {name!r}; allowed: a hash printed by `eyes list`")
     n_files = erase_eyes(_folder(folder), begin)
     if json_output:
         print_json({"erased_files": n_files})
     else:
-        say(f"{n_files} files erased" if n_files else "nothing was kept of it")
+        say(f"{n_files} files erased" if n_files else "nothing was cached")

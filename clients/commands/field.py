@@ -1,4 +1,4 @@
-"""`ocufilter field`: wavefronts of an eye over its visual field."""
+"""`ocufilter field`: aberrations of an eye over its visual field."""
 
 import math
 from pathlib import Path
@@ -24,7 +24,7 @@ HORIZONTAL, VERTICAL = "-40,-30,-20,-10,0,10,20,30,40", "0"
 def field(
     profile: Annotated[
         str,
-        typer.Argument(help="A preset name, or a .json, .abp or .csv profile."),
+        typer.Argument(help="Preset name, or a .json, .abp or .csv profile."),
     ],
     pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength, nm.")],
@@ -36,21 +36,23 @@ def field(
     ] = VERTICAL,
     focus_dpt: Annotated[
         float | None,
-        typer.Option(help="Distance made sharpest, dpt; relaxed if not given."),
+        typer.Option(help="Focus distance, dpt; relaxed if not given."),
     ] = None,
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="OUT.png", help="Maps of M, astigmatism, coma and blur."),
+        typer.Option(
+            metavar="OUT.png", help="Plot maps of M, astigmatism, coma and blur."
+        ),
     ] = None,
     json_output: Json = False,
 ) -> None:
     """Print refraction and aberrations over a grid of visual field directions.
 
     The grid combines each azimuth with each elevation.  Coefficients are OSA, um, at
-    the cornea, on the circle about the chief ray that encloses the pupil; M, J0 and
-    J45 are the least-squares refraction.  Off the axis they are those measured in the
-    profile, or typical of people with such an axis; "periphery": "model" in the
-    profile selects those of the eye model.
+    the cornea, on the circle about the chief ray that encloses the pupil.  M, J0 and
+    J45 are the least-squares refraction.  Off-axis values are those measured in the
+    profile, or those of a measured population with the same on-axis values; with
+    "periphery": "model" in the profile, they are those of the eye model.
 
     ocufilter field keratoconus --pupil-mm 4 --wavelength-nm 555 --v-deg=-20,0,20
     """
@@ -61,8 +63,8 @@ def field(
     azimuths, elevations = _angles("--h-deg", h_deg), _angles("--v-deg", v_deg)
     if len(azimuths) * len(elevations) > MAX_DIRECTIONS:
         raise ValueError(
-            f"--h-deg, --v-deg: {len(azimuths)} x {len(elevations)} directions; "
-            f"allowed are {MAX_DIRECTIONS}"
+            f"--h-deg and --v-deg: {len(azimuths)} x {len(elevations)} directions; "
+            f"allowed: at most {MAX_DIRECTIONS}"
         )
 
     import numpy as np
@@ -90,11 +92,11 @@ def field(
         plot_field(found, plot, title=f"{eye.name}, {pupil_mm:g} mm")
     notes = list(found.notes)
     if eye.correction is not None:
-        notes.append("through the correction")
+        notes.append("seen through the correction")
     if rings_of(eye.correction) is not None:
         notes.append(
-            "coefficients cannot represent its rings or lenslets: they "
-            "describe its distance power"
+            "coefficients cannot represent the rings or lenslets of the correction: "
+            "they describe its distance power"
         )
     if json_output:
         print_json({"directions": _directions(found), "notes": notes})
@@ -103,14 +105,14 @@ def field(
 
 
 def _angles(option: str, text: str) -> list[float]:
-    """Parse a list of angles.
+    """Parse a list of angles in degrees.
 
     Raises
     ------
     ValueError
-        If an angle is invalid; the message names option, value and allowed range.
+        If an angle is invalid.  The message names the option, the value and the range.
     """
-    allowed = f"allowed are numbers from -{FIELD_LIMIT_DEG:g} to {FIELD_LIMIT_DEG:g}"
+    allowed = f"-{FIELD_LIMIT_DEG:g} to {FIELD_LIMIT_DEG:g}, separated by commas"
     angles = []
     for word in text.replace(",", " ").split():
         try:
@@ -118,10 +120,10 @@ def _angles(option: str, text: str) -> list[float]:
         except ValueError:
             angle = math.nan
         if not abs(angle) <= FIELD_LIMIT_DEG:
-            raise ValueError(f"{option} {word!r}: {allowed}, with commas between")
+            raise ValueError(f"{option}: {word!r}; allowed: {allowed}")
         angles.append(angle)
     if not angles:
-        raise ValueError(f"{option} is empty: {allowed}, with commas between")
+        raise ValueError(f"{option} is empty; allowed: {allowed}")
     return angles
 
 

@@ -1,4 +1,4 @@
-"""`ocufilter filter`: filter one RGB-D image through one eye, without a server."""
+"""`ocufilter filter`: filter one RGB-D image through one eye, without a service."""
 
 import time
 from collections.abc import Callable
@@ -54,36 +54,36 @@ def filter_image(
         Path,
         typer.Option(
             metavar="IMG",
-            help="PNG, JPEG (sRGB), .npy (uint8 sRGB or float linear) or .exr; linear "
-            "light may be above 1 and below 0.",
+            help="PNG or JPEG (sRGB), .npy (uint8 sRGB or linear floats) or .exr.  "
+            "Linear light may be above 1 and below 0.",
         ),
     ],
     profile: Annotated[
         str,
         typer.Option(
             metavar="P",
-            help="A preset's name, a .json, .abp or .csv file, or JSON as "
+            help="Preset name, a .json, .abp or .csv file, or JSON such as "
             '{"kind": "prescription", "sphere_dpt": -2}.',
         ),
     ],
     out: Annotated[
         Path,
         typer.Option(
-            "--out", "-o", help=".png (sRGB), or .npy or .exr (linear floats)."
+            "--out", "-o", help="Output: .png (sRGB), .npy or .exr (linear floats)."
         ),
     ],
     depth: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Meters: .npy, 32-bit float TIFF, .exr; or a 16-bit PNG with "
-            "--depth-scale.  inf is infinity; 0, negative and NaN are missing.",
+            help="Depth in meters: .npy, 32-bit float TIFF or .exr; or a 16-bit PNG "
+            "with --depth-scale.  inf is infinity; 0, negative and NaN are missing.",
         ),
     ] = None,
     distance_m: Annotated[
         float | None,
         typer.Option(
-            help="Distance of the whole image, instead of --depth; inf is infinity."
+            help="Distance of the entire image, instead of --depth; inf is infinity."
         ),
     ] = None,
     fov_deg: Annotated[
@@ -94,7 +94,9 @@ def filter_image(
     ] = None,
     intrinsics: Annotated[
         str | None,
-        typer.Option(metavar="FX,FY,CX,CY", help="Camera in px, instead of --fov-deg."),
+        typer.Option(
+            metavar="FX,FY,CX,CY", help="Camera matrix in px, instead of --fov-deg."
+        ),
     ] = None,
     hidden_color: Annotated[
         Path | None,
@@ -108,8 +110,8 @@ def filter_image(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Its depth, as --depth; 0, negative and NaN mean that nothing is "
-            "hidden.",
+            help="Depth of that surface, as for --depth; 0, negative and NaN mean that "
+            "nothing is hidden.",
         ),
     ] = None,
     pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")] = 4.0,
@@ -118,10 +120,11 @@ def filter_image(
     ] = 0.0,
     accumulation: Annotated[
         Accumulation,
-        typer.Option(help="coverage conserves light; paper is the published rule."),
+        typer.Option(help="coverage: conserves light; paper: the published rule."),
     ] = "coverage",
     depth_kind: Annotated[
-        DepthKind, typer.Option(help="planar: view-space z; radial: distance.")
+        DepthKind,
+        typer.Option(help="planar: view-space z; radial: distance from the camera."),
     ] = "planar",
     depth_scale: Annotated[
         float | None,
@@ -139,26 +142,26 @@ def filter_image(
     engine: Annotated[
         Engine,
         typer.Option(
-            help="gl: a GPU's shaders; native: compiled loops; auto: gl on a GPU."
+            help="gl: shaders on a GPU; native: compiled loops; auto: gl on a GPU."
         ),
     ] = "auto",
     half: Annotated[
-        bool, typer.Option("--half", help="Half floats in the .npy or .exr.")
+        bool, typer.Option("--half", help="Write half floats to .npy or .exr.")
     ] = False,
     plan: Annotated[
         bool,
-        typer.Option("--plan", help="Print which PSFs would be computed, and stop."),
+        typer.Option("--plan", help="Print which PSFs would be computed, then stop."),
     ] = False,
     json_output: Json = False,
     *,
     settings: dict[str, Any],
 ) -> None:
-    """Filter one image with depth through one eye; no server is needed.
+    """Filter one image with depth through one eye, without a service.
 
     ocufilter filter --color room.png --depth room.npy --fov-deg 50
     --profile myopia --pupil-mm 5 -o blurred.png
 
-    Place a photograph without depth at one distance:
+    For a photograph without depth, give its distance:
 
     ocufilter filter --color photo.jpg --distance-m 2 --fov-deg 50
     --profile myopia -o blurred.png
@@ -230,7 +233,7 @@ def filter_image(
 
 
 def _check_one_of(options: dict[str, object]) -> None:
-    """Raise unless exactly one of several equivalent options is given."""
+    """Raise ValueError unless exactly one of several options is given."""
     given = [name for name, value in options.items() if value is not None]
     if len(given) != 1:
         found = " and ".join(given) if given else ", ".join(options)
@@ -289,7 +292,7 @@ def _filtered(
     progress: Callable[[float, str], None],
     **options: Any,
 ) -> _Filtered:
-    """Filter one view like a stream, with the eye estimated in this process."""
+    """Filter a view as one frame of a stream; the eye is estimated in this process."""
     from filter_service.filtering.eye_filter import EyeFilter
     from filter_service.filtering.filtered import BuildingEye, EyeReady
     from filter_service.filtering.shared_builder import open_inline_builder
@@ -319,12 +322,12 @@ def _filtered(
 
 
 def _output(out: Path, *, half: bool) -> Output:
-    """Return the output format of a file of this name."""
+    """Return the output format for a file name."""
     from filter_service.image_files import LINEAR_SUFFIXES
 
     linear = out.suffix.lower() in LINEAR_SUFFIXES
     if half and not linear:
-        raise ValueError("--half: allowed with an output of .npy or .exr")
+        raise ValueError("--half: allowed with .npy and .exr output")
     return ("linear16" if half else "linear") if linear else "srgb8"
 
 
@@ -377,13 +380,13 @@ def _read_hidden(
         return None, None
     if color_path is None or depth_path is None:
         lacking = "--hidden-color" if color_path is None else "--hidden-depth"
-        raise ValueError(f"{lacking}: not given; allowed: both files or neither")
+        raise ValueError(f"{lacking} is not given; allowed: both files or neither")
     hidden = read_color(color_path, option="hidden-color")
     _check_size("hidden-color", color_path, hidden, color)
     if hidden.dtype != color.dtype:
         raise ValueError(
             f"--hidden-color '{color_path}': {hidden.dtype}; "
-            f"allowed: as the color image, {color.dtype}"
+            f"allowed: {color.dtype}, as the color image"
         )
     depth_m = read_depth(depth_path, depth_scale=depth_scale, option="hidden-depth")
     _check_size("hidden-depth", depth_path, depth_m, color)
@@ -400,7 +403,7 @@ def _check_size(
         f"the size of the color image, {color.shape[1]}x{color.shape[0]}"
     )
     if image.shape[:2] == color.shape[1::-1]:
-        text += " (photographs are turned upright, as their EXIF data say)"
+        text += " (photographs are rotated upright according to their EXIF data)"
     raise ValueError(text)
 
 
@@ -440,12 +443,12 @@ def _summary(
 
 
 def _depth_words(depth_m: "NDArray[Any]", missing_count: int) -> str:
-    """Return the depth range and the share of filled-in pixels, as text."""
+    """Return the depth range and the percentage of filled pixels, as text."""
     from filter_service.rgbd_view import LEAST_DEPTH_M
 
     known_m = depth_m[depth_m >= LEAST_DEPTH_M]
     if not known_m.size:
-        return "depth: none, infinity is assumed"
+        return "no depth; infinity is assumed"
     low, high = (
         f"{value_m:.3g} m" if value_m < float("inf") else "infinity"
         for value_m in (known_m.min(), known_m.max())
@@ -461,7 +464,7 @@ def _report(summary: dict[str, Any]) -> None:
     for note in summary["notes"]:
         say(f"note: {note}")
     if count := summary["clamped_depth_count"]:
-        say(f"note: {count} pixels nearer or farther than the prepared distances")
+        say(f"note: {count} pixels are nearer or farther than the prepared distances")
     say(summary["depth"])
     settings = summary["settings"]
     ranges = ", ".join(

@@ -1,4 +1,4 @@
-"""`ocufilter keys`: manage the client keys of a service that other machines reach."""
+"""`ocufilter keys`: manage the client keys of a service on a network."""
 
 import os
 from pathlib import Path
@@ -16,20 +16,20 @@ Folder = Annotated[
     typer.Option(
         "--dir",
         metavar="DIR",
-        help="Folder of the keys; by default ocufilter/keys in $XDG_CONFIG_HOME.",
+        help="Key folder; by default ocufilter/keys in $XDG_CONFIG_HOME.",
     ),
 ]
-Name = Annotated[str, typer.Argument(metavar="NAME", help="Of the client.")]
+Name = Annotated[str, typer.Argument(metavar="NAME", help="Client name.")]
 
 keys = typer.Typer(
-    help="Create and revoke client keys, for a service that other machines reach.",
+    help="Create and revoke client keys, for a service that accepts other machines.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
 
 
 def default_folder() -> Path:
-    """Return the default folder of keys."""
+    """Return the default key folder."""
     home = os.environ.get("XDG_CONFIG_HOME") or str(Path.home() / ".config")
     return Path(home) / "ocufilter" / "keys"
 
@@ -45,15 +45,16 @@ def add(
     name: Name,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="The client's file; by default NAME.toml."),
+        typer.Option(metavar="FILE", help="Key file to write; by default NAME.toml."),
     ] = None,
     folder: Folder = None,
     json_output: Json = False,
 ) -> None:
     """Authorize a client and write the key file that it connects with.
 
-    Send the file to the client over a secure channel, and to nobody else.  A service
-    that runs with this folder (keys_dir in its configuration) applies it at once.
+    Send the file to the client, and only to the client, over a secure channel.  A
+    service that runs with this folder (keys_dir in its configuration) accepts the key
+    at once.
 
     ocufilter keys add lab
     """
@@ -88,4 +89,4 @@ def list_names(folder: Folder = None, json_output: Json = False) -> None:
     if json_output:
         print_json({"names": names})
     else:
-        print("\n".join(names) if names else "nobody may connect yet")
+        print("\n".join(names) if names else "no client may connect yet")

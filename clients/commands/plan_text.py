@@ -11,7 +11,7 @@ AXIS_WORDS = {"h": "azimuth", "v": "elevation"}
 
 
 def plan_summary(plan: "CachePlan") -> dict[str, Any]:
-    """Return the plan's nodes and prediction, ready for JSON."""
+    """Return a plan's nodes and prediction in JSON-compatible types."""
     assert plan.nodes is not None
     predicted, defocus = plan.prediction, plan.nodes.defocus
     return {

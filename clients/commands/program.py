@@ -1,4 +1,4 @@
-"""The `ocufilter` program: dispatch of commands, and one line for every error."""
+"""The `ocufilter` program: dispatch of commands, and one line for each error."""
 
 import sys
 
@@ -7,16 +7,14 @@ from typer.exceptions import Abort, TyperException
 
 from clients.commands.checkout import bench, paper
 from clients.commands.console import CommandFailed
-from clients.commands.doctor import doctor
 from clients.commands.estimate import estimate
 from clients.commands.eyes import eyes
 from clients.commands.field import field
 from clients.commands.filter_image import filter_image
 from clients.commands.keys import keys
-from clients.commands.prepare import prepare
-from clients.commands.programs import batch, demo, headset, report, web
+from clients.commands.programs import batch, demo, doctor, headset, report, web
 from clients.commands.psf import psf
-from clients.commands.serve import serve
+from clients.commands.serve import prepare, serve
 from clients.commands.status import status
 from clients.commands.wavefront import wavefront
 from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
@@ -28,9 +26,10 @@ EXIT_INTERRUPTED = 130
 app = typer.Typer(
     name="ocufilter",
     help="See through another person's eyes.  Start with `ocufilter demo`; "
-    "`ocufilter doctor` says what this machine lacks.",
-    epilog="Units end names: mm, nm, dpt (diopters; infinity is 0), deg.  "
-    "Exit codes: 0 done, 1 failure, 2 bad input.",
+    "`ocufilter doctor` reports what is missing on this machine.",
+    epilog="Option names end in their unit: mm, nm, deg, dpt (diopters; 0 is "
+    "infinity).  "
+    "Exit codes: 0 success, 1 failure, 2 invalid input.",
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -53,7 +52,7 @@ for program in (headset, web, batch, report):
         context_settings={
             "allow_extra_args": True,
             "ignore_unknown_options": True,
-            "help_option_names": [],  # the program has its own help
+            "help_option_names": [],  # the program prints its own help
         }
     )(program)
 app.command()(paper)
@@ -65,7 +64,7 @@ app.command()(doctor)
 def _root(
     context: typer.Context,
     traceback: bool = typer.Option(  # noqa: ARG001  (`_exit_code` reads it)
-        False, help="Show where an error came from."
+        False, help="Show the traceback of an error."
     ),
 ) -> None:
     if context.invoked_subcommand is None:
@@ -99,12 +98,12 @@ def _code_and_text(error: Exception) -> tuple[int, str]:
         return EXIT_BAD_INPUT if error.field else EXIT_FAILURE, str(error)
     if isinstance(error, CommandFailed):
         return EXIT_FAILURE, str(error)
-    if isinstance(error, ValueError):  # by convention invalid input
+    if isinstance(error, ValueError):  # invalid input, by convention
         return EXIT_BAD_INPUT, str(error)
     if isinstance(error, OSError):
         return EXIT_FAILURE, str(error)
     kind = type(error).__name__
-    return EXIT_FAILURE, f"{kind}: {error} (ocufilter --traceback ... shows where)"
+    return EXIT_FAILURE, f"{kind}: {error} (see ocufilter --traceback ...)"
 
 
 if __name__ == "__main__":

@@ -1,12 +1,15 @@
-"""`ocufilter demo`, `headset`, `report`, `batch` and `web`."""
+"""`ocufilter demo`, `headset`, `report`, `batch`, `web` and `doctor`.
+
+Modules that do the work are imported only when a command runs.
+"""
 
 import importlib
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from clients.commands.console import CommandFailed, Json
+from clients.commands.console import CommandFailed, Json, print_json, say
 from clients.extra import what_to_install
 
 
@@ -15,16 +18,17 @@ def demo(
         "out/demo"
     ),
     frames: Annotated[
-        int | None, typer.Option(min=1, help="Frames of each eye.")
+        int | None, typer.Option(min=1, help="Number of frames per eye.")
     ] = None,
     size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Frame size in px, as 480x270.")
+        str | None,
+        typer.Option(metavar="WxH", help="Frame size in px, such as 480x270."),
     ] = None,
     json_output: Json = False,
 ) -> None:
     """Stream two scenes through six eyes and write a video and a contact sheet.
 
-    Starts its own service and a pyrender client that connects to it.  Writes a video,
+    Starts a service of its own and a client that connects to it.  Writes a video,
     contact_sheet.png and latency.json.
 
     ocufilter demo --out out/demo --frames 24 --size 480x270
@@ -33,7 +37,7 @@ def demo(
     if frames is not None:
         arguments += ["--frames", str(frames)]
     if size is not None:
-        from clients.arguments import read_size_px  # reads profiles, too: 60 ms
+        from clients.arguments import read_size_px  # imports the profile reader: 60 ms
 
         width_px, height_px = read_size_px(size)
         arguments += ["--size", f"{width_px}x{height_px}"]
@@ -46,7 +50,7 @@ def demo(
 def headset(context: typer.Context) -> None:
     """Show a scene in an OpenXR headset, each eye through its own profile.
 
-    Its options: `ocufilter headset --help`.
+    For its options, see `ocufilter headset --help`.
 
     ocufilter headset --left myopia --right keratoconus
     """
@@ -54,9 +58,9 @@ def headset(context: typer.Context) -> None:
 
 
 def report(context: typer.Context) -> None:
-    """Write a report of one eye, or a before-and-after comparison, as HTML or PDF.
+    """Write a report on one eye, or a before-and-after comparison, as HTML or PDF.
 
-    Its options: `ocufilter report --help`.
+    For its options, see `ocufilter report --help`.
 
     ocufilter report keratoconus -o eye.html
     """
@@ -66,7 +70,7 @@ def report(context: typer.Context) -> None:
 def batch(context: typer.Context) -> None:
     """Filter data sets, folders and videos of color and depth, on all cores.
 
-    Its options and the layouts it reads: `ocufilter batch --help`.
+    For its options and the supported layouts, see `ocufilter batch --help`.
 
     ocufilter batch rgbd_dataset_freiburg1_desk -p myopia -p keratoconus -o seen
     """
@@ -74,9 +78,9 @@ def batch(context: typer.Context) -> None:
 
 
 def web(context: typer.Context) -> None:
-    """Serve a web page with an eye's data, sliders, and before and after views.
+    """Serve a web page with an eye's data, sliders, and before-and-after views.
 
-    Its options: `ocufilter web --help`.
+    For its options, see `ocufilter web --help`.
 
     ocufilter web --profile myopia
     """
@@ -84,7 +88,46 @@ def web(context: typer.Context) -> None:
 
 
 def _run(module: str, arguments: list[str]) -> None:
-    """Run a program of the clients, which is loaded only when it is used."""
+    """Import a client program and run it."""
     code = importlib.import_module(module).main(arguments)
     if code:
         raise typer.Exit(code)
+
+
+def doctor(json_output: Json = False) -> None:
+    """Check whether this machine has everything that ocufilter requires.
+
+    Prints how to install what is missing.  The exit code is 0 if the service can run
+    here and 1 if it cannot.
+
+    ocufilter doctor --json
+    """
+    from clients.commands.doctor_checks import examine
+
+    report = examine()
+    if json_output:
+        print_json(report)
+    else:
+        _print_diagnosis(report)
+    if not report["ok"]:
+        fails = ", ".join(name for name, ok in report["works"].items() if not ok)
+        raise CommandFailed(f"the service cannot run here; failed: {fails}")
+
+
+def _print_diagnosis(report: dict[str, Any]) -> None:
+    machine = report["machine"]
+    say(f"{machine['system']}, {machine['processor']}, {machine['n_cores']} cores")
+    for check in report["checks"]:
+        say(f"  {'ok ' if check['ok'] else 'NO '} {check['name']}: {check['detail']}")
+    for name, value in report["gl"]["limits"].items():
+        say(f"      {name}: {value}")
+    for device in report["gl"]["devices"]:
+        found = device["renderer"] or f"no context: {device['error']}"
+        say(f"      EGL device {device['index']} ({device['name']}): {found}")
+    works = [name for name, ok in report["works"].items() if ok]
+    fails = [name for name, ok in report["works"].items() if not ok]
+    say("works here: " + (", ".join(works) or "nothing"))
+    if fails:
+        say("does not work here: " + ", ".join(fails))
+    for command in report["install"]:
+        say(f"install: {command}")

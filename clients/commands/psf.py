@@ -1,4 +1,4 @@
-"""`ocufilter psf`: compute one point-spread function as an array or an image."""
+"""`ocufilter psf`: compute a point-spread function as an array or an image."""
 
 import math
 from dataclasses import dataclass
@@ -36,11 +36,11 @@ PIXEL_LIMITS_ARCMIN = (0.05, 60.0)
 ARCMIN_PER_DEG = 60.0
 
 MAX_RADIUS_PX = 1023
-"""Largest radius of a kernel written to a file; the service's own cap is lower."""
+"""Largest radius of a kernel written to a file; the service has a lower limit."""
 
 WITHOUT_TYPICAL = (
-    "on axis the prescription alone, without the higher-order aberrations that are "
-    "typical of the age; `ocufilter filter`, and psf off the axis, add them"
+    "on-axis, this is the prescription alone, without the higher-order aberrations "
+    "that are typical for the age; `ocufilter filter` and off-axis PSFs include them"
 )
 
 
@@ -55,7 +55,7 @@ class Method(StrEnum):
 
 @dataclass(frozen=True)
 class _State:
-    """Wavefront of the eye in the requested state and direction."""
+    """Wavefront of an eye in the requested state and direction."""
 
     name: str
     zernike_um: "np.ndarray"
@@ -71,30 +71,35 @@ def psf(
     eye: Annotated[
         str,
         typer.Argument(
-            help="A preset name, a .json, .abp or .csv profile, or a .json with "
+            help="Preset name, a .json, .abp or .csv profile, or a .json file with "
             "surfaces or the 45 parameters."
         ),
     ],
     pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength, nm.")],
-    pixel_arcmin: Annotated[float, typer.Option(help="Edge of a pixel, arcmin.")],
+    pixel_arcmin: Annotated[float, typer.Option(help="Pixel size, arcmin.")],
     out: Annotated[
-        Path, typer.Option("--out", "-o", help=".npy (kernel) or .png (log picture).")
+        Path,
+        typer.Option("--out", "-o", help="Output: .npy (kernel) or .png (log scale)."),
     ],
     object_dpt: Annotated[
-        float, typer.Option(help="Distance of the point, dpt; 0 is infinity.")
+        float, typer.Option(help="Distance of the point source, dpt; 0 is infinity.")
     ] = 0.0,
     focus_dpt: Annotated[
         float | None,
-        typer.Option(help="Distance focused at, dpt; infinity if not given."),
+        typer.Option(help="Focus distance, dpt; infinity if not given."),
     ] = None,
-    h_deg: Annotated[float, typer.Option(help="Source to the right, deg.")] = 0.0,
-    v_deg: Annotated[float, typer.Option(help="Source above, deg.")] = 0.0,
+    h_deg: Annotated[
+        float, typer.Option(help="Azimuth of the source, deg; positive is right.")
+    ] = 0.0,
+    v_deg: Annotated[
+        float, typer.Option(help="Elevation of the source, deg; positive is up.")
+    ] = 0.0,
     method: Annotated[
         Method,
         typer.Option(
-            help="auto selects the valid one for this wavefront; enz fails outside the "
-            "domain of its series."
+            help="auto selects a valid method for this wavefront; enz fails outside "
+            "the domain of its series."
         ),
     ] = Method.AUTO,
     stiles_crawford: Annotated[
@@ -106,8 +111,8 @@ def psf(
     """Compute one PSF, integrated over pixels that are square in visual angle.
 
     The kernel is an array [y, x] in image orientation (rows grow downward), with the
-    chief ray at its center and unit sum.  On axis a measured wavefront is used as it
-    is; off axis the eye is estimated and ray-traced, with its elliptical pupil.
+    chief ray at its center and unit sum.  On-axis, a measured wavefront is used as it
+    is; off-axis, the eye is estimated and ray-traced, with its elliptical pupil.
 
     ocufilter psf keratoconus --pupil-mm 5 --wavelength-nm 549
     --pixel-arcmin 1 --h-deg 20 -o psf.png
@@ -164,8 +169,8 @@ def _measured(source: str, focus_dpt: float | None, **view: Any) -> _State:
     from estimator.profiles.measured_wavefront import MeasuredWavefront
 
     profile = load_profile(source)
-    worn = MeasuredWavefront.from_profile(profile)
-    found = worn.state(focus_dpt=focus_dpt or 0.0, **view)
+    measured = MeasuredWavefront.from_profile(profile)
+    found = measured.state(focus_dpt=focus_dpt or 0.0, **view)
     notes = tuple(found.notes)
     if profile.higher_order == "typical":
         notes = (*notes, WITHOUT_TYPICAL)
@@ -177,7 +182,7 @@ def _measured(source: str, focus_dpt: float | None, **view: Any) -> _State:
         ellipse=None,
         eye_side=profile.eye_side,
         notes=notes,
-        rings=worn.rings,
+        rings=measured.rings,
     )
 
 
@@ -195,7 +200,7 @@ def _traced(source: str, focus_dpt: float | None, **view: Any) -> _State:
     if not found.rms_residual_um >= 0.0:
         raise CommandFailed(
             f"{name}, h {view['h_deg']:g} v {view['v_deg']:g} deg: "
-            + ("; ".join(found.notes) or "too little of the pupil to fit")
+            + ("; ".join(found.notes) or "too few rays pass the pupil for a fit")
         )
     return _State(
         name=name,
@@ -219,7 +224,7 @@ def _apodization(state: _State) -> "StilesCrawford":
 def _compute(
     state: _State, *, pixel_arcmin: float, method: str, **options: Any
 ) -> tuple["Psf", float]:
-    """Return the PSF and the PSNR that images filtered with it should exceed."""
+    """Return the PSF and the predicted PSNR of images that are filtered with it."""
     from estimator.optics.units import MRAD_PER_RAD
     from estimator.psf.compute import compute_psfs, plan_psfs
     from estimator.psf.switch import predicted_least_psnr_db
@@ -282,6 +287,6 @@ def _report(summary: dict[str, Any]) -> None:
         f"{summary['pupil_diameter_mm']:g} mm, {summary['wavelength_nm']:g} nm; radius "
         f"{summary['radius_px']} px ({summary['radius_px'] * arcmin:.3g} arcmin), half "
         f"of the light within {summary['half_light_radius_px'] * arcmin:.3g} arcmin, "
-        f"{summary['lost_energy_ratio']:.2g} of it outside; images filtered with it "
-        f"should be right to {summary['predicted_psnr_db']:.0f} dB"
+        f"{summary['lost_energy_ratio']:.2g} of it outside the kernel; predicted PSNR "
+        f"of filtered images: {summary['predicted_psnr_db']:.0f} dB or more"
     )

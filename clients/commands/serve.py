@@ -1,4 +1,4 @@
-"""`ocufilter serve`: run the service."""
+"""`ocufilter serve`: run the service; `prepare`: compile its loops ahead of time."""
 
 from functools import partial
 from pathlib import Path
@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from clients.commands.console import Json, print_json, say
 from filter_service.settings import Engine
 
 
@@ -18,26 +19,26 @@ def serve(
         ),
     ] = None,
     config: Annotated[
-        Path | None, typer.Option(metavar="FILE.toml", help="Settings file.")
+        Path | None, typer.Option(metavar="FILE.toml", help="Configuration file.")
     ] = None,
     engine: Annotated[
         Engine | None,
         typer.Option(
-            help="gl: a GPU's shaders; native: compiled loops; auto: gl on a GPU."
+            help="gl: shaders on a GPU; native: compiled loops; auto: gl on a GPU."
         ),
     ] = None,
     gl_device: Annotated[
         str | None,
         typer.Option(
             metavar="INDEX",
-            help="EGL device of the shaders, of those that doctor lists; or auto.",
+            help="Index of the EGL device, as listed by `doctor`; or auto.",
         ),
     ] = None,
     devices: Annotated[
         str | None,
         typer.Option(
             metavar="NAME,...",
-            help="A process for each: gl:0,gl:1 or native:4,native:4.",
+            help="A render process for each device: gl:0,gl:1 or native:4,native:4.",
         ),
     ] = None,
     keep_eyes: Annotated[
@@ -58,9 +59,9 @@ def serve(
 ) -> None:
     """Filter frames for clients until interrupted.
 
-    Messages are described in filter_service/PROTOCOL.md.  --bind overrides the
-    settings file.  SIGHUP reloads the file's limits and timeouts; the service keeps
-    listening.
+    filter_service/PROTOCOL.md describes the messages.  --bind overrides the
+    configuration file.  SIGHUP reloads the file's limits and timeouts without
+    interrupting the service.
 
     ocufilter serve --bind tcp://127.0.0.1:5577
     """
@@ -80,3 +81,26 @@ def serve(
         store_cache_dir=None if keep_eyes is None else str(keep_eyes.absolute()),
     )
     serving.run(load(), read_again=load)
+
+
+def prepare(json_output: Json = False) -> None:
+    """Compile the loops that trace eyes and plan frames, once per machine.
+
+    This takes a minute on two cores; later runs only check.  Otherwise the service
+    compiles while idle after its first start, and the first eye waits for that.
+
+    ocufilter prepare
+    """
+    import time
+
+    from filter_service.filtering.compile_loops import compile_loops
+    from filter_service.progress import Progress
+
+    started_s = time.monotonic()
+    with Progress(quiet=json_output) as progress:
+        compile_loops(progress)
+    spent_s = time.monotonic() - started_s
+    if json_output:
+        print_json({"ok": True, "seconds": round(spent_s, 1)})
+    else:
+        say(f"prepared in {spent_s:.0f} s")

@@ -1,9 +1,9 @@
-"""Command-line options generated from `FilterSettings`, one for every new setting.
+"""Command-line options generated from `FilterSettings`.
 
-Choices become ``--mode``, angles ``--gaze-h-deg`` and ``--gaze-v-deg``.  Switches that
-are on by default become ``--no-chromatic``, and switches that are off
-``--lateral-color``.  Ranges and planes have no option: a command derives them from its
-image.
+A choice becomes an option such as ``--mode``, and angles become ``--gaze-h-deg`` and
+``--gaze-v-deg``.  A switch becomes ``--no-chromatic`` if it is on by default, and
+``--lateral-color`` if it is off.  Ranges and planes have no option: commands derive
+them from the image.
 """
 
 import functools
@@ -24,7 +24,9 @@ HELP_OF_SIDE = {"h": "to the right", "v": "upward"}
 def with_setting_options(
     **defaults: Any,
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Add an option for each setting to a command, which receives ``settings``.
+    """Add an option for each setting to a command.
+
+    The command receives their values as the argument ``settings``, a dict.
 
     Parameters
     ----------
@@ -71,7 +73,7 @@ def _options(name: str, default: Any) -> list[inspect.Parameter]:
                 f"{stem}_{side}_{unit}",
                 float,
                 default=value,
-                words=f"{words}  Here: {HELP_OF_SIDE[side]}.",
+                words=f"{words}  This is the angle {HELP_OF_SIDE[side]}.",
             )
             for side, value in zip(HELP_OF_SIDE, default, strict=True)
         ]
@@ -90,7 +92,7 @@ def _option(
 
 
 def _plain_type(kind: Any) -> Any:
-    """Return a type without its limits; `FilterSettings` checks those."""
+    """Return a type without its limits, which `FilterSettings` checks."""
     if hasattr(kind, "__metadata__"):
         return kind.__origin__
     parts = get_args(kind)
@@ -100,12 +102,12 @@ def _plain_type(kind: Any) -> Any:
 
 
 def _settings(given: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of settings from those of their options.
+    """Convert the values of options to those of settings.
 
     Raises
     ------
     ValueError
-        If a value is invalid; the message names option, value and allowed range.
+        If a value is invalid.  The message names the option, the value and the range.
     """
     found = {}
     for name, kind in setting_types().items():

@@ -12,18 +12,18 @@ Seconds = Annotated[float, typer.Option("--timeout", metavar="S", help="Timeout,
 
 def status(
     endpoint: Annotated[
-        str, typer.Argument(metavar="ENDPOINT", help="Where it listens.")
+        str, typer.Argument(metavar="ENDPOINT", help="Endpoint of the service.")
     ] = "tcp://127.0.0.1:5577",
     key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The client's key file.")
+        Path | None, typer.Option(metavar="FILE", help="Key file of the client.")
     ] = None,
     timeout_s: Seconds = 3.0,
     json_output: Json = False,
 ) -> None:
-    """Print the state of a service; the exit code is 0 if it answers.
+    """Print the state of a service; the exit code is 0 if it responds.
 
-    A ready service filters frames.  A service that is alive but not ready is starting,
-    or is restarting its render process.
+    A ready service filters frames.  A service that is alive but not ready is starting
+    or restarting its render process.
 
     ocufilter status tcp://127.0.0.1:5577
     """
@@ -35,7 +35,7 @@ def status(
         return
     state = "ready" if found["is_ready"] else "alive, not ready"
     if found["is_degraded"]:
-        state += ", degraded: a process keeps ending, see the service's log"
+        state += ", degraded: a process ends repeatedly; see the service's log"
     print(f"{endpoint} is {state}")
     for name in ("n_connections", "n_sessions", "n_rendered", "n_dropped", "memory_mb"):
         print(f"  {name:<16} {found[name]:g}")
@@ -47,12 +47,12 @@ def status(
 
 
 def _of_device(device: dict[str, Any]) -> str:
-    """Return the identity, state and load of a device, in one line."""
+    """Return one line with the name, state and load of a device."""
     is_ready = "ready" if device["is_ready"] else "not ready"
     if device["is_lost"]:
-        is_ready = "given up"
+        is_ready = "lost"
     return (
-        f"{device['name']}: {device['renderer'] or 'not known yet'}, {is_ready}, "
+        f"{device['name']}: {device['renderer'] or 'unknown renderer'}, {is_ready}, "
         f"{device['n_sessions']} sessions, busy {device['busy_ratio']:.0%}, "
         f"{device['n_rendered']} frames, {device['memory_mb']:.0f} MB"
     )

@@ -1,4 +1,4 @@
-"""`ocufilter wavefront`: ray-trace the aberrations of an eye in one direction."""
+"""`ocufilter wavefront`: ray-trace an eye's aberrations in one field direction."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -26,7 +26,7 @@ FOCUS_LIMITS_DPT = (0.0, 20.0)
 
 
 class Fit(StrEnum):
-    """Quantity whose squared residual is minimized."""
+    """Quantity that the least-squares fit is made to."""
 
     OPD = "opd"
     SLOPE = "slope"
@@ -36,35 +36,40 @@ def wavefront(
     eye: Annotated[
         str,
         typer.Argument(
-            help="A .json with surfaces or the 45 parameters, any profile file, or a "
-            "preset name; a profile that is a measurement is estimated first."
+            help="A .json file with surfaces or the 45 parameters, a profile file, or "
+            "a preset name.  A measurement is converted to an eye model first."
         ),
     ],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength, nm.")],
     stop_mm: Annotated[
-        float | None, typer.Option(help="Diameter of the stop (iris), mm.")
+        float | None, typer.Option(help="Diameter of the iris, mm.")
     ] = None,
     pupil_mm: Annotated[
-        float | None, typer.Option(help="Entrance pupil at 555 nm, mm, instead.")
+        float | None,
+        typer.Option(help="Entrance pupil at 555 nm, mm, instead of the iris."),
     ] = None,
-    h_deg: Annotated[float, typer.Option(help="Source to the right, deg.")] = 0.0,
-    v_deg: Annotated[float, typer.Option(help="Source above, deg.")] = 0.0,
+    h_deg: Annotated[
+        float, typer.Option(help="Azimuth of the source, deg; positive is right.")
+    ] = 0.0,
+    v_deg: Annotated[
+        float, typer.Option(help="Elevation of the source, deg; positive is up.")
+    ] = 0.0,
     focus_dpt: Annotated[
         float | None,
-        typer.Option(help="Distance made sharpest, dpt; relaxed if not given."),
+        typer.Option(help="Focus distance, dpt; relaxed if not given."),
     ] = None,
     object_dpt: Annotated[
         float, typer.Option(help="Distance of the source, dpt; 0 is infinity.")
     ] = 0.0,
     fit: Annotated[
-        Fit, typer.Option(help="Least squares of the wavefront or of its slopes.")
+        Fit, typer.Option(help="Fit the wavefront (opd) or its slopes.")
     ] = Fit.OPD,
     json_output: Json = False,
 ) -> None:
     """Trace the wavefront of an eye and print its Zernike coefficients.
 
-    They are OSA coefficients, um, on the circle about the chief ray that encloses
-    the projected pupil.
+    Coefficients are OSA, um, on the circle about the chief ray that encloses the
+    projected pupil.
 
     ocufilter wavefront eye.json --stop-mm 4 --wavelength-nm 555 --h-deg 20
     """
@@ -88,7 +93,7 @@ def wavefront(
     if not found.rms_residual_um >= 0.0:
         raise CommandFailed(
             f"{name}, h {h_deg:g} v {v_deg:g} deg: "
-            + ("; ".join(found.notes) or "too little of the pupil to fit")
+            + ("; ".join(found.notes) or "too few rays pass the pupil for a fit")
         )
     summary = {
         **_facts(found),
@@ -118,7 +123,7 @@ def _check(
     object_dpt: float,
 ) -> None:
     if (stop_mm is None) == (pupil_mm is None):
-        raise ValueError("give either --stop-mm or --pupil-mm")
+        raise ValueError("--stop-mm, --pupil-mm: allowed: exactly one of them")
     if stop_mm is not None:
         check_range("--stop-mm", stop_mm, PUPIL_LIMITS_MM)
     if pupil_mm is not None:
@@ -132,7 +137,7 @@ def _check(
 
 
 def explicit_body(source: str) -> dict[str, Any] | None:
-    """Return the content of a JSON file of surfaces; None for any other source."""
+    """Return the content of a JSON file with surfaces; None for other sources."""
     from estimator.bounded_files import InvalidFile, read_json
     from estimator.eye.explicit import is_explicit_eye
     from estimator.profiles.files import MAX_PROFILE_BYTES
@@ -154,12 +159,16 @@ def load_surfaces(
     pupil_mm: float | None = None,
     stop_mm: float | None = None,
 ) -> tuple[str, "EyeSurfaces", tuple[str, ...]]:
-    """Return the name, surfaces and notes of a source.
+    """Return the name, surfaces and notes of an eye.
 
     Parameters
     ----------
+    source : str
+        Preset name or path of a file.
     focus_dpt : float or None
-        Distance that is sharpest through the given pupil or stop; relaxed if None.
+        Focus distance through the given pupil or stop; the eye is relaxed if None.
+    pupil_mm, stop_mm : float, optional
+        Diameter of the entrance pupil or of the iris.
     """
     body = explicit_body(source)
     if body is not None:
@@ -168,7 +177,7 @@ def load_surfaces(
         if focus_dpt is not None:
             raise ValueError(
                 "--focus-dpt: an eye given by its surfaces does not accommodate; "
-                "allowed for profiles and for the 45 parameters"
+                "allowed: a profile, or the 45 parameters"
             )
         return str(body.get("name", Path(source).name)), parse_explicit_eye(body), ()
 
@@ -181,7 +190,7 @@ def load_surfaces(
     found = estimate_eye(profile)
     notes = found.notes
     if profile.correction is not None:
-        notes = (*notes, "these coefficients do not include the correction")
+        notes = (*notes, "the coefficients do not include the correction")
     relaxed = eye_surfaces(found.parameters, retina=found.retina)
     if focus_dpt is None:
         return profile.name, relaxed, notes
@@ -192,7 +201,7 @@ def load_surfaces(
 
 
 def ellipse_facts(ellipse: "PupilEllipse") -> dict[str, Any]:
-    """Return the pupil of a traced wavefront in the form of the JSON output."""
+    """Return the pupil of a traced wavefront as in the JSON output."""
     return {
         "centre_x_mm": ellipse.centre_x_mm,
         "centre_y_mm": ellipse.centre_y_mm,

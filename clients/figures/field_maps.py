@@ -13,6 +13,7 @@ from clients.figures.style import (
     SEQUENTIAL,
     SMALL_PT,
     SOFT,
+    TEXT_PT,
     color_bar,
     dress,
     new_figure,
@@ -85,6 +86,11 @@ def draw_field_maps(panel: FigureBase, study: EyeStudy) -> None:
     panel.supxlabel(
         f"{left}  ←  visual field, deg  →  {right}", fontsize=SMALL_PT, color=SOFT
     )
+    if study.is_field_assumed:
+        panel.suptitle(
+            "Assumed off-axis: the average of people with such an axis",
+            fontsize=TEXT_PT, color=SOFT,
+        )  # fmt: skip
     panel.supylabel("elevation, deg", fontsize=SMALL_PT, color=SOFT)
 
 

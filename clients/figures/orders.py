@@ -18,7 +18,7 @@ from clients.figures.style import (
     SMALL_PT,
     SOFT,
     dress,
-    legend,
+    legend_above,
     new_figure,
     with_grid,
 )
@@ -85,13 +85,17 @@ def draw_rms_by_order(
         )
         seconds.append(f"{by_order[2]:.2f}")
     axes.set_xticks(places, names)
-    axes.margins(y=0.5 if labels else 0.18)  # labels are above the bars
+    axes.margins(y=0.4 if labels else 0.18)  # labels are above the bars
     axes.set_ylim(0.0, max(axes.get_ylim()[1], LEAST_TOP_UM))
     note = f"{2 * radius_mm:.1f} mm pupil; order 2: {', '.join(seconds)} µm"
-    dress(axes, title="RMS by radial order", x=f"radial order\n{note}", y="RMS, µm")
+    title = f"RMS by radial order{studies[0].assumed_suffix}"
+    dress(axes, title=title, x=f"radial order\n{note}", y="RMS, µm")
     axes.xaxis.label.set_fontsize(SMALL_PT)
     if labels:
-        legend(axes, loc="upper left")
+        axes.figure.legend(
+            *axes.get_legend_handles_labels(), fontsize=SMALL_PT, labelcolor=INK,
+            frameon=False, loc="outside lower center",
+        )  # fmt: skip
 
 
 def rms_by_order_figure(studies: Sequence[EyeStudy], **options: Any) -> Figure:
@@ -105,8 +109,9 @@ def draw_terms(axes: Axes, study: EyeStudy) -> None:
     """Draw each higher-order coefficient: measured, and of the estimated eye."""
     index = np.arange(order_range(FIRST_HIGHER).start, study.measured_um.size)
     measured, eye = study.measured_um[index], study.found.zernike_um[index]
-    axes.bar(index - 0.2, measured, 0.4, color=SOFT, label="measured or assumed")
-    axes.bar(index + 0.2, eye, 0.4, color=BLUE, label="of the eye found")
+    source = "assumed" if study.has_assumed_aberrations else "measured"
+    axes.bar(index - 0.2, measured, 0.4, color=SOFT, label=source)
+    axes.bar(index + 0.2, eye, 0.4, color=BLUE, label="estimated eye")
     names = [
         "{},{:+d}".format(*nm_from_index(int(j))).replace("+0", "0") for j in index
     ]
@@ -116,7 +121,7 @@ def draw_terms(axes: Axes, study: EyeStudy) -> None:
     dress(axes, title="Coefficients by order and frequency", x="n, m", y="µm, RMS")
     axes.axhline(0.0, color=SOFT, linewidth=0.6)
     with_grid(axes)
-    legend(axes)
+    legend_above(axes)
 
 
 def terms_figure(study: EyeStudy) -> Figure:

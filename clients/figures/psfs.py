@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -113,22 +114,56 @@ def _draw_scale(axes: Axes, side_arcmin: float) -> None:
     )  # fmt: skip
 
 
-def draw_psfs(panel: FigureBase, study: EyeStudy) -> None:
-    """Draw PSFs of a far point through 3 and 5 mm: as it is, and best corrected."""
+def psf_sides_arcmin(studies: Sequence[EyeStudy]) -> tuple[float, float]:
+    """Return the sides of images that hold the PSFs of all studies.
+
+    Returns
+    -------
+    as_it_is_arcmin, corrected_arcmin : float
+    """
+    states = [_states(study) for study in studies]
+    return _side_arcmin(states, "as it is"), _side_arcmin(states, "best corrected")
+
+
+def _side_arcmin(states: list[dict[str, list[PupilWavefront]]], name: str) -> float:
+    reaches_arcmin = (centered(seen)[1] for state in states for seen in state[name])
+    return max(LEAST_SIDE_ARCMIN, 2.0 * ROOM_RATIO * max(reaches_arcmin))
+
+
+def _states(study: EyeStudy) -> dict[str, list[PupilWavefront]]:
+    """Return wavefronts of a far point through 3 and 5 mm, as is and corrected."""
     states = [study.wavefront(pupil_mm) for pupil_mm in PUPILS_MM]
-    rows = {
+    return {
         "as it is": states,
         "best corrected": [state.best_corrected() for state in states],
     }
+
+
+def draw_psfs(
+    panel: FigureBase,
+    study: EyeStudy,
+    *,
+    sides_arcmin: tuple[float, float] | None = None,
+) -> None:
+    """Draw PSFs of a far point through 3 and 5 mm: as it is, and best corrected.
+
+    Parameters
+    ----------
+    sides_arcmin : (float, float), optional
+        Sides of the images of both rows, to compare eyes at one scale; by default those
+        that hold the PSFs of this eye.
+    """
+    rows = _states(study)
+    if sides_arcmin is None:
+        sides_arcmin = psf_sides_arcmin([study])
     grid = panel.subplots(2, 2)
-    for across, (name, wavefronts) in zip(grid, rows.items(), strict=True):
-        pictures = [centered(wavefront) for wavefront in wavefronts]
-        reach_arcmin = max(reach for _, reach in pictures)
-        side_arcmin = max(LEAST_SIDE_ARCMIN, 2.0 * ROOM_RATIO * reach_arcmin)
-        for axes, (wavefront, _) in zip(across, pictures, strict=True):
-            draw_psf(axes, wavefront, side_arcmin=side_arcmin)
+    for across, side_arcmin, (name, wavefronts) in zip(
+        grid, sides_arcmin, rows.items(), strict=True
+    ):
+        for axes, wavefront in zip(across, wavefronts, strict=True):
+            draw_psf(axes, centered(wavefront)[0], side_arcmin=side_arcmin)
         across[0].set_ylabel(name, fontsize=TEXT_PT)
-    for axes, state in zip(grid[0], states, strict=True):
+    for axes, state in zip(grid[0], rows["as it is"], strict=True):
         axes.set_title(f"{state.circle_diameter_mm:.3g} mm", fontsize=TEXT_PT)
 
 

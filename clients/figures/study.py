@@ -106,6 +106,24 @@ class EyeStudy:
         """Return the profile's name."""
         return self.profile.name
 
+    @property
+    def has_assumed_aberrations(self) -> bool:
+        """Return whether the higher orders are typical ones, not this person's."""
+        profile = self.profile
+        return profile.kind == "prescription" and profile.higher_order == "typical"
+
+    @property
+    def assumed_suffix(self) -> str:
+        """Return what figures of assumed higher orders append to their title."""
+        return ", assumed" if self.has_assumed_aberrations else ""
+
+    @property
+    def is_field_assumed(self) -> bool:
+        """Return whether all off-axis wavefronts are those of the population."""
+        profile = self.profile
+        measured = any(not m.is_on_axis for m in profile.measurements)
+        return profile.periphery == "people" and not measured
+
     @cached_property
     def measured_um(self) -> NDArray[np.float64]:
         """Return the measured wavefront (28,), at the cornea, without correction.

@@ -55,9 +55,13 @@ def with_grid(axes: Axes) -> None:
     axes.grid(color=GRID, linewidth=0.5)
 
 
-def legend(axes: Axes, **options: Any) -> None:
-    """Draw a legend inside the axes."""
-    axes.legend(fontsize=SMALL_PT, labelcolor=INK, frameon=False, **options)
+def legend_above(axes: Axes) -> None:
+    """Draw a legend above the right end of axes, where it covers no data."""
+    axes.legend(
+        fontsize=SMALL_PT, labelcolor=INK, frameon=False, ncols=2, loc="lower right",
+        bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, columnspacing=1.2,
+        handlelength=1.2,
+    )  # fmt: skip
 
 
 def legend_below(axes: Axes, entries: Mapping[str, dict[str, Any]]) -> None:

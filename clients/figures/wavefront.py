@@ -101,7 +101,7 @@ def draw_wavefront_maps(panel: FigureBase, study: EyeStudy) -> None:
     for axes, from_order, title in zip(
         panel.subplots(1, 2),
         (FIRST_SEEN, FIRST_HIGHER),
-        ("All orders", "Higher orders (3 to 6)"),
+        ("All orders", f"Higher orders (3 to 6){study.assumed_suffix}"),
         strict=True,
     ):
         draw_wavefront_map(

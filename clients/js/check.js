@@ -4,8 +4,8 @@
 //
 // Covers mono and stereo frames, two eyes with separate profiles (PROFILE_JSON by
 // default), 8-bit and linear light, and errors with their fields. It then prints "lost"
-// on a separate line, waits for a line on stdin (meanwhile the caller may break the
-// connection), and filters once more.
+// on a line of its own and waits for a line on stdin, so that the caller may break the
+// connection. Finally it filters another frame.
 
 import { createInterface } from "node:readline";
 import { FilterClient } from "./filter_client.js";

@@ -8,9 +8,9 @@
 //
 // A camera is { widthPx, heightPx, tangents: [left, right, up, down] }. A view is a
 // camera with color, a Uint8Array of sRGB or a Float32Array of linear light, and
-// depthM, a Float32Array of meters. A view may also have eye, "left" or "right"; the
-// state of that eye: pupilMm, focusDpt, gazeDeg; and pose, seven numbers, which the
-// result repeats. Only one call of `filter` at a time.
+// depthM, a Float32Array of meters. Optional fields of a view are eye ("left" or
+// "right"), the state of that eye (pupilMm, focusDpt, gazeDeg), and pose (seven numbers,
+// which the result repeats). Calls of `filter` must not overlap.
 
 import { decode, encode } from "@msgpack/msgpack";
 import { Dealer } from "zeromq";
@@ -29,14 +29,14 @@ export class FilterError extends Error {
 }
 
 export class FilterClient {
-  // Options: timeoutMs, the longest wait for a reply; name, for the service's log;
+  // Options: timeoutMs, the timeout of a reply; name, which appears in the service's log;
   // key, { server, publicKey, secretKey }, for a service that requires one.
   constructor(endpoint, { timeoutMs = 10000, name = "filter_client.js", key } = {}) {
     this.endpoint = endpoint;
     this.timeoutMs = timeoutMs;
     this.name = name;
     this.welcome = null;
-    this.profiles = new Map(); // last request of each eye, resent to a new session
+    this.profiles = new Map(); // last request of each eye, sent again to a new session
     this.nextFrameId = 0;
     this.nextProfileId = 0;
     this.waiting = []; // { accepts, resolve, reject, timer }
@@ -84,7 +84,7 @@ export class FilterClient {
       "the profile to be accepted",
       ours,
     );
-    // An eye may be ready before we have read the number of its cameras.
+    // An eye may be ready before the number of its cameras has been read.
     const isReady = (reply) => ours(reply) && reply.type === "ready";
     const arrived = [];
     const note = (reply) => isReady(reply) && arrived.push(reply);
@@ -106,7 +106,7 @@ export class FilterClient {
     }
   }
 
-  // Resolves with the result's header and its pictures, `colors`, one per view.
+  // Resolves with the header of the result, whose `colors` are one image per view.
   async filter(views, look) {
     const { pupilMm, focusDpt, gazeDeg, displayTimeNs, output = "uint8", options = {} } = look;
     const end = Date.now() + this.timeoutMs;
@@ -208,7 +208,7 @@ export class FilterClient {
       const waiting = { accepts, concerns, what, resolve, reject };
       waiting.timer = setTimeout(() => {
         this.waiting = this.waiting.filter((other) => other !== waiting);
-        const message = `waited in vain for ${what}; is there a service at ${this.endpoint}?`;
+        const message = `timed out waiting for ${what}; is there a service at ${this.endpoint}?`;
         reject(new FilterError({ code: "service_timeout", message }));
       }, timeoutMs);
       this.waiting.push(waiting);
@@ -274,6 +274,6 @@ function images(view) {
 function picture(result, part, index) {
   const { dtype } = result.views[index].color;
   if (dtype === "uint8") return new Uint8Array(part.buffer, part.byteOffset, part.byteLength);
-  const copy = new Uint8Array(part); // aligned; the message need not be
+  const copy = new Uint8Array(part); // aligned, unlike the message
   return dtype === "float32" ? new Float32Array(copy.buffer) : new Uint16Array(copy.buffer);
 }

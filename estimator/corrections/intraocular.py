@@ -2,7 +2,8 @@
 
 Because the cornea refracts, rays of a distant object cross the lens closer to the axis
 than the entrance pupil.  A phase in the lens is therefore stretched by that ratio in
-the pupil, and its power is weakened by the square: 3 dpt at 4.6 mm are 2.2.
+the pupil, and its power is weakened by the square of it: 3 dpt at a depth of 4.6 mm act
+as 2.2 dpt.
 """
 
 from estimator.optics.units import MM_PER_M

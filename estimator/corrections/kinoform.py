@@ -1,9 +1,9 @@
 """Distribution of light over the orders of a diffractive lens, by scalar theory.
 
 The zones have equal areas, so the profile is periodic in r².  The amplitude of order k
-is the Fourier integral of the phase over a period; a sawtooth of h waves gives it
-sinc²(h - k), 40.5 % to each of two for half a wave.  Shading by the steps and the
-dispersion of their material are not modeled.
+is the Fourier integral of the phase over a period.  A sawtooth of h waves sends the
+share sinc²(h - k) of the light into order k: 40.5 % into each of two orders for half a
+wave.  Shading by the steps and the dispersion of their material are not modeled.
 """
 
 from dataclasses import dataclass
@@ -51,9 +51,9 @@ class Kinoform:
     def with_light(cls, light: dict[int, float]) -> "Kinoform":
         """Return a profile with the given shares of light by order.
 
-        Manufacturers publish shares but not profiles.  The search is that of holograms:
-        set the orders' amplitudes to the wanted ones and the profile to a pure phase,
-        alternately (Gerchberg and Saxton, Optik 35, 1972).
+        Manufacturers publish shares but not profiles.  The search is the one used for
+        holograms: it alternately imposes the requested amplitudes on the orders and
+        unit modulus on the profile (Gerchberg and Saxton, Optik 35, 1972).
         """
         orders = np.array(list(light))
         wanted = np.sqrt(np.array(list(light.values())))

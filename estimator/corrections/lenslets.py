@@ -4,7 +4,7 @@ Each lenslet passes its own part of the light, undeviated through its center.  T
 they make a disc as wide as power times diameter on the retina, 12 arcmin for 3.5 dpt
 and 1.03 mm, for any pupil.  Which lenslets the pupil sees depends on gaze and field.
 The phase of the lens is applied unchanged in the plane of the pupil; `bench
-corrections` measures the error of ignoring the 15 mm between.
+corrections` measures the error of ignoring the 15 mm between lens and pupil.
 """
 
 from dataclasses import dataclass, replace

@@ -132,7 +132,7 @@ class ProgressiveLens(rx.Prescription):
         return found
 
     def _places(self, x_mm: ArrayLike, y_mm: ArrayLike) -> tuple[NDArray[Any], ...]:
-        """Return positions along and beside the corridor over its width; the width."""
+        """Return positions along and across the corridor over its width; the width."""
         x, y = np.broadcast_arrays(*(np.asarray(c, float) for c in (x_mm, y_mm)))
         wide_mm = np.hypot(self.corridor_mm / 4.0, x)
         return (-y - self.corridor_mm / 2.0) / wide_mm, x / wide_mm, wide_mm

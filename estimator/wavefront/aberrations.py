@@ -276,8 +276,8 @@ def eyes_aberrations(
         Sampling of the stop, see `wavefront.nodes`.
     """
     packed = np.ascontiguousarray(packed, dtype=np.float64)
-    n_eyes, n_rows = packed.shape[:2]
-    indices = broadcast_copy(indices, (n_eyes, n_rows))
+    n_eyes = len(packed)
+    indices = broadcast_copy(indices, (n_eyes, np.shape(indices)[-1]))
     stops_mm = np.broadcast_to(np.asarray(stop_diameters_mm, float), (n_eyes,))
     fields_deg = np.empty((n_eyes, 2))
     fields_deg[:, 0], fields_deg[:, 1] = h_deg, v_deg
@@ -341,8 +341,8 @@ def on_axis_zernike(
         Worst `RayStatus`; failed rays are excluded from the fit.
     """
     packed = np.ascontiguousarray(packed, dtype=np.float64)
-    n_eyes, n_rows = packed.shape[:2]
-    indices = broadcast_copy(indices, (n_eyes, n_rows))
+    n_eyes = len(packed)
+    indices = broadcast_copy(indices, (n_eyes, np.shape(indices)[-1]))
     zernike_um, status = np.empty((n_eyes, N_TERMS)), np.empty(n_eyes, np.int64)
     field_rad = (math.radians(h_deg), math.radians(v_deg))
     radii_mm = np.empty(n_eyes)

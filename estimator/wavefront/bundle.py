@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from estimator.optics.raytrace_kernels import RAY_SIZE, TRACED, put
+from estimator.optics.surface_kernels import RAY_SIZE, TRACED, put
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.fit import N_ELLIPSE, fit_ellipse, fit_zernike, rim_radius
 from estimator.wavefront.kernels import (

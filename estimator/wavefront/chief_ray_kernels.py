@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from estimator.optics.raytrace_kernels import RAY_SIZE, TRACED, put
+from estimator.optics.surface_kernels import RAY_SIZE, TRACED, put
 from estimator.wavefront.kernels import (
     N_SAMPLE,
     SLOPE_X,

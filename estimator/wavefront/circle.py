@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from estimator.optics.raytrace_kernels import NOT_CONVERGED, RAY_SIZE, TRACED, put
+from estimator.optics.surface_kernels import NOT_CONVERGED, RAY_SIZE, TRACED, put
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.bundle import extrapolate, prepare_chief
 from estimator.wavefront.fit import fit_zernike

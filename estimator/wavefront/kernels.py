@@ -11,23 +11,15 @@ import math
 import numpy as np
 from numba import njit
 
-from estimator.optics.raytrace_kernels import (
-    NOT_CONVERGED,
-    RAY_SIZE,
-    TRACED,
-    inward,
-    outward,
-    put,
-    to_retina,
-    to_stop,
-)
-from estimator.optics.surfaces import (
+from estimator.optics.packed import (
     CURVATURE_X,
     CURVATURE_Y,
     N_BEFORE_STOP,
     STOP_Z,
     VERTEX,
 )
+from estimator.optics.raytrace_kernels import inward, outward, to_retina, to_stop
+from estimator.optics.surface_kernels import NOT_CONVERGED, RAY_SIZE, TRACED, put
 
 UM_PER_MM = 1000.0
 

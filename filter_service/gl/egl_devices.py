@@ -5,6 +5,7 @@ import ctypes.util
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 EGL_VENDOR, EGL_EXTENSIONS, EGL_RENDERER_EXT = 0x3053, 0x3055, 0x335F
 EGL_DRM_RENDER_NODE_FILE_EXT = 0x3377
@@ -52,12 +53,11 @@ class EglDevice:
 def egl_devices() -> list[EglDevice]:
     """Return the devices in EGL's order; empty if EGL cannot list them."""
     address_of = _address_of()
-    addresses = [
-        address_of(name) for name in (b"eglQueryDevicesEXT", b"eglQueryDeviceStringEXT")
-    ]
-    if not all(addresses):
+    of_query = address_of(b"eglQueryDevicesEXT")
+    of_text = address_of(b"eglQueryDeviceStringEXT")
+    if not of_query or not of_text:
         return []
-    query, text_of = _QUERY_DEVICES(addresses[0]), _QUERY_STRING(addresses[1])
+    query, text_of = _QUERY_DEVICES(of_query), _QUERY_STRING(of_text)
     count = ctypes.c_int(0)
     if not query(0, None, ctypes.byref(count)) or count.value < 1:
         return []
@@ -65,7 +65,7 @@ def egl_devices() -> list[EglDevice]:
     if not query(count.value, handles, ctypes.byref(count)):
         return []
     return [
-        _described(index, lambda what, h=handle: text_of(h, what))
+        _described(index, partial(text_of, handle))
         for index, handle in enumerate(handles[: count.value])
     ]
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import moderngl
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from filter_service import constants
 from filter_service.errors import OutOfGpuMemory, RenderFailed
@@ -90,8 +90,10 @@ class Gpu:
     def close(self) -> None:
         """Free everything; the object cannot be used afterward."""
         with self.context:  # without a context, the driver frees nothing
-            for memory in (*self._buffers.values(), *self._atlases.values()):
-                memory.release()
+            for buffer in self._buffers.values():
+                buffer.release()
+            for atlas in self._atlases.values():
+                atlas.release()
             self.passes.release()
             for block in (self._staging or {}).values():
                 block.release()
@@ -231,7 +233,9 @@ class Gpu:
         """Return whether no other owner has filled the memory since."""
         return self._owners.get(name) is owner
 
-    def read(self, buffer: Buffer, shape: tuple, dtype) -> NDArray[Any]:
+    def read(
+        self, buffer: Buffer, shape: tuple[int, ...], dtype: DTypeLike
+    ) -> NDArray[Any]:
         """Read the start of a buffer as an array; waits for the GPU."""
         out = np.empty(shape, dtype=dtype)
         self.read_into((buffer, 0, out))
@@ -272,6 +276,7 @@ class Gpu:
     def _end_read(self, waiting: "_Read") -> None:
         if not any(one is waiting for one in self._reads):
             return
+        assert self._staging is not None  # what is read back was staged
         self._reads = [one for one in self._reads if one is not waiting]
         self._staging["from"].wait(waiting.fence)
         for target, source in waiting.targets:
@@ -314,9 +319,8 @@ class _Read(NamedTuple):
 
 
 def _context_on(index: int) -> moderngl.Context:
-    return moderngl.create_context(
-        standalone=True, require=430, backend="egl", device_index=index
-    )
+    settings: dict[str, Any] = {"backend": "egl", "device_index": index}
+    return moderngl.create_context(standalone=True, require=430, **settings)
 
 
 def _bytes_of(array: NDArray[Any]) -> NDArray[np.uint8]:

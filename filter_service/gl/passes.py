@@ -1,6 +1,6 @@
 """Passes: compiled once per variant, dispatched on buffers by name."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import moderngl
 
@@ -59,9 +59,9 @@ class Passes:
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
-        self.programs: dict[tuple, moderngl.ComputeShader] = {}
-        self._variants: dict[tuple, moderngl.ComputeShader] = {}
-        self._uniforms: dict[moderngl.ComputeShader, dict] = {}
+        self.programs: dict[tuple[Any, ...], moderngl.ComputeShader] = {}
+        self._variants: dict[tuple[Any, ...], moderngl.ComputeShader] = {}
+        self._uniforms: dict[moderngl.ComputeShader, dict[str, Any]] = {}
         self._bound: dict[int, Buffer | BufferPart] = {}
 
     def release(self) -> None:
@@ -92,8 +92,8 @@ class Passes:
         groups: tuple[int, ...],
         *,
         buffers: dict[str, Buffer | BufferPart],
-        uniforms: dict | None = None,
-        defines: dict | None = None,
+        uniforms: dict[str, Any] | None = None,
+        defines: dict[str, Any] | None = None,
         images: dict[str, Atlas] | None = None,
         textures: dict[str, Atlas | Pages] | None = None,
         indirect: tuple[Buffer, int] | None = None,
@@ -133,8 +133,13 @@ class Passes:
         self._context.memory_barrier(_IMAGE_BARRIERS if images else _BARRIERS)
 
     def _variant_of(
-        self, name: str, defines: dict, buffers: dict, images: dict, textures: dict
-    ) -> tuple[moderngl.ComputeShader, dict, dict]:
+        self,
+        name: str,
+        defines: dict[str, Any],
+        buffers: dict[str, Any],
+        images: dict[str, Any],
+        textures: dict[str, Any],
+    ) -> tuple[moderngl.ComputeShader, dict[str, Any], dict[str, Any]]:
         """Return a pass and its images and textures; bind the buffers among them."""
         is_buffer = False
         for named in (images, textures):
@@ -161,7 +166,9 @@ class Passes:
             buffer.bind_to_storage_buffer(point)
         self._bound[point] = buffer
 
-    def _set_uniforms(self, program: moderngl.ComputeShader, uniforms: dict) -> None:
+    def _set_uniforms(
+        self, program: moderngl.ComputeShader, uniforms: dict[str, Any]
+    ) -> None:
         """Set the uniforms that have changed since the last dispatch.
 
         Each is a driver call.
@@ -176,5 +183,5 @@ class Passes:
                 member.value = value
 
 
-def _no_buffers(named: dict) -> dict:
+def _no_buffers(named: dict[str, Any]) -> dict[str, Any]:
     return {key: kept for key, kept in named.items() if not isinstance(kept, Buffer)}

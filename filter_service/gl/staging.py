@@ -9,7 +9,7 @@ or ARB_buffer_storage), which moderngl does not offer, so the few calls are made
 import ctypes
 import ctypes.util
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,7 @@ _SIGNATURES = {
 }
 
 
-def gl_calls() -> dict[str, Callable] | None:
+def gl_calls() -> dict[str, Callable[..., Any]] | None:
     """Return the calls that `Staging` needs, or None if EGL lacks one of them."""
     library = ctypes.util.find_library("EGL") or "libEGL.so.1"
     try:
@@ -61,7 +61,7 @@ def gl_calls() -> dict[str, Callable] | None:
     except (OSError, AttributeError):
         return None
     address_of.restype, address_of.argtypes = _pointer, [ctypes.c_char_p]
-    calls = {}
+    calls: dict[str, Callable[..., Any]] = {}
     for name, (result, *arguments) in _SIGNATURES.items():
         address = address_of(name.encode())
         if not address:
@@ -85,7 +85,9 @@ class Staging:
         From `gl_calls`.
     """
 
-    def __init__(self, context: "moderngl.Context", calls: dict[str, Callable]):
+    def __init__(
+        self, context: "moderngl.Context", calls: dict[str, Callable[..., Any]]
+    ):
         self._context = context
         self._calls = calls
         self._name = _uint(0)
@@ -154,15 +156,21 @@ class Staging:
         self._used = -(-(start + n_bytes) // ALIGNMENT) * ALIGNMENT
         return start, self._bytes[start : start + n_bytes]
 
-    def copy_to(self, buffer: "moderngl.Buffer", start: int, at: int, n_bytes: int):
+    def copy_to(
+        self, buffer: "moderngl.Buffer", start: int, at: int, n_bytes: int
+    ) -> None:
         """Queue a copy of bytes from an offset of the block to a buffer."""
         self._copy(self._name.value, buffer.glo, start, at, n_bytes)
 
-    def copy_from(self, buffer: "moderngl.Buffer", at: int, start: int, n_bytes: int):
+    def copy_from(
+        self, buffer: "moderngl.Buffer", at: int, start: int, n_bytes: int
+    ) -> None:
         """Queue a copy of bytes from a buffer to an offset of the block."""
         self._copy(buffer.glo, self._name.value, at, start, n_bytes)
 
-    def _copy(self, source: int, target: int, read_at: int, write_at: int, n_bytes):
+    def _copy(
+        self, source: int, target: int, read_at: int, write_at: int, n_bytes: int
+    ) -> None:
         calls = self._calls
         calls["glBindBuffer"](GL_COPY_READ_BUFFER, source)
         calls["glBindBuffer"](GL_COPY_WRITE_BUFFER, target)
@@ -185,4 +193,4 @@ class Staging:
             self.release()
             raise OutOfGpuMemory(f"no {n_bytes / 1e6:.0f} MB of memory to map")
         memory = (ctypes.c_uint8 * n_bytes).from_address(address)
-        self._bytes = np.frombuffer(memory, np.uint8)
+        self._bytes = np.ctypeslib.as_array(memory)

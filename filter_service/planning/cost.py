@@ -34,7 +34,7 @@ COMPUTED_BEYOND = 0.2
 """Light that a computed kernel may lack, over what trimming may drop."""
 
 
-def predicted_cost(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> dict:
+def predicted_cost(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> dict[str, float]:
     """Return fields of `PlanPrediction`: count, memory, time and cores."""
     count = channels_of(spec) * len(plan.nodes.defocus.values_dpt)
     states = sampled_states(spec, plan, SAMPLES)
@@ -154,5 +154,5 @@ def cost_terms(spec: GridSpec, survey: PupilSurvey) -> dict[str, NDArray[np.floa
     return {
         "psf": np.ones(count),
         "wave": samples * np.log2(np.maximum(samples, 2.0)),
-        "texels": (2.0 * radius_px + 1.0) ** 2,
+        "texels": np.asarray((2.0 * radius_px + 1.0) ** 2, dtype=np.float64),
     }

@@ -199,7 +199,9 @@ class _Rays:
         )
         values, sizes = _spread(lows, highs, needed)
         first = np.cumsum(counts) - counts
-        return RaggedNodes.joined(values, np.add.reduceat(sizes, first))
+        return RaggedNodes.joined(
+            values, np.add.reduceat(sizes, first.astype(np.int64))
+        )
 
     def limited(
         self, ranges_dpt: NDArray[np.float64], spec: GridSpec, groups: PupilStates

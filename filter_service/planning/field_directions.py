@@ -75,12 +75,14 @@ def field_range_deg(
     """Return the ranges of h and v in an image, within ±`MAX_FIELD_DEG`."""
     along = np.linspace(0.0, 1.0, BORDER_SAMPLES)
     x, y = np.meshgrid(along * camera.width_px, along * camera.height_px)
-    return tuple(
-        (
-            float(np.clip(angle.min(), -MAX_FIELD_DEG, MAX_FIELD_DEG)),
-            float(np.clip(angle.max(), -MAX_FIELD_DEG, MAX_FIELD_DEG)),
-        )
-        for angle in field_deg(camera, x, y, gaze_deg=gaze_deg)
+    h_deg, v_deg = field_deg(camera, x, y, gaze_deg=gaze_deg)
+    return _limits_deg(h_deg), _limits_deg(v_deg)
+
+
+def _limits_deg(angle_deg: NDArray[np.float64]) -> tuple[float, float]:
+    return (
+        float(np.clip(angle_deg.min(), -MAX_FIELD_DEG, MAX_FIELD_DEG)),
+        float(np.clip(angle_deg.max(), -MAX_FIELD_DEG, MAX_FIELD_DEG)),
     )
 
 

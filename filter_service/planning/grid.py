@@ -146,17 +146,16 @@ class GridSpec:
             field_range_deg(self.camera, gaze_deg=gaze_deg)
             for gaze_deg in self.gaze_samples_deg()
         ]
-        seen_deg = tuple(
+        h_deg, v_deg = (
             (min(r[axis][0] for r in ranges), max(r[axis][1] for r in ranges))
             for axis in range(2)
         )
         if self.settings.grid == "planned":
-            return seen_deg
-        return tuple(
-            (min(low, -reach), max(high, reach))
-            for (low, high), reach in zip(
-                seen_deg, PAPER_REACH_DEG[self.settings.mode], strict=True
-            )
+            return h_deg, v_deg
+        reach_h, reach_v = PAPER_REACH_DEG[self.settings.mode]
+        return (
+            (min(h_deg[0], -reach_h), max(h_deg[1], reach_h)),
+            (min(v_deg[0], -reach_v), max(v_deg[1], reach_v)),
         )
 
     @property

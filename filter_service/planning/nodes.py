@@ -121,10 +121,10 @@ class RaggedNodes:
         fraction : (...)
             Share of the upper node, 0 to 1.
         """
-        groups, t = np.broadcast_arrays(np.asarray(groups), np.asarray(t, float))
+        groups, wanted = np.broadcast_arrays(np.asarray(groups), np.asarray(t, float))
         first, last = self.starts[groups], self.starts[groups + 1] - 1
-        t = np.clip(t, self.values_dpt[first], self.values_dpt[last])
-        keys = t - self.lowest_dpt + self.span_dpt * groups
+        inside = np.clip(wanted, self.values_dpt[first], self.values_dpt[last])
+        keys = inside - self.lowest_dpt + self.span_dpt * groups
         upper = np.searchsorted(self.keys_dpt, keys)
         upper = np.clip(upper, np.minimum(first + 1, last), last)
         lower = np.maximum(upper - 1, first)
@@ -250,18 +250,15 @@ class PlanNodes:
         if len(several) == 1:
             return several[0]
         return cls(
-            RaggedNodes.joined(
+            defocus=RaggedNodes.joined(
                 np.concatenate([one.defocus.values_dpt for one in several]),
                 np.concatenate([one.defocus.counts for one in several]),
             ),
-            *(
-                np.concatenate([getattr(one, name) for one in several])
-                for name in (
-                    *("channel_shift_dpt", "blur_px"),
-                    *("is_limited", "shrink_ratio"),
-                )
-            ),
-            NodeWavefronts.joined([one.wavefronts for one in several]),
+            channel_shift_dpt=np.concatenate([n.channel_shift_dpt for n in several]),
+            blur_px=np.concatenate([one.blur_px for one in several]),
+            is_limited=np.concatenate([one.is_limited for one in several]),
+            shrink_ratio=np.concatenate([one.shrink_ratio for one in several]),
+            wavefronts=NodeWavefronts.joined([one.wavefronts for one in several]),
         )
 
 

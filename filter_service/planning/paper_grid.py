@@ -58,7 +58,8 @@ def paper_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
         pupil_range_mm=(float(usable_mm[0]), widest_mm),
     )
     used_dpt = np.unique([low_dpt, *used_dpt[1:-1], high_dpt])
-    return PlanAxes(*angles_deg, usable_mm, used_dpt)
+    h_deg, v_deg = angles_deg
+    return PlanAxes(h_deg, v_deg, usable_mm, used_dpt)
 
 
 def paper_defocus(eye: EyeOptics, spec: GridSpec, groups: PupilStates) -> DefocusNodes:

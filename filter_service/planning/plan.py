@@ -8,6 +8,7 @@ stream only when a frame first reads those nodes.
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -331,7 +332,8 @@ def _field_axes(use: Use, allowed_error: float) -> PlanAxes:
         "v": spec.field_range_deg[1],
         "h": spec.field_range_deg[0],
     }
-    nodes, spent = {}, []
+    nodes: dict[str, NDArray[np.float64]] = {}
+    spent: list[float] = []
     open_ = [axis for axis, (low, high) in ranges.items() if high - low > 1e-9]
     for axis, range_ in ranges.items():
         if axis not in open_:
@@ -343,7 +345,8 @@ def _field_axes(use: Use, allowed_error: float) -> PlanAxes:
         nodes[axis], error = axis_nodes(use, axis, range_, allowed_error=share)
         spent.append(error)
     left = equal_share(allowed_error, spent=spent, count=1)
-    return PlanAxes(*(nodes[axis] for axis in AXES[:-1]), left)
+    h_deg, v_deg, pupils_mm, used_dpt = (nodes[axis] for axis in AXES[:-1])
+    return PlanAxes(h_deg, v_deg, pupils_mm, used_dpt, left)
 
 
 def _central_defocus(
@@ -398,9 +401,10 @@ def _mb(memory_mb: float) -> str:
 
 def _smaller_specs(spec: GridSpec) -> list[tuple[str, GridSpec]]:
     """Return cumulative changes that make a plan smaller, least harmful first."""
-    steps, words = [], []
+    steps: list[tuple[str, GridSpec]] = []
+    words: list[str] = []
 
-    def step(text: str, **settings) -> None:
+    def step(text: str, **settings: Any) -> None:
         words.append(text)
         last = steps[-1][1] if steps else spec
         steps.append((" and ".join(words), last.with_settings(**settings)))

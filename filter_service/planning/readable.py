@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,11 +157,11 @@ def readable_defocus(
     if eye.rings is None:
         by = pupils_mm[reads_pupil] / pupils_mm[own_pupil]
         near_far = near_far * by[:, None, None, None]
-    ranges = np.stack(
+    found = np.stack(
         [near_far[..., 0].min(axis=2), near_far[..., 1].max(axis=2)], axis=-1
     )
     return ReadableDefocus(
-        ranges.reshape(-1, *ranges.shape[2:]),
+        found.reshape(-1, *found.shape[2:]),
         (at_node_dpt - at_node_dpt[..., GREEN, None]).reshape(-1, 3),
     )
 
@@ -188,7 +189,7 @@ def _readers(
 
 
 def _over_neighbors(
-    values: NDArray[np.float64], axis: int, extreme
+    values: NDArray[np.float64], axis: int, extreme: Callable[..., Any]
 ) -> NDArray[np.float64]:
     """Return extremes over each field node and its neighbors along an axis."""
     count = values.shape[axis]

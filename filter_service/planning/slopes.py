@@ -52,7 +52,9 @@ def state_frames(
         wavelength_nm=states.wavelength_nm,
         pixel_from_mrad=pixel_from_mrad,
         pupil_ellipse=found.pupil_ellipse,
-        apodization=weighed and weighed.amplitude(states.wavelength_nm),
+        apodization=(
+            None if weighed is None else weighed.amplitude(states.wavelength_nm)
+        ),
     )
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+from estimator.corrections.progressive import ProgressiveLens
 from estimator.corrections.worn_lens import WornLens, turns_with_gaze
 from estimator.field.eye_optics import EyeOptics
 from estimator.field.prepare import prepare_eye
@@ -54,8 +55,9 @@ def eye_for_spec(
         _check_diffracts(settings.diffraction)
     if settings.age_years is not None:
         profile = replace(profile, age_years=settings.age_years)
-    if turns_with_gaze(profile.correction):
-        worn = profile.correction.looking(settings.gaze_deg)
+    lens = profile.correction
+    if isinstance(lens, ProgressiveLens | WornLens) and turns_with_gaze(lens):
+        worn = lens.looking(settings.gaze_deg)
         profile = replace(profile, correction=worn)
     low_mm, high_mm = (min(p, MAX_PUPIL_MM) for p in settings.pupil_range_mm)
     eye, notes = prepare_eye(

@@ -91,9 +91,11 @@ class NodeRings:
         ellipse = wavefronts.pupil_ellipse
         offset_mm = ellipse[..., :2] - center_mm[:, None, None]
         largest_mm = ellipse[..., 2] + np.linalg.norm(offset_mm, axis=-1)
-        is_lattice = seen.lattice_mm is not None
-        lattice_mm = seen.lattice_mm if is_lattice else ONE_CENTER
-        radius_mm = lattice_mm[0] if is_lattice else BEYOND_EDGE * largest_mm.max()
+        lattice_mm = ONE_CENTER if seen.lattice_mm is None else seen.lattice_mm
+        if seen.lattice_mm is None:
+            radius_mm = float(BEYOND_EDGE * largest_mm.max())
+        else:
+            radius_mm = seen.lattice_mm[0]
         square_mm2 = (np.arange(TABLE_COUNT) + 0.5) / TABLE_COUNT * radius_mm**2
         reach_mrad = np.empty(largest_mm.shape)
         tables = np.empty((*wavefronts.wavelength_nm.shape, TABLE_COUNT, 2), np.float32)
@@ -178,7 +180,9 @@ class NativePsfs:
         if rings is not None:
             arrays["ring_offset_mm"] = rings.offset_mm
             arrays["ring_reach_mrad"] = rings.reach_mrad
-        arrays = {n: np.ascontiguousarray(a, np.float64) for n, a in arrays.items()}
+        arrays: dict[str, NDArray[Any]] = {
+            n: np.ascontiguousarray(a, np.float64) for n, a in arrays.items()
+        }
         if rings is not None:
             arrays["ring_tables"] = rings.amplitude_ratio
         arrays["groups"] = np.ascontiguousarray(groups, np.int64)

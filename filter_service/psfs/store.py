@@ -222,7 +222,7 @@ class PsfStore:
             first += self.fields_count
         # Frames in progress may still read the old arrays.
         self.nodes, self.tables = new, self.tables.grown(new)
-        self._rings = None
+        self._rings: NodeRings | None = None
 
     # Kernels
 
@@ -496,7 +496,10 @@ class PsfStore:
         planned = [*self._ahead.values()]
         if self._first_groups:
             planned.append(self.nodes)
-        arrays = [*self.tables, *(a for nodes in planned for a in nodes.arrays)]
+        arrays: list[NDArray[Any]] = [
+            *self.tables,
+            *(a for nodes in planned for a in nodes.arrays),
+        ]
         return sum(array.nbytes for array in arrays) / 1e6
 
 

@@ -207,11 +207,13 @@ class StoreCache:
         threading.Thread(target=save, daemon=True).start()
 
     def _path(self, key: str) -> Path:
+        assert self._folder is not None  # otherwise nothing is stored
         return self._folder / f"{key}{SUFFIX}"
 
     def _evict(self) -> None:
         """Remove the least recently used files until the rest is within the limit."""
         found = []
+        assert self._folder is not None  # otherwise nothing is stored
         for path in self._folder.iterdir():
             try:
                 status = path.lstat()

@@ -117,7 +117,7 @@ def read_file(path: Path, *, go_on: Look = lambda: None) -> Any:
         file.seek(start)
         data, checksum = np.empty(n_bytes, np.uint8), 0
         for first in range(0, n_bytes, BLOCK_BYTES):
-            block = memoryview(data[first : first + BLOCK_BYTES])
+            block = data[first : first + BLOCK_BYTES].data
             if file.readinto(block) != len(block):
                 raise DamagedFile("it was cut off while it was read")
             checksum = zlib.crc32(block, checksum)
@@ -157,7 +157,7 @@ def _places(arrays: dict[str, NDArray[Any]]) -> tuple[dict[str, list[Any]], int]
 def _blocks(arrays: dict[str, NDArray[Any]]) -> Iterator[bytes | memoryview]:
     for array in arrays.values():
         if array.nbytes:
-            plain = memoryview(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+            plain = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
             for first in range(0, len(plain), BLOCK_BYTES):
                 yield plain[first : first + BLOCK_BYTES]
         yield bytes(_round_up(array.nbytes, ALIGNMENT_BYTES) - array.nbytes)

@@ -26,6 +26,10 @@ def layer_step_ratio(tolerance: float) -> float:
     return min(max(math.sqrt(tolerance), LAYER_STEP_RATIOS[0]), LAYER_STEP_RATIOS[1])
 
 
+CornerWeights = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Weights of the field's spline along h and v at the corners of cells."""
+
+
 class Timer(Protocol):
     """Stage timer of an engine."""
 
@@ -114,15 +118,15 @@ class FrameStates:
     use are not kept alive.
     """
 
-    def __init__(self):
+    def __init__(self) -> None:
         self._start_anew(None)
 
     def _start_anew(self, handle: FrameStore | None) -> None:
         self._handle = handle
         self._layers: tuple[tuple[float, float, float], FrameLayers] | None = None
-        self._image: tuple[tuple, ImageCells] | None = None
+        self._image: tuple[tuple[Any, ...], ImageCells] | None = None
         self._change: tuple[FrameLayers, ImageCells, NDArray[Any]] | None = None
-        self._corner_weights: tuple[FieldAxes, ImageCells, tuple] | None = None
+        self._corner_weights: tuple[FieldAxes, ImageCells, CornerWeights] | None = None
 
     def _forget_others(self, handle: FrameStore) -> None:
         if self._handle is not handle:
@@ -186,15 +190,13 @@ class FrameStates:
         if last is None or last[0] is not layers or last[1] is not image:
             with timer.wall("psf_plan_ms"):
                 change_dpt = layers.field.of_weights(self._weights(layers, image))
-            self._change = layers, image, change_dpt.astype(np.float32)
-        return self._change[2]
+            last = self._change = layers, image, change_dpt.astype(np.float32)
+        return last[2]
 
-    def _weights(
-        self, layers: FrameLayers, image: ImageCells
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _weights(self, layers: FrameLayers, image: ImageCells) -> CornerWeights:
         """Return the corners' weights in the field's spline, the same in any state."""
         axes, last = layers.field.axes, self._corner_weights
         if last is None or last[0] is not axes or last[1] is not image:
             weights = axes.weights(image.corner_h_deg, image.corner_v_deg)
-            self._corner_weights = axes, image, weights
-        return self._corner_weights[2]
+            last = self._corner_weights = axes, image, weights
+        return last[2]

@@ -30,12 +30,13 @@ def usable_gaze(
         raise BadMessage(
             f"{gaze_deg}", field="gaze_deg", allowed="two finite angles (h, v)"
         )
-    used_deg = tuple(
+    h_deg, v_deg = (
         min(max(angle, middle - reach), middle + reach)
         for angle, middle, reach in zip(
             asked_deg, spec.settings.gaze_deg, spec.settings.gaze_range_deg, strict=True
         )
     )
+    used_deg = h_deg, v_deg
     if not spec.follows_field:
         used_deg = spec.settings.gaze_deg
     if math.dist(asked_deg, used_deg) <= ROUNDING_DEG:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from filter_service.constants import FIELD_CORNERS
 from filter_service.planning.field_directions import field_deg
 from filter_service.planning.grid import GridSpec
-from filter_service.planning.nodes import CachePlan, bracket_axis, triangle
+from filter_service.planning.nodes import PlanAxes, bracket_axis, triangle
 from filter_service.rendering.cell_maps import CellMaps
 
 CELL_DEG = {"quality": 2.0, "dynamic": 4.0}
@@ -73,7 +73,7 @@ class ImageCells:
 
 def image_cells(
     spec: GridSpec,
-    plan: CachePlan,
+    plan: PlanAxes,
     gaze_deg: tuple[float, float] | None = None,
     *,
     cell_px: int | None = None,
@@ -136,7 +136,7 @@ def image_cells(
 
 
 def _field_nodes(
-    plan: CachePlan, h_deg: NDArray[np.float64], v_deg: NDArray[np.float64]
+    plan: PlanAxes, h_deg: NDArray[np.float64], v_deg: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return nodes and weights (n_cells, 3) of the triangle around each direction.
 
@@ -180,7 +180,7 @@ def check_texels(n_texels: int, image: ImageCells, spec: GridSpec) -> None:
         )
 
 
-def stored_scale(spec: GridSpec, plan: CachePlan) -> NDArray[np.float64]:
+def stored_scale(spec: GridSpec, plan: PlanAxes) -> NDArray[np.float64]:
     """Return the scale (n_fields, 2, 2) of the pixels of the nodes' stored kernels."""
     return spec.node_pixel_from_mrad(*plan.field_nodes_deg)
 

@@ -29,7 +29,6 @@ from pathlib import Path
 import moderngl
 import numpy as np
 
-from clients.headset.built_scene import built_scene
 from clients.headset.controls import Controls
 from clients.headset.gltf_scene import load_gltf
 from clients.headset.local_filter import LocalFilter
@@ -41,6 +40,7 @@ from clients.headset.stereo_filter import StereoFilter
 from clients.headset.stereo_gaze import StereoGaze
 from clients.headset.viewer import Viewer
 from clients.headset.viewpoint import viewpoint
+from clients.scenes.catalog import build_scene
 from clients.service_process import ServiceProcess
 from filter_service import FilterSettings
 from filter_service.errors import FilterError
@@ -162,7 +162,7 @@ def ways(names):
 
 def measure(sizes_px, n_frames: int) -> list[Row]:
     """Return the rows of a simulated headset."""
-    scene = built_scene("courtyard")
+    scene = build_scene("courtyard")
     stand = upright(viewpoint(scene))
     rows = []
     context = moderngl.create_context(standalone=True, backend="egl", require=430)

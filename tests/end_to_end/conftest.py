@@ -8,7 +8,7 @@ import pytest
 import zmq
 
 from clients.filter_client import FilterClient, RgbdView, tangents_from_fov
-from clients.headset.scene_view import SceneView
+from clients.scenes.scene_view import SceneView
 from clients.service_process import ServiceProcess
 from filter_service.messages import (
     Camera,

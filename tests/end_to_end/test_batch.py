@@ -80,7 +80,7 @@ def usual(room, tmp_path_factory):
     """What one worker makes of it, undisturbed."""
     out = tmp_path_factory.mktemp("usual") / "out"
     told = run(room, *PROFILES, *MODE, "--fov-deg", 20, "-o", out, "--workers", 1)
-    assert "80 of 80 pictures" in told[0]
+    assert "80 of 80 images" in told[0]
     return out
 
 
@@ -182,7 +182,7 @@ def test_a_batch_that_is_interrupted_says_how_to_go_on(long_room, tmp_path):
     process.send_signal(signal.SIGTERM)
     _, error = process.communicate(timeout=20)
     assert process.returncode == 130
-    assert error.endswith("batch: stopped; run the same command to continue\n")
+    assert error.endswith("batch: stopped; run the same command again to continue\n")
     assert "Traceback" not in error
 
 
@@ -214,7 +214,7 @@ def test_a_rerun_does_only_what_is_missing(room, usual, tmp_path):
         file.write(b'{"kind": "frame", "profile": "myo')  # a power cut
     (out / "myopia/.005.abc.part.png").write_bytes(b"half")
     told, _ = run(*arguments)
-    assert "80 of 80 pictures, 2 of them in this run" in told
+    assert "80 of 80 images, 2 of them in this run" in told
     assert pictures(out) == pictures(usual)
 
 
@@ -229,13 +229,13 @@ def refusal(capsys, *arguments):
 def test_another_job_in_the_same_folder_is_refused(room, usual, tmp_path, capsys):
     arguments = (room, *PROFILES, *MODE, "--fov-deg", 20)
     error = refusal(capsys, *arguments, "-o", usual, "--pupil-mm", 5)
-    assert "states.pupil_mm is 5.0, and was 4.0" in error
+    assert "states.pupil_mm is 5.0, but was 4.0" in error
     assert "--overwrite" in error
     fewer = refusal(capsys, room, *PROFILES[:2], *MODE, "--fov-deg", 20, "-o", usual)
-    assert "is not given, and was" in fewer
+    assert "is not given, but was" in fewer
     (tmp_path / "thesis.pdf").touch()
     error = refusal(capsys, *arguments, "-o", tmp_path)
-    assert "holds 'thesis.pdf' and no manifest.jsonl" in error
+    assert "contains 'thesis.pdf' and no manifest.jsonl" in error
 
 
 @pytest.mark.slow
@@ -243,7 +243,7 @@ def test_overwrite_begins_anew(room, tmp_path):
     common = (room, "-p", "myopia", *MODE, "--fov-deg", 20, "-o", tmp_path / "out")
     run(*common, "--limit", 2, "--format", "npy")
     told, _ = run(*common, "--limit", 1, "--format", "exr", "--half", "--overwrite")
-    assert "1 of 1 pictures" in told
+    assert "1 of 1 images" in told
     names = {path.name for path in (tmp_path / "out/myopia").iterdir()}
     assert names == {"000.exr"}
     assert read_color(tmp_path / "out/myopia/000.exr").max() < 1.2
@@ -261,17 +261,17 @@ def test_bad_files_are_named_and_the_rest_goes_on(tmp_path, rng):
     out = tmp_path / "out"
     common = (room, "-p", "myopia", *MODE, "--fov-deg", 20, "-o", out, "--workers", 1)
     told, error = run(*common, code=1)
-    assert "1 of 4 pictures, 1 of them in this run" in told
+    assert "1 of 4 images, 1 of them in this run" in told
     assert "1.png': cannot be read" in error
-    assert "no depth of the name '2'" in error
+    assert "no depth with the name '2'" in error
     assert "5x5 px; allowed: the size of" in error
-    assert "3 pictures failed" in error
+    assert "3 images failed" in error
     summary = json.loads((out / "manifest.json").read_text())
     assert [one["frame"] for one in summary["failures"]] == ["1", "2", "3"]
     for number in (1, 2, 3):  # mended
         write_frame(room, f"{number}", rng)
     told, _ = run(*common)
-    assert "4 of 4 pictures, 3 of them in this run" in told
+    assert "4 of 4 images, 3 of them in this run" in told
 
 
 def decoded(path):
@@ -351,7 +351,7 @@ def test_a_dry_run_groups_notes_as_a_run_does(room, tmp_path):
     told, _ = run(*common, "--states", states, "--dry-run")
     notes = [line for line in told.splitlines() if "note:" in line]
     assert len([note for note in notes if "far point" in note]) == 1, told
-    assert "6 frames, as: focus" in notes[0]
+    assert "6 frames: focus" in notes[0]
 
 
 def test_profiles_may_be_json_and_photographs_are_turned_upright(tmp_path, rng):
@@ -376,9 +376,12 @@ def test_profiles_may_be_json_and_photographs_are_turned_upright(tmp_path, rng):
     [
         (("nowhere", "-p", "myopia"), "'nowhere': no such file"),
         (("{room}", "-p", "hawk"), "'hawk' is not known"),
-        (("{room}", "-p", "myopia", "-p", "myopia"), "the name 'myopia' is taken"),
-        (("{room}", "-p", "myopia", "--focus-dpt", "near"), "--focus-dpt 'near'"),
-        (("{room}", "-p", "myopia", "--workers", "0"), "--workers 0: allowed is 1"),
+        (
+            ("{room}", "-p", "myopia", "-p", "myopia"),
+            "'myopia' is empty or already used",
+        ),
+        (("{room}", "-p", "myopia", "--focus-dpt", "near"), "--focus-dpt is 'near'"),
+        (("{room}", "-p", "myopia", "--workers", "0"), "--workers is 0; allowed: 1"),
         (("{room}", "-p", "myopia", "--half"), "--half: allowed with --format npy"),
     ],
 )

@@ -207,7 +207,7 @@ def write_depth(folder, *stored_m):
         ((2.5,), "depth 2.5 m"),
         ((3.0, np.nan), "depth 3 m, 50 % missing, filled from neighbors"),
         ((0.5, np.inf), "depth 0.5 m to infinity"),
-        ((np.nan,), "depth: none, infinity is assumed"),
+        ((np.nan,), "no depth; infinity is assumed"),
         ((211.0, 502.0), "note: all depth is beyond 100 m: is it in meters?"),
     ],
 )
@@ -262,11 +262,11 @@ def test_a_camera_is_told_by_its_angle_its_focal_length_or_its_calibration(scene
             ("--distance-m", 1, "--depth", "d.npy"),
             "--depth and --distance-m: given together",
         ),
-        (("--distance-m", 0.001), "--distance-m 0.001: allowed is"),
-        (("--distance-m", "nan"), "--distance-m nan: allowed is"),
+        (("--distance-m", 0.001), "--distance-m is 0.001; allowed:"),
+        (("--distance-m", "nan"), "--distance-m is nan; allowed:"),
         (("--distance-m", 1), "--fov-deg, --focal-px, --intrinsics: none is given"),
         (("--distance-m", 1, "--intrinsics", "1,2"), "allowed is FX,FY,CX,CY"),
-        (("--distance-m", 1, "--focal-px", 0), "--focal-px 0: allowed is"),
+        (("--distance-m", 1, "--focal-px", 0), "--focal-px is 0; allowed:"),
         (
             ("--distance-m", 1, "--fov-deg", 50, "--focal-px", 9),
             "--fov-deg and --focal-px: given together",
@@ -298,7 +298,7 @@ def test_a_photograph_is_turned_upright_and_so_is_its_depth_expected(scene, rng)
     assert np.abs(seen.astype(int) - upright).max() <= 1
     said = refusal(*common, "--depth", folder / "depth.npy", *out)
     assert "48x32 px; allowed: the size of the color image, 32x48" in said
-    assert "turned upright" in said
+    assert "rotated upright" in said
 
 
 def test_a_profile_may_be_json_on_the_command_line(scene):

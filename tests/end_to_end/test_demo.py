@@ -5,15 +5,17 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
 
 from clients import demo, pyrender_stream, sheet, video
 from clients.arguments import read_profile, read_size_px
+from clients.batch.video_reading import VideoReader
 from clients.demo_eyes import EYES
 from clients.frame_log import FrameLog, percentiles
 from clients.pyrender_stream import path_settings
@@ -99,10 +101,10 @@ def test_demo_writes_a_video_of_all_frames_and_a_contact_sheet(demo_run):
 
 def _decoded(path, width, height):
     """All frames (n, h, w, 3) of a video of that size."""
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-i", str(path)]
-    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
-    raw = subprocess.run(command, capture_output=True, check=True).stdout
-    return np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
+    with VideoReader(Path(path)) as reader:
+        frames = np.stack([reader.color(index) for index in range(reader.count)])
+    assert frames.shape[1:] == (height, width, 3)
+    return frames
 
 
 def _detail(image):
@@ -146,12 +148,16 @@ def test_demo_reports_a_service_that_dies_on_the_way(monkeypatch, capsys, tmp_pa
     assert f"serving on {services[0].endpoint}" in output.err
 
 
-@pytest.mark.parametrize("encoder", ["false", "/no/such/encoder"])
-def test_gif_stands_in_where_the_encoder_fails(encoder, monkeypatch, tmp_path):
-    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: encoder)
+@pytest.mark.parametrize(
+    "broken", [{"codec": "no_such_encoder"}, {"options": (("preset", "none"),)}]
+)
+def test_gif_stands_in_where_the_encoder_fails(broken, monkeypatch, tmp_path):
+    kind = replace(video.VIDEO_KINDS["h264"], **broken)
+    monkeypatch.setitem(video.VIDEO_KINDS, "h264", kind)
     shades = [np.full((20, 40, 3), shade, np.uint8) for shade in (0, 120, 250)]
     written = video.write_video(tmp_path / "film", lambda: iter(shades), 10)
     assert written == tmp_path / "film.gif"
+    assert list(tmp_path.iterdir()) == [written]
     with Image.open(written) as gif:
         assert gif.n_frames == 3
         assert gif.size == (40, 20)
@@ -164,6 +170,7 @@ def test_mp4_keeps_colors_and_order(tmp_path):
     images = [np.full((64, 96, 3), color, np.uint8) for color in colors]
     written = video.write_video(tmp_path / "film", lambda: iter(images), 10)
     assert written == tmp_path / "film.mp4"
+    assert list(tmp_path.iterdir()) == [written]
     means = _decoded(written, 96, 64).mean(axis=(1, 2))
     # Chroma at half resolution and video levels cost a few steps on flat colors.
     assert means == pytest.approx(np.array(colors, float), abs=8)

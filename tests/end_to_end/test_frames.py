@@ -145,7 +145,7 @@ def test_a_wrong_argument_is_named_and_the_next_frame_works(client, change, word
     with pytest.raises(errors.BadMessage, match=words):
         client.filter(**{"color": view, **SEE, **change})
     assert client.filter(view, **SEE).color[0, 0, 0] == 7
-    with pytest.raises(errors.BadMessage, match=r"profile: a NoneType .* mapping"):
+    with pytest.raises(errors.BadMessage, match=r"profile: is a NoneType .* mapping"):
         client.set_profile(None)
 
 

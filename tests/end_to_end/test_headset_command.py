@@ -142,7 +142,7 @@ def test_a_program_of_ones_own_renders(tmp_path):
         (("--pupil-mm", "30"), "0.5 to 9"),
         (("--gaze-range", "a,b"), "H,V"),
         (("--settings", '{"nonsense": 1}'), "nonsense"),
-        (("--scale", "0.5"), "--scale is for a headset"),
+        (("--scale", "0.5"), "--scale requires a headset"),
         (("--white-cd-m2", "-1"), "white_cd_m2"),
         (("--profile", "{broken"), "not JSON"),
         (("--left", "{broken"), "--left"),
@@ -178,7 +178,7 @@ def test_how_far_eyes_turn_follows_from_the_tracker_unless_it_is_told():
         options = options_module.arguments_of(arguments, "")
         settings = options_module.settings_of(options)
         is_told = options.gaze_range is not None
-        found = program.gaze_range_of(settings, runtime, is_told=is_told)
+        found = program.gaze_range_of(settings, runtime, is_given=is_told)
         assert found == expected
 
 

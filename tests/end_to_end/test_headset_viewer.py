@@ -48,7 +48,7 @@ def test_poses_turn_left_and_up():
     np.testing.assert_allclose(
         level[:3, :3] @ direction_of(0, 0), direction_of(-30.0, 0.0), atol=1e-12
     )
-    with pytest.raises(ValueError, match="not a unit quaternion"):
+    with pytest.raises(ValueError, match="allowed: a unit quaternion"):
         matrix_of((0.0,) * 7)
 
 

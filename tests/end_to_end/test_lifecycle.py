@@ -119,7 +119,7 @@ def test_a_service_that_is_stopped_for_a_moment_is_used_again(start_service, nam
             if name == "supervisor":  # nobody needs it as long as all is well
                 assert client.filter(view, **SEE).color[0, 0, 0] == 5
             else:
-                with pytest.raises(ServiceTimeout, match="waited in vain for frame 0"):
+                with pytest.raises(ServiceTimeout, match="reply to frame 0"):
                     client.filter(view, **SEE, timeout_s=0.5)
         finally:
             os.kill(pid, signal.SIGCONT)

@@ -1,15 +1,16 @@
 #!/bin/sh
-# Gets what `make gl-witness` and `make check` ask for, beside the system: nothing is
-# installed and no rights are needed; Debian's packages are unpacked into .gl_witness.
+# Download the tools for `make gl-witness` and `make check`.  The script unpacks Debian
+# packages into .gl_witness; it installs nothing and needs no special permissions.
 #
-#   sh tests/gl_witness/setup.sh drivers    Mesa with its Vulkan driver lavapipe, and the
-#                                           validation layers of Vulkan; 160 MB
-#   sh tests/gl_witness/setup.sh glslang    the reference compiler of GLSL; 20 MB
+#   sh tests/gl_witness/setup.sh drivers    Mesa with its Vulkan driver lavapipe, and
+#                                           Vulkan's validation layers; 160 MB
+#   sh tests/gl_witness/setup.sh glslang    the GLSL reference compiler; 20 MB
 #
-# Zink, OpenGL over Vulkan, comes with libgl1-mesa-dri; llvmpipe does so too, and both
-# are then of one version.  Running this again costs a fraction of a second.
+# libgl1-mesa-dri contains both zink (OpenGL over Vulkan) and llvmpipe, so their
+# versions match.  Running the script again takes a fraction of a second.
 #
-# 0: made, or there already.  77: it cannot be made here.
+# Exit status: 0 if the tools are available, 77 if they cannot be set up on this
+# machine.
 set -eu
 cd "$(dirname "$0")/../.."
 
@@ -24,7 +25,7 @@ drivers)
     ;;
 glslang) PACKAGES="glslang-tools spirv-tools" ;;
 *)
-    echo "gl-witness: '$what': there are drivers and glslang" >&2
+    echo "gl-witness: unknown argument '$what'; expected drivers or glslang" >&2
     exit 2
     ;;
 esac
@@ -41,11 +42,11 @@ if [ "$what" = glslang ] && command -v glslangValidator >/dev/null &&
     exit 0
 fi
 if ! command -v apt-get >/dev/null || ! command -v dpkg-query >/dev/null; then
-    cannot "$what: only where apt-get and dpkg are (Debian, Ubuntu)"
+    cannot "$what: requires apt-get and dpkg (Debian, Ubuntu)"
 fi
 
-# Another Mesa in the system asks for another one here: packages of one source fit only
-# each other.
+# Download again if the system's Mesa has changed, because packages from the same source
+# must have the same version.
 installed=$(dpkg-query -W libgl1-mesa-dri libegl1 libc6 2>/dev/null || true)
 wanted="$(cksum <tests/gl_witness/setup.sh) $installed"
 if [ "$(cat "$folder/.made" 2>/dev/null || true)" = "$wanted" ]; then exit 0; fi
@@ -56,13 +57,13 @@ rm -rf "$folder" "$folder.new"
 mkdir -p "$folder.new/archives"
 cd "$folder.new/archives"
 
-apt() { # with lists of its own where those of the system do not do
+apt() { # run apt-get, with separate package lists if $lists is set
     command=$1
     shift
     apt-get -q -o APT::Sandbox::User=root ${lists:-} "$command" "$@"
 }
 
-plan() { # name=version of what is missing, or older in the system
+plan() { # print name=version of packages that are missing or outdated
     apt install --simulate --no-install-recommends $PACKAGES 2>/dev/null |
         sed -n 's/^Inst \([^ ]*\) .*(\([^ ]*\) .*/\1=\2/p' | grep -v -e '-dev=' || true
 }
@@ -75,7 +76,7 @@ download() {
     apt download $planned >log 2>&1
 }
 
-say "$what: downloading Debian's packages (seconds)"
+say "$what: downloading Debian packages (seconds)"
 if ! download; then
     mkdir -p "$root/apt/lists/partial" "$root/apt/cache/archives/partial"
     lists="-o Dir::State::Lists=$root/apt/lists -o Dir::Cache=$root/apt/cache"
@@ -89,9 +90,9 @@ for archive in *.deb; do dpkg -x "$archive" ..; done
 cd "$folder.new"
 rm -rf archives "$root/apt"
 
-if [ "$what" = drivers ]; then # found by name: the package says where it would lie
+if [ "$what" = drivers ]; then # replace the absolute path of the driver by its name
     for icd in usr/share/vulkan/icd.d/lvp_icd*.json; do
-        if [ ! -e "$icd" ]; then cannot "drivers: the packages have no lavapipe"; fi
+        if [ ! -e "$icd" ]; then cannot "drivers: lavapipe is not in the packages"; fi
         sed 's#"[^"]*/\(libvulkan_lvp\.so\)"#"\1"#' "$icd" >lavapipe.json
     done
 fi

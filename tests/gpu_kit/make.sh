@@ -1,14 +1,14 @@
 #!/bin/sh
-# Makes a folder for a GPU machine without a network, and an archive of it.
+# Build a kit for a GPU machine without a network: a folder and an archive of it.
 #
-#   sh tests/gpu_kit/make.sh [FOLDER]     FOLDER is out/gpu_kit
+#   sh tests/gpu_kit/make.sh [FOLDER]     default FOLDER: out/gpu_kit
 #
-# It has wheels, the loaders of OpenGL, the tree of the last commit, and run.sh.
-# From the environment:
-#   PYTHON_VERSION  the Python of that machine; 3.12
-#   WITH            more packages to carry, with what they need, of those that it is
-#                   expected to have
-#   PYTHON          whose pip fetches the wheels; .venv/bin/python
+# The kit contains wheels, the OpenGL loaders, the source tree of the last commit, and
+# run.sh.  Environment variables:
+#   PYTHON_VERSION  Python version of the GPU machine (default: 3.12)
+#   WITH            packages to include, with their dependencies, that the GPU machine
+#                   is otherwise expected to have
+#   PYTHON          Python whose pip downloads the wheels (default: .venv/bin/python)
 set -eu
 here=$(cd "$(dirname "$0")" && pwd)
 checkout=$(cd "$here/../.." && pwd)
@@ -17,18 +17,18 @@ kit=${1:-out/gpu_kit}
 version=${PYTHON_VERSION:-3.12}
 python=${PYTHON:-.venv/bin/python}
 
-# what a machine for numerical work lacks, or has too old
+# packages that a machine for numerical work often lacks or has in an old version
 CARRIED="moderngl glcontext pyzmq msgpack msgspec lz4 lazy-loader packaging OpenEXR
     typer rich shellingham annotated-doc markdown-it-py mdurl Pygments pydantic
     pydantic-core annotated-types typing-extensions typing-inspection
-    pyrender PyOpenGL trimesh freetype-py pyglet imageio six networkx glfw
+    trimesh networkx glfw
     pytest pluggy iniconfig hypothesis sortedcontainers"
-# what it is expected to have: large, and bound to its other packages
+# packages that the GPU machine is expected to have: large, with many dependencies
 EXPECTED="numpy scipy numba matplotlib pillow onnxruntime"
-# torch too, for training; without it that step is left out
+# and optionally torch; without it, the training step is skipped
 PLATFORMS="manylinux_2_28_x86_64 manylinux_2_27_x86_64 manylinux_2_17_x86_64
     manylinux2014_x86_64 manylinux1_x86_64"
-# libglvnd, and what its GLX links to
+# libglvnd, and the libraries that its GLX links to
 LOADERS="libegl1 libglvnd0 libopengl0 libgl1 libglx0
     libx11-6 libxcb1 libxau6 libxdmcp6 libbsd0 libmd0"
 
@@ -47,19 +47,19 @@ fetch_wheels() {
     "$python" -m pip --disable-pip-version-check download -qq --no-deps "$@" $CARRIED &&
         { [ -z "${WITH:-}" ] ||
             "$python" -m pip --disable-pip-version-check download -qq "$@" $WITH; } ||
-        fail "a wheel for Python $version is missing; its name stands above"
+        fail "a wheel for Python $version is missing; see its name above"
 }
 
-fetch_loaders() { # shared libraries under their sonames, side by side
+fetch_loaders() { # copy shared libraries into one folder, named by their sonames
     if ! command -v apt-get >/dev/null || [ "$(dpkg --print-architecture)" != amd64 ]; then
-        say "without apt-get of an amd64 Debian no loaders go along:" \
-            "that machine must have libEGL.so.1, libGL.so.1 and libOpenGL.so.0"
+        say "cannot include the OpenGL loaders without apt-get on amd64 Debian;" \
+            "the GPU machine must have libEGL.so.1, libGL.so.1 and libOpenGL.so.0"
         return
     fi
     packages=$(mktemp -d)
     if ! (cd "$packages" && apt-get download $LOADERS) >"$packages/log" 2>&1; then
         tail -n 3 "$packages/log" >&2
-        fail "apt-get cannot download the loaders; does 'apt-get update' help?"
+        fail "apt-get cannot download the loaders; try 'apt-get update' first"
     fi
     mkdir -p "$kit/loaders"
     for package in "$packages"/*.deb; do dpkg -x "$package" "$packages/root"; done
@@ -71,7 +71,7 @@ fetch_loaders() { # shared libraries under their sonames, side by side
 pack_tree() {
     git rev-parse --short HEAD >"$kit/COMMIT"
     if [ -n "$(git status --porcelain)" ]; then
-        say "what is not committed stays behind: the tree is that of $(cat "$kit/COMMIT")"
+        say "uncommitted changes are not included; commit: $(cat "$kit/COMMIT")"
     fi
     git archive --format=tar.gz -o "$kit/tree.tar.gz" HEAD
 }
@@ -79,13 +79,13 @@ pack_tree() {
 rm -rf "$kit"
 mkdir -p "$kit/wheels"
 kit=$(cd "$kit" && pwd)
-say "fetching wheels for Python $version"
+say "downloading wheels for Python $version"
 fetch_wheels
-say "fetching the loaders of OpenGL"
+say "downloading the OpenGL loaders"
 fetch_loaders
 pack_tree
 echo "$version" >"$kit/PYTHON_VERSION"
 cp "$here/run.sh" "$here/README.md" "$kit/"
 tar -czf "$kit.tar.gz" -C "$(dirname "$kit")" "$(basename "$kit")"
-say "$(du -sh "$kit" | cut -f1) in $kit, $(du -h "$kit.tar.gz" | cut -f1) in its archive"
-say "there:  sh $(basename "$kit")/run.sh [--quick]"
+say "$kit: $(du -sh "$kit" | cut -f1); archive: $(du -h "$kit.tar.gz" | cut -f1)"
+say "on the GPU machine, run:  sh $(basename "$kit")/run.sh [--quick]"

@@ -1,9 +1,9 @@
 #!/bin/sh
-# Measures ocufilter on this machine; no network is needed.
+# Run the tests and benchmarks of ocufilter on this machine, without a network.
 #
-#   sh run.sh [--quick] [--out DIR] [--steps NAME ...]     run.sh --help tells more
+#   sh run.sh [--quick] [--out DIR] [--steps NAME ...]     see run.sh --help
 #
-# PYTHON names another Python than python3.
+# PYTHON selects the Python to use (default: python3).
 set -eu
 kit=$(cd "$(dirname "$0")" && pwd)
 commit=$(cat "$kit/COMMIT")
@@ -11,8 +11,8 @@ wanted=$(cat "$kit/PYTHON_VERSION")
 python=${PYTHON:-python3}
 found=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 if [ "$found" != "$wanted" ]; then
-    echo "gpu-kit: the wheels are for Python $wanted, and $python is $found:" \
-        "name another in PYTHON, or make the kit with PYTHON_VERSION=$found" >&2
+    echo "gpu-kit: the wheels are for Python $wanted, but $python is $found; set" \
+        "PYTHON, or build the kit with PYTHON_VERSION=$found" >&2
     exit 1
 fi
 tree=$kit/unpacked/tree-$commit

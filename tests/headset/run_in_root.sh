@@ -1,18 +1,19 @@
 #!/bin/sh
-# Runs a command in the root that setup_root.sh made, this checkout at /checkout.
+# Run a command in the chroot that setup_root.sh created, with this checkout at
+# /checkout.
 #
 #   sh tests/headset/run_in_root.sh python -m pytest tests/headset
 #   sh tests/headset/run_in_root.sh --online apt-get update
 #
-# The command starts in /checkout, which follows the checkout and is read-only; /tmp and
-# the caches of the root are kept.  It reaches no network but its own loopback, so that
-# what the runtime opens to everyone stays inside, and has the environment that stands
-# below: more is given by  env NAME=value COMMAND.  With --online, to install something,
-# it has the network and the environment of the host.
+# The command starts in /checkout, a read-only mount of the checkout.  /tmp and the
+# caches of the chroot persist.  The command can only reach its own loopback interface,
+# so that ports that the runtime opens are not exposed.  It has the environment defined
+# below; to set more variables, use  env NAME=value COMMAND.  With --online, which is
+# for installing packages, it has the network and the environment of the host.
 #
-# HEADSET_ROOT names another root than .headset in the checkout.  Mounts are the
-# command's own and vanish with it; signals reach it, and its exit code comes back.
-# 77 says that it may not run here, or that there is no root.
+# HEADSET_ROOT selects the chroot (default: .headset in the checkout).  Mounts are
+# private to the command.  Signals are passed on, and the exit status is the command's.
+# It is 77 if the command may not run on this machine or if the chroot does not exist.
 set -eu
 here=$(cd "$(dirname "$0")" && pwd)
 checkout=$(cd "$here/../.." && pwd)
@@ -25,14 +26,14 @@ if [ "${1:-}" != --mounting ]; then
         shift
     fi
     if [ ! -x "$root/bin/sh" ]; then
-        echo "headset: no root in $root; to make it:  sh $here/setup_root.sh" >&2
+        echo "headset: no chroot in $root; to create it:  sh $here/setup_root.sh" >&2
         exit 77
     fi
     prefix=
     if [ "$(id -u)" != 0 ]; then
         prefix="sudo -n"
         if ! $prefix true 2>/dev/null; then
-            echo "headset: only root may run commands in $root" >&2
+            echo "headset: running commands in $root requires root permissions" >&2
             exit 77
         fi
     fi

@@ -1,15 +1,17 @@
 #!/bin/sh
-# Makes a root with OpenXR's runtime Monado, Xvfb and this project, to run tests in.
+# Create a chroot with the OpenXR runtime Monado, Xvfb and this project, for tests.
 #
-#   sh tests/headset/setup_root.sh [ROOT]     ROOT is .headset in the checkout, or what
-#                                             HEADSET_ROOT says; 2.5 GB, a few minutes
+#   sh tests/headset/setup_root.sh [ROOT]     default: $HEADSET_ROOT, or .headset in the
+#                                             checkout; 2.5 GB, a few minutes
 #
-# Debian has Monado from trixie on; the root is a trixie whatever the host is, from the
-# mirror that the host's apt uses (or DEBIAN_MIRROR).  run_in_root.sh runs commands in
-# it.  Running this again costs a fraction of a second: packages are installed anew only
-# when this file, pyproject.toml, constraints.txt or the sources in C have changed.
+# Monado is available in Debian since trixie, so the chroot is trixie on any host.  Its
+# packages come from the mirror that the host's apt uses, or from DEBIAN_MIRROR.  Use
+# run_in_root.sh to run commands in it.  Running this script again takes a fraction of a
+# second: it reinstalls packages only if this file, pyproject.toml, constraints.txt or
+# the C sources have changed.
 #
-# 0: made.  1: a step failed, its last lines stand above.  77: it cannot be made here.
+# Exit status: 0 on success, 1 if a step failed (its last lines are printed), and 77 if
+# the chroot cannot be created on this machine.
 set -eu
 here=$(cd "$(dirname "$0")" && pwd)
 checkout=$(cd "$here/../.." && pwd)
@@ -35,31 +37,31 @@ cannot() {
 log=$(mktemp)
 trap 'rm -f "$log"' EXIT
 
-step() { # what it is, and the command
+step() { # run a command and describe it; exit with its last lines if it fails
     say "$1"
     shift
     if ! "$@" >"$log" 2>&1; then
         tail -n 15 "$log" >&2
-        say "that failed"
+        say "this step failed"
         exit 1
     fi
 }
 
 in_root() { HEADSET_ROOT=$root sh "$here/run_in_root.sh" --online "$@"; }
 
-# --- whether it can be made ---------------------------------------------------
+# --- requirements -------------------------------------------------------------
 
 check_rights() {
     if [ "$(id -u)" != 0 ]; then
         if ! sudo -n true 2>/dev/null; then
-            cannot "only root, or who may use sudo without a password, can make a root"
+            cannot "creating a chroot requires root, or sudo without a password"
         fi
         sudo -n --preserve-env sh "$here/setup_root.sh" "$root" || exit $?
         exit 0
     fi
     if ! unshare --mount --net sh -c 'mount -t tmpfs tmpfs /mnt && chroot / true' \
         2>/dev/null; then
-        cannot "mounts and networks of one's own, and chroot, are not permitted here"
+        cannot "private mounts, private networks or chroot are not permitted here"
     fi
 }
 
@@ -72,7 +74,7 @@ install_debootstrap() {
     fi
 }
 
-find_mirror() { # what apt takes Debian from
+find_mirror() { # set mirror to the Debian mirror of the host's apt
     mirror=${DEBIAN_MIRROR:-}
     if [ -n "$mirror" ]; then return; fi
     mirror=$(apt-get indextargets --format '$(REPO_URI) $(LABEL)' \
@@ -81,7 +83,7 @@ find_mirror() { # what apt takes Debian from
     mirror+file:*) mirror=$(sed -n '/^http/ { s/[[:space:]].*//p; q; }' "${mirror#*:}") ;;
     esac
     if [ -z "$mirror" ]; then
-        cannot "apt on this machine knows no mirror of Debian; name one in DEBIAN_MIRROR"
+        cannot "apt on this machine has no Debian mirror; set DEBIAN_MIRROR"
     fi
 }
 
@@ -89,9 +91,9 @@ find_mirror() { # what apt takes Debian from
 
 make_base() {
     if [ -e "$MARK" ]; then
-        rm -rf "$root" # ours, and not finished
+        rm -rf "$root" # created by this script, but incomplete
     elif [ -n "$(ls -A "$root" 2>/dev/null)" ]; then
-        say "$root holds something else; nothing is changed"
+        say "$root contains other files; nothing was changed"
         exit 1
     fi
     mkdir -p "$root"
@@ -102,7 +104,7 @@ make_base() {
         $RELEASE "$root" "$mirror"
 }
 
-copy_from_host() { # files and folders, to where they lie on the host
+copy_from_host() { # copy files and folders to the same path in the chroot
     for path in "$@"; do
         if [ ! -e "$path" ]; then continue; fi
         mkdir -p "$root$(dirname "$path")"
@@ -110,7 +112,7 @@ copy_from_host() { # files and folders, to where they lie on the host
     done
 }
 
-copy_host_settings() { # how the host reaches mirrors and package indices
+copy_host_settings() { # copy the settings for mirrors and package indices
     apt-config dump | grep -E '^Acquire::(http|https|Check|Retries)' \
         >"$root/etc/apt/apt.conf.d/90host" || true
     copy_from_host /etc/apt/auth.conf /etc/apt/auth.conf.d /etc/resolv.conf /etc/hosts \
@@ -139,7 +141,7 @@ install_system() {
 
 # --- this project ---------------------------------------------------------------
 
-install_packages() { # those of the service, and those of the tests
+install_packages() { # for the service and for the tests
     in_root /usr/bin/python3 -c 'import tomllib
 project = tomllib.load(open("pyproject.toml", "rb"))["project"]
 print(*project["dependencies"], sep="\n")' >"$root/tmp/requirements.txt" &&
@@ -147,13 +149,13 @@ print(*project["dependencies"], sep="\n")' >"$root/tmp/requirements.txt" &&
             -c constraints.txt -r /tmp/requirements.txt $PYTHON_PACKAGES
 }
 
-follow_checkout() { # what is edited there is seen here at once
+follow_checkout() { # import the project from the mounted checkout
     for packages in "$root"/opt/venv/lib/python3*/site-packages; do
         echo /checkout >"$packages/checkout.pth"
     done
 }
 
-build_loops() { # of the native engine: those of the host are for its own Python
+build_loops() { # for the native engine; the host's build is for its own Python
     in_root python -c 'from pathlib import Path
 from tests.native_build import build_library
 build_library(Path("/opt/ocufilter"))'
@@ -166,15 +168,15 @@ install_project() {
     rm -f "$PYTHON_STAMP"
     copy_host_settings
     mkdir -p "$root/opt/ocufilter" "$root/var/cache/ocufilter"
-    step "making an environment of Python" \
+    step "creating a Python environment" \
         in_root /usr/bin/python3 -m venv --clear /opt/venv
     step "installing the pinned Python packages (half a minute)" install_packages
     follow_checkout
-    step "compiling the loops in C" build_loops
-    step "compiling numba's loops (a minute of two cores)" \
+    step "compiling the C code" build_loops
+    step "compiling numba's loops (a minute on two cores)" \
         sh "$here/run_in_root.sh" python -m filter_service.filtering.compile_loops
     echo "$wanted" >"$PYTHON_STAMP"
-    say "the root is ready"
+    say "the chroot is ready"
 }
 
 export HEADSET_ROOT="$root"

@@ -23,7 +23,7 @@ SCREEN_ERROR = 3  # of 255: two conversions between sRGB and linear light
 EDGE_PX = 3
 N_FRAMES = 60
 VARIABLE = "OCUFILTER_HEADSET_GRAPHICS"
-NO_DISPLAY = "this OpenXR runtime needs an X display"
+NO_DISPLAY = "this OpenXR runtime requires an X display"
 
 
 @pytest.fixture

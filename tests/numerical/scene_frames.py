@@ -1,7 +1,6 @@
-"""Frames of the two scenes for tests and benchmarks, rendered in a process apart.
+"""Frames of the two scenes for tests and benchmarks, rendered in another process.
 
-pyrender ends the EGL display when it closes, and with it any other context of the same
-process; the service and its clients never share one.
+A renderer leaves no OpenGL context current, and the tests keep theirs current.
 """
 
 import json

@@ -310,3 +310,13 @@ def test_refraction_at_the_cornea_is_known_as_far_as_light_passes(name, pupil_mm
     inside = used_dpt <= known_dpt[-1]
     assert inside.any()
     assert np.abs(again_dpt - used_dpt)[inside].max() < 0.01
+
+
+def test_an_eye_prepared_again_is_the_same_to_the_last_bit():
+    parameters = EyeParameters.mean_eye()
+    wanted_dpt = np.linspace(0.0, 4.0, 41)
+    first, *others = (
+        AccommodatingEye(parameters).lens_diameters_mm(wanted_dpt) for _ in range(6)
+    )
+    for other in others:
+        assert np.array_equal(other, first)

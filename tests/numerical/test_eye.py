@@ -18,22 +18,24 @@ from estimator.eye.parameters import (
     column,
     mean_vector,
     offset_name,
-    parse_parameters,
     random_vectors,
 )
 from estimator.optics.raytrace import trace_rays
 from estimator.optics.surfaces import pack_eye
 from estimator.optics.zernike import nm_from_index, zernike_values
-from estimator.profiles.parse import ProfileError
+from estimator.profiles.parse import ProfileError, parse_profile
 
 LENS_ROWS = json.loads(
     (Path(__file__).parents[1] / "data" / "lens_rules.json").read_text("utf-8")
 )["rows"]
 
 
+def parsed(parameters):
+    return parse_profile({"kind": "eye", "parameters": parameters}).eye
+
+
 def eye_with(**changes):
-    values = EyeParameters.mean_eye().to_mapping() | changes
-    return parse_parameters(values)
+    return parsed(EyeParameters.mean_eye().to_mapping() | changes)
 
 
 def apex_ray(eye, x_mm, y_mm):
@@ -90,7 +92,7 @@ def test_vector_mapping_and_fields_are_the_same_numbers(rng):
     vector = random_vectors(1, rng)[0]
     eye = EyeParameters.from_vector(vector)
     assert np.array_equal(eye.to_vector(), vector)
-    assert parse_parameters(eye.to_mapping()).to_vector() == pytest.approx(vector)
+    assert parsed(eye.to_mapping()).to_vector() == pytest.approx(vector)
     assert eye.cornea_offset_mm[5] == vector[column(offset_name(5))]
     assert eye.lens_volume_mm3 == vector[column("lens_volume_mm3")]
 
@@ -116,7 +118,7 @@ def test_offsets_may_be_left_out():
         for name, value in EyeParameters.mean_eye().to_mapping().items()
         if not name.startswith("cornea_offset")
     }
-    assert np.array_equal(parse_parameters(given).to_vector(), mean_vector())
+    assert np.array_equal(parsed(given).to_vector(), mean_vector())
 
 
 def test_packing_many_eyes_equals_packing_each(rng):

@@ -109,7 +109,8 @@ HOME = {
         "filter_service/gl/passes.py",  # and of what runs in it
         "filter_service/gl/staging.py",  # names its types
         "clients/window.py",  # shows frames in a window of its own
-        "clients/headset/*",  # renders for both eyes of a headset
+        "clients/scenes/scene_*.py",  # renders scenes
+        "clients/headset/*",  # draws into a headset's images
     ),
     "glfw": ("clients/window.py", "clients/headset/openxr_gl.py"),
     "xr": ("clients/headset/openxr_*",),  # makes PyOpenGL use GLX
@@ -129,6 +130,7 @@ HOME = {
     "lz4": ("filter_service/wire/compression.py",),
     "msgpack": ("filter_service/messages.py", "filter_service/wire/unpacking.py"),
     "msgspec": (
+        "estimator/profiles/*",  # types of profiles
         "filter_service/validation.py",  # values against annotated types
         "filter_service/settings.py",  # their limits
         "filter_service/camera.py",
@@ -136,10 +138,13 @@ HOME = {
         "filter_service/protocol_schema.py",
         "filter_service/wire/*",
     ),
+    "weasyprint": ("clients/report/make.py",),  # loads the system library Pango
     "lazy_loader": ("*/__init__.py",),  # names without what they load
     "numba": (
         "estimator/psf/*",  # kernels of the PSF engines
-        "estimator/optics/raytrace_kernels.py",
+        "estimator/optics/*_kernels.py",
+        "estimator/optics/forms/*",  # sags
+        "estimator/optics/gradients/*",  # indices at a point
         "estimator/wavefront/*",  # aiming and fitting
         "filter_service/rendering/reference*.py",  # twins of the passes
         "filter_service/psfs/pack.py",  # loops over single kernels
@@ -157,12 +162,6 @@ HOME = {
         "clients/commands/doctor_probes.py",  # asks which threads it runs on
         "filter_service/threads.py",
     ),
-    "pyrender": ("clients/*",),
-    "trimesh": ("clients/*",),
-    "OpenGL": ("clients/*",),
-    "pyglet": ("clients/*",),
-    "imageio": ("clients/*",),
-    "imageio_ffmpeg": ("clients/*",),  # videos
     "av": ("clients/batch/video_*.py",),  # frames of videos, exactly
     "ray": ("clients/batch/ray_pool.py",),  # many machines
     "matplotlib": (

@@ -10,18 +10,21 @@ from clients.commands.console import CommandFailed
 from clients.extra import INSTALL
 from tests.source_tree import ROOT
 
-WITHOUT_PYRENDER = (
+WITHOUT_A_PACKAGE = (
     "import runpy, sys\n"
-    "sys.modules['pyrender'] = None\n"
+    "sys.modules[sys.argv[2]] = None\n"
     "sys.argv = [sys.argv[1]]\n"
     "runpy.run_module(sys.argv[0], run_name='__main__', alter_sys=True)\n"
 )
 
 
-@pytest.mark.parametrize("module", ["clients.demo", "clients.pyrender_stream"])
-def test_without_pyrender_a_program_says_in_one_line_what_to_install(module):
+@pytest.mark.parametrize(
+    ("module", "package"),
+    [("clients.demo", "av"), ("clients.pyrender_stream", "glfw")],
+)
+def test_a_missing_package_is_reported_in_one_line_with_its_command(module, package):
     finished = subprocess.run(
-        [sys.executable, "-c", WITHOUT_PYRENDER, module],
+        [sys.executable, "-c", WITHOUT_A_PACKAGE, module, package],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -30,7 +33,7 @@ def test_without_pyrender_a_program_says_in_one_line_what_to_install(module):
     assert finished.returncode == 1
     assert finished.stdout == ""
     assert finished.stderr.count("\n") == 1, finished.stderr
-    assert "pyrender is not installed" in finished.stderr
+    assert f"{package} is not installed" in finished.stderr
     assert INSTALL in finished.stderr
 
 

@@ -121,7 +121,7 @@ def test_profiles_that_are_shown_are_accepted(document):
 
 def test_the_presets_are_those_that_exist():
     page = text_of("docs/reference/profiles.md")
-    sentence = re.search(r"A preset's name alone is a profile, too: ([^.]*)\.", page)[1]
+    sentence = re.search(r"The name of a preset is also a profile: ([^.]*)\.", page)[1]
     assert tuple(re.findall(r"`(\w+)`", sentence)) == preset_names()
 
 

@@ -390,8 +390,8 @@ def position(**fields):
 
 GLTF = {
     "nested nodes": ({"nodes": nested(5000)}, "more than 1000 deep"),
-    "a circle": ({"nodes": [{"children": [1]}, {"children": [0]}]}, "stands twice"),
-    "two parents": ({"nodes": [{"children": [1, 1]}, {}]}, "stands twice"),
+    "a circle": ({"nodes": [{"children": [1]}, {"children": [0]}]}, "occurs twice"),
+    "two parents": ({"nodes": [{"children": [1, 1]}, {}]}, "occurs twice"),
     "a child": ({"nodes": [{"children": [-1]}]}, "node -1"),
     "many nodes": (
         {"scenes": [{"nodes": list(range(40_000))}], "nodes": [{"mesh": 0}] * 40_000},
@@ -419,7 +419,7 @@ GLTF = {
                 {"mesh": 0, "scale": [1e200] * 3},
             ]
         },
-        "finite numbers",
+        "is not finite",
     ),
     "no list": ({"meshes": {"0": 1}}, "not a list"),
     "a huge image": (textured({"uri": "large.png"}), "13000x13000"),
@@ -490,8 +490,8 @@ def test_a_gltf_texture_beside_it_is_read(tmp_path):
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("1.0 /etc/passwd", "leads out of the data set"),
-        ("1.0 rgb/../../secret.png", "leads out of the data set"),
+        ("1.0 /etc/passwd", "is outside the data set"),
+        ("1.0 rgb/../../secret.png", "is outside the data set"),
         ("nan rgb/a.png", "not a time"),
         ("1e999 rgb/a.png", "not a time"),
         ("1.0", "1 fields"),

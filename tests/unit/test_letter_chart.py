@@ -105,10 +105,10 @@ def test_light_of_a_pixel_is_the_share_without_ink():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"distance_m": 0.0}, "distance_m 0: allowed is above 0"),
-        ({"letters": ["AB"]}, "letters 'AB': allowed are rows of CDHKNORSVZ"),
-        ({"log_mar": [4.0]}, "log_mar 4: allowed is -1 to 2.5"),
-        ({"log_mar": [1.4]}, "more than the camera sees"),
+        ({"distance_m": 0.0}, "distance_m is 0; allowed: above 0"),
+        ({"letters": ["AB"]}, "letters are 'AB'; allowed: rows of CDHKNORSVZ"),
+        ({"log_mar": [4.0]}, "log_mar is 4; allowed: -1 to 2.5"),
+        ({"log_mar": [1.4]}, "more than the field of view"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(change, said):

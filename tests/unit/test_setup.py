@@ -7,8 +7,6 @@ import tomllib
 
 import pytest
 
-from clients.commands.doctor_checks import FIX_PYRENDER
-from clients.extra import INSTALL
 from tests.source_tree import ROOT
 
 PINS = dict(
@@ -34,12 +32,6 @@ def _required() -> list[str]:
 def test_every_requirement_has_a_pin():
     pinned = {_normal(name) for name in PINS}
     assert [name for name in _required() if _normal(name) not in pinned] == []
-
-
-def test_pyrender_is_installed_in_the_pinned_version():
-    setup = (ROOT / "setup.sh").read_text(encoding="utf-8")
-    for text in (setup, INSTALL, FIX_PYRENDER):
-        assert f"--no-deps pyrender=={PINS['pyrender']}" in text
 
 
 IMPORTED_TO_COMPILE = """

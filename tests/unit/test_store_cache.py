@@ -349,7 +349,7 @@ def test_a_person_s_eye_is_erased_and_no_other(kept, tmp_path):
     assert (
         "1 file" in eyes_command("erase", "--name", left.name[:9], "--dir", kept).output
     )
-    assert "no eye is kept" in eyes_command("list", "--dir", kept).output
+    assert "no eye is cached" in eyes_command("list", "--dir", kept).output
 
 
 def test_all_eyes_are_erased_at_once(kept):
@@ -366,7 +366,7 @@ def test_all_eyes_are_erased_at_once(kept):
         (["erase", "--name", "*"], "allowed"),
         (["erase", "--name", ""], "allowed"),
         (["list", "--dir", "/no/such/folder"], "no folder"),
-        (["list"], "no folder"),
+        (["list"], "no cache folder"),
     ],
 )
 def test_what_cannot_be_erased_or_listed_is_said(arguments, text, monkeypatch):

@@ -100,9 +100,9 @@ def _refused(capsys, *arguments):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--wavelength-nm", "555"], "either --stop-mm or --pupil-mm"),
-        (["--stop-mm", "4", "--wavelength-nm", "300"], "--wavelength-nm 300"),
-        ([*VIEW, "--h-deg", "90"], "--h-deg 90: allowed is -75 to 75"),
+        (["--wavelength-nm", "555"], "--stop-mm, --pupil-mm: allowed: exactly one"),
+        (["--stop-mm", "4", "--wavelength-nm", "300"], "--wavelength-nm is 300"),
+        ([*VIEW, "--h-deg", "90"], "--h-deg is 90; allowed: -75 to 75"),
         ([*VIEW, "--focus-dpt", "2"], "does not accommodate"),
     ],
 )

@@ -103,13 +103,14 @@ class ListPasses:
     @property
     def _capacities(self) -> tuple[int, int]:
         """Capacities of the two list buffers in entries, as one band."""
-        return tuple(
+        entries, spare = (
             min(
                 self.strip.buffers[name].size // ENTRY_BYTES,
                 self._list_limit,
             )
             for name in ("ENTRIES", "ENTRIES_SPARE")
         )
+        return entries, spare
 
     def count_bins(self) -> None:
         """Compute the lengths and offsets of the lists."""

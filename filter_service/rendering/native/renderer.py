@@ -2,7 +2,7 @@
 
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -27,6 +27,7 @@ from filter_service.rendering.native.kernel_plan import KernelPlan, plan_kernels
 from filter_service.rendering.native.native_store import NativeStore
 from filter_service.rendering.request_checks import check_request, output_array
 from filter_service.rendering.white_level import white_level
+from filter_service.rgbd_view import RgbdView
 
 
 class NativeRenderer(OneView):
@@ -136,11 +137,11 @@ class NativeRenderer(OneView):
 
     def _render(
         self,
-        timer,
+        timer: "StageTimes",
         request: ViewRequest,
         kept: EyeState,
         layers: FrameLayers,
-        image,
+        image: ImageCells,
         fill: Fill,
     ) -> FilteredView:
         view, options = request.view, request.options
@@ -187,11 +188,11 @@ class NativeRenderer(OneView):
 
     def _pixels(
         self,
-        timer,
+        timer: "StageTimes",
         frame: FrameRecord,
-        view,
+        view: RgbdView,
         kept: EyeState,
-        layers,
+        layers: FrameLayers,
         image: ImageCells,
     ) -> tuple[int, NDArray[np.bool_]]:
         """Compute the pixels; return the count of filled depths and the used pairs."""
@@ -209,7 +210,14 @@ class NativeRenderer(OneView):
             self._loops.run("pixels", frame.c)
         return missing_count, used
 
-    def _planned(self, kept: EyeState, layers, image, used, fill: Fill) -> KernelPlan:
+    def _planned(
+        self,
+        kept: EyeState,
+        layers: FrameLayers,
+        image: ImageCells,
+        used: NDArray[np.bool_],
+        fill: Fill,
+    ) -> KernelPlan:
         """Return the last frame's kernels if they suffice; otherwise plan new ones."""
         state = (kept.handle, layers, image)
         if kept.plan is None or not kept.plan.serves(state, used):
@@ -234,7 +242,7 @@ class NativeRenderer(OneView):
             handle.store.fill(psfs, until_s=until_s, between=self._rest_between)
 
     def _blend(
-        self, timer, frame: FrameRecord, plan: KernelPlan, kept: EyeState
+        self, timer: "StageTimes", frame: FrameRecord, plan: KernelPlan, kept: EyeState
     ) -> BlendSizes:
         """Blend the kernels that fragments use, unless they already exist."""
         levels = plan.shapes["levels_used"]
@@ -263,7 +271,7 @@ class StageTimes:
         self._before_s = rested_s()
 
     @contextmanager
-    def wall(self, name: str):
+    def wall(self, name: str) -> Iterator[None]:
         """Time a stage; times of the same name add up."""
         started_s, inner_ms = time.perf_counter() - self._rested_s(), self._inner_ms
         yield
@@ -272,7 +280,7 @@ class StageTimes:
         self._ms[name] = self._ms.get(name, 0.0) + elapsed_ms
 
     @contextmanager
-    def inner(self, name: str):
+    def inner(self, name: str) -> Iterator[None]:
         """Time a stage within another, and exclude it from the outer stage's time."""
         before_ms = sum(self._ms.values())
         with self.wall(name):
