@@ -299,6 +299,8 @@ class Page:
 
     def _write_link(self) -> None:
         """Write the entries to the browser's address, for reloads and links."""
+        if self.view.is_deleted:  # an upload may end after its page was closed
+            return
         fragment = fragment_of(self.state, self.scene.kind)
         if fragment != self._fragment:
             self._fragment = fragment
