@@ -5,7 +5,7 @@ ray-traced least-squares refraction M, from C(2,0) at the given pupil and 555 nm
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -15,7 +15,7 @@ from scipy.interpolate import BarycentricInterpolator
 from estimator.corrections.worn_lens import worn_refraction
 from estimator.eye.assembly import eye_surfaces
 from estimator.eye.focus_table import FocusTable, table_pupils_mm
-from estimator.eye.focusing import Focusing
+from estimator.eye.focusing import FocusedSurfaces, TabulatedFocusing
 from estimator.eye.lens_change import (
     AQUEOUS,
     DIAMETER,
@@ -31,7 +31,6 @@ from estimator.eye.tracing import (
 )
 from estimator.optics import prescription as rx
 from estimator.optics.paraxial import entrance_pupil_mm
-from estimator.optics.surfaces import EyeSurfaces
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.vergence import ObjectVergence, refraction_at_cornea_dpt
 from estimator.optics.zernike import N_TERMS
@@ -51,20 +50,12 @@ MAX_REFINEMENTS = 6
 
 
 @dataclass(frozen=True)
-class FocusedEye:
-    """One eye at one focus.
-
-    ``focus_dpt`` is the focus actually reached; ``notes`` report a difference from the
-    requested one.
-    """
+class FocusedEye(FocusedSurfaces):
+    """An eye of 45 parameters at one focus."""
 
     parameters: EyeParameters
-    surfaces: EyeSurfaces
-    focus_dpt: float
-    accommodation_dpt: float
     lens_diameter_change_mm: float
     aqueous_thickness_change_mm: float
-    notes: tuple[str, ...]
 
 
 class ResidualPhase(Protocol):
@@ -74,7 +65,7 @@ class ResidualPhase(Protocol):
         """Return monomials (n, 28) at 555 nm in the plane of pupils (n,)."""
 
 
-def _falling_count(refractions_dpt: NDArray[np.float64]) -> int:
+def falling_count(refractions_dpt: NDArray[np.float64]) -> int:
     """Return how many leading refractions are finite and decreasing."""
     usable = np.isfinite(refractions_dpt)
     usable[1:] &= np.diff(refractions_dpt) < 0.0
@@ -82,7 +73,7 @@ def _falling_count(refractions_dpt: NDArray[np.float64]) -> int:
     return int(np.argmin(usable)) if not usable.all() else usable.size
 
 
-def _polynomial(
+def polynomial_through(
     x: NDArray[np.float64], y: NDArray[np.float64]
 ) -> BarycentricInterpolator:
     """Return the polynomial through points, with the same rounding in every process.
@@ -94,11 +85,8 @@ def _polynomial(
     return BarycentricInterpolator(x, y, rng=np.random.default_rng(0))
 
 
-class AccommodatingEye(Focusing):
-    """An eye that can focus, at any pupil.
-
-    *Accommodation* identifies a state of the lens by the change of refraction at
-    ``pupil_diameter_mm``.  Through another pupil the change differs.
+class AccommodatingEye(TabulatedFocusing[FocusedEye]):
+    """An eye of 45 parameters that can focus, at any pupil.
 
     Attributes
     ----------
@@ -145,7 +133,6 @@ class AccommodatingEye(Focusing):
         diameters_mm, refractions_dpt = self._refraction_table()
         self._bare_dpt = float(refractions_dpt[0])
         self._rest = rest
-        self._table: FocusTable | None = None
         at_cornea_dpt = 0.0
         if correction is not None:
             at_cornea_dpt, *_ = rx.power_vector(correction)
@@ -173,16 +160,6 @@ class AccommodatingEye(Focusing):
         rest_dpt: NDArray[np.float64] = total_defocus_dpt(zernike_um, radius_mm)[0]
         return rest_dpt
 
-    @property
-    def _focus_table(self) -> FocusTable:
-        """Refraction without correction over pupil and accommodation, traced lazily.
-
-        It is not a cached property, so that storing an eye stores the table too.
-        """
-        if self._table is None:
-            self._table = self._new_focus_table()
-        return self._table
-
     def _new_focus_table(self) -> FocusTable:
         """Trace the table; omit pupils that light does not fill in every state."""
         pupils_mm = np.array(table_pupils_mm(self.pupil_diameter_mm))
@@ -206,47 +183,6 @@ class AccommodatingEye(Focusing):
             pupils_mm[usable], self._accommodations_dpt[some], found_dpt[usable]
         )
 
-    def accommodation_dpt(
-        self, focus_dpt: float, *, pupil_diameter_mm: float | None = None
-    ) -> float:
-        """Return the accommodation for a focus, by default at the eye's own pupil."""
-        pupil_mm = pupil_diameter_mm or self.pupil_diameter_mm
-        return super().accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
-
-    def refraction_at_dpt(
-        self, *, pupil_diameter_mm: float, accommodation_dpt: float
-    ) -> float:
-        """Return least-squares M at 555 nm through a pupil, at an accommodation."""
-        bare_dpt = self._focus_table.refraction_dpt(
-            pupil_mm=pupil_diameter_mm, accommodation_dpt=accommodation_dpt
-        )
-        return bare_dpt - self._taken_off_dpt(pupil_diameter_mm)
-
-    def _taken_off_dpt(self, pupil_diameter_mm: float) -> float:
-        """Return M of the correction through a pupil."""
-        at_center_dpt, per_mm2 = self._correction_dpt
-        return at_center_dpt + per_mm2 * (pupil_diameter_mm / 2.0) ** 2
-
-    def accommodation_for_dpt(
-        self, refraction_dpt: float, *, pupil_diameter_mm: float
-    ) -> float:
-        """Return the accommodation in reach whose M at a pupil is nearest to this."""
-        relaxed_dpt = self.refraction_at_dpt(
-            pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=0.0
-        )
-        least_dpt = relaxed_dpt - self._age_amplitude_dpt
-        return self._focus_table.accommodation_dpt(
-            pupil_mm=pupil_diameter_mm,
-            refraction_dpt=max(refraction_dpt, least_dpt)
-            + self._taken_off_dpt(pupil_diameter_mm),
-        )
-
-    def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
-        """Return the accommodation for the near point through a pupil."""
-        return self.accommodation_for_dpt(
-            -math.inf, pupil_diameter_mm=pupil_diameter_mm
-        )
-
     def _cornea_table(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return accommodations of the table, and M at the cornea of the traced eye.
 
@@ -265,7 +201,7 @@ class AccommodatingEye(Focusing):
                 "light does not pass the relaxed eye's cornea at "
                 f"{self.pupil_diameter_mm:g} mm"
             )
-        count = _falling_count(refractions_dpt)
+        count = falling_count(refractions_dpt)
         return self._accommodations_dpt[:count], refractions_dpt[:count]
 
     def at_cornea_dpt(self, accommodations_dpt: ArrayLike) -> NDArray[np.float64]:
@@ -276,7 +212,7 @@ class AccommodatingEye(Focusing):
         """
         used_dpt = np.atleast_1d(np.asarray(accommodations_dpt, dtype=np.float64))
         known_dpt, refractions_dpt = self._cornea_table()
-        found_dpt: NDArray[np.float64] = _polynomial(known_dpt, refractions_dpt)(
+        found_dpt: NDArray[np.float64] = polynomial_through(known_dpt, refractions_dpt)(
             np.minimum(used_dpt, known_dpt[-1])
         )
         return found_dpt
@@ -289,7 +225,7 @@ class AccommodatingEye(Focusing):
         if known_dpt.size == 1:
             return np.zeros(np.shape(refractions_dpt))
         wanted_dpt = np.clip(refractions_dpt, at_cornea_dpt[-1], at_cornea_dpt[0])
-        used_dpt = _polynomial(at_cornea_dpt, known_dpt)(wanted_dpt)
+        used_dpt = polynomial_through(at_cornea_dpt, known_dpt)(wanted_dpt)
         within_dpt: NDArray[np.float64] = np.clip(used_dpt, 0.0, self.amplitude_dpt)
         return within_dpt
 
@@ -304,7 +240,7 @@ class AccommodatingEye(Focusing):
             raise TraceFailed(
                 f"light does not pass the relaxed eye at {self.pupil_diameter_mm:g} mm"
             )
-        count = _falling_count(refractions_dpt)
+        count = falling_count(refractions_dpt)
         return diameters_mm[:count], refractions_dpt[:count]
 
     def _refractions_dpt(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -328,7 +264,7 @@ class AccommodatingEye(Focusing):
             return np.full(wanted_dpt.shape, known_mm[0])
         # The table is smooth and short: linear interpolation would be 1e-2 dpt off,
         # and every further step costs a trace for each focus.
-        curve = _polynomial(known_dpt, known_mm)
+        curve = polynomial_through(known_dpt, known_mm)
         diameters_mm: NDArray[np.float64] = np.clip(
             curve(wanted_dpt), known_mm[-1], known_mm[0]
         )
@@ -350,48 +286,6 @@ class AccommodatingEye(Focusing):
             self._vector, lens_diameter_mm=self.lens_diameters_mm(accommodations_dpt)
         )
         return (vectors - self._vector)[:, [DIAMETER, AQUEOUS]]
-
-    def focused(
-        self, focus_dpt: float, *, pupil_diameter_mm: float | None = None
-    ) -> FocusedEye:
-        """Return the eye focused as near to ``focus_dpt`` as possible."""
-        return self.focused_at([focus_dpt], pupil_diameter_mm=pupil_diameter_mm)[0]
-
-    def focused_at(
-        self, focuses_dpt: ArrayLike, *, pupil_diameter_mm: float | None = None
-    ) -> list[FocusedEye]:
-        """Focus at many distances in one batch of traces.
-
-        Parameters
-        ----------
-        pupil_diameter_mm : float, optional
-            Pupil through which they are sharpest; the eye's own if None.
-
-        Raises
-        ------
-        ValueError
-            A distance is not finite.
-        """
-        focuses_dpt = np.atleast_1d(np.asarray(focuses_dpt, dtype=np.float64))
-        if not np.all(np.isfinite(focuses_dpt)):
-            raise ValueError(f"focus {focuses_dpt} dpt: must be finite; infinity is 0")
-        pupil_mm = pupil_diameter_mm or self.pupil_diameter_mm
-        used_dpt = [
-            self.accommodation_dpt(f, pupil_diameter_mm=pupil_mm)
-            for f in focuses_dpt.tolist()
-        ]
-        return [
-            replace(
-                state,
-                focus_dpt=self.sharpest_dpt(
-                    state.accommodation_dpt, pupil_diameter_mm=pupil_mm
-                ),
-                notes=self.focus_notes(focus_dpt, pupil_diameter_mm=pupil_mm),
-            )
-            for focus_dpt, state in zip(
-                focuses_dpt.tolist(), self.states_at(used_dpt), strict=True
-            )
-        ]
 
     def states_at(self, accommodations_dpt: ArrayLike) -> list[FocusedEye]:
         """Return states (P,) at accommodations within the amplitude, traced in a batch.

@@ -5,11 +5,18 @@ pupil too: spherical aberration moves the sharpest distance as the pupil opens, 
 method requires the pupil diameter.
 """
 
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from estimator.corrections.rings import Rings
+from estimator.eye.focus_table import FocusTable
+from estimator.optics.surfaces import EyeSurfaces
 from estimator.optics.vergence import ObjectVergence
 
 OUT_OF_REACH_DPT = 0.01
@@ -132,6 +139,146 @@ class Focusing(ABC):
             f"focus {focus_dpt:g} dpt {reached}: "
             f"accommodation stops at {added_dpt:.3g} dpt",
         )
+
+
+@dataclass(frozen=True)
+class FocusedSurfaces:
+    """One eye at one focus.
+
+    ``focus_dpt`` is the focus actually reached; ``notes`` report a difference from the
+    requested one.
+    """
+
+    surfaces: EyeSurfaces
+    focus_dpt: float
+    accommodation_dpt: float
+    notes: tuple[str, ...]
+
+
+State = TypeVar("State", bound=FocusedSurfaces)
+
+
+class TabulatedFocusing(Focusing, Generic[State]):
+    """A `Focusing` eye that is traced, with a table of its refraction.
+
+    *Accommodation* identifies a state of the lens by the change of refraction at
+    ``pupil_diameter_mm``.  Through another pupil the change differs.
+
+    Attributes
+    ----------
+    pupil_diameter_mm : float
+        The eye's own pupil, at which accommodation is measured.
+    """
+
+    pupil_diameter_mm: float
+
+    _age_amplitude_dpt: float
+    _correction_dpt: tuple[float, float]
+    _table: FocusTable | None = None
+
+    @abstractmethod
+    def _new_focus_table(self) -> FocusTable:
+        """Trace the refraction without correction over pupil and accommodation."""
+
+    @abstractmethod
+    def states_at(self, accommodations_dpt: ArrayLike) -> Sequence[State]:
+        """Return states (P,) at accommodations within the amplitude.
+
+        Their ``focus_dpt`` is that of the eye's own pupil.
+        """
+
+    @property
+    def _focus_table(self) -> FocusTable:
+        """Refraction without correction over pupil and accommodation, traced lazily.
+
+        It is not a cached property, so that storing an eye stores the table too.
+        """
+        if self._table is None:
+            self._table = self._new_focus_table()
+        return self._table
+
+    def accommodation_dpt(
+        self, focus_dpt: float, *, pupil_diameter_mm: float | None = None
+    ) -> float:
+        """Return the accommodation for a focus, by default at the eye's own pupil."""
+        pupil_mm = pupil_diameter_mm or self.pupil_diameter_mm
+        return super().accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
+
+    def refraction_at_dpt(
+        self, *, pupil_diameter_mm: float, accommodation_dpt: float
+    ) -> float:
+        """Return least-squares M at 555 nm through a pupil, at an accommodation."""
+        bare_dpt = self._focus_table.refraction_dpt(
+            pupil_mm=pupil_diameter_mm, accommodation_dpt=accommodation_dpt
+        )
+        return bare_dpt - self._taken_off_dpt(pupil_diameter_mm)
+
+    def _taken_off_dpt(self, pupil_diameter_mm: float) -> float:
+        """Return M of the correction through a pupil."""
+        at_center_dpt, per_mm2 = self._correction_dpt
+        return at_center_dpt + per_mm2 * (pupil_diameter_mm / 2.0) ** 2
+
+    def accommodation_for_dpt(
+        self, refraction_dpt: float, *, pupil_diameter_mm: float
+    ) -> float:
+        """Return the accommodation in reach whose M at a pupil is nearest to this."""
+        relaxed_dpt = self.refraction_at_dpt(
+            pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=0.0
+        )
+        least_dpt = relaxed_dpt - self._age_amplitude_dpt
+        return self._focus_table.accommodation_dpt(
+            pupil_mm=pupil_diameter_mm,
+            refraction_dpt=max(refraction_dpt, least_dpt)
+            + self._taken_off_dpt(pupil_diameter_mm),
+        )
+
+    def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
+        """Return the accommodation for the near point through a pupil."""
+        return self.accommodation_for_dpt(
+            -math.inf, pupil_diameter_mm=pupil_diameter_mm
+        )
+
+    def focused(
+        self, focus_dpt: float, *, pupil_diameter_mm: float | None = None
+    ) -> State:
+        """Return the eye focused as near to ``focus_dpt`` as possible."""
+        return self.focused_at([focus_dpt], pupil_diameter_mm=pupil_diameter_mm)[0]
+
+    def focused_at(
+        self, focuses_dpt: ArrayLike, *, pupil_diameter_mm: float | None = None
+    ) -> list[State]:
+        """Focus at many distances in one batch of traces.
+
+        Parameters
+        ----------
+        pupil_diameter_mm : float, optional
+            Pupil through which they are sharpest; the eye's own if None.
+
+        Raises
+        ------
+        ValueError
+            A distance is not finite.
+        """
+        focuses_dpt = np.atleast_1d(np.asarray(focuses_dpt, dtype=np.float64))
+        if not np.all(np.isfinite(focuses_dpt)):
+            raise ValueError(f"focus {focuses_dpt} dpt: must be finite; infinity is 0")
+        pupil_mm = pupil_diameter_mm or self.pupil_diameter_mm
+        accommodations_dpt = [
+            self.accommodation_dpt(f, pupil_diameter_mm=pupil_mm)
+            for f in focuses_dpt.tolist()
+        ]
+        return [
+            replace(
+                state,
+                focus_dpt=self.sharpest_dpt(
+                    state.accommodation_dpt, pupil_diameter_mm=pupil_mm
+                ),
+                notes=self.focus_notes(focus_dpt, pupil_diameter_mm=pupil_mm),
+            )
+            for focus_dpt, state in zip(
+                focuses_dpt.tolist(), self.states_at(accommodations_dpt), strict=True
+            )
+        ]
 
 
 class FocusingEye(Focusing):

@@ -131,20 +131,67 @@ def seen_refraction_of_vectors(
     """
     packed = pack_eyes(vectors, retina=retina)
     indices = eye_indices(REFERENCE_WAVELENGTH_NM)
+    return seen_refraction_dpt(
+        packed,
+        indices,
+        pupil_z_mm=entrance_pupils_mm(packed, indices),
+        pupil_diameter_mm=pupil_diameter_mm,
+        added_um=added_um,
+    )
+
+
+def seen_refraction_dpt(
+    packed: NDArray[np.float64],
+    indices: NDArray[np.float64],
+    *,
+    pupil_z_mm: ArrayLike,
+    pupil_diameter_mm: ArrayLike,
+    added_um: NDArray[np.float64] | float = 0.0,
+) -> NDArray[np.float64]:
+    """Return `seen_refraction_of_vectors` of packed eyes (P, ...).
+
+    ``indices`` is the index row of all of them at 555 nm, ``pupil_z_mm`` the position
+    of their entrance pupils.
+    """
     pupils_mm = np.broadcast_to(
-        np.asarray(pupil_diameter_mm, dtype=np.float64), (len(vectors),)
+        np.asarray(pupil_diameter_mm, dtype=np.float64), (len(packed),)
     )
     found = eyes_aberrations(
         packed,
         indices,
         stop_diameters_mm=pupils_mm / magnifications(packed, indices),
-        pupil_z_mm=entrance_pupils_mm(packed, indices),
+        pupil_z_mm=pupil_z_mm,
     )
     polynomial_um = polynomial_in_mm(found.zernike_um, found.zernike_radius_mm)
     rim_mm = rim_from_ellipse(found.ellipse_mm)
     scale = pupils_mm / 2.0 / circumscribed_radius_mm(rim_mm)
     seen_dpt = pupil_refraction_dpt(polynomial_um + added_um, rim_mm * scale[:, None])
     return np.where(found.open_ratio > OPEN_RATIO, seen_dpt, np.nan)
+
+
+def refraction_of_packed(
+    packed: NDArray[np.float64],
+    indices: NDArray[np.float64],
+    *,
+    pupil_z_mm: ArrayLike,
+    pupil_diameter_mm: float,
+) -> NDArray[np.float64]:
+    """Return least-squares M (P,), dpt, of packed eyes (P, ...) on axis at 555 nm.
+
+    Parameters
+    ----------
+    indices : (P, n)
+        Index row of each eye.
+    pupil_z_mm : (P,)
+        Plane of the circle, such as the entrance pupil.
+    pupil_diameter_mm : float
+        Circle of the fit, filled regardless of the stop.
+    """
+    radius_mm = pupil_diameter_mm / 2.0
+    zernike_um, _ = on_axis_zernike(
+        packed, indices, zernike_radius_mm=radius_mm, pupil_z_mm=pupil_z_mm
+    )
+    return -SPHERE_PER_C20 * zernike_um[:, C20] / radius_mm**2
 
 
 def on_axis_zernike_um(

@@ -25,12 +25,26 @@ from estimator.profiles.correction_bodies import (
     SphereDpt,
     VertexMm,
 )
+from estimator.profiles.surface_bodies import (
+    MAX_STATES,
+    STATES_ALLOWED,
+    Indices,
+    Media,
+    RetinalSurfaceBody,
+    StateBody,
+    StopDepthMm,
+    Surfaces,
+)
 from estimator.profiles.validation import ALLOWED
 
 PRESETS: dict[str, dict[str, Any]] = json.loads(
     (Path(__file__).parent / "presets.json").read_text(encoding="utf-8")
 )["presets"]
 """Bodies of the preset eyes, of kind ``zernike``, by name."""
+
+PUBLISHED = Path(__file__).parent / "published"
+PUBLISHED_NAMES = tuple(sorted(path.stem for path in PUBLISHED.glob("*.json")))
+"""Names of the schematic eyes of `published`."""
 
 MAX_MEASUREMENTS = 100
 MAX_COEFFICIENT_UM = 200.0
@@ -120,8 +134,9 @@ class CommonBody(Body, kw_only=True):
             Literal["people", "model"],
             Meta(
                 description="`people` (default): off-axis wavefronts of the measured "
-                "population; `model`: those of the surfaces. Kind `eye` and profiles "
-                "with a `retina` always use `model`"
+                "population; `model`: those of the surfaces. Kinds `eye`, "
+                "`surfaces` and `published`, and profiles with a `retina`, always use "
+                "`model`"
             ),
         ]
         | UnsetType
@@ -239,4 +254,43 @@ class EyeBody(CommonBody, kw_only=True, tag_field="kind", tag="eye"):
     ]
 
 
-ProfileBody = PresetBody | PrescriptionBody | ZernikeBody | ZernikeSetBody | EyeBody
+class SurfacesBody(CommonBody, kw_only=True, tag_field="kind", tag="surfaces"):
+    """An eye by its surfaces and media."""
+
+    surfaces: Surfaces
+    stop_z_mm: StopDepthMm
+    # every eye of this kind has a retina of its own
+    retina: Annotated[  # type: ignore[assignment]
+        RetinalSurfaceBody, Meta(description="where light is received")
+    ]
+    indices: Indices = None
+    media: Media = None
+    states: (
+        Annotated[
+            list[StateBody],
+            Meta(
+                min_length=1,
+                max_length=MAX_STATES,
+                description="the eye while it accommodates; none: its focus is fixed",
+                extra={ALLOWED: STATES_ALLOWED},
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
+
+
+class PublishedBody(CommonBody, kw_only=True, tag_field="kind", tag="published"):
+    """A schematic eye from the literature by its name."""
+
+    name: Literal[PUBLISHED_NAMES]  # type: ignore[valid-type]  # names of files
+
+
+ProfileBody = (
+    PresetBody
+    | PrescriptionBody
+    | ZernikeBody
+    | ZernikeSetBody
+    | EyeBody
+    | SurfacesBody
+    | PublishedBody
+)

@@ -78,14 +78,14 @@ def _check(value: object, kind: inspect.Type, path: str) -> None:
     """Raise an error at the first field of ``value`` that is not of type ``kind``."""
     if isinstance(kind, inspect.Metadata):
         allowed = (kind.extra or {}).get(ALLOWED)
-        if allowed is not None and not _is_container(value, kind.type):
+        if allowed is not None and not _accepts(value, kind.type):
             raise ProfileError(path, _mismatch(value, kind.type), allowed)
         _check(value, kind.type, path)
     elif isinstance(kind, inspect.UnionType):
         _check_union(value, kind, path)
     elif isinstance(kind, inspect.StructType):
         _check_object(value, kind, path)
-    elif isinstance(kind, inspect.FloatType):
+    elif isinstance(kind, inspect.FloatType | inspect.IntType):
         _check_number(value, kind, path)
     elif isinstance(kind, inspect.BoolType):
         if not isinstance(value, bool):
@@ -109,9 +109,9 @@ def _check_union(value: object, kind: inspect.UnionType, path: str) -> None:
         return
     members = {m.tag: m for m in kind.types if isinstance(m, inspect.StructType)}
     if None in members or not members:
-        for member in kind.types:
-            if not isinstance(member, inspect.NoneType):
-                _check(value, member, path)
+        others = [m for m in kind.types if not isinstance(m, inspect.NoneType)]
+        fitting = [m for m in others if _accepts(value, m)]
+        _check(value, (fitting or others)[0], path)
         return
     data = _object(value, path)
     prefix = f"{path}." if path else ""
@@ -149,7 +149,14 @@ def _check_object(value: object, kind: inspect.StructType, path: str) -> None:
             )
 
 
-def _check_number(value: object, kind: inspect.FloatType, path: str) -> None:
+def _check_number(
+    value: object, kind: inspect.FloatType | inspect.IntType, path: str
+) -> None:
+    if isinstance(kind, inspect.IntType) and isinstance(value, float):
+        if not value.is_integer():
+            raise ProfileError(
+                path, f"{_shown(value)} is not an integer", allowed_values(kind)
+            )
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ProfileError(
             path, f"{_shown(value)} is not a number", allowed_values(kind)
@@ -173,7 +180,7 @@ def _check_list(
     kind: inspect.ListType | inspect.TupleType | inspect.VarTupleType,
     path: str,
 ) -> None:
-    if not _is_container(value, kind):
+    if not _accepts(value, kind):
         raise ProfileError(path, _mismatch(value, kind), allowed_values(kind))
     assert isinstance(value, list)
     for index, item in enumerate(value):
@@ -185,10 +192,22 @@ def _check_list(
         _check(item, item_type, f"{path}.{index}")
 
 
-def _is_container(value: object, kind: inspect.Type) -> bool:
-    """Return whether ``value`` is an object or a list of an allowed length."""
+def _accepts(value: object, kind: inspect.Type) -> bool:
+    """Return whether ``value`` is of the JSON type of ``kind``, lists of its length."""
+    if isinstance(kind, inspect.Metadata):
+        return _accepts(value, kind.type)
+    if isinstance(kind, inspect.UnionType):
+        return any(_accepts(value, member) for member in kind.types)
+    if isinstance(kind, inspect.NoneType):
+        return value is None
+    if isinstance(kind, inspect.FloatType):
+        return isinstance(value, int | float) and not isinstance(value, bool)
     if isinstance(kind, inspect.StructType | inspect.DictType):
         return isinstance(value, dict)
+    if not isinstance(
+        kind, inspect.ListType | inspect.TupleType | inspect.VarTupleType
+    ):
+        return True
     low, high = _lengths(kind)
     return isinstance(value, list) and low <= len(value) <= high
 
@@ -198,7 +217,8 @@ def _mismatch(value: object, kind: inspect.Type) -> str:
         return f"{_shown(value)} is not an object"
     if isinstance(value, list):
         return f"{_shown(value)} has {len(value)} elements"
-    return f"{_shown(value)} is not a list"
+    is_list = isinstance(kind, inspect.ListType | inspect.VarTupleType)
+    return f"{_shown(value)} is not {'a list' if is_list else 'valid'}"
 
 
 def _lengths(kind: inspect.Type) -> tuple[int, int]:
@@ -221,6 +241,13 @@ def allowed_values(kind: inspect.Type) -> str:
         return (kind.extra or {}).get(ALLOWED) or allowed_values(kind.type)
     if isinstance(kind, inspect.FloatType):
         return f"a number from {kind.ge:g} to {kind.le:g}"
+    if isinstance(kind, inspect.IntType):
+        return f"an integer from {kind.ge:g} to {kind.le:g}"
+    if isinstance(kind, inspect.UnionType):
+        return " or ".join(
+            "null" if isinstance(member, inspect.NoneType) else allowed_values(member)
+            for member in kind.types
+        )
     if isinstance(kind, inspect.LiteralType):
         return "one of " + ", ".join(sorted(map(str, kind.values)))
     if isinstance(kind, inspect.TupleType | inspect.VarTupleType):

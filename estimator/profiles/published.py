@@ -2,18 +2,18 @@
 
 A file names the eye (``title``), its publication (``reference``), the places from which
 the numbers were taken (``sources``), the wavelength of its figures, the eye in the
-format of `explicit`, and published figures of the eye, each with its own source.
+format of kind ``surfaces``, and published figures of the eye, each with its own source.
 """
 
 import json
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
-from estimator.eye.explicit import parse_explicit_eye
+from estimator.eye.surface_model import SurfaceModel
 from estimator.optics.surfaces import EyeSurfaces
-
-FOLDER = Path(__file__).parent / "published"
+from estimator.profiles.bodies import PUBLISHED, PUBLISHED_NAMES, SurfacesBody
+from estimator.profiles.surfaces import surface_model
+from estimator.profiles.validation import convert
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class PublishedEye:
         What the sources leave open.
     wavelength_nm : float
         Wavelength of the figures.
-    surfaces : EyeSurfaces
+    model : SurfaceModel
     figures : tuple of Figure
     """
 
@@ -59,13 +59,13 @@ class PublishedEye:
     sources: tuple[str, ...]
     notes: str
     wavelength_nm: float
-    surfaces: EyeSurfaces
+    model: SurfaceModel
     figures: tuple[Figure, ...]
 
-
-def published_names() -> tuple[str, ...]:
-    """Return the names of the eyes, in alphabetical order."""
-    return tuple(sorted(path.stem for path in FOLDER.glob("*.json")))
+    @property
+    def surfaces(self) -> EyeSurfaces:
+        """Return the relaxed eye."""
+        return self.model.relaxed
 
 
 @cache
@@ -75,18 +75,18 @@ def published_eye(name: str) -> PublishedEye:
     Raises
     ------
     ValueError
-        The name is none of `published_names`.
+        The name is none of `bodies.PUBLISHED_NAMES`.
     """
-    if name not in published_names():
-        known = ", ".join(published_names())
+    if name not in PUBLISHED_NAMES:
+        known = ", ".join(PUBLISHED_NAMES)
         raise ValueError(f"published eye '{name}': allowed are {known}")
-    data = json.loads((FOLDER / f"{name}.json").read_text(encoding="utf-8"))
+    data = json.loads((PUBLISHED / f"{name}.json").read_text(encoding="utf-8"))
     return PublishedEye(
         title=data["title"],
         reference=data["reference"],
         sources=tuple(data["sources"]),
         notes=data.get("notes", ""),
         wavelength_nm=data["wavelength_nm"],
-        surfaces=parse_explicit_eye(data["eye"]),
+        model=surface_model(convert(data["eye"], SurfacesBody)),
         figures=tuple(Figure(**figure) for figure in data["figures"]),
     )

@@ -1,0 +1,199 @@
+"""Eyes by their surfaces: from the types of `surface_bodies` to a `SurfaceModel`."""
+
+import math
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.eye.checked_fields import ProfileError
+from estimator.eye.surface_model import StatesDiffer, SurfaceModel
+from estimator.optics.media import MEDIA
+from estimator.optics.surfaces import (
+    EyeSurfaces,
+    Retina,
+    Surface,
+    check_eye,
+    media_indices,
+)
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.optics.zernike import N_TERMS
+from estimator.profiles import surface_bodies
+from estimator.profiles.bodies import SurfacesBody
+from estimator.profiles.surface_bodies import RetinalSurfaceBody, StateBody, SurfaceBody
+
+N_CHECKED_BETWEEN = 4
+"""Eyes between neighboring states that are checked as well."""
+
+
+def surface_model(body: SurfacesBody) -> SurfaceModel:
+    """Return the eye of a body.
+
+    Raises
+    ------
+    ProfileError
+        The surfaces cannot be traced, or the states do not fit together.
+    """
+    relaxed = _eye(body, body, path="")
+    if body.states is msgspec.UNSET:
+        return SurfaceModel(relaxed)
+    states = body.states
+    nominal_dpt = tuple(state.accommodation_dpt for state in states)
+    if any(b <= a for a, b in pairwise(nominal_dpt)):
+        raise ProfileError(
+            "states",
+            f"accommodations {', '.join(f'{a:g}' for a in nominal_dpt)} dpt",
+            "ascending accommodations",
+        )
+    model = SurfaceModel(
+        relaxed,
+        nominal_dpt,
+        tuple(
+            _eye(state, body, path=f"states.{number}.")
+            for number, state in enumerate(states)
+        ),
+    )
+    _check_between(model)
+    return model
+
+
+def _check_between(model: SurfaceModel) -> None:
+    """Raise where the eye between two states cannot be traced."""
+    nodes = [0.0, *model.accommodations_dpt]
+    steps = np.arange(len(nodes), step=1.0 / (N_CHECKED_BETWEEN + 1))
+    for dpt in np.interp(steps, np.arange(len(nodes)), nodes).tolist():
+        try:
+            _check_traceable(model.at(dpt))
+        except StatesDiffer as error:
+            raise ProfileError(
+                "states", str(error), "states with the same parts"
+            ) from None
+        except ValueError as error:
+            raise ProfileError(
+                "states", f"at {dpt:.3g} dpt, {error}", "surfaces in order"
+            ) from None
+
+
+def _eye(
+    state: SurfacesBody | StateBody, body: SurfacesBody, *, path: str
+) -> EyeSurfaces:
+    """Return the eye in a state; what the state omits is as in the body."""
+
+    def given(name: str) -> Any:
+        value = getattr(state, name)
+        return getattr(body, name) if value is msgspec.UNSET else value
+
+    indices, bodies_of_media = given("indices"), given("media")
+    media = bodies_of_media and {
+        name: _built(medium, f"{path}media.{name}")
+        for name, medium in bodies_of_media.items()
+    }
+    known = list(dict.fromkeys((*MEDIA, *(indices or {}), *(media or {}))))
+    eye = EyeSurfaces(
+        surfaces=tuple(
+            _surface(surface, f"{path}surfaces.{number}.", known)
+            for number, surface in enumerate(state.surfaces)
+        ),
+        stop_z_mm=given("stop_z_mm"),
+        retina=_retina(body.retina),
+        indices=indices,
+        media=media,
+    )
+    try:
+        _check_traceable(eye)
+    except ValueError as error:
+        allowed = "surfaces in order"
+        raise ProfileError(f"{path}surfaces", str(error), allowed) from None
+    return eye
+
+
+def _check_traceable(eye: EyeSurfaces) -> None:
+    from estimator.optics.raytrace import check_order  # compiled: loads slowly
+
+    check_eye(eye)
+    check_order(eye)
+    if eye.media:
+        media_indices(eye, REFERENCE_WAVELENGTH_NM)
+
+
+def _surface(body: SurfaceBody, path: str, media: list[str]) -> Surface:
+    if body.medium_after not in media:
+        raise ProfileError(
+            f"{path}medium_after",
+            f"{body.medium_after!r:.60} is unknown",
+            "one of " + ", ".join(media),
+        )
+    clear_mm = body.clear_radius_mm
+    return Surface(
+        **_shape(body, path),
+        medium_after=body.medium_after,
+        offset_mm=_offsets(body.offset_mm, path),
+        offset_radius_mm=body.offset_radius_mm,
+        clear_radius_mm=math.inf if clear_mm is None else clear_mm,
+    )
+
+
+def _retina(body: RetinalSurfaceBody) -> Retina:
+    return Retina(**_shape(body, "retina."))
+
+
+def _shape(body: RetinalSurfaceBody, path: str) -> dict[str, Any]:
+    return {
+        "radius_mm": _radii(body.radius_mm, path),
+        "conic_constant": body.conic_constant,
+        "z_mm": body.z_mm,
+        "rotation_deg": body.rotation_deg,
+        "decentration_mm": body.decentration_mm,
+        "tilt_deg": body.tilt_deg,
+        "form": body.form and _built(body.form, f"{path}form"),
+    }
+
+
+def _radii(value: float | list[float | None] | None, path: str) -> tuple[float, float]:
+    """Return both radii; None is a plane."""
+    radii = value if isinstance(value, list) else [value, value]
+    low, high = surface_bodies.SMALLEST_RADIUS_MM, surface_bodies.NUMBER_LIMIT
+    if not all(r is None or low <= abs(r) <= high for r in radii) or len(radii) != 2:
+        raise ProfileError(
+            f"{path}radius_mm",
+            f"{value!r:.60} is out of range",
+            surface_bodies.RADIUS_ALLOWED,
+        )
+    first, second = (math.inf if r is None else float(r) for r in radii)
+    return first, second
+
+
+def _offsets(value: list[float] | None, path: str) -> NDArray[np.float64] | None:
+    if value is None:
+        return None
+    if len(value) not in (N_TERMS - 1, N_TERMS):
+        raise ProfileError(
+            f"{path}offset_mm",
+            f"has {len(value)} entries",
+            surface_bodies.OFFSETS_ALLOWED,
+        )
+    return np.array([0.0] * (N_TERMS - len(value)) + value)
+
+
+def _built(body: msgspec.Struct, path: str) -> Any:
+    """Return the form or medium of a body.
+
+    Raises
+    ------
+    ProfileError
+        Fields contradict each other; ``path`` is that of the body.
+    """
+    kind = surface_bodies.KINDS[cast(str, body.__struct_config__.tag)]
+    values: Mapping[str, Any] = {
+        name: _built(value, f"{path}.{name}")
+        if isinstance(value, msgspec.Struct)
+        else value
+        for name, value in ((n, getattr(body, n)) for n in body.__struct_fields__)
+    }
+    try:
+        return kind(**values)
+    except ValueError as error:
+        raise ProfileError(path, str(error), "see the other fields") from None
