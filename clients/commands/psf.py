@@ -18,7 +18,6 @@ from clients.commands.console import (
 from clients.commands.wavefront import (
     FIELD_LIMITS_DEG,
     ellipse_facts,
-    explicit_body,
     load_surfaces,
 )
 
@@ -71,8 +70,7 @@ def psf(
     eye: Annotated[
         str,
         typer.Argument(
-            help="Preset name, a .json, .abp or .csv profile, or a .json file with "
-            "surfaces or the 45 parameters."
+            help="Preset or schematic eye by name, or a .json, .abp or .csv profile."
         ),
     ],
     pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")],
@@ -129,7 +127,7 @@ def psf(
     from filter_service.image_files import check_output
 
     check_output(out, (".npy", ".png"))
-    is_traced = h_deg != 0.0 or v_deg != 0.0 or explicit_body(eye) is not None
+    is_traced = h_deg != 0.0 or v_deg != 0.0 or _has_surfaces(eye)
     view = {
         "pupil_diameter_mm": pupil_mm,
         "object_dpt": object_dpt,
@@ -164,6 +162,12 @@ def psf(
         _report(summary)
 
 
+def _has_surfaces(source: str) -> bool:
+    from estimator.profiles.files import load_profile
+
+    return load_profile(source).surfaces is not None
+
+
 def _measured(source: str, focus_dpt: float | None, **view: Any) -> _State:
     from estimator.profiles.files import load_profile
     from estimator.profiles.measured_wavefront import MeasuredWavefront
@@ -190,11 +194,8 @@ def _traced(source: str, focus_dpt: float | None, **view: Any) -> _State:
     from estimator.profiles.files import load_profile
     from estimator.wavefront.aberrations import wavefront_aberrations
 
-    is_explicit = explicit_body(source) is not None
-    if focus_dpt is None and not is_explicit:
-        focus_dpt = 0.0
     name, surfaces, notes = load_surfaces(
-        source, focus_dpt, pupil_mm=view["pupil_diameter_mm"]
+        source, focus_dpt or 0.0, pupil_mm=view["pupil_diameter_mm"]
     )
     found = wavefront_aberrations(surfaces, **view)
     if not found.rms_residual_um >= 0.0:
@@ -208,7 +209,7 @@ def _traced(source: str, focus_dpt: float | None, **view: Any) -> _State:
         zernike_radius_mm=found.zernike_radius_mm,
         pupil_diameter_mm=view["pupil_diameter_mm"],
         ellipse=ellipse_facts(found.pupil_ellipse),
-        eye_side=None if is_explicit else load_profile(source).eye_side,
+        eye_side=load_profile(source).eye_side,
         notes=(*notes, *found.notes),
     )
 

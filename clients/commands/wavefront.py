@@ -1,7 +1,6 @@
 """`ocufilter wavefront`: ray-trace an eye's aberrations in one field direction."""
 
 from enum import StrEnum
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -36,8 +35,8 @@ def wavefront(
     eye: Annotated[
         str,
         typer.Argument(
-            help="A .json file with surfaces or the 45 parameters, a profile file, or "
-            "a preset name.  A measurement is converted to an eye model first."
+            help="Preset or schematic eye by name, or a .json, .abp or .csv profile.  "
+            "A measurement is converted to an eye model first."
         ),
     ],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength, nm.")],
@@ -136,22 +135,6 @@ def _check(
     check_range("--object-dpt", object_dpt, OBJECT_LIMITS_DPT)
 
 
-def explicit_body(source: str) -> dict[str, Any] | None:
-    """Return the content of a JSON file with surfaces; None for other sources."""
-    from estimator.bounded_files import InvalidFile, read_json
-    from estimator.eye.explicit import is_explicit_eye
-    from estimator.profiles.files import MAX_PROFILE_BYTES
-
-    path = Path(source)
-    if path.suffix.lower() != ".json" or not path.is_file():
-        return None
-    try:
-        body = read_json(path, max_bytes=MAX_PROFILE_BYTES)
-    except InvalidFile:
-        return None  # the profile reader reports the problem
-    return body if is_explicit_eye(body) else None
-
-
 def load_surfaces(
     source: str,
     focus_dpt: float | None,
@@ -170,28 +153,16 @@ def load_surfaces(
     pupil_mm, stop_mm : float, optional
         Diameter of the entrance pupil or of the iris.
     """
-    body = explicit_body(source)
-    if body is not None:
-        from estimator.eye.explicit import parse_explicit_eye
-
-        if focus_dpt is not None:
-            raise ValueError(
-                "--focus-dpt: an eye given by its surfaces does not accommodate; "
-                "allowed: a profile, or the 45 parameters"
-            )
-        return str(body.get("name", Path(source).name)), parse_explicit_eye(body), ()
-
-    from estimator.estimate.estimation import estimate_eye
-    from estimator.eye.assembly import eye_surfaces
+    from estimator.estimate.given_surfaces import eye_model
     from estimator.profiles.files import load_profile
     from estimator.wavefront.aberrations import pupil_magnification
 
     profile = load_profile(source)
-    found = estimate_eye(profile)
+    found = eye_model(profile)
     notes = found.notes
     if profile.correction is not None:
         notes = (*notes, "the coefficients do not include the correction")
-    relaxed = eye_surfaces(found.parameters, retina=found.retina)
+    relaxed = found.relaxed
     if focus_dpt is None:
         return profile.name, relaxed, notes
     if stop_mm is not None:

@@ -14,7 +14,7 @@ def draw_cross_section(axes: Axes, study: EyeStudy) -> None:
     """Draw an eye focused far, with rays from infinity, without its correction."""
     focused = study.found.focused(0.0)
     draw_section(axes, focused.surfaces, pupil_diameter_mm=FIELD_PUPIL_MM)
-    length_mm = focused.parameters.eye_length_mm
+    length_mm = study.found.eye_length_mm
     dress(
         axes,
         title=f"Vertical section, {length_mm:.2f} mm long",

@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from clients.figures.acuity import AcuityByDistance, acuity_by_distance
 from clients.figures.pupil_wavefront import PupilWavefront
 from estimator import (
-    EstimatedEye,
+    EyeModel,
     EyeOptics,
     EyeProfile,
     FieldTable,
     Lenslets,
     Rings,
-    estimate_eye,
+    eye_model,
     field_table,
     load_profile,
     parse_profile,
@@ -65,7 +65,7 @@ class EyeStudy:
     ----------
     profile : EyeProfile
         Profile as given.
-    found : EstimatedEye
+    found : EyeModel
     optics : EyeOptics
         Optics on the axis, at 555 nm, in all states of focus.
     notes : tuple of str
@@ -73,7 +73,7 @@ class EyeStudy:
     """
 
     profile: EyeProfile
-    found: EstimatedEye
+    found: EyeModel
     optics: EyeOptics
     notes: tuple[str, ...]
 
@@ -99,7 +99,7 @@ class EyeStudy:
             wavelengths_nm=(WAVELENGTH_NM,),
             progress=progress,
         )
-        return cls(parsed, estimate_eye(parsed), optics, notes)
+        return cls(parsed, eye_model(parsed), optics, notes)
 
     @property
     def name(self) -> str:

@@ -203,7 +203,7 @@ def eye_numbers(study: EyeStudy) -> dict[str, Any]:
     """Return the numbers of one eye, ready for JSON."""
     profile, found = study.profile, study.found
     worn = worn_lens(profile)
-    length_mm = found.parameters.eye_length_mm
+    length_mm = found.eye_length_mm
     return {
         "profile": {
             "name": profile.name,

@@ -8,7 +8,7 @@ from clients.report.blocks import Table
 from clients.report.correction_text import correction_text
 from clients.report.numbers import is_beyond_measured
 from clients.report.sources import Citations
-from estimator import Prescription, WornLens
+from estimator import GivenSurfaces, Prescription, WornLens
 
 WELL_DETERMINED = 0.5
 """Fraction of the prior's variance that a measurement must remove."""
@@ -25,7 +25,7 @@ def provenance_table(study: EyeStudy, cite: Citations) -> Table:
         _periphery(study, cite),
         _accommodation(study, cite),
         _shape(study, cite),
-        ("Color", TYPICAL, f"longitudinal color of measured eyes {cite('color')}"),
+        _color(study, cite),
         _media(study, cite),
         _nerves(cite),
         _worn(study),
@@ -42,7 +42,7 @@ def _refraction(study: EyeStudy) -> tuple[str, ...]:
     profile = study.profile
     if profile.kind == "prescription":
         return ("Refraction", STATED, "the prescription, as powers at the cornea")
-    if profile.eye is not None:
+    if profile.is_given:
         return ("Refraction", STATED, "traced through the eye that the profile gives")
     return ("Refraction", MEASURED, f"second order of {_measurement(study)}")
 
@@ -59,7 +59,7 @@ def _measurement(study: EyeStudy) -> str:
 
 def _higher_orders(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
     profile = study.profile
-    if profile.eye is not None:
+    if profile.is_given:
         return ("Higher orders", STATED, "of the eye that the profile gives")
     if profile.kind != "prescription":
         return ("Higher orders", MEASURED, f"orders 3 to 6 of {_measurement(study)}")
@@ -105,6 +105,9 @@ def _accommodation(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
     profile, amplitude_dpt = study.profile, study.found.amplitude_dpt
     if _replaces_lens(profile.correction):
         return ("Accommodation", STATED, "none: the eye's own lens is gone")
+    if profile.surfaces is not None and profile.age_years is None:
+        text = f"{amplitude_dpt:.1f} dpt, by the states that the profile gives"
+        return ("Accommodation", STATED, text)
     if profile.age_years is None and not profile.add_dpt:
         text = f"age not given: a young eye's {amplitude_dpt:.1f} dpt"
         return ("Accommodation", TYPICAL, text)
@@ -122,15 +125,24 @@ def _replaces_lens(lens: Prescription | None) -> bool:
 
 
 def _shape(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
-    if study.profile.eye is not None:
+    found = study.found
+    if isinstance(found, GivenSurfaces):
+        return ("Shape of the eye", STATED, "the surfaces of the profile")
+    if study.profile.is_given:
         return ("Shape of the eye", STATED, "the 45 parameters of the profile")
-    ratios = study.found.determined_ratio.values()
+    ratios = found.determined_ratio.values()
     count = sum(ratio > WELL_DETERMINED for ratio in ratios)
     text = (
         f"{count} of 45 parameters follow from the wavefront for the most part; the "
         f"others are those of a mean eye of this refraction {cite('csoba', 'length')}"
     )
     return ("Shape of the eye", TYPICAL, text)
+
+
+def _color(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
+    if isinstance(study.found, GivenSurfaces):
+        return ("Color", STATED, "dispersion of the media that the profile gives")
+    return ("Color", TYPICAL, f"longitudinal color of measured eyes {cite('color')}")
 
 
 def _media(study: EyeStudy, cite: Citations) -> tuple[str, ...]:

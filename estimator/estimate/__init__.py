@@ -1,6 +1,7 @@
 """Estimation of an eye from a measurement.
 
 estimation         entry point: refined, by network, or by pattern search
+given_surfaces     an eye that a profile gives by its surfaces
 problem            compared coefficients and the model of them
 prior              prior distribution of eyes, by refraction
 bounded_fit        least squares with bounds

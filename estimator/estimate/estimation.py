@@ -22,6 +22,7 @@ from estimator.estimate.plausible import unusual
 from estimator.estimate.problem import EstimationProblem
 from estimator.estimate.table import table_vectors
 from estimator.eye.accommodation import AccommodatingEye, FocusedEye
+from estimator.eye.assembly import eye_surfaces
 from estimator.eye.parameters import (
     PARAMETER_NAMES,
     EyeParameters,
@@ -124,7 +125,7 @@ class EstimatedEye:
         This is the fraction of the prior variance that a measurement with 0.01 um noise
         per coefficient removes: 0 is the prior alone, 1 is known.
         """
-        if self.profile.eye is not None:
+        if self.profile.is_given:
             return dict.fromkeys(PARAMETER_NAMES, 1.0)
         problem = EstimationProblem(self.profile)
         return problem.determined_ratio(self.parameters.to_vector())
@@ -134,6 +135,16 @@ class EstimatedEye:
         return MeasuredResidual.of(
             self.parameters, self.profile, wavelengths_nm=wavelengths_nm
         )
+
+    @property
+    def relaxed(self) -> "EyeSurfaces":
+        """Return the surfaces of the relaxed eye."""
+        return eye_surfaces(self.parameters, retina=self.retina)
+
+    @property
+    def eye_length_mm(self) -> float:
+        """Return the length of the eye."""
+        return self.parameters.eye_length_mm
 
     @cached_property
     def accommodating(self) -> AccommodatingEye:
@@ -220,7 +231,7 @@ def estimate_eye(
     Raises
     ------
     ValueError
-        The method or a start is unknown.
+        The method or a start is unknown, or the profile gives the eye by its surfaces.
     WeightsMissing, DamagedWeights
         The weights of ``network`` are missing or damaged.
     """
@@ -228,6 +239,11 @@ def estimate_eye(
         raise ValueError(f"method '{method}': allowed are {', '.join(METHODS)}")
     if not starts or not set(starts) <= set(STARTS):
         raise ValueError(f"starts {starts}: allowed are {', '.join(STARTS)}")
+    if profile.surfaces is not None:
+        raise ValueError(
+            f"profile kind '{profile.kind}' gives the eye by its surfaces, not by the "
+            "parameters of the eye model: allowed are the other kinds"
+        )
     if profile.higher_order != "none":
         found = estimate_eye(
             with_typical_aberrations(profile),

@@ -70,9 +70,8 @@ class MeasuredResidual:
         """Return the residual of an estimated eye; zero for a given eye."""
         wavelengths_nm = np.unique(wavelengths_nm)
         radius_mm, measured_nm = profile.pupil_diameter_mm / 2.0, profile.wavelength_nm
-        if profile.eye is not None:
-            none = np.zeros(wavelengths_nm.size)
-            return cls(np.zeros(N_TERMS), radius_mm, wavelengths_nm, none)
+        if profile.is_given:
+            return cls.zero(profile.pupil_diameter_mm, wavelengths_nm=wavelengths_nm)
         traced_um, depth_mm = _traced_um(
             parameters, profile, np.append(measured_nm, wavelengths_nm)
         )
@@ -88,6 +87,14 @@ class MeasuredResidual:
         people_dpt = people_dpt - chromatic_refraction_dpt(measured_nm)
         color_dpt = people_dpt - (eye_dpt[1:] - eye_dpt[0])
         return cls(residue_um, radius_mm, wavelengths_nm, color_dpt)
+
+    @classmethod
+    def zero(
+        cls, pupil_diameter_mm: float, *, wavelengths_nm: NDArray[np.float64]
+    ) -> "MeasuredResidual":
+        """Return no residual at ascending wavelengths (n,)."""
+        none = np.zeros(wavelengths_nm.size)
+        return cls(np.zeros(N_TERMS), pupil_diameter_mm / 2.0, wavelengths_nm, none)
 
     @property
     def rms_um(self) -> float:

@@ -2,9 +2,10 @@ from .accommodation import AccommodatingEye as AccommodatingEye
 from .accommodation import FocusedEye as FocusedEye
 from .assembly import eye_surfaces as eye_surfaces
 from .checked_fields import ProfileError as ProfileError
-from .explicit import parse_explicit_eye as parse_explicit_eye
 from .focusing import FocusingEye as FocusingEye
 from .parameters import EyeParameters as EyeParameters
 from .parameters import RetinaShape as RetinaShape
+from .surface_eye import SurfaceEye as SurfaceEye
+from .surface_model import SurfaceModel as SurfaceModel
 from .tracing import TraceFailed as TraceFailed
 from .tracing import zernike_of_vectors as zernike_of_vectors

@@ -6,6 +6,7 @@ accommodation, such as that of the Arizona eye, are therefore exact with three s
 """
 
 import dataclasses
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -47,6 +48,12 @@ class SurfaceModel:
         return self.accommodations_dpt[-1] if self.accommodations_dpt else 0.0
 
     @cached_property
+    def digest(self) -> str:
+        """Return the SHA-256 of all numbers, with the kinds of forms and media."""
+        content = self.accommodations_dpt, [_plain(eye) for eye in self._states]
+        return hashlib.sha256(repr(content).encode()).hexdigest()
+
+    @cached_property
     def _states(self) -> tuple[EyeSurfaces, ...]:
         return (self.relaxed, *self.accommodated)
 
@@ -67,6 +74,20 @@ class SurfaceModel:
             return self.relaxed
         blended: EyeSurfaces = _blended(self._states, self._weights(nominal_dpt), "")
         return blended
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as lists and dicts that name the classes of its parts."""
+    if dataclasses.is_dataclass(value):
+        parts = {
+            f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)
+        }
+        return {"class": type(value).__name__, **parts}
+    if isinstance(value, Mapping):
+        return {key: _plain(value[key]) for key in sorted(value)}
+    if isinstance(value, tuple):
+        return [_plain(entry) for entry in value]
+    return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def _blended(values: Sequence[Any], weights: NDArray[np.float64], name: str) -> Any:

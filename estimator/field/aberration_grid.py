@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.estimate.estimation import EstimatedEye
-from estimator.eye.accommodation import FocusedEye
+from estimator.estimate.given_surfaces import EyeModel
+from estimator.eye.focusing import FocusedSurfaces
 from estimator.wavefront.aberrations import wavefront_grid
 from estimator.wavefront.chief_rays import chief_shift_mrad
 from estimator.wavefront.nodes import N_AZIMUTHS, N_RINGS
@@ -52,7 +52,7 @@ class AberrationGrid:
 
 
 def aberration_grid(
-    eye: EstimatedEye,
+    eye: EyeModel,
     *,
     pupil_diameters_mm: ArrayLike,
     accommodations_dpt: ArrayLike,
@@ -61,7 +61,7 @@ def aberration_grid(
     v_deg: ArrayLike = (0.0,),
     n_rings: int = N_RINGS,
     n_azimuths: int = N_AZIMUTHS,
-    states: Sequence[FocusedEye] | None = None,
+    states: Sequence[FocusedSurfaces] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> AberrationGrid:
     """Trace the wavefront of every combination of the axes.

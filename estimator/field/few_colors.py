@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.estimate.estimation import EstimatedEye
-from estimator.eye.accommodation import FocusedEye
+from estimator.estimate.given_surfaces import EyeModel
+from estimator.eye.focusing import FocusedSurfaces
 from estimator.field.aberration_grid import AberrationGrid, aberration_grid
 from estimator.field.interpolation import (
     FieldInterpolation,
@@ -42,13 +42,13 @@ COLOR_AXIS = {"chief_shift_mrad": 3}
 
 
 def few_colors_grid(
-    eye: EstimatedEye,
+    eye: EyeModel,
     *,
     h_deg: ArrayLike,
     v_deg: ArrayLike,
     accommodations_dpt: ArrayLike,
     wavelengths_nm: ArrayLike,
-    states: Sequence[FocusedEye] | None = None,
+    states: Sequence[FocusedSurfaces] | None = None,
     progress: Callable[[float], None] | None = None,
     **sampling: Any,
 ) -> AberrationGrid:

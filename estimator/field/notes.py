@@ -1,13 +1,14 @@
 """Notes of a reply on how its eye was computed, and how exactly."""
 
-from estimator.estimate.estimation import POOR_FIT_UM, EstimatedEye
+from estimator.estimate.estimation import POOR_FIT_UM
+from estimator.estimate.given_surfaces import EyeModel, GivenSurfaces
 from estimator.eye.accommodation import REFRACTION_TOLERANCE_DPT
 from estimator.field.traced_eye import TRACED_ERROR_UM, TracedEye
 from estimator.periphery.change import DISAGREES_UM
 from estimator.periphery.meridian import KNOTS_DEG
 
 
-def eye_notes(estimated: EstimatedEye) -> tuple[str, ...]:
+def eye_notes(estimated: EyeModel) -> tuple[str, ...]:
     """Return notes on how the eye, its focus and its aberrations were computed."""
     return (
         _of_eye(estimated),
@@ -34,7 +35,9 @@ def periphery_note(eye: TracedEye) -> str:
     return found
 
 
-def _of_eye(estimated: EstimatedEye) -> str:
+def _of_eye(estimated: EyeModel) -> str:
+    if isinstance(estimated, GivenSurfaces):
+        return "eye as given by its surfaces"
     if estimated.method == "given":
         return "eye as given by its parameters"
     poor = "poorly " if estimated.mean_abs_error_um > POOR_FIT_UM else ""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from estimator.estimate.estimation import estimate_eye
+from estimator.estimate.given_surfaces import eye_model as model_of
 from estimator.field.eye_optics import EyeOptics
 from estimator.field.few_colors import few_colors_grid
 from estimator.field.notes import eye_notes, periphery_note
@@ -67,7 +67,7 @@ def prepare_eye(
         )
     if accuracy not in ACCURACIES:
         raise ValueError(f"accuracy '{accuracy}': allowed are {', '.join(ACCURACIES)}")
-    if eye_model == "wavefront" and profile.eye is None:
+    if eye_model == "wavefront" and not profile.is_given:
         return MeasuredWavefront.from_profile(profile), profile.notes
 
     def report(fraction: float, stage: str) -> None:
@@ -75,7 +75,7 @@ def prepare_eye(
             progress(fraction, stage)
 
     report(0.0, "eye")
-    estimated = estimate_eye(profile, starts=("table",))
+    estimated = model_of(profile)
     report(ESTIMATION_SHARE, "aberrations")
     eye = TracedEye.trace(
         estimated,

@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.estimate.estimation import EstimatedEye
+from estimator.estimate.given_surfaces import EyeModel, GivenSurfaces
 from estimator.eye.tracing import TraceFailed
 from estimator.field.aberration_grid import (
     FIELD_AZIMUTHS,
@@ -57,7 +57,7 @@ def field_pupils_mm(low_mm: float, high_mm: float) -> NDArray[np.float64]:
 
 
 def trace_field(
-    eye: EstimatedEye,
+    eye: EyeModel,
     axis: FieldInterpolation,
     field_range_deg: FieldRange,
     field_grid: Callable[..., AberrationGrid],
@@ -85,13 +85,15 @@ def trace_field(
 
 
 def peripheral_residual(
-    eye: EstimatedEye, field_range_deg: FieldRange
+    eye: EyeModel, field_range_deg: FieldRange
 ) -> PeripheralResidual | None:
     """Return people's periphery for an eye, or None if it has the model's.
 
     It has the model's if light does not pass the usual eye over the whole range.
     """
-    if eye.profile.periphery == "model" or not np.any(field_range_deg):
+    if isinstance(eye, GivenSurfaces) or eye.profile.periphery == "model":
+        return None
+    if not np.any(field_range_deg):
         return None
     rest = PeripheralResidual(peripheral_change(eye.profile), eye, field_range_deg)
     return rest if rest.passes else None

@@ -17,7 +17,7 @@ from estimator.corrections.progressive import (
     progressive_polynomial,
 )
 from estimator.corrections.worn_lens import rings_of, worn_polynomial
-from estimator.estimate.estimation import EstimatedEye
+from estimator.estimate.given_surfaces import EyeModel
 from estimator.eye.focusing import FocusingEye
 from estimator.field.aberration_grid import AberrationGrid, aberration_grid
 from estimator.field.fixed_defocus import FixedDefocus
@@ -61,7 +61,7 @@ AXIS_PROGRESS = 0.1
 
 
 class TracedEye(FocusingEye):
-    """Wavefronts of an estimated eye over a range of fields, pupils and foci.
+    """Wavefronts of an estimated or given eye over a range of fields, pupils and foci.
 
     On axis the circle circumscribed about the pupil is the requested pupil: the traced
     rim, up to a few percent smaller than the paraxial entrance pupil, is scaled to it,
@@ -94,7 +94,7 @@ class TracedEye(FocusingEye):
 
     def __init__(
         self,
-        eye: EstimatedEye,
+        eye: EyeModel,
         axis: FieldInterpolation,
         field: FieldInterpolation | None = None,
         *,
@@ -126,7 +126,7 @@ class TracedEye(FocusingEye):
     @classmethod
     def trace(
         cls,
-        eye: EstimatedEye,
+        eye: EyeModel,
         *,
         pupil_diameters_mm: ArrayLike,
         focus_range_dpt: tuple[float, float],

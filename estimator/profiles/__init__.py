@@ -2,9 +2,12 @@
 
 bodies               types of the profile object: fields, ranges, defaults
 correction_bodies    the same for corrections
+surface_bodies       the same for eyes by surfaces, their forms and media
 validation           conversion of plain data to these types, and its errors
 parse                from a typed profile to an `EyeProfile`
 correction           from a typed correction to a lens
+surfaces             from typed surfaces to an eye
+published            schematic eyes from the literature with their sources
 reference            JSON Schema, tables and limits of the typed profiles
 files                .json, .abp and .csv profiles, and presets by name
 presets.json         the six presets

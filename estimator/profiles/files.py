@@ -12,6 +12,7 @@ from estimator.bounded_files import (
     reason_of,
 )
 from estimator.eye.checked_fields import did_you_mean
+from estimator.profiles.bodies import PUBLISHED_NAMES
 from estimator.profiles.parse import (
     EyeProfile,
     ProfileError,
@@ -26,6 +27,9 @@ JSON."""
 MAX_PROFILE_LINES = 20_000
 """Line limit of an .abp or .csv file, which has one line for each of at most 28
 coefficients."""
+
+NAMES = {"preset": preset_names(), "published": PUBLISHED_NAMES}
+"""Names of eyes by the kind of their profile."""
 
 _ABP_SETTING = re.compile(r"(Ap|Wa)\s*=\s*(\S+)")
 _ABP_TERM = re.compile(r"Z\s*\[\s*(-?\d+)\s*,\s*(-?\d+)\s*\]\s*=\s*(\S+)")
@@ -66,7 +70,8 @@ def load_profile(
     Parameters
     ----------
     source : str or Path
-        Name of a preset (see `preset_names`), a ``.json``, ``.abp`` or ``.csv`` file,
+        Name of a preset (see `preset_names`) or of a schematic eye
+        (`bodies.PUBLISHED_NAMES`), a ``.json``, ``.abp`` or ``.csv`` file,
         or a JSON object, ``{"kind": "prescription", "sphere_dpt": -2}``.
     pupil_diameter_mm, wavelength_nm : float, optional
         Pupil and wavelength of a CSV file, which may instead contain them as
@@ -110,19 +115,20 @@ def profile_body(
     InvalidFile
         The file cannot be parsed; its fields are not validated here.
     """
-    if str(source) in preset_names():
-        return {"kind": "preset", "name": str(source)}
+    for kind, names in NAMES.items():
+        if str(source) in names:
+            return {"kind": kind, "name": str(source)}
     if not _is_path(source):
         return _inline(str(source))
     path = Path(source)
     readers = {".json": _read_json, ".abp": _read_abp, ".csv": _read_csv}
     reader = readers.get(path.suffix.lower())
     allowed = (
-        f"a preset ({', '.join(preset_names())}), a .json, .abp or .csv file, or a "
-        "JSON object"
+        f"a preset ({', '.join(preset_names())}), a schematic eye "
+        f"({', '.join(PUBLISHED_NAMES)}), a .json, .abp or .csv file, or a JSON object"
     )
     if reader is None:
-        meant = did_you_mean(str(source), preset_names())
+        meant = did_you_mean(str(source), [n for ns in NAMES.values() for n in ns])
         raise ProfileError("profile", f"'{source}' is not known{meant}", allowed)
     try:
         is_file = path.is_file()
@@ -142,10 +148,10 @@ def profile_body(
 
 
 def _is_path(source: str | Path) -> bool:
-    """Return whether a source is neither a preset's name nor JSON."""
-    return str(source) not in preset_names() and not str(source).lstrip().startswith(
-        "{"
-    )
+    """Return whether a source is neither the name of an eye nor JSON."""
+    text = str(source)
+    is_name = any(text in names for names in NAMES.values())
+    return not is_name and not text.lstrip().startswith("{")
 
 
 def _inline(text: str) -> dict[str, Any]:
@@ -167,6 +173,8 @@ def _read_json(text: str, path: Path) -> dict[str, Any]:
     if not isinstance(body, dict):
         problem = f"{body!r:.60} is not an object"
         raise InvalidProfileFile(path, "", problem, "one JSON object")
+    if "surfaces" in body:  # files of schematic eyes need not state their kind
+        body.setdefault("kind", "surfaces")
     return body
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from estimator.corrections.worn_lens import replaces_lens
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters, RetinaShape
+from estimator.eye.surface_model import SurfaceModel
 from estimator.media.straylight import CATARACTS, DEFAULT_AGE_YEARS, Straylight
 from estimator.optics import prescription as rx
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
@@ -30,6 +31,7 @@ from estimator.optics.zernike import (
 )
 from estimator.profiles import bodies
 from estimator.profiles.correction import parse_correction, prescription, vertex_notes
+from estimator.profiles.surfaces import surface_model
 from estimator.profiles.validation import convert
 
 __all__ = [
@@ -47,6 +49,9 @@ PRESCRIPTION_RADIUS_MM = 3.0
 
 EYE_PUPIL_MM = 6.0
 """Entrance pupil at which the wavefront of a given eye is represented."""
+
+SURFACES_PUPIL_MM = 4.0
+"""The same for an eye given by surfaces, whose lens may be smaller than 6 mm."""
 
 
 @dataclass(frozen=True)
@@ -89,9 +94,11 @@ class EyeProfile:
     add_dpt : float
         Near addition; limits the amplitude of accommodation when above zero.
     measurements : tuple of Measurement
-        All measurements, the leading one first.  Empty for kind ``eye``.
+        All measurements, the leading one first.  Empty for a given eye.
     eye : EyeParameters or None
         The eye itself, for kind ``eye``.
+    surfaces : SurfaceModel or None
+        The eye itself, for kinds ``surfaces`` and ``published``.
     retina : RetinaShape or None
         Retina that replaces the sphere of radius eye length / 2.
     straylight : Straylight or None
@@ -128,6 +135,12 @@ class EyeProfile:
     yellowing: str | None = None
     spectacle_magnification: bool = False
     notes: tuple[str, ...] = ()
+    surfaces: SurfaceModel | None = None
+
+    @property
+    def is_given(self) -> bool:
+        """Return whether the profile gives the eye itself instead of measurements."""
+        return self.eye is not None or self.surfaces is not None
 
     @cached_property
     def compared_measurements(self) -> tuple[Measurement, ...]:
@@ -147,8 +160,12 @@ class EyeProfile:
         """
         content = replace(self, name="", notes=())
         encoded = msgspec.json.encode(
-            content, order="deterministic", enc_hook=lambda array: array.tolist()
+            replace(content, surfaces=None),
+            order="deterministic",
+            enc_hook=lambda array: array.tolist(),
         )
+        if self.surfaces is not None:
+            encoded += self.surfaces.digest.encode()
         return hashlib.sha256(encoded).hexdigest()
 
     @cached_property
@@ -163,9 +180,11 @@ class EyeProfile:
         ProfileError
             Light does not pass the given eye.
         """
-        if self.eye is None:
-            return self.measurements[0].zernike_um
-        return _traced_zernike_um(self.eye, self.retina)
+        if self.surfaces is not None:
+            return _surfaces_zernike_um(self.surfaces)
+        if self.eye is not None:
+            return _traced_zernike_um(self.eye, self.retina)
+        return self.measurements[0].zernike_um
 
 
 def parse_profile(data: object) -> EyeProfile:
@@ -185,6 +204,10 @@ def parse_profile(data: object) -> EyeProfile:
         return _zernike_set(body)
     if isinstance(body, bodies.EyeBody):
         return _eye(body)
+    if isinstance(body, bodies.SurfacesBody):
+        return _surfaces(body)
+    if isinstance(body, bodies.PublishedBody):
+        return _published(body)
     return _zernike(body)
 
 
@@ -206,9 +229,11 @@ def _common(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
         raise ProfileError(
             "correction", "is required with spectacle_magnification", "an object"
         )
-    retina = body.retina and RetinaShape(
-        radius_mm=body.retina.radius_mm, conic_constant=body.retina.conic_constant
-    )
+    retina = None
+    if isinstance(body.retina, bodies.RetinaBody):
+        retina = RetinaShape(
+            radius_mm=body.retina.radius_mm, conic_constant=body.retina.conic_constant
+        )
     is_prescription = isinstance(body, bodies.PrescriptionBody)
     return {
         "name": kind if body.name is msgspec.UNSET else str(body.name),
@@ -228,14 +253,16 @@ def _common(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
 
 
 def _periphery(body: bodies.CommonBody) -> str:
-    is_model = body.retina is not None or isinstance(body, bodies.EyeBody)
+    is_model = body.retina is not None or isinstance(
+        body, bodies.EyeBody | bodies.PublishedBody
+    )
     if body.periphery is msgspec.UNSET:
         return "model" if is_model else "people"
     if is_model and body.periphery != "model":
         raise ProfileError(
             "periphery",
             "is 'people', but the profile defines the eye's surfaces",
-            "model, for kind 'eye' and with 'retina'",
+            "model, for the kinds of given eyes and with 'retina'",
         )
     return body.periphery
 
@@ -359,6 +386,58 @@ def _eye(body: bodies.EyeBody) -> EyeProfile:
         eye=EyeParameters.from_vector(vector),
         **_common(body, "eye"),
     )
+
+
+def _surfaces(body: bodies.SurfacesBody) -> EyeProfile:
+    return _with_surfaces(body, "surfaces", surface_model(body))
+
+
+def _published(body: bodies.PublishedBody) -> EyeProfile:
+    from estimator.profiles.published import published_eye
+
+    if body.retina is not None:
+        raise ProfileError(
+            "retina", "is part of a published eye", "null, or kind 'surfaces'"
+        )
+    return _with_surfaces(body, "published", published_eye(body.name).model)
+
+
+def _with_surfaces(
+    body: bodies.CommonBody, kind: str, surfaces: SurfaceModel
+) -> EyeProfile:
+    common = _common(body, kind)
+    if replaces_lens(common["correction"]):
+        raise ProfileError(
+            "correction.kind",
+            "'iol' replaces the lens of an eye that is given by its surfaces",
+            "spectacles or a contact lens; give the implant as surfaces",
+        )
+    return EyeProfile(
+        kind=kind,
+        pupil_diameter_mm=SURFACES_PUPIL_MM,
+        wavelength_nm=REFERENCE_WAVELENGTH_NM,
+        max_pupil_diameter_mm=math.inf,
+        surfaces=surfaces,
+        **common,
+    )
+
+
+def _surfaces_zernike_um(model: SurfaceModel) -> NDArray[np.float64]:
+    from estimator.optics.surfaces import media_indices, pack_eye
+    from estimator.wavefront.aberrations import on_axis_zernike  # loads slowly
+
+    zernike_um: NDArray[np.float64] = on_axis_zernike(
+        pack_eye(model.relaxed)[None],
+        media_indices(model.relaxed, REFERENCE_WAVELENGTH_NM),
+        zernike_radius_mm=SURFACES_PUPIL_MM / 2.0,
+    )[0][0]
+    if not np.isfinite(zernike_um).all():
+        raise ProfileError(
+            "surfaces",
+            f"light does not pass the eye at {SURFACES_PUPIL_MM:g} mm",
+            f"an eye that light crosses at a {SURFACES_PUPIL_MM:g} mm pupil",
+        )
+    return zernike_um
 
 
 def _traced_zernike_um(

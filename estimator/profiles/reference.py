@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
-from estimator.profiles import bodies, correction_bodies
+from estimator.profiles import bodies, correction_bodies, surface_bodies, validation
 from estimator.profiles.validation import KIND, allowed_values
 
 SCHEMA_DRAFT = "https://json-schema.org/draft/2020-12/schema"
@@ -37,6 +37,12 @@ INTRODUCTIONS: dict[type[msgspec.Struct], str] = {
     correction_bodies.ZonesBody: "Design `zones`.",
     bodies.EyeBody: "Kind `eye`: the eye model by its parameters.",
     bodies.ParametersBody: "`parameters`.",
+    bodies.SurfacesBody: "Kind `surfaces`: an eye by its surfaces and media.",
+    surface_bodies.RetinalSurfaceBody: "`retina` of kind `surfaces`, and fields of "
+    "every surface.",
+    surface_bodies.SurfaceBody: "Each entry of `surfaces`.",
+    surface_bodies.StateBody: "Each entry of `states`.",
+    bodies.PublishedBody: "Kind `published`: a schematic eye by its name.",
 }
 """Tables of the reference in their order, with the line above each."""
 
@@ -88,7 +94,21 @@ def profile_tables() -> str:
         rows = ["| field | default | allowed | meaning |", "|---|---|---|---|"]
         rows += [_row(field) for field in _own_fields(body)]
         blocks.append("\n".join([introduction, "", *rows]))
+    for introduction, kinds in surface_bodies.TABLES.items():
+        rows = ["| kind | fields (default) | definition |", "|---|---|---|"]
+        rows += [_kind_row(kind) for kind in kinds]
+        blocks.append("\n".join([introduction, "", *rows]))
     return "\n\n".join(blocks) + "\n"
+
+
+def _kind_row(body: type[msgspec.Struct]) -> str:
+    fields = [
+        f"`{field.encode_name}`"
+        + ("" if field.required else f" ({_default(field) or 'none'})")
+        for field in _fields(body)
+    ]
+    tag = body.__struct_config__.tag
+    return f"| `{tag}` | {', '.join(fields) or 'none'} | {body.__doc__} |"
 
 
 def field_limits(body: type[msgspec.Struct], name: str) -> tuple[float, float]:
@@ -121,7 +141,7 @@ def _own_fields(body: type[msgspec.Struct]) -> list[inspect.Field]:
         if base in INTRODUCTIONS
         for field in _fields(base)
     }
-    if body is bodies.PresetBody:  # its name selects the eye
+    if body in (bodies.PresetBody, bodies.PublishedBody):  # its name selects the eye
         listed.discard("name")
     return [field for field in _fields(body) if field.encode_name not in listed]
 
@@ -156,7 +176,9 @@ def _allowed(field: inspect.Field) -> str:
         return ", ".join(f"`{value}`" for value in sorted(map(str, bare.values)))
     if isinstance(bare, inspect.AnyType):
         return "text"
-    if isinstance(bare, inspect.StructType | inspect.UnionType):
+    if isinstance(kind, inspect.Metadata) and validation.ALLOWED in (kind.extra or {}):
+        return allowed_values(kind)
+    if isinstance(bare, inspect.StructType | inspect.UnionType | inspect.DictType):
         return "an object"
     if isinstance(bare, inspect.BoolType):
         return "`true`, `false`"

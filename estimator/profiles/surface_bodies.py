@@ -10,7 +10,7 @@ import typing
 from collections.abc import Sequence
 from functools import reduce
 from operator import or_
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
@@ -48,7 +48,7 @@ DepthMm = Annotated[float, Meta(ge=-50.0, le=100.0, description="from the first 
 ShiftMm = Annotated[float, Meta(ge=-5.0, le=5.0)]
 TiltDeg = Annotated[float, Meta(ge=-45.0, le=45.0)]
 RadiusMm = Annotated[
-    float | list[float | None] | None,
+    float | Annotated[list[float | None], Meta(min_length=2, max_length=2)] | None,
     Meta(
         description="one radius or [Rx, Ry], positive where the center of curvature "
         "lies toward the retina; null is a plane",
@@ -67,7 +67,7 @@ Tilt = Annotated[
 ]
 
 
-def _body(kind: type[Any], dispersions: Any) -> type[msgspec.Struct]:
+def _body(kind: Any, dispersions: Any) -> type[msgspec.Struct]:
     """Return the body of a form or medium: its fields, tagged by its kind."""
     hints = typing.get_type_hints(kind)
     fields: list[Any] = []
@@ -97,23 +97,40 @@ def _hint(hint: Any, name: str, dispersions: Any) -> Any:
     if isinstance(hint, types.UnionType):  # the medium whose dispersion is followed
         return dispersions | None
     entries = typing.get_args(hint)
+    inner: Any = tuple[  # type: ignore[misc]  # built from a dataclass
+        tuple(e if e is Ellipsis else _hint(e, name, dispersions) for e in entries)
+    ]
     if entries[-1] is not Ellipsis:
-        return tuple[tuple(_hint(entry, name, dispersions) for entry in entries)]
-    is_table = typing.get_origin(entries[0]) is tuple
-    longest = MAX_POWERS if is_table or name == "coefficients" else MAX_NUMBERS
-    inner = tuple[_hint(entries[0], name, dispersions), ...]  # type: ignore[misc]
+        return inner
+    longest = MAX_NUMBERS if name in ("wavelengths_nm", "indices") else MAX_POWERS
     return Annotated[inner, Meta(min_length=1, max_length=longest)]
 
 
-def _union(kinds: Sequence[type[Any]], dispersions: Any = None) -> Any:
-    return reduce(or_, (_body(kind, dispersions) for kind in kinds))
+def _union(bodies: Sequence[Any]) -> Any:
+    return reduce(or_, bodies)
 
 
-DispersionBody = _union(DISPERSIONS)
-GradientBody = _union(GRADIENTS, DispersionBody)
-FormBody = _union(FORMS)
-KINDS = {kind.kind: kind for kind in (*DISPERSIONS, *GRADIENTS, *FORMS)}
+_DISPERSIONS = [_body(kind, None) for kind in DISPERSIONS]
+_GRADIENTS = [_body(kind, _union(_DISPERSIONS)) for kind in GRADIENTS]
+_FORMS = [_body(kind, None) for kind in FORMS]
+if TYPE_CHECKING:  # their members come from tables
+    DispersionBody: TypeAlias = msgspec.Struct
+    GradientBody: TypeAlias = msgspec.Struct
+    FormBody: TypeAlias = msgspec.Struct
+else:
+    DispersionBody, GradientBody, FormBody = map(
+        _union, (_DISPERSIONS, _GRADIENTS, _FORMS)
+    )
+
+_CLASSES: tuple[Any, ...] = (*DISPERSIONS, *GRADIENTS, *FORMS)
+KINDS = {kind.kind: kind for kind in _CLASSES}
 """Dataclasses of the bodies, by kind."""
+
+TABLES = {
+    "Kinds of `form`.": _FORMS,
+    "Kinds of media; L is the wavelength in µm.": [*_DISPERSIONS, *_GRADIENTS],
+}
+"""Bodies of forms and media for the reference, with the line above their table."""
 
 
 class RetinalSurfaceBody(Body, kw_only=True):

@@ -156,7 +156,7 @@ def _radii(value: float | list[float | None] | None, path: str) -> tuple[float, 
     """Return both radii; None is a plane."""
     radii = value if isinstance(value, list) else [value, value]
     low, high = surface_bodies.SMALLEST_RADIUS_MM, surface_bodies.NUMBER_LIMIT
-    if not all(r is None or low <= abs(r) <= high for r in radii) or len(radii) != 2:
+    if not all(r is None or low <= abs(r) <= high for r in radii):
         raise ProfileError(
             f"{path}radius_mm",
             f"{value!r:.60} is out of range",

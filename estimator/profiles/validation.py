@@ -25,6 +25,9 @@ DEFAULT_DESIGNS = {"iol": "monofocal"}
 ALLOWED = "allowed"
 """Key of `msgspec.Meta.extra`: the allowed values in words, for error messages."""
 
+MAX_SHOWN = 160
+"""Largest number of characters of a value in a message."""
+
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel = 4
 _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 60
@@ -217,7 +220,7 @@ def _mismatch(value: object, kind: inspect.Type) -> str:
         return f"{_shown(value)} is not an object"
     if isinstance(value, list):
         return f"{_shown(value)} has {len(value)} elements"
-    is_list = isinstance(kind, inspect.ListType | inspect.VarTupleType)
+    is_list = not isinstance(kind, inspect.UnionType)
     return f"{_shown(value)} is not {'a list' if is_list else 'valid'}"
 
 
@@ -258,10 +261,14 @@ def allowed_values(kind: inspect.Type) -> str:
             if isinstance(kind, inspect.TupleType)
             else kind.item_type
         )
+        bare = item.type if isinstance(item, inspect.Metadata) else item
+        if isinstance(bare, inspect.TupleType | inspect.VarTupleType):
+            return f"a list of {count} lists"
         return (
             f"a list of {count} numbers{allowed_values(item).removeprefix('a number')}"
         )
-    return "a JSON object" if isinstance(kind, inspect.StructType) else "text"
+    is_object = isinstance(kind, inspect.StructType | inspect.DictType)
+    return "a JSON object" if is_object else "text"
 
 
 def _shown(value: object) -> str:
@@ -269,6 +276,7 @@ def _shown(value: object) -> str:
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     try:
-        return _SHORT.repr(value)
+        text = _SHORT.repr(value)
     except ValueError:  # an integer of more digits than Python prints
         return "an integer"
+    return text if len(text) <= MAX_SHOWN else text[:MAX_SHOWN] + " ..."

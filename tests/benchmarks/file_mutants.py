@@ -84,7 +84,6 @@ def kinds(folder: Path) -> list[Kind]:
     from clients.batch.states import read_states
     from clients.batch.video_reading import VideoReader
     from clients.commands.display_file import display_of_file
-    from clients.commands.wavefront import explicit_body
     from clients.headset.gltf_scene import load_gltf
     from clients.web.eye_form import read_profile_file
     from clients.web.picture import photo_picture
@@ -103,7 +102,6 @@ def kinds(folder: Path) -> list[Kind]:
         return photo_picture(path.name, content, width_deg=40.0, distance_dpt=1.0)
 
     def profile(path: Path) -> object:
-        explicit_body(str(path))
         read_profile_file(path.name, path.read_bytes())
         return load_profile(path)
 

@@ -30,7 +30,7 @@ HELD = (
     "estimator/networks/weights/*.json",
     "estimator/profiles/presets.json",
     "estimator/estimate/eye_table.json",
-    "estimator/eye/published/*.json",
+    "estimator/profiles/published/*.json",
     "estimator/periphery/population.json",
     "filter_service/PROTOCOL.md",
     "filter_service/*.schema.json",

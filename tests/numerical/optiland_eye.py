@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from estimator.eye.explicit import parse_explicit_eye
 from estimator.optics.forms import EvenAsphere, SeparateProfiles, Toroid
 from estimator.optics.surfaces import rotation_matrix
 from estimator.optics.zernike import N_TERMS, nm_from_index
+from tests.numerical.surface_bodies import parsed_eye
 
 FROZEN = Path(__file__).parents[1] / "data" / "optiland_eye.json"
 FROZEN_FORMS = FROZEN.with_name("optiland_forms.json")
@@ -189,7 +189,7 @@ def trace_with_optiland(body, rays):
     from optiland.optic import Optic
     from optiland.rays import RealRays
 
-    eye = parse_explicit_eye(body)
+    eye = parsed_eye(body)
     optic = Optic()
     start_z = float(rays[0, 2])
     optic.surfaces.add(index=0, z=start_z, radius=np.inf, comment="start")

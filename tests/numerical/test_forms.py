@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.eye.explicit import parse_explicit_eye
 from estimator.optics.forms import EvenAsphere, TwoConics
 from estimator.optics.paraxial import cardinal_points
 from estimator.optics.raytrace import RayStatus, trace_rays
@@ -20,6 +19,7 @@ from tests.numerical.optiland_eye import (
     trace_with_optiland,
 )
 from tests.numerical.schematic_eyes import irregular_eye, navarro, reference
+from tests.numerical.surface_bodies import parsed_eye
 
 TRACED = json.loads(FROZEN_FORMS.read_text(encoding="utf-8"))["eyes"]
 TOLERANCE_MM = 1e-12
@@ -30,7 +30,7 @@ def _compare(body, rays, points, directions, paths):
     complete = np.isfinite(points).all(axis=(1, 2))
     assert complete.sum() > 0.6 * len(rays)
     traced = trace_rays(
-        parse_explicit_eye(body),
+        parsed_eye(body),
         start_mm=rays[complete, :3],
         direction=rays[complete, 3:],
         wavelength_nm=WAVELENGTH_NM,
@@ -162,19 +162,19 @@ def _surfaces(index, **changes):
         ),
         ({**BODY, "surfaces": [*BODY["surfaces"]] * 400}, "1 to 20 surfaces"),
         ({**BODY, "retina": {"radius_mm": 12, "z_mm": 5}}, "retina at 5 mm"),
-        (_surfaces(0, form={"kind": "even"}), r"surfaces\[0\].form.kind"),
+        (_surfaces(0, form={"kind": "even"}), r"surfaces\.0\.form.kind"),
         (_surfaces(0, form={"kind": "even_asphere"}), "coefficients.*is missing"),
         (
             _surfaces(0, form={"kind": "even_asphere", "coefficients": [0.1] * 13}),
-            r"surfaces\[0\].form.*at most 12",
+            r"surfaces\.0\.form.*1 to 12",
         ),
         (
             _surfaces(0, form={"kind": "two_conics", "conic_constants": [1]}),
-            r"conic_constants.*1 entries",
+            r"conic_constants.*has 1 elements",
         ),
         (
             _surfaces(0, form={"kind": "toroid", "color": 1}),
-            r"surfaces\[0\].form.color",
+            r"surfaces\.0\.form.color",
         ),
         (
             {**BODY, "media": {"lens": {"kind": "abbe_number", "d_line_index": 1.5}}},
@@ -182,13 +182,13 @@ def _surfaces(index, **changes):
         ),
         (
             {**BODY, "media": {"lens": {"kind": "cauchy", "coefficients": ["a"]}}},
-            r"media.lens.coefficients\[0\]",
+            r"media.lens.coefficients\.0",
         ),
     ],
 )
 def test_a_malformed_eye_is_refused_with_the_surface_and_the_reason(body, message):
     with pytest.raises(ValueError, match=message):
-        parse_explicit_eye(body)
+        parsed_eye(body)
 
 
 def test_an_eye_in_json_keeps_its_forms_and_media():
@@ -205,7 +205,7 @@ def test_an_eye_in_json_keeps_its_forms_and_media():
         **BODY["retina"],
         "form": {"kind": "two_conics", "conic_constants": [1, 2]},
     }
-    eye = parse_explicit_eye({**body, "media": {"grin": gradient}, "retina": retina})
+    eye = parsed_eye({**body, "media": {"grin": gradient}, "retina": retina})
     assert eye.surfaces[1].form == EvenAsphere((0.0, 1e-4))
     assert eye.retina.form == TwoConics((1.0, 2.0))
     grin = eye.media["grin"]

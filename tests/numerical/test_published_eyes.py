@@ -5,13 +5,14 @@ import re
 import numpy as np
 import pytest
 
-from estimator.eye.published import published_eye, published_names
 from estimator.optics.gradients import GRADIENTS
 from estimator.optics.paraxial import cardinal_points
+from estimator.profiles.bodies import PUBLISHED_NAMES
+from estimator.profiles.published import published_eye
 from estimator.wavefront.aberrations import wavefront_grid
 
 
-@pytest.mark.parametrize("name", published_names())
+@pytest.mark.parametrize("name", PUBLISHED_NAMES)
 def test_figures_are_met_to_the_digits_given(name):
     eye = published_eye(name)
     found = cardinal_points(eye.surfaces, wavelength_nm=eye.wavelength_nm)
@@ -21,7 +22,7 @@ def test_figures_are_met_to_the_digits_given(name):
         assert round(value, figure.digits) == pytest.approx(figure.value), figure
 
 
-@pytest.mark.parametrize("name", published_names())
+@pytest.mark.parametrize("name", PUBLISHED_NAMES)
 def test_every_number_has_a_retrievable_source(name):
     eye = published_eye(name)
     places = (*eye.sources, *(figure.source for figure in eye.figures))
@@ -29,7 +30,7 @@ def test_every_number_has_a_retrievable_source(name):
     assert re.search(r"\(?(19|20)\d\d\)", eye.reference)
 
 
-@pytest.mark.parametrize("name", published_names())
+@pytest.mark.parametrize("name", PUBLISHED_NAMES)
 def test_light_passes_over_the_field(name):
     """All rays of a 3 mm stop reach the retina up to 40 deg, at three colors."""
     found = wavefront_grid(
@@ -43,7 +44,7 @@ def test_light_passes_over_the_field(name):
 
 
 def test_there_are_several_eyes_and_one_has_a_gradient():
-    eyes = [published_eye(name) for name in published_names()]
+    eyes = [published_eye(name) for name in PUBLISHED_NAMES]
     assert len(eyes) >= 5
     media = [m for e in eyes for m in (e.surfaces.media or {}).values()]
     assert any(isinstance(m, GRADIENTS) for m in media)

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.eye.explicit import parse_explicit_eye
 from estimator.optics.media import refractive_index
 from estimator.optics.raytrace import RayStatus, trace_rays
 from estimator.optics.surfaces import EyeSurfaces, Retina, Surface, rotation_matrix
@@ -24,6 +23,7 @@ from tests.numerical.schematic_eyes import (
     opticstudio_eye,
     reference,
 )
+from tests.numerical.surface_bodies import parsed_eye
 
 REFERENCE = reference()
 
@@ -94,7 +94,7 @@ def test_reverse_rays_match_the_reference_at_every_surface():
 
 def _compare_with_optiland(body, rays, points, directions, paths):
     traced = trace_rays(
-        parse_explicit_eye(body),
+        parsed_eye(body),
         start_mm=rays[:, :3],
         direction=rays[:, 3:],
         wavelength_nm=WAVELENGTH_NM,
@@ -311,14 +311,14 @@ def _with(**changes):
 
 
 def test_an_explicit_eye_takes_every_documented_form():
-    plain = parse_explicit_eye(BODY)
+    plain = parsed_eye(BODY)
     assert plain.surfaces[0].radius_mm == (7.8, 7.8)
     assert plain.indices is None
-    flat = parse_explicit_eye(_with(surface={"radius_mm": [None, 7.0]}))
+    flat = parsed_eye(_with(surface={"radius_mm": [None, 7.0]}))
     assert flat.surfaces[0].radius_mm == (math.inf, 7.0)
     terms = [0.001 * j for j in range(28)]
-    whole = parse_explicit_eye(_with(surface={"offset_mm": terms}))
-    short = parse_explicit_eye(_with(surface={"offset_mm": terms[1:]}))
+    whole = parsed_eye(_with(surface={"offset_mm": terms}))
+    short = parsed_eye(_with(surface={"offset_mm": terms[1:]}))
     assert np.array_equal(whole.surfaces[0].offset_mm, short.surfaces[0].offset_mm)
     assert whole.surfaces[0].offset_mm[27] == terms[27]
 
@@ -327,7 +327,7 @@ def test_an_explicit_eye_takes_every_documented_form():
     ("body", "field"),
     [
         (_with(stop_z_mm=None), "stop_z_mm"),
-        (_with(surface={"radius_mm": 0}), r"surfaces\[0\].radius_mm"),
+        (_with(surface={"radius_mm": 0}), r"surfaces\.0\.radius_mm"),
         (_with(surface={"medium_after": "jelly"}), "medium_after"),
         (_with(surface={"offset_mm": [0.0] * 5}), "offset_mm"),
         (_with(surface={"color": 1}), "color"),
@@ -338,4 +338,4 @@ def test_an_explicit_eye_takes_every_documented_form():
 )
 def test_a_wrong_explicit_eye_is_refused_by_field(body, field):
     with pytest.raises(ValueError, match=field):
-        parse_explicit_eye(body)
+        parsed_eye(body)

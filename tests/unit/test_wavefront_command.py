@@ -118,7 +118,7 @@ def test_a_wrong_surface_is_named(eye_file, capsys):
     eye_file.write_text(json.dumps(body), encoding="utf-8")
     code, text = _refused(capsys, eye_file, *VIEW)
     assert code == 2
-    assert "surfaces[2].z_mm" in text
+    assert "surfaces.2.z_mm" in text
 
 
 def test_a_lost_chief_ray_is_a_failure_in_words(eye_file, capsys):
