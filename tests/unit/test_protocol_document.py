@@ -19,7 +19,10 @@ from filter_service import protocol_schema as schema
 from filter_service.wire import replies
 from tests.unit.test_profile_bodies import WRONG
 
-IN_ORDER = ("preset", "prescription", "zernike", "zernike_set", "eye")
+IN_ORDER = (
+    *("preset", "prescription", "zernike", "zernike_set", "eye", "surfaces"),
+    "published",
+)
 
 PAGE = (Path(messages.__file__).parent / "PROTOCOL.md").read_text(encoding="utf-8")
 
