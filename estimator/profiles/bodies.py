@@ -25,6 +25,19 @@ from estimator.profiles.correction_bodies import (
     SphereDpt,
     VertexMm,
 )
+from estimator.profiles.implant_bodies import (
+    AxialLengthMm,
+    ChamberDepthMm,
+    ImplantBody,
+    IrisDepthMm,
+    KeratometricIndex,
+    Keratometry,
+    KeratometryAxisDeg,
+    LensCenterMm,
+    LensThicknessMm,
+    OlsenC,
+    PosteriorRatio,
+)
 from estimator.profiles.surface_bodies import (
     MAX_STATES,
     STATES_ALLOWED,
@@ -135,8 +148,8 @@ class CommonBody(Body, kw_only=True):
             Meta(
                 description="`people` (default): off-axis wavefronts of the measured "
                 "population; `model`: those of the surfaces. Kinds `eye`, "
-                "`surfaces` and `published`, and profiles with a `retina`, always use "
-                "`model`"
+                "`surfaces`, `pseudophakic` and `published`, and profiles with a "
+                "`retina`, always use `model`"
             ),
         ]
         | UnsetType
@@ -279,6 +292,36 @@ class SurfacesBody(CommonBody, kw_only=True, tag_field="kind", tag="surfaces"):
     ) = UNSET
 
 
+class PseudophakicBody(CommonBody, kw_only=True, tag_field="kind", tag="pseudophakic"):
+    """An eye with an intraocular lens, by biometry and the lens's geometry."""
+
+    axial_length_mm: AxialLengthMm
+    keratometry_dpt: Keratometry
+    keratometry_axis_deg: KeratometryAxisDeg | UnsetType = UNSET
+    keratometric_index: KeratometricIndex = 1.3375
+    posterior_ratio: PosteriorRatio = 0.825
+    cornea_conic_constant: (
+        Annotated[
+            float,
+            Meta(
+                ge=-5.0,
+                le=5.0,
+                description="of the anterior surface; that of the mean eye by default",
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
+    cornea_zernike_um: CoefficientsUm | UnsetType = UNSET
+    cornea_pupil_diameter_mm: PupilDiameterMm = 6.0
+    frame: Frame = "eye"
+    acd_mm: ChamberDepthMm | UnsetType = UNSET
+    lens_thickness_mm: LensThicknessMm | UnsetType = UNSET
+    olsen_c: OlsenC = 0.39
+    lens_center_mm: LensCenterMm | UnsetType = UNSET
+    iris_depth_mm: IrisDepthMm | UnsetType = UNSET
+    implant: Annotated[ImplantBody, Meta(description="the intraocular lens")]
+
+
 class PublishedBody(CommonBody, kw_only=True, tag_field="kind", tag="published"):
     """A schematic eye from the literature by its name."""
 
@@ -292,5 +335,6 @@ ProfileBody = (
     | ZernikeSetBody
     | EyeBody
     | SurfacesBody
+    | PseudophakicBody
     | PublishedBody
 )

@@ -31,6 +31,8 @@ from estimator.optics.zernike import (
 )
 from estimator.profiles import bodies
 from estimator.profiles.correction import parse_correction, prescription, vertex_notes
+from estimator.profiles.correction_bodies import IntraocularBody
+from estimator.profiles.pseudophakic import pseudophakic_model
 from estimator.profiles.surfaces import surface_model
 from estimator.profiles.validation import convert
 
@@ -49,6 +51,11 @@ PRESCRIPTION_RADIUS_MM = 3.0
 
 EYE_PUPIL_MM = 6.0
 """Entrance pupil at which the wavefront of a given eye is represented."""
+
+IMPLANT_NOTE = (
+    "the eye is traced through its implant: wavefronts measured before surgery are not "
+    "part of it"
+)
 
 SURFACES_PUPIL_MM = 4.0
 """The same for an eye given by surfaces, whose lens may be smaller than 6 mm."""
@@ -208,6 +215,8 @@ def parse_profile(data: object) -> EyeProfile:
         return _surfaces(body)
     if isinstance(body, bodies.PublishedBody):
         return _published(body)
+    if isinstance(body, bodies.PseudophakicBody):
+        return _pseudophakic(body)
     return _zernike(body)
 
 
@@ -254,7 +263,7 @@ def _common(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
 
 def _periphery(body: bodies.CommonBody) -> str:
     is_model = body.retina is not None or isinstance(
-        body, bodies.EyeBody | bodies.PublishedBody
+        body, bodies.EyeBody | bodies.PublishedBody | bodies.PseudophakicBody
     )
     if body.periphery is msgspec.UNSET:
         return "model" if is_model else "people"
@@ -402,11 +411,31 @@ def _published(body: bodies.PublishedBody) -> EyeProfile:
     return _with_surfaces(body, "published", published_eye(body.name).model)
 
 
+def _pseudophakic(body: bodies.PseudophakicBody) -> EyeProfile:
+    cornea_um = None
+    if body.cornea_zernike_um is not msgspec.UNSET:
+        cornea_um = _coefficients(
+            body.cornea_zernike_um, body.frame, path="", name="cornea_zernike_um"
+        )
+    worn = body.correction
+    if isinstance(worn, IntraocularBody) and (
+        worn.sphere_dpt or worn.cylinder_dpt or worn.spherical_aberration_um
+    ):
+        raise ProfileError(
+            "correction.sphere_dpt",
+            "the power and aberration of a pseudophakic eye are those of its implant",
+            "0 in sphere_dpt, cylinder_dpt and spherical_aberration_um: the correction "
+            "only adds the steps or zones of its design",
+        )
+    profile = _with_surfaces(body, "pseudophakic", pseudophakic_model(body, cornea_um))
+    return replace(profile, notes=(IMPLANT_NOTE, *profile.notes))
+
+
 def _with_surfaces(
     body: bodies.CommonBody, kind: str, surfaces: SurfaceModel
 ) -> EyeProfile:
     common = _common(body, kind)
-    if replaces_lens(common["correction"]):
+    if kind != "pseudophakic" and replaces_lens(common["correction"]):
         raise ProfileError(
             "correction.kind",
             "'iol' replaces the lens of an eye that is given by its surfaces",
@@ -464,23 +493,24 @@ def _traced_zernike_um(
 
 
 def _coefficients(
-    entries: Mapping[str, float], frame: str, *, path: str
+    entries: Mapping[str, float], frame: str, *, path: str, name: str = "zernike_um"
 ) -> NDArray[np.float64]:
     """Return coefficients (28,) in the eye frame."""
     zernike_um = np.zeros(N_TERMS)
     named: dict[int, str] = {}
     for key, value_um in entries.items():
-        j = _term_index(key, path=path)
+        field = f"{path}{name}.{key}"
+        j = _term_index(key, field)
         if j in named:
             problem = f"names the same term as {named[j]!r}"
-            raise ProfileError(f"{path}zernike_um.{key}", problem, "each term once")
+            raise ProfileError(field, problem, "each term once")
         named[j] = key
         zernike_um[j] = value_um
     return flip_horizontal(zernike_um) if frame == "examiner" else zernike_um
 
 
-def _term_index(key: str, *, path: str) -> int:
-    name, allowed = f"{path}zernike_um.{key}", bodies.COEFFICIENTS_ALLOWED
+def _term_index(key: str, name: str) -> int:
+    allowed = bodies.COEFFICIENTS_ALLOWED
     try:
         n, m = (int(part) for part in key.split(","))
     except ValueError:

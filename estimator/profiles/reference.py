@@ -9,7 +9,13 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
-from estimator.profiles import bodies, correction_bodies, surface_bodies, validation
+from estimator.profiles import (
+    bodies,
+    correction_bodies,
+    implant_bodies,
+    surface_bodies,
+    validation,
+)
 from estimator.profiles.validation import KIND, allowed_values
 
 SCHEMA_DRAFT = "https://json-schema.org/draft/2020-12/schema"
@@ -42,6 +48,9 @@ INTRODUCTIONS: dict[type[msgspec.Struct], str] = {
     "every surface.",
     surface_bodies.SurfaceBody: "Each entry of `surfaces`.",
     surface_bodies.StateBody: "Each entry of `states`.",
+    bodies.PseudophakicBody: "Kind `pseudophakic`: an eye with an intraocular lens by "
+    "its geometry.",
+    implant_bodies.ImplantBody: "`implant`.",
     bodies.PublishedBody: "Kind `published`: a schematic eye by its name.",
 }
 """Tables of the reference in their order, with the line above each."""

@@ -142,7 +142,7 @@ def _retina(body: RetinalSurfaceBody) -> Retina:
 
 def _shape(body: RetinalSurfaceBody, path: str) -> dict[str, Any]:
     return {
-        "radius_mm": _radii(body.radius_mm, path),
+        "radius_mm": radii_mm(body.radius_mm, f"{path}radius_mm"),
         "conic_constant": body.conic_constant,
         "z_mm": body.z_mm,
         "rotation_deg": body.rotation_deg,
@@ -152,13 +152,21 @@ def _shape(body: RetinalSurfaceBody, path: str) -> dict[str, Any]:
     }
 
 
-def _radii(value: float | list[float | None] | None, path: str) -> tuple[float, float]:
-    """Return both radii; None is a plane."""
+def radii_mm(
+    value: float | list[float | None] | None, name: str
+) -> tuple[float, float]:
+    """Return both radii; None is a plane.
+
+    Raises
+    ------
+    ProfileError
+        A radius is too small; ``name`` is the path of the field.
+    """
     radii = value if isinstance(value, list) else [value, value]
     low, high = surface_bodies.SMALLEST_RADIUS_MM, surface_bodies.NUMBER_LIMIT
     if not all(r is None or low <= abs(r) <= high for r in radii):
         raise ProfileError(
-            f"{path}radius_mm",
+            name,
             f"{value!r:.60} is out of range",
             surface_bodies.RADIUS_ALLOWED,
         )

@@ -10,7 +10,6 @@ from estimator.estimate.given_surfaces import eye_model
 from estimator.eye.assembly import eye_surfaces
 from estimator.eye.lens_change import accommodated
 from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters
-from estimator.eye.surface_eye import SurfaceEye
 from estimator.eye.surface_model import StatesDiffer, SurfaceModel
 from estimator.eye.tracing import TraceFailed
 from estimator.field.prepare import prepare_eye
@@ -243,12 +242,21 @@ SETTINGS = FilterSettings(
 )
 
 
-@pytest.mark.parametrize("name", ["arizona", "atchison_2006", "toric"])
+@pytest.mark.parametrize("name", ["arizona", "atchison_2006", "toric", "implant"])
 def test_frames_agree_with_the_exact_psf_of_every_pixel(engine, name, rng):
-    """A homogeneous lens that accommodates, a gradient, and a toric cornea."""
+    """A lens that accommodates, a gradient, a toric cornea, and a tilted implant."""
     if name == "toric":
         first = {**RELAXED["surfaces"][0], "radius_mm": [7.9, 7.6], "rotation_deg": 25}
         body = {**RELAXED, "surfaces": [first, *RELAXED["surfaces"][1:]]}
+    elif name == "implant":
+        body = {
+            "kind": "pseudophakic",
+            "axial_length_mm": 23.4,
+            "keratometry_dpt": [42.5, 43.5],
+            "keratometry_axis_deg": 170,
+            "lens_center_mm": 4.9,
+            "implant": {"power_dpt": 21.5, "tilt_deg": [2, 4], "abbe_number": 50},
+        }
     else:
         body = {"kind": "published", "name": name}
     job = BuildJob(
