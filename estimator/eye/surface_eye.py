@@ -25,9 +25,19 @@ from estimator.eye.surface_model import SurfaceModel
 from estimator.eye.tracing import TraceFailed, refraction_of_packed, seen_refraction_dpt
 from estimator.optics import prescription as rx
 from estimator.optics.paraxial import entrance_pupil_mm
+from estimator.optics.raytrace import obstruction
 from estimator.optics.surfaces import EyeSurfaces, media_indices, pack_eye
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.vergence import ObjectVergence, refraction_at_cornea_dpt
+
+
+def _reason(eye: EyeSurfaces, pupil_diameter_mm: float) -> str:
+    reason = obstruction(
+        eye,
+        radius_mm=pupil_diameter_mm / 2.0,
+        wavelength_nm=REFERENCE_WAVELENGTH_NM,
+    )
+    return f" ({reason})" if reason else ""
 
 
 def _entrance_pupil_mm(eye: EyeSurfaces) -> float:
@@ -94,6 +104,7 @@ class SurfaceEye(TabulatedFocusing[FocusedSurfaces]):
         if not np.isfinite(refractions_dpt[0]):
             raise TraceFailed(
                 f"light does not pass the relaxed eye at {self.pupil_diameter_mm:g} mm"
+                + _reason(self.model.relaxed, self.pupil_diameter_mm)
             )
         falling = falling_count(refractions_dpt)
         return nominal_dpt[:falling], refractions_dpt[:falling]
@@ -130,6 +141,7 @@ class SurfaceEye(TabulatedFocusing[FocusedSurfaces]):
         if not usable.any():
             raise TraceFailed(
                 f"light does not fill a pupil of {pupils_mm[0]:g} mm in every state"
+                + _reason(self.model.relaxed, pupils_mm[0])
             )
         return FocusTable(
             pupils_mm[usable], self._accommodations_dpt[some], found_dpt[usable]

@@ -133,6 +133,38 @@ def trace_rays(
     return TracedRays(points_mm, cosines, path_mm, status, stop_index)
 
 
+def obstruction(eye: EyeSurfaces, *, radius_mm: float, wavelength_nm: float) -> str:
+    """Return where axial light is stopped and why, or "" if it passes.
+
+    Parameters
+    ----------
+    radius_mm : float
+        Radius of the bundle in front of the eye: its center and rim are traced.
+    """
+    angle = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
+    start_mm = np.zeros((len(angle) + 1, 3))
+    start_mm[1:, 0] = radius_mm * np.cos(angle)
+    start_mm[1:, 1] = radius_mm * np.sin(angle)
+    start_mm[:, 2] = eye.surfaces[0].z_mm - START_MM
+    found = trace_rays(
+        eye, start_mm=start_mm, direction=(0.0, 0.0, 1.0), wavelength_nm=wavelength_nm
+    )
+    stopped = np.flatnonzero(found.status_index != RayStatus.TRACED)
+    if not stopped.size:
+        return ""
+    ray = stopped[0]
+    element = int(np.isnan(found.points_mm[ray, :, 2]).argmax())
+    name = _name(eye, element, found.stop_index)
+    return f"{name}: {STATUS_WORDS[RayStatus(found.status_index[ray])]}"
+
+
+def _name(eye: EyeSurfaces, element: int, stop_index: int) -> str:
+    if element == stop_index:
+        return "stop"
+    i = element - (element > stop_index)
+    return f"surfaces[{i}]" if i < len(eye.surfaces) else "retina"
+
+
 def check_order(eye: EyeSurfaces) -> None:
     """Raise if surfaces cross within `ORDER_RADIUS_MM` of the axis.
 

@@ -21,6 +21,7 @@ from tests.unit.test_profile_bodies import WRONG
 
 IN_ORDER = (
     *("preset", "prescription", "zernike", "zernike_set", "eye", "surfaces"),
+    "pseudophakic",
     "published",
 )
 
