@@ -24,7 +24,7 @@ EyeSide = Literal["OD", "OS"]
 Source = Literal["prescription", "preset", "file"]
 
 SIDES: dict[EyeSide, str] = {"OD": "Right eye", "OS": "Left eye"}
-PROFILE_SUFFIXES = (".json", ".csv", ".abp")
+PROFILE_SUFFIXES = (".json", ".csv", ".abp", ".zmx")
 MAX_PROFILE_BYTES = 2_000_000
 
 PRESET_TITLES = {

@@ -5,19 +5,23 @@ pupil too: spherical aberration moves the sharpest distance as the pupil opens, 
 method requires the pupil diameter.
 """
 
+from __future__ import annotations
+
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from estimator.corrections.rings import Rings
 from estimator.eye.focus_table import FocusTable
-from estimator.optics.surfaces import EyeSurfaces
 from estimator.optics.vergence import ObjectVergence
+
+if TYPE_CHECKING:
+    from estimator.optics.surfaces import EyeSurfaces  # compiled: loads slowly
 
 OUT_OF_REACH_DPT = 0.01
 """Distance from the eye's range beyond which a focus is reported as out of reach.

@@ -1,6 +1,7 @@
-"""Profile files: JSON, the ``.abp`` of the paper's framework, CSV of coefficients."""
+"""Profile files: JSON, ``.abp`` of the paper's framework, CSV, and lens files."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +9,18 @@ from estimator.bounded_files import (
     InvalidFile,
     loads_bounded,
     numbered_lines,
+    read_bytes,
     read_text,
     reason_of,
 )
 from estimator.eye.checked_fields import did_you_mean
 from estimator.profiles.bodies import PUBLISHED_NAMES
+from estimator.profiles.lens_files import (
+    is_optiland,
+    optiland_body,
+    zmx_body,
+    zmx_text,
+)
 from estimator.profiles.parse import (
     EyeProfile,
     ProfileError,
@@ -71,7 +79,7 @@ def load_profile(
     ----------
     source : str or Path
         Name of a preset (see `preset_names`) or of a schematic eye
-        (`bodies.PUBLISHED_NAMES`), a ``.json``, ``.abp`` or ``.csv`` file,
+        (`bodies.PUBLISHED_NAMES`), a ``.json``, ``.abp``, ``.csv`` or ``.zmx`` file,
         or a JSON object, ``{"kind": "prescription", "sphere_dpt": -2}``.
     pupil_diameter_mm, wavelength_nm : float, optional
         Pupil and wavelength of a CSV file, which may instead contain them as
@@ -121,11 +129,17 @@ def profile_body(
     if not _is_path(source):
         return _inline(str(source))
     path = Path(source)
-    readers = {".json": _read_json, ".abp": _read_abp, ".csv": _read_csv}
+    readers = {
+        ".json": _read_json,
+        ".abp": _read_abp,
+        ".csv": _read_csv,
+        ".zmx": _read_zmx,
+    }
     reader = readers.get(path.suffix.lower())
     allowed = (
         f"a preset ({', '.join(preset_names())}), a schematic eye "
-        f"({', '.join(PUBLISHED_NAMES)}), a .json, .abp or .csv file, or a JSON object"
+        f"({', '.join(PUBLISHED_NAMES)}), a .json, .abp, .csv or .zmx "
+        "file, or a JSON object"
     )
     if reader is None:
         meant = did_you_mean(str(source), [n for ns in NAMES.values() for n in ns])
@@ -137,7 +151,12 @@ def profile_body(
     if not is_file:
         raise ProfileError("profile", f"file '{source}' does not exist", allowed)
     try:
-        text = read_text(path, max_bytes=MAX_PROFILE_BYTES, max_lines=MAX_PROFILE_LINES)
+        if reader is _read_zmx:
+            text = zmx_text(read_bytes(path, max_bytes=MAX_PROFILE_BYTES))
+        else:
+            text = read_text(
+                path, max_bytes=MAX_PROFILE_BYTES, max_lines=MAX_PROFILE_LINES
+            )
     except InvalidFile as error:
         raise InvalidProfileFile(path, "", error.found, error.allowed) from None
     body = reader(text, path)
@@ -173,9 +192,26 @@ def _read_json(text: str, path: Path) -> dict[str, Any]:
     if not isinstance(body, dict):
         problem = f"{body!r:.60} is not an object"
         raise InvalidProfileFile(path, "", problem, "one JSON object")
+    if is_optiland(body):
+        return _from_lens_file(optiland_body, body, path)
     if "surfaces" in body:  # files of schematic eyes need not state their kind
         body.setdefault("kind", "surfaces")
     return body
+
+
+def _read_zmx(text: str, path: Path) -> dict[str, Any]:
+    return _from_lens_file(zmx_body, text, path)
+
+
+def _from_lens_file(
+    reader: Callable[..., dict[str, Any]], content: object, path: Path
+) -> dict[str, Any]:
+    try:
+        return reader(content, path.stem)
+    except ProfileError as error:
+        raise InvalidProfileFile(
+            path, error.field, error.problem, error.allowed
+        ) from None
 
 
 def _set_once(

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, cast, get_args
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 import numpy as np
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from estimator.corrections.worn_lens import replaces_lens
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters, RetinaShape
-from estimator.eye.surface_model import SurfaceModel
 from estimator.media.straylight import CATARACTS, DEFAULT_AGE_YEARS, Straylight
 from estimator.optics import prescription as rx
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
@@ -31,10 +30,10 @@ from estimator.optics.zernike import (
 )
 from estimator.profiles import bodies
 from estimator.profiles.correction import parse_correction, prescription, vertex_notes
-from estimator.profiles.correction_bodies import IntraocularBody
-from estimator.profiles.pseudophakic import pseudophakic_model
-from estimator.profiles.surfaces import surface_model
-from estimator.profiles.validation import convert
+from estimator.profiles.validation import KIND, convert
+
+if TYPE_CHECKING:
+    from estimator.eye.surface_model import SurfaceModel
 
 __all__ = [
     "EyeProfile",
@@ -44,21 +43,11 @@ __all__ = [
     "preset_names",
 ]
 
-KINDS = tuple(str(kind.__struct_config__.tag) for kind in get_args(bodies.ProfileBody))
-
 PRESCRIPTION_RADIUS_MM = 3.0
 """Circle on which a prescription is represented; it is exact on every other."""
 
 EYE_PUPIL_MM = 6.0
 """Entrance pupil at which the wavefront of a given eye is represented."""
-
-IMPLANT_NOTE = (
-    "the eye is traced through its implant: wavefronts measured before surgery are not "
-    "part of it"
-)
-
-SURFACES_PUPIL_MM = 4.0
-"""The same for an eye given by surfaces, whose lens may be smaller than 6 mm."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +131,7 @@ class EyeProfile:
     yellowing: str | None = None
     spectacle_magnification: bool = False
     notes: tuple[str, ...] = ()
-    surfaces: SurfaceModel | None = None
+    surfaces: "SurfaceModel | None" = None
 
     @property
     def is_given(self) -> bool:
@@ -188,7 +177,9 @@ class EyeProfile:
             Light does not pass the given eye.
         """
         if self.surfaces is not None:
-            return _surfaces_zernike_um(self.surfaces)
+            from estimator.profiles.given_eyes import surfaces_zernike_um
+
+            return surfaces_zernike_um(self.surfaces)
         if self.eye is not None:
             return _traced_zernike_um(self.eye, self.retina)
         return self.measurements[0].zernike_um
@@ -202,7 +193,12 @@ def parse_profile(data: object) -> EyeProfile:
     ProfileError
         A field is invalid; the error names it, its value and the accepted values.
     """
-    body = convert(data, bodies.ProfileBody)
+    kind = data.get(KIND) if isinstance(data, Mapping) else None
+    if kind not in bodies.MEASURED_KINDS:  # loads compiled code
+        from estimator.profiles.given_eyes import parse_given_eye
+
+        return parse_given_eye(data)
+    body = convert(data, bodies.MeasuredBody)
     if isinstance(body, bodies.PresetBody):
         return _preset(body, cast(Mapping[str, Any], data))
     if isinstance(body, bodies.PrescriptionBody):
@@ -211,12 +207,6 @@ def parse_profile(data: object) -> EyeProfile:
         return _zernike_set(body)
     if isinstance(body, bodies.EyeBody):
         return _eye(body)
-    if isinstance(body, bodies.SurfacesBody):
-        return _surfaces(body)
-    if isinstance(body, bodies.PublishedBody):
-        return _published(body)
-    if isinstance(body, bodies.PseudophakicBody):
-        return _pseudophakic(body)
     return _zernike(body)
 
 
@@ -230,7 +220,7 @@ def _preset(body: bodies.PresetBody, data: Mapping[str, Any]) -> EyeProfile:
     return _zernike(convert({**bodies.PRESETS[body.name], **own}, bodies.ZernikeBody))
 
 
-def _common(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
+def common_fields(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
     age_years = None if body.age_years is msgspec.UNSET else body.age_years
     if body.yellowing is not None and age_years is None:
         raise ProfileError("age_years", "is required with yellowing", "3 to 120")
@@ -262,8 +252,9 @@ def _common(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
 
 
 def _periphery(body: bodies.CommonBody) -> str:
-    is_model = body.retina is not None or isinstance(
-        body, bodies.EyeBody | bodies.PublishedBody | bodies.PseudophakicBody
+    is_measured = isinstance(body, bodies.MeasuredBody)
+    is_model = (
+        body.retina is not None or isinstance(body, bodies.EyeBody) or not is_measured
     )
     if body.periphery is msgspec.UNSET:
         return "model" if is_model else "people"
@@ -300,7 +291,7 @@ def _prescription(body: bodies.PrescriptionBody) -> EyeProfile:
         *rx.power_vector(prescription(body, path="")),
         zernike_radius_mm=PRESCRIPTION_RADIUS_MM,
     )
-    common = _common(body, "prescription")
+    common = common_fields(body, "prescription")
     return EyeProfile(
         kind="prescription",
         **_primary(
@@ -341,7 +332,7 @@ def _primary(first: Measurement, *others: Measurement) -> dict[str, Any]:
 
 def _zernike(body: bodies.ZernikeBody) -> EyeProfile:
     measurement = Measurement(
-        _coefficients(body.zernike_um, body.frame, path=""),
+        coefficients_um(body.zernike_um, body.frame, path=""),
         body.pupil_diameter_mm,
         body.wavelength_nm,
     )
@@ -349,7 +340,7 @@ def _zernike(body: bodies.ZernikeBody) -> EyeProfile:
         kind="zernike",
         **_primary(measurement),
         max_pupil_diameter_mm=measurement.pupil_diameter_mm,
-        **_common(body, "zernike"),
+        **common_fields(body, "zernike"),
     )
 
 
@@ -358,7 +349,7 @@ def _zernike_set(body: bodies.ZernikeSetBody) -> EyeProfile:
     frame = "eye" if body.frame is msgspec.UNSET else body.frame
     measurements = [
         Measurement(
-            _coefficients(
+            coefficients_um(
                 entry.zernike_um,
                 frame if entry.frame is msgspec.UNSET else entry.frame,
                 path=f"measurements.{number}.",
@@ -381,7 +372,7 @@ def _zernike_set(body: bodies.ZernikeSetBody) -> EyeProfile:
         kind="zernike_set",
         **_primary(first, *others),
         max_pupil_diameter_mm=first.pupil_diameter_mm,
-        **_common(body, "zernike set"),
+        **common_fields(body, "zernike set"),
     )
 
 
@@ -393,80 +384,8 @@ def _eye(body: bodies.EyeBody) -> EyeProfile:
         wavelength_nm=REFERENCE_WAVELENGTH_NM,
         max_pupil_diameter_mm=EYE_PUPIL_MM,
         eye=EyeParameters.from_vector(vector),
-        **_common(body, "eye"),
+        **common_fields(body, "eye"),
     )
-
-
-def _surfaces(body: bodies.SurfacesBody) -> EyeProfile:
-    return _with_surfaces(body, "surfaces", surface_model(body))
-
-
-def _published(body: bodies.PublishedBody) -> EyeProfile:
-    from estimator.profiles.published import published_eye
-
-    if body.retina is not None:
-        raise ProfileError(
-            "retina", "is part of a published eye", "null, or kind 'surfaces'"
-        )
-    return _with_surfaces(body, "published", published_eye(body.name).model)
-
-
-def _pseudophakic(body: bodies.PseudophakicBody) -> EyeProfile:
-    cornea_um = None
-    if body.cornea_zernike_um is not msgspec.UNSET:
-        cornea_um = _coefficients(
-            body.cornea_zernike_um, body.frame, path="", name="cornea_zernike_um"
-        )
-    worn = body.correction
-    if isinstance(worn, IntraocularBody) and (
-        worn.sphere_dpt or worn.cylinder_dpt or worn.spherical_aberration_um
-    ):
-        raise ProfileError(
-            "correction.sphere_dpt",
-            "the power and aberration of a pseudophakic eye are those of its implant",
-            "0 in sphere_dpt, cylinder_dpt and spherical_aberration_um: the correction "
-            "only adds the steps or zones of its design",
-        )
-    profile = _with_surfaces(body, "pseudophakic", pseudophakic_model(body, cornea_um))
-    return replace(profile, notes=(IMPLANT_NOTE, *profile.notes))
-
-
-def _with_surfaces(
-    body: bodies.CommonBody, kind: str, surfaces: SurfaceModel
-) -> EyeProfile:
-    common = _common(body, kind)
-    if kind != "pseudophakic" and replaces_lens(common["correction"]):
-        raise ProfileError(
-            "correction.kind",
-            "'iol' replaces the lens of an eye that is given by its surfaces",
-            "spectacles or a contact lens; give the implant as surfaces",
-        )
-    return EyeProfile(
-        kind=kind,
-        pupil_diameter_mm=SURFACES_PUPIL_MM,
-        wavelength_nm=REFERENCE_WAVELENGTH_NM,
-        max_pupil_diameter_mm=math.inf,
-        surfaces=surfaces,
-        **common,
-    )
-
-
-def _surfaces_zernike_um(model: SurfaceModel) -> NDArray[np.float64]:
-    from estimator.optics.surfaces import media_indices, pack_eye
-    from estimator.wavefront.aberrations import on_axis_zernike  # loads slowly
-
-    zernike_um: NDArray[np.float64] = on_axis_zernike(
-        pack_eye(model.relaxed)[None],
-        media_indices(model.relaxed, REFERENCE_WAVELENGTH_NM),
-        zernike_radius_mm=SURFACES_PUPIL_MM / 2.0,
-    )[0][0]
-    if not np.isfinite(zernike_um).all():
-        raise ProfileError(
-            "surfaces",
-            f"light does not pass the eye at {SURFACES_PUPIL_MM:g} mm",
-            f"an eye that light crosses at a {SURFACES_PUPIL_MM:g} mm pupil",
-        )
-    return zernike_um
 
 
 def _traced_zernike_um(
@@ -492,7 +411,7 @@ def _traced_zernike_um(
         ) from None
 
 
-def _coefficients(
+def coefficients_um(
     entries: Mapping[str, float], frame: str, *, path: str, name: str = "zernike_um"
 ) -> NDArray[np.float64]:
     """Return coefficients (28,) in the eye frame."""

@@ -30,7 +30,7 @@ from estimator.optics.surfaces import (
 )
 from estimator.optics.units import MM_PER_M, REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import N_TERMS, nm_from_index
-from estimator.profiles.bodies import PseudophakicBody
+from estimator.profiles.given_bodies import PseudophakicBody
 from estimator.profiles.implant_bodies import ImplantBody
 from estimator.profiles.surfaces import radii_mm
 

@@ -11,7 +11,8 @@ from functools import cache
 
 from estimator.eye.surface_model import SurfaceModel
 from estimator.optics.surfaces import EyeSurfaces
-from estimator.profiles.bodies import PUBLISHED, PUBLISHED_NAMES, SurfacesBody
+from estimator.profiles.bodies import PUBLISHED, PUBLISHED_NAMES
+from estimator.profiles.given_bodies import SurfacesBody
 from estimator.profiles.surfaces import surface_model
 from estimator.profiles.validation import convert
 

@@ -12,6 +12,7 @@ from msgspec import inspect
 from estimator.profiles import (
     bodies,
     correction_bodies,
+    given_bodies,
     implant_bodies,
     surface_bodies,
     validation,
@@ -43,15 +44,15 @@ INTRODUCTIONS: dict[type[msgspec.Struct], str] = {
     correction_bodies.ZonesBody: "Design `zones`.",
     bodies.EyeBody: "Kind `eye`: the eye model by its parameters.",
     bodies.ParametersBody: "`parameters`.",
-    bodies.SurfacesBody: "Kind `surfaces`: an eye by its surfaces and media.",
+    given_bodies.SurfacesBody: "Kind `surfaces`: an eye by its surfaces and media.",
     surface_bodies.RetinalSurfaceBody: "`retina` of kind `surfaces`, and fields of "
     "every surface.",
     surface_bodies.SurfaceBody: "Each entry of `surfaces`.",
     surface_bodies.StateBody: "Each entry of `states`.",
-    bodies.PseudophakicBody: "Kind `pseudophakic`: an eye with an intraocular lens by "
+    given_bodies.PseudophakicBody: "Kind `pseudophakic`: an eye with an intraocular lens by "
     "its geometry.",
     implant_bodies.ImplantBody: "`implant`.",
-    bodies.PublishedBody: "Kind `published`: a schematic eye by its name.",
+    given_bodies.PublishedBody: "Kind `published`: a schematic eye by its name.",
 }
 """Tables of the reference in their order, with the line above each."""
 
@@ -59,7 +60,7 @@ INTRODUCTIONS: dict[type[msgspec.Struct], str] = {
 def profile_schema() -> dict[str, Any]:
     """Return the JSON Schema of a profile body."""
     schema, parts = msgspec.json.schema_components(
-        [bodies.ProfileBody], ref_template="#/$defs/{name}"
+        [given_bodies.ProfileBody], ref_template="#/$defs/{name}"
     )
     for part in parts.values():
         _separate_design(part)
@@ -150,7 +151,10 @@ def _own_fields(body: type[msgspec.Struct]) -> list[inspect.Field]:
         if base in INTRODUCTIONS
         for field in _fields(base)
     }
-    if body in (bodies.PresetBody, bodies.PublishedBody):  # its name selects the eye
+    if body in (
+        bodies.PresetBody,
+        given_bodies.PublishedBody,
+    ):  # its name selects the eye
         listed.discard("name")
     return [field for field in _fields(body) if field.encode_name not in listed]
 

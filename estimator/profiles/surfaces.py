@@ -22,7 +22,7 @@ from estimator.optics.surfaces import (
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import N_TERMS
 from estimator.profiles import surface_bodies
-from estimator.profiles.bodies import SurfacesBody
+from estimator.profiles.given_bodies import SurfacesBody
 from estimator.profiles.surface_bodies import RetinalSurfaceBody, StateBody, SurfaceBody
 
 N_CHECKED_BETWEEN = 4

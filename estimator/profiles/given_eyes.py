@@ -1,0 +1,119 @@
+"""Profiles that give the eye by its surfaces, or fail to name their kind."""
+
+import math
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.corrections.worn_lens import replaces_lens
+from estimator.eye.checked_fields import ProfileError
+from estimator.eye.surface_model import SurfaceModel
+from estimator.optics.surfaces import media_indices, pack_eye
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.profiles import bodies, given_bodies
+from estimator.profiles.correction_bodies import IntraocularBody
+from estimator.profiles.parse import EyeProfile, coefficients_um, common_fields
+from estimator.profiles.pseudophakic import pseudophakic_model
+from estimator.profiles.published import published_eye
+from estimator.profiles.surfaces import surface_model
+from estimator.profiles.validation import convert
+
+IMPLANT_NOTE = (
+    "the eye is traced through its implant: wavefronts measured before surgery are not "
+    "part of it"
+)
+
+SURFACES_PUPIL_MM = 4.0
+"""Entrance pupil at which the wavefront of such an eye is represented: less than that
+of the 45 parameters, because its lens may be smaller."""
+
+
+def parse_given_eye(data: object) -> EyeProfile:
+    """Parse a profile of kind ``surfaces``, ``pseudophakic`` or ``published``.
+
+    Raises
+    ------
+    ProfileError
+        A field is invalid, or the kind is unknown.
+    """
+    body = convert(data, given_bodies.ProfileBody)
+    if isinstance(body, given_bodies.PseudophakicBody):
+        return _pseudophakic(body)
+    if isinstance(body, given_bodies.PublishedBody):
+        return _published(body)
+    assert isinstance(body, given_bodies.SurfacesBody)
+    return _with_surfaces(body, "surfaces", surface_model(body))
+
+
+def _published(body: given_bodies.PublishedBody) -> EyeProfile:
+    if body.retina is not None:
+        raise ProfileError(
+            "retina", "is part of a published eye", "null, or kind 'surfaces'"
+        )
+    return _with_surfaces(body, "published", published_eye(body.name).model)
+
+
+def _pseudophakic(body: given_bodies.PseudophakicBody) -> EyeProfile:
+    cornea_um = None
+    if body.cornea_zernike_um is not msgspec.UNSET:
+        cornea_um = coefficients_um(
+            body.cornea_zernike_um, body.frame, path="", name="cornea_zernike_um"
+        )
+    worn = body.correction
+    if isinstance(worn, IntraocularBody) and (
+        worn.sphere_dpt or worn.cylinder_dpt or worn.spherical_aberration_um
+    ):
+        raise ProfileError(
+            "correction.sphere_dpt",
+            "the power and aberration of a pseudophakic eye are those of its implant",
+            "0 in sphere_dpt, cylinder_dpt and spherical_aberration_um: the correction "
+            "only adds the steps or zones of its design",
+        )
+    profile = _with_surfaces(body, "pseudophakic", pseudophakic_model(body, cornea_um))
+    return replace(profile, notes=(IMPLANT_NOTE, *profile.notes))
+
+
+def _with_surfaces(
+    body: bodies.CommonBody, kind: str, surfaces: SurfaceModel
+) -> EyeProfile:
+    common = common_fields(body, kind)
+    if kind != "pseudophakic" and replaces_lens(common["correction"]):
+        raise ProfileError(
+            "correction.kind",
+            "'iol' replaces the lens of an eye that is given by its surfaces",
+            "spectacles or a contact lens; give the implant as surfaces",
+        )
+    return EyeProfile(
+        kind=kind,
+        pupil_diameter_mm=SURFACES_PUPIL_MM,
+        wavelength_nm=REFERENCE_WAVELENGTH_NM,
+        max_pupil_diameter_mm=math.inf,
+        surfaces=surfaces,
+        **common,
+    )
+
+
+def surfaces_zernike_um(model: SurfaceModel) -> NDArray[np.float64]:
+    """Return the wavefront (28,), um, of the relaxed eye on axis, at the cornea.
+
+    Raises
+    ------
+    ProfileError
+        Light does not pass the eye.
+    """
+    from estimator.wavefront.aberrations import on_axis_zernike  # loads slowly
+
+    zernike_um: NDArray[np.float64] = on_axis_zernike(
+        pack_eye(model.relaxed)[None],
+        media_indices(model.relaxed, REFERENCE_WAVELENGTH_NM),
+        zernike_radius_mm=SURFACES_PUPIL_MM / 2.0,
+    )[0][0]
+    if not np.isfinite(zernike_um).all():
+        raise ProfileError(
+            "surfaces",
+            f"light does not pass the eye at {SURFACES_PUPIL_MM:g} mm",
+            f"an eye that light crosses at a {SURFACES_PUPIL_MM:g} mm pupil",
+        )
+    return zernike_um

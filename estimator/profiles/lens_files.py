@@ -1,0 +1,419 @@
+"""Eyes in lens files of other programs, as bodies of kind ``surfaces``.
+
+Sequential Zemax files (``.zmx``) and the JSON files of optiland are read as far as eyes
+use them: conics, even aspheres, decentrations, and, from optiland, tilts and Zernike
+sags.  Whatever else would change a ray is refused by its name.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from estimator.eye.checked_fields import ProfileError
+from estimator.optics.zernike import N_TERMS, nm_from_index
+
+MAX_ELEMENTS = 60
+AIR = "air"
+
+Medium = dict[str, Any]
+
+
+@dataclass
+class Element:
+    """A surface of a lens file, before surfaces without effect are dropped.
+
+    Attributes
+    ----------
+    number : int
+        Its number in the file.
+    z_mm : float
+        Position of the vertex.
+    radius_mm : float, list of two, or None
+        None is a plane.
+    medium : dict or None
+        Body of the medium behind; None is air.
+    shape : dict
+        Other fields of a surface's body.
+    """
+
+    number: int
+    z_mm: float = 0.0
+    radius_mm: float | list[float] | None = None
+    medium: Medium | None = None
+    is_stop: bool = False
+    shape: dict[str, Any] = field(default_factory=dict)
+
+
+def refused(number: int, what: str, allowed: str) -> ProfileError:
+    """Return the error for an element that is not understood."""
+    return ProfileError(f"surface {number} of the file", what, allowed)
+
+
+def surfaces_body(elements: Sequence[Element], name: str) -> dict[str, Any]:
+    """Return the body of an eye; the last element is the retina.
+
+    Parameters
+    ----------
+    elements : sequence of Element
+        In the order light meets them, without the object.
+
+    Raises
+    ------
+    ProfileError
+        There are too few or too many elements, or no stop.
+    """
+    if not 2 <= len(elements) <= MAX_ELEMENTS:
+        raise ProfileError(
+            "surfaces",
+            f"the file has {len(elements)}",
+            f"2 to {MAX_ELEMENTS} surfaces, the retina last",
+        )
+    stops = [element for element in elements if element.is_stop]
+    if not stops:
+        raise ProfileError("stop_z_mm", "the file has no stop", "a surface as the stop")
+    *refracting, retina = elements
+    media: dict[str, Medium] = {}
+    surfaces: list[dict[str, Any]] = []
+    before: Medium | None = None
+    for element in refracting:
+        if element.medium != before:
+            surfaces.append(
+                {
+                    "radius_mm": element.radius_mm,
+                    "z_mm": element.z_mm,
+                    "medium_after": _named(media, element.medium),
+                    **element.shape,
+                }
+            )
+        before = element.medium
+    if not surfaces:
+        raise ProfileError("surfaces", "no surface refracts", "a cornea and a lens")
+    apex_mm = surfaces[0]["z_mm"]
+    for surface in surfaces:
+        surface["z_mm"] -= apex_mm
+    return {
+        "kind": "surfaces",
+        "name": name,
+        "surfaces": surfaces,
+        "stop_z_mm": stops[0].z_mm - apex_mm,
+        "retina": {
+            "radius_mm": retina.radius_mm,
+            "z_mm": retina.z_mm - apex_mm,
+            **retina.shape,
+        },
+        "media": media,
+    }
+
+
+def _named(media: dict[str, Medium], medium: Medium | None) -> str:
+    """Return the name of a medium; add it if it is new."""
+    if medium is None:
+        return AIR
+    for name, known in media.items():
+        if known == medium:
+            return name
+    name = f"medium_{len(media) + 1}"
+    media[name] = medium
+    return name
+
+
+# --- Zemax --------------------------------------------------------------------------
+
+WITHOUT_EFFECT = {
+    *("BLNK", "CLAP", "COFN", "COMM", "DIAM", "ELEM", "FCMI", "FIMP", "FLAP"),
+    *("HIDE", "MEMA", "MIRR", "OEMA", "POPS", "PPAR", "QOFF", "SLAB", "TRAC"),
+}
+"""Operands of a surface that are ignored: display, coatings, semi-diameters, comments.
+Of apertures, only the stop counts."""
+
+EVEN_TERMS = 8
+
+
+def zmx_text(content: bytes) -> str:
+    """Return the text of a .zmx file, which is UTF-16, UTF-8 or Latin-1."""
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return content.decode("utf-16", "replace")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def zmx_body(text: str, name: str) -> dict[str, Any]:
+    """Return the body of the eye in a sequential Zemax file.
+
+    Raises
+    ------
+    ProfileError
+        The file is not sequential or not in mm, or an element is not understood.
+    """
+    blocks: list[dict[str, list[str]]] = []
+    header: dict[str, list[str]] = {}
+    parameters: list[dict[int, float]] = []
+    for line in text.splitlines():
+        words = line.split()
+        if not words:
+            continue
+        operand, *values = words
+        if operand == "SURF":
+            if len(blocks) > MAX_ELEMENTS:
+                raise ProfileError(
+                    "surfaces", "the file has too many", f"up to {MAX_ELEMENTS}"
+                )
+            blocks.append({})
+            parameters.append({})
+        elif not blocks:
+            header.setdefault(operand, values)
+        elif operand == "PARM" and len(values) > 1:
+            number = int(_number(values[0], len(blocks) - 1, "PARM"))
+            parameters[-1][number] = _number(values[1], len(blocks) - 1, "PARM")
+        else:
+            blocks[-1].setdefault(operand, values)
+    _check_header(header)
+    return surfaces_body(
+        _zmx_elements(blocks, parameters), " ".join(header.get("NAME", [])) or name
+    )
+
+
+def _check_header(header: Mapping[str, list[str]]) -> None:
+    mode = (header.get("MODE") or ["SEQ"])[0]
+    unit = (header.get("UNIT") or ["MM"])[0]
+    if mode != "SEQ":
+        raise ProfileError("MODE", f"{mode!r:.20} is not sequential", "SEQ")
+    if unit != "MM":
+        raise ProfileError("UNIT", f"{unit!r:.20}", "MM")
+
+
+def _zmx_elements(
+    blocks: Sequence[Mapping[str, list[str]]],
+    parameters: Sequence[Mapping[int, float]],
+) -> list[Element]:
+    elements: list[Element] = []
+    z_mm, x_mm, y_mm = 0.0, 0.0, 0.0
+    for number, (block, parms) in enumerate(zip(blocks, parameters, strict=True)):
+        kind = (block.get("TYPE") or ["STANDARD"])[0]
+        thickness = (block.get("DISZ") or ["0"])[0]
+        known = {"TYPE", "CURV", "DISZ", "CONI", "GLAS", "STOP"}
+        unknown = sorted(set(block) - known - WITHOUT_EFFECT)
+        if number == 0:  # the object
+            continue
+        if unknown:
+            raise refused(
+                number,
+                f"operand {unknown[0]!r:.20} is not understood",
+                "files without it",
+            )
+        if kind == "COORDBRK":
+            if any(parms.get(i, 0.0) for i in (3, 4, 5)):
+                raise refused(number, "COORDBRK tilts", "COORDBRK that decenters only")
+            x_mm, y_mm = x_mm + parms.get(1, 0.0), y_mm + parms.get(2, 0.0)
+        else:
+            elements.append(_zmx_element(number, block, parms, kind))
+            elements[-1].z_mm = z_mm
+            if x_mm or y_mm:
+                elements[-1].shape["decentration_mm"] = [x_mm, y_mm]
+        if number < len(blocks) - 1:
+            z_mm += _number(thickness, number, "DISZ")
+    return elements
+
+
+def _zmx_element(
+    number: int, block: Mapping[str, list[str]], parms: Mapping[int, float], kind: str
+) -> Element:
+    curvature = _number((block.get("CURV") or ["0"])[0], number, "CURV")
+    element = Element(
+        number,
+        radius_mm=1.0 / curvature if curvature else None,
+        is_stop="STOP" in block,
+        medium=_zmx_medium(number, block["GLAS"]) if "GLAS" in block else None,
+    )
+    conic = _number((block.get("CONI") or ["0"])[0], number, "CONI")
+    if conic:
+        element.shape["conic_constant"] = conic
+    if kind == "EVENASPH":
+        terms = [parms.get(i, 0.0) for i in range(1, EVEN_TERMS + 1)]
+        if any(terms):
+            element.shape["form"] = {"kind": "even_asphere", "coefficients": terms}
+    elif kind != "STANDARD":
+        raise refused(
+            number, f"type {kind!r:.20} is not understood", "STANDARD, EVENASPH"
+        )
+    return element
+
+
+def _zmx_medium(number: int, values: Sequence[str]) -> Medium:
+    """Return a model glass; catalog glasses are not in the file."""
+    name = values[0] if values else ""
+    is_model = len(values) > 4 and _number(values[1], number, "GLAS") == 1.0
+    if not is_model or _number(values[3], number, "GLAS") < 1.0:
+        raise refused(
+            number,
+            f"glass {name!r:.30} is in a catalog, not in the file",
+            "model glasses, with index and Abbe number",
+        )
+    index, abbe = (_number(v, number, "GLAS") for v in values[3:5])
+    return _glass(index, abbe)
+
+
+def _glass(index: float, abbe: float) -> Medium:
+    if abbe == 0.0:
+        return {"kind": "constant", "index": index}
+    return {"kind": "abbe_number", "d_line_index": index, "abbe_number": abbe}
+
+
+def _number(text: str, number: int, operand: str) -> float:
+    try:
+        value = float(text.replace(",", "."))
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise refused(number, f"{operand} {text!r:.30} is not a number", "a number")
+    return value
+
+
+# --- optiland -----------------------------------------------------------------------
+
+
+def is_optiland(data: Mapping[str, Any]) -> bool:
+    """Return whether a JSON object is an optic that optiland saved."""
+    return "surface_group" in data
+
+
+def optiland_body(data: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return the body of the eye in a JSON object of optiland.
+
+    Raises
+    ------
+    ProfileError
+        An element is not understood, or a field is missing.
+    """
+    try:
+        listed = list(data["surface_group"]["surfaces"])[: MAX_ELEMENTS + 2]
+        elements = [
+            _optiland_element(number, surface)
+            for number, surface in enumerate(listed)
+            if number  # 0 is the object
+        ]
+        return surfaces_body(elements, str(data.get("name") or name))
+    except ProfileError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise ProfileError(
+            "surface_group",
+            f"is incomplete ({type(error).__name__}: {error!s:.80})",
+            "an optic saved by optiland",
+        ) from None
+
+
+def _optiland_element(number: int, surface: Mapping[str, Any]) -> Element:
+    kind, geometry = surface["type"], surface["geometry"]
+    if kind != "Surface" or surface["interaction_model"]["is_reflective"]:
+        raise refused(number, f"{kind!r:.40} is not understood", "refracting surfaces")
+    axes = geometry["cs"]
+    if axes["reference_cs"] is not None:
+        raise refused(number, "reference_cs is not understood", "null")
+    element = Element(
+        number,
+        z_mm=float(axes["z"]),
+        is_stop=surface["is_stop"],
+        medium=_optiland_medium(number, surface["material_post"]),
+    )
+    shape = element.shape
+    if axes["x"] or axes["y"]:
+        shape["decentration_mm"] = [axes["x"], axes["y"]]
+    if axes["rx"] or axes["ry"] or axes["rz"]:
+        shape["rotation_deg"], shape["tilt_deg"] = _turns_deg(
+            axes["rx"], axes["ry"], axes["rz"]
+        )
+    _optiland_shape(element, geometry)
+    aperture = surface.get("aperture")
+    if aperture is not None:
+        if aperture["type"] != "RadialAperture" or aperture["r_min"]:
+            raise refused(
+                number,
+                f"aperture {aperture['type']!r:.40} is not understood",
+                "RadialAperture with r_min 0",
+            )
+        if not element.is_stop:
+            shape["clear_radius_mm"] = aperture["r_max"]
+    return element
+
+
+def _optiland_shape(element: Element, geometry: Mapping[str, Any]) -> None:
+    kind, shape = geometry["type"], element.shape
+    if kind == "Plane":
+        return
+    if kind in ("BiconicGeometry", "ToroidalGeometry"):
+        element.radius_mm = [geometry["radius_x"], geometry["radius_y"]]
+        if kind == "BiconicGeometry":
+            conics = [geometry["conic_x"], geometry["conic_y"]]
+            shape["form"] = {"kind": "separate_profiles", "conic_constants": conics}
+        elif any(geometry["coeffs_poly_y"]):
+            raise refused(element.number, "coeffs_poly_y is not understood", "no terms")
+        else:
+            shape["conic_constant"] = geometry["conic_yz"]
+            shape["form"] = {"kind": "toroid"}
+        return
+    radius_mm = geometry["radius"]
+    element.radius_mm = radius_mm if math.isfinite(radius_mm) else None
+    if geometry["conic"]:
+        shape["conic_constant"] = geometry["conic"]
+    if kind == "EvenAsphere":
+        terms = list(geometry["coefficients"])
+        if any(terms):
+            shape["form"] = {"kind": "even_asphere", "coefficients": terms}
+    elif kind == "ZernikePolynomialGeometry":
+        shape.update(_zernike_sag(element.number, geometry))
+    elif kind != "StandardGeometry":
+        raise refused(
+            element.number,
+            f"geometry {kind!r:.40} is not understood",
+            "Plane, StandardGeometry, EvenAsphere, BiconicGeometry, ToroidalGeometry "
+            "or ZernikePolynomialGeometry",
+        )
+
+
+def _zernike_sag(number: int, geometry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return offset terms; optiland's are normalized, in the OSA order."""
+    terms = list(geometry["coefficients"])
+    if geometry["zernike_type"] != "standard" or len(terms) > N_TERMS:
+        raise refused(
+            number,
+            f"{len(terms)} Zernike terms of type {geometry['zernike_type']!r:.20}",
+            f"up to {N_TERMS} of type 'standard'",
+        )
+    offsets = []
+    for j, term in enumerate(terms + [0.0] * (N_TERMS - len(terms))):
+        n, m = nm_from_index(j)
+        offsets.append(term * math.sqrt((2 - (m == 0)) * (n + 1)))
+    return {"offset_mm": offsets, "offset_radius_mm": geometry["norm_radius"]}
+
+
+def _turns_deg(rx: float, ry: float, rz: float) -> tuple[float, list[float]]:
+    """Return rotation and tilts for turns about x, then y, then z, in radians.
+
+    A profile turns a surface about z first, then about x, then about y.
+    """
+    (cx, sx), (cy, sy), (cz, sz) = ((math.cos(a), math.sin(a)) for a in (rx, ry, rz))
+    # rows of Rz Ry Rx that hold the other angles
+    first = cz * sy * cx + sz * sx
+    second = (sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx)
+    about_x = -math.asin(max(-1.0, min(1.0, second[2])))
+    about_y = math.atan2(first, cy * cx)
+    about_z = math.atan2(second[0], second[1])
+    return math.degrees(about_z), [math.degrees(about_x), math.degrees(about_y)]
+
+
+def _optiland_medium(number: int, material: Mapping[str, Any]) -> Medium | None:
+    kind = material["type"]
+    if kind == "IdealMaterial":
+        index = material["index"]
+        return None if index == 1.0 else _glass(index, 0.0)
+    if kind == "AbbeMaterial":
+        return _glass(material["index"], material["abbe"])
+    raise refused(
+        number,
+        f"material {kind!r:.40} is not understood",
+        "IdealMaterial or AbbeMaterial",
+    )
