@@ -1,5 +1,7 @@
 """Cost of a planned cache: memory from predicted radii, time from a cost model."""
 
+from typing import TypedDict
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,8 +36,17 @@ COMPUTED_BEYOND = 0.2
 """Light that a computed kernel may lack, over what trimming may drop."""
 
 
-def predicted_cost(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> dict[str, float]:
-    """Return fields of `PlanPrediction`: count, memory, time and cores."""
+class PlanCost(TypedDict):
+    """Cost of a plan; fields as in `PlanPrediction`."""
+
+    psf_count: int
+    memory_mb: float
+    build_s: float
+    core_count: int
+
+
+def predicted_cost(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> PlanCost:
+    """Predict the number, memory and build time of a plan's PSFs."""
     count = channels_of(spec) * len(plan.nodes.defocus.values_dpt)
     states = sampled_states(spec, plan, SAMPLES)
     survey = state_survey(eye, spec, states)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -274,7 +274,7 @@ class CachePlan(PlanAxes):
         None unless requested: it takes longer than the plan.
     """
 
-    nodes: PlanNodes | None = None
+    nodes: PlanNodes = field(kw_only=True)
     prediction: PlanPrediction | None = None
 
 

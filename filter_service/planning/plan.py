@@ -110,10 +110,11 @@ def plan_cache(eye: EyeOptics, spec: GridSpec) -> CachePlan:
     PlanTooLarge
         If the kernels exceed ``spec.memory_budget_mb``; the message proposes a change.
     """
-    plan = unchecked_plan(eye, spec)
-    if plan.prediction.memory_mb > spec.memory_budget_mb:
-        raise PlanTooLarge(spec, plan.prediction, _advice(eye, spec))
-    return plan
+    plan = unchecked_plan(eye, spec, predict=False)
+    prediction = _prediction(eye, spec, plan)
+    if prediction.memory_mb > spec.memory_budget_mb:
+        raise PlanTooLarge(spec, prediction, _advice(eye, spec))
+    return replace(plan, prediction=prediction)
 
 
 def unchecked_plan(
@@ -140,13 +141,16 @@ def unchecked_plan(
     )
     if not predict:
         return plan
+    return replace(plan, prediction=_prediction(eye, spec, plan))
+
+
+def _prediction(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> PlanPrediction:
     errors = _errors(sample_use(eye, spec, USE_SAMPLES), plan)
-    prediction = PlanPrediction(
+    return PlanPrediction(
         **predicted_cost(eye, spec, plan),
         interpolation_db=psnr_db(combined_error(list(errors.values()))),
         error_db_by_axis={name: psnr_db(error) for name, error in errors.items()},
     )
-    return replace(plan, prediction=prediction)
 
 
 def plan_axes(
@@ -385,7 +389,7 @@ def _nodes_by_blur(
 def _advice(eye: EyeOptics, spec: GridSpec) -> str:
     """Return text on which change of settings makes the plan fit, and its memory."""
     for words, smaller in _smaller_specs(spec):
-        found = unchecked_plan(eye, smaller).prediction
+        found = _prediction(eye, smaller, unchecked_plan(eye, smaller, predict=False))
         if found.memory_mb <= spec.memory_budget_mb:
             return f"{words} needs {_needs(found)}"
     return f"even {words} needs {_needs(found)}; use a smaller image"

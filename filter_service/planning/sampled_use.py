@@ -1,7 +1,6 @@
 """Sampled states of the frames of a cache, and the errors of blended PSFs there."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,14 +118,15 @@ def sample_use(eye: EyeOptics, spec: GridSpec, count: int) -> Use:
     states = PupilStates(
         **known, total_defocus_dpt=eye.total_defocus_dpt(**known) + vergence_dpt
     )
-    if not any(spec.settings.gaze_range_deg):
-        scale = None
-    exact_px = slopes_px(state_frames(eye, spec, states, pixel_from_mrad=scale))
-    return Use(eye, spec, states, vergence_dpt, scale, exact_px)
+    pixel_from_mrad = scale if any(spec.settings.gaze_range_deg) else None
+    exact_px = slopes_px(
+        state_frames(eye, spec, states, pixel_from_mrad=pixel_from_mrad)
+    )
+    return Use(eye, spec, states, vergence_dpt, pixel_from_mrad, exact_px)
 
 
 def _nearest_object_dpt(
-    spec: GridSpec, focused_dpt: NDArray[Any]
+    spec: GridSpec, focused_dpt: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the object distances (P,) nearest to the eye's focus."""
     ranges_dpt = np.array(spec.object_ranges_dpt)
@@ -135,7 +135,7 @@ def _nearest_object_dpt(
     return found[np.arange(best.size), best]
 
 
-def _objects_dpt(spec: GridSpec, share: NDArray[Any]) -> NDArray[np.float64]:
+def _objects_dpt(spec: GridSpec, share: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the object distances (P,) at shares of the concatenated ranges."""
     ranges_dpt = np.array(spec.object_ranges_dpt)
     steps = share * len(ranges_dpt)
@@ -145,8 +145,8 @@ def _objects_dpt(spec: GridSpec, share: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _seen_directions(
-    spec: GridSpec, x: NDArray[Any], y: NDArray[Any]
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    spec: GridSpec, x: NDArray[np.float64], y: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return field directions (P,) and scales at image positions in 0..1.
 
     The positions cycle through the gaze directions that frames may have.
@@ -188,19 +188,19 @@ def moved(use: Use, axis: str, to: NDArray[np.float64]) -> PupilStates:
     return PupilStates(**columns, total_defocus_dpt=total_dpt)
 
 
-def _blur_scale(use: Use, pupils_mm: NDArray[Any]) -> NDArray[np.float64]:
+def _blur_scale(use: Use, pupils_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the ratio (P,) of the defocus at which pupils are read to the states'."""
     if use.eye.rings is not None:  # foci are the same in any pupil
         return np.ones(pupils_mm.shape)
     return use.states.pupil_diameter_mm / pupils_mm
 
 
-def axis_error(use: Use, axis: str, nodes: NDArray[Any]) -> float:
+def axis_error(use: Use, axis: str, nodes: NDArray[np.float64]) -> float:
     """Return the mean square error when one axis is interpolated between nodes."""
     return axis_errors(use, axis, [nodes])[0]
 
 
-def axis_errors(use: Use, axis: str, choices: list[NDArray[Any]]) -> list[float]:
+def axis_errors(use: Use, axis: str, choices: list[NDArray[np.float64]]) -> list[float]:
     """Return `axis_error` of several choices of nodes, evaluating the eye once."""
     found = [
         bracket_axis(nodes, vars(use.states)[FIELD_OF_AXIS[axis]]) for nodes in choices
@@ -264,13 +264,13 @@ def _at_infinity_dpt(use: Use, states: PupilStates) -> NDArray[np.float64]:
     return use.eye.total_defocus_dpt(**columns)
 
 
-def _error(use: Use, neighbors: PupilStates, share: NDArray[Any]) -> float:
+def _error(use: Use, neighbors: PupilStates, share: NDArray[np.float64]) -> float:
     """Return the mean square error; neighbors are all lower, then all upper ones."""
     return float(_errors_of(use, neighbors, share).mean())
 
 
 def _errors_of(
-    use: Use, neighbors: PupilStates, share: NDArray[Any]
+    use: Use, neighbors: PupilStates, share: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return square errors (P,); neighbors are all lower, then all upper ones."""
     found = np.zeros(share.size)
@@ -312,7 +312,7 @@ def light_of_foci(use: Use) -> list[tuple[NDArray[np.float64], NDArray[np.float6
 
 
 def focus_slopes_px(
-    use: Use, states: PupilStates, added_dpt: NDArray[Any]
+    use: Use, states: PupilStates, added_dpt: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return slopes (m P, n, 2), px, of light for a focus, in pixels of the states."""
     count = states.h_deg.size // use.states.h_deg.size

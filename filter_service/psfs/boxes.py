@@ -10,6 +10,14 @@ MAX_REACH_PX = 255
 
 SIDES = 4
 
+MAX_CENTROID_SHIFT_RATIO = 0.005
+"""Largest shift of a kernel's centroid by cropping, relative to its spread, or to a
+pixel for sharper kernels; `GridSpec.kept_energy_ratio` states the total cost."""
+
+CUT_STEPS = 7
+"""Number of halvings of the cropped light, until the centroid shift is small enough;
+after them, nothing is cropped."""
+
 
 def box_sizes(reach_px: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return widths and heights (...) of kernels with reaches (..., 4)."""
@@ -28,16 +36,3 @@ def unpack_reach(words: NDArray[np.uint32]) -> NDArray[np.uint8]:
     """Unpack four reaches (..., 4) from words (...)."""
     little = np.ascontiguousarray(words, "<u4")
     return little[..., None].view(np.uint8)
-
-
-def square_kernel(
-    weights: NDArray[np.uint16], offset: int, reach_px: NDArray[Any], radius_px: int
-) -> NDArray[np.float64]:
-    """Return a centered kernel (2 R + 1, 2 R + 1), in its quantization steps."""
-    left, right, up, down = (int(r) for r in reach_px)
-    width, height = left + right + 1, up + down + 1
-    square = np.zeros((2 * radius_px + 1,) * 2)
-    square[
-        radius_px - up : radius_px + down + 1, radius_px - left : radius_px + right + 1
-    ] = weights[offset : offset + width * height].reshape(height, width)
-    return square

@@ -58,14 +58,13 @@ def computed_kernels(
     total_dpt = nodes.defocus.values_dpt[psfs // RGB]
     total_dpt = total_dpt + nodes.channel_shift_dpt[groups, channels]
     wavefronts = nodes.wavefronts
-    asked = groups, channels, total_dpt
     generic = partial(generic_kernels, eye, spec, wavefronts, engine)
     native = engine.native
     if native is None or wavefronts.wavelength_nm.shape[1] > MAX_PRIMARIES:
-        return generic(*asked)
+        return generic(groups, channels, total_dpt)
     packed, methods, left = native.kernels(
         wavefronts,
-        *asked,
+        *(groups, channels, total_dpt),
         kept_energy_ratio=spec.kept_energy_ratio,
         max_radius_px=spec.max_blur_radius_px,
         diffraction=spec.settings.diffraction,
@@ -73,7 +72,7 @@ def computed_kernels(
         rings=rings,
     )
     if left.size:
-        others, more = generic(*(array[left] for array in asked))
+        others, more = generic(groups[left], channels[left], total_dpt[left])
         packed, methods = packed.with_kernels(left, others), methods + more
     return packed, methods
 
@@ -132,11 +131,7 @@ def mean_batch(batch: PsfBatch, count: int) -> PsfBatch:
     """Return a batch (P,) of means over ``count`` consecutive kernels each."""
     if count == 1:
         return batch
-
-    def of_each(values: np.ndarray) -> np.ndarray:
-        return values.reshape(-1, count)
-
-    radius_px = of_each(batch.radius_px).max(axis=1)
+    radius_px = batch.radius_px.reshape(-1, count).max(axis=1)
     sides = 2 * radius_px + 1
     offsets = np.concatenate([[0], np.cumsum(sides**2)])
     kernels = np.zeros(offsets[-1], np.float32)
@@ -152,7 +147,7 @@ def mean_batch(batch: PsfBatch, count: int) -> PsfBatch:
         flat_kernels=kernels,
         offset_count=offsets[:-1],
         radius_px=radius_px,
-        lost_energy_ratio=of_each(batch.lost_energy_ratio).mean(axis=1),
-        blur_radius_px=of_each(batch.blur_radius_px).mean(axis=1),
-        geometric_ratio=of_each(batch.geometric_ratio).mean(axis=1),
+        lost_energy_ratio=batch.lost_energy_ratio.reshape(-1, count).mean(axis=1),
+        blur_radius_px=batch.blur_radius_px.reshape(-1, count).mean(axis=1),
+        geometric_ratio=batch.geometric_ratio.reshape(-1, count).mean(axis=1),
     )

@@ -10,7 +10,6 @@ from collections import Counter
 from dataclasses import dataclass, field
 from functools import cache
 from threading import Lock
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,12 +31,8 @@ from filter_service.native.records import (
     pointer_to,
 )
 from filter_service.planning.node_wavefronts import NodeWavefronts
-from filter_service.psfs.boxes import SIDES
-from filter_service.psfs.pack import (
-    CUT_STEPS,
-    MAX_CENTROID_SHIFT_RATIO,
-    PackedKernels,
-)
+from filter_service.psfs.boxes import CUT_STEPS, MAX_CENTROID_SHIFT_RATIO, SIDES
+from filter_service.psfs.pack import PackedKernels
 
 MAX_PRIMARIES = 16
 
@@ -163,7 +158,7 @@ class NativePsfs:
         """
         count, primaries = groups.size, wavefronts.wavelength_nm.shape[1]
         sampling = ACCURACY["normal"]
-        arrays = {
+        inputs = {
             "zernike_um": wavefronts.zernike_um,
             "per_dpt_um": wavefronts.per_dpt_um,
             "circle_diameter_mm": wavefronts.circle_diameter_mm,
@@ -175,13 +170,14 @@ class NativePsfs:
         center_mm = (0.0, 0.0)
         if stiles_crawford is not None:
             per_mm2, _ = stiles_crawford.amplitude(wavefronts.wavelength_nm.ravel())
-            arrays["apodization_per_mm2"] = per_mm2
+            inputs["apodization_per_mm2"] = per_mm2
             center_mm = stiles_crawford.centre_mm
         if rings is not None:
-            arrays["ring_offset_mm"] = rings.offset_mm
-            arrays["ring_reach_mrad"] = rings.reach_mrad
-        arrays: dict[str, NDArray[Any]] = {
-            n: np.ascontiguousarray(a, np.float64) for n, a in arrays.items()
+            inputs["ring_offset_mm"] = rings.offset_mm
+            inputs["ring_reach_mrad"] = rings.reach_mrad
+        arrays: dict[str, NDArray[np.generic]] = {
+            name: np.ascontiguousarray(array, np.float64)
+            for name, array in inputs.items()
         }
         if rings is not None:
             arrays["ring_tables"] = rings.amplitude_ratio
@@ -246,7 +242,9 @@ def native_psfs() -> NativePsfs | None:
     return NativePsfs(library, library.new_threads(thread_count()))
 
 
-def _with_changes(table: NDArray[Any]) -> NDArray[np.float32]:
+def _with_changes(
+    table: NDArray[np.float32] | NDArray[np.float64],
+) -> NDArray[np.float32]:
     """Return entries (n, 2) of a table (n,): values, and differences to the next."""
     return np.stack([table, np.diff(table, append=table[-1])], axis=1).astype(
         np.float32
@@ -254,7 +252,7 @@ def _with_changes(table: NDArray[Any]) -> NDArray[np.float32]:
 
 
 @cache
-def _tables() -> tuple[PsfTables, dict[str, NDArray[Any]]]:
+def _tables() -> tuple[PsfTables, dict[str, NDArray[np.generic]]]:
     """Return the tables of `estimator.psf`, and the arrays that they point to."""
     half_width = ACCURACY["normal"].filter_half_width
     filters = [fourier.pixel_filter(k + 1, half_width) for k in range(FILTER_COUNT)]
@@ -272,7 +270,7 @@ def _tables() -> tuple[PsfTables, dict[str, NDArray[Any]]]:
         padded[:, :n_points] = values
         padded[:, n_points:] = values[:, -1:]
     fresnel = geometric.fresnel_table()
-    arrays = {
+    contents: dict[str, NDArray[np.generic]] = {
         "monomials": monomial_matrix(),
         "zernike_terms": np.linalg.inv(monomial_matrix()),
         "node_xy": pupil.NODES.T,
@@ -289,7 +287,7 @@ def _tables() -> tuple[PsfTables, dict[str, NDArray[Any]]]:
         "twiddle_first": first.astype(np.int32),
         "twiddles": twiddles.astype(np.float32),
     }
-    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    arrays = {name: np.ascontiguousarray(array) for name, array in contents.items()}
     tables = PsfTables(
         **{name: pointer_to(array) for name, array in arrays.items()},
         cosine=waves.COSINE_OF_TURNS,

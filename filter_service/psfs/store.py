@@ -104,6 +104,7 @@ class PsfStore:
         self._words = np.empty(0, np.uint16)
         self._n_words = 0
         self._added: list[NDArray[np.int64]] = []
+        self._rings: NodeRings | None = None
         if isinstance(plan, CachePlan):
             self._add_nodes(self._states, plan.nodes)
 
@@ -161,7 +162,9 @@ class PsfStore:
         if new:
             with self._states_of_eye():
                 planned = [
-                    self._ahead.pop(state, None) or self._planner.nodes(*state)
+                    self._ahead.pop(state)
+                    if state in self._ahead
+                    else self._planner.nodes(*state)
                     for state in new
                 ]
             self._add_nodes(new, PlanNodes.joined(planned))
@@ -222,7 +225,7 @@ class PsfStore:
             first += self.fields_count
         # Frames in progress may still read the old arrays.
         self.nodes, self.tables = new, self.tables.grown(new)
-        self._rings: NodeRings | None = None
+        self._rings = None
 
     # Kernels
 
@@ -406,7 +409,7 @@ class PsfStore:
 
     def box_sizes_of(
         self, psfs: NDArray[np.int64]
-    ) -> tuple[NDArray[Any], NDArray[Any]]:
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return widths and heights (n,) of kernels."""
         left, right, up, down = np.moveaxis(
             unpack_reach(self.tables.reach_words[psfs]).astype(np.int64), -1, 0
@@ -496,7 +499,7 @@ class PsfStore:
         planned = [*self._ahead.values()]
         if self._first_groups:
             planned.append(self.nodes)
-        arrays: list[NDArray[Any]] = [
+        arrays: list[NDArray[np.generic]] = [
             *self.tables,
             *(a for nodes in planned for a in nodes.arrays),
         ]

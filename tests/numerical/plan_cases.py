@@ -20,9 +20,9 @@ from filter_service.planning.node_wavefronts import PupilStates
 from filter_service.planning.nodes import bracket_axis
 from filter_service.planning.paper_grid import DISTANCES_DPT
 from filter_service.planning.sampled_use import FIELD_OF_AXIS, sample_use
-from filter_service.psfs.boxes import square_kernel
 from filter_service.psfs.pack import pack_kernels
 from tests.grid_specs import grid_spec
+from tests.reference.packed_kernels import square_kernel
 
 SPECTRUM_SIDE_PX = 256
 

@@ -14,7 +14,6 @@ from estimator.psf.kernel_types import PsfTooLarge
 from estimator.psf.stiles_crawford import StilesCrawford
 from filter_service.native.library import Library, library_path
 from filter_service.planning.node_wavefronts import NodeWavefronts
-from filter_service.psfs.boxes import square_kernel
 from filter_service.psfs.compute_kernels import mean_batch, pack_pool
 from filter_service.psfs.native_psfs import (
     NativePsfs,
@@ -24,6 +23,7 @@ from filter_service.psfs.native_psfs import (
 )
 from filter_service.psfs.pack import pack_kernels
 from tests.numerical.psf_cases import CASE_NAMES, case_zernike_um
+from tests.reference.packed_kernels import square_kernel
 from tests.reference.psf_integral import reference_kernel
 
 RGB_NM = np.array([[610.0], [536.0], [460.0]])
