@@ -1,4 +1,4 @@
-"""Boxes that kernels are cropped to: sizes, packed reaches, unpacking of kernels."""
+"""Boxes that kernels are cropped to: limits, sizes and packed reaches."""
 
 from typing import Any
 
@@ -6,17 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_REACH_PX = 255
-"""Limit of a reach, as four reaches share a word."""
+"""Limit of a reach, because four reaches share a word."""
 
 SIDES = 4
 
 MAX_CENTROID_SHIFT_RATIO = 0.005
-"""Largest shift of a kernel's centroid by cropping, relative to its spread, or to a
-pixel for sharper kernels; `GridSpec.kept_energy_ratio` states the total cost."""
+"""Largest shift of a kernel's centroid by cropping, relative to its spread or at least
+to a pixel.  `GridSpec.kept_energy_ratio` documents the total error of cropping."""
 
 CUT_STEPS = 7
-"""Number of halvings of the cropped light, until the centroid shift is small enough;
-after them, nothing is cropped."""
+"""Number of attempts to crop a kernel.  Each one halves the cropped light, until the
+shift of the centroid is small enough.  After the last one, nothing is cropped."""
 
 
 def box_sizes(reach_px: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:

@@ -1,4 +1,4 @@
-"""Computation of a store's kernels: from the wavefronts of nodes to packed PSFs."""
+"""Computation of packed kernels from the wavefronts of nodes."""
 
 import os
 from collections import Counter
@@ -31,26 +31,26 @@ def computed_kernels(
     engine: PsfEngine,
     rings: NodeRings | None = None,
 ) -> tuple[PackedKernels, Counter[str]]:
-    """Compute some PSFs of nodes.
+    """Compute the kernels of PSFs.
 
     Parameters
     ----------
     psfs : (n,)
-        Indices of PSFs: node n and channel c have PSF 3 n + c.
+        PSF indices.
     rings : NodeRings, optional
         Rings of the eye's lens at the nodes.
 
     Returns
     -------
     kernels : PackedKernels
-        Kernels of the n PSFs.
+        Kernels (n,), in the order of ``psfs``.
     methods : Counter
-        PSFs by the method that computed the larger share of each.
+        Number of PSFs by the method that computed the larger share of each.
 
     Raises
     ------
     PsfTooLarge
-        If a PSF blurs farther than ``spec.max_blur_radius_px``.
+        If a PSF is larger than ``spec.max_blur_radius_px``.
     ValueError
         If no light arrives within a kernel.
     """
@@ -86,7 +86,7 @@ def generic_kernels(
     channels: NDArray[np.int64],
     total_dpt: NDArray[np.float64],
 ) -> tuple[PackedKernels, Counter[str]]:
-    """Compute PSFs (n,) in batches of whole kernels, and crop those afterward."""
+    """Compute whole kernels (n,) with `PsfEngine.compute`, and crop them afterward."""
     n_primaries = wavefronts.wavelength_nm.shape[1]
     each = np.repeat(groups, n_primaries)
     found = wavefronts.at(groups, channels, total_dpt)
@@ -121,7 +121,7 @@ os.register_at_fork(after_in_child=pack_pool.cache_clear)  # threads are not inh
 
 
 def _methods(batch: PsfBatch) -> Counter[str]:
-    """Count PSFs by the method that has the larger share in them."""
+    """Count PSFs by the method that computed the larger share of each."""
     by_rays = int(np.count_nonzero(batch.geometric_ratio > 0.5))
     counts = {"geometric": by_rays, batch.wave_method: len(batch) - by_rays}
     return Counter({name: number for name, number in counts.items() if number})

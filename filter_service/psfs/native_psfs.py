@@ -1,6 +1,6 @@
-"""Compiled PSF engine: from the wavefronts of nodes to packed kernels in one call.
+"""PSF engine in C: one call computes packed kernels from the wavefronts of nodes.
 
-`estimator.psf` computes the same in Python; tests compare the two.
+`estimator.psf` computes the same in Python, and tests compare the two.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ FILTER_COUNT = 256
 pupils of 8 mm."""
 
 CORNERS_TWICE = 1.2
-"""Light beyond the four sides of a box, over the light outside the box, as light beyond
-a corner counts twice.  With 1.2, boxes lose 0.68 to 1.08 % where 1 % may be lost, like
-those of `pack_kernels`."""
+"""Ratio of the light beyond the four sides of a box to the light outside the box: light
+beyond a corner counts for two sides.  With 1.2, boxes lose 0.68 to 1.08 % of the light
+where 1 % is allowed, like those of `pack_kernels`."""
 
 VECTOR = 8
 
@@ -56,12 +56,12 @@ def fft_lengths() -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class NodeRings:
-    """Rings of a lens in the pupils of nodes, see `estimator.psf.screens`.
+    """Rings of a lens in the pupils of groups, see `estimator.psf.screens`.
 
     Attributes
     ----------
     offset_mm : (n_groups, 3, n_primaries, 2)
-        Center of the pupil, relative to the center of the rings.
+        Center of the pupil relative to the center of the rings.
     reach_mrad : (n_groups, 3, n_primaries)
         Distance beyond the rays to which the rings send light.
     amplitude_ratio : (3, n_primaries, TABLE_COUNT, 2), float32
@@ -80,7 +80,7 @@ class NodeRings:
 
     @classmethod
     def of(cls, rings: Rings, wavefronts: NodeWavefronts) -> NodeRings:
-        """Tabulate a lens for the pupils of nodes."""
+        """Tabulate a lens for the pupils of groups."""
         seen = rings.seen_from(wavefronts.h_deg, wavefronts.v_deg)
         center_mm = np.broadcast_to(seen.centre_mm, (wavefronts.h_deg.size, 2))
         ellipse = wavefronts.pupil_ellipse
@@ -131,7 +131,7 @@ class NativePsfs:
         stiles_crawford: StilesCrawford | None = None,
         rings: NodeRings | None = None,
     ) -> tuple[PackedKernels, Counter[str], NDArray[np.int64]]:
-        """Compute PSFs.
+        """Compute the kernels of PSFs (n,).
 
         Parameters
         ----------
@@ -139,9 +139,9 @@ class NativePsfs:
         groups, channels : (n,)
             Group and channel of each PSF.
         total_dpt : (n,)
-            Total defocus in the middle of the channel.
+            Total defocus at the middle wavelength of the channel.
         kept_energy_ratio : float
-            Share of a kernel's light that its box must hold.
+            Share of a kernel's light that its box must contain.
         max_radius_px : int
         diffraction : bool
         stiles_crawford : StilesCrawford, optional
@@ -150,11 +150,11 @@ class NativePsfs:
         Returns
         -------
         kernels : PackedKernels
-            Kernels; those in ``left`` have no texels.
+            Kernels (n,); those in ``left`` have no texels.
         methods : Counter
-            PSFs by the method that computed the larger share of each.
+            Number of PSFs by the method that computed the larger share of each.
         left : (m,)
-            Indices, among the n, of PSFs that `estimator.psf` has to compute or refuse.
+            Indices of the PSFs among the n that `estimator.psf` must compute or refuse.
         """
         count, primaries = groups.size, wavefronts.wavelength_nm.shape[1]
         sampling = ACCURACY["normal"]

@@ -1,8 +1,8 @@
 """Packing of computed kernels: cropped to their boxes, 16 bits per weight.
 
-Off axis a kernel is elongated and displaced from its center: the box that holds its
-light has a third of the area of the disc about the center.  The loops over single
-kernels are compiled; threads share a batch.
+Off axis, kernels are elongated and displaced from their center.  The box that contains
+the light of such a kernel has a third of the area of the disc about the center.
+Threads share a batch and run compiled loops over its kernels.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ PSFS_PER_TASK = 64
 
 @dataclass(frozen=True)
 class PackedKernels:
-    """P concatenated kernels.
+    """Concatenated kernels (P,).
 
     Attributes
     ----------
     weights : (n_texels,), uint16
-        Rows from top to bottom; in steps of the kernel's peak over WEIGHT_MAX.
+        Rows from top to bottom, in steps of the kernel's peak over `WEIGHT_MAX`.
     offsets : (P,)
     reach_px : (P, 4)
         Columns left and right of the center, and rows above and below it.
@@ -37,9 +37,9 @@ class PackedKernels:
     peak_ratio : (P,)
         Largest weight.
     spread_px : (P,)
-        Radius of the uniform disc that has the kernel's sum of squares.
+        Radius of the uniform disc with the same sum of squares as the kernel.
     lost_energy_ratio : (P,)
-        Light outside the box, before the kernel was normalized to unit sum.
+        Share of light outside the box, before normalization to unit sum.
     """
 
     weights: NDArray[np.uint16]
@@ -53,7 +53,7 @@ class PackedKernels:
     def with_kernels(
         self, places: NDArray[np.int64], others: PackedKernels
     ) -> PackedKernels:
-        """Return these kernels with those at ``places`` replaced by others."""
+        """Return the kernels with those at ``places`` replaced by others."""
         arrays = {
             name: getattr(self, name).copy()
             for name in (
@@ -72,12 +72,12 @@ class PackedKernels:
 def pack_kernels(
     batch: PsfBatch, *, kept_energy_ratio: float, pool: Executor
 ) -> PackedKernels:
-    """Crop and quantize a batch.
+    """Crop and quantize a batch of kernels.
 
     Parameters
     ----------
     kept_energy_ratio : float
-        Share of a kernel's light that its box must hold.
+        Share of a kernel's light that its box must contain.
     """
     count = len(batch)
     reach_px = np.empty((count, SIDES), np.int64)

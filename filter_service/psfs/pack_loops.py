@@ -1,4 +1,4 @@
-"""Compiled loops of `pack`, over single kernels."""
+"""Compiled loops of `pack`, which crop and quantize single kernels."""
 
 import math
 
@@ -15,7 +15,11 @@ from filter_service.psfs.boxes import (
 
 @njit(nogil=True, cache=True)
 def crop(kernels, cut_ratio, starts, full_px, reach_px, removed_ratio):
-    """Write reaches beyond which each side has its share of the light to crop."""
+    """Write the reaches and the removed light of kernels (P,).
+
+    Each side of a box may remove a quarter of `cut_ratio`.  The share is halved until
+    the shift of the centroid is within `MAX_CENTROID_SHIFT_RATIO`.
+    """
     for p in range(starts.size):
         full, start = full_px[p], starts[p]
         width = 2 * full + 1
@@ -51,7 +55,10 @@ def crop(kernels, cut_ratio, starts, full_px, reach_px, removed_ratio):
 
 @njit(nogil=True, cache=True)
 def _ends(light, allowed, full):
-    """Return reaches before and after the center, and the shift of the centroid."""
+    """Return the reaches before and after the center, and the shift of the centroid.
+
+    Each end removes at most the allowed light.
+    """
     first, cut = 0, 0.0
     while first < full and cut + light[first] <= allowed:
         cut += light[first]
@@ -83,7 +90,7 @@ def quantize(
     peak_ratio,
     spread_px,
 ):
-    """Normalize the boxes to unit sum, and quantize them in steps of their peak."""
+    """Write the weights of boxes (P,), in steps of their peak, and their statistics."""
     for p in range(starts.size):
         full = full_px[p]
         width = 2 * full + 1
