@@ -147,7 +147,7 @@ def readable_defocus(
     at_node_dpt = at_infinity_dpt[:, :, own_pupil, own_accommodation]
     read_dpt = at_infinity_dpt[:, :, reads_pupil][:, :, :, reads_accommodation]
     lows, highs = read_dpt.min(axis=3), read_dpt.max(axis=3)
-    if spec.blends_at_equal_blur:  # a blend reads both nodes at its own defocus
+    if spec.blends_at_equal_blur:  # both nodes are read at a defocus between theirs
         own_lows, own_highs = lows, highs
         for axis in (0, 1):
             lows = _over_neighbors(lows, axis, np.min)
@@ -156,8 +156,8 @@ def readable_defocus(
         highs = np.minimum(highs, own_highs + MAX_FIELD_STEP_DPT)
     objects_dpt = eye.vergence.vergence_dpt(_extended(spec.object_ranges_dpt))
     near_far = np.stack([lows, highs], axis=-1)[..., None, :, :] + objects_dpt[:, None]
-    # A pupil between two nodes reads both at equal blur, and with several foci at equal
-    # defocus.
+    # A pupil between two nodes, up to the other node itself, reads both at equal blur;
+    # with several foci, at equal defocus.
     if eye.rings is None:
         ratio = pupils_mm[reads_pupil] / pupils_mm[own_pupil]
         near_far = near_far * ratio[:, None, None, None]

@@ -167,15 +167,15 @@ class PsfStore:
         """
         new = [state for state in states if state not in self._first_groups]
         if new:
-            with self._states_of_eye():
-                planned = [
-                    self._ahead.pop(state)
-                    if state in self._ahead
-                    else self._planner.nodes(*state)
-                    for state in new
-                ]
+            with self._client_errors():
+                planned = [self._nodes_of(state) for state in new]
             self._add_nodes(new, PlanNodes.joined(planned))
         return np.array([self._first_groups[state] for state in states])
+
+    def _nodes_of(self, state: State) -> PlanNodes:
+        """Return the nodes of a state that were planned ahead, or plan them."""
+        planned = self._ahead.pop(state, None)
+        return self._planner.nodes(*state) if planned is None else planned
 
     def planned_ahead(
         self, pupil_diameter_mm: float, focus_dpt: float
@@ -286,12 +286,11 @@ class PsfStore:
         step = batch_count or self.engine.batch_count
         batches = np.array_split(psfs, -(-psfs.size // step) or 1)
         for number, batch in enumerate(batches):
-            batch = batch[
-                ~self.tables.is_computed[batch]
-            ]  # ``between`` may compute some
+            # `between` may have computed some of them.
+            batch = batch[~self.tables.is_computed[batch]]
             if not batch.size:
                 continue
-            with self._states_of_eye():
+            with self._client_errors():
                 packed, methods = computed_kernels(
                     *(self.eye, self.spec, self.nodes),
                     *(batch, self.engine, self._node_rings()),
@@ -319,7 +318,7 @@ class PsfStore:
         return self._rings
 
     @contextmanager
-    def _states_of_eye(self) -> Iterator[None]:
+    def _client_errors(self) -> Iterator[None]:
         """Convert errors of the PSF engines and the planner into errors for clients."""
         from estimator.psf.compute import PsfTooLarge
 
