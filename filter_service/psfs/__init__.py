@@ -30,8 +30,8 @@ reach
     the rows above and below it.
 rings
     Zones of a diffractive, multifocal or lenslet correction.  They multiply the pupil
-    function by a complex amplitude, which depends on the distance from the center of
-    the rings.
+    function by a complex amplitude, which depends on the distance from the nearest
+    center.
 """
 
 import lazy_loader

@@ -15,8 +15,8 @@ MAX_CENTROID_SHIFT_RATIO = 0.005
 to a pixel.  `GridSpec.kept_energy_ratio` documents the total error of cropping."""
 
 CUT_STEPS = 7
-"""Number of attempts to crop a kernel.  Each one halves the cropped light, until the
-shift of the centroid is small enough.  After the last one, nothing is cropped."""
+"""Number of times that the light to crop is halved until the shift of the centroid is
+small enough.  If it never is, nothing is cropped."""
 
 
 def box_sizes(reach_px: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
