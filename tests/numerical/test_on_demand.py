@@ -302,7 +302,7 @@ def test_memory_is_limited(streamed, views):
         assert small.memory_mb <= limit_mb
     assert small.generation > 0
     tiny = PsfStore(eye, replace(spec, memory_budget_mb=0.001), plan)
-    with pytest.raises(OutOfMemory, match="one frame take"):
+    with pytest.raises(OutOfMemory, match="one frame need"):
         renderer.render(views[0], renderer.load(tiny), **STATES[0])
 
 

@@ -111,7 +111,7 @@ def test_one_direction_for_the_whole_image_does_not_follow_the_gaze():
 
 def test_a_range_of_gaze_keeps_the_image_within_the_field():
     spec_of(40.0, gaze_deg=(10.0, 0.0), gaze_range_deg=(29.0, 0.0))
-    with pytest.raises(ValueError, match=r"31 beside a field of -50 to 30.* 80"):
+    with pytest.raises(ValueError, match=r"31 deg with a field of -50 to 30.* 80"):
         spec_of(40.0, gaze_deg=(10.0, 0.0), gaze_range_deg=(31.0, 0.0))
     with pytest.raises(ValueError, match="gaze_range_deg"):
         spec_of(40.0, gaze_range_deg=(0.0, -1.0))
