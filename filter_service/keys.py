@@ -230,7 +230,7 @@ class KeyRing:
             path = self._clients / name
             try:
                 status = path.stat()
-                identity = (status.st_ino, status.st_mtime_ns, status.st_size)
+                identity = _stamp(status)
                 known = self._keys.get(name)
                 if known is not None and known[0] == identity:
                     found[name] = known
@@ -241,7 +241,8 @@ class KeyRing:
                     raise
                 if isinstance(error, FileNotFoundError) and not path.is_symlink():
                     continue  # removed meanwhile
-                if (self._keys.get(name) or (None,))[0] != (identity := _stamp(path)):
+                identity = _stamp(path.lstat())  # exists even for a dangling link
+                if (self._keys.get(name) or (None,))[0] != identity:
                     log.warning("skipped a key file: %s", error)
                 found[name] = identity, None
         self._keys = found
@@ -270,9 +271,8 @@ def _public_of(secret: str) -> str:
     return zmq.curve_public(secret.encode()).decode()
 
 
-def _stamp(path: Path) -> tuple[int, ...]:
-    """Return values that change with a file; also works for a dangling link."""
-    status = path.lstat()
+def _stamp(status: os.stat_result) -> tuple[int, ...]:
+    """Return values that differ once a file has changed."""
     return status.st_ino, status.st_mtime_ns, status.st_size
 
 

@@ -115,42 +115,31 @@ class Passes:
         indirect : (buffer, byte), optional
             Location of the group counts on the GPU; ``groups`` is ignored.
         """
-        program, images, textures = self._variant_of(
-            name, defines or {}, buffers, images or {}, textures or {}
-        )
+        images, textures, defines = images or {}, textures or {}, defines or {}
+        barriers = _BARRIERS
+        for key, image in images.items():
+            if isinstance(image, Buffer):
+                self._bind(POINTS[ATLAS_BINDINGS[key]], image)
+                defines = {**defines, "ATLAS_IS_BUFFER": 1}
+            else:
+                unit = getattr(constants, f"IMAGE_{key}")
+                image.bind_to_image(unit, read=True, write=True)
+                barriers = _IMAGE_BARRIERS
+        for key, texture in textures.items():
+            if isinstance(texture, Buffer):
+                self._bind(POINTS[ATLAS_BINDINGS[key]], texture)
+                defines = {**defines, "ATLAS_IS_BUFFER": 1}
+            else:
+                texture.use(getattr(constants, f"TEXTURE_{key}"))
         for binding, buffer in buffers.items():
             self._bind(POINTS[binding], buffer)
+        program = self.program(name, **defines)
         self._set_uniforms(program, uniforms or {})
-        for name_of, image in images.items():
-            unit = getattr(constants, f"IMAGE_{name_of}")
-            image.bind_to_image(unit, read=True, write=True)
-        for name_of, texture in textures.items():
-            texture.use(getattr(constants, f"TEXTURE_{name_of}"))
         if indirect is not None:
             program.run_indirect(*indirect)
         else:
             program.run(*(max(count, 1) for count in (*groups, 1)[:3]))
-        self._context.memory_barrier(_IMAGE_BARRIERS if images else _BARRIERS)
-
-    def _variant_of(
-        self,
-        name: str,
-        defines: dict[str, Any],
-        buffers: dict[str, Any],
-        images: dict[str, Any],
-        textures: dict[str, Any],
-    ) -> tuple[moderngl.ComputeShader, dict[str, Any], dict[str, Any]]:
-        """Return a pass and its images and textures; bind the buffers among them."""
-        is_buffer = False
-        for named in (images, textures):
-            for key, atlas in named.items():
-                if isinstance(atlas, Buffer):
-                    self._bind(POINTS[ATLAS_BINDINGS[key]], atlas)
-                    is_buffer = True
-        if is_buffer:
-            defines = {**defines, "ATLAS_IS_BUFFER": 1}
-            images, textures = _no_buffers(images), _no_buffers(textures)
-        return self.program(name, **defines), images, textures
+        self._context.memory_barrier(barriers)
 
     def _bind(self, point: int, buffer: Buffer | BufferPart) -> None:
         """Bind a buffer unless it is already bound; most stay from frame to frame.
@@ -179,9 +168,5 @@ class Passes:
                 continue
             known[key] = value
             member = program.get(key, None)
-            if member is not None:
+            if isinstance(member, moderngl.Uniform):
                 member.value = value
-
-
-def _no_buffers(named: dict[str, Any]) -> dict[str, Any]:
-    return {key: kept for key, kept in named.items() if not isinstance(kept, Buffer)}

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Any
 
 from filter_service.gl.gpu import Gpu, Query
 
@@ -19,7 +18,7 @@ class StageTimer:
         self._ms: dict[str, float] = {}
         self._queries: list[tuple[str, Query]] = []
 
-    def stage(self, name: str) -> AbstractContextManager[Any]:
+    def stage(self, name: str) -> AbstractContextManager[None] | Query:
         """Time a GPU stage; times of the same name add up."""
         if self._gpu.is_software:
             return self._finished(name)
@@ -33,7 +32,7 @@ class StageTimer:
             yield
             self._gpu.context.finish()
 
-    def wall(self, name: str) -> AbstractContextManager[Any]:
+    def wall(self, name: str) -> AbstractContextManager[None]:
         """Time a CPU stage."""
         return _Wall(self._ms, name)
 

@@ -39,17 +39,18 @@ GL_TIMEOUT_EXPIRED, GL_WAIT_FAILED = 0x911B, 0x911D
 WAIT_NS = 1_000_000_000
 
 _uint, _size, _pointer = ctypes.c_uint, ctypes.c_ssize_t, ctypes.c_void_p
-_SIGNATURES = {
-    "glGenBuffers": (None, ctypes.c_int, _pointer),
-    "glDeleteBuffers": (None, ctypes.c_int, _pointer),
-    "glBindBuffer": (None, _uint, _uint),
-    "glBufferStorage": (None, _uint, _size, _pointer, _uint),
-    "glMapBufferRange": (_pointer, _uint, _size, _size, _uint),
-    "glCopyBufferSubData": (None, _uint, _uint, _size, _size, _size),
-    "glFenceSync": (_pointer, _uint, _uint),
-    "glClientWaitSync": (_uint, _pointer, _uint, ctypes.c_uint64),
-    "glDeleteSync": (None, _pointer),
-    "glFlush": (None,),
+_function = ctypes.CFUNCTYPE
+_PROTOTYPES = {
+    "glGenBuffers": _function(None, ctypes.c_int, _pointer),
+    "glDeleteBuffers": _function(None, ctypes.c_int, _pointer),
+    "glBindBuffer": _function(None, _uint, _uint),
+    "glBufferStorage": _function(None, _uint, _size, _pointer, _uint),
+    "glMapBufferRange": _function(_pointer, _uint, _size, _size, _uint),
+    "glCopyBufferSubData": _function(None, _uint, _uint, _size, _size, _size),
+    "glFenceSync": _function(_pointer, _uint, _uint),
+    "glClientWaitSync": _function(_uint, _pointer, _uint, ctypes.c_uint64),
+    "glDeleteSync": _function(None, _pointer),
+    "glFlush": _function(None),
 }
 
 
@@ -62,11 +63,11 @@ def gl_calls() -> dict[str, Callable[..., Any]] | None:
         return None
     address_of.restype, address_of.argtypes = _pointer, [ctypes.c_char_p]
     calls: dict[str, Callable[..., Any]] = {}
-    for name, (result, *arguments) in _SIGNATURES.items():
+    for name, prototype in _PROTOTYPES.items():
         address = address_of(name.encode())
         if not address:
             return None
-        calls[name] = ctypes.CFUNCTYPE(result, *arguments)(address)
+        calls[name] = prototype(address)
     return calls
 
 

@@ -1,11 +1,14 @@
 """Preparation of a view for filtering: missing depth, borders, object distances."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from math import ceil
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from filter_service.camera import Tangents
 from filter_service.constants import TILE_SIZE_PX
 from filter_service.psfs.boxes import MAX_REACH_PX
 from filter_service.psfs.frame_layers import FrameLayers
@@ -70,6 +73,27 @@ def reach_px_of(view: RgbdView, layers: FrameLayers, image: ImageCells) -> int:
     return ceil(image.maps.largest_stretch_ratio * reach_px)
 
 
+def map_images(
+    view: RgbdView,
+    change: Callable[[NDArray[Any]], NDArray[Any]],
+    tangents: Tangents,
+) -> RgbdView:
+    """Return a view with a function applied to each image, and with new tangents."""
+    images: dict[str, Any] = {
+        name: change(image)
+        for name in IMAGES
+        if (image := getattr(view, name)) is not None
+    }
+    return replace(view, **images, tangents=tangents)
+
+
+def drop_empty_layer(view: RgbdView) -> RgbdView:
+    """Return a view without its hidden layer if no pixel of the layer has depth."""
+    if view.hidden_depth_m is None or np.any(view.hidden_depth_m > 0.0):
+        return view
+    return replace(view, hidden_color=None, hidden_depth_m=None)
+
+
 def extended(view: RgbdView, border_px: int) -> RgbdView:
     """Return a view extended on all sides by repeating its edge."""
     if border_px == 0:
@@ -78,13 +102,11 @@ def extended(view: RgbdView, border_px: int) -> RgbdView:
     across = (right - left) / view.width_px * border_px
     along = (up - down) / view.height_px * border_px
     sides = ((border_px, border_px), (border_px, border_px), (0, 0))
-    images = {
-        name: np.pad(image, sides[: image.ndim], mode="edge")
-        for name in IMAGES
-        if (image := getattr(view, name)) is not None
-    }
-    tangents = (left - across, right + across, up + along, down - along)
-    return replace(view, **images, tangents=tangents)
+    return map_images(
+        view,
+        lambda image: np.pad(image, sides[: image.ndim], mode="edge"),
+        (left - across, right + across, up + along, down - along),
+    )
 
 
 def radial_stretch(view: RgbdView) -> NDArray[np.float64]:

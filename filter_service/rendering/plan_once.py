@@ -4,8 +4,6 @@ Importing numba and SciPy and reading the compiled loops takes 1 s, which a serv
 spends after it is ready; compiling them, once per machine, takes 10 s.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from estimator.field.defocus_loops import N_DEGREES, fill_defocus, weights_at
@@ -13,6 +11,7 @@ from estimator.media.straylight import Straylight
 from estimator.wavefront.field_wavefronts import N_RIM
 from filter_service.camera import Camera
 from filter_service.constants import RGB
+from filter_service.planning.nodes import PlanAxes
 from filter_service.planning.plan import NodePlanner
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import PsfStore
@@ -60,8 +59,14 @@ def plan_once() -> None:
 
 def _plan_nodes_once(store: PsfStore) -> None:
     """Plan the nodes of one state over the field, as frames do."""
-    spec = store.spec.with_settings(mode="dynamic")
-    axes = replace(store.plan, nodes=None, h_deg=np.arange(2.0), defocus_error=1e-3)
+    spec, plan = store.spec.with_settings(mode="dynamic"), store.plan
+    axes = PlanAxes(
+        h_deg=np.arange(2.0),
+        v_deg=plan.v_deg,
+        pupils_mm=plan.pupils_mm,
+        accommodations_dpt=plan.accommodations_dpt,
+        defocus_error=1e-3,
+    )
     NodePlanner(store.eye, spec, axes).nodes(0, 0)
 
 

@@ -27,7 +27,8 @@ def check_request(
     CameraMismatch
         The store is for another camera, see `camera.is_same_camera`.
     """
-    checked(request.output, Output, "output")
+    output: Any = Output  # mypy takes only classes for types as arguments
+    checked(request.output, output, "output")
     checked(request.options.fields(), RenderOptions)
     if not store.spec.serves(request.view.camera):
         raise CameraMismatch(

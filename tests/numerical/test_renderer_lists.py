@@ -219,11 +219,11 @@ def test_a_list_that_overflows_keeps_its_first_entries_and_is_counted(
     assert bench.render(view).color.tobytes() == whole.color.tobytes()
 
 
-@pytest.mark.parametrize("limit", ["MAX_BAND_ENTRIES", "MAX_GROUPS"])
+@pytest.mark.parametrize("limit", ["MAX_BAND_ENTRIES", "MAX_BAND_BINS"])
 @pytest.mark.parametrize("rule", RULES)
 def test_bands_change_nothing(bench, view, monkeypatch, limit, rule):
     whole = bench.render(view, accumulation=rule)
-    few = 7 if limit == "MAX_GROUPS" else whole.entry_count // 7
+    few = 7 if limit == "MAX_BAND_BINS" else whole.entry_count // 7
     monkeypatch.setattr(list_bands, limit, few)
     banded = bench.render(view, accumulation=rule)
     assert (banded.entry_count, banded.overflow_count) == (whole.entry_count, 0)

@@ -1,6 +1,7 @@
 """Frame engine of OpenGL compute shaders.
 
 renderer         the engine: stores, frames, results
+gl_store         a PSF store with a copy of its kernels on the GPU
 frame_run        one view, from start to result
 strips           division of a frame into strips that fit the buffers
 strip            size and buffers of a frame or strip

@@ -3,27 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from filter_service.gl.gpu import Gpu
 from filter_service.rendering.frame_states import FrameStates
+from filter_service.rendering.gl.gl_store import GlStore
 from filter_service.rendering.gl.kernel_passes import KernelMaker
 
 MAX_KEPT = 2
 """The two eyes of a stereo frame; each has its own kernel atlas."""
 
 
-class Released(Protocol):
-    """A loaded store that records whether it was released."""
-
-    is_released: bool
-
-
 @dataclass(eq=False)
 class EyeState:
     """State of an eye's last frame that the next frame in the same state reuses."""
 
-    handle: Released
+    handle: GlStore
     kernels: KernelMaker
     states: FrameStates = field(default_factory=FrameStates)
 
@@ -35,7 +29,7 @@ class EyeStates:
         self._free = [KernelMaker(gpu, slot) for slot in range(MAX_KEPT)]
         self._kept: list[EyeState] = []  # most recently used last
 
-    def of(self, handle: Released) -> EyeState:
+    def of(self, handle: GlStore) -> EyeState:
         """Return the state of an eye, and mark it as most recently used."""
         self.drop_released()
         found = next((kept for kept in self._kept if kept.handle is handle), None)

@@ -185,7 +185,7 @@ class FragmentPasses:
         """Merge pixels into fragments, in blocks."""
         slots = self.strip.block_count * THREADS
         largest_reach_px = int(kernels.kernels.reach_px.max()) + 1.5
-        self.strip.buffers.update(kernels.buffers)
+        self.strip.kernel_buffers = kernels.buffers
         self.kernel_count = kernels.kernels.count
         self.kernel_texel_count = kernels.texel_count
         self.atlas = kernels.atlas

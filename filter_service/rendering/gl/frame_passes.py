@@ -43,7 +43,7 @@ class FramePasses:
     def __init__(self, strip: Strip, fragments: FragmentPasses):
         self.strip = strip
         self.fragments = fragments
-        self.lists: ListPasses | None = None
+        self.lists: ListPasses  # set by `run`
         self._kept: KernelSet | None = None
         self._output = ""
         self._arrived: Callable[[], None] = lambda: None
@@ -56,7 +56,7 @@ class FramePasses:
         expected: Callable[[], KernelSet | None] = lambda: None,
         used: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Filter the strip; `read_back` fetches the image.
+        """Filter the strip; `begin_read` and `end_read` return the image.
 
         Parameters
         ----------
@@ -73,18 +73,16 @@ class FramePasses:
         self.fragments.upload()
         self.fragments.build_fragments()
         self._kept = None if used is not None else expected()
-        if self._kept is None and used is None:
-            used = self.fragments.wait_for_used()
-        self.fragments.merge_fragments(self._kept or kernels(used))
+        if self._kept is not None:
+            self.fragments.merge_fragments(self._kept)
+        else:
+            if used is None:
+                used = self.fragments.wait_for_used()
+            self.fragments.merge_fragments(kernels(used))
         self.lists = ListPasses(
             self.strip, self.fragments.search_blocks, self.fragments.atlas
         )
         self.lists.run()
-
-    def read_back(self, output: str, room: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Fetch the filtered image in the requested encoding, and all counters."""
-        self.begin_read(output, room)
-        return self.end_read()
 
     def begin_read(self, output: str, room: NDArray[Any] | None = None) -> None:
         """Start the readback of the image (into ``room`` if given) and the counts."""

@@ -4,6 +4,7 @@ In between, the processor is free for another view.
 """
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -18,6 +19,7 @@ from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.frame import (
     border_px_of,
+    drop_empty_layer,
     extended,
     fill_missing_depth,
     reach_px_of,
@@ -56,9 +58,10 @@ class FrameRun:
     Parameters
     ----------
     request : ViewRequest
-        With the gaze to use.
     out : (height, width, 3) array
         Output array, of the type of the output.
+    gaze_deg : (h, v)
+        Gaze of the eye, within the prepared range.
     fill_depth : bool
         Whether to fill missing depth first, because the previous frame had some.
 
@@ -74,11 +77,13 @@ class FrameRun:
         request: ViewRequest,
         out: NDArray[Any],
         *,
+        gaze_deg: tuple[float, float],
         fill_depth: bool,
     ):
         self.timer = StageTimer(gpu)
         self._gpu, self._kept, self._request = gpu, kept, request
-        self._out, view = out, request.view
+        self._gaze_deg = gaze_deg
+        self._out = out
         self._cell_px: int | None = None
         self._missing_count: int | None = None
         self.layers: FrameLayers = kept.states.layers(
@@ -89,9 +94,7 @@ class FrameRun:
             request.options.render_tolerance,
         )
         with self.timer.wall("prepare_ms"):
-            if view.surface_count > 1 and not (view.hidden_depth_m > 0.0).any():
-                view = replace(view, hidden_color=None, hidden_depth_m=None)
-        self._view = view
+            self._view = drop_empty_layer(request.view)
         if fill_depth:
             self._fill_depth()
         self._begun = self._begin()
@@ -151,7 +154,7 @@ class FrameRun:
     def _plan(self) -> _Plan:
         kept, view = self._kept, self._view
         image = kept.states.cells(
-            self.timer, kept.handle, self._request.gaze_deg, self._cell_px
+            self.timer, kept.handle, self._gaze_deg, self._cell_px
         )
         border_px = border_px_of(view, self.layers, image)
         with self.timer.wall("prepare_ms"):
@@ -269,16 +272,27 @@ class _StripRun:
             used = self.passes.fragments.used
             self.passes = self._frame.passes_of(self.plan, self.rows)
             self._run(self.passes, used=used)
-            picture = self.passes.read_back(self._frame.output, self._out)
+            self.passes.begin_read(self._frame.output, self._out)
+            picture = self.passes.end_read()
+        assert picture is not None  # all kernels exist, and no other passes ran
         return picture
 
     @property
     def _out(self) -> NDArray[Any] | None:
         return self._frame.out_of(self.plan)
 
-    def _run(self, passes: FramePasses, **options) -> None:
-        image = self.plan.state.image
-        passes.run(lambda used: self._frame.kernels(image, used), **options)
+    def _run(
+        self,
+        passes: FramePasses,
+        *,
+        expected: Callable[[], KernelSet | None] = lambda: None,
+        used: NDArray[np.bool_] | None = None,
+    ) -> None:
+        passes.run(
+            lambda pairs: self._frame.kernels(self.plan.state.image, pairs),
+            expected=expected,
+            used=used,
+        )
 
 
 def _prepared_range_dpt(store: PsfStore) -> tuple[float, float]:

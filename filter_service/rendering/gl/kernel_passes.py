@@ -1,7 +1,7 @@
 """Passes that blend a frame's kernels from the cache, and keep them between frames."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from filter_service.rendering.frame_kernels import (
     interval_count,
 )
 from filter_service.rendering.gl.expected_pairs import ExpectedPairs, FrameState
+from filter_service.rendering.gl.gl_store import GlStore
 from filter_service.rendering.gl.strip import grid_of
 from filter_service.rendering.image_cells import (
     ImageCells,
@@ -40,16 +41,6 @@ MAX_KERNEL_TEXELS = 24 * 2**20
 """Largest texel count of a frame: 400 MB at 16 bytes each."""
 
 _WORD_BYTES = 4
-
-
-class Handle(Protocol):
-    """A loaded store."""
-
-    store: PsfStore
-    pages: Pages
-
-    def sync(self) -> None:
-        """Copy the kernels that were computed since the last call."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +98,7 @@ class KernelMaker:
         self._pairs.note(state, words)
 
     def expected(
-        self, handle: Handle, state: FrameState, timer: StageTimer, fill: Fill
+        self, handle: GlStore, state: FrameState, timer: StageTimer, fill: Fill
     ) -> KernelSet | None:
         """Return predicted kernels of a frame: those of the last, or new ones.
 
@@ -127,7 +118,7 @@ class KernelMaker:
             return None  # the pairs that are actually used may fit
 
     def kept(
-        self, handle: Handle, layers: FrameLayers, image: ImageCells
+        self, handle: GlStore, layers: FrameLayers, image: ImageCells
     ) -> KernelSet | None:
         """Return the last frame's kernels if they were made for the same state.
 
@@ -145,7 +136,7 @@ class KernelMaker:
 
     def kernels(
         self,
-        handle: Handle,
+        handle: GlStore,
         layers: FrameLayers,
         image: ImageCells,
         used: NDArray[np.bool_],
@@ -164,10 +155,10 @@ class KernelMaker:
                     handle.store, layers, image, used | kept.have, fill
                 )
             plan = planned or _plan(handle.store, layers, image, used, fill)
-            handle.sync()
+            pages = handle.sync()
             tables = kernel_tables(plan.kernels, plan.levels, used.shape)
         with timer.stage("psf_blend_ms"):
-            self._set = self._blend(plan, tables, handle.pages)
+            self._set = self._blend(plan, tables, pages)
         self._made_for = (handle, layers, image)
         return self._set
 

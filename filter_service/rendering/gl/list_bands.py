@@ -22,6 +22,9 @@ also the capacity of one bin's list: a bin has fewer than 2**19 pixels within th
 of a kernel, so entries are dropped, and counted, only with many surfaces or a smaller
 limit."""
 
+MAX_BAND_BINS = MAX_GROUPS
+"""Bins in one band: the passes dispatch a row of work groups, one for each bin."""
+
 
 @dataclass(frozen=True)
 class ListTotals:
@@ -54,7 +57,7 @@ def read_totals(whole: NDArray[np.uint32]) -> ListTotals:
 
 
 def split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], list[Any]]:
-    """Divide lists into bands of at most ``limit`` entries and MAX_GROUPS bins.
+    """Divide lists into bands of at most ``limit`` entries and MAX_BAND_BINS bins.
 
     Returns
     -------
@@ -65,7 +68,7 @@ def split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], lis
     bands, offsets = [], np.zeros(len(counts), dtype=np.int64)
     first = 0
     while first < len(counts):
-        sums = np.cumsum(counts[first : first + MAX_GROUPS])
+        sums = np.cumsum(counts[first : first + MAX_BAND_BINS])
         bins = max(int(np.searchsorted(sums, limit, side="right")), 1)
         offsets[first : first + bins] = sums[:bins] - counts[first : first + bins]
         bands.append((first, bins, int(sums[bins - 1])))

@@ -78,7 +78,7 @@ class ListPasses:
         """
         self.strip.reserve(COLOR_OUT=16 * self.strip.pixel_count)
         self.count_bins()
-        if self.strip.bin_count <= list_bands.MAX_GROUPS:
+        if self.strip.bin_count <= list_bands.MAX_BAND_BINS:
             self._make_lists_and_splat(0, self.strip.bin_count, indirect=True)
 
     @property
@@ -95,7 +95,7 @@ class ListPasses:
         entries, spare = self._capacities
         needs_spare = self.lists.longest > SORT_CAPACITIES[-1]
         return (
-            self.strip.bin_count <= list_bands.MAX_GROUPS
+            self.strip.bin_count <= list_bands.MAX_BAND_BINS
             and self.lists.entry_count <= entries
             and (not needs_spare or self.lists.entry_count <= spare)
         )
@@ -162,7 +162,7 @@ class ListPasses:
         limit = self._list_limit
         if (
             self.lists.entry_count <= limit
-            and self.strip.bin_count <= list_bands.MAX_GROUPS
+            and self.strip.bin_count <= list_bands.MAX_BAND_BINS
         ):
             return [(0, self.strip.bin_count, self.lists.entry_count)]
         counts = self.strip.gpu.read(

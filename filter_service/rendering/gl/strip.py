@@ -4,7 +4,7 @@ from typing import Any
 
 from filter_service.constants import BIN_TILES, TILE_SIZE_PX
 from filter_service.gl.gpu import Gpu
-from filter_service.gl.passes import Buffer
+from filter_service.gl.passes import Buffer, BufferPart
 from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rgbd_view import RgbdView
@@ -63,6 +63,7 @@ class Strip:
         self.bin_grid = tuple(group_count(side, BIN_TILES) for side in self.grid)
         self.bin_count = self.bin_grid[0] * self.bin_grid[1]
         self.buffers: dict[str, Buffer] = {}
+        self.kernel_buffers: dict[str, BufferPart] = {}
 
     def reserve(self, **n_bytes: int) -> None:
         """Reserve buffers of these sizes by name."""
@@ -79,7 +80,10 @@ class Strip:
         self.gpu.passes.dispatch(
             name,
             groups,
-            buffers={binding: self.buffers[binding] for binding in bindings},
+            buffers={
+                binding: self.kernel_buffers.get(binding) or self.buffers[binding]
+                for binding in bindings
+            },
             uniforms=uniforms,
             defines=defines,
             textures=textures,

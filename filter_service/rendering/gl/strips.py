@@ -1,13 +1,13 @@
 """Division of a frame into strips of rows whose buffers fit the storage blocks."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from filter_service.constants import BIN_SIZE_PX, TILE_SIZE_PX
 from filter_service.errors import OutOfGpuMemory
-from filter_service.rendering.frame import IMAGES
+from filter_service.rendering.frame import map_images
 from filter_service.rgbd_view import RgbdView
 
 BYTES_PER_PIXEL = 16
@@ -72,15 +72,10 @@ def _rows_of(view: RgbdView, first: int, last: int) -> RgbdView:
     """Return rows first..last of a view, with the tangents of their edges."""
     left, right, up, down = view.tangents
     per_row = (down - up) / view.height_px
-    images = {
-        name: np.ascontiguousarray(image[first:last])
-        for name in IMAGES
-        if (image := getattr(view, name)) is not None
-    }
-    return replace(
+    return map_images(
         view,
-        **images,
-        tangents=(left, right, up + first * per_row, up + last * per_row),
+        lambda image: np.ascontiguousarray(image[first:last]),
+        (left, right, up + first * per_row, up + last * per_row),
     )
 
 

@@ -17,7 +17,12 @@ from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import OneView, Pending, ViewRequest
 from filter_service.rendering.filtered_view import FilteredView, input_notes
-from filter_service.rendering.frame import border_px_of, extended, fill_missing_depth
+from filter_service.rendering.frame import (
+    border_px_of,
+    drop_empty_layer,
+    extended,
+    fill_missing_depth,
+)
 from filter_service.rendering.frame_kernels import Fill
 from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
 from filter_service.rendering.native.arrays import Arrays
@@ -113,7 +118,6 @@ class NativeRenderer(OneView):
         """
         handle = request.handle
         gaze_deg, gaze_notes = check_request(request, handle.store)
-        request = replace(request, gaze_deg=gaze_deg)
         timer = StageTimes(lambda: self._rested_s)
         kept = self._kept.of(handle)
         layers = kept.states.layers(
@@ -128,17 +132,21 @@ class NativeRenderer(OneView):
         while True:
             image = kept.states.cells(timer, handle, gaze_deg, cell_px)
             try:
-                found = self._render(timer, request, kept, layers, image, fill)
-                notes = [*layers.notes, *gaze_notes, *found.notes]
-                found = replace(found, notes=notes)
-                return lambda: found
+                rendered = self._render(
+                    timer, request, gaze_deg, kept, layers, image, fill
+                )
+                break
             except KernelsTooLarge:
                 cell_px = 2 * image.cell_px
+        notes = [*layers.notes, *gaze_notes, *rendered.notes]
+        rendered = replace(rendered, notes=notes)
+        return lambda: rendered
 
     def _render(
         self,
         timer: "StageTimes",
         request: ViewRequest,
+        gaze_deg: tuple[float, float],
         kept: EyeState,
         layers: FrameLayers,
         image: ImageCells,
@@ -176,7 +184,7 @@ class NativeRenderer(OneView):
             bad_color_count=frame.c.bad_color_count,
             pupil_diameter_mm=layers.pupil_diameter_mm,
             focus_dpt=layers.focus_dpt,
-            gaze_deg=request.gaze_deg,
+            gaze_deg=gaze_deg,
             fragment_count=frame.c.fragment_count,
             merged_count=frame.c.merged_count,
             entry_count=frame.c.entry_count,
@@ -198,9 +206,7 @@ class NativeRenderer(OneView):
         """Compute the pixels; return the count of filled depths and the used pairs."""
         with timer.wall("prepare_ms"):
             filled_m, missing_count = fill_missing_depth(view.depth_m)
-            whole = replace(view, depth_m=filled_m)
-            if view.surface_count > 1 and not (view.hidden_depth_m > 0.0).any():
-                whole = replace(whole, hidden_color=None, hidden_depth_m=None)
+            whole = drop_empty_layer(replace(view, depth_m=filled_m))
             border_px = border_px_of(whole, layers, image)
             whole = extended(whole, border_px)
         change_dpt = kept.states.corner_change_dpt(timer, layers, image)
