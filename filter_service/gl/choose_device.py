@@ -44,17 +44,17 @@ def open_on_device(
 def _open_named(
     index: int, devices: Sequence[EglDevice], open_context: Callable[[int], Context]
 ) -> tuple[Context, int]:
-    there_are = ", ".join(map(str, devices)) or "none that EGL lists"
+    available = ", ".join(map(str, devices)) or "none that EGL lists"
     if devices and index >= len(devices):
         raise RenderFailed(
-            f"gl_device is {index}; allowed: auto, or a device of EGL: {there_are}"
+            f"gl_device is {index}; allowed: auto, or a device of EGL: {available}"
         )
     try:
         return open_context(index), index
     except Exception as error:
         raise RenderFailed(
             f"gl_device {index} gives no OpenGL 4.3 context through EGL "
-            f"({_one_line(error)}); devices: {there_are}; {ADVICE}"
+            f"({_one_line(error)}); devices: {available}; {ADVICE}"
         ) from error
 
 
@@ -93,9 +93,9 @@ def _one_line(error: Exception) -> str:
 @contextmanager
 def _without_backend_variable() -> Iterator[None]:
     """Hide the variable that would override the index; it has already been read."""
-    said = os.environ.pop(BACKEND_VARIABLE, None)
+    saved = os.environ.pop(BACKEND_VARIABLE, None)
     try:
         yield
     finally:
-        if said is not None:
-            os.environ[BACKEND_VARIABLE] = said
+        if saved is not None:
+            os.environ[BACKEND_VARIABLE] = saved

@@ -150,7 +150,7 @@ class Gpu:
             buffer.write(words, offset=offset)
             return
         block = self._staging["to"]
-        start, free = block.take(words.size)
+        start, free = block.allocate(words.size)
         copy_bytes(free, words)
         block.copy_to(buffer, start, offset, words.size)
 
@@ -259,11 +259,11 @@ class Gpu:
                 buffer.read_into(_bytes_of(out), size=out.nbytes, offset=offset)
             return lambda: None
         block = self._staging["from"]
-        room = sum(out.nbytes + ALIGNMENT for _, _, out in parts)
-        if not block.has_room(room):
+        size = sum(out.nbytes + ALIGNMENT for _, _, out in parts)
+        if not block.has_space(size):
             for waiting in tuple(self._reads):
                 self._end_read(waiting)
-        start, free = block.take(room)
+        start, free = block.allocate(size)
         targets, at = [], 0
         for buffer, offset, out in parts:
             block.copy_from(buffer, offset, start + at, out.nbytes)
@@ -294,11 +294,11 @@ class Gpu:
 
     # ----- timers and errors
 
-    def take_query(self) -> moderngl.Query:
-        """Return an unused timer query; see `give_queries`."""
+    def acquire_query(self) -> moderngl.Query:
+        """Return an unused timer query; see `release_queries`."""
         return self._queries.pop() if self._queries else self.context.query(time=True)
 
-    def give_queries(self, queries: list[moderngl.Query]) -> None:
+    def release_queries(self, queries: list[moderngl.Query]) -> None:
         """Return timer queries to the pool; they are never freed, only reused."""
         self._queries += queries
 

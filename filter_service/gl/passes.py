@@ -15,7 +15,7 @@ Atlas = moderngl.Buffer | moderngl.Texture
 ATLAS_BINDINGS = {"ATLAS": "ATLAS", "NODES": "NODE_ATLAS"}
 """Binding of an atlas that is a buffer, by the name of its texture."""
 
-POINTS = {
+BINDING_POINTS = {
     name.removeprefix("BINDING_"): point for name, point in constants.BINDINGS.items()
 }
 
@@ -119,7 +119,7 @@ class Passes:
         barriers = _BARRIERS
         for key, image in images.items():
             if isinstance(image, Buffer):
-                self._bind(POINTS[ATLAS_BINDINGS[key]], image)
+                self._bind(BINDING_POINTS[ATLAS_BINDINGS[key]], image)
                 defines = {**defines, "ATLAS_IS_BUFFER": 1}
             else:
                 unit = getattr(constants, f"IMAGE_{key}")
@@ -127,12 +127,12 @@ class Passes:
                 barriers = _IMAGE_BARRIERS
         for key, texture in textures.items():
             if isinstance(texture, Buffer):
-                self._bind(POINTS[ATLAS_BINDINGS[key]], texture)
+                self._bind(BINDING_POINTS[ATLAS_BINDINGS[key]], texture)
                 defines = {**defines, "ATLAS_IS_BUFFER": 1}
             else:
                 texture.use(getattr(constants, f"TEXTURE_{key}"))
         for binding, buffer in buffers.items():
-            self._bind(POINTS[binding], buffer)
+            self._bind(BINDING_POINTS[binding], buffer)
         program = self.program(name, **defines)
         self._set_uniforms(program, uniforms or {})
         if indirect is not None:

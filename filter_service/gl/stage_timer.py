@@ -22,7 +22,7 @@ class StageTimer:
         """Time a GPU stage; times of the same name add up."""
         if self._gpu.is_software:
             return self._finished(name)
-        query = self._gpu.take_query()
+        query = self._gpu.acquire_query()
         self._queries.append((name, query))
         return query
 
@@ -40,7 +40,7 @@ class StageTimer:
         """Return times by stage; waits for the GPU."""
         for name, query in self._queries:
             self._ms[name] = self._ms.get(name, 0.0) + query.elapsed / 1e6
-        self._gpu.give_queries([query for _, query in self._queries])
+        self._gpu.release_queries([query for _, query in self._queries])
         self._queries.clear()
         return dict(self._ms)
 

@@ -27,9 +27,9 @@ GL_CLIENT_STORAGE_BIT = 0x200
 ALIGNMENT = 256
 """Parts of a block start at multiples of this."""
 
-FIRST_BYTES = 1 << 20
+INITIAL_BYTES = 1 << 20
 
-MOST_BYTES = 1 << 29
+MAX_BYTES = 1 << 29
 """Largest block: up to this it grows to hold all transfers in flight; then it waits and
 starts over."""
 
@@ -110,7 +110,7 @@ class Staging:
         """Start over from the beginning; the caller ensures that no copy is pending."""
         self._used = 0
 
-    def has_room(self, n_bytes: int) -> bool:
+    def has_space(self, n_bytes: int) -> bool:
         """Return whether this many bytes are free."""
         return self._used + n_bytes <= self.size
 
@@ -137,7 +137,7 @@ class Staging:
         if found == GL_WAIT_FAILED:
             raise RenderFailed("the driver cannot wait for the GPU")
 
-    def take(self, n_bytes: int) -> tuple[int, NDArray[np.uint8]]:
+    def allocate(self, n_bytes: int) -> tuple[int, NDArray[np.uint8]]:
         """Allocate bytes; return their offset and the bytes.
 
         If there are not enough free bytes, this waits for the GPU to finish its copies.
@@ -147,11 +147,11 @@ class Staging:
         OutOfGpuMemory
             The driver cannot map a block of that size.
         """
-        if not self.has_room(n_bytes):
+        if not self.has_space(n_bytes):
             self._context.finish()
-            wanted = max(2 * (self._used + n_bytes), FIRST_BYTES)
-            if n_bytes > self.size or wanted <= MOST_BYTES:
-                self._allocate(max(min(wanted, MOST_BYTES), n_bytes))
+            wanted = max(2 * (self._used + n_bytes), INITIAL_BYTES)
+            if n_bytes > self.size or wanted <= MAX_BYTES:
+                self._map_block(max(min(wanted, MAX_BYTES), n_bytes))
             self._used = 0
         start = self._used
         self._used = -(-(start + n_bytes) // ALIGNMENT) * ALIGNMENT
@@ -179,7 +179,7 @@ class Staging:
             GL_COPY_READ_BUFFER, GL_COPY_WRITE_BUFFER, read_at, write_at, n_bytes
         )
 
-    def _allocate(self, n_bytes: int) -> None:
+    def _map_block(self, n_bytes: int) -> None:
         self.release()
         calls = self._calls
         access = GL_MAP_READ_BIT | GL_MAP_WRITE_BIT

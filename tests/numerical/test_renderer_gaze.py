@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filter_service.errors import BadMessage
-from filter_service.rendering.gaze import usable_gaze
+from filter_service.rendering.gaze import clamped_gaze
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec
 from tests.numerical.synthetic import tangents, texture
@@ -104,7 +104,7 @@ def spec_of(h_half_deg, **settings):
 
 def test_one_direction_for_the_whole_image_does_not_follow_the_gaze():
     spec = spec_of(20.0, mode="on-axis", gaze_range_deg=(30.0, 30.0))
-    used_deg, notes = usable_gaze(spec, (5.0, 0.0))
+    used_deg, notes = clamped_gaze(spec, (5.0, 0.0))
     assert used_deg == (0.0, 0.0)
     assert "on-axis" in notes[0]
 

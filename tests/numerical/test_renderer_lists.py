@@ -98,7 +98,7 @@ def made_lists(passes, blocks, place, color, *, reach_px):
         passes.count_bins()
         totals = np.empty(constants.TOTAL_WORDS, np.uint32)
         gpu.read_into((*passes.totals, totals))
-        passes.take_totals(totals)
+        passes.record_totals(totals)
         passes.reserve_lists()
         assert len(passes.bands) == 1
         passes.make_lists(0, passes.strip.bin_count)

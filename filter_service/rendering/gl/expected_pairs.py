@@ -56,41 +56,41 @@ class ExpectedPairs:
     """Predictor of the used pairs (n_cells, n_intervals) of an eye's next frame."""
 
     def __init__(self) -> None:
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Discard the previous frame."""
         self._last: tuple[FrameState, NDArray[np.uint32]] | None = None
-        self._told: tuple[FrameState, NDArray[np.bool_]] | None = None
+        self._predicted: tuple[FrameState, NDArray[np.bool_]] | None = None
         self._moving = 0
 
-    def note(self, state: FrameState, words: NDArray[np.uint32]) -> None:
+    def record(self, state: FrameState, words: NDArray[np.uint32]) -> None:
         """Record the parts of intervals (n_cells, n_words) that a frame used."""
-        from filter_service.rendering.pair_loops import used_pairs
+        from filter_service.rendering.pair_loops import unpack_pairs
 
-        if self._told is not None and self._told[0] is state:
-            told = self._told[1]
-            used = used_pairs(words, told.shape[1])
-            is_wrong = bool(np.any(used & ~told))
+        if self._predicted is not None and self._predicted[0] is state:
+            predicted = self._predicted[1]
+            used = unpack_pairs(words, predicted.shape[1])
+            is_wrong = bool(np.any(used & ~predicted))
             self._moving = MOVING_FRAMES if is_wrong else max(self._moving - 1, 0)
         last = self._last
         if last is not None and _is_same(last[0], state):
             words = words | last[1]  # another view of the eye, or a moving scene
-        self._last, self._told = (state, words), None
+        self._last, self._predicted = (state, words), None
 
-    def at(self, state: FrameState) -> NDArray[np.bool_] | None:
+    def predict(self, state: FrameState) -> NDArray[np.bool_] | None:
         """Return the predicted pairs of a frame, or None if its cells are new."""
-        from filter_service.rendering.pair_loops import carry_over, spread
+        from filter_service.rendering.pair_loops import dilate, predict_pairs
 
         if self._last is None or self._last[0].image is not state.image:
             return None
         before, words = self._last
         columns, rows = state.image.grid
-        told = carry_over(
+        predicted = predict_pairs(
             words.reshape(rows, columns, -1),
             *(part_edges_dpt(before.layers), before.change_dpt),
             *(state.layers.layer_dpt, state.change_dpt, MARGIN_DPT),
         )
-        flat = told.reshape(state.image.count, -1)
-        self._told = state, flat
-        return spread(told).reshape(flat.shape) if self._moving else flat
+        flat = predicted.reshape(state.image.count, -1)
+        self._predicted = state, flat
+        return dilate(predicted).reshape(flat.shape) if self._moving else flat

@@ -165,9 +165,9 @@ class FragmentPasses:
     @property
     def used(self) -> NDArray[np.bool_]:
         """Return the used pairs (n_cells, n_intervals), once they have been read."""
-        from filter_service.rendering.pair_loops import used_pairs
+        from filter_service.rendering.pair_loops import unpack_pairs
 
-        return used_pairs(self.used_words, interval_count(self.strip.layers))
+        return unpack_pairs(self.used_words, interval_count(self.strip.layers))
 
     @property
     def _common(self) -> dict[str, Any]:

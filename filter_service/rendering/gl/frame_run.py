@@ -30,7 +30,7 @@ from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.frame_passes import FramePasses
 from filter_service.rendering.gl.kernel_passes import KernelSet, words_per_cell
 from filter_service.rendering.gl.strip import Strip
-from filter_service.rendering.gl.strips import Rows, counted_px, cut_in_strips
+from filter_service.rendering.gl.strips import Rows, counted_px, split_into_strips
 from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
 from filter_service.rendering.white_level import white_level
 from filter_service.rgbd_view import RgbdView
@@ -73,7 +73,7 @@ class FrameRun:
     def __init__(
         self,
         gpu: Gpu,
-        kept: EyeState,
+        eye: EyeState,
         request: ViewRequest,
         out: NDArray[Any],
         *,
@@ -81,14 +81,14 @@ class FrameRun:
         fill_depth: bool,
     ):
         self.timer = StageTimer(gpu)
-        self._gpu, self._kept, self._request = gpu, kept, request
+        self._gpu, self._eye, self._request = gpu, eye, request
         self._gaze_deg = gaze_deg
         self._out = out
         self._cell_px: int | None = None
         self._missing_count: int | None = None
-        self.layers: FrameLayers = kept.states.layers(
+        self.layers: FrameLayers = eye.states.layers(
             self.timer,
-            kept.handle,
+            eye.handle,
             request.pupil_diameter_mm,
             request.focus_dpt,
             request.options.render_tolerance,
@@ -106,7 +106,7 @@ class FrameRun:
 
     def finish(self) -> tuple[NDArray[Any], Counts]:
         """Return the image and the counts."""
-        picture, counts = self._begun_or_whole()
+        picture, counts = self._finish_begun()
         if self._missing_count is None and counts["missing_depth_count"]:
             self._fill_depth()
             picture, counts = self._whole()
@@ -132,7 +132,7 @@ class FrameRun:
             return None
         return begun
 
-    def _begun_or_whole(self) -> tuple[NDArray[Any], Counts]:
+    def _finish_begun(self) -> tuple[NDArray[Any], Counts]:
         begun, self._begun = self._begun, None
         if begun is not None:
             try:
@@ -152,20 +152,18 @@ class FrameRun:
                 self._cell_px = 2 * plan.state.image.cell_px
 
     def _plan(self) -> _Plan:
-        kept, view = self._kept, self._view
-        image = kept.states.cells(
-            self.timer, kept.handle, self._gaze_deg, self._cell_px
-        )
+        eye, view = self._eye, self._view
+        image = eye.states.cells(self.timer, eye.handle, self._gaze_deg, self._cell_px)
         border_px = border_px_of(view, self.layers, image)
         with self.timer.wall("prepare_ms"):
             whole = extended(view, border_px)
-        change_dpt = kept.states.corner_change_dpt(self.timer, self.layers, image)
+        change_dpt = eye.states.corner_change_dpt(self.timer, self.layers, image)
         return _Plan(
             whole,
             border_px,
             FrameState(self.layers, image, change_dpt),
             white_level(view.color),
-            cut_in_strips(
+            split_into_strips(
                 whole,
                 partial(reach_px_of, view, self.layers, image),
                 self._gpu.max_block_bytes,
@@ -181,10 +179,10 @@ class FrameRun:
         used_words = np.zeros(shape, np.uint32)
         pictures = []
         for run in runs:
-            pictures.append(run.finish()[run.rows.kept])
+            pictures.append(run.finish()[run.rows.output_rows])
             counts.update(run.passes.counts())
             used_words |= run.passes.fragments.used_words
-        self._kept.kernels.note(plan.state, used_words)
+        self._eye.kernels.record_pairs(plan.state, used_words)
         if self.out_of(plan) is None:
             picture = pictures[0] if len(pictures) == 1 else np.concatenate(pictures)
             rows, columns = (
@@ -216,7 +214,7 @@ class FrameRun:
             image_size_px=(self._view.width_px, self._view.height_px),
             border_px=plan.border_px,
             counted_px=counted_px(rows, self._view, plan.border_px),
-            object_range_dpt=_prepared_range_dpt(self._kept.handle.store),
+            object_range_dpt=_prepared_range_dpt(self._eye.handle.store),
             white_level=plan.white_level,
             is_encoded=self.output == "srgb8",
         )
@@ -224,20 +222,20 @@ class FrameRun:
 
     def kernels(self, image: ImageCells, used: NDArray[np.bool_]) -> KernelSet:
         """Return the kernels of used pairs."""
-        return self._kept.kernels.kernels(
-            self._kept.handle, self.layers, image, used, self.timer, self._fill
+        return self._eye.kernels.kernels(
+            self._eye.handle, self.layers, image, used, self.timer, self._fill
         )
 
-    def expected(self, state: FrameState) -> KernelSet | None:
+    def predicted(self, state: FrameState) -> KernelSet | None:
         """Return the predicted kernels, or None."""
-        return self._kept.kernels.expected(
-            self._kept.handle, state, self.timer, self._fill
+        return self._eye.kernels.predicted(
+            self._eye.handle, state, self.timer, self._fill
         )
 
     def _fill(self, psfs: NDArray[np.int64]) -> None:
         """Compute the missing PSFs of a frame, as one of its stages."""
         with self.timer.wall("psf_compute_ms"):
-            self._kept.handle.store.fill(psfs, until_s=self._request.until_s)
+            self._eye.handle.store.fill(psfs, until_s=self._request.until_s)
 
     def out_of(self, plan: _Plan) -> NDArray[Any] | None:
         """Return the output array if a strip's image is the whole image, else None."""
@@ -259,7 +257,7 @@ class _StripRun:
 
     def begin(self) -> None:
         """Start the passes on the GPU and the readback of the image."""
-        self._run(self.passes, expected=lambda: self._frame.expected(self.plan.state))
+        self._run(self.passes, predicted=lambda: self._frame.predicted(self.plan.state))
         self.passes.begin_read(self._frame.output, self._out)
         self._is_begun = True
 
@@ -285,12 +283,12 @@ class _StripRun:
         self,
         passes: FramePasses,
         *,
-        expected: Callable[[], KernelSet | None] = lambda: None,
+        predicted: Callable[[], KernelSet | None] = lambda: None,
         used: NDArray[np.bool_] | None = None,
     ) -> None:
         passes.run(
             lambda pairs: self._frame.kernels(self.plan.state.image, pairs),
-            expected=expected,
+            predicted=predicted,
             used=used,
         )
 

@@ -10,7 +10,7 @@ from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.image_cells import image_cells
 
-FIRST_WORDS = 2**20
+INITIAL_WORDS = 2**20
 """Initial size of a store's copy on the GPU, 2 MB; it grows by doubling."""
 
 
@@ -42,7 +42,7 @@ class GlStore(FrameStore):
         words, pages = self.store.kernels, self._pages
         if words.size > self._capacity or pages is None:
             self._free()
-            self._capacity = max(2 * words.size, FIRST_WORDS)
+            self._capacity = max(2 * words.size, INITIAL_WORDS)
             pages = self._pages = self._gpu.pages(self._capacity)
             self._n_words = 0
         if self._generation != self.store.generation:

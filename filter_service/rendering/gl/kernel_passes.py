@@ -21,7 +21,7 @@ from filter_service.rendering.frame_kernels import (
 )
 from filter_service.rendering.gl.expected_pairs import ExpectedPairs, FrameState
 from filter_service.rendering.gl.gl_store import GlStore
-from filter_service.rendering.gl.strip import grid_of
+from filter_service.rendering.gl.strip import dispatch_grid
 from filter_service.rendering.image_cells import (
     ImageCells,
     KernelsTooLarge,
@@ -56,7 +56,7 @@ class KernelSet:
         KERNELS and KERNEL_OF.
     atlas : Atlas
         Texels of the kernels.
-    have : (n_cells, n_intervals), bool
+    available : (n_cells, n_intervals), bool
         Pairs that have a kernel.
     """
 
@@ -64,11 +64,11 @@ class KernelSet:
     texel_count: int
     buffers: dict[str, BufferPart]
     atlas: Atlas
-    have: NDArray[np.bool_]
+    available: NDArray[np.bool_]
 
     def lacks(self, used: NDArray[np.bool_]) -> bool:
         """Return whether a frame uses pairs that have no kernel."""
-        return bool(np.any(used & ~self.have))
+        return bool(np.any(used & ~self.available))
 
 
 class KernelMaker:
@@ -85,19 +85,19 @@ class KernelMaker:
         self._gpu, self._slot = gpu, slot
         self._memory = f"kernels {slot}"
         self._pairs = ExpectedPairs()
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Discard the last frame's kernels and the prediction."""
         self._made_for: tuple[Any, ...] | None = None
         self._set: KernelSet | None = None
-        self._pairs.forget()
+        self._pairs.reset()
 
-    def note(self, state: FrameState, words: NDArray[np.uint32]) -> None:
+    def record_pairs(self, state: FrameState, words: NDArray[np.uint32]) -> None:
         """Record the pairs that a whole frame used, to predict the next."""
-        self._pairs.note(state, words)
+        self._pairs.record(state, words)
 
-    def expected(
+    def predicted(
         self, handle: GlStore, state: FrameState, timer: StageTimer, fill: Fill
     ) -> KernelSet | None:
         """Return predicted kernels of a frame: those of the last, or new ones.
@@ -105,11 +105,11 @@ class KernelMaker:
         Returns None if there is no prediction, or if reading back the used pairs is
         cheaper, as on a software renderer.
         """
-        kept = self.kept(handle, state.layers, state.image)
-        if kept is not None or self._gpu.is_software:
-            return kept
+        cached = self.cached(handle, state.layers, state.image)
+        if cached is not None or self._gpu.is_software:
+            return cached
         with timer.wall("psf_plan_ms"):
-            used = self._pairs.at(state)
+            used = self._pairs.predict(state)
         if used is None:
             return None
         try:
@@ -117,7 +117,7 @@ class KernelMaker:
         except KernelsTooLarge:
             return None  # the pairs that are actually used may fit
 
-    def kept(
+    def cached(
         self, handle: GlStore, layers: FrameLayers, image: ImageCells
     ) -> KernelSet | None:
         """Return the last frame's kernels if they were made for the same state.
@@ -144,15 +144,15 @@ class KernelMaker:
         fill: Fill,
     ) -> KernelSet:
         """Return kernels of all used (cell, interval) pairs (n_cells, n_intervals)."""
-        kept = self.kept(handle, layers, image)
-        if kept is not None and not kept.lacks(used):
-            return kept
+        cached = self.cached(handle, layers, image)
+        if cached is not None and not cached.lacks(used):
+            return cached
         self._made_for = None  # remains None if the following fails
         with timer.wall("psf_plan_ms"):
             planned = None
-            if kept is not None:  # the next frame may use the last one's pairs
-                planned = _plan_if_they_fit(
-                    handle.store, layers, image, used | kept.have, fill
+            if cached is not None:  # the next frame may use the last one's pairs
+                planned = _plan_or_none(
+                    handle.store, layers, image, used | cached.available, fill
                 )
             plan = planned or _plan(handle.store, layers, image, used, fill)
             pages = handle.sync()
@@ -179,7 +179,7 @@ class KernelMaker:
                 return
             gpu.passes.dispatch(
                 name,
-                grid_of(count),
+                dispatch_grid(count),
                 buffers={"WORK": parts[work], **{key: parts[key] for key in bindings}},
                 uniforms={"group_count": count, **options.pop("uniforms", {})},
                 **options,
@@ -201,8 +201,10 @@ class KernelMaker:
                 images={"ATLAS": atlas},
                 uniforms={"level": level},
             )
-        kept = {name: parts[name] for name in ("KERNELS", "KERNEL_OF")}
-        return KernelSet(plan.kernels, plan.levels.texel_count, kept, atlas, plan.used)
+        cached = {name: parts[name] for name in ("KERNELS", "KERNEL_OF")}
+        return KernelSet(
+            plan.kernels, plan.levels.texel_count, cached, atlas, plan.used
+        )
 
 
 @dataclass(frozen=True)
@@ -239,7 +241,7 @@ def _plan(
     return _Plan(used, kernels, levels)
 
 
-def _plan_if_they_fit(*arguments: Any) -> _Plan | None:
+def _plan_or_none(*arguments: Any) -> _Plan | None:
     try:
         return _plan(*arguments)
     except KernelsTooLarge:

@@ -74,7 +74,7 @@ class ListPasses:
         """Count, list, sort and splat, in the existing buffers.
 
         Nothing is read back: if the lists do not fit, the passes after the count do
-        nothing, and `take_totals` returns False.
+        nothing, and `record_totals` returns False.
         """
         self.strip.reserve(COLOR_OUT=16 * self.strip.pixel_count)
         self.count_bins()
@@ -86,7 +86,7 @@ class ListPasses:
         """Location of the totals: a buffer, and the offset in bytes."""
         return self.strip.buffers["BIN_OFFSETS"], 4 * self.strip.bin_count
 
-    def take_totals(self, words: NDArray[np.uint32]) -> bool:
+    def record_totals(self, words: NDArray[np.uint32]) -> bool:
         """Record the totals; return whether the frame is complete.
 
         If not, `splat_bands` completes it.
@@ -128,7 +128,7 @@ class ListPasses:
                 "count_bins",
                 self.strip.bin_grid,
                 *("FRAGMENT_PLACE", "BLOCKS", "WINDOWS", "BIN_COUNTS"),
-                **self._walk,
+                **self._bin_uniforms,
                 order_always=int(self.strip.paper_rule),
                 defines=self._list_threads,
             )
@@ -142,7 +142,7 @@ class ListPasses:
             )
 
     @property
-    def _walk(self) -> dict[str, Any]:
+    def _bin_uniforms(self) -> dict[str, Any]:
         """Uniforms of common/binning.glsl, and the capacity of a list."""
         return {
             "tile_grid": self.strip.grid,
@@ -209,7 +209,7 @@ class ListPasses:
                 "scatter_fragments",
                 (bin_count, 1),
                 *("FRAGMENT_PLACE", "BLOCKS", "WINDOWS", "BIN_OFFSETS", "ENTRIES"),
-                **self._walk,
+                **self._bin_uniforms,
                 bin_columns=self.strip.bin_grid[0],
                 first_bin=first_bin,
                 defines=self._list_threads,

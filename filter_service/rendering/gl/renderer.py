@@ -18,8 +18,8 @@ class FilterRenderer(OneView):
 
     def __init__(self, gpu: Gpu):
         self._gpu = gpu
-        self._kept = EyeStates(gpu)
-        self._lacks_depth = False
+        self._eyes = EyeStates(gpu)
+        self._had_missing_depth = False
 
     @property
     def name(self) -> str:
@@ -35,7 +35,7 @@ class FilterRenderer(OneView):
 
         The buffers of a GPU are bounded, and expensive to allocate again.
         """
-        self._kept.drop_released()
+        self._eyes.drop_released()
 
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
         """Do nothing and return False: no frame occupies a GPU for long."""
@@ -54,11 +54,11 @@ class FilterRenderer(OneView):
         with self._gpu.context:
             run = FrameRun(
                 self._gpu,
-                self._kept.of(request.handle),
+                self._eyes.of(request.handle),
                 request,
                 output_array(request),
                 gaze_deg=gaze[0],
-                fill_depth=self._lacks_depth,
+                fill_depth=self._had_missing_depth,
             )
         return partial(self._finish, run, *gaze)
 
@@ -66,14 +66,14 @@ class FilterRenderer(OneView):
         self, run: FrameRun, gaze_deg: tuple[float, float], gaze_notes: tuple[str, ...]
     ) -> FilteredView:
         with self._gpu.context:
-            picture, counts = run.finish()
+            color, counts = run.finish()
             self._gpu.check("render")
             stages_ms = run.timer.result_ms()
-        self._lacks_depth = counts["missing_depth_count"] > 0
+        self._had_missing_depth = counts["missing_depth_count"] > 0
         layers = run.layers
         noted = counts["missing_depth_count"], counts["bad_color_count"]
         return FilteredView(
-            color=picture,
+            color=color,
             stage_times_ms=stages_ms,
             pupil_diameter_mm=layers.pupil_diameter_mm,
             focus_dpt=layers.focus_dpt,

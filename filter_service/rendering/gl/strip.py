@@ -18,7 +18,7 @@ def group_count(count: int, size: int) -> int:
     return (count + size - 1) // size
 
 
-def grid_of(groups: int) -> tuple[int, int]:
+def dispatch_grid(groups: int) -> tuple[int, int]:
     """Return columns and rows of at least this many groups, within OpenGL's limits."""
     columns = min(groups, MAX_GROUPS)
     return columns, group_count(groups, columns)
