@@ -1,4 +1,4 @@
-"""Passes: compiled once per variant, dispatched on buffers by name."""
+"""Compute passes: compilation of variants, and dispatch with named buffers."""
 
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ Pages = moderngl.TextureArray
 Atlas = moderngl.Buffer | moderngl.Texture
 
 ATLAS_BINDINGS = {"ATLAS": "ATLAS", "NODES": "NODE_ATLAS"}
-"""Binding of an atlas that is a buffer, by the name of its texture."""
+"""Storage block of an atlas that is a buffer, by the name of its texture."""
 
 BINDING_POINTS = {
     name.removeprefix("BINDING_"): point for name, point in constants.BINDINGS.items()
@@ -30,13 +30,13 @@ _IMAGE_BARRIERS = (
     | moderngl.SHADER_IMAGE_ACCESS_BARRIER_BIT
     | moderngl.TEXTURE_FETCH_BARRIER_BIT
 )
-"""Kinds of access after a pass that may read its output."""
+"""Kinds of later access to the output of a pass."""
 
 
 class BufferPart(NamedTuple):
-    """A range of a buffer that is bound like a buffer.
+    """A range of a buffer that can be bound instead of a buffer.
 
-    It starts at a multiple of 256 bytes, which every device allows.
+    It starts at a multiple of 256 bytes, an alignment that every device accepts.
     """
 
     buffer: Buffer
@@ -45,7 +45,7 @@ class BufferPart(NamedTuple):
 
 
 class Passes:
-    """Programs of a context, and its current bindings.
+    """Compiled programs of a context, and its current bindings.
 
     Parameters
     ----------
@@ -104,16 +104,15 @@ class Passes:
         ----------
         groups : (x, y) or (x, y, z)
         buffers : dict
-            Buffers, or parts of buffers, by binding name without ``BINDING_``.
+            Buffers, or ranges of buffers, by binding name without ``BINDING_``.
         uniforms : dict, optional
-            Values by name; a uniform that the compiler removed is skipped.
+            Values by name; uniforms that the compiler has removed are skipped.
         defines : dict, optional
             Variant of the pass.
         images, textures : dict, optional
-            Textures, or results of `Gpu.atlas`, by name without ``IMAGE_`` or
-            ``TEXTURE_``.
+            Textures or atlases by name without ``IMAGE_`` or ``TEXTURE_``.
         indirect : (buffer, byte), optional
-            Location of the group counts on the GPU; ``groups`` is ignored.
+            Location of the group counts on the GPU, which replace ``groups``.
         """
         images, textures, defines = images or {}, textures or {}, defines or {}
         barriers = _BARRIERS
@@ -142,9 +141,9 @@ class Passes:
         self._context.memory_barrier(barriers)
 
     def _bind(self, point: int, buffer: Buffer | BufferPart) -> None:
-        """Bind a buffer unless it is already bound; most stay from frame to frame.
+        """Bind a buffer unless it is already bound; most bindings never change.
 
-        The buffer itself is kept here, so that no other buffer can get its identity.
+        ``_bound`` holds references, so that a new buffer cannot equal a deleted one.
         """
         if self._bound.get(point) == buffer:
             return
@@ -158,10 +157,7 @@ class Passes:
     def _set_uniforms(
         self, program: moderngl.ComputeShader, uniforms: dict[str, Any]
     ) -> None:
-        """Set the uniforms that have changed since the last dispatch.
-
-        Each is a driver call.
-        """
+        """Set the uniforms that have changed, as each takes a driver call."""
         known = self._uniforms.setdefault(program, {})
         for key, value in uniforms.items():
             if key in known and known[key] == value:

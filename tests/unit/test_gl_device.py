@@ -164,4 +164,4 @@ def test_names_are_asked_for_where_the_device_has_them():
     assert str(_described(0, {0x3055: SOFTWARE_EXTENSION.encode()}.get)) == (
         "0 (software)"
     )
-    assert str(_described(1, lambda what: None)) == "1 (no name)"
+    assert str(_described(1, lambda what: None)) == "1 (unnamed)"

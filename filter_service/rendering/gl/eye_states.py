@@ -1,4 +1,4 @@
-"""State of each kept between frames on the GPU, so that two eyes can alternate."""
+"""Cached state of the two most recently used eyes, so that they can alternate."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from filter_service.rendering.gl.gl_store import GlStore
 from filter_service.rendering.gl.kernel_passes import KernelMaker
 
 MAX_EYES = 2
-"""The two eyes of a stereo frame; each has its own kernel atlas."""
+"""Cache size: the two eyes of a stereo frame; each has its own kernel atlas."""
 
 
 @dataclass(eq=False)
 class EyeState:
-    """State of an eye's last frame that the next frame in the same state reuses."""
+    """Results of an eye's last frame that the next frame can reuse."""
 
     handle: GlStore
     kernels: KernelMaker
@@ -30,7 +30,7 @@ class EyeStates:
         self._eyes: list[EyeState] = []  # most recently used last
 
     def of(self, handle: GlStore) -> EyeState:
-        """Return the state of an eye, and mark it as most recently used."""
+        """Return the state of an eye, which becomes the most recently used."""
         self.drop_released()
         found = next((eye for eye in self._eyes if eye.handle is handle), None)
         others = [eye for eye in self._eyes if eye is not found]
@@ -41,7 +41,7 @@ class EyeStates:
         return found
 
     def drop_released(self) -> None:
-        """Drop the eyes whose stores were released."""
+        """Drop the state of eyes whose stores were released."""
         for eye in [eye for eye in self._eyes if eye.handle.is_released]:
             self._eyes.remove(eye)
             self._recycle(eye)

@@ -1,4 +1,4 @@
-"""Passes that turn a frame, or a strip of it, into fragments."""
+"""Passes that convert a frame, or a strip of it, to fragments."""
 
 from typing import Any
 
@@ -29,11 +29,11 @@ COLOR_VARIANTS = {
     "float32": {"COLOR_IS_LINEAR": 1},
     "float16": {"COLOR_IS_HALF": 1},
 }
-"""Defines of `build_fragments` by the dtype of the color image."""
+"""Defines of ``build_fragments`` by the dtype of the color image."""
 
 
 class FragmentPasses:
-    """Fragments of one strip.
+    """Passes from the pixels of one strip to its fragments.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ class FragmentPasses:
     corner_change_dpt : (rows + 1, columns + 1), float32
         Change of defocus at the corners of the cells.
     tolerance : float
-        Merging error relative to the default; at 0 nothing merges.
+        Merging error relative to the default; 0 disables merging.
     first_row : int
         First row of the strip within the frame.
     frame_pixel_count : int, optional
@@ -53,21 +53,22 @@ class FragmentPasses:
     border_px : int
         Columns and rows added on each side of the image.
     counted_px : (left, top, right, bottom), optional
-        Part of the strip whose pixels are counted; all by default.
+        Part of the strip whose pixels are counted; by default all of it.
     object_range_dpt : (low, high)
-        Prepared distances; pixels at others are counted.
+        Prepared distances; pixels outside are counted.
     white_level : float
-        Reference light for the contrast of a merged quad.
+        Reference of the contrast below which pixels merge.
     is_encoded : bool
-        Whether the image is for a display, where dark parts need finer steps.
+        Whether the output is encoded for a display, where contrast in dark areas is
+        more visible.
 
     Attributes
     ----------
     search_blocks : int
-        Distance at which a bin searches for fragments that reach it; known after
-        merging.
+        Distance, in blocks, within which a bin searches for fragments that reach it;
+        set by `merge_fragments`.
     stats : (STAT_LANES, STAT_WORDS), uint32
-        Counters of the passes; filled when the frame is fetched.
+        Counters of the passes, written by the readback.
     """
 
     def __init__(
@@ -109,7 +110,7 @@ class FragmentPasses:
         self.used_words = np.zeros((0, 0), np.uint32)
 
     def upload(self) -> None:
-        """Upload the strip; bytes are padded to whole words."""
+        """Upload the strip, padded to whole words."""
         colors, depths_m = (
             self.strip.view.surface_colors,
             self.strip.view.surface_depths_m,
@@ -157,14 +158,14 @@ class FragmentPasses:
             )
 
     def wait_for_used(self) -> NDArray[np.bool_]:
-        """Read back the used pairs in the middle of the frame."""
+        """Wait for the GPU, and return the used pairs."""
         with self.strip.timer.wall("psf_plan_ms"):
             self.strip.gpu.read_into((self.strip.buffers["USED"], 0, self.used_words))
             return self.used
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """Return the used pairs (n_cells, n_intervals), once they have been read."""
+        """Return the used pairs (n_cells, n_intervals), after the readback."""
         from filter_service.rendering.pair_loops import unpack_pairs
 
         return unpack_pairs(self.used_words, interval_count(self.strip.layers))
@@ -182,7 +183,7 @@ class FragmentPasses:
         }
 
     def merge_fragments(self, kernels: KernelSet) -> None:
-        """Merge pixels into fragments, in blocks."""
+        """Merge pixels into fragments, and pack the fragments of each block."""
         slots = self.strip.block_count * THREADS
         largest_reach_px = int(kernels.kernels.reach_px.max()) + 1.5
         self.strip.kernel_buffers = kernels.buffers
@@ -219,15 +220,15 @@ class FragmentPasses:
 
     @property
     def _max_level(self) -> int:
-        """Highest merging level; the paper merges once."""
+        """Highest level of merging; the paper has one level."""
         if self.tolerance == 0.0:
             return 0
-        most = 1 if self.strip.paper_rule else MAX_LEVEL
+        highest = 1 if self.strip.paper_rule else MAX_LEVEL
         cell_px = self.image.cell_px
-        return min(most, cell_px.bit_length() - 1) if cell_px else most
+        return min(highest, cell_px.bit_length() - 1) if cell_px else highest
 
     def counts(self) -> dict[str, int]:
-        """Return counts of `FilteredView` by name, once the frame has been fetched."""
+        """Return the counts of `FilteredView` by name, after the readback."""
         stats = self.stats.sum(axis=0, dtype=np.int64).tolist()
         return {
             "missing_depth_count": stats[STAT_MISSING],

@@ -1,4 +1,4 @@
-"""All passes of a frame, or a strip of it, in order, and the output image."""
+"""All passes of a frame, or a strip of it, and the readback of the image."""
 
 from collections.abc import Callable
 from typing import Any
@@ -23,11 +23,10 @@ ENCODERS = {
     "linear16": ("encode_half", HALVES_PER_WORD, np.float16),
     "linear": ("encode_float", 1, np.float32),
 }
-"""Encoding of the image: pass, pixels per thread (for RGB words), dtype."""
-
+"""Encoding of the image: pass, pixels per thread (which writes whole words), dtype."""
 
 PASSES = "buffers of the passes"
-"""Name under which a caller claims the buffers, see `Gpu.claim`."""
+"""Name of the buffers in `Gpu.claim`."""
 
 
 class FramePasses:
@@ -61,13 +60,13 @@ class FramePasses:
         Parameters
         ----------
         kernels : callable
-            Function that returns the kernels of used (cell, interval) pairs.
+            Function that returns the kernels of used pairs.
         predicted : callable, optional
-            Function that returns predicted kernels, or None.  With them nothing is
-            read back in the middle of the frame, and the prediction is checked at its
-            end.  They are computed while the GPU is busy.
+            Function that returns predicted kernels, or None; it is called while the
+            GPU works.  With a prediction, there is no readback in the middle of the
+            frame; `end_read` checks the prediction.
         used : (n_cells, n_intervals), optional
-            Used pairs, if known.
+            Used pairs, if they are known.
         """
         self.strip.gpu.claim(PASSES, self)
         self.fragments.upload()
@@ -85,7 +84,7 @@ class FramePasses:
         self.lists.run()
 
     def begin_read(self, output: str, out: NDArray[Any] | None = None) -> None:
-        """Start the readback of the image (into ``out`` if given) and the counts."""
+        """Start the readback of the image (to ``out`` if given) and the counters."""
         self._output = output
         name, pixels_per_thread, dtype = ENCODERS[output]
         self._encode(name, pixels_per_thread)
@@ -103,10 +102,10 @@ class FramePasses:
             )
 
     def end_read(self) -> NDArray[Any] | None:
-        """Return the image, or None if the strip must be filtered again.
+        """Wait for the image; return it, or None if the strip must be filtered again.
 
-        That is the case if a kernel was missing, or if the lists did not fit and other
-        passes have run since.
+        That is the case if a kernel was missing, or if the fragment lists did not fit
+        their buffer and another strip has overwritten the inputs since.
         """
         with self.strip.timer.wall("readback_ms"):
             self._wait()
@@ -138,5 +137,5 @@ class FramePasses:
             )
 
     def counts(self) -> dict[str, int]:
-        """Return counts of `FilteredView` by name."""
+        """Return the counts of `FilteredView` by name."""
         return self.fragments.counts() | self.lists.counts()

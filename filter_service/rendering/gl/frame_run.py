@@ -1,6 +1,6 @@
-"""One view on the GPU: started first, and finished when its image is needed.
+"""One view on the GPU: started at once, and finished when the caller needs the image.
 
-In between, the processor is free for another view.
+In between, the CPU is free for another view.
 """
 
 from collections import Counter
@@ -40,7 +40,7 @@ Counts = dict[str, int]
 
 @dataclass(frozen=True)
 class _Plan:
-    """Plan shared by all strips of a frame."""
+    """Plan that all strips of a frame share."""
 
     whole: RgbdView
     border_px: int
@@ -52,7 +52,7 @@ class _Plan:
 class FrameRun:
     """Filtering of one view through an eye in one state.
 
-    The GPU counts the pixels without depth.  If a frame has some, it is filtered again
+    The GPU counts pixels without depth.  If there are any, the frame is filtered again
     with their depth filled in.
 
     Parameters
@@ -63,7 +63,7 @@ class FrameRun:
     gaze_deg : (h, v)
         Gaze of the eye, within the prepared range.
     fill_depth : bool
-        Whether to fill missing depth first, because the previous frame had some.
+        Whether to fill missing depth first, because the previous frame had any.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class FrameRun:
 
     @property
     def depth_m(self) -> NDArray[np.float32]:
-        """Depth of the view, with missing pixels filled."""
+        """Depth of the view, with missing depth filled in."""
         return self._view.depth_m
 
     def finish(self) -> tuple[NDArray[Any], Counts]:
@@ -120,7 +120,7 @@ class FrameRun:
             self._view = replace(self._view, depth_m=depth_m)
 
     def _begin(self) -> "_StripRun | None":
-        """Start a frame of one strip; frames of several strips run in `finish`."""
+        """Start a frame of one strip; `finish` runs frames of several strips."""
         plan = self._plan()
         if len(plan.strips) > 1:
             return None
@@ -142,7 +142,7 @@ class FrameRun:
         return self._whole()
 
     def _whole(self) -> tuple[NDArray[Any], Counts]:
-        """Filter the frame, with larger cells if its kernels take too much memory."""
+        """Filter the frame, with larger cells if its kernels need too much memory."""
         while True:
             plan = self._plan()
             runs = [_StripRun(self, plan, rows) for rows in plan.strips]
@@ -233,12 +233,12 @@ class FrameRun:
         )
 
     def _fill(self, psfs: NDArray[np.int64]) -> None:
-        """Compute the missing PSFs of a frame, as one of its stages."""
+        """Compute the missing PSFs of a frame, timed as a stage of its own."""
         with self.timer.wall("psf_compute_ms"):
             self._eye.handle.store.fill(psfs, until_s=self._request.until_s)
 
     def out_of(self, plan: _Plan) -> NDArray[Any] | None:
-        """Return the output array if a strip's image is the whole image, else None."""
+        """Return the output array if the frame is one strip without a border."""
         return None if plan.border_px or len(plan.strips) > 1 else self._out
 
     @property
@@ -294,7 +294,7 @@ class _StripRun:
 
 
 def _prepared_range_dpt(store: PsfStore) -> tuple[float, float]:
-    """Return the prepared object distances of a store, with a margin for rounding."""
+    """Return the range of prepared object distances, with a margin for rounding."""
     low_dpt, high_dpt = store.spec.object_range_dpt
     margin = 1e-6 * max(high_dpt, 1.0)
     return low_dpt - margin, high_dpt + margin

@@ -11,7 +11,7 @@ from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.image_cells import image_cells
 
 INITIAL_WORDS = 2**20
-"""Initial size of a store's copy on the GPU, 2 MB; it grows by doubling."""
+"""Initial capacity of the copy on the GPU, 2 MB; it grows by doubling."""
 
 
 class GlStore(FrameStore):
@@ -67,7 +67,7 @@ class GlStore(FrameStore):
 
 
 def _lines(words: NDArray[np.uint16], first: int, end: int) -> NDArray[np.uint16]:
-    """Return words as whole lines (n, STORE_SIDE); the last is padded with zeros."""
+    """Return whole lines (n, STORE_SIDE) of words; the last is padded with zeros."""
     part = words[first * STORE_SIDE : end * STORE_SIDE]
     missing = -part.size % STORE_SIDE
     if missing:

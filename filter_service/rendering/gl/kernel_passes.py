@@ -1,4 +1,4 @@
-"""Passes that blend a frame's kernels from the cache, and keep them between frames."""
+"""Passes that blend a frame's kernels from cached PSFs; frames can reuse kernels."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -38,7 +38,7 @@ from filter_service.rendering.kernel_tables import (
 )
 
 MAX_KERNEL_TEXELS = 24 * 2**20
-"""Largest texel count of a frame: 400 MB at 16 bytes each."""
+"""Largest texel count of a frame's kernels: 400 MB at 16 bytes per texel."""
 
 _WORD_BYTES = 4
 
@@ -67,18 +67,18 @@ class KernelSet:
     available: NDArray[np.bool_]
 
     def lacks(self, used: NDArray[np.bool_]) -> bool:
-        """Return whether a frame uses pairs that have no kernel."""
+        """Return whether a frame uses pairs without a kernel."""
         return bool(np.any(used & ~self.available))
 
 
 class KernelMaker:
-    """Blends the kernels that a frame uses; reuses those of the last frame if possible.
+    """Blend the kernels that frames use, and cache those of the last frame.
 
     Parameters
     ----------
     gpu : Gpu
     slot : int
-        Number of this maker in its context; each has its own memory.
+        Number of this instance in its context; each has its own atlas.
     """
 
     def __init__(self, gpu: Gpu, slot: int = 0):
@@ -94,16 +94,16 @@ class KernelMaker:
         self._pairs.reset()
 
     def record_pairs(self, state: FrameState, words: NDArray[np.uint32]) -> None:
-        """Record the pairs that a whole frame used, to predict the next."""
+        """Record the pairs that a frame used, from which the next are predicted."""
         self._pairs.record(state, words)
 
     def predicted(
         self, handle: GlStore, state: FrameState, timer: StageTimer, fill: Fill
     ) -> KernelSet | None:
-        """Return predicted kernels of a frame: those of the last, or new ones.
+        """Return kernels for the predicted pairs of a frame.
 
-        Returns None if there is no prediction, or if reading back the used pairs is
-        cheaper, as on a software renderer.
+        Returns None if there is no prediction, or if a readback of the used pairs costs
+        nothing, as on a software renderer.
         """
         cached = self.cached(handle, state.layers, state.image)
         if cached is not None or self._gpu.is_software:
@@ -115,15 +115,15 @@ class KernelMaker:
         try:
             return self.kernels(handle, state.layers, state.image, used, timer, fill)
         except KernelsTooLarge:
-            return None  # the pairs that are actually used may fit
+            return None  # the pairs that the frame actually uses may fit
 
     def cached(
         self, handle: GlStore, layers: FrameLayers, image: ImageCells
     ) -> KernelSet | None:
-        """Return the last frame's kernels if they were made for the same state.
+        """Return the last frame's kernels if they are for the same state.
 
-        They must also still exist: another renderer of this context uses memory of the
-        same name.
+        Another renderer of this context may have overwritten them, because it uses
+        buffers of the same names; None is returned then, too.
         """
         key = (handle, layers, image)
         if not self._gpu.is_owner(self._memory, self):
@@ -143,14 +143,16 @@ class KernelMaker:
         timer: StageTimer,
         fill: Fill,
     ) -> KernelSet:
-        """Return kernels of all used (cell, interval) pairs (n_cells, n_intervals)."""
+        """Return kernels for all used pairs (n_cells, n_intervals)."""
         cached = self.cached(handle, layers, image)
         if cached is not None and not cached.lacks(used):
             return cached
         self._made_for = None  # remains None if the following fails
         with timer.wall("psf_plan_ms"):
             planned = None
-            if cached is not None:  # the next frame may use the last one's pairs
+            if (
+                cached is not None
+            ):  # the next frame may use the last frame's pairs again
                 planned = _plan_or_none(
                     handle.store, layers, image, used | cached.available, fill
                 )
@@ -209,7 +211,7 @@ class KernelMaker:
 
 @dataclass(frozen=True)
 class _Plan:
-    """Kernels of the used pairs, and their sizes."""
+    """Kernels of used pairs, and their sizes."""
 
     used: NDArray[np.bool_]
     kernels: FrameKernels
@@ -228,14 +230,14 @@ def _plan(
     Raises
     ------
     KernelsTooLarge
-        There are too many texels; larger cells have fewer.
+        There are too many texels, and larger cells are possible.
     """
     kernels = frame_kernels(store, layers, image, used, fill=fill)
     levels = kernel_levels(kernels)
     check_texels(int(levels.sizes[:, 0].sum()), image, store.spec)
     if levels.texel_count > MAX_KERNEL_TEXELS and can_coarsen(image):
         raise KernelsTooLarge(
-            f"the frame's kernels need {levels.texel_count} texels; allowed are "
+            f"the frame's kernels have {levels.texel_count} texels; expected at most "
             f"{MAX_KERNEL_TEXELS}",
         )
     return _Plan(used, kernels, levels)
@@ -249,12 +251,12 @@ def _plan_or_none(*arguments: Any) -> _Plan | None:
 
 
 def words_per_cell(layers: FrameLayers) -> int:
-    """Return the number of words for the used parts of a cell's intervals.
+    """Return the number of words with the bits of a cell's intervals.
 
     Raises
     ------
     GridTooLarge
-        There are more layers than a frame may have.
+        There are more than `MAX_LAYERS`.
     """
     if len(layers.layer_dpt) > MAX_LAYERS:
         raise GridTooLarge(

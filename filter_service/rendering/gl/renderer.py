@@ -1,4 +1,4 @@
-"""The OpenGL frame engine: checks, stores on the GPU, start and result of frames."""
+"""The OpenGL frame engine."""
 
 from collections.abc import Callable
 from functools import partial
@@ -14,7 +14,7 @@ from filter_service.rendering.request_checks import check_request, output_array
 
 
 class FilterRenderer(OneView):
-    """Runs the passes on one view at a time; not thread-safe."""
+    """Frame engine of OpenGL compute shaders; not thread-safe."""
 
     def __init__(self, gpu: Gpu):
         self._gpu = gpu
@@ -27,18 +27,18 @@ class FilterRenderer(OneView):
         return str(self._gpu.info["renderer"])
 
     def load(self, store: PsfStore) -> GlStore:
-        """Load a store; its kernels may all be computed later."""
+        """Load a store; its kernels may be computed later."""
         return GlStore(self._gpu, store)
 
     def trim(self) -> None:
-        """Drop released eyes only.
+        """Drop the state of released stores.
 
-        The buffers of a GPU are bounded, and expensive to allocate again.
+        Buffers on the GPU are kept: their size is bounded, and allocation is slow.
         """
         self._eyes.drop_released()
 
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
-        """Do nothing and return False: no frame occupies a GPU for long."""
+        """Return False: frames on a GPU are too short for pauses."""
         return False
 
     def begin(self, request: ViewRequest) -> Pending:
@@ -47,10 +47,10 @@ class FilterRenderer(OneView):
         Raises
         ------
         OutOfGpuMemory, RenderFailed
-            Besides those of `FrameEngine.begin`.
+            In addition to the errors of `FrameEngine.begin`.
         """
         gaze = check_request(request, request.handle.store)
-        # Another library's context (that of the input's renderer) may be current.
+        # The application's own context may be current.
         with self._gpu.context:
             run = FrameRun(
                 self._gpu,

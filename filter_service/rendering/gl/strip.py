@@ -14,29 +14,28 @@ MAX_GROUPS = 65535
 
 
 def group_count(count: int, size: int) -> int:
-    """Return the number of groups of a size that hold a count."""
+    """Return the number of groups of ``size`` elements for ``count`` elements."""
     return (count + size - 1) // size
 
 
 def dispatch_grid(groups: int) -> tuple[int, int]:
-    """Return columns and rows of at least this many groups, within OpenGL's limits."""
+    """Return a dispatch (columns, rows) with at least this many work groups."""
     columns = min(groups, MAX_GROUPS)
     return columns, group_count(groups, columns)
 
 
 class Strip:
-    """State shared by all passes of a strip; buffers are the context's named ones.
+    """State that all passes of a strip share; its buffers belong to the context.
 
     Parameters
     ----------
     view : RgbdView
-        The strip, with depth filled in; hidden depth is 0 where nothing is hidden.
+        The strip; hidden depth is 0 where the hidden layer is empty.
     layers : FrameLayers
     paper_rule : bool
-        Whether fragments are accumulated by the paper's rule.
+        Whether the paper's rule accumulates the fragments.
     surface_count : int, optional
-        Surfaces whose fragments follow each other in the blocks; by default those of
-        the view, unless a test makes its own blocks.
+        Surfaces in the blocks of fragments; by default those of the view.
     """
 
     def __init__(
@@ -66,14 +65,14 @@ class Strip:
         self.kernel_buffers: dict[str, BufferPart] = {}
 
     def reserve(self, **n_bytes: int) -> None:
-        """Reserve buffers of these sizes by name."""
+        """Allocate named buffers of at least these sizes."""
         for name, size in n_bytes.items():
             self.buffers[name] = self.gpu.storage(name, size)
 
     def run(
         self, name: str, groups: tuple[int, ...], *bindings: str, **uniforms: Any
     ) -> None:
-        """Dispatch a pass on buffers given by name."""
+        """Dispatch a pass on the named buffers."""
         defines = uniforms.pop("defines", None)
         textures = uniforms.pop("textures", None)
         indirect = uniforms.pop("indirect", None)

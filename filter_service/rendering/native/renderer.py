@@ -222,7 +222,7 @@ class NativeRenderer(OneView):
         used: NDArray[np.bool_],
         fill: Fill,
     ) -> KernelPlan:
-        """Return the last frame's plan if it serves this frame, otherwise a new plan."""
+        """Return the last frame's plan if it serves this frame, else a new one."""
         state = (eye.handle, layers, image)
         if eye.plan is None or not eye.plan.serves(state, used):
             eye.plan = None  # remains None if the following fails
