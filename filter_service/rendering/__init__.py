@@ -2,23 +2,25 @@
 
 Terms, in addition to the rendering terms of ``CONVENTIONS.md``:
 
-kernel     weights of one PSF in a box of pixels, for red, green and blue
-reach      distance from a kernel's center to the left, right, upper and lower
-           side of its box, px
-spread     radius of the uniform disc with the same sum of squared weights, px
-node       field direction for which PSFs are cached
-tap        one cached kernel in a weighted sum of kernels, as in a filter tap
-cell       square of the image whose pixels share kernels
-interval   range between two adjacent layers; fragments interpolate linearly
-           between the kernels at its two ends
-pair       cell and interval; each pair that a frame uses has one kernel
-merge      replace a square of 2, 4 or 8 similar pixels by one fragment
-level      of a merged square: its edge is 2^level px, as with mipmaps
-texel      element of a kernel in memory; an atlas is a buffer or texture that
-           contains the kernels of a frame one after the other
-block      the fragments of 8 x 8 pixels, stored together
-window     rectangle of the blocks whose fragments may reach a bin
-margin     amount that is added to a bound, against rounding
+- kernel: weights of one PSF in a box of pixels, for red, green and blue
+- reach: distance from a kernel's center to the left, right, upper and lower side of
+  its box, px
+- spread: radius of the uniform disc with the same sum of squared weights, px
+- node: field direction for which PSFs are cached
+- tap: one cached kernel in a weighted sum of kernels, as in a filter tap
+- cell: square of the image whose pixels share kernels
+- interval: range between two adjacent layers; fragments interpolate linearly between
+  the kernels at its two ends
+- pair: a cell and an interval; each pair that a frame uses has one kernel
+- merge: replace a square of 2, 4 or 8 similar pixels by one fragment
+- level: binary logarithm of a merged square's edge in px, as with mipmaps
+- texel, atlas: element of a kernel on the GPU; buffer or texture with the kernels of a
+  frame
+- block: the fragments of 8 x 8 pixels, stored together
+- window: rectangle of the blocks whose fragments may reach a bin
+- margin: amount that is added to a bound, against rounding
+
+Modules:
 
 engine           interface of the frame engines
 request_checks   checks of a request against its store

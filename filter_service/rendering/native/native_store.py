@@ -23,8 +23,8 @@ cataract had 0.1 dB more error at 1280x720."""
 
 COARSE_SPREAD_RATIO = 0.25
 """Cached kernels are downsampled if their spread is at least this fraction of the
-limit: a frame's kernel is a weighted sum of wider and narrower ones.  Narrower cached kernels
-become a single coarse pixel."""
+limit: a frame's kernel is a weighted sum of wider and narrower ones.  Narrower cached
+kernels become a single coarse pixel."""
 
 
 class StoredKernels(NamedTuple):
