@@ -1,5 +1,7 @@
 """The bins' lists against their twin, at their limits, and what frames make of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -43,13 +45,14 @@ def view(bench, rng):
 def new_passes(bench, *, paper_rule=False, surface_count=1):
     """Passes of a view, about to make its lists."""
     view = bench.view(np.zeros((HEIGHT, WIDTH, 3), np.float32), 1.0)
+    if surface_count == 2:
+        view = replace(view, hidden_color=view.color, hidden_depth_m=view.depth_m)
     strip = Strip(
         bench.gpu,
         view,
         StageTimer(bench.gpu),
         layers=bench.layers(),
         paper_rule=paper_rule,
-        surface_count=surface_count,
     )
     return ListPasses(strip, search_blocks=0)
 

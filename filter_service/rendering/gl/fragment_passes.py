@@ -46,14 +46,14 @@ class FragmentPasses:
         Merging error relative to the default; 0 disables merging.
     first_row : int
         First row of the strip within the frame.
-    frame_pixel_count : int, optional
-        Pixel count of the whole frame, if it is larger than the strip.
-    image_size_px : (width, height), optional
-        Size of the whole image, if the frame has a border around it.
+    frame_pixel_count : int
+        Pixel count of the whole frame.
+    image_size_px : (width, height)
+        Size of the whole image without its border.
     border_px : int
         Columns and rows added on each side of the image.
-    counted_px : (left, top, right, bottom), optional
-        Part of the strip whose pixels are counted; by default all of it.
+    counted_px : (left, top, right, bottom)
+        Part of the strip whose pixels are counted.
     object_range_dpt : (low, high)
         Prepared distances; pixels outside are counted.
     white_level : float
@@ -78,27 +78,24 @@ class FragmentPasses:
         image: ImageCells,
         corner_change_dpt: NDArray[np.float32],
         tolerance: float,
-        first_row: int = 0,
-        frame_pixel_count: int | None = None,
-        image_size_px: tuple[int, int] | None = None,
-        border_px: int = 0,
-        counted_px: tuple[int, int, int, int] | None = None,
-        object_range_dpt: tuple[float, float] = (0.0, np.inf),
-        white_level: float = 1.0,
-        is_encoded: bool = False,
+        first_row: int,
+        frame_pixel_count: int,
+        image_size_px: tuple[int, int],
+        border_px: int,
+        counted_px: tuple[int, int, int, int],
+        object_range_dpt: tuple[float, float],
+        white_level: float,
+        is_encoded: bool,
     ):
         self.strip = strip
         self.image = image
         self.corner_change_dpt = corner_change_dpt
         self.tolerance = tolerance
         self.first_row = first_row
-        self.scan = (
-            first_row * strip.view.width_px,
-            frame_pixel_count or strip.pixel_count,
-        )
-        self.image_size_px = image_size_px or strip.size
+        self.scan = (first_row * strip.view.width_px, frame_pixel_count)
+        self.image_size_px = image_size_px
         self.border_px = border_px
-        self.counted_px = counted_px or (0, 0, *strip.size)
+        self.counted_px = counted_px
         self.object_range_dpt = object_range_dpt
         self.stats = np.zeros((STAT_LANES, STAT_WORDS), np.uint32)
         self.white_level = white_level

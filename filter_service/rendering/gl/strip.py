@@ -34,8 +34,6 @@ class Strip:
     layers : FrameLayers
     paper_rule : bool
         Whether the paper's rule accumulates the fragments.
-    surface_count : int, optional
-        Surfaces in the blocks of fragments; by default those of the view.
     """
 
     def __init__(
@@ -46,7 +44,6 @@ class Strip:
         *,
         layers: FrameLayers,
         paper_rule: bool,
-        surface_count: int | None = None,
     ):
         self.gpu = gpu
         self.view = view
@@ -57,7 +54,7 @@ class Strip:
         self.pixel_count = view.width_px * view.height_px
         self.grid = tuple(group_count(side, TILE_SIZE_PX) for side in self.size)
         self.tile_count = self.grid[0] * self.grid[1]
-        self.surface_count = surface_count or view.surface_count
+        self.surface_count = view.surface_count
         self.block_count = self.surface_count * self.tile_count
         self.bin_grid = tuple(group_count(side, BIN_TILES) for side in self.grid)
         self.bin_count = self.bin_grid[0] * self.bin_grid[1]
