@@ -309,8 +309,8 @@ class Page:
     async def _renew_figures(self) -> None:
         await asyncio.sleep(FIGURES_REST_S)
         self._renewal = None  # from here on it is not canceled: newer ones wait
-        await self.figures.renew()
         await self._mark_rows()
+        await self.figures.renew()
 
     async def _mark_rows(self) -> None:
         """Label the rows of a chart, and the smallest one that each eye reads."""
@@ -369,7 +369,7 @@ class Page:
         )
         self._set_empty("")
         self.view.show_scene(picture.title, picture.aspect_ratio)
-        self.view.mark_rows([], {})
+        self.view.mark_rows(marks_of(picture.chart_rows, {}), {})
         number = self.state.number + 1
         self.out.put(
             SentPicture(

@@ -92,11 +92,13 @@ def test_a_link_on_another_site_opens_the_page(browser, address):
         thread = threading.Thread(target=site.serve_forever)
         thread.start()
         context = browser.new_context()
-        page = PageUnderTest(context.new_page())
-        page.page.goto(f"http://localhost:{site.server_port}/")  # another site
-        page.page.get_by_text("the eye").click()
-        page.settle()
-        assert page.entry("sphere_dpt").input_value() == "-3.50"
-        context.close()
-        site.shutdown()
-        thread.join()
+        try:
+            page = PageUnderTest(context.new_page())
+            page.page.goto(f"http://localhost:{site.server_port}/")  # another site
+            page.page.get_by_text("the eye").click()
+            page.settle()
+            assert page.entry("sphere_dpt").input_value() == "-3.50"
+        finally:
+            context.close()
+            site.shutdown()
+            thread.join()
