@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 
@@ -116,10 +117,12 @@ class EyePanel:
         def take(event: events.ValueChangeEventArguments) -> None:
             nonlocal is_pasted
             texts[number.name] = event.value or ""
-            if is_pasted and self._spread(number, event.value or "", is_worn):
-                return
+            if is_pasted and number is SPHERE and prescription_texts(event.value or ""):
+                # nicegui sends no value for an entry while it handles the entry's event
+                asyncio.get_running_loop().call_soon(leave)
+            else:
+                self._on_change()  # an invalid entry is reported
             is_pasted = False
-            self._on_change()  # an invalid entry is reported
 
         def leave() -> None:
             text = entry.value or ""

@@ -29,10 +29,10 @@ export default {
                       x2="78.5%" :y2="mark.top + line / 2"></line>
               </svg>
               <ol class="oc-marks" :style="{ ...clip, fontSize: 0.75 * line + 'px', lineHeight: line + 'px' }">
-                <li class="oc-marks-head"><span>logMAR</span><span>dec.</span></li>
+                <li class="oc-marks-head"><span>logMAR</span> <span>dec.</span></li>
                 <li v-for="mark in labels" :style="{ top: mark.top + 'px' }"
                     :class="{ 'oc-read': mark.eyes.includes(eye) }"
-                    ><span>{{ mark.log_mar }}</span><span>{{ mark.decimal }}</span></li>
+                    ><span>{{ mark.log_mar }}</span> <span>{{ mark.decimal }}</span></li>
               </ol>
             </template>
             <span class="oc-tag oc-tag-left" :style="{ opacity: shownSplit > 12 ? 1 : 0 }">Scene</span>

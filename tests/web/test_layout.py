@@ -80,7 +80,6 @@ _ONE = """element => {
 
 
 def test_the_focus_ring_of_a_slider_does_not_cross_a_label(page):
-    heads = rectangles(page, ".oc-sliders .oc-slider-head")
     for slider in page.page.locator(".oc-sliders input[type=range]").all():
         if slider.is_disabled():
             continue
@@ -94,7 +93,7 @@ def test_the_focus_ring_of_a_slider_does_not_cross_a_label(page):
         assert width_px > 0.0
         ring["top"] -= width_px
         ring["bottom"] += width_px
-        for head in heads:
+        for head in rectangles(page, ".oc-sliders .oc-slider-head"):
             assert overlap_px(ring, head) == 0.0
 
 
