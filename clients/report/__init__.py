@@ -8,6 +8,7 @@ correction_text  descriptions of corrections
 charts           filtered letter charts, near and far
 provenance       measured, entered and assumed data
 sources          literature references
+labels           names of the eyes
 origin           reference, date, version and digest of the profile
 blocks           sections, rows, tables and figures
 tables           tables of a report

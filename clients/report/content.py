@@ -31,6 +31,7 @@ from clients.report.blocks import (
 from clients.report.charts import DISTANCES_M
 from clients.report.correction_text import limits_text, subtitle_text
 from clients.report.facts import EyeFacts
+from clients.report.labels import SIDE_NAMES
 from clients.report.provenance import provenance_table
 from clients.report.sources import Citations
 from clients.report.tables import (
@@ -45,7 +46,6 @@ DAY_MM, DUSK_MM = PUPILS_MM
 
 MAP_MM, PSF_MM = 42.0, 48.0
 FIELD_MM, CURVE_MM, TERMS_MM = 76.0, 60.0, 40.0
-SIDES = {"OD": "right eye (OD)", "OS": "left eye (OS)"}
 NOT_A_DEVICE = (
     "A simulation for research and explanation, not a medical device: no diagnosis or "
     "treatment may rest on it."
@@ -57,7 +57,7 @@ def eye_document(facts: EyeFacts) -> Document:
     cite = Citations()
     cite("csoba", "osa", "vectors")
     return Document(
-        title=f"Eye report: {facts.label}",
+        title=f"Eye report: {facts.label or SIDE_NAMES[facts.study.profile.eye_side]}",
         subtitle=subtitle(facts.study),
         sections=(summary(facts), *details(facts, cite), sources(cite)),
         footer=NOT_A_DEVICE,
@@ -70,7 +70,8 @@ def subtitle(study: EyeStudy) -> str:
     age = "age not given"
     if profile.age_years is not None:
         age = f"{profile.age_years:g} years"
-    whose = f"{SIDES[profile.eye_side]}, {age}, from a {KIND_WORDS[profile.kind]}"
+    side = f"{SIDE_NAMES[profile.eye_side]} ({profile.eye_side})"
+    whose = f"{side}, {age}, from a {KIND_WORDS[profile.kind]}"
     return whose + subtitle_text(profile)
 
 

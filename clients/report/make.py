@@ -12,6 +12,7 @@ from clients.report.comparison import comparison_document
 from clients.report.content import eye_document
 from clients.report.facts import EyeFacts, facts_of
 from clients.report.html_page import html_of
+from clients.report.labels import distinct_labels
 from clients.report.origin import origin_of
 
 SUFFIXES = (".html", ".pdf")
@@ -92,7 +93,14 @@ def eyes_of(
     ]
     if progress is not None:
         progress(WRITING_AT, "writing")
-    return eyes
+    if len(eyes) == 1:
+        return eyes
+    before, after = eyes
+    names = distinct_labels(
+        (before.label, after.label),
+        (before.study.profile.eye_side, after.study.profile.eye_side),
+    )
+    return [replace(facts, label=name) for facts, name in zip(eyes, names, strict=True)]
 
 
 def document_of(eyes: list[EyeFacts], *, reference: str = "") -> Document:

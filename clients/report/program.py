@@ -116,7 +116,8 @@ def run(options: argparse.Namespace) -> str:
     for eye in eyes:
         if eye.chart_problem and not options.no_charts:
             print(f"note: no letter charts: {eye.chart_problem}", file=sys.stderr)
-    return f"{options.out}: {', '.join(labels)}, {time.monotonic() - started_s:.1f} s"
+    names = "".join(f"{eye.label}, " for eye in eyes if eye.label)
+    return f"{options.out}: {names}{time.monotonic() - started_s:.1f} s"
 
 
 def _check_out(options: argparse.Namespace) -> None:
@@ -132,9 +133,9 @@ def _check_out(options: argparse.Namespace) -> None:
 
 
 def _called(source: str) -> str:
-    """Return a file's name without its suffix, a preset's name, or "eye" for JSON."""
+    """Return a file's name without its suffix, or a preset's name; empty for JSON."""
     if source.lstrip().startswith("{"):
-        return "eye"
+        return ""
     return Path(source).stem if Path(source).suffix else source
 
 

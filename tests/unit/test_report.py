@@ -4,6 +4,7 @@ import json
 import math
 import re
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 from importlib.metadata import version
 
@@ -32,6 +33,7 @@ from clients.report.charts import picture_side_px
 from clients.report.correction_text import correction_text
 from clients.report.facts import EyeFacts, facts_of
 from clients.report.html_page import STYLE, html_of
+from clients.report.labels import distinct_labels
 from clients.report.make import document_of, write_report
 from clients.report.numbers import Refraction, measured_numbers, spectacles_for
 from clients.report.program import main
@@ -287,6 +289,33 @@ def test_two_eyes_make_one_document(myope, corrected, tmp_path):
     )
     both = report_numbers([myope, corrected])
     assert json.loads(json.dumps(both, allow_nan=False))["after"]["correction"]
+
+
+@pytest.mark.parametrize(
+    ("labels", "sides", "expected"),
+    [
+        (("", ""), ("OD", "OD"), ("first eye", "second eye")),
+        (("", ""), ("OS", "OD"), ("left eye", "right eye")),
+        (("eye", "eye"), ("OD", "OD"), ("eye (first)", "eye (second)")),
+        (("eye", "eye"), ("OD", "OS"), ("eye (right eye)", "eye (left eye)")),
+        (("", "after"), ("OD", "OD"), ("first eye", "after")),
+    ],
+)
+def test_two_eyes_have_distinct_labels(labels, sides, expected):
+    assert distinct_labels(labels, sides) == expected
+
+
+def test_a_report_of_two_inline_profiles_needs_no_names(capsys, tmp_path):
+    out = tmp_path / "eyes.html"
+    eye = {"kind": "prescription", "sphere_dpt": -1.0}
+    profiles = [json.dumps(eye), json.dumps(eye | {"sphere_dpt": -2.0})]
+    assert main([*profiles, "-o", str(out), "--no-charts"]) == 0
+    assert "<h1>Eye report: first eye → second eye</h1>" in out.read_text()
+
+
+def test_an_eye_without_a_name_is_titled_by_its_side(corrected):
+    title = document_of([replace(corrected, label="")]).title
+    assert title == "Eye report: left eye"
 
 
 def test_blocks_share_a_row_by_their_widths():
