@@ -169,6 +169,16 @@ class EyeStudy:
             rings=self._rings(float(seen.circle_diameter_mm[0])),
         )
 
+    def far(self, pupil_diameter_mm: float) -> PupilWavefront:
+        """Return the wavefront of a far point, cached with its best correction."""
+        if pupil_diameter_mm not in self._far:
+            self._far[pupil_diameter_mm] = self.wavefront(pupil_diameter_mm)
+        return self._far[pupil_diameter_mm]
+
+    @cached_property
+    def _far(self) -> dict[float, PupilWavefront]:
+        return {}
+
     def _rings(self, circle_diameter_mm: float) -> Rings | None:
         """Return the lens's rings in front of a pupil; None if there are none."""
         if self.optics.rings is None:

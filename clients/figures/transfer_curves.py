@@ -47,11 +47,11 @@ def modulation(
     Parameters
     ----------
     is_corrected : bool
-        Whether sphere and cylinder of this pupil are corrected.
+        Whether the best sphere and cylinder for this pupil are worn.
     at_cpd : (n,)
     """
-    wavefront = study.wavefront(pupil_diameter_mm)
-    seen = wavefront.best_corrected() if is_corrected else wavefront
+    wavefront = study.far(pupil_diameter_mm)
+    seen = wavefront.best_corrected if is_corrected else wavefront
     try:
         return seen.transfer().modulation(at_cpd)
     except ValueError:
@@ -84,7 +84,7 @@ def _draw_states(axes: Axes, study: EyeStudy, pupil_mm: float, color: str) -> No
     for is_corrected, looks in ((True, CORRECTED), (False, AS_IT_IS)):
         values = modulation(study, pupil_mm, is_corrected=is_corrected)
         axes.plot(FREQUENCY_CPD, values, color=color, **looks)
-    if not study.wavefront(pupil_mm).is_readable:
+    if not study.far(pupil_mm).is_readable:
         raise_unknown(axes)
 
 

@@ -125,7 +125,8 @@ def _legend(study: EyeStudy) -> str:
         "on a logarithmic scale of two decades. “As it is”: looking far away, "
         "accommodating where that helps"
         + (", through the worn correction" if study.profile.correction else "")
-        + ". “Best corrected”: sphere and cylinder of that pupil taken off. Charts: "
+        + ". “Best corrected”: with the sphere and cylinder of the highest visual "
+        "Strehl ratio through that pupil, at an acuity not worse than as it is. Charts: "
         "letters of logMAR 1.0 to −0.2, the eye trying to focus on each."
     )
 

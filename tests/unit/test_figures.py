@@ -1,6 +1,7 @@
 """The figures' numbers, against what they stand for."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -220,6 +221,30 @@ def test_the_strongest_prescriptions_have_a_point(sphere_dpt):
     wavefront, reach_arcmin = centered(eye.wavefront(5.0))
     kernel = psf_picture(wavefront, side_arcmin=2.5 * reach_arcmin)
     assert kernel.sum() == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("pupil_mm", [3.0, 5.0])
+@pytest.mark.parametrize(
+    "profile",
+    [
+        "keratoconus",
+        "post_lasik",
+        {"kind": "prescription", "sphere_dpt": 0.0, "age_years": 70},
+        {"kind": "prescription", "sphere_dpt": -0.25, "age_years": 70},
+        {"kind": "prescription", "sphere_dpt": -20.0, "higher_order": "none"},
+    ],
+)
+def test_the_best_correction_is_not_worse_than_none(profile, pupil_mm):
+    seen = EyeStudy.of(profile).far(pupil_mm)
+    assert seen.best_corrected.is_as_good_as(seen)
+
+
+def test_an_irregular_cornea_is_corrected_by_more_than_least_squares(cone):
+    seen = cone.far(5.0)
+    flat_um = np.where((np.arange(28) < 3) | (np.arange(28) > 5), seen.zernike_um, 0.0)
+    best, flat = seen.best_corrected.predicted, replace(seen, zernike_um=flat_um)
+    assert best.log_mar < flat.predicted.log_mar - 0.5
+    assert best.visual_strehl_ratio > 2 * flat.predicted.visual_strehl_ratio
 
 
 def test_a_map_faces_the_person_and_has_the_wavefronts_height(cone):
