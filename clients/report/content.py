@@ -126,7 +126,7 @@ def _legend(study: EyeStudy) -> str:
         "accommodating where that helps"
         + (", through the worn correction" if study.profile.correction else "")
         + ". “Best corrected”: with the sphere and cylinder of the highest visual "
-        "Strehl ratio through that pupil, at an acuity not worse than as it is. Charts: "
+        "Strehl ratio through that pupil, and an acuity not below “as it is”. Charts: "
         "letters of logMAR 1.0 to −0.2, the eye trying to focus on each."
     )
 

@@ -295,6 +295,40 @@ def test_figures_of_a_left_eye_are_drawn(left, figure_of, axes_count, tmp_path):
     assert (tmp_path / "figure.svg").stat().st_size > 5000
 
 
+def _spread_on_retina_mm(body):
+    """Return the height of the spot that rays from far away leave on the retina."""
+    lines = cross_section_figure(EyeStudy.of(body)).axes[0].lines
+    rays = [line for line in lines if line.get_color() == "tab:red"]
+    assert len(rays) > 5
+    return np.ptp([line.get_ydata()[-1] for line in rays])
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"sphere_dpt": -5.0, "cylinder_dpt": -2.0, "axis_deg": 30.0, "vertex_mm": 12.0},
+        {
+            "kind": "contact_lens",
+            "sphere_dpt": -5.0 / 1.06,
+            "cylinder_dpt": -7.0 / 1.084 + 5.0 / 1.06,
+            "axis_deg": 30.0,
+        },
+    ],
+)
+def test_the_section_shows_the_correction_and_its_focus_on_the_retina(lens):
+    eye = {
+        "kind": "prescription",
+        "sphere_dpt": -5.0,
+        "cylinder_dpt": -2.0,
+        "axis_deg": 30.0,
+        "vertex_mm": 12.0,
+        "higher_order": "none",
+    }
+    bare_mm = _spread_on_retina_mm(eye)
+    assert bare_mm > 0.3
+    assert _spread_on_retina_mm(eye | {"correction": lens}) < 0.05 * bare_mm
+
+
 def test_figures_work_without_pyplot():
     found = package_imports("clients/figures") + package_imports("clients/report")
     assert any(entry.module == "matplotlib.figure.Figure" for entry in found)
