@@ -28,6 +28,9 @@ from clients.figures.style import (
 WORST_LOG_MAR, BEST_LOG_MAR = 1.6, -0.3
 ACCOMMODATING: dict[str, Any] = {"linestyle": "-", "linewidth": LINE_PT}
 LOOKING_FAR: dict[str, Any] = {"linestyle": "--", "linewidth": LINE_PT}
+EDGE_RATIO = 0.95
+"""Place along the axis from which a centered text would cross its end."""
+
 MARKS = {0.0: " far", 1.0: "1 m", 2.5: "40 cm", 5.0: "20 cm", 10.0: "10 cm"}
 
 
@@ -81,9 +84,16 @@ def _finish(
         if distance_dpt <= nearest_dpt:
             axes.text(
                 distance_dpt, WORST_LOG_MAR - 0.03, name, fontsize=SMALL_PT, color=SOFT,
-                ha="left" if distance_dpt == 0.0 else "center", va="bottom",
+                ha=_alignment(distance_dpt / nearest_dpt), va="bottom",
             )  # fmt: skip
     legend_below(axes, looks)
+
+
+def _alignment(place_ratio: float) -> str:
+    """Return the alignment that keeps a text at a place along an axis within it."""
+    if place_ratio == 0.0:
+        return "left"
+    return "center" if place_ratio < EDGE_RATIO else "right"
 
 
 def through_focus_acuity_figure(study: EyeStudy) -> Figure:

@@ -25,6 +25,7 @@ from estimator import (
     load_profile,
     parse_profile,
     prepare_eye,
+    preset_names,
 )
 
 PUPILS_MM = (3.0, 5.0)
@@ -105,6 +106,24 @@ class EyeStudy:
     def name(self) -> str:
         """Return the profile's name."""
         return self.profile.name
+
+    @cached_property
+    def is_example(self) -> bool:
+        """Return whether the eye is a preset, which is nobody's own measurement."""
+        if self.profile.name not in preset_names():
+            return False
+        preset = load_profile(self.profile.name)
+        measured = zip(self.profile.measurements, preset.measurements, strict=False)
+        return self.profile.kind == preset.kind and all(
+            np.array_equal(mine.zernike_um, its.zernike_um) for mine, its in measured
+        )
+
+    @property
+    def source_word(self) -> str:
+        """Return where the wavefront comes from: entered, measured or an example."""
+        if self.profile.kind in ("prescription", "eye"):
+            return "entered"
+        return "example" if self.is_example else "measured"
 
     @property
     def has_assumed_aberrations(self) -> bool:

@@ -9,6 +9,7 @@ from clients.figures.study import WAVELENGTH_NM
 from clients.report.blocks import Table
 from clients.report.correction_text import correction_text
 from clients.report.facts import EyeFacts
+from clients.report.method_text import entered_text, um_text
 from clients.report.numbers import SPECTACLE_VERTEX_MM, spectacles_for, written
 
 N_COLUMNS = 4
@@ -38,7 +39,6 @@ def refraction_text(refraction: dict[str, Any], name: str) -> str:
 def refraction_table(facts: EyeFacts) -> Table:
     """Return the entered or measured refraction, and that of the estimated eye."""
     numbers = facts.numbers
-    is_entered = facts.study.profile.kind in ("prescription", "eye")
     pairs = numbers["measured"]["refraction"], numbers["eye"]["refraction"]
     return Table(
         "Refraction",
@@ -48,7 +48,7 @@ def refraction_table(facts: EyeFacts) -> Table:
         ),
         head=(
             "at the cornea, 555 nm",
-            "entered" if is_entered else "measured",
+            facts.study.source_word,
             "estimated",
         ),
         note=_refraction_note(facts),
@@ -57,13 +57,12 @@ def refraction_table(facts: EyeFacts) -> Table:
 
 def _refraction_note(facts: EyeFacts) -> str:
     numbers, fit = facts.numbers, facts.numbers["eye"]
+    entered = entered_text(facts.study.profile)
     note = (
+        f"{entered}{' ' if entered else ''}{spectacles_text(facts)}. "
         f"{numbers['measured']['refraction_pupil_mm']:.3g} mm pupil, relaxed, without "
-        f"correction. The estimated eye is {fit['eye_length_mm']:.2f} mm long, "
-        f"accommodates {fit['amplitude_dpt']:.1f} dpt, and misses the wavefront by "
-        f"{fit['rms_error_um']:.1g} µm RMS. As spectacles at "
-        f"{SPECTACLE_VERTEX_MM:g} mm: "
-        f"{written(spectacles_for(numbers['eye']['refraction']))}."
+        f"correction. The estimated eye is {fit['eye_length_mm']:.2f} mm long and "
+        f"misses the wavefront by {um_text(fit['rms_error_um'])} RMS."
     )
     light_nm = facts.study.found.wavelength_nm
     if light_nm != WAVELENGTH_NM:
@@ -77,6 +76,17 @@ def _refraction_note(facts: EyeFacts) -> str:
     return note
 
 
+def spectacles_text(facts: EyeFacts) -> str:
+    """Return the spectacles that correct an eye."""
+    lens = spectacles_for(facts.numbers["eye"]["refraction"])
+    return f"As spectacles at {SPECTACLE_VERTEX_MM:g} mm: {written(lens)}"
+
+
+def change_text(before: float, after: float) -> str:
+    """Return the difference of two numbers as they are shown."""
+    return signed(round(after, 2) - round(before, 2))
+
+
 def signed(value: float) -> str:
     """Return a number with its sign, rounded to a hundredth."""
     if abs(value) < 0.005:
@@ -87,15 +97,23 @@ def signed(value: float) -> str:
 def vision_table(facts: EyeFacts) -> Table:
     """Return the vision through both pupils, as it is and best corrected."""
     pupils = facts.numbers["pupils"]
-    note = "Acuity in logMAR, and as a decimal."
-    if any(p["is_beyond_measured"] for p in pupils):
-        note += " * wider than the pupil measured: see “What is known”."
     return Table(
         "Vision on the axis",
         tuple((word, *map(words, pupils)) for word, words in VISION_ROWS.items()),
         head=("far object, 555 nm", *(pupil_text(p) for p in pupils)),
-        note=note,
+        note=vision_note(pupils),
     )
+
+
+def vision_note(pupils: list[dict[str, Any]]) -> str:
+    """Return the note below numbers of vision through some pupils."""
+    note = (
+        "Acuity in logMAR, and as a decimal. Higher orders: in the entrance pupil; "
+        "the map and the bars show them at the cornea."
+    )
+    if any(p["is_beyond_measured"] for p in pupils):
+        note += " * wider than the pupil measured: see “What is known”."
+    return note
 
 
 def distance_text(distance_dpt: float) -> str:
@@ -122,6 +140,7 @@ VISION_ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     ),
     "far point, dpt": lambda p: distance_text(p["far_point_dpt"]),
     "near point, dpt": lambda p: distance_text(p["near_point_dpt"]),
+    "accommodation, dpt": lambda p: f"{p['near_point_dpt'] - p['far_point_dpt']:.1f}",
 }
 
 
@@ -154,7 +173,7 @@ def acuity_range_text(log_mar: float | None) -> str:
     return f"{text} ({10.0**-log_mar:.2f})"
 
 
-def coefficient_table(facts: EyeFacts) -> Table:
+def coefficient_table(facts: EyeFacts, *, name: str = "") -> Table:
     """Return all coefficients in four columns."""
     measured = facts.numbers["measured"]
     cells = [
@@ -170,7 +189,8 @@ def coefficient_table(facts: EyeFacts) -> Table:
     )
     radius_mm, light_nm = measured["zernike_radius_mm"], measured["wavelength_nm"]
     return Table(
-        "Coefficients, µm (OSA; x to the person's right, y up)",
+        f"Coefficients{f' ({name})' if name else ''}, µm (OSA; x to the person's right, "
+        "y up)",
         rows,
         head=("n, m", "µm") * N_COLUMNS,
         note=f"At the cornea, on a circle of {2 * radius_mm:.3g} mm, {light_nm:g} nm; "

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 from nicegui import Client, app, events, run, ui
 
 from clients.report import report_html
-from clients.web.chart import row_text
+from clients.scenes.letter_chart import row_text
 from clients.web.eye_form import SIDES, EyeSide
 from clients.web.eye_panel import EyePanel
 from clients.web.figure_panel import FigurePanel

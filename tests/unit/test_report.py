@@ -36,6 +36,7 @@ from clients.report.html_page import STYLE, html_of
 from clients.report.labels import distinct_labels
 from clients.report.make import document_of, write_report
 from clients.report.numbers import Refraction, measured_numbers, spectacles_for
+from clients.report.origin import Record
 from clients.report.program import main
 from clients.report.provenance import provenance_table
 from clients.report.sources import SOURCES, Citations
@@ -352,7 +353,7 @@ def test_a_pdf_is_tagged_and_starts_with_the_whole_summary(corrected, tmp_path):
     charts = {(p, d): gray for p in (3.0, 5.0) for d in (0.4, 1.0, 6.0)}
     shown = EyeFacts(corrected.study, "x", corrected.numbers, charts)
     out = tmp_path / "eye.pdf"
-    write_report([shown], out, reference="A-1047")
+    write_report([shown], out, Record(reference="A-1047"))
     read = PdfReader(out)
     assert read.root_object["/MarkInfo"]["/Marked"]
     assert "/StructTreeRoot" in read.root_object
@@ -360,7 +361,7 @@ def test_a_pdf_is_tagged_and_starts_with_the_whole_summary(corrected, tmp_path):
     first = read.pages[0].extract_text()
     assert "Reference A-1047" in first
     assert "6 m, 3 mm: logMAR" in first  # caption of the summary's last chart
-    assert "1 / 3" in first
+    assert "page 1 of 3" in first
     assert len(read.pages) == 3
 
 
@@ -372,7 +373,7 @@ def test_body_text_is_at_least_9_pt():
 
 
 def test_a_report_says_what_when_and_of_which_profile_it_is(myope, corrected):
-    text = html_of(document_of([myope], reference="<A-1047>"))
+    text = html_of(document_of([myope], Record(reference="<A-1047>")))
     digest = myope.study.profile.digest[:16]
     assert "<span>Reference &lt;A-1047&gt;</span>" in text
     assert f"<span>Profile {digest}</span>" in text
