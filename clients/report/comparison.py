@@ -28,14 +28,14 @@ from clients.report.blocks import (
     Words,
 )
 from clients.report.content import (
-    FIELD_TITLE,
     KNOWN_TITLE,
     NOT_A_DEVICE,
     chart_row,
-    coefficient_rows,
-    field_rows,
+    field_row,
+    legend,
     method_row,
     on_axes,
+    section_plot,
     sources,
     subtitle,
 )
@@ -49,6 +49,7 @@ from clients.report.tables import (
     REFRACTION_ROWS,
     VISION_ROWS,
     change_text,
+    joint_coefficient_table,
     pupil_text,
     refraction_text,
     signed,
@@ -56,10 +57,10 @@ from clients.report.tables import (
     vision_note,
 )
 
-MAP_MM, PSF_MM = 52.0, 54.0
+MAP_MM, PSF_MM = 48.0, 50.0
 
-CURVES_MM = 64.0
-"""Height of curves of both eyes."""
+CURVES_MM, FIELD_MM, SECTION_MM = 54.0, 66.0, 52.0
+"""Height of curves of both eyes, and of each eye's maps and section."""
 
 
 def comparison_document(before: EyeFacts, after: EyeFacts) -> Document:
@@ -73,10 +74,7 @@ def comparison_document(before: EyeFacts, after: EyeFacts) -> Document:
             _difference(before, after),
             _curves(before, after),
             _known(before, after, cite),
-            *(
-                Section(f"{FIELD_TITLE} ({facts.label})", field_rows(facts))
-                for facts in (before, after)
-            ),
+            _field(before, after),
             sources(cite),
         ),
         footer=NOT_A_DEVICE,
@@ -98,6 +96,7 @@ def _difference(before: EyeFacts, after: EyeFacts) -> Section:
             *(Row((table,)) for table in tables),
             Row((*(_map(*pair, studies) for pair in pairs), bars)),
             Row(tuple(_psfs(*pair, psf_sides_arcmin(studies)) for pair in pairs)),
+            Row((Words((legend(after.study),)),)),
             *(Row((Words(limits),)) for limits in _limits(before, after)),
         ),
     )
@@ -119,18 +118,22 @@ def _known(before: EyeFacts, after: EyeFacts, cite: Citations) -> Section:
         (
             Row((joint_provenance_table(studies, labels, cite),)),
             method_row(*shared, *own),
-            *_coefficients(before, after),
+            Row((joint_coefficient_table(before, after, _moments(before, after)),)),
         ),
     )
 
 
-def _coefficients(before: EyeFacts, after: EyeFacts) -> tuple[Row, ...]:
-    first, second = (facts.numbers["measured"] for facts in (before, after))
-    if first["zernike_um"] == second["zernike_um"]:
-        return coefficient_rows(before, name="both")
-    return (
-        *coefficient_rows(before, name=before.label),
-        *coefficient_rows(after, name=after.label),
+def _field(before: EyeFacts, after: EyeFacts) -> Section:
+    both = before, after
+    return Section(
+        "Over the visual field, and section of the eye",
+        (
+            *(
+                field_row(facts, name=moment, height_mm=FIELD_MM)
+                for facts, moment in zip(both, _moments(before, after), strict=True)
+            ),
+            Row(tuple(section_plot(f.study, height_mm=SECTION_MM) for f in both)),
+        ),
     )
 
 
@@ -218,8 +221,10 @@ def _eye_note(moment: str, facts: EyeFacts) -> str:
     """Return the name of an eye, its powers as entered, and spectacles for it."""
     entered = entered_text(facts.study.profile)
     spectacles = f"{spectacles_text(facts)}."
-    name = f"{moment.capitalize()}: {facts.label}."
-    return " ".join(text for text in (name, entered, spectacles) if text)
+    name = moment.capitalize()
+    if facts.label != moment:
+        name += f" ({facts.label})"
+    return " ".join(text for text in (f"{name}:", entered, spectacles) if text)
 
 
 def _vision_table(before: EyeFacts, after: EyeFacts) -> Table:

@@ -50,7 +50,7 @@ DAY_MM, DUSK_MM = PUPILS_MM
 FIELD_TITLE = "Over the visual field, and by distance"
 KNOWN_TITLE = "What is known"
 
-MAP_MM, PSF_MM = 42.0, 48.0
+MAP_MM, PSF_MM = 39.0, 44.0
 FIELD_MM, CURVE_MM, TERMS_MM = 76.0, 60.0, 40.0
 NOT_A_DEVICE = (
     "A simulation for research and explanation, not a medical device: no diagnosis or "
@@ -70,7 +70,8 @@ def eye_document(facts: EyeFacts) -> Document:
             Section(
                 FIELD_TITLE,
                 (
-                    *field_rows(facts),
+                    field_row(facts),
+                    _distance_row(facts),
                     chart_row(facts, DUSK_MM),
                     method_row(*method_text(facts.study)),
                 ),
@@ -79,7 +80,7 @@ def eye_document(facts: EyeFacts) -> Document:
                 KNOWN_TITLE,
                 (
                     Row((provenance_table(facts.study, cite),)),
-                    *coefficient_rows(facts),
+                    *_coefficient_rows(facts),
                 ),
             ),
             sources(cite),
@@ -148,12 +149,12 @@ def summary(facts: EyeFacts) -> Section:
             Row((maps, orders), (2.0, 1.0)),
             Row((points, contrast), (1.0, 1.4)),
             chart_row(facts, DAY_MM),
-            Row((Words((_legend(study), *limits_text(study.profile.correction))),)),
+            Row((Words((legend(study), *limits_text(study.profile.correction))),)),
         ),
     )
 
 
-def _legend(study: EyeStudy) -> str:
+def legend(study: EyeStudy) -> str:
     return (
         "Wavefront at the cornea, without a correction, as the examiner faces the eye "
         "(T temporal, N nasal). Point images and charts as the person sees them; light "
@@ -162,7 +163,8 @@ def _legend(study: EyeStudy) -> str:
         + (", through the worn correction" if study.profile.correction else "")
         + ". “Best corrected”: with the sphere and cylinder of the highest visual "
         "Strehl ratio through that pupil, and an acuity not below “as it is”. Charts: "
-        "the eye tries to focus on each; rows in logMAR and decimal; ◂ smallest row read."
+        "the eye tries to focus on each; rows in logMAR and decimal, ◂ the smallest "
+        "read."
     )
 
 
@@ -179,7 +181,7 @@ def chart_row(facts: EyeFacts, pupil_mm: float, *, name: str = "") -> Row:
     """Return the charts at all distances through one pupil."""
     if not facts.charts:
         return Row((Words((f"No letter charts: {facts.chart_problem}.",)),))
-    of_whom = f"{name}, " if name else ""
+    start, unit = (f"{name}, ", "") if name else ("", "logMAR ")
     pictures: list[Block] = []
     for distance_m in DISTANCES_M:
         where = f"{100 * distance_m:.0f} cm" if distance_m < 1 else f"{distance_m:g} m"
@@ -188,7 +190,7 @@ def chart_row(facts: EyeFacts, pupil_mm: float, *, name: str = "") -> Row:
         pictures.append(
             Picture(
                 facts.charts[pupil_mm, distance_m],
-                f"{of_whom}{where}, {pupil_mm:g} mm: logMAR {acuity_text(found)}{near}",
+                f"{start}{where}, {pupil_mm:g} mm: {unit}{acuity_text(found)}{near}",
                 _row_marks(found),
             )
         )
@@ -207,27 +209,34 @@ def _row_marks(found: dict[str, Any]) -> tuple[Mark, ...]:
     )
 
 
-def field_rows(facts: EyeFacts) -> tuple[Row, ...]:
-    """Return the visual field, acuity by distance, and the section of an eye."""
+def field_row(facts: EyeFacts, *, name: str = "", height_mm: float = FIELD_MM) -> Row:
+    """Return the visual field of an eye as maps and as a table."""
     study = facts.study
     maps = Plot(
         lambda panel: draw_field_maps(panel, study),
-        FIELD_MM,
+        height_mm,
         "Maps of M, J0, J45 and blur over 60 by 40 degrees",
     )
+    return Row((maps, field_table_block(facts, name=name)), (2.4, 1.0))
+
+
+def _distance_row(facts: EyeFacts) -> Row:
+    """Return acuity by distance, and the section of an eye."""
+    study = facts.study
     acuity = on_axes(
         lambda axes: draw_through_focus_acuity(axes, study),
         CURVE_MM,
         "Acuity by distance, looking far and accommodating",
     )
-    section = on_axes(
+    return Row((acuity, section_plot(study)))
+
+
+def section_plot(study: EyeStudy, *, height_mm: float = CURVE_MM) -> Plot:
+    """Return the section of an eye."""
+    return on_axes(
         lambda axes: draw_cross_section(axes, study),
-        CURVE_MM,
+        height_mm,
         "Vertical section of the eye found, with rays from far away",
-    )
-    return (
-        Row((maps, field_table_block(facts)), (2.4, 1.0)),
-        Row((acuity, section)),
     )
 
 
@@ -236,7 +245,7 @@ def method_row(*texts: str) -> Row:
     return Row((Words(texts, "How it was computed", is_list=True),))
 
 
-def coefficient_rows(facts: EyeFacts, *, name: str = "") -> tuple[Row, ...]:
+def _coefficient_rows(facts: EyeFacts) -> tuple[Row, ...]:
     """Return the coefficients of an eye as a chart and as a table."""
     study = facts.study
     terms = on_axes(
@@ -244,7 +253,7 @@ def coefficient_rows(facts: EyeFacts, *, name: str = "") -> tuple[Row, ...]:
         TERMS_MM,
         "Coefficients of orders 3 to 6, as they came and of the eye",
     )
-    return Row((terms,)), Row((coefficient_table(facts, name=name),))
+    return Row((terms,)), Row((coefficient_table(facts),))
 
 
 def sources(cite: Citations) -> Section:

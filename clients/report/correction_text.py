@@ -144,7 +144,8 @@ def near_text(lens: Prescription | None) -> str:
     """Return what a caption of a near chart says about a progressive lens."""
     if not isinstance(lens, ProgressiveLens):
         return ""
-    return f"; {gaze_text(lens.gaze_deg)} through {written(lens)}"
+    gaze = gaze_text(lens.gaze_deg).removeprefix("looking ")
+    return f"; {gaze} through {written(lens)}"
 
 
 def limits_text(lens: Prescription | None) -> tuple[str, ...]:

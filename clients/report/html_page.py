@@ -59,7 +59,7 @@ ul { margin: 0; padding-left: 4mm; font-size: 9pt; }
 figure { margin: 0; }
 figure img { display: block; width: 100%; height: auto; }
 figure.picture img { border: .6pt solid #d9dee4; }
-.marked { position: relative; padding-right: 15mm; }
+.marked { position: relative; padding-right: 16.5mm; }
 .marks { position: absolute; top: 0; right: 0; bottom: 0; width: 24mm; margin: 0;
   padding: 0; list-style: none; }
 .marks li { position: absolute; right: 0; margin-top: -1.6mm; text-align: right;
@@ -77,7 +77,7 @@ footer { border-top: .4pt solid #4c5866; margin-top: 4mm; padding-top: 1.5mm;
 """
 """Style of screen and paper; the margins of a page have the footer of the screen."""
 
-MARK_MM = 15.0
+MARK_MM = 16.5
 """Width beside an image that holds its marks."""
 
 MARK_LINE_MM = 3.2

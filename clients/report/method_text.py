@@ -14,8 +14,8 @@ WORDS = {
     " um": " µm",
     " deg ": "° ",
     "vertex_mm is missing: the powers of spectacles need it, usually 12 to 14 mm": (
-        "no vertex distance was given; powers of spectacles refer to a lens 12 to 14 mm "
-        "in front of it"
+        "no vertex distance was given; powers of spectacles usually refer to a lens "
+        "12 to 14 mm in front of it"
     ),
 }
 OPTION_HINT = '; "higher_order"'

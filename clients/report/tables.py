@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from clients.figures.study import WAVELENGTH_NM
 from clients.report.blocks import Table
-from clients.report.correction_text import correction_text
 from clients.report.facts import EyeFacts
 from clients.report.method_text import entered_text, um_text
 from clients.report.numbers import SPECTACLE_VERTEX_MM, spectacles_for, written
 
-N_COLUMNS = 4
-"""Columns of the coefficients."""
+N_COLUMNS, N_JOINT_COLUMNS = 4, 3
+"""Columns of the coefficients of one eye, and of two."""
+
+COEFFICIENTS_TITLE = "Coefficients, µm (OSA; x to the person's right, y up)"
 
 THROUGH_LENSLETS = "not known"
 """Text in place of an acuity; the summary gives the reason."""
@@ -67,10 +68,9 @@ def _refraction_note(facts: EyeFacts) -> str:
     light_nm = facts.study.found.wavelength_nm
     if light_nm != WAVELENGTH_NM:
         note += f" Measured at {light_nm:g} nm, moved to 555 nm by the eye's color."
-    lens = facts.study.profile.correction
-    if lens is not None:
+    if facts.study.profile.correction is not None:
         note += (
-            f" Worn: {correction_text(lens)}; M through it "
+            " M through the worn correction: "
             f"{signed(fit['refraction_through_correction_dpt'])} dpt."
         )
     return note
@@ -109,7 +109,7 @@ def vision_note(pupils: list[dict[str, Any]]) -> str:
     """Return the note below numbers of vision through some pupils."""
     note = (
         "Acuity in logMAR, and as a decimal. Higher orders: in the entrance pupil; "
-        "the map and the bars show them at the cornea."
+        "maps and bars show them at the cornea."
     )
     if any(p["is_beyond_measured"] for p in pupils):
         note += " * wider than the pupil measured: see “What is known”."
@@ -173,32 +173,67 @@ def acuity_range_text(log_mar: float | None) -> str:
     return f"{text} ({10.0**-log_mar:.2f})"
 
 
-def coefficient_table(facts: EyeFacts, *, name: str = "") -> Table:
+def coefficient_table(facts: EyeFacts) -> Table:
     """Return all coefficients in four columns."""
     measured = facts.numbers["measured"]
     cells = [
-        (
-            f"({name.replace(',', ', ')})".replace("-", "−"),
-            f"{value:+.4f}".replace("-", "−"),
-        )
+        (_term_text(name), _coefficient_text(value))
         for name, value in measured["zernike_um"].items()
     ]
-    n_rows = -(-len(cells) // N_COLUMNS)
-    rows = tuple(
+    return Table(
+        COEFFICIENTS_TITLE,
+        _side_by_side(cells, N_COLUMNS),
+        head=("n, m", "µm") * N_COLUMNS,
+        note=_circle_text(measured),
+    )
+
+
+def joint_coefficient_table(
+    before: EyeFacts, after: EyeFacts, names: tuple[str, str]
+) -> Table:
+    """Return all coefficients of two eyes in three columns."""
+    first, second = (facts.numbers["measured"] for facts in (before, after))
+    cells = [
+        (_term_text(term), *map(_coefficient_text, (value, second["zernike_um"][term])))
+        for term, value in first["zernike_um"].items()
+    ]
+    notes = [_circle_text(measured) for measured in (first, second)]
+    if notes[0] != notes[1]:
+        notes = [f"{name}: {note}" for name, note in zip(names, notes, strict=True)]
+    return Table(
+        COEFFICIENTS_TITLE,
+        _side_by_side(cells, N_JOINT_COLUMNS),
+        head=("n, m", *names) * N_JOINT_COLUMNS,
+        note=" ".join(dict.fromkeys(notes)),
+    )
+
+
+def _term_text(name: str) -> str:
+    return f"({name.replace(',', ', ')})".replace("-", "−")
+
+
+def _coefficient_text(value_um: float) -> str:
+    return f"{value_um:+.4f}".replace("-", "−")
+
+
+def _side_by_side(
+    cells: Sequence[tuple[str, ...]], n_columns: int
+) -> tuple[tuple[str, ...], ...]:
+    n_rows = -(-len(cells) // n_columns)
+    return tuple(
         tuple(text for cell in cells[k::n_rows] for text in cell) for k in range(n_rows)
     )
+
+
+def _circle_text(measured: dict[str, Any]) -> str:
     radius_mm, light_nm = measured["zernike_radius_mm"], measured["wavelength_nm"]
-    return Table(
-        f"Coefficients{f' ({name})' if name else ''}, µm (OSA; x to the person's right, "
-        "y up)",
-        rows,
-        head=("n, m", "µm") * N_COLUMNS,
-        note=f"At the cornea, on a circle of {2 * radius_mm:.3g} mm, {light_nm:g} nm; "
-        f"higher orders {measured['higher_order_rms_um']:.3f} µm RMS.",
+    return (
+        f"At the cornea, on a circle of {2 * radius_mm:.3g} mm, {light_nm:g} nm; "
+        f"higher orders {measured['higher_order_rms_um']:.3f} µm RMS."
     )
 
 
-def field_table_block(facts: EyeFacts) -> Table:
+def field_table_block(facts: EyeFacts, *, name: str = "") -> Table:
     """Return the refraction along the horizontal meridian."""
     rows = tuple(
         (
@@ -209,7 +244,7 @@ def field_table_block(facts: EyeFacts) -> Table:
         for entry in facts.numbers["field"]
     )
     return Table(
-        "Along the horizontal",
+        f"Along the horizontal{f' ({name})' if name else ''}",
         rows,
         head=("h, deg", "M, dpt", "J0, dpt"),
         note="Relaxed, 4 mm pupil, at the cornea; h to the person's right.",

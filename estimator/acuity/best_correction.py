@@ -109,7 +109,9 @@ def _visual_strehl(
     of the neural sensitivity, which needs one Fourier transform instead of two.
     """
     step_mm = 2.0 * radius_mm / N_SAMPLES
-    along_mm = (np.arange(N_SAMPLES) + 0.5) * step_mm - radius_mm
+    along_mm = np.asarray(
+        (np.arange(N_SAMPLES) + 0.5) * step_mm - radius_mm, dtype=np.float64
+    )
     clear = clear_pupil(
         along_mm,
         zernike_radius_mm=radius_mm,
