@@ -155,6 +155,7 @@ def summary(facts: EyeFacts) -> Section:
 
 
 def legend(study: EyeStudy) -> str:
+    """Return the explanation of a report's maps, states and charts."""
     return (
         "Wavefront at the cornea, without a correction, as the examiner faces the eye "
         "(T temporal, N nasal). Point images and charts as the person sees them; light "

@@ -18,6 +18,7 @@ from clients.figures import (
     rms_by_order_um,
     rms_um,
     terms_figure,
+    through_focus_acuity_figure,
     through_focus_log_mar,
     wavefront_map_figure,
 )
@@ -293,6 +294,15 @@ def test_figures_of_a_left_eye_are_drawn(left, figure_of, axes_count, tmp_path):
     assert len(figure.axes) == axes_count
     figure.savefig(tmp_path / "figure.svg")
     assert (tmp_path / "figure.svg").stat().st_size > 5000
+
+
+def test_texts_of_distances_stay_within_the_axes(cone):
+    figure = through_focus_acuity_figure(cone)
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    right_px = axes.get_window_extent().x1
+    assert {text.get_text() for text in axes.texts} >= {" far", "20 cm"}
+    assert all(text.get_window_extent().x1 <= right_px + 1 for text in axes.texts)
 
 
 def _spread_on_retina_mm(body):

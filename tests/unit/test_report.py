@@ -148,7 +148,7 @@ def test_what_is_assumed_is_told_from_what_was_measured():
 
 def test_a_pupil_wider_than_the_measured_one_is_named():
     rows = _rows("post_lasik")
-    assert rows["Higher orders"][0] == "measured"
+    assert rows["Higher orders"][0] == "example"
     assert rows["Pupil of 5 mm"][0] == "assumed"
     assert "3 mm measured" in rows["Pupil of 5 mm"][1]
     assert "age not given" in rows["Accommodation"][1]
