@@ -20,7 +20,7 @@ def draw_cross_section(axes: Axes, study: EyeStudy) -> None:
         lens = None
     draw_section(axes, focused.surfaces, pupil_diameter_mm=FIELD_PUPIL_MM, lens=lens)
     length_mm = focused.parameters.eye_length_mm
-    worn = "" if lens is None else ", with correction"
+    worn = "" if lens is None else ", corrected"
     dress(
         axes,
         title=f"Vertical section, {length_mm:.2f} mm long{worn}",
