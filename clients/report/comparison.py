@@ -59,7 +59,7 @@ from clients.report.tables import (
 
 MAP_MM, PSF_MM = 46.0, 44.0
 
-CURVES_MM, FIELD_MM, SECTION_MM = 54.0, 66.0, 52.0
+CURVES_MM, FIELD_MM, SECTION_MM = 49.0, 64.0, 50.0
 """Height of curves of both eyes, and of each eye's maps and section."""
 
 
