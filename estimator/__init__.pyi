@@ -1,3 +1,5 @@
+from .acuity.best_correction import best_correction_um as best_correction_um
+from .acuity.predict import Acuity as Acuity
 from .acuity.predict import log_mar_of as log_mar_of
 from .acuity.predict import predict_acuity as predict_acuity
 from .acuity.sensitivity import perfect_transfer as perfect_transfer

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from clients.scenes.letter_chart import letter_chart, letter_height
+from clients.scenes.letter_chart import letter_chart, letter_height, row_texts
 from clients.web.picture import ChartRow, Picture, camera_of, picture_of
 
 ROWS = tuple(round(1.0 - 0.1 * k, 1) for k in range(12))
@@ -19,9 +19,6 @@ WIDTH_DEG = 13.6
 SIZE_PX = (1200, 675)
 HEIGHTS = 4.5
 """Half of a row's width, in heights of its letters: five letters and their gaps."""
-
-ROUNDING = 0.05
-"""A row counts as read from half a step below its size."""
 
 
 def chart_picture(distance_dpt: float) -> Picture:
@@ -40,12 +37,6 @@ def chart_picture(distance_dpt: float) -> Picture:
     )
     # the camera turns with the eye, so that the rows stay on the fovea
     return replace(picture, chart_rows=rows, follows_gaze=True).at(distance_dpt)
-
-
-def row_texts(log_mar: float) -> tuple[str, str]:
-    """Return a row's size in logMAR, and as a decimal acuity."""
-    text = f"{log_mar:.1f}".replace("-", "\N{MINUS SIGN}")
-    return text, f"{10.0**-log_mar:.2f}"
 
 
 def marks_of(
@@ -75,14 +66,3 @@ def caption(rows: Sequence[ChartRow], smallest: int | None) -> str:
     if smallest is not None:
         found = "logMAR {}, decimal {}".format(*row_texts(rows[smallest].log_mar))
     return f"smallest line read: {found}"
-
-
-def smallest_row(rows: Sequence[float], acuity_log_mar: float) -> int | None:
-    """Return the index of the smallest row that an acuity reads; None if it reads none.
-
-    Parameters
-    ----------
-    rows : logMAR of each row, largest first
-    """
-    read = [k for k, row in enumerate(rows) if row >= acuity_log_mar - ROUNDING]
-    return read[-1] if read else None

@@ -10,7 +10,7 @@ from typing import Any
 
 from nicegui import events, ui
 
-from clients.web.chart import smallest_row
+from clients.scenes.letter_chart import smallest_row
 from clients.web.eye_figures import FIGURE_TITLES, eye_figure, predicted_log_mar
 from clients.web.eye_form import SIDES, EyeSide
 from clients.web.figure_worker import FigureWorker, StudyFailed

@@ -3,6 +3,7 @@
 transfer     optical transfer functions of wavefronts
 sensitivity  contrast sensitivity of people, with and without their optics
 predict      visual Strehl ratio and acuity
+best_correction  sphere and cylinder of the highest visual Strehl ratio
 retina       sampling density of the retina
 curves       acuity through focus and over the field
 """

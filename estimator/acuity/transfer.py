@@ -122,15 +122,15 @@ def optical_transfer(
     )
     step_mm = 2.0 * zernike_radius_mm / count
     along_mm = (np.arange(count) + 0.5) * step_mm - zernike_radius_mm
-    x_mm, y_mm = np.meshgrid(along_mm, along_mm)
-    wavefront_um = _wavefront_um(zernike_um, along_mm / zernike_radius_mm)
-    inside = _inside(x_mm, y_mm, zernike_radius_mm, pupil_ellipse, step_mm)
-    phase = 2.0 * np.pi * wavefront_um * UM_PER_MM / wavelength_nm
-    pupil = inside * np.exp(1j * phase)
-    if pupil_screen is not None:
-        cx, cy = cast("tuple[float, float]", pupil_screen.centre_mm)  # one center
-        square_mm2 = (x_mm - cx) ** 2 + (y_mm - cy) ** 2
-        pupil = pupil * pupil_screen.transmission(square_mm2, wavelength_nm)
+    clear = clear_pupil(
+        along_mm,
+        zernike_radius_mm=zernike_radius_mm,
+        wavelength_nm=wavelength_nm,
+        pupil_ellipse=pupil_ellipse,
+        pupil_screen=pupil_screen,
+    )
+    wavefront_um = grid_wavefront_um(zernike_um, along_mm / zernike_radius_mm)
+    pupil = clear * np.exp(2j * np.pi * wavefront_um * UM_PER_MM / wavelength_nm)
     padded = 2 * count
     intensity = np.abs(fft.fft2(pupil, (padded, padded))) ** 2
     transfer = fft.fftshift(fft.ifft2(intensity))[1:, 1:]  # odd, 0 in the middle
@@ -141,7 +141,34 @@ def optical_transfer(
     )
 
 
-def _wavefront_um(zernike_um: NDArray[Any], along: NDArray[Any]) -> NDArray[np.float64]:
+def clear_pupil(
+    along_mm: NDArray[np.float64],
+    *,
+    zernike_radius_mm: float,
+    wavelength_nm: float,
+    pupil_ellipse: NDArray[np.float64] | None,
+    pupil_screen: PupilScreen | None,
+) -> NDArray[Any]:
+    """Return the pupil function (n, n), y then x, of a flat wavefront.
+
+    Parameters
+    ----------
+    along_mm : (n,)
+        Coordinates along either axis, evenly spaced.
+    """
+    x_mm, y_mm = np.meshgrid(along_mm, along_mm)
+    step_mm = along_mm[1] - along_mm[0]
+    clear: NDArray[Any] = _inside(x_mm, y_mm, zernike_radius_mm, pupil_ellipse, step_mm)
+    if pupil_screen is not None:
+        cx, cy = cast("tuple[float, float]", pupil_screen.centre_mm)  # one center
+        square_mm2 = (x_mm - cx) ** 2 + (y_mm - cy) ** 2
+        clear = clear * pupil_screen.transmission(square_mm2, wavelength_nm)
+    return clear
+
+
+def grid_wavefront_um(
+    zernike_um: NDArray[Any], along: NDArray[Any]
+) -> NDArray[np.float64]:
     """Return the wavefront (n, n), y then x, on coordinates (n,) of the unit square."""
     by_powers = np.zeros((MAX_RADIAL_ORDER + 1,) * 2)
     by_powers[EXPONENTS[:, 1], EXPONENTS[:, 0]] = wavefront_polynomial(zernike_um)

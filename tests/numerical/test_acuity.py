@@ -8,6 +8,7 @@ import pytest
 from estimator.acuity import (
     acuity_over_field,
     acuity_through_focus,
+    best_correction_um,
     mean_eye_transfer,
     optical_transfer,
     predict_acuity,
@@ -50,6 +51,29 @@ def test_a_perfect_pupil_has_its_transfer_in_closed_form(pupil_mm, wavelength_nm
     )
     assert found.modulation(CPD) == pytest.approx(expected, abs=0.006)
     assert np.abs(found.transfer_ratio.imag).max() < 1e-12
+
+
+@pytest.mark.parametrize("pupil_mm", [3.0, 6.0])
+def test_the_best_correction_of_a_lens_is_its_opposite(pupil_mm):
+    zernike_um = np.zeros(28)
+    zernike_um[3:6] = 0.4, -1.1, 0.7
+    pupil = {"zernike_radius_mm": pupil_mm / 2, "wavelength_nm": 555.0}
+    found = best_correction_um(zernike_um, **pupil)
+    assert predict_acuity(found, **pupil).visual_strehl_ratio > 0.999
+    assert np.array_equal(found[6:], zernike_um[6:])
+
+
+def test_no_lens_of_a_grid_beats_the_best_correction():
+    pupil = {"zernike_radius_mm": 2.5, "wavelength_nm": 555.0}
+    zernike_um = typical(5.0)
+    zernike_um[[7, 12]] += 0.3, 0.1
+    best = predict_acuity(best_correction_um(zernike_um, **pupil), **pupil)
+    tried = zernike_um.copy()
+    for m_um in np.linspace(-0.6, 0.6, 5):
+        for j0_um in (-0.3, 0.0, 0.3):
+            tried[3:6] = 0.0, m_um, j0_um
+            other = predict_acuity(tried, **pupil)
+            assert other.visual_strehl_ratio < best.visual_strehl_ratio + 0.001
 
 
 def test_large_defocus_has_the_transfer_of_a_disc():
