@@ -95,7 +95,7 @@ def first_texts() -> dict[str, str]:
     }
 
 
-def turns_with_gaze(profile: Mapping[str, Any]) -> bool:
+def depends_on_gaze(profile: Mapping[str, Any]) -> bool:
     """Return whether the part of the correction looked through depends on the gaze."""
     worn = profile.get("correction") or {}
     return worn.get("kind") in ("progressive", "lenslets")
@@ -105,7 +105,7 @@ def looking(
     profile: Mapping[str, Any], gaze_deg: tuple[float, float]
 ) -> dict[str, Any]:
     """Return a profile with its correction at a gaze."""
-    if not turns_with_gaze(profile):
+    if not depends_on_gaze(profile):
         return dict(profile)
     worn = dict(profile["correction"])
     own_deg = worn.get("gaze_deg", (0.0, 0.0))

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from clients.web.correction_form import turns_with_gaze
+from clients.web.correction_form import depends_on_gaze
 from clients.web.eye_form import EyeSide
 from clients.web.picture import coarser
 from clients.web.picture_files import jpeg_of, png_of
@@ -84,7 +84,7 @@ class EyeView:
         if self._quick is None:
             self._quick = _ProfiledFilter(EyeFilter())
         settings = QUICK.covering(foci_dpt=(request.focus_dpt,))
-        if turns_with_gaze(request.bodies[self.side]):
+        if depends_on_gaze(request.bodies[self.side]):
             settings = settings.changed(gaze_deg=request.gaze_deg)
         return self._look(
             self._quick, "preview", request, settings, request.picture.small
