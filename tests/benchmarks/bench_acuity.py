@@ -49,7 +49,7 @@ ASTIGMATISM_RATIO = 0.5
 
 PUPILS_MM = (2.0, 3.0, 4.0, 6.0)
 DEFOCUS_DPT = (1.0, 2.0, 3.0, 4.0, 6.0)
-YOUNG_LOG_MAR = -0.13
+YOUNG_ADULT_LOG_MAR = -0.13
 SMITH_ARCMIN = 0.65
 FOVEAL_CPD = 65.37
 
@@ -130,7 +130,7 @@ def acuity_rows(pupils_mm, defocus_dpt) -> list[Row]:
             times_ms = [1e3 * (time.perf_counter() - start_s)]
             if error_dpt == 0.0:
                 method, reference = "in focus", "Elliott et al. 1995"
-                expected = YOUNG_LOG_MAR
+                expected = YOUNG_ADULT_LOG_MAR
             else:
                 method, reference = "out of focus", "Smith 1991"
                 expected = np.log10(SMITH_ARCMIN * pupil_mm * error_dpt)
