@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from estimator.optics.surface_kernels import RAY_SIZE, TRACED, put
+from estimator.optics.surface_kernels import RAY_SIZE, TRACED, copy_values
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.fit import N_ELLIPSE, fit_ellipse, fit_zernike, rim_radius
 from estimator.wavefront.kernels import (
@@ -62,8 +62,8 @@ def prepare_chief(packed, indices, h_rad, v_rad, chief, frame, axes, response, s
     status = chief_ray(packed, indices, h_rad, v_rad, axes, start, ray, sag)
     if status != TRACED:
         return status, math.nan
-    put(ray, chief[0])
-    put(ray, chief[1])
+    copy_values(ray, chief[0])
+    copy_values(ray, chief[1])
     for i in range(3):
         frame[2, i] = -ray[3 + i]
     across(frame[2], frame)
@@ -74,7 +74,7 @@ def prepare_chief(packed, indices, h_rad, v_rad, chief, frame, axes, response, s
     status = leave_eye(packed, indices, chief, axes, 0.0, ray, sample, sag)
     if status != TRACED:
         return status, math.nan
-    put(ray, chief[1])
+    copy_values(ray, chief[1])
     path_mm = ray[6]
     status = stop_response(packed, indices, chief, frame, ray, response, sag)
     return status, path_mm
@@ -126,7 +126,7 @@ def _walk_spoke(light, radii, azimuth, response, solution, out, sag):
         status = _shoot(light, x, y, tolerance, guess, inverse, ray, out[ring - 1], sag)
         if status != TRACED:
             return ring - 1, status
-        put(guess, solution[ring])
+        copy_values(guess, solution[ring])
     return radii.shape[0] - 1, TRACED
 
 
@@ -142,7 +142,7 @@ def _open_radius(light, low, high, azimuth, inner, response, sag):
         radius = 0.5 * (low + high)
         share = radius / low if low > 0.0 else 1.0
         for i in range(2):
-            put(response[i], inverse[i])
+            copy_values(response[i], inverse[i])
             guess[i] = share * known[i]
         x, y = radius * azimuth[0], radius * azimuth[1]
         status = _shoot(
@@ -150,7 +150,7 @@ def _open_radius(light, low, high, azimuth, inner, response, sag):
         )
         if status == TRACED:
             low = radius
-            put(guess, known)
+            copy_values(guess, known)
         else:
             high = radius
     return low
@@ -276,8 +276,8 @@ def analyze_field(packed, indices, field_rad, stop_radii, viewed, nodes, results
         result[WORST_STATUS] = sample_pupil(
             light, response, stop_radii[s], rings, azimuths, samples, edge, sag
         )
-        put(chief[0], result[RETINA_POINT : RETINA_POINT + 3])
-        put(chief[1], result[PLANE_POINT : PLANE_POINT + 3])
+        copy_values(chief[0], result[RETINA_POINT : RETINA_POINT + 3])
+        copy_values(chief[1], result[PLANE_POINT : PLANE_POINT + 3])
         _read_pupil(samples, edge, ring_weights, distance_mm, use_slopes, result)
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from estimator.optics.surface_kernels import RAY_SIZE, TRACED, put
+from estimator.optics.surface_kernels import RAY_SIZE, TRACED, copy_values
 from estimator.wavefront.kernels import (
     N_SAMPLE,
     SLOPE_X,
@@ -39,7 +39,7 @@ def fill_chief_shifts(packed, indices, reference, fields_rad, shifts):
             status = chief_ray(packed, indices[w], h_rad, v_rad, axes, start, ray, sag)
             if status != TRACED:
                 continue
-            put(ray, chief[0])
+            copy_values(ray, chief[0])
             chief[1] = 0.0  # any plane outside: only the slope is read
             for i in range(3):
                 frame[2, i] = -ray[3 + i]

@@ -10,7 +10,12 @@ import math
 import numpy as np
 from numba import njit
 
-from estimator.optics.surface_kernels import NOT_CONVERGED, RAY_SIZE, TRACED, put
+from estimator.optics.surface_kernels import (
+    NOT_CONVERGED,
+    RAY_SIZE,
+    TRACED,
+    copy_values,
+)
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.bundle import extrapolate, prepare_chief
 from estimator.wavefront.fit import fit_zernike
@@ -121,8 +126,8 @@ def _circle_samples(light, radius_mm, rings, azimuths, samples, weights, sag):
                 samples[k, ring - 1 :] = 0.0
                 weights[k, ring - 1 :] = 0.0
                 break
-            put(guess, solution[ring])
-            put(sample, samples[k, ring - 1])
+            copy_values(guess, solution[ring])
+            copy_values(sample, samples[k, ring - 1])
     return worst
 
 

@@ -19,7 +19,12 @@ from estimator.optics.packed import (
     VERTEX,
 )
 from estimator.optics.raytrace_kernels import inward, outward, to_retina, to_stop
-from estimator.optics.surface_kernels import NOT_CONVERGED, RAY_SIZE, TRACED, put
+from estimator.optics.surface_kernels import (
+    NOT_CONVERGED,
+    RAY_SIZE,
+    TRACED,
+    copy_values,
+)
 
 UM_PER_MM = 1000.0
 
@@ -174,7 +179,7 @@ def magnification(packed, indices):
         b = start[1] + (h if i == 2 else -h if i == 3 else 0.0)
         if _chief_shot(packed, indices, axes, base_z, a, b, ray, sag) != TRACED:
             return math.nan
-        put(ray, ends[i])
+        copy_values(ray, ends[i])
     ax, ay = ends[0, 0] - ends[1, 0], ends[0, 1] - ends[1, 1]
     bx, by = ends[2, 0] - ends[3, 0], ends[2, 1] - ends[3, 1]
     return 2.0 * h / math.sqrt(abs(ax * by - ay * bx))
@@ -277,7 +282,7 @@ def stop_response(packed, indices, chief, frame, ray, inverse, sag):
         status = back_to_stop(packed, indices, chief, frame, a, b, ray, sag)
         if status != TRACED:
             return status
-        put(ray, ends[i])
+        copy_values(ray, ends[i])
     xa, ya = (ends[1, 0] - ends[0, 0]) / h, (ends[1, 1] - ends[0, 1]) / h
     xb, yb = (ends[2, 0] - ends[0, 0]) / h, (ends[2, 1] - ends[0, 1]) / h
     determinant = xa * yb - xb * ya
