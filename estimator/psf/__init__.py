@@ -1,20 +1,30 @@
-"""Point-spread functions of wavefronts, each by the method that is valid for it.
+"""Point-spread functions (PSFs) of wavefronts, by wave optics or ray optics.
 
-compute            entry point: many PSFs at once
+compute            entry point: many PSFs in one call
 arguments          argument checks
-kernel_types       finished kernels and their buffers
-pupil              the pupil's ellipse as a unit disc
-survey             pre-pass: slopes, curvatures and sizes
-switch             choice of waves or rays, by predicted error
+kernel_types       result type, kernel buffer, kernel disc
+pupil              pupils in pixel coordinates
+survey             wavefront slopes and kernel radii, before any PSF is computed
+switch             choice of wave or ray optics, by predicted error
 fourier            wave optics by FFT
 fourier_kernels    its compiled loops
-geometric          ray optics with Fresnel's edge
+geometric          ray optics plus diffraction at the edge of the pupil
 geometric_kernels  its compiled loops
-enz                the extended Nijboer-Zernike series
-enz_series         its coefficients
-tail               mean light far outside the spot
-stiles_crawford    the eye's apodization
-screens            rings in the pupil, of lenses with several foci
+enz                wave optics by the extended Nijboer-Zernike series
+enz_series         functions and coefficients of the series
+tail               mean diffracted light far outside the geometric spot
+stiles_crawford    Stiles-Crawford apodization
+screens            complex amplitude of multifocal lenses, tabulated
+
+Terms:
+
+kernel   a PSF integrated over pixels, ``[y, x]`` in image orientation, with unit sum,
+on
+         the disc dx² + dy² <= (R + 0.5)² px²; its center is the chief ray
+pitch    the visual angle of a pixel, mrad; in general, a Jacobian from mrad to px
+grid     angular samples of a wave-optical PSF, a whole number per pixel
+t        pupil coordinates in um/px, in which pixels are unit squares (see `pupil`)
+slope    gradient of W in t, px: where a ray of that pupil point meets the image
 """
 
 import lazy_loader

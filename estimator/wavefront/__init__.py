@@ -18,7 +18,7 @@ chief ray meets the cornea, or where it crosses the plane of the paraxial *entra
 pupil*.  W is the optical path of the chief ray minus that of a ray, positive where
 light is ahead.  Coefficients use OSA/ANSI order and normalization, to radial order 6,
 on the *circle* about the chief ray that circumscribes the *rim* of the pupil.  Piston
-is zero. Tilt is kept, so that it balances coma at the chief ray.
+is zero.  Tilt is kept, so that it balances coma at the chief ray.
 """
 
 import lazy_loader
