@@ -3,7 +3,7 @@
 from estimator.estimate.estimation import POOR_FIT_UM, EstimatedEye
 from estimator.eye.accommodation import REFRACTION_TOLERANCE_DPT
 from estimator.field.traced_eye import TRACED_ERROR_UM, TracedEye
-from estimator.periphery.change import DISAGREES_UM
+from estimator.periphery.change import MAX_MISFIT_UM
 from estimator.periphery.meridian import KNOTS_DEG
 
 
@@ -29,8 +29,10 @@ def periphery_note(eye: TracedEye) -> str:
     if change.measured_count:
         whose = f"measured in {change.measured_count} directions beside the axis"
     found = f"periphery: {whose}; M at 10, 20, 30 deg known to +-{known} dpt"
-    if change.miss_um > DISAGREES_UM:
-        found += f"; the measurements contradict each other by {change.miss_um:.2f} um"
+    if change.misfit_um > MAX_MISFIT_UM:
+        found += (
+            f"; the measurements contradict each other by {change.misfit_um:.2f} um"
+        )
     return found
 
 

@@ -59,7 +59,7 @@ class PeripheralResidual:
         field_range_deg: tuple[tuple[float, float], tuple[float, float]],
     ):
         self.change = change
-        usual = usual_eye(change, eye)
+        usual = clamped_eye(change, eye)
         self._traced = FieldInterpolation(
             aberration_grid(
                 usual,
@@ -114,9 +114,9 @@ def stretch_ratio(radius_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     return ratio[:, None] ** np.maximum(DEGREE - 2, 0)
 
 
-def usual_eye(change: PeripheralChange, eye: EstimatedEye) -> EstimatedEye:
+def clamped_eye(change: PeripheralChange, eye: EstimatedEye) -> EstimatedEye:
     """Return an eye with the axis of a change; ``eye`` itself if that is usual."""
-    if change.is_usual:
+    if change.is_in_population:
         return eye
     zernike_um = np.zeros(N_TERMS)
     zernike_um[list(TERMS)] = change.axis_um

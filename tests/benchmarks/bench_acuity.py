@@ -32,7 +32,7 @@ from estimator.acuity import (
 )
 from estimator.optics.prescription import zernike_from_power_vector
 from estimator.optics.zernike import rescale_pupil
-from estimator.periphery.people import load_people
+from estimator.periphery.measured_eyes import load_measured_eyes
 from estimator.profiles.typical_aberrations import (
     TYPICAL_PUPIL_MM,
     typical_zernike_um,
@@ -64,7 +64,7 @@ def _row(method, case, setting, n, times_ms, name, error, reference) -> Row:
 
 def measured_eyes(residual_dpt: float) -> list[NDArray[np.float64]]:
     """Return wavefronts (28,), um on 4 mm, of people's higher orders and a residue."""
-    axis_um = load_people(PEOPLE).axis_um
+    axis_um = load_measured_eyes(PEOPLE).axis_um
     axis_um = axis_um[np.isfinite(axis_um).all(axis=1)]
     noise = np.random.default_rng(0).standard_normal((len(axis_um), 3))
     noise *= residual_dpt * np.array([1.0, ASTIGMATISM_RATIO, ASTIGMATISM_RATIO])

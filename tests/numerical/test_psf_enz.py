@@ -43,7 +43,7 @@ def enz(zernike_um, *, pupil_mm=3.0, method="enz", **options):
 
 
 def enz_function(n, m, r, defocus_rad):
-    """V_n^|m|(r, f) (k,) by the quadrature of the series; r in lambda / pupil radius."""
+    """V_n^|m|(r, f) (k,) by the quadrature of the series, r in lambda / radius."""
     r = np.atleast_1d(np.asarray(r, np.float64))
     rho, weight = radial_nodes(n, abs(defocus_rad), float(r.max(initial=0.0)))
     weighted = np.zeros((rho.size, 2 * abs(m) + 1), np.complex128)
