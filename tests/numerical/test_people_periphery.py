@@ -242,7 +242,7 @@ def test_the_model_alone_stays_what_it_was():
     profile = preset("emmetropia", periphery="model")
     table = asked(profile, [-30.0, 30.0])
     assert table.power_dpt[0] == pytest.approx(table.power_dpt[1], abs=1e-3)
-    assert any("eye model's own" in note for note in table.notes)
+    assert any("from the eye model" in note for note in table.notes)
 
 
 def test_the_free_field_is_as_large_as_people_depart():
