@@ -1,4 +1,4 @@
-"""Entries of a correction, and the profile fields that they give."""
+"""Entries of a correction, and the resulting fields of a profile."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any, Literal
 
 from clients.web.numbers import NumberField
 
-WornKind = Literal[
+CorrectionKind = Literal[
     "spectacles", "progressive", "lenslets", "contact_lens", "iol", "file"
 ]
 
-KINDS: dict[WornKind, str] = {
+KINDS: dict[CorrectionKind, str] = {
     "spectacles": "Spectacles",
     "progressive": "Progressive spectacles",
     "lenslets": "Spectacles with lenslets",
@@ -26,7 +26,7 @@ DESIGNS = {
     "trifocal": "Trifocal",
     "edof": "Extended depth of focus",
 }
-HINTS: dict[WornKind, str] = {
+HINTS: dict[CorrectionKind, str] = {
     "progressive": "Use the gaze sliders to look through other parts of the lens.",
     "lenslets": "396 lenslets around a clear center; use the gaze sliders to look "
     "through other parts.",
@@ -62,7 +62,7 @@ ABERRATION = NumberField(
     is_signed=True,
 )
 
-OF_KIND: dict[WornKind, tuple[NumberField, ...]] = {
+FIELDS_OF_KIND: dict[CorrectionKind, tuple[NumberField, ...]] = {
     "spectacles": PRESCRIPTION,
     "progressive": (*PRESCRIPTION, PROGRESSIVE_ADD, CORRIDOR),
     "lenslets": PRESCRIPTION,
@@ -70,7 +70,7 @@ OF_KIND: dict[WornKind, tuple[NumberField, ...]] = {
     "iol": (*PRESCRIPTION[:3], ABERRATION),
     "file": (),
 }
-OF_DESIGN: dict[str, tuple[NumberField, ...]] = {
+FIELDS_OF_DESIGN: dict[str, tuple[NumberField, ...]] = {
     "monofocal": (),
     "bifocal": (BIFOCAL_ADD,),
     "trifocal": (MIDDLE_ADD, NEAR_ADD),
@@ -96,78 +96,84 @@ def first_texts() -> dict[str, str]:
 
 
 def depends_on_gaze(profile: Mapping[str, Any]) -> bool:
-    """Return whether the part of the correction looked through depends on the gaze."""
-    worn = profile.get("correction") or {}
-    return worn.get("kind") in ("progressive", "lenslets")
+    """Return whether the correction of a profile changes with the direction of gaze."""
+    correction = profile.get("correction") or {}
+    return correction.get("kind") in ("progressive", "lenslets")
 
 
-def looking(
+def at_gaze(
     profile: Mapping[str, Any], gaze_deg: tuple[float, float]
 ) -> dict[str, Any]:
-    """Return a profile with its correction at a gaze."""
+    """Return a profile whose correction is rotated by a gaze (h, v)."""
     if not depends_on_gaze(profile):
         return dict(profile)
-    worn = dict(profile["correction"])
-    own_deg = worn.get("gaze_deg", (0.0, 0.0))
-    worn["gaze_deg"] = [own + more for own, more in zip(own_deg, gaze_deg, strict=True)]
-    return {**profile, "correction": worn}
+    correction = dict(profile["correction"])
+    own_deg = correction.get("gaze_deg", (0.0, 0.0))
+    correction["gaze_deg"] = [
+        own + more for own, more in zip(own_deg, gaze_deg, strict=True)
+    ]
+    return {**profile, "correction": correction}
 
 
 @dataclass
 class CorrectionForm:
-    """The entries of one eye's correction.
+    """Entries of the correction of one eye.
 
     Attributes
     ----------
-    design : of an intraocular lens
-    texts : as typed, by field name
-    file_body : a correction that the entries cannot represent, or None
+    kind : CorrectionKind
+    design : str
+        Design of an intraocular lens.
+    texts : dict
+        Texts as typed, by field name.
+    file_body : dict or None
+        Correction of a file that the entries cannot represent.
     """
 
-    kind: WornKind = "spectacles"
+    kind: CorrectionKind = "spectacles"
     design: str = "monofocal"
     texts: dict[str, str] = field(default_factory=first_texts)
     file_body: dict[str, Any] | None = None
 
     @property
-    def kinds(self) -> dict[WornKind, str]:
-        """Return the available kinds."""
+    def kinds(self) -> dict[CorrectionKind, str]:
+        """Available kinds with their labels."""
         return KINDS if self.file_body is None else {**KINDS, "file": AS_IN_FILE}
 
     @property
     def entries(self) -> tuple[NumberField, ...]:
-        """Return the entries in use."""
-        more = OF_DESIGN[self.design] if self.kind == "iol" else ()
-        return (*more, *OF_KIND[self.kind])
+        """Entries of the selected kind and design."""
+        more = FIELDS_OF_DESIGN[self.design] if self.kind == "iol" else ()
+        return (*more, *FIELDS_OF_KIND[self.kind])
 
     def body(self) -> dict[str, Any]:
-        """Return the correction.
+        """Return the correction as in a profile.
 
         Raises
         ------
         ValueError
-            Names the entry, its value and what is allowed.
+            An entry is invalid; the message has its label, value and allowed range.
         """
         if self.kind == "file":
             return dict(self.file_body or {})
-        values = read_numbers(self.entries, self.texts, "Worn correction: ")
+        values = read_numbers(self.entries, self.texts, "Correction: ")
         if self.kind == "spectacles":
             return dict(values)
         found: dict[str, Any] = {"kind": self.kind, **values}
         if self.kind != "iol":
             return found
         if self.design == "trifocal":
-            adds = [found.pop(entry.name) for entry in OF_DESIGN["trifocal"]]
+            adds = [found.pop(entry.name) for entry in FIELDS_OF_DESIGN["trifocal"]]
             found |= {"adds_dpt": adds, "light_ratio": list(TRIFOCAL_LIGHT)}
         return found | {"design": self.design}
 
-    def take(self, body: Mapping[str, Any]) -> None:
-        """Set the entries from a correction, or keep it as a file if they cannot."""
+    def set_from(self, body: Mapping[str, Any]) -> None:
+        """Set the entries from a correction, or `file_body` if that is impossible."""
         kind, design = body.get("kind", "spectacles"), body.get("design", "monofocal")
         values = dict(body)
         names: list[str] | set[str]
         if design == "trifocal" and values.pop("light_ratio", 0) == [*TRIFOCAL_LIGHT]:
-            names = [entry.name for entry in OF_DESIGN["trifocal"]]
+            names = [entry.name for entry in FIELDS_OF_DESIGN["trifocal"]]
             values |= dict(zip(names, values.pop("adds_dpt", ()), strict=False))
         known = (
             CorrectionForm(kind, design)
@@ -185,7 +191,7 @@ class CorrectionForm:
             text = first_texts()[entry.name] if value is None else entry.show(value)
             self.texts[entry.name] = text
 
-    def copied(self) -> CorrectionForm:
+    def copy(self) -> CorrectionForm:
         """Return a copy for the other eye."""
         return CorrectionForm(self.kind, self.design, dict(self.texts), self.file_body)
 
@@ -193,12 +199,12 @@ class CorrectionForm:
 def read_numbers(
     entries: tuple[NumberField, ...], texts: Mapping[str, str], where: str = ""
 ) -> dict[str, float]:
-    """Return the numbers of entries.
+    """Return the numbers of entries, by field name.
 
     Raises
     ------
     ValueError
-        Names the entry, its value and what is allowed.
+        An entry is invalid; the message has its label, value and allowed range.
     """
     values = {}
     for entry in entries:

@@ -62,7 +62,7 @@ class EyeForm:
     preset : name
     file_body : profile from a file, or None
     file_name : name of that file
-    wears_correction : whether `worn` is used
+    wears_correction : whether `correction` is used
     """
 
     side: EyeSide
@@ -73,7 +73,7 @@ class EyeForm:
     file_body: dict[str, Any] | None = None
     file_name: str = ""
     wears_correction: bool = False
-    worn: CorrectionForm = field(default_factory=CorrectionForm)
+    correction: CorrectionForm = field(default_factory=CorrectionForm)
 
     def body(self, *, age_years: float) -> dict[str, Any]:
         """Return the profile.
@@ -85,8 +85,8 @@ class EyeForm:
         """
         body = {**self._source_body(), "age_years": age_years, "eye_side": self.side}
         if self.wears_correction:
-            body["correction"] = self.worn.body()
-            if self.worn.kind == "iol":  # no natural lens, no typical aberrations
+            body["correction"] = self.correction.body()
+            if self.correction.kind == "iol":  # no natural lens, no typical aberrations
                 body.pop("higher_order", None)
         parse_profile(body)
         return body
@@ -106,8 +106,8 @@ class EyeForm:
 
     def correct_fully(self) -> None:
         """Wear spectacles of the prescription."""
-        self.worn.kind = "spectacles"
-        self.worn.texts |= self.texts
+        self.correction.kind = "spectacles"
+        self.correction.texts |= self.texts
         self.wears_correction = True
 
     def take_file(self, name: str, content: bytes) -> float | None:
@@ -128,7 +128,7 @@ class EyeForm:
         correction = body.pop("correction", None)
         if correction is not None:
             self.wears_correction = True
-            self.worn.take(correction)
+            self.correction.set_from(correction)
         if body.get("kind") == "preset":
             self.source, self.preset = "preset", body["name"]
         elif _is_plain_prescription(body):

@@ -146,31 +146,34 @@ class EyePanel:
                     "flat dense no-caps size=sm"
                 ).tooltip("Wear spectacles of the prescription above")
         if form.wears_correction:
-            self._worn()
+            self._correction()
 
-    def _worn(self) -> None:
-        worn = self.form.worn
+    def _correction(self) -> None:
+        correction = self.form.correction
         ui.select(
-            worn.kinds, value=worn.kind, on_change=self._choose_worn, label="Correction"
+            correction.kinds,
+            value=correction.kind,
+            on_change=self._choose_correction,
+            label="Correction",
         ).props("outlined dense options-dense").classes("oc-wide oc-worn-kind")
-        if worn.kind == "iol":
+        if correction.kind == "iol":
             ui.select(
                 DESIGNS,
-                value=worn.design,
+                value=correction.design,
                 on_change=self._choose_design,
                 label="Design",
             ).props("outlined dense options-dense").classes("oc-wide oc-worn-design")
         with ui.element("div").classes("oc-fields oc-worn"):
-            for number in worn.entries:
-                self._entry(number, worn.texts).props["data-worn"] = ""
-        if worn.kind in HINTS:
-            ui.label(HINTS[worn.kind]).classes("oc-hint")
+            for number in correction.entries:
+                self._entry(number, correction.texts).props["data-worn"] = ""
+        if correction.kind in HINTS:
+            ui.label(HINTS[correction.kind]).classes("oc-hint")
 
     def copy(self, other: EyeForm) -> None:
         """Copy the entries of the other eye."""
         form = self.form
         form.source, form.preset = other.source, other.preset
-        form.texts, form.worn = dict(other.texts), other.worn.copied()
+        form.texts, form.correction = dict(other.texts), other.correction.copy()
         form.has_higher_order = other.has_higher_order
         form.file_body, form.file_name = other.file_body, other.file_name
         form.wears_correction = other.wears_correction
@@ -194,12 +197,12 @@ class EyePanel:
         self.form.wears_correction = event.value
         self._changed()
 
-    def _choose_worn(self, event: events.ValueChangeEventArguments) -> None:
-        self.form.worn.kind = event.value
+    def _choose_correction(self, event: events.ValueChangeEventArguments) -> None:
+        self.form.correction.kind = event.value
         self._changed()
 
     def _choose_design(self, event: events.ValueChangeEventArguments) -> None:
-        self.form.worn.design = event.value
+        self.form.correction.design = event.value
         self._changed()
 
     def _correct_fully(self) -> None:

@@ -128,7 +128,7 @@ class FigurePanel:
             return None
 
     def _body(self) -> str | None:
-        body = self._state.looking_body(self._side)
+        body = self._state.body_at_gaze(self._side)
         return None if body is None else json.dumps(body, sort_keys=True)
 
     async def _show_point(self) -> None:
@@ -158,7 +158,7 @@ class FigurePanel:
         rows = [row for row, _ in picture.chart_rows] if picture else []
         found: dict[int, list[EyeSide]] = {}
         for side in self._state.sides if rows else ():
-            body = self._state.looking_body(side)
+            body = self._state.body_at_gaze(side)
             if body is None:
                 continue
             log_mar = await self._ask(

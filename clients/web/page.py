@@ -448,7 +448,7 @@ class Page:
 
     async def _download_report(self) -> None:
         for side in self.state.sides:
-            body = self.state.looking_body(side)
+            body = self.state.body_at_gaze(side)
             if body is None:
                 continue
             title = SIDES[side]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from clients.web.correction_form import looking
+from clients.web.correction_form import at_gaze
 from clients.web.eye_form import SIDES, EyeForm, EyeSide, NoFile
 from clients.web.numbers import NumberField
 from clients.web.picture import Picture, Place
@@ -85,10 +85,10 @@ class PageState:
         """Return the gaze in the picture."""
         return self.values[GAZE_H.name], self.values[GAZE_V.name]
 
-    def looking_body(self, side: EyeSide) -> dict[str, Any] | None:
+    def body_at_gaze(self, side: EyeSide) -> dict[str, Any] | None:
         """Return an eye's last valid profile, with the correction at the gaze."""
         body = self.right.get(side)
-        return None if body is None else looking(body, self.gaze_deg)
+        return None if body is None else at_gaze(body, self.gaze_deg)
 
     def set_picture(self, picture: Picture) -> None:
         """Set the picture; the first one also sets the state that it suggests."""

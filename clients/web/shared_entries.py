@@ -75,9 +75,9 @@ def _eye(form: EyeForm, new: EyeForm) -> dict[str, Any]:
         found["texts"] = texts
     if form.wears_correction:
         found["correction"] = {
-            "kind": form.worn.kind,
-            "design": form.worn.design,
-            "texts": form.worn.texts,
+            "kind": form.correction.kind,
+            "design": form.correction.design,
+            "texts": form.correction.texts,
         }
     return found
 
@@ -151,14 +151,14 @@ def _restore_eye(form: EyeForm, entries: dict[str, Any]) -> list[str]:
     correction = _mapping(entries.get("correction"))
     if correction:
         form.wears_correction = True
-        form.worn = CorrectionForm()
+        form.correction = CorrectionForm()
         if correction.get("kind") in KINDS:
-            form.worn.kind = correction["kind"]
+            form.correction.kind = correction["kind"]
         else:
             problems.append(f"correction {correction.get('kind')!r:.30} is unknown")
         if correction.get("design") in DESIGNS:
-            form.worn.design = correction["design"]
-        _restore_texts(form.worn.texts, _mapping(correction.get("texts")))
+            form.correction.design = correction["design"]
+        _restore_texts(form.correction.texts, _mapping(correction.get("texts")))
     return problems
 
 

@@ -20,7 +20,7 @@ def checked_zernike_um(zernike_um: ArrayLike) -> NDArray[np.float64]:
     if array.ndim != 2 or array.shape[1] != N_TERMS:
         raise ValueError(f"zernike_um has shape {array.shape}: must be (P, {N_TERMS})")
     if not np.all(np.isfinite(array)):
-        raise ValueError("zernike_um: coefficients must be finite")
+        raise ValueError("zernike_um: must be finite, got NaN or infinite coefficients")
     return array
 
 

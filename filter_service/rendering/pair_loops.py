@@ -1,6 +1,10 @@
-"""The (cell, interval) pairs that a frame uses, and a prediction for the next frame.
+"""Pairs of cell and interval that a frame uses, and those predicted for the next frame.
 
-The GPU marks parts of intervals, `USED_PARTS` each, as bits in the words of a cell.
+A *cell* is a part of the image with its own kernels (`ImageCells`).  An *interval* is
+the range between two consecutive layers, the object distances that have kernels; the
+kernel of a pixel is interpolated between those of both layers.  The *state* of an eye,
+its pupil and focus, determines the layers.  An interval has `USED_PARTS` parts, and the
+GPU marks the parts that a frame uses as bits in the words of a cell.
 """
 
 import numpy as np
@@ -11,7 +15,7 @@ from filter_service.constants import BITS_PER_WORD, USED_PARTS
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def used_pairs(words, interval_count):
-    """Return the used pairs (n_cells, n_intervals) of words (n_cells, n_words)."""
+    """Return the pairs (n_cells, n_intervals) that words (n_cells, n_words) mark."""
     used = np.zeros((words.shape[0], interval_count), np.bool_)
     for cell in range(words.shape[0]):
         for k in range(words.shape[1]):
@@ -27,19 +31,23 @@ def used_pairs(words, interval_count):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def carry_over(words, edge_dpt, change_dpt, new_layer_dpt, new_change_dpt, margin_dpt):
-    """Return pairs (rows, columns, n_intervals) of the same scene in a new state.
+    """Return the pairs (rows, columns, n_intervals) of the same scene in a new state.
 
-    A pixel's position among the layers is its vergence plus the change of defocus over
-    the field, which is between the changes at its cell's corners.
+    The position of a pixel among the layers is its vergence plus the change of defocus
+    over the field, which is interpolated between the corners of its cell.
 
     Parameters
     ----------
     words : (rows, columns, n_words)
+        Marks of the previous frame.
     edge_dpt : (n_parts + 1,)
-        Edges of the parts of the intervals in the old state.
+        Edges of the parts of all intervals in the previous state.
     change_dpt, new_change_dpt : (rows + 1, columns + 1)
-        Change of defocus at the corners of cells, in the old and in the new state.
+        Change of defocus at the corners of cells, in the previous and in the new state.
     new_layer_dpt : (n_layers,)
+        Layers of the new state.
+    margin_dpt : float
+        Widening of each marked part on both sides, for rounding errors of the GPU.
     """
     rows, columns, word_count = words.shape
     last = max(new_layer_dpt.size - 1, 1) - 1
@@ -74,7 +82,7 @@ def carry_over(words, edge_dpt, change_dpt, new_layer_dpt, new_change_dpt, margi
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def spread(used):
-    """Return pairs (rows, columns, n_intervals), spread to the eight cells around."""
+    """Return pairs (rows, columns, n_intervals) including those of adjacent cells."""
     rows, columns, count = used.shape
     found = np.zeros(used.shape, np.bool_)
     for row in range(rows):

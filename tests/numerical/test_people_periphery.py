@@ -308,7 +308,7 @@ def test_measurements_that_contradict_each_other_meet_in_the_middle_and_say_so()
     profile = measured_set([(20.0, 0.0, 2.0), (20.0, 0.0, -2.0)])
     table = asked(profile, [0.0, 20.0])
     assert table.power_dpt[1, 0] - table.power_dpt[0, 0] == pytest.approx(0.0, abs=0.3)
-    assert any("contradict" in note for note in table.notes)
+    assert any("misfit" in note for note in table.notes)
 
 
 # ----- hard cases

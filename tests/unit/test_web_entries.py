@@ -76,8 +76,8 @@ def test_the_entries_become_a_profile_with_what_is_worn():
 
 def test_a_wrong_worn_entry_is_told_as_such():
     form = EyeForm("OD", wears_correction=True)
-    form.worn.texts["axis_deg"] = "200"
-    with pytest.raises(ValueError, match=r"Worn correction: Axis: 200 is out of range"):
+    form.correction.texts["axis_deg"] = "200"
+    with pytest.raises(ValueError, match=r"Correction: Axis: 200 is out of range"):
         form.body(age_years=30.0)
 
 
@@ -88,20 +88,20 @@ def test_a_wrong_worn_entry_is_told_as_such():
 )
 def test_every_lens_of_the_page_is_one_that_a_profile_may_have(kind, design, source):
     form = EyeForm("OD", source=source, wears_correction=True)
-    form.worn.kind, form.worn.design = kind, design
-    form.worn.texts.update(cylinder_dpt="-1.00", axis_deg="20")
+    form.correction.kind, form.correction.design = kind, design
+    form.correction.texts.update(cylinder_dpt="-1.00", axis_deg="20")
     body = form.body(age_years=70.0)
     assert parse_profile(body).correction is not None
     again = EyeForm("OD")
     again.take_body(body, "p.json")
-    assert again.worn == form.worn
+    assert again.correction == form.correction
 
 
 def test_a_lens_that_the_page_has_no_entries_for_stays_as_it_is():
     zones = {"kind": "iol", "design": "zones", "zone_adds_dpt": [2, 0]}
     zones["zone_diameters_mm"] = [1.5, 6]
     form = CorrectionForm()
-    form.take(zones)
+    form.set_from(zones)
     assert form.body() == zones
     assert "file" in form.kinds
     assert form.entries == ()
@@ -110,15 +110,15 @@ def test_a_lens_that_the_page_has_no_entries_for_stays_as_it_is():
 
 def test_additions_that_no_lens_can_have_are_told():
     form = EyeForm("OD", wears_correction=True)
-    form.worn.kind, form.worn.design = "iol", "bifocal"
-    form.worn.texts["add_dpt"] = "7"
+    form.correction.kind, form.correction.design = "iol", "bifocal"
+    form.correction.texts["add_dpt"] = "7"
     with pytest.raises(
         ValueError,
-        match=r"Worn correction: Addition: 7 is out of range; allowed: 0\.5 to 6 dpt",
+        match=r"Correction: Addition: 7 is out of range; allowed: 0\.5 to 6 dpt",
     ):
         form.body(age_years=70.0)
-    form.worn.design = "trifocal"
-    form.worn.texts["middle_add_dpt"] = "3.1"
+    form.correction.design = "trifocal"
+    form.correction.texts["middle_add_dpt"] = "3.1"
     with pytest.raises(ValueError, match="a ratio of whole numbers"):
         form.body(age_years=70.0)
 
@@ -126,16 +126,16 @@ def test_additions_that_no_lens_can_have_are_told():
 def test_the_gaze_slider_turns_a_progressive_lens_of_the_figures():
     state = PageState(picture=a_picture())
     form = state.eyes["OD"]
-    form.wears_correction, form.worn.kind = True, "progressive"
+    form.wears_correction, form.correction.kind = True, "progressive"
     state.values[GAZE_V.name] = -15.0
     request = state.request()
     assert "gaze_deg" not in request.bodies["OD"]["correction"]  # the settings have it
-    seen = parse_profile(state.looking_body("OD")).correction
+    seen = parse_profile(state.body_at_gaze("OD")).correction
     # 25.5 mm before the center of rotation 15 deg are 6.8 mm, half of the corridor
     assert seen.sphere_dpt == pytest.approx(2.0 / 2, abs=0.15)
-    form.worn.kind = "contact_lens"
+    form.correction.kind = "contact_lens"
     state.request()
-    assert state.looking_body("OD") == state.right["OD"]
+    assert state.body_at_gaze("OD") == state.right["OD"]
 
 
 @pytest.mark.parametrize("name", preset_names())
