@@ -146,9 +146,9 @@ class EyePanel:
                     "flat dense no-caps size=sm"
                 ).tooltip("Wear spectacles of the prescription above")
         if form.wears_correction:
-            self._correction()
+            self._correction_entries()
 
-    def _correction(self) -> None:
+    def _correction_entries(self) -> None:
         correction = self.form.correction
         ui.select(
             correction.kinds,

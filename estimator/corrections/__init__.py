@@ -11,8 +11,8 @@ intraocular       conversion from the plane of an intraocular lens to the pupil
 A *correction* is a `Prescription` or one of its subclasses here, given in the plane of
 the device: spectacles at the *vertex distance* ``vertex_mm`` in front of the cornea, a
 contact lens on it, an intraocular lens behind it.  Single-vision lenses, and the
-carrier of lenslets, are polynomials subtracted from the wavefront in the entrance
-pupil.  *Rings* are the complex amplitude that a multifocal lens adds to them.
+carrier of lenslets, are polynomials that are subtracted from the wavefront in the
+entrance pupil.  *Rings* are the complex amplitude that a multifocal lens adds to them.
 """
 
 import lazy_loader

@@ -89,8 +89,9 @@ class Kinoform:
         field = np.exp(2j * np.pi * color_ratio * np.array(self.path_ratio))
         # Samples are at the centers of their intervals.
         half_sample = np.exp(-1j * np.pi * orders / N_SAMPLES)
-        spectrum: NDArray[np.complex128] = np.fft.fft(field) / N_SAMPLES
-        return spectrum[orders % N_SAMPLES] * half_sample
+        spectrum = np.fft.fft(field) / N_SAMPLES
+        amplitudes: NDArray[np.complex128] = spectrum[orders % N_SAMPLES] * half_sample
+        return amplitudes
 
 
 def _period_positions() -> NDArray[np.float64]:

@@ -16,8 +16,8 @@ plot                 maps of a field table
 notes                notes on how an eye was computed
 
 A *field* is a direction in the visual field, azimuth h and elevation v.  A *grid* has
-axes of h, v, pupil, accommodation and wavelength.  A *state* of an eye is its pupil and
-accommodation.  A *total defocus* is the least-squares refraction of a state.
+axes of h, v, pupil, accommodation and wavelength.  The *state* of an eye is its pupil
+and its accommodation.  The *total defocus* is the least-squares refraction of a state.
 """
 
 import lazy_loader

@@ -22,12 +22,12 @@ pinhole           directions and local scale of a pinhole image
 
 Terms:
 
-surface         a refracting surface: its *form* (the sag), position and rotation
-medium          the material between two surfaces; it is homogeneous, with an index that
-                follows a *dispersion*, or a *gradient* with an index by position
-stop            the plane of the iris; the *entrance pupil* is its image in object space
-chief ray       the ray through the center of the stop
-packed eye      the array of numbers that compiled code traces rays through
+- A *surface* has a *form* (its sag), a position and a rotation.  - A *medium* is the
+material between two surfaces.  It is homogeneous, with an index that
+  follows a *dispersion*, or a *gradient*, with an index by position.
+- The *stop* is the plane of the iris, and the *entrance pupil* its image in object
+space.  - The *chief ray* is the ray through the center of the stop.  - A *packed eye*
+is the array of numbers that compiled code traces rays through.
 """
 
 import lazy_loader

@@ -11,8 +11,8 @@ A form is a frozen dataclass whose fields are numbers or tuples of numbers, with
 kind : str
     Its name in files.
 sag(packed, row, x, y, out) -> bool
-    Compiled.  It writes z, dz/dx, dz/dy in the axes of the surface and returns whether
-    the form is defined at (x, y).  Its parameters start at column FORM_NUMBERS.
+    Compiled function that writes z, dz/dx, dz/dy in the axes of the surface and returns
+    whether the form is defined at (x, y).  Its parameters start at column FORM_NUMBERS.
 numbers() -> tuple of float
     The parameters, at most N_FORM_NUMBERS.
 added_curvature(curvatures) -> float

@@ -9,9 +9,9 @@ A gradient is a frozen dataclass with
 kind : str
     Its name in files.
 index(media, start, x, y, z) -> 4 floats
-    Compiled.  It returns n² and n times the gradient of n at a point, in the axes of
-    the surface in front of the medium.  ``media`` is the index row, in which the
-    parameters of the gradient start at ``start``.
+    Compiled function that returns n² and n times the gradient of n at a point, in the
+    axes of the surface in front of the medium.  ``media`` is the index row, in which
+    the parameters of the gradient start at ``start``.
 steps : int
     Number of integration steps through the medium.
 vertex_index(wavelength_nm) -> float
