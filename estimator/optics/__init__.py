@@ -25,8 +25,8 @@ Terms:
 - A *surface* has a *form* (its sag), a position and a rotation.  - A *medium* is the
 material between two surfaces.  It is homogeneous, with an index that
   follows a *dispersion*, or a *gradient*, with an index by position.
-- The *stop* is the plane of the iris, and the *entrance pupil* its image in object
-space.  - The *chief ray* is the ray through the center of the stop.  - A *packed eye*
+- The *stop* is the plane of the iris; its image by the cornea is the *entrance pupil*.
+- The *chief ray* is the ray through the center of the stop.  - A *packed eye*
 is the array of numbers that compiled code traces rays through.
 """
 

@@ -18,13 +18,12 @@ screens            complex amplitude of multifocal lenses, tabulated
 
 Terms:
 
-kernel   a PSF integrated over pixels, ``[y, x]`` in image orientation, with unit sum,
-on
-         the disc dx² + dy² <= (R + 0.5)² px²; its center is the chief ray
-pitch    the visual angle of a pixel, mrad; in general, a Jacobian from mrad to px
-grid     angular samples of a wave-optical PSF, a whole number per pixel
-t        pupil coordinates in um/px, in which pixels are unit squares (see `pupil`)
-slope    gradient of W in t, px: where a ray of that pupil point meets the image
+- A *kernel* is a PSF integrated over pixels, ``[y, x]`` in image orientation, with unit
+  sum, on the disc dx² + dy² <= (R + 0.5)² px².  Its center is the chief ray.
+- The *pitch* is the visual angle of a pixel, mrad; in general, it is a Jacobian.
+- A *grid* has the angular samples of a wave-optical PSF, a whole number per pixel.
+- *t* are pupil coordinates in um/px, in which pixels are unit squares; see `pupil`.
+- A *slope* is the gradient of W in t: the position of that point's ray, px.
 """
 
 import lazy_loader
