@@ -22,12 +22,12 @@ pinhole           directions and local scale of a pinhole image
 
 Terms:
 
-- A *surface* has a *form* (its sag), a position and a rotation.  - A *medium* is the
-material between two surfaces.  It is homogeneous, with an index that
-  follows a *dispersion*, or a *gradient*, with an index by position.
+- A *surface* has a *form* (its sag), a position and a rotation.
+- A *medium* is the material between two surfaces.  It is homogeneous, with an index by
+  wavelength, its *dispersion*, or a *gradient*, with an index by position.
 - The *stop* is the plane of the iris; its image by the cornea is the *entrance pupil*.
-- The *chief ray* is the ray through the center of the stop.  - A *packed eye*
-is the array of numbers that compiled code traces rays through.
+- The *chief ray* is the ray through the center of the stop.
+- A *packed eye* is the array of numbers that compiled code traces rays through.
 """
 
 import lazy_loader
