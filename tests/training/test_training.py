@@ -164,7 +164,7 @@ def test_a_training_goes_on_with_as_many_processes(folder, stop_late, monkeypatc
     run = _run(folder, "alone")
     stop_late(run)
     monkeypatch.setattr("training.train._join", two_processes)
-    with pytest.raises(RunFileError, match=r"128 rows a step.*now they are 256"):
+    with pytest.raises(RunFileError, match=r"128 rows per step.*got 256"):
         train(run)
 
 
@@ -180,7 +180,7 @@ def test_data_of_another_recipe_are_refused(folder):
 def test_more_processes_than_rows_are_refused(folder):
     run = _run(folder, "many")
     rows = load_rows(run, run.data_folder)
-    with pytest.raises(DataError, match="fewer than the 12800 of a step of 100"):
+    with pytest.raises(DataError, match="a step of 100 processes requires 12800"):
         Batches(rows, run, rank=0, n_ranks=100, device=torch.device("cpu"))
 
 
