@@ -63,8 +63,8 @@ def state_survey(eye: EyeOptics, spec: GridSpec, states: PupilStates) -> PupilSu
     survey = survey_pupils(state_frames(eye, spec, states))
     if eye.rings is None:
         return survey
-    return survey.behind(
-        ScreenTables.of(
+    return survey.with_screen(
+        ScreenTables.from_screen(
             eye.rings.seen_from(states.h_deg, states.v_deg),
             half_width_um_per_px=survey.frames.half_width_um_per_px,
             pixel_from_mrad=spec.node_pixel_from_mrad(states.h_deg, states.v_deg),

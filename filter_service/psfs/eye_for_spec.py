@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from estimator.corrections.progressive import ProgressiveLens
-from estimator.corrections.worn_lens import WornLens, turns_with_gaze
+from estimator.corrections.worn_lens import WornLens, depends_on_gaze
 from estimator.field.eye_optics import EyeOptics
 from estimator.field.prepare import prepare_eye
 from estimator.field.trace_range import FieldRange
@@ -58,8 +58,9 @@ def eye_for_spec(
     if settings.age_years is not None:
         profile = replace(profile, age_years=settings.age_years)
     lens = profile.correction
-    if isinstance(lens, ProgressiveLens | WornLens) and turns_with_gaze(lens):
-        profile = replace(profile, correction=lens.looking(settings.gaze_deg))
+    if isinstance(lens, ProgressiveLens | WornLens) and depends_on_gaze(lens):
+        lens = lens.with_gaze_offset(settings.gaze_deg)
+        profile = replace(profile, correction=lens)
     low_mm, high_mm = (min(p, MAX_PUPIL_MM) for p in settings.pupil_range_mm)
     eye, notes = prepare_eye(
         profile,
@@ -73,7 +74,7 @@ def eye_for_spec(
     )
     if settings.lateral_color and isinstance(eye, MeasuredWavefront):
         notes = (*notes, NO_LATERAL_COLOR)
-    if turns_with_gaze(profile.correction) and any(settings.gaze_range_deg):
+    if depends_on_gaze(profile.correction) and any(settings.gaze_range_deg):
         notes = (*notes, ONE_GAZE)
     return eye, notes
 

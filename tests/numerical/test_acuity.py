@@ -18,7 +18,7 @@ from estimator.acuity.sensitivity import contrast_sensitivity, perfect_transfer
 from estimator.field.field_table import field_table
 from estimator.optics.prescription import zernike_from_power_vector
 from estimator.optics.zernike import rescale_pupil, zernike_values
-from estimator.periphery.people import load_people
+from estimator.periphery.measured_eyes import load_measured_eyes
 from estimator.profiles.parse import parse_profile
 from estimator.profiles.typical_aberrations import (
     TYPICAL_PUPIL_MM,
@@ -164,7 +164,7 @@ def test_a_perfect_eye_has_a_ratio_of_one_and_tilt_does_not_matter():
 def test_a_wavefront_too_steep_is_refused():
     steep = np.zeros(28)
     steep[4] = 200.0
-    with pytest.raises(ValueError, match="up to"):
+    with pytest.raises(ValueError, match="at most"):
         predict_acuity(steep, zernike_radius_mm=3.0)
     with pytest.raises(ValueError, match="finite"):
         predict_acuity(np.full(28, np.nan), zernike_radius_mm=3.0)
@@ -214,7 +214,7 @@ def test_people_pass_on_what_the_mean_eye_does():
     Terms of orders 3 and 4 alone pass far more; with what best correction leaves of
     sphere and cylinder (0.3 dpt from eye to eye) they pass what he found.
     """
-    axis = load_people(PEOPLE).axis_um
+    axis = load_measured_eyes(PEOPLE).axis_um
     axis = axis[np.isfinite(axis).all(axis=1)][::5]
     spread = np.random.default_rng(0).standard_normal((len(axis), 3))
     at_cpd = np.array([5.0, 10.0, 20.0, 30.0])
