@@ -6,17 +6,17 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from estimator import InvalidFile, profile_body
+from estimator import InvalidFile, profile_body, published_names
 from estimator.bounded_files import loads_bounded
 
 MAX_ARGUMENT_BYTES = 1_000_000
+PROFILE_SUFFIXES = (".json", ".abp", ".csv", ".zmx")
 
 
 def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
-    """Return a profile from JSON text, a file, or the name of a preset.
+    """Return a profile from JSON text, a file, or the name of an eye.
 
-    A file has the suffix ``.json``, ``.abp`` or ``.csv``.  The service resolves preset
-    names.
+    A file has one of `PROFILE_SUFFIXES`.  The service resolves preset names.
 
     Raises
     ------
@@ -26,7 +26,9 @@ def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
     if text.lstrip().startswith("{"):
         return read_object(option, text)
     path = Path(text)
-    if path.suffix.lower() not in (".json", ".abp", ".csv") and not path.is_file():
+    if text in published_names():
+        return {"kind": "published", "name": text}
+    if path.suffix.lower() not in PROFILE_SUFFIXES and not path.is_file():
         return {"kind": "preset", "name": text}
     try:
         body = profile_body(path)

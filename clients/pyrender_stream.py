@@ -197,7 +197,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--profile",
         default="myopia",
-        help="preset name, JSON, or a .json, .abp or .csv file",
+        help="preset name, JSON, or a .json, .abp, .csv or .zmx file",
     )
     parser.add_argument(
         "--size", default="480x270", type=size_px_argument, metavar="WxH"

@@ -1,3 +1,5 @@
+from .acuity.best_correction import best_correction_um as best_correction_um
+from .acuity.predict import Acuity as Acuity
 from .acuity.predict import log_mar_of as log_mar_of
 from .acuity.predict import predict_acuity as predict_acuity
 from .acuity.sensitivity import perfect_transfer as perfect_transfer
@@ -37,6 +39,7 @@ from .profiles.files import profile_body as profile_body
 from .profiles.parse import EyeProfile as EyeProfile
 from .profiles.parse import parse_profile as parse_profile
 from .profiles.parse import preset_names as preset_names
+from .profiles.parse import published_names as published_names
 from .psf.compute import compute_psf_batch as compute_psf_batch
 from .psf.compute import compute_psfs as compute_psfs
 from .threads import thread_count as thread_count

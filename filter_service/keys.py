@@ -1,8 +1,9 @@
-"""Keys for clients on other machines: ZeroMQ's CURVE, with a list of allowed clients.
+"""CURVE keys of ZeroMQ for clients on other machines, with a list of allowed clients.
 
-A folder, 0700, holds ``server.toml``, the service's key pair, and in ``clients/`` the
-public key of every client that may connect.  A client's own file, 0600, has its pair
-and the service's public key; the service keeps no copy of the secret.
+The key folder (mode 0700) contains the service's key pair, ``server.toml``, and the
+public key of each allowed client, in ``clients/``.  The client's own file (mode 0600)
+contains its key pair and the service's public key.  The service has no copy of the
+client's secret key.
 """
 
 from __future__ import annotations
@@ -23,12 +24,12 @@ from filter_service.atomic_files import write_atomically
 from filter_service.log_lines import ONCE_A_SECOND
 
 MAX_FILE_BYTES = 4096
-"""Largest size of a key file; those of `KeyRing` have 300 bytes."""
+"""Largest size of a key file; `KeyRing` writes 300 bytes."""
 
 MAX_CLIENTS = 10_000
 RESCAN_S = 1.0
-"""Interval at which the clients' files are checked one by one; added and removed files
-are detected at once, by the modification time of the folder."""
+"""Interval of checks for modified client files.  Added and removed files are detected
+at once, by the modification time of the folder."""
 
 RETRY_S = 0.1
 
@@ -41,12 +42,12 @@ KEY = re.compile(r"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
-HEAD = "# A key of the ocufilter service.  Whoever reads this file may use it.\n"
+HEAD = "# A key of the ocufilter service.  Anyone who can read this file can use it.\n"
 
 
 @dataclass(frozen=True)
 class KeyPair:
-    """A public key and its secret, Z85."""
+    """A public and a secret key, in Z85."""
 
     public: str
     secret: str
@@ -54,26 +55,26 @@ class KeyPair:
 
 @dataclass(frozen=True)
 class ClientKey:
-    """Keys of a client: its own pair, and the service's public key."""
+    """Keys of a client: its key pair, and the service's public key."""
 
     name: str
     pair: KeyPair
     server: str
 
     def use_on(self, socket: Any) -> None:
-        """Set this key on a ZeroMQ socket."""
+        """Set these keys on a ZeroMQ socket."""
         socket.curve_serverkey = self.server.encode()
         socket.curve_publickey = self.pair.public.encode()
         socket.curve_secretkey = self.pair.secret.encode()
 
 
 def load_client_key(path: Path | str) -> ClientKey:
-    """Read a client's key file, written by `KeyRing.add`.
+    """Read a client's key file, which `KeyRing.add` has written.
 
     Raises
     ------
     ValueError
-        The file is not a valid key file; the message says what is wrong.
+        The file is not a valid key file.
     OSError
     """
     values = _read(Path(path), ("public", "secret", "server"))
@@ -82,7 +83,7 @@ def load_client_key(path: Path | str) -> ClientKey:
 
 
 class KeyRing:
-    """The folder of a service's keys.
+    """The key folder of a service.
 
     Parameters
     ----------
@@ -109,22 +110,22 @@ class KeyRing:
         return KeyPair(values["public"], values["secret"])
 
     def check(self) -> None:
-        """Check the permissions and the key pair before a service starts.
+        """Check the permissions and the service's key pair.
 
         Raises
         ------
         ValueError, OSError
-            Other users may write to the folder or read the service's key, or the public
-            key does not match the secret one.
+            Other users can write to the folder or read the service's key, or the public
+            and the secret key do not match.
         """
         if not (self.folder / "server.toml").is_file():
             raise ValueError(
                 f"{self.folder} has no server.toml; expected a folder that "
-                "`ocufilter keys add NAME` has made"
+                "`ocufilter keys add NAME` has created"
             )
         for path, bad_bits, what in (
-            (self.folder, 0o022, "other users may change it"),
-            (self.folder / "server.toml", 0o077, "other users may read it"),
+            (self.folder, 0o022, "other users can change it"),
+            (self.folder / "server.toml", 0o077, "other users can read it"),
         ):
             mode = stat.S_IMODE(path.stat().st_mode)
             if mode & bad_bits:
@@ -137,11 +138,11 @@ class KeyRing:
         if _public_of(pair.secret) != pair.public:
             raise ValueError(
                 f"{self.folder / 'server.toml'}: 'public' does not belong to 'secret'; "
-                "expected a pair that `ocufilter keys` has made"
+                "expected a pair that `ocufilter keys` has created"
             )
 
     def create(self) -> KeyPair:
-        """Create the folder and the service's key pair if missing; return the pair."""
+        """Return the service's key pair; create folder and key pair if missing."""
         self._clients.mkdir(parents=True, exist_ok=True)
         self.folder.chmod(0o700)
         file = self.folder / "server.toml"
@@ -153,14 +154,14 @@ class KeyRing:
         return self.server
 
     def add(self, name: str, client_file: Path) -> ClientKey:
-        """Allow a new client; write the key file to hand to it.
+        """Add a client, and write its key file.
 
         Raises
         ------
         ValueError
             The name is not a valid file name, or the client already exists.
         OSError
-            The file cannot be written, or already exists.
+            The key file cannot be written, or already exists.
         """
         file = self._file_of(name)
         if file.exists():
@@ -179,7 +180,7 @@ class KeyRing:
         return key
 
     def remove(self, name: str) -> None:
-        """Remove a client; a running service detects it.
+        """Remove a client; a running service disconnects it.
 
         Raises
         ------
@@ -193,14 +194,14 @@ class KeyRing:
         file.unlink()
 
     def names(self) -> list[str]:
-        """Return the names of the clients that may connect."""
+        """Return the names of the allowed clients."""
         return sorted(file.stem for file in self._clients.glob("*.toml"))
 
     def allowed(self) -> frozenset[str]:
-        """Return the public keys of all clients, read again if the folder has changed.
+        """Return the public keys of the allowed clients, including recent changes.
 
-        An invalid key file is skipped and logged once; if the folder cannot be read,
-        the last keys remain allowed.
+        Invalid key files are skipped and logged once.  If the folder cannot be read,
+        the previous keys remain allowed.
         """
         now_s = time.monotonic()
         if now_s < self._retry_s:
@@ -220,17 +221,19 @@ class KeyRing:
         return self._allowed
 
     def _scan(self) -> None:
-        """Read the new and changed files."""
+        """Read new and changed files."""
         found: dict[str, tuple[tuple[int, ...], str | None]] = {}
         with os.scandir(self._clients) as entries:
             names = sorted(e.name for e in entries if e.name.endswith(".toml"))
         if len(names) > MAX_CLIENTS:
-            log.warning("%s: only the first %d keys count", self._clients, MAX_CLIENTS)
+            log.warning(
+                "%s: only the first %d keys are used", self._clients, MAX_CLIENTS
+            )
         for name in names[:MAX_CLIENTS]:
             path = self._clients / name
             try:
                 status = path.stat()
-                identity = (status.st_ino, status.st_mtime_ns, status.st_size)
+                identity = _stamp(status)
                 known = self._keys.get(name)
                 if known is not None and known[0] == identity:
                     found[name] = known
@@ -241,8 +244,9 @@ class KeyRing:
                     raise
                 if isinstance(error, FileNotFoundError) and not path.is_symlink():
                     continue  # removed meanwhile
-                if (self._keys.get(name) or (None,))[0] != (identity := _stamp(path)):
-                    log.warning("skipped a key file: %s", error)
+                identity = _stamp(path.lstat())  # exists even for a dangling link
+                if (self._keys.get(name) or (None,))[0] != identity:
+                    log.warning("skipped an invalid key file: %s", error)
                 found[name] = identity, None
         self._keys = found
         keys = (key for _, key in found.values())
@@ -270,14 +274,13 @@ def _public_of(secret: str) -> str:
     return zmq.curve_public(secret.encode()).decode()
 
 
-def _stamp(path: Path) -> tuple[int, ...]:
-    """Return values that change with a file; also works for a dangling link."""
-    status = path.lstat()
+def _stamp(status: os.stat_result) -> tuple[int, ...]:
+    """Return values that differ once a file has changed."""
     return status.st_ino, status.st_mtime_ns, status.st_size
 
 
 def _read(path: Path, wanted: tuple[str, ...]) -> dict[str, str]:
-    """Read a key file safely: without blocking on a pipe, and with a size limit."""
+    """Read a key file; never block on a pipe, and limit the size."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -292,7 +295,7 @@ def _read(path: Path, wanted: tuple[str, ...]) -> dict[str, str]:
     try:
         values = tomllib.loads(content.decode("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"{path} is no key file: {error}") from None
+        raise ValueError(f"{path} is not a key file: {error}") from None
     for name in wanted:
         if not isinstance(values.get(name), str) or not KEY.fullmatch(values[name]):
             raise ValueError(f"{path}: {name!r} is not a key of 40 characters (Z85)")
@@ -300,6 +303,6 @@ def _read(path: Path, wanted: tuple[str, ...]) -> dict[str, str]:
 
 
 def _write(path: Path, values: dict[str, str]) -> None:
-    """Write a new file atomically, accessible to its owner only."""
+    """Write a new file atomically; only its owner can access it."""
     text = HEAD + "".join(f"{name} = '{value}'\n" for name, value in values.items())
     write_atomically(path, text, is_new=True)

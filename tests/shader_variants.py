@@ -107,7 +107,7 @@ class _NoGpu(Gpu):
             out.reshape(-1).view(np.uint8)[:] = 255 if buffer.name == "USED" else 0
         return lambda: None
 
-    def take_query(self):
+    def acquire_query(self):
         return _Anything()
 
     def check(self, where):

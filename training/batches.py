@@ -1,4 +1,4 @@
-"""Rows of a data set as a task's inputs and targets, and the batches of a training."""
+"""Inputs and targets of a task from the rows of a data set, and training batches."""
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -28,15 +28,15 @@ from training.run_file import Run
 from training.tasks import N_EYE, TASKS
 
 SCALING_ROWS = 200_000
-"""Rows from which means and deviations are computed."""
+"""Rows from which means and standard deviations are computed."""
 
 FRESH_SEED = 7919
-"""Added to the run's seed, so that fresh rows never equal those of the shards."""
+"""Added to the seed of the run, so that fresh rows differ from those of the shards."""
 
 FRESH_STEPS = 8
-"""Steps whose rows are traced at once: a call takes some ten thousand operations,
-however many rows. On a GPU, where nobody has measured it, launching them should cost
-most."""
+"""Steps whose rows are traced in one call: the number of operations of a call, some ten
+thousand, does not depend on the number of rows. On a GPU, launching them should
+dominate the time; this has not been measured."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def task_rows(task: str, shard: Shard) -> tuple[Tensor, Tensor]:
     """Return inputs and targets of a task, from labeled rows of its domain."""
     inputs, targets = torch.from_numpy(shard.inputs), torch.from_numpy(shard.targets)
     if task == "focus":
-        # The lens was given and its focus traced; the network learns the inverse.
+        # Rows have a lens and its traced focus; the network learns the inverse.
         known = torch.cat([inputs[:, : N_EYE + 1], targets[:, :1]], dim=1)
         return known, targets[:, 1:]
     if task != "eye":
@@ -94,13 +94,13 @@ def load_rows(run: Run, folder: Path) -> Rows:
     Raises
     ------
     DataError
-        It is missing, incomplete, or does not match the run file.
+        The data set is missing or incomplete, or does not match the run file.
     """
     found = recipe_of(read_manifest(folder))
     if found != run.recipe:
         raise DataError(
-            f"{folder} holds {found}, the run asks for {run.recipe}; "
-            "choose another folder, or remove it and generate"
+            f"{folder} contains {found}, expected {run.recipe}; choose another folder, "
+            "or remove this one and run python -m training.generate"
         )
     shard, share = load(folder), run.training.validation_ratio
     parts = split(shard.inputs, share=share, seed=run.seed)
@@ -108,20 +108,20 @@ def load_rows(run: Run, folder: Path) -> Rows:
 
 
 class Batches:
-    """The batch of every step, a function of only the run's seed and the step.
+    """Training batches, which depend only on the seed of the run and the step.
 
     Parameters
     ----------
     rows : Rows
     run : Run
     rank, n_ranks : int
-        This process takes every n-th batch.
+        This process uses every n-th batch.
     device : torch.device
 
     Raises
     ------
     DataError
-        A step takes more rows than there are.
+        There are fewer rows than a step requires.
     """
 
     def __init__(
@@ -135,24 +135,24 @@ class Batches:
         n_rows = len(rows.training_index)
         if n_ranks > 1 and n_rows < self.rows_per_step:
             raise DataError(
-                f"{n_rows} rows to train on: fewer than the {self.rows_per_step} of a "
-                f"step of {n_ranks} processes"
+                f"{n_rows} training rows: a step of {n_ranks} processes requires "
+                f"{self.rows_per_step}"
             )
         self.steps_per_epoch = max(1, n_rows // self.rows_per_step)
         self.n_steps = max(1, round(settings.n_epochs * self.steps_per_epoch))
         self._order = (-1, rows.training_index)
         self._pool = ThreadPoolExecutor(1) if settings.is_fresh else None
-        self._coming: dict[int, Future[tuple[Tensor, Tensor]]] = {}
+        self._pending: dict[int, Future[tuple[Tensor, Tensor]]] = {}
 
     def at(self, step: int) -> tuple[Tensor, Tensor]:
         """Return inputs and targets of a step, on the device."""
         if self._pool is None:
-            x, y = self._kept(step)
+            x, y = self._stored(step)
         else:
             x, y = self._fresh(step)
         return x.to(self._device), y.to(self._device)
 
-    def _kept(self, step: int) -> tuple[Tensor, Tensor]:
+    def _stored(self, step: int) -> tuple[Tensor, Tensor]:
         epoch, place = divmod(step, self.steps_per_epoch)
         if self._order[0] != epoch:
             rng = np.random.default_rng([self._run.seed, epoch])
@@ -162,14 +162,14 @@ class Batches:
         return self._rows.x[chosen], self._rows.y[chosen]
 
     def _fresh(self, step: int) -> tuple[Tensor, Tensor]:
-        """Return the step's rows; trace blocks of steps, the next one in a thread."""
+        """Return the rows of a step; a thread traces the next block of steps."""
         assert self._pool is not None
         block, place = divmod(step, FRESH_STEPS)
         for number in (block, block + 1):
-            if number not in self._coming:
-                self._coming[number] = self._pool.submit(self._trace, number)
-        self._coming = {n: self._coming[n] for n in (block, block + 1)}
-        x, y = self._coming[block].result()
+            if number not in self._pending:
+                self._pending[number] = self._pool.submit(self._trace, number)
+        self._pending = {n: self._pending[n] for n in (block, block + 1)}
+        x, y = self._pending[block].result()
         share = len(x) // FRESH_STEPS
         part = slice(place * share, (place + 1) * share)
         return x[part], y[part]

@@ -42,7 +42,7 @@ def save_checkpoint(
 
 
 def load_finished(file: Path) -> tuple[Network, dict[str, Any]]:
-    """Load a checkpoint whose training is finished, as `load_checkpoint`.
+    """Load the checkpoint of a finished training; see `load_checkpoint`.
 
     Raises
     ------
@@ -52,14 +52,14 @@ def load_finished(file: Path) -> tuple[Network, dict[str, Any]]:
     network, state = load_checkpoint(file)
     if state["step"] != state["n_steps"]:
         raise DataError(
-            f"checkpoint {file} is of step {state['step']} of {state['n_steps']}: "
-            "`python -m training.train` goes on where it stopped"
+            f"checkpoint {file}: at step {state['step']} of {state['n_steps']}; resume "
+            "with python -m training.train"
         )
     return network, state
 
 
 def load_checkpoint(file: Path) -> tuple[Network, dict[str, Any]]:
-    """Load a network and the rest of a checkpoint, on the CPU.
+    """Load a network and the state of its training, on the CPU.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def load_checkpoint(file: Path) -> tuple[Network, dict[str, Any]]:
         There is no checkpoint.
     """
     if not file.exists():
-        raise DataError(f"checkpoint {file}: not there")
+        raise DataError(f"checkpoint {file}: does not exist")
     state = torch.load(file, map_location="cpu", weights_only=True)
     network = make_network(state["task"], ModelSettings(**state["model"]))
     network.load_state_dict(state["weights"])

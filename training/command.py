@@ -9,7 +9,7 @@ from training.run_file import RunFileError
 
 
 def make_parser(module: str, documentation: str) -> argparse.ArgumentParser:
-    """Return the parser of ``python -m training.<module>``; the docstring is help."""
+    """Return the parser of ``python -m training.<module>``; help is its docstring."""
     return argparse.ArgumentParser(
         prog=f"python -m training.{module}",
         description=documentation,

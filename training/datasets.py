@@ -1,7 +1,7 @@
-"""Samples of a domain: drawn by seed, labeled, stored in shards with a manifest.
+"""Data sets: rows of a domain, sampled and labeled, in shards with a manifest.
 
 Row i of a data set depends only on the domain, the sampling and the seed, so shards can
-be made in any order, by several processes, and made again.
+be generated in any order and by several processes, and regenerated.
 """
 
 import json
@@ -15,19 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from training.population import at_some_focus, population_eyes, population_ranges
+from training.population import (
+    partly_accommodated_eyes,
+    population_eyes,
+    population_ranges,
+)
 from training.tasks import DOMAINS, MAX_COEFFICIENT_UM, N_EYE, Domain, Labels
 
 FORMAT = 1
 MANIFEST = "manifest.json"
 SAMPLINGS = ("random", "sobol")
-N_MORE_AXES = 3
-"""Axes of a population: whether an eye belongs to it, its refraction, and the part of
-its accommodation in use."""
+N_POPULATION_AXES = 3
+"""Additional sampling axes: choice of the population, refraction, accommodation."""
 
 
 class DataError(ValueError):
-    """A data set that cannot be made or read as requested."""
+    """A data set or checkpoint cannot be created or read as requested."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +42,14 @@ class Recipe:
     domain : str
         Name in `tasks.DOMAINS`.
     n_rows : int
-        Rows drawn; rows through which light does not pass are left out of the shards.
+        Rows to draw; vignetted ones are not written to the shards.
     rows_per_shard : int
     seed : int
     sampling : {"random", "sobol"}
         Uniform and independent, or a scrambled low-discrepancy sequence.
     population_ratio : float
-        Share of rows whose eyes are drawn from the population (`population`) instead of
-        from the box of Table 2.
+        Fraction of rows whose eyes are drawn from the population (see `population`)
+        instead of the ranges of Table 2.
     """
 
     domain: str
@@ -82,9 +85,14 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Shard:
-    """Labeled rows; float32, as networks read them.
+    """Labeled rows, in float32.
 
-    ``inputs`` (n, n_inputs), ``targets`` (n, n_targets), ``n_rejected`` rows left out.
+    Attributes
+    ----------
+    inputs : (n, n_inputs)
+    targets : (n, n_targets)
+    n_rejected : int
+        Number of vignetted rows, which are omitted.
     """
 
     inputs: NDArray[np.float32]
@@ -93,10 +101,15 @@ class Shard:
 
 
 def draw(recipe: Recipe, shard: int) -> NDArray[np.float64]:
-    """Draw the inputs (n, n_inputs) of one shard.
+    """Draw the inputs (n, n_inputs) of a shard.
 
-    In a Cartesian product every eye has ``n_repeats`` values of the last input, one in
-    each part of its range (the paper's focus set), at a random position in it.
+    If the domain has several rows per eye (as the paper's focus set), the range of the
+    last input is divided into ``n_repeats`` parts, with one random value in each.
+
+    Raises
+    ------
+    DataError
+        The data set has no such shard.
     """
     domain, n_repeats = DOMAINS[recipe.domain], DOMAINS[recipe.domain].n_repeats
     first = shard * recipe.rows_per_shard
@@ -105,7 +118,7 @@ def draw(recipe: Recipe, shard: int) -> NDArray[np.float64]:
         raise DataError(f"shard {shard}: the data set has {recipe.n_shards}")
     low, high = domain.ranges.T
     n_eyes = -(-n // n_repeats)
-    n_axes = len(low) + (N_MORE_AXES if recipe.population_ratio else 0)
+    n_axes = len(low) + (N_POPULATION_AXES if recipe.population_ratio else 0)
     unit = _unit_points(recipe, first // n_repeats, n_eyes, n_axes)
     rows = low + (high - low) * unit[:, : len(low)]
     if recipe.population_ratio:
@@ -122,11 +135,11 @@ def _populate(
     recipe: Recipe, domain: Domain, rows: NDArray[Any], unit: NDArray[Any]
 ) -> None:
     """Replace a share of the eyes of rows (n, n_inputs) by population eyes."""
-    choice, refraction, used = unit[:, -N_MORE_AXES:].T
+    choice, refraction, used = unit[:, -N_POPULATION_AXES:].T
     chosen = choice < recipe.population_ratio
     eyes = population_eyes(unit[chosen, :N_EYE], refraction[chosen])
     if domain.is_focused:
-        eyes = at_some_focus(eyes, used[chosen])
+        eyes = partly_accommodated_eyes(eyes, used[chosen])
     rows[chosen, :N_EYE] = eyes
 
 
@@ -157,9 +170,9 @@ def _unit_points(recipe: Recipe, first: int, n: int, n_axes: int) -> NDArray[Any
 def label(
     domain: Domain, inputs: NDArray[np.float64], *, labels: Labels | None = None
 ) -> Shard:
-    """Trace a block of inputs; rows through which light does not pass are left out.
+    """Trace inputs (n, n_inputs), and omit vignetted rows.
 
-    ``labels`` replaces the domain's own tracer.
+    ``labels`` replaces the tracer of the domain.
     """
     targets = (labels or domain.label)(inputs)
     with np.errstate(invalid="ignore"):
@@ -232,10 +245,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """
     file = folder / MANIFEST
     if not file.exists():
-        raise DataError(f"{folder} holds no data set: `python -m training.generate`")
+        raise DataError(f"{folder}: no data set; run python -m training.generate")
     manifest = json.loads(file.read_text(encoding="utf-8"))
     if manifest.get("format") != FORMAT:
-        raise DataError(f"{file}: format {manifest.get('format')}, needed is {FORMAT}")
+        raise DataError(f"{file}: format {manifest.get('format')}, expected {FORMAT}")
     return manifest
 
 
@@ -258,8 +271,8 @@ def load_shards(folder: Path) -> Iterator[Shard]:
         file = shard_file(folder, number)
         if not file.exists():
             raise DataError(
-                f"{file.name} of {recipe.n_shards} is missing in {folder}: "
-                "`python -m training.generate` goes on where it stopped"
+                f"{file.name} of {recipe.n_shards} is missing in {folder}; resume with "
+                "python -m training.generate"
             )
         with np.load(file) as data:
             yield Shard(data["inputs"], data["targets"], int(data["n_rejected"]))
@@ -280,8 +293,8 @@ def split(
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return indices of training rows and, with probability ``share``, validation rows.
 
-    Rows (n, n_inputs) of one eye are consecutive and go to the same set: in a product
-    of eyes and distances, a network knows an eye that it saw at another distance.
+    All rows (n, n_inputs) of an eye, which are consecutive, are in the same set,
+    because a network trained on an eye at one distance generalizes to others.
     """
     is_new = np.r_[True, np.any(inputs[1:, :N_EYE] != inputs[:-1, :N_EYE], axis=1)]
     eye = np.cumsum(is_new) - 1

@@ -1,4 +1,4 @@
-"""Labels of fresh rows on a GPU: the domains of `tasks`, by the tracer in torch."""
+"""Labels of the domains of `tasks`, traced on a GPU by `training.tracer`."""
 
 import numpy as np
 import torch
@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from estimator.eye.lens_change import AQUEOUS, DIAMETER
-from training.tasks import LENS_ROOM, N_EYE, Domain
+from training.tasks import LENS_DIAMETER_MARGINS, N_EYE, Domain
 from training.tracer.accommodation import (
     accommodated_eyes,
     focus_of_eyes,
@@ -22,13 +22,12 @@ def label_on_device(
 ) -> NDArray[np.float64]:
     """Label inputs (n, n_inputs) like ``domain.label``: targets (n, n_targets).
 
-    A row through which light does not pass completely is nan. Rays are traced in
-    float64.
+    Vignetted rows are nan. Rays are traced in float64.
 
     Raises
     ------
     ValueError
-        The domain has no tracer here.
+        The domain is not supported.
     """
     columns = torch.as_tensor(inputs, dtype=torch.float64, device=device)
     makers = {"on_axis": _on_axis, "field": _field, "focus": _focus, "lens": _lens}
@@ -68,7 +67,7 @@ def _focus(columns: Tensor, domain: Domain) -> tuple[Tensor, Tensor]:
 
 def _lens(columns: Tensor, _domain: Domain) -> tuple[Tensor, Tensor]:
     eyes, pupil_mm = columns[:, :N_EYE], columns[:, N_EYE]
-    widest, least = LENS_ROOM.ravel().tolist()
+    widest, least = LENS_DIAMETER_MARGINS.ravel().tolist()
     widest_mm = widest * eyes[:, DIAMETER]
     room_mm = least * smallest_diameters_mm(eyes) - widest_mm
     focused = accommodated_eyes(eyes, widest_mm + columns[:, -1] * room_mm)

@@ -2,9 +2,9 @@
 
     python -m training.evaluate RUN.toml [RUN.toml ...] [--rows N] [--json OUT.json]
 
-Every run's checkpoint is evaluated on the same newly traced rows; the eye estimator by
-tracing the eyes that it finds. The table is the paper's Table 3, by radial order, with
-the paper's figures for its 72 M and 221 M parameters beside ours.
+The checkpoints of all runs are evaluated on the same newly traced rows; estimated eyes
+are traced for it. The table is the paper's Table 3, by radial order, with the paper's
+values for 72 M and 221 M parameters.
 """
 
 import argparse
@@ -19,7 +19,7 @@ import torch
 
 from training.checkpoint import load_finished
 from training.command import make_parser, run_command
-from training.export import JUDGED_ROWS, fresh_rows, judged
+from training.export import EVALUATION_ROWS, fresh_rows, tracing_errors
 from training.run_file import Run, read_run
 from training.tasks import TASKS
 from training.train import CHECKPOINT
@@ -45,13 +45,13 @@ PUBLISHED = {
     ("aberration", "resnet", ""): 0.037234,
     ("aberration", "ours", ""): 0.015308,
 }
-"""Csoba & Kunkli 2023. Their eyes were evaluated by their discriminator, not by
-tracing, and over 27 terms with tilt; their circles are some 13 % larger than ours."""
+"""Csoba & Kunkli 2023. Their eyes were evaluated by a discriminator instead of tracing,
+over 27 terms including tilt; their circles are about 13 % larger."""
 
 
 @dataclass(frozen=True)
-class Judged:
-    """One row: a network, its cost and its error."""
+class Evaluation:
+    """One row of the table: a network, its cost and its error."""
 
     run: str
     task: str
@@ -66,7 +66,7 @@ class Judged:
     published_mae: str
 
 
-def judge(run: Run, x: "NDArray[Any]", y: "NDArray[Any]") -> Judged:
+def evaluate_run(run: Run, x: "NDArray[Any]", y: "NDArray[Any]") -> Evaluation:
     """Evaluate the checkpoint of a run on rows (n, n_inputs), (n, n_targets).
 
     Raises
@@ -77,7 +77,7 @@ def judge(run: Run, x: "NDArray[Any]", y: "NDArray[Any]") -> Judged:
     network, state = load_finished(run.output_folder / CHECKPOINT)
     found = predict(network, torch.from_numpy(x), torch.device("cpu"))
     loss = run.training.loss if run.task == "eye" else ""
-    return Judged(
+    return Evaluation(
         run=run.name,
         task=run.task,
         kind=run.model.kind,
@@ -87,7 +87,7 @@ def judge(run: Run, x: "NDArray[Any]", y: "NDArray[Any]") -> Judged:
         n_parameters=network.n_parameters,
         rows_seen=state["log"]["rows"],
         time_s=round(state["seconds"]),
-        error=judged(TASKS[run.task], found, x, y),
+        error=tracing_errors(TASKS[run.task], found, x, y),
         published_mae=_published(run.task, run.model.kind, loss),
     )
 
@@ -97,7 +97,7 @@ def _published(task: str, kind: str, loss: str) -> str:
     return "" if value is None else f"{value:.6f} {TASKS[task].unit}"
 
 
-def format_row(row: Judged) -> str:
+def format_row(row: Evaluation) -> str:
     """Format one row as text."""
     orders = "  ".join(
         f"n{n} {value:.4f}" for n, value in row.error["by_radial_order"].items()
@@ -111,8 +111,8 @@ def format_row(row: Judged) -> str:
     )
 
 
-def make_table(runs: Iterable[Run], n_rows: int, file: Path | None) -> list[Judged]:
-    """Evaluate every run on the same fresh rows of its task; print rows as they come.
+def make_table(runs: Iterable[Run], n_rows: int, file: Path | None) -> list[Evaluation]:
+    """Evaluate runs on the same fresh rows per task, and print each row.
 
     The table is also written to ``file`` as JSON, with the commit.
 
@@ -125,7 +125,7 @@ def make_table(runs: Iterable[Run], n_rows: int, file: Path | None) -> list[Judg
     for run in runs:
         if run.task not in samples:
             samples[run.task] = fresh_rows(TASKS[run.task], n_rows)
-        rows.append(judge(run, *samples[run.task]))
+        rows.append(evaluate_run(run, *samples[run.task]))
         print(format_row(rows[-1]), flush=True)
     if file:
         table = {"commit": commit_id(), "rows": [asdict(row) for row in rows]}
@@ -137,7 +137,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command; return its exit code."""
     parser = make_parser("evaluate", __doc__)
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN.toml")
-    parser.add_argument("--rows", type=int, default=JUDGED_ROWS)
+    parser.add_argument("--rows", type=int, default=EVALUATION_ROWS)
     parser.add_argument("--json", type=Path, help="write the table here, too")
     return run_command(parser, _work, arguments)
 

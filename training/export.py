@@ -2,11 +2,10 @@
 
     python -m training.export RUN.toml [--out DIR] [--half]
 
-Reads the run's checkpoint. Inputs and outputs are in physical units; scaling and optics
-are part of the graph. ``--half`` stores the weights in 16 bits; arithmetic stays in 32.
-The card, a JSON file beside the network, holds settings, ranges, data, parity with the
-checkpoint on 1,000 samples, and the error of the *written* file on newly traced
-samples.
+Reads the checkpoint of the run. Inputs and outputs are in physical units; scaling and
+optics are part of the graph. ``--half`` stores weights in 16 bits; arithmetic is in 32.
+The card is a JSON file with settings, ranges, data, parity with the checkpoint on 1,000
+samples, and the error of the exported network on newly traced samples.
 """
 
 import argparse
@@ -49,15 +48,15 @@ from training.versions import commit_id
 
 CARD_FORMAT = 1
 PARITY_ROWS = 1_000
-JUDGED_ROWS = 20_000
-JUDGE_SEED = 20_001
-"""Seed of fresh rows: no data set uses it."""
+EVALUATION_ROWS = 20_000
+EVALUATION_SEED = 20_001
+"""Seed of fresh rows, which no data set uses."""
 
 SMALLEST_HALVED = 256
-"""Smaller tensors stay in 32 bits."""
+"""Smaller tensors are stored in 32 bits."""
 
 LARGEST_PARITY_RATIO = 0.25
-"""Largest allowed mean difference from the trained network, over the error."""
+"""Largest mean difference from the trained network, over its error."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -66,7 +65,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("run", type=Path, metavar="RUN.toml")
     parser.add_argument("--out", type=Path, default=WEIGHTS_FOLDER)
     parser.add_argument("--half", action="store_true", help="weights in 16 bits")
-    parser.add_argument("--rows", type=int, default=JUDGED_ROWS, help="traced anew")
+    parser.add_argument("--rows", type=int, default=EVALUATION_ROWS, help="traced anew")
     return run_command(parser, _work, arguments)
 
 
@@ -77,23 +76,23 @@ def _work(options: argparse.Namespace) -> None:
 
 
 def export(
-    run: Run, folder: Path, *, is_half: bool, n_rows: int = JUDGED_ROWS
+    run: Run, folder: Path, *, is_half: bool, n_rows: int = EVALUATION_ROWS
 ) -> dict[str, Any]:
     """Write ``<task>.onnx`` and its card; return the card.
 
     Raises
     ------
     DataError
-        There is no checkpoint, or its training is not finished; or the written network
-        differs from it by more than a share of its error.
+        There is no checkpoint, its training is not finished, or the exported network
+        differs from it by more than `LARGEST_PARITY_RATIO`.
     RunFileError
         The checkpoint belongs to another run file.
     """
     network, state = load_finished(run.output_folder / CHECKPOINT)
     if state["run"] != run.text:
         raise RunFileError(
-            f"{run.output_folder / CHECKPOINT} was trained by another run file; a card "
-            "must state what its network was trained with"
+            f"{run.output_folder / CHECKPOINT} was trained with another run file; a "
+            "card requires the one of the training"
         )
     task = TASKS[run.task]
     folder.mkdir(parents=True, exist_ok=True)
@@ -101,11 +100,11 @@ def export(
     written = to_onnx(network.eval(), n_inputs=len(task.inputs), half=is_half)
     session = onnxruntime.InferenceSession(written, providers=["CPUExecutionProvider"])
     x, y = fresh_rows(task, n_rows)
-    errors = {"table_2": judged(task, evaluate(session, x), x, y)}
+    errors = {"table_2": tracing_errors(task, evaluate(session, x), x, y)}
     if run.recipe.population_ratio:
         people, wanted = fresh_rows(task, n_rows, population_ratio=1.0)
         found = evaluate(session, people)
-        errors["population"] = judged(task, found, people, wanted)
+        errors["population"] = tracing_errors(task, found, people, wanted)
         x = np.concatenate([x, people])
     card = {
         "network": task.name,
@@ -125,7 +124,7 @@ def export(
         "precision": "float16" if is_half else "float32",
         "bytes": len(written),
         "parity": _parity(task, network, session, x[:: max(1, len(x) // PARITY_ROWS)]),
-        # the error stated for an eye is that of population eyes
+        # Users' eyes are like those of the population.
         "error": errors.get("population", errors["table_2"]),
         "error_by_rows": errors,
     }
@@ -136,17 +135,17 @@ def export(
 
 def _check_parity(card: dict[str, Any]) -> None:
     unit, error = card["error"]["unit"], card["error"]["mean_abs"]
-    gap = card["parity"]["mean_abs"].get(unit, 0.0)  # none for the light of an eye
+    gap = card["parity"]["mean_abs"].get(unit, 0.0)  # absent for the eye estimator
     if gap > LARGEST_PARITY_RATIO * error:
         raise DataError(
-            f"the written network differs from the trained one by {gap:.2g} {unit} in "
-            f"the mean, its error is {error:.2g} {unit}: more than a share of "
-            f"{LARGEST_PARITY_RATIO:g}; nothing was written"
+            f"the exported network differs from the trained one by {gap:.2g} {unit} on "
+            f"average; allowed is {LARGEST_PARITY_RATIO:g} of its error of {error:.2g} "
+            f"{unit}; nothing was written"
         )
 
 
 def _write_both(file: Path, written: bytes, card: dict[str, Any]) -> None:
-    """Write network and card; the previous ones stay until both are complete."""
+    """Write network and card, and replace the previous ones when both are complete."""
     text = json.dumps(card, indent=1) + "\n"
     contents = {file: written, file.with_suffix(".json"): text.encode()}
     partials = {
@@ -161,14 +160,15 @@ def _write_both(file: Path, written: bytes, card: dict[str, Any]) -> None:
 def fresh_rows(
     task: Task, n_rows: int, *, population_ratio: float = 0.0
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return float32 inputs and targets that no training saw.
+    """Return float32 inputs and targets that are in no data set.
 
-    They are drawn from the box of Table 2, with a share of population eyes.
+    Eyes are drawn from the ranges of Table 2 and, with probability
+    ``population_ratio``, from the population.
     """
-    domain = task.judged_domain
+    domain = task.evaluation_domain
     n_rows = -(-n_rows // domain.n_repeats) * domain.n_repeats
     recipe = Recipe(
-        *(domain.name, n_rows, n_rows, JUDGE_SEED, "random", population_ratio)
+        *(domain.name, n_rows, n_rows, EVALUATION_SEED, "random", population_ratio)
     )
     shard: Shard = label(domain, draw(recipe, 0))
     if task.name == "focus":
@@ -178,9 +178,9 @@ def fresh_rows(
 
 
 def column_ranges(run: Run, x: NDArray[Any]) -> list[dict[str, Any]]:
-    """Return the range of every input: as sampled or, for coefficients, as observed."""
+    """Return the ranges of inputs: as sampled or, for coefficients, as observed."""
     task = TASKS[run.task]
-    domain = task.judged_domain
+    domain = task.evaluation_domain
     ranges = input_ranges(domain, run.recipe.population_ratio)
     sampled = dict(zip(domain.inputs, ranges.tolist(), strict=True))
     seen = zip(x.min(axis=0).tolist(), x.max(axis=0).tolist(), strict=True)
@@ -196,21 +196,21 @@ def _data(run: Run) -> dict[str, Any]:
         manifest = read_manifest(run.data_folder)
     except DataError:
         return asdict(run.recipe)
-    kept = ("n_rows_kept", "n_rows_rejected", "commit")
-    return asdict(run.recipe) | {name: manifest[name] for name in kept}
+    keys = ("n_rows_kept", "n_rows_rejected", "commit")
+    return asdict(run.recipe) | {name: manifest[name] for name in keys}
 
 
 def evaluate(
     session: onnxruntime.InferenceSession, x: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Return the outputs of a written network, in physical units."""
+    """Return the outputs of an exported network, in physical units."""
     return session.run(None, {"features": x})[0]
 
 
 def _parity(
     task: Task, network: Network, session: onnxruntime.InferenceSession, x: NDArray[Any]
 ) -> dict[str, Any]:
-    """Return largest and mean difference between written and trained network."""
+    """Return the largest and the mean difference of exported and trained network."""
     with torch.no_grad():
         wanted = network(torch.from_numpy(x)).numpy()
     gap = np.abs(evaluate(session, x) - wanted)
@@ -223,7 +223,7 @@ def _parity(
     }
 
 
-def judged(
+def tracing_errors(
     task: Task, found: NDArray[Any], x: NDArray[Any], y: NDArray[Any]
 ) -> dict[str, Any]:
     """Return errors against ray tracing, in the form of a card."""
@@ -233,11 +233,11 @@ def judged(
         error = found.astype(np.float64) - y
     names = error_columns(task.name)
     n_main = sum(name.endswith(f"_{task.unit}") for name in names)
-    asked = np.ones(len(error), dtype=bool)
-    if task.name == "focus":  # at a bound any answer beyond it is correct
-        asked = is_within_reach(torch.from_numpy(x), torch.from_numpy(y)).numpy()
+    is_compared = np.ones(len(error), dtype=bool)
+    if task.name == "focus":  # at a bound of the lens, any output beyond it is correct
+        is_compared = is_within_reach(torch.from_numpy(x), torch.from_numpy(y)).numpy()
     everywhere = float(np.abs(error).mean())
-    error = error[asked]
+    error = error[is_compared]
     good = np.all(np.isfinite(error), axis=1)
     found_means = summary(task.name, error)
     per_row = np.abs(error[good][:, :n_main]).mean(axis=1)
@@ -263,12 +263,12 @@ def judged(
 
 
 def to_onnx(network: Network, *, n_inputs: int, half: bool) -> bytes:
-    """Serialize a network; one input ``features``, one output ``values``."""
+    """Return a network as ONNX: one input ``features``, one output ``values``."""
     example = torch.rand(4, n_inputs)
     network = with_one_exponential(network)
     rows = torch.export.Dim("rows", min=1)
     with warnings.catch_warnings():
-        # torch's exporter warns about torch's own code
+        # The exporter of torch emits warnings about torch itself.
         warnings.simplefilter("ignore", FutureWarning)
         warnings.simplefilter("ignore", DeprecationWarning)
         program = torch.onnx.export(
@@ -281,7 +281,7 @@ def to_onnx(network: Network, *, n_inputs: int, half: bool) -> bytes:
             verbose=False,
         )
     model = program.model_proto
-    # Source locations of layers are not needed, and are half of the file's text.
+    # Source locations of layers are not needed; they are half of the text of the file.
     for node in model.graph.node:
         node.ClearField("metadata_props")
         node.ClearField("doc_string")
@@ -296,15 +296,15 @@ def to_onnx(network: Network, *, n_inputs: int, half: bool) -> bytes:
 class OneExponential(nn.Module):
     """Mish, x tanh(log(1 + e^x)), as x n / (n + 2) with n = e^x (e^x + 2).
 
-    onnxruntime evaluates its own Mish and Softplus one number at a time, which takes
-    three quarters of a network's time.
+    The Mish and Softplus of onnxruntime are not vectorized and would take three
+    quarters of the time of a network.
     """
 
     LARGEST = 20.0
-    """Beyond it, Mish is x in float32."""
+    """Value above which Mish is x in float32."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """Apply it to values of any shape."""
+        """Apply Mish to values of any shape."""
         power = torch.exp(torch.clamp(x, max=self.LARGEST))
         ratio = power * (power + 2.0)
         return x * ratio / (ratio + 2.0)
@@ -321,9 +321,10 @@ def with_one_exponential(network: Network) -> Network:
 
 
 def _halve_weights(graph: onnx.GraphProto) -> None:
-    """Store the layers' weights in 16 bits, cast back when the file is loaded.
+    """Store weights of layers in 16 bits, with a cast to 32 bits in the graph.
 
-    Optics and quadratic form keep 32 bits: no layer compensates for their loss.
+    Optics and quadratic form remain in 32 bits, because no layer compensates for their
+    rounding errors.
     """
     casts = []
     for tensor in graph.initializer:

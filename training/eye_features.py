@@ -1,6 +1,6 @@
-"""Optical features of an eye: closed forms of the 45 parameters, as a layer.
+"""Optical features of an eye: closed-form functions of the 45 parameters, as layers.
 
-Rotated and shifted offsets, curvatures, paraxial vergence. Used by `features`.
+They are rotated and shifted offset terms, curvatures and paraxial vergences.
 """
 
 import math
@@ -30,7 +30,7 @@ from estimator.optics.zernike import (
 from training.meridional import Conic, excess_vergence
 
 PUPIL_MM = 6.0
-"""Pupil to which coefficients are scaled; any constant would do."""
+"""Pupil diameter to which coefficients are scaled; any constant would do."""
 
 ENTRANCE_PUPIL_RATIO = 0.86
 """Approximate depth of the entrance pupil over that of the stop."""
@@ -45,11 +45,11 @@ def _orders(first: int = 1) -> list[tuple[int, int]]:
     return [nm_from_index(j) for j in range(first, N_TERMS)]
 
 
-class Turn(nn.Module):
+class ZernikeRotation(nn.Module):
     """Rotate Zernike coefficients j = 1 to 27 about the axis.
 
-    A term (n, m) at an angle phi mixes with (n, -m) by cos and sin of m phi; both have
-    the same norm, so the rule holds for normalized and for plain polynomials.
+    A rotation by phi mixes the terms (n, m) and (n, -m) by cos and sin of m phi. Both
+    have the same norm, so this is valid for normalized and unnormalized polynomials.
     """
 
     def __init__(self) -> None:
@@ -76,7 +76,7 @@ class Turn(nn.Module):
         return terms * c + terms[:, self.partner] * (self.sign * s)
 
 
-def turned_pair(
+def rotated_pair(
     x: Tensor, y: Tensor, cosine: Tensor, sine: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Rotate vectors (N,), (N,) by the angle whose cosine and sine are given."""
@@ -84,10 +84,10 @@ def turned_pair(
 
 
 class Shift(nn.Module):
-    """The corneal offsets at the footprint of one field's light.
+    """Corneal offset terms on the footprint of the light of a field.
 
-    On the pupil's circle, at (x + a u, b v) of the disc on which the offsets are given,
-    their sum is again a polynomial of degree 6 in (u, v): coefficients (N, 27) of it.
+    At the point (x + a u, b v) of the disc of the offset terms, their sum is again a
+    polynomial of degree 6 in (u, v) of the pupil, with coefficients (N, 27).
     """
 
     DEGREE = MAX_RADIAL_ORDER
@@ -136,16 +136,20 @@ def _powers(x: Tensor) -> Tensor:
 class EyeFeatures(nn.Module):
     """Optical features (N, 49) of eyes, in axes rotated by minus a given angle.
 
-    Curvatures, thicknesses, fourth-order terms of the conics, posterior astigmatism and
-    lens position rotated to the eye's axes, the paraxial vergence of light from the
-    retina (mean, along, across), and the offsets at the footprint of the pupil's light.
+    Features are curvatures, thicknesses, fourth-order terms of the conics, posterior
+    astigmatism, lens position, paraxial vergence of light from the retina (mean, along,
+    across), and offset terms on the footprint of the pupil.
     """
 
     N_FEATURES = 8 + 11 + 3 + 27
 
     def __init__(self) -> None:
         super().__init__()
-        self.turn, self.shift, self.scale = Turn(), Shift(), PupilPowers()
+        self.rotation, self.shift, self.scale = (
+            ZernikeRotation(),
+            Shift(),
+            PupilPowers(),
+        )
 
     def forward(
         self,
@@ -162,7 +166,9 @@ class EyeFeatures(nn.Module):
         (N,) that of the field's eccentricity, toward the new x axis.
         """
         cornea, lens = _cornea(eye, cosine, sine), _lens(eye, cosine, sine)
-        offsets = self.turn(eye[:, OFFSET_SLICE], *_turn_of_offsets(eye, cosine, sine))
+        offsets = self.rotation(
+            eye[:, OFFSET_SLICE], *_offset_rotation(eye, cosine, sine)
+        )
         vergence = _vergence(cornea, lens, _apex(offsets), _indices(wavelength_nm))
         x, a = _footprint(cornea, lens, tangent)
         half = 0.5 * pupil_mm / OFFSET_RADIUS_MM
@@ -173,16 +179,16 @@ class EyeFeatures(nn.Module):
     def vergence_of(
         self, eye: Tensor, pupil_mm: Tensor, wavelength_nm: Tensor
     ) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
-        """Return functions that give eyes with other lenses their vergence, 1/mm.
+        """Return functions for the vergence, 1/mm, of eyes with other lenses.
 
-        Both return the mean (N,) for light from the retina, outside of the eye. The
-        first is paraxial; the second is the least-squares excess over the pupil: that
-        of the offsets, to first order, and the spherical aberration of the centered
-        eye.
+        Both return the mean vergence (N,), outside the eye, of light from the retina.
+        The first is paraxial. The second is the least-squares excess over the pupil: of
+        the offset terms, to first order, and of the spherical aberration of the
+        centered eye.
         """
         one, zero = torch.ones_like(wavelength_nm), torch.zeros_like(wavelength_nm)
         cornea, indices = _cornea(eye, one, zero), _indices(wavelength_nm)
-        offsets = self.turn(eye[:, OFFSET_SLICE], *_turn_of_offsets(eye, one, zero))
+        offsets = self.rotation(eye[:, OFFSET_SLICE], *_offset_rotation(eye, one, zero))
         apex, radius_mm = _apex(offsets), 0.5 * pupil_mm
         half = radius_mm / OFFSET_RADIUS_MM
         defocus_mm = self.shift(offsets, zero, half, half)[:, DEFOCUS]
@@ -210,7 +216,7 @@ def named(eye: Tensor, name: str) -> Tensor:
     return eye[:, column(name)]
 
 
-def _turn_of_offsets(
+def _offset_rotation(
     eye: Tensor, cosine: Tensor, sine: Tensor
 ) -> tuple[Tensor, Tensor]:
     angle_rad = torch.deg2rad(named(eye, "cornea_anterior_rotation_deg"))
@@ -226,7 +232,7 @@ def _cornea(eye: Tensor, cosine: Tensor, sine: Tensor) -> dict[str, Tensor]:
     angle_rad = 2.0 * torch.deg2rad(named(eye, "cornea_posterior_rotation_deg"))
     oblique = half * torch.cos(angle_rad), half * torch.sin(angle_rad)
     twice_c, twice_s = cosine * cosine - sine * sine, 2.0 * cosine * sine
-    along, across = turned_pair(*oblique, twice_c, -twice_s)
+    along, across = rotated_pair(*oblique, twice_c, -twice_s)
     return {
         "length": named(eye, "eye_length_mm"),
         "thickness": named(eye, "cornea_thickness_mm"),
@@ -252,8 +258,8 @@ def _lens(eye: Tensor, cosine: Tensor, sine: Tensor) -> dict[str, Tensor]:
     shift = (named(eye, "lens_decentration_x_mm"), named(eye, "lens_decentration_y_mm"))
     # of the lens axis; degrees do not rotate as a vector does
     lean = (torch.sin(about_y) * torch.cos(about_x), -torch.sin(about_x))
-    x, y = turned_pair(*shift, cosine, -sine)
-    lean_x, lean_y = turned_pair(*lean, cosine, -sine)
+    x, y = rotated_pair(*shift, cosine, -sine)
+    lean_x, lean_y = rotated_pair(*lean, cosine, -sine)
     return {
         "aqueous": aqueous_mm,
         "thickness": thickness_mm,
@@ -283,8 +289,8 @@ def _transferred(vergence: Tensor3, reduced_mm: Tensor) -> Tensor3:
     mean, along, across = vergence
     square = along**2 + across**2
     scale = 1.0 / ((1.0 - reduced_mm * mean) ** 2 - reduced_mm**2 * square)
-    kept = mean - reduced_mm * (mean**2 - square)
-    return kept * scale, along * scale, across * scale
+    transferred = mean - reduced_mm * (mean**2 - square)
+    return transferred * scale, along * scale, across * scale
 
 
 def _vergence(
@@ -368,10 +374,10 @@ def _index_coefficients() -> list[list[float]]:
 def _footprint(
     cornea: dict[str, Tensor], lens: dict[str, Tensor], tangent: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return where a field's chief ray meets the cornea, mm, and the pupil's stretch.
+    """Return the chief ray's position on the cornea, mm, and the footprint's stretch.
 
-    The ray aims at the entrance pupil; where the cornea is inclined, the light of a
-    pupil covers more of it along the field.
+    The chief ray is aimed at the entrance pupil. On an inclined cornea, the footprint
+    of the pupil is longer along the field.
     """
     depth_mm = _pupil_depth_mm(cornea, lens)
     x = torch.zeros_like(tangent)

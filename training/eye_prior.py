@@ -1,7 +1,7 @@
 """Prior of the estimation in torch: distribution of eyes with a given refraction.
 
-See `estimator.estimate.prior`. 25 coefficients leave 20 of the 45 parameters open; an
-estimator trained on coefficients alone rotates corneas and tilts lenses at random.
+See `estimator.estimate.prior`. 25 coefficients do not determine 45 parameters; without
+a prior, an estimator rotates corneas and tilts lenses at random.
 """
 
 from functools import cache

@@ -1,10 +1,13 @@
 """Known optics as layers before and after a network.
 
-A plain network must learn from examples that rotating the cornea rotates its offsets,
-that diameter and volume of a lens determine its radii, that a coefficient of order n
-grows with the n-th power of the pupil, and that an eye rotated about its axis sees the
-field rotated. All four are closed forms. Layers here apply them, so that the network
-learns only the rest; they are part of the exported graph.
+These layers compute in closed form what a network would otherwise have to learn:
+
+- rotating the cornea rotates its offset terms;
+- diameter and volume of the lens determine its radii;
+- a coefficient of order n is proportional to the n-th power of the pupil;
+- rotating the eye about its axis rotates the field.
+
+They are part of the exported graph.
 """
 
 import numpy as np
@@ -16,14 +19,14 @@ from estimator.eye.parameters import allowed_ranges, mean_vector
 from training.eye_features import (
     EyeFeatures,
     PupilPowers,
-    Turn,
-    turned_pair,
+    ZernikeRotation,
+    rotated_pair,
 )
 from training.eye_prior import mean_eyes
 from training.focus_features import FocusFeatures
 
 SMALLEST_SINE = 1e-6
-"""Closer to the axis than this, the direction of the field is undefined."""
+"""Sine of the eccentricity below which the azimuth of the field is set to 0."""
 
 
 def _size_and_color(pupil_mm: Tensor, wavelength_nm: Tensor) -> list[Tensor]:
@@ -70,7 +73,11 @@ class FieldFeatures(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.eye, self.turn, self.scale = EyeFeatures(), Turn(), PupilPowers()
+        self.eye, self.rotation, self.scale = (
+            EyeFeatures(),
+            ZernikeRotation(),
+            PupilPowers(),
+        )
 
     @staticmethod
     def _field(x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -103,23 +110,23 @@ class FieldFeatures(nn.Module):
         """Convert scaled values in rotated axes (N, 33) to the requested axes."""
         _, cosine, cos_alpha, sin_alpha = self._field(x)
         c, s = self._beta(cosine, cos_alpha, sin_alpha)
-        zernike = self.turn(y[:, :27] * self.scale(x[:, 45]), c, s)
+        zernike = self.rotation(y[:, :27] * self.scale(x[:, 45]), c, s)
         return torch.cat([zernike, self._rim(y[:, 27:] * x[:, 45:46], c, s)], dim=1)
 
     def encode(self, x: Tensor, y: Tensor, features: Tensor | None = None) -> Tensor:
         """Invert `decode`."""
         _, cosine, cos_alpha, sin_alpha = self._field(x)
         c, s = self._beta(cosine, cos_alpha, sin_alpha)
-        zernike = self.turn(y[:, :27], c, -s) / self.scale(x[:, 45])
+        zernike = self.rotation(y[:, :27], c, -s) / self.scale(x[:, 45])
         return torch.cat([zernike, self._rim(y[:, 27:], c, -s) / x[:, 45:46]], dim=1)
 
     @staticmethod
     def _rim(rim: Tensor, c: Tensor, s: Tensor) -> Tensor:
         """Rotate radius, center and symmetric matrix (N, 6)."""
         radius, x, y, xx, xy, yy = rim.unbind(dim=1)
-        x, y = turned_pair(x, y, c, s)
+        x, y = rotated_pair(x, y, c, s)
         mean, along, across = 0.5 * (xx + yy), 0.5 * (xx - yy), xy
-        along, across = turned_pair(along, across, c * c - s * s, 2.0 * c * s)
+        along, across = rotated_pair(along, across, c * c - s * s, 2.0 * c * s)
         return torch.stack([radius, x, y, mean + along, across, mean - along], dim=1)
 
 

@@ -1,9 +1,9 @@
-"""Program that computes the table of start eyes.
+"""Compute the table of initial eyes of the estimation.
 
     python -m training.first_guess_table
 
-writes ``eye_table.json``: the eyes that the estimator itself finds, from the mean eye,
-for a range of refractions and aberrations.
+Writes ``eye_table.json``: eyes that are estimated from the mean eye, for a range of
+refractions and aberrations.
 """
 
 import json

@@ -1,9 +1,8 @@
-"""Focusing in closed form, before and after the focused-eye estimator.
+"""Approximate focusing, as layers before and after the focused-eye estimator.
 
-The lens that focuses an eye's light is found by Newton steps, as a layer: paraxially,
-with the spherical aberration of the centered eye. The network learns the remainder, the
-effect of tilts, decentration and offsets: some hundredths of a diopter, and smooth in
-all inputs.
+Newton steps find the lens that focuses the eye, from paraxial optics and the spherical
+aberration of the centered eye. The network learns the residual, the effect of tilts,
+decentrations and offset terms: a few hundredths of a diopter, smooth in all inputs.
 """
 
 import torch
@@ -16,25 +15,24 @@ from training.eye_features import EyeFeatures, lens_thickness_mm, named
 from training.tracer.accommodation import smallest_diameters_mm
 
 BOUND_MARGIN_MM = 1e-4
-"""Changes of the lens closer to a bound than this count as bounded."""
+"""Distance from a bound within which a change of the lens counts as bounded."""
 
 N_STEPS = 2
 STEP_MM = -0.2
-"""Step for the slope of the vergence; shorter steps lose it in the rounding of 32
-bits."""
+"""Step of the difference quotient; shorter ones are inaccurate in float32."""
 
 SLOPE_SHARES = (0.5, 2.0)
-"""Least and greatest slope of the vergence over the paraxial one."""
+"""Range of the slope of the vergence over the paraxial one."""
 
 WIDEST_RATIO = 1.03
 """Limit on the lens diameter during the search, over the relaxed one."""
 
 
 class FocusFeatures(nn.Module):
-    """Inputs (N, 47) of the focused-eye estimator.
+    """Features of the inputs (N, 47) of the focused-eye estimator.
 
-    The network predicts the error of the lens found here and may leave the range of the
-    lens: it is bounded here, and the aqueous follows from the lens.
+    The network predicts the error of the lens that these layers find. `decode` clamps
+    the lens to its range and computes the aqueous thickness.
     """
 
     n_features = EyeFeatures.N_FEATURES + 5
@@ -60,7 +58,7 @@ class FocusFeatures(nn.Module):
     def _centered(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return lens change, mm, its slope, mm/dpt, and the focus error, dpt (N,)."""
         eye, focus_dpt = x[:, :45], x[:, 46]
-        lowest_mm, highest_mm = _room_mm(eye)
+        lowest_mm, highest_mm = _change_range_mm(eye)
         highest_mm = highest_mm + (WIDEST_RATIO - 1.0) * named(eye, "lens_diameter_mm")
         color_nm = torch.full_like(focus_dpt, REFERENCE_WAVELENGTH_NM)
         paraxial, excess = self.eye.vergence_of(eye, x[:, 45], color_nm)
@@ -94,7 +92,7 @@ class FocusFeatures(nn.Module):
         features = self(x) if features is None else features
         found_mm, slope, missed_dpt = features[:, -3:].unbind(dim=1)
         change_mm = found_mm + slope * missed_dpt + y[:, 0]
-        lowest_mm, highest_mm = _room_mm(x)
+        lowest_mm, highest_mm = _change_range_mm(x)
         change_mm = torch.minimum(torch.maximum(change_mm, lowest_mm), highest_mm)
         return torch.stack([change_mm, _aqueous_change_mm(x, change_mm)], dim=1)
 
@@ -107,13 +105,13 @@ class FocusFeatures(nn.Module):
 
 def is_within_reach(x: Tensor, y: Tensor) -> Tensor:
     """Return the rows (N,) whose change of the lens (N, 2) is not at a bound."""
-    lowest_mm, highest_mm = _room_mm(x)
+    lowest_mm, highest_mm = _change_range_mm(x)
     above = y[:, 0] > lowest_mm + BOUND_MARGIN_MM
     return above & (y[:, 0] < highest_mm - BOUND_MARGIN_MM)
 
 
-def _room_mm(eye: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the least and greatest change (N,) of the lens diameter."""
+def _change_range_mm(eye: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the smallest and largest change (N,) of the lens diameter, mm."""
     lowest_mm = smallest_diameters_mm(eye[:, :45]) - named(eye, "lens_diameter_mm")
     return lowest_mm, torch.zeros_like(lowest_mm)
 

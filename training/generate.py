@@ -3,9 +3,9 @@
     python -m training.generate RUN.toml [--folder DIR]
     torchrun --nproc-per-node 2 -m training.generate RUN.toml
 
-Reads the table ``[data]`` of the run file. Existing shards are kept, so that an
-interrupted run can be resumed; under `torchrun` each process makes its share of the
-shards. Prints the statistics of the paper's Table 11 at the end.
+Reads the table ``[data]`` of the run file. Existing shards are not regenerated, so an
+interrupted run can be resumed. With `torchrun`, each process generates a part of the
+shards. Finally prints the statistics of the paper's Table 11.
 """
 
 import argparse
@@ -67,7 +67,7 @@ def _n_ranks() -> int:
 
 
 def generate(recipe: Recipe, folder: Path, *, rank: int = 0, n_ranks: int = 1) -> None:
-    """Make the missing ones of the shards ``rank``, ``rank + n_ranks``, ...
+    """Generate the missing shards out of ``rank``, ``rank + n_ranks``, ...
 
     Raises
     ------
@@ -77,8 +77,8 @@ def generate(recipe: Recipe, folder: Path, *, rank: int = 0, n_ranks: int = 1) -
     folder.mkdir(parents=True, exist_ok=True)
     if (folder / MANIFEST).exists() and recipe_of(read_manifest(folder)) != recipe:
         raise DataError(
-            f"{folder} holds another data set ({recipe_of(read_manifest(folder))}); "
-            "choose another folder or remove it"
+            f"{folder} contains another data set ({recipe_of(read_manifest(folder))}); "
+            "choose another folder or remove this one"
         )
     if rank == 0:
         commit = _commits(recipe, folder)
@@ -105,7 +105,7 @@ def generate(recipe: Recipe, folder: Path, *, rank: int = 0, n_ranks: int = 1) -
 
 
 def _commits(recipe: Recipe, folder: Path) -> str:
-    """Return the commits of all shards, including those still to be made."""
+    """Return the commits of all shards, including those to be generated."""
     is_made = [shard_file(folder, k).exists() for k in range(recipe.n_shards)]
     is_begun = any(is_made) and (folder / MANIFEST).exists()
     before = read_manifest(folder)["commit"].split(", ") if is_begun else []

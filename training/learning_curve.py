@@ -1,12 +1,11 @@
-"""Learning curves: error against rows seen and against weights.
+"""Learning curves: error by number of training rows and by number of weights.
 
     python -m training.learning_curve [--tasks NAME ...] [--json FILE] [--plot FILE]
 
-Trains the modified ResNet on physical features with a quadratic form, on the data of
-`table3`, for several numbers of rows at one width and for several widths at one number
-of rows, and evaluates by ray tracing on fresh rows of the paper's Table 2. The curves
-show the effect of more data and of more weights. Networks that are already trained are
-kept.
+Trains the modified ResNet on physical features with a quadratic form, with the data of
+`table3`: for several numbers of rows at one width, and for several widths at one number
+of rows. All are evaluated by ray tracing on fresh rows of the paper's Table 2. Finished
+networks are not trained again.
 """
 
 import argparse
@@ -14,8 +13,8 @@ import sys
 from pathlib import Path
 
 from training.command import make_parser, run_command
-from training.evaluate import PUBLISHED, Judged, make_table
-from training.export import JUDGED_ROWS
+from training.evaluate import PUBLISHED, Evaluation, make_table
+from training.export import EVALUATION_ROWS
 from training.table3 import ROWS_SEEN, VARIANTS, WIDTH, make_run, trained
 from training.tasks import TASKS
 
@@ -23,8 +22,8 @@ ROWS = (125_000, 250_000, 500_000, 1_000_000, 2_000_000, 4_000_000)
 WIDTHS = (32, 64, 128, 256)
 VARIANT = "ours, quadratic"
 LOSSES = {"discriminator": "physical", "aberration": "physical", "focus": "standard"}
-"""As in the run files: in standard units the smallest terms weigh as much as the
-largest."""
+"""As in the run files. In standard units, the smallest terms have the same weight as
+the largest."""
 
 
 def sizes(
@@ -35,7 +34,7 @@ def sizes(
     return list(dict.fromkeys(points))
 
 
-def plot(rows: list[Judged], file: Path) -> None:
+def plot(rows: list[Evaluation], file: Path) -> None:
     """Plot both curves of every task; dashed lines: the paper's networks."""
     from matplotlib import pyplot as plt
     from matplotlib.ticker import LogLocator
@@ -45,13 +44,13 @@ def plot(rows: list[Judged], file: Path) -> None:
     )
     for number, task in enumerate(dict.fromkeys(row.task for row in rows)):
         mine, color = [row for row in rows if row.task == task], f"C{number}"
-        for axes, name, kept in (
+        for axes, name, shown in (
             (by_rows, "rows_seen", [r for r in mine if r.width == WIDTH]),
             (by_weights, "n_parameters", _of_one_budget(mine)),
         ):
-            kept.sort(key=lambda row: getattr(row, name))
-            x = [getattr(row, name) / 1e6 for row in kept]
-            y = [row.error["mean_abs"] for row in kept]
+            shown.sort(key=lambda row: getattr(row, name))
+            x = [getattr(row, name) / 1e6 for row in shown]
+            y = [row.error["mean_abs"] for row in shown]
             axes.loglog(x, y, "o-", color=color, label=f"{task}, {TASKS[task].unit}")
             axes.axhline(PUBLISHED[task, "ours", ""], color=color, linestyle="--")
     by_rows.plot([], [], "k--", label="the paper's, 72 million weights")
@@ -69,7 +68,7 @@ def plot(rows: list[Judged], file: Path) -> None:
     plt.close(figure)
 
 
-def _of_one_budget(rows: list[Judged]) -> list[Judged]:
+def _of_one_budget(rows: list[Evaluation]) -> list[Evaluation]:
     return [row for row in rows if abs(row.rows_seen / ROWS_SEEN - 1.0) < 0.05]
 
 
@@ -79,7 +78,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tasks", nargs="+", choices=LOSSES, default=list(LOSSES))
     parser.add_argument("--rows", type=int, nargs="+", default=ROWS)
     parser.add_argument("--widths", type=int, nargs="+", default=WIDTHS)
-    parser.add_argument("--judged-rows", type=int, default=JUDGED_ROWS)
+    parser.add_argument("--judged-rows", type=int, default=EVALUATION_ROWS)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--plot", type=Path)
     return run_command(parser, _work, arguments)
@@ -92,9 +91,9 @@ def _work(options: argparse.Namespace) -> None:
         for task in options.tasks
         for width, rows in sizes(tuple(options.rows), tuple(options.widths))
     )
-    judged = make_table(map(trained, runs), options.judged_rows, options.json)
+    evaluations = make_table(map(trained, runs), options.judged_rows, options.json)
     if options.plot:
-        plot(judged, options.plot)
+        plot(evaluations, options.plot)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Losses: direct, and of an estimated eye by its effect on light."""
+"""Losses: of outputs, and of estimated eyes by their wavefronts."""
 
 import torch
 from torch import Tensor, nn
@@ -10,10 +10,10 @@ from training.tracer.circle import zernike_of_eyes
 
 N_ZERNIKE = len(ZERNIKE_NAMES)
 RIM_WEIGHT = 0.1
-"""Weight of an error of a pupil's rim in mm against one of the wavefront in um."""
+"""Weight of errors of the rim in mm relative to errors of the wavefront in um."""
 
 LARGEST_MISFIT_UM = 20.0
-"""Errors of traced coefficients are clipped here: rays of a hopeless eye scatter."""
+"""Limit to which errors of traced coefficients are clipped: some eyes form no image."""
 
 
 def standard_loss(model: Network, x: Tensor, y: Tensor) -> Tensor:
@@ -32,7 +32,7 @@ def physical_loss(model: Network, x: Tensor, y: Tensor) -> Tensor:
 def parameter_loss(model: Network, x: Tensor, y: Tensor) -> Tensor:
     """Return the mean absolute error of the 45 parameters: naive loss (paper, 7.1.3).
 
-    ``y`` (N, 45 + 27): the eye, and its coefficients, which this loss does not read.
+    ``y`` (N, 45 + 27) are the eye and its coefficients, which are ignored.
     """
     return standard_loss(model, x, y[:, :N_EYE])
 
@@ -46,7 +46,7 @@ class DiscriminatorLoss(nn.Module):
         self.discriminator = discriminator.eval().requires_grad_(False)
 
     def forward(self, model: Network, x: Tensor, y: Tensor) -> Tensor:
-        """Return mean absolute error (um) of the 25 terms without tilt, plus prior."""
+        """Return the mean absolute error (um) of 25 terms without tilt, plus prior."""
         eyes = model(x)
         found_um = self.discriminator(torch.cat([eyes, x[:, -2:]], dim=1))[:, 2:]
         misfit_um = torch.mean(torch.abs(found_um - x[:, :-2]))
@@ -61,7 +61,7 @@ class TracerLoss(nn.Module):
         self.prior_weight = prior_weight
 
     def forward(self, model: Network, x: Tensor, y: Tensor) -> Tensor:
-        """Return the loss as `DiscriminatorLoss`, without eyes that block light."""
+        """Return the loss as in `DiscriminatorLoss`, without vignetted eyes."""
         eyes = model(x)
         found_um, is_traced = zernike_of_eyes(
             eyes.double(), x[:, -2].double(), x[:, -1].double(), ray_dtype=torch.float32
@@ -72,5 +72,5 @@ class TracerLoss(nn.Module):
 
 
 def _prior(eyes: Tensor, x: Tensor, weight: float) -> Tensor | float:
-    """Return the loss of eyes (N, 45) that differ from their refraction's mean eye."""
+    """Return the loss of eyes (N, 45) by their deviation from the mean eye."""
     return weight * squared_deviation(eyes, x).mean() if weight else 0.0

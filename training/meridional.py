@@ -1,8 +1,8 @@
 """Spherical aberration of a centered eye, by a few rays in closed form, as a layer.
 
-Rays leave the axial point of the retina in one meridian, are refracted exactly at four
-conics, and their slopes outside are integrated to the least-squares vergence over the
-pupil. Offsets and tilts are ignored: their effect is left to a network.
+Rays from the axial point of the retina are refracted exactly at four conics, in one
+meridian. The least-squares vergence over the pupil is an integral of their slopes
+outside. Offset terms and tilts are ignored; a network learns their effect.
 """
 
 import math
@@ -20,14 +20,13 @@ MOMENTS = (1.0, 0.5, 0.3)
 """Integrals of 6 q (1 - q) q^k over 0..1."""
 
 NODAL_DISTANCE_MM = 22.3
-"""Approximate height in the pupil over the slope at the retina."""
+"""Approximate height in the pupil over slope at the retina."""
 
 LARGEST_EXCESS = 0.015
-"""Beyond it, 15 dpt, rays of an eye have crossed or missed a surface."""
+"""Limit of the excess, 1/mm: above 15 dpt, rays have crossed or missed a surface."""
 
 LEAST_ROOT = 1e-4
-"""Lower bound of squares under a root: a ray that misses a surface grazes it
-instead."""
+"""Lower bound of radicands: a ray that misses a surface becomes tangential to it."""
 
 
 class Conic(NamedTuple):
@@ -81,11 +80,11 @@ def excess_vergence(
     radius_mm: Tensor,
     pupil_z_mm: Tensor,
 ) -> Tensor:
-    """Return least-squares vergence over the pupil minus the paraxial (N,), 1/mm.
+    """Return the least-squares minus the paraxial vergence over the pupil (N,), 1/mm.
 
-    With the direction s(r) toward the axis, s = r g(q), q = r²/R²: the coefficient of
-    Z(2,0) is sqrt(3) R times the integral of s (ρ² - ρ⁴) over ρ, and so the vergence is
-    that of 6 q (1 - q) g(q) over q. g is the parabola through three rays.
+    For slopes s(r) = r g(q) toward the axis, with q = r²/R², the coefficient of Z(2,0)
+    is sqrt(3) R times the integral of s (ρ² - ρ⁴) over ρ. The vergence is therefore the
+    integral of 6 q (1 - q) g(q) over q. g is the parabola through three rays.
 
     Parameters
     ----------

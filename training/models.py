@@ -1,7 +1,7 @@
 """Networks: the paper's modified ResNet, the original one, and a plain network.
 
-Csoba & Kunkli 2023, section 5.3 and Table 3. A network is enclosed by two scalings, so
-that inputs and outputs are in physical units.
+Csoba & Kunkli 2023, section 5.3 and Table 3. Inputs and outputs are in physical units:
+networks include their scaling.
 """
 
 from dataclasses import dataclass
@@ -145,8 +145,8 @@ def _plain(n_in: int, width: int, n_stacks: int) -> list[nn.Module]:
 class Quadratic(nn.Module):
     """A quadratic form of standardized features, fitted by least squares.
 
-    It is not trained further: 27 outputs of 53 features take 40,000 weights, which
-    training would move slowly and least squares find at once.
+    It is not trained further: for 27 outputs and 53 features it has 40,000 weights, for
+    which least squares are much faster than training.
     """
 
     def __init__(self, n_features: int, n_outputs: int):
@@ -236,12 +236,12 @@ class Network(nn.Module):
         self.input_scale.copy_(torch.ones(()))
         features = self.features(x)
         encoded = self.features.encode(x, y, features)
-        _take(self.input_mean, self.input_scale, features)
+        _set_scaling(self.input_mean, self.input_scale, features)
         if self.baseline is not None:
             standard = self._standard(features)
             self.baseline.fit(standard, encoded)
             encoded = encoded - self.baseline(standard)
-        _take(self.output_mean, self.output_scale, encoded)
+        _set_scaling(self.output_mean, self.output_scale, encoded)
 
     @torch.no_grad()
     def set_output_range(self, low: Tensor, high: Tensor) -> None:
@@ -274,10 +274,10 @@ class Network(nn.Module):
         return found - self._wanted(x, y, features)
 
     def _through_layers(self, standard: Tensor) -> Tensor:
-        """Return the layers' outputs (N, n_encoded); in training optionally in 16 bits.
+        """Return the outputs (N, n_encoded) of the layers.
 
-        Only the layers: 8 bits of mantissa in the optics before them or in the
-        quadratic form would leave an error that the layers cannot learn.
+        If ``is_mixed``, the layers are in bfloat16 during training. The optics and the
+        quadratic form are not: layers could not learn the error of an 8-bit mantissa.
         """
         if not (self.is_mixed and self.training):
             return self.bound(self.layers(standard))
@@ -299,7 +299,7 @@ class Network(nn.Module):
         return fitted + sum(p.numel() for p in self.parameters())
 
 
-def _take(mean: Tensor, scale: Tensor, rows: Tensor) -> None:
+def _set_scaling(mean: Tensor, scale: Tensor, rows: Tensor) -> None:
     """Set mean and deviation of columns; 1 for a constant column."""
     rows = rows.double()
     deviation = rows.std(dim=0, correction=0)

@@ -49,8 +49,8 @@ class Lookahead:
             torch._foreach_lerp_(self._slow, self._parameters, self.share)
             torch._foreach_copy_(self._parameters, self._slow)
 
-    def set_pace(self, *, learning_rate: float, weight_decay: float) -> None:
-        """Set learning rate and weight decay for the next steps."""
+    def set_rates(self, *, learning_rate: float, weight_decay: float) -> None:
+        """Set learning rate and weight decay of the next steps."""
         for group in self.fast.param_groups:
             group["lr"], group["weight_decay"] = learning_rate, weight_decay
 
@@ -88,13 +88,13 @@ def make_optimizer(
     return Lookahead(fast)
 
 
-def pace(
+def rate_factor(
     progress: float, *, n_epochs: float, decay_per_epoch: float, final_ratio: float
 ) -> float:
-    """Return the factor of the learning rate at ``progress`` (0 to 1) of the training.
+    """Return the factor of the learning rate at a progress of 0 to 1.
 
-    It falls by a factor per epoch, smoothly, and over the last ``final_ratio`` of the
-    training also linearly to zero.
+    It decays exponentially by ``decay_per_epoch`` and, over the last ``final_ratio`` of
+    the training, also linearly to zero.
     """
     value = decay_per_epoch ** (progress * n_epochs)
     if progress > 1.0 - final_ratio:

@@ -1,8 +1,7 @@
-"""Population eyes: rows drawn from the prior of the estimation.
+"""Eyes drawn from the prior of the estimation (`estimator.estimate.prior`).
 
-Table 2 is a box: its corners contain eyes that nobody has, and a myope's long eye is
-outside of it. The service estimates with a prior (`estimator.estimate.prior`), so
-these are the eyes for which its networks are used.
+The ranges of Table 2 contain improbable eyes and exclude long, myopic ones. The service
+estimates eyes with this prior, so these are the eyes for which it uses the networks.
 """
 
 import numpy as np
@@ -21,10 +20,10 @@ from estimator.eye.lens_change import (
 from estimator.eye.parameters import allowed_ranges
 
 LEAST_PROBABILITY = 1e-4
-"""Normal deviates are truncated here, at 3.7 deviations."""
+"""Normal deviates are truncated at this probability, 3.7 standard deviations."""
 
 RELAXED_RATIO = 0.5
-"""Share of eyes that look at their far point, where some accommodate."""
+"""Fraction of relaxed eyes, if eyes may be accommodated."""
 
 
 def population_eyes(
@@ -45,13 +44,13 @@ def population_eyes(
     return np.clip(means + deviations() * normal, *allowed_ranges().T)
 
 
-def at_some_focus(
+def partly_accommodated_eyes(
     eyes: NDArray[np.float64], used_unit: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return eyes (n, 45), half of them accommodated to some degree.
+    """Return eyes (n, 45), half of them accommodated.
 
-    ``used_unit`` (n,) in 0..1: relaxed up to `RELAXED_RATIO`, then evenly distributed
-    over the lens diameters.
+    ``used_unit`` (n,) is in 0..1: up to `RELAXED_RATIO`, eyes are relaxed; above, the
+    lens diameter is uniform over its range.
     """
     used = np.maximum(used_unit - RELAXED_RATIO, 0.0) / (1.0 - RELAXED_RATIO)
     relaxed_mm = eyes[:, DIAMETER]
@@ -60,7 +59,7 @@ def at_some_focus(
 
 
 def population_ranges(*, is_focused: bool) -> NDArray[np.float64]:
-    """Return the ranges (45, 2) of such eyes, accommodated ones if requested."""
+    """Return the ranges (45, 2) of population eyes, with or without accommodation."""
     ranges = allowed_ranges()
     if is_focused:
         ranges[DIAMETER, 0] *= SMALLEST_DIAMETER_RATIO

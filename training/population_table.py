@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from estimator.periphery.people import load_people
+from estimator.periphery.measured_eyes import load_measured_eyes
 from estimator.periphery.population import POPULATION_FILE, Population
 
 SOURCE = (
@@ -22,9 +22,9 @@ def main() -> None:
     """Fit the population and write the file."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("people", type=Path, help="peripheral_wavefronts.npz")
-    people = load_people(parser.parse_args().people)
+    people = load_measured_eyes(parser.parse_args().people)
     count = int(np.isfinite(people.axis_um).all(axis=-1).sum())
-    data = {"source": SOURCE, "eyes": count, **Population.of(people).to_json()}
+    data = {"source": SOURCE, "eyes": count, **Population.fit(people).to_json()}
     POPULATION_FILE.write_text(json.dumps(data) + "\n", encoding="utf-8")
     print(f"{POPULATION_FILE.name}: {count} eyes")
 

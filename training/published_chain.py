@@ -1,9 +1,10 @@
-"""Known properties of the published data sets, only for comparing their statistics.
+"""Known properties of the published data sets, for a comparison of statistics.
 
-Differences of the authors' framework (`lens_shape.compat_lens_shape` and the facts in
-its published sources): circles of the stop's size, another lens rule, two offset slots
-that receive other terms, a narrower range of one conic, and off the axis a stretch that
-multiplies slopes where it should divide them. Nothing here is used for training.
+The authors' framework (see its published sources and `lens_shape.compat_lens_shape`)
+differs from this one: circles have the size of the stop, the lens has another shape
+rule, two offset terms receive the values of others, one conic constant has a narrower
+range, and off axis, a stretch multiplies slopes that it should divide. Training does
+not use this module.
 """
 
 from collections.abc import Sequence
@@ -76,14 +77,14 @@ def _traced(inputs: NDArray[np.float64], steps: Sequence[str]) -> FieldResults:
 def label_on_axis_as_published(
     inputs: NDArray[np.float64], steps: Sequence[str]
 ) -> NDArray[np.float64]:
-    """Return coefficients (n, 27), um, with the published chain's ``steps``."""
+    """Return coefficients (n, 27), um, with the properties ``steps``."""
     return _traced(inputs, steps).zernike_um[:, 1:]
 
 
 def label_field_as_published(
     inputs: NDArray[np.float64], steps: Sequence[str]
 ) -> NDArray[np.float64]:
-    """Return coefficients and zero rims (n, 33), with `STRETCH` where requested."""
+    """Return coefficients and zero rims (n, 33), with the properties ``steps``."""
     found = _traced(inputs, steps)
     zernike_um = found.zernike_um
     if STRETCH in steps:
@@ -105,9 +106,9 @@ def stretched(
 ) -> NDArray[np.float64]:
     """Return coefficients (28,) after the published stretch to the major circle.
 
-    Both the points and the rays' transverse errors are stretched along the minor axis,
-    so that slopes there are multiplied by the ratio of the axes; a wavefront in
-    stretched coordinates has them divided by it.
+    It stretches points and transverse ray errors along the minor axis, which multiplies
+    slopes by the ratio of the axes; in stretched coordinates they should be divided by
+    it.
     """
     if not np.all(np.isfinite(zernike_um)):
         return zernike_um

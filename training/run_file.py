@@ -17,7 +17,7 @@ _FROM_FILE: Any = None
 
 
 class RunFileError(ValueError):
-    """An invalid run file; names the key and what is allowed."""
+    """A run file is invalid; the message has the key and the allowed values."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def read_run(file: Path) -> Run:
     Raises
     ------
     RunFileError
-        Names the table, the key and what is allowed.
+        The file is invalid; the message has the table, the key and the allowed values.
     """
     try:
         text = file.read_text(encoding="utf-8")
@@ -114,7 +114,7 @@ def read_run(file: Path) -> Run:
         )
     model = _table(ModelSettings, body.get("model", {}), "model")
     if "n_rows" not in data:
-        raise RunFileError("data.n_rows: missing; say how many rows are to be drawn")
+        raise RunFileError("data.n_rows: missing; expected the number of rows to draw")
     recipe = _table(Recipe, data, "data")
     return Run(
         name=file.stem,

@@ -1,11 +1,10 @@
-"""The paper's Table 11: our data, the published figures, and the causes of differences.
+"""The paper's Table 11: statistics of our data and the published ones, and differences.
 
     python -m training.table11 [--rows N] [--json OUT.json]
 
 Draws N eyes of Table 2 and labels them several times: as in our data sets, and with the
-known properties of the published chain restored one after the other
-(`published_chain`). Where the last row of a group agrees with the paper's, those
-properties explain the difference.
+known properties of the published data sets added one by one (`published_chain`). These
+properties explain a difference if the last row of a group agrees with the paper.
 """
 
 import argparse
@@ -35,7 +34,7 @@ from training.versions import commit_id
 ROWS_DRAWN = 6_000
 SEED = 132
 PUBLISHED_FOCUS_DPT = (0.125, 8.125)
-"""The published distances; ours extend behind infinity and nearer."""
+"""Published range of focus distances; ours is larger on both sides."""
 
 
 @dataclass(frozen=True)

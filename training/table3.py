@@ -1,14 +1,14 @@
-"""The paper's Table 3 at one size: architectures and losses, equal weights and rows.
+"""The paper's Table 3 at one size: architectures and losses compared.
 
     python -m training.table3 [--width N] [--rows N] [--tasks NAME ...] [--json FILE]
 
 Trains three architectures on raw inputs (the paper's ablation) and the modified ResNet
 on physical features, with and without a quadratic form, for each of the four networks;
 and the eye estimator with each of its losses. Every network has about the same number
-of weights and sees the same number of rows, from the box of the paper's Table 2; all
-are evaluated by ray tracing on the same fresh rows of it. Missing data sets are made;
-networks that are already trained are kept. The eye's loss requires the trained
-discriminator of ``training/runs``.
+of weights and is trained on the same number of rows, from the ranges of the paper's
+Table 2. All are evaluated by ray tracing on the same fresh rows. Missing data sets are
+generated; finished networks are not trained again. The loss of the eye estimator
+requires the trained discriminator of ``training/runs``.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from pathlib import Path
 from training.command import make_parser, run_command
 from training.datasets import MANIFEST, Recipe
 from training.evaluate import make_table
-from training.export import JUDGED_ROWS
+from training.export import EVALUATION_ROWS
 from training.generate import generate
 from training.models import ModelSettings
 from training.run_file import (
@@ -79,7 +79,9 @@ def make_run(
     """Return the run of one table row, on data of the paper's Table 2."""
     domain = TASKS[task].domain.name
     recipe = Recipe(domain, DATA_ROWS[domain])
-    judge_file = read_run(RUNS / "discriminator.toml").output_folder / CHECKPOINT
+    discriminator_file = (
+        read_run(RUNS / "discriminator.toml").output_folder / CHECKPOINT
+    )
     settings = TrainingSettings(
         loss=loss,
         batch_size=EYE_BATCH_SIZE if task == "eye" else BATCH_SIZE,
@@ -89,7 +91,7 @@ def make_run(
         decay_per_epoch=1.0,
         final_ratio=0.5,
         validation_ratio=VALIDATION_RATIO,
-        discriminator=str(judge_file) if loss == "discriminator" else "",
+        discriminator=str(discriminator_file) if loss == "discriminator" else "",
         prior_weight=prior_weight,
     )
     label = name.replace(", ", "-").replace(" ", "-")
@@ -106,7 +108,7 @@ def make_run(
 
 
 def trained(run: Run) -> Run:
-    """Return the run, trained if necessary, on data made if missing.
+    """Train a run unless it is finished, and return it; generate missing data.
 
     Raises
     ------
@@ -127,7 +129,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--width", type=int, default=WIDTH)
     parser.add_argument("--rows", type=int, default=ROWS_SEEN, help="seen in training")
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
-    parser.add_argument("--judged-rows", type=int, default=JUDGED_ROWS)
+    parser.add_argument("--judged-rows", type=int, default=EVALUATION_ROWS)
     parser.add_argument("--json", type=Path)
     return run_command(parser, _work, arguments)
 

@@ -1,8 +1,8 @@
 """Domains and tasks: the columns, ranges and labels of each network.
 
-A *domain* is a box of inputs and the ray tracing that labels them; a *task* is a
-network, which takes its columns from one domain. Ranges are those of the paper's
-Table 2. Labels come from the service's own tracer, on the CPU, in float64.
+A *domain* is a set of input columns with ranges, and the ray tracing that labels them.
+A *task* is a network, whose columns are those of a domain. Ranges are those of the
+paper's Table 2. Labels are traced on the CPU in float64, by the tracer of the service.
 """
 
 import os
@@ -33,19 +33,20 @@ from estimator.wavefront.kernels import magnifications
 
 N_EYE = len(PARAMETER_NAMES)
 COMPARED_NAMES = ZERNIKE_NAMES[2:]
-"""Without tilt: the chief ray's zero slope ties it to coma."""
+"""Compared coefficients, without tilt, which the zero slope of the chief ray determines
+from coma."""
 
 FOCUS_RANGE_DPT = (-6.0, 16.0)
-"""The paper's range is 0.125 to 8.125. A hyperope that accommodates by less than the
-refraction is focused behind infinity; a myope of -10 dpt begins at 10."""
+"""The paper's range is 0.125 to 8.125. A hyperopic eye that accommodates less than its
+refraction has a negative focus; the far point of a -10 dpt myope is at 10 dpt."""
 
-LENS_ROOM = np.array([[1.02], [0.99]])
-"""Training lenses extend a little beyond the widest and the smallest one, where a
-network's output is clipped."""
+LENS_DIAMETER_MARGINS = np.array([[1.02], [0.99]])
+"""Factors of the largest and smallest lens diameter in the training data, which extends
+beyond the range to which outputs are clamped."""
 
 MAX_COEFFICIENT_UM = 200.0
-"""Larger coefficients belong to eyes that form no image; the published data, too, end
-at 115 um."""
+"""Larger coefficients are those of eyes that form no image; the published data end at
+115 um."""
 
 N_CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 2
 
@@ -54,7 +55,7 @@ Labels = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class Domain:
-    """A box of inputs and its labels.
+    """Input columns with ranges, and their labels.
 
     Attributes
     ----------
@@ -62,8 +63,7 @@ class Domain:
         Column names; the first 45 inputs are the eye.
     ranges : (n_inputs, 2)
     label : callable
-        Maps inputs (n, n_inputs) to targets (n, n_targets); a row is nan where light
-        does not pass.
+        Maps inputs (n, n_inputs) to targets (n, n_targets); vignetted rows are nan.
     n_repeats : int
         Number of values of the last input per eye: 1, or the length of a Cartesian
         product.
@@ -129,7 +129,7 @@ def label_field(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
         ],
         axis=1,
     )
-    # A vignetted pupil has a kinked rim, which no smooth function can fit.
+    # The rim of a vignetted pupil has kinks, which a smooth function cannot fit.
     targets[~usable | (found.open_ratio < 1.0 - 1e-9)] = np.nan
     return targets
 
@@ -184,12 +184,14 @@ def _focus_of_one(
 def label_lens(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return focus (dpt) and changes (mm) of eyes with a shrunken lens: targets (n, 3).
 
-    The inverse of `label_focus`: it takes one trace per row instead of a search, so
-    that every row can be another eye.
+    This is the inverse of `label_focus`. It takes one trace per row instead of a
+    search, so every row can have a different eye.
     """
     eyes, pupil_mm, share = inputs[:, :N_EYE], inputs[:, N_EYE], inputs[:, -1]
     relaxed_mm = eyes[:, DIAMETER]
-    widest_mm, least_mm = LENS_ROOM * np.stack([relaxed_mm, smallest_diameter_mm(eyes)])
+    widest_mm, least_mm = LENS_DIAMETER_MARGINS * np.stack(
+        [relaxed_mm, smallest_diameter_mm(eyes)]
+    )
     focused = accommodated_eyes(eyes, widest_mm + share * (least_mm - widest_mm))
     color_nm = np.full(len(eyes), REFERENCE_WAVELENGTH_NM)
     zernike_um = _whole_circles(focused, pupil_mm, color_nm)
@@ -258,15 +260,15 @@ class Task:
     ----------
     domain : Domain
         Domain of its training data.
-    judged_domain : Domain
-        Domain for which its error is stated.
+    evaluation_domain : Domain
+        Domain of its evaluation.
     unit : str
         Unit of that error.
     """
 
     name: str
     domain: Domain
-    judged_domain: Domain
+    evaluation_domain: Domain
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     unit: str
@@ -274,15 +276,15 @@ class Task:
 
 TASKS = {
     name: Task(
-        name, DOMAINS[trained], DOMAINS[judged], INPUTS[name], OUTPUTS[name], unit
+        name, DOMAINS[trained], DOMAINS[evaluated], INPUTS[name], OUTPUTS[name], unit
     )
-    for name, trained, judged, unit in (
+    for name, trained, evaluated, unit in (
         ("discriminator", "on_axis", "on_axis", "um"),
         ("eye", "on_axis", "on_axis", "um"),
         ("focus", "lens", "focus", "mm"),
         ("aberration", "field", "field", "um"),
     )
 }
-"""The paper's four networks (Table 1). The aberration estimator also returns the circle
-of its coefficients, without which they have no meaning. The focused-eye estimator is
-trained on lenses and their focus, and evaluated on the lens that a focus requires."""
+"""The four networks of the paper (Table 1). The aberration estimator also returns the
+circle of its coefficients. The focused-eye estimator is trained on lenses and their
+focus, and evaluated on the lens that a focus requires."""

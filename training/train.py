@@ -3,8 +3,8 @@
     python -m training.train RUN.toml [--folder DIR]
     torchrun --nproc-per-node 2 -m training.train RUN.toml
 
-Writes ``checkpoint.pt`` and ``log.jsonl`` into the run's folder; when started again, it
-resumes exactly from the last checkpoint. The whole loop is in `train`.
+Writes ``checkpoint.pt`` and ``log.jsonl`` to the folder of the run. When started again,
+it resumes exactly from the last checkpoint. `train` contains the training loop.
 """
 
 import argparse
@@ -32,7 +32,7 @@ from training.losses import (
     physical_loss,
     standard_loss,
 )
-from training.optimizer import Lookahead, make_optimizer, pace
+from training.optimizer import Lookahead, make_optimizer, rate_factor
 from training.run_file import Run, RunFileError, read_run
 from training.validation import validation_error
 
@@ -68,9 +68,11 @@ def _loss(run: Run, device: torch.device) -> "Loss":
     if run.training.loss in named:
         return named[run.training.loss]()
     if not run.training.discriminator:
-        raise RunFileError("training.discriminator: name a checkpoint")
-    judge, _ = load_checkpoint(Path(run.training.discriminator))
-    return DiscriminatorLoss(judge.to(device), prior_weight=run.training.prior_weight)
+        raise RunFileError("training.discriminator: missing; expected a checkpoint")
+    discriminator, _ = load_checkpoint(Path(run.training.discriminator))
+    return DiscriminatorLoss(
+        discriminator.to(device), prior_weight=run.training.prior_weight
+    )
 
 
 def train(run: Run, *, data_folder: Path | None = None) -> dict[str, Any]:
@@ -119,13 +121,13 @@ def train(run: Run, *, data_folder: Path | None = None) -> dict[str, Any]:
         task = bar.add_task(run.name, total=n_steps, completed=step)
         while step < n_steps:
             x, y = batches.at(step)
-            share = pace(
+            share = rate_factor(
                 step / n_steps,
                 n_epochs=settings.n_epochs,
                 decay_per_epoch=settings.decay_per_epoch,
                 final_ratio=settings.final_ratio,
             )
-            optimizer.set_pace(
+            optimizer.set_rates(
                 learning_rate=settings.learning_rate * share,
                 weight_decay=settings.weight_decay * share,
             )
@@ -196,12 +198,14 @@ def _resumed(
         return 0, 0.0, None, {}
     saved, state = load_checkpoint(file)
     if state["run"] != run.text:
-        raise RunFileError(f"{file} is of another run file; remove it to start anew")
+        raise RunFileError(
+            f"{file} belongs to another run file; remove it to restart the training"
+        )
     if state["rows_per_step"] != batches.rows_per_step:
         raise RunFileError(
-            f"{file} was made with {state['rows_per_step']} rows a step, over all "
-            f"processes; now they are {batches.rows_per_step}: start as many processes "
-            "as before, or remove it to start anew"
+            f"{file} has {state['rows_per_step']} rows per step of all processes, got "
+            f"{batches.rows_per_step}; start as many processes as before, or remove it "
+            "to restart the training"
         )
     network.load_state_dict(saved.state_dict())
     optimizer.load_state_dict(state["optimizer"])
@@ -213,8 +217,8 @@ def _cut_log(file: Path, step: int) -> None:
     if not file.exists():
         return
     lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
-    kept = [line for line in lines if json.loads(line)["step"] <= step]
-    file.write_text("".join(kept), encoding="utf-8")
+    retained = [line for line in lines if json.loads(line)["step"] <= step]
+    file.write_text("".join(retained), encoding="utf-8")
 
 
 class _Whole(torch.nn.Module):

@@ -1,4 +1,4 @@
-"""Version of the code that made a file."""
+"""Version of the code, for generated files."""
 
 import os
 import subprocess
@@ -6,13 +6,13 @@ from pathlib import Path
 
 
 def commit_id() -> str:
-    """Return the checkout's short hash, with "+" if files differ; "none" without git.
+    """Return the short hash of the commit, with "+" if tracked files differ.
 
-    For a copy without history, set OCUFILTER_COMMIT.
+    It is "none" without git. OCUFILTER_COMMIT replaces it, for copies without history.
     """
-    told = os.environ.get("OCUFILTER_COMMIT")
-    if told:
-        return told
+    commit = os.environ.get("OCUFILTER_COMMIT")
+    if commit:
+        return commit
     root = Path(__file__).parents[1]
 
     def git(*arguments: str) -> str | None:

@@ -74,8 +74,8 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
         action="append",
         required=True,
         metavar="P",
-        help="preset name, a .json, .abp or .csv file, or JSON; repeatable; NAME=P "
-        "sets the name of its folder",
+        help="preset name, a .json, .abp, .csv or .zmx file, or JSON; repeatable; "
+        "NAME=P sets the name of its folder",
     )
     _add_source(parser.add_argument_group("input"))
     _add_eye(parser.add_argument_group("eye and filter"))

@@ -31,7 +31,7 @@ class Method(StrEnum):
 def estimate(
     profile: Annotated[
         str,
-        typer.Argument(help="A preset name, or a .json, .abp or .csv profile."),
+        typer.Argument(help="A preset name, or a .json, .abp, .csv or .zmx profile."),
     ],
     method: Annotated[
         Method,

@@ -24,7 +24,7 @@ HORIZONTAL, VERTICAL = "-40,-30,-20,-10,0,10,20,30,40", "0"
 def field(
     profile: Annotated[
         str,
-        typer.Argument(help="Preset name, or a .json, .abp or .csv profile."),
+        typer.Argument(help="Preset name, or a .json, .abp, .csv or .zmx profile."),
     ],
     pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength, nm.")],

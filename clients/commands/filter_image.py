@@ -62,7 +62,7 @@ def filter_image(
         str,
         typer.Option(
             metavar="P",
-            help="Preset name, a .json, .abp or .csv file, or JSON such as "
+            help="Preset name, a .json, .abp, .csv or .zmx file, or JSON such as "
             '{"kind": "prescription", "sphere_dpt": -2}.',
         ),
     ],

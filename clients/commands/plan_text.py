@@ -12,7 +12,6 @@ AXIS_WORDS = {"h": "azimuth", "v": "elevation"}
 
 def plan_summary(plan: "CachePlan") -> dict[str, Any]:
     """Return a plan's nodes and prediction in JSON-compatible types."""
-    assert plan.nodes is not None
     predicted, defocus = plan.prediction, plan.nodes.defocus
     return {
         "h_deg": plan.h_deg.tolist(),

@@ -70,7 +70,8 @@ def psf(
     eye: Annotated[
         str,
         typer.Argument(
-            help="Preset or schematic eye by name, or a .json, .abp or .csv profile."
+            help="Name of a preset or schematic eye, or a .json, .abp, .csv or .zmx "
+            "profile."
         ),
     ],
     pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")],
@@ -194,8 +195,10 @@ def _traced(source: str, focus_dpt: float | None, **view: Any) -> _State:
     from estimator.profiles.files import load_profile
     from estimator.wavefront.aberrations import wavefront_aberrations
 
+    if focus_dpt is None and not _has_surfaces(source):
+        focus_dpt = 0.0
     name, surfaces, notes = load_surfaces(
-        source, focus_dpt or 0.0, pupil_mm=view["pupil_diameter_mm"]
+        source, focus_dpt, pupil_mm=view["pupil_diameter_mm"]
     )
     found = wavefront_aberrations(surfaces, **view)
     if not found.rms_residual_um >= 0.0:

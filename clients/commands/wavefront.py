@@ -35,7 +35,8 @@ def wavefront(
     eye: Annotated[
         str,
         typer.Argument(
-            help="Preset or schematic eye by name, or a .json, .abp or .csv profile.  "
+            help="Name of a preset or schematic eye, or a .json, .abp, .csv or .zmx "
+            "profile.  "
             "A measurement is converted to an eye model first."
         ),
     ],

@@ -28,6 +28,9 @@ from clients.figures.style import (
 WORST_LOG_MAR, BEST_LOG_MAR = 1.6, -0.3
 ACCOMMODATING: dict[str, Any] = {"linestyle": "-", "linewidth": LINE_PT}
 LOOKING_FAR: dict[str, Any] = {"linestyle": "--", "linewidth": LINE_PT}
+EDGE_RATIO = 0.95
+"""Place along the axis from which a centered text would cross its end."""
+
 MARKS = {0.0: " far", 1.0: "1 m", 2.5: "40 cm", 5.0: "20 cm", 10.0: "10 cm"}
 
 
@@ -40,10 +43,10 @@ def draw_through_focus_acuity(
         found = study.acuity(pupil_mm)
         axes.plot(found.object_dpt, found.near_log_mar, color=color, **ACCOMMODATING)
         axes.plot(found.object_dpt, found.far_log_mar, color=color, **LOOKING_FAR)
-    looks = {f"{pupil_mm:g} mm": {"color": c} for pupil_mm, c in colors.items()}
+    looks = [(f"{pupil_mm:g} mm", {"color": c}) for pupil_mm, c in colors.items()]
     styles = {"accommodating": ACCOMMODATING, "looking far": LOOKING_FAR}
-    black = {name: {"color": INK} | style for name, style in styles.items()}
-    _finish(axes, found.object_dpt[-1], looks | black, "Acuity by distance")
+    black = [(name, {"color": INK} | style) for name, style in styles.items()]
+    _finish(axes, found.object_dpt[-1], [*looks, *black], "Acuity by distance")
     if np.isnan(found.far_log_mar[0]):
         raise_unknown(axes)
 
@@ -52,21 +55,26 @@ def draw_acuity_of_several(
     axes: Axes, studies: Sequence[EyeStudy], *, labels: Sequence[str], pupil_mm: float
 ) -> None:
     """Draw the acuity of several accommodating eyes through one pupil."""
-    colors = dict(zip(labels, (BLUE, GREEN), strict=False))
+    looks = []
     nearest_dpt, is_known = 0.0, True
-    for study, color in zip(studies, colors.values(), strict=True):
+    for study, label, color in zip(studies, labels, (BLUE, GREEN), strict=True):
+        looks.append((label, {"color": color}))
         found = study.acuity(pupil_mm)
         axes.plot(found.object_dpt, found.near_log_mar, color=color, **ACCOMMODATING)
         is_known &= not np.isnan(found.far_log_mar[0])
         nearest_dpt = max(nearest_dpt, float(found.object_dpt[-1]))
-    looks = {label: {"color": color} for label, color in colors.items()}
     title = f"Acuity by distance, accommodating, {pupil_mm:g} mm"
     _finish(axes, nearest_dpt, looks, title)
     if not is_known:
         raise_unknown(axes)
 
 
-def _finish(axes: Axes, nearest_dpt: float, looks: dict[str, Any], title: str) -> None:
+def _finish(
+    axes: Axes,
+    nearest_dpt: float,
+    looks: Sequence[tuple[str, dict[str, Any]]],
+    title: str,
+) -> None:
     dress(axes, title=title, x="distance of the chart, dpt", y="acuity, logMAR")
     axes.set_xlim(0.0, nearest_dpt)
     axes.set_ylim(WORST_LOG_MAR, BEST_LOG_MAR)  # better is higher, as on charts
@@ -76,9 +84,16 @@ def _finish(axes: Axes, nearest_dpt: float, looks: dict[str, Any], title: str) -
         if distance_dpt <= nearest_dpt:
             axes.text(
                 distance_dpt, WORST_LOG_MAR - 0.03, name, fontsize=SMALL_PT, color=SOFT,
-                ha="left" if distance_dpt == 0.0 else "center", va="bottom",
+                ha=_alignment(distance_dpt / nearest_dpt), va="bottom",
             )  # fmt: skip
     legend_below(axes, looks)
+
+
+def _alignment(place_ratio: float) -> str:
+    """Return the alignment that keeps a text at a place along an axis within it."""
+    if place_ratio == 0.0:
+        return "left"
+    return "center" if place_ratio < EDGE_RATIO else "right"
 
 
 def through_focus_acuity_figure(study: EyeStudy) -> Figure:

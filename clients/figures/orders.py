@@ -109,7 +109,7 @@ def draw_terms(axes: Axes, study: EyeStudy) -> None:
     """Draw each higher-order coefficient: measured, and of the estimated eye."""
     index = np.arange(order_range(FIRST_HIGHER).start, study.measured_um.size)
     measured, eye = study.measured_um[index], study.found.zernike_um[index]
-    source = "assumed" if study.has_assumed_aberrations else "measured"
+    source = "assumed" if study.has_assumed_aberrations else study.source_word
     axes.bar(index - 0.2, measured, 0.4, color=SOFT, label=source)
     axes.bar(index + 0.2, eye, 0.4, color=BLUE, label="estimated eye")
     names = [

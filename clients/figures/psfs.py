@@ -132,10 +132,10 @@ def _side_arcmin(states: list[dict[str, list[PupilWavefront]]], name: str) -> fl
 
 def _states(study: EyeStudy) -> dict[str, list[PupilWavefront]]:
     """Return wavefronts of a far point through 3 and 5 mm, as is and corrected."""
-    states = [study.wavefront(pupil_mm) for pupil_mm in PUPILS_MM]
+    states = [study.far(pupil_mm) for pupil_mm in PUPILS_MM]
     return {
         "as it is": states,
-        "best corrected": [state.best_corrected() for state in states],
+        "best corrected": [state.best_corrected for state in states],
     }
 
 

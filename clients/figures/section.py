@@ -7,17 +7,23 @@ from matplotlib.figure import Figure
 
 from clients.figures.study import FIELD_PUPIL_MM, EyeStudy
 from clients.figures.style import dress, new_figure
-from estimator import draw_section
+from estimator import WornLens, draw_section
 
 
 def draw_cross_section(axes: Axes, study: EyeStudy) -> None:
-    """Draw an eye focused far, with rays from infinity, without its correction."""
-    focused = study.found.focused(0.0)
-    draw_section(axes, focused.surfaces, pupil_diameter_mm=FIELD_PUPIL_MM)
+    """Draw an eye focused far, with rays from infinity through its correction.
+
+    An intraocular lens is not drawn: the eye model has its natural lens.
+    """
+    focused, lens = study.found.focused(0.0), study.profile.correction
+    if isinstance(lens, WornLens) and lens.replaces_lens:
+        lens = None
+    draw_section(axes, focused.surfaces, pupil_diameter_mm=FIELD_PUPIL_MM, lens=lens)
     length_mm = study.found.eye_length_mm
+    worn = "" if lens is None else ", corrected"
     dress(
         axes,
-        title=f"Vertical section, {length_mm:.2f} mm long",
+        title=f"Vertical section, {length_mm:.2f} mm long{worn}",
         x="mm into the eye",
         y="mm, up",
     )

@@ -25,6 +25,7 @@ from estimator import (
     load_profile,
     parse_profile,
     prepare_eye,
+    preset_names,
 )
 
 PUPILS_MM = (3.0, 5.0)
@@ -106,6 +107,24 @@ class EyeStudy:
         """Return the profile's name."""
         return self.profile.name
 
+    @cached_property
+    def is_example(self) -> bool:
+        """Return whether the eye is a preset, which is nobody's own measurement."""
+        if self.profile.name not in preset_names():
+            return False
+        preset = load_profile(self.profile.name)
+        measured = zip(self.profile.measurements, preset.measurements, strict=False)
+        return self.profile.kind == preset.kind and all(
+            np.array_equal(mine.zernike_um, its.zernike_um) for mine, its in measured
+        )
+
+    @property
+    def source_word(self) -> str:
+        """Return where the wavefront comes from: entered, measured or an example."""
+        if self.profile.kind in ("prescription", "eye"):
+            return "entered"
+        return "example" if self.is_example else "measured"
+
     @property
     def has_assumed_aberrations(self) -> bool:
         """Return whether the higher orders are typical ones, not this person's."""
@@ -168,6 +187,16 @@ class EyeStudy:
             wavelength_nm=WAVELENGTH_NM,
             rings=self._rings(float(seen.circle_diameter_mm[0])),
         )
+
+    def far(self, pupil_diameter_mm: float) -> PupilWavefront:
+        """Return the wavefront of a far point, cached with its best correction."""
+        if pupil_diameter_mm not in self._far:
+            self._far[pupil_diameter_mm] = self.wavefront(pupil_diameter_mm)
+        return self._far[pupil_diameter_mm]
+
+    @cached_property
+    def _far(self) -> dict[float, PupilWavefront]:
+        return {}
 
     def _rings(self, circle_diameter_mm: float) -> Rings | None:
         """Return the lens's rings in front of a pupil; None if there are none."""

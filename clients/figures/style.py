@@ -5,7 +5,7 @@ Figures are made without pyplot, which is not thread-safe.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from matplotlib.axes import Axes
@@ -64,15 +64,14 @@ def legend_above(axes: Axes) -> None:
     )  # fmt: skip
 
 
-def legend_below(axes: Axes, entries: Mapping[str, dict[str, Any]]) -> None:
-    """Draw a legend below the axes, clear of the curves; maps labels to line styles."""
-    lines = [
-        Line2D([], [], **({"linewidth": LINE_PT} | looks)) for looks in entries.values()
-    ]
+def legend_below(axes: Axes, entries: Sequence[tuple[str, dict[str, Any]]]) -> None:
+    """Draw a legend of labels and line styles below the axes, clear of the curves."""
+    lines = [Line2D([], [], **({"linewidth": LINE_PT} | looks)) for _, looks in entries]
     down = ScaledTranslation(0.0, -LEGEND_DOWN_PT / 72.0, axes.figure.dpi_scale_trans)
     below = axes.transAxes + down
     axes.legend(
-        lines, list(entries), fontsize=SMALL_PT, labelcolor=INK, frameon=False,
+        lines, [label for label, _ in entries], fontsize=SMALL_PT, labelcolor=INK,
+        frameon=False,
         loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=3, columnspacing=1.2,
         bbox_transform=below,
         handlelength=1.6, borderaxespad=0.0,

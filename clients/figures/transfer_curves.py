@@ -47,11 +47,11 @@ def modulation(
     Parameters
     ----------
     is_corrected : bool
-        Whether sphere and cylinder of this pupil are corrected.
+        Whether the best sphere and cylinder for this pupil are worn.
     at_cpd : (n,)
     """
-    wavefront = study.wavefront(pupil_diameter_mm)
-    seen = wavefront.best_corrected() if is_corrected else wavefront
+    wavefront = study.far(pupil_diameter_mm)
+    seen = wavefront.best_corrected if is_corrected else wavefront
     try:
         return seen.transfer().modulation(at_cpd)
     except ValueError:
@@ -64,7 +64,7 @@ def draw_mtf(axes: Axes, study: EyeStudy) -> None:
     for pupil_mm, color in colors.items():
         _draw_states(axes, study, pupil_mm, color)
         axes.plot(FREQUENCY_CPD, _perfect(pupil_mm), color=color, **PERFECT)
-    looks = {f"{pupil_mm:g} mm": {"color": c} for pupil_mm, c in colors.items()}
+    looks = [(f"{pupil_mm:g} mm", {"color": c}) for pupil_mm, c in colors.items()]
     _finish(axes, looks, "Contrast passed on (MTF), far object, 555 nm")
 
 
@@ -72,11 +72,11 @@ def draw_mtf_of_several(
     axes: Axes, studies: Sequence[EyeStudy], *, labels: Sequence[str], pupil_mm: float
 ) -> None:
     """Draw the transfer functions of several eyes through one pupil."""
-    colors = dict(zip(labels, (BLUE, GREEN), strict=False))
-    for study, color in zip(studies, colors.values(), strict=True):
+    looks = []
+    for study, label, color in zip(studies, labels, (BLUE, GREEN), strict=True):
+        looks.append((label, {"color": color}))
         _draw_states(axes, study, pupil_mm, color)
     axes.plot(FREQUENCY_CPD, _perfect(pupil_mm), color=SOFT, **PERFECT)
-    looks = {label: {"color": color} for label, color in colors.items()}
     _finish(axes, looks, f"Contrast passed on (MTF), far object, {pupil_mm:g} mm")
 
 
@@ -84,7 +84,7 @@ def _draw_states(axes: Axes, study: EyeStudy, pupil_mm: float, color: str) -> No
     for is_corrected, looks in ((True, CORRECTED), (False, AS_IT_IS)):
         values = modulation(study, pupil_mm, is_corrected=is_corrected)
         axes.plot(FREQUENCY_CPD, values, color=color, **looks)
-    if not study.wavefront(pupil_mm).is_readable:
+    if not study.far(pupil_mm).is_readable:
         raise_unknown(axes)
 
 
@@ -94,7 +94,9 @@ def _perfect(pupil_mm: float) -> NDArray[np.float64]:
     )
 
 
-def _finish(axes: Axes, looks: dict[str, Any], title: str) -> None:
+def _finish(
+    axes: Axes, looks: Sequence[tuple[str, dict[str, Any]]], title: str
+) -> None:
     dress(axes, title=title, x="cycles per degree", y="modulation")
     axes.set_xlim(0.0, FREQUENCY_CPD[-1])
     axes.set_ylim(0.0, 1.0)
@@ -104,8 +106,8 @@ def _finish(axes: Axes, looks: dict[str, Any], title: str) -> None:
         "as it is": AS_IT_IS,
         "no aberrations": PERFECT,
     }
-    black = {name: {"color": INK} | style for name, style in styles.items()}
-    legend_below(axes, looks | black)
+    black = [(name, {"color": INK} | style) for name, style in styles.items()]
+    legend_below(axes, [*looks, *black])
 
 
 def mtf_figure(study: EyeStudy) -> Figure:

@@ -37,7 +37,7 @@ def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Names
         "--supersampling", type=int, default=2, help="samples per pixel along each axis"
     )
     eyes = parser.add_argument_group("the eyes")
-    what = "preset name, JSON, or a .json, .abp or .csv file"
+    what = "preset name, JSON, or a .json, .abp, .csv or .zmx file"
     eyes.add_argument(
         "--profile",
         default="myopia",

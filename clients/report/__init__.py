@@ -6,8 +6,10 @@ facts            computed content of a report on one eye
 numbers          numbers of a report
 correction_text  descriptions of corrections
 charts           filtered letter charts, near and far
+method_text      how the eye was computed
 provenance       measured, entered and assumed data
 sources          literature references
+labels           names of the eyes
 origin           reference, date, version and digest of the profile
 blocks           sections, rows, tables and figures
 tables           tables of a report

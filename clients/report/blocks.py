@@ -47,11 +47,21 @@ class Plot:
 
 
 @dataclass(frozen=True)
+class Mark:
+    """A text beside an image, at a height from 0, its top, to 1."""
+
+    y_ratio: float
+    text: str
+    is_emphasized: bool = False
+
+
+@dataclass(frozen=True)
 class Picture:
-    """An sRGB image (height, width, 3) with a caption."""
+    """An sRGB image (height, width, 3) with a caption and texts on its right."""
 
     image: NDArray[np.uint8]
     caption: str
+    marks: tuple[Mark, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -97,7 +107,9 @@ class Document:
     Attributes
     ----------
     origin : tuple of (str, str)
-        Name and value of what identifies the report: reference, date, version, profile.
+        Name and value of what identifies the report: patient, reference, date, version.
+    running : str
+        Text in the margin of every page: what identifies the report.
     """
 
     title: str
@@ -105,3 +117,4 @@ class Document:
     sections: tuple[Section, ...]
     footer: str
     origin: tuple[tuple[str, str], ...] = ()
+    running: str = ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +61,14 @@ def charts_of(
                 if progress is not None:
                     progress(len(found) / (len(pupils_mm) * len(views)))
     return found
+
+
+@cache
+def chart_rows() -> tuple[tuple[float, float], ...]:
+    """Return the size of each row, logMAR, and its height in the image, 0 to 1."""
+    camera = Camera.from_fov(FIELD_DEG, width_px=LEAST_SIDE_PX, height_px=LEAST_SIDE_PX)
+    chart = letter_chart(camera, distance_m=1.0, log_mar=LOG_MAR)
+    return tuple((row.log_mar, row.y_px / LEAST_SIDE_PX) for row in chart.rows)
 
 
 def _settings(pupil_mm: float, distances_m: Sequence[float]) -> FilterSettings:

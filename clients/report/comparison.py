@@ -20,57 +20,61 @@ from clients.figures.psfs import psf_sides_arcmin
 from clients.figures.study import PUPILS_MM
 from clients.figures.style import TITLE_PT
 from clients.report.blocks import (
-    Block,
     Document,
-    Picture,
     Plot,
     Row,
     Section,
     Table,
     Words,
 )
-from clients.report.charts import DISTANCES_M
 from clients.report.content import (
-    DAY_MM,
-    DUSK_MM,
+    KNOWN_TITLE,
     NOT_A_DEVICE,
     chart_row,
-    details,
+    field_row,
+    legend,
+    method_row,
     on_axes,
+    section_plot,
     sources,
     subtitle,
 )
 from clients.report.correction_text import limits_text
 from clients.report.facts import EyeFacts
+from clients.report.labels import SIDE_NAMES
+from clients.report.method_text import entered_text, method_text
+from clients.report.provenance import joint_provenance_table
 from clients.report.sources import Citations
 from clients.report.tables import (
     REFRACTION_ROWS,
     VISION_ROWS,
-    acuity_text,
+    change_text,
+    joint_coefficient_table,
     pupil_text,
     refraction_text,
     signed,
+    spectacles_text,
+    vision_note,
 )
 
-NEAR_M, FAR_M = DISTANCES_M[0], DISTANCES_M[-1]
-MAP_MM, PSF_MM = 52.0, 54.0
+MAP_MM, PSF_MM = 46.0, 44.0
 
-CURVES_MM = 64.0
-"""Height of curves of both eyes."""
+CURVES_MM, FIELD_MM, SECTION_MM = 49.0, 64.0, 50.0
+"""Height of curves of both eyes, and of each eye's maps and section."""
 
 
 def comparison_document(before: EyeFacts, after: EyeFacts) -> Document:
     """Return the report of two eyes: first the differences, then each eye."""
     cite = Citations()
     cite("csoba", "osa", "vectors")
-    of_each = [details(facts, cite, name=facts.label) for facts in (before, after)]
     return Document(
         title=f"Eye report: {before.label} → {after.label}",
         subtitle=f"{subtitle(before.study)} → {subtitle(after.study)}",
         sections=(
             _difference(before, after),
             _curves(before, after),
-            *(section for pair in zip(*of_each, strict=True) for section in pair),
+            _known(before, after, cite),
+            _field(before, after),
             sources(cite),
         ),
         footer=NOT_A_DEVICE,
@@ -84,18 +88,61 @@ def _difference(before: EyeFacts, after: EyeFacts) -> Section:
     bars = on_axes(
         lambda axes: draw_rms_by_order(axes, studies, labels=labels),
         MAP_MM,
-        "Root mean square by radial order, before and after",
+        "Root mean square by radial order of both eyes",
     )
     return Section(
-        "Before and after",
+        "Both eyes of this report",
         (
             *(Row((table,)) for table in tables),
             Row((*(_map(*pair, studies) for pair in pairs), bars)),
             Row(tuple(_psfs(*pair, psf_sides_arcmin(studies)) for pair in pairs)),
-            _charts(before, after, DAY_MM),
+            Row((Words((legend(after.study),)),)),
             *(Row((Words(limits),)) for limits in _limits(before, after)),
         ),
     )
+
+
+def _known(before: EyeFacts, after: EyeFacts, cite: Citations) -> Section:
+    """Return what is known of both eyes: what they share once."""
+    studies, labels = (before.study, after.study), (before.label, after.label)
+    methods = [method_text(study) for study in studies]
+    shared = [text for text in methods[0] if text in methods[1]]
+    own = [
+        f"{label}: {text}"
+        for label, texts in zip(labels, methods, strict=True)
+        for text in texts
+        if text not in shared
+    ]
+    return Section(
+        KNOWN_TITLE,
+        (
+            Row((joint_provenance_table(studies, labels, cite),)),
+            method_row(*shared, *own),
+            Row((joint_coefficient_table(before, after, _moments(before, after)),)),
+        ),
+    )
+
+
+def _field(before: EyeFacts, after: EyeFacts) -> Section:
+    both = before, after
+    return Section(
+        "Over the visual field, and section of the eye",
+        (
+            *(
+                field_row(facts, name=moment, height_mm=FIELD_MM)
+                for facts, moment in zip(both, _moments(before, after), strict=True)
+            ),
+            Row(tuple(section_plot(f.study, height_mm=SECTION_MM) for f in both)),
+        ),
+    )
+
+
+def _moments(before: EyeFacts, after: EyeFacts) -> tuple[str, str]:
+    """Return what tables call the eyes: before and after, or their sides."""
+    sides = [facts.study.profile.eye_side for facts in (before, after)]
+    if sides[0] == sides[1]:
+        return "before", "after"
+    return SIDE_NAMES[sides[0]], SIDE_NAMES[sides[1]]
 
 
 def _limits(before: EyeFacts, after: EyeFacts) -> tuple[tuple[str, ...], ...]:
@@ -132,44 +179,59 @@ def _map(study: EyeStudy, label: str, studies: tuple[EyeStudy, ...]) -> Plot:
 
 
 def _refraction_table(before: EyeFacts, after: EyeFacts) -> Table:
-    eyes = [facts.numbers["eye"] for facts in (before, after)]
+    both = before, after
+    eyes = [facts.numbers["eye"] for facts in both]
+    moments = _moments(before, after)
     rows = [
         (
-            when,
+            moment,
             *(refraction_text(eye["refraction"], n) for n in REFRACTION_ROWS.values()),
         )
-        for when, eye in zip(("before", "after"), eyes, strict=True)
+        for moment, eye in zip(moments, eyes, strict=True)
     ]
     first, last = (eye["refraction"] for eye in eyes)
     rows.append(
         (
             "change",
             *(
-                "" if name == "axis_deg" else signed(last[name] - first[name])
+                "" if name == "axis_deg" else change_text(first[name], last[name])
                 for name in REFRACTION_ROWS.values()
             ),
         )
     )
     head = ("at the cornea", *REFRACTION_ROWS)
-    if any(facts.study.profile.correction for facts in (before, after)):
+    if any(facts.study.profile.correction for facts in both):
         worn_dpt = [eye["refraction_through_correction_dpt"] for eye in eyes]
-        through_dpt = (*worn_dpt, worn_dpt[1] - worn_dpt[0])
-        rows = [(*row, signed(dpt)) for row, dpt in zip(rows, through_dpt, strict=True)]
+        through = (*map(signed, worn_dpt), change_text(*worn_dpt))
+        rows = [(*row, text) for row, text in zip(rows, through, strict=True)]
         head = (*head, "M as worn")
     return Table(
         "Refraction of the estimated eyes, dpt",
         tuple(rows),
         head=tuple(cell.removesuffix(", dpt") for cell in head),
-        note=f"Before: {before.label}; after: {after.label}. Relaxed, 555 nm.",
+        note=" ".join(
+            _eye_note(moment, facts)
+            for moment, facts in zip(moments, both, strict=True)
+        )
+        + " Relaxed, 555 nm.",
     )
+
+
+def _eye_note(moment: str, facts: EyeFacts) -> str:
+    """Return the name of an eye, its powers as entered, and spectacles for it."""
+    entered = entered_text(facts.study.profile)
+    spectacles = f"{spectacles_text(facts)}."
+    name = moment.capitalize()
+    if facts.label != moment:
+        name += f" ({facts.label})"
+    return " ".join(text for text in (f"{name}:", entered, spectacles) if text)
 
 
 def _vision_table(before: EyeFacts, after: EyeFacts) -> Table:
-    of_pupils = list(
-        zip(before.numbers["pupils"], after.numbers["pupils"], strict=True)
-    )
-    groups = tuple((f"{pupil_text(pair[0])} pupil", 2) for pair in of_pupils)
-    head = ("far object, 555 nm", *("before", "after") * len(of_pupils))
+    pupils = before.numbers["pupils"], after.numbers["pupils"]
+    of_pupils = list(zip(*pupils, strict=True))
+    groups = tuple((f"{_pair_text(pair)} pupil", 2) for pair in of_pupils)
+    head = ("far object, 555 nm", *_moments(before, after) * len(of_pupils))
     rows = tuple(
         (word, *(words(numbers) for pair in of_pupils for numbers in pair))
         for word, words in VISION_ROWS.items()
@@ -179,25 +241,13 @@ def _vision_table(before: EyeFacts, after: EyeFacts) -> Table:
         rows,
         head=head,
         groups=(("", 1), *groups),
-        note="Acuity in logMAR, and as a decimal. * wider than the pupil measured.",
+        note=vision_note([numbers for found in pupils for numbers in found]),
     )
 
 
-def _charts(before: EyeFacts, after: EyeFacts, pupil_mm: float) -> Row:
-    """Return near and far charts of both eyes through one pupil."""
-    pictures: list[Block] = []
-    for facts in (before, after):
-        if not facts.charts:
-            return chart_row(facts, pupil_mm)
-        for distance_m, where in ((NEAR_M, "40 cm"), (FAR_M, "6 m")):
-            told = acuity_text(facts.chart_numbers[pupil_mm, distance_m])
-            pictures.append(
-                Picture(
-                    facts.charts[pupil_mm, distance_m],
-                    f"{facts.label}, {where}, {pupil_mm:g} mm: {told}",
-                )
-            )
-    return Row(tuple(pictures))
+def _pair_text(pair: tuple[dict[str, Any], dict[str, Any]]) -> str:
+    """Return the pupil of two eyes, with a star if it is wider than measured in one."""
+    return pupil_text(max(pair, key=lambda numbers: numbers["is_beyond_measured"]))
 
 
 def _curves(before: EyeFacts, after: EyeFacts) -> Section:
@@ -221,10 +271,15 @@ def _curves(before: EyeFacts, after: EyeFacts) -> Section:
     mtfs = by_pupil(draw_mtf_of_several, "Modulation transfer of both")
     acuities = by_pupil(draw_acuity_of_several, "Acuity of both by distance")
     return Section(
-        "Contrast and acuity, before and after",
+        "Contrast, acuity and charts",
         (
             Row(mtfs),
             Row(acuities),
-            _charts(before, after, DUSK_MM),
+            *(
+                chart_row(facts, pupil_mm, name=facts.label)
+                for pupil_mm in PUPILS_MM
+                for facts in (before, after)
+                if facts.charts or pupil_mm == PUPILS_MM[0]
+            ),
         ),
     )

@@ -22,15 +22,18 @@ from clients.figures.study import PUPILS_MM
 from clients.report.blocks import (
     Block,
     Document,
+    Mark,
     Picture,
     Plot,
     Row,
     Section,
     Words,
 )
-from clients.report.charts import DISTANCES_M
-from clients.report.correction_text import limits_text, subtitle_text
+from clients.report.charts import DISTANCES_M, chart_rows
+from clients.report.correction_text import limits_text, near_text, subtitle_text
 from clients.report.facts import EyeFacts
+from clients.report.labels import SIDE_NAMES
+from clients.report.method_text import method_text
 from clients.report.provenance import provenance_table
 from clients.report.sources import Citations
 from clients.report.tables import (
@@ -40,12 +43,15 @@ from clients.report.tables import (
     refraction_table,
     vision_table,
 )
+from clients.scenes.letter_chart import row_text, smallest_row
 
 DAY_MM, DUSK_MM = PUPILS_MM
 
-MAP_MM, PSF_MM = 42.0, 48.0
+FIELD_TITLE = "Over the visual field, and by distance"
+KNOWN_TITLE = "What is known"
+
+MAP_MM, PSF_MM = 39.0, 44.0
 FIELD_MM, CURVE_MM, TERMS_MM = 76.0, 60.0, 40.0
-SIDES = {"OD": "right eye (OD)", "OS": "left eye (OS)"}
 NOT_A_DEVICE = (
     "A simulation for research and explanation, not a medical device: no diagnosis or "
     "treatment may rest on it."
@@ -57,11 +63,39 @@ def eye_document(facts: EyeFacts) -> Document:
     cite = Citations()
     cite("csoba", "osa", "vectors")
     return Document(
-        title=f"Eye report: {facts.label}",
+        title=f"Eye report: {_title(facts)}",
         subtitle=subtitle(facts.study),
-        sections=(summary(facts), *details(facts, cite), sources(cite)),
+        sections=(
+            summary(facts),
+            Section(
+                FIELD_TITLE,
+                (
+                    field_row(facts),
+                    _distance_row(facts),
+                    chart_row(facts, DUSK_MM),
+                    method_row(*method_text(facts.study)),
+                ),
+            ),
+            Section(
+                KNOWN_TITLE,
+                (
+                    Row((provenance_table(facts.study, cite),)),
+                    *_coefficient_rows(facts),
+                ),
+            ),
+            sources(cite),
+        ),
         footer=NOT_A_DEVICE,
     )
+
+
+def _title(facts: EyeFacts) -> str:
+    """Return the name of an eye, or its side, and that of its preset."""
+    profile = facts.study.profile
+    label = facts.label or SIDE_NAMES[profile.eye_side]
+    if facts.study.is_example and profile.name not in label:
+        label += f", {profile.name}"
+    return label
 
 
 def subtitle(study: EyeStudy) -> str:
@@ -70,8 +104,11 @@ def subtitle(study: EyeStudy) -> str:
     age = "age not given"
     if profile.age_years is not None:
         age = f"{profile.age_years:g} years"
-    whose = f"{SIDES[profile.eye_side]}, {age}, from a {KIND_WORDS[profile.kind]}"
-    return whose + subtitle_text(profile)
+    side = f"{SIDE_NAMES[profile.eye_side]} ({profile.eye_side})"
+    source = f"from a {KIND_WORDS[profile.kind]}"
+    if study.is_example:
+        source = f"example eye (preset {profile.name})"
+    return f"{side}, {age}, {source}{subtitle_text(profile)}"
 
 
 KIND_WORDS = {
@@ -112,20 +149,23 @@ def summary(facts: EyeFacts) -> Section:
             Row((maps, orders), (2.0, 1.0)),
             Row((points, contrast), (1.0, 1.4)),
             chart_row(facts, DAY_MM),
-            Row((Words((_legend(study), *limits_text(study.profile.correction))),)),
+            Row((Words((legend(study), *limits_text(study.profile.correction))),)),
         ),
     )
 
 
-def _legend(study: EyeStudy) -> str:
+def legend(study: EyeStudy) -> str:
+    """Return the explanation of a report's maps, states and charts."""
     return (
         "Wavefront at the cornea, without a correction, as the examiner faces the eye "
         "(T temporal, N nasal). Point images and charts as the person sees them; light "
         "on a logarithmic scale of two decades. “As it is”: looking far away, "
         "accommodating where that helps"
         + (", through the worn correction" if study.profile.correction else "")
-        + ". “Best corrected”: sphere and cylinder of that pupil taken off. Charts: "
-        "letters of logMAR 1.0 to −0.2, the eye trying to focus on each."
+        + ". “Best corrected”: with the sphere and cylinder of the highest visual "
+        "Strehl ratio through that pupil, and an acuity not below “as it is”. Charts: "
+        "the eye tries to focus on each; rows in logMAR and decimal, ◂ the smallest "
+        "read."
     )
 
 
@@ -138,72 +178,83 @@ def on_axes(draw: Callable[[Any], None], height_mm: float, alt: str) -> Plot:
     return Plot(draw_panel, height_mm, alt)
 
 
-def chart_row(facts: EyeFacts, pupil_mm: float) -> Row:
+def chart_row(facts: EyeFacts, pupil_mm: float, *, name: str = "") -> Row:
     """Return the charts at all distances through one pupil."""
     if not facts.charts:
         return Row((Words((f"No letter charts: {facts.chart_problem}.",)),))
+    start, unit = (f"{name}, ", "") if name else ("", "logMAR ")
     pictures: list[Block] = []
     for distance_m in DISTANCES_M:
         where = f"{100 * distance_m:.0f} cm" if distance_m < 1 else f"{distance_m:g} m"
+        found = facts.chart_numbers[pupil_mm, distance_m]
+        near = near_text(facts.study.profile.correction) if distance_m < 1 else ""
         pictures.append(
             Picture(
                 facts.charts[pupil_mm, distance_m],
-                f"{where}, {pupil_mm:g} mm: logMAR "
-                f"{acuity_text(facts.chart_numbers[pupil_mm, distance_m])}",
+                f"{start}{where}, {pupil_mm:g} mm: {unit}{acuity_text(found)}{near}",
+                _row_marks(found),
             )
         )
     return Row(tuple(pictures))
 
 
-def details(facts: EyeFacts, cite: Citations, *, name: str = "") -> tuple[Section, ...]:
-    """Return the sections that follow the summary."""
-    of_whom = f" ({name})" if name else ""
-    return _field_section(facts, of_whom), _known_section(facts, cite, of_whom)
+def _row_marks(found: dict[str, Any]) -> tuple[Mark, ...]:
+    """Return the size of each row, and which one is the smallest line read."""
+    rows = chart_rows()
+    sizes = [log_mar for log_mar, _ in rows]
+    acuity = found["log_mar"]
+    read = None if acuity is None else smallest_row(sizes, acuity)
+    return tuple(
+        Mark(y_ratio, row_text(log_mar), k == read)
+        for k, (log_mar, y_ratio) in enumerate(rows)
+    )
 
 
-def _field_section(facts: EyeFacts, of_whom: str) -> Section:
+def field_row(facts: EyeFacts, *, name: str = "", height_mm: float = FIELD_MM) -> Row:
+    """Return the visual field of an eye as maps and as a table."""
     study = facts.study
     maps = Plot(
         lambda panel: draw_field_maps(panel, study),
-        FIELD_MM,
+        height_mm,
         "Maps of M, J0, J45 and blur over 60 by 40 degrees",
     )
+    return Row((maps, field_table_block(facts, name=name)), (2.4, 1.0))
+
+
+def _distance_row(facts: EyeFacts) -> Row:
+    """Return acuity by distance, and the section of an eye."""
+    study = facts.study
     acuity = on_axes(
         lambda axes: draw_through_focus_acuity(axes, study),
         CURVE_MM,
         "Acuity by distance, looking far and accommodating",
     )
-    section = on_axes(
+    return Row((acuity, section_plot(study)))
+
+
+def section_plot(study: EyeStudy, *, height_mm: float = CURVE_MM) -> Plot:
+    """Return the section of an eye."""
+    return on_axes(
         lambda axes: draw_cross_section(axes, study),
-        CURVE_MM,
+        height_mm,
         "Vertical section of the eye found, with rays from far away",
     )
-    return Section(
-        f"Over the visual field, and by distance{of_whom}",
-        (
-            Row((maps, field_table_block(facts)), (2.4, 1.0)),
-            Row((acuity, section)),
-            chart_row(facts, DUSK_MM),
-            Row((Words(study.field.notes, "How it was computed", is_list=True),)),
-        ),
-    )
 
 
-def _known_section(facts: EyeFacts, cite: Citations, of_whom: str) -> Section:
+def method_row(*texts: str) -> Row:
+    """Return the list of how eyes were computed."""
+    return Row((Words(texts, "How it was computed", is_list=True),))
+
+
+def _coefficient_rows(facts: EyeFacts) -> tuple[Row, ...]:
+    """Return the coefficients of an eye as a chart and as a table."""
     study = facts.study
     terms = on_axes(
         lambda axes: draw_terms(axes, study),
         TERMS_MM,
         "Coefficients of orders 3 to 6, as they came and of the eye",
     )
-    return Section(
-        f"What is known{of_whom}",
-        (
-            Row((provenance_table(study, cite),)),
-            Row((terms,)),
-            Row((coefficient_table(facts),)),
-        ),
-    )
+    return Row((terms,)), Row((coefficient_table(facts),))
 
 
 def sources(cite: Citations) -> Section:

@@ -137,7 +137,15 @@ def _power(power_dpt: float) -> str:
 def subtitle_text(profile: EyeProfile) -> str:
     """Return the end of a report's subtitle."""
     lens = profile.correction
-    return "" if lens is None else f"; {short_text(lens)}"
+    return "" if lens is None else f"; {correction_text(lens)}"
+
+
+def near_text(lens: Prescription | None) -> str:
+    """Return what a caption of a near chart says about a progressive lens."""
+    if not isinstance(lens, ProgressiveLens):
+        return ""
+    gaze = gaze_text(lens.gaze_deg).removeprefix("looking ")
+    return f"; {gaze} through {written(lens)}"
 
 
 def limits_text(lens: Prescription | None) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from clients.figures import EyeStudy
 from clients.figures.study import PUPILS_MM, Profile, Report
 from clients.report.charts import DISTANCES_M, Chart, charts_of
+from clients.report.labels import own_name
 from clients.report.numbers import chart_numbers, eye_numbers
 from filter_service import FilterError
 
@@ -26,7 +27,7 @@ class EyeFacts:
     Attributes
     ----------
     label : str
-        Name of the eye in this report.
+        Name of the eye in this report; empty if it has none.
     charts : dict
         Images (height, width, 3) by pupil, mm, and distance, m; if they could not be
         made, empty, and ``chart_problem`` gives the reason.
@@ -89,7 +90,7 @@ def facts_of(
         for distance_m in DISTANCES_M
     ]
     charts, problem = _charts(study, has_charts, say)
-    return EyeFacts(study, label or study.name, numbers, charts, problem)
+    return EyeFacts(study, label or own_name(study.profile), numbers, charts, problem)
 
 
 def _charts(

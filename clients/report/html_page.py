@@ -15,6 +15,7 @@ from clients.figures.style import new_figure
 from clients.report.blocks import (
     Block,
     Document,
+    Mark,
     Picture,
     Plot,
     Row,
@@ -27,14 +28,15 @@ JPEG_QUALITY = 88
 
 STYLE = """
 @page { size: A4; margin: 11mm 12mm 13mm;
-  @bottom-left { content: string(footer); font: 7.5pt "DejaVu Sans", sans-serif;
-    color: #4c5866; width: 160mm; }
-  @bottom-right { content: counter(page) " / " counter(pages);
+  @bottom-left { content: string(running) "\\A" string(footer); white-space: pre-line;
+    font: 7.5pt "DejaVu Sans", sans-serif; color: #4c5866; width: 165mm; }
+  @bottom-right { content: "page " counter(page) " of " counter(pages);
     font: 7.5pt "DejaVu Sans", sans-serif; color: #4c5866; } }
 * { box-sizing: border-box; }
 body { font: 9.5pt/1.35 "DejaVu Sans", Verdana, system-ui, sans-serif; color: #1b2430;
   background: #eef1f4; margin: 0; }
-main { background: #fff; max-width: 210mm; margin: 0 auto; padding: 12mm; }
+main { background: #fff; max-width: 210mm; margin: 0 auto; padding: 12mm;
+  string-set: running attr(data-running), footer attr(data-footer); }
 header { border-bottom: 1.5pt solid #1f5fa8; margin-bottom: 4mm; }
 h1 { font-size: 16pt; margin: 0; }
 header p { margin: 1mm 0; color: #4c5866; }
@@ -57,17 +59,29 @@ ul { margin: 0; padding-left: 4mm; font-size: 9pt; }
 figure { margin: 0; }
 figure img { display: block; width: 100%; height: auto; }
 figure.picture img { border: .6pt solid #d9dee4; }
+.marked { position: relative; padding-right: 16.5mm; }
+.marks { position: absolute; top: 0; right: 0; bottom: 0; width: 24mm; margin: 0;
+  padding: 0; list-style: none; }
+.marks li { position: absolute; right: 0; margin-top: -1.6mm; text-align: right;
+  white-space: nowrap; font-size: 9pt; line-height: 3.2mm; color: #4c5866; }
+.marks li.read { color: #1b2430; font-weight: bold; }
 footer { border-top: .4pt solid #4c5866; margin-top: 4mm; padding-top: 1.5mm;
-  font-size: 9pt; color: #4c5866; string-set: footer content(); }
-@media screen and (max-width: 700px) { .row { grid-template-columns: 1fr !important; }
-  main { padding: 5mm; } }
+  font-size: 9pt; color: #4c5866; }
+@media screen and (max-width: 700px) { main { padding: 5mm; }
+  .row { grid-template-columns: minmax(0, 1fr) !important; }
+  .row > div { overflow-x: auto; }
+  table.short td, table.short th { white-space: normal; } }
 @media print { body { background: #fff; } main { padding: 0; max-width: none; }
   h2, h3 { break-after: avoid; } .row, tr, figure { break-inside: avoid; }
-  .row.text { break-inside: auto; }
-  footer { border: 0; margin: 0; padding: 0; font-size: 0; height: 0;
-    overflow: hidden; } }
+  .row.list { break-inside: auto; } footer { display: none; } }
 """
-"""Style of screen and paper; the margins of a page repeat the footer."""
+"""Style of screen and paper; the margins of a page have the footer of the screen."""
+
+MARK_MM = 16.5
+"""Width beside an image that holds its marks."""
+
+MARK_LINE_MM = 3.2
+"""Height of a mark's line."""
 
 
 def html_of(document: Document) -> str:
@@ -81,11 +95,12 @@ def html_of(document: Document) -> str:
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{escape(document.title)}</title>\n<style>{STYLE}</style>\n</head>\n"
-        f"<body>\n<main>\n<footer>{escape(document.footer)}</footer>\n"
+        f'<body>\n<main data-running="{escape(document.running)}" '
+        f'data-footer="{escape(document.footer)}">\n'
         f"<header><h1>{escape(document.title)}</h1>"
         f"<p>{escape(document.subtitle)}</p>"
         f'<p class="origin">{origin}</p></header>\n{sections}\n'
-        "</main>\n</body>\n</html>\n"
+        f"<footer>{escape(document.footer)}</footer>\n</main>\n</body>\n</html>\n"
     )
 
 
@@ -100,8 +115,8 @@ def _row(row: Row) -> str:
         _block(block, width_mm)
         for block, width_mm in zip(row.blocks, row.widths_mm, strict=True)
     )
-    is_text = all(isinstance(block, Words) for block in row.blocks)
-    kind = "row text" if is_text else "row"
+    is_list = all(isinstance(block, Words) and block.is_list for block in row.blocks)
+    kind = "row list" if is_list else "row"
     style = f"grid-template-columns:{columns}"
     return f'<div class="{kind}" style="{style}">\n{blocks}\n</div>'
 
@@ -112,7 +127,7 @@ def _block(block: Block, width_mm: float) -> str:
     if isinstance(block, Words):
         return _words(block)
     if isinstance(block, Picture):
-        return _picture(block)
+        return _picture(block, width_mm)
     return _plot(block, width_mm)
 
 
@@ -155,12 +170,31 @@ def _words(words: Words) -> str:
     return f"<div{columns}>{title}{texts}</div>"
 
 
-def _picture(picture: Picture) -> str:
+def _picture(picture: Picture, width_mm: float) -> str:
     caption = escape(picture.caption)
-    return (
-        f'<figure class="picture"><img alt="{caption}" src="{_jpeg(picture.image)}">'
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
+    image = f'<img alt="{caption}" src="{_jpeg(picture.image)}">'
+    if picture.marks:
+        height, width = picture.image.shape[:2]
+        marks = _apart(picture.marks, (width_mm - MARK_MM) * height / width)
+        items = "".join(map(_mark, marks))
+        image = f'<div class="marked">{image}<ul class="marks">{items}</ul></div>'
+    return f'<figure class="picture">{image}<figcaption>{caption}</figcaption></figure>'
+
+
+def _mark(mark: Mark) -> str:
+    kind, sign = (' class="read"', "◂ ") if mark.is_emphasized else ("", "")
+    place = f"top:{100 * mark.y_ratio:.1f}%"
+    return f'<li{kind} style="{place}">{sign}{escape(mark.text)}</li>'
+
+
+def _apart(marks: tuple[Mark, ...], height_mm: float) -> list[Mark]:
+    """Return the marks that do not overlap; emphasized ones come first."""
+    kept: list[Mark] = []
+    for mark in sorted(marks, key=lambda mark: not mark.is_emphasized):
+        gaps_mm = (abs(mark.y_ratio - other.y_ratio) * height_mm for other in kept)
+        if all(gap_mm >= MARK_LINE_MM for gap_mm in gaps_mm):
+            kept.append(mark)
+    return sorted(kept, key=lambda mark: mark.y_ratio)
 
 
 def _plot(plot: Plot, width_mm: float) -> str:

@@ -12,7 +12,8 @@ from clients.report.comparison import comparison_document
 from clients.report.content import eye_document
 from clients.report.facts import EyeFacts, facts_of
 from clients.report.html_page import html_of
-from clients.report.origin import origin_of
+from clients.report.labels import distinct_labels
+from clients.report.origin import Record, origin_of, running_text
 
 SUFFIXES = (".html", ".pdf")
 PANGO_PACKAGES = ("libpango-1.0-0", "libpangoft2-1.0-0", "libharfbuzz-subset0")
@@ -33,6 +34,8 @@ def report_html(
     label: str = "",
     after_label: str = "",
     reference: str = "",
+    patient: str = "",
+    examiner: str = "",
     has_charts: bool = True,
     progress: Report | None = None,
 ) -> str:
@@ -47,8 +50,9 @@ def report_html(
         With ``after``, the report starts with the differences.
     label, after_label : str
         Names of the eyes, instead of their profiles' names.
-    reference : str
-        Identifier of a record or an order, shown in the header.
+    reference, patient, examiner : str
+        Identifier of a record or an order, and names, shown in the header; 60
+        characters at most.
     has_charts : bool
         Whether to filter letter charts, which takes a quarter of the time.
     progress : callable, optional
@@ -57,15 +61,16 @@ def report_html(
     Raises
     ------
     ValueError
-        If a profile is invalid, or light does not pass an eye.
+        If a profile is invalid, light does not pass an eye, or a text is too long.
     """
+    record = Record(patient=patient, examiner=examiner, reference=reference)
     eyes = eyes_of(
         [profile] if after is None else [profile, after],
         labels=(label, after_label),
         has_charts=has_charts,
         progress=progress,
     )
-    text = html_of(document_of(eyes, reference=reference))
+    text = html_of(document_of(eyes, record))
     if progress is not None:
         progress(1.0, "writing")
     return text
@@ -92,16 +97,28 @@ def eyes_of(
     ]
     if progress is not None:
         progress(WRITING_AT, "writing")
-    return eyes
+    if len(eyes) == 1:
+        return eyes
+    before, after = eyes
+    names = distinct_labels(
+        (before.label, after.label),
+        (before.study.profile.eye_side, after.study.profile.eye_side),
+    )
+    return [replace(facts, label=name) for facts, name in zip(eyes, names, strict=True)]
 
 
-def document_of(eyes: list[EyeFacts], *, reference: str = "") -> Document:
+def document_of(eyes: list[EyeFacts], record: Record | None = None) -> Document:
     """Return the document of one eye, or of the comparison of two."""
     document = eye_document(*eyes) if len(eyes) == 1 else comparison_document(*eyes)
-    return replace(document, origin=origin_of(eyes, reference))
+    origin = origin_of(eyes, record or Record())
+    return replace(
+        document, origin=origin, running=running_text(document.title, origin)
+    )
 
 
-def write_report(eyes: list[EyeFacts], path: Path, *, reference: str = "") -> None:
+def write_report(
+    eyes: list[EyeFacts], path: Path, record: Record | None = None
+) -> None:
     """Write a report as ``.html``, or as ``.pdf`` tagged for screen readers.
 
     Raises
@@ -111,7 +128,7 @@ def write_report(eyes: list[EyeFacts], path: Path, *, reference: str = "") -> No
     OSError
         If the file cannot be written.
     """
-    text = html_of(document_of(eyes, reference=reference))
+    text = html_of(document_of(eyes, record))
     if path.suffix.lower() == ".pdf":
         path.write_bytes(_pdf_of(text))
     else:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from clients.figures import EyeStudy, PupilWavefront, acuity_log_mar, rms_by_order_um
 from clients.figures.orders import rms_um
-from clients.figures.pupil_wavefront import TILTS
 from clients.figures.study import PUPILS_MM, WAVELENGTH_NM
 from estimator import (
     EyeProfile,
@@ -20,7 +19,6 @@ from estimator import (
     nm_from_index,
     power_vector,
     power_vector_from_zernike,
-    predict_acuity,
     prescription_from_power_vector,
     rescale_pupil,
 )
@@ -130,17 +128,8 @@ def worn_lens(profile: EyeProfile) -> Refraction | None:
 
 def state_numbers(seen: PupilWavefront) -> dict[str, Any]:
     """Return the modulation transfer and acuity of a wavefront."""
-    zernike_um = seen.zernike_um.copy()
-    zernike_um[TILTS] = 0.0
-    try:
-        found = predict_acuity(
-            zernike_um,
-            zernike_radius_mm=seen.circle_diameter_mm / 2.0,
-            wavelength_nm=seen.wavelength_nm,
-            pupil_ellipse=seen.pupil_ellipse,
-            pupil_screen=seen.rings,
-        )
-    except ValueError:  # too steep for transfer functions, or lenslets
+    found = seen.predicted
+    if found is None:
         return {
             "log_mar": None,
             "visual_strehl_ratio": None,
@@ -161,7 +150,7 @@ def state_numbers(seen: PupilWavefront) -> dict[str, Any]:
 
 def pupil_numbers(study: EyeStudy, pupil_diameter_mm: float) -> dict[str, Any]:
     """Return the numbers of a far object through a pupil, as is and best corrected."""
-    seen = study.wavefront(pupil_diameter_mm)
+    seen = study.far(pupil_diameter_mm)
     higher_um = rms_um(seen.zernike_um)
     far_dpt, near_dpt = study.optics.focus_limits_dpt(seen.circle_diameter_mm)
     return {
@@ -171,7 +160,7 @@ def pupil_numbers(study: EyeStudy, pupil_diameter_mm: float) -> dict[str, Any]:
         "far_point_dpt": far_dpt,
         "near_point_dpt": near_dpt,
         "as_it_is": state_numbers(seen),
-        "best_corrected": state_numbers(seen.best_corrected()),
+        "best_corrected": state_numbers(seen.best_corrected),
     }
 
 

@@ -4,8 +4,8 @@
     ocufilter report eye.json -o eye.pdf
     ocufilter report before.json after.json -o surgery.pdf
 
-A profile is a preset's name, a .json, .abp or .csv file, or a JSON object.  The report
-begins with a summary: refraction, acuity, wavefront, point images, contrast, a letter
+A profile is a preset's name, a .json, .abp, .csv or .zmx file, or a JSON object.  The
+report begins with a summary: refraction, acuity, wavefront, point images, contrast, a letter
 chart near and far.  Then it shows the visual field, acuity by distance, the estimated
 eye, which data were measured or assumed, and the literature references.  The HTML file
 is self-contained and prints on A4.  The PDF is tagged for screen readers; it needs the
@@ -31,6 +31,7 @@ from clients.report.make import (
     report_numbers,
     write_report,
 )
+from clients.report.origin import Record
 from filter_service.errors import FilterError
 from filter_service.progress import Progress
 
@@ -51,7 +52,7 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "profile", help="preset's name, .json, .abp or .csv file, or JSON object"
+        "profile", help="preset's name, .json, .abp, .csv or .zmx file, or JSON object"
     )
     parser.add_argument(
         "after", nargs="?", help="the eye afterward: after surgery, with spectacles"
@@ -67,7 +68,13 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
         "--reference",
         default="",
         metavar="TEXT",
-        help="identifier of a record or an order, shown in the header",
+        help="identifier of a record or an order, shown on each page",
+    )
+    parser.add_argument(
+        "--patient", default="", metavar="TEXT", help="patient, shown on each page"
+    )
+    parser.add_argument(
+        "--examiner", default="", metavar="TEXT", help="examiner, shown in the header"
     )
     parser.add_argument(
         "--no-charts", action="store_true", help="leave out the letter charts (faster)"
@@ -84,11 +91,16 @@ def run(options: argparse.Namespace) -> str:
     Raises
     ------
     ValueError
-        If a profile or file name cannot be used.
+        If a profile, a text or a file name cannot be used.
     ReportError
         If PDFs cannot be written here.
     """
     _check_out(options)
+    record = Record(
+        patient=options.patient,
+        examiner=options.examiner,
+        reference=options.reference,
+    )
     if options.out is not None and options.out.suffix.lower() == ".pdf":
         check_pdf()
     sources = [options.profile] + ([options.after] if options.after else [])
@@ -109,14 +121,15 @@ def run(options: argparse.Namespace) -> str:
             progress=task.update,
         )
         if options.out is not None:
-            write_report(eyes, options.out, reference=options.reference)
+            write_report(eyes, options.out, record)
         task.update(1.0, "written")
     if options.json:
         return json.dumps(report_numbers(eyes), allow_nan=False)
     for eye in eyes:
         if eye.chart_problem and not options.no_charts:
             print(f"note: no letter charts: {eye.chart_problem}", file=sys.stderr)
-    return f"{options.out}: {', '.join(labels)}, {time.monotonic() - started_s:.1f} s"
+    names = "".join(f"{eye.label}, " for eye in eyes if eye.label)
+    return f"{options.out}: {names}{time.monotonic() - started_s:.1f} s"
 
 
 def _check_out(options: argparse.Namespace) -> None:
@@ -132,9 +145,9 @@ def _check_out(options: argparse.Namespace) -> None:
 
 
 def _called(source: str) -> str:
-    """Return a file's name without its suffix, a preset's name, or "eye" for JSON."""
+    """Return a file's name without its suffix, or a preset's name; empty for JSON."""
     if source.lstrip().startswith("{"):
-        return "eye"
+        return ""
     return Path(source).stem if Path(source).suffix else source
 
 

@@ -13,11 +13,43 @@ from estimator import GivenSurfaces, Prescription, WornLens
 WELL_DETERMINED = 0.5
 """Fraction of the prior's variance that a measurement must remove."""
 
-MEASURED, TYPICAL, STATED = "measured", "assumed", "entered"
+MEASURED, TYPICAL, STATED, EXAMPLE = "measured", "assumed", "entered", "example"
 
 
 def provenance_table(study: EyeStudy, cite: Citations) -> Table:
     """Return the source of each part of the eye."""
+    return _table(_rows(study, cite))
+
+
+def joint_provenance_table(
+    studies: tuple[EyeStudy, EyeStudy], labels: tuple[str, str], cite: Citations
+) -> Table:
+    """Return the source of each part of two eyes: once where they agree."""
+    of_each = [{row[0]: row for row in _rows(study, cite)} for study in studies]
+    rows: list[tuple[str, ...]] = []
+    for part in dict.fromkeys(part for found in of_each for part in found):
+        pair = [found.get(part) for found in of_each]
+        if pair[0] == pair[1]:
+            rows += [row for row in pair[:1] if row]
+        else:
+            rows += [
+                (part, row[1], f"{label}: {row[2]}")
+                for row, label in zip(pair, labels, strict=True)
+                if row
+            ]
+    return _table(tuple(rows))
+
+
+def _table(rows: tuple[tuple[str, ...], ...]) -> Table:
+    return Table(
+        "What is known, and what is assumed",
+        rows,
+        head=("part", "", "where it comes from"),
+        has_prose=True,
+    )
+
+
+def _rows(study: EyeStudy, cite: Citations) -> tuple[tuple[str, ...], ...]:
     rows = (
         _refraction(study),
         _higher_orders(study, cite),
@@ -30,12 +62,7 @@ def provenance_table(study: EyeStudy, cite: Citations) -> Table:
         _nerves(cite),
         _worn(study),
     )
-    return Table(
-        "What is known of this eye, and what is assumed",
-        tuple(row for row in rows if row),
-        head=("part", "", "where it comes from"),
-        has_prose=True,
-    )
+    return tuple(row for row in rows if row)
 
 
 def _refraction(study: EyeStudy) -> tuple[str, ...]:
@@ -44,13 +71,18 @@ def _refraction(study: EyeStudy) -> tuple[str, ...]:
         return ("Refraction", STATED, "the prescription, as powers at the cornea")
     if profile.is_given:
         return ("Refraction", STATED, "traced through the eye that the profile gives")
-    return ("Refraction", MEASURED, f"second order of {_measurement(study)}")
+    return ("Refraction", _origin(study), f"second order of {_measurement(study)}")
+
+
+def _origin(study: EyeStudy) -> str:
+    return EXAMPLE if study.is_example else MEASURED
 
 
 def _measurement(study: EyeStudy) -> str:
     profile = study.profile
+    whose = "an example eye's" if study.is_example else "the measured"
     text = (
-        f"the measured wavefront ({profile.pupil_diameter_mm:g} mm, "
+        f"{whose} wavefront ({profile.pupil_diameter_mm:g} mm, "
         f"{profile.wavelength_nm:g} nm)"
     )
     others = len(profile.measurements) - 1
@@ -62,7 +94,8 @@ def _higher_orders(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
     if profile.is_given:
         return ("Higher orders", STATED, "of the eye that the profile gives")
     if profile.kind != "prescription":
-        return ("Higher orders", MEASURED, f"orders 3 to 6 of {_measurement(study)}")
+        text = f"orders 3 to 6 of {_measurement(study)}"
+        return ("Higher orders", _origin(study), text)
     if _replaces_lens(profile.correction):
         text = "the cornea's and the lens's spherical aberration; no others are known"
         return ("Higher orders", TYPICAL, text)
@@ -108,15 +141,18 @@ def _accommodation(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
     if profile.surfaces is not None and profile.age_years is None:
         text = f"{amplitude_dpt:.1f} dpt, by the states that the profile gives"
         return ("Accommodation", STATED, text)
+    through = ""
+    if profile.kind.startswith("zernike"):
+        through = f" through {profile.pupil_diameter_mm:g} mm"
     if profile.age_years is None and not profile.add_dpt:
-        text = f"age not given: a young eye's {amplitude_dpt:.1f} dpt"
+        text = f"age not given: a young eye's {amplitude_dpt:.1f} dpt{through}"
         return ("Accommodation", TYPICAL, text)
     known = []
     if profile.age_years is not None:
         known.append(f"age of {profile.age_years:g} years {cite('amplitude')}")
     if profile.add_dpt:
         known.append(f"addition of {profile.add_dpt:g} dpt")
-    text = f"{amplitude_dpt:.1f} dpt, by {' and '.join(known)}"
+    text = f"{amplitude_dpt:.1f} dpt{through}, by {' and '.join(known)}"
     return ("Accommodation", TYPICAL, text)
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from clients.figures.study import WAVELENGTH_NM
 from clients.report.blocks import Table
-from clients.report.correction_text import correction_text
 from clients.report.facts import EyeFacts
+from clients.report.method_text import entered_text, um_text
 from clients.report.numbers import SPECTACLE_VERTEX_MM, spectacles_for, written
 
-N_COLUMNS = 4
-"""Columns of the coefficients."""
+N_COLUMNS, N_JOINT_COLUMNS = 4, 3
+"""Columns of the coefficients of one eye, and of two."""
+
+COEFFICIENTS_TITLE = "Coefficients, µm (OSA; x to the person's right, y up)"
 
 THROUGH_LENSLETS = "not known"
 """Text in place of an acuity; the summary gives the reason."""
@@ -38,7 +40,6 @@ def refraction_text(refraction: dict[str, Any], name: str) -> str:
 def refraction_table(facts: EyeFacts) -> Table:
     """Return the entered or measured refraction, and that of the estimated eye."""
     numbers = facts.numbers
-    is_entered = facts.study.profile.kind in ("prescription", "eye")
     pairs = numbers["measured"]["refraction"], numbers["eye"]["refraction"]
     return Table(
         "Refraction",
@@ -48,7 +49,7 @@ def refraction_table(facts: EyeFacts) -> Table:
         ),
         head=(
             "at the cornea, 555 nm",
-            "entered" if is_entered else "measured",
+            facts.study.source_word,
             "estimated",
         ),
         note=_refraction_note(facts),
@@ -57,24 +58,33 @@ def refraction_table(facts: EyeFacts) -> Table:
 
 def _refraction_note(facts: EyeFacts) -> str:
     numbers, fit = facts.numbers, facts.numbers["eye"]
+    entered = entered_text(facts.study.profile)
     note = (
+        f"{entered}{' ' if entered else ''}{spectacles_text(facts)}. "
         f"{numbers['measured']['refraction_pupil_mm']:.3g} mm pupil, relaxed, without "
-        f"correction. The estimated eye is {fit['eye_length_mm']:.2f} mm long, "
-        f"accommodates {fit['amplitude_dpt']:.1f} dpt, and misses the wavefront by "
-        f"{fit['rms_error_um']:.1g} µm RMS. As spectacles at "
-        f"{SPECTACLE_VERTEX_MM:g} mm: "
-        f"{written(spectacles_for(numbers['eye']['refraction']))}."
+        f"correction. The estimated eye is {fit['eye_length_mm']:.2f} mm long and "
+        f"misses the wavefront by {um_text(fit['rms_error_um'])} RMS."
     )
     light_nm = facts.study.found.wavelength_nm
     if light_nm != WAVELENGTH_NM:
         note += f" Measured at {light_nm:g} nm, moved to 555 nm by the eye's color."
-    lens = facts.study.profile.correction
-    if lens is not None:
+    if facts.study.profile.correction is not None:
         note += (
-            f" Worn: {correction_text(lens)}; M through it "
+            " M through the worn correction: "
             f"{signed(fit['refraction_through_correction_dpt'])} dpt."
         )
     return note
+
+
+def spectacles_text(facts: EyeFacts) -> str:
+    """Return the spectacles that correct an eye."""
+    lens = spectacles_for(facts.numbers["eye"]["refraction"])
+    return f"As spectacles at {SPECTACLE_VERTEX_MM:g} mm: {written(lens)}"
+
+
+def change_text(before: float, after: float) -> str:
+    """Return the difference of two numbers as they are shown."""
+    return signed(round(after, 2) - round(before, 2))
 
 
 def signed(value: float) -> str:
@@ -87,15 +97,23 @@ def signed(value: float) -> str:
 def vision_table(facts: EyeFacts) -> Table:
     """Return the vision through both pupils, as it is and best corrected."""
     pupils = facts.numbers["pupils"]
-    note = "Acuity in logMAR, and as a decimal."
-    if any(p["is_beyond_measured"] for p in pupils):
-        note += " * wider than the pupil measured: see “What is known”."
     return Table(
         "Vision on the axis",
         tuple((word, *map(words, pupils)) for word, words in VISION_ROWS.items()),
         head=("far object, 555 nm", *(pupil_text(p) for p in pupils)),
-        note=note,
+        note=vision_note(pupils),
     )
+
+
+def vision_note(pupils: list[dict[str, Any]]) -> str:
+    """Return the note below numbers of vision through some pupils."""
+    note = (
+        "Acuity in logMAR, and as a decimal. Higher orders: in the entrance pupil; "
+        "maps and bars show them at the cornea."
+    )
+    if any(p["is_beyond_measured"] for p in pupils):
+        note += " * wider than the pupil measured: see “What is known”."
+    return note
 
 
 def distance_text(distance_dpt: float) -> str:
@@ -122,6 +140,7 @@ VISION_ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     ),
     "far point, dpt": lambda p: distance_text(p["far_point_dpt"]),
     "near point, dpt": lambda p: distance_text(p["near_point_dpt"]),
+    "accommodation, dpt": lambda p: f"{p['near_point_dpt'] - p['far_point_dpt']:.1f}",
 }
 
 
@@ -158,27 +177,63 @@ def coefficient_table(facts: EyeFacts) -> Table:
     """Return all coefficients in four columns."""
     measured = facts.numbers["measured"]
     cells = [
-        (
-            f"({name.replace(',', ', ')})".replace("-", "−"),
-            f"{value:+.4f}".replace("-", "−"),
-        )
+        (_term_text(name), _coefficient_text(value))
         for name, value in measured["zernike_um"].items()
     ]
-    n_rows = -(-len(cells) // N_COLUMNS)
-    rows = tuple(
+    return Table(
+        COEFFICIENTS_TITLE,
+        _side_by_side(cells, N_COLUMNS),
+        head=("n, m", "µm") * N_COLUMNS,
+        note=_circle_text(measured),
+    )
+
+
+def joint_coefficient_table(
+    before: EyeFacts, after: EyeFacts, names: tuple[str, str]
+) -> Table:
+    """Return all coefficients of two eyes in three columns."""
+    first, second = (facts.numbers["measured"] for facts in (before, after))
+    cells = [
+        (_term_text(term), *map(_coefficient_text, (value, second["zernike_um"][term])))
+        for term, value in first["zernike_um"].items()
+    ]
+    notes = [_circle_text(measured) for measured in (first, second)]
+    if notes[0] != notes[1]:
+        notes = [f"{name}: {note}" for name, note in zip(names, notes, strict=True)]
+    return Table(
+        COEFFICIENTS_TITLE,
+        _side_by_side(cells, N_JOINT_COLUMNS),
+        head=("n, m", *names) * N_JOINT_COLUMNS,
+        note=" ".join(dict.fromkeys(notes)),
+    )
+
+
+def _term_text(name: str) -> str:
+    return f"({name.replace(',', ', ')})".replace("-", "−")
+
+
+def _coefficient_text(value_um: float) -> str:
+    return f"{value_um:+.4f}".replace("-", "−")
+
+
+def _side_by_side(
+    cells: Sequence[tuple[str, ...]], n_columns: int
+) -> tuple[tuple[str, ...], ...]:
+    n_rows = -(-len(cells) // n_columns)
+    return tuple(
         tuple(text for cell in cells[k::n_rows] for text in cell) for k in range(n_rows)
     )
+
+
+def _circle_text(measured: dict[str, Any]) -> str:
     radius_mm, light_nm = measured["zernike_radius_mm"], measured["wavelength_nm"]
-    return Table(
-        "Coefficients, µm (OSA; x to the person's right, y up)",
-        rows,
-        head=("n, m", "µm") * N_COLUMNS,
-        note=f"At the cornea, on a circle of {2 * radius_mm:.3g} mm, {light_nm:g} nm; "
-        f"higher orders {measured['higher_order_rms_um']:.3f} µm RMS.",
+    return (
+        f"At the cornea, on a circle of {2 * radius_mm:.3g} mm, {light_nm:g} nm; "
+        f"higher orders {measured['higher_order_rms_um']:.3f} µm RMS."
     )
 
 
-def field_table_block(facts: EyeFacts) -> Table:
+def field_table_block(facts: EyeFacts, *, name: str = "") -> Table:
     """Return the refraction along the horizontal meridian."""
     rows = tuple(
         (
@@ -189,7 +244,7 @@ def field_table_block(facts: EyeFacts) -> Table:
         for entry in facts.numbers["field"]
     )
     return Table(
-        "Along the horizontal",
+        f"Along the horizontal{f' ({name})' if name else ''}",
         rows,
         head=("h, deg", "M, dpt", "J0, dpt"),
         note="Relaxed, 4 mm pupil, at the cornea; h to the person's right.",

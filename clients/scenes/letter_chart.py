@@ -29,6 +29,9 @@ ROWS_OF_LETTERS = (
 ARCMIN_PER_DEG = 60.0
 LOG_MAR_LIMITS = (-1.0, 2.5)
 
+ROUNDING_LOG_MAR = 0.05
+"""A row counts as read from half a step below its size."""
+
 SAMPLES = 6
 """Samples of a letter per pixel along each axis."""
 
@@ -61,6 +64,29 @@ class LetterChart:
 
     view: RgbdView
     rows: tuple[ChartRow, ...]
+
+
+def row_texts(log_mar: float) -> tuple[str, str]:
+    """Return a row's size in logMAR, and as a decimal acuity."""
+    text = f"{log_mar:.1f}".replace("-", "\N{MINUS SIGN}")
+    return text, f"{10.0**-log_mar:.2f}"
+
+
+def row_text(log_mar: float) -> str:
+    """Return both sizes of a row."""
+    return " · ".join(row_texts(log_mar))
+
+
+def smallest_row(rows: Sequence[float], acuity_log_mar: float) -> int | None:
+    """Return the index of the smallest row that an acuity reads; None if it reads none.
+
+    Parameters
+    ----------
+    rows : logMAR of each row, largest first
+    """
+    limit = acuity_log_mar - ROUNDING_LOG_MAR
+    read = [k for k, row in enumerate(rows) if row >= limit]
+    return read[-1] if read else None
 
 
 def letter_height(log_mar: float) -> float:

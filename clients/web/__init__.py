@@ -13,6 +13,8 @@ correction_form   the entries of a correction, and the resulting correction
 numbers           numeric entries with their limits
 slider_row        a slider with its name and value, with range_slider.js
 shared_entries    the entries as the fragment of an address
+page_link         the browser's address, and the link to copy
+downloads         buttons that download picture, profile and report
 upload_entry      a file upload
 file_names        sanitized file names
 scene_panel       selection of the scene

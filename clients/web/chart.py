@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
-from clients.scenes.letter_chart import letter_chart
+from clients.scenes.letter_chart import letter_chart, letter_height, row_texts
 from clients.web.picture import ChartRow, Picture, camera_of, picture_of
 
-ROWS = tuple(round(0.8 - 0.1 * k, 1) for k in range(10))
-"""LogMAR, from 0.8 to -0.1."""
+ROWS = tuple(round(1.0 - 0.1 * k, 1) for k in range(12))
+"""LogMAR, from 1.0 to -0.1."""
 
-WIDTH_DEG = 9.6
-SIZE_PX = (960, 540)
-ROUNDING = 0.05
-"""A row counts as read from half a step below its size."""
+WIDTH_DEG = 13.6
+"""The largest row takes 7.5 deg; beside it is room for the labels."""
+
+SIZE_PX = (1200, 675)
+HEIGHTS = 4.5
+"""Half of a row's width, in heights of its letters: five letters and their gaps."""
 
 
 def chart_picture(distance_dpt: float) -> Picture:
@@ -23,21 +26,43 @@ def chart_picture(distance_dpt: float) -> Picture:
     camera = camera_of(WIDTH_DEG, width_px=SIZE_PX[0], height_px=SIZE_PX[1])
     chart = letter_chart(camera, distance_m=math.inf, log_mar=ROWS)
     picture = picture_of("Letter chart", chart.view, distance_dpt=0.0)
-    rows = tuple(ChartRow(row.log_mar, row.y_px / SIZE_PX[1]) for row in chart.rows)
-    return replace(picture, chart_rows=rows).at(distance_dpt)
+    half_width = math.tan(math.radians(WIDTH_DEG) / 2.0)
+    rows = tuple(
+        ChartRow(
+            row.log_mar,
+            row.y_px / SIZE_PX[1],
+            0.5 + letter_height(row.log_mar) * HEIGHTS / half_width / 2.0,
+        )
+        for row in chart.rows
+    )
+    # the camera turns with the eye, so that the rows stay on the fovea
+    return replace(picture, chart_rows=rows, follows_gaze=True).at(distance_dpt)
 
 
-def row_text(log_mar: float) -> str:
-    """Return a row's size in logMAR and as a decimal acuity."""
-    return f"{log_mar:.1f} · {10.0**-log_mar:.2f}".replace("-", "\N{MINUS SIGN}")
-
-
-def smallest_row(rows: Sequence[float], acuity_log_mar: float) -> int | None:
-    """Return the index of the smallest row that an acuity reads; None if it reads none.
+def marks_of(
+    rows: Sequence[ChartRow], read: Mapping[str, int | None]
+) -> list[dict[str, Any]]:
+    """Return the labels of a chart's rows.
 
     Parameters
     ----------
-    rows : logMAR of each row, largest first
+    read : index of the smallest row that each eye reads, or None
     """
-    read = [k for k, row in enumerate(rows) if row >= acuity_log_mar - ROUNDING]
-    return read[-1] if read else None
+    return [
+        {
+            "y": row.y_ratio,
+            "x": row.end_ratio,
+            "log_mar": row_texts(row.log_mar)[0],
+            "decimal": row_texts(row.log_mar)[1],
+            "eyes": [eye for eye, smallest in read.items() if smallest == k],
+        }
+        for k, row in enumerate(rows)
+    ]
+
+
+def caption(rows: Sequence[ChartRow], smallest: int | None) -> str:
+    """Return the smallest row that an eye reads in words."""
+    found = "none of these rows"
+    if smallest is not None:
+        found = "logMAR {}, decimal {}".format(*row_texts(rows[smallest].log_mar))
+    return f"smallest line read: {found}"

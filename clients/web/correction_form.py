@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -27,7 +29,8 @@ DESIGNS = {
     "edof": "Extended depth of focus",
 }
 HINTS: dict[WornKind, str] = {
-    "progressive": "Use the gaze sliders to look through other parts of the lens.",
+    "progressive": "Look: Reading turns the gaze to the end of the corridor; the gaze "
+    "sliders reach other parts of the lens.",
     "lenslets": "396 lenslets around a clear center; use the gaze sliders to look "
     "through other parts.",
     "iol": "Replaces the eye's own lens: enter the refraction that remains after "
@@ -93,6 +96,28 @@ def first_texts() -> dict[str, str]:
         "near_add_dpt": "+3.32",
         "spherical_aberration_um": "0.00",
     }
+
+
+DISTANCE_KINDS: tuple[WornKind, ...] = (
+    *("spectacles", "progressive", "lenslets", "contact_lens"),
+)
+"""Kinds whose distance powers can be those of the prescription."""
+
+MM_PER_M = 1000.0
+ROTATION_CENTER_MM = 13.5
+"""Depth of the eye's center of rotation behind the cornea."""
+
+
+def reading_gaze_deg(profile: Mapping[str, Any]) -> float | None:
+    """Return the vertical gaze through the end of a progressive lens's corridor.
+
+    Rounded down to a whole degree; None for other corrections.
+    """
+    worn = profile.get("correction") or {}
+    if worn.get("kind") != "progressive":
+        return None
+    depth_mm = worn["vertex_mm"] + ROTATION_CENTER_MM
+    return math.floor(-math.degrees(math.atan2(worn["corridor_mm"], depth_mm)))
 
 
 def turns_with_gaze(profile: Mapping[str, Any]) -> bool:
@@ -161,6 +186,21 @@ class CorrectionForm:
             found |= {"adds_dpt": adds, "light_ratio": list(TRIFOCAL_LIGHT)}
         return found | {"design": self.design}
 
+    def fill_distance(self, texts: Mapping[str, str]) -> None:
+        """Set the distance powers from the entries of a prescription."""
+        self.texts |= {entry.name: texts[entry.name] for entry in PRESCRIPTION}
+        if self.kind == "contact_lens":
+            with suppress(ValueError):  # reported at the prescription
+                self.texts |= _texts_at_cornea(read_numbers(PRESCRIPTION, texts))
+
+    @property
+    def is_plano(self) -> bool:
+        """Return whether sphere and cylinder are zero."""
+        try:
+            return not any(e.read(self.texts[e.name]) for e in (SPHERE, CYLINDER))
+        except ValueError:
+            return False
+
     def take(self, body: Mapping[str, Any]) -> None:
         """Set the entries from a correction, or keep it as a file if they cannot."""
         kind, design = body.get("kind", "spectacles"), body.get("design", "monofocal")
@@ -188,6 +228,22 @@ class CorrectionForm:
     def copied(self) -> CorrectionForm:
         """Return a copy for the other eye."""
         return CorrectionForm(self.kind, self.design, dict(self.texts), self.file_body)
+
+
+def _texts_at_cornea(lens: Mapping[str, float]) -> dict[str, str]:
+    """Return the texts of sphere and cylinder with the vertex distance removed."""
+    vertex_m = lens[VERTEX.name] / MM_PER_M
+    sphere_dpt, other_dpt = (
+        power_dpt / (1.0 - vertex_m * power_dpt)
+        for power_dpt in (
+            lens[SPHERE.name],
+            lens[SPHERE.name] + lens[CYLINDER.name],
+        )
+    )
+    return {
+        SPHERE.name: SPHERE.show(sphere_dpt),
+        CYLINDER.name: CYLINDER.show(other_dpt - sphere_dpt),
+    }
 
 
 def read_numbers(

@@ -11,7 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from clients.web.correction_form import PRESCRIPTION, CorrectionForm, read_numbers
+from clients.web.correction_form import (
+    DISTANCE_KINDS,
+    PRESCRIPTION,
+    CorrectionForm,
+    WornKind,
+    read_numbers,
+)
 from estimator import (
     InvalidFile,
     load_profile,
@@ -62,6 +68,7 @@ class EyeForm:
     preset : name
     file_body : profile from a file, or None
     file_name : name of that file
+    loaded_name : name of the file that the other entries come from, or empty
     wears_correction : whether `worn` is used
     """
 
@@ -72,6 +79,7 @@ class EyeForm:
     preset: str = "myopia"
     file_body: dict[str, Any] | None = None
     file_name: str = ""
+    loaded_name: str = ""
     wears_correction: bool = False
     worn: CorrectionForm = field(default_factory=CorrectionForm)
 
@@ -105,26 +113,28 @@ class EyeForm:
         }
 
     def correct_fully(self) -> None:
-        """Wear spectacles of the prescription."""
-        self.worn.kind = "spectacles"
-        self.worn.texts |= self.texts
+        """Wear the prescription; the kind of lens and its addition stay."""
+        if not self.wears_correction or self.worn.kind not in DISTANCE_KINDS:
+            self.worn.kind = "spectacles"
+        self.worn.fill_distance(self.texts)
         self.wears_correction = True
 
-    def take_file(self, name: str, content: bytes) -> float | None:
-        """Read a profile file; return the age that it states, in years.
+    def choose_worn(self, kind: WornKind) -> None:
+        """Wear another kind of lens; a lens without power gets the prescription's."""
+        self.worn.kind = kind
+        is_graded = kind in ("progressive", "lenslets")
+        if is_graded and self.source == "prescription" and self.worn.is_plano:
+            self.worn.fill_distance(self.texts)
 
-        Raises
-        ------
-        ValueError
-            Not a profile; the form is unchanged.
-        """
-        body = read_profile_file(name, content)
-        self.take_body(body, Path(name).name)
-        return body.get("age_years")
+    def reset(self) -> None:
+        """Set the initial entries; the uploaded file stays available."""
+        new = EyeForm(self.side, file_body=self.file_body, file_name=self.file_name)
+        vars(self).update(vars(new))
 
     def take_body(self, body: Mapping[str, Any], name: str) -> None:
         """Set the entries from a profile."""
         body = dict(body)
+        self.loaded_name = name if Path(name).suffix in PROFILE_SUFFIXES else ""
         correction = body.pop("correction", None)
         if correction is not None:
             self.wears_correction = True

@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import asyncio
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 
 from nicegui import events, ui
 
-from clients.web.correction_form import DESIGNS, HINTS, PRESCRIPTION, SPHERE
+from clients.web.correction_form import (
+    AXIS,
+    CYLINDER,
+    DESIGNS,
+    DISTANCE_KINDS,
+    HINTS,
+    PRESCRIPTION,
+    SPHERE,
+)
 from clients.web.eye_form import (
     MAX_PROFILE_BYTES,
     PROFILE_SUFFIXES,
     EyeForm,
+    EyeSide,
     preset_titles,
 )
-from clients.web.numbers import NumberField
+from clients.web.numbers import NumberField, prescription_texts
 from clients.web.slider_row import SliderRow
 from clients.web.upload_entry import upload_entry
 
@@ -36,17 +46,18 @@ class EyePanel:
     Parameters
     ----------
     on_change : called when the entries have changed and are valid
-    on_age : called with the age that a file states, years
+    on_file : called with this eye, and the name and the content of a profile file
     """
 
     def __init__(
         self,
         form: EyeForm,
         on_change: Callable[[], None],
-        on_age: Callable[[float], None],
+        on_file: Callable[[EyeSide, str, bytes], Awaitable[None]],
     ) -> None:
         self.form = form
-        self._on_change, self._on_age = on_change, on_age
+        self._on_change, self._on_file = on_change, on_file
+        self._entries: dict[tuple[str, bool], ui.input] = {}
         with ui.element("div").classes("oc-eye") as self.box:
             self.box.props["data-eye-panel"] = form.side
             self._build()
@@ -54,6 +65,7 @@ class EyePanel:
     @ui.refreshable_method
     def _build(self) -> None:
         form = self.form
+        self._entries.clear()
         ui.toggle(SOURCES, value=form.source, on_change=self._choose_source).props(
             'no-caps unelevated spread dense role=group aria-label="Kind of entries"'
         ).classes("oc-toggle")
@@ -68,6 +80,8 @@ class EyePanel:
             ).props("outlined dense options-dense").classes("oc-wide").mark("preset")
         else:
             self._file()
+        if form.loaded_name and form.source != "file":
+            ui.label(f"Loaded: {form.loaded_name}").classes("oc-hint")
         ui.separator()
         self._correction()
 
@@ -94,12 +108,30 @@ class EyePanel:
         ).classes("oc-sphere")
         entry.on_value_change(lambda event: slider.show(_within(event.value)))
 
-    def _entry(self, number: NumberField, texts: dict[str, str]) -> ui.input:
+    def _entry(
+        self, number: NumberField, texts: dict[str, str], *, is_worn: bool = False
+    ) -> ui.input:
         """Return an entry for one number, with validation."""
+        is_pasted = False
 
         def take(event: events.ValueChangeEventArguments) -> None:
+            nonlocal is_pasted
             texts[number.name] = event.value or ""
-            self._on_change()  # an invalid entry is reported
+            if is_pasted and number is SPHERE and prescription_texts(event.value or ""):
+                # nicegui sends no value for an entry while it handles the entry's event
+                asyncio.get_running_loop().call_soon(leave)
+            else:
+                self._on_change()  # an invalid entry is reported
+            is_pasted = False
+
+        def leave() -> None:
+            text = entry.value or ""
+            if not self._spread(number, text, is_worn):
+                entry.set_value(number.normalized(text))
+
+        def paste() -> None:
+            nonlocal is_pasted
+            is_pasted = True
 
         entry = ui.input(
             number.label,
@@ -112,7 +144,9 @@ class EyePanel:
             f'autocomplete="off" debounce={TYPING_MS}'
         ).classes("oc-entry")
         entry.props["data-name"] = number.name
-        entry.on("blur", lambda: entry.set_value(number.normalized(entry.value or "")))
+        self._entries[number.name, is_worn] = entry
+        entry.on("blur", leave)
+        entry.on("paste", paste)
         for key, steps in (("up", 1), ("down", -1)):
             entry.on(
                 f"keydown.{key}.prevent",
@@ -121,6 +155,15 @@ class EyePanel:
                 ),
             )
         return entry
+
+    def _spread(self, number: NumberField, text: str, is_worn: bool) -> bool:
+        """Set sphere, cylinder and axis from a whole prescription in the sphere."""
+        found = prescription_texts(text) if number is SPHERE else None
+        if found is None:
+            return False
+        for each, part in zip((SPHERE, CYLINDER, AXIS), found, strict=True):
+            self._entries[each.name, is_worn].set_value(each.normalized(part))
+        return True
 
     def _file(self) -> None:
         upload_entry(
@@ -141,10 +184,11 @@ class EyePanel:
                 value=form.wears_correction,
                 on_change=self._switch_correction,
             ).props("dense").classes("oc-switch")
-            if form.source == "prescription":
+            keeps = not form.wears_correction or form.worn.kind in DISTANCE_KINDS
+            if form.source == "prescription" and keeps:
                 ui.button("Correct fully", on_click=self._correct_fully).props(
                     "flat dense no-caps size=sm"
-                ).tooltip("Wear spectacles of the prescription above")
+                ).tooltip("Wear the prescription above; kind of lens and addition stay")
         if form.wears_correction:
             self._worn()
 
@@ -162,7 +206,8 @@ class EyePanel:
             ).props("outlined dense options-dense").classes("oc-wide oc-worn-design")
         with ui.element("div").classes("oc-fields oc-worn"):
             for number in worn.entries:
-                self._entry(number, worn.texts).props["data-worn"] = ""
+                entry = self._entry(number, worn.texts, is_worn=True)
+                entry.props["data-worn"] = ""
         if worn.kind in HINTS:
             ui.label(HINTS[worn.kind]).classes("oc-hint")
 
@@ -173,6 +218,7 @@ class EyePanel:
         form.texts, form.worn = dict(other.texts), other.worn.copied()
         form.has_higher_order = other.has_higher_order
         form.file_body, form.file_name = other.file_body, other.file_name
+        form.loaded_name = other.loaded_name
         form.wears_correction = other.wears_correction
         self._changed()
 
@@ -195,7 +241,7 @@ class EyePanel:
         self._changed()
 
     def _choose_worn(self, event: events.ValueChangeEventArguments) -> None:
-        self.form.worn.kind = event.value
+        self.form.choose_worn(event.value)
         self._changed()
 
     def _choose_design(self, event: events.ValueChangeEventArguments) -> None:
@@ -207,10 +253,7 @@ class EyePanel:
         self._changed()
 
     async def _take_file(self, name: str, content: bytes) -> None:
-        age_years = self.form.take_file(name, content)
-        if age_years is not None:
-            self._on_age(age_years)
-        self._changed()
+        await self._on_file(self.form.side, name, content)
 
     def show(self) -> None:
         """Show the entries of the form again."""

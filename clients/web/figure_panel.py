@@ -10,7 +10,7 @@ from typing import Any
 
 from nicegui import events, ui
 
-from clients.web.chart import smallest_row
+from clients.scenes.letter_chart import smallest_row
 from clients.web.eye_figures import FIGURE_TITLES, eye_figure, predicted_log_mar
 from clients.web.eye_form import SIDES, EyeSide
 from clients.web.figure_worker import FigureWorker, StudyFailed
@@ -62,7 +62,7 @@ class FigurePanel:
         """Build the card of the point-spread function."""
         with (
             ui.element("section")
-            .classes("oc-card")
+            .classes("oc-card oc-point")
             .props("aria-label='Point of light'")
         ):
             ui.html("A point of light here", tag="h2", sanitize=False).classes(
@@ -137,7 +137,7 @@ class FigurePanel:
             return
         values = self._state.values
         point = PointState(
-            direction_deg=place.direction_deg(self._state.gaze_deg),
+            direction_deg=place.direction_deg(self._state.picture_gaze_deg),
             object_dpt=place.distance_dpt,
             pupil_diameter_mm=values[PUPIL.name],
             focus_dpt=values[FOCUS.name],
@@ -149,14 +149,14 @@ class FigurePanel:
         self._psf.content = f'<img src="{data_url(png)}" alt="Light of the point">'
         self._told.text = point_words(facts)
 
-    async def smallest_rows(self) -> dict[int, list[EyeSide]] | None:
-        """Return the eyes that read each row of the chart as their smallest line.
+    async def smallest_rows(self) -> dict[EyeSide, int | None] | None:
+        """Return the smallest row of the chart that each eye reads, None for no row.
 
-        None if the worker is behind.  An eye that reads no row is in none.
+        None if the worker is behind.  An eye whose acuity is unknown is left out.
         """
         picture, values = self._state.picture, self._state.values
-        rows = [row for row, _ in picture.chart_rows] if picture else []
-        found: dict[int, list[EyeSide]] = {}
+        rows = [row.log_mar for row in picture.chart_rows] if picture else []
+        found: dict[EyeSide, int | None] = {}
         for side in self._state.sides if rows else ():
             body = self._state.looking_body(side)
             if body is None:
@@ -171,9 +171,8 @@ class FigurePanel:
             )
             if log_mar is None:
                 return None
-            row = smallest_row(rows, log_mar)
-            if row is not None:
-                found.setdefault(row, []).append(side)
+            if not math.isnan(log_mar):
+                found[side] = smallest_row(rows, log_mar)
         return found
 
     async def _show_figure(self) -> None:

@@ -116,7 +116,9 @@ class Guard:
         )
 
     async def _welcome(self, send: Send) -> None:
-        cookie = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict"
+        # not Strict: after a link on another site, a browser would not send it to the
+        # address that it is redirected to
+        cookie = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Lax"
         # keeps the token out of the address bar and the browser's history
         headers = [
             (b"set-cookie", cookie.encode("latin-1")),

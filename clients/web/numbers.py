@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 
 DEGREE = "°"
 MINUS_SIGNS = str.maketrans({"\N{MINUS SIGN}": "-", "\N{EN DASH}": "-", ",": "."})
+
+_POWER = r"([+-]?\d+(?:\.\d+)?)"
+_PRESCRIPTION = re.compile(
+    rf"{_POWER}\s*(?:[/;]\s*|\s+|(?=[+-])){_POWER}\s*"
+    r"(?:[x×*@/;]|ax(?:is|e)?\.?|\s)\s*(\d{1,3})\s*°?",
+    re.IGNORECASE | re.ASCII,
+)
 
 
 @dataclass(frozen=True)
@@ -112,3 +120,12 @@ def distance_text(vergence_dpt: float) -> str:
     meters = 1.0 / vergence_dpt
     told = f"{100 * meters:.0f} cm" if meters < 1.0 else f"{meters:.1f} m"
     return f"{vergence_dpt:.2f} dpt · {told}"
+
+
+def prescription_texts(text: str) -> tuple[str, str, str] | None:
+    """Return sphere, cylinder and axis of a text as "-3.5 -1.25 x 80".
+
+    None if the text has another form.
+    """
+    found = _PRESCRIPTION.fullmatch(text.strip().translate(MINUS_SIGNS))
+    return None if found is None else (found[1], found[2], found[3])

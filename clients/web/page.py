@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from nicegui import Client, app, events, run, ui
 
-from clients.report import report_html
-from clients.web.chart import row_text
+from clients.web.chart import caption, marks_of
+from clients.web.downloads import Downloads
 from clients.web.eye_form import SIDES, EyeSide
 from clients.web.eye_panel import EyePanel
 from clients.web.figure_panel import FigurePanel
-from clients.web.figure_worker import FigureWorker, StudyFailed
+from clients.web.figure_worker import FigureWorker
 from clients.web.filter_thread import FilterThread
-from clients.web.numbers import distance_text
+from clients.web.numbers import NumberField, distance_text
+from clients.web.page_link import PageLink
 from clients.web.page_state import AGE, DISTANCE, FOCUS, LOOKS, PUPIL, PageState
 from clients.web.picture import Picture
 from clients.web.picture_files import png_of
@@ -27,7 +27,7 @@ from clients.web.picture_sender import PictureSender
 from clients.web.picture_view import PictureView
 from clients.web.scene_file import SceneNotRendered, scene_picture
 from clients.web.scene_panel import FIRST, ScenePanel
-from clients.web.shared_entries import fragment_of, restore
+from clients.web.shared_entries import SCENES, restore
 from clients.web.slider_row import SliderRow
 
 if TYPE_CHECKING:
@@ -43,15 +43,15 @@ FIRST_ASPECT = 960 / 540
 STATUS_REST_S = 0.3
 """Time after which an eye that is being prepared is announced: most are quicker."""
 
-LINK_REST_S = 0.5
-"""Time after the last change until the address in the browser is renewed."""
-
 FIRST_S = 1.5
 """Longest time that a page waits for its first scene before it opens without one."""
 
 CONNECT_S = 30.0
-READY_S = 120.0
-"""Longest time that a download waits for the full picture."""
+
+AMPLITUDE = (
+    "The amplitude is that of objective accommodation; a push-up measurement also "
+    "includes the depth of focus and reads higher."
+)
 
 PICTURES_PATH = "/pictures/"
 
@@ -79,12 +79,11 @@ class Page:
     Parameters
     ----------
     profile : initial profile of both eyes, and its name
+    token : the access token, part of a copied link
     """
 
     def __init__(
-        self,
-        resources: SharedResources,
-        profile: NamedProfile | None,
+        self, resources: SharedResources, profile: NamedProfile | None, token: str
     ) -> None:
         self.resources = resources
         self.name = secrets.token_urlsafe(16)
@@ -94,12 +93,26 @@ class Page:
         self.out = resources.out[self.name] = PictureSender()
         self._loop = asyncio.get_running_loop()
         self._renewal: asyncio.Task[None] | None = None
-        self._linking: asyncio.Task[None] | None = None
         self._announcing: asyncio.Task[None] | None = None
         self._ready: dict[EyeSide, asyncio.Event] = {s: asyncio.Event() for s in SIDES}
-        self._fragment = ""
+        self._empty = ""
         resources.filter_thread.open(self.name, self._from_thread)
+        self.downloads = Downloads(
+            self.name,
+            self.state,
+            self.out,
+            resources.figure_worker,
+            ready=self._ready,
+            no_scene=lambda: self._empty,
+        )
         self._build()
+        self.link = PageLink(
+            self.state,
+            token,
+            scene=lambda: self.scene.kind,
+            on_fragment=self._restore,
+            place=self.view,
+        )
 
     def _set_profile(self, body: Mapping[str, Any], name: str) -> None:
         for form in self.state.eyes.values():
@@ -115,17 +128,23 @@ class Page:
 
     async def start(self) -> None:
         """Set the entries of the address's fragment; the browser must be connected."""
-        try:
-            fragment = await ui.run_javascript("location.hash.slice(1)", timeout=10.0)
-        except TimeoutError:  # the browser has left
-            return
-        if not fragment:
-            return
-        found = restore(self.state, str(fragment))
+        fragment = await self.link.read()
+        if fragment:
+            self._restore(fragment)
+        else:
+            self.link.renew()
+
+    def _restore(self, fragment: str) -> None:
+        """Set the entries from a fragment of the address."""
+        found = restore(self.state, fragment)
         self._show_entries()
         self._said.text = " ".join(found.problems)
-        if found.scene is not None and found.scene != FIRST:
-            self.scene.choose(found.scene)
+        scene = found.scene if found.scene in SCENES else None
+        # a photo is in no link: it stays where the link names no other scene
+        if scene == FIRST and self.scene.kind not in SCENES:
+            scene = None
+        if scene is not None and scene != self.scene.kind:
+            self.scene.choose(scene)
         else:
             self.request()
 
@@ -133,9 +152,12 @@ class Page:
         """Show the state's entries after they were set from a link."""
         for panel in self.panels.values():
             panel.show()
+        self._show_values()
+        self._shown.value = self.state.shown  # shows the eyes, too
+
+    def _show_values(self) -> None:
         for name, row in self.rows.items():
             row.show(self.state.values[name])
-        self._shown.value = self.state.shown  # shows the eyes, too
 
     # Layout
 
@@ -147,34 +169,18 @@ class Page:
             ui.html("ocufilter", tag="h1", sanitize=False).classes("oc-brand")
             ui.label("See through another person’s eyes").classes("oc-motto")
             ui.element("span").classes("oc-grow")
-            self._download_buttons()
+            self.downloads.build(lambda: self.link.copy())
+        self.rows: dict[str, SliderRow] = {}
+        self.figures = FigurePanel(self.name, self.state, self.resources.figure_worker)
         with ui.element("div").classes("oc-page"):  # NiceGUI adds the <main>
-            with ui.element("div").classes("oc-left"):
-                self._eyes_card()
-            with ui.element("div").classes("oc-middle"):
-                self._picture_card()
-                self._sliders_card()
-            self.figures = FigurePanel(
-                self.name, self.state, self.resources.figure_worker
-            )
-            with ui.element("div").classes("oc-point"):
-                self.figures.build_point()
-            with ui.element("div").classes("oc-right"):
-                self.figures.build_figure()
-
-    def _download_buttons(self) -> None:
-        with ui.element("nav").classes("oc-downloads").props("aria-label=Downloads"):
-            for label, tip, act in (
-                ("Picture", "What the eye sees, PNG", self._download_picture),
-                ("Profile", "The eye's profile, JSON", self._download_profile),
-                ("Report", "What this eye sees and why, HTML", self._download_report),
-            ):
-                ui.button(label, icon="download", on_click=act).props(
-                    "outline dense no-caps size=sm"
-                ).classes("oc-download").tooltip(tip)
-            ui.button("Copy link", icon="link", on_click=self._copy_link).props(
-                "outline dense no-caps size=sm"
-            ).classes("oc-download").tooltip("Link to these entries, without files")
+            with ui.element("div").classes("oc-columns"):
+                with ui.element("div").classes("oc-left"):
+                    self._eyes_card()
+                    self.figures.build_point()
+                with ui.element("div").classes("oc-middle"):
+                    self._picture_card()
+                    self._sliders_card()
+            self.figures.build_figure()
 
     def _picture_card(self) -> None:
         with (
@@ -182,12 +188,14 @@ class Page:
             .classes("oc-card oc-picture")
             .props("aria-label=Picture")
         ):
-            self.scene = ScenePanel(self.state, self._set_picture, FIRST)
+            self.scene = ScenePanel(
+                self.state, self._set_picture, self._set_empty, FIRST
+            )
             self.view = PictureView(
                 PICTURES_PATH + self.name, list(self.state.sides), FIRST_ASPECT
             )
             self.view.on("point", self._point)
-            self.view.on("look", self._look)
+            self.view.on("look", self._focus)
             self._status = (
                 ui.label("").classes("oc-status").props("role=status aria-live=polite")
             )
@@ -196,24 +204,31 @@ class Page:
             self._notes: dict[EyeSide, str] = {}
 
     def _sliders_card(self) -> None:
-        values = self.state.values
         with (
             ui.element("section")
             .classes("oc-card oc-sliders")
             .props('aria-label="Viewing conditions"')
         ):
-            self.rows = {
-                number.name: SliderRow(
-                    number,
-                    values[number.name],
-                    cast(
-                        "Callable[[float], None]",
-                        lambda value, name=number.name: self._slide(name, value),
-                    ),
-                    words=distance_text if number in (FOCUS, DISTANCE) else None,
-                )
-                for number in LOOKS
-            }
+            for number in LOOKS:
+                if number is not AGE:
+                    self._slider(number)
+            with (
+                ui.element("div").classes("oc-look").props("role=group aria-label=Look")
+            ):
+                ui.label("Look").props("aria-hidden=true")
+                for label, is_reading in (("Far", False), ("Reading", True)):
+                    ui.button(
+                        label, on_click=lambda _, near=is_reading: self._look(near)
+                    ).props("outline dense no-caps size=sm").classes("oc-download")
+
+    def _slider(self, number: NumberField) -> None:
+        name = number.name
+        self.rows[name] = SliderRow(
+            number,
+            self.state.values[name],
+            lambda value: self._slide(name, value),
+            words=distance_text if number in (FOCUS, DISTANCE) else None,
+        )
 
     def _eyes_card(self) -> None:
         with ui.element("section").classes("oc-card").props("aria-label=Eye"):
@@ -229,6 +244,7 @@ class Page:
                 )
                 .classes("oc-toggle oc-shown")
             )
+            self._slider(AGE)
             self.panels: dict[EyeSide, EyePanel] = {}
             self._boxes: dict[EyeSide, tuple[ui.element, ui.element]] = {}
             for side, title in SIDES.items():
@@ -236,7 +252,7 @@ class Page:
                     heading = ui.html(title, tag="h3", sanitize=False)
                     heading.classes("oc-eye-title")
                     self.panels[side] = EyePanel(
-                        self.state.eyes[side], self.request, self._set_age
+                        self.state.eyes[side], self.request, self._take_file
                     )
                 self._boxes[side] = (box, heading)
             self._show_boxes()
@@ -254,9 +270,7 @@ class Page:
         if request is None:
             return
         self._prepare()
-        if self._linking is not None:
-            self._linking.cancel()
-        self._linking = asyncio.create_task(self._renew_link())
+        self.link.renew()
         self.resources.filter_thread.request(self.name, request)
         if self._renewal is not None:
             self._renewal.cancel()
@@ -292,31 +306,11 @@ class Page:
             f"{distance_text(values[FOCUS.name])}"
         )
 
-    async def _renew_link(self) -> None:
-        await asyncio.sleep(LINK_REST_S)
-        self._linking = None
-        self._write_link()
-
-    def _write_link(self) -> None:
-        """Write the entries to the browser's address, for reloads and links."""
-        if self.view.is_deleted:  # an upload may end after its page was closed
-            return
-        fragment = fragment_of(self.state, self.scene.kind)
-        if fragment != self._fragment:
-            self._fragment = fragment
-            with self.view:
-                ui.run_javascript(f'history.replaceState(null, "", "#{fragment}")')
-
-    def _copy_link(self) -> None:
-        self._write_link()
-        ui.run_javascript("navigator.clipboard.writeText(location.href)")
-        ui.notify("Link copied; it has no uploaded files", position="top", timeout=3000)
-
     async def _renew_figures(self) -> None:
         await asyncio.sleep(FIGURES_REST_S)
         self._renewal = None  # from here on it is not canceled: newer ones wait
-        await self.figures.renew()
         await self._mark_rows()
+        await self.figures.renew()
 
     async def _mark_rows(self) -> None:
         """Label the rows of a chart, and the smallest one that each eye reads."""
@@ -327,20 +321,44 @@ class Page:
             return
         if self.state.picture.chart_rows != rows:
             return
-        self.view.mark_rows(
-            [
-                {"y": y, "text": row_text(log_mar), "eyes": read.get(k, [])}
-                for k, (log_mar, y) in enumerate(rows)
-            ]
-        )
+        captions = {side: caption(rows, smallest) for side, smallest in read.items()}
+        self.view.mark_rows(marks_of(rows, cast("Mapping[str, Any]", read)), captions)
 
     def _slide(self, name: str, value: float) -> None:
-        self.state.values[name] = value
+        self.state.move(name, value)
+        if name == DISTANCE.name:
+            self.rows[FOCUS.name].show(self.state.values[FOCUS.name])
         self.request()
 
-    def _set_age(self, age_years: float) -> None:
-        self.state.values[AGE.name] = age_years
-        self.rows[AGE.name].show(age_years)
+    def _look(self, is_reading: bool) -> None:
+        self.state.look(is_reading=is_reading)
+        self._show_values()
+        self.request()
+
+    async def _take_file(self, side: EyeSide, name: str, content: bytes) -> None:
+        taken = self.state.take_file(side, name, content)
+        self.rows[AGE.name].show(self.state.values[AGE.name])
+        for panel in self.panels.values():
+            panel.show()
+        if taken == side:
+            self.request()
+            return
+        ui.notify(
+            f"{name} is a profile of the {SIDES[taken].lower()} and was loaded there",
+            position="top",
+            timeout=6000,
+        )
+        if self.state.shown == "both":
+            self.request()
+        else:
+            self._shown.value = taken  # requests it
+
+    def _set_empty(self, text: str) -> None:
+        """Show a text in place of the picture."""
+        self._empty = text
+        self.view.show_empty(text)
+        self._status.set_visibility(not text)
+        self._note.set_visibility(not text)
 
     def _set_picture(self, picture: Picture) -> None:
         self.state.set_picture(picture)
@@ -349,8 +367,9 @@ class Page:
         self.rows[DISTANCE.name].enable(
             picture.distance_dpt is not None, "as in the picture"
         )
+        self._set_empty("")
         self.view.show_scene(picture.title, picture.aspect_ratio)
-        self.view.mark_rows([])
+        self.view.mark_rows(marks_of(picture.chart_rows, {}), {})
         number = self.state.number + 1
         self.out.put(
             SentPicture(
@@ -389,7 +408,7 @@ class Page:
         if event.args["eye"] in SIDES:
             await self.figures.point(event.args["eye"], *_share(event))
 
-    def _look(self, event: events.GenericEventArguments) -> None:
+    def _focus(self, event: events.GenericEventArguments) -> None:
         self.state.look_at(*_share(event))
         self.rows[FOCUS.name].show(self.state.values[FOCUS.name])
         self.request()
@@ -404,7 +423,10 @@ class Page:
         if seen.kind in ("full", "failed"):
             assert seen.eye is not None
             notes = seen.facts.get("notes") or [seen.facts.get("error", "")]
-            self._notes[seen.eye] = " ".join(_sentence(note) for note in notes if note)
+            told = [_sentence(note) for note in notes if note]
+            if any("accommodation stops" in note for note in told):
+                told.append(AMPLITUDE)
+            self._notes[seen.eye] = " ".join(told)
             self._show_notes()
             if seen.number == self.state.number:
                 self._finish(seen.eye, is_full=seen.kind == "full")
@@ -429,63 +451,10 @@ class Page:
             told = [f"{title}: {text}" for title, text in lines if text]
             self._note.text = "\n".join(told)
 
-    # Downloads
-
-    async def _download_picture(self) -> None:
-        sides = self.state.sides
-        for side in sides:  # a click while the eye is prepared waits for it
-            try:
-                await asyncio.wait_for(self._ready[side].wait(), READY_S)
-            except TimeoutError:
-                ui.notify(
-                    "The full picture is not ready yet", type="warning", position="top"
-                )
-                return
-        for side in sides:
-            seen = self._full(side)
-            if seen is not None:
-                ui.download(seen.data, f"ocufilter_{side}.png")
-
-    async def _download_report(self) -> None:
-        for side in self.state.sides:
-            body = self.state.looking_body(side)
-            if body is None:
-                continue
-            title = SIDES[side]
-            waiting = ui.notification(
-                f"Writing the report: {title.lower()} …",
-                spinner=True,
-                timeout=None,
-                position="top",
-            )
-            try:
-                text = await self.resources.figure_worker.ask(
-                    self.name, f"report {side}", report_html, body, label=title
-                )
-            except StudyFailed as error:
-                ui.notify(str(error), type="negative", position="top")
-                continue
-            finally:
-                waiting.dismiss()
-            if text is not None:
-                ui.download(text.encode(), f"ocufilter_{side}.html")
-
-    def _full(self, side: EyeSide) -> SentPicture | None:
-        seen = self.out.last(side)
-        return seen if seen is not None and seen.kind == "full" else None
-
-    def _download_profile(self) -> None:
-        for side in self.state.sides:
-            try:
-                text = json.dumps(self.state.body(side), indent=1)
-            except ValueError as error:
-                ui.notify(str(error), type="negative", position="top")
-                return
-            ui.download(text.encode(), f"ocufilter_{side}.json")
-
     def close(self) -> None:
         """Release the page's resources."""
-        for task in (self._renewal, self._linking, self._announcing):
+        self.link.close()
+        for task in (self._renewal, self._announcing):
             if task is not None:
                 task.cancel()
         self.resources.filter_thread.forget(self.name)
@@ -503,7 +472,9 @@ def _sentence(note: str) -> str:
     return note[:1].upper() + note[1:].rstrip(".") + "."
 
 
-def add_page(resources: SharedResources, profile: NamedProfile | None) -> None:
+def add_page(
+    resources: SharedResources, profile: NamedProfile | None, token: str
+) -> None:
     """Serve the page at `/`."""
 
     @ui.page("/", title="ocufilter")
@@ -511,7 +482,7 @@ def add_page(resources: SharedResources, profile: NamedProfile | None) -> None:
         # rendered while the server started, so that the page usually opens with it
         first = asyncio.ensure_future(run.io_bound(scene_picture, FIRST))
         await asyncio.wait({first}, timeout=FIRST_S)
-        page = Page(resources, profile)
+        page = Page(resources, profile, token)
         client.on_delete(page.close)
         if first.done():
             page.show_first(first)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
-from clients.web.correction_form import looking
-from clients.web.eye_form import SIDES, EyeForm, EyeSide, NoFile
+from clients.web.correction_form import looking, reading_gaze_deg
+from clients.web.eye_form import SIDES, EyeForm, EyeSide, NoFile, read_profile_file
 from clients.web.numbers import NumberField
 from clients.web.picture import Picture, Place
 from clients.web.picture_requests import PictureRequest
@@ -18,10 +19,26 @@ PUPIL = NumberField("pupil_diameter_mm", "Pupil", "mm", 2.0, 7.0, 0.1, digits=1)
 FOCUS = NumberField("focus_dpt", "Focus", "dpt", 0.0, 8.0, 0.05)
 DISTANCE = NumberField("distance_dpt", "Distance", "dpt", 0.0, 6.0, 0.05)
 GAZE_H = NumberField("gaze_h_deg", "Gaze, right", "°", -20.0, 20.0, 1.0, digits=0)
-GAZE_V = NumberField("gaze_v_deg", "Gaze, up", "°", -15.0, 15.0, 1.0, digits=0)
+GAZE_V = NumberField("gaze_v_deg", "Gaze, up", "°", -45.0, 30.0, 1.0, digits=0)
 AGE = NumberField("age_years", "Age", "years", 5.0, 90.0, 1.0, digits=0)
 LOOKS = (PUPIL, FOCUS, DISTANCE, AGE, GAZE_H, GAZE_V)
 """In the order of the page."""
+
+READING_DPT = 2.5
+READING_GAZE_DEG = -30.0
+"""Of an eye without a progressive lens."""
+
+
+def first_values() -> dict[str, float]:
+    """Return the initial viewing conditions."""
+    return {
+        PUPIL.name: 4.0,
+        FOCUS.name: 0.0,
+        DISTANCE.name: 0.25,
+        GAZE_H.name: 0.0,
+        GAZE_V.name: 0.0,
+        AGE.name: 30.0,
+    }
 
 
 @dataclass
@@ -33,21 +50,14 @@ class PageState:
     picture : the scene; None until one is ready
     right : the last valid profile of each eye
     shown : which eye, or both
+    is_focus_set : whether the focus stays when the distance changes
     """
 
     eyes: dict[EyeSide, EyeForm] = field(
         default_factory=lambda: {side: EyeForm(side) for side in SIDES}
     )
-    values: dict[str, float] = field(
-        default_factory=lambda: {
-            PUPIL.name: 4.0,
-            FOCUS.name: 0.0,
-            DISTANCE.name: 0.25,
-            GAZE_H.name: 0.0,
-            GAZE_V.name: 0.0,
-            AGE.name: 30.0,
-        }
-    )
+    values: dict[str, float] = field(default_factory=first_values)
+    is_focus_set: bool = False
     picture: Picture | None = None
     shown: Shown = "OD"
     number: int = 0
@@ -82,8 +92,14 @@ class PageState:
 
     @property
     def gaze_deg(self) -> tuple[float, float]:
-        """Return the gaze in the picture."""
+        """Return the gaze relative to straight ahead of the head."""
         return self.values[GAZE_H.name], self.values[GAZE_V.name]
+
+    @property
+    def picture_gaze_deg(self) -> tuple[float, float]:
+        """Return the gaze relative to the picture's center."""
+        follows = self.picture is not None and self.picture.follows_gaze
+        return (0.0, 0.0) if follows else self.gaze_deg
 
     def looking_body(self, side: EyeSide) -> dict[str, Any] | None:
         """Return an eye's last valid profile, with the correction at the gaze."""
@@ -98,10 +114,69 @@ class PageState:
                 (PUPIL, picture.pupil_diameter_mm),
             ):
                 if value is not None:
-                    self.values[number.name] = min(value, number.high)
+                    shown = round(value, number.digits)
+                    self.values[number.name] = min(shown, number.high)
         self.picture = picture
         if picture.distance_dpt is not None:
             self.values[DISTANCE.name] = picture.distance_dpt
+            self._focus_on_picture()
+
+    def _focus_on_picture(self) -> None:
+        is_flat = self.picture is not None and self.picture.distance_dpt is not None
+        if is_flat and not self.is_focus_set:
+            self.values[FOCUS.name] = min(self.values[DISTANCE.name], FOCUS.high)
+
+    def move(self, name: str, value: float) -> None:
+        """Set a viewing condition.
+
+        The focus follows the distance of a flat picture until it is set itself.
+        """
+        self.values[name] = value
+        if name == FOCUS.name:
+            self.is_focus_set = True
+        elif name == DISTANCE.name:
+            self._focus_on_picture()
+
+    def look(self, *, is_reading: bool) -> None:
+        """Look straight ahead and far, or down at a reading distance."""
+        bodies = (self.right.get(side, {}) for side in self.sides)
+        turns_deg = [turn for body in bodies if (turn := reading_gaze_deg(body))]
+        gaze_deg = max(min([*turns_deg, 0.0]) or READING_GAZE_DEG, GAZE_V.low)
+        distance_dpt = READING_DPT if is_reading else 0.0
+        self.values |= {
+            GAZE_H.name: 0.0,
+            GAZE_V.name: gaze_deg if is_reading else 0.0,
+            DISTANCE.name: distance_dpt,
+            FOCUS.name: distance_dpt,
+        }
+        self.is_focus_set = False
+
+    def take_file(self, side: EyeSide, name: str, content: bytes) -> EyeSide:
+        """Read a profile file into the eye that it names, by default into `side`.
+
+        Returns
+        -------
+        The eye that has it.
+
+        Raises
+        ------
+        ValueError
+            Not a profile; nothing has changed.
+        """
+        body = read_profile_file(name, content)
+        taken: EyeSide = body.get("eye_side", side)
+        self.eyes[taken].take_body(body, Path(name).name)
+        if taken != side and self.eyes[side].file_body is None:
+            self.eyes[side].source = "prescription"
+        self.values[AGE.name] = body.get(AGE.name, self.values[AGE.name])
+        return taken
+
+    def reset(self) -> None:
+        """Set the initial entries; picture and uploaded files stay available."""
+        for form in self.eyes.values():
+            form.reset()
+        self.values.update(first_values())
+        self.shown, self.is_focus_set = "OD", False
 
     def request(self) -> PictureRequest | None:
         """Return the request for the current state; None without a picture or an eye.
@@ -117,6 +192,8 @@ class PageState:
         if self.picture is None or not bodies:
             return None
         self.picture = self.picture.at(self.values[DISTANCE.name])
+        if self.picture.follows_gaze:
+            bodies = {s: looking(body, self.gaze_deg) for s, body in bodies.items()}
         self.number += 1
         return PictureRequest(
             number=self.number,
@@ -124,7 +201,7 @@ class PageState:
             bodies=bodies,
             pupil_diameter_mm=self.values[PUPIL.name],
             focus_dpt=self.values[FOCUS.name],
-            gaze_deg=self.gaze_deg,
+            gaze_deg=self.picture_gaze_deg,
         )
 
     def place(self, x: float, y: float) -> Place | None:
@@ -135,4 +212,5 @@ class PageState:
         """Focus on the place at a position in the picture."""
         place = self.place(x, y)
         if place is not None:
-            self.values[FOCUS.name] = min(place.distance_dpt, FOCUS.high)
+            focus_dpt = round(place.distance_dpt, FOCUS.digits)
+            self.move(FOCUS.name, min(focus_dpt, FOCUS.high))

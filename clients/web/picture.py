@@ -38,10 +38,11 @@ DEPTH_HELP = ".npy or .exr in meters, 16-bit .png in millimeters, float .tif"
 
 
 class ChartRow(NamedTuple):
-    """One row of a letter chart: its size, and its height from 0 (top) to 1."""
+    """One row of a letter chart: its size, and its center and right end, 0 to 1."""
 
     log_mar: float
     y_ratio: float
+    end_ratio: float
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,7 @@ class Picture:
     distance_dpt : distance of a flat picture; None if it has its own depth
     focus_dpt, pupil_diameter_mm : an initial state, or None
     chart_rows : the rows of a chart, from the top
+    follows_gaze : whether its center is always on the line of sight
     """
 
     title: str
@@ -65,6 +67,7 @@ class Picture:
     focus_dpt: float | None = None
     pupil_diameter_mm: float | None = None
     chart_rows: tuple[ChartRow, ...] = ()
+    follows_gaze: bool = False
 
     @property
     def aspect_ratio(self) -> float:

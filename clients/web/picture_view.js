@@ -7,36 +7,47 @@ const SPLIT_STEPS = { ArrowLeft: -2, ArrowDown: -2, ArrowRight: 2, ArrowUp: 2,
   PageDown: -20, PageUp: 20, Home: -100, End: 100 }; // percent
 const POINT_MS = 90; // between two reports of where the pointer is
 const RECONNECT_MS = 1000;
-const MARK_PX = 16; // height of a label beside a row of the chart
+const LINE_PX = 16; // height of a label beside a row of the chart
+const LEAST_LINE_PX = 11; // below it labels cannot be read: the caption remains
 
 export default {
   template: `
     <div class="oc-stage" ref="stage">
       <div class="oc-views" :class="{ 'oc-two': eyes.length > 1 }">
-        <div v-for="eye in eyes" :key="eye" class="oc-view" :class="{ 'oc-empty': !hasScene }" :data-eye="eye"
-             :style="frame"
-             @pointermove="onMove($event, eye)" @pointerdown="onDown($event, eye)"
-             @pointerup="onUp($event, eye)" @pointercancel="dragging = false">
-          <canvas :ref="'before' + eye" class="oc-before" role="img"
-                  :aria-label="'Scene: ' + scene"></canvas>
-          <canvas :ref="'after' + eye" class="oc-after" :style="clip" role="img"
-                  :aria-label="alts[eye] || label(eye)"></canvas>
-          <ol v-if="marks.length" class="oc-marks" :style="clip">
-            <li v-for="mark in shownMarks(eye)" :style="{ top: 100 * mark.y + '%' }"
-                :class="{ 'oc-read': mark.eyes.includes(eye) }">{{ mark.text }}<span
-                v-if="mark.eyes.includes(eye)"> smallest line read</span></li>
-          </ol>
-          <span class="oc-tag oc-tag-left" :style="{ opacity: shownSplit > 12 ? 1 : 0 }">Scene</span>
-          <span class="oc-tag oc-tag-right" :style="{ opacity: shownSplit < 88 ? 1 : 0 }">
-            {{ label(eye) }}</span>
-          <span class="oc-state" :class="'oc-' + state(eye).kind" :key="state(eye).text">{{ state(eye).text }}</span>
-          <span v-if="point && point.eye === eye" class="oc-cross"
-                :style="{ left: 100 * point.x + '%', top: 100 * point.y + '%' }"></span>
-          <div class="oc-split" :style="{ left: shownSplit + '%' }" role="slider" tabindex="0"
-               :aria-label="'Split between the scene and the ' + label(eye).toLowerCase()"
-               aria-valuemin="0" aria-valuemax="100" :aria-valuenow="Math.round(split)"
-               :aria-valuetext="Math.round(split) + ' % scene'"
-               @keydown="onKey"><i></i></div>
+        <div v-for="eye in eyes" :key="eye" class="oc-eye-view">
+          <div class="oc-view" :class="{ 'oc-empty': isEmpty, 'oc-chart': marks.length }" :data-eye="eye"
+               :style="frame"
+               @pointermove="onMove($event, eye)" @pointerdown="onDown($event, eye)"
+               @pointerup="onUp($event, eye)" @pointercancel="dragging = false">
+            <canvas :ref="'before' + eye" class="oc-before" role="img"
+                    :aria-label="'Scene: ' + scene"></canvas>
+            <canvas :ref="'after' + eye" class="oc-after" :style="clip" role="img"
+                    :aria-label="alts[eye] || label(eye)"></canvas>
+            <template v-if="labels.length">
+              <svg class="oc-leaders" :style="clip" aria-hidden="true">
+                <line v-for="mark in labels" :x1="100 * mark.x + 1 + '%'" :y1="100 * mark.y + '%'"
+                      x2="78.5%" :y2="mark.top + line / 2"></line>
+              </svg>
+              <ol class="oc-marks" :style="{ ...clip, fontSize: 0.75 * line + 'px', lineHeight: line + 'px' }">
+                <li class="oc-marks-head"><span>logMAR</span> <span>dec.</span></li>
+                <li v-for="mark in labels" :style="{ top: mark.top + 'px' }"
+                    :class="{ 'oc-read': mark.eyes.includes(eye) }"
+                    ><span>{{ mark.log_mar }}</span> <span>{{ mark.decimal }}</span></li>
+              </ol>
+            </template>
+            <span class="oc-tag oc-tag-left" :style="{ opacity: shownSplit > 12 ? 1 : 0 }">Scene</span>
+            <span class="oc-tag oc-tag-right" :style="{ opacity: shownSplit < 88 ? 1 : 0 }">
+              {{ label(eye) }}</span>
+            <span class="oc-state" :class="'oc-' + state(eye).kind" :key="state(eye).text">{{ state(eye).text }}</span>
+            <span v-if="point && point.eye === eye" class="oc-cross"
+                  :style="{ left: 100 * point.x + '%', top: 100 * point.y + '%' }"></span>
+            <div class="oc-split" :style="{ left: shownSplit + '%' }" role="slider" tabindex="0"
+                 :aria-label="'Split between the scene and the ' + label(eye).toLowerCase()"
+                 aria-valuemin="0" aria-valuemax="100" :aria-valuenow="Math.round(split)"
+                 :aria-valuetext="Math.round(split) + ' % scene'"
+                 @keydown="onKey"><i></i></div>
+          </div>
+          <p v-if="captions[eye] && !isEmpty" class="oc-caption">{{ label(eye) }}: {{ captions[eye] }}</p>
         </div>
       </div>
       <div class="oc-view-tools">
@@ -48,19 +59,42 @@ export default {
         <button type="button" class="oc-tool" @click="fill">Full screen</button>
       </div>
     </div>`,
-  props: { address: String, eyes: Array, aspect: Number, scene: String, alts: Object, marks: Array },
+  props: { address: String, eyes: Array, aspect: Number, scene: String, alts: Object, marks: Array,
+    captions: Object, empty: String },
   data() {
     return { hasScene: false, height: 0, split: 50, held: false, dragging: false, point: null, states: {}, down: null };
   },
   computed: {
     frame() {
-      return { aspectRatio: this.aspect, maxWidth: `calc(var(--tallest) * ${this.aspect})` };
+      return { aspectRatio: this.aspect, maxWidth: `calc(var(--tallest) * var(--share) * ${this.aspect})` };
     },
     shownSplit() {
       return this.held ? 100 : this.split;
     },
     clip() {
       return { clipPath: `inset(0 0 0 ${this.shownSplit}%)` };
+    },
+    isEmpty() {
+      return !this.hasScene || Boolean(this.empty);
+    },
+    line() {
+      return Math.min(LINE_PX, this.height / (this.marks.length + 1));
+    },
+    labels() {
+      // beside their rows; where rows are closer than lines, moved up or down
+      if (this.isEmpty || this.line < LEAST_LINE_PX) return [];
+      const tops = [];
+      let next = this.line; // below the heads
+      for (const mark of this.marks) {
+        tops.push(Math.max(mark.y * this.height - this.line / 2, next));
+        next = tops.at(-1) + this.line;
+      }
+      let last = this.height;
+      for (let k = tops.length - 1; k >= 0; k--) {
+        last = Math.min(tops[k], last - this.line);
+        tops[k] = last;
+      }
+      return this.marks.map((mark, k) => ({ ...mark, top: tops[k] }));
     },
   },
   created() {
@@ -87,21 +121,11 @@ export default {
     label(eye) {
       return LABELS[eye];
     },
-    shownMarks(eye) {
-      // of rows that are closer than their labels, the larger one has its own
-      const height = this.height || 500;
-      let last = -Infinity;
-      return this.marks.filter((mark) => {
-        const y = mark.y * height;
-        if (y - last < MARK_PX && !mark.eyes.includes(eye)) return false;
-        last = y;
-        return true;
-      });
-    },
     measure() {
       this.height = this.$el.querySelector(".oc-view")?.clientHeight;
     },
     state(eye) {
+      if (this.empty) return { kind: "wait", text: this.empty };
       const waiting = this.hasScene ? "preparing …" : "rendering the scene …";
       return this.states[eye] ?? { kind: "wait", text: waiting };
     },
@@ -186,12 +210,12 @@ export default {
     onMove(event, eye) {
       const { x, y } = this.where(event);
       if (this.dragging) this.split = 100 * x;
-      else this.report(eye, x, y);
+      else if (!this.isEmpty) this.report(eye, x, y);
     },
     onUp(event, eye) {
       const moved = this.down && Math.hypot(event.clientX - this.down.x, event.clientY - this.down.y);
       const { x, y } = this.where(event);
-      if (!this.dragging && this.down && moved < 5) this.$emit("look", { eye, x, y });
+      if (!this.dragging && !this.isEmpty && this.down && moved < 5) this.$emit("look", { eye, x, y });
       this.dragging = false;
       this.down = null;
     },

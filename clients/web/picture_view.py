@@ -31,6 +31,8 @@ class PictureView(Element, component="picture_view.js"):  # type: ignore[call-ar
                 "scene": "",
                 "alts": {},
                 "marks": [],
+                "captions": {},
+                "empty": "",
             }
         )
 
@@ -42,6 +44,11 @@ class PictureView(Element, component="picture_view.js"):  # type: ignore[call-ar
     def show_scene(self, title: str, ratio: float) -> None:
         """Set the scene's title and the ratio of its width to its height."""
         self._props["scene"], self._props["aspect"] = title, ratio
+        self.show_empty("")
+
+    def show_empty(self, text: str) -> None:
+        """Show a text in place of the pictures; an empty one shows the pictures."""
+        self._props["empty"] = text
         self.update()
 
     def describe(self, alts: Mapping[EyeSide, str]) -> None:
@@ -49,14 +56,17 @@ class PictureView(Element, component="picture_view.js"):  # type: ignore[call-ar
         self._props["alts"] = dict(alts)
         self.update()
 
-    def mark_rows(self, marks: Sequence[Mapping[str, Any]]) -> None:
-        """Set the labels beside rows of a chart.
+    def mark_rows(
+        self, marks: Sequence[Mapping[str, Any]], captions: Mapping[EyeSide, str]
+    ) -> None:
+        """Set the labels beside rows of a chart, and the caption of each eye.
 
         Parameters
         ----------
         marks : sequence of mapping
-            ``y`` from 0 to 1, ``text``, and ``eyes``: the eyes whose smallest line this
-            is.
+            ``y`` and ``x`` of the row's right end from 0 to 1, ``log_mar`` and
+            ``decimal`` as text, and ``eyes``: the eyes whose smallest line this is.
         """
         self._props["marks"] = [dict(mark) for mark in marks]
+        self._props["captions"] = dict(captions)
         self.update()

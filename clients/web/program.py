@@ -65,7 +65,7 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--profile",
         metavar="P",
-        help="both eyes at first: a preset's name, or a .json, .abp or .csv file",
+        help="both eyes at first: a preset's name, or a .json, .abp, .csv or .zmx file",
     )
     parser.add_argument(
         "--json", action="store_true", help="print the address as a JSON object"

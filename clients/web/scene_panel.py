@@ -47,14 +47,20 @@ class ScenePanel:
     Parameters
     ----------
     on_picture : called with each new picture
+    on_empty : called with a text if the chosen scene has no file yet
     kind : first scene, one of `KINDS`
     """
 
     def __init__(
-        self, state: PageState, on_picture: Callable[[Picture], None], kind: str
+        self,
+        state: PageState,
+        on_picture: Callable[[Picture], None],
+        on_empty: Callable[[str], None],
+        kind: str,
     ) -> None:
-        self._state, self._on_picture = state, on_picture
+        self._state, self._on_picture, self._on_empty = state, on_picture, on_empty
         self._kind = kind
+        self._gltf: Picture | None = None
         self._n_waiting = 0
         self._photo: NamedFile | None = None
         self._depth: NamedFile | None = None
@@ -129,12 +135,18 @@ class ScenePanel:
             elif self._kind == "chart":
                 await self._make(chart_picture, self._state.values[DISTANCE.name])
             elif self._kind == "photo":
+                if self._photo is None:
+                    self._on_empty("No photo yet: upload one")
                 await self._show_again()
+            elif self._gltf is None:
+                self._on_empty("No 3D file yet: upload one")
+            else:
+                self._on_picture(self._gltf)
         except ValueError as error:
             self._problem.text = str(error)
 
     async def _take_gltf(self, name: str, content: bytes) -> None:
-        await self._make(gltf_picture, name, content)
+        self._gltf = await self._make(gltf_picture, name, content)
 
     async def _take_photo(self, name: str, content: bytes) -> None:
         # A depth file uploaded first belongs to this photo, any other to the last one.
@@ -179,8 +191,8 @@ class ScenePanel:
 
     async def _make(
         self, make: Callable[..., Picture], *args: Any, **options: Any
-    ) -> None:
-        """Show the picture that a function makes.
+    ) -> Picture:
+        """Show the picture that a function makes; return it.
 
         Raises
         ------
@@ -203,3 +215,4 @@ class ScenePanel:
             self._busy.set_visibility(self._n_waiting > 0)
         if picture is not None and kind == self._kind:  # else another was chosen
             self._on_picture(picture)
+        return picture

@@ -67,7 +67,7 @@ def make_server(
             await out.serve(socket)
 
     resources.append(SharedResources())
-    add_page(resources[0], profile)
+    add_page(resources[0], profile, token)
     ui.run_with(
         application,
         title="ocufilter",

@@ -32,7 +32,7 @@ class Restored:
     Attributes
     ----------
     scene : str or None
-        Scene to show.
+        Scene to show; None if the fragment has no entries of a page.
     problems : list of str
         Sentences on what the link contains and the page does not accept.
     """
@@ -50,6 +50,8 @@ def fragment_of(state: PageState, scene: str) -> str:
     if scene in SCENES[1:]:
         entries["scene"] = scene
     values = {name: v for name, v in state.values.items() if v != new.values[name]}
+    if state.is_focus_set:
+        entries["focus_set"] = True
     if values:
         entries["values"] = {name: round(v, 4) for name, v in values.items()}
     eyes = {side: _eye(form, new.eyes[side]) for side, form in state.eyes.items()}
@@ -85,19 +87,20 @@ def _eye(form: EyeForm, new: EyeForm) -> dict[str, Any]:
 def restore(state: PageState, fragment: str) -> Restored:
     """Set a page's entries from a fragment; report what it does not accept.
 
-    Entries are checked like typed ones; an invalid one keeps its initial value.
+    Entries are checked like typed ones. Invalid and absent ones get their initial
+    values.
     """
     found = Restored()
-    if not fragment:
-        return found
     entries = _read(fragment)
     if entries is None:
         found.problems.append("The link has no entries of this page: it is incomplete.")
         return found
+    state.reset()
+    state.is_focus_set = entries.get("focus_set") is True
     if entries.get("shown") in get_args(Shown):
         state.shown = entries["shown"]
     scene = entries.get("scene")
-    found.scene = scene if scene in SCENES else None
+    found.scene = scene if scene in SCENES else SCENES[0]
     values = _mapping(entries.get("values"))
     for number in LOOKS:
         if number.name not in values:
@@ -139,7 +142,12 @@ def _restore_eye(form: EyeForm, entries: dict[str, Any]) -> list[str]:
     problems = []
     if entries.get("source") == "file":
         name = str(entries.get("file", ""))[:MAX_ENTRY_CHARACTERS]
-        problems.append(f"the profile file {name!r} is not part of a link; upload it")
+        if form.file_body is not None and form.file_name[:MAX_ENTRY_CHARACTERS] == name:
+            form.source = "file"
+        else:
+            problems.append(
+                f"the profile file {name!r} is not part of a link; upload it"
+            )
     elif entries.get("source") == "preset":
         form.source = "preset"
     if entries.get("preset") in preset_titles():

@@ -1,3 +1,4 @@
+from .best_correction import best_correction_um as best_correction_um
 from .curves import FieldAcuity as FieldAcuity
 from .curves import acuity_over_field as acuity_over_field
 from .curves import acuity_through_focus as acuity_through_focus

@@ -15,14 +15,14 @@ from estimator.optics.units import SPHERE_PER_C20
 
 @dataclass(frozen=True)
 class FieldAcuity:
-    """Acuity in several directions.
+    """Acuity over the visual field.
 
     Attributes
     ----------
     optics_log_mar : (n,)
-        Limit by the optics, with the neural sensitivity of the fovea.
+        Acuity as limited by the optics, with the neural sensitivity of the fovea.
     retina_log_mar : (n,)
-        Limit by the retina's sampling, with perfect optics.
+        Acuity as limited by the sampling of the retina, with perfect optics.
     visual_strehl_ratio : (n,)
     """
 
@@ -32,7 +32,7 @@ class FieldAcuity:
 
     @property
     def log_mar(self) -> NDArray[np.float64]:
-        """Worse of both limits, (n,)."""
+        """Worse of the two limits, (n,)."""
         return np.maximum(self.optics_log_mar, self.retina_log_mar)
 
 
@@ -46,33 +46,42 @@ def acuity_through_focus(
     pupil_screen: PupilScreen | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return acuity, logMAR, and visual Strehl ratio (n,) at distances (n,).
+    """Return acuity and visual Strehl ratio at object distances.
 
     Parameters
     ----------
     zernike_um : (28,)
-        Wavefront of the eye in its state of focus, for an object at infinity.
+        Wavefront of the eye in its state of accommodation, for an object at infinity.
+    zernike_radius_mm : float
+        Radius of the circle of the coefficients.
     object_dpt : (n,)
-        Distances from the entrance pupil; negative ones lie behind the eye, as with a
-        plus lens.
+        Distances from the entrance pupil.  Negative values are virtual objects behind
+        the eye, as seen through a plus lens.
+    wavelength_nm : float
     pupil_ellipse : (5,), optional
     pupil_screen : PupilScreen, optional
         See `optical_transfer`.
+    progress : callable, optional
+        Callback with the completed fraction.
+
+    Returns
+    -------
+    log_mar, visual_strehl_ratio : (n,)
 
     Raises
     ------
     ValueError
-        A wavefront too steep to be resolved.
+        The wavefront is too steep to be sampled.
     """
     distances_dpt = np.atleast_1d(np.asarray(object_dpt, dtype=np.float64))
     per_dpt_um = zernike_radius_mm**2 / SPHERE_PER_C20
     found = np.empty((2, distances_dpt.size))
     for k, distance_dpt in enumerate(distances_dpt):
-        seen_um = np.array(zernike_um, dtype=np.float64)
+        wavefront_um = np.array(zernike_um, dtype=np.float64)
         # M = -SPHERE_PER_C20 C(2,0) / r²: a near object requires more power.
-        seen_um[C20] -= per_dpt_um * distance_dpt
+        wavefront_um[C20] -= per_dpt_um * distance_dpt
         acuity = predict_acuity(
-            seen_um,
+            wavefront_um,
             zernike_radius_mm=zernike_radius_mm,
             wavelength_nm=wavelength_nm,
             pupil_ellipse=pupil_ellipse,
@@ -96,22 +105,27 @@ def acuity_over_field(
     wavelength_nm: float = 555.0,
     progress: Callable[[float], None] | None = None,
 ) -> FieldAcuity:
-    """Return acuity by direction from wavefronts and ellipses, as of a field table.
+    """Return the acuity in several directions, for example those of a `FieldTable`.
 
     Parameters
     ----------
     zernike_um : (n, 28)
-    zernike_radius_mm : (n,) or one
+    zernike_radius_mm : scalar or (n,)
     pupil_ellipse : (n, 5)
-        As for `optical_transfer`.
+        See `optical_transfer`.
     h_deg, v_deg : (n,)
+        Directions in the visual field, to the person's right and up.
+    eye_side : "OD" or "OS"
     object_dpt : float
-        One distance for all directions.
+        Object distance, the same in all directions.
+    wavelength_nm : float
+    progress : callable, optional
+        Callback with the completed fraction.
 
     Raises
     ------
     ValueError
-        A wavefront too steep to be resolved.
+        A wavefront is too steep to be sampled.
     """
     radii_mm = np.broadcast_to(
         np.asarray(zernike_radius_mm, dtype=np.float64), (len(zernike_um),)

@@ -1,20 +1,20 @@
-"""Sampling density of the retina by direction, which limits acuity off the axis.
+"""Sampling density of the retina, which limits acuity in the periphery.
 
-Detail finer than the spacing of midget ganglion cells of one kind (on or off) is not
-resolved, however sharp the optics.
+The retina does not resolve detail finer than the spacing of midget ganglion cells of
+one type (on or off).
 """
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 PEAK_PER_DEG2 = 33163.2
-"""Receptive fields of all ganglion cells at the fovea: two midget cells per cone."""
+"""Density of ganglion cell receptive fields at the fovea: two midget cells per cone."""
 
 FOVEAL_MIDGET_RATIO = 1.0 / 1.12
 MIDGET_SCALE_DEG = 41.03
 
 MERIDIANS = {
-    # of the visual field: share, and scales of both decays, deg
+    # of the visual field: weight of the first term, and scales of both terms, deg
     "temporal": (0.9851, 1.058, 22.14),
     "superior": (0.9935, 1.035, 16.35),
     "nasal": (0.9729, 1.084, 7.633),
@@ -29,10 +29,15 @@ def midget_density_per_deg2(
 ) -> NDArray[np.float64]:
     """Return the density (...) of midget receptive fields, on and off together.
 
+    Parameters
+    ----------
+    eccentricity_deg : (...)
+    meridian : {"temporal", "superior", "nasal", "inferior"}
+        Meridian of the visual field.
+
     References
     ----------
-    Watson, J. Vision 14(7):15, 2014, equations 4, 7 and 8, table 1; meridians are those
-    of the visual field.
+    Watson, J. Vision 14(7):15, 2014, equations 4, 7 and 8, table 1.
     """
     share, square_deg, exponential_deg = MERIDIANS[meridian]
     r = np.asarray(eccentricity_deg, dtype=np.float64)
@@ -46,7 +51,7 @@ def midget_density_per_deg2(
 def retina_nyquist_cpd(
     h_deg: ArrayLike, v_deg: ArrayLike, *, eye_side: str
 ) -> NDArray[np.float64]:
-    """Return the highest frequency (...) that cells of one kind sample, cycles/degree.
+    """Return the Nyquist frequency (...) of cells of one type, cycles per degree.
 
     Parameters
     ----------
@@ -56,8 +61,8 @@ def retina_nyquist_cpd(
 
     Notes
     -----
-    Between the meridians the spacing follows an ellipse (Watson 2014, equation 10);
-    the blind spot is not excluded.
+    Between the meridians the spacing follows an ellipse (Watson 2014, equation 10).
+    The blind spot is not modeled.
     """
     h, v = np.broadcast_arrays(
         np.asarray(h_deg, dtype=np.float64), np.asarray(v_deg, dtype=np.float64)
@@ -75,9 +80,8 @@ def retina_nyquist_cpd(
             (v, "superior", "inferior"),
         )
     )
-    away = np.maximum(radius_deg, 1e-9)
-    along = np.hypot(h * across_deg, v * up_deg) / away
-    spacing_deg = np.where(radius_deg < 1e-9, _spacing_deg(0.0, "temporal"), along)
+    between = np.hypot(h * across_deg, v * up_deg) / np.maximum(radius_deg, 1e-9)
+    spacing_deg = np.where(radius_deg < 1e-9, _spacing_deg(0.0, "temporal"), between)
     nyquist_cpd: NDArray[np.float64] = 1.0 / (np.sqrt(3.0) * spacing_deg)
     return nyquist_cpd
 
@@ -85,16 +89,17 @@ def retina_nyquist_cpd(
 def retina_log_mar(
     h_deg: ArrayLike, v_deg: ArrayLike, *, eye_side: str
 ) -> NDArray[np.float64]:
-    """Return the acuity (...) with perfect optics: a gap of half a cycle at Nyquist.
+    """Return the acuity (...), logMAR, with perfect optics.
 
-    The arguments are those of `retina_nyquist_cpd`.
+    The gap is half a cycle at the Nyquist frequency.  The arguments are those of
+    `retina_nyquist_cpd`.
     """
     nyquist_cpd = retina_nyquist_cpd(h_deg, v_deg, eye_side=eye_side)
     return np.log10(ARCMIN_PER_DEG / 2.0 / nyquist_cpd)
 
 
 def _spacing_deg(eccentricity_deg: ArrayLike, meridian: str) -> NDArray[np.float64]:
-    """Return the spacing of neighbors of one kind in a hexagonal lattice."""
-    one_kind = midget_density_per_deg2(eccentricity_deg, meridian) / 2.0
-    spacing_deg: NDArray[np.float64] = np.sqrt(2.0 / (np.sqrt(3.0) * one_kind))
+    """Return the spacing (...) of cells of one type in a hexagonal lattice."""
+    one_type = midget_density_per_deg2(eccentricity_deg, meridian) / 2.0
+    spacing_deg: NDArray[np.float64] = np.sqrt(2.0 / (np.sqrt(3.0) * one_type))
     return spacing_deg

@@ -1,8 +1,7 @@
-"""Contrast sensitivity of people: total, optical and neural.
+"""Contrast sensitivity of the visual system, and its optical and neural parts.
 
-The Standard Spatial Observer's contrast sensitivity is that of many people with their
-natural optics; divided by the mean eye's modulation transfer it is that of the retina
-and the brain alone.
+The contrast sensitivity of the Standard Spatial Observer, measured with natural optics,
+divided by the modulation transfer of the mean eye is the neural contrast sensitivity.
 """
 
 import math
@@ -11,13 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 OBSERVER_PUPIL_MM = 4.0
-"""Natural pupils of the observers of the ModelFest displays (30 cd/m²)."""
+"""Natural pupil diameter of the ModelFest observers (displays of 30 cd/m²)."""
 
 MEAN_EYE_NM = 555.0
 
 
 def contrast_sensitivity(frequency_cpd: ArrayLike) -> NDArray[np.float64]:
-    """Return the contrast sensitivity (...) of people with their natural optics.
+    """Return the contrast sensitivity (...) with natural optics.
 
     References
     ----------
@@ -32,7 +31,7 @@ def contrast_sensitivity(frequency_cpd: ArrayLike) -> NDArray[np.float64]:
 def perfect_transfer(
     frequency_cpd: ArrayLike, *, pupil_diameter_mm: float, wavelength_nm: float
 ) -> NDArray[np.float64]:
-    """Return the modulation transfer (...) of a round pupil without aberrations."""
+    """Return the diffraction-limited modulation transfer (...) of a circular pupil."""
     cutoff_cpd = math.radians(1.0) * pupil_diameter_mm * 1e6 / wavelength_nm
     ratio = np.clip(np.abs(np.asarray(frequency_cpd)) / cutoff_cpd, 0.0, 1.0)
     transfer: NDArray[np.float64] = (
@@ -44,23 +43,25 @@ def perfect_transfer(
 def mean_eye_transfer(
     frequency_cpd: ArrayLike, *, pupil_diameter_mm: float
 ) -> NDArray[np.float64]:
-    """Return the mean modulation transfer (...) of 200 best corrected eyes, 555 nm.
+    """Return the mean modulation transfer (...) of 200 best-corrected eyes at 555 nm.
+
+    The formula is valid for pupils of 2 to 6 mm.
 
     References
     ----------
-    Watson, J. Vision 13(6):18, 2013: pupils of 2 to 6 mm.
+    Watson, J. Vision 13(6):18, 2013.
     """
     d = pupil_diameter_mm
     knee_cpd = 21.95 - 5.512 * d + 0.3922 * d**2
     perfect = perfect_transfer(
         frequency_cpd, pupil_diameter_mm=d, wavelength_nm=MEAN_EYE_NM
     )
-    fall = 1.0 + np.square(np.asarray(frequency_cpd) / knee_cpd)
-    return np.sqrt(perfect) * fall**-0.62
+    falloff = 1.0 + np.square(np.asarray(frequency_cpd) / knee_cpd)
+    return np.sqrt(perfect) * falloff**-0.62
 
 
 def neural_sensitivity(frequency_cpd: ArrayLike) -> NDArray[np.float64]:
-    """Return the contrast sensitivity (...) of retina and brain without the optics."""
+    """Return the neural contrast sensitivity (...), without the optics."""
     cpd = np.asarray(frequency_cpd, dtype=np.float64)
     optics = mean_eye_transfer(cpd, pupil_diameter_mm=OBSERVER_PUPIL_MM)
     return contrast_sensitivity(cpd) / np.maximum(optics, 1e-3)

@@ -1,4 +1,4 @@
-"""Optical transfer functions of wavefronts: autocorrelations of the pupil, by FFT."""
+"""Optical transfer functions: autocorrelations of the pupil function, by FFT."""
 
 import math
 from dataclasses import dataclass
@@ -16,14 +16,14 @@ from estimator.optics.zernike import (
     zernike_gradient,
 )
 
-LEAST_SAMPLES, MOST_SAMPLES = 128, 1024
-"""Number of samples across the pupil's circle."""
+MIN_SAMPLES, MAX_SAMPLES = 128, 1024
+"""Number of samples across the circle of the coefficients."""
 
 FREQUENCY_STEP_CPD = 0.3
-"""Largest step of the grid; out of focus, all visible detail lies below 2 cpd."""
+"""Largest frequency step; with strong defocus, visible detail is below 2 cpd."""
 
 STEP_WAVES = 0.25
-"""Largest step of the wavefront from one sample to the next."""
+"""Largest difference of the wavefront between neighboring samples."""
 
 NM_PER_MM = 1e6
 UM_PER_MM = 1e3
@@ -31,14 +31,14 @@ UM_PER_MM = 1e3
 
 @dataclass(frozen=True)
 class Transfer:
-    """Transfer function of one wavefront on a grid of spatial frequencies.
+    """Optical transfer function on a grid of spatial frequencies.
 
     Attributes
     ----------
     frequency_cpd : (n,)
-        Frequencies along either axis, cycles per degree, ascending, 0 in the middle.
+        Frequencies along each axis, cycles per degree, ascending, 0 in the middle.
     transfer_ratio : (n, n), complex
-        Values by y, then x; 1 at frequency 0.
+        Values ``[y, x]``; 1 at frequency 0.
     """
 
     frequency_cpd: NDArray[np.float64]
@@ -46,41 +46,43 @@ class Transfer:
 
     @property
     def radial_cpd(self) -> NDArray[np.float64]:
-        """Radial frequency (n, n) of each value."""
+        """Radial frequencies, (n, n)."""
         return np.hypot(self.frequency_cpd[:, None], self.frequency_cpd)
 
     def modulation(self, at_cpd: ArrayLike) -> NDArray[np.float64]:
-        """Return the mean of the modulation transfer function over all directions."""
-        return self._mean(np.abs(self.transfer_ratio), at_cpd)
-
-    def in_phase(self, at_cpd: ArrayLike) -> NDArray[np.float64]:
-        """Return the mean of the real part over all directions.
-
-        Detail with a phase shift appears displaced or reversed.
-        """
-        return self._mean(self.transfer_ratio.real, at_cpd)
-
-    def _mean(self, values: NDArray[Any], at_cpd: ArrayLike) -> NDArray[np.float64]:
-        """Return the mean (m,) of values (n, n) over all directions.
+        """Return the modulation transfer (m,), averaged over orientations.
 
         Parameters
         ----------
         at_cpd : (m,)
+            Radial frequencies.
         """
+        return self._mean(np.abs(self.transfer_ratio), at_cpd)
+
+    def in_phase(self, at_cpd: ArrayLike) -> NDArray[np.float64]:
+        """Return the real part (m,), averaged over orientations.
+
+        It excludes detail that a phase shift displaces, and counts detail of reversed
+        contrast as negative.  The argument is that of `modulation`.
+        """
+        return self._mean(self.transfer_ratio.real, at_cpd)
+
+    def _mean(self, values: NDArray[Any], at_cpd: ArrayLike) -> NDArray[np.float64]:
+        """Return the mean (m,) of values (n, n) over orientations."""
         from scipy.ndimage import map_coordinates
 
         at_cpd = np.atleast_1d(np.asarray(at_cpd, dtype=np.float64))
         angles = 2.0 * np.pi * (np.arange(180) + 0.5) / 180
         step_cpd = self.frequency_cpd[1] - self.frequency_cpd[0]
         middle = (self.frequency_cpd.size - 1) / 2
-        places = (
+        positions = (
             middle
             + at_cpd[:, None]
             / step_cpd
             * np.stack([np.sin(angles), np.cos(angles)])[:, None]
         )
-        found = map_coordinates(values, places, order=1)
-        mean: NDArray[np.float64] = found.mean(axis=-1)
+        around = map_coordinates(values, positions, order=1)
+        mean: NDArray[np.float64] = around.mean(axis=-1)
         return mean
 
 
@@ -92,27 +94,30 @@ def optical_transfer(
     pupil_ellipse: NDArray[np.float64] | None = None,
     pupil_screen: PupilScreen | None = None,
 ) -> Transfer:
-    """Return the transfer function of a wavefront, for light of one wavelength.
+    """Return the monochromatic optical transfer function of a wavefront.
 
     Parameters
     ----------
     zernike_um : (28,)
+    zernike_radius_mm : float
+        Radius of the circle of the coefficients.
+    wavelength_nm : float
     pupil_ellipse : (5,), optional
         Center x, y and semi-axes, mm, and angle, rad, of the pupil within the circle;
-        default: the whole circle.
+        the whole circle by default.
     pupil_screen : PupilScreen, optional
-        Rings of a lens with several foci, such as an eye's ``rings``.
+        Complex amplitude of a multifocal lens, such as the ``rings`` of an eye.
 
     Raises
     ------
     ValueError
-        A wavefront that is not finite, or so steep that `MOST_SAMPLES` do not resolve
-        it; a honeycomb of lenslets.
+        The wavefront is not finite or too steep for `MAX_SAMPLES`, or the screen is a
+        lattice of lenslets.
     """
     if pupil_screen is not None and pupil_screen.lattice_mm is not None:
-        raise ValueError("pupil_screen: rings about one center, not lenslets")
+        raise ValueError("pupil_screen: expected rings about one center, got lenslets")
     if not np.all(np.isfinite(zernike_um)):
-        raise ValueError("zernike_um: all 28 coefficients must be finite")
+        raise ValueError("zernike_um: expected 28 finite coefficients")
     per_mm_cpd = math.radians(1.0) * NM_PER_MM / wavelength_nm
     count = max(
         _samples(zernike_um, wavelength_nm, pupil_screen, zernike_radius_mm),
@@ -122,15 +127,15 @@ def optical_transfer(
     )
     step_mm = 2.0 * zernike_radius_mm / count
     along_mm = (np.arange(count) + 0.5) * step_mm - zernike_radius_mm
-    x_mm, y_mm = np.meshgrid(along_mm, along_mm)
-    wavefront_um = _wavefront_um(zernike_um, along_mm / zernike_radius_mm)
-    inside = _inside(x_mm, y_mm, zernike_radius_mm, pupil_ellipse, step_mm)
-    phase = 2.0 * np.pi * wavefront_um * UM_PER_MM / wavelength_nm
-    pupil = inside * np.exp(1j * phase)
-    if pupil_screen is not None:
-        cx, cy = cast("tuple[float, float]", pupil_screen.centre_mm)  # one center
-        square_mm2 = (x_mm - cx) ** 2 + (y_mm - cy) ** 2
-        pupil = pupil * pupil_screen.transmission(square_mm2, wavelength_nm)
+    clear = clear_pupil(
+        along_mm,
+        zernike_radius_mm=zernike_radius_mm,
+        wavelength_nm=wavelength_nm,
+        pupil_ellipse=pupil_ellipse,
+        pupil_screen=pupil_screen,
+    )
+    wavefront_um = grid_wavefront_um(zernike_um, along_mm / zernike_radius_mm)
+    pupil = clear * np.exp(2j * np.pi * wavefront_um * UM_PER_MM / wavelength_nm)
     padded = 2 * count
     intensity = np.abs(fft.fft2(pupil, (padded, padded))) ** 2
     transfer = fft.fftshift(fft.ifft2(intensity))[1:, 1:]  # odd, 0 in the middle
@@ -141,7 +146,34 @@ def optical_transfer(
     )
 
 
-def _wavefront_um(zernike_um: NDArray[Any], along: NDArray[Any]) -> NDArray[np.float64]:
+def clear_pupil(
+    along_mm: NDArray[np.float64],
+    *,
+    zernike_radius_mm: float,
+    wavelength_nm: float,
+    pupil_ellipse: NDArray[np.float64] | None,
+    pupil_screen: PupilScreen | None,
+) -> NDArray[Any]:
+    """Return the pupil function (n, n), y then x, of a flat wavefront.
+
+    Parameters
+    ----------
+    along_mm : (n,)
+        Coordinates along either axis, evenly spaced.
+    """
+    x_mm, y_mm = np.meshgrid(along_mm, along_mm)
+    step_mm = along_mm[1] - along_mm[0]
+    clear: NDArray[Any] = _inside(x_mm, y_mm, zernike_radius_mm, pupil_ellipse, step_mm)
+    if pupil_screen is not None:
+        cx, cy = cast("tuple[float, float]", pupil_screen.centre_mm)  # one center
+        square_mm2 = (x_mm - cx) ** 2 + (y_mm - cy) ** 2
+        clear = clear * pupil_screen.transmission(square_mm2, wavelength_nm)
+    return clear
+
+
+def grid_wavefront_um(
+    zernike_um: NDArray[Any], along: NDArray[Any]
+) -> NDArray[np.float64]:
     """Return the wavefront (n, n), y then x, on coordinates (n,) of the unit square."""
     by_powers = np.zeros((MAX_RADIAL_ORDER + 1,) * 2)
     by_powers[EXPONENTS[:, 1], EXPONENTS[:, 0]] = wavefront_polynomial(zernike_um)
@@ -155,31 +187,31 @@ def _samples(
     screen: PupilScreen | None,
     radius_mm: float,
 ) -> int:
-    """Return the number of samples across the circle that resolves its steepest rim.
+    """Return the number of samples across the circle for the slope at its rim.
 
-    The increase for rings is capped at `MOST_SAMPLES`: beyond their foci there is
-    little light, and only that of the rim is then wrong.
+    The additional samples for a screen are capped at `MAX_SAMPLES`: only light that
+    orders of high power deflect at the rim is then aliased, and there is little of it.
     """
     angles = 2.0 * np.pi * np.arange(72) / 72
     slopes = zernike_gradient(np.cos(angles), np.sin(angles))  # per radius
     steepest_um = float(np.linalg.norm(slopes @ zernike_um, axis=-1).max())
 
-    def following(slope_um: float) -> int:
+    def samples_for(slope_um: float) -> int:
         waves_across = 2.0 * slope_um * UM_PER_MM / wavelength_nm
-        return max(LEAST_SAMPLES, math.ceil(waves_across / STEP_WAVES))
+        return max(MIN_SAMPLES, math.ceil(waves_across / STEP_WAVES))
 
-    wanted = following(steepest_um)
-    if screen is not None and wanted <= MOST_SAMPLES:
-        aside_mrad = float(screen.reach_mrad(radius_mm, wavelength_nm))
-        more = following(steepest_um + radius_mm * aside_mrad)
-        wanted = min(more, MOST_SAMPLES)
-    if wanted > MOST_SAMPLES:
+    needed = samples_for(steepest_um)
+    if screen is not None and needed <= MAX_SAMPLES:
+        deflection_mrad = float(screen.reach_mrad(radius_mm, wavelength_nm))
+        with_screen = samples_for(steepest_um + radius_mm * deflection_mrad)
+        needed = min(with_screen, MAX_SAMPLES)
+    if needed > MAX_SAMPLES:
         raise ValueError(
-            f"wavefront of {steepest_um:.0f} um per pupil radius at its rim: transfer "
-            f"functions are for up to "
-            f"{MOST_SAMPLES * STEP_WAVES * wavelength_nm / 2.0 / UM_PER_MM:.0f}"
+            f"zernike_um: slope of {steepest_um:.0f} um per pupil radius at the rim; "
+            "expected at most "
+            f"{MAX_SAMPLES * STEP_WAVES * wavelength_nm / 2.0 / UM_PER_MM:.0f}"
         )
-    count: int = fft.next_fast_len(wanted)
+    count: int = fft.next_fast_len(needed)
     return count
 
 
@@ -191,17 +223,17 @@ def _inside(
     step_mm: float,
 ) -> NDArray[np.float64]:
     """Return the part of each sample within the pupil; its edge is a sample wide."""
-    circle = np.hypot(x_mm, y_mm) / radius_mm
-    found: NDArray[np.float64] = np.clip(
-        0.5 + (1.0 - circle) * radius_mm / step_mm, 0.0, 1.0
+    radius = np.hypot(x_mm, y_mm) / radius_mm
+    circle: NDArray[np.float64] = np.clip(
+        0.5 + (1.0 - radius) * radius_mm / step_mm, 0.0, 1.0
     )
     if ellipse is None:
-        return found
+        return circle
     cx, cy, major_mm, minor_mm, angle = ellipse
     along = (x_mm - cx) * np.cos(angle) + (y_mm - cy) * np.sin(angle)
     across = (y_mm - cy) * np.cos(angle) - (x_mm - cx) * np.sin(angle)
     from_rim = 1.0 - np.hypot(along / major_mm, across / minor_mm)
     within: NDArray[np.float64] = np.minimum(
-        found, np.clip(0.5 + from_rim * minor_mm / step_mm, 0.0, 1.0)
+        circle, np.clip(0.5 + from_rim * minor_mm / step_mm, 0.0, 1.0)
     )
     return within

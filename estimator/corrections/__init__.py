@@ -1,12 +1,18 @@
 """Corrections of the eye, by their effect on light in the entrance pupil.
 
-worn_lens         lens on or in the eye: power, own aberration, position
-rings             simultaneous foci: diffractive rings, refractive zones
-kinoform          light in the orders of a diffractive profile, by scalar theory
+worn_lens         contact and intraocular lenses, and the wavefront of any correction
+rings             multifocal lenses: diffractive rings, refractive zones
+kinoform          diffraction efficiency of the orders of a phase profile
 lens_plane        point of a spectacle lens that the line of sight crosses
 lenslets          spectacles with lenslets around a clear center
-progressive       spectacles whose power changes with the direction of gaze
+progressive       progressive spectacles
 intraocular       conversion from the plane of an intraocular lens to the pupil
+
+A *correction* is a `Prescription` or one of its subclasses here, given in the plane of
+the device: spectacles at the *vertex distance* ``vertex_mm`` in front of the cornea, a
+contact lens on it, an intraocular lens behind it.  Single-vision lenses, and the
+carrier of lenslets, are polynomials that are subtracted from the wavefront in the
+entrance pupil.  *Rings* are the complex amplitude that a multifocal lens adds to them.
 """
 
 import lazy_loader

@@ -16,10 +16,19 @@ def lens_point_mm(
     vertex_mm: float,
     gaze_deg: tuple[float, float],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return x and y (...) where light from field directions crosses a lens.
+    """Return the points x and y (...), mm, where field directions cross a lens.
 
-    The origin is in front of the pupil of an eye that looks straight ahead.  Gaze
-    rotates about the center of rotation, field directions about the entrance pupil.
+    The origin is in front of the pupil in primary gaze.  Gaze rotates about the eye's
+    center of rotation, field directions about the entrance pupil.
+
+    Parameters
+    ----------
+    h_deg, v_deg : (...)
+        Field directions relative to the line of sight.
+    vertex_mm : float
+        Distance from lens to cornea.
+    gaze_deg : (h, v)
+        Gaze relative to the head.
     """
     by_gaze_mm = vertex_mm + ROTATION_CENTER_MM
     by_field_mm = vertex_mm + TYPICAL_ENTRANCE_PUPIL_MM

@@ -1,10 +1,10 @@
-"""Spectacles with lenslets around a clear center, worn for myopia control.
+"""Spectacle lenses with lenslets around a clear center, for myopia control.
 
-Each lenslet passes its own part of the light, undeviated through its center.  Together
-they make a disc as wide as power times diameter on the retina, 12 arcmin for 3.5 dpt
-and 1.03 mm, for any pupil.  Which lenslets the pupil sees depends on gaze and field.
-The phase of the lens is applied unchanged in the plane of the pupil; `bench
-corrections` measures the error of ignoring the 15 mm between lens and pupil.
+Each lenslet images a distant point without deviating its chief ray.  On the retina, all
+lenslets together blur the point to a disc of power times diameter, 12 arcmin for 3.5
+dpt and 1.03 mm, regardless of the pupil.  Gaze and field direction determine which
+lenslets cover the pupil.  Their phase is applied unchanged in the plane of the pupil;
+`bench corrections` measures the error of neglecting the 15 mm between lens and pupil.
 """
 
 from dataclasses import dataclass, replace
@@ -17,8 +17,8 @@ from estimator.corrections.lens_plane import lens_point_mm
 from estimator.optics.units import NM_PER_UM
 
 EDGE_ORDERS = 4.0
-"""Limit up to which light deflected by the edges of lenslets is included, in lambda
-over their diameter."""
+"""Largest deflection by diffraction at the edges of lenslets that is included, in
+wavelengths over their diameter."""
 
 
 @dataclass(frozen=True)
@@ -28,17 +28,17 @@ class Lenslets:
     Attributes
     ----------
     power_dpt : float
-        Added power of each lenslet.
+        Power of a lenslet in addition to that of the carrier lens.
     diameter_mm, pitch_mm : float
-        Diameter of a lenslet, and distance to the next.
+        Diameter of a lenslet, and distance between the centers of neighbors.
     inner_mm, outer_mm : float
-        Radii between which the lenslets' centers lie.
+        Radii of the annulus that contains the centers of the lenslets.
     vertex_mm : float
         Distance from lens to cornea.
     gaze_deg : (h, v)
-        Gaze relative to straight ahead of the head.
+        Gaze relative to the head.
     centre_mm : (2,) or (P, 2)
-        Center of the lens from that of the pupil, x and y.
+        Position x, y of the lens center relative to the pupil center.
     """
 
     power_dpt: float
@@ -52,35 +52,36 @@ class Lenslets:
 
     @property
     def lattice_mm(self) -> tuple[float, float, float]:
-        """Pitch, inner and outer radius of the honeycomb."""
+        """Pitch, inner radius and outer radius of the honeycomb."""
         return self.pitch_mm, self.inner_mm, self.outer_mm
 
-    def looking(self, gaze_deg: tuple[float, float]) -> "Lenslets":
-        """Return the lens for a gaze rotated by (h, v) from the present one."""
+    def with_gaze_offset(self, offset_deg: tuple[float, float]) -> "Lenslets":
+        """Return the lens after a rotation of gaze by (h, v) from ``gaze_deg``."""
         h_deg, v_deg = (
-            own + more for own, more in zip(self.gaze_deg, gaze_deg, strict=True)
+            gaze + offset
+            for gaze, offset in zip(self.gaze_deg, offset_deg, strict=True)
         )
         return replace(self, gaze_deg=(h_deg, v_deg))
 
     def seen_from(self, h_deg: ArrayLike, v_deg: ArrayLike) -> "Lenslets":
-        """Return the lens as seen from the pupil at field directions (P,)."""
+        """Return the lens with its center for each of the field directions (P,)."""
         x, y = lens_point_mm(
             h_deg, v_deg, vertex_mm=self.vertex_mm, gaze_deg=self.gaze_deg
         )
         return replace(self, centre_mm=-np.stack([x, y], axis=-1))
 
     def main_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
-        """Return the powers of sharp foci; lenslets make no focus of their own."""
+        """Return the power (1,) of the only sharp focus, that of the carrier lens."""
         return np.zeros(1)
 
     def main_light_ratio(
         self, radius_mm: ArrayLike, wavelength_nm: float
     ) -> NDArray[Any]:
-        """Return the share (1, ...) of a pupil's light there, lenslets' included."""
+        """Return the share (1, ...) of the light at that focus, counted as 1."""
         return np.ones((1, *np.shape(radius_mm)))
 
     def reach_mrad(self, radius_mm: ArrayLike, wavelength_nm: float) -> NDArray[Any]:
-        """Return the largest deflection of light by the lenslets and their edges."""
+        """Return the largest deflection (...) by refraction plus diffraction."""
         by_lens = abs(self.power_dpt) * self.diameter_mm / 2.0
         by_edge = EDGE_ORDERS * wavelength_nm / NM_PER_UM / self.diameter_mm
         return np.full(np.shape(radius_mm), by_lens + by_edge)
@@ -88,7 +89,7 @@ class Lenslets:
     def transmission(
         self, square_mm2: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.complex128]:
-        """Return the complex amplitude at squared distances from a lenslet's center."""
+        """Return the complex amplitude (...) at squared distances from the center."""
         square = np.asarray(square_mm2, dtype=np.float64)
         path_um = np.where(
             square <= (self.diameter_mm / 2.0) ** 2, self.power_dpt / 2.0 * square, 0.0

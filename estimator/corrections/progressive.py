@@ -1,16 +1,17 @@
-"""A progressive lens: spectacles whose power changes with the direction of gaze.
+"""Progressive spectacle lenses, whose power changes with the direction of gaze.
 
-No manufacturer publishes a surface.  This one is U(y) with U'' = F, along the corridor
-x = 0, smoothed vertically by a normal distribution as wide as |x|.  On the corridor it
-has the power F(y) in every meridian, from far to the addition.  Beside the corridor it
-has the astigmatism 2 |F'(y)| x with an oblique axis, which no smooth surface can avoid
-(Minkwitz, Optica Acta 10, 1963) and which levels off at 0.8 of the addition.  F is the
-normal distribution itself, a quarter of the corridor wide.
+Manufacturers do not publish their surfaces.  The surface used here is U(y) with
+U'' = F on the corridor x = 0, smoothed along y with a Gaussian of width |x|.  F is the
+cumulative normal distribution with a quarter of the corridor as its standard deviation.
 
-Power changes over the pupil too, which causes coma and trefoil: 0.07 um through 4 mm in
-the middle of a corridor of 14 mm to 2 dpt.  They are modeled by the surface's third
-derivatives, which omit 0.005 um of the wavefront there, and 0.02 um at the corridor's
-ends.
+- On the corridor, the power is F(y) in all meridians, from distance power to addition.
+- Beside it, the surface has the astigmatism 2 |F'(y)| x at an oblique axis, which no
+  smooth surface can avoid (Minkwitz, Optica Acta 10, 1963).  It levels off at 0.8 of
+  the addition.
+- The power changes across the pupil as well, which causes coma and trefoil: 0.07 um
+  through 4 mm in the middle of a 14 mm corridor with an addition of 2 dpt.  The third
+  derivatives of the surface describe all but 0.005 um of them there, and all but
+  0.02 um at the ends of the corridor.
 """
 
 from dataclasses import dataclass, field, replace
@@ -31,18 +32,19 @@ CUBES = [EXPONENTS.tolist().index([a, 3 - a]) for a in (3, 2, 1, 0)]
 
 @dataclass(frozen=True)
 class ProgressiveLens(rx.Prescription):
-    """A progressive lens; as a `Prescription` it has the power seen by the fovea.
+    """A progressive lens; its `Prescription` is the power on the line of sight.
 
     Attributes
     ----------
     distance : Prescription
-        Prescription for far.
+        Prescription for distance vision.
     add_dpt : float
+        Addition.
     corridor_mm : float
-        Length from the fitting cross, in front of the pupil of an eye that looks
-        straight ahead and with 2 % of the addition, down to 98 % of the addition.
+        Length of the corridor, from 2 % of the addition at the fitting cross (in front
+        of the pupil in primary gaze) down to 98 % of the addition.
     gaze_deg : (h, v)
-        Gaze relative to straight ahead of the head.
+        Gaze relative to the head.
     """
 
     distance: rx.Prescription = field(default_factory=lambda: rx.Prescription(0.0))
@@ -59,7 +61,7 @@ class ProgressiveLens(rx.Prescription):
         corridor_mm: float,
         gaze_deg: tuple[float, float] = (0.0, 0.0),
     ) -> "ProgressiveLens":
-        """Return the lens for a direction of gaze."""
+        """Build a lens from its distance prescription, for a direction of gaze."""
         lens = cls(
             **vars(distance),
             distance=distance,
@@ -74,10 +76,11 @@ class ProgressiveLens(rx.Prescription):
         seen = replace(seen, vertex_mm=distance.vertex_mm)
         return replace(lens, **vars(seen))
 
-    def looking(self, gaze_deg: tuple[float, float]) -> "ProgressiveLens":
-        """Return the lens for a gaze rotated by (h, v) from the present one."""
+    def with_gaze_offset(self, offset_deg: tuple[float, float]) -> "ProgressiveLens":
+        """Return the lens after a rotation of gaze by (h, v) from ``gaze_deg``."""
         h_deg, v_deg = (
-            own + more for own, more in zip(self.gaze_deg, gaze_deg, strict=True)
+            gaze + offset
+            for gaze, offset in zip(self.gaze_deg, offset_deg, strict=True)
         )
         return ProgressiveLens.of(
             self.distance,
@@ -89,53 +92,60 @@ class ProgressiveLens(rx.Prescription):
     def lens_point_mm(
         self, h_deg: ArrayLike, v_deg: ArrayLike
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return x and y (...) where light from field directions crosses the lens.
+        """Return the points x and y (...), mm, where field directions cross the lens.
 
-        The origin is the fitting cross, see `lens_plane`.
+        The origin is the fitting cross; see `lens_plane.lens_point_mm`.
         """
         return lens_point_mm(
             h_deg, v_deg, vertex_mm=self.vertex_mm, gaze_deg=self.gaze_deg
         )
 
     def power_matrices_dpt(self, x_mm: ArrayLike, y_mm: ArrayLike) -> NDArray[Any]:
-        """Return the power (..., 2, 2) at points of the lens, x to the right, y up."""
+        """Return dioptric power matrices (..., 2, 2) at points of the lens.
+
+        Axes are x to the person's right and y up.
+        """
         # Imported here so that the service starts without loading scipy.
         from scipy.special import ndtr
 
-        z, aside, _ = self._places(x_mm, y_mm)
-        power_dpt = self.add_dpt * ndtr(z)
-        bell_dpt = self.add_dpt * _bell(z)
-        found = np.empty((*z.shape, 2, 2))
-        found[..., 0, 0] = power_dpt - bell_dpt * z * aside**2
+        along, lateral, _ = self._corridor_coordinates(x_mm, y_mm)
+        power_dpt = self.add_dpt * ndtr(along)
+        bell_dpt = self.add_dpt * _bell(along)
+        found = np.empty((*along.shape, 2, 2))
+        found[..., 0, 0] = power_dpt - bell_dpt * along * lateral**2
         found[..., 1, 1] = power_dpt
-        found[..., 0, 1] = found[..., 1, 0] = -bell_dpt * aside
+        found[..., 0, 1] = found[..., 1, 0] = -bell_dpt * lateral
         m, j0, j45 = rx.power_vector(replace(self.distance, vertex_mm=0.0))
         far_dpt: NDArray[np.float64] = np.array([[m + j0, j45], [j45, m - j0]])
         return found + far_dpt
 
-    def uneven_polynomial(self, x_mm: ArrayLike, y_mm: ArrayLike) -> NDArray[Any]:
-        """Return monomials (..., 28) subtracted by the power's change over the pupil.
+    def power_gradient_polynomial(
+        self, x_mm: ArrayLike, y_mm: ArrayLike
+    ) -> NDArray[Any]:
+        """Return the monomials (..., 28) that the gradient of the power subtracts.
 
-        Uses the third derivatives of the surface at the point on the line of sight.
+        They are cubic, from the third derivatives of the surface at the given points.
         """
-        z, aside, wide_mm = self._places(x_mm, y_mm)
-        slope_dpt_mm = self.add_dpt * _bell(z) / wide_mm
+        along, lateral, width_mm = self._corridor_coordinates(x_mm, y_mm)
+        slope_dpt_mm = self.add_dpt * _bell(along) / width_mm
         derivatives = [
-            z * aside * ((3.0 - z * z) * aside**2 - 3.0),  # xxx
-            -1.0 - (z * z - 1.0) * aside**2,  # xxy
-            -z * aside,  # xyy
-            -np.ones_like(z),  # yyy
+            along * lateral * ((3.0 - along * along) * lateral**2 - 3.0),  # xxx
+            -1.0 - (along * along - 1.0) * lateral**2,  # xxy
+            -along * lateral,  # xyy
+            -np.ones_like(along),  # yyy
         ]
-        found = np.zeros((*z.shape, N_TERMS))
-        for place, times, third in zip(CUBES, (1, 3, 3, 1), derivatives, strict=True):
-            found[..., place] = -slope_dpt_mm * times * third / 6.0
+        found = np.zeros((*along.shape, N_TERMS))
+        for index, factor, third in zip(CUBES, (1, 3, 3, 1), derivatives, strict=True):
+            found[..., index] = -slope_dpt_mm * factor * third / 6.0
         return found
 
-    def _places(self, x_mm: ArrayLike, y_mm: ArrayLike) -> tuple[NDArray[Any], ...]:
-        """Return positions along and across the corridor over its width; the width."""
+    def _corridor_coordinates(
+        self, x_mm: ArrayLike, y_mm: ArrayLike
+    ) -> tuple[NDArray[Any], ...]:
+        """Return positions along and across the corridor, in widths, and the width."""
         x, y = np.broadcast_arrays(*(np.asarray(c, float) for c in (x_mm, y_mm)))
-        wide_mm = np.hypot(self.corridor_mm / 4.0, x)
-        return (-y - self.corridor_mm / 2.0) / wide_mm, x / wide_mm, wide_mm
+        width_mm = np.hypot(self.corridor_mm / 4.0, x)
+        return (-y - self.corridor_mm / 2.0) / width_mm, x / width_mm, width_mm
 
 
 def progressive_polynomial(
@@ -145,13 +155,20 @@ def progressive_polynomial(
     *,
     entrance_pupil_mm: float,
 ) -> NDArray[np.float64]:
-    """Return monomials (..., 28) that a lens subtracts at field directions (...).
+    """Return the monomials (..., 28), um/mm^degree, that a lens subtracts in the pupil.
 
-    In the plane of the entrance pupil, by meridians: P (1 - L P)^-1, plus the change of
-    power over the pupil.
+    The power matrix P at the vertex distance becomes P (1 - L P)^-1 at the entrance
+    pupil, at a distance L.  The effect of the power gradient is added.
+
+    Parameters
+    ----------
+    h_deg, v_deg : (...)
+        Field directions.
+    entrance_pupil_mm : float
+        Depth of the entrance pupil behind the cornea.
     """
-    place_mm = lens.lens_point_mm(h_deg, v_deg)
-    power = lens.power_matrices_dpt(*place_mm)
+    point_mm = lens.lens_point_mm(h_deg, v_deg)
+    power = lens.power_matrices_dpt(*point_mm)
     before_m = (lens.vertex_mm + entrance_pupil_mm) / MM_PER_M
     at_pupil = power @ np.linalg.inv(np.eye(2) - before_m * power)
     m = (at_pupil[..., 0, 0] + at_pupil[..., 1, 1]) / 2.0
@@ -165,10 +182,10 @@ def progressive_polynomial(
     parts = np.stack([m, j0, at_pupil[..., 0, 1]], axis=-1)
     found: NDArray[np.float64] = parts @ polynomial_in_mm(
         unit, 1.0
-    ) + lens.uneven_polynomial(*place_mm)
+    ) + lens.power_gradient_polynomial(*point_mm)
     return found
 
 
-def _bell(z: NDArray[np.float64]) -> NDArray[np.float64]:
-    bell: NDArray[np.float64] = np.exp(-z * z / 2.0) / np.sqrt(2.0 * np.pi)
+def _bell(along: NDArray[np.float64]) -> NDArray[np.float64]:
+    bell: NDArray[np.float64] = np.exp(-along * along / 2.0) / np.sqrt(2.0 * np.pi)
     return bell

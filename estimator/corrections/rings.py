@@ -1,7 +1,7 @@
-"""Lenses with simultaneous foci, by the effect of their rings on light in the pupil.
+"""Complex amplitude of multifocal lenses in the plane of the entrance pupil.
 
-Foci are not summed incoherently: through 2 to 3 mm their light interferes, which
-extends the depth of focus of weak additions.
+The light of the foci interferes.  Through pupils of 2 to 3 mm, interference extends the
+depth of focus of low additions, which an incoherent sum would miss.
 """
 
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ from estimator.corrections.lenslets import Lenslets
 from estimator.optics.units import NM_PER_UM
 
 LOWEST_ORDER, HIGHEST_ORDER = -3, 3
-"""Orders included below the lowest and above the highest design order.  The remaining
-light, a few percent still farther out of focus, is assigned to the two end orders."""
+"""Orders included below the lowest and above the highest design order.  The light of
+all other orders, a few percent, is assigned to the two outermost ones."""
 
 MAIN_SHARE = 0.1
-"""Least share of the light for which a focus is treated on its own."""
+"""Smallest share of the light with which a focus is treated separately."""
 
 
 @dataclass(frozen=True)
@@ -29,17 +29,21 @@ class DiffractiveRings:
     Attributes
     ----------
     spacing_dpt : float
-        Power of the first order at ``design_nm``; that of order k is k times as large,
-        and all are in proportion to the wavelength.
+        Power of the first order at ``design_nm``.  Order k has k times this power, and
+        powers are proportional to the wavelength.
     kinoform : Kinoform
+        Phase profile of the zones.
     orders : (lowest, highest)
-        Orders of the design.
+        Design orders.
     far_order : int
-        Order that is in focus for far; its power at ``design_nm`` is part of the eye's.
+        Order of the distance focus; its power at ``design_nm`` belongs to the
+        prescription.
     design_nm : float
+        Design wavelength.
     diameter_mm : float
-        Diameter of the rings; beyond them all light goes to the far focus.
+        Diameter of the diffractive zone; light outside it goes to the distance focus.
     centre_mm : (x, y)
+        Center relative to that of the pupil.
     """
 
     spacing_dpt: float
@@ -52,7 +56,7 @@ class DiffractiveRings:
 
     @property
     def followed_orders(self) -> NDArray[np.int64]:
-        """Orders (K,) that are included."""
+        """Included orders, (K,)."""
         lowest, highest = self.orders
         return np.arange(lowest + LOWEST_ORDER, highest + HIGHEST_ORDER + 1)
 
@@ -61,15 +65,15 @@ class DiffractiveRings:
         found = self.kinoform.amplitudes(
             self.followed_orders, color_ratio=self.design_nm / wavelength_nm
         )
-        left = max(1.0 - float((np.abs(found) ** 2).sum()), 0.0) / 2.0
+        remaining = max(1.0 - float((np.abs(found) ** 2).sum()), 0.0) / 2.0
         for end in (0, -1):
-            size = abs(found[end])
-            turn = found[end] / size if size > 0.0 else 1.0
-            found[end] = np.hypot(size, np.sqrt(left)) * turn
+            modulus = abs(found[end])
+            phase = found[end] / modulus if modulus > 0.0 else 1.0
+            found[end] = np.hypot(modulus, np.sqrt(remaining)) * phase
         return found
 
     def added_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
-        """Return the power (K,) of each order relative to the far focus."""
+        """Return the power (K,) of each order relative to the distance focus."""
         color = wavelength_nm / self.design_nm
         added_dpt = self.spacing_dpt * (self.followed_orders * color - self.far_order)
         return cast("NDArray[np.float64]", added_dpt)
@@ -89,7 +93,13 @@ class DiffractiveRings:
     def main_light_ratio(
         self, radius_mm: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.float64]:
-        """Return the share (n, ...) of a pupil's light in each of those orders."""
+        """Return the share (n, ...) of the light in the orders of `main_dpt`.
+
+        Parameters
+        ----------
+        radius_mm : (...)
+            Radius of the pupil.
+        """
         is_main = self._is_main(wavelength_nm)
         light = np.abs(self.amplitudes(wavelength_nm)[is_main]) ** 2
         is_far = self.followed_orders[is_main] == self.far_order
@@ -114,29 +124,30 @@ class DiffractiveRings:
     def transmission(
         self, square_mm2: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.complex128]:
-        """Return the complex amplitude behind the lens at squared distances (...)."""
+        """Return the complex amplitude (...) at squared distances from the center."""
         square = np.asarray(square_mm2, dtype=np.float64)
         inside = np.minimum(square, (self.diameter_mm / 2.0) ** 2)
-        turns_um = NM_PER_UM / wavelength_nm
+        waves_per_um = NM_PER_UM / wavelength_nm
         field = np.zeros(square.shape, complex)
         for added_dpt, amplitude in zip(
             self.added_dpt(wavelength_nm), self.amplitudes(wavelength_nm), strict=True
         ):
-            field += amplitude * np.exp(1j * np.pi * turns_um * added_dpt * inside)
+            field += amplitude * np.exp(1j * np.pi * waves_per_um * added_dpt * inside)
         return np.where(square > inside, np.exp(1j * np.angle(field)), field)
 
 
 @dataclass(frozen=True)
 class RefractiveZones:
-    """Rings of different power, in the plane of the entrance pupil.
+    """Concentric refractive zones, in the plane of the entrance pupil.
 
     Attributes
     ----------
     outer_mm : tuple of float
-        Outer radius of each ring, ascending; the last ring has no outer limit.
+        Outer radius of each zone, ascending; the last zone extends beyond its radius.
     powers_dpt : tuple of float
-        Power of each ring relative to far.
+        Power of each zone relative to the distance focus.
     centre_mm : (x, y)
+        Center relative to that of the pupil.
     """
 
     outer_mm: tuple[float, ...]
@@ -152,13 +163,13 @@ class RefractiveZones:
         return self
 
     def main_dpt(self, wavelength_nm: float) -> NDArray[np.float64]:
-        """Return the power (n,) of all rings."""
+        """Return the distinct powers (n,) of the zones."""
         return np.unique(self.powers_dpt)
 
     def main_light_ratio(
         self, radius_mm: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.float64]:
-        """Return the share (n, ...) of a pupil's light, by area, at each power."""
+        """Return the share (n, ...) of the pupil's area with each of these powers."""
         square = np.square(np.asarray(radius_mm, dtype=np.float64))
         ends = np.square([0.0, *self.outer_mm[:-1], np.inf])
         within = np.diff(np.minimum(square[..., None], ends)) / square[..., None]
@@ -177,7 +188,7 @@ class RefractiveZones:
     def transmission(
         self, square_mm2: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.complex128]:
-        """Return the complex amplitude behind the lens; its surface has no steps."""
+        """Return the complex amplitude (...); the phase is continuous between zones."""
         square = np.asarray(square_mm2, dtype=np.float64)
         ends = np.square(self.outer_mm)
         path_um, before = np.zeros(square.shape), 0.0

@@ -1,4 +1,4 @@
-"""A lens on or in the eye: prescription, own aberration and position."""
+"""Contact and intraocular lenses, and the wavefront that any correction subtracts."""
 
 from dataclasses import dataclass, replace
 
@@ -20,36 +20,36 @@ from estimator.wavefront.field_wavefronts import (
 )
 
 ABERRATION_PUPIL_MM = 6.0
-"""Pupil diameter for which a lens's spherical aberration is stated."""
+"""Pupil diameter at which the spherical aberration of a lens is specified."""
 
 POWER_PUPIL_MM = 4.0
-"""Pupil diameter for which its power is stated, as for an eye's refraction."""
+"""Pupil diameter at which power is specified, both of lenses and of eyes."""
 
 C40 = index_from_nm(4, 0)
 
 
 @dataclass(frozen=True)
 class WornLens(rx.Prescription):
-    """A lens with properties beyond its powers, as it acts in the entrance pupil.
+    """A contact lens, intraocular lens or lenslet lens, as it acts in the pupil.
 
     Attributes
     ----------
     sphere_dpt, cylinder_dpt, axis_deg, vertex_mm : float
-        See `Prescription`; for a lens in the plane of the pupil, ``vertex_mm`` is minus
-        the pupil's depth.
+        See `Prescription`.  If the powers are those in the plane of the pupil,
+        ``vertex_mm`` is minus the depth of the pupil.
     kind : {"contact_lens", "iol", "lenslets"}
     spherical_aberration_um : float
-        Added C(4,0) on 6 mm; the power through 4 mm stays the same.
+        C(4,0) of the lens on 6 mm; it leaves the power through 4 mm unchanged.
     centre_mm : (x, y)
         Center in the entrance pupil, x to the person's right, y up.
     rings : Rings or None
-        Rings of a lens with several foci.
+        Complex amplitude of a multifocal lens.
     replaces_lens : bool
-        Whether the eye's own lens, and with it accommodation, is gone.
+        Whether the lens replaces the crystalline lens and its accommodation.
     design : str
         Design name of an intraocular lens.
     depth_mm : float
-        Depth of an intraocular lens behind the cornea; the powers here are those in
+        Depth of an intraocular lens behind the cornea.  Its powers here are those in
         the pupil.
     """
 
@@ -62,68 +62,79 @@ class WornLens(rx.Prescription):
     depth_mm: float = 0.0
 
     def at_lens_dpt(self, power_dpt: float) -> float:
-        """Return the power in the lens's own plane of a power in the pupil's plane."""
+        """Convert a power from the plane of the pupil to that of the lens, dpt."""
         return power_dpt / height_ratio(self.depth_mm) ** 2
 
-    def looking(self, gaze_deg: tuple[float, float]) -> "WornLens":
-        """Return the lens for a gaze rotated by (h, v) from the present one."""
+    def with_gaze_offset(self, offset_deg: tuple[float, float]) -> "WornLens":
+        """Return the lens after a rotation of gaze by (h, v) from the present gaze."""
         if not isinstance(self.rings, Lenslets):
             return self
-        return replace(self, rings=self.rings.looking(gaze_deg))
+        return replace(self, rings=self.rings.with_gaze_offset(offset_deg))
 
 
-def turns_with_gaze(correction: rx.Prescription | None) -> bool:
-    """Return whether a correction depends on the direction of gaze."""
+def depends_on_gaze(correction: rx.Prescription | None) -> bool:
+    """Return whether a correction changes with the direction of gaze."""
     return isinstance(correction, ProgressiveLens) or isinstance(
         rings_of(correction), Lenslets
     )
 
 
 def rings_of(correction: rx.Prescription | None) -> Rings | None:
-    """Return the rings of a correction with several foci, or None."""
+    """Return the rings of a multifocal correction, or None."""
     return correction.rings if isinstance(correction, WornLens) else None
 
 
 def replaces_lens(correction: rx.Prescription | None) -> bool:
-    """Return whether a correction replaces the eye's own lens."""
+    """Return whether a correction replaces the crystalline lens."""
     return isinstance(correction, WornLens) and correction.replaces_lens
 
 
 def worn_polynomial(
     correction: rx.Prescription | None, *, entrance_pupil_mm: float
 ) -> NDArray[np.float64]:
-    """Return monomials (28,), um/mm^degree, that a correction subtracts in the pupil.
+    """Return the monomials (28,), um/mm^degree, that a correction subtracts on axis.
 
-    The power of `correction_polynomial` minus the correction's own aberration.
+    They are those of its power (`correction_polynomial`) minus its own aberration, in
+    the plane of the entrance pupil.
+
+    Parameters
+    ----------
+    entrance_pupil_mm : float
+        Depth of the entrance pupil behind the cornea.
     """
-    taken_um = correction_polynomial(correction, entrance_pupil_mm=entrance_pupil_mm)
+    subtracted_um = correction_polynomial(
+        correction, entrance_pupil_mm=entrance_pupil_mm
+    )
     if isinstance(correction, ProgressiveLens):
-        place_mm = correction.lens_point_mm(0.0, 0.0)
-        taken_um = taken_um + correction.uneven_polynomial(*place_mm)
+        point_mm = correction.lens_point_mm(0.0, 0.0)
+        subtracted_um = subtracted_um + correction.power_gradient_polynomial(*point_mm)
     if isinstance(correction, WornLens) and correction.spherical_aberration_um:
-        taken_um = taken_um - own_polynomial(correction)
-    return taken_um
+        subtracted_um = subtracted_um - aberration_polynomial(correction)
+    return subtracted_um
 
 
 def worn_refraction(
     correction: rx.Prescription | None, *, entrance_pupil_mm: float
 ) -> tuple[float, float]:
-    """Return M, dpt, subtracted through a pinhole, and its change per radius², mm²."""
+    """Return the paraxial M, dpt, that a correction subtracts, and its slope.
+
+    M through a pupil of radius r mm is the first value plus the second times r².
+    """
     if correction is None:
         return 0.0, 0.0
-    taken_um = worn_polynomial(correction, entrance_pupil_mm=entrance_pupil_mm)
+    subtracted_um = worn_polynomial(correction, entrance_pupil_mm=entrance_pupil_mm)
     radii_mm = np.array([1.0, 2.0])
-    on_circles = zernike_from_polynomial(np.tile(taken_um, (2, 1)), radii_mm)
+    on_circles = zernike_from_polynomial(np.tile(subtracted_um, (2, 1)), radii_mm)
     narrow_dpt, wide_dpt = total_defocus_dpt(on_circles, radii_mm).tolist()
     per_mm2 = (wide_dpt - narrow_dpt) / (radii_mm[1] ** 2 - radii_mm[0] ** 2)
     return narrow_dpt - per_mm2 * radii_mm[0] ** 2, per_mm2
 
 
-def own_polynomial(lens: WornLens) -> NDArray[np.float64]:
-    """Return monomials (28,) of a lens's own aberration, about the pupil's center.
+def aberration_polynomial(lens: WornLens) -> NDArray[np.float64]:
+    """Return the monomials (28,), um/mm^degree, of the aberration of a lens.
 
-    A decentered lens has coma and astigmatism too; tilt is removed, because the chief
-    ray has none.
+    They are about the center of the pupil, where a decentered lens also has coma and
+    astigmatism.  Tilt is removed, because the chief ray has zero slope.
     """
     zernike_um = np.zeros(N_TERMS)
     zernike_um[C40] = lens.spherical_aberration_um
@@ -139,17 +150,17 @@ def own_polynomial(lens: WornLens) -> NDArray[np.float64]:
 def shifted_polynomial(
     polynomial_um: NDArray[np.float64], centre_mm: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Return monomials (28,) of p(u - center)."""
+    """Return the monomials (28,) of p(u - center) from those of p(u)."""
     if not any(centre_mm):
         return polynomial_um
-    place = {tuple(e): k for k, e in enumerate(EXPONENTS.astype(int).tolist())}
+    index = {tuple(e): k for k, e in enumerate(EXPONENTS.astype(int).tolist())}
     found = np.zeros(N_TERMS)
-    for (a, b), value in zip(place, polynomial_um.tolist(), strict=True):
+    for (a, b), value in zip(index, polynomial_um.tolist(), strict=True):
         if value == 0.0:
             continue
         along_x = np.polynomial.polynomial.polypow((-centre_mm[0], 1.0), a)
         along_y = np.polynomial.polynomial.polypow((-centre_mm[1], 1.0), b)
         for i, from_x in enumerate(along_x.tolist()):
             for j, from_y in enumerate(along_y.tolist()):
-                found[place[i, j]] += value * from_x * from_y
+                found[index[i, j]] += value * from_x * from_y
     return found

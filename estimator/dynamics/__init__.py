@@ -1,10 +1,12 @@
-"""Dynamics of the eye: pupil, accommodation and gaze.
+"""Dynamics of the eye: pupil, accommodation and gaze over time.
 
-accommodation_response  accommodation over time
-pupil_size              pupil diameter in steady light
-pupil_reflex            pupil diameter over time
-gaze                    smoothed gaze of a tracker, with a fallback
-delayed_approach        value that follows its target after a latency
+accommodation_response  accommodation that follows the fixation distance
+pupil_size              steady-state pupil diameter
+pupil_reflex            pupillary light reflex
+gaze                    smoothed gaze of an eye tracker
+delayed_approach        exponential approach to a target after a latency
+
+Times are in seconds on any clock; each model is independent of the sampling rate.
 """
 
 import lazy_loader

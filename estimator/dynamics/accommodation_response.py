@@ -1,4 +1,4 @@
-"""Response of an eye's accommodation over time."""
+"""Response of accommodation to changes of the fixation distance."""
 
 from __future__ import annotations
 
@@ -9,34 +9,33 @@ from estimator.dynamics.delayed_approach import DelayedApproach
 Cue = Literal["both", "blur"]
 
 LATENCY_S = 0.36
-"""Latency (Campbell & Westheimer 1960); from 18 to 49 years it does not change with age
-(Heron, Charman & Gray 2002)."""
+"""Latency (Campbell & Westheimer 1960).  It does not change with age from 18 to 49
+years (Heron, Charman & Gray 2002)."""
 
 PEAK_SPEED_PER_DPT = {"both": 3.56, "blur": 7.10}
-"""Main sequence, dpt/s per diopter: of accommodation driven by vergence, with both
-eyes, and of one eye's by blur alone (ARVO 2007, article 2407307)."""
+"""Slope of the main sequence, dpt/s per dpt, for binocular viewing (driven by vergence)
+and for monocular viewing (driven by blur alone).  ARVO 2007, article 2407307."""
 
 RELAXING_SPEED_PER_DPT, RELAXING_SPEED_DPT_S = 1.39, 1.12
-"""Coefficients of the peak speed of relaxation, which depends on its start and not on
-its size (Bharadwaj & Schor 2006)."""
+"""Slope and intercept of the peak speed of disaccommodation, which depends on the
+initial accommodation and not on the step size (Bharadwaj & Schor 2006)."""
 
 PLANT_S = 0.156
-"""Time constant of lens and ciliary muscle alone (Schor & Bharadwaj 2006), the lower
-limit."""
+"""Time constant of the plant, lens and ciliary muscle (Schor & Bharadwaj 2006); no
+response is faster."""
 
 
 def time_constant_s(begin_dpt: float, end_dpt: float, cue: Cue = "both") -> float:
-    """Return the time constant of a step of accommodation, which is exponential.
+    """Return the time constant of an exponential step of accommodation.
 
-    It is the step's size divided by its peak speed.  Relaxation from near is faster,
-    and lens and muscle limit the speed of small steps.
+    It is the step size divided by the peak speed.  The plant limits small steps.
 
     Parameters
     ----------
     begin_dpt, end_dpt : float
-        Accommodation, 0 if relaxed.
-    cue : "both" or "blur"
-        Both eyes, driven by vergence, or blur alone.
+        Initial and final accommodation, 0 if relaxed.
+    cue : {"both", "blur"}
+        Binocular viewing, driven by vergence, or monocular viewing, driven by blur.
     """
     if end_dpt >= begin_dpt:
         return max(PLANT_S, 1.0 / PEAK_SPEED_PER_DPT[cue])
@@ -45,20 +44,25 @@ def time_constant_s(begin_dpt: float, end_dpt: float, cue: Cue = "both") -> floa
 
 
 class AccommodationResponse:
-    """Accommodation that follows the distance of the fixated object.
+    """Accommodation that follows the fixation distance.
 
-    In the steady state the eye is focused at that distance: acuity is best at or near
-    it, despite the lag that refractors report (Labhishetty, Cholewiak, Roorda & Banks,
-    J. Vision 21(3):21, 2021).  Age limits the amplitude and not the speed: the speed of
-    steps hardly changes from 18 to 49 years (Heron, Charman & Gray, IOVS 40:2872, 1999;
+    In the steady state, the eye is focused at the fixation distance: acuity is best at
+    or near it, despite the lag that autorefractors report (Labhishetty, Cholewiak,
+    Roorda & Banks, J. Vision 21(3):21, 2021).  Age limits the amplitude, but the speed
+    hardly changes from 18 to 49 years (Heron, Charman & Gray, IOVS 40:2872, 1999;
     Heron, Charman & Schor 2001).
 
     Parameters
     ----------
     far_dpt, near_dpt : float
-        Far and near point through the correction, see `Focusing.focus_limits_dpt`.
-    cue : "both" or "blur"
-        Both eyes, driven by vergence, or blur alone.
+        Far and near point through the correction; see `Focusing.focus_limits_dpt`.
+    cue : {"both", "blur"}
+        Binocular viewing, driven by vergence, or monocular viewing, driven by blur.
+
+    Raises
+    ------
+    ValueError
+        The cue is unknown, or the near point is beyond the far point.
     """
 
     def __init__(self, far_dpt: float, near_dpt: float, *, cue: Cue = "both") -> None:
@@ -73,10 +77,13 @@ class AccommodationResponse:
         )
 
     def hold(self, far_dpt: float, near_dpt: float) -> None:
-        """Limit accommodation to the range between an actual far and near point."""
+        """Limit accommodation to the present far and near point, dpt.
+
+        Both change with the pupil.
+        """
         self._response.hold(far_dpt - self.far_dpt, near_dpt - self.far_dpt)
 
     def follow(self, distance_dpt: float, at_s: float) -> float:
-        """Set the target distance from now on; return the current focus, dpt."""
-        wanted_dpt = min(max(distance_dpt, self.far_dpt), self.near_dpt)
-        return self.far_dpt + self._response.follow(wanted_dpt - self.far_dpt, at_s)
+        """Set the fixation distance from ``at_s`` on; return the focus then, dpt."""
+        target_dpt = min(max(distance_dpt, self.far_dpt), self.near_dpt)
+        return self.far_dpt + self._response.follow(target_dpt - self.far_dpt, at_s)

@@ -1,4 +1,4 @@
-"""Gaze from a tracker: smoothed, limited in age, straight ahead when lost."""
+"""Gaze of an eye tracker: smoothed, and straight ahead while tracking is lost."""
 
 from __future__ import annotations
 
@@ -7,23 +7,24 @@ from dataclasses import dataclass
 
 MIN_CUTOFF_HZ = 2.0
 SPEED_WEIGHT = 0.1
-"""Speed weight of the filter, in Hz per deg/s: at rest it removes noise above 2 Hz, and
-in a saccade of 300 deg/s the delay is at most 5 ms."""
+"""Increase of the cutoff, Hz per deg/s: in fixations, the filter removes noise above
+2 Hz; in a saccade of 300 deg/s, its delay is at most 5 ms."""
 
 SPEED_CUTOFF_HZ = 1.0
 BLINK_S = 0.4
-"""Time for which a lost gaze is held: a blink takes 0.1 to 0.4 s."""
+"""Time for which the last gaze is held: a blink takes 0.1 to 0.4 s."""
 
 STRAIGHT_AHEAD_DEG = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Gaze:
-    """Gaze direction of an eye, to the right and up from the camera's axis.
+    """Gaze direction of an eye.
 
     Attributes
     ----------
     h_deg, v_deg : float
+        Angles to the right and up from the camera's axis.
     is_tracked : bool
         Whether the gaze is known; otherwise it is straight ahead.
     age_s : float
@@ -37,19 +38,28 @@ class Gaze:
 
 
 class GazeFollower:
-    """Smoothing of gaze with the 1 euro filter.
+    """Gaze smoothed with the 1 euro filter.
 
-    Casiez, Roussel & Vogel, CHI 2012: a low-pass filter whose cutoff rises with speed,
-    so that a resting eye does not jitter and a saccade is not delayed.
+    The cutoff of this low-pass filter rises with speed, so that fixations do not jitter
+    and saccades are not delayed.
 
     Parameters
     ----------
     min_cutoff_hz : float
-        Cutoff of the low-pass filter at rest.
+        Cutoff at zero speed.
     speed_weight : float
         Increase of the cutoff, Hz per deg/s.
     max_age_s : float
-        Age above which a sample counts as lost.
+        Age above which a sample is not used.
+
+    Raises
+    ------
+    ValueError
+        A parameter is out of range.
+
+    References
+    ----------
+    Casiez, Roussel & Vogel, CHI 2012.
     """
 
     def __init__(
@@ -75,27 +85,31 @@ class GazeFollower:
         self._at_s = -math.inf
 
     def see(self, h_deg: float, v_deg: float, at_s: float) -> None:
-        """Add a sample; ignore one that is not finite or not newer."""
+        """Add a sample; samples that are not finite or not newer are ignored."""
         if not all(map(math.isfinite, (h_deg, v_deg, at_s))) or at_s <= self._at_s:
             return
         step_s = at_s - self._at_s
-        before_deg, self._at_s = self._gaze_deg, at_s
-        if before_deg is None or step_s > self._max_age_s:
+        previous_deg, self._at_s = self._gaze_deg, at_s
+        if previous_deg is None or step_s > self._max_age_s:
             self._gaze_deg, self._speed_deg_s = (h_deg, v_deg), (0.0, 0.0)
             return
-        share = _share(SPEED_CUTOFF_HZ, step_s)
+        weight = _filter_weight(SPEED_CUTOFF_HZ, step_s)
         self._speed_deg_s = (
-            _blend(self._speed_deg_s[0], (h_deg - before_deg[0]) / step_s, share),
-            _blend(self._speed_deg_s[1], (v_deg - before_deg[1]) / step_s, share),
+            _interpolated(
+                self._speed_deg_s[0], (h_deg - previous_deg[0]) / step_s, weight
+            ),
+            _interpolated(
+                self._speed_deg_s[1], (v_deg - previous_deg[1]) / step_s, weight
+            ),
         )
         # One cutoff for both axes: otherwise an oblique saccade would be curved.
         cutoff_hz = self._min_cutoff_hz + self._speed_weight * math.hypot(
             *self._speed_deg_s
         )
-        share = _share(cutoff_hz, step_s)
+        weight = _filter_weight(cutoff_hz, step_s)
         self._gaze_deg = (
-            _blend(before_deg[0], h_deg, share),
-            _blend(before_deg[1], v_deg, share),
+            _interpolated(previous_deg[0], h_deg, weight),
+            _interpolated(previous_deg[1], v_deg, weight),
         )
 
     def at(self, at_s: float) -> Gaze:
@@ -106,10 +120,10 @@ class GazeFollower:
         return Gaze(*self._gaze_deg, is_tracked=True, age_s=max(0.0, age_s))
 
 
-def _share(cutoff_hz: float, step_s: float) -> float:
-    """Return the weight of a new sample in a low-pass filter."""
+def _filter_weight(cutoff_hz: float, step_s: float) -> float:
+    """Return the weight of a new sample in a first-order low-pass filter."""
     return 1.0 / (1.0 + 1.0 / (2.0 * math.pi * cutoff_hz * step_s))
 
 
-def _blend(before: float, new: float, share: float) -> float:
-    return before + share * (new - before)
+def _interpolated(before: float, new: float, weight: float) -> float:
+    return before + weight * (new - before)

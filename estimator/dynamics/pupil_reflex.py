@@ -1,4 +1,4 @@
-"""Response of the pupil to light over time."""
+"""Pupillary light reflex: the pupil diameter over time."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from estimator.dynamics.pupil_size import steady_pupil_mm
 LATENCY_AT_1_CD_M2_S = 0.270
 LATENCY_PER_LOG_UNIT_S = 0.034
 LATENCY_RANGE_S = (0.20, 0.36)
-"""Latency falls by 34 ms for each log unit of light (Myers & Stark 1993); at 1 cd/m² it
-is that of Link & Stark's formula for a single step."""
+"""Latency falls by 34 ms per log unit of luminance (Myers & Stark 1993).  At 1 cd/m² it
+is that of Link & Stark's formula for a step."""
 
 FAST_SHARE = 0.4
 CONSTRICTING_S = (0.28, 0.28)
 DILATING_S = (0.9, 2.9)
-"""Time constants of the fast and the slow part: redilation has both.  They are fitted,
-to 0.14 mm, to pulses of 1 s at five powers of light (recorded by Martin, Pinto, Bulte &
-Spitschan, 2021)."""
+"""Time constants of the fast and the slow component; only redilation has two.  They are
+fitted, to 0.14 mm, to responses to pulses of 1 s at five light levels (data of Martin,
+Pinto, Bulte & Spitschan, 2021)."""
 
 
 def reflex_latency_s(luminance_cd_m2: float) -> float:
-    """Return the latency of the pupil at a luminance."""
+    """Return the latency of the reflex at a luminance."""
     log_light = math.log10(max(luminance_cd_m2, 1e-9))
     latency_s = LATENCY_AT_1_CD_M2_S - LATENCY_PER_LOG_UNIT_S * log_light
     return min(max(latency_s, LATENCY_RANGE_S[0]), LATENCY_RANGE_S[1])
@@ -36,11 +36,11 @@ class PupilReflex:
     Parameters
     ----------
     age_years, field_area_deg2, n_eyes
-        Parameters of `steady_pupil_mm`, which the pupil approaches.
+        Arguments of `steady_pupil_mm`, which gives the target diameter.
     luminance_cd_m2 : float
-        Initial luminance, at which the pupil is steady.
+        Initial luminance, to which the pupil is adapted.
     latency_s : float, optional
-        Measured latency of this person; `reflex_latency_s` by default.
+        Measured latency of the person; `reflex_latency_s` by default.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class PupilReflex:
         n_eyes: int = 2,
         latency_s: float | None = None,
     ) -> None:
-        self._how = field_area_deg2, age_years, n_eyes
+        self._adaptation = field_area_deg2, age_years, n_eyes
         self._latency_s = latency_s
         begin_mm = self._steady_mm(luminance_cd_m2)
         self._parts = tuple(
@@ -70,13 +70,13 @@ class PupilReflex:
         )
 
     def _steady_mm(self, luminance_cd_m2: float) -> float:
-        field_area_deg2, age_years, n_eyes = self._how
+        field_area_deg2, age_years, n_eyes = self._adaptation
         return steady_pupil_mm(
             luminance_cd_m2, field_area_deg2, age_years, n_eyes=n_eyes
         )
 
     def follow(self, luminance_cd_m2: float, at_s: float) -> float:
-        """Set the luminance from now on; return the current pupil diameter, mm."""
+        """Set the luminance from ``at_s`` on; return the diameter then, mm."""
         target_mm = self._steady_mm(luminance_cd_m2)
         latency_s = self._latency_s
         if latency_s is None:

@@ -1,4 +1,4 @@
-"""Pupil diameter in steady light."""
+"""Steady-state pupil diameter."""
 
 from __future__ import annotations
 
@@ -16,24 +16,27 @@ def steady_pupil_mm(
     *,
     n_eyes: int = 2,
 ) -> float:
-    """Return the diameter of the entrance pupil in steady light.
-
-    Watson & Yellott, J. Vision 12(10):12, 2012: the "unified formula".
+    """Return the diameter of the entrance pupil, mm, in steady light.
 
     Parameters
     ----------
     luminance_cd_m2 : float, 0 or more
         Mean luminance of the adapting field.
     field_area_deg2 : float, above 0
-        Area of the field: a disk of 60 deg has 2827 deg².
+        Area of the field, 2827 deg² for a disc of 60 deg.
     age_years : float
-        Age, clamped to the formula's range of 20 to 83.
+        Age, clamped to the range of the formula, 20 to 83.
     n_eyes : 1 or 2
-        Eyes that see the light; one alone counts a tenth.
+        Number of adapted eyes.  Monocular adaptation has a tenth of the effect.
 
     Raises
     ------
     ValueError
+        A value is out of range.
+
+    References
+    ----------
+    Watson & Yellott, J. Vision 12(10):12, 2012: the "unified formula".
     """
     if not (math.isfinite(luminance_cd_m2) and luminance_cd_m2 >= 0.0):
         raise ValueError(f"luminance_cd_m2 is {luminance_cd_m2}; allowed: 0 or more")

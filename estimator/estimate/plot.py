@@ -1,6 +1,7 @@
 """Plot of an estimated eye's cross-section with traced rays."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.estimate.estimation import EstimatedEye
+from estimator.optics import prescription as rx
 from estimator.optics.raytrace import RayStatus, trace_rays
 from estimator.optics.surfaces import EyeSurfaces, Surface, rotation_matrix
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
@@ -21,7 +23,9 @@ HALF_HEIGHTS_MM = (5.5, 5.2, 4.5, 4.5)
 N_POINTS = 201
 N_RAYS = 11
 OBJECT_SIDE_MM = 5.0
-"""Distance in front of the cornea from which rays are drawn."""
+"""Distance in front of the cornea, or of a lens, from which rays are drawn."""
+
+LENS, LENS_HALF_HEIGHT_MM = "tab:blue", 8.0
 
 
 def surface_line_mm(
@@ -88,13 +92,21 @@ def plot_eye(found: EstimatedEye, path: Path, *, focus_dpt: float = 0.0) -> None
     figure.savefig(path, dpi=130)
 
 
-def draw_section(axes: "Axes", eye: EyeSurfaces, *, pupil_diameter_mm: float) -> None:
+def draw_section(
+    axes: "Axes",
+    eye: EyeSurfaces,
+    *,
+    pupil_diameter_mm: float,
+    lens: rx.Prescription | None = None,
+) -> None:
     """Draw the vertical section of an eye and rays from infinity into matplotlib axes.
 
     Parameters
     ----------
     pupil_diameter_mm : float
         Diameter of the ray bundle in front of the cornea.
+    lens : Prescription, optional
+        Thin lens in front of the eye that the rays pass.
     """
     for surface, half_height_mm in zip(eye.surfaces, HALF_HEIGHTS_MM, strict=True):
         line = surface_line_mm(surface, half_height_mm=half_height_mm)
@@ -103,11 +115,30 @@ def draw_section(axes: "Axes", eye: EyeSurfaces, *, pupil_diameter_mm: float) ->
     for sign in (-1.0, 1.0):
         y_mm = sign * np.array([pupil_diameter_mm / 2.0 / 1.13, 5.6])
         axes.plot([eye.stop_z_mm] * 2, y_mm, color="tab:brown", lw=2.5)
-    for path in ray_paths_mm(eye, pupil_diameter_mm=pupil_diameter_mm):
+    if lens is not None:
+        _draw_lens(axes, lens)
+    for path in ray_paths_mm(eye, pupil_diameter_mm=pupil_diameter_mm, lens=lens):
         axes.plot(path[:, 2], path[:, 1], color="tab:red", lw=0.6)
     axes.set_aspect("equal")
     axes.set_xlabel("z, mm (into the eye)")
     axes.set_ylabel("y, mm (up)")
+
+
+def _draw_lens(axes: "Axes", lens: rx.Prescription) -> None:
+    """Draw the symbol of a thin lens: arrowheads point outward for positive power."""
+    z_mm = -lens.vertex_mm
+    axes.plot([z_mm] * 2, [-LENS_HALF_HEIGHT_MM, LENS_HALF_HEIGHT_MM], color=LENS, lw=2)
+    markers = ("v", "^") if _vertical_power_dpt(lens)[0] >= 0.0 else ("^", "v")
+    for y_mm, marker in zip(
+        (-LENS_HALF_HEIGHT_MM, LENS_HALF_HEIGHT_MM), markers, strict=True
+    ):
+        axes.plot([z_mm], [y_mm], marker, color=LENS, markersize=5)
+
+
+def _vertical_power_dpt(lens: rx.Prescription) -> tuple[float, float]:
+    """Return the power along the vertical at the lens, and that across it."""
+    m_dpt, j0_dpt, j45_dpt = rx.power_vector(replace(lens, vertex_mm=0.0))
+    return m_dpt - j0_dpt, j45_dpt
 
 
 def _draw_retina(axes: "Axes", eye: EyeSurfaces) -> None:
@@ -141,25 +172,42 @@ def _draw_coefficients(axes: "Axes", found: EstimatedEye) -> None:
 
 
 def ray_paths_mm(
-    eye: EyeSurfaces, *, pupil_diameter_mm: float, n_rays: int = N_RAYS
+    eye: EyeSurfaces,
+    *,
+    pupil_diameter_mm: float,
+    lens: rx.Prescription | None = None,
+    n_rays: int = N_RAYS,
 ) -> list[NDArray[np.float64]]:
     """Return paths (n_points, 3) of rays from infinity to the retina, plane x = 0.
 
     Rays that do not pass are omitted.
+
+    Parameters
+    ----------
+    lens : Prescription, optional
+        Thin lens that the rays pass first.
     """
     heights_mm = np.linspace(-0.5, 0.5, n_rays) * pupil_diameter_mm
-    start_mm = np.zeros((n_rays, 3))
+    start_mm, direction = np.zeros((2, n_rays, 3))
     start_mm[:, 1], start_mm[:, 2] = heights_mm, -OBJECT_SIDE_MM
+    direction[:, 2] = 1.0
+    infinity_mm = start_mm.copy()
+    if lens is not None:
+        along_dpt, across_dpt = _vertical_power_dpt(lens)
+        start_mm[:, 2] = -lens.vertex_mm
+        infinity_mm[:, 2] -= lens.vertex_mm
+        direction[:, 0] = -heights_mm / 1000.0 * across_dpt
+        direction[:, 1] = -heights_mm / 1000.0 * along_dpt
     traced = trace_rays(
         eye,
         start_mm=start_mm,
-        direction=(0.0, 0.0, 1.0),
+        direction=direction,
         wavelength_nm=REFERENCE_WAVELENGTH_NM,
     )
     passed = traced.status_index == RayStatus.TRACED
     return [
-        np.concatenate([start[None], points])
-        for start, points in zip(
-            start_mm[passed], traced.points_mm[passed], strict=True
+        np.concatenate([infinity[None], start[None], points])
+        for infinity, start, points in zip(
+            infinity_mm[passed], start_mm[passed], traced.points_mm[passed], strict=True
         )
     ]

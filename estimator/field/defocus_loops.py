@@ -1,9 +1,8 @@
-"""Compiled loop for the total defocus of fixed fields, one state after the other.
+"""Compiled loop for the total defocus at fixed fields, for one state of the eye.
 
-It runs once for every frame whose pupil or focus has changed, and total defocus is all
-that it needs.  So it carries three sums by degree instead of the 28 monomials, and
-rims for the circle.  `TracedFields.wavefronts` does the same in NumPy for complete
-wavefronts.
+It runs for every frame whose pupil or focus has changed.  Total defocus depends only on
+three sums of monomials, by degree, and on the rim of the pupil.
+`TracedFields.wavefronts` is the NumPy equivalent for complete wavefronts.
 """
 
 import math
@@ -20,7 +19,7 @@ from estimator.wavefront.field_wavefronts import (
 )
 
 N_DEGREES = 3
-"""Degrees 2, 4 and 6: no others contribute to C(2,0)."""
+"""Degrees 2, 4 and 6, which contribute to C(2,0)."""
 
 _ANGLES = 2.0 * np.pi * np.arange(N_SAMPLED) / N_SAMPLED
 _COSINES, _SINES = np.cos(_ANGLES), np.sin(_ANGLES)
@@ -55,33 +54,34 @@ def fill_defocus(pupil_mm, field, axis, state, added, found_dpt):
     Parameters
     ----------
     pupil_mm : float
-    field, axis : (nodes_mm, powers, used, values)
-        Grids of the field and of the axis: pupils (n_pupils,), powers (8,) of the
-        pupil by which sums and rims change, weights (n_accommodations,) of this
-        focus, and values (n_fields, n_channels, n_pupils, n_accommodations, 8).
+    field, axis : (nodes_mm, powers, weights, values)
+        Grids over the field and on the axis: pupils (n_pupils,), powers (8,) of the
+        pupil with which sums and rims change, weights (n_accommodations,) of this
+        accommodation, and values (n_fields, n_channels, n_pupils, n_accommodations, 8).
     state : (number, channel, open_mm)
-        For each requested field: its index, the index of its wavelength, and the
-        open pupil, mm.
+        Index of the field, index of the wavelength and unvignetted pupil, mm, of each
+        of the n requests.
     added : (always, fading, fading_mm, stretched, stretched_mm)
-        Sums (n, 3) to add: unchanged; reduced in pupils beyond the radius
-        ``fading_mm``; and as a phase that grows only as the square beyond the radius
-        ``stretched_mm``.
+        Sums (n, 3) to add: constant ones; those of a phase that is stretched in pupils
+        with a radius above ``fading_mm``; and those of a phase whose orders above the
+        second are stretched in pupils with a radius above ``stretched_mm``.
+    found_dpt : (n,) out
     """
     number, channel, open_mm = state
     always, fading, fading_mm, stretched, stretched_mm = added
     values = np.empty(N_DEGREES + N_RIM)
-    share, own_share = np.empty(values.size), np.empty(values.size)
-    lower = _shares(pupil_mm, field, share)
+    weight, own_weight = np.empty(values.size), np.empty(values.size)
+    lower = _pupil_weights(pupil_mm, field, weight)
     scale = _scales(pupil_mm, axis)
     for k in range(number.size):
         own_mm = min(pupil_mm, open_mm[k])
         if own_mm == pupil_mm:
             own_scale = scale[channel[k]]
-            _between(number[k], channel[k], field, lower, share, values)
+            _between(number[k], channel[k], field, lower, weight, values)
         else:
             own_scale = _scales(own_mm, axis)[channel[k]]
-            own_lower = _shares(own_mm, field, own_share)
-            _between(number[k], channel[k], field, own_lower, own_share, values)
+            own_lower = _pupil_weights(own_mm, field, own_weight)
+            _between(number[k], channel[k], field, own_lower, own_weight, values)
         _scale_rim(values, own_mm, own_scale)
         radius_mm = _circumscribed_mm(values[N_DEGREES:])
         fade = min(2.0 * fading_mm / own_mm, 1.0)
@@ -97,45 +97,45 @@ def fill_defocus(pupil_mm, field, axis, state, added, found_dpt):
 
 @njit(**_OPTIONS)
 def _scales(pupil_mm, axis):
-    """Return ratios (n_channels,) of the pupil to the traced one, on the axis."""
-    values, share = np.empty(N_DEGREES + N_RIM), np.empty(N_DEGREES + N_RIM)
+    """Return ratios (n_channels,) of the requested to the traced pupil, on axis."""
+    values, weight = np.empty(N_DEGREES + N_RIM), np.empty(N_DEGREES + N_RIM)
     scale = np.empty(axis[3].shape[1])
-    lower = _shares(pupil_mm, axis, share)
+    lower = _pupil_weights(pupil_mm, axis, weight)
     for channel in range(scale.size):
-        _between(0, channel, axis, lower, share, values)
+        _between(0, channel, axis, lower, weight, values)
         _scale_rim(values, pupil_mm, 1.0)
         scale[channel] = 0.5 * pupil_mm / _circumscribed_mm(values[N_DEGREES:])
     return scale
 
 
 @njit(**_OPTIONS)
-def _shares(pupil_mm, grid, share):
-    """Return the index of the lower pupil; fill in weights (8,) of the next one."""
+def _pupil_weights(pupil_mm, grid, weight):
+    """Return the index of the next smaller pupil; write weights (8,) of the larger."""
     nodes_mm, powers = grid[0], grid[1]
-    share[:] = 0.0
+    weight[:] = 0.0
     if nodes_mm.size == 1:
         return 0
     lower = 0
     while lower < nodes_mm.size - 2 and nodes_mm[lower + 1] <= pupil_mm:
         lower += 1
     high_mm = nodes_mm[lower + 1]
-    for k in range(share.size):
+    for k in range(weight.size):
         least = (nodes_mm[lower] / high_mm) ** powers[k]
-        share[k] = ((pupil_mm / high_mm) ** powers[k] - least) / (1.0 - least)
+        weight[k] = ((pupil_mm / high_mm) ** powers[k] - least) / (1.0 - least)
     return lower
 
 
 @njit(**_OPTIONS)
-def _between(number, channel, grid, lower, share, found):
+def _between(number, channel, grid, lower, weight, found):
     """Interpolate sums and rim (8,) between pupils and accommodations."""
-    used, values = grid[2], grid[3]
+    weights, values = grid[2], grid[3]
     upper = min(lower + 1, values.shape[2] - 1)
     for k in range(found.size):
         low, high = 0.0, 0.0
-        for a in range(used.size):
-            low += used[a] * values[number, channel, lower, a, k]
-            high += used[a] * values[number, channel, upper, a, k]
-        found[k] = low + share[k] * (high - low)
+        for a in range(weights.size):
+            low += weights[a] * values[number, channel, lower, a, k]
+            high += weights[a] * values[number, channel, upper, a, k]
+        found[k] = low + weight[k] * (high - low)
 
 
 @njit(**_OPTIONS)
@@ -149,7 +149,7 @@ def _scale_rim(values, pupil_mm, scale):
 
 @njit(**_OPTIONS)
 def _circumscribed_mm(rim):
-    """Return the circle's radius about the chief ray, as `circumscribed_radius_mm`."""
+    """Return the radius of the circumscribed circle; see `circumscribed_radius_mm`."""
     x, y, xx, xy, yy = rim
     sampled, angle = -1.0, 0.0
     for k in range(N_SAMPLED):

@@ -12,19 +12,19 @@ from estimator.wavefront.field_wavefronts import FieldWavefronts
 
 
 class EyeOptics(Protocol):
-    """Wavefronts over field, pupil, accommodation, wavelength and defocus.
+    """Wavefronts by field, pupil, accommodation, wavelength and total defocus.
 
-    Wavefronts are given in the plane of the entrance pupil.  There object distance adds
-    its vergence to the total defocus, so a PSF depends on it through that sum alone.
+    Wavefronts are in the plane of the entrance pupil.  In that plane, the vergence of
+    the object adds to the total defocus, so PSFs depend on the object distance only
+    through this sum.
 
-    The arrays of a state broadcast with each other: field angles ``h_deg`` and
-    ``v_deg``, entrance pupil diameter in mm, accommodation in dpt, wavelength in nm.
-    An eye that was traced for a range raises ValueError for a state outside it.
+    Array arguments broadcast: field angles ``h_deg`` and ``v_deg``, diameter of the
+    entrance pupil in mm, accommodation in dpt and wavelength in nm.
     """
 
     @property
     def eye_side(self) -> str:
-        """OD or OS, which sets the center of the Stiles-Crawford effect."""
+        """OD or OS, for the center of the Stiles-Crawford effect."""
 
     @property
     def vergence(self) -> ObjectVergence:
@@ -32,18 +32,18 @@ class EyeOptics(Protocol):
 
     @property
     def rings(self) -> Rings | None:
-        """Rings of a multifocal correction, if one is worn."""
+        """Complex amplitude of a multifocal correction, or None."""
 
     def usable_pupil_mm(self, pupil_diameter_mm: float) -> float:
-        """Return the requested pupil diameter, mm, capped at the eye's known pupil."""
+        """Return a pupil diameter, mm, limited to the largest one of this eye."""
 
     def accommodation_dpt(self, focus_dpt: float, *, pupil_diameter_mm: float) -> float:
-        """Return the accommodation at which a distance is sharpest through a pupil."""
+        """Return the accommodation, dpt, that focuses a distance through a pupil."""
 
     def sharpest_dpt(
         self, accommodation_dpt: float, *, pupil_diameter_mm: float
     ) -> float:
-        """Return the sharpest distance, dpt, at an accommodation through a pupil."""
+        """Return the focus distance, dpt, for an accommodation and a pupil."""
 
     def reachable_focus_dpt(
         self, focus_dpt: float, *, pupil_diameter_mm: float
@@ -51,7 +51,7 @@ class EyeOptics(Protocol):
         """Return the reachable distance, dpt, nearest to the requested focus."""
 
     def focus_limits_dpt(self, pupil_diameter_mm: float) -> tuple[float, float]:
-        """Return far point and near point through a pupil, dpt."""
+        """Return the far point and the near point, dpt, through a pupil."""
 
     def accommodation_range_dpt(
         self,
@@ -59,10 +59,10 @@ class EyeOptics(Protocol):
         *,
         pupil_range_mm: tuple[float, float],
     ) -> tuple[float, float]:
-        """Return smallest and largest accommodation for ranges of focus and pupil."""
+        """Return the accommodation range, dpt, for ranges of focus and pupil."""
 
     def notes(self, *, pupil_diameter_mm: float, focus_dpt: float) -> tuple[str, ...]:
-        """Return a sentence for each part of a request that cannot be met."""
+        """Return a note on each part of a request that cannot be fulfilled."""
 
     def accommodation_nodes_dpt(
         self,
@@ -70,7 +70,7 @@ class EyeOptics(Protocol):
         *,
         pupil_range_mm: tuple[float, float],
     ) -> NDArray[np.float64]:
-        """Return ascending accommodations (n,), dpt, between which to blend."""
+        """Return ascending accommodations (n,), dpt, between which PSFs are blended."""
 
     def total_defocus_dpt(
         self,
@@ -83,8 +83,8 @@ class EyeOptics(Protocol):
     ) -> NDArray[np.float64]:
         """Return the least-squares refraction, dpt, for an object at infinity.
 
-        It has the broadcast shape and holds on the circle about the pupil, correction
-        included.
+        It has the broadcast shape, includes the correction and is on the circle of the
+        pupil.
 
         Raises
         ------
@@ -118,7 +118,9 @@ class EyeOptics(Protocol):
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
     ) -> NDArray[np.float64]:
-        """Return the lateral color against 555 nm along the pupil axes, (..., 2), mrad.
+        """Return the lateral color relative to 555 nm, (..., 2), mrad.
+
+        It is along the pupil axes of the field.
 
         Raises
         ------
@@ -141,7 +143,7 @@ class EyeOptics(Protocol):
         Parameters
         ----------
         total_defocus_dpt : array
-            Defocus of eye and object together; it replaces the eye's own.
+            Defocus of eye and object, which replaces that of the eye.
 
         Raises
         ------

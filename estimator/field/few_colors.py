@@ -1,8 +1,7 @@
-"""Wavefronts over the field, with only one wavelength traced at every node.
+"""Wavefronts over the field, with one wavelength traced at all nodes, others at fewer.
 
-Colors differ from each other far less than the wavefront changes over the field, and
-more smoothly.  So the other wavelengths are traced at fewer fields and accommodations,
-and their difference from the first one is interpolated.
+The difference between wavelengths is smaller and smoother than the change over the
+field.  It is therefore traced at fewer fields and accommodations, and interpolated.
 """
 
 from __future__ import annotations
@@ -23,22 +22,23 @@ from estimator.field.interpolation import (
     lagrange_weights,
     stretched,
 )
-from estimator.field.trace_range import share_of
+from estimator.field.trace_range import scaled_progress
 from estimator.wavefront.field_wavefronts import ellipse_from_rim, rim_from_ellipse
 
 FIELD_RATIO = 0.7
-"""Ratio of the other colors' field nodes to those of the first, along each axis:
-7 x 6 for 10 x 8.  Wavefronts at random fields are then within 0.98e-3 um of traced ones
-(RMS, emmetropia, 5 mm) instead of 0.95e-3; with 6 x 5, within 1.2e-3."""
+"""Ratio of the field nodes of other wavelengths to those of the first, along each axis:
+7 x 6 for 10 x 8.  The RMS error at random fields (emmetropia, 5 mm) is then 0.98e-3 um
+instead of 0.95e-3; with 6 x 5, it is 1.2e-3."""
 
 FEW_ACCOMMODATIONS = 3
-"""Largest number of accommodations of the other colors; two give 2.1e-3 um."""
+"""Largest number of accommodations of other wavelengths; with two, the RMS error is
+2.1e-3 um."""
 
 FIRST_SHARE = 0.6
-"""Fraction of the time that the first color takes."""
+"""Fraction of the time that the first wavelength takes."""
 
 COLOR_AXIS = {"chief_shift_mrad": 3}
-"""Color axis of a grid's array, where it is not the fifth axis."""
+"""Wavelength axis of an array of a grid, if it is not 4."""
 
 
 def few_colors_grid(
@@ -52,17 +52,17 @@ def few_colors_grid(
     progress: Callable[[float], None] | None = None,
     **sampling: Any,
 ) -> AberrationGrid:
-    """Return the grid of `aberration_grid` in about half the time.
+    """Return a grid like `aberration_grid`, in about half the time.
 
-    If any node is vignetted, every color is traced at every node.
+    If a node is vignetted, all wavelengths are traced at all nodes.
 
     Parameters
     ----------
     h_deg, v_deg : (n_h,), (n_v,)
-        Field nodes, as `field_nodes_deg` places them.
+        Field nodes from `field_nodes_deg`.
     accommodations_dpt : (n_accommodations,)
     wavelengths_nm : (n_wavelengths,)
-        Ascending; the middle one is traced at every node.
+        Ascending; the middle one is traced at all nodes.
     states : (n_accommodations,), optional
         Eye at each accommodation, if already computed.
     progress : callable, optional
@@ -74,12 +74,12 @@ def few_colors_grid(
     Raises
     ------
     ValueError
-        Values are out of range, or the eye cannot be traced.
+        A value is out of range, or the eye cannot be traced.
     """
-    nm, used_dpt = np.atleast_1d(wavelengths_nm), np.atleast_1d(accommodations_dpt)
+    nm, nodes_dpt = np.atleast_1d(wavelengths_nm), np.atleast_1d(accommodations_dpt)
     place = {"h_deg": np.atleast_1d(h_deg), "v_deg": np.atleast_1d(v_deg)}
     middle = nm.size // 2
-    known = eye.accommodating.states_at(used_dpt) if states is None else states
+    known = eye.accommodating.states_at(nodes_dpt) if states is None else states
 
     def traced(
         of_nm: NDArray[Any],
@@ -90,40 +90,41 @@ def few_colors_grid(
         return aberration_grid(
             eye,
             **at,
-            accommodations_dpt=used_dpt[some],
+            accommodations_dpt=nodes_dpt[some],
             wavelengths_nm=of_nm,
             states=[known[k] for k in some.tolist()],
-            progress=share_of(progress, *shares),
+            progress=scaled_progress(progress, *shares),
             **sampling,
         )
 
-    every = np.arange(used_dpt.size)
+    every = np.arange(nodes_dpt.size)
     first = traced(nm[middle : middle + 1], place, every, 0.0, FIRST_SHARE)
     if nm.size == 1:
         return first
-    rest_nm, rest, left = np.delete(nm, middle), None, (FIRST_SHARE, 1.0)
-    if _passes(first):
+    other_nm, others, progress_range = np.delete(nm, middle), None, (FIRST_SHARE, 1.0)
+    if _is_open(first):
         few = {
             name: fewer_field_nodes_deg(at, FIELD_RATIO) for name, at in place.items()
         }
-        ends = np.linspace(0, used_dpt.size - 1, FEW_ACCOMMODATIONS)
-        coarse = traced(rest_nm, few, np.unique(ends.round().astype(int)), *left)
-        if _passes(coarse):
-            rest = _like(first, coarse)
-    if rest is None:
-        rest = traced(rest_nm, place, every, *left)
-    return _joined(first, rest, middle)
+        ends = np.linspace(0, nodes_dpt.size - 1, FEW_ACCOMMODATIONS)
+        some = np.unique(ends.round().astype(int))
+        coarse = traced(other_nm, few, some, *progress_range)
+        if _is_open(coarse):
+            others = _interpolated_to(first, coarse)
+    if others is None:
+        others = traced(other_nm, place, every, *progress_range)
+    return _merged(first, others, middle)
 
 
-def _passes(grid: AberrationGrid) -> bool:
+def _is_open(grid: AberrationGrid) -> bool:
     return bool(
         FieldInterpolation.is_open(grid).all()
         and np.isfinite(grid.chief_shift_mrad).all()
     )
 
 
-def _like(first: AberrationGrid, coarse: AberrationGrid) -> AberrationGrid:
-    """Interpolate the other colors from few nodes to the nodes of the first."""
+def _interpolated_to(first: AberrationGrid, coarse: AberrationGrid) -> AberrationGrid:
+    """Interpolate the other wavelengths from ``coarse`` to the nodes of ``first``."""
     to_coarse, to_all = (
         [
             lagrange_weights(transformed(nodes), transformed(at))
@@ -141,7 +142,8 @@ def _like(first: AberrationGrid, coarse: AberrationGrid) -> AberrationGrid:
         if name == "ellipse_mm":
             known, few = rim_from_ellipse(known), rim_from_ellipse(few)
         axis = COLOR_AXIS.get(name, 4) - 1  # of the accommodations
-        found = known + _moved(few - _moved(known, to_coarse, axis), to_all, axis)
+        difference = few - _resampled(known, to_coarse, axis)
+        found = known + _resampled(difference, to_all, axis)
         return ellipse_from_rim(found) if name == "ellipse_mm" else found
 
     names = [f.name for f in fields(first) if getattr(first, f.name).ndim > 1]
@@ -152,7 +154,7 @@ def _like(first: AberrationGrid, coarse: AberrationGrid) -> AberrationGrid:
     )
 
 
-def _moved(
+def _resampled(
     values: NDArray[np.float64], weights: list[NDArray[np.float64]], axis: int
 ) -> NDArray[np.float64]:
     """Interpolate values [h, v, ...] to other nodes of field and accommodation."""
@@ -161,18 +163,20 @@ def _moved(
     return values
 
 
-def _joined(first: AberrationGrid, rest: AberrationGrid, middle: int) -> AberrationGrid:
-    """Return the first color's grid with the others around it."""
+def _merged(
+    first: AberrationGrid, others: AberrationGrid, middle: int
+) -> AberrationGrid:
+    """Insert the first wavelength at index ``middle`` of the others."""
 
     def of(name: str) -> NDArray[np.float64]:
         own: NDArray[np.float64]
-        own, others = getattr(first, name), getattr(rest, name)
+        own, other = getattr(first, name), getattr(others, name)
         if own.ndim == 1:
             return own
         axis = COLOR_AXIS.get(name, 4)
-        before, after = np.split(others, [middle], axis=axis)
+        before, after = np.split(other, [middle], axis=axis)
         return np.concatenate([before, own, after], axis=axis)
 
-    nm = np.insert(rest.wavelengths_nm, middle, first.wavelengths_nm)
+    nm = np.insert(others.wavelengths_nm, middle, first.wavelengths_nm)
     names = (f.name for f in fields(first) if f.name != "wavelengths_nm")
     return AberrationGrid(wavelengths_nm=nm, **{name: of(name) for name in names})

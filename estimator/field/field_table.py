@@ -1,4 +1,4 @@
-"""Wavefronts of a profile's eye in many directions, as an instrument reports them."""
+"""Wavefronts of an eye in many directions, at the cornea as instruments report them."""
 
 from dataclasses import dataclass
 from typing import Any, cast
@@ -17,7 +17,7 @@ from estimator.wavefront.field_wavefronts import (
 from estimator.wavefront.moved_plane import moved_polynomial
 
 RELAXED_DPT = -60.0
-"""Distance at which every eye is relaxed."""
+"""Focus distance at which every eye is relaxed."""
 
 LEAST_EXTENT_DEG = 1.0
 """Smallest half extent of the traced field about the axis."""
@@ -31,8 +31,9 @@ class FieldTable:
     ----------
     h_deg, v_deg : (n,)
     zernike_um : (n, 28)
-        Coefficients at the cornea, on circles about the chief ray of radius
-        ``zernike_radius_mm`` (n,).
+        Coefficients at the cornea.
+    zernike_radius_mm : (n,)
+        Radius of their circle about the chief ray.
     power_dpt : (n, 3)
         M, J0 and J45 of these wavefronts.
     pupil_ellipse : (n, 5)
@@ -62,13 +63,17 @@ def field_table(
 
     Parameters
     ----------
+    profile : EyeProfile
+    h_deg, v_deg : (n,)
+        Azimuths and elevations.
+    pupil_diameter_mm, wavelength_nm : float
     focus_dpt : float, optional
-        Sharpest distance; the eye is relaxed if None.
+        Focus distance; the eye is relaxed by default.
 
     Raises
     ------
     ValueError
-        Light does not pass the eye, or not through a pupil this wide.
+        The eye cannot be traced, or not through a pupil of this diameter.
     """
     h_deg, v_deg = np.broadcast_arrays(np.atleast_1d(h_deg), np.atleast_1d(v_deg))
     at_dpt = RELAXED_DPT if focus_dpt is None else focus_dpt
@@ -94,8 +99,7 @@ def field_table(
     }
     found = eye.wavefronts(**states, total_defocus_dpt=eye.total_defocus_dpt(**states))
     radius_mm = found.circle_diameter_mm / 2.0
-    # Frames need wavefronts in the entrance pupil; instruments report them at the
-    # cornea.
+    # `TracedEye` has wavefronts in the entrance pupil, instruments at the cornea.
     at_cornea_um = moved_polynomial(
         polynomial_in_mm(found.zernike_um, radius_mm), depth_mm=-eye.entrance_pupil_mm
     )
@@ -126,7 +130,7 @@ def _edge_notes(
     if inside.all():
         return ()
     return (
-        f"light passes the eye's pupil from h {h_low:.1f} to {h_high:.1f} deg and v "
+        f"light passes the pupil from h {h_low:.1f} to {h_high:.1f} deg and v "
         f"{v_low:.1f} to {v_high:.1f} deg: {np.count_nonzero(~inside)} directions "
-        "beyond answer as its edge",
+        "outside have the wavefront at the edge",
     )

@@ -1,6 +1,6 @@
-"""Total defocus of a traced eye at fixed fields, as pupil and focus change.
+"""Total defocus of a traced eye at fixed fields, as pupil and accommodation change.
 
-Terms that depend only on field and wavelength are summed once; see `defocus_loops`.
+Terms that depend only on field and wavelength are computed once; see `defocus_loops`.
 """
 
 import numpy as np
@@ -19,32 +19,32 @@ DEGREES = (2, 4, 6)
 
 
 class FixedDefocus:
-    """Total defocus of n fields and wavelengths, one state after the other.
+    """Total defocus of n pairs of field and wavelength, as a function of the state.
 
     Parameters
     ----------
     field, on_axis : (FieldInterpolation, FieldValues)
         Wavefronts over the field, and on the axis at the same wavelengths.
-    rest : MeasuredResidual
-        Residual of the estimated eye.
-    left_share : (n,)
-        Fraction of the residual to add.
-    people_um : (n, 28), optional
-        Phase of people's periphery.
+    residual : MeasuredResidual
+        Residual of the estimate.
+    residual_weight : (n,)
+        Weight of the residual.
+    periphery_um : (n, 28), optional
+        Phase of the population's periphery.
     added_um : (n, 28)
-        Phase added at any pupil.
+        Phase that does not depend on the pupil.
     open_mm : (n,), optional
-        Open pupils; unlimited if None.
+        Unvignetted pupil diameters; unlimited by default.
     """
 
     def __init__(
         self,
         field: tuple[FieldInterpolation, FieldValues],
         on_axis: tuple[FieldInterpolation, FieldValues],
-        rest: MeasuredResidual,
+        residual: MeasuredResidual,
         *,
-        left_share: NDArray[np.float64],
-        people_um: NDArray[np.float64] | None,
+        residual_weight: NDArray[np.float64],
+        periphery_um: NDArray[np.float64] | None,
         added_um: NDArray[np.float64],
         open_mm: NDArray[np.float64] | None,
     ):
@@ -53,24 +53,25 @@ class FixedDefocus:
         count = values.field.size
         open_mm = np.full(count, np.inf) if open_mm is None else open_mm
         self._state = values.field, values.channel, np.ascontiguousarray(open_mm)
-        people_um = np.zeros((count, N_TERMS)) if people_um is None else people_um
-        fading = left_share[:, None] * sums_by_degree(rest.residue_um)
+        if periphery_um is None:
+            periphery_um = np.zeros((count, N_TERMS))
+        fading = residual_weight[:, None] * sums_by_degree(residual.residue_um)
         self._added = (
             sums_by_degree(added_um),
             np.ascontiguousarray(fading),
-            float(rest.radius_mm),
-            sums_by_degree(people_um),
+            float(residual.radius_mm),
+            sums_by_degree(periphery_um),
             WIDEST_RATIO * CIRCLE_MM,
         )
 
     def at(
         self, *, pupil_diameter_mm: float, accommodation_dpt: float
     ) -> NDArray[np.float64]:
-        """Return the least-squares refraction (n,), dpt, on the pupil's circle."""
+        """Return the least-squares refraction (n,), dpt, on the circle of the pupil."""
         from estimator.field.defocus_loops import fill_defocus
 
         found_dpt = np.empty(self._state[0].size)
-        grids = (grid.used_at(accommodation_dpt) for grid in self._grids)
+        grids = (grid.inputs_at(accommodation_dpt) for grid in self._grids)
         fill_defocus(
             float(pupil_diameter_mm), *grids, self._state, self._added, found_dpt
         )
@@ -78,7 +79,7 @@ class FixedDefocus:
 
 
 class _Grid:
-    """Nodes of a grid, and its values as sums by degree and rims."""
+    """Nodes of a grid, and its values: sums of monomials by degree, and rims."""
 
     def __init__(self, interpolation: FieldInterpolation, values: FieldValues):
         self._nodes_mm = np.array(interpolation.grid.pupil_diameters_mm, np.float64)
@@ -89,16 +90,16 @@ class _Grid:
         of_degree = [float(POWER[:N_TERMS][degree == DEGREE][0]) for degree in DEGREES]
         self._powers = np.array([*of_degree, *POWER[N_TERMS:]])
 
-    def used_at(self, accommodation_dpt: float) -> tuple[NDArray[np.float64], ...]:
-        """Return the loop's inputs from this grid at an accommodation."""
+    def inputs_at(self, accommodation_dpt: float) -> tuple[NDArray[np.float64], ...]:
+        """Return the arguments of the compiled loop for an accommodation."""
         from estimator.field.defocus_loops import weights_at
 
-        used = weights_at(self._accommodations_dpt, float(accommodation_dpt))
-        return self._nodes_mm, self._powers, used, self._values
+        weights = weights_at(self._accommodations_dpt, float(accommodation_dpt))
+        return self._nodes_mm, self._powers, weights, self._values
 
 
 def sums_by_degree(polynomial_um: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the C(2,0) on a 1 mm circle from monomials (..., 28), by degree."""
+    """Return the contributions (..., 3) by degree to C(2,0) on a radius of 1 mm."""
     share = np.linalg.inv(monomial_matrix())[:, C20] * polynomial_um
     sums = [share[..., degree == DEGREE].sum(axis=-1) for degree in DEGREES]
     return np.stack(sums, axis=-1)

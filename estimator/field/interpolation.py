@@ -1,9 +1,9 @@
 """Interpolation of traced wavefronts over field, pupil and accommodation.
 
 Wavefronts are interpolated as polynomials in mm of the pupil plane, rims as center and
-matrix.  Over the field a polynomial runs through Chebyshev nodes in the stretched
-angles of `stretched`, over accommodation another one through its nodes.  Over the pupil
-the interpolation follows the terms that a sixth-order fit leaves out, see `POWER`.
+matrix.  Interpolation is polynomial over the field, with Chebyshev nodes in the angles
+of `stretched`, and over accommodation.  Over the pupil, it follows the orders that a
+fit of sixth order omits; see `POWER`.
 """
 
 import math
@@ -27,39 +27,39 @@ from estimator.wavefront.field_wavefronts import (
 )
 
 NODES_PER_EXTENT = 7.7
-"""Field nodes per half extent in stretched angle: 10 for 40 deg, 8 for 25 deg; fewer
-for a range that is not centered on the axis."""
+"""Field nodes per half extent in stretched angle: 10 for 40 deg, 8 for 25 deg, and
+fewer for ranges that are not centered on the axis."""
 
 FAR_DEG, FAR_NODES = 48.0, 9.0
-"""Additional nodes per extent beyond this angle, where wavefronts change fast."""
+"""Angle beyond which wavefronts change fast, and additional nodes per extent there."""
 
 STRETCH = 1.75
 
 DPT_PER_NODE = 2.0
-"""Largest mean distance between traced accommodations."""
+"""Largest mean step between traced accommodations."""
 
 _CHUNK = 16384
 _RIM_SCALE = np.array([2, 2, 1, 1, 1])
 """A rim's center scales with the square of the pupil, its axes with the pupil."""
 
 POWER = np.concatenate([8 - DEGREE - DEGREE % 2, np.full(N_RIM, 2.3)])
-"""Powers of the pupil A by which coefficients change: a term of order 8 (7 for the odd)
-that a fit of order 6 leaves out adds a part proportional to A^(8 - degree) to a
-coefficient of its parity; a rim departs from its paraxial form with A² and a little
+"""Powers of the pupil diameter A with which values change.  A fit of order 6 omits
+order 8 (7 if odd), which adds a part proportional to A^(8 - degree) to monomials of the
+same parity.  Rims deviate from their paraxial form with A² and, to a lesser degree,
 A⁴."""
 
 
 def stretched(angle_deg: ArrayLike) -> NDArray[np.float64]:
-    """Map angles to a variable in which wavefronts are low-degree polynomials.
+    """Map angles (...) to a variable in which wavefronts are polynomials of low degree.
 
-    Wavefronts change slowly near the axis and ever faster outside, as cos and tan of
-    the angle do: the angle itself needs two more nodes.
+    Wavefronts change slowly near the axis and faster with eccentricity, as cos and tan
+    do.  Interpolation in the angle itself would need two more nodes.
     """
     return np.arcsinh(STRETCH * np.radians(angle_deg))
 
 
 def field_nodes_deg(low_deg: float, high_deg: float) -> NDArray[np.float64]:
-    """Return ascending Chebyshev nodes in stretched angle; one for a single angle."""
+    """Return Chebyshev nodes (n,) in stretched angle, ascending; one if low is high."""
     low, high = stretched([low_deg, high_deg])
     half = 0.5 * (high - low)
     if half < 1e-9:
@@ -88,7 +88,7 @@ def _chebyshev_deg(middle: float, half: float, count: int) -> NDArray[np.float64
 
 
 def accommodation_nodes_dpt(low_dpt: float, high_dpt: float) -> NDArray[np.float64]:
-    """Return Chebyshev-Lobatto nodes, ends included; one for a single value."""
+    """Return Chebyshev-Lobatto nodes (n,), ends included; one if low is high."""
     if high_dpt - low_dpt < 1e-9:
         return np.array([low_dpt])
     last = max(math.ceil((high_dpt - low_dpt) / DPT_PER_NODE), 2)
@@ -99,7 +99,7 @@ def accommodation_nodes_dpt(low_dpt: float, high_dpt: float) -> NDArray[np.float
 def lagrange_weights(
     nodes: NDArray[np.float64], at: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return Lagrange weights (n, n_nodes), exact at a node."""
+    """Return the Lagrange weights (n, n_nodes) of nodes at positions (n,)."""
     weights: NDArray[np.float64] = all_weights(
         np.asarray(nodes, np.float64), np.asarray(at, np.float64)
     )
@@ -107,14 +107,14 @@ def lagrange_weights(
 
 
 def _linear(nodes: NDArray[Any], at: NDArray[Any]) -> NDArray[np.float64]:
-    """Return weights (n, n_nodes) of linear interpolation, constant beyond the ends."""
+    """Return weights (n, n_nodes) of linear interpolation, constant outside."""
     return np.stack([np.interp(at, nodes, row) for row in np.eye(nodes.size)], axis=-1)
 
 
 _Found = TypeVar("_Found", NDArray[Any], tuple[NDArray[Any], ...])
 
 
-def _for_distinct(
+def _evaluate_distinct(
     function: Callable[[NDArray[Any]], _Found], values: NDArray[Any]
 ) -> _Found:
     """Evaluate a function at values (n,), once for each distinct value."""
@@ -127,9 +127,9 @@ def _for_distinct(
 
 @dataclass(frozen=True)
 class FieldValues:
-    """Values of a grid at the fields and wavelengths of n states.
+    """Values of a grid at the fields and wavelengths of n requests.
 
-    Pupil and accommodation are still open.
+    They are not yet interpolated over pupil and accommodation.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class FieldValues:
     first_pupil : int
         Index in the grid of the first pupil in `values`.
     field, channel : (n,)
-        Indices of each state's field and wavelength in `values`.
+        Indices in `values` of the field and wavelength of each request.
     """
 
     values: NDArray[np.float64]
@@ -145,24 +145,24 @@ class FieldValues:
     field: NDArray[np.int64]
     channel: NDArray[np.int64]
 
-    def of(self, states: NDArray[np.int64]) -> "FieldValues":
-        """Return the values of some of the states."""
+    def select(self, states: NDArray[np.int64]) -> "FieldValues":
+        """Return the values of the requests with given indices."""
         return replace(self, field=self.field[states], channel=self.channel[states])
 
 
 class FieldInterpolation:
-    """Wavefronts and rims of one grid, anywhere between its nodes.
+    """Interpolation of the wavefronts and rims of a grid.
 
-    Where a pupil is vignetted, the wavefront of the next smaller open pupil is
-    continued: a fit to part of a pupil would not be continuous with its neighbors.
+    A vignetted pupil has the wavefront of the next smaller unvignetted one, because a
+    fit to part of a pupil is not continuous with those of its neighbors.
 
     Attributes
     ----------
     grid : AberrationGrid
     passes : bool
-        Whether the smallest pupil is open at all nodes; otherwise the grid is unusable.
+        Whether the smallest pupil is unvignetted at all nodes, as the grid requires.
     open_pupil_mm : (n_h, n_v)
-        Diameter of a pupil with the area that light passes, the smallest over
+        Diameter of the pupil with the unvignetted area, the smallest of all
         accommodations and wavelengths.
     """
 
@@ -185,13 +185,13 @@ class FieldInterpolation:
         self.passes = bool(is_open[:, :, 0].all() and has_chief_rays)
         self.open_pupil_mm = passed_mm.max(axis=2).min(axis=(2, 3))
         self.all_open = bool(is_open.all())
-        # (n_h, n_v, n_wavelengths, n_pupils, n_accommodations, 33), contiguous because
-        # every call multiplies it.
+        # (n_h, n_v, n_wavelengths, n_pupils, n_accommodations, 33), contiguous for
+        # matrix products.
         self._values = np.ascontiguousarray(np.moveaxis(values, 4, 2))
 
     @staticmethod
     def is_open(grid: AberrationGrid) -> NDArray[np.bool_]:
-        """Return whether light passes the whole pupil, for all nodes of a grid."""
+        """Return whether pupils are unvignetted, for all nodes of a grid."""
         is_finite = np.isfinite(grid.zernike_um).all(axis=-1)
         is_finite &= np.isfinite(grid.ellipse_mm).all(axis=-1)
         return is_finite & (grid.open_ratio > OPEN_RATIO)
@@ -199,7 +199,7 @@ class FieldInterpolation:
     def open_pupils_mm(
         self, h_deg: NDArray[Any], v_deg: NDArray[Any]
     ) -> NDArray[np.float64] | None:
-        """Return the open pupils (n,) at fields, or None if all are open."""
+        """Return the unvignetted pupils (n,) at fields, or None if all are open."""
         if self.all_open:
             return None
         open_mm: NDArray[np.float64] = np.einsum(
@@ -246,12 +246,12 @@ class FieldInterpolation:
         wavelength_nm: NDArray[np.float64],
         pupil_diameter_mm: NDArray[np.float64] | None = None,
     ) -> FieldValues:
-        """Return values at the fields and wavelengths (n,) of states, for `between`.
+        """Return values at fields and wavelengths (n,), for `between`.
 
         Parameters
         ----------
         pupil_diameter_mm : (n,), optional
-            Pupils that will be requested; any pupil if None.
+            Pupils that will be requested; by default, any of them may be.
 
         Raises
         ------
@@ -264,7 +264,7 @@ class FieldInterpolation:
         first, field = distinct_rows(h_deg, v_deg)
         pupils = slice(0, None)
         if pupil_diameter_mm is not None:
-            # Select only the requested ones: few calls need all wavelengths and pupils.
+            # Few calls need all wavelengths and pupils.
             lower = self._lower_pupils(pupil_diameter_mm)
             pupils = slice(int(lower.min()), int(lower.max()) + 2)
         values = self._over_field(h_deg[first], v_deg[first], channels, pupils)
@@ -278,11 +278,11 @@ class FieldInterpolation:
         accommodation_dpt: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return polynomials (n, 28), um/mm^degree, and rims (n, 5), mm, of states."""
-        used = _for_distinct(
+        weights = _evaluate_distinct(
             lambda dpt: lagrange_weights(self.grid.accommodations_dpt, dpt),
             accommodation_dpt,
         )
-        lower, share = _for_distinct(self._pupil_shares, pupil_diameter_mm)
+        lower, weight = _evaluate_distinct(self._pupil_weights, pupil_diameter_mm)
         lower = lower - states.first_pupil
         upper = np.minimum(lower + 1, states.values.shape[2] - 1)
         found = np.empty((lower.size, N_TERMS + N_RIM))
@@ -290,10 +290,10 @@ class FieldInterpolation:
             part = slice(start, start + _CHUNK)
             at = states.field[part], states.channel[part]
             low, high = (
-                np.einsum("na,nac->nc", used[part], states.values[*at, pupil[part]])
+                np.einsum("na,nac->nc", weights[part], states.values[*at, pupil[part]])
                 for pupil in (lower, upper)
             )
-            found[part] = low + share[part] * (high - low)
+            found[part] = low + weight[part] * (high - low)
         rim_mm = found[:, N_TERMS:] * pupil_diameter_mm[:, None] ** _RIM_SCALE
         return found[:, :N_TERMS], rim_mm
 
@@ -308,14 +308,14 @@ class FieldInterpolation:
         """Return the lateral color (n, 2) of states (n,), mrad, see `chief_rays`."""
         over_h = lagrange_weights(stretched(self.grid.h_deg), stretched(h_deg))
         over_v = lagrange_weights(stretched(self.grid.v_deg), stretched(v_deg))
-        used = lagrange_weights(self.grid.accommodations_dpt, accommodation_dpt)
+        weights = lagrange_weights(self.grid.accommodations_dpt, accommodation_dpt)
         channel = self._channels(wavelength_nm)
         found = np.empty((h_deg.size, 2))
         for c in np.unique(channel):
             at = channel == c
             found[at] = np.einsum(
                 "nh,nv,na,hvak->nk",
-                *(over_h[at], over_v[at], used[at]),
+                *(over_h[at], over_v[at], weights[at]),
                 self.grid.chief_shift_mrad[:, :, :, c],
                 optimize=True,
             )
@@ -336,12 +336,12 @@ class FieldInterpolation:
         found: NDArray[np.float64] = weights @ values.reshape(weights.shape[1], -1)
         return found.reshape(h_deg.size, *values.shape[2:])
 
-    def _pupil_shares(
+    def _pupil_weights(
         self, pupil_mm: NDArray[Any]
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the index (n,) of the lower pupil, and the next one's weight (n, 33).
+        """Return indices (n,) of the smaller pupil, and weights (n, 33) of the larger.
 
-        Below the smallest traced pupil the first two are extrapolated.
+        Below the smallest traced pupil, the first two are extrapolated.
         """
         nodes_mm = self.grid.pupil_diameters_mm
         if nodes_mm.size == 1:
@@ -349,8 +349,8 @@ class FieldInterpolation:
         lower = self._lower_pupils(pupil_mm)
         high_mm = nodes_mm[lower + 1]
         lowest = (nodes_mm[lower] / high_mm)[:, None] ** POWER
-        share = ((pupil_mm / high_mm)[:, None] ** POWER - lowest) / (1.0 - lowest)
-        return lower, share
+        weight = ((pupil_mm / high_mm)[:, None] ** POWER - lowest) / (1.0 - lowest)
+        return lower, weight
 
     def _lower_pupils(self, pupil_mm: NDArray[Any]) -> NDArray[np.int64]:
         """Return the index (n,) of the next smaller traced pupil."""

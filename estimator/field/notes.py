@@ -1,15 +1,15 @@
-"""Notes of a reply on how its eye was computed, and how exactly."""
+"""Notes on how an eye was computed, and on its accuracy."""
 
 from estimator.estimate.estimation import POOR_FIT_UM
 from estimator.estimate.given_surfaces import EyeModel, GivenSurfaces
 from estimator.eye.accommodation import REFRACTION_TOLERANCE_DPT
 from estimator.field.traced_eye import TRACED_ERROR_UM, TracedEye
-from estimator.periphery.change import DISAGREES_UM
+from estimator.periphery.change import MAX_MISFIT_UM
 from estimator.periphery.meridian import KNOTS_DEG
 
 
 def eye_notes(estimated: EyeModel) -> tuple[str, ...]:
-    """Return notes on how the eye, its focus and its aberrations were computed."""
+    """Return notes on the computation of the eye, its focus and its aberrations."""
     return (
         _of_eye(estimated),
         f"focus traced to {REFRACTION_TOLERANCE_DPT:.0e} dpt",
@@ -19,20 +19,20 @@ def eye_notes(estimated: EyeModel) -> tuple[str, ...]:
 
 
 def periphery_note(eye: TracedEye) -> str:
-    """Return a note on the source and accuracy of an eye's periphery."""
+    """Return a note on the source and the accuracy of the periphery of an eye."""
     if eye.periphery is None:
-        return "periphery: the eye model's own, not that of people"
+        return "periphery: from the eye model, not from measured eyes"
     change = eye.periphery.change
     at_deg = (10.0, 20.0, 30.0)
     known_dpt = dict(zip(KNOTS_DEG, change.sphere_deviation_dpt, strict=True))
     known = ", ".join(f"{max(known_dpt[a], known_dpt[-a]):.1f}" for a in at_deg)
-    whose = "typical of people with such an axis"
+    source = "mean of measured eyes with similar on-axis wavefronts"
     if change.measured_count:
-        whose = f"measured in {change.measured_count} directions beside the axis"
-    found = f"periphery: {whose}; M at 10, 20, 30 deg known to +-{known} dpt"
-    if change.miss_um > DISAGREES_UM:
-        found += f"; the measurements contradict each other by {change.miss_um:.2f} um"
-    return found
+        source = f"measured in {change.measured_count} directions off the axis"
+    note = f"periphery: {source}; M at 10, 20, 30 deg known to +-{known} dpt"
+    if change.misfit_um > MAX_MISFIT_UM:
+        note += f"; RMS misfit of the measurements {change.misfit_um:.2f} um"
+    return note
 
 
 def _of_eye(estimated: EyeModel) -> str:

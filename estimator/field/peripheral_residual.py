@@ -1,12 +1,14 @@
-"""Difference between people's periphery and an estimated eye's, kept as a phase.
+"""Difference of the population's periphery from that of an estimated eye, as a phase.
 
-An eye with a person's axis does not have that person's periphery: the model's lens is
-homogeneous, its retina a sphere, and the axis determines neither.  The wavefronts of
-measured people with such an axis (`periphery`), less those of their eye model, are
-added to the traced wavefronts.  On the axis the difference is zero.
+An estimated eye has the on-axis wavefront of the person, but not the periphery: the
+lens of the model is homogeneous and its retina is a sphere, and neither follows from
+the axis.  Wavefronts of the population with this on-axis wavefront (`periphery`), minus
+those of the eye model, are added to the traced ones.  On the axis, the difference is
+zero.
 
-An eye unlike the measured people, such as one with keratoconus, gets the difference of
-the nearest usual eye; its own departure from that eye is traced.
+An eye outside the range of the population, for example with keratoconus, gets the
+difference of the eye whose on-axis wavefront is clamped to this range.  Its own
+difference from that eye is traced.
 """
 
 from dataclasses import replace
@@ -36,12 +38,12 @@ from estimator.wavefront.field_wavefronts import (
 from estimator.wavefront.moved_plane import moved_polynomial
 
 WIDEST_RATIO = 1.5
-"""Ratio to the measured pupil beyond which the terms of the third and fourth order are
-stretched: polynomials diverge beyond the measured pupil."""
+"""Ratio to the measured pupil above which the third and fourth orders are stretched,
+because polynomials diverge outside the measured pupil."""
 
 
 class PeripheralResidual:
-    """Phase (n, 28) in the plane of the entrance pupil, over a range of fields.
+    """Phase in the plane of the entrance pupil, over a range of fields.
 
     Parameters
     ----------
@@ -49,7 +51,7 @@ class PeripheralResidual:
     eye : EstimatedEye
         Eye to whose wavefronts the phase is added.
     field_range_deg : ((h_low, h_high), (v_low, v_high))
-        Fields that light passes.
+        Fields without vignetting.
     """
 
     def __init__(
@@ -59,7 +61,7 @@ class PeripheralResidual:
         field_range_deg: tuple[tuple[float, float], tuple[float, float]],
     ):
         self.change = change
-        usual = usual_eye(change, eye)
+        usual = clamped_eye(change, eye)
         self._traced = FieldInterpolation(
             aberration_grid(
                 usual,
@@ -78,7 +80,7 @@ class PeripheralResidual:
 
     @property
     def passes(self) -> bool:
-        """Whether the usual eye could be traced over the whole range."""
+        """Whether the eye could be traced over the whole range."""
         return self._traced.passes
 
     def at(
@@ -90,9 +92,9 @@ class PeripheralResidual:
     def _difference_um(
         self, h_deg: NDArray[Any], v_deg: NDArray[Any]
     ) -> NDArray[np.float64]:
-        people_um = self._at_cornea_um + self.change.zernike_um(h_deg, v_deg)
-        people_um = moved_polynomial(
-            polynomial_in_mm(remove_central_tilt(people_um), CIRCLE_MM),
+        population_um = self._at_cornea_um + self.change.zernike_um(h_deg, v_deg)
+        population_um = moved_polynomial(
+            polynomial_in_mm(remove_central_tilt(population_um), CIRCLE_MM),
             depth_mm=self._depth_mm,
         )
         traced_um, _ = self._traced.at(
@@ -102,21 +104,21 @@ class PeripheralResidual:
             accommodation_dpt=np.zeros(h_deg.size),
             wavelength_nm=np.full(h_deg.size, REFERENCE_WAVELENGTH_NM),
         )
-        missing_um = zernike_from_polynomial(people_um - traced_um, CIRCLE_MM)
+        difference_um = zernike_from_polynomial(population_um - traced_um, CIRCLE_MM)
         known = np.isin(np.arange(N_TERMS), TERMS)
-        missing_um = remove_central_tilt(np.where(known, missing_um, 0.0))
-        return polynomial_in_mm(missing_um, CIRCLE_MM)
+        difference_um = remove_central_tilt(np.where(known, difference_um, 0.0))
+        return polynomial_in_mm(difference_um, CIRCLE_MM)
 
 
 def stretch_ratio(radius_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return factors (n, 28) of the phase's monomials in pupils of radii (n,)."""
+    """Return factors (n, 28) of monomials of the phase, for pupils of radii (n,)."""
     ratio = np.minimum(WIDEST_RATIO * CIRCLE_MM / radius_mm, 1.0)
     return ratio[:, None] ** np.maximum(DEGREE - 2, 0)
 
 
-def usual_eye(change: PeripheralChange, eye: EstimatedEye) -> EstimatedEye:
-    """Return an eye with the axis of a change; ``eye`` itself if that is usual."""
-    if change.is_usual:
+def clamped_eye(change: PeripheralChange, eye: EstimatedEye) -> EstimatedEye:
+    """Return an eye with the axis of a change: ``eye`` itself if it is not clamped."""
+    if change.is_in_population:
         return eye
     zernike_um = np.zeros(N_TERMS)
     zernike_um[list(TERMS)] = change.axis_um
@@ -138,7 +140,7 @@ def _with_axis(profile: EyeProfile, zernike_um: NDArray[Any]) -> EyeProfile:
 
 
 def _on_circle(eye: EstimatedEye) -> NDArray[np.float64]:
-    """Return an eye's wavefront (28,) at the cornea, on the population's circle."""
+    """Return the wavefront (28,) of an eye at the cornea, on `meridian`'s circle."""
     return on_axis_zernike_um(
         eye.parameters,
         retina=eye.retina,

@@ -1,4 +1,4 @@
-"""Plots of an eye's wavefronts over its visual field."""
+"""Plots of wavefronts over the visual field."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,10 +17,10 @@ COMA = [7, 8]
 
 
 def plot_field(table: "FieldTable", file: Path, *, title: str) -> None:
-    """Plot maps of M, astigmatism, coma and blur, or lines for a single elevation.
+    """Plot M, astigmatism, coma and blur: maps, or lines if one angle is constant.
 
-    Blur is the root mean square extent of a point's image by the wavefront's second
-    order, over the pupil's circle, in minutes of arc.
+    Blur is the RMS radius, in minutes of arc, of the geometric image of a point by the
+    second order of the wavefront, over the circle of the pupil.
     """
     from matplotlib.figure import Figure  # loads slowly
 
@@ -42,7 +42,7 @@ def plot_field(table: "FieldTable", file: Path, *, title: str) -> None:
 
 
 def blur_arcmin(table: "FieldTable") -> NDArray[np.float64]:
-    """Return the root mean square blur (n,) of the second order, minutes of arc."""
+    """Return the RMS blur (n,) of the second order, in minutes of arc."""
     m_dpt, j0_dpt, j45_dpt = table.power_dpt.T
     # Light at r mm is deflected by r times the power, in mrad; mean r² is R² / 2.
     power_dpt = np.sqrt(m_dpt**2 + j0_dpt**2 + j45_dpt**2)

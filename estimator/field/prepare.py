@@ -1,4 +1,4 @@
-"""Preparation of a profile's eye for PSFs: measured wavefront or traced model."""
+"""Preparation of the eye of a profile for PSFs: measured wavefront or traced model."""
 
 from collections.abc import Callable
 
@@ -20,7 +20,6 @@ EYE_MODELS = ("traced", "wavefront")
 ESTIMATION_SHARE = 0.5
 """Progress at the end of the estimation."""
 
-
 ACCURACIES = ("fast", "balanced", "exact")
 
 
@@ -35,31 +34,38 @@ def prepare_eye(
     accuracy: str = "exact",
     progress: Callable[[float, str], None] | None = None,
 ) -> tuple[EyeOptics, tuple[str, ...]]:
-    """Return the eye of a profile over its visual field, and notes about it.
+    """Return the eye of a profile over its visual field, and notes on it.
 
     Parameters
     ----------
+    profile : EyeProfile
     pupil_diameters_mm : (n,)
-        Entrance pupils to trace on axis; pupils between them, and those over the
-        field, are interpolated.
+        Entrance pupils to trace on axis; others are interpolated.  Off axis, fewer are
+        traced.
     focus_range_dpt : (low, high)
         Range of focus distances that will be requested.
     wavelengths_nm : (n,)
     field_range_deg : ((h_low, h_high), (v_low, v_high))
         Azimuths and elevations.
     eye_model : {"traced", "wavefront"}
-        Estimate a 45-parameter eye and trace every wavefront; or use the measurement
-        in closed form, which costs nothing but models no larger pupil and no change
-        of shape with accommodation.
+        "traced" estimates a 45-parameter eye and traces its wavefronts.  "wavefront"
+        uses the measurement in closed form, at no cost, but does not model pupils
+        larger than the measured one or the effect of accommodation on other
+        aberrations.
     accuracy : {"exact", "fast", "balanced"}
-        Deprecated, without effect: everything is traced.  Goes with version 0.3.
+        Deprecated and without effect; it will be removed in version 0.3.
     progress : callable, optional
         Callback with the completed fraction and a stage; may raise to cancel.
+
+    Returns
+    -------
+    eye : EyeOptics
+    notes : tuple of str
 
     Raises
     ------
     ValueError
-        The model or accuracy is unknown, or light does not pass the eye.
+        The model or accuracy is unknown, or the eye cannot be traced.
     """
     if eye_model not in EYE_MODELS:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Traced part of an eye's visual field, and the pupils traced there."""
+"""Traced part of the visual field, and the pupils traced there."""
 
 from collections.abc import Callable
 from typing import Any, cast
@@ -27,18 +27,18 @@ LARGE_FIELD_PUPIL_RATIOS = (0.56, 0.8, 1.0)
 
 ON_AXIS_DEG = ((0.0, 0.0), (0.0, 0.0))
 SHRINK_RATIO, SMALLEST_SHARE = 0.85, 0.05
-"""Step by which the traced field shrinks until light passes all of it."""
+"""Factor by which the traced field shrinks until it is unvignetted, and its limit."""
 
 FieldRange = tuple[tuple[float, float], tuple[float, float]]
 
 
 def largest_open_pupil_mm(grid: AberrationGrid) -> float:
-    """Return the largest pupil of an on-axis grid that is open in all its states.
+    """Return the largest pupil of an on-axis grid that is unvignetted in all states.
 
     Raises
     ------
     TraceFailed
-        No pupil is open.
+        All pupils are vignetted.
     """
     is_open = FieldInterpolation.is_open(grid)[0, 0].all(axis=(1, 2))
     if not is_open.any():
@@ -49,7 +49,7 @@ def largest_open_pupil_mm(grid: AberrationGrid) -> float:
 
 
 def field_pupils_mm(low_mm: float, high_mm: float) -> NDArray[np.float64]:
-    """Return the pupils (n,) to trace over the field for a range of pupils."""
+    """Return the pupils (n,), mm, to trace over the field, for a range of pupils."""
     large = high_mm > LARGE_PUPIL_MM
     ratios = LARGE_FIELD_PUPIL_RATIOS if large else FIELD_PUPIL_RATIOS
     pupils_mm = np.maximum(high_mm * np.array(ratios), low_mm)
@@ -63,7 +63,13 @@ def trace_field(
     field_grid: Callable[..., AberrationGrid],
     **axes: Any,
 ) -> tuple[FieldInterpolation, FieldRange]:
-    """Trace a range of fields, shrunk toward the axis until light passes all of it."""
+    """Trace a range of fields, which is shrunk until it is unvignetted.
+
+    Returns
+    -------
+    field : FieldInterpolation
+    traced_range_deg : ((h_low, h_high), (v_low, v_high))
+    """
     limited = np.clip(field_range_deg, -TRACED_FIELD_LIMIT_DEG, TRACED_FIELD_LIMIT_DEG)
     share = 1.0
     while share > SMALLEST_SHARE:
@@ -87,33 +93,35 @@ def trace_field(
 def peripheral_residual(
     eye: EyeModel, field_range_deg: FieldRange
 ) -> PeripheralResidual | None:
-    """Return people's periphery for an eye, or None if it has the model's.
+    """Return the phase of the population's periphery for an eye.
 
-    It has the model's if light does not pass the usual eye over the whole range.
+    It is None if the eye has the periphery of the model, because the profile requests
+    it or the phase cannot be traced over the whole range.
     """
     if isinstance(eye, GivenSurfaces) or eye.profile.periphery == "model":
         return None
     if not np.any(field_range_deg):
         return None
-    rest = PeripheralResidual(peripheral_change(eye.profile), eye, field_range_deg)
-    return rest if rest.passes else None
+    residual = PeripheralResidual(peripheral_change(eye.profile), eye, field_range_deg)
+    return residual if residual.passes else None
 
 
-def share_of(
+def scaled_progress(
     progress: Callable[[float], None] | None, low: float, high: float
 ) -> Callable[[float], None] | None:
-    """Return a progress callback that maps a part's fraction to [low, high]."""
+    """Return a progress callback that maps fractions to [low, high]."""
     if progress is None:
         return None
     return lambda done: progress(low + (high - low) * done)
 
 
 def check_field_range(field_range_deg: FieldRange) -> None:
-    """Reject a range that is not ascending.
+    """Check a range of fields.
 
     Raises
     ------
     ValueError
+        The range is not ascending or exceeds 90 degrees.
     """
     for low, high in field_range_deg:
         if not -90.0 < low <= high < 90.0:

@@ -1,8 +1,8 @@
-"""Estimated eye with ray-traced wavefronts, as the PSF cache uses it.
+"""Estimated eye with ray-traced wavefronts, for the PSF cache.
 
-It has the interface of `measured_wavefront.MeasuredWavefront` without its limits:
-pupils larger than the measured one are traced, not extrapolated; accommodation changes
-the lens and with it all aberrations; and every field has its own wavefront.
+It has the interface of `measured_wavefront.MeasuredWavefront` without its limitations:
+pupils larger than the measured one are traced, accommodation changes the lens and thus
+all aberrations, and every field has its own wavefront.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,7 +33,7 @@ from estimator.field.trace_range import (
     field_pupils_mm,
     largest_open_pupil_mm,
     peripheral_residual,
-    share_of,
+    scaled_progress,
     trace_field,
 )
 from estimator.field.traced_fields import TracedFields, check_limits
@@ -48,14 +48,15 @@ MAX_PUPIL_MM = 8.0
 """Largest diameter to which an iris opens."""
 
 ACCOMMODATION_STEP_DPT = 1.0
-"""Largest step between accommodations whose PSFs are blended.  Blending is at equal
-defocus, so only the slow change of the other aberrations is interpolated."""
+"""Largest step between accommodations whose PSFs are blended.  PSFs are blended at
+equal total defocus, so only the slow change of the other aberrations is
+interpolated."""
 
 TRACED_ERROR_UM = 1e-3
 """Error of traced aberrations that a reply states."""
 
 PREPARED_MARGIN_DPT = 0.02
-"""Focus error beyond which a reply notes that the focus was not prepared."""
+"""Focus error above which a note states that the focus was not prepared."""
 
 AXIS_PROGRESS = 0.1
 
@@ -63,16 +64,17 @@ AXIS_PROGRESS = 0.1
 class TracedEye(FocusingEye):
     """Wavefronts of an estimated or given eye over a range of fields, pupils and foci.
 
-    On axis the circle circumscribed about the pupil is the requested pupil: the traced
-    rim, up to a few percent smaller than the paraxial entrance pupil, is scaled to it,
-    and at other fields by the same factor.  The residual of the estimate is added to
-    the wavefronts, see `measured_residual`.  The correction is subtracted equally at
-    every field, except for a progressive lens, see `worn_lens.worn_polynomial`.
+    The traced rim, which is up to a few percent smaller than the paraxial entrance
+    pupil, is scaled such that on axis its circumscribed circle has the requested
+    diameter; the factor is the same at all fields.  The residual of the estimate is
+    added to the wavefronts (see `measured_residual`).  The correction is subtracted
+    equally at all fields, except for progressive lenses (see
+    `corrections.progressive`).
 
-    Vignetting: the largest pupil is the largest traced one that is open on axis.  Where
-    the rim of a pupil is vignetted off axis, the pupil is reduced to one of the open
-    area.  Fields that light does not pass take the wavefront of the nearest traced
-    field; the traced range is shrunk until light passes all of its nodes.
+    The largest pupil is the largest traced one that is unvignetted on axis.  Off axis,
+    a vignetted pupil is reduced to one with the unvignetted area.  The traced range is
+    shrunk until it is unvignetted; fields outside have the wavefront of the nearest
+    traced field.
 
     Attributes
     ----------
@@ -83,11 +85,11 @@ class TracedEye(FocusingEye):
     field_range_deg : ((h_low, h_high), (v_low, v_high))
         Fields that may be requested.
     traced_range_deg : the same
-        Fields that were traced; those beyond take the value at its edge.
+        Fields that were traced.
     entrance_pupil_mm : float
         Depth of the entrance pupil behind the cornea.
     periphery : PeripheralResidual or None
-        Phase added off the axis; None if the eye model's own periphery is used.
+        Phase added off the axis; None if the eye has the periphery of the model.
     """
 
     pupil_limit = "traced"
@@ -117,11 +119,11 @@ class TracedEye(FocusingEye):
         self._on_axis = self._field if has_axis else axis
         self.entrance_pupil_mm = eye.accommodating.entrance_pupil_mm
         self.rings = rings_of(eye.profile.correction)
-        self._worn = eye.profile.correction
+        self._lens = eye.profile.correction
         self._correction = worn_polynomial(
-            self._worn, entrance_pupil_mm=self.entrance_pupil_mm
+            self._lens, entrance_pupil_mm=self.entrance_pupil_mm
         )
-        self._rest = eye.rest(axis.grid.wavelengths_nm)
+        self._residual = eye.rest(axis.grid.wavelengths_nm)
 
     @classmethod
     def trace(
@@ -140,12 +142,12 @@ class TracedEye(FocusingEye):
         Parameters
         ----------
         pupil_diameters_mm : (n,)
-            Pupils.  On axis each of them is traced; elsewhere only the largest and one
-            or two smaller ones, from which all others are interpolated.
+            Pupils, all of which are traced on axis.  Off axis, the largest and one or
+            two smaller ones are traced, from which others are interpolated.
         field_range_deg : ((h_low, h_high), (v_low, v_high))
             Azimuths and elevations; ((0, 0), (0, 0)) is the axis alone.
         field_grid : callable, optional
-            Traces the grid over the field; `few_colors.few_colors_grid` takes half the
+            Function that traces the grid; `few_colors.few_colors_grid` takes half the
             time of the default.
         progress : callable, optional
             Callback with the completed fraction; may raise to cancel.
@@ -153,17 +155,17 @@ class TracedEye(FocusingEye):
         Raises
         ------
         TraceFailed
-            No light passes on axis.
+            All pupils are vignetted on axis.
         ValueError
             The field range is not ascending.
         """
         check_field_range(field_range_deg)
         pupils_mm = np.unique(pupil_diameters_mm)
-        used_dpt = eye.accommodating.accommodation_range_dpt(
+        range_dpt = eye.accommodating.accommodation_range_dpt(
             focus_range_dpt, pupil_range_mm=(pupils_mm[0], pupils_mm[-1])
         )
         states: dict[str, Any] = {
-            "accommodations_dpt": accommodation_nodes_dpt(*used_dpt),
+            "accommodations_dpt": accommodation_nodes_dpt(*range_dpt),
             "wavelengths_nm": np.unique(wavelengths_nm),
         }
         on_axis_only = not np.any(field_range_deg)
@@ -172,7 +174,7 @@ class TracedEye(FocusingEye):
             eye,
             pupil_diameters_mm=pupils_mm,
             **states,
-            progress=share_of(progress, 0.0, axis_share),
+            progress=scaled_progress(progress, 0.0, axis_share),
         )
         axis = FieldInterpolation(axis_grid)
         if on_axis_only:
@@ -186,7 +188,7 @@ class TracedEye(FocusingEye):
                 axis_grid.pupil_diameters_mm[0], largest_open_pupil_mm(axis_grid)
             ),
             **states,
-            progress=share_of(progress, axis_share, 1.0),
+            progress=scaled_progress(progress, axis_share, 1.0),
         )
         return cls(
             eye,
@@ -208,12 +210,12 @@ class TracedEye(FocusingEye):
     def accommodation_for_dpt(
         self, refraction_dpt: float, *, pupil_diameter_mm: float
     ) -> float:
-        """Return the traced accommodation whose M at a pupil is nearest to this."""
-        used_dpt = self._accommodating.accommodation_for_dpt(
+        """Return the traced accommodation with the nearest M through a pupil."""
+        accommodation_dpt = self._accommodating.accommodation_for_dpt(
             refraction_dpt, pupil_diameter_mm=pupil_diameter_mm
         )
         low_dpt, high_dpt = self.grid.accommodations_dpt[[0, -1]].tolist()
-        traced_dpt: float = min(max(used_dpt, low_dpt), high_dpt)
+        traced_dpt: float = min(max(accommodation_dpt, low_dpt), high_dpt)
         return traced_dpt
 
     def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
@@ -227,14 +229,14 @@ class TracedEye(FocusingEye):
         notes = super().focus_notes(focus_dpt, pupil_diameter_mm=pupil_diameter_mm)
         if notes:
             return notes  # the limit is the eye's own
-        used_dpt = self.reachable_focus_dpt(
+        reachable_dpt = self.reachable_focus_dpt(
             focus_dpt, pupil_diameter_mm=pupil_diameter_mm
         )
-        if abs(used_dpt - focus_dpt) <= PREPARED_MARGIN_DPT:
+        if abs(reachable_dpt - focus_dpt) <= PREPARED_MARGIN_DPT:
             return ()
         return (
-            f"focus {focus_dpt:g} dpt is outside what was prepared "
-            f"(settings.focus_range_dpt): {used_dpt:.3g} dpt used",
+            f"focus {focus_dpt:g} dpt is outside the prepared range "
+            f"(settings.focus_range_dpt): {reachable_dpt:.3g} dpt is used instead",
         )
 
     def accommodation_nodes_dpt(
@@ -259,10 +261,9 @@ class TracedEye(FocusingEye):
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
     ) -> NDArray[np.float64]:
-        """Return least-squares refraction, dpt, on the pupil's circle; far object.
+        """Return the least-squares refraction, dpt, for an object at infinity.
 
-        All arguments broadcast, and the result has their shape.  The object is at
-        infinity.
+        All arguments broadcast, and the result has their shape.
         """
         states = np.broadcast_arrays(
             h_deg, v_deg, pupil_diameter_mm, accommodation_dpt, wavelength_nm
@@ -331,7 +332,7 @@ class TracedEye(FocusingEye):
     def wavefronts_at(
         self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike
     ) -> Callable[..., FieldWavefronts]:
-        """See `EyeOptics.wavefronts_at`; 4 ms per state, `wavefronts` takes 17."""
+        """See `EyeOptics.wavefronts_at`; a call takes 4 ms, `wavefronts` 17 ms."""
         return partial(
             self._wavefronts_of, *self._fixed_fields(h_deg, v_deg, wavelength_nm)
         )
@@ -380,21 +381,21 @@ class TracedEye(FocusingEye):
         accommodation_dpt: ArrayLike,
         wavelength_nm: ArrayLike,
     ) -> NDArray[np.float64]:
-        """Return lateral color against 555 nm along the pupil axes, mrad.
+        """Return the lateral color relative to 555 nm, mrad, along the pupil axes.
 
-        All arguments broadcast, and the result has their shape with 2 last.  The
-        contribution of a correction is not included.  See `chief_rays`.
+        All arguments broadcast; the result has their shape and a last axis of 2.
+        Corrections are not included.  See `chief_rays`.
         """
         states = np.broadcast_arrays(h_deg, v_deg, accommodation_dpt, wavelength_nm)
         columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]
         first, number = distinct_rows(*columns)
-        h, v, used_dpt, nm = (column[first] for column in columns)
+        h, v, accommodation_at_dpt, nm = (column[first] for column in columns)
         h, v = (
             np.clip(angle, *limits)
             for angle, limits in zip((h, v), self.traced_range_deg, strict=True)
         )
         found = self._field.chief_shift_mrad(
-            h_deg=h, v_deg=v, accommodation_dpt=used_dpt, wavelength_nm=nm
+            h_deg=h, v_deg=v, accommodation_dpt=accommodation_at_dpt, wavelength_nm=nm
         )
         return found[number].reshape(*states[0].shape, 2)
 
@@ -403,15 +404,17 @@ class TracedEye(FocusingEye):
     ) -> tuple[
         NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]
     ]:
-        """Return coefficients, rims and radii of distinct states, and each's index."""
+        """Return coefficients, rims and radii of distinct states, and the inverse."""
         columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]
         first, number = distinct_rows(*columns)
-        h_deg, v_deg, pupil_mm, used_dpt, wavelength_nm = (c[first] for c in columns)
+        h_deg, v_deg, pupil_mm, accommodation_dpt, wavelength_nm = (
+            c[first] for c in columns
+        )
         self._check_fields(h_deg, v_deg)
-        rest = {"pupil_diameter_mm": pupil_mm, "accommodation_dpt": used_dpt}
-        self._check_states(**rest)
+        state = {"pupil_diameter_mm": pupil_mm, "accommodation_dpt": accommodation_dpt}
+        self._check_states(**state)
         fields = self._fields(h_deg, v_deg, wavelength_nm, pupil_diameter_mm=pupil_mm)
-        return *fields.wavefronts(**rest), number
+        return *fields.wavefronts(**state), number
 
     def _fields(
         self,
@@ -429,7 +432,7 @@ class TracedEye(FocusingEye):
             self._field,
             self._on_axis,
             self._correction_at(h_deg, v_deg),
-            self._rest,
+            self._residual,
             periphery=self.periphery,
             h_deg=h_deg,
             v_deg=v_deg,
@@ -440,11 +443,11 @@ class TracedEye(FocusingEye):
     def _correction_at(
         self, h_deg: NDArray[Any], v_deg: NDArray[Any]
     ) -> NDArray[np.float64]:
-        """Return the correction's wavefront to subtract, (28,) or (n, 28) at fields."""
-        if not isinstance(self._worn, ProgressiveLens):
+        """Return the wavefront of the correction, (28,) or (n, 28) at fields (n,)."""
+        if not isinstance(self._lens, ProgressiveLens):
             return self._correction
         return progressive_polynomial(
-            self._worn, h_deg, v_deg, entrance_pupil_mm=self.entrance_pupil_mm
+            self._lens, h_deg, v_deg, entrance_pupil_mm=self.entrance_pupil_mm
         )
 
     def _check_fields(

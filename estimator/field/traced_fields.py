@@ -1,7 +1,7 @@
 """Wavefronts of a traced eye at fixed fields, as pupil and accommodation change.
 
-The interpolation over field and wavelength is done once, see `FieldValues`: a stream of
-frames requests the same fields repeatedly.
+The interpolation over field and wavelength is done once (see `FieldValues`), because a
+stream of frames requests the same fields repeatedly.
 """
 
 from collections.abc import Callable
@@ -21,17 +21,18 @@ from estimator.wavefront.field_wavefronts import (
 )
 
 MARGIN = 1e-3
-"""Degrees, mm or dpt beyond the traced range that are extrapolated, not rejected."""
+"""Distance from the traced range, in deg, mm or dpt, that is extrapolated."""
 
 
 def check_limits(
     name: str, values: NDArray[Any] | np.float64, low: float, high: float
 ) -> None:
-    """Reject values outside the traced range.
+    """Check that values are in the traced range.
 
     Raises
     ------
     ValueError
+        A value is outside.
     """
     if values.size and not (
         values.min() >= low - MARGIN and values.max() <= high + MARGIN
@@ -43,23 +44,23 @@ def check_limits(
 
 
 class TracedFields:
-    """Wavefronts at the fields and wavelengths of n states.
+    """Wavefronts at n pairs of field and wavelength.
 
     Parameters
     ----------
     field, on_axis : FieldInterpolation
-        Interpolation of the states, and one that contains the axis.
+        Interpolation over the field, and one that contains the axis.
     correction_um : (28,) or (n, 28), um/mm^degree
-        Wavefront of the correction, to subtract.
-    rest : MeasuredResidual
-        Residual of the estimate, to add.
+        Wavefront of the correction, which is subtracted.
+    residual : MeasuredResidual
+        Residual of the estimate, which is added.
     periphery : PeripheralResidual, optional
-        Phase added off the axis.  The residual is then the same over the field, because
-        people's wavefronts are given as changes from the axis.
+        Phase added off the axis.  The residual is then added at all fields with a
+        weight of 1, because this phase is a change from the axis.
     h_deg, v_deg, wavelength_nm : (n,)
         Fields and wavelengths within the traced range.
     pupil_diameter_mm : (n,), optional
-        Pupils that will be requested; any pupil if None.
+        Pupils that will be requested; by default, any of them may be.
     """
 
     def __init__(
@@ -67,7 +68,7 @@ class TracedFields:
         field: FieldInterpolation,
         on_axis: FieldInterpolation,
         correction_um: NDArray[np.float64],
-        rest: MeasuredResidual,
+        residual: MeasuredResidual,
         *,
         periphery: PeripheralResidual | None = None,
         h_deg: NDArray[np.float64],
@@ -83,12 +84,15 @@ class TracedFields:
         self._states = field.values(
             h_deg=h_deg, v_deg=v_deg, wavelength_nm=wavelength_nm, **pupils
         )
-        self._rest = rest
-        self._left_share, self._people_um = rest.left_share(h_deg, v_deg), None
+        self._residual = residual
+        self._residual_weight, self._periphery_um = (
+            residual.left_share(h_deg, v_deg),
+            None,
+        )
         if periphery is not None:
-            self._left_share = np.ones(h_deg.size)
-            self._people_um = _of_distinct(periphery.at, h_deg, v_deg)
-        self._added_um = rest.color_um(wavelength_nm) - correction_um
+            self._residual_weight = np.ones(h_deg.size)
+            self._periphery_um = _evaluate_distinct(periphery.at, h_deg, v_deg)
+        self._added_um = residual.color_um(wavelength_nm) - correction_um
         zeros = np.zeros(h_deg.size)
         self._axis_states = on_axis.values(
             h_deg=zeros, v_deg=zeros, wavelength_nm=wavelength_nm, **pupils
@@ -106,42 +110,44 @@ class TracedFields:
         ----------
         pupil_diameter_mm, accommodation_dpt : (n,)
         """
-        pupil_mm, used_dpt = self._usable_mm(pupil_diameter_mm), accommodation_dpt
+        pupil_mm = self._usable_mm(pupil_diameter_mm)
         polynomial_um, rim_mm = self._field.between(
-            self._states, pupil_diameter_mm=pupil_mm, accommodation_dpt=used_dpt
+            self._states,
+            pupil_diameter_mm=pupil_mm,
+            accommodation_dpt=accommodation_dpt,
         )
-        rim_mm = rim_mm * self._rim_scale(pupil_mm, used_dpt)[:, None]
+        rim_mm = rim_mm * self._rim_scale(pupil_mm, accommodation_dpt)[:, None]
         radius_mm = circumscribed_radius_mm(rim_mm)
-        residue_um = self._rest.residues_um(pupil_mm / 2.0, self._left_share)
-        if self._people_um is not None:
-            residue_um += self._people_um * stretch_ratio(pupil_mm / 2.0)
+        residue_um = self._residual.residues_um(pupil_mm / 2.0, self._residual_weight)
+        if self._periphery_um is not None:
+            residue_um += self._periphery_um * stretch_ratio(pupil_mm / 2.0)
         zernike_um = zernike_from_polynomial(
             polynomial_um + self._added_um + residue_um, radius_mm
         )
         return zernike_um, rim_mm, radius_mm
 
     def fixed_defocus(self) -> FixedDefocus:
-        """Return a fast form of total defocus for states that share pupil and focus."""
+        """Return a fast function of total defocus, for one pupil and accommodation."""
         return FixedDefocus(
             (self._field, self._states),
             (self._on_axis, self._axis_states),
-            self._rest,
-            left_share=self._left_share,
-            people_um=self._people_um,
+            self._residual,
+            residual_weight=self._residual_weight,
+            periphery_um=self._periphery_um,
             added_um=self._added_um,
             open_mm=self._open_mm,
         )
 
     def _rim_scale(
-        self, pupil_mm: NDArray[Any], used_dpt: NDArray[Any]
+        self, pupil_mm: NDArray[Any], accommodation_dpt: NDArray[Any]
     ) -> NDArray[np.float64]:
         """Return ratios (n,) of the requested pupils to the traced ones, on axis."""
         channel = self._axis_states.channel
-        first, number = distinct_rows(channel, pupil_mm, used_dpt)
+        first, number = distinct_rows(channel, pupil_mm, accommodation_dpt)
         _, rim_mm = self._on_axis.between(
-            self._axis_states.of(first),
+            self._axis_states.select(first),
             pupil_diameter_mm=pupil_mm[first],
-            accommodation_dpt=used_dpt[first],
+            accommodation_dpt=accommodation_dpt[first],
         )
         scale: NDArray[np.float64] = (
             pupil_mm[first] / 2.0 / circumscribed_radius_mm(rim_mm)
@@ -149,14 +155,14 @@ class TracedFields:
         return scale[number]
 
     def _usable_mm(self, pupil_mm: NDArray[Any]) -> NDArray[np.float64]:
-        """Return pupils (n,), reduced at fields where they are vignetted."""
+        """Return the pupils (n,), reduced at fields where they are vignetted."""
         if self._open_mm is None:
             return pupil_mm
         usable_mm: NDArray[np.float64] = np.minimum(pupil_mm, self._open_mm)
         return usable_mm
 
 
-def _of_distinct(
+def _evaluate_distinct(
     function: Callable[..., NDArray[np.float64]],
     h_deg: NDArray[Any],
     v_deg: NDArray[Any],

@@ -1,7 +1,7 @@
 """Scattering and absorption in the ocular media.
 
-straylight  scattering over wide angles, by age, pigment and cataract
-absorption  absorption by the aging lens, mostly of blue light
+straylight  wide-angle scattering, by age, pigmentation and cataract
+absorption  spectral absorption, by age
 """
 
 import lazy_loader

@@ -1,10 +1,11 @@
-"""Light scattered in the eye over wide angles: haze around lamps, and lost contrast.
+"""Straylight: wide-angle scattering in the eye, which causes glare and lowers contrast.
 
-The CIE total glare function is the point-spread function of an eye of known age and
-pigment from 0 to 100 deg (Vos & van den Berg, CIE Research Note 135/1, 1999).  Its core
-is due to aberrations and diffraction, which the filter computes for the individual eye;
-the light beyond the core is scattered here.  Clinics state it as the straylight
-parameter s = angle² x light per solid angle and incident light, deg²/sr, at 7 deg.
+The CIE total glare function is the point-spread function of an eye from 0 to 100 deg,
+by age and pigmentation (Vos & van den Berg, CIE Research Note 135/1, 1999).  Its core
+is due to aberrations and diffraction, which the PSFs of the individual eye contain;
+this module models the light outside the core.  The clinical measure is the straylight
+parameter s at 7 deg, in deg²/sr: angle² times the scattered light per steradian and
+incident light.
 """
 
 import math
@@ -14,8 +15,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 CORE_DEG = 0.5
-"""Angle around which the light beyond the core begins; at 1 deg 98 % of it is included.
-Aberrations and diffraction send hardly any light that far."""
+"""Angle at which the core is cut off: 98 % of the glare function remain at 1 deg, which
+aberrations and diffraction hardly reach."""
 
 SMALLEST_DEG, LARGEST_DEG = 0.01, 90.0
 STATED_AT_DEG = 7.0
@@ -23,11 +24,11 @@ STATED_AT_DEG = 7.0
 
 DEFAULT_AGE_YEARS = 25.0
 BROWN = 0.5
-"""Pigmentation: 0 for black eyes, 0.5 brown, 1 light blue eyes of Caucasians."""
+"""Pigmentation factor: 0 for black, 0.5 for brown, 1 for light blue eyes."""
 
 CATARACTS = {"nuclear": 1.22, "cortical": 1.26, "posterior_subcapsular": 1.48}
-"""Mean log s of 592, 776 and 75 eyes before surgery (+-0.20, 0.23 and 0.34), from five
-studies: J. Ophthalmol. 2017, 5649532."""
+"""Mean log s of 592, 776 and 75 eyes before surgery (standard deviations 0.20, 0.23 and
+0.34), from five studies: J. Ophthalmol. 2017, 5649532."""
 
 N_ANGLES = 4000
 
@@ -42,11 +43,16 @@ def cie_glare_per_sr(
     angle_deg : (...)
     age_years : float
     pigmentation : float
+        0 for black, 0.5 for brown, 1 for light blue eyes.
+
+    Notes
+    -----
+    The function integrates to 1.03 at 25 years and to 1.07 at 70.  The published
+    normalization is omitted, because veiling luminance is specified without it.
 
     References
     ----------
-    Vos & van den Berg 1999, equation 8.  It integrates to 1.03 at 25 years and to 1.07
-    at 70; the published normalization is omitted, as veils are stated without it.
+    Vos & van den Berg 1999, equation 8.
     """
     square = np.square(np.asarray(angle_deg, dtype=np.float64))
     age = (age_years / 70.0) ** 4
@@ -64,16 +70,17 @@ def cie_glare_per_sr(
 
 @dataclass(frozen=True)
 class Straylight:
-    """Scatter of one eye.
+    """Straylight of one eye.
 
     Attributes
     ----------
     age_years : float
     pigment_ratio : float
+        Pigmentation; see `cie_glare_per_sr`.
     log_s : float or None
-        Straylight parameter at 7 deg, if measured or known from the kind of cataract;
-        that of the age if None.  The excess over the age scatters as the inverse square
-        of the angle, as cataracts do (van den Berg & Ijspeert 1995).
+        Straylight parameter at 7 deg, measured or typical of a cataract; by default
+        that of the age.  The difference from the latter is proportional to the inverse
+        square of the angle, as in cataracts (van den Berg & Ijspeert 1995).
     """
 
     age_years: float = DEFAULT_AGE_YEARS
@@ -82,26 +89,26 @@ class Straylight:
 
     @property
     def age_log_s(self) -> float:
-        """Return log s at 7 deg of a clear eye of this age, by the CIE function."""
+        """Straylight parameter log s at 7 deg of a healthy eye of this age."""
         per_sr = cie_glare_per_sr(
             STATED_AT_DEG, age_years=self.age_years, pigmentation=self.pigment_ratio
         )
         return math.log10(STATED_AT_DEG**2 * float(per_sr))
 
     def per_sr(self, angle_deg: ArrayLike) -> NDArray[np.float64]:
-        """Return scattered light (...) per steradian and incident light."""
+        """Return the scattered light (...), per steradian and incident light."""
         angle_deg = np.maximum(np.asarray(angle_deg, dtype=np.float64), SMALLEST_DEG)
         found = cie_glare_per_sr(
             angle_deg, age_years=self.age_years, pigmentation=self.pigment_ratio
         )
         if self.log_s is not None:
-            more = 10.0**self.log_s - 10.0**self.age_log_s
-            found = np.maximum(found + more / angle_deg**2, 0.0)
+            excess = 10.0**self.log_s - 10.0**self.age_log_s
+            found = np.maximum(found + excess / angle_deg**2, 0.0)
         return found * -np.expm1(-np.square(angle_deg / CORE_DEG))
 
     @property
     def fraction(self) -> float:
-        """Return the fraction of all light that is scattered."""
+        """Scattered fraction of the incident light."""
         angles_deg = np.geomspace(SMALLEST_DEG, LARGEST_DEG, N_ANGLES)
         ring_sr = 2.0 * np.pi * np.sin(np.radians(angles_deg))
         return float(

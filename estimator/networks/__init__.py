@@ -1,8 +1,8 @@
-"""The trained networks; PyTorch is needed only in `training`.
+"""Inference with the trained networks; only `training` requires PyTorch.
 
-card       cards of the networks: columns, ranges, error
-inference  loading and evaluation
-weights    the files that `python -m training.export` writes
+card       cards of the networks: columns, training ranges, expected error
+inference  loading and evaluation, by ONNX Runtime
+weights/   cards and ONNX files, written by `python -m training.export`
 """
 
 import lazy_loader

@@ -17,10 +17,11 @@ from estimator.eye.parameters import PARAMETER_NAMES
 from estimator.optics.zernike import N_TERMS
 
 WEIGHTS_FOLDER = Path(__file__).parent / "weights"
+REMEDY = "restore it from the repository or run python -m training.export"
 CARD_FORMAT = 1
 
 FIRST_TERM = 3
-"""First coefficient of the eye network's inputs: a measured tilt is uninformative."""
+"""First coefficient of the eye network's inputs: measured tilt is uninformative."""
 
 ZERNIKE_NAMES = tuple(f"zernike_j{j}_um" for j in range(1, N_TERMS))
 RIM_NAMES = (
@@ -50,17 +51,11 @@ OUTPUTS: Mapping[str, tuple[str, ...]] = {
 NETWORK_NAMES = tuple(INPUTS)
 
 MARGIN_RATIO = 1e-6
-"""Fraction of a range beyond its ends that still counts as inside, for rounding."""
-
-
-LARGEST_ERROR_RATIO = 3.0
-"""Ratio of the traced error in one eye to the stated 95th percentile above which a
-network is not used for that eye.  Ranges of single columns do not define a domain: a
-wavefront may resemble no eye's even if each of its terms is small."""
+"""Tolerance of the range check for rounding errors, as a fraction of the range."""
 
 
 class NetworkUnavailable(ValueError):
-    """A network is unavailable: no weights, or an input outside its training."""
+    """A network cannot be used: no weights, or an input outside its training range."""
 
 
 class WeightsMissing(NetworkUnavailable):
@@ -72,12 +67,12 @@ class DamagedWeights(NetworkUnavailable):
 
 
 class NetworkUnfit(NetworkUnavailable):
-    """A network is not accurate for this eye, though its inputs are in range."""
+    """The output of a network is unusable although its inputs are in range."""
 
 
 @dataclass(frozen=True)
 class Excess:
-    """One input column outside its training range, in the column's own unit."""
+    """An input column outside its training range; values are in the column's unit."""
 
     column: str
     value: float
@@ -97,7 +92,7 @@ class OutOfDomain(NetworkUnavailable):
     Attributes
     ----------
     excesses : tuple of Excess
-        Columns outside their ranges, the farthest first, relative to the range.
+        Columns outside their ranges, sorted by the relative distance, largest first.
     """
 
     def __init__(self, network: str, excesses: tuple[Excess, ...]):
@@ -111,8 +106,8 @@ class OutOfDomain(NetworkUnavailable):
 class ExpectedError:
     """Mean and 95th percentile of a network's error against ray tracing.
 
-    Both are in ``unit``; ``by_radial_order`` holds the mean of each order if the output
-    is a wavefront.
+    Both are in ``unit``.  For wavefronts, ``by_radial_order`` maps radial orders to
+    mean errors.
     """
 
     mean_abs: float
@@ -138,10 +133,10 @@ class Card:
     precision : str
         Precision of the stored weights, ``float16`` or ``float32``.
     error : ExpectedError
-        Error for eyes as the service sees them.
+        Error for eyes like those of the service's users.
     error_by_rows : mapping
-        Error by the distribution of eyes: ``table_2``, the box of the paper's Table 2,
-        and ``population``, the prior of the estimation.
+        Error by distribution of eyes: ``table_2``, uniform over the ranges of the
+        paper's Table 2, and ``population``, the prior of the estimation.
     """
 
     network: str
@@ -154,9 +149,10 @@ class Card:
     error_by_rows: Mapping[str, ExpectedError] = field(default_factory=dict)
 
     def outside(self, features: NDArray[np.float64]) -> tuple[Excess, ...]:
-        """Return columns of inputs (P, n_inputs) outside their ranges, farthest first.
+        """Return the columns of inputs (P, n_inputs) outside their training ranges.
 
-        Each has its value farthest outside; NaN is outside every range.
+        They are sorted by the relative distance of their worst value, largest first.
+        NaN is outside every range.
         """
         width = np.maximum(self.high - self.low, np.finfo(np.float64).tiny)
         beyond = np.maximum(self.low - features, features - self.high) / width
@@ -184,19 +180,6 @@ class Card:
         if excesses := self.outside(features):
             raise OutOfDomain(self.network, excesses)
 
-    def check_error(self, traced_error: float, where: str) -> None:
-        """Reject a traced error far above the expected error.
-
-        Raises
-        ------
-        NetworkUnfit
-        """
-        if not traced_error <= LARGEST_ERROR_RATIO * self.error.p95_abs:
-            raise NetworkUnfit(
-                f"error of {traced_error:.2g} {self.error.unit} {where} (95 % should "
-                f"be below {self.error.p95_abs:.2g})"
-            )
-
 
 def card_path(name: str) -> Path:
     """Return the path of a network's card."""
@@ -214,7 +197,7 @@ def read_card(name: str) -> Card:
     Raises
     ------
     WeightsMissing, DamagedWeights
-        The card is missing or invalid; the error names the file and a remedy.
+        The card is missing or invalid; the message names the file and the remedy.
     """
     path = card_path(name)
     if not path.is_file():
@@ -223,19 +206,15 @@ def read_card(name: str) -> Card:
         return parse_card(name, json.loads(path.read_text(encoding="utf-8")))
     except (KeyError, TypeError, ValueError) as error:
         raise DamagedWeights(
-            f"{path.name} is not a card of the network '{name}' ({error!r}): restore "
-            "it "
-            "from the repository, or make it anew with python -m training.export"
+            f"{path.name}: expected the card of the network '{name}' ({error!r}); "
+            f"{REMEDY}"
         ) from error
 
 
 def missing_text(path: Path) -> str:
-    """Return a message that names a missing file and a remedy."""
+    """Return the message for a missing file."""
     name = path.relative_to(WEIGHTS_FOLDER.parents[2]).as_posix()
-    return (
-        f"{name} is missing: restore it from the repository, or make it anew with "
-        "python -m training.export"
-    )
+    return f"{name} is missing; {REMEDY}"
 
 
 def parse_card(name: str, data: Mapping[str, Any]) -> Card:
@@ -247,20 +226,20 @@ def parse_card(name: str, data: Mapping[str, Any]) -> Card:
         The card is incomplete, or belongs to another network or version.
     """
     columns = tuple(column["name"] for column in data["inputs"])
-    for what, found, wanted in (
+    for key, value, expected in (
         ("format", data["format"], CARD_FORMAT),
         ("network", data["network"], name),
         ("inputs", columns, INPUTS[name]),
         ("outputs", tuple(data["outputs"]), OUTPUTS[name]),
     ):
-        if found != wanted:
-            raise ValueError(f"{what} {found}, wanted {wanted}")
+        if value != expected:
+            raise ValueError(f"{key}: expected {expected}, got {value}")
     low, high = (
         np.array([float(column[end]) for column in data["inputs"]])
         for end in ("low", "high")
     )
     if not np.all(low <= high):
-        raise ValueError("a range that is not ascending")
+        raise ValueError("inputs: expected low <= high in every range")
     return Card(
         network=name,
         low=low,

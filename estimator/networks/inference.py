@@ -1,9 +1,8 @@
 """Inference with the trained networks, in microseconds instead of a ray trace.
 
-Each network is evaluated by ONNX Runtime on the CPU and loaded on first use, once per
-process.  Inputs outside the training ranges are rejected, never extrapolated: the
-caller falls back to ray tracing.  The networks are trained by `training`; the interface
-to it is the two files of each network, see `networks.card`.
+ONNX Runtime evaluates the networks on the CPU.  Each is loaded on first use, once per
+process.  Inputs outside the training ranges raise `OutOfDomain`, and callers fall back
+to ray tracing.  `training` writes the two files of each network; see `networks.card`.
 """
 
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from estimator.networks.card import (
     FIRST_TERM,
     INPUTS,
+    REMEDY,
     Card,
     DamagedWeights,
     WeightsMissing,
@@ -27,15 +27,15 @@ from estimator.optics.zernike import N_TERMS
 from estimator.threads import thread_count
 
 BATCH = 2048
-"""Rows per batch, so that activations stay in the processor cache."""
+"""Rows per batch: activations stay in the processor cache."""
 
 ERRORS_ONLY = 3
-"""Lowest severity that ONNX Runtime logs; its warnings do not concern us."""
+"""Minimum severity of ONNX Runtime's log; its warnings are not relevant here."""
 
 
 @dataclass(frozen=True)
 class Network:
-    """One loaded network, called with inputs in physical units."""
+    """A loaded network; inputs and outputs are in physical units."""
 
     card: Card
     _session: Any
@@ -59,10 +59,16 @@ class Network:
 
 @dataclass(frozen=True)
 class PupilAberrations:
-    """Wavefronts with their pupils, as predicted by the aberration network.
+    """Wavefronts and their pupils, predicted by the aberration network.
 
-    ``zernike_um`` (P, 28) is on the circumscribed circles ``zernike_radius_mm`` (P,),
-    piston zero; ``rim_mm`` (P, 5) as in `field_wavefronts.rim_from_ellipse`.
+    Attributes
+    ----------
+    zernike_um : (P, 28)
+        Coefficients on the circumscribed circle; piston is zero.
+    zernike_radius_mm : (P,)
+        Radius of this circle.
+    rim_mm : (P, 5)
+        Rim of the pupil; see `field_wavefronts.rim_from_ellipse`.
     """
 
     zernike_um: NDArray[np.float64]
@@ -72,13 +78,14 @@ class PupilAberrations:
 
 @cache
 def load_network(name: str) -> Network:
-    """Load a network and its card, or return the loaded one.
+    """Load a network and its card; the result is cached.
 
     Raises
     ------
     WeightsMissing
-        A file or package is missing; the error names it.
+        A file or package is missing; the message names it.
     DamagedWeights
+        A file is invalid.
     """
     card = read_card(name)
     path = weights_path(name)
@@ -88,7 +95,7 @@ def load_network(name: str) -> Network:
         import onnxruntime
     except ImportError as error:
         raise WeightsMissing(
-            "onnxruntime, which evaluates the networks, is missing: sh setup.sh"
+            "the package onnxruntime is missing; run sh setup.sh"
         ) from error
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = thread_count()
@@ -102,8 +109,7 @@ def load_network(name: str) -> Network:
         )
     except Exception as error:  # its errors have no common class
         raise DamagedWeights(
-            f"{path.name} cannot be loaded ({type(error).__name__}): restore it "
-            "from the repository, or make it anew with python -m training.export"
+            f"{path.name} cannot be loaded ({type(error).__name__}); {REMEDY}"
         ) from error
     return Network(card, session)
 
@@ -111,12 +117,14 @@ def load_network(name: str) -> Network:
 def network_eye(
     zernike_um: ArrayLike, *, pupil_diameter_mm: ArrayLike, wavelength_nm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return parameters (..., 45) of relaxed eyes with about these wavefronts.
+    """Return the parameters (..., 45) of relaxed eyes with given wavefronts.
+
+    The wavefronts of these eyes are approximately the given ones.
 
     Parameters
     ----------
     zernike_um : (..., 28)
-        Coefficients on axis, on the circle of the pupil; piston and tilt are not used.
+        On-axis coefficients on the circle of the pupil; piston and tilt are ignored.
     pupil_diameter_mm, wavelength_nm : (...)
 
     Raises
@@ -131,9 +139,15 @@ def network_eye(
 def network_zernike(
     vectors: ArrayLike, *, pupil_diameter_mm: ArrayLike, wavelength_nm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return coefficients (..., 28), um, of eyes (..., 45) on axis, by discriminator.
+    """Return the on-axis coefficients (..., 28), um, of eyes.
 
-    They approximate `eye.tracing.zernike_of_vectors`; piston is zero.
+    The discriminator network approximates `eye.tracing.zernike_of_vectors`.  Piston is
+    zero.
+
+    Parameters
+    ----------
+    vectors : (..., 45)
+    pupil_diameter_mm, wavelength_nm : (...)
 
     Raises
     ------
@@ -146,7 +160,7 @@ def network_zernike(
 def network_focus(
     vectors: ArrayLike, *, pupil_diameter_mm: ArrayLike, focus_dpt: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return changes (...) of lens diameter and aqueous thickness, mm, for a focus.
+    """Return the changes of the lens that focus relaxed eyes at given distances.
 
     Parameters
     ----------
@@ -156,6 +170,10 @@ def network_focus(
         Pupil through which the eye is focused.
     focus_dpt : (...)
         Focus distance, without correction.
+
+    Returns
+    -------
+    lens_diameter_change_mm, aqueous_thickness_change_mm : (...)
 
     Raises
     ------
@@ -174,10 +192,16 @@ def network_aberrations(
     h_deg: ArrayLike = 0.0,
     v_deg: ArrayLike = 0.0,
 ) -> PupilAberrations:
-    """Return aberrations of focused eyes (..., 45) over the field, object at infinity.
+    """Return the aberrations of eyes over the field, for an object at infinity.
 
-    They approximate `aberrations.wavefront_grid`.  All arguments broadcast, and the
-    leading axes of the result are theirs.
+    The network approximates `aberrations.wavefront_grid`.  All arguments broadcast; the
+    result has their shape as its leading axes.
+
+    Parameters
+    ----------
+    vectors : (..., 45)
+        Eyes in their state of accommodation.
+    pupil_diameter_mm, wavelength_nm, h_deg, v_deg : (...)
 
     Raises
     ------
@@ -194,7 +218,7 @@ def network_aberrations(
 
 
 def _features(first: ArrayLike, *columns: ArrayLike) -> NDArray[np.float64]:
-    """Join (..., n) and columns that broadcast with it to (..., n + n_columns)."""
+    """Broadcast (..., n) and columns (...), and join them to (..., n + n_columns)."""
     first = np.asarray(first, dtype=np.float64)
     others = [np.asarray(column, dtype=np.float64) for column in columns]
     shape = np.broadcast_shapes(first.shape[:-1], *(c.shape for c in others))

@@ -1,24 +1,33 @@
-"""Optics common to all eyes and lenses.
+"""Surfaces, media, ray tracing, paraxial optics and Zernike polynomials.
 
 arrays            arrays in the form that compiled loops require
 units             unit conversions, reference wavelengths
-zernike           the polynomials, their indices, rescaling, mirrors
-media             refractive indices of the eye's media by wavelength
+zernike           Zernike polynomials: indices, values, gradients, rescaling, mirroring
+media             refractive indices of the ocular media by wavelength
 dispersion/       refractive index of other media by formula, Abbe number or table
 gradients/        gradient-index media
-forms/            forms of surfaces besides conics, biconics and offset terms
+forms/            surface forms other than conics, biconics and offset terms
 packed            columns of the arrays that describe an eye to compiled code
-chromatic         chromatic difference of refraction of the average eye
-prescription      spectacle prescriptions, power vectors, their coefficients
-surfaces          one surface, a stack of them, and both packed for compiled loops
-raytrace          rays through a stack of surfaces, each with its status
+chromatic         chromatic difference of refraction of the mean eye
+prescription      spectacle prescriptions, power vectors, Zernike coefficients
+surfaces          surfaces of an eye, and their packing for compiled code
+raytrace          exact ray tracing, with a status per ray
 raytrace_kernels  its compiled loops
 surface_kernels   intersection with one surface and refraction, compiled
 gradient_kernels  rays through gradient-index media, compiled
-paraxial          first-order power, cardinal points and pupils
-vergence          the plane of the entrance pupil: distances, spectacles
-pupil_screen      interface of rings in the pupil, for wave optics
+paraxial          power, cardinal points and entrance pupil
+vergence          object distances and vergences in the plane of the entrance pupil
+pupil_screen      interface of a complex amplitude in the pupil, for wave optics
 pinhole           directions and local scale of a pinhole image
+
+Terms:
+
+- A *surface* has a *form* (its sag), a position and a rotation.
+- A *medium* is the material between two surfaces.  It is homogeneous, with an index by
+  wavelength, its *dispersion*, or a *gradient*, with an index by position.
+- The *stop* is the plane of the iris; its image by the cornea is the *entrance pupil*.
+- The *chief ray* is the ray through the center of the stop.
+- A *packed eye* is the array of numbers that compiled code traces rays through.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Chromatic difference of refraction of the average eye."""
+"""Chromatic difference of refraction of the mean eye."""
 
 from typing import overload
 
@@ -19,10 +19,13 @@ def chromatic_refraction_dpt(
 def chromatic_refraction_dpt(
     wavelength_nm: float | NDArray[np.float64],
 ) -> float | NDArray[np.float64]:
-    """Return the refraction of the Indiana chromatic eye, dpt, zero at 589.98 nm.
+    """Return the refraction (...), dpt, of the Indiana chromatic eye.
 
-    A fit to measured eyes (Thibos, Ye, Zhang & Bradley 1992), used for profiles that
-    consist of a wavefront without an eye.  Only differences between wavelengths are
-    used.  Shorter wavelengths are more myopic (negative).
+    It is zero at 589.98 nm and negative (myopic) at shorter wavelengths.  Only
+    differences between wavelengths have a meaning.
+
+    References
+    ----------
+    Thibos, Ye, Zhang & Bradley, Appl. Opt. 31, 1992: a fit to measured eyes.
     """
     return INDIANA_OFFSET_DPT - INDIANA_SLOPE_DPT_NM / (wavelength_nm - INDIANA_POLE_NM)

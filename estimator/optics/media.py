@@ -31,18 +31,18 @@ def refractive_index(
     indices: Mapping[str, float] | None = None,
     media: Mapping[str, Any] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the refractive index of one homogeneous medium.
+    """Return the refractive index of a homogeneous medium.
 
     Parameters
     ----------
     medium : str
-        ``cornea``, ``aqueous``, ``lens``, ``vitreous`` or ``air``, or any name in
+        ``cornea``, ``aqueous``, ``lens``, ``vitreous``, ``air``, or a key of
         ``indices`` or ``media``.
-    wavelength_nm : (...), nm
+    wavelength_nm : (...)
     indices : mapping, optional
-        Constant indices by medium; they replace the dispersion formula.
+        Constant indices by medium, which take precedence over dispersions.
     media : mapping, optional
-        Dispersions by medium; they, too, replace the formula.
+        Dispersions by medium, which take precedence over the formula below.
 
     Returns
     -------
@@ -51,14 +51,14 @@ def refractive_index(
     Raises
     ------
     ValueError
-        An unknown medium, or a wavelength outside the range of the medium: 365 to
-        1014 nm for the formula.
+        The medium is unknown, or a wavelength is outside its range: 365 to 1014 nm for
+        the formula below.
 
     Notes
     -----
-    n(L) = a1 n(365.0) + a2 n(486.1) + a3 n(656.3) + a4 n(1014.0), each a a sum over
-    1, L², 1/(L² - 0.028), 1/(L² - 0.028)² (Navarro et al. 1985, after Herzberger).
-    Air is 1.
+    n(L) = a1 n(365.0) + a2 n(486.1) + a3 n(656.3) + a4 n(1014.0).  Each a is a linear
+    combination of 1, L², 1/(L² - 0.028) and 1/(L² - 0.028)², with L in micrometers
+    (Navarro et al. 1985, after Herzberger).  The index of air is 1.
     """
     wavelength_nm = np.asarray(wavelength_nm, dtype=np.float64)
     if indices is not None and medium in indices:

@@ -1,8 +1,8 @@
-"""First-order optics of an eye about its axis: power, cardinal points, entrance pupil.
+"""Paraxial optics of an eye about its axis: power, cardinal points, entrance pupil.
 
-Astigmatic surfaces enter by their mean curvature.  Conic constants, tilts and
-decentrations have no effect at first order, and corneal offsets enter by their mean
-curvature and height at the vertex.  Lengths are mm from the corneal apex, powers dpt.
+Astigmatic surfaces are represented by their mean curvature, offset terms by their mean
+curvature and their height at the vertex.  Conic constants, tilts and decentrations have
+no effect to first order.  Positions are in mm from the corneal apex, powers in dpt.
 """
 
 from dataclasses import dataclass
@@ -38,24 +38,23 @@ from estimator.optics.zernike import EXPONENTS
 
 @dataclass(frozen=True)
 class CardinalPoints:
-    """First-order description of an eye.
+    """Paraxial powers and cardinal points of an eye.
 
     Attributes
     ----------
     power_dpt, cornea_power_dpt, lens_power_dpt : float
-        Power of the whole eye, and of the surfaces in front of and behind the stop,
-        each in its own media.
+        Powers of the eye, of the surfaces in front of the stop and of those behind it.
     object_focal_length_mm, image_focal_length_mm : float
-        Focal lengths from the principal points; the first is negative.
+        Focal lengths, from the principal points; the first is negative.
     object_focus_mm, image_focus_mm, object_principal_mm, image_principal_mm,
     object_nodal_mm, image_nodal_mm : float
         Positions on the axis.
     entrance_pupil_mm : float
-        Position of the stop's image in air.
+        Position of the entrance pupil.
     entrance_pupil_ratio : float
-        Entrance pupil over stop.
+        Diameter of the entrance pupil over that of the stop.
     refraction_dpt : float
-        Refraction at the cornea: vergence of the far point there; negative if myopic.
+        Refraction at the cornea; negative if myopic.
     """
 
     power_dpt: float
@@ -77,7 +76,7 @@ class CardinalPoints:
 def _offset_part(
     packed: NDArray[np.float64], *exponents: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Sum some monomial coefficients of the offsets; zero where there are none."""
+    """Return the sum of offset coefficients per surface; zero without offset terms."""
     order = [tuple(e) for e in EXPONENTS[horner_order()].tolist()]
     total = sum(packed[:, OFFSET + order.index(e)] for e in exponents)
     has_offset = (packed[:, FORM] == WITH_OFFSET) | (packed[:, HAS_OFFSET] != 0.0)
@@ -91,14 +90,14 @@ def _mean_curvatures(packed: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _vertices_mm(packed: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the surfaces' axial positions; an offset may shift its surface there."""
+    """Return the axial positions of the surfaces, with their offset at the vertex."""
     return packed[:, VERTEX + 2] + _offset_part(packed, (0, 0))
 
 
 def _gap(
     packed: NDArray[Any], indices: NDArray[Any], i: int, z_mm: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Return the matrix (2, 2) through the medium behind surface ``i``."""
+    """Return the transfer matrix (2, 2) of the medium behind surface ``i``."""
     from_mm, to_mm = z_mm
     if packed[i, GRADIENT] == 0.0:
         reduced_mm = (to_mm - from_mm) / indices[i + 1]
@@ -122,7 +121,10 @@ def _index_behind(
 def system_matrix(
     packed: NDArray[Any], indices: NDArray[Any], *, first: int, last: int
 ) -> NDArray[np.float64]:
-    """Return the matrix (2, 2) on (height, index * slope), surfaces [first, last)."""
+    """Return the ray transfer matrix (2, 2) of surfaces ``first`` to ``last - 1``.
+
+    It acts on (height, index * slope).
+    """
     curvature, z_mm = _mean_curvatures(packed), _vertices_mm(packed)
     matrix = np.eye(2)
     for i in range(first, last):
@@ -138,13 +140,13 @@ def system_matrix(
 def _entrance_pupil(
     packed: NDArray[Any], indices: NDArray[Any], stop_z_mm: float
 ) -> tuple[float, float]:
-    """Return position and magnification of the stop's image in air."""
+    """Return the position of the entrance pupil, and its magnification."""
     n_before = int(packed[-1, N_BEFORE_STOP])
     matrix = system_matrix(packed, indices, first=0, last=n_before)
     z_mm = _vertices_mm(packed)
     gap = _gap(packed, indices, n_before - 1, (z_mm[n_before - 1], stop_z_mm))
     to_stop = gap @ matrix
-    # Object plane at z: height at the stop must not depend on the slope there.
+    # Imaging condition: the height in the stop must not depend on the object slope.
     back_mm = -indices[0] * to_stop[0, 1] / to_stop[0, 0]
     return float(z_mm[0] - back_mm), float(1.0 / to_stop[0, 0])
 
@@ -152,12 +154,13 @@ def _entrance_pupil(
 def entrance_pupils_mm(
     packed: NDArray[np.float64], indices: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return axial entrance pupil positions (n_eyes,) of eyes with the same surfaces.
+    """Return the positions (n_eyes,), mm, of the entrance pupils of many eyes.
 
     Parameters
     ----------
     packed : (n_eyes, n_surfaces + 1, N_COLUMNS)
-        Stacked `surfaces.pack_eye`, homogeneous in front of the stop.
+        Stacked results of `surfaces.pack_eye`; the media in front of the stop must be
+        homogeneous.
     indices : (n_surfaces + 1,)
         From `surfaces.media_indices`.
     """
@@ -184,7 +187,7 @@ def cardinal_points(eye: EyeSurfaces, *, wavelength_nm: float) -> CardinalPoints
     Raises
     ------
     ValueError
-        An eye that cannot be traced, or a wavelength out of range.
+        The eye cannot be traced, or the wavelength is out of range.
     """
     check_eye(eye)
     packed, indices = pack_eye(eye), media_indices(eye, wavelength_nm)
@@ -200,7 +203,7 @@ def cardinal_points(eye: EyeSurfaces, *, wavelength_nm: float) -> CardinalPoints
     object_focus, image_focus = front_mm + n_air * d / c, back_mm - n_last * a / c
     object_focal, image_focal = n_air / c, -n_last / c
     pupil_mm, ratio = _entrance_pupil(packed, indices, eye.stop_z_mm)
-    # Rays that the eye focuses on the retina's pole: slope over height in air.
+    # Slope over height, in air, of the rays that the eye focuses on the retina's pole.
     reach = (retina_mm - back_mm) / n_last
     refraction = MM_PER_M * (a + c * reach) / (b + d * reach)
     return CardinalPoints(
@@ -222,7 +225,7 @@ def cardinal_points(eye: EyeSurfaces, *, wavelength_nm: float) -> CardinalPoints
 
 
 def entrance_pupil_mm(eye: EyeSurfaces, *, wavelength_nm: float) -> float:
-    """Return the axial position of the stop's image in air."""
+    """Return the position of the entrance pupil, mm behind the corneal apex."""
     packed, indices = pack_eye(eye), media_indices(eye, wavelength_nm)
     return _entrance_pupil(packed, indices, eye.stop_z_mm)[0]
 

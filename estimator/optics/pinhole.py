@@ -1,8 +1,8 @@
-"""Pinhole camera in the eye's entrance pupil: directions and the image's local scale.
+"""Pinhole camera at the entrance pupil: directions, and local scale of the image.
 
-A PSF is a function of angle.  A pinhole image magnifies it by sec² along the radius and
-by sec across it.  `pixel_from_mrad` returns this as a matrix, by which the PSF engines
-map a PSF before they integrate it over pixels.
+PSFs are functions of visual angle, which a pinhole image magnifies by sec² radially and
+by sec tangentially.  The PSF engines transform a PSF with the matrix that
+`pixel_from_mrad` returns before they integrate it over pixels.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ def _tangents(tangents: ArrayLike) -> tuple[float, float, float, float]:
 def tangents_at(
     x_px: ArrayLike, y_px: ArrayLike, *, tangents: ArrayLike, size_px: tuple[int, int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the tangents (right, up) of the direction through an image point.
+    """Return the tangents (...), right and up, of the direction of an image point.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def tangents_at(
 def direction_deg(
     tangent_x: ArrayLike, tangent_y: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return azimuth h and elevation v in degrees of the direction (t_x, t_y, -1)."""
+    """Return azimuth h and elevation v (...) of the direction (t_x, t_y, -1)."""
     x, y = np.asarray(tangent_x, np.float64), np.asarray(tangent_y, np.float64)
     h_deg = np.degrees(np.arctan(x))
     return h_deg, np.degrees(np.arctan2(y, np.hypot(1.0, x)))
@@ -69,7 +69,7 @@ def pixel_from_mrad(
     Raises
     ------
     ValueError
-        A direction outside of any pinhole image.
+        A direction is 90 degrees or more from the camera's axis.
     """
     left, right, up, down = _tangents(tangents)
     h, v = np.radians(np.asarray(h_deg, float)), np.radians(np.asarray(v_deg, float))

@@ -16,10 +16,15 @@ C2M2 = index_from_nm(2, -2)
 
 @dataclass(frozen=True)
 class Prescription:
-    """Sphere and cylinder at the spectacle plane, axis in the examiner's frame.
+    """Sphere, cylinder and axis in the plane of a lens.
 
-    ``vertex_mm`` is the distance from lens to cornea; 0 means that the powers are
-    those at the cornea (as for a contact lens or the paper's conditions).
+    Attributes
+    ----------
+    sphere_dpt, cylinder_dpt : float
+    axis_deg : float
+        Axis as the examiner writes it, facing the person.
+    vertex_mm : float
+        Distance from lens to cornea; 0 for powers at the cornea.
     """
 
     sphere_dpt: float
@@ -29,12 +34,12 @@ class Prescription:
 
 
 def power_at_cornea_dpt(power_dpt: float, *, vertex_mm: float) -> float:
-    """Convert a thin lens power to the cornea: F / (1 - d F)."""
+    """Convert a lens power F at a vertex distance d to the cornea: F / (1 - d F)."""
     return power_dpt / (1.0 - vertex_mm / MM_PER_M * power_dpt)
 
 
 def at_cornea(lens: Prescription) -> Prescription:
-    """Return the lens with its powers at the cornea."""
+    """Convert a prescription to the cornea."""
     other_dpt = lens.sphere_dpt + lens.cylinder_dpt
     sphere_dpt, other_dpt = (
         power_at_cornea_dpt(power_dpt, vertex_mm=lens.vertex_mm)
@@ -44,7 +49,7 @@ def at_cornea(lens: Prescription) -> Prescription:
 
 
 def written(lens: Prescription) -> str:
-    """Format powers in the usual notation: sphere, cylinder x axis."""
+    """Format a prescription as "sphere cylinder x axis"."""
     text = f"{lens.sphere_dpt:+.2f}"
     if abs(lens.cylinder_dpt) >= 0.005:
         text += f" {lens.cylinder_dpt:+.2f} x {lens.axis_deg:.0f}"
@@ -54,11 +59,20 @@ def written(lens: Prescription) -> str:
 def power_vector(
     prescription: Prescription, *, depth_mm: float = 0.0
 ) -> tuple[float, float, float]:
-    """Return M, J0, J45 in dpt at the cornea, eye frame (x to the person's right).
+    """Return the power vector M, J0, J45, dpt, in the eye's frame.
 
-    The examiner sees the eye mirrored, so the axis A becomes 180 - A, which changes
-    only the sign of J45.  Thibos, Wheeler & Horner 1997.  With ``depth_mm`` the powers
-    are those at that depth behind the cornea.
+    The examiner faces the person, so the axis A becomes 180 - A, which changes the sign
+    of J45.
+
+    Parameters
+    ----------
+    prescription : Prescription
+    depth_mm : float
+        Depth behind the cornea of the plane to which the powers are converted.
+
+    References
+    ----------
+    Thibos, Wheeler & Horner, Optom. Vis. Sci. 74, 1997.
     """
     vertex_mm = prescription.vertex_mm + depth_mm
     sphere = power_at_cornea_dpt(prescription.sphere_dpt, vertex_mm=vertex_mm)
@@ -73,7 +87,7 @@ def power_vector(
 def zernike_from_power_vector(
     m_dpt: float, j0_dpt: float, j45_dpt: float, *, zernike_radius_mm: float
 ) -> NDArray[np.float64]:
-    """Return coefficients (28,), um, of a sphero-cylindrical refraction on a circle."""
+    """Return the coefficients (28,), um, of a spherocylindrical refraction."""
     zernike_um = np.zeros(N_TERMS)
     area = zernike_radius_mm**2
     zernike_um[C20] = -m_dpt * area / SPHERE_PER_C20
@@ -85,7 +99,10 @@ def zernike_from_power_vector(
 def power_vector_from_zernike(
     zernike_um: NDArray[np.float64], *, zernike_radius_mm: float
 ) -> tuple[float, float, float]:
-    """Return least-squares M, J0, J45 in dpt, from second-order coefficients only."""
+    """Return least-squares M, J0, J45, dpt, of coefficients (28,).
+
+    They follow from the second-order coefficients alone (Thibos, Wheeler & Horner).
+    """
     m, j0, j45 = power_vectors_dpt(np.asarray(zernike_um), zernike_radius_mm).tolist()
     return m, j0, j45
 
@@ -93,7 +110,10 @@ def power_vector_from_zernike(
 def power_vectors_dpt(
     zernike_um: NDArray[np.float64], zernike_radius_mm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return least-squares M, J0, J45 (..., 3) of sets (..., 28) on circles (...)."""
+    """Return least-squares M, J0, J45 (..., 3), dpt, of coefficients (..., 28), um.
+
+    ``zernike_radius_mm`` (...) is the radius of their circle.
+    """
     second = zernike_um[..., [C20, C22, C2M2]]
     per_um = -np.array([SPHERE_PER_C20, ASTIGMATISM_PER_C22, ASTIGMATISM_PER_C22])
     return per_um * second / np.square(zernike_radius_mm)[..., None]
@@ -102,7 +122,7 @@ def power_vectors_dpt(
 def prescription_from_power_vector(
     m_dpt: float, j0_dpt: float, j45_dpt: float
 ) -> Prescription:
-    """Return the minus-cylinder prescription at the cornea, axis as the examiner's."""
+    """Return the minus-cylinder prescription, at the cornea, of a power vector."""
     cylinder_dpt = -2.0 * math.hypot(j0_dpt, j45_dpt)
     axis_deg = 180.0 - math.degrees(math.atan2(j45_dpt, j0_dpt)) / 2.0
     axis_deg = axis_deg % 180.0

@@ -1,4 +1,4 @@
-"""Interface of rings in the pupil that no polynomial describes, for wave optics."""
+"""Interface of a complex amplitude in the pupil that is not a polynomial phase."""
 
 from typing import Protocol
 
@@ -7,22 +7,22 @@ from numpy.typing import ArrayLike, NDArray
 
 
 class PupilScreen(Protocol):
-    """Effect of rings on light, about one center or many."""
+    """Complex amplitude that is rotationally symmetric about one or many centers."""
 
     @property
     def centre_mm(self) -> ArrayLike:
-        """Center of the rings from the pupil's center: (2,), or (P, 2) by pupil."""
+        """Center relative to that of the pupil: (2,), or (P, 2) for P pupils."""
 
     @property
     def lattice_mm(self) -> tuple[float, float, float] | None:
-        """Pitch of a honeycomb of rings, and its inner and outer radius."""
+        """Pitch, inner and outer radius of a honeycomb of centers; None for one."""
 
     def reach_mrad(
         self, radius_mm: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.float64]:
-        """Return the largest deflection of light at distances from the center."""
+        """Return the largest deflection (...) of light within distances (...)."""
 
     def transmission(
         self, square_mm2: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.complex128]:
-        """Return the complex amplitude at squared distances from the rings' center."""
+        """Return the complex amplitude (...) at squared distances from a center."""

@@ -1,4 +1,4 @@
-"""Exact ray tracing through an eye, in both directions, with a status per ray."""
+"""Exact ray tracing through an eye, inward or outward, with a status per ray."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -23,13 +23,13 @@ from estimator.optics.surfaces import (
 )
 
 ORDER_RADIUS_MM = 1.0
-"""Distance from the axis up to which surfaces must not cross: a 2 mm pupil."""
+"""Distance from the axis within which surfaces must not cross: a 2 mm pupil."""
 
 START_MM = 20.0
 
 
 class RayStatus(IntEnum):
-    """Outcome of tracing a ray; data, never an exception."""
+    """Outcome of tracing a ray; failures are data, not exceptions."""
 
     TRACED = kernels.TRACED
     MISSED = kernels.MISSED
@@ -51,16 +51,18 @@ STATUS_WORDS = {
 
 @dataclass(frozen=True)
 class TracedRays:
-    """Rays through an eye; elements count inward and include the stop and the retina.
+    """Rays through the elements of an eye.
+
+    Elements are the surfaces, the stop and the retina, in the order from air inward.
 
     Attributes
     ----------
     points_mm : (n_rays, n_elements, 3)
         Intersection of each ray with each element; nan from the first failure on.
     direction_ratio : (n_rays, n_elements, 3)
-        Direction cosines behind the element, as the ray travels.
+        Direction cosines after the element, in the direction of propagation.
     path_mm : (n_rays, n_elements)
-        Optical path from the start.
+        Optical path length from the start.
     status_index : (n_rays,) int
         `RayStatus`.
     stop_index : int
@@ -97,13 +99,13 @@ def trace_rays(
     Returns
     -------
     TracedRays
-        With ``reverse`` the path starts at the retina; the order of elements stays.
+        With ``reverse``, paths start at the retina; the order of elements is the same.
 
     Raises
     ------
     ValueError
-        An eye that cannot be traced, directions with the wrong sign of z, or a
-        wavelength outside the range of the media.
+        The eye cannot be traced, a direction has the wrong sign of z, or the wavelength
+        is outside the range of a medium.
     """
     check_eye(eye)
     start_mm, direction = np.broadcast_arrays(
@@ -113,8 +115,8 @@ def trace_rays(
     length = np.linalg.norm(direction, axis=-1, keepdims=True)
     along = -direction[:, 2] if reverse else direction[:, 2]
     if not (np.all(np.isfinite(start_mm)) and np.all(along > 0.0)):
-        wanted = "negative" if reverse else "positive"
-        raise ValueError(f"ray directions must have a {wanted} z, starts be finite")
+        sign = "negative" if reverse else "positive"
+        raise ValueError(f"expected directions with {sign} z and finite start_mm")
     packed = pack_eye(eye)
     shape = (len(start_mm), len(packed) + 1)
     points_mm, cosines = np.empty((*shape, 3)), np.empty((*shape, 3))
@@ -166,12 +168,12 @@ def _name(eye: EyeSurfaces, element: int, stop_index: int) -> str:
 
 
 def check_order(eye: EyeSurfaces) -> None:
-    """Raise if surfaces cross within `ORDER_RADIUS_MM` of the axis.
+    """Check that surfaces do not cross within `ORDER_RADIUS_MM` of the axis.
 
     Raises
     ------
     ValueError
-        Names the surface that lies in front of the one before it, and where.
+        Surfaces cross; the message names them and the position.
     """
     packed = pack_eye(eye)
     angle = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
@@ -195,6 +197,6 @@ def check_order(eye: EyeSurfaces) -> None:
     name = f"surfaces[{i}]" if i < len(eye.surfaces) else "retina"
     x_mm, y_mm = rays[crossed[0], :2]
     raise ValueError(
-        f"{name} crosses surfaces[{i - 1}] before ({x_mm:.2g}, {y_mm:.2g}) mm: it must "
-        f"lie behind it at least up to {ORDER_RADIUS_MM:g} mm from the axis"
+        f"{name} crosses surfaces[{i - 1}] before ({x_mm:.2g}, {y_mm:.2g}) mm: must "
+        f"lie behind it up to {ORDER_RADIUS_MM:g} mm from the axis"
     )

@@ -10,15 +10,20 @@ from numba import njit
 
 from estimator.optics.gradient_kernels import index_at, travel
 from estimator.optics.packed import GRADIENT, N_BEFORE_STOP, NEAR_GRADIENT, STOP_Z
-from estimator.optics.surface_kernels import RAY_SIZE, TRACED, cross_surface, put
+from estimator.optics.surface_kernels import (
+    RAY_SIZE,
+    TRACED,
+    copy_values,
+    cross_surface,
+)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def meet_gradient(packed, media, i, ray, before, behind, sag):
-    """Trace a ray to surface ``i`` and refract it, with a gradient on either side.
+def cross_gradient_surface(packed, media, i, ray, before, behind, sag):
+    """Trace a ray to surface ``i``, with a gradient on either side, and refract it.
 
-    ``before`` and ``behind`` are the surfaces in front of the media that the ray leaves
-    and enters, -1 for air.
+    ``before`` and ``behind`` identify the media that the ray leaves and enters, by the
+    surface in front of them; -1 is air.
     """
     if before >= 0 and packed[before, GRADIENT] != 0.0:
         status = travel(packed, media, before, i, ray, sag)
@@ -32,13 +37,13 @@ def meet_gradient(packed, media, i, ray, before, behind, sag):
     return cross_surface(packed, i, ray, n_before, n_behind, sag)
 
 
-# The loops below choose between `cross_surface` and `meet_gradient` themselves: in a
-# function of its own, the choice takes a ray 1.6 times as long.
+# The loops below choose between `cross_surface` and `cross_gradient_surface` inline: as
+# a function, the choice would make a ray take 1.6 times as long.
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def to_stop(packed, ray, n):
-    """Trace a ray to the stop plane, also backward (the plane may cut the lens)."""
+    """Trace a ray to the stop plane, backward if the lens extends through it."""
     t = (packed[-1, STOP_Z] - ray[2]) / ray[5]
     ray[0] += t * ray[3]
     ray[1] += t * ray[4]
@@ -54,7 +59,7 @@ def inward(packed, indices, ray, first, last, sag):
         if packed[i, NEAR_GRADIENT] == 0.0:
             status = cross_surface(packed, i, ray, indices[i], indices[i + 1], sag)
         else:
-            status = meet_gradient(packed, indices, i, ray, i - 1, i, sag)
+            status = cross_gradient_surface(packed, indices, i, ray, i - 1, i, sag)
         if status != TRACED:
             return status
     return TRACED
@@ -67,7 +72,7 @@ def outward(packed, indices, ray, first, last, sag):
         if packed[i, NEAR_GRADIENT] == 0.0:
             status = cross_surface(packed, i, ray, indices[i + 1], indices[i], sag)
         else:
-            status = meet_gradient(packed, indices, i, ray, i, i - 1, sag)
+            status = cross_gradient_surface(packed, indices, i, ray, i, i - 1, sag)
         if status != TRACED:
             return status
     return TRACED
@@ -88,11 +93,11 @@ def trace_bundle(packed, indices, rays, reverse, points, directions, paths, stat
     sag = np.empty(3)
     ray = np.empty(RAY_SIZE)
     for r in range(rays.shape[0]):
-        put(rays[r], ray[:6])
+        copy_values(rays[r], ray[:6])
         ray[6:] = 0.0
         status[r] = TRACED
         for step in range(n_surfaces + 2):
-            # Elements in the order light meets them: surfaces and stop, then retina.
+            # Elements in the order of propagation.
             e = n_surfaces + 1 - step if reverse else step
             if reverse and step == 0:
                 code = TRACED  # the ray starts on the retina
@@ -107,7 +112,9 @@ def trace_bundle(packed, indices, rays, reverse, points, directions, paths, stat
                 if packed[i, NEAR_GRADIENT] != 0.0:
                     before = i if reverse else i - 1
                     behind = i - 1 if reverse else i
-                    code = meet_gradient(packed, indices, i, ray, before, behind, sag)
+                    code = cross_gradient_surface(
+                        packed, indices, i, ray, before, behind, sag
+                    )
                 elif reverse:
                     code = cross_surface(packed, i, ray, inner, outer, sag)
                 else:
@@ -123,6 +130,6 @@ def trace_bundle(packed, indices, rays, reverse, points, directions, paths, stat
                     directions[r, e:] = math.nan
                     paths[r, e:] = math.nan
                 break
-            put(ray, points[r, e])
-            put(ray[3:], directions[r, e])
+            copy_values(ray, points[r, e])
+            copy_values(ray[3:], directions[r, e])
             paths[r, e] = ray[6]

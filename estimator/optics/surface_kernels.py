@@ -1,8 +1,8 @@
 """Compiled: intersection of a ray with one packed surface, and refraction there.
 
-A ray is an array of 8: position (mm), direction cosines, optical path (mm), and the
-distance since the last refracting surface (mm).  Everything is float64, releases the
-GIL and starts no threads.  `packed` describes the arrays.
+A ray is an array of 8: position (mm), direction cosines, optical path length (mm) and
+distance from the last refracting surface (mm).  The functions work in float64, release
+the GIL and start no threads.  `packed` describes the arrays.
 """
 
 import math
@@ -27,10 +27,10 @@ from estimator.optics.packed import (
 )
 
 TRACED = 0
-MISSED = 1  # no intersection with the surface's vertex sheet
+MISSED = 1  # no intersection with the sheet through the vertex
 CLIPPED = 2  # outside the clear radius
 TOTAL_REFLECTION = 3
-OUT_OF_ORDER = 4  # surfaces cross there: the next one lies behind the ray
+OUT_OF_ORDER = 4  # surfaces cross: the next one lies behind the ray
 NOT_CONVERGED = 5
 
 RAY_SIZE = 8
@@ -44,27 +44,27 @@ _INFINITE = math.inf
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def put(source, to):
-    """Copy (n,) numbers; a slice assignment takes 3 s longer to compile.
+def copy_values(source, target):
+    """Copy (n,) numbers.
 
-    (Numba compiles an error message in case the shapes differ.)
+    A slice assignment takes 3 s longer to compile, for numba's check of the shapes.
     """
-    for i in range(to.shape[0]):
-        to[i] = source[i]
+    for i in range(target.shape[0]):
+        target[i] = source[i]
 
 
 @njit(nogil=True, error_model="numpy")
 def _no_sag(_packed, _i, _x, _y, out):
-    """Report an unknown form, which only a stale numba cache can meet."""
+    """Return an error for an unknown form, which only a stale numba cache has."""
     out[:] = math.nan
     return False
 
 
 def _chained(code, first, rest):
-    """Return a compiled function that runs ``first`` for a form's code, or ``rest``.
+    """Return a compiled function that calls ``first`` for a form code, else ``rest``.
 
-    It is not cached: numba keys closures by the functions they enclose, which differ in
-    every process.  The loops that call it are cached with it inside.
+    It is not cached: numba's key of a closure includes the functions it captures, which
+    differ in every process.  The cached loops that call it contain its code.
     """
 
     @njit(nogil=True, error_model="numpy")
@@ -83,7 +83,10 @@ for _place, _form in reversed(list(enumerate(FORMS))):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sag(packed, i, x, y, out):
-    """Write sag and gradient (z, zx, zy) of an iterated form; return False outside."""
+    """Write the sag and its gradient (z, zx, zy) of a form without a closed solution.
+
+    Return False outside the domain of the form.
+    """
     form = packed[i, FORM]
     if form < FIRST_FORM:
         inside = biconic_sag(packed, i, x, y, out)
@@ -98,10 +101,10 @@ def _sag(packed, i, x, y, out):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _conic_distance(c, k, x, y, z, dx, dy, dz):
-    """Return the distance to the vertex sheet of a conic of revolution; nan if none.
+    """Return the distance to a conic of revolution; nan without an intersection.
 
-    Of the two roots, the one that tends to the plane's as the curvature vanishes; for a
-    ray inside a closed retina it is the far one.
+    Of the two roots, it is the one that becomes that of the plane as the curvature
+    vanishes.  For a ray inside a closed retina, this is the farther one.
     """
     a = c * (1.0 + k * dz * dz)
     b = c * (x * dx + y * dy + (1.0 + k) * z * dz) - dz
@@ -115,7 +118,7 @@ def _conic_distance(c, k, x, y, z, dx, dy, dz):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _iterated_distance(packed, i, x, y, z, dx, dy, dz, sag):
-    """Return the distance to an iterated form; nan outside, inf if not converged."""
+    """Return the distance by Newton's method; nan outside, inf if not converged."""
     c = 0.5 * (packed[i, CURVATURE_X] + packed[i, CURVATURE_Y])
     t = _conic_distance(c, packed[i, CONIC], x, y, z, dx, dy, dz)
     if t != t:
@@ -133,7 +136,7 @@ def _iterated_distance(packed, i, x, y, z, dx, dy, dz, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def to_surface_axes(packed, i, x, y, z):
-    """Return a vector of the eye in the axes of a surface."""
+    """Rotate a vector from the eye's axes to those of a surface."""
     return (
         packed[i, ROTATION] * x
         + packed[i, ROTATION + 3] * y
@@ -149,7 +152,7 @@ def to_surface_axes(packed, i, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def to_eye_axes(packed, i, x, y, z):
-    """Return a vector of a surface in the axes of the eye."""
+    """Rotate a vector from the axes of a surface to the eye's."""
     return (
         packed[i, ROTATION] * x
         + packed[i, ROTATION + 1] * y
@@ -165,9 +168,9 @@ def to_eye_axes(packed, i, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def straight_distance(packed, i, ray, sag):
-    """Return the distance of a ray to one surface along a straight line.
+    """Return the distance of a ray to a surface along a straight line.
 
-    nan where it misses the vertex sheet, inf where the iteration does not converge.
+    It is nan if the ray misses the surface and inf if the iteration does not converge.
     """
     x, y, z = (
         ray[0] - packed[i, VERTEX],
@@ -186,9 +189,9 @@ def straight_distance(packed, i, ray, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cross_surface(packed, i, ray, n_from, n_to, sag):
-    """Trace a ray to one surface, refract it there and return its status.
+    """Trace a ray to a surface, refract it and return its status.
 
-    Equal indices leave its direction unchanged.  ``sag`` is a scratch array of 3.
+    Equal indices leave the direction unchanged.  ``sag`` is a scratch array of 3.
     """
     x, y, z = (
         ray[0] - packed[i, VERTEX],
@@ -196,8 +199,8 @@ def cross_surface(packed, i, ray, n_from, n_to, sag):
         ray[2] - packed[i, VERTEX + 2],
     )
     dx, dy, dz = ray[3], ray[4], ray[5]
-    turned = packed[i, IS_TURNED] != 0.0
-    if turned:
+    rotated = packed[i, IS_TURNED] != 0.0
+    if rotated:
         x, y, z = to_surface_axes(packed, i, x, y, z)
         dx, dy, dz = to_surface_axes(packed, i, dx, dy, dz)
     revolved = packed[i, FORM] == REVOLVED
@@ -229,13 +232,15 @@ def cross_surface(packed, i, ray, n_from, n_to, sag):
         squared = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
         if squared < 0.0:
             return TOTAL_REFLECTION
-        push = (math.copysign(math.sqrt(squared), cosine) - ratio * cosine) * inverse
+        normal_factor = (
+            math.copysign(math.sqrt(squared), cosine) - ratio * cosine
+        ) * inverse
         dx, dy, dz = (
-            ratio * dx + push * gx,
-            ratio * dy + push * gy,
-            ratio * dz + push * gz,
+            ratio * dx + normal_factor * gx,
+            ratio * dy + normal_factor * gy,
+            ratio * dz + normal_factor * gz,
         )
-    if turned:
+    if rotated:
         x, y, z = to_eye_axes(packed, i, x, y, z)
         dx, dy, dz = to_eye_axes(packed, i, dx, dy, dz)
     ray[0], ray[1], ray[2] = (

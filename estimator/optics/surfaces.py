@@ -1,8 +1,8 @@
 """Surfaces of an eye, and the packed float64 array that compiled code traces through.
 
-An eye consists of refracting surfaces from the anterior cornea inward, a stop plane, a
-retina and the media between them.  Its frame has the origin at the corneal apex, x to
-the person's right, y up, z into the eye.
+An eye consists of refracting surfaces, from the anterior cornea inward, a stop plane, a
+retina, and the media between them.  Its frame has its origin at the corneal apex, x to
+the person's right, y up and z into the eye.
 """
 
 import math
@@ -51,7 +51,7 @@ from estimator.optics.zernike import (
 )
 
 OFFSET_RADIUS_MM = 6.2
-"""Circle of the corneal offset terms (half of the 12.4 mm of the paper's model)."""
+"""Radius of the circle of the corneal offset terms: half of the paper's 12.4 mm."""
 
 MAX_SURFACES = 20
 
@@ -60,16 +60,17 @@ MAX_STEPS = 1000
 INDEX_LIMITS = (1.0, 5.0)
 
 STOP_TOLERANCE_MM = 1e-6
-"""A surface whose vertex lies in the stop plane comes after the stop."""
+"""Tolerance within which a vertex counts as in the stop plane, and thus behind it."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """One refracting surface.
+    """A refracting surface.
 
-    z = (x²/Rx + y²/Ry) / (1 + sqrt(1 - (1+k)(x²/Rx² + y²/Ry²))) + offset, in axes that
-    originate at the vertex, rotated by ``rotation_deg`` about the surface's own axis,
-    then by ``tilt_deg`` about the eye's x, then y axis (right-handed).
+    The sag is z = (x²/Rx + y²/Ry) / (1 + sqrt(1 - (1+k)(x²/Rx² + y²/Ry²))) + offset, in
+    axes with their origin at the vertex.  They are rotated (right-handed) by
+    ``rotation_deg`` about the axis of the surface, then by ``tilt_deg`` about the eye's
+    x and y axes.
 
     Attributes
     ----------
@@ -82,16 +83,18 @@ class Surface:
         Position of the vertex.
     medium_after : str
         Medium behind the surface.
-    rotation_deg, decentration_mm, tilt_deg
-        Orientation and position; the vertex is at (decentration_mm, z_mm).
+    rotation_deg : float
+    decentration_mm : (x, y)
+        Position of the vertex across the axis.
+    tilt_deg : (about x, about y)
     offset_mm : (28,) or None
         Unnormalized Zernike terms (OSA order) added to the sag, mm.
     offset_radius_mm : float
-        Circle of the offset terms.
+        Radius of the circle of the offset terms.
     clear_radius_mm : float
-        Distance from the surface's axis beyond which rays are clipped.
+        Distance from the axis of the surface beyond which rays are clipped.
     form : Form or None
-        A form of `forms` that replaces the biconic; offset terms still add to it.
+        Form that replaces the biconic; offset terms are added to it.
     """
 
     radius_mm: tuple[float, float]
@@ -109,11 +112,16 @@ class Surface:
 
 @dataclass(frozen=True)
 class Retina:
-    """The retina: a conic, concave toward the lens.
+    """The retina: a conic or biconic, concave toward the lens.
 
-    ``radius_mm`` is one radius or (Rx, Ry); its sign is ignored, because no retina
-    bulges inward.  ``z_mm`` is the position of its pole.  The other attributes are
-    those of `Surface`.
+    Attributes
+    ----------
+    radius_mm : float or (Rx, Ry)
+        Radii; their sign is ignored.
+    z_mm : float
+        Position of the posterior pole.
+    conic_constant, rotation_deg, decentration_mm, tilt_deg, form
+        See `Surface`.
     """
 
     radius_mm: float | tuple[float, float]
@@ -127,20 +135,20 @@ class Retina:
 
 @dataclass(frozen=True)
 class EyeSurfaces:
-    """An eye ready to trace.
+    """Geometry and media of an eye.
 
     Attributes
     ----------
     surfaces : tuple of Surface
-        In the order light meets them.
+        Refracting surfaces, from the anterior cornea inward.
     stop_z_mm : float
-        Plane of the iris; its opening is a circle about the z axis.
+        Position of the stop plane, whose aperture is a circle about the z axis.
     retina : Retina
     indices : mapping or None
-        Constant refractive indices by medium; None uses the dispersion of `media`.
+        Constant refractive indices by medium.
     media : mapping or None
-        Dispersions and gradients by medium; other media have the dispersion of
-        `media`.
+        Dispersions and gradients by medium.  Media in neither mapping have the
+        dispersion of `optics.media`.
     """
 
     surfaces: tuple[Surface, ...]
@@ -152,9 +160,9 @@ class EyeSurfaces:
 
 @cache
 def horner_order() -> NDArray[np.int64]:
-    """Return positions in ``EXPONENTS`` of the monomials in the order of Horner's rule.
+    """Return the indices (28,) in ``EXPONENTS`` of monomials in Horner's order.
 
-    Powers of y fall from 6 to 0, and within each the powers of x.
+    Powers of y descend from 6 to 0 and, for each of them, the powers of x.
     """
     position = {tuple(e): t for t, e in enumerate(EXPONENTS.tolist())}
     return np.array(
@@ -179,13 +187,14 @@ def _unnormalized_monomials() -> NDArray[np.float64]:
 def offset_monomials(
     offset_mm: ArrayLike, *, offset_radius_mm: ArrayLike
 ) -> NDArray[Any]:
-    """Return coefficients (..., 28) of x^a y^b, mm, in Horner's order, of offset terms.
+    """Return the monomial coefficients (..., 28) of offset terms, in Horner's order.
 
     Parameters
     ----------
-    offset_mm : (..., 28), mm
+    offset_mm : (..., 28)
         Unnormalized Zernike terms, index = j.
-    offset_radius_mm : (...), mm
+    offset_radius_mm : (...)
+        Radius of their circle.
     """
     degree: NDArray[np.int64] = EXPONENTS.sum(axis=1)
     radius_mm = np.asarray(offset_radius_mm, dtype=np.float64)[..., None]
@@ -196,7 +205,10 @@ def offset_monomials(
 def rotation_matrix(
     *, rotation_deg: float, tilt_deg: tuple[float, float]
 ) -> NDArray[Any]:
-    """Return the rotation (3, 3) from surface to eye axes: about z, then x, then y."""
+    """Return the rotation matrix (3, 3) from the axes of a surface to the eye's.
+
+    The rotations are about z, then x, then y.
+    """
 
     def turn(angle_deg: float, i: int, j: int) -> NDArray[np.float64]:
         matrix = np.eye(3)
@@ -264,10 +276,10 @@ def pack_eye(eye: EyeSurfaces) -> NDArray[np.float64]:
     Returns
     -------
     packed : (n_surfaces + 1, N_COLUMNS)
-        One row per refracting surface, then the retina; the columns are those of
-        `packed`.  Refractive indices are passed separately (`media_indices`), because
-        one geometry serves many wavelengths.  Eyes with the same number of surfaces
-        and the same gradients stack to (n_eyes, n_surfaces + 1, N_COLUMNS).
+        One row per refracting surface, then one for the retina; `packed` lists the
+        columns.  Refractive indices are separate (`media_indices`), because they change
+        with wavelength.  Eyes with the same number of surfaces and the same gradients
+        can be stacked to (n_eyes, n_surfaces + 1, N_COLUMNS).
     """
     packed = np.zeros((len(eye.surfaces) + 1, N_COLUMNS))
     for surface, row in zip(eye.surfaces, packed, strict=False):
@@ -291,11 +303,11 @@ def pack_eye(eye: EyeSurfaces) -> NDArray[np.float64]:
 
 
 GRADIENT_LAYOUT_NM = 555.0
-"""A wavelength to count the numbers of a gradient, the same at every wavelength."""
+"""Wavelength at which the parameters of a gradient are counted; any would do."""
 
 
 def _gradients(eye: EyeSurfaces) -> list[tuple[int, Gradient]]:
-    """Return the gradients behind surfaces, with the surface's number."""
+    """Return the gradient-index media, each with the index of the surface in front."""
     media = eye.media
     if not media:
         return []
@@ -328,13 +340,14 @@ def _check_indices(indices: NDArray[np.float64], names: list[str]) -> None:
 def media_indices(eye: EyeSurfaces, wavelength_nm: ArrayLike) -> NDArray[np.float64]:
     """Return the index rows (..., n) of an eye at wavelengths (...).
 
-    The first n_surfaces + 1 numbers are indices: air, then behind each surface, of a
-    gradient at the vertex of the surface.  The numbers of the gradients follow.
+    The first n_surfaces + 1 columns are the refractive indices of air and of the medium
+    behind each surface (of a gradient, at the vertex).  The parameters of the gradients
+    follow.
 
     Raises
     ------
     ValueError
-        An unknown medium, a wavelength outside its range, or an index below 1.
+        A medium is unknown, or a wavelength or an index is out of range.
     """
     wavelength_nm = np.asarray(wavelength_nm, dtype=np.float64)
     gradients = _gradients(eye)
@@ -369,12 +382,12 @@ def media_indices(eye: EyeSurfaces, wavelength_nm: ArrayLike) -> NDArray[np.floa
 
 
 def check_eye(eye: EyeSurfaces) -> None:
-    """Raise if an eye cannot be traced at all.
+    """Check the geometry of an eye.
 
     Raises
     ------
     ValueError
-        Names the surface and the invalid value.
+        The eye cannot be traced; the message names the surface and the invalid value.
     """
     if not 1 <= len(eye.surfaces) <= MAX_SURFACES:
         raise ValueError(
@@ -383,11 +396,15 @@ def check_eye(eye: EyeSurfaces) -> None:
     depths_mm = [s.z_mm for s in eye.surfaces]
     for i, surface in enumerate(eye.surfaces):
         if 0.0 in surface.radius_mm or not all(r == r for r in surface.radius_mm):
-            raise ValueError(f"surfaces[{i}].radius_mm {surface.radius_mm}: not 0")
+            raise ValueError(
+                f"surfaces[{i}].radius_mm {surface.radius_mm}: must not be 0 or nan"
+            )
         if not math.isfinite(surface.conic_constant + surface.z_mm):
             raise ValueError(f"surfaces[{i}]: conic constant and z must be finite")
         if surface.offset_radius_mm <= 0.0 or surface.clear_radius_mm <= 0.0:
-            raise ValueError(f"surfaces[{i}]: radii of circles must be positive")
+            raise ValueError(
+                f"surfaces[{i}]: offset_radius_mm and clear_radius_mm must be positive"
+            )
         _check_form(surface.form, f"surfaces[{i}].form")
         if i and surface.z_mm < depths_mm[i - 1]:
             raise ValueError(
@@ -405,7 +422,7 @@ def check_eye(eye: EyeSurfaces) -> None:
             f"({depths_mm[-1]:g} mm)"
         )
     if not np.all(np.asarray(eye.retina.radius_mm, dtype=float)):
-        raise ValueError(f"retina.radius_mm {eye.retina.radius_mm}: not 0")
+        raise ValueError(f"retina.radius_mm {eye.retina.radius_mm}: must not be 0")
     _check_form(eye.retina.form, "retina.form")
     if eye.media:
         _check_gradients(eye)
@@ -425,7 +442,7 @@ def _check_form(form: Form | None, name: str) -> None:
 
 
 def _check_gradients(eye: EyeSurfaces) -> None:
-    """Raise where the stop lies in a gradient, or an index is out of range."""
+    """Check the position and the index of the gradient-index media."""
     depths_mm = [*(s.z_mm for s in eye.surfaces), eye.retina.z_mm]
     n_before = sum(z < eye.stop_z_mm - STOP_TOLERANCE_MM for z in depths_mm[:-1])
     for i, gradient in _gradients(eye):

@@ -1,4 +1,4 @@
-"""Unit conversions and reference wavelengths; every conversion goes through here."""
+"""Unit conversions and reference wavelengths."""
 
 import math
 
@@ -11,7 +11,7 @@ REFERENCE_WAVELENGTH_NM = 555.0
 """Wavelength at which accommodation and pupil sizes are defined (CONVENTIONS.md)."""
 
 RGB_WAVELENGTHS_NM = (618.0, 536.0, 453.0)
-"""Single wavelengths that best represent the primaries of common displays, see
+"""Wavelengths that represent the primaries of common displays; see
 `filter_service.displays`."""
 
 SPHERE_PER_C20 = 4.0 * math.sqrt(3.0)

@@ -1,8 +1,8 @@
-"""The entrance pupil as the reference plane of distances, pupils and wavefronts.
+"""Object distances and vergences in the plane of the entrance pupil.
 
-Instruments and prescriptions refer to the cornea, and spectacles are in front of it.
-Pupil sizes and camera distances refer to the entrance pupil: there light of any
-distance d fills the same pupil and adds the vergence d to the eye's refraction.
+Instruments and prescriptions refer to the cornea.  Pupil diameters and object distances
+refer to the entrance pupil: light from d dpt fills the same pupil for every d and adds
+the vergence d to the refraction.
 """
 
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ from estimator.optics.prescription import Prescription, power_at_cornea_dpt
 from estimator.optics.units import MM_PER_M
 
 TYPICAL_ENTRANCE_PUPIL_MM = 3.05
-"""Depth of the entrance pupil behind the corneal apex in a schematic eye, used where
-only a measured wavefront is given."""
+"""Depth of the entrance pupil behind the corneal apex in a schematic eye, for profiles
+that consist of a measured wavefront only."""
 
 
 @dataclass(frozen=True)
 class ObjectVergence:
-    """Vergence of light from a distance minus that from infinity: s d / (1 + o d).
+    """Vergence of light from d dpt minus that from infinity: s d / (1 + o d).
 
-    Distances are from the entrance pupil, vergences are in its plane.
+    Distances are from the entrance pupil; vergences are in its plane.
 
     Attributes
     ----------
@@ -39,17 +39,20 @@ class ObjectVergence:
     def seen_through(
         cls, correction: Prescription | None, *, entrance_pupil_mm: float
     ) -> "ObjectVergence":
-        """Return the object vergence of an eye with its correction.
-
-        A thin lens of power F, at L in front of the entrance pupil, converts the
-        vergence -u of light at it to (F - u) / (1 - L (F - u)) in the pupil.  Minus
-        that of u = 0 this is u / ((1 - L F) (1 - L F + L u)): with minus lenses near
-        objects require less.  The power is the mean of both meridians.
+        """Return the object vergence through a correction.
 
         Parameters
         ----------
+        correction : Prescription or None
         entrance_pupil_mm : float
-            Depth behind the corneal apex.
+            Depth of the entrance pupil behind the corneal apex.
+
+        Notes
+        -----
+        A thin lens of power F at a distance L in front of the entrance pupil converts
+        the vergence -u at the lens to (F - u) / (1 - L (F - u)) in the pupil.  The
+        difference from u = 0 is u / ((1 - L F) (1 - L F + L u)).  F is the spherical
+        equivalent.
         """
         if correction is None:
             return cls()
@@ -63,7 +66,7 @@ class ObjectVergence:
     @overload
     def vergence_dpt(self, object_dpt: NDArray[Any]) -> NDArray[Any]: ...
     def vergence_dpt(self, object_dpt: float | NDArray[Any]) -> float | NDArray[Any]:
-        """Return the vergence of light from an object's distance."""
+        """Return the vergence (...) of light from object distances (...), dpt."""
         return self.scale_ratio * object_dpt / (1.0 + self.offset_m * object_dpt)
 
     @overload
@@ -71,7 +74,7 @@ class ObjectVergence:
     @overload
     def object_dpt(self, vergence_dpt: NDArray[Any]) -> NDArray[Any]: ...
     def object_dpt(self, vergence_dpt: float | NDArray[Any]) -> float | NDArray[Any]:
-        """Return the distance whose light has the given vergence."""
+        """Return the object distances (...), dpt, of light with vergences (...)."""
         return vergence_dpt / (self.scale_ratio - self.offset_m * vergence_dpt)
 
 

@@ -1,8 +1,8 @@
-"""Zernike circle polynomials up to radial order 6, OSA/ANSI index and normalization.
+"""Zernike circle polynomials to radial order 6, with OSA/ANSI index and normalization.
 
-Every set is an array of 28 coefficients in um, index = j, piston first, and is passed
-with the radius of its circle.  Evaluation uses monomials x^a y^b, so gradients and
-pupil rescaling are exact and share one table.
+Coefficients are arrays of 28 in um, index = j, element 0 is piston; the radius of their
+circle is a separate argument.  Values, gradients and rescaled coefficients are computed
+from monomials x^a y^b, without approximation.
 """
 
 import math
@@ -26,7 +26,13 @@ EXPONENTS: NDArray[np.int64] = np.array(
 
 
 def nm_from_index(index: int) -> tuple[int, int]:
-    """Return radial order n and frequency m of OSA/ANSI index j (j = 0 is piston)."""
+    """Return the radial order n and azimuthal frequency m of OSA/ANSI index j.
+
+    Raises
+    ------
+    ValueError
+        The index is negative.
+    """
     if index < 0:
         raise ValueError(f"Zernike index {index}: must be 0 or more")
     n = math.ceil((-3.0 + math.sqrt(9.0 + 8.0 * index)) / 2.0)
@@ -34,7 +40,13 @@ def nm_from_index(index: int) -> tuple[int, int]:
 
 
 def index_from_nm(n: int, m: int) -> int:
-    """Return the OSA/ANSI index j = (n(n+2)+m)/2; n >= |m| with n - |m| even."""
+    """Return the OSA/ANSI index j = (n(n+2)+m)/2.
+
+    Raises
+    ------
+    ValueError
+        There is no such term: n >= |m| is required, with n - |m| even.
+    """
     if n < 0 or abs(m) > n or (n - abs(m)) % 2:
         raise ValueError(f"Zernike term ({n},{m}): needs n >= |m| >= 0, n - |m| even")
     return (n * (n + 2) + m) // 2
@@ -81,8 +93,9 @@ def monomial_matrix() -> NDArray[np.float64]:
     Returns
     -------
     matrix : (28, 28)
-        ``matrix[j, t]`` multiplies ``x**a * y**b`` with ``(a, b) = EXPONENTS[t]``;
-        ``zernike_um @ matrix`` are the monomial coefficients of a wavefront.
+        ``matrix[j, t]`` is the coefficient of ``x**a * y**b`` in Z_j, with
+        ``(a, b) = EXPONENTS[t]``; ``zernike_um @ matrix`` are the monomial coefficients
+        of a wavefront.
     """
     column = {tuple(e): t for t, e in enumerate(EXPONENTS.tolist())}
     matrix = np.zeros((N_TERMS, N_TERMS))
@@ -101,7 +114,10 @@ def monomial_matrix() -> NDArray[np.float64]:
 
 
 def wavefront_polynomial(zernike_um: ArrayLike) -> NDArray[np.float64]:
-    """Return monomial coefficients (..., 28), um, of W = sum C_j Z_j, unit circle."""
+    """Return the monomial coefficients (..., 28), um, of W on the unit circle.
+
+    W is the sum of C_j Z_j over coefficients (..., 28), um.
+    """
     return np.asarray(zernike_um, dtype=np.float64) @ monomial_matrix()
 
 
@@ -146,22 +162,26 @@ def zernike_gradient(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
 
 
 def rescale_pupil(zernike_um: ArrayLike, *, radius_ratio: ArrayLike) -> NDArray[Any]:
-    """Return coefficients of the same wavefront on a concentric circle.
+    """Return the coefficients of a wavefront on a concentric circle.
 
     Parameters
     ----------
     zernike_um : (..., 28), um
     radius_ratio : (...)
-        New radius over old.  The algebra is exact for any ratio; above 1 it
-        extrapolates a measurement, which callers must not do silently.
+        New radius over old one.  Ratios above 1 extrapolate the wavefront.
 
     Returns
     -------
     zernike_um : (..., 28), um
 
+    Raises
+    ------
+    ValueError
+        A ratio is not positive.
+
     Notes
     -----
-    Equals the closed form of Dai 2006 to 1e-12 (tests/numerical/test_zernike.py).
+    The result agrees with the closed form of Dai (2006) to 1e-12.
     """
     ratio = np.asarray(radius_ratio, dtype=np.float64)
     if not np.all(ratio > 0):
@@ -179,12 +199,15 @@ def _horizontal_parity() -> NDArray[np.float64]:
 
 
 def flip_horizontal(zernike_um: ArrayLike) -> NDArray[np.float64]:
-    """Mirror x: examiner's frame to eye frame and back, or OD to OS (um in, um out)."""
+    """Mirror coefficients (..., 28) in x.
+
+    This converts between the examiner's and the eye's frame, and between OD and OS.
+    """
     return np.asarray(zernike_um, dtype=np.float64) * _horizontal_parity()
 
 
 def remove_central_tilt(zernike_um: ArrayLike) -> NDArray[np.float64]:
-    """Set C(1,±1) so that the slope at the pupil center is zero."""
+    """Return coefficients (..., 28) with C(1,±1) such that W has zero slope at 0."""
     zernike_um = np.array(zernike_um, dtype=np.float64)
     slope = zernike_gradient(0.0, 0.0)
     for row, j in ((0, index_from_nm(1, 1)), (1, index_from_nm(1, -1))):

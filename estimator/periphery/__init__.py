@@ -1,9 +1,13 @@
-"""Measured changes of people's wavefronts from the axis to the periphery.
+"""Change of wavefronts from the axis to the periphery in measured eyes.
 
-meridian         extension of the horizontal meridian to the visual field
-people           measured people, all as right eyes
-population       their mean and covariance
+meridian         extension from the horizontal meridian to the visual field
+measured_eyes    data of measured eyes, all as right eyes
+population       mean and covariance of these data
 change           change of one eye, conditioned on its axis and other measurements
+
+The *change* is the wavefront in a direction minus that on the axis: terms 3 to 14 on a
+circle of 4 mm about the chief ray, at the cornea.  It is stored at *knots*, azimuths of
+the horizontal meridian.
 """
 
 import lazy_loader

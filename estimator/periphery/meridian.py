@@ -1,13 +1,14 @@
-"""Extension of wavefronts along the horizontal meridian to the whole visual field.
+"""Extension of wavefronts from the horizontal meridian to the whole visual field.
 
-People were measured along the horizontal meridian.  A nearly rotationally symmetric eye
-seen along its own axis (angle alpha) has aberrations whose form around that axis is
-known (nodal theory: Thompson, JOSA A 22, 2005): defocus is proportional to |H|²,
-astigmatism to the complex H², coma to H, with H = h + iv; a shifted axis adds H to the
-first two.  So terms even along the meridian rotate with one multiple of the azimuth,
-odd ones with another.  For five people measured over +-40 x 25 deg (Polans 2015), this
-is as accurate as the mean of the other four; separate vertical terms, fitted to those
-four, bring no improvement.
+Eyes were measured along the horizontal meridian.  About the symmetry axis of a nearly
+rotationally symmetric eye (angle alpha), nodal aberration theory (Thompson, JOSA A 22,
+2005) gives the dependence on direction H = h + iv: defocus is proportional to |H|²,
+astigmatism to H² and coma to H.  A shift of the axis adds terms in H to the first two.
+Terms that are even along the meridian therefore rotate with one multiple of the
+azimuth, and odd terms with another.
+
+For five eyes measured over +-40 x 25 deg (Polans 2015), this is as accurate as the mean
+of the other four.  Separate vertical terms, fitted to those four, are no improvement.
 """
 
 from functools import cache
@@ -20,18 +21,18 @@ TERMS = tuple(range(3, 15))
 """OSA indices of the measured terms: orders 2 to 4."""
 
 CIRCLE_MM = 2.0
-"""Radius of the circle on which they are given."""
+"""Radius of the circle of the coefficients."""
 
 KNOTS_DEG = (-40.0, -30.0, -20.0, -10.0, 10.0, 20.0, 30.0, 40.0)
-"""Azimuths h of the knots at which a right eye's change from the axis is stored."""
+"""Azimuths h of the knots, in a right eye."""
 
 MEASURED_DEG = 40.0
-"""Largest measured angle; the slope there fades beyond it."""
+"""Largest measured angle; beyond it, the slope decays exponentially."""
 
 FADE_DEG = 15.0
 
-_SPINS = (
-    # cosine and sine term, multiples of the azimuth of the parts even and odd along it
+_AZIMUTHAL_ORDERS = (
+    # cosine term, sine term, azimuthal order of the even part and of the odd part
     (4, None, 0, 1),
     (5, 3, 2, 1),
     (8, 7, 0, 1),
@@ -65,19 +66,19 @@ def field_terms(
 ) -> NDArray[np.float64]:
     """Return terms (n, 12) at directions (n,) from those at the knots (12, 8).
 
-    This is the product of `field_matrix` and the knots, in a tenth of the time: most of
-    the matrix is zero.
+    The result is the product of `field_matrix` and the knots, in a tenth of the time,
+    because most of the matrix is zero.
     """
     h_deg, v_deg = np.broadcast_arrays(np.atleast_1d(h_deg), np.atleast_1d(v_deg))
     angle_deg, azimuth = np.hypot(h_deg, v_deg), np.arctan2(v_deg, h_deg)
     right, left = (meridian_weights(a) @ knots.T for a in (angle_deg, -angle_deg))
     parts = 0.5 * (right + left), 0.5 * (right - left)
     found = np.zeros((h_deg.size, len(TERMS)))
-    turned = [(np.cos(k * azimuth), np.sin(k * azimuth)) for k in range(3)]
-    for cosine, sine, *turns in _SPINS:
+    rotations = [(np.cos(k * azimuth), np.sin(k * azimuth)) for k in range(3)]
+    for cosine, sine, *orders in _AZIMUTHAL_ORDERS:
         c, s = TERMS.index(cosine), None if sine is None else TERMS.index(sine)
-        for part, turn in zip(parts, turns, strict=True):
-            cos, sin = turned[turn]
+        for part, order in zip(parts, orders, strict=True):
+            cos, sin = rotations[order]
             found[:, c] += cos * part[:, c]
             if s is not None:
                 found[:, c] -= sin * part[:, s]
@@ -91,11 +92,11 @@ def field_matrix(h_deg: ArrayLike, v_deg: ArrayLike) -> NDArray[np.float64]:
     angle_deg, azimuth = np.hypot(h_deg, v_deg), np.arctan2(v_deg, h_deg)
     right, left = meridian_weights(angle_deg), meridian_weights(-angle_deg)
     matrix = np.zeros((h_deg.size, len(TERMS), len(TERMS), len(KNOTS_DEG)))
-    for cosine, sine, *turns in _SPINS:
+    for cosine, sine, *orders in _AZIMUTHAL_ORDERS:
         parts = (0.5 * (right + left), 0.5 * (right - left))
-        for part, turn in zip(parts, turns, strict=True):
-            along = np.cos(turn * azimuth)[:, None] * part
-            across = np.sin(turn * azimuth)[:, None] * part
+        for part, order in zip(parts, orders, strict=True):
+            along = np.cos(order * azimuth)[:, None] * part
+            across = np.sin(order * azimuth)[:, None] * part
             c = TERMS.index(cosine)
             matrix[:, c, c] += along
             if sine is not None:

@@ -1,10 +1,11 @@
-"""Mean and covariance of people's wavefronts, on the axis and along the meridian.
+"""Mean and covariance of wavefronts on the axis and along the horizontal meridian.
 
-There are few people and many variables.  The periphery is predicted from the axis by
-ridge regression, with a smaller penalty on the sphere than on other terms, and each
-prediction is shrunk by the fraction that chance explains (James and Stein).  The
-residual has a covariance, which is shrunk as well.  The penalties and shrinkages are
-those that best predict people left out, at no angle worse than their sphere alone.
+There are few eyes and many variables.  The periphery is predicted from the axis by
+ridge regression, with a smaller penalty on the sphere than on other terms.  Each
+prediction is shrunk by the fraction that chance explains (James and Stein), and so is
+the covariance of the residuals.  Penalties and shrinkage factors are those with the
+smallest cross-validation error that, at every angle, do not predict worse than the
+sphere alone.
 """
 
 import json
@@ -16,36 +17,36 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.periphery.measured_eyes import MeasuredEyes, knots_um
 from estimator.periphery.meridian import KNOTS_DEG, TERMS
-from estimator.periphery.people import People, knots_um
 
 POPULATION_FILE = Path(__file__).parent / "population.json"
 
-PLACES = 1 + len(KNOTS_DEG)
-"""Number of places of each term: the axis and the knots."""
+N_PLACES = 1 + len(KNOTS_DEG)
+"""Number of positions of each term: the axis and the knots."""
 
 SPHERE_RIDGE, OTHER_RIDGE = 20.0, 400.0
 """Penalties of the regression on standardized terms of the axis."""
 
-SAME_SHARE, OTHER_SHARE = 0.95, 0.5
-"""Shrinkage factors of covariances between angles of one term, and between terms; on
-the axis all terms count as one."""
+SAME_TERM_SHRINKAGE, OTHER_TERM_SHRINKAGE = 0.95, 0.5
+"""Shrinkage factors of covariances between angles of one term, and between terms.  On
+the axis, the first is used between all terms."""
 
-ROUNDS = 15
-"""Rounds of expectation and maximization: some people were not measured everywhere."""
+EM_ITERATIONS = 15
+"""Iterations of expectation and maximization, for eyes with missing directions."""
 
 RIDGE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class Population:
-    """Normal distribution of (12 terms, 9 places), the axis first.
+    """Normal distribution of 12 terms at 9 positions, the axis first.
 
     Attributes
     ----------
     mean_um, deviation_um : (12, 9)
     correlation_ratio : (108, 108)
-        Correlations, in C order of terms and places.
+        Correlations, in C order of terms and positions.
     """
 
     mean_um: NDArray[np.float64]
@@ -53,28 +54,30 @@ class Population:
     correlation_ratio: NDArray[np.float64]
 
     @classmethod
-    def of(cls, people: People) -> "Population":
-        """Fit the population of measured people; omit those without an axis."""
-        has_axis = np.isfinite(people.axis_um).all(axis=-1)
-        people = people.of(cast("NDArray[np.bool_]", has_axis))
-        axis_um = people.axis_um
+    def fit(cls, eyes: MeasuredEyes) -> "Population":
+        """Fit the distribution to measured eyes; those without an axis are omitted."""
+        has_axis = np.isfinite(eyes.axis_um).all(axis=-1)
+        eyes = eyes.select(cast("NDArray[np.bool_]", has_axis))
+        axis_um = eyes.axis_um
         away_um = axis_um - axis_um.mean(axis=0)
-        changes_um = knots_um(people).reshape(len(axis_um), -1)
-        slopes, mean_um = _regressed(away_um, changes_um)
+        changes_um = knots_um(eyes).reshape(len(axis_um), -1)
+        slopes, mean_um = _ridge_regression(away_um, changes_um)
         axis_um2 = away_um.T @ away_um / len(away_um)
-        axis_um2 *= np.where(np.eye(len(TERMS), dtype=bool), 1.0, SAME_SHARE)
-        rest_um2 = _rest_um2(changes_um - mean_um - away_um @ slopes.T)
+        axis_um2 *= np.where(np.eye(len(TERMS), dtype=bool), 1.0, SAME_TERM_SHRINKAGE)
+        residual_um2 = _residual_covariance_um2(
+            changes_um - mean_um - away_um @ slopes.T
+        )
         covariance_um2 = np.block(
             [
                 [axis_um2, axis_um2 @ slopes.T],
-                [slopes @ axis_um2, slopes @ axis_um2 @ slopes.T + rest_um2],
+                [slopes @ axis_um2, slopes @ axis_um2 @ slopes.T + residual_um2],
             ]
         )
         order = _by_terms()
         covariance_um2 = covariance_um2[np.ix_(order, order)]
         deviation_um = np.sqrt(np.diag(covariance_um2))
         mean_um = np.concatenate([axis_um.mean(axis=0), mean_um])[order]
-        shape = (len(TERMS), PLACES)
+        shape = (len(TERMS), N_PLACES)
         return cls(
             mean_um.reshape(shape),
             deviation_um.reshape(shape),
@@ -94,8 +97,8 @@ class Population:
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> "Population":
-        """Build from the result of `to_json`."""
-        size = len(TERMS) * PLACES
+        """Return the population of a result of `to_json`."""
+        size = len(TERMS) * N_PLACES
         correlation = np.zeros((size, size))
         for k, row in enumerate(data["correlation"]):
             correlation[k, : k + 1] = correlation[: k + 1, k] = row
@@ -117,16 +120,16 @@ def _rounded(values: NDArray[np.float64]) -> list[Any]:
 
 
 def _by_terms() -> NDArray[np.int64]:
-    """Return indices (108,) that sort axis and knots by terms and places."""
+    """Return indices (108,) that sort axis and knots by terms and positions."""
     axis = np.arange(len(TERMS))[:, None]
     knots = len(TERMS) + np.arange(len(TERMS) * len(KNOTS_DEG))
     return np.concatenate([axis, knots.reshape(len(TERMS), -1)], axis=1).ravel()
 
 
-def _regressed(
+def _ridge_regression(
     axis_um: NDArray[np.float64], changes_um: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return slopes (96, 12) over the centered axis (n, 12), and values (96,) there."""
+    """Return slopes (96, 12) and intercepts (96,) over the centered axis (n, 12)."""
     deviation_um = axis_um.std(axis=0)
     penalty = np.full(len(TERMS), OTHER_RIDGE)
     penalty[TERMS.index(4)] = SPHERE_RIDGE
@@ -139,37 +142,37 @@ def _regressed(
         square = inputs.T @ inputs
         ridge = np.linalg.inv(square + np.diag(penalty))
         weights = ridge @ inputs.T @ targets
-        left = float(np.mean((targets - inputs @ weights) ** 2))
-        explained = max(float(np.mean(targets**2)) - left, 1e-12)
+        residual = float(np.mean((targets - inputs @ weights) ** 2))
+        explained = max(float(np.mean(targets**2)) - residual, 1e-12)
         freedom = float(np.trace(ridge @ square)) / known.sum()
-        weights *= max(1.0 - freedom * left / explained, 0.0)
+        weights *= max(1.0 - freedom * residual / explained, 0.0)
         slopes[k] = weights / deviation_um
         mean_um.append(column[known].mean() - center @ weights)
     return slopes, np.array(mean_um)
 
 
-def _rest_um2(rest_um: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the covariance (96, 96) of regression residuals (n, 96) with gaps."""
-    deviation_um = np.nanstd(rest_um, axis=0)
-    covariance = _fitted(rest_um / deviation_um)
+def _residual_covariance_um2(residual_um: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the covariance (96, 96) of residuals (n, 96), some of them missing."""
+    deviation_um = np.nanstd(residual_um, axis=0)
+    covariance = _shrunk_covariance(residual_um / deviation_um)
     return covariance * np.outer(deviation_um, deviation_um)
 
 
-def _fitted(units: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the shrunk covariance (96, 96) about 0 of rows with gaps."""
-    covariance, share = np.eye(units.shape[1]), _believed()
-    for _ in range(ROUNDS):
-        filled, spread = _expected(units, covariance)
-        covariance = (filled.T @ filled + spread) / len(units) * share
+def _shrunk_covariance(units: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the shrunk covariance (96, 96) about 0 of rows with missing values."""
+    covariance, shrinkage = np.eye(units.shape[1]), _shrinkage()
+    for _ in range(EM_ITERATIONS):
+        filled, imputed_covariance = _imputed(units, covariance)
+        covariance = (filled.T @ filled + imputed_covariance) / len(units) * shrinkage
         covariance += RIDGE * np.eye(len(covariance))
     return covariance
 
 
-def _expected(
+def _imputed(
     units: NDArray[Any], covariance: NDArray[Any]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return rows with their gaps filled in, and the filled values' covariance."""
-    filled, spread = units.copy(), np.zeros_like(covariance)
+    """Return rows with imputed missing values, and the covariance of these values."""
+    filled, imputed_covariance = units.copy(), np.zeros_like(covariance)
     for row in filled:
         gap = np.isnan(row)
         if not gap.any():
@@ -179,15 +182,16 @@ def _expected(
             covariance[np.ix_(known, known)], covariance[np.ix_(known, gap)]
         ).T
         row[gap] = gain @ row[known]
-        spread[np.ix_(gap, gap)] += (
+        imputed_covariance[np.ix_(gap, gap)] += (
             covariance[np.ix_(gap, gap)] - gain @ covariance[np.ix_(known, gap)]
         )
-    return filled, spread
+    return filled, imputed_covariance
 
 
-def _believed() -> NDArray[np.float64]:
-    """Return the shrinkage (96, 96) of sample covariances, which keeps their signs."""
+def _shrinkage() -> NDArray[np.float64]:
+    """Return the shrinkage factors (96, 96) of sample covariances."""
     term = np.repeat(np.arange(len(TERMS)), len(KNOTS_DEG))
-    share = np.where(term[:, None] == term, SAME_SHARE, OTHER_SHARE)
-    np.fill_diagonal(share, 1.0)
-    return share
+    is_same = term[:, None] == term
+    shrinkage = np.where(is_same, SAME_TERM_SHRINKAGE, OTHER_TERM_SHRINKAGE)
+    np.fill_diagonal(shrinkage, 1.0)
+    return shrinkage

@@ -1,15 +1,20 @@
 """Eye profiles: prescriptions, measurements and eye models.
 
 bodies               types of the profile object: fields, ranges, defaults
+given_bodies         the same for eyes given by their surfaces, and all bodies
 correction_bodies    the same for corrections
-surface_bodies       the same for eyes by surfaces, their forms and media
+surface_bodies       the same for surfaces, their forms and media
+implant_bodies       the same for implants and biometry
 validation           conversion of plain data to these types, and its errors
 parse                from a typed profile to an `EyeProfile`
 correction           from a typed correction to a lens
+given_eyes           from a typed profile to an eye given by its surfaces
 surfaces             from typed surfaces to an eye
+pseudophakic         from biometry and an implant to an eye
 published            schematic eyes from the literature with their sources
 reference            JSON Schema, tables and limits of the typed profiles
-files                .json, .abp and .csv profiles, and presets by name
+files                .json, .abp, .csv and .zmx profiles, and eyes by name
+lens_files           eyes in Zemax and optiland files
 presets.json         the six presets
 measured_wavefront   a measurement used in closed form, without an eye model
 typical_aberrations  higher-order aberrations added to a prescription, by age

@@ -4,3 +4,4 @@ from .parse import EyeProfile as EyeProfile
 from .parse import Measurement as Measurement
 from .parse import parse_profile as parse_profile
 from .parse import preset_names as preset_names
+from .parse import published_names as published_names

@@ -215,6 +215,11 @@ def preset_names() -> tuple[str, ...]:
     return tuple(bodies.PRESETS)
 
 
+def published_names() -> tuple[str, ...]:
+    """Return the names accepted by ``{"kind": "published", "name": ...}``."""
+    return bodies.PUBLISHED_NAMES
+
+
 def _preset(body: bodies.PresetBody, data: Mapping[str, Any]) -> EyeProfile:
     own = {name: value for name, value in data.items() if name != "kind"}
     return _zernike(convert({**bodies.PRESETS[body.name], **own}, bodies.ZernikeBody))

@@ -49,8 +49,8 @@ INTRODUCTIONS: dict[type[msgspec.Struct], str] = {
     "every surface.",
     surface_bodies.SurfaceBody: "Each entry of `surfaces`.",
     surface_bodies.StateBody: "Each entry of `states`.",
-    given_bodies.PseudophakicBody: "Kind `pseudophakic`: an eye with an intraocular lens by "
-    "its geometry.",
+    given_bodies.PseudophakicBody: "Kind `pseudophakic`: an eye with an intraocular "
+    "lens by its geometry.",
     implant_bodies.ImplantBody: "`implant`.",
     given_bodies.PublishedBody: "Kind `published`: a schematic eye by its name.",
 }

@@ -1,20 +1,29 @@
-"""Point-spread functions of wavefronts, each by the method that is valid for it.
+"""Point-spread functions (PSFs) of wavefronts, by wave optics or ray optics.
 
-compute            entry point: many PSFs at once
+compute            entry point: many PSFs in one call
 arguments          argument checks
-kernel_types       finished kernels and their buffers
-pupil              the pupil's ellipse as a unit disc
-survey             pre-pass: slopes, curvatures and sizes
-switch             choice of waves or rays, by predicted error
+kernel_types       result type, kernel buffer, kernel disc
+pupil              pupils in pixel coordinates
+survey             wavefront slopes and kernel radii, before any PSF is computed
+switch             choice of wave or ray optics, by predicted error
 fourier            wave optics by FFT
 fourier_kernels    its compiled loops
-geometric          ray optics with Fresnel's edge
+geometric          ray optics plus diffraction at the edge of the pupil
 geometric_kernels  its compiled loops
-enz                the extended Nijboer-Zernike series
-enz_series         its coefficients
-tail               mean light far outside the spot
-stiles_crawford    the eye's apodization
-screens            rings in the pupil, of lenses with several foci
+enz                wave optics by the extended Nijboer-Zernike series
+enz_series         functions and coefficients of the series
+tail               mean diffracted light far outside the geometric spot
+stiles_crawford    Stiles-Crawford apodization
+screens            complex amplitude of multifocal lenses, tabulated
+
+Terms:
+
+- A *kernel* is a PSF integrated over pixels, ``[y, x]`` in image orientation, with unit
+  sum, on the disc dx² + dy² <= (R + 0.5)² px².  Its center is the chief ray.
+- The *pitch* is the visual angle of a pixel, mrad; in general, it is a Jacobian.
+- A *grid* has the angular samples of a wave-optical PSF, a whole number per pixel.
+- *t* are pupil coordinates in um/px, in which pixels are unit squares; see `pupil`.
+- A *slope* is the gradient of W in t: the position of that point's ray, px.
 """
 
 import lazy_loader

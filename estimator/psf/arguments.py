@@ -1,4 +1,7 @@
-"""Argument checks of the PSF engines; each returns one canonical form."""
+"""Argument checks of the PSF engines; each returns the argument in canonical form.
+
+They raise ValueError with the name of the argument, its value and the allowed range.
+"""
 
 import math
 from collections.abc import Collection
@@ -17,12 +20,12 @@ def checked_zernike_um(zernike_um: ArrayLike) -> NDArray[np.float64]:
     if array.ndim != 2 or array.shape[1] != N_TERMS:
         raise ValueError(f"zernike_um has shape {array.shape}: must be (P, {N_TERMS})")
     if not np.all(np.isfinite(array)):
-        raise ValueError("zernike_um holds NaN or infinite coefficients")
+        raise ValueError("zernike_um: must be finite, got NaN or infinite coefficients")
     return array
 
 
 def checked_positive(name: str, values: ArrayLike, count: int) -> NDArray[np.float64]:
-    """Return a scalar or (P,) of positive numbers as (P,)."""
+    """Return positive numbers, scalar or (P,), as (P,)."""
     array = np.asarray(values, dtype=np.float64)
     if array.ndim > 1 or (array.ndim == 1 and array.size not in (1, count)):
         raise ValueError(
@@ -44,7 +47,7 @@ def checked_scale(
 ) -> NDArray[np.float64]:
     """Return Jacobians (P, 2, 2) from either a pixel pitch or Jacobians."""
     if (pixel_pitch_mrad is None) == (pixel_from_mrad is None):
-        raise ValueError("give either pixel_pitch_mrad or pixel_from_mrad")
+        raise ValueError("expected either pixel_pitch_mrad or pixel_from_mrad")
     if pixel_from_mrad is None:
         try:
             pitch = np.broadcast_to(np.asarray(pixel_pitch_mrad, np.float64), (2,))
@@ -73,9 +76,10 @@ def checked_scale(
 def checked_ellipse(
     pupil_ellipse: ArrayLike | None, circle_radius_mm: NDArray[np.float64]
 ) -> NDArray[np.float64] | None:
-    """Return ellipses (P, 5) within their circles to 2 % of the radius, or None.
+    """Return ellipses (P, 5), or None.
 
-    An ellipse fitted to a rim bulges slightly beyond the rim's circumscribed circle.
+    They may extend beyond their circles by 2 % of the radius, because an ellipse fitted
+    to a rim does so slightly.
     """
     if pupil_ellipse is None:
         return None

@@ -1,8 +1,4 @@
-"""Point-spread functions of wavefronts, each by the method that is valid for it.
-
-Takes wavefronts of the eye (`zernike_um`) and returns pixel-integrated kernels for the
-PSF store.  `render_passes.py` is the slow float64 ground truth.
-"""
+"""Pixel-integrated point-spread functions of wavefronts, each by a suitable method."""
 
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
@@ -21,7 +17,7 @@ from estimator.psf.arguments import (
     checked_scale,
     checked_zernike_um,
 )
-from estimator.psf.enz import RELEASED_DEGREE, EnzOutsideDomain, enz_kernels
+from estimator.psf.enz import PAPER_DEGREE, EnzOutsideDomain, enz_kernels
 from estimator.psf.fourier import FourierAccuracy, fourier_kernels
 from estimator.psf.geometric import geometric_kernels
 from estimator.psf.kernel_types import (
@@ -71,22 +67,24 @@ ACCURACY = {
 
 MIN_ENERGY_RATIO = 0.999
 
-EDGE_LIGHT_TRUSTED = 0.03
-"""Share up to which the edge-light formula is more accurate than a kernel's sum."""
+MAX_FORMULA_LIGHT = 0.03
+"""Share of the light up to which the edge-light formula is more accurate than the sum
+of a kernel."""
 
 
 @dataclass(frozen=True)
 class PsfBatch:
-    """P point-spread functions with concatenated kernels; items are `Psf`.
+    """P point-spread functions with concatenated kernels; its items are `Psf`.
 
     Attributes
     ----------
     flat_kernels : (total,) float32
-        PSF p fills (2R+1)² elements from ``offset_count[p]``, row-major.
+        PSF p has (2R+1)² elements from ``offset_count[p]`` on, row-major.
     offset_count, radius_px : (P,) int64
     lost_energy_ratio, blur_radius_px : (P,)
+        See `Psf`.
     geometric_ratio : (P,)
-        Share of ray optics: 0 is ``wave_method``, 1 "geometric".
+        Weight of ray optics: 0 is ``wave_method``, 1 is "geometric".
     wave_method : str
         "fourier", "enz" or "enz_unchecked".
     """
@@ -105,27 +103,27 @@ class PsfBatch:
     def __getitem__(self, index: int) -> Psf:
         radius = int(self.radius_px[index])
         start, side = int(self.offset_count[index]), 2 * radius + 1
-        words = {0.0: self.wave_method, 1.0: "geometric"}
-        share = float(self.geometric_ratio[index])
+        methods = {0.0: self.wave_method, 1.0: "geometric"}
+        weight = float(self.geometric_ratio[index])
         return Psf(
             kernel=self.flat_kernels[start : start + side * side].reshape(side, side),
             radius_px=radius,
             lost_energy_ratio=float(self.lost_energy_ratio[index]),
-            method=words.get(share, f"{self.wave_method}+geometric"),
+            method=methods.get(weight, f"{self.wave_method}+geometric"),
             blur_radius_px=float(self.blur_radius_px[index]),
         )
 
 
 @dataclass(frozen=True)
 class PsfPlan:
-    """Survey, radii and methods of P kernels, known before any is computed.
+    """Radii and methods of P kernels, chosen before any kernel is computed.
 
     Attributes
     ----------
     survey : PupilSurvey
     radius_px : (P,) int64
     geometric_ratio : (P,)
-        Share of ray optics in each.
+        Weight of ray optics in each kernel.
     """
 
     survey: PupilSurvey
@@ -170,11 +168,20 @@ def finished_batch(
     method: str,
     first: int = 0,
 ) -> PsfBatch:
-    """Return the batch with each kernel's lost light; raise if a kernel is dark.
+    """Return the batch, with the share of the light that each kernel omits.
 
-    ``first`` is the index of PSF 0 in the call.  The lost light comes from a closed
-    form while it is small; a kernel's own sum has the method's energy error of a few
-    1e-3.
+    While this share is small, it is computed in closed form: the sum of a kernel has an
+    error of a few 1e-3, from the method.
+
+    Parameters
+    ----------
+    first : int
+        Index of PSF 0 in the call, for the message.
+
+    Raises
+    ------
+    ValueError
+        No light falls in a kernel.
     """
     dark = np.flatnonzero(~(output.total_ratio > 0.0))
     if dark.size:
@@ -186,7 +193,7 @@ def finished_batch(
     lost = 1.0 - output.total_ratio
     if diffraction:
         outside = edge_light_outside(survey, radius_px=output.radius_px)
-        lost = np.where(outside < EDGE_LIGHT_TRUSTED, outside, lost)
+        lost = np.where(outside < MAX_FORMULA_LIGHT, outside, lost)
     return PsfBatch(
         flat_kernels=output.flat_kernels,
         offset_count=output.offset_count,
@@ -214,7 +221,10 @@ def plan_psfs(
     max_radius_px: int = 255,
     min_energy_ratio: float = MIN_ENERGY_RATIO,
 ) -> PsfPlan:
-    """Check the arguments of `compute_psf_batch` and choose all radii and methods."""
+    """Check arguments, and choose the radius and method of each PSF.
+
+    The arguments are those of `compute_psf_batch`.
+    """
     zernike_um = checked_zernike_um(zernike_um)
     count = zernike_um.shape[0]
     checked_choice("method", method, METHODS)
@@ -228,8 +238,8 @@ def plan_psfs(
         method not in ("auto", "fourier") or not diffraction
     ):
         raise ValueError(
-            f"method {method!r}, diffraction {diffraction}: rings in the pupil are "
-            "known to 'fourier' alone, with diffraction"
+            f"method {method!r}, diffraction {diffraction}: pupil_screen requires "
+            "'fourier' with diffraction"
         )
     pixel_from_mrad = checked_scale(pixel_pitch_mrad, pixel_from_mrad, count)
     ellipse = checked_ellipse(pupil_ellipse, circle_mm)
@@ -246,8 +256,8 @@ def plan_psfs(
         )
     )
     if pupil_screen is not None:
-        survey = survey.behind(
-            ScreenTables.of(
+        survey = survey.with_screen(
+            ScreenTables.from_screen(
                 pupil_screen,
                 half_width_um_per_px=survey.frames.half_width_um_per_px,
                 pixel_from_mrad=pixel_from_mrad,
@@ -284,7 +294,7 @@ def compute_psf_batch(
     radius_px: int | None = None,
     method: str = "auto",
     accuracy: str = "normal",
-    enz_degree: int = RELEASED_DEGREE,
+    enz_degree: int = PAPER_DEGREE,
     diffraction: bool = True,
     max_radius_px: int = 255,
     min_energy_ratio: float = MIN_ENERGY_RATIO,
@@ -295,42 +305,42 @@ def compute_psf_batch(
     Parameters
     ----------
     zernike_um : (P, 28), um
-        Wavefronts on circles of the given diameter; tilt moves the kernel, piston has
-        no effect.
-    pupil_diameter_mm, wavelength_nm : (P,) or scalar
-        Diameter of the circle of the coefficients, which is the pupil unless an
-        ellipse is given; wavelength.
+        Coefficients of the wavefronts.  Tilt shifts the kernel; piston has no effect.
+    pupil_diameter_mm : (P,) or scalar
+        Diameter of the circle of the coefficients, which is the pupil unless
+        ``pupil_ellipse`` is given.
+    wavelength_nm : (P,) or scalar
     pixel_pitch_mrad : (x, y) or scalar
-        Visual angle of a pixel; the alternative to ``pixel_from_mrad``.
+        Visual angle of a pixel.  Either this or ``pixel_from_mrad`` is required.
     pixel_from_mrad : (P, 2, 2) or (2, 2)
-        Jacobian of the image at each PSF's position: visual angle (x right, y up, in
-        the pupil axes of the field) to pixels (x right, y up), see `pinhole.py`.
+        Jacobian of the image at the position of each PSF, from visual angle (x right,
+        y up, in the pupil axes of the field) to pixels (x right, y up); see
+        `optics.pinhole`.
     pupil_ellipse : (P, 5) or (5,), optional
-        Pupil on the circle: center x, center y, semi-major and semi-minor axis in mm,
-        angle of the major axis in rad from x.  Only the ellipse passes light.
-        Default: the whole circle.
+        Pupil within the circle: center x, center y, semi-major and semi-minor axis in
+        mm, and angle of the major axis from x in rad.  The whole circle by default.
     stiles_crawford : StilesCrawford, optional
-        Directional sensitivity of the cones.
+        Apodization by the directional sensitivity of the cones.
     pupil_screen : PupilScreen, optional
-        Rings of a lens with several foci, in front of all pupils; wave method only.
+        Complex amplitude of a multifocal lens, for all pupils; wave optics only.
     radius_px : int, optional
-        Kernel radius of all PSFs; by default chosen for each.
-    method : "auto", "fourier", "geometric", "enz" or "enz_unchecked"
-        "auto" uses `switch.geometric_shares`.  "enz" raises outside the domain of its
-        series; "enz_unchecked" does not and serves only tables that show where the
-        series fails.
-    accuracy : "normal" or "fine"
-        Wave method: relative L2 error of at most 3e-2 or 1e-2.
+        Kernel radius of all PSFs; by default it is chosen for each.
+    method : {"auto", "fourier", "geometric", "enz", "enz_unchecked"}
+        "auto" uses `switch.geometric_shares`.  "enz" raises outside the domain of the
+        series; "enz_unchecked" does not, for tables that show where the series fails.
+    accuracy : {"normal", "fine"}
+        Relative L2 error of wave-optical PSFs: at most 3e-2 or 1e-2.
     enz_degree : int
-        Largest Zernike degree of "enz"; the default is the paper's.
+        Largest Zernike degree of the ENZ series; that of the paper by default.
     diffraction : bool
-        False: ray optics only; a perfect eye then gives exactly one pixel.
+        Whether to include diffraction.  Without it, the PSF of a perfect eye is exactly
+        one pixel.
     max_radius_px : int
-        Largest kernel radius; wider blur raises `PsfTooLarge`.  Light that only
-        diffraction sends farther is omitted and counted (`lost_energy_ratio`),
-        regardless of ``min_energy_ratio``.
+        Largest kernel radius; wider blur raises `PsfTooLarge`.  Light that diffraction
+        sends farther is omitted and counted in `lost_energy_ratio`, regardless of
+        ``min_energy_ratio``.
     min_energy_ratio : float
-        Least share of the light within a chosen radius.
+        Minimum share of the light within a chosen radius.
     workers : int, optional
         Number of threads; by default as many as the process may use.
 
@@ -345,12 +355,12 @@ def compute_psf_batch(
     EnzOutsideDomain
         The ENZ series of this degree cannot represent a wavefront.
     ValueError
-        Wrong shapes, values out of range, or no light inside a given radius.
+        A shape is wrong, a value is out of range, or no light is within a given radius.
 
     Notes
     -----
-    Pupil point u (mm, x to the person's right, y up) sends light to theta = grad W
-    (mrad): PSF(theta) = |int exp(2 pi i (W - theta.u) / lambda) du|².
+    A pupil point u (mm, x to the person's right, y up) sends light to the visual angle
+    theta = grad W (mrad): PSF(theta) = |int exp(2 pi i (W - theta.u) / lambda) du|².
     """
     checked_choice("accuracy", accuracy, ACCURACY)
     plan = plan_psfs(
@@ -389,6 +399,6 @@ def compute_psf_batch(
 
 
 def compute_psfs(zernike_um: ArrayLike, **options: Any) -> list[Psf]:
-    """Return point-spread functions of many wavefronts, see `compute_psf_batch`."""
+    """Return a list of point-spread functions; see `compute_psf_batch`."""
     batch = compute_psf_batch(zernike_um, **options)
-    return list(cast("Iterable[Psf]", batch))  # by its indices
+    return list(cast("Iterable[Psf]", batch))  # iterable by __getitem__

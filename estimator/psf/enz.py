@@ -1,10 +1,10 @@
 """PSFs by the extended Nijboer-Zernike (ENZ) series, within its domain.
 
-The method of Csoba & Kunkli 2023 (section 4): the pupil function is expanded in Zernike
-functions with complex coefficients beta, and every Zernike function has a known image
-V.  Signed defocus stays outside the expansion; tilt shifts the image.  The series needs
-Zernike degrees up to about 2 pi times the waves (peak to valley) of all other
-aberrations, so it suits good eyes and small pupils and raises an error elsewhere.
+The method is that of Csoba & Kunkli (2023), section 4.  The pupil function is expanded
+in Zernike functions with complex coefficients beta; the image of each Zernike function
+is V.  Defocus is part of V, and tilt shifts the image.  The series needs a Zernike
+degree of about 2 pi times the other aberrations (peak to valley, in waves), which is
+feasible for eyes with small aberrations and for small pupils.
 """
 
 import math
@@ -31,23 +31,24 @@ from estimator.psf.tail import add_tail
 if TYPE_CHECKING:
     from estimator.psf.pupil import PupilFrames
 
-RELEASED_DEGREE = 30
-"""Zernike degree of the paper's released program: 4.5 waves of non-defocus PV."""
+PAPER_DEGREE = 30
+"""Zernike degree of the program published with the paper: 4.5 waves PV."""
 
 MAX_DEGREE = 120
 MIN_CAPTURED_RATIO = 0.998
-"""Least share of the pupil's energy in the expansion: kernels then err by at most 2 %
-(L2), at 99 % by up to 6 % (the six presets, fields to 40 deg)."""
+"""Minimum share of the pupil's energy in the expansion.  The L2 error of kernels is
+then at most 2 %; with 99 % of the energy, it is up to 6 % (six presets, fields to 40
+deg)."""
 
 DEGREE_PER_WAVE = 2.0 * math.pi
-"""Degree per wave of PV that holds 99 % of the energy; measured 0.9 to 1.4 times it."""
+"""Degree per wave (PV) for 99 % of the energy; measured were 0.9 to 1.4 times this."""
 
 _RADIAL_STEPS = 32
-"""Samples of V per lambda / pupil radius; cubic interpolation errs by 4e-5."""
+"""Samples of V per lambda / pupil radius; cubic interpolation has an error of 4e-5."""
 
 
 class EnzOutsideDomain(ValueError):
-    """The aberrations need a higher Zernike degree than the series has.
+    """The aberrations require a higher Zernike degree than that of the series.
 
     Attributes
     ----------
@@ -57,12 +58,16 @@ class EnzOutsideDomain(ValueError):
     """
 
     def __init__(self, *, index: int, degree: int, needed: int, captured: float | None):
-        share = "" if captured is None else f" and hold {captured:.1%} of the pupil"
+        energy = (
+            ""
+            if captured is None
+            else f", which captures {captured:.1%} of the energy (required: "
+            f"{MIN_CAPTURED_RATIO:.1%})"
+        )
         super().__init__(
-            f"PSF {index} is outside the domain of the ENZ series: its non-defocus "
-            f"aberrations need Zernike degree {needed}{share}; degree {degree} is in "
-            f"use (at least {MIN_CAPTURED_RATIO:.1%} must be held): use the fourier or "
-            "auto method"
+            f"PSF {index} is outside the domain of the ENZ series: its aberrations "
+            f"require Zernike degree {needed}, got {degree}{energy}; use the method "
+            "fourier or auto"
         )
         self.index, self.degree_count = index, degree
         self.needed_degree_count = needed
@@ -78,7 +83,7 @@ def _intensities(
     per_r: int,
     out: NDArray[np.float64],
 ) -> None:
-    """Compute |U|² on a grid of pixel samples by cubic interpolation of the table.
+    """Compute |U|² on a grid, by cubic interpolation of the table.
 
     U = sum_m table_m(r) exp(i m phi) at q = qx (2,) x + qy (2,) y.
     """
@@ -115,7 +120,7 @@ def _intensities(
 
 
 class _Series:
-    """Series of one PSF: expansion, domain check and image on the pixel grid."""
+    """ENZ series of one PSF: expansion, domain check and pixel integration."""
 
     def __init__(self, survey: PupilSurvey, index: int, degree: int, is_checked: bool):
         frames = survey.frames
@@ -137,10 +142,10 @@ class _Series:
     def _log_amplitude(self, log_amplitude: NDArray[np.float64]) -> LogAmplitude | None:
         if not log_amplitude.any():
             return None
-        room = math.sqrt(1.0 - self.shear**2)
+        s = math.sqrt(1.0 - self.shear**2)
 
         def at(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-            y = self.shear * x + room * y
+            y = self.shear * x + s * y
             powers = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
             return powers @ log_amplitude
 
@@ -153,20 +158,20 @@ class _Series:
         x, y = rho * np.cos(angle), rho * np.sin(angle)
         waves = zernike_values(x, y) @ self.residual_um / self.wavelength_um
         self.needed = math.ceil(DEGREE_PER_WAVE * float(np.ptp(waves)))
-        far = {"index": self.index, "degree": self.degree, "needed": self.needed}
+        domain = {"index": self.index, "degree": self.degree, "needed": self.needed}
         if is_checked and self.needed > 1.4 * self.degree:
-            raise EnzOutsideDomain(**far, captured=None)
+            raise EnzOutsideDomain(**domain, captured=None)
         betas = zernike_betas(
             self.residual_um,
             wavelength_um=self.wavelength_um,
             degree=self.degree,
             log_amplitude=self._log_amplitude(frames.log_amplitude[self.index]),
         )
-        held = sum(float((np.abs(b) ** 2).sum()) for b in betas.values())
-        held /= float(self.survey.passed_ratio[self.index])
-        if is_checked and held < MIN_CAPTURED_RATIO:
-            far["needed"] = max(self.needed, self.degree + 1)
-            raise EnzOutsideDomain(**far, captured=held)
+        captured = sum(float((np.abs(b) ** 2).sum()) for b in betas.values())
+        captured /= float(self.survey.passed_ratio[self.index])
+        if is_checked and captured < MIN_CAPTURED_RATIO:
+            domain["needed"] = max(self.needed, self.degree + 1)
+            raise EnzOutsideDomain(**domain, captured=captured)
         return betas
 
     def _radial_table(self, reach: float) -> NDArray[np.complex128]:
@@ -189,7 +194,10 @@ class _Series:
         return table
 
     def kernel(self, radius: int, accuracy: FourierAccuracy) -> NDArray[np.float32]:
-        """Return shares of the light (2R+1, 2R+1); beyond a window, the edge light."""
+        """Return the kernel (2R+1, 2R+1), in shares of the light.
+
+        Outside the window of the series, it has the mean edge light.
+        """
         survey, p = self.survey, slice(self.index, self.index + 1)
         plan = plan_grids(
             extent_px=survey.extent_px[p], unit_px=survey.unit_px[p], accuracy=accuracy
@@ -222,11 +230,11 @@ class _Series:
     def _intensity(
         self, x_px: NDArray[np.float64], y_px: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the share of the light per sample-pixel area on a grid of points."""
-        room = math.sqrt(1.0 - self.shear**2)
+        """Return the share of the light per pixel area at points of a grid."""
+        s = math.sqrt(1.0 - self.shear**2)
         # q = T^T p / lambda, t = T w with T lower triangular.
         qx = np.array([self.half[0], 0.0]) / self.wavelength_um
-        qy = np.array([self.shear, room]) * self.half[1] / self.wavelength_um
+        qy = np.array([self.shear, s]) * self.half[1] / self.wavelength_um
         # Tilt moves the image: p - T^-T shift.
         shift_y = self.shift[1] / qy[1]
         shift_x = (self.shift[0] - qy[0] * shift_y) / qx[0]
@@ -234,7 +242,7 @@ class _Series:
         far = np.abs(x).max() * np.hypot(*qx) + np.abs(y).max() * np.hypot(*qy)
         out = np.empty((y.size, x.size))
         _intensities(qx, qy, x, y, self._radial_table(float(far)), _RADIAL_STEPS, out)
-        area = math.pi * self.half[0] * self.half[1] * room
+        area = math.pi * self.half[0] * self.half[1] * s
         passed = float(self.survey.passed_ratio[self.index])
         light: NDArray[np.float64] = out * area / self.wavelength_um**2 / passed
         return light
@@ -248,7 +256,7 @@ def _reach(samples_per_px: int) -> int:
 
 
 def _filter_matrix(n_px: int, samples_per_px: int) -> NDArray[np.float64]:
-    """Return weights (pixels, samples) that average samples 1/k px apart by pixel."""
+    """Return weights (pixels, samples) that average samples 1/k px apart per pixel."""
     weights = pixel_filter(samples_per_px, _FILTER_REACH) / samples_per_px
     matrix = np.zeros((n_px, (n_px - 1) * samples_per_px + weights.size))
     for q in range(n_px):
@@ -276,13 +284,16 @@ def enz_kernels(
     degree : int
         Largest Zernike degree of the expansion.
     is_checked : bool
-        False skips the domain check; only for tables that show where the series fails.
+        Whether to check the domain of the series.
     accuracy, output, pool
-        As in `fourier.fourier_kernels`.
+        See `fourier.fourier_kernels`.
 
     Raises
     ------
     EnzOutsideDomain
+        A wavefront is outside the domain.
+    ValueError
+        The degree is out of range.
     """
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"enz_degree {degree}: must be 0 to {MAX_DEGREE}")

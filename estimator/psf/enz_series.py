@@ -1,13 +1,18 @@
 """Functions and coefficients of the extended Nijboer-Zernike (ENZ) series.
 
-V_n^m is the image of a Zernike function through a defocused lens; beta_n^m are the
-coefficients of a pupil function.  `enz.py` computes PSFs from them.
+V_n^m is the image of a Zernike function, with defocus; beta_n^m are the coefficients of
+a pupil function:
+
+    V_n^|m|(r, f) = int_0^1 exp(i f rho²) R_n^|m|(rho) J_|m|(2 pi r rho) rho drho
+
+It is computed by Gauss-Legendre quadrature.  The Bessel-Bessel series of Braat et al.
+(2008) is the same integral with exp(i f rho²) expanded by Bauer's formula; it needs
+f/2 + 15 terms, a table of weights, and separate limits at r = 0 and f = 0.
 """
 
 import math
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -21,7 +26,7 @@ LogAmplitude = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.f
 
 
 def radial_polynomial(n: int, m: int, rho: ArrayLike) -> NDArray[np.float64]:
-    """Return Zernike's R_n^|m| by the Jacobi recurrence, which is stable at any n."""
+    """Return R_n^|m| by the recurrence of Jacobi polynomials, stable at any n."""
     m, rho = abs(m), np.asarray(rho, np.float64)
     values: NDArray[np.float64] = rho**m * eval_jacobi(
         (n - m) // 2, 0, m, 2.0 * rho**2 - 1.0
@@ -30,12 +35,12 @@ def radial_polynomial(n: int, m: int, rho: ArrayLike) -> NDArray[np.float64]:
 
 
 _UPWARD_FROM = 50.0
-"""Argument from which J_0 and J_1 are computed by Hankel's expansion, to 1e-15."""
+"""Argument above which J_0 and J_1 are computed by Hankel's expansion, to 1e-15."""
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
 def _hankel_asymptotic(order: int, x: float) -> float:
-    """Return J_order(x) for order 0 or 1 and large x."""
+    """Return J_order(x) for an order of 0 or 1 and large x."""
     term, even, odd = 1.0, 1.0, 0.0
     for k in range(1, 13):
         term *= (4.0 * order * order - (2.0 * k - 1.0) ** 2) / (8.0 * k * x)
@@ -51,9 +56,10 @@ def _hankel_asymptotic(order: int, x: float) -> float:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
 def _bessel_orders(x: float, count: int, out: NDArray[np.float64]) -> None:
-    """Compute J_0 .. J_(count-1) at x >= 0 by the stable recurrence.
+    """Compute J_0 .. J_(count-1) at x >= 0 by a stable recurrence.
 
-    Upward for orders below the argument, Miller's downward recurrence elsewhere.
+    It is the upward one for orders below the argument, and Miller's downward one
+    otherwise.
     """
     out[:count] = 0.0
     if x > max(_UPWARD_FROM, count + 1.0):
@@ -103,46 +109,22 @@ def hankel_table(
                 out[q, m + top] += weighted[g, m + top] * bessel[abs(m)]
 
 
-def enz_function(n: int, m: int, r: ArrayLike, defocus_rad: float) -> NDArray[Any]:
-    """Evaluate V_n^|m|(r, f), the image of a Zernike function.
-
-    V_n^|m|(r, f) = int_0^1 exp(i f rho²) R_n^|m|(rho) J_|m|(2 pi r rho) rho drho.
-
-    Parameters
-    ----------
-    r : (k,)
-        Image radius in lambda / pupil radius (lambda / NA), 0 included.
-    defocus_rad : float
-        f, signed; at 0, V is (-1)^((n-|m|)/2) J_(n+1)(2 pi r) / (2 pi r).
-
-    Returns
-    -------
-    V : (k,) complex128
-
-    Notes
-    -----
-    Gauss-Legendre quadrature.  The Bessel-Bessel series of Braat et al. 2008 is the
-    same integral with exp(i f rho²) expanded by Bauer's formula; it needs f/2 + 15
-    terms, a table of weights, and separate limits at r = 0 and f = 0.
-    """
-    r = np.atleast_1d(np.asarray(r, np.float64))
-    rho, weight = radial_nodes(n, abs(defocus_rad), float(r.max(initial=0.0)))
-    weighted = np.zeros((rho.size, 2 * abs(m) + 1), np.complex128)
-    weighted[:, -1] = (
-        weight * rho * np.exp(1j * defocus_rad * rho**2) * radial_polynomial(n, m, rho)
-    )
-    out = np.empty((r.size, weighted.shape[1]), np.complex128)
-    hankel_table(r, rho, weighted, out)
-    return out[:, -1]
-
-
 def radial_nodes(
     degree: int, defocus_rad: float, r: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return Gauss-Legendre nodes, weights on 0..1 for degree, defocus and radius."""
-    swing = defocus_rad + (degree + 2.0 * math.pi * r) / 2.0
-    count = math.ceil(swing / 2.0 + 3.0 * swing ** (1.0 / 3.0)) + 8
-    # Rounded up so that a few sets of nodes serve all PSFs.
+    """Return Gauss-Legendre nodes and weights on [0, 1] for V.
+
+    Parameters
+    ----------
+    degree : int
+    defocus_rad : float
+        Magnitude of f.
+    r : float
+        Largest image radius, in lambda / pupil radius.
+    """
+    phase_rad = defocus_rad + (degree + 2.0 * math.pi * r) / 2.0
+    count = math.ceil(phase_rad / 2.0 + 3.0 * phase_rad ** (1.0 / 3.0)) + 8
+    # Rounded up, so that PSFs share a few cached sets of nodes.
     node, weight = _legendre(32 * math.ceil(count / 32))
     return (node + 1.0) / 2.0, weight / 2.0
 
@@ -178,21 +160,28 @@ def zernike_betas(
     degree: int,
     log_amplitude: LogAmplitude | None = None,
 ) -> dict[int, NDArray[np.complex128]]:
-    """Return beta_n^m of the pupil function as {m: values for n = |m|, |m|+2 ...}.
+    """Return the coefficients beta of a pupil function.
 
     Parameters
     ----------
     zernike_um : (28,)
-        Coefficients on the unit disc; every term counts.
+        Coefficients on the unit disc, including piston, tilt and defocus.
+    wavelength_um : float
     degree : int
         Largest n.
     log_amplitude : callable, optional
-        Logarithm of the apodization at unit-disc points (x, y).
+        Logarithm of the apodization at points (x, y) of the unit disc.
+
+    Returns
+    -------
+    dict
+        Arrays of beta_n^m for n = |m|, |m| + 2, ..., by m.
 
     Notes
     -----
-    Projection by Gauss-Legendre times trapezoid, converged for any wavefront that the
-    degree can represent.  The sum of |beta|² is the share of the energy it holds.
+    The projection uses a Gauss-Legendre times a trapezoidal rule, which converges for
+    every wavefront that the degree can represent.  The sum of |beta|² is the captured
+    share of the energy.
     """
     n_nodes, n_angles = 2 * degree + 40, 4 * degree + 64
     rho, weight, radial = _basis(degree, n_nodes)

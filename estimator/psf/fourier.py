@@ -1,8 +1,8 @@
 """Wave-optical PSFs: one FFT per wavefront, integrated exactly over pixels.
 
-The angular sampling is an integer fraction of the pixel, so the integral over pixels
-is one short filter for all PSFs of a call.  The pupil's edge is low-passed, so its
-diffraction does not alias into the window.  float32 throughout.
+The angular samples per pixel are a whole number, so a short filter integrates over
+pixels.  The edge of the pupil is low-pass filtered, so that its diffracted light does
+not alias into the window.  All arithmetic is in float32.
 """
 
 import math
@@ -28,10 +28,11 @@ from estimator.psf.kernel_types import KernelBuffer
 from estimator.psf.survey import PupilSurvey
 
 MARGIN_PX = 1.6
-"""Least margin in pixels; it keeps the neighbors of the spot's pixels in the window.
+"""Minimum margin of the window, px: it contains the neighbors of the spot's pixels.
 
-With large pupils a pixel is 16 lambda/D wide and its neighbors hold up to 10 % of a
-sharp spot; the mean edge light is too inaccurate there (L2 7 % instead of 2 %).
+For large pupils, a pixel is 16 lambda/D wide, and its neighbors contain up to 10 % of
+the light of a sharp spot.  The mean edge light would be too inaccurate there: 7 % L2
+error instead of 2 %.
 """
 
 MAX_LENGTH = 4096
@@ -44,20 +45,20 @@ _CHUNK_SAMPLES = 1 << 17
 
 @dataclass(frozen=True)
 class FourierAccuracy:
-    """Sampling rule of one accuracy level.
+    """Sampling parameters of an accuracy level.
 
     Attributes
     ----------
     oversampling : float
-        Least field samples per lambda/D.  From 2 on the intensity is band-limited;
-        fewer suffice where a pixel holds many samples, because it then averages the
-        undersampled fringes.
+        Minimum number of angular samples per lambda/D.  With 2 or more, the intensity
+        is not aliased.  Fewer suffice if a pixel contains many samples, because it
+        averages the undersampled fringes.
     min_samples_per_px : int
-        Samples per pixel below which the oversampling rises, up to 2.
+        Samples per pixel below which the oversampling is increased, up to 2.
     margin : float
-        Margin of the window around the geometric spot, lambda/D on each side.
+        Margin of the window on each side of the geometric spot, lambda/D.
     filter_half_width : int
-        Reach of the pixel filter beyond the pixel, samples.
+        Extent of the pixel filter beyond the pixel, samples.
     """
 
     oversampling: float
@@ -68,7 +69,7 @@ class FourierAccuracy:
 
 @dataclass(frozen=True)
 class FourierPlan:
-    """Grids of M PSFs, x before y.
+    """Grids of M PSFs; columns are x and y.
 
     Attributes
     ----------
@@ -77,7 +78,7 @@ class FourierPlan:
     samples_per_px_count : (M, 2) int64
         Angular samples per pixel.
     pupil_samples : (M, 2)
-        Pupil samples across the bounding box, not integers.
+        Samples across the bounding box of the pupil, in general not integers.
     """
 
     length_count: NDArray[np.int64]
@@ -86,7 +87,10 @@ class FourierPlan:
 
 
 def _fast_lengths() -> NDArray[np.int64]:
-    """Return even 5-smooth lengths, measured within 20 % of powers of two in cost."""
+    """Return even 5-smooth FFT lengths.
+
+    Their cost per sample was measured to be within 20 % of that of powers of two.
+    """
     found = {
         2**a * 3**b * 5**c for a in range(2, 15) for b in range(6) for c in range(4)
     }
@@ -103,14 +107,22 @@ def plan_grids(
     accuracy: FourierAccuracy,
     lengths: NDArray[np.int64] = FAST_LENGTHS,
 ) -> FourierPlan:
-    """Return the smallest grids whose windows hold the spots (M, 2) and their margins.
+    """Return the smallest grids whose windows contain the spots and their margins.
 
-    ``lengths`` are the FFT lengths to choose from, ascending.
+    Parameters
+    ----------
+    extent_px : (M, 2)
+        Sides of the geometric spots.
+    unit_px : (M, 2)
+        lambda/D in pixels.
+    accuracy : FourierAccuracy
+    lengths : (n,) int64
+        Allowed FFT lengths, ascending.
 
     Raises
     ------
     ValueError
-        No length holds the window.
+        A window exceeds the largest length.
     """
     margin_px = np.maximum(accuracy.margin * unit_px, MARGIN_PX)
     window_px = extent_px + 2.0 * margin_px
@@ -135,11 +147,11 @@ def plan_grids(
 
 @lru_cache(maxsize=1)
 def edge_response() -> NDArray[np.float32]:
-    """Return the step response of a Kaiser-windowed sinc, at 1/256 sample.
+    """Return the step response of a Kaiser-windowed sinc, in steps of 1/256 sample.
 
-    Half width 8, beta 3.75: light from the pupil's edge is kept up to 0.43 of the
-    window and 40 dB down from 0.57 on, so hardly any aliases into the window.
-    Wider or less tapered edges measured no better.
+    With a half width of 8 and beta = 3.75, light from the edge of the pupil passes up
+    to 0.43 of the window and is attenuated by 40 dB from 0.57 on, so little of it
+    aliases.  Measurements with wider or less tapered windows were no better.
     """
     t: NDArray[Any] = np.arange(
         -EDGE_HALF_WIDTH * EDGE_STEPS, EDGE_HALF_WIDTH * EDGE_STEPS + 1
@@ -160,10 +172,10 @@ def edge_response() -> NDArray[np.float32]:
 def pixel_filter(samples_per_px: int, half_width: int) -> NDArray[np.float32]:
     """Return weights that integrate a band-limited intensity over one pixel.
 
-    Tap l stands for the sample at l - reach from the pixel's center,
-    reach = ceil(k/2) + half_width.  Exact weights of the sinc interpolation,
-    (Si(pi b) - Si(pi a)) / pi with a, b the distances to the pixel's edges, tapered
-    beyond the pixel; their sum is k, the pixel in samples.
+    Weight l is that of the sample at l - reach from the center of the pixel, with reach
+    = ceil(k/2) + half_width and k samples per pixel.  The weights are those of sinc
+    interpolation, (Si(pi b) - Si(pi a)) / pi for distances a and b to the edges of the
+    pixel, tapered outside the pixel.  Their sum is k.
     """
     reach = (samples_per_px + 1) // 2 + half_width
     t = np.arange(-reach, reach + 1)
@@ -180,7 +192,7 @@ def pixel_filter(samples_per_px: int, half_width: int) -> NDArray[np.float32]:
 def _filter_table(
     samples_per_px: NDArray[np.int64], half_width: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.int64]]:
-    """Return a plan's pixel filters: (n, longest) table, lengths and index (M, 2)."""
+    """Return pixel filters: table (n, longest), lengths (n,) and indices (M, 2)."""
     counts, which = np.unique(samples_per_px, return_inverse=True)
     filters = [pixel_filter(int(k), half_width) for k in counts]
     table = np.zeros((len(filters), max((f.size for f in filters), default=1)))
@@ -191,9 +203,9 @@ def _filter_table(
 
 
 def _chunks(plan: FourierPlan, shear: NDArray[Any]) -> list[NDArray[np.int64]]:
-    """Return members (indices into the plan) in batches of equal FFT lengths.
+    """Return indices into the plan, in batches of equal FFT lengths.
 
-    Equal pupils are adjacent, because they share their mask.
+    Equal pupils are adjacent, so that they share their mask.
     """
     keys = (*plan.pupil_samples.T, shear, *plan.length_count.T)
     order = np.lexsort(keys)
@@ -203,7 +215,7 @@ def _chunks(plan: FourierPlan, shear: NDArray[Any]) -> list[NDArray[np.int64]]:
     for group in np.split(order, ends):
         step = max(1, _CHUNK_SAMPLES // int(plan.length_count[group[0]].prod()))
         chunks += [group[i : i + step] for i in range(0, group.size, step)]
-    # Longest first, so that threads finish together.
+    # Longest first, so that threads finish at about the same time.
     return chunks[::-1]
 
 
@@ -231,9 +243,9 @@ class _Work:
             self.plan.length_count,
             np.ceil(self.plan.pupil_samples).astype(np.int64) + 2 * EDGE_HALF_WIDTH,
         )
-        # |sum|² (area of a pupil sample)² / (lambda² A) (angle of a sample)² is the
-        # share of the light in one angular sample; areas and angles multiply to
-        # lambda²/N², leaving 1/N² over the pupil's area A in samples.
+        # The share of the light in an angular sample is |sum|² (area of a pupil
+        # sample)² / (lambda² A) times (angle of a sample)².  The product of the areas
+        # and angles is lambda²/N², which leaves 1/(N² A) for A in samples.
         shear = survey.frames.shear_ratio[members]
         ellipse = math.pi / 4.0 * np.sqrt(1.0 - shear**2)
         area = ellipse * self.plan.pupil_samples.prod(axis=1)
@@ -246,7 +258,7 @@ class _Work:
     def _scratch(self, *shape: int) -> NDArray[np.complex64]:
         """Return zeros in memory that this thread reuses.
 
-        Page faults of fresh memory cost a third of the total time.
+        Page faults in newly allocated memory would take a third of the total time.
         """
         count = math.prod(shape)
         if getattr(self.local, "field", np.empty(0)).size < count:
@@ -277,7 +289,7 @@ class _Work:
         if self.survey.screen is not None:
             samples = self.plan.pupil_samples[part]
             self.survey.screen.apply(members, samples, size, field)
-        # In place; the rows below the pupil stay zero.
+        # In place; rows outside the pupil are zero.
         lit = field[:, : int(size[:, 1].max())]
         spectra = scipy.fft.fft(lit, axis=2, overwrite_x=True)
         if not np.may_share_memory(spectra, lit):

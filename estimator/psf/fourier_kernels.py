@@ -1,7 +1,7 @@
-"""Compiled inner loops of the wave method: pupil phase and pixel integration.
+"""Compiled inner loops of wave optics: pupil function and pixel integration.
 
-They release the GIL and are single-threaded, so callers may run them from any number
-of threads with any numba threading layer.
+They release the GIL and are single-threaded, so callers may run them in any number of
+threads, with any numba threading layer.
 """
 
 import math
@@ -20,26 +20,26 @@ def _even_polynomial(function) -> tuple[np.float32, ...]:
     return tuple(np.float32(c) for c in coefficients)
 
 
-# cos(2 pi t) and sin(2 pi t) / t to 3e-7: range reduction in turns is one floor, and
-# the loop vectorizes; libm's sincos does not and is about 10 times slower.
+# cos(2 pi t) and sin(2 pi t) / t, t in turns, to 3e-7.  Range reduction is one floor,
+# so the loop vectorizes; with libm's sincos it would not and take 10 times as long.
 COSINE_OF_TURNS = _even_polynomial(lambda t: np.cos(2.0 * np.pi * t))
 SINE_OF_TURNS = _even_polynomial(lambda t: np.sin(2.0 * np.pi * t) / t)
 _HALF = np.float32(0.5)
 
 EDGE_HALF_WIDTH = 8
-"""Samples by which the smoothed pupil extends beyond its edge."""
+"""Number of samples by which the smoothed pupil extends beyond its edge."""
 
 EDGE_STEPS = 256
-"""Entries per sample of the tabulated edge."""
+"""Entries per sample of the tabulated step response."""
 
 
-# The loops below run over whole slices from 0: an index that numba can prove positive
-# needs no wrap-around test, and without that test they vectorize.
+# The loops below run over whole slices from 0: numba omits the wraparound test for an
+# index that it can prove to be positive, and without this test they vectorize.
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _fill_row(row, x, mask, cosine, sine, out_re_im):
-    """Write mask * exp(2 pi i W) along one row; ``row`` has the 7 coefficients in x."""
+    """Write mask * exp(2 pi i W) along a row; ``row`` is the polynomial in x, (7,)."""
     c0, c1, c2, c3, c4, c5, c6 = row[0], row[1], row[2], row[3], row[4], row[5], row[6]
     a0, a1, a2, a3, a4, a5, a6 = COSINE_OF_TURNS
     b0, b1, b2, b3, b4, b5, b6 = SINE_OF_TURNS
@@ -59,7 +59,7 @@ def _fill_row(row, x, mask, cosine, sine, out_re_im):
 
 @njit(cache=True, nogil=True)
 def _chord(y, r, shear, samples_x, middle):
-    """Return the real first and last column of an ellipse scaled by r in the row y."""
+    """Return the first and last column, as floats, of an ellipse scaled by r at y."""
     square = (r * r - y * y) * (1.0 - shear * shear)
     if r <= 0.0 or square <= 0.0:
         return 0.0, -1.0
@@ -69,10 +69,11 @@ def _chord(y, r, shear, samples_x, middle):
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _edge_places(x, y, shear, half, places):
-    """Compute real indices into the edge table for consecutive samples of a row.
+    """Compute positions in the edge table for consecutive samples of a row.
 
-    The distance to the edge in samples follows from the slope of
-    q = (x² - 2 r x y + y²) / (1 - r²): exact for a circle, else of first order.
+    The distance to the edge, in samples, is computed from the gradient of
+    q = (x² - 2 r x y + y²) / (1 - r²).  It is exact for a circle and of first order for
+    an ellipse.
     """
     one, steps = np.float32(1.0), np.float32(EDGE_STEPS)
     least, most = np.float32(0.0), np.float32(2 * EDGE_HALF_WIDTH * EDGE_STEPS)
@@ -92,7 +93,7 @@ def _edge_places(x, y, shear, half, places):
 
 @njit(cache=True, nogil=True)
 def _edge_row(first, end, x, y, shear, half, edge, places, row):
-    """Write the smoothed pupil near its edge, for samples first to end of a row."""
+    """Write the smoothed pupil near its edge, for samples ``first`` to ``end - 1``."""
     if end <= first:
         return
     _edge_places(x[first:end], y, shear, half, places[: end - first])
@@ -104,19 +105,19 @@ def _edge_row(first, end, x, y, shear, half, edge, places, row):
 
 @njit(cache=True, nogil=True)
 def fill_mask(samples, shear, log_amplitude, edge, mask, spans):
-    """Write the smoothed elliptical pupil of one frame and the spans of its rows.
+    """Write the smoothed elliptical pupil, and the spans of its rows.
 
     Parameters
     ----------
     samples : (2,)
-        Samples across the bounding box, not integers.
+        Samples across the bounding box, in general not integers.
     shear : float
     log_amplitude : (6,)
     edge : (2 EDGE_HALF_WIDTH EDGE_STEPS + 1,) float32
-        Response of the low-pass to a step.
-    mask : (My, Mx) float32, written
-    spans : (My, 2) int64, written
-        First and end column of each row's light.
+        Step response of the low-pass filter.
+    mask : (My, Mx) float32 out
+    spans : (My, 2) int64 out
+        First column inside the pupil, and the one after the last, in each row.
     """
     my, mx = mask.shape
     ax, ay = 0.5 * samples[0], 0.5 * samples[1]
@@ -153,12 +154,12 @@ def fill_mask(samples, shear, log_amplitude, edge, mask, spans):
 
 @njit(cache=True, nogil=True)
 def fill_pupil(turns, mask, spans, samples_x, samples_y, field):
-    """Write mask * exp(2 pi i W) into the corner of a field.
+    """Write mask * exp(2 pi i W) to the corner of a field.
 
     Parameters
     ----------
     turns : (7, 7) float64
-        Phase polynomial in turns, ``[i, j]`` multiplies y^i x^j.
+        Phase in turns; ``[i, j]`` is the coefficient of y^i x^j.
     mask : (My, Mx) float32
     spans : (My, 2) int64
     samples_x, samples_y : float
@@ -179,7 +180,7 @@ def fill_pupil(turns, mask, spans, samples_x, samples_y, field):
             value = 0.0
             for power in range(6 - a, -1, -1):
                 value = value * y + turns[power, a]
-            # Remove whole turns before the cast: float32 keeps the rest to 1e-6.
+            # Whole turns are removed before the cast to float32: the error is 1e-6.
             row[a] = value - math.floor(value) if a == 0 else value
         _fill_row(
             row,
@@ -193,7 +194,7 @@ def fill_pupil(turns, mask, spans, samples_x, samples_y, field):
 
 @njit(cache=True, nogil=True)
 def fill_pupils(frames, power_x, power_y, grid, center_px, edge, field):
-    """Fill a batch of fields with their pupils, windows centered on whole samples.
+    """Write the pupil functions of a batch, with windows centered on ``center_px``.
 
     Parameters
     ----------
@@ -201,9 +202,10 @@ def fill_pupils(frames, power_x, power_y, grid, center_px, edge, field):
         wavelength_um (B,))
     power_x, power_y : (28,) int64
     grid : (samples (B, 2), size (B, 2) int64)
-        Samples across the box, and columns and rows that hold light.
+        Samples across the bounding box, and numbers of columns and rows of the mask.
     center_px : (B, 2)
-    edge : step response
+    edge : (2 EDGE_HALF_WIDTH EDGE_STEPS + 1,) float32
+        Step response of the low-pass filter.
     field : (B, My, N) complex64, zero on entry
     """
     polynomial, half, shear, log_amplitude, wavelength_um = frames
@@ -257,12 +259,12 @@ def integrate_pixels(field, center, window, k, filter_x, filter_y, scale, kernel
     Parameters
     ----------
     field : (Ny, Nx) complex64
-        Spectrum of the pupil, not shifted: sample j stands for center + j, or
-        center + j - N beyond the middle.
+        Spectrum of the pupil, not shifted: sample j is at center + j in the first half
+        and at center + j - N in the second.
     center : (2,) int64
-        Window center (x, y) in angular samples.
+        Center (x, y) of the window, in angular samples.
     window : (4,) int64
-        Pixel offsets x0, x1, y0, y1 (y upward, ends included) to fill.
+        Pixel offsets x0, x1, y0, y1 (y upward, ends included) to write.
     k : (2,) int64
         Samples per pixel.
     filter_x, filter_y : (2*reach+1,) float32
@@ -285,7 +287,7 @@ def integrate_pixels(field, center, window, k, filter_x, filter_y, scale, kernel
     sums = np.zeros((n_y, n_columns + 2 * pad), np.float32)
     first_row = max(0, y0 * ky - center[1] + half_y - reach_y)
     last_row = min(n_rows - 1, y1 * ky - center[1] + half_y + reach_y)
-    # Rows first: each overlaps about two pixels, and sums of whole rows vectorize.
+    # Rows first: each contributes to about two pixels, and sums of rows vectorize.
     for j in range(first_row, last_row + 1):
         parts = field[(j + half_y) % n_rows].view(np.float32)
         _intensity(parts[:n_columns], line[half_x:])
@@ -306,7 +308,7 @@ def integrate_pixels(field, center, window, k, filter_x, filter_y, scale, kernel
 
 @njit(cache=True, nogil=True)
 def integrate_batch(field, grid, filters, tails, output):
-    """Turn a batch of spectra into kernels in the output buffer.
+    """Convert a batch of spectra to kernels in the output buffer.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Ray-optical PSFs: splatted footprints of pupil cells plus diffraction at the edge.
+"""Ray-optical PSFs: footprints of pupil cells, plus diffraction at the pupil's edge.
 
-As long as blur is wider than diffraction, only light from the pupil's edge deviates
-from ray optics: Fresnel's straight edge, applied along the edge's image.  Without
-diffraction the method is exact at any blur, down to a perfect eye's delta.
+If blur is wider than diffraction, light deviates from ray optics only near the image of
+the edge of the pupil, where it follows Fresnel diffraction at a straight edge.  Without
+diffraction, the method is exact at any blur; the PSF of a perfect eye is one pixel.
 """
 
 import math
@@ -19,16 +19,19 @@ from estimator.psf.kernel_types import KernelBuffer
 from estimator.psf.survey import PupilSurvey
 
 FRESNEL_LIMIT = 14.0
-"""Limit of the table of Fresnel's edge; beyond, its fringes are taken as averaged."""
+"""Limit of the table of straight-edge diffraction; fringes beyond it are averaged."""
 
 _FRESNEL_STEPS = 4096
 _PART = 32
-"""PSFs per task: dispatching a task to a thread costs as much as half a PSF."""
+"""PSFs per task: dispatching a task to a thread takes as long as half a PSF."""
 
 
 @lru_cache(maxsize=1)
 def fresnel_table() -> NDArray[np.float64]:
-    """Integrate (1/2)[(1/2+C)² + (1/2+S)²] less the step, from the dark side."""
+    """Return the integral of straight-edge diffraction minus the geometric shadow.
+
+    The irradiance is (1/2)[(1/2+C)² + (1/2+S)²]; the integral starts in the shadow.
+    """
     fine = 16
     v = np.linspace(-FRESNEL_LIMIT, FRESNEL_LIMIT, fine * _FRESNEL_STEPS + 1)
     s, c = fresnel(v)
@@ -56,7 +59,7 @@ def geometric_kernels(
     members : (M,)
         Indices of the PSFs in the survey.
     diffraction : bool
-        False omits the edge's light.
+        Whether to include diffraction at the edge of the pupil.
     output : KernelBuffer
     pool : Executor
         Thread pool.

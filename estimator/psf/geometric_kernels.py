@@ -1,6 +1,6 @@
-"""Compiled inner loops of ray optics: footprints of pupil cells, and the edge's light.
+"""Compiled inner loops of ray optics: footprints of pupil cells, and edge diffraction.
 
-They release the GIL and are single-threaded, like those of `fourier_kernels.py`.
+They release the GIL and are single-threaded, like those of `fourier_kernels`.
 """
 
 import math
@@ -13,35 +13,36 @@ from estimator.psf.tail import add_tail
 
 MIN_CELLS = 32
 MAX_CELLS = 192
-"""Cells across the pupil; below 40 the pupil's own edge shows, above 192 nothing."""
+"""Cells across the pupil; more than 192 have no visible effect."""
 
 CELLS_PER_PX = 1.2
-"""Cells per pixel of blur: footprints of at most about a pixel."""
+"""Cells per pixel of blur: footprints are then at most about a pixel wide."""
 
 MIN_EDGE_POINTS = 64
 EDGE_POINTS_PER_PX = 3.0
 POINTS_AT_ONCE = 8
-"""Points on the edge per pixel of the spot's size."""
+"""The number of edge points is a multiple of this."""
 
 NEAR_PX = 2
 FAR_PX = 6
-"""Distances from the edge's image up to which its light is computed at half and at
-whole pixels; beyond, its mean is used (`tail.py`)."""
+"""Distances from the image of the edge within which its light is sampled at steps of
+half a pixel and of one pixel; farther out, its mean is used (see `tail`)."""
 
 MIN_CURVATURE_RATIO = 0.1
-"""Share of the wavefront's curvature below which the curvature along the edge counts
-as zero: the rim's image has a cusp there, and Fresnel's edge does not apply."""
+"""Ratio to the curvature of the wavefront below which the curvature along the edge
+counts as zero: the image of the edge has a cusp there, where the straight-edge
+approximation fails."""
 
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _row_footprints(row, x, cell, factor_x, factor_y, boxes):
-    """Compute left and lower ends (px), sizes and inverse sizes of a footprint row.
+    """Compute left and lower ends (px), sizes and inverse sizes of a row of footprints.
 
-    ``row`` holds float32 coefficients in x of W, dW/dy and d²W/dy² at this row.  Sizes
-    are those of the box with the same variance as the parallelogram of the cell's
-    corners.
+    ``row`` (3, 7) float32 are the polynomials in x of W, dW/dy and d²W/dy² at this row.
+    A footprint is the box with the same variance as the image of the cell, a
+    parallelogram.
     """
-    # Load scalars first: read inside the loop they might alias its outputs, and the
+    # Scalars are loaded first: inside the loop, they might alias its outputs, and the
     # loop would not vectorize.
     two, three, four, five = np.float32(2), np.float32(3), np.float32(4), np.float32(5)
     c, d, e = row[0], row[1], row[2]
@@ -69,7 +70,7 @@ def _row_footprints(row, x, cell, factor_x, factor_y, boxes):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _splat_wide_box(image, box, weight):
-    """Spread a weight over the pixels a box covers, by overlap area."""
+    """Distribute a weight over the pixels that a box covers, by area."""
     x0, x1, y0, y1 = box
     radius = image.shape[0] // 2
     per_area = weight / ((x1 - x0) * (y1 - y0))
@@ -84,7 +85,7 @@ def _splat_wide_box(image, box, weight):
 
 @njit(cache=True, nogil=True)
 def _three_shares(over, per_width):
-    """Return shares of three pixels in a box ending ``over`` beyond the first one."""
+    """Return the shares of three pixels; ``over`` is the box's part past the first."""
     one, zero = np.float32(1.0), np.float32(0.0)
     last = max(over - one, zero) * per_width
     middle = min(max(over, zero), one) * per_width
@@ -93,9 +94,9 @@ def _three_shares(over, per_width):
 
 @njit(cache=True, nogil=True)
 def _splat_boxes(image, boxes, first, end, weights):
-    """Spread weights over the pixels that boxes cover; a point fills its pixel.
+    """Distribute weights over the pixels that boxes cover, by area.
 
-    Most boxes span at most two pixels per axis and take the short path.
+    Most boxes span at most two pixels per axis, which is the fast path.
     """
     radius = image.shape[0] // 2
     half, one, two = np.float32(0.5), np.float32(1.0), np.float32(2.0)
@@ -109,7 +110,7 @@ def _splat_boxes(image, boxes, first, end, weights):
         over_y = y0 + height - np.float32(iy) - half
         is_inside = -radius <= ix < radius - 1 and -radius <= iy < radius - 1
         if not is_inside or over_x > two or over_y > two:
-            # Never empty: a zero-size box in the last pixel would divide by zero.
+            # A box of size zero in the last pixel would divide by zero.
             tiny = 1e-9
             box = (x0, x0 + width + tiny, y0, y0 + height + tiny)
             _splat_wide_box(image, box, weights[i])
@@ -124,8 +125,8 @@ def _splat_boxes(image, boxes, first, end, weights):
                 image[row - j, column + 1] += part * x_shares[1]
                 image[row - j, column + 2] += part * x_shares[2]
             continue
-        # Write all four pixels, with zero share where the box ends earlier: cheaper
-        # than unpredictable branches.
+        # All four pixels are written, some with weight 0, which is faster than
+        # unpredictable branches.
         share_x = max(over_x, zero) * per_wide[i]
         share_y = max(over_y, zero) * per_high[i]
         upper = weights[i] * share_y
@@ -138,7 +139,7 @@ def _splat_boxes(image, boxes, first, end, weights):
 
 @njit(cache=True, nogil=True)
 def _row_coefficients(polynomial, y, row):
-    """Compute coefficients (3, 7) in x of W, dW/dy and d²W/dy² at one y."""
+    """Compute the polynomials (3, 7) in x of W, dW/dy and d²W/dy² at one y."""
     for a in range(7):
         value, first, second = 0.0, 0.0, 0.0
         for b in range(6 - a, -1, -1):
@@ -150,48 +151,48 @@ def _row_coefficients(polynomial, y, row):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def splat_pupil(polynomial, half, shear, log_amplitude, n_cells, image):
-    """Splat the footprints of the elliptical pupil's cells and return their weight.
+    """Add the footprints of the pupil's cells to an image; return their total weight.
 
     Parameters
     ----------
     polynomial : (7, 7), um
-        ``[b, a]`` multiplies y^b x^a of W over the bounding box.
+        ``[b, a]`` is the coefficient of y^b x^a of W over the bounding box.
     half, shear, log_amplitude : (2,), float, (6,)
         See `psf.pupil.PupilFrames`.
     n_cells : int
         Cells across the bounding box.
-    image : (2R+1, 2R+1) float32
-        Image to add to, in image orientation.
+    image : (2R+1, 2R+1) float32, updated
+        In image orientation.
     """
     cell = 2.0 / n_cells
     x = ((np.arange(n_cells) + 0.5) * cell - 1.0).astype(np.float32)
     boxes, weights = np.empty((6, n_cells), np.float32), np.empty(n_cells, np.float32)
     row = np.empty((3, 7), np.float32)
-    room = 1.0 - shear * shear
+    s2 = 1.0 - shear * shear
     is_apodized = False
     for c in log_amplitude:
         is_apodized = is_apodized or c != 0.0
-    # Cells within this radius lie wholly inside, even at the ellipse's narrowest.
+    # Cells within this radius are inside the ellipse, even at its minor axis.
     inner = max(0.0, 1.0 - 0.75 * cell / math.sqrt(1.0 - abs(shear)))
     total = 0.0
     for j in range(n_cells):
         y = (j + 0.5) * cell - 1.0
         _row_coefficients(polynomial, y, row)
-        reach = math.sqrt(max(0.0, (1.0 + 0.5 * cell) ** 2 - y * y) * room) + cell
+        reach = math.sqrt(max(0.0, (1.0 + 0.5 * cell) ** 2 - y * y) * s2) + cell
         first = max(0, math.floor((1.0 + shear * y - reach) / cell))
         end = min(n_cells, math.ceil((1.0 + shear * y + reach) / cell))
-        core = math.sqrt(max(0.0, inner * inner - y * y) * room)
+        core = math.sqrt(max(0.0, inner * inner - y * y) * s2)
         core_first = math.ceil((1.0 + shear * y - core) / cell)
         core_end = math.floor((1.0 + shear * y + core) / cell)
         for i in range(first, end):
             weights[i] = 1.0
             if core_first <= i < core_end:
                 continue
-            # Area of the cell inside the ellipse, with the edge taken as straight.
+            # Area of the cell inside the ellipse, whose edge is taken as straight.
             slope_x, slope_y = x[i] - shear * y, y - shear * x[i]
-            r = math.sqrt((x[i] * slope_x + y * slope_y) / room)
+            r = math.sqrt((x[i] * slope_x + y * slope_y) / s2)
             steep = math.sqrt(slope_x * slope_x + slope_y * slope_y)
-            depth = (1.0 - r) * r * room / max(steep, 1e-9)
+            depth = (1.0 - r) * r * s2 / max(steep, 1e-9)
             weights[i] = min(1.0, max(0.0, depth / cell + 0.5))
         if is_apodized:
             _apodize(x, y, log_amplitude, first, end, weights)
@@ -214,7 +215,7 @@ def _apodize(x, y, log_amplitude, first, end, weights):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fresnel(v, table, limit):
-    """Integrate Fresnel's straight edge less its step, from the dark to v."""
+    """Return the integral up to v of straight-edge diffraction minus the shadow."""
     if abs(v) >= limit:
         return -1.0 / (2.0 * math.pi**2 * v)
     place = (v + limit) / (2.0 * limit) * (table.size - 1)
@@ -223,8 +224,8 @@ def _fresnel(v, table, limit):
 
 
 @njit(cache=True, nogil=True)
-def _lay(image, x, y, per_width, light):
-    """Spread light over the pixels (up to four) under a small box at (x, y)."""
+def _deposit(image, x, y, per_width, light):
+    """Distribute light over the pixels, up to four, under a small box at (x, y)."""
     radius = image.shape[0] // 2
     ix, iy = math.floor(x), math.floor(y)
     if ix < -radius or iy < -radius or ix >= radius or iy >= radius:
@@ -242,7 +243,7 @@ def _lay(image, x, y, per_width, light):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _point_on_edge(polynomial, x, y, half, row):
-    """Return slope (px) and second derivatives in t (px²/um) of W at a box point."""
+    """Return slopes (px) and second derivatives (px²/um) of W at a point of the box."""
     _row_coefficients(polynomial, y, row)
     sx, sy, hxx, hxy, hyy = 0.0, 0.0, 0.0, 0.0, 0.0
     value = 0.0
@@ -258,11 +259,11 @@ def _point_on_edge(polynomial, x, y, half, row):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lay_profile(image, start, normal, strength, v_per_px, fresnel):
-    """Add an edge point's light along its normal: half pixels near, whole ones far.
+def _deposit_profile(image, start, normal, strength, v_per_px, fresnel):
+    """Add the diffracted light of an edge point along the normal of the edge.
 
-    One half pixel is centered on the edge: where the wavefront is flat, the profile
-    has a pole there whose two sides cancel.
+    Near the edge, steps are half a pixel, one of them centered on the edge: for a flat
+    wavefront, the profile has a pole there, whose two sides cancel.
     """
     table, limit = fresnel
     near_end, end = NEAR_PX + 0.25, FAR_PX + 0.25
@@ -274,7 +275,7 @@ def _lay_profile(image, start, normal, strength, v_per_px, fresnel):
         after = _fresnel((b + step) * v_per_px, table, limit)
         d = b + 0.5 * step
         x, y = start[0] + d * normal[0], start[1] + d * normal[1]
-        _lay(image, x, y, 2.0 if is_near else 1.0, strength * (after - before))
+        _deposit(image, x, y, 2.0 if is_near else 1.0, strength * (after - before))
         before = after
         b += step
 
@@ -283,30 +284,30 @@ def _lay_profile(image, start, normal, strength, v_per_px, fresnel):
 def add_edge_light(
     polynomial, half, shear, log_amplitude, passed, wave, extent_px, image
 ):
-    """Add the effect of diffraction at the pupil's edge to a ray-optical spot.
+    """Add diffraction at the edge of the pupil to a ray-optical spot.
 
     Parameters
     ----------
     polynomial, half, shear, log_amplitude
-        As in `splat_pupil`.
+        See `splat_pupil`.
     passed : float
-        Light that the apodized pupil passes.
+        Transmission of the apodized pupil.
     wave : (wavelength_um, table, limit)
-        Fresnel's edge, see `geometric`.
+        Wavelength, and the table of `geometric.fresnel_table`.
     extent_px : float
         Larger side of the spot.
-    image : (2R+1, 2R+1) float32
-        Image to add to, in shares of the light.
+    image : (2R+1, 2R+1) float32, updated
+        In shares of the light.
 
     Notes
     -----
-    An edge element ds with slope s and outward normal n (t-space, `pupil.py`) sends
-    its light along p = s + d n.  Across the edge the wavefront is curved by
-    k = H_nn - H_nt²/H_tt, H its second derivatives, so that d = k q at a depth q; the
-    irradiance is Fresnel's straight edge at v = -sign(k) d sqrt(2 / (lambda |k|)) and
-    its difference from the rays' step holds ds/A sqrt(lambda / (2 |k|)) times the
-    integral over v.  For k -> 0, and far outside, this is the mean edge light of
-    `survey.needed_radius_px`.
+    An edge element ds with slope s and outward normal n (in t, see `pupil`) sends its
+    light along p = s + d n.  The curvature of the wavefront across the edge is
+    k = H_nn - H_nt²/H_tt, for second derivatives H, so that d = k q at a depth q.  The
+    irradiance is that of straight-edge diffraction at
+    v = -sign(k) d sqrt(2 / (lambda |k|)).  The light of its difference from the
+    geometric shadow is ds/A sqrt(lambda / (2 |k|)) times the integral over v.  For
+    k -> 0, and far outside, it is the mean edge light of `survey.needed_radius_px`.
     """
     wavelength_um, table, limit = wave
     n_points = max(MIN_EDGE_POINTS, EDGE_POINTS_PER_PX * extent_px)
@@ -333,12 +334,12 @@ def add_edge_light(
         share *= math.exp(2.0 * (c0 + x * (c1 + c3 * x + c4 * y) + y * (c2 + c5 * y)))
         strength = share * math.sqrt(wavelength_um / (2.0 * size))
         strength = math.copysign(strength, v_per_px)
-        _lay_profile(image, (sx, sy), (nx, ny), strength, v_per_px, (table, limit))
+        _deposit_profile(image, (sx, sy), (nx, ny), strength, v_per_px, (table, limit))
 
 
 @njit(cache=True, nogil=True)
 def trace_batch(frames, power_x, power_y, survey, wave, output):
-    """Compute ray-optical kernels into the output buffer, one by one.
+    """Compute ray-optical kernels and add them to the output buffer.
 
     Parameters
     ----------
@@ -363,8 +364,8 @@ def trace_batch(frames, power_x, power_y, survey, wave, output):
         radius = radius_px[b]
         side = 2 * radius + 1
         image = np.zeros((side, side), np.float32)
-        room = math.sqrt(1.0 - shear[b] * shear[b])
-        n_cells = math.ceil(max(MIN_CELLS / room, CELLS_PER_PX * extent_px[b]))
+        s = math.sqrt(1.0 - shear[b] * shear[b])
+        n_cells = math.ceil(max(MIN_CELLS / s, CELLS_PER_PX * extent_px[b]))
         weight = splat_pupil(
             dense,
             half[b],
@@ -388,8 +389,8 @@ def trace_batch(frames, power_x, power_y, survey, wave, output):
                 extent_px[b],
                 image,
             )
-            # Beside a caustic the edge's fringes can outweigh the rays; clamp negative
-            # light.
+            # Beside a caustic, fringes of the edge can exceed the light of the rays, so
+            # negative values are clamped.
             for row in range(side):
                 for column in range(side):
                     image[row, column] = max(image[row, column], np.float32(0.0))

@@ -1,4 +1,4 @@
-"""Types shared by the PSF engines: result, size error, buffer and kernel disc."""
+"""Result, size error, buffer and kernel disc of the PSF engines."""
 
 import math
 from collections.abc import Callable
@@ -17,16 +17,15 @@ class Psf:
     Attributes
     ----------
     kernel : (2R+1, 2R+1) float32
-        ``[y, x]`` in image orientation: the row index grows downward, so light sent
-        to +theta_y lands in a smaller row.  Unit sum, zero outside the disc
-        dx² + dy² <= (R + 0.5)², center element = chief ray (theta = 0).
+        ``[y, x]`` in image orientation: rows are downward, so +theta_y is in a row with
+        a smaller index.  It has unit sum and is zero outside the disc
+        dx² + dy² <= (R + 0.5)²; the center element is the chief ray (theta = 0).
     radius_px : int
         R.
     lost_energy_ratio : float
-        Share of the light outside the disc, before the kernel was normalized to
-        unit sum.
+        Share of the light outside the disc, before normalization to unit sum.
     method : str
-        ``"fourier"`` or ``"geometric"``.
+        "fourier", "geometric", "fourier+geometric" or an ENZ method.
     blur_radius_px : float
         Largest wavefront slope over the pupil, in pixels.
     """
@@ -53,9 +52,9 @@ class PsfTooLarge(ValueError):
 
     def __init__(self, *, radius_px: int, max_radius_px: int, index: int):
         super().__init__(
-            f"PSF {index} needs a radius of {radius_px} px; "
-            f"allowed are at most {max_radius_px} px: "
-            "fewer pixels per degree, a smaller pupil or less defocus need less"
+            f"PSF {index} needs a radius of {radius_px} px, allowed are up to "
+            f"{max_radius_px} px: use fewer pixels per degree, a smaller pupil or less "
+            "defocus"
         )
         self.radius_px = radius_px
         self.max_radius_px = max_radius_px
@@ -64,7 +63,7 @@ class PsfTooLarge(ValueError):
     def __reduce__(
         self,
     ) -> tuple[Callable[[int, int, int], "PsfTooLarge"], tuple[int, int, int]]:
-        """Pickle by keyword, because builds run in worker processes."""
+        """Support pickling, because worker processes build PSFs."""
         return _rebuild_psf_too_large, (
             self.radius_px,
             self.max_radius_px,
@@ -97,9 +96,9 @@ class KernelBuffer:
         All kernels; PSF p starts at ``offset_count[p]``.
     offset_count, radius_px : (P,) int64
     geometric_ratio : (P,)
-        Share of ray optics in a kernel; each engine adds its part.
+        Weight of ray optics in each kernel; both engines add their part.
     total_ratio : (P,)
-        Light inside the disc, from the kernels' own sums.
+        Share of the light inside the disc, from the sums of the kernels.
     """
 
     flat_kernels: NDArray[np.float32]
@@ -113,7 +112,7 @@ def empty_buffer(
     radius_px: NDArray[np.int64],
     geometric_ratio: NDArray[np.float64],
 ) -> KernelBuffer:
-    """Return a buffer of zeros for kernels of the given radii."""
+    """Return a buffer of zeros for kernels with given radii (P,)."""
     counts = (2 * radius_px + 1) ** 2
     ends = np.cumsum(counts)
     return KernelBuffer(
@@ -129,9 +128,9 @@ def empty_buffer(
 def finish_kernel(
     kernel: NDArray[np.float32], share: float, flat: NDArray[np.float32]
 ) -> float:
-    """Crop a kernel to its disc and add it, scaled to a sum of ``share``.
+    """Crop a kernel to its disc, scale it to a sum of ``share`` and add it to ``flat``.
 
-    Returns ``share`` times the light in the disc; adds nothing where there is none.
+    Return ``share`` times the light in the disc.  Without light, nothing is added.
     """
     radius = kernel.shape[0] // 2
     side = 2 * radius + 1

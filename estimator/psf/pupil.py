@@ -1,9 +1,9 @@
-"""Pupils in pixel coordinates, which combine the ellipse, image scale and shear.
+"""Pupils in pixel coordinates t, in which pixels are unit squares.
 
-An elliptical pupil seen through a sheared image scale is again an ellipse.  With
-p = J theta (J = `pixel_from_mrad`) the kernel is |int exp(2 pi i (W - p.t) / lambda)|²
-over t = J^-T u.  Every engine therefore sees square pixels of size 1 and an ellipse in
-t (um/px), given by its bounding box and one shear; nothing is stretched or resampled.
+With p = J theta for a Jacobian J (``pixel_from_mrad``), the kernel is |int exp(2 pi i
+(W - p.t) / lambda)|² over t = J^-T u.  In t (um/px), an elliptical pupil is again an
+ellipse, described by its bounding box and a shear.  PSFs are therefore computed
+directly on the pixel grid, without resampling.
 """
 
 import math
@@ -17,24 +17,25 @@ from numpy.typing import NDArray
 from estimator.optics.zernike import EXPONENTS, N_TERMS
 
 ELLIPSE_COLUMNS = 5
-"""Center x, y, semi-axes major, minor (mm) and angle of the major axis (rad)."""
+"""Center x, y, semi-major and semi-minor axis (mm), angle of the major axis (rad)."""
 
 
 @dataclass(frozen=True)
 class PupilFrames:
-    """P pupils, each on its ellipse's bounding box and on the unit disc.
+    """P pupils with their wavefronts, over the bounding box and over the unit disc.
 
     Attributes
     ----------
     box_polynomial_um : (P, 28), um
-        Monomial coefficients of W over the bounding box, x and y in [-1, 1]; no piston.
+        Monomials of W over the bounding box, x and y in [-1, 1], without piston.
     disc_polynomial_um : (P, 28), um
-        The same over the unit disc w; the box point is (w_x, r w_x + s w_y) with
-        r = ``shear_ratio`` and s = sqrt(1 - r²).
+        Monomials of W over the unit disc w.  The point of the box is
+        (w_x, r w_x + s w_y) with r = ``shear_ratio`` and s = sqrt(1 - r²).
     half_width_um_per_px : (P, 2)
-        Half sides of the box; a slope per box coordinate divided by it is in pixels.
+        Half sides of the box in t.  A derivative by box coordinates divided by it is a
+        slope in pixels.
     shear_ratio : (P,)
-        r: the pupil is x² - 2 r x y + y² <= 1 - r².
+        r; in box coordinates, the pupil is x² - 2 r x y + y² <= 1 - r².
     log_amplitude : (P, 6)
         Apodization exp(c0 + c1 x + c2 y + c3 x² + c4 x y + c5 y²) over the box.
     wavelength_nm : (P,)
@@ -49,7 +50,7 @@ class PupilFrames:
 
 
 def _bos_nodes() -> NDArray[np.float64]:
-    """Return 28 points that fix a polynomial of degree 6: rings of 13, 9, 5 and 1."""
+    """Return 28 nodes that determine a polynomial of degree 6: rings of 13, 9, 5, 1."""
     points = [
         (radius * math.cos(angle), radius * math.sin(angle))
         for radius, count in ((1.0, 13), (0.78, 9), (0.43, 5), (0.0, 1))
@@ -79,7 +80,7 @@ def _substitute(
     power_y: NDArray[np.int64],
     out: NDArray[np.float64],
 ) -> None:
-    """Write coefficients of source(shift + matrix w) to ``out``, from node values."""
+    """Write the monomials of source(shift + matrix w) to ``out``, from node values."""
     values = np.zeros(source.size)
     xs, ys = np.empty(7), np.empty(7)
     xs[0] = ys[0] = 1.0
@@ -110,7 +111,7 @@ def _frames(
     half: NDArray[np.float64],
     shear: NDArray[np.float64],
 ) -> None:
-    """Fill the arrays of `PupilFrames`, pupil by pupil."""
+    """Fill the arrays of `PupilFrames`."""
     nodes, from_nodes, power_x, power_y = tables
     matrix, shift, lower = np.empty((2, 2)), np.empty(2), np.zeros((2, 2))
     lower[0, 0] = 1.0
@@ -170,7 +171,10 @@ def _log_amplitudes(
     ellipse: NDArray[np.float64],
     half: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Expand -k |u - u0|² (log amplitude) over boxes; k (P,) per mm², u0 (P, 2) mm."""
+    """Return the coefficients (P, 6) of -k |u - u0|² over the boxes.
+
+    The apodization is k (P,), mm^-2, and u0 (P, 2), mm.
+    """
     log_amplitude = np.zeros((ellipse.shape[0], 6))
     if apodization is None:
         return log_amplitude
@@ -189,7 +193,7 @@ def _log_amplitudes(
 def pupil_ellipses(
     pupil_ellipse: NDArray[np.float64] | None, circle_radius_mm: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return ellipses (P, 5) of pupils, see `ELLIPSE_COLUMNS`; by default circles."""
+    """Return ellipses (P, 5), see `ELLIPSE_COLUMNS`; by default, the circles."""
     if pupil_ellipse is not None:
         return pupil_ellipse
     found = np.zeros((circle_radius_mm.size, ELLIPSE_COLUMNS))
@@ -211,14 +215,14 @@ def pupil_frames(
     Parameters
     ----------
     polynomial_um : (P, 28), um
-        Monomial coefficients on the unit circle; tilt counts, piston does not.
+        Monomials on the unit circle; piston is ignored.
     circle_radius_mm, wavelength_nm : (P,)
     pixel_from_mrad : (P, 2, 2)
-        Visual angle (x right, y up) to image pixels (x right, y up).
+        Jacobian from visual angle (x right, y up) to pixels (x right, y up).
     pupil_ellipse : (P, 5), optional
-        See `ELLIPSE_COLUMNS`; default: the whole circle.
+        See `ELLIPSE_COLUMNS`; the whole circle by default.
     apodization : ((P,), (P, 2)), optional
-        k in mm^-2 and center in mm of the amplitude exp(-k |u - u0|²).
+        k in mm^-2 and u0 in mm of the amplitude exp(-k |u - u0|²).
     """
     count = polynomial_um.shape[0]
     pupil_ellipse = pupil_ellipses(pupil_ellipse, circle_radius_mm)

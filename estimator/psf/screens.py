@@ -1,7 +1,8 @@
-"""Rings in the pupil that no polynomial describes, as a factor by radial distance.
+"""Complex amplitude of multifocal lenses in the pupil, tabulated.
 
-Only the wave method supports them.  They are tabulated over the squared distance from
-their center, where the rings of a lens are about equally wide.
+It is a factor of the pupil function, which only wave optics supports.  The tables are
+over the squared distance from the center, in which the zones of a lens are about
+equally wide.
 """
 
 import math
@@ -14,34 +15,32 @@ from numpy.typing import NDArray
 from estimator.optics.pupil_screen import PupilScreen
 
 TABLE_COUNT = 1 << 15
-"""Entries of a table; rings of 40 waves over the pupil have 800 each."""
-
+"""Entries of a table: 800 per zone if there are 40 waves over the pupil."""
 
 BEYOND_EDGE = 1.5
 """Extent of tables in pupil radii: the smoothed edge extends beyond the pupil."""
 
-
 ONE_CENTER = (0.0, 0.0, 0.0)
-"""Lattice without a honeycomb."""
+"""Value of the lattice for a single center."""
 
 
 @dataclass(frozen=True)
 class ScreenTables:
-    """Tables of a screen in front of P pupils.
+    """Tables of a screen for P pupils.
 
     Attributes
     ----------
     from_box_mm : (P, 2, 3)
-        Position from the screen's center: matrix for the box's x and y, and offset.
+        Affine map from box coordinates to the position relative to the screen's center.
     tables : (n_wavelengths, TABLE_COUNT) complex64
     which : (P,) int64
-        Table index of each pupil.
+        Table of each pupil.
     radius_mm : float
         Radius of the last entry.
     lattice_mm : (pitch, inner, outer)
-        Honeycomb of such rings; zeros for a single center.
+        Honeycomb of centers, see `PupilScreen`; zeros for a single center.
     reach_px : (P, 2)
-        Distance that light goes farther than without the screen, x and y.
+        Largest additional deflection by the screen, x and y.
     """
 
     from_box_mm: NDArray[np.float64]
@@ -52,7 +51,7 @@ class ScreenTables:
     reach_px: NDArray[np.float64]
 
     @classmethod
-    def of(
+    def from_screen(
         cls,
         screen: PupilScreen,
         *,
@@ -61,7 +60,7 @@ class ScreenTables:
         pupil_ellipse: NDArray[np.float64],
         wavelength_nm: NDArray[np.float64],
     ) -> "ScreenTables":
-        """Tabulate a screen for pupils, see `pupil.pupil_frames`."""
+        """Tabulate a screen; see `pupil.pupil_frames` for the pupils."""
         matrix = np.swapaxes(pixel_from_mrad, 1, 2) * half_width_um_per_px[:, None, :]
         offset = pupil_ellipse[:, :2] - np.array(screen.centre_mm)
         largest_mm = pupil_ellipse[:, 2] + np.hypot(*offset.T)
@@ -91,7 +90,7 @@ class ScreenTables:
         size: NDArray[np.int64],
         field: NDArray[np.complex64],
     ) -> None:
-        """Multiply fields (B, My, N) by the screen; grids as in `fill_pupils`."""
+        """Multiply fields (B, My, N) by the screen; see `fill_pupils` for the grids."""
         _apply(
             self.from_box_mm[members],
             self.tables,
@@ -106,11 +105,11 @@ class ScreenTables:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
 def _square_mm2(u: float, v: float, lattice: tuple[float, float, float]) -> float:
-    """Return the squared distance from the nearest center; infinite if none is near."""
+    """Return the squared distance from the nearest center, inf outside the lattice."""
     pitch, inner, outer = lattice
     if pitch == 0.0:
         return u * u + v * v
-    row = math.sqrt(3.0) * pitch  # every second one
+    row = math.sqrt(3.0) * pitch  # of every second row
     x, y = pitch * round(u / pitch), row * round(v / row)
     p = pitch * (round(u / pitch - 0.5) + 0.5)
     q = row * (round(v / row - 0.5) + 0.5)

@@ -1,7 +1,6 @@
-"""Cheap pre-pass over all wavefronts: slopes and kernel radii.
+"""Wavefront slopes and kernel radii, computed before the PSFs.
 
-The slopes determine the method, the sampling and the kernel size of the PSF engines
-(`fourier.py`, `geometric.py`).
+The slopes determine method, sampling and kernel size.
 """
 
 import math
@@ -22,7 +21,7 @@ N_RING = 24
 RADIUS_LIMIT_PX = 1 << 14
 
 PIXEL_CORNER_PX = 0.21
-"""Added to a blur radius so that the disc holds the corners of the last pixels."""
+"""Addition to a blur radius, so that the disc contains the corners of its pixels."""
 
 
 @dataclass(frozen=True)
@@ -35,20 +34,20 @@ class PupilSurvey:
     slope_low_px, slope_high_px : (P, 2)
         Bounding box (x, y) of the slopes.
     edge_slope_px : (P, N_EDGE, 2)
-        Slopes along the pupil's edge, counterclockwise from +x of the unit disc.
+        Slopes along the edge of the pupil, counterclockwise from +x of the unit disc.
     edge_normal_px_per_um : (P, N_EDGE, 2)
-        Outward normals of the edge in t; their length is that of w per t.
+        Outward normals of the edge in t, the gradients of the unit disc's radius.
     blur_radius_px : (P,)
         Largest slope.
     narrow_ratio : (P,)
-        RMS of the slopes along the spot's narrowest direction, in lambda/D.
+        RMS of the slopes along the minor principal axis of the spot, in lambda/D.
     passed_ratio : (P,)
-        Share of the light that the apodized pupil passes.
+        Transmission of the apodized pupil.
     edge_light_um : (P,)
-        Wavelength times the edge's share of the passed light over its share of the
-        area; the edge's diffracted light is proportional to it.
+        Wavelength times the intensity at the edge of the pupil over the mean intensity;
+        diffracted light is proportional to it.
     screen : ScreenTables, optional
-        Rings in the pupils; light then goes farther than the slopes indicate.
+        Complex amplitude in the pupils.
     """
 
     frames: PupilFrames
@@ -62,8 +61,8 @@ class PupilSurvey:
     edge_light_um: NDArray[np.float64]
     screen: ScreenTables | None = None
 
-    def behind(self, screen: ScreenTables) -> "PupilSurvey":
-        """Return the same pupils with rings in front of them."""
+    def with_screen(self, screen: ScreenTables) -> "PupilSurvey":
+        """Return the survey with a screen, whose deflection is added to the slopes."""
         return replace(
             self,
             slope_low_px=self.slope_low_px - screen.reach_px,
@@ -74,7 +73,7 @@ class PupilSurvey:
 
     @property
     def extent_px(self) -> NDArray[np.float64]:
-        """Sides of the slope bounding box, (P, 2)."""
+        """Sides of the bounding box of the slopes, (P, 2)."""
         return self.slope_high_px - self.slope_low_px
 
     @property
@@ -85,7 +84,7 @@ class PupilSurvey:
 
     @property
     def wave_number(self) -> NDArray[np.float64]:
-        """Larger side of the spot in units of lambda/D, n = 2 g D / lambda, (P,)."""
+        """Larger side of the spot in lambda/D, n = 2 g D / lambda, (P,)."""
         larger: NDArray[np.float64] = (self.extent_px / self.unit_px).max(axis=1)
         return larger
 
@@ -173,9 +172,9 @@ _N_RADIAL = 8
 
 
 def _passed_points() -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return powers (6, n) of unit-disc points, ring by ring, and ring weights (8,).
+    """Return powers (6, n) of points on rings of the unit disc, and ring weights (8,).
 
-    The last ring is the edge and has no weight.
+    The last ring is the edge, which has no weight.
     """
     node, weight = np.polynomial.legendre.leggauss(_N_RADIAL)
     rings = np.append(np.sqrt((node + 1.0) / 2.0), 1.0)
@@ -188,7 +187,7 @@ PASSED_POWERS, RING_WEIGHTS = _passed_points()
 
 
 def _disc_log_amplitude(frames: PupilFrames) -> NDArray[np.float64]:
-    """Return the apodization (P, 6) over the unit disc instead of the box."""
+    """Return the apodization (P, 6) over the unit disc."""
     one, x, y, xx, xy, yy = frames.log_amplitude.T
     r = frames.shear_ratio
     s = np.sqrt(1.0 - r * r)
@@ -197,7 +196,7 @@ def _disc_log_amplitude(frames: PupilFrames) -> NDArray[np.float64]:
 
 
 def _passed_light(frames: PupilFrames) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the mean intensity (P,) over each apodized pupil and over its edge."""
+    """Return the mean intensity (P,) over the apodized pupils, and over their edges."""
     count = frames.shear_ratio.size
     if not frames.log_amplitude.any():
         return np.ones(count), np.ones(count)
@@ -207,7 +206,7 @@ def _passed_light(frames: PupilFrames) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def survey_pupils(frames: PupilFrames) -> PupilSurvey:
-    """Sample the slopes of P wavefronts at 193 points each (about 3 us a wavefront)."""
+    """Sample the slopes of P wavefronts at 193 points each, in about 3 us each."""
     count = frames.shear_ratio.size
     low, high = np.empty((count, 2)), np.empty((count, 2))
     edge, normal = np.empty((count, N_EDGE, 2)), np.empty((count, N_EDGE, 2))
@@ -245,7 +244,7 @@ def _edge_light_outside(
     edge_um: float,
     radius_px: float,
 ) -> float:
-    """Return the share of the light that the pupil's edge sends beyond a disc."""
+    """Return the share of the light that the edge of the pupil sends outside a disc."""
     total = 0.0
     for i in range(edge_px.shape[0]):
         sx, sy = edge_px[i, 0], edge_px[i, 1]
@@ -309,17 +308,22 @@ def _edge_light_outside_all(
 def _edge_geometry(
     survey: PupilSurvey,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return edge slopes, normals and strengths in the form of the compiled loops."""
+    """Return the arguments of the compiled loops: edge slopes, normals, strengths."""
     return survey.edge_slope_px, survey.edge_normal_px_per_um, survey.edge_light_um
 
 
 def edge_light_outside(
     survey: PupilSurvey, *, radius_px: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the share (P,) of light that the edge sends beyond discs of given radii.
+    """Return the share (P,) of the light that the edges send outside discs.
 
-    Infinite where the geometric spot reaches the disc's rim; the formula is that of
-    `needed_radius_px`.
+    The formula is that of `needed_radius_px`.  The result is infinite if the geometric
+    spot extends to the rim of the disc.
+
+    Parameters
+    ----------
+    radius_px : (P,)
+        Radii of the discs.
     """
     outside = _edge_light_outside_all(*_edge_geometry(survey), radius_px + 0.5)
     return np.where(radius_px + 0.5 > survey.blur_radius_px, outside, math.inf)
@@ -328,22 +332,25 @@ def edge_light_outside(
 def needed_radius_px(
     survey: PupilSurvey, *, lost_energy_ratio: float, tail_end_px: int | None = None
 ) -> NDArray[np.int64]:
-    """Return the smallest kernel radius (P,) px that loses at most a share of light.
+    """Return the smallest kernel radii (P,), px, for a given loss of light.
 
     Parameters
     ----------
+    survey : PupilSurvey
+    lost_energy_ratio : float
+        Allowed share of the light outside the kernel.
     tail_end_px : int, optional
-        Upper bound of the radius where all rays land within it: diffracted light
-        falls so slowly that a share of it always lies farther out.
+        Upper bound of the radius for PSFs all of whose rays are within it: diffracted
+        light falls so slowly that a part of it is always farther out.
 
     Notes
     -----
-    Far from the geometric spot only the pupil's edge sends light.  By stationary
-    phase on the boundary integral, an edge element ds with local slope s and outward
-    normal n sends lambda / (4 pi² A d²) ds dd to p = s + d n, d of either sign and A
-    the pupil's area; the caustic factor cancels against the Jacobian.  For W = 0 and
-    a circle this is the mean Airy tail, 2 lambda / (pi² D theta) outside theta; for
-    defocus lambda / (pi² D) [1/(theta-g) + 1/(theta+g)].
+    Far from the geometric spot, light comes from the edge of the pupil only.  By the
+    method of stationary phase for the boundary integral, an edge element ds with slope
+    s and outward normal n sends lambda / (4 pi² A d²) ds dd to p = s + d n, for d of
+    either sign and the area A of the pupil; the caustic factor cancels the Jacobian.
+    For W = 0 and a circle, this is the mean Airy tail, 2 lambda / (pi² D theta) outside
+    theta; for defocus, it is lambda / (pi² D) [1/(theta-g) + 1/(theta+g)].
     """
     radii: NDArray[np.int64] = _smallest_radii(
         *_edge_geometry(survey),
@@ -353,8 +360,8 @@ def needed_radius_px(
     )
     if tail_end_px is None:
         return radii
-    lands_within = np.ceil(survey.blur_radius_px + PIXEL_CORNER_PX) <= tail_end_px
+    is_within = np.ceil(survey.blur_radius_px + PIXEL_CORNER_PX) <= tail_end_px
     bounded: NDArray[np.int64] = np.where(
-        lands_within, np.minimum(radii, tail_end_px), radii
+        is_within, np.minimum(radii, tail_end_px), radii
     )
     return bounded

@@ -1,11 +1,12 @@
-"""Choice of the PSF engine: ray optics where its predicted error permits it.
+"""Choice of the PSF engine: ray optics if its predicted error permits it.
 
-The rule is a fit.  2,600 random wavefronts (pure cylinders with a meridian in focus,
-spherical aberration, coma, trefoil and higher orders, defocus; n = 16 to 400; pupils 2
-to 7 mm, three wavelengths, three pixel sizes) were filtered with both engines; 98 % of
-them lie above the prediction (bench_psf.py --switch repeats it).  The tilt-free RMS is
-a better predictor than the spot's width n = 2 g D / lambda, because a wide spot may
-hold most of its light in a narrow core (coma, caustics), where rays fail.
+The prediction is a fit to 2,600 random wavefronts (pure cylinders with a meridian in
+focus, spherical aberration, coma, trefoil, higher orders and defocus; n = 16 to 400;
+pupils of 2 to 7 mm, three wavelengths, three pixel sizes).  Images were filtered with
+both engines, and the PSNR of 98 % of them exceeds the prediction (``bench_psf.py
+--switch`` repeats this).  The RMS without tilt is a better predictor than the width of
+the spot, n = 2 g D / lambda, because a wide spot may have most of its light in a narrow
+core (coma, caustics), where ray optics fails.
 """
 
 import numpy as np
@@ -18,33 +19,31 @@ BASE_DB = 41.56
 PER_RMS_DB = 7.40
 PER_PIXEL_DB = 5.88
 PER_NARROW_DB = 2.58
-"""PSNR of ray optics: base, and increments per decade of the RMS in waves; the pixel in
-lambda/D; one plus the RMS slope, lambda/D, across the spot's narrow side (a meridian in
-focus)."""
+"""PSNR of ray optics: constant, and slopes per decade of the RMS in waves, of the pixel
+in lambda/D, and of one plus `PupilSurvey.narrow_ratio`."""
 
 GEOMETRIC_FROM_DB = 51.0
 CROSS_FADE_DB = 0.5
-"""Above the first the engines are blended; from their sum on only rays are traced.  The
-fade is narrow, because a blended kernel costs both; the step it bridges is below 50 dB
-anyway."""
+"""Predicted PSNR from which kernels of both engines are blended, and width of the
+blend, above which only ray optics is used.  The blend is narrow because it costs both
+engines; the step that it smooths has a PSNR above 50 dB."""
 
 WAVE_DB = 54.0
-"""PSNR exceeded by images filtered with the wave method, or the ENZ series in its
-domain."""
+"""PSNR exceeded by wave optics, and by the ENZ series within its domain."""
 
 _N_PLANE = 3
-"""Piston and tilts."""
+"""Number of terms of piston and tilt."""
 
 
 def rms_waves_ratio(survey: PupilSurvey) -> NDArray[np.float64]:
-    """Return the tilt-free RMS (P,) of wavefronts over their pupils, in wavelengths."""
+    """Return the RMS (P,) of wavefronts without tilt over their pupils, in waves."""
     zernike_um = survey.frames.disc_polynomial_um @ np.linalg.inv(monomial_matrix())
     rms_um: NDArray[np.float64] = np.sqrt((zernike_um[:, _N_PLANE:] ** 2).sum(axis=1))
     return rms_um / (survey.frames.wavelength_nm / 1000.0)
 
 
 def predicted_psnr_db(survey: PupilSurvey) -> NDArray[np.float64]:
-    """Return the PSNR (P,) that ray-optical images exceed in 98 of 100 cases."""
+    """Return the PSNR (P,) that ray-optical images exceed in 98 % of all cases."""
     pixel_ratio = 1.0 / survey.unit_px.max(axis=1)
     rms = np.maximum(rms_waves_ratio(survey), 1e-6)
     psnr_db: NDArray[np.float64] = (
@@ -57,7 +56,7 @@ def predicted_psnr_db(survey: PupilSurvey) -> NDArray[np.float64]:
 
 
 def geometric_shares(survey: PupilSurvey) -> NDArray[np.float64]:
-    """Return the share (P,) of ray optics in each kernel: 0 waves, 1 rays."""
+    """Return the weight (P,) of ray optics in each kernel: 0 is waves, 1 is rays."""
     above = (predicted_psnr_db(survey) - GEOMETRIC_FROM_DB) / CROSS_FADE_DB
     return np.clip(above, 0.0, 1.0)
 
@@ -65,5 +64,5 @@ def geometric_shares(survey: PupilSurvey) -> NDArray[np.float64]:
 def predicted_least_psnr_db(
     survey: PupilSurvey, geometric_ratio: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the PSNR (P,) that images filtered with these kernels should exceed."""
+    """Return the PSNR (P,) that images with these kernels are predicted to exceed."""
     return np.where(geometric_ratio > 0.0, predicted_psnr_db(survey), WAVE_DB)

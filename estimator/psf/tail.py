@@ -1,8 +1,8 @@
-"""Mean light far outside the geometric spot, where no grid needs to reach.
+"""Mean diffracted light far outside the geometric spot, in closed form.
 
-At 3 mm and 550 nm, 99.9 % of a perfect eye's light lies within 200 lambda/D, far
-beyond any affordable FFT window.  Only the pupil's edge sends light there, in closed
-form.
+At 3 mm and 550 nm, 99.9 % of the light of a perfect eye is within 200 lambda/D, far
+more than a practical FFT window.  Light far from the spot comes from the edge of the
+pupil only.
 """
 
 import math
@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 EDGE_STRIDE = 4
-"""Every fourth edge sample is used; distances to the edge need no more."""
+"""Every fourth edge sample is used, which suffices for distances to the edge."""
 
 
 @njit(cache=True, nogil=True, fastmath=True)  # type: ignore[untyped-decorator]  # numba
@@ -24,7 +24,7 @@ def _distances(
     near: NDArray[np.float32],
     far: NDArray[np.float32],
 ) -> None:
-    """Write squared distances of a pixel row to the nearest and farthest edge slope."""
+    """Write squared distances of pixels to the nearest and farthest edge slope."""
     for i in range(near.shape[0]):
         near[i] = np.float32(1e30)
         far[i] = np.float32(0.0)
@@ -54,7 +54,7 @@ def _densities(
 ) -> None:
     """Compute the light of a row of pixels from their squared distances.
 
-    ``center`` holds x of the spot's center and the row's height above it.
+    ``center`` is x of the spot's center, and y of the row relative to the center.
     """
     y = center[1]
     xx, yy = np.float32(half[0] * half[0]), np.float32(half[1] * half[1])
@@ -86,12 +86,12 @@ def add_tail(
     shear: float,
     wavelength_um: float,
 ) -> None:
-    """Raise pixels that no engine reaches to the mean edge-diffracted light.
+    """Add the mean edge light to pixels that are outside the window of an engine.
 
     Parameters
     ----------
     kernel : (2R+1, 2R+1) float32
-        Image orientation, in shares of the total light; only the disc is written.
+        In image orientation and shares of the light; only the disc is written.
     window : (4,) int64
         Pixel offsets x0, x1, y0, y1 (y upward, ends included) already computed.
     border_px : float
@@ -99,18 +99,18 @@ def add_tail(
     edge : (n, 2), px
         Edge slopes.
     half, shear : (2,), float
-        The pupil, see `psf.pupil.PupilFrames`.
+        Pupil, see `psf.pupil.PupilFrames`.
     wavelength_um : float
 
     Notes
     -----
-    The edge light of `survey.needed_radius_px` for a wavefront whose edge slopes
-    lie on a circle of radius g about c: density lambda / (2 pi³ D rho)
-    [1/(rho-g)² + 1/(rho+g)²], rho = |p - c|.  For any other edge the distances to its
-    nearest and farthest point replace rho -+ g, so that an elongated spot gets no light
-    beside its long sides that only its ends could send.  An elliptical pupil sends
-    light along its normals: D³ becomes the pupil's cubed width toward p over its area.
-    Fringes are omitted, because pixels average them.
+    For edge slopes on a circle of radius g about c, the edge light of
+    `survey.needed_radius_px` has the density lambda / (2 pi³ D rho)
+    [1/(rho-g)² + 1/(rho+g)²] with rho = |p - c|.  For other edges, the distances to the
+    nearest and farthest edge slope replace rho -+ g, so that an elongated spot has
+    little light beside its long sides.  For an elliptical pupil, D is replaced by the
+    cubed width of the pupil toward p over its area, because light is sent along the
+    normals of the edge.  Fringes are omitted, because pixels average them.
     """
     radius = kernel.shape[0] // 2
     edge_x = np.ascontiguousarray(edge[::EDGE_STRIDE, 0]).astype(np.float32)
@@ -119,7 +119,7 @@ def add_tail(
     border2 = np.float32(border_px * border_px)
     area = half[0] * half[1] * math.sqrt(1.0 - shear * shear)
     strength = wavelength_um * area / (4.0 * math.pi**3)
-    # No integer conversions in the loops, which would not vectorize with them.
+    # Integer conversions inside the loops would prevent vectorization.
     pixels = np.arange(-radius, radius + 1).astype(np.float32)
     distances = np.empty((3, 2 * radius + 1), np.float32)
     for dy in range(-radius, radius + 1):

@@ -1,17 +1,24 @@
-"""Wavefronts of a stack of surfaces, traced from the retina outward.
+"""Wavefronts of an eye, from rays traced from the retina outward.
 
-aberrations        coefficients at any field, pupil and wavelength; many eyes at once
-results            results for wavefronts and their pupils
+aberrations        Zernike coefficients by field, pupil and wavelength; of many eyes
+results            result types
 circle             wavefront on a given circle outside the eye, regardless of the stop
-bundle             ray bundle aimed at the stop and traced out of the eye
-kernels            compiled ray aiming and optical paths
-nodes              sampling points of the stop or a circle
-fit                coefficients and the pupil's rim from rays
-chief_rays         chief rays of other colors: lateral color
+bundle             ray bundle that fills the stop, and its fit
+kernels            compiled chief ray, ray aiming and optical path differences
+nodes              quadrature nodes over the stop or a circle
+fit                least-squares fit of Zernike coefficients and of the pupil's rim
+chief_rays         chief rays by wavelength: lateral color
 chief_ray_kernels  its compiled loops
 field_wavefronts   wavefronts over the field with their pupils, input of the PSF engines
-moved_plane        coefficients transferred from the cornea to the entrance pupil
-pupil_refraction   least-squares refraction over the light that passes
+moved_plane        transfer of a wavefront to another plane along the chief ray
+pupil_refraction   least-squares refraction over the area of the pupil
+
+Wavefronts are given in a plane normal to the chief ray, outside the eye: where the
+chief ray meets the cornea, or where it crosses the plane of the paraxial *entrance
+pupil*.  W is the optical path of the chief ray minus that of a ray, positive where
+light is ahead.  Coefficients use OSA/ANSI order and normalization, to radial order 6,
+on the *circle* about the chief ray that circumscribes the *rim* of the pupil.  Piston
+is zero.  Tilt is kept, so that it balances coma at the chief ray.
 """
 
 import lazy_loader

@@ -1,11 +1,10 @@
-"""Zernike aberrations of a traced eye: Algorithm 1 of Csoba & Kunkli 2023, exactly.
+"""Zernike aberrations of a traced eye: Algorithm 1 of Csoba & Kunkli (2023).
 
-Rays run from the retinal point of the chief ray out of the eye.  They are aimed at the
-stop by Broyden's method from a warm start, where the paper contracts a grid: the same
-rays at a few traces each.  W at a point of the plane through the cornea, normal to the
-chief ray, is the chief ray's optical path minus that point's; its slope is the ray's.
-Pupil coordinates are true positions on the circumscribed circle about the chief ray;
-nothing is stretched, and the ellipse of the projected pupil is returned as well.
+Rays are traced from the retinal point of the chief ray out of the eye.  They are aimed
+at nodes of the stop with Broyden's method, which takes a few traces per ray; the
+paper's contracting grid finds the same rays.  The slope of W at a point is that of the
+ray.  Pupil coordinates are true positions on the circumscribed circle.  They are not
+stretched along the minor axis of the projected pupil, whose ellipse is returned too.
 """
 
 import math
@@ -36,10 +35,10 @@ TRACED_FIELD_LIMIT_DEG = 75.0
 
 
 def pupil_magnification(eye: EyeSurfaces) -> float:
-    """Return entrance pupil over stop at 555 nm about the axial chief ray (parabasal).
+    """Return the diameter of the entrance pupil over that of the stop, at 555 nm.
 
-    For an astigmatic cornea, the root of the product of both meridians' ratios.
-    nan where no axial ray passes the center of the stop.
+    The ratio is parabasal, about the axial chief ray: the geometric mean of both
+    principal meridians.  It is nan if no axial ray passes the center of the stop.
     """
     return float(
         magnification(pack_eye(eye), media_indices(eye, REFERENCE_WAVELENGTH_NM))
@@ -50,7 +49,7 @@ def _stop_diameters_mm(
     eye: EyeSurfaces, stop_mm: ArrayLike | None, pupil_mm: ArrayLike | None
 ) -> NDArray[np.float64]:
     if (stop_mm is None) == (pupil_mm is None):
-        raise ValueError("give either a stop diameter or an (entrance) pupil diameter")
+        raise ValueError("expected either a stop diameter or a pupil diameter")
     given = np.atleast_1d(np.asarray(pupil_mm if stop_mm is None else stop_mm, float))
     if not np.all((given > 0.0) & (given <= 12.0)):
         raise ValueError(f"stop or pupil {given} mm: allowed is above 0 to 12 mm")
@@ -59,8 +58,8 @@ def _stop_diameters_mm(
     ratio = pupil_magnification(eye)
     if not ratio > 0.0:
         raise ValueError(
-            "no light along the axis reaches the middle of the stop, so the entrance "
-            "pupil is unknown: give a stop diameter"
+            "no axial ray passes the center of the stop, so the entrance pupil is "
+            "unknown: give a stop diameter"
         )
     return given / ratio
 
@@ -84,7 +83,7 @@ def _is_at_pupil(plane: str) -> bool:
 
 
 def _in_threads(n: int, n_threads: int | None, work: Callable[[slice], None]) -> None:
-    """Distribute ``n`` items over threads; the compiled work releases the GIL."""
+    """Divide ``n`` items among threads; compiled code releases the GIL."""
     n_threads = max(1, min(n_threads or thread_count(), n))
     bounds = np.linspace(0, n, n_threads + 1).astype(int)
     parts = [slice(a, b) for a, b in pairwise(bounds)]
@@ -110,7 +109,7 @@ def wavefront_grid(
     n_azimuths: int = N_AZIMUTHS,
     n_threads: int | None = None,
 ) -> FieldResults:
-    """Trace the aberrations over fields, wavelengths and pupils, each exactly.
+    """Trace the aberrations for all combinations of field, wavelength and pupil.
 
     Parameters
     ----------
@@ -118,17 +117,17 @@ def wavefront_grid(
     fields_deg : (n_fields, 2)
         Azimuth h and elevation v of the source.
     wavelengths_nm : (n_wavelengths,)
-    stop_diameters_mm or pupil_diameters_mm : (n_stops,)
-        Diameter of the iris, or of the entrance pupil at 555 nm; give one.
+    stop_diameters_mm, pupil_diameters_mm : (n_stops,)
+        Either diameters of the iris, or of the entrance pupil at 555 nm.
     object_dpt : float
-        Vergence of the source, from the entrance pupil along the chief ray; the
-        wavefront is relative to its spherical wave on the plane.
+        Vergence of the source, measured from the entrance pupil along the chief ray.
+        The spherical wave of the source is subtracted from the wavefront.
     plane : {"cornea", "pupil"}
-        Plane of the wavefront, normal to the chief ray: where the chief ray meets the
-        cornea, as for instruments and prescriptions, or where it crosses the plane of
-        the paraxial entrance pupil, the reference of pupils and distances.
+        Plane of the wavefront: where the chief ray meets the cornea, as for instruments
+        and prescriptions, or where it crosses the plane of the paraxial entrance pupil,
+        the reference plane of pupils and distances.
     fit : {"opd", "slope"}
-        Least squares of W, or of its slopes (Algorithm 1).
+        Least-squares fit of W, or of its slopes (Algorithm 1).
     n_rings, n_azimuths : int
         Sampling of the stop, see `wavefront.nodes`.
     n_threads : int, optional
@@ -142,8 +141,12 @@ def wavefront_grid(
     Raises
     ------
     ValueError
-        Values out of range, an eye that cannot be traced, or an entrance pupil
-        diameter for an eye without entrance pupil.
+        A value is out of range, the eye cannot be traced, or a pupil diameter is given
+        for an eye without entrance pupil.
+
+    References
+    ----------
+    Csoba & Kunkli 2023, Algorithm 1.
     """
     check_eye(eye)
     fields_deg = np.atleast_2d(np.asarray(fields_deg, dtype=np.float64))
@@ -155,7 +158,7 @@ def wavefront_grid(
     pupil_z = entrance_pupil_mm(eye, wavelength_nm=REFERENCE_WAVELENGTH_NM)
     shape = (len(fields_deg), len(indices), len(stops_mm), bundle.N_RESULT)
     rows, fields_rad = np.empty(shape), np.radians(fields_deg)
-    viewed = (float(object_dpt), pupil_z, at_pupil, fit == "slope")
+    view = (float(object_dpt), pupil_z, at_pupil, fit == "slope")
 
     def work(part: slice) -> None:
         bundle.analyze_fields(
@@ -163,7 +166,7 @@ def wavefront_grid(
             indices,
             fields_rad[part],
             stops_mm / 2.0,
-            viewed,
+            view,
             nodes,
             rows[part],
         )
@@ -185,33 +188,33 @@ def wavefront_aberrations(
     n_rings: int = N_RINGS,
     n_azimuths: int = N_AZIMUTHS,
 ) -> Aberrations:
-    """Trace the aberrations of one field, wavelength and pupil exactly.
+    """Trace the aberrations of one field, wavelength and pupil.
 
     Parameters
     ----------
     eye : EyeSurfaces
     wavelength_nm : float
-    stop_diameter_mm or pupil_diameter_mm : float
-        Diameter of the iris, or of the entrance pupil at 555 nm; give one.
+    stop_diameter_mm, pupil_diameter_mm : float
+        Either the diameter of the iris, or that of the entrance pupil at 555 nm.
     h_deg, v_deg : float
         Azimuth and elevation of the source.
     object_dpt : float
-        Vergence of the source, from the entrance pupil along the chief ray.
+        Vergence of the source, measured from the entrance pupil along the chief ray.
     fit : {"opd", "slope"}
-        Least squares of W, or of its slopes (paper, Algorithm 1).
+        Least-squares fit of W, or of its slopes (Algorithm 1 of the paper).
     n_rings, n_azimuths : int
         Sampling of the stop, see `wavefront.nodes`.
 
     Returns
     -------
     Aberrations
-        ``zernike_um`` (28,), on the circle of ``zernike_radius_mm`` about the pupil.
+        ``zernike_um`` (28,) is on the circle of ``zernike_radius_mm``, at the cornea.
 
     Raises
     ------
     ValueError
-        Values out of range, an eye that cannot be traced, or an entrance pupil
-        diameter for an eye without entrance pupil.
+        A value is out of range, the eye cannot be traced, or a pupil diameter is given
+        for an eye without entrance pupil.
     """
     stops_mm = _stop_diameters_mm(eye, stop_diameter_mm, pupil_diameter_mm)
     found = wavefront_grid(
@@ -260,20 +263,34 @@ def eyes_aberrations(
     n_azimuths: int = N_AZIMUTHS,
     n_threads: int | None = None,
 ) -> FieldResults:
-    """Trace the aberrations of many eyes, each at one field; leading axis (n_eyes,).
+    """Trace the aberrations of many eyes, each at one field and for one stop.
 
     Parameters
     ----------
-    packed : (n_eyes, n_surfaces + 1, 48)
-        Stacked `surfaces.pack_eye`.
+    packed : (n_eyes, n_surfaces + 1, N_COLUMNS)
+        Stacked results of `surfaces.pack_eye`.
     indices : (n_surfaces + 1,) or (n_eyes, n_surfaces + 1)
-        From `surfaces.media_indices`, at the wavelength of the wavefront.
+        Results of `surfaces.media_indices` at the wavelength of the wavefront.
     stop_diameters_mm, h_deg, v_deg : scalar or (n_eyes,)
     pupil_z_mm : scalar or (n_eyes,)
-        Position where the chief ray crosses the plane of the wavefront, such as the
-        entrance pupil; nan for the cornea.
+        z of the point of the chief ray in the plane of the wavefront, for example that
+        of the entrance pupil; nan for the cornea.
+    fit : {"opd", "slope"}
+        See `wavefront_grid`.
     n_rings, n_azimuths : int
         Sampling of the stop, see `wavefront.nodes`.
+    n_threads : int, optional
+        Number of threads; by default as many as the process may use.
+
+    Returns
+    -------
+    FieldResults
+        Leading axis (n_eyes,).
+
+    Raises
+    ------
+    ValueError
+        A value is out of range.
     """
     packed = np.ascontiguousarray(packed, dtype=np.float64)
     n_eyes = len(packed)
@@ -313,30 +330,31 @@ def on_axis_zernike(
     pupil_z_mm: ArrayLike = math.nan,
     n_threads: int | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Compute coefficients of many eyes on given circles outside the eye.
+    """Trace the wavefronts of many eyes on circles of given radius.
 
-    The circle is filled regardless of the stop; used for measurements, whose circle
-    has half their pupil diameter as its radius.
+    Rays fill the circle regardless of the stop, as in a measurement that is given on
+    the circle of its pupil.
 
     Parameters
     ----------
-    packed : (n_eyes, n_surfaces + 1, 48)
-        Stacked `surfaces.pack_eye`.
+    packed : (n_eyes, n_surfaces + 1, N_COLUMNS)
+        Stacked results of `surfaces.pack_eye`.
     indices : (n_surfaces + 1,) or (n_eyes, n_surfaces + 1)
-        From `surfaces.media_indices`, at the wavelength of the measurement.
+        Results of `surfaces.media_indices` at the wavelength of the measurement.
     zernike_radius_mm : scalar or (n_eyes,)
+        Radius of the circle about the chief ray.
     h_deg, v_deg : float
-        Field; off axis a real pupil fills its circle only in part.
+        Field, the same for all eyes.
     pupil_z_mm : scalar or (n_eyes,)
-        Position where the chief ray crosses the plane of the circle, such as the
-        entrance pupil; nan for the cornea.
+        z of the point of the chief ray in the plane of the circle, for example that of
+        the entrance pupil; nan for the cornea.
     n_threads : int, optional
         Number of threads; by default as many as the process may use.
 
     Returns
     -------
     zernike_um : (n_eyes, 28)
-        Piston zero.  nan where the chief ray or most of the circle fails.
+        Coefficients; nan if the chief ray or most of the other rays fail.
     status_index : (n_eyes,) int
         Worst `RayStatus`; failed rays are excluded from the fit.
     """

@@ -1,8 +1,9 @@
-"""Compiled: the ray bundle that fills the stop of one field, and its results.
+"""Compiled: ray bundle that fills the stop for one field, and the fit of its wavefront.
 
 Rays are aimed at the nodes of a quadrature over the stop: Gauss-Radau rings in the
-squared radius (the last one on the rim), equal azimuths.  It integrates polynomials of
-degree 4 n_rings - 4 (below n_azimuths) exactly, so the fit converges exponentially.
+squared radius, the last one on the rim, at equally spaced azimuths.  The quadrature is
+exact for polynomials of degree 4 n_rings - 4 (if below n_azimuths), so the fit
+converges exponentially.
 """
 
 import math
@@ -10,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from estimator.optics.surface_kernels import RAY_SIZE, TRACED, put
+from estimator.optics.surface_kernels import RAY_SIZE, TRACED, copy_values
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.fit import N_ELLIPSE, fit_ellipse, fit_zernike, rim_radius
 from estimator.wavefront.kernels import (
@@ -21,28 +22,28 @@ from estimator.wavefront.kernels import (
     W,
     X,
     Y,
-    across,
     aim,
     back_to_stop,
     chief_ray,
-    depth_along,
+    distance_along,
     leave_eye,
-    sink_plane,
+    move_plane_inward,
     stop_response,
+    transverse_axes,
 )
 
-_AIM_TOLERANCE_MM = 1e-7  # only moves a sample
-_RIM_TOLERANCE_MM = 1e-9  # equals the error of the radius
+_AIM_TOLERANCE_MM = 1e-7  # an error only moves the sample
+_RIM_TOLERANCE_MM = 1e-9  # an error changes the radius of the circle
 _EDGE_HALVINGS = 40
-_EDGE_MARGIN = 1e-6  # times the stop: more than the aim's tolerance
+_EDGE_MARGIN = 1e-6  # times the stop's radius: exceeds the aiming tolerance
 _FEWEST_SPOKES = 6
 
-# --- columns of one result ---
+# --- columns of a result row ---
 ZERNIKE = 0
 RADIUS = N_TERMS
 ELLIPSE = RADIUS + 1
 RMS = ELLIPSE + N_ELLIPSE
-OPEN_SHARE = RMS + 1  # of the stop's area that light passes
+OPEN_SHARE = RMS + 1  # unvignetted fraction of the stop's area
 CHIEF_STATUS = OPEN_SHARE + 1
 WORST_STATUS = CHIEF_STATUS + 1
 RETINA_POINT = WORST_STATUS + 1
@@ -50,23 +51,24 @@ PLANE_POINT = RETINA_POINT + 3
 N_RESULT = PLANE_POINT + 3
 
 
-# Arguments that always go together are passed as one tuple, ``light``:
-# (packed, indices, chief (2, 3): retinal point and plane's point, frame (2, 3) across
-# the chief ray in the eye and the ray itself, axes (3, 3) outside, chief path in mm).
+# The tuple ``light`` describes the source of the rays and the plane of the wavefront:
+# (packed, indices, chief (2, 3): retinal point and point in the plane, frame (3, 3):
+# axes inside the eye, the third along the chief ray, axes (3, 3) outside, path of the
+# chief ray in mm).
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def prepare_chief(packed, indices, h_rad, v_rad, chief, frame, axes, response, sag):
-    """Trace a field's chief ray in and out; return (status, optical path in mm)."""
+    """Trace the chief ray of a field in and out; return (status, path in mm)."""
     ray, start = np.empty(RAY_SIZE), np.empty(2)
     status = chief_ray(packed, indices, h_rad, v_rad, axes, start, ray, sag)
     if status != TRACED:
         return status, math.nan
-    put(ray, chief[0])
-    put(ray, chief[1])
+    copy_values(ray, chief[0])
+    copy_values(ray, chief[1])
     for i in range(3):
         frame[2, i] = -ray[3 + i]
-    across(frame[2], frame)
+    transverse_axes(frame[2], frame)
     status = back_to_stop(packed, indices, chief, frame, 0.0, 0.0, ray, sag)
     if status != TRACED:
         return status, math.nan
@@ -74,7 +76,7 @@ def prepare_chief(packed, indices, h_rad, v_rad, chief, frame, axes, response, s
     status = leave_eye(packed, indices, chief, axes, 0.0, ray, sample, sag)
     if status != TRACED:
         return status, math.nan
-    put(ray, chief[1])
+    copy_values(ray, chief[1])
     path_mm = ray[6]
     status = stop_response(packed, indices, chief, frame, ray, response, sag)
     return status, path_mm
@@ -82,7 +84,7 @@ def prepare_chief(packed, indices, h_rad, v_rad, chief, frame, axes, response, s
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def extrapolate(radii, solution, ring, out):
-    """Extrapolate the directions of inner rings (and the chief ray) to this one."""
+    """Extrapolate ray directions at the retina from inner rings to ring ``ring``."""
     first = max(0, ring - 3)
     out[:] = 0.0
     for i in range(first, ring):
@@ -95,8 +97,8 @@ def extrapolate(radii, solution, ring, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _shoot(light, x, y, tolerance, guess, inverse, ray, sample, sag):
-    """Trace one ray through (x, y) of the stop and out; return its status."""
+def _trace_aimed(light, x, y, tolerance, guess, inverse, ray, sample, sag):
+    """Trace a ray aimed at (x, y) of the stop out of the eye; return its status."""
     packed, indices, chief, frame, axes, path = light
     status = aim(
         packed, indices, chief, frame, x, y, tolerance, guess, inverse, ray, sag
@@ -107,10 +109,11 @@ def _shoot(light, x, y, tolerance, guess, inverse, ray, sample, sag):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _walk_spoke(light, radii, azimuth, response, solution, out, sag):
-    """Trace rings 1.. of one azimuth, outward; return (rings done, status of the next).
+def _trace_spoke(light, radii, azimuth, response, solution, out, sag):
+    """Trace the rings of one azimuth; return their number and the last ray's status.
 
-    ``radii`` (n_rings + 1,) start at 0, the chief ray; ``out`` is (n_rings, N_SAMPLE).
+    ``radii`` (n_rings + 1,) start with 0, the chief ray; ``out`` is (n_rings,
+    N_SAMPLE).
     """
     inverse, guess, ray = response.copy(), np.empty(2), np.empty(RAY_SIZE)
     solution[0] = 0.0
@@ -123,18 +126,21 @@ def _walk_spoke(light, radii, azimuth, response, solution, out, sag):
             extrapolate(radii, solution, ring, guess)
         is_rim = ring == radii.shape[0] - 1
         tolerance = _RIM_TOLERANCE_MM if is_rim else _AIM_TOLERANCE_MM
-        status = _shoot(light, x, y, tolerance, guess, inverse, ray, out[ring - 1], sag)
+        status = _trace_aimed(
+            light, x, y, tolerance, guess, inverse, ray, out[ring - 1], sag
+        )
         if status != TRACED:
             return ring - 1, status
-        put(guess, solution[ring])
+        copy_values(guess, solution[ring])
     return radii.shape[0] - 1, TRACED
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _open_radius(light, low, high, azimuth, inner, response, sag):
-    """Bisect the largest stop radius on this azimuth that light still passes.
+    """Return the largest radius of the stop on an azimuth without vignetting.
 
-    ``inner`` (2,) holds the direction cosines of the ray through radius ``low``.
+    It is found by bisection; ``inner`` (2,) is the direction of the ray through
+    ``low``.
     """
     ray, sample, guess = np.empty(RAY_SIZE), np.empty(N_SAMPLE), np.empty(2)
     inverse, known = np.empty((2, 2)), inner.copy()
@@ -142,15 +148,15 @@ def _open_radius(light, low, high, azimuth, inner, response, sag):
         radius = 0.5 * (low + high)
         share = radius / low if low > 0.0 else 1.0
         for i in range(2):
-            put(response[i], inverse[i])
+            copy_values(response[i], inverse[i])
             guess[i] = share * known[i]
         x, y = radius * azimuth[0], radius * azimuth[1]
-        status = _shoot(
+        status = _trace_aimed(
             light, x, y, _AIM_TOLERANCE_MM, guess, inverse, ray, sample, sag
         )
         if status == TRACED:
             low = radius
-            put(guess, known)
+            copy_values(guess, known)
         else:
             high = radius
     return low
@@ -158,10 +164,11 @@ def _open_radius(light, low, high, azimuth, inner, response, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def sample_pupil(light, response, stop_radius, rings, azimuths, samples, edge, sag):
-    """Fill ``samples`` (n_azimuths, n_rings, N_SAMPLE) with one field's wavefront.
+    """Sample the wavefront of a field; return the worst status of its rays.
 
-    Where an azimuth is vignetted, its rings are compressed to the open part; ``edge``
-    (n_azimuths,) is the open share of the radius.  Returns the worst status.
+    ``samples`` is (n_azimuths, n_rings, N_SAMPLE).  On vignetted azimuths, the rings
+    are compressed to the open part, whose fraction of the radius is written to ``edge``
+    (n_azimuths,).
     """
     n_rings, worst = rings.shape[0], TRACED
     radii, solution = np.zeros(n_rings + 1), np.zeros((n_rings + 1, 2))
@@ -170,7 +177,7 @@ def sample_pupil(light, response, stop_radius, rings, azimuths, samples, edge, s
         for attempt in range(2):
             for ring in range(n_rings):
                 radii[ring + 1] = stop_radius * edge[k] * rings[ring]
-            done, status = _walk_spoke(
+            done, status = _trace_spoke(
                 light, radii, azimuths[k], response, solution, samples[k], sag
             )
             if status == TRACED:
@@ -193,8 +200,8 @@ def sample_pupil(light, response, stop_radius, rings, azimuths, samples, edge, s
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _refer_to_object(samples, distance_mm):
-    """Subtract from W the wave of a point ``distance_mm`` in front of the plane."""
+def _subtract_object_wave(samples, distance_mm):
+    """Subtract the spherical wave of a source ``distance_mm`` in front of the plane."""
     for i in range(samples.shape[0]):
         squared = samples[i, X] ** 2 + samples[i, Y] ** 2
         root = math.sqrt(1.0 + squared / (distance_mm * distance_mm))
@@ -205,8 +212,8 @@ def _refer_to_object(samples, distance_mm):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _read_pupil(samples, edge, ring_weights, distance_mm, use_slopes, result):
-    """Compute coefficients, radius, ellipse and residual of one filled stop."""
+def _analyze_pupil(samples, edge, ring_weights, distance_mm, use_slopes, result):
+    """Compute coefficients, radius, ellipse and residual from the samples of a stop."""
     n_azimuths, n_rings = samples.shape[0], samples.shape[1]
     weights = np.zeros((n_azimuths, n_rings))
     rim = np.empty((2, n_azimuths))
@@ -230,25 +237,27 @@ def _read_pupil(samples, edge, ring_weights, distance_mm, use_slopes, result):
     fit_ellipse(rim[0], rim[1], radius, result[ELLIPSE : ELLIPSE + N_ELLIPSE])
     flat = samples.reshape(n_azimuths * n_rings, N_SAMPLE)
     if distance_mm < math.inf:
-        _refer_to_object(flat, distance_mm)
+        _subtract_object_wave(flat, distance_mm)
     result[RMS] = fit_zernike(
         flat, weights.ravel(), radius, use_slopes, result[ZERNIKE : ZERNIKE + N_TERMS]
     )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def analyze_field(packed, indices, field_rad, stop_radii, viewed, nodes, results):
+def analyze_field(packed, indices, field_rad, stop_radii, view, nodes, results):
     """Compute the results of one field and wavelength, one row per stop.
 
     Parameters
     ----------
+    packed : (n_surfaces + 1, N_COLUMNS)
+    indices : (n_surfaces + 1,)
     field_rad : (h, v)
     stop_radii : (n_stops,) mm
-    viewed : (object_dpt, entrance pupil z in mm, at_pupil, use_slopes)
+    view : (object_dpt, entrance pupil z in mm, at_pupil, use_slopes)
     nodes : (rings (n_rings,), their weights, azimuths (n_azimuths, 2))
     results : (n_stops, N_RESULT) out
     """
-    object_dpt, pupil_z, at_pupil, use_slopes = viewed
+    object_dpt, pupil_z, at_pupil, use_slopes = view
     rings, ring_weights, azimuths = nodes
     chief, frame, axes = np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 3))
     response, sag = np.empty((2, 2)), np.empty(3)
@@ -261,9 +270,9 @@ def analyze_field(packed, indices, field_rad, stop_radii, viewed, nodes, results
     results[:, WORST_STATUS] = status
     if status != TRACED:
         return
-    along, distance_mm = depth_along(chief, axes, pupil_z), math.inf
+    along, distance_mm = distance_along(chief, axes, pupil_z), math.inf
     if at_pupil:
-        sink_plane(chief, axes, along)
+        move_plane_inward(chief, axes, along)
         path -= along * indices[0]
         along = 0.0
     if object_dpt != 0.0:
@@ -276,13 +285,13 @@ def analyze_field(packed, indices, field_rad, stop_radii, viewed, nodes, results
         result[WORST_STATUS] = sample_pupil(
             light, response, stop_radii[s], rings, azimuths, samples, edge, sag
         )
-        put(chief[0], result[RETINA_POINT : RETINA_POINT + 3])
-        put(chief[1], result[PLANE_POINT : PLANE_POINT + 3])
-        _read_pupil(samples, edge, ring_weights, distance_mm, use_slopes, result)
+        copy_values(chief[0], result[RETINA_POINT : RETINA_POINT + 3])
+        copy_values(chief[1], result[PLANE_POINT : PLANE_POINT + 3])
+        _analyze_pupil(samples, edge, ring_weights, distance_mm, use_slopes, result)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def analyze_fields(packed, indices, fields_rad, stop_radii, viewed, nodes, results):
+def analyze_fields(packed, indices, fields_rad, stop_radii, view, nodes, results):
     """Run `analyze_field` over fields (F, 2) and wavelengths (L, n_surfaces + 1).
 
     ``results`` is (F, L, n_stops, N_RESULT).
@@ -291,7 +300,7 @@ def analyze_fields(packed, indices, fields_rad, stop_radii, viewed, nodes, resul
         field_rad = (fields_rad[f, 0], fields_rad[f, 1])
         for w in range(indices.shape[0]):
             analyze_field(
-                packed, indices[w], field_rad, stop_radii, viewed, nodes, results[f, w]
+                packed, indices[w], field_rad, stop_radii, view, nodes, results[f, w]
             )
 
 
@@ -301,12 +310,17 @@ def analyze_eyes(
 ):
     """Run `analyze_field` over eyes, each with its own field and stop.
 
-    ``packed`` (E, n_surfaces + 1, 48), ``indices`` (E, n_surfaces + 1), ``fields_rad``
-    (E, 2), ``stop_radii`` and ``pupil_z_mm`` (E,), nan for the plane at the cornea,
-    ``results`` (E, N_RESULT).
+    Parameters
+    ----------
+    packed : (E, n_surfaces + 1, N_COLUMNS)
+    indices : (E, n_surfaces + 1)
+    fields_rad : (E, 2)
+    stop_radii, pupil_z_mm : (E,)
+        In mm; a ``pupil_z_mm`` of nan selects the plane at the cornea.
+    results : (E, N_RESULT) out
     """
     for e in range(packed.shape[0]):
         field_rad = (fields_rad[e, 0], fields_rad[e, 1])
         stop, result = stop_radii[e : e + 1], results[e : e + 1]
-        viewed = (0.0, pupil_z_mm[e], not math.isnan(pupil_z_mm[e]), use_slopes)
-        analyze_field(packed[e], indices[e], field_rad, stop, viewed, nodes, result)
+        view = (0.0, pupil_z_mm[e], not math.isnan(pupil_z_mm[e]), use_slopes)
+        analyze_field(packed[e], indices[e], field_rad, stop, view, nodes, result)

@@ -1,9 +1,9 @@
-"""Lateral color: apparent direction of each wavelength's chief ray.
+"""Lateral color: shift of the apparent direction of chief rays with wavelength.
 
-Light of one wavelength from a direction u goes through the center of the stop to a
-point of the retina.  The eye attributes it to the direction whose light at 555 nm ends
-at that point, that is the 555 nm ray from the point back through the center of the
-stop and out.  The angle from u to that direction is the shift.
+The chief ray of a wavelength from direction u meets the retina at a point.  The
+apparent direction is the one whose 555 nm chief ray meets the same point; it is found
+by tracing from that point back through the center of the stop.  The shift is the angle
+from u to the apparent direction.
 """
 
 import numpy as np
@@ -17,10 +17,11 @@ from estimator.wavefront.chief_ray_kernels import fill_chief_shifts
 def chief_shift_mrad(
     eye: EyeSurfaces, *, fields_deg: ArrayLike, wavelengths_nm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return the shift of chief rays against 555 nm, along the pupil axes, mrad.
+    """Return the lateral color of an eye relative to 555 nm.
 
     Parameters
     ----------
+    eye : EyeSurfaces
     fields_deg : (n_fields, 2)
         Azimuth h and elevation v of the source.
     wavelengths_nm : (n_wavelengths,)
@@ -28,8 +29,13 @@ def chief_shift_mrad(
     Returns
     -------
     shift_mrad : (n_fields, n_wavelengths, 2)
-        Direction cosines of the apparent direction along ex and ey of the field; nan
-        where a chief ray fails.
+        Direction cosines of the apparent direction along ex and ey of the field, times
+        1000; nan if a chief ray fails.
+
+    Raises
+    ------
+    ValueError
+        The eye cannot be traced, or a wavelength is out of range.
     """
     check_eye(eye)
     fields_rad = np.radians(np.atleast_2d(np.asarray(fields_deg, dtype=np.float64)))

@@ -1,8 +1,9 @@
-"""Compiled: the wavefront on a given circle outside the eye, for many eyes at once.
+"""Compiled: wavefront on a given circle outside the eye, for many eyes at once.
 
-Estimation compares these: a measurement is given on a circle about the chief ray, so
-rays are aimed at fixed points of that circle instead of the stop.  The fit is then one
-fixed matrix.  A ray need not hit its point exactly: its slope extrapolates W to it.
+Measurements, with which the estimation compares eyes, are given on a circle about the
+chief ray.  Rays are therefore aimed at fixed points of this circle instead of the stop,
+and the fit is a product with a constant matrix.  Aiming errors are corrected to first
+order: the slope at the ray extrapolates W to the point.
 """
 
 import math
@@ -10,7 +11,12 @@ import math
 import numpy as np
 from numba import njit
 
-from estimator.optics.surface_kernels import NOT_CONVERGED, RAY_SIZE, TRACED, put
+from estimator.optics.surface_kernels import (
+    NOT_CONVERGED,
+    RAY_SIZE,
+    TRACED,
+    copy_values,
+)
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.bundle import extrapolate, prepare_chief
 from estimator.wavefront.fit import fit_zernike
@@ -22,14 +28,14 @@ from estimator.wavefront.kernels import (
     X,
     Y,
     back_to_stop,
-    depth_along,
+    distance_along,
     leave_eye,
-    sink_plane,
+    move_plane_inward,
     update_inverse,
 )
 
 _TOLERANCE_MM = 2e-5
-"""Miss that the slope compensates: W'' of 20 um/mm² leaves 4e-9 um."""
+"""Aiming error that the slope corrects: with W'' = 20 um/mm², to 4e-9 um."""
 
 _STEPS = 20
 _SMALLEST_SHARE = 1e-2
@@ -50,7 +56,7 @@ def _through(light, a, b, ray, sample, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _circle_response(light, inverse, ray, sample, sag):
-    """Write the inverse (2, 2) of the change on the circle with retinal direction."""
+    """Write the inverse Jacobian (2, 2) of position on the circle by ray direction."""
     h = _DIFFERENCE_COSINE
     status = _through(light, h, 0.0, ray, sample, sag)
     if status != TRACED:
@@ -66,7 +72,7 @@ def _circle_response(light, inverse, ray, sample, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _aim_outside(light, x, y, guess, inverse, ray, sample, sag):
-    """Find the ray that leaves at (x, y) by Broyden's method; extrapolate W to it."""
+    """Aim a ray at (x, y) of the circle by Broyden's method; extrapolate W to it."""
     a, b = guess[0], guess[1]
     status = _through(light, a, b, ray, sample, sag)
     if status != TRACED:
@@ -121,8 +127,8 @@ def _circle_samples(light, radius_mm, rings, azimuths, samples, weights, sag):
                 samples[k, ring - 1 :] = 0.0
                 weights[k, ring - 1 :] = 0.0
                 break
-            put(guess, solution[ring])
-            put(sample, samples[k, ring - 1])
+            copy_values(guess, solution[ring])
+            copy_values(sample, samples[k, ring - 1])
     return worst
 
 
@@ -138,20 +144,20 @@ def _count_used(weights):
 def circle_zernike(
     packed, indices, field_rad, radii_mm, pupil_z_mm, nodes, zernike_um, status
 ):
-    """Compute coefficients of many eyes, each on its circle about one chief ray.
+    """Compute the coefficients of many eyes, each on its own circle, at one field.
 
     Parameters
     ----------
-    packed : (n_eyes, n_surfaces + 1, 48)
+    packed : (n_eyes, n_surfaces + 1, N_COLUMNS)
     indices : (n_eyes, n_surfaces + 1)
     field_rad : (h, v)
     radii_mm : (n_eyes,)
     pupil_z_mm : (n_eyes,)
-        Position where the chief ray crosses the plane of the circle; nan: the cornea.
+        z of the point of the chief ray in the plane of the circle; nan: the cornea.
     nodes : (rings (n_rings,), weights (n_rings,), azimuths (n_azimuths, 2),
         projection (28, n_azimuths * n_rings))
     zernike_um : (n_eyes, 28) out
-        nan where the chief ray or most of the circle fails.
+        nan if the chief ray or most of the other rays fail.
     status : (n_eyes,) out
         Worst ray status; failed rays are excluded from the fit.
     """
@@ -179,8 +185,8 @@ def circle_zernike(
         if code != TRACED:
             continue
         if not math.isnan(pupil_z_mm[e]):
-            along = depth_along(chief, axes, pupil_z_mm[e])
-            sink_plane(chief, axes, along)
+            along = distance_along(chief, axes, pupil_z_mm[e])
+            move_plane_inward(chief, axes, along)
             path -= along * indices[e, 0]
         for k in range(n_azimuths):
             for ring in range(n_rings):

@@ -1,8 +1,8 @@
-"""Wavefronts over the visual field, in the form that the PSF engines take.
+"""Wavefronts over the visual field, as input of the PSF engines.
 
-Wavefronts are interpolated between nodes as polynomials in mm of the pupil plane, which
-do not depend on the circle of the fit.  A pupil's rim is a center and a symmetric
-matrix, which vary smoothly where the axes of an ellipse jump.
+Wavefronts are interpolated as polynomials in mm of the pupil plane, which do not depend
+on the circle of the fit.  The rim of a pupil is represented by its center and a
+symmetric matrix, which vary smoothly even where the axes of the ellipse are equal.
 """
 
 from dataclasses import dataclass
@@ -22,24 +22,25 @@ TILT_Y, TILT_X = 1, 2
 """Index of C(1,-1) and C(1,1)."""
 
 N_RIM = 5
-"""Columns of a rim: center x, y and the matrix' xx, xy, yy, mm."""
+"""Columns of a rim: x, y of the center and xx, xy, yy of the matrix, mm."""
 
 N_SAMPLED, N_NEWTON_STEPS, NEWTON_STEP_RAD = 16, 4, 0.2
-"""Search for a rim's farthest point: number of samples, then Newton steps and limit."""
+"""Search for the farthest point of a rim: number of samples, and number and largest
+length of Newton steps."""
 
 _ANGLES = 2.0 * np.pi * np.arange(N_SAMPLED) / N_SAMPLED
 
 
 @dataclass(frozen=True)
 class FieldWavefronts:
-    """P wavefronts with their pupils, as `psf.compute.compute_psf_batch` takes them.
+    """P wavefronts with their pupils, as arguments of `psf.compute.compute_psf_batch`.
 
     Attributes
     ----------
     zernike_um : (P, 28), um
-        OSA coefficients on the circle, tilt kept, piston zero.
+        Coefficients on the circle; tilt is kept, piston is zero.
     circle_diameter_mm : (P,)
-        Circle about the chief ray, circumscribed about the pupil.
+        Diameter of the circle about the chief ray that circumscribes the pupil.
     pupil_ellipse : (P, 5)
         Center x, y, semi-axes major, minor (mm) and angle of the major axis (rad).
     """
@@ -50,7 +51,7 @@ class FieldWavefronts:
 
 
 def rim_from_ellipse(ellipse_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return center and symmetric matrix (..., 5) of ellipses (..., 5), mm."""
+    """Return the rims (..., 5), center and symmetric matrix, of ellipses (..., 5)."""
     x, y, major, minor, angle = np.moveaxis(ellipse_mm, -1, 0)
     cosine, sine = np.cos(angle), np.sin(angle)
     xx = major * cosine**2 + minor * sine**2
@@ -59,7 +60,11 @@ def rim_from_ellipse(ellipse_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def ellipse_from_rim(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ellipses (..., 5): center x, y, semi-major, semi-minor, angle < pi."""
+    """Return the ellipses (..., 5) of rims (..., 5).
+
+    Columns are center x, y, semi-major and semi-minor axis, mm, and the angle of the
+    major axis, 0 to pi.
+    """
     x, y, xx, xy, yy = np.moveaxis(rim_mm, -1, 0)
     mean, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
     angle = 0.5 * np.arctan2(2.0 * xy, xx - yy) % np.pi
@@ -67,7 +72,7 @@ def ellipse_from_rim(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def circumscribed_radius_mm(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the radius (...) of the circle about the chief ray that holds a rim."""
+    """Return the radius (...), mm, of the circumscribed circle about the chief ray."""
     x, y, xx, xy, yy = np.moveaxis(rim_mm[..., None], -2, 0)
 
     def rim_point(
@@ -76,14 +81,14 @@ def circumscribed_radius_mm(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         return x + xx * cosine + xy * sine, y + xy * cosine + yy * sine
 
     def half_square(angle: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return half the squared distance of a rim point."""
+        """Return half the squared distance of a rim point from the chief ray."""
         px, py = rim_point(np.cos(angle), np.sin(angle))
         return 0.5 * (px * px + py * py)
 
     def derivatives(
         angle: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the first two derivatives of that."""
+        """Return the first and second derivative of `half_square`."""
         cosine, sine = np.cos(angle), np.sin(angle)
         px, py = rim_point(cosine, sine)
         tx, ty = xy * cosine - xx * sine, yy * cosine - xy * sine
@@ -94,8 +99,8 @@ def circumscribed_radius_mm(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     angle = _ANGLES[np.argmax(sampled, axis=-1)][..., None]
     for _ in range(N_NEWTON_STEPS):
         first, second = derivatives(angle)
-        bends_down = second < 0.0
-        step = np.where(bends_down, -first / np.where(bends_down, second, 1.0), 0.0)
+        is_concave = second < 0.0
+        step = np.where(is_concave, -first / np.where(is_concave, second, 1.0), 0.0)
         angle = angle + np.clip(step, -NEWTON_STEP_RAD, NEWTON_STEP_RAD)
     highest = np.maximum(half_square(angle)[..., 0], sampled.max(axis=-1))
     radius_mm: NDArray[np.float64] = np.sqrt(2.0 * highest)
@@ -105,7 +110,7 @@ def circumscribed_radius_mm(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 def polynomial_in_mm(
     zernike_um: NDArray[np.float64], radius_mm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return monomial coefficients (..., 28), um/mm^degree, from circles (...)."""
+    """Return monomials (..., 28), um/mm^degree, of coefficients on circles (...)."""
     radius_mm = np.asarray(radius_mm, dtype=np.float64)[..., None]
     return wavefront_polynomial(zernike_um) / radius_mm**DEGREE
 
@@ -113,7 +118,10 @@ def polynomial_in_mm(
 def zernike_from_polynomial(
     polynomial_um: NDArray[np.float64], radius_mm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return OSA coefficients (..., 28), um, on circles (...); piston zero."""
+    """Return coefficients (..., 28), um, on circles (...), of monomials in mm.
+
+    Piston is zero.
+    """
     radius_mm = np.asarray(radius_mm, dtype=np.float64)[..., None]
     zernike_um = (polynomial_um * radius_mm**DEGREE) @ np.linalg.inv(monomial_matrix())
     zernike_um[..., 0] = 0.0
@@ -123,11 +131,16 @@ def zernike_from_polynomial(
 def correction_polynomial(
     correction: rx.Prescription | None, *, entrance_pupil_mm: float
 ) -> NDArray[np.float64]:
-    """Return monomial coefficients (28,), um/mm^degree, that a correction subtracts.
+    """Return the monomials (28,), um/mm^degree, of a correction's power, to subtract.
 
-    The same diopters at every field, in the plane of the entrance pupil at that depth
-    behind the cornea: a lens that is turned to the source.  The off-axis aberrations of
-    a real lens depend on its shape.
+    The power, in the plane of the entrance pupil, is the same at all fields.  Oblique
+    aberrations of spectacle lenses depend on their shape and are not modeled.
+
+    Parameters
+    ----------
+    correction : Prescription or None
+    entrance_pupil_mm : float
+        Depth of the entrance pupil behind the cornea.
     """
     if correction is None:
         return np.zeros(DEGREE.size)
@@ -140,7 +153,7 @@ def correction_polynomial(
 def total_defocus_dpt(
     zernike_um: NDArray[np.float64], radius_mm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return M = -4 sqrt(3) C(2,0) / r² (...), least-squares, of sets on circles."""
+    """Return the least-squares M = -4 sqrt(3) C(2,0) / r² (...), dpt."""
     return -SPHERE_PER_C20 * zernike_um[..., rx.C20] / np.square(radius_mm)
 
 
@@ -151,7 +164,16 @@ def with_defocus(
     *,
     total_defocus_dpt: ArrayLike,
 ) -> FieldWavefronts:
-    """Return wavefronts (P, 28) on circles (P,) with their defocus replaced."""
+    """Return P wavefronts whose least-squares defocus is replaced.
+
+    Parameters
+    ----------
+    zernike_um : (P, 28)
+    rim_mm : (P, 5)
+    radius_mm : (P,)
+        Radius of the circle of the coefficients.
+    total_defocus_dpt : (P,)
+    """
     zernike_um = zernike_um.copy()
     zernike_um[:, rx.C20] = -np.ravel(total_defocus_dpt) * radius_mm**2 / SPHERE_PER_C20
     return FieldWavefronts(
@@ -166,9 +188,9 @@ def with_tilt(
     radius_mm: ArrayLike,
     shift_mrad: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return wavefronts (P, 28) on circles (P,) with PSFs shifted by (P, 2), x and y.
+    """Return wavefronts (P, 28) with a tilt that shifts their PSFs by (P, 2), mrad.
 
-    A PSF lies at +grad W (mrad = um/mm), and Z(1,1) = 2 x / r.
+    A PSF is at +grad W (um/mm = mrad), and Z(1,1) = 2 x / r.
     """
     zernike_um = zernike_um.copy()
     tilt_um = 0.5 * np.asarray(radius_mm)[..., None] * shift_mrad
@@ -179,11 +201,11 @@ def with_tilt(
 def distinct_rows(
     *columns: NDArray[Any],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first index of each distinct row of columns (n,), and row numbers."""
+    """Return indices (m,) of distinct rows of columns (n,), and the inverse (n,)."""
     number = np.zeros(columns[0].size, dtype=np.int64)
     for column in columns:
         if (column == column[:1]).all():
-            continue  # most calls vary only one or two of them
-        values, place = np.unique(column, return_inverse=True)
-        number = np.unique(number * values.size + place, return_inverse=True)[1]
+            continue  # in most calls, only one or two columns vary
+        values, inverse = np.unique(column, return_inverse=True)
+        number = np.unique(number * values.size + inverse, return_inverse=True)[1]
     return np.unique(number, return_index=True)[1], number

@@ -1,4 +1,4 @@
-"""Compiled least squares of wavefront samples: Zernike terms, rim radius, ellipse."""
+"""Compiled fits to wavefront samples: Zernike coefficients, rim radius, ellipse."""
 
 import math
 
@@ -11,7 +11,7 @@ from estimator.wavefront.kernels import SLOPE_X, SLOPE_Y, W, X, Y
 _FROM_MONOMIALS = np.ascontiguousarray(monomial_matrix().T)  # [monomial, j]
 _ORDER = MAX_RADIAL_ORDER
 _PIVOT_LIMIT = 1e-13
-"""Smallest pivot, relative to its diagonal, of a non-singular fit."""
+"""Smallest pivot, relative to the diagonal, of a regular matrix."""
 
 _RIM_STEPS = 20
 _NO_DERIVATIVE = np.int64(0)
@@ -24,7 +24,7 @@ N_ELLIPSE = 5
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cholesky_solve(matrix, right):
-    """Solve a symmetric system in place (lower triangle read); False if singular."""
+    """Solve a symmetric system in place from its lower triangle; False if singular."""
     n = matrix.shape[0]
     for i in range(n):
         diagonal = matrix[i, i]
@@ -91,7 +91,7 @@ def _powers(x, y):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _combine(px, py, d_x, d_y, basis):
-    """Write the basis (28, n) from monomials, or its derivative by ``d_x``, ``d_y``."""
+    """Write the polynomials (28, n) or their derivatives of order ``d_x``, ``d_y``."""
     basis[:] = 0.0
     monomial = np.empty(px.shape[1])
     t = -1
@@ -110,7 +110,7 @@ def _combine(px, py, d_x, d_y, basis):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def zernike_basis(x, y):
-    """Return values (28, n) of the polynomials at points (n,) of the unit circle."""
+    """Return the polynomials (28, n) at points (n,) of the unit circle."""
     basis = np.empty((N_TERMS, x.shape[0]))
     px, py = _powers(x, y)
     _combine(px, py, _NO_DERIVATIVE, _NO_DERIVATIVE, basis)
@@ -129,7 +129,7 @@ def _add_normal_equations(basis, values, weights, first, matrix, right):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fit_zernike(samples, weights, radius_mm, use_slopes, zernike_um):
-    """Fit samples on the circle of ``radius_mm`` by weighted least squares.
+    """Fit Zernike coefficients to samples by weighted least squares.
 
     Parameters
     ----------
@@ -137,15 +137,17 @@ def fit_zernike(samples, weights, radius_mm, use_slopes, zernike_um):
         Position (mm), W (um) and slopes (um/mm).
     weights : (n,)
         Zero excludes a sample.
+    radius_mm : float
+        Radius of the circle of the coefficients.
     use_slopes : bool
         Fit the slopes (Algorithm 1) instead of W.
     zernike_um : (28,) out
-        Piston is zero and not part of the residual.
+        Coefficients; piston is zero.
 
     Returns
     -------
     rms_um : float
-        RMS residual of W over the samples; nan where the fit is singular.
+        RMS residual of W without piston; nan if the fit is singular.
     """
     x, y = samples[:, X] / radius_mm, samples[:, Y] / radius_mm
     first = 1 if use_slopes else 0
@@ -159,25 +161,25 @@ def fit_zernike(samples, weights, radius_mm, use_slopes, zernike_um):
             slopes = samples[:, SLOPE_Y if d_y else SLOPE_X] * radius_mm
             _add_normal_equations(basis, slopes, weights, first, matrix, right)
     _combine(px, py, _NO_DERIVATIVE, _NO_DERIVATIVE, basis)
-    rest = samples[:, W].copy()
+    residual = samples[:, W].copy()
     if not use_slopes:
-        _add_normal_equations(basis, rest, weights, first, matrix, right)
+        _add_normal_equations(basis, residual, weights, first, matrix, right)
     if not cholesky_solve(matrix, right):
         zernike_um[:] = math.nan
         return math.nan
     zernike_um[0] = 0.0
     for j in range(1, N_TERMS):
         zernike_um[j] = right[j - first]
-        _add_scaled(-zernike_um[j], basis[j], rest)
+        _add_scaled(-zernike_um[j], basis[j], residual)
     total = weights.sum()
-    rest -= _dot(weights, rest) / total
-    _product(rest, rest, basis[0])
+    residual -= _dot(weights, residual) / total
+    _product(residual, residual, basis[0])
     return math.sqrt(_dot(weights, basis[0]) / total)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _series_peak(mean, even, odd, angle, reach):
-    """Return a Fourier series' maximum within ``reach`` of ``angle``, by Newton."""
+    """Return the maximum of a Fourier series within ``reach`` of ``angle``."""
     largest, start = 0.0, angle
     for _ in range(_RIM_STEPS):
         value, slope, bend = mean, 0.0, 0.0
@@ -199,10 +201,10 @@ def _series_peak(mean, even, odd, angle, reach):
 def rim_radius(x, y, is_whole):
     """Return the largest distance (mm) of the rim from the chief ray.
 
-    ``x``, ``y`` (n,) are rim points at equal steps of stop azimuth.  A whole rim is
-    smooth: its squared distance is interpolated by its Fourier series, and Newton's
-    method finds the peak near every local maximum.  A vignetted rim has kinks, and its
-    farthest point is used.
+    ``x``, ``y`` (n,) are rim points at equally spaced azimuths of the stop.  The rim of
+    an unvignetted pupil is smooth: Newton's method finds the maxima of the Fourier
+    series of its squared distance.  A vignetted rim has kinks, so the farthest of its
+    points is used.
     """
     n = x.shape[0]
     squared = x * x + y * y
@@ -228,7 +230,7 @@ def rim_radius(x, y, is_whole):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fit_ellipse(x, y, radius_mm, ellipse):
-    """Fit the conic a x² + b xy + c y² + d x + e y = 1 to rim points."""
+    """Fit an ellipse, the conic a x² + b xy + c y² + d x + e y = 1, to rim points."""
     matrix, right, row = np.zeros((5, 5)), np.zeros(5), np.empty(5)
     for i in range(x.shape[0]):
         u, v = x[i] / radius_mm, y[i] / radius_mm
@@ -249,6 +251,6 @@ def fit_ellipse(x, y, radius_mm, ellipse):
     ellipse[CENTER_X], ellipse[CENTER_Y] = cx * radius_mm, cy * radius_mm
     ellipse[SEMI_MAJOR] = radius_mm * math.sqrt(level / (half - spread))
     ellipse[SEMI_MINOR] = radius_mm * math.sqrt(level / (half + spread))
-    # The direction of the larger eigenvalue is the minor axis; the major is at 90 deg.
+    # The minor axis is along the eigenvector of the larger eigenvalue.
     axis = 0.5 * math.atan2(b, a - c) + 0.5 * math.pi
     ellipse[MAJOR_AXIS_RAD] = axis % math.pi

@@ -1,9 +1,9 @@
 """Compiled: chief ray, ray aiming and wavefront samples of one eye and field.
 
-The chief ray comes from the air through the center of the stop to the retina.  From
-its retinal point O rays run *out* of the eye (Algorithm 1 of the paper).  All share O
-exactly, so their optical paths to a plane outside are the eikonal of one wave; an error
-in aiming moves a sample without corrupting its value.
+The chief ray is traced from air through the center of the stop to the retina.  From its
+retinal point, rays are traced out of the eye (Algorithm 1 of the paper).  All rays have
+the same origin, so their optical paths to a plane outside sample the eikonal of one
+wave: an aiming error moves a sample, but its value is exact at the new position.
 """
 
 import math
@@ -19,7 +19,12 @@ from estimator.optics.packed import (
     VERTEX,
 )
 from estimator.optics.raytrace_kernels import inward, outward, to_retina, to_stop
-from estimator.optics.surface_kernels import NOT_CONVERGED, RAY_SIZE, TRACED, put
+from estimator.optics.surface_kernels import (
+    NOT_CONVERGED,
+    RAY_SIZE,
+    TRACED,
+    copy_values,
+)
 
 UM_PER_MM = 1000.0
 
@@ -57,7 +62,7 @@ def field_axes(h_rad, v_rad, axes):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def entrance_pupil_z(packed, indices):
-    """Return z of the stop's paraxial image in air, mm, from mean curvatures."""
+    """Return z of the paraxial entrance pupil, mm, from mean curvatures."""
     n_before = int(packed[-1, N_BEFORE_STOP])
     z, height, slope = packed[-1, STOP_Z], 0.0, 1.0 / indices[n_before]
     for i in range(n_before - 1, -1, -1):
@@ -87,7 +92,10 @@ def _chief_shot(packed, indices, axes, base_z, a, b, ray, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _solve_chief(packed, indices, axes, base_z, start, ray, sag):
-    """Minimize the miss at the stop by Newton; ``start`` (2,): guess, then solution."""
+    """Aim the chief ray at the center of the stop by Newton's method.
+
+    ``start`` (2,) is the initial value and receives the solution.
+    """
     a, b = start[0], start[1]
     status = _chief_shot(packed, indices, axes, base_z, a, b, ray, sag)
     if status != TRACED:
@@ -131,9 +139,9 @@ def _solve_chief(packed, indices, axes, base_z, start, ray, sag):
 def chief_ray(packed, indices, h_rad, v_rad, axes, start, ray, sag):
     """Trace the chief ray of a field to the retina and return its status.
 
-    On return ``ray`` is at the retina, and ``axes`` and ``start`` belong to the field.
-    Where direct aiming at the paraxial entrance pupil fails, the field is approached
-    from the axis in steps.
+    On return, ``ray`` is at the retina, and ``axes`` and ``start`` are those of the
+    field.  If aiming from the paraxial entrance pupil fails, the field angle is
+    increased in steps from the axis (continuation).
     """
     base_z = entrance_pupil_z(packed, indices)
     field_axes(h_rad, v_rad, axes)
@@ -144,7 +152,7 @@ def chief_ray(packed, indices, h_rad, v_rad, axes, start, ray, sag):
         share = 1.0 if step < 0 else step / _CONTINUATION_STEPS
         field_axes(share * h_rad, share * v_rad, axes)
         status = _solve_chief(packed, indices, axes, base_z, start, ray, sag)
-        # Direct aiming ends the loop on success, the approach on failure.
+        # Direct aiming ends the loop on success, continuation on failure.
         if (status == TRACED) == (step < 0):
             break
     if status != TRACED:
@@ -158,10 +166,10 @@ def chief_ray(packed, indices, h_rad, v_rad, axes, start, ray, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def magnification(packed, indices):
-    """Return entrance pupil over stop, parabasal about the axial chief ray; else nan.
+    """Return the parabasal magnification of the entrance pupil, about the chief ray.
 
-    Parallel light at height h crosses the stop at h / m, so m is the inverse of the
-    map's stretch (root of its determinant for an astigmatic eye).
+    Parallel rays at height h cross the stop at h / m.  For an astigmatic eye, 1 / m is
+    the root of the determinant of this map.  nan if a ray fails.
     """
     axes, start = np.empty((3, 3)), np.empty(2)
     ray, sag = np.empty(RAY_SIZE), np.empty(3)
@@ -174,7 +182,7 @@ def magnification(packed, indices):
         b = start[1] + (h if i == 2 else -h if i == 3 else 0.0)
         if _chief_shot(packed, indices, axes, base_z, a, b, ray, sag) != TRACED:
             return math.nan
-        put(ray, ends[i])
+        copy_values(ray, ends[i])
     ax, ay = ends[0, 0] - ends[1, 0], ends[0, 1] - ends[1, 1]
     bx, by = ends[2, 0] - ends[3, 0], ends[2, 1] - ends[3, 1]
     return 2.0 * h / math.sqrt(abs(ax * by - ay * bx))
@@ -182,7 +190,7 @@ def magnification(packed, indices):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def magnifications(packed, indices):
-    """Return `magnification` (n_eyes,) of eyes (n_eyes, n_surfaces + 1, 48)."""
+    """Return `magnification` (n_eyes,) of eyes (n_eyes, n_surfaces + 1, N_COLUMNS)."""
     found = np.empty(packed.shape[0])
     for e in range(packed.shape[0]):
         found[e] = magnification(packed[e], indices)
@@ -190,8 +198,8 @@ def magnifications(packed, indices):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def across(direction, frame):
-    """Write two unit vectors to ``frame`` (2, 3) that complete a right-handed basis."""
+def transverse_axes(direction, frame):
+    """Write two unit vectors to ``frame`` that complete ``direction`` to a basis."""
     dx, dy, dz = direction[0], direction[1], direction[2]
     length = math.hypot(dx, dz)
     frame[0, 0], frame[0, 1], frame[0, 2] = dz / length, 0.0, -dx / length
@@ -201,7 +209,7 @@ def across(direction, frame):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def depth_along(chief, axes, pupil_z):
+def distance_along(chief, axes, pupil_z):
     """Return the distance along the chief ray from the plane to z = ``pupil_z``, mm."""
     along = 0.0
     for i in range(3):
@@ -210,15 +218,18 @@ def depth_along(chief, axes, pupil_z):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sink_plane(chief, axes, along):
-    """Move the plane's point inward along the chief ray, as if in air."""
+def move_plane_inward(chief, axes, along):
+    """Move the plane inward along the chief ray in object space."""
     for i in range(3):
         chief[1, i] -= along * axes[2, i]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def launch(chief, frame, a, b, ray):
-    """Start a ray at the retinal point, direction cosines (a, b) to the chief ray."""
+    """Start a ray at the retinal point, with direction cosines (a, b) in ``frame``.
+
+    Return False if it does not point out of the eye.
+    """
     squared = 1.0 - a * a - b * b
     if squared <= 0.0:
         return False
@@ -232,7 +243,7 @@ def launch(chief, frame, a, b, ray):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def leave_eye(packed, indices, chief, axes, chief_path, ray, sample, sag):
-    """Trace from the stop to the plane through ``chief[1]`` and write the sample."""
+    """Trace a ray from the stop to the plane through ``chief[1]``; write its sample."""
     n_before = int(packed[-1, N_BEFORE_STOP])
     status = outward(packed, indices, ray, _FIRST, n_before, sag)
     if status != TRACED:
@@ -257,7 +268,7 @@ def leave_eye(packed, indices, chief, axes, chief_path, ray, sample, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def back_to_stop(packed, indices, chief, frame, a, b, ray, sag):
-    """Trace from the retinal point through the lens to the stop plane."""
+    """Trace a ray from the retinal point through the lens to the stop plane."""
     if not launch(chief, frame, a, b, ray):
         return NOT_CONVERGED
     n_before, n_surfaces = int(packed[-1, N_BEFORE_STOP]), packed.shape[0] - 1
@@ -269,7 +280,7 @@ def back_to_stop(packed, indices, chief, frame, a, b, ray, sag):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def stop_response(packed, indices, chief, frame, ray, inverse, sag):
-    """Write the inverse (2, 2) of the stop's change with (a, b) at the chief ray."""
+    """Write the inverse Jacobian (2, 2) of position in the stop by (a, b)."""
     h = _DIFFERENCE_COSINE
     ends = np.empty((3, 2))
     for i in range(3):
@@ -277,7 +288,7 @@ def stop_response(packed, indices, chief, frame, ray, inverse, sag):
         status = back_to_stop(packed, indices, chief, frame, a, b, ray, sag)
         if status != TRACED:
             return status
-        put(ray, ends[i])
+        copy_values(ray, ends[i])
     xa, ya = (ends[1, 0] - ends[0, 0]) / h, (ends[1, 1] - ends[0, 1]) / h
     xb, yb = (ends[2, 0] - ends[0, 0]) / h, (ends[2, 1] - ends[0, 1]) / h
     determinant = xa * yb - xb * ya
@@ -306,7 +317,8 @@ def update_inverse(inverse, da, db, cx, cy):
 def aim(packed, indices, chief, frame, x, y, tolerance, guess, inverse, ray, sag):
     """Aim a ray at (x, y) of the stop by Broyden's method and return its status.
 
-    ``guess`` (2,) holds (a, b) and receives the solution; ``inverse`` is updated.
+    ``guess`` (2,) is the initial (a, b) and receives the solution; ``inverse`` is the
+    inverse Jacobian, which is updated.
     """
     a, b = guess[0], guess[1]
     status = back_to_stop(packed, indices, chief, frame, a, b, ray, sag)

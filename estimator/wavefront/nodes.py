@@ -1,10 +1,10 @@
-"""Sampling of the pupil: quadratures over rings and azimuths.
+"""Quadrature nodes over the pupil: rings and azimuths.
 
-The coefficients of a wavefront that six orders do not describe exactly depend on how
-the fit weights the pupil.  The weighting here is that of the reference data
-(eye_reference.json): 14 rings of equal area, each sampled at its outer edge.  Fewer
-rings are traced: the Gauss rule of the same measure, whose error falls exponentially
-with the number of rings.
+If six orders do not describe a wavefront exactly, its coefficients depend on the
+weighting of the pupil in the fit.  The weighting is that of the reference data
+(eye_reference.json): 14 rings of equal area, each sampled at its outer edge.  The Gauss
+rule of this discrete measure needs fewer rings, with an error that falls exponentially
+with their number.
 """
 
 from functools import cache
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from estimator.optics.zernike import zernike_values
 
 N_RINGS, N_AZIMUTHS = 8, 24
-"""Default sampling: 192 rays, 2e-7 um from the limit at 7 mm and 45 deg."""
+"""Default sampling of the stop: 192 rays; error of 2e-7 um at 7 mm and 45 deg."""
 
 N_CIRCLE_RINGS, N_CIRCLE_AZIMUTHS = 6, 16
-"""Sampling of a full circle on axis: 96 rays."""
+"""Default sampling of a circle: 96 rays."""
 
 N_REFERENCE_RINGS = 14
 
@@ -46,7 +46,7 @@ def _gauss_nodes(atoms: NDArray[Any], weights: NDArray[Any], n: int) -> NDArray[
 def _rule(
     atoms: NDArray[Any], weights: NDArray[Any], n: int, *, with_rim: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a unit-sum Gauss rule, or Gauss-Radau with a node at 1, on [0, 1]."""
+    """Return nodes and weights on [0, 1]: Gauss, or Gauss-Radau with a node at 1."""
     weights = weights / weights.sum()
     if with_rim:
         inner = _gauss_nodes(atoms, weights * (1.0 - atoms), n - 1)
@@ -65,18 +65,28 @@ def _azimuths(n: int) -> NDArray[np.float64]:
 
 @cache
 def stop_nodes(n_rings: int = N_RINGS, n_azimuths: int = N_AZIMUTHS) -> Nodes:
-    """Return rings (share of the stop's radius), weights and azimuths (cosine, sine).
+    """Return quadrature nodes over the stop.
 
-    The last ring is the rim.  From 14 rings on the rule is the measure itself.
+    Returns
+    -------
+    rings : (n_rings,)
+        Radii relative to that of the stop; the last one is the rim.
+    weights : (n_rings,)
+    azimuths : (n_azimuths, 2)
+        Cosine and sine.
 
     Raises
     ------
     ValueError
-        Fewer than 5 rings or 14 azimuths, which cannot carry 28 terms.
+        There are fewer than 5 rings or 14 azimuths, too few for 28 coefficients.
+
+    Notes
+    -----
+    From 14 rings on, the rule is the discrete measure itself.
     """
     if n_rings < 5 or n_azimuths < 14:
         raise ValueError(
-            f"{n_rings} rings, {n_azimuths} azimuths: at least 5 and 14 are needed"
+            f"n_rings {n_rings}, n_azimuths {n_azimuths}: must be at least 5 and 14"
         )
     atoms = np.arange(1, N_REFERENCE_RINGS + 1) / N_REFERENCE_RINGS
     weights = np.ones(N_REFERENCE_RINGS) / N_REFERENCE_RINGS
@@ -89,7 +99,11 @@ def stop_nodes(n_rings: int = N_RINGS, n_azimuths: int = N_AZIMUTHS) -> Nodes:
 def circle_nodes(
     n_rings: int = N_CIRCLE_RINGS, n_azimuths: int = N_CIRCLE_AZIMUTHS
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return nodes of a uniformly weighted circle and the projection (28, n) of W."""
+    """Return nodes over a circle with uniform weight, and the projection of W.
+
+    Rings, weights and azimuths are as in `stop_nodes`; the projection (28, n) maps
+    samples of W to coefficients.
+    """
     legendre_nodes, legendre_weights = np.polynomial.legendre.leggauss(n_rings)
     rings, weights = np.sqrt((legendre_nodes + 1.0) / 2.0), legendre_weights / 2.0
     azimuths = _azimuths(n_azimuths)

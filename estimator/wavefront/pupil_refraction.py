@@ -1,8 +1,8 @@
-"""Least-squares refraction over the light that passes the pupil.
+"""Least-squares refraction over the area of the pupil.
 
-On a round pupil that is -4 sqrt(3) C(2,0) / r².  Where the projected iris is elliptical
-or decentered from the chief ray, it is the least squares over that shape: with the
-wavefront of a cataract the two differ by 0.1 dpt at 7 mm.
+For a circular pupil about the chief ray it is -4 sqrt(3) C(2,0) / r².  For an
+elliptical or decentered pupil, the fit is over the ellipse: with the wavefront of a
+cataract, the two differ by 0.1 dpt at 7 mm.
 """
 
 from functools import cache
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from estimator.optics.zernike import EXPONENTS
 
 N_RINGS, N_AZIMUTHS = 5, 14
-"""Exact for products of the sixth order and the second."""
+"""Quadrature that is exact for products of sixth and second order."""
 
 
 @cache
 def _disc() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return points (n, 2) of the unit disc and their shares (n,) of its area."""
+    """Return quadrature points (n, 2) and weights (n,) of the unit disc."""
     unit, weights = np.polynomial.legendre.leggauss(N_RINGS)
     radius = np.sqrt(0.5 + 0.5 * unit)
     angle = 2.0 * np.pi * np.arange(N_AZIMUTHS) / N_AZIMUTHS
@@ -30,12 +30,14 @@ def _disc() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def pupil_refraction_dpt(
     polynomial_um: NDArray[np.float64], rim_mm: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return M (...), dpt, of wavefronts (..., 28) over pupils (..., 5).
+    """Return the least-squares M (...), dpt, of wavefronts over their pupils.
 
     Parameters
     ----------
-    polynomial_um : monomials in mm, see `field_wavefronts.polynomial_in_mm`
-    rim_mm : center and matrix, see `field_wavefronts.rim_from_ellipse`
+    polynomial_um : (..., 28), um/mm^degree
+        Monomials; see `field_wavefronts.polynomial_in_mm`.
+    rim_mm : (..., 5)
+        Center and matrix; see `field_wavefronts.rim_from_ellipse`.
     """
     points, shares = _disc()
     cosine, sine = points.T
@@ -47,8 +49,8 @@ def pupil_refraction_dpt(
     )
     # 1, x and y are orthogonal over the unit disc: project out piston and tilt.
     plane = np.stack([np.ones_like(cosine), 2.0 * cosine, 2.0 * sine])
-    bowl = px**2 + py**2
-    bowl = bowl - (bowl * shares) @ plane.T @ plane
-    flat = 2.0 * (wave_um * shares * bowl).sum(axis=-1)
-    found_dpt: NDArray[np.float64] = -flat / (bowl**2 * shares).sum(axis=-1)
+    quadratic = px**2 + py**2
+    quadratic = quadratic - (quadratic * shares) @ plane.T @ plane
+    flat = 2.0 * (wave_um * shares * quadratic).sum(axis=-1)
+    found_dpt: NDArray[np.float64] = -flat / (quadratic**2 * shares).sum(axis=-1)
     return found_dpt

@@ -1,4 +1,4 @@
-"""Result types for wavefronts and the pupils that they fill."""
+"""Result types for wavefronts and their pupils."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,9 +14,15 @@ from estimator.wavefront.fit import N_ELLIPSE
 
 @dataclass(frozen=True)
 class PupilEllipse:
-    """Least-squares ellipse of the projected pupil's rim, chief ray at the origin.
+    """Least-squares ellipse of the rim of the projected pupil.
 
-    ``major_axis_deg`` is measured from +x toward +y, 0 to 180.
+    Attributes
+    ----------
+    centre_x_mm, centre_y_mm : float
+        Center relative to the chief ray.
+    semi_major_mm, semi_minor_mm : float
+    major_axis_deg : float
+        Angle of the major axis from +x toward +y, 0 to 180.
     """
 
     centre_x_mm: float
@@ -27,33 +33,33 @@ class PupilEllipse:
 
     @property
     def axis_ratio(self) -> float:
-        """Ratio of minor to major semi-axis."""
+        """Ratio of the minor to the major semi-axis."""
         return self.semi_minor_mm / self.semi_major_mm
 
 
 @dataclass(frozen=True)
 class FieldResults:
-    """Results of many evaluations, as arrays with common leading axes.
+    """Wavefronts and pupils of several fields, wavelengths, stops or eyes.
 
     Attributes
     ----------
     zernike_um : (..., 28)
-        OSA coefficients, piston zero; nan where the chief ray fails.
+        Coefficients; piston is zero; nan where the chief ray fails.
     zernike_radius_mm : (...)
-        Largest distance of the pupil's rim from the chief ray.
+        Radius of their circle: the largest distance of the rim from the chief ray.
     ellipse_mm : (..., 5)
         Center x, y, semi-axes major, minor (mm) and angle of the major axis (rad).
     rms_residual_um : (...)
-        RMS residual of W.
+        RMS residual of the fit of W.
     open_ratio : (...)
-        Share of the stop's area that light passes; below 1 the pupil is vignetted.
+        Unvignetted fraction of the stop's area.
     chief_status_index, worst_status_index : (...) int
         `RayStatus` of the chief ray, and the worst of all rays.
     retinal_point_mm : (..., 3)
         Intersection of the chief ray with the retina.
     pupil_point_mm : (..., 3)
-        Intersection with the cornea or the plane of the entrance pupil: origin of the
-        wavefront's plane.
+        Intersection of the chief ray with the cornea or with the plane of the entrance
+        pupil: the origin of the plane of the wavefront.
     """
 
     zernike_um: NDArray[np.float64]
@@ -85,7 +91,7 @@ class FieldResults:
 
 @dataclass(frozen=True)
 class Aberrations:
-    """Aberrations of one eye, field, wavelength and stop; arrays as in FieldResults."""
+    """Aberrations for one field, wavelength and stop; fields as in `FieldResults`."""
 
     zernike_um: NDArray[np.float64]
     zernike_radius_mm: float
@@ -100,7 +106,7 @@ class Aberrations:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Explanations of blocked light; empty for a whole pupil."""
+        """Notes on vignetting; empty for an unvignetted pupil."""
         if self.chief_status != RayStatus.TRACED:
             return (f"no chief ray: {STATUS_WORDS[self.chief_status]}",)
         if self.worst_status != RayStatus.TRACED:

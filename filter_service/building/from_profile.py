@@ -16,7 +16,7 @@ from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import PlanAxes
 from filter_service.planning.plan import PlanTooLarge, plan_axes, plan_cache
 from filter_service.psfs.eye_for_spec import eye_for_spec
-from filter_service.psfs.store import PsfStore
+from filter_service.psfs.store import PsfStore, no_psfs
 from filter_service.psfs.store_cache import StoreCache, Stored, store_key
 
 Progress = Callable[[float, str], None]
@@ -54,11 +54,7 @@ def build(
     except ValueError as error:  # the settings do not suit this eye or camera
         field = getattr(error, "field", None)
         if field is None:  # raised by a computation, which knows no fields
-            raise BuildFailed(
-                f"no PSFs can be computed for this eye ({error})",
-                field="settings",
-                allowed="ranges, and a camera, that this eye can be seen through",
-            ) from error
+            raise no_psfs(error) from error
         text = getattr(error, "message", str(error))
         allowed = getattr(error, "allowed", None)
         raise BuildFailed(text, field=field, allowed=allowed) from error
@@ -71,16 +67,16 @@ def _built(
     cache = StoreCache(job.limits.store_cache_dir, max_mb=job.limits.store_cache_max_mb)
     key = store_key(profile, spec)
 
-    def go_on() -> None:
+    def check_cancelled() -> None:
         if cancelled():
             raise BuildCancelled("replaced by a newer profile")
 
-    stored = cache.load(key, go_on=go_on)
+    stored = cache.load(key, check_cancelled=check_cancelled)
     if stored is not None:
         notes = (*stored.notes, "eye from the disk cache")
         return BuiltStore(PsfStore(**stored.parts), notes)
     eye, notes = eye_for_spec(profile, spec, progress=progress, cancelled=cancelled)
-    go_on()
+    check_cancelled()
     progress(1.0, "plan")
     # The total memory of the PSFs is known only if all ranges are prepared at once;
     # otherwise nodes are planned when frames first read them.
@@ -89,7 +85,7 @@ def _built(
         plan = plan_cache(eye, spec)
     else:
         plan = plan_axes(eye, spec)
-    go_on()
+    check_cancelled()
     store = PsfStore(eye, spec, plan)
     cache.save_aside(key, Stored(store.parts, notes))
     return BuiltStore(store, notes)

@@ -35,7 +35,7 @@ from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedS
 from filter_service.filtering.filtered import BuildingEye, EyeFailed, EyeReady
 from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes, Wanted
 from filter_service.rendering.engine import FrameEngine
-from filter_service.rendering.frame_use import first_frame
+from filter_service.rendering.sampled_frame import first_frame
 from filter_service.settings import FilterSettings
 
 MS_PER_S = 1e3
@@ -255,7 +255,7 @@ class Builder:
         """Pass a part from the worker to its store, if that is still in use."""
         for prepared in self._prepared():
             if prepared.ticket == event.ticket:
-                prepared.store.take(event.part)
+                prepared.store.add_part(event.part)
 
     # PSFs ahead of frames
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 
-from filter_service.rendering.frame_use import FrameUse, SampledView
+from filter_service.rendering.sampled_frame import SampledFrame, SampledView
 from filter_service.rgbd_view import RgbdView
 
 SPEED_S = 0.25
@@ -24,8 +24,8 @@ class StreamUse:
 
     def __init__(self) -> None:
         self._states: deque[tuple[float, float, float]] = deque()
-        self.last: FrameUse | None = None
-        self.warmed: FrameUse | None = None  # last one that is fully warmed
+        self.last: SampledFrame | None = None
+        self.warmed: SampledFrame | None = None  # last one that is fully warmed
 
     def note(
         self,
@@ -38,7 +38,7 @@ class StreamUse:
     ) -> None:
         """Record a frame."""
         seen = tuple(SampledView.of(view) for view in views)
-        self.last = FrameUse(at_s, pupil_diameter_mm, focus_dpt, gaze_deg, seen)
+        self.last = SampledFrame(at_s, pupil_diameter_mm, focus_dpt, gaze_deg, seen)
         self._states.append((at_s, pupil_diameter_mm, focus_dpt))
         while self._states[0][0] < at_s - SPEED_S and len(self._states) > 2:
             self._states.popleft()

@@ -1,14 +1,14 @@
-"""OpenGL: the context and everything that uses it directly.
+"""OpenGL: context, memory and programs.
 
-choose_device  choice of the EGL device of the context
-copying        multithreaded copies of large images
+choose_device  choice of the EGL device
+copying        multithreaded copies of large arrays
 egl_devices    list of the EGL devices
 gpu            context, buffers, textures
 hardware       detection of GPUs and software renderers
-passes         compilation and dispatch of programs
-shader_source  shader text: includes, defines, line numbers
+passes         compilation and dispatch of compute passes
+shader_source  shader preprocessor: includes, defines, line numbers
 stage_timer    times of a frame's stages
-staging        mapped memory for transfers to and from the GPU
+staging        persistently mapped memory for uploads and readbacks
 """
 
 import lazy_loader

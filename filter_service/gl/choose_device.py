@@ -1,4 +1,4 @@
-"""Choice of the EGL device of a context: the one named, or the first that works."""
+"""Choice of the EGL device: the configured one, or the first that works."""
 
 import logging
 import os
@@ -25,14 +25,14 @@ def open_on_device(
     Parameters
     ----------
     choice : str
-        "auto" for the first device that works, hardware before software; or an index.
+        "auto" for the first device that works, GPUs first; or the index of a device.
     open_context : callable
         ``open_context(index)``; raises if the device has no suitable context.
 
     Raises
     ------
     RenderFailed
-        No device works, or the named one does not; the message lists the devices.
+        No device works, or the configured one does not; the message lists the devices.
     """
     devices = egl_devices()
     with _without_backend_variable():
@@ -44,17 +44,17 @@ def open_on_device(
 def _open_named(
     index: int, devices: Sequence[EglDevice], open_context: Callable[[int], Context]
 ) -> tuple[Context, int]:
-    there_are = ", ".join(map(str, devices)) or "none that EGL lists"
+    available = ", ".join(map(str, devices)) or "EGL lists none"
     if devices and index >= len(devices):
         raise RenderFailed(
-            f"gl_device is {index}; allowed: auto, or a device of EGL: {there_are}"
+            f"gl_device is {index}; allowed: auto, or an EGL device: {available}"
         )
     try:
         return open_context(index), index
     except Exception as error:
         raise RenderFailed(
-            f"gl_device {index} gives no OpenGL 4.3 context through EGL "
-            f"({_one_line(error)}); devices: {there_are}; {ADVICE}"
+            f"gl_device {index} has no OpenGL 4.3 context through EGL "
+            f"({_one_line(error)}); devices: {available}; {ADVICE}"
         ) from error
 
 
@@ -63,7 +63,7 @@ def _open_first(
 ) -> tuple[Context, int]:
     failed: list[str] = []
     last: Exception | None = None
-    # If there is no list, the backend's error is the most informative.
+    # Without a list, the first device is tried for the backend's own error message.
     for device in by_preference(devices) or [EglDevice(0, "first")]:
         try:
             context = open_context(device.index)
@@ -74,7 +74,7 @@ def _open_first(
         for text in failed:
             log.warning("no OpenGL 4.3 context on EGL %s", text)
         if failed:
-            log.warning("OpenGL works on EGL device %s instead", device)
+            log.warning("using EGL device %s instead", device)
         return context, device.index
     raise RenderFailed(
         f"no OpenGL 4.3 context through EGL ({'; '.join(failed)}); {ADVICE}"
@@ -82,7 +82,7 @@ def _open_first(
 
 
 def by_preference(devices: Sequence[EglDevice]) -> list[EglDevice]:
-    """Return the devices, hardware before software, otherwise in EGL's order."""
+    """Return the devices in EGL's order, but GPUs before software renderers."""
     return sorted(devices, key=lambda device: device.is_software)
 
 
@@ -92,10 +92,10 @@ def _one_line(error: Exception) -> str:
 
 @contextmanager
 def _without_backend_variable() -> Iterator[None]:
-    """Hide the variable that would override the index; it has already been read."""
-    said = os.environ.pop(BACKEND_VARIABLE, None)
+    """Unset the variable that would override the index; `gl_device` has read it."""
+    saved = os.environ.pop(BACKEND_VARIABLE, None)
     try:
         yield
     finally:
-        if said is not None:
-            os.environ[BACKEND_VARIABLE] = said
+        if saved is not None:
+            os.environ[BACKEND_VARIABLE] = saved

@@ -1,4 +1,4 @@
-"""The devices that EGL lists: GPUs and the software renderer."""
+"""List of the EGL devices: GPUs and the software renderer."""
 
 import ctypes
 import ctypes.util
@@ -14,8 +14,7 @@ NAME_EXTENSION = "EGL_EXT_device_query_name"
 NODE_EXTENSION = "EGL_EXT_device_drm_render_node"
 
 LIBRARY_VARIABLE = "GLCONTEXT_LINUX_LIBEGL"
-"""Environment variable with the EGL library, shared with the package that opens
-contexts."""
+"""Environment variable with the path of the EGL library; glcontext reads it, too."""
 
 _pointer, _int = ctypes.c_void_p, ctypes.c_int
 _QUERY_DEVICES = ctypes.CFUNCTYPE(
@@ -26,13 +25,13 @@ _QUERY_STRING = ctypes.CFUNCTYPE(ctypes.c_char_p, _pointer, _int)
 
 @dataclass(frozen=True)
 class EglDevice:
-    """Properties of an EGL device, available before it is opened.
+    """An EGL device, as far as it can be described before it is opened.
 
     Attributes
     ----------
     index : int
     name : str
-        Name as far as EGL provides one.
+        Name, if EGL provides one.
     extensions : tuple of str
     """
 
@@ -42,7 +41,7 @@ class EglDevice:
 
     @property
     def is_software(self) -> bool:
-        """Whether the device renders on the processor."""
+        """Whether the device renders on the CPU."""
         return SOFTWARE_EXTENSION in self.extensions
 
     def __str__(self) -> str:
@@ -71,7 +70,7 @@ def egl_devices() -> list[EglDevice]:
 
 
 def _address_of() -> Callable[[bytes], int | None]:
-    """Return a lookup of EGL functions; it returns None if there is no EGL."""
+    """Return a function that looks up addresses; it returns None without EGL."""
     library = os.environ.get(LIBRARY_VARIABLE) or ctypes.util.find_library("EGL")
     try:
         address_of = ctypes.CDLL(library or "libEGL.so.1").eglGetProcAddress
@@ -82,7 +81,7 @@ def _address_of() -> Callable[[bytes], int | None]:
 
 
 def _described(index: int, text_of: Callable[[int], bytes | None]) -> EglDevice:
-    """Return a device, described as far as its extensions allow."""
+    """Return a device, with the name that its extensions provide."""
 
     def text(what: int) -> str:
         return (text_of(what) or b"").decode(errors="replace")
@@ -97,4 +96,4 @@ def _described(index: int, text_of: Callable[[int], bytes | None]) -> EglDevice:
         words.append(text(EGL_DRM_RENDER_NODE_FILE_EXT))
     if "EGL_NV_device_cuda" in extensions and not any(words):
         words.append("NVIDIA")
-    return EglDevice(index, " ".join(filter(None, words)) or "no name", extensions)
+    return EglDevice(index, " ".join(filter(None, words)) or "unnamed", extensions)

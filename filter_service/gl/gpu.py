@@ -1,4 +1,4 @@
-"""The OpenGL context and its memory: buffers, textures, transfers."""
+"""The OpenGL context and its memory: buffers, textures, uploads and readbacks."""
 
 from collections.abc import Callable
 from functools import partial
@@ -20,16 +20,16 @@ from filter_service.gl_device import checked_gl_device, wanted_gl_device
 Query = moderngl.Query
 
 GROWTH = 1.25
-"""Over-allocation of a buffer that must grow, so that slowly rising sizes do not
-reallocate every frame."""
+"""Over-allocation of buffers that grow, so that slowly rising sizes do not reallocate
+in every frame."""
 
 ATLAS_TEXEL_BYTES = 16
 
 ATLAS_BYTES = 1 << 30
-"""Upper bound of an atlas: twice the kernels of a frame."""
+"""Upper bound on the size of an atlas: twice the kernels of a frame."""
 
 PASS_BLOCKS = 9
-"""Largest number of storage blocks in a pass, if an atlas is one of them."""
+"""Largest number of storage blocks that a pass binds, including its atlases."""
 
 
 class Gpu:
@@ -38,13 +38,12 @@ class Gpu:
     Parameters
     ----------
     device : str, optional
-        "auto", or the index of an EGL device; by default from the environment.
+        "auto", or the index of an EGL device; by default that of the environment.
 
     Attributes
     ----------
     info : dict
-        Renderer, version, index of the EGL device, and the limits that the renderer
-        plans with.
+        Renderer, version, index of the EGL device, and limits.
     is_software : bool
         Whether the renderer runs on the CPU.
     passes : Passes
@@ -70,11 +69,11 @@ class Gpu:
         self._owners: dict[str, object] = {}
         self._reads: list[_Read] = []
         self.atlas_is_buffer = not self.is_software and self._holds_large_atlases()
-        # On a software renderer all memory is the host's: staging only adds a copy.
+        # A software renderer uses host memory, where staging would only add a copy.
         self.use_staging(not self.is_software)
 
     def _holds_large_atlases(self) -> bool:
-        """Return whether a pass can bind a full-size atlas with its other buffers."""
+        """Return whether a pass can bind a full-size atlas as a storage buffer."""
         blocks = int(self.context.info["GL_MAX_COMPUTE_SHADER_STORAGE_BLOCKS"])
         return blocks >= PASS_BLOCKS and self.max_block_bytes >= ATLAS_BYTES
 
@@ -88,7 +87,7 @@ class Gpu:
         )
 
     def close(self) -> None:
-        """Free everything; the object cannot be used afterward."""
+        """Free all resources; the object cannot be used afterward."""
         with self.context:  # without a context, the driver frees nothing
             for buffer in self._buffers.values():
                 buffer.release()
@@ -104,7 +103,7 @@ class Gpu:
     # ----- buffers
 
     def storage(self, name: str, n_bytes: int) -> Buffer:
-        """Return a buffer of at least this size; its contents are lost when it grows.
+        """Return a named buffer of at least this size; growing loses its contents.
 
         Raises
         ------
@@ -116,8 +115,8 @@ class Gpu:
             return buffer
         if n_bytes > self.max_block_bytes:
             raise OutOfGpuMemory(
-                f"buffer '{name}' needs {n_bytes / 1e6:.0f} MB, "
-                f"a storage block holds {self.max_block_bytes / 1e6:.0f} MB here"
+                f"buffer '{name}' needs {n_bytes / 1e6:.0f} MB; the largest storage "
+                f"block of this device has {self.max_block_bytes / 1e6:.0f} MB"
             )
         wanted = max(int(n_bytes * (GROWTH if buffer is not None else 1.0)), 16)
         if buffer is not None:
@@ -127,13 +126,13 @@ class Gpu:
             created = self.context.buffer(reserve=min(wanted, self.max_block_bytes))
         except moderngl.Error as error:
             raise OutOfGpuMemory(
-                f"buffer '{name}' of {wanted} bytes: {error}"
+                f"cannot allocate buffer '{name}' of {wanted} bytes: {error}"
             ) from error
         self._buffers[name] = created
         return created
 
     def upload(self, name: str, *arrays: NDArray[Any]) -> Buffer:
-        """Copy arrays to the start of a named buffer, one after the other."""
+        """Copy arrays to a named buffer, one after the other."""
         buffer = self.storage(name, sum(data.nbytes for data in arrays))
         start = 0
         for data in arrays:
@@ -150,7 +149,7 @@ class Gpu:
             buffer.write(words, offset=offset)
             return
         block = self._staging["to"]
-        start, free = block.take(words.size)
+        start, free = block.allocate(words.size)
         copy_bytes(free, words)
         block.copy_to(buffer, start, offset, words.size)
 
@@ -180,13 +179,13 @@ class Gpu:
             pages.filter = (moderngl.NEAREST, moderngl.NEAREST)
             return pages
         raise OutOfGpuMemory(
-            f"{2e-6 * n_words:.0f} MB of PSFs, a texture array holds "
-            f"{2e-6 * limit * side * side:.0f} MB here; narrow the pupil, focus or "
-            "object range, or use a smaller image"
+            f"{2e-6 * n_words:.0f} MB of PSFs do not fit a texture array here "
+            f"({2e-6 * limit * side * side:.0f} MB); narrow the pupil, focus or object "
+            "range, or use a smaller image"
         )
 
     def write_pages(self, pages: Pages, first_line: int, lines: NDArray[Any]) -> None:
-        """Copy whole lines (n, STORE_SIDE) of words to pages from a line on."""
+        """Copy whole lines (n, STORE_SIDE) of words to pages, starting at a line."""
         side = constants.STORE_SIDE
         while len(lines):
             page, row = divmod(first_line, side)
@@ -198,10 +197,10 @@ class Gpu:
             first_line, lines = first_line + count, lines[count:]
 
     def atlas(self, name: str, n_texels: int) -> Atlas:
-        """Return a named, grow-only line of texels of four uints.
+        """Return a named, grow-only atlas of texels of four uints.
 
-        It is a storage buffer, or a texture in lines of ATLAS_WIDTH, see
-        `atlas_is_buffer`.
+        It is a storage buffer if `atlas_is_buffer`, otherwise a texture with rows of
+        ATLAS_WIDTH texels.
         """
         if self.atlas_is_buffer:
             return self.storage(f"{name} atlas", ATLAS_TEXEL_BYTES * n_texels)
@@ -212,8 +211,8 @@ class Gpu:
         limit = int(self.context.info["GL_MAX_TEXTURE_SIZE"])
         if rows > limit:
             raise OutOfGpuMemory(
-                f"the frame's kernels need {n_texels} texels, "
-                f"a texture holds {limit * constants.ATLAS_WIDTH} here"
+                f"the frame's kernels have {n_texels} texels; a texture of this device "
+                f"has at most {limit * constants.ATLAS_WIDTH}"
             )
         wanted = rows
         if atlas is not None:
@@ -226,32 +225,32 @@ class Gpu:
         return atlas
 
     def claim(self, name: str, owner: object) -> None:
-        """Record the owner that last filled the memory of a name."""
+        """Record an owner that is about to overwrite the memory of a name."""
         self._owners[name] = owner
 
     def is_owner(self, name: str, owner: object) -> bool:
-        """Return whether no other owner has filled the memory since."""
+        """Return whether no other owner has claimed the memory since."""
         return self._owners.get(name) is owner
 
     def read(
         self, buffer: Buffer, shape: tuple[int, ...], dtype: DTypeLike
     ) -> NDArray[Any]:
-        """Read the start of a buffer as an array; waits for the GPU."""
+        """Wait for the GPU, and return the start of a buffer as an array."""
         out = np.empty(shape, dtype=dtype)
         self.read_into((buffer, 0, out))
         return out
 
     def read_into(self, *parts: tuple[Buffer, int, NDArray[Any]]) -> None:
-        """Fill arrays from (buffer, byte offset) each; waits for the GPU once."""
+        """Wait for the GPU, and read each array from a buffer at a byte offset."""
         self.begin_read(*parts)()
 
     def begin_read(
         self, *parts: tuple[Buffer, int, NDArray[Any]]
     ) -> Callable[[], None]:
-        """Start a readback; return a function that waits for it and fills the arrays.
+        """Start a readback; return a function that waits and then fills the arrays.
 
-        Later dispatches may change the buffers.  Without mapped memory the arrays are
-        filled at once.
+        Later dispatches may overwrite the buffers.  Without mapped memory, the arrays
+        are filled at once.
         """
         parts = tuple(part for part in parts if part[2].nbytes)
         if self._staging is None:
@@ -259,11 +258,11 @@ class Gpu:
                 buffer.read_into(_bytes_of(out), size=out.nbytes, offset=offset)
             return lambda: None
         block = self._staging["from"]
-        room = sum(out.nbytes + ALIGNMENT for _, _, out in parts)
-        if not block.has_room(room):
+        size = sum(out.nbytes + ALIGNMENT for _, _, out in parts)
+        if not block.has_space(size):
             for waiting in tuple(self._reads):
                 self._end_read(waiting)
-        start, free = block.take(room)
+        start, free = block.allocate(size)
         targets, at = [], 0
         for buffer, offset, out in parts:
             block.copy_from(buffer, offset, start + at, out.nbytes)
@@ -276,7 +275,7 @@ class Gpu:
     def _end_read(self, waiting: "_Read") -> None:
         if not any(one is waiting for one in self._reads):
             return
-        assert self._staging is not None  # what is read back was staged
+        assert self._staging is not None  # pending readbacks use it
         self._reads = [one for one in self._reads if one is not waiting]
         self._staging["from"].wait(waiting.fence)
         for target, source in waiting.targets:
@@ -294,16 +293,16 @@ class Gpu:
 
     # ----- timers and errors
 
-    def take_query(self) -> moderngl.Query:
-        """Return an unused timer query; see `give_queries`."""
+    def acquire_query(self) -> moderngl.Query:
+        """Return a timer query from the pool; see `release_queries`."""
         return self._queries.pop() if self._queries else self.context.query(time=True)
 
-    def give_queries(self, queries: list[moderngl.Query]) -> None:
-        """Return timer queries to the pool; they are never freed, only reused."""
+    def release_queries(self, queries: list[moderngl.Query]) -> None:
+        """Return timer queries to the pool, which never frees them."""
         self._queries += queries
 
     def check(self, where: str) -> None:
-        """Raise if OpenGL has recorded an error since the last check."""
+        """Raise the error that OpenGL has recorded since the last check, if any."""
         error = self.context.error
         if error == "GL_OUT_OF_MEMORY":
             raise OutOfGpuMemory(f"{where}: {error}")
@@ -312,7 +311,7 @@ class Gpu:
 
 
 class _Read(NamedTuple):
-    """A pending readback: its fence, and pairs of arrays and mapped memory."""
+    """A pending readback: its fence, and arrays with their mapped memory."""
 
     fence: int
     targets: list[tuple[NDArray[np.uint8], NDArray[np.uint8]]]

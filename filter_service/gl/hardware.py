@@ -4,13 +4,13 @@ import sys
 from pathlib import Path
 
 RENDER_NODES = ("/dev/dri/renderD*", "/dev/nvidia[0-9]*", "/dev/dxg")
-"""Device files of GPU drivers on Linux; the last is that of the Windows subsystem."""
+"""Device files of GPU drivers on Linux; the last is for the Windows subsystem."""
 
 
 def may_have_gpu(root: Path = Path("/")) -> bool:
-    """Return whether a driver is present; always True on systems other than Linux.
+    """Return whether there may be a GPU driver; always True if not on Linux.
 
-    This takes a fraction of a millisecond; opening a context takes 0.2 s.
+    This takes less than a millisecond; opening a context takes 0.2 s.
     """
     if not sys.platform.startswith("linux"):
         return True
@@ -21,5 +21,5 @@ SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swr", "software")
 
 
 def is_software_renderer(name: str) -> bool:
-    """Return whether a renderer of this name runs on the processor."""
+    """Return whether an OpenGL renderer of this name runs on the CPU."""
     return any(word in name.lower() for word in SOFTWARE_RENDERERS)

@@ -1,4 +1,4 @@
-"""Passes: compiled once per variant, dispatched on buffers by name."""
+"""Compute passes: compilation of variants, and dispatch with named buffers."""
 
 from typing import Any, NamedTuple
 
@@ -13,9 +13,9 @@ Pages = moderngl.TextureArray
 Atlas = moderngl.Buffer | moderngl.Texture
 
 ATLAS_BINDINGS = {"ATLAS": "ATLAS", "NODES": "NODE_ATLAS"}
-"""Binding of an atlas that is a buffer, by the name of its texture."""
+"""Storage block of an atlas that is a buffer, by the name of its texture."""
 
-POINTS = {
+BINDING_POINTS = {
     name.removeprefix("BINDING_"): point for name, point in constants.BINDINGS.items()
 }
 
@@ -30,13 +30,13 @@ _IMAGE_BARRIERS = (
     | moderngl.SHADER_IMAGE_ACCESS_BARRIER_BIT
     | moderngl.TEXTURE_FETCH_BARRIER_BIT
 )
-"""Kinds of access after a pass that may read its output."""
+"""Kinds of later access to the output of a pass."""
 
 
 class BufferPart(NamedTuple):
-    """A range of a buffer that is bound like a buffer.
+    """A range of a buffer that can be bound instead of a buffer.
 
-    It starts at a multiple of 256 bytes, which every device allows.
+    It starts at a multiple of 256 bytes, an alignment that every device accepts.
     """
 
     buffer: Buffer
@@ -45,7 +45,7 @@ class BufferPart(NamedTuple):
 
 
 class Passes:
-    """Programs of a context, and its current bindings.
+    """Compiled programs of a context, and its current bindings.
 
     Parameters
     ----------
@@ -104,58 +104,46 @@ class Passes:
         ----------
         groups : (x, y) or (x, y, z)
         buffers : dict
-            Buffers, or parts of buffers, by binding name without ``BINDING_``.
+            Buffers, or ranges of buffers, by binding name without ``BINDING_``.
         uniforms : dict, optional
-            Values by name; a uniform that the compiler removed is skipped.
+            Values by name; uniforms that the compiler has removed are skipped.
         defines : dict, optional
             Variant of the pass.
         images, textures : dict, optional
-            Textures, or results of `Gpu.atlas`, by name without ``IMAGE_`` or
-            ``TEXTURE_``.
+            Textures or atlases by name without ``IMAGE_`` or ``TEXTURE_``.
         indirect : (buffer, byte), optional
-            Location of the group counts on the GPU; ``groups`` is ignored.
+            Location of the group counts on the GPU, which replace ``groups``.
         """
-        program, images, textures = self._variant_of(
-            name, defines or {}, buffers, images or {}, textures or {}
-        )
+        images, textures, defines = images or {}, textures or {}, defines or {}
+        barriers = _BARRIERS
+        for key, image in images.items():
+            if isinstance(image, Buffer):
+                self._bind(BINDING_POINTS[ATLAS_BINDINGS[key]], image)
+                defines = {**defines, "ATLAS_IS_BUFFER": 1}
+            else:
+                unit = getattr(constants, f"IMAGE_{key}")
+                image.bind_to_image(unit, read=True, write=True)
+                barriers = _IMAGE_BARRIERS
+        for key, texture in textures.items():
+            if isinstance(texture, Buffer):
+                self._bind(BINDING_POINTS[ATLAS_BINDINGS[key]], texture)
+                defines = {**defines, "ATLAS_IS_BUFFER": 1}
+            else:
+                texture.use(getattr(constants, f"TEXTURE_{key}"))
         for binding, buffer in buffers.items():
-            self._bind(POINTS[binding], buffer)
+            self._bind(BINDING_POINTS[binding], buffer)
+        program = self.program(name, **defines)
         self._set_uniforms(program, uniforms or {})
-        for name_of, image in images.items():
-            unit = getattr(constants, f"IMAGE_{name_of}")
-            image.bind_to_image(unit, read=True, write=True)
-        for name_of, texture in textures.items():
-            texture.use(getattr(constants, f"TEXTURE_{name_of}"))
         if indirect is not None:
             program.run_indirect(*indirect)
         else:
             program.run(*(max(count, 1) for count in (*groups, 1)[:3]))
-        self._context.memory_barrier(_IMAGE_BARRIERS if images else _BARRIERS)
-
-    def _variant_of(
-        self,
-        name: str,
-        defines: dict[str, Any],
-        buffers: dict[str, Any],
-        images: dict[str, Any],
-        textures: dict[str, Any],
-    ) -> tuple[moderngl.ComputeShader, dict[str, Any], dict[str, Any]]:
-        """Return a pass and its images and textures; bind the buffers among them."""
-        is_buffer = False
-        for named in (images, textures):
-            for key, atlas in named.items():
-                if isinstance(atlas, Buffer):
-                    self._bind(POINTS[ATLAS_BINDINGS[key]], atlas)
-                    is_buffer = True
-        if is_buffer:
-            defines = {**defines, "ATLAS_IS_BUFFER": 1}
-            images, textures = _no_buffers(images), _no_buffers(textures)
-        return self.program(name, **defines), images, textures
+        self._context.memory_barrier(barriers)
 
     def _bind(self, point: int, buffer: Buffer | BufferPart) -> None:
-        """Bind a buffer unless it is already bound; most stay from frame to frame.
+        """Bind a buffer unless it is already bound; most bindings never change.
 
-        The buffer itself is kept here, so that no other buffer can get its identity.
+        ``_bound`` holds references, so that a new buffer cannot equal a deleted one.
         """
         if self._bound.get(point) == buffer:
             return
@@ -169,19 +157,12 @@ class Passes:
     def _set_uniforms(
         self, program: moderngl.ComputeShader, uniforms: dict[str, Any]
     ) -> None:
-        """Set the uniforms that have changed since the last dispatch.
-
-        Each is a driver call.
-        """
+        """Set the uniforms that have changed, as each takes a driver call."""
         known = self._uniforms.setdefault(program, {})
         for key, value in uniforms.items():
             if key in known and known[key] == value:
                 continue
             known[key] = value
             member = program.get(key, None)
-            if member is not None:
+            if isinstance(member, moderngl.Uniform):
                 member.value = value
-
-
-def _no_buffers(named: dict[str, Any]) -> dict[str, Any]:
-    return {key: kept for key, kept in named.items() if not isinstance(kept, Buffer)}

@@ -1,4 +1,4 @@
-"""Shader text: include-once, ``#define``s from Python, line numbers for errors."""
+"""Shader preprocessor: includes, ``#define``s from Python, line numbers for errors."""
 
 import re
 from pathlib import Path
@@ -11,13 +11,13 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 _INSIDE = _PACKAGE / "shaders"
 
 SHADER_ROOT = _INSIDE if _INSIDE.is_dir() else _PACKAGE.parent / "shaders"
-"""Inside the package if it was installed from a wheel, beside it in a checkout."""
+"""Inside the package if installed from a wheel, beside it in a checkout."""
 
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 
 
 def shared_defines() -> dict[str, int | float]:
-    """Return every upper-case number of `constants`, and the bindings."""
+    """Return all numeric constants of `constants`, and the bindings."""
     numbers = {
         name: value
         for name, value in vars(constants).items()
@@ -75,6 +75,6 @@ def _expand(name: str, files: list[str]) -> list[str]:
 
 
 def legend(message: str, files: list[str]) -> str:
-    """Return a compiler message with a legend of its file numbers."""
+    """Return a compiler message with the names of its numbered files."""
     names = ", ".join(f"{i} = {name}" for i, name in enumerate(files))
     return f"{message}\n(files: {names})"

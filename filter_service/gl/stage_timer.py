@@ -1,17 +1,16 @@
-"""Times of a frame's stages, on the GPU and on the processor."""
+"""Times of a frame's stages, on the GPU and on the CPU."""
 
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Any
 
 from filter_service.gl.gpu import Gpu, Query
 
 
 class StageTimer:
-    """Times of named stages, ms: GPU queries on hardware, wall clock on software.
+    """Times of named stages, ms: by timer queries on a GPU, else by the wall clock.
 
-    A software renderer runs inside the call, so waiting for it costs nothing there.
+    Waiting for a software renderer after each stage does not slow it down.
     """
 
     def __init__(self, gpu: Gpu):
@@ -19,11 +18,11 @@ class StageTimer:
         self._ms: dict[str, float] = {}
         self._queries: list[tuple[str, Query]] = []
 
-    def stage(self, name: str) -> AbstractContextManager[Any]:
-        """Time a GPU stage; times of the same name add up."""
+    def stage(self, name: str) -> AbstractContextManager[None] | Query:
+        """Time a GPU stage; the times of equal names are added."""
         if self._gpu.is_software:
             return self._finished(name)
-        query = self._gpu.take_query()
+        query = self._gpu.acquire_query()
         self._queries.append((name, query))
         return query
 
@@ -33,21 +32,21 @@ class StageTimer:
             yield
             self._gpu.context.finish()
 
-    def wall(self, name: str) -> AbstractContextManager[Any]:
+    def wall(self, name: str) -> AbstractContextManager[None]:
         """Time a CPU stage."""
         return _Wall(self._ms, name)
 
     def result_ms(self) -> dict[str, float]:
-        """Return times by stage; waits for the GPU."""
+        """Wait for the GPU, and return the times by stage."""
         for name, query in self._queries:
             self._ms[name] = self._ms.get(name, 0.0) + query.elapsed / 1e6
-        self._gpu.give_queries([query for _, query in self._queries])
+        self._gpu.release_queries([query for _, query in self._queries])
         self._queries.clear()
         return dict(self._ms)
 
 
 class _Wall:
-    """Adds its wall time to a stage; a generator would take four times as long."""
+    """Context manager for wall time; a generator takes four times as long."""
 
     def __init__(self, times_ms: dict[str, float], name: str):
         self._times_ms, self._name = times_ms, name

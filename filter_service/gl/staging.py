@@ -1,9 +1,9 @@
-"""Staging buffers: pinned, persistently mapped memory for transfers with the GPU.
+"""Staging buffers: persistently mapped memory for uploads and readbacks.
 
-A driver moves a buffer that is mapped for reading to host memory, and every pass that
-uses it then works over the bus.  So the buffers of the passes are never mapped; their
-data is copied through a separate block.  This requires `glBufferStorage` (OpenGL 4.4,
-or ARB_buffer_storage), which moderngl does not offer, so the few calls are made here.
+Drivers move buffers that are mapped for reading to host memory, and passes then access
+them over the bus.  The buffers of the passes are therefore never mapped; data is copied
+through a separate block.  This requires `glBufferStorage` (OpenGL 4.4 or
+ARB_buffer_storage), which moderngl does not offer; this module calls it by ctypes.
 """
 
 import ctypes
@@ -25,13 +25,13 @@ GL_MAP_PERSISTENT_BIT, GL_MAP_COHERENT_BIT = 0x40, 0x80
 GL_CLIENT_STORAGE_BIT = 0x200
 
 ALIGNMENT = 256
-"""Parts of a block start at multiples of this."""
+"""Allocations start at multiples of this."""
 
-FIRST_BYTES = 1 << 20
+INITIAL_BYTES = 1 << 20
 
-MOST_BYTES = 1 << 29
-"""Largest block: up to this it grows to hold all transfers in flight; then it waits and
-starts over."""
+MAX_BYTES = 1 << 29
+"""Largest size of a block.  Up to this size it grows for all transfers in flight; then
+it waits for them and starts over."""
 
 GL_SYNC_GPU_COMMANDS_COMPLETE = 0x9117
 GL_SYNC_FLUSH_COMMANDS_BIT = 0x1
@@ -39,22 +39,23 @@ GL_TIMEOUT_EXPIRED, GL_WAIT_FAILED = 0x911B, 0x911D
 WAIT_NS = 1_000_000_000
 
 _uint, _size, _pointer = ctypes.c_uint, ctypes.c_ssize_t, ctypes.c_void_p
-_SIGNATURES = {
-    "glGenBuffers": (None, ctypes.c_int, _pointer),
-    "glDeleteBuffers": (None, ctypes.c_int, _pointer),
-    "glBindBuffer": (None, _uint, _uint),
-    "glBufferStorage": (None, _uint, _size, _pointer, _uint),
-    "glMapBufferRange": (_pointer, _uint, _size, _size, _uint),
-    "glCopyBufferSubData": (None, _uint, _uint, _size, _size, _size),
-    "glFenceSync": (_pointer, _uint, _uint),
-    "glClientWaitSync": (_uint, _pointer, _uint, ctypes.c_uint64),
-    "glDeleteSync": (None, _pointer),
-    "glFlush": (None,),
+_function = ctypes.CFUNCTYPE
+_PROTOTYPES = {
+    "glGenBuffers": _function(None, ctypes.c_int, _pointer),
+    "glDeleteBuffers": _function(None, ctypes.c_int, _pointer),
+    "glBindBuffer": _function(None, _uint, _uint),
+    "glBufferStorage": _function(None, _uint, _size, _pointer, _uint),
+    "glMapBufferRange": _function(_pointer, _uint, _size, _size, _uint),
+    "glCopyBufferSubData": _function(None, _uint, _uint, _size, _size, _size),
+    "glFenceSync": _function(_pointer, _uint, _uint),
+    "glClientWaitSync": _function(_uint, _pointer, _uint, ctypes.c_uint64),
+    "glDeleteSync": _function(None, _pointer),
+    "glFlush": _function(None),
 }
 
 
 def gl_calls() -> dict[str, Callable[..., Any]] | None:
-    """Return the calls that `Staging` needs, or None if EGL lacks one of them."""
+    """Return the OpenGL functions of `Staging`, or None if EGL lacks one of them."""
     library = ctypes.util.find_library("EGL") or "libEGL.so.1"
     try:
         address_of = ctypes.CDLL(library).eglGetProcAddress
@@ -62,11 +63,11 @@ def gl_calls() -> dict[str, Callable[..., Any]] | None:
         return None
     address_of.restype, address_of.argtypes = _pointer, [ctypes.c_char_p]
     calls: dict[str, Callable[..., Any]] = {}
-    for name, (result, *arguments) in _SIGNATURES.items():
+    for name, prototype in _PROTOTYPES.items():
         address = address_of(name.encode())
         if not address:
             return None
-        calls[name] = ctypes.CFUNCTYPE(result, *arguments)(address)
+        calls[name] = prototype(address)
     return calls
 
 
@@ -76,7 +77,7 @@ def has_buffer_storage(context: "moderngl.Context") -> bool:
 
 
 class Staging:
-    """A block of mapped memory, allocated from its start; starts over when it is full.
+    """A linear allocator on mapped memory, which starts over when it is full.
 
     Parameters
     ----------
@@ -96,25 +97,25 @@ class Staging:
 
     @property
     def size(self) -> int:
-        """Bytes of the block."""
+        """Size of the block in bytes."""
         return self._bytes.size
 
     def release(self) -> None:
-        """Free the block; allocated parts must not be accessed afterward."""
+        """Free the block; its allocations must not be accessed afterward."""
         if self._name.value:
             self._calls["glDeleteBuffers"](1, ctypes.byref(self._name))
         self._name, self._bytes, self._used = _uint(0), np.zeros(0, np.uint8), 0
 
     def reset(self) -> None:
-        """Start over from the beginning; the caller ensures that no copy is pending."""
+        """Free all allocations; the caller ensures that no copy is pending."""
         self._used = 0
 
-    def has_room(self, n_bytes: int) -> bool:
-        """Return whether this many bytes are free."""
+    def has_space(self, n_bytes: int) -> bool:
+        """Return whether the block has this many free bytes."""
         return self._used + n_bytes <= self.size
 
     def fence(self) -> int:
-        """Return a fence after all commands so far, and submit them to the GPU."""
+        """Submit all commands so far, and return a fence that follows them."""
         mark = self._calls["glFenceSync"](GL_SYNC_GPU_COMMANDS_COMPLETE, 0)
         self._calls["glFlush"]()
         return int(mark)
@@ -125,7 +126,7 @@ class Staging:
         Raises
         ------
         RenderFailed
-            The driver cannot wait because it has lost the GPU.
+            The driver has lost the GPU.
         """
         found = GL_TIMEOUT_EXPIRED
         while found == GL_TIMEOUT_EXPIRED:
@@ -134,23 +135,23 @@ class Staging:
             )
         self._calls["glDeleteSync"](mark)
         if found == GL_WAIT_FAILED:
-            raise RenderFailed("the driver cannot wait for the GPU")
+            raise RenderFailed("the OpenGL driver has lost the GPU")
 
-    def take(self, n_bytes: int) -> tuple[int, NDArray[np.uint8]]:
-        """Allocate bytes; return their offset and the bytes.
+    def allocate(self, n_bytes: int) -> tuple[int, NDArray[np.uint8]]:
+        """Allocate bytes; return their offset and an array of them.
 
-        If there are not enough free bytes, this waits for the GPU to finish its copies.
+        If the block is full, this waits until the GPU has finished all copies.
 
         Raises
         ------
         OutOfGpuMemory
-            The driver cannot map a block of that size.
+            The driver cannot map a block of the required size.
         """
-        if not self.has_room(n_bytes):
+        if not self.has_space(n_bytes):
             self._context.finish()
-            wanted = max(2 * (self._used + n_bytes), FIRST_BYTES)
-            if n_bytes > self.size or wanted <= MOST_BYTES:
-                self._allocate(max(min(wanted, MOST_BYTES), n_bytes))
+            wanted = max(2 * (self._used + n_bytes), INITIAL_BYTES)
+            if n_bytes > self.size or wanted <= MAX_BYTES:
+                self._map_block(max(min(wanted, MAX_BYTES), n_bytes))
             self._used = 0
         start = self._used
         self._used = -(-(start + n_bytes) // ALIGNMENT) * ALIGNMENT
@@ -178,7 +179,7 @@ class Staging:
             GL_COPY_READ_BUFFER, GL_COPY_WRITE_BUFFER, read_at, write_at, n_bytes
         )
 
-    def _allocate(self, n_bytes: int) -> None:
+    def _map_block(self, n_bytes: int) -> None:
         self.release()
         calls = self._calls
         access = GL_MAP_READ_BIT | GL_MAP_WRITE_BIT
@@ -191,6 +192,6 @@ class Staging:
         address = calls["glMapBufferRange"](GL_COPY_READ_BUFFER, 0, n_bytes, access)
         if not address:
             self.release()
-            raise OutOfGpuMemory(f"no {n_bytes / 1e6:.0f} MB of memory to map")
+            raise OutOfGpuMemory(f"cannot map {n_bytes / 1e6:.0f} MB of memory")
         memory = (ctypes.c_uint8 * n_bytes).from_address(address)
         self._bytes = np.ctypeslib.as_array(memory)

@@ -1,4 +1,4 @@
-"""Compiled loop for the blur of every node and channel, run once for each new plan."""
+"""Compiled loop of `node_blur`, run once for each planned state."""
 
 import math
 
@@ -15,11 +15,11 @@ def fill_blur_px(zero_px, per_dpt, values_dpt, starts, shift_dpt, foci_dpt, blur
     Parameters
     ----------
     zero_px, per_dpt : (n_groups, n_rays, 2)
-        Landing points of rays at 0 dpt, and their shift per diopter.
+        Landing points of rays at 0 dpt, and their shift per diopter, px.
     values_dpt, starts : see `RaggedNodes`
     shift_dpt : (n_groups, 3)
     foci_dpt : (3, n_foci)
-        Defocus at which light is in focus; infinity for unused entries.
+        Total defocus of each focus; infinity for unused entries.
     """
     for group in range(starts.size - 1):
         for node in range(starts[group], starts[group + 1]):

@@ -1,4 +1,6 @@
-"""Cost of a planned cache: memory from predicted radii, time from a cost model."""
+"""Cost of a planned cache: memory from predicted box sizes, time from a cost model."""
+
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +25,8 @@ from filter_service.planning.slopes import state_survey
 _LENGTHS = np.unique(
     [2**a * 3**b * 5**c for a in range(5, 24) for b in range(3) for c in range(2)]
 )
-"""FFT lengths, without a limit: PSFs that need too long ones are refused when built."""
+"""FFT lengths without an upper limit: PSFs that need longer FFTs than the engine
+supports are refused when the cache is built."""
 
 SAMPLES = 1536
 """Largest number of PSFs whose wavefronts are evaluated for a prediction."""
@@ -31,13 +34,23 @@ SAMPLES = 1536
 BYTES_PER_TEXEL = 2
 
 COMPUTED_BEYOND = 0.2
-"""Light that a computed kernel may lack, over what trimming may drop."""
+"""Light that a computed kernel may lack, relative to the light that cropping may
+drop."""
 
 
-def predicted_cost(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> dict[str, float]:
-    """Return fields of `PlanPrediction`: count, memory, time and cores."""
-    count = channels_of(spec) * len(plan.nodes.defocus.values_dpt)
-    states = sampled_states(spec, plan, SAMPLES)
+class PlanCost(TypedDict):
+    """Cost of a plan; fields as in `PlanPrediction`."""
+
+    psf_count: int
+    memory_mb: float
+    build_s: float
+    core_count: int
+
+
+def predicted_cost(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> PlanCost:
+    """Predict the number, memory and build time of a plan's PSFs."""
+    count = channel_count(spec) * len(plan.nodes.defocus.values_dpt)
+    states = plan_states(spec, plan, SAMPLES)
     survey = state_survey(eye, spec, states)
     texels = float(np.mean(box_texels(spec, survey)))
     cores = thread_count()
@@ -58,16 +71,16 @@ def predicted_cost(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> dict[str,
     }
 
 
-def sampled_states(spec: GridSpec, plan: CachePlan, most: int) -> PupilStates:
-    """Return the states of a plan's PSFs: all, or ``most`` of them spread evenly."""
-    channels = channels_of(spec)
-    count = channels * len(plan.nodes.defocus.values_dpt)
+def plan_states(spec: GridSpec, plan: CachePlan, most: int) -> PupilStates:
+    """Return the states of a plan's PSFs, or of ``most`` evenly spaced ones."""
+    n_channels = channel_count(spec)
+    count = n_channels * len(plan.nodes.defocus.values_dpt)
     psfs = np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.int64))
-    return states_of(spec, plan, psfs // channels, psfs % channels)
+    return states_of(spec, plan, psfs // n_channels, psfs % n_channels)
 
 
-def channels_of(spec: GridSpec) -> int:
-    """Return the number of channels with PSFs of their own."""
+def channel_count(spec: GridSpec) -> int:
+    """Return the number of channels that do not share PSFs: 3, or 1 without color."""
     return RGB if spec.settings.chromatic else 1
 
 
@@ -77,15 +90,15 @@ def states_of(
     nodes: NDArray[np.int64],
     channel: NDArray[np.int64],
 ) -> PupilStates:
-    """Return the states (n,) of the eye at some nodes and channels of a plan."""
+    """Return the states (n,) of the eye at nodes and channels of a plan."""
     defocus = plan.nodes.defocus
     groups = defocus.group_at(nodes)
-    pupil, used, v, h = np.unravel_index(groups, plan.group_shape)
+    pupil, accommodation, v, h = np.unravel_index(groups, plan.group_shape)
     return PupilStates(
         h_deg=plan.h_deg[h],
         v_deg=plan.v_deg[v],
         pupil_diameter_mm=plan.pupils_mm[pupil],
-        accommodation_dpt=plan.accommodations_dpt[used],
+        accommodation_dpt=plan.accommodations_dpt[accommodation],
         wavelength_nm=spec.channel_wavelengths_nm[channel],
         total_defocus_dpt=defocus.values_dpt[nodes]
         + plan.nodes.channel_shift_dpt[groups, channel],
@@ -95,7 +108,7 @@ def states_of(
 def kernel_radius_px(
     spec: GridSpec, survey: PupilSurvey, *, share: float
 ) -> NDArray[np.int64]:
-    """Return radii (P,) that hold all but a share of the light a cache may drop."""
+    """Return kernel radii (P,) that lose a share of the light that a cache may drop."""
     if not spec.settings.diffraction:
         radius_px = np.ceil(survey.blur_radius_px + PIXEL_CORNER_PX)
         return np.minimum(radius_px, LARGEST_RADIUS_PX).astype(np.int64)
@@ -109,8 +122,9 @@ def kernel_radius_px(
 def box_texels(spec: GridSpec, survey: PupilSurvey) -> NDArray[np.float64]:
     """Return the size (P,) of the boxes that kernels are cropped to (`psfs/pack.py`).
 
-    This is the bounding box of the rays, widened by what diffraction needs of the disc.
-    It was 0.89 to 1.09 of the measured size of the caches of 24 plans.
+    The box is the bounding box of the rays, extended by the radius that diffraction
+    adds to the disc.  For 24 plans, the result was 0.89 to 1.09 of the measured size of
+    the cache.
     """
     beyond_px = np.maximum(
         kernel_radius_px(spec, survey, share=1.0)
@@ -125,17 +139,17 @@ def box_texels(spec: GridSpec, survey: PupilSurvey) -> NDArray[np.float64]:
 
 
 LARGEST_RADIUS_PX = 1e9
-"""Far more than any plan allows, and within the range of integers."""
+"""A radius beyond the limit of any plan and within the range of integers."""
 
 TERM_US = {"psf": 56.5, "wave": 2.24e-4, "texels": 0.0134}
-"""Processor time per unit of each term of `cost_terms` on an AMD EPYC; other machines
-are scaled by `machine_speed`.  36 batches of 768 PSFs of three eyes and three image
-sizes, 56 to 465 us per PSF, took 0.77 to 1.19 of the prediction
+"""Processor time per unit of each term of `cost_terms` on an AMD EPYC, in us.
+`machine_speed` scales it for other machines.  36 batches of 768 PSFs of three eyes and
+three image sizes, 56 to 465 us per PSF, took 0.77 to 1.19 of the prediction
 (`python -m tests.benchmarks.bench_plan --calibrate` repeats the fit)."""
 
 
 def cost_terms(spec: GridSpec, survey: PupilSurvey) -> dict[str, NDArray[np.float64]]:
-    """Count the work of each PSF (P,): the PSF itself, its transform and its texels."""
+    """Return the work for each PSF (P,): a constant, its transform and its texels."""
     radius_px = kernel_radius_px(spec, survey, share=COMPUTED_BEYOND)
     count = survey.blur_radius_px.size
     share = geometric_shares(survey) if spec.settings.diffraction else np.ones(count)

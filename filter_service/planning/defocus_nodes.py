@@ -1,9 +1,9 @@
-"""Nodes of total defocus: denser where PSFs are sharper, none where frames read none.
+"""Nodes of total defocus: denser where PSFs are sharper, and only where frames read.
 
-A node is either one defocus for all channels, or one for green with red and blue
-shifted by their chromatic differences.  The first suits deep scenes; the second suits
-few object distances, where the three channels of a distance are read together.  Each
-group uses the variant that needs fewer nodes.
+There are two variants.  Either a node is the same defocus for all channels, which suits
+deep scenes.  Or it is the defocus of green, and red and blue are shifted by their
+chromatic differences, which suits few object distances, because frames read the three
+channels of a distance together.  Each group uses the variant with fewer nodes.
 """
 
 from __future__ import annotations
@@ -27,23 +27,23 @@ from filter_service.planning.node_blur import GroupRays
 from filter_service.planning.node_wavefronts import PupilStates
 from filter_service.planning.nodes import RaggedNodes
 from filter_service.planning.readable import ReadableDefocus, joined_ranges
-from filter_service.planning.sampled_use import unit_px
 from filter_service.planning.slopes import main_foci_dpt, main_light_ratio
+from filter_service.planning.state_samples import unit_px
 
-_LADDER = 49
+_SAMPLES = 49
 
 _LARGEST_RATIO = 0.86
-"""Limit of ray landing points, as a share of the largest kernel radius; the remainder
-is left for diffraction and the rim."""
+"""Limit of the distance of rays, as a share of the largest kernel radius.  The rest of
+the radius is for diffraction and the rim of the spot."""
 
 EXACT_DPT = 1e-9
 """Ranges narrower than this are treated as one value."""
 
 DEEP_DPT = 6.0
-"""Width of a range from which chromatic shifts save too little to be tried."""
+"""Width of a range above which chromatic shifts save too little to be tried."""
 
 MAX_GROUP_NODES = 100_000
-"""Limit of defocus nodes in one group.  The largest blur, 255 px, takes 1,000 steps of
+"""Largest number of nodes in a group.  The largest blur, 255 px, takes 1,000 steps of
 0.25 px."""
 
 Ranges = list[NDArray[np.float64]]
@@ -62,7 +62,7 @@ class DefocusNodes:
     def unlimited(
         cls, nodes: RaggedNodes, channel_shift_dpt: NDArray[np.float64]
     ) -> DefocusNodes:
-        """Return nodes whose kernels are neither limited nor shrunk."""
+        """Return nodes of groups that are neither limited nor shrunk."""
         count = len(nodes.starts) - 1
         return cls(nodes, channel_shift_dpt, np.zeros(count, bool), np.ones(count))
 
@@ -76,17 +76,17 @@ def defocus_nodes(
     *,
     allowed_error: float,
 ) -> DefocusNodes:
-    """Return the nodes of total defocus of every group for a mean square error.
+    """Return the nodes of total defocus of every group for an allowed error.
 
     Parameters
     ----------
     groups : PupilStates
-        Field nodes (P,) in one state, in green light without defocus.
+        Field nodes (P,) of one state, in green light without defocus.
     group_rays : GroupRays
     readable : ReadableDefocus
     """
     rays = _Rays.of(eye, spec, groups, group_rays, allowed_error=allowed_error)
-    split = joined_ranges(readable.of_any_channel_dpt)
+    split = joined_ranges(readable.all_channels_dpt)
     whole_dpt = np.array([[own[0, 0], own[-1, 1]] for own in split])
     limited_dpt, shrink_ratio = rays.limited(whole_dpt, spec, groups)
     is_limited = np.any(limited_dpt != whole_dpt, axis=1)
@@ -95,45 +95,47 @@ def defocus_nodes(
     shift_dpt = np.zeros((len(split), RGB))
     free = np.flatnonzero(~is_limited)
 
-    def try_others(
+    def replace_where_fewer(
         index: NDArray[np.int64], ranges: Ranges, shifts_dpt: Any = None
     ) -> None:
         nonlocal nodes
         if not index.size:
             return
-        nodes, taken = nodes.where_fewer(index, rays.nodes(index, ranges, shifts_dpt))
-        shift_dpt[index[taken]] = 0.0 if shifts_dpt is None else shifts_dpt[taken]
+        nodes, replaced = nodes.where_fewer(
+            index, rays.nodes(index, ranges, shifts_dpt)
+        )
+        shift_dpt[index[replaced]] = 0.0 if shifts_dpt is None else shifts_dpt[replaced]
 
     several = free[[len(split[k]) > 1 for k in free.tolist()]]
-    try_others(several, [split[k] for k in several.tolist()])
+    replace_where_fewer(several, [split[k] for k in several.tolist()])
     narrow = free[np.ptp(whole_dpt[free], axis=1) < DEEP_DPT]
-    shifted = joined_ranges(readable.beside_shift_dpt[narrow])
+    shifted = joined_ranges(readable.without_shift_dpt[narrow])
     hulls = [np.array([[own[0, 0], own[-1, 1]]]) for own in shifted]
-    try_others(narrow, hulls, readable.shift_dpt[narrow])
+    replace_where_fewer(narrow, hulls, readable.shift_dpt[narrow])
     if any(len(own) > 1 for own in shifted):
-        try_others(narrow, shifted, readable.shift_dpt[narrow])
+        replace_where_fewer(narrow, shifted, readable.shift_dpt[narrow])
     return DefocusNodes(nodes, shift_dpt, is_limited, shrink_ratio)
 
 
 @dataclass(frozen=True)
 class _Rays:
-    """Landing points of the rays of each group (P,), px, linear in defocus.
+    """Landing points of the rays of each group (P,), in px and linear in defocus.
 
     Attributes
     ----------
     zero_px, per_dpt : (P, n, 2)
     covariance : (P, 4, 3)
-        Polynomial in defocus of the spot's covariance xx, yy, xy, px²: three
-        coefficients of each; then the mean square shift of rays per diopter.
+        The covariance xx, yy, xy of the spot, px², as polynomials in defocus of three
+        coefficients; then the mean square shift of rays per diopter.
     unit_px : (P,)
     half_way_error : float
         RMS error half-way between nodes.
     foci_dpt : (n_foci,)
-        Defocus at which light is in focus: 0, and others with a multifocal lens.
+        Total defocus of each focus: 0, and others with a multifocal lens.
     light_ratio : (n_foci, P)
         Share of the light in each focus.
     reach_px : (P,)
-        Distance beyond the rays to which such a lens sends light.
+        Distance beyond the rays to which a multifocal lens sends light.
     """
 
     zero_px: NDArray[np.float64]
@@ -180,7 +182,7 @@ class _Rays:
         ranges: Ranges,
         shifts_dpt: NDArray[np.float64] | None = None,
     ) -> RaggedNodes:
-        """Return the nodes of groups (n,) over one or several ranges (k, 2) of each."""
+        """Return the nodes of groups (n,) over the ranges (k, 2) of each group."""
         counts = [len(own) for own in ranges]
         lows, highs = np.concatenate(ranges).T
         place = np.repeat(np.arange(index.size), counts)
@@ -190,7 +192,7 @@ class _Rays:
         # Imported here: reading a plan must not load numba.
         from filter_service.planning.spread_loops import needed_intervals
 
-        needed = np.zeros((lows.size, _LADDER))
+        needed = np.zeros((lows.size, _SAMPLES))
         needed_intervals(
             *(self.covariance, self.unit_px, self.light_ratio, self.foci_dpt),
             *(index[place], lows, highs, shifts),
@@ -206,17 +208,17 @@ class _Rays:
     def limited(
         self, ranges_dpt: NDArray[np.float64], spec: GridSpec, groups: PupilStates
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Clip ranges (P, 2) to the defocus whose kernels are small enough.
+        """Clip ranges (P, 2) to the defocus at which kernels are small enough.
 
-        If no kernel of a range is small enough, the range becomes the defocus of the
-        smallest one, with the ratio (P,) by which that has to shrink.  On the axis the
-        range stays, so that computing it raises an error with numbers: the object that
-        the eye looks at is never drawn shrunk.
+        If no kernel in a range is small enough, the range becomes the defocus of the
+        smallest one, with the ratio (P,) that shrinks it to the limit.  On the axis,
+        the range stays as it is, so that computing its kernels raises an error with
+        numbers: the object that the eye looks at is never drawn shrunk.
         """
         lows, highs = ranges_dpt.T
         limit_px = _LARGEST_RATIO * spec.max_blur_radius_px - self.reach_px
-        first_dpt, last_dpt, room = self._within(limit_px)
-        fits = (room > 0.0).all(axis=1) & (
+        first_dpt, last_dpt, discriminant = self._within(limit_px)
+        fits = (discriminant > 0.0).all(axis=1) & (
             np.maximum(first_dpt, lows) <= np.minimum(last_dpt, highs)
         )
         limited_dpt = np.where(
@@ -230,7 +232,7 @@ class _Rays:
         shrunk = np.flatnonzero(~fits & (away_deg > away_deg.min() + 1e-9))
         ratio = np.ones(lows.size)
         if shrunk.size:
-            at_dpt = np.linspace(lows[shrunk], highs[shrunk], _LADDER)
+            at_dpt = np.linspace(lows[shrunk], highs[shrunk], _SAMPLES)
             slopes = (
                 self.zero_px[shrunk] + at_dpt[..., None, None] * self.per_dpt[shrunk]
             )
@@ -245,18 +247,19 @@ class _Rays:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return the first and last defocus (P,) with all rays within a limit.
 
-        They solve |zero + t per|² = limit² for each ray; the discriminant (P, n) is
-        positive for rays that come within the limit at all.
+        They solve |zero + t per|² = limit² for each ray.  The third result is the
+        discriminant (P, n), which is positive if a ray is within the limit at some
+        defocus.
         """
         a = np.maximum((self.per_dpt**2).sum(axis=-1), 1e-12)
         half_b = (self.zero_px * self.per_dpt).sum(axis=-1)
         beyond = (self.zero_px**2).sum(axis=-1) - limit_px[:, None] ** 2
-        room = half_b**2 - a * beyond
-        reach = np.sqrt(np.maximum(room, 0.0))
+        discriminant = half_b**2 - a * beyond
+        reach = np.sqrt(np.maximum(discriminant, 0.0))
         return (
             ((-half_b - reach) / a).max(axis=1),
             ((-half_b + reach) / a).min(axis=1),
-            room,
+            discriminant,
         )
 
 
@@ -275,7 +278,7 @@ def _reach_px(
 def _spread(
     lows: NDArray[np.float64], highs: NDArray[np.float64], needed: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return nodes from end to end of ranges (n,), and the number in each."""
+    """Return the nodes that cover ranges (n,), and the number in each range."""
     # Imported here: reading a plan must not load numba.
     from filter_service.planning.spread_loops import spread_nodes
 
@@ -285,7 +288,7 @@ def _spread(
         k = int(bad[0])
         raise GridTooLarge(
             f"defocus from {lows[k]:.4g} to {highs[k]:.4g} dpt needs "
-            f"{needed[k, -1]:.3g} PSFs at one place in the image",
+            f"{needed[k, -1]:.3g} PSFs at one position in the image",
             field="settings.object_range_dpt",
             allowed=f"ranges and an eye that need at most {MAX_GROUP_NODES:,}",
         )

@@ -1,12 +1,14 @@
 """Image error caused by blending neighboring PSFs.
 
-The law is a fit (`python -m tests.benchmarks.plan_law` repeats it).  3,600 random pairs
-of neighbors in defocus, pupil, accommodation and field - five eyes, pupils of 2 to
-7 mm, fields to 40 x 25 deg, pixels of 0.8 to 3.5 mrad - were blended half and half and
-compared with the exact PSF between them on linear 720p frames of the scene *Courtyard*.
-Blending has two errors.  Rays at a distance D are doubled, which counts as D² relative
-to the blur.  Where rays do not move in proportion, the blend is displaced from the
-exact PSF, which counts at first order.
+The law is a fit to measurements; `python -m tests.benchmarks.plan_law` repeats it.  The
+data are 3,600 random pairs of neighbors in defocus, pupil, accommodation and field,
+from five eyes, pupils of 2 to 7 mm, fields to 40 x 25 deg and pixels of 0.8 to
+3.5 mrad.  Each pair was blended half and half and compared with the exact PSF between
+its members on linear 720p frames of the scene *Courtyard*.
+
+Blending has two errors.  It doubles rays that are at a distance D from each other; this
+error grows with D² relative to the blur.  Where rays do not move in proportion, it also
+displaces the blend from the exact PSF; this error is of first order.
 """
 
 from typing import Any
@@ -24,8 +26,8 @@ BLUR_EXPONENT = 0.795
 SHARP_PX = 0.384
 OWN_SHARE = 0.41
 DIFFRACTION_SHARE = 2.9
-"""Squared blur added to that of the rays: of the pixel; per squared difference D²; per
-squared lambda / pupil diameter."""
+"""Terms of the squared blur besides that of the rays: that of a pixel, px, and factors
+of D² and of the squared wavelength over pupil diameter."""
 
 AXIS_FACTOR = {
     "h": 1.15,
@@ -34,21 +36,23 @@ AXIS_FACTOR = {
     "accommodation": 2.5,
     "defocus": 2.2,
 }
-"""Measured mean square error over that of the law, by interpolated axis."""
+"""Measured mean square error relative to that of the law, by interpolated axis."""
 
 COHERENCE = 0.09
-"""Degree to which errors of several axes add as amplitudes: all of them blur."""
+"""Degree to which the errors of several axes add as amplitudes, because all of them
+blur."""
 
 FLOOR = 1.8e-6
-"""Mean square error that remains with denser nodes: rims of spots that cross a pixel
-edge between two nodes, and the transition between PSF methods.  Both are from whole
-plans, measured and predicted (36 of three eyes, spread 0.7 dB)."""
+"""Mean square error that denser nodes do not remove: from rims of spots that cross a
+pixel edge between two nodes, and from the transition between PSF methods.  `COHERENCE`
+and `FLOOR` are from 36 whole plans of three eyes, measured and predicted (spread
+0.7 dB)."""
 
 LEAST_SHARE = 0.02
-"""Share of the total error left to an axis when the others have spent all of it."""
+"""Least share of the total error for an axis, if the other axes have used all of it."""
 
 MEAN_OF_HALF_WAY = 8.0 / 15.0
-"""Mean square over an interval of an error that is 4 f (1 - f) of its middle value."""
+"""Mean square over an interval of 4 f (1 - f), the error relative to its middle."""
 
 
 def mean_square(vectors_px: NDArray[Any]) -> NDArray[np.float64]:
@@ -93,7 +97,7 @@ def blend_error(
     share_ratio : (P,)
         Share of the upper neighbor.
     unit_px : (P,)
-        lambda / pupil diameter.
+        Wavelength over pupil diameter, px.
     """
     share = share_ratio[:, None, None]
     difference_px2 = mean_square(upper_px - lower_px)
@@ -101,7 +105,7 @@ def blend_error(
     blur_px2 = _blur_px2(spot_covariance(exact_px), difference_px2, unit_px)
     half_way = 4.0 * share_ratio * (1.0 - share_ratio)
     doubled = DOUBLING * half_way * difference_px2 / blur_px2**BLUR_EXPONENT
-    # A displacement beyond the blur counts ever less: image contrast is limited.
+    # The error of a displacement beyond the blur saturates: image contrast is limited.
     aside_square = (
         ASIDE**2 * aside_px2 * (blur_px2 + aside_px2) ** (1.0 - 2.0 * BLUR_EXPONENT)
     )
@@ -114,7 +118,7 @@ def allowed_difference_px(
     unit_px: NDArray[Any],
     half_way_error: float | NDArray[Any],
 ) -> NDArray[np.float64]:
-    """Return the RMS difference (P,) of neighbors for a given RMS error half-way.
+    """Return the RMS difference (P,) of neighbors that causes an error half-way.
 
     Parameters
     ----------
@@ -134,7 +138,7 @@ def half_way_error(axis: str, allowed_error: float) -> float:
 
 
 def combined_error(errors: list[float]) -> float:
-    """Return the mean square error of several combined interpolations."""
+    """Return the mean square error of several interpolations together."""
     amplitude = float(np.sum(np.sqrt(errors)))
     return FLOOR + (1.0 - COHERENCE) * float(np.sum(errors)) + COHERENCE * amplitude**2
 
@@ -145,7 +149,7 @@ def equal_share(allowed_error: float, *, spent: list[float], count: int) -> floa
     Parameters
     ----------
     spent : list
-        Errors of the interpolations that are already decided.
+        Errors of the interpolations whose nodes are known.
     count : int
         Number of remaining interpolations, which share equally.
     """

@@ -1,8 +1,8 @@
 """Directions of a camera in the visual field of an eye that may look elsewhere.
 
-The camera is a pinhole in the eye's entrance pupil; gaze rotates the eye relative to
-it.  Field directions (h, v) are the eye's (CONVENTIONS.md), so the PSFs of a field
-direction move over the image with the gaze.
+The camera is a pinhole in the eye's entrance pupil, and gaze rotates the eye relative
+to it.  Field directions (h, v) are relative to the eye (CONVENTIONS.md), so the PSFs of
+a field direction move over the image with the gaze.
 """
 
 from typing import Any
@@ -14,7 +14,7 @@ from estimator.optics import pinhole
 from filter_service.camera import Camera
 
 MAX_FIELD_DEG = 80.0
-"""Directions farther from the camera's axis or the gaze have no PSF nodes."""
+"""Largest angle from the camera's axis and from the gaze at which there are nodes."""
 
 BORDER_SAMPLES = 33
 """Number of points along each image edge at which the field extent is sampled."""
@@ -53,7 +53,7 @@ def field_deg(
     *,
     gaze_deg: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the field direction (h, v), deg, seen at an image point, y downward.
+    """Return the field direction (h, v), deg, of an image point, y downward.
 
     The center of the top-left pixel is (0.5, 0.5).
     """
@@ -93,7 +93,7 @@ def nearest_inside_deg(
     *,
     gaze_deg: tuple[float, float],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return field directions (h, v), clamped to the image where they lie outside."""
+    """Return field directions (h, v), clamped to the image."""
     turn = gaze_rotation(gaze_deg)
     x, y, z = np.moveaxis(unit_direction(h_deg, v_deg) @ turn.T, -1, 0)
     left, right, up, down = camera.tangents

@@ -38,14 +38,14 @@ MIN_BLUR_STEP_PX = 0.25
 BLUR_STEP_RATIO = 0.1
 LARGE_BLUR_STEP_RATIO = 0.025
 """Blur step between nodes: a tenth of the blur radius, at least 0.25 px and at most
-`GridSpec.max_blur_step_px`, but never finer than 2.5 % of the radius, because in a wide
+`GridSpec.max_blur_step_px`, but never less than 2.5 % of the radius, because in a wide
 kernel only the relative change of the radius is visible."""
 
 BASE_OBJECT_STEP_DPT = 0.25
 """Step of the paper's object distances: 33 over 8 dpt."""
 
-FOCUS_LADDER = 65
-"""Number of positions between two foci at which the next step is evaluated."""
+FOCUS_SAMPLES = 65
+"""Number of positions between two foci at which the step is evaluated."""
 
 LAYER_BLUR_RATIO = {"on-axis": 0.05, "quality": 0.05, "dynamic": 0.1}
 """Blur step between layers, of the blur radius; at least `MIN_BLUR_STEP_PX`."""
@@ -95,7 +95,7 @@ class GridSpec:
     kept_energy_ratio: float = 0.99
 
     def __post_init__(self) -> None:
-        """Refuse cameras and gazes that no cache can be built for."""
+        """Refuse cameras and gazes for which no cache can be built."""
         for pitch_mrad in self.pixel_pitch_mrad:
             if not 0.005 <= pitch_mrad <= 100.0:
                 raise BadMessage(
@@ -114,9 +114,9 @@ class GridSpec:
         for (low, high), turn in zip(seen_deg, turns_deg, strict=True):
             if turn > 0.0 and max(-low, high) + turn > MAX_FIELD_DEG:
                 raise BadMessage(
-                    f"{turn:g} beside a field of {low:.3g} to {high:.3g} deg",
+                    f"{turn:g} deg with a field of {low:.3g} to {high:.3g} deg",
                     field="settings.gaze_range_deg",
-                    allowed=f"{MAX_FIELD_DEG:g} together",
+                    allowed=f"up to {MAX_FIELD_DEG:g} deg in total",
                 )
 
     def with_settings(self, **changes: Any) -> "GridSpec":
@@ -139,7 +139,7 @@ class GridSpec:
 
     @property
     def field_range_deg(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Ranges of field directions (h, v) that PSFs are needed for."""
+        """Ranges of the field directions (h, v) for which PSFs are needed."""
         if not self.follows_field:
             return (0.0, 0.0), (0.0, 0.0)
         ranges = [
@@ -174,14 +174,14 @@ class GridSpec:
 
     @property
     def channel_wavelengths_nm(self) -> NDArray[np.float64]:
-        """Wavelengths (3,) of the channels; all the same without chromatic blur."""
+        """Wavelengths (3,) of the channels; equal without chromatic blur."""
         if not self.settings.chromatic:
             return np.full(len(self.wavelengths_nm), REFERENCE_WAVELENGTH_NM)
         return np.array(self.wavelengths_nm)
 
     @property
     def primary_wavelengths_nm(self) -> NDArray[np.float64]:
-        """Wavelengths (n, 3) whose averaged PSFs are those of the channels."""
+        """Wavelengths (n, 3) whose PSFs are averaged for each channel."""
         middle_nm = self.channel_wavelengths_nm
         if not (self.settings.chromatic and self.settings.wide_primaries):
             return middle_nm[None]
@@ -256,9 +256,9 @@ class GridSpec:
     ) -> NDArray[np.float64]:
         """Return the pixel scale (..., 2, 2) of the stored kernels of a field node.
 
-        It is that of the image where the node is seen.  A node that the gaze moves over
-        the image has the axis's pixels, reduced to be no larger than any in the image,
-        so that frames only ever average stored pixels.
+        It is the scale of the image where the node appears.  A node that the gaze moves
+        over the image has the pixels of the axis, reduced to the smallest pixels in the
+        image, so that frames average stored pixels and never enlarge them.
         """
         if not any(self.settings.gaze_range_deg) or not self.follows_field:
             return self.pixel_from_mrad(h_deg, v_deg)
@@ -295,15 +295,15 @@ def nodes_through_foci_dpt(
     blur_px_per_dpt: float,
     max_blur_step_px: float,
 ) -> NDArray[np.float64]:
-    """Return nodes as `defocus_nodes_dpt` does, for a lens with several foci.
+    """Return nodes like `defocus_nodes_dpt`, for a lens with several foci.
 
-    Each focus inside the range is a node, and steps are those of the nearest focus.
+    Each focus inside the range is a node.  Steps depend on the nearest focus.
     """
     inside = foci_dpt[(foci_dpt > low_dpt) & (foci_dpt < high_dpt)]
     ends = np.unique(np.concatenate([[low_dpt], inside, [high_dpt]]))
     nodes = [ends[:1]]
     for first, last in pairwise(ends.tolist()):
-        at_dpt = np.linspace(first, last, FOCUS_LADDER)
+        at_dpt = np.linspace(first, last, FOCUS_SAMPLES)
         away_dpt = np.abs(at_dpt[:, None] - foci_dpt).min(axis=1)
         step_px = [
             blur_step_px(blur, max_blur_step_px)
@@ -321,10 +321,10 @@ def nodes_through_foci_dpt(
 def defocus_nodes_dpt(
     low_dpt: float, high_dpt: float, *, blur_px_per_dpt: float, max_blur_step_px: float
 ) -> NDArray[np.float64]:
-    """Return total defocus of the nodes of one pupil, ascending, covering a range.
+    """Return nodes of total defocus that cover a range, ascending.
 
-    Zero is a node if it lies in the range, so that a focused object needs no
-    interpolation.
+    Zero is a node if it lies in the range, so that an object in focus is not
+    interpolated.
     """
 
     def outward(limit_dpt: float) -> list[float]:

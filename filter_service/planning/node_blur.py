@@ -1,7 +1,8 @@
-"""Geometric blur of a plan's nodes, known before any of their PSFs is computed.
+"""Geometric blur of a plan's nodes, computed without their PSFs.
 
-The layers of frames depend on it, so it must not depend on which PSFs are computed.
-Landing points of rays are linear in defocus, so two defocus values of a group suffice.
+The layers of frames depend on this blur, so it must not depend on which PSFs have been
+computed.  Landing points of rays are linear in defocus, so two values of defocus
+suffice for each group.
 """
 
 from typing import NamedTuple
@@ -64,7 +65,7 @@ def node_blur_px(
 ) -> NDArray[np.float32]:
     """Return the largest distance (n_psfs,), px, of rays from the chief ray.
 
-    With several foci, it is that of the nearest focus.
+    With several foci, these are the rays of the nearest focus.
     """
     # Imported here: reading a plan must not load numba.
     from filter_service.planning.blur_loops import fill_blur_px

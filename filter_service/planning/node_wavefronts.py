@@ -1,7 +1,7 @@
 """Wavefronts of field nodes in one state of an eye, evaluated once for all PSFs.
 
-Nodes of a group differ by defocus alone, so each group and channel has one wavefront.
-Evaluating the eye for each batch of PSFs took 12 ms per batch, regardless of its size.
+Nodes of a group differ by defocus alone, so each group and channel needs one wavefront.
+Evaluating the eye for each batch of PSFs instead took 12 ms per batch of any size.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from filter_service.planning.grid import GREEN, GridSpec
 
 @dataclass(frozen=True)
 class PupilStates:
-    """Parameters of wavefronts; arrays (P,)."""
+    """Directions, states, wavelengths and defocus of wavefronts, as arrays (P,)."""
 
     h_deg: NDArray[np.float64]
     v_deg: NDArray[np.float64]
@@ -36,8 +36,8 @@ class PupilStates:
         arrays = np.broadcast_arrays(*(np.asarray(v, float) for v in values.values()))
         return cls(**dict(zip(values, (a.ravel() for a in arrays), strict=True)))
 
-    def taken(self, index: NDArray[np.int64] | slice) -> PupilStates:
-        """Return a selection of the states, in any order."""
+    def select(self, index: NDArray[np.int64] | slice) -> PupilStates:
+        """Return the states at the given indices."""
         return PupilStates(**{name: v[index] for name, v in vars(self).items()})
 
 
@@ -47,7 +47,7 @@ WavefrontsOf = Callable[..., FieldWavefronts]
 
 @dataclass(frozen=True)
 class NodeWavefronts:
-    """Wavefronts of groups, channels and the wavelengths of each channel.
+    """Wavefronts of groups, by channel and wavelength of the channel.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class NodeWavefronts:
     pupil_ellipse : (n_groups, 3, n_primaries, 5)
     wavelength_nm : (3, n_primaries)
     pixel_from_mrad : (n_groups, 2, 2)
-        Scale of the pixels that kernels are stored in.
+        Pixel scale of the stored kernels.
     h_deg, v_deg : (n_groups,)
     """
 
@@ -85,15 +85,15 @@ class NodeWavefronts:
         Parameters
         ----------
         wavefronts_of : callable, optional
-            Result of `node_evaluator`, if it is shared by several states.
+            Result of `node_evaluator`, to share it between states.
         """
         wavefronts_of = wavefronts_of or node_evaluator(
             eye, spec, groups.h_deg, groups.v_deg
         )
-        states = of_channels(spec, groups)
+        states = channel_states(spec, groups)
         n_primaries = len(spec.primary_wavelengths_nm)
         if n_primaries > 1:
-            states = states_of_primaries(eye, spec, states)
+            states = primary_states(eye, spec, states)
         shape = (groups.h_deg.size, RGB, n_primaries)
         count = states.h_deg.size
         found = wavefronts_of(
@@ -130,7 +130,7 @@ class NodeWavefronts:
             },
         )
 
-    def flatter(self, ratio: NDArray[np.float64]) -> NodeWavefronts:
+    def scaled(self, ratio: NDArray[np.float64]) -> NodeWavefronts:
         """Return the wavefronts scaled by a ratio (n_groups,)."""
         each = ratio[:, None, None, None]
         return replace(
@@ -140,11 +140,11 @@ class NodeWavefronts:
     def with_lateral_color(
         self, eye: EyeOptics, spec: GridSpec, groups: PupilStates
     ) -> NodeWavefronts:
-        """Return wavefronts with the tilts of the colors relative to green."""
+        """Return wavefronts with the tilt of each color relative to green."""
         n_primaries = self.wavelength_nm.shape[1]
-        states = of_channels(spec, groups)
+        states = channel_states(spec, groups)
         if n_primaries > 1:
-            states = states_of_primaries(eye, spec, states)
+            states = primary_states(eye, spec, states)
         tilted_um = with_tilt(
             self.zernike_um.reshape(states.h_deg.size, -1),
             self.circle_diameter_mm.ravel() / 2.0,
@@ -165,7 +165,7 @@ class NodeWavefronts:
         Parameters
         ----------
         primaries : int, optional
-            Number of wavelengths of each channel; all by default.
+            Number of wavelengths per channel; all by default.
         """
         own = (groups, channels, slice(primaries))
         zernike_um = self.zernike_um[own] + (
@@ -181,7 +181,10 @@ class NodeWavefronts:
 def node_evaluator(
     eye: EyeOptics, spec: GridSpec, h_deg: NDArray[Any], v_deg: NDArray[Any]
 ) -> WavefrontsOf:
-    """Return a function that evaluates wavefronts at field nodes (n,), node by node."""
+    """Return a function that evaluates the wavefronts of field nodes (n,) in a state.
+
+    Its result is ordered by node, channel and wavelength.
+    """
     per_node = spec.primary_wavelengths_nm.size
     return eye.wavefronts_at(
         h_deg=np.repeat(h_deg, per_node),
@@ -190,30 +193,28 @@ def node_evaluator(
     )
 
 
-def of_channels(spec: GridSpec, groups: PupilStates) -> PupilStates:
-    """Return the states (3 n_groups,) of the channels of groups, group by group."""
-    states = groups.taken(np.repeat(np.arange(groups.h_deg.size), RGB))
+def channel_states(spec: GridSpec, groups: PupilStates) -> PupilStates:
+    """Return the states (3 n_groups,) of the channels, ordered by group."""
+    states = groups.select(np.repeat(np.arange(groups.h_deg.size), RGB))
     wavelength_nm = np.tile(spec.channel_wavelengths_nm, groups.h_deg.size)
     return replace(states, wavelength_nm=wavelength_nm)
 
 
-def states_of_primaries(
-    eye: EyeOptics, spec: GridSpec, states: PupilStates
-) -> PupilStates:
-    """Return the states (n P,) of the n wavelengths of each state's primary.
+def primary_states(eye: EyeOptics, spec: GridSpec, states: PupilStates) -> PupilStates:
+    """Return the states (n P,) at the n wavelengths of each state's primary.
 
-    The states of a primary are adjacent; their total defocus differs by the eye's
-    chromatic difference.
+    The states of a primary are adjacent and differ in total defocus by the chromatic
+    difference of the eye.
     """
-    of_primary_nm = spec.primary_wavelengths_nm
+    primaries_nm = spec.primary_wavelengths_nm
     away_nm = np.abs(spec.channel_wavelengths_nm - states.wavelength_nm[:, None])
-    wavelength_nm = of_primary_nm[:, away_nm.argmin(axis=1)].T.ravel()
-    every = np.repeat(np.arange(away_nm.shape[0]), len(of_primary_nm))
-    found = replace(states.taken(every), wavelength_nm=wavelength_nm)
-    places = {n: c for n, c in vars(found).items() if n != "total_defocus_dpt"}
+    wavelength_nm = primaries_nm[:, away_nm.argmin(axis=1)].T.ravel()
+    every = np.repeat(np.arange(away_nm.shape[0]), len(primaries_nm))
+    found = replace(states.select(every), wavelength_nm=wavelength_nm)
+    location = {n: c for n, c in vars(found).items() if n != "total_defocus_dpt"}
     middle_nm = states.wavelength_nm[every]
-    shift_dpt = eye.total_defocus_dpt(**places) - eye.total_defocus_dpt(
-        **(places | {"wavelength_nm": middle_nm})
+    shift_dpt = eye.total_defocus_dpt(**location) - eye.total_defocus_dpt(
+        **(location | {"wavelength_nm": middle_nm})
     )
     return replace(found, total_defocus_dpt=found.total_defocus_dpt + shift_dpt)
 

@@ -1,9 +1,9 @@
-"""Nodes of a PSF cache: plain arrays, and the search for a value's neighbors."""
+"""Nodes of a PSF cache as plain arrays, and the search for the neighbors of a value."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -40,12 +40,12 @@ class RaggedNodes:
     ) -> RaggedNodes:
         """Split values (n,) into groups of ``counts`` (n_groups,)."""
         if not counts.size or counts.min() < 1:
-            raise ValueError(f"groups of {counts} nodes: at least one node each")
+            raise ValueError(f"expected at least one node in each group, got {counts}")
         starts = np.concatenate([[0], np.cumsum(counts)])
         rises = np.diff(values_dpt) > 0.0
         rises[starts[1:-1] - 1] = True
         if not rises.all():
-            raise ValueError("the values of a group must ascend")
+            raise ValueError("expected ascending values in each group")
         return cls(values_dpt.astype(np.float64), starts.astype(np.int64))
 
     def where_fewer(
@@ -56,23 +56,23 @@ class RaggedNodes:
         Parameters
         ----------
         index : (k,)
-            Groups to which the groups of `other` correspond.
+            Groups that correspond to the groups of `other`.
 
         Returns
         -------
         nodes : RaggedNodes
-        taken : (m,)
-            Positions in `index` of the groups that were replaced.
+        replaced : (m,)
+            Positions in `index` of the replaced groups.
         """
-        taken = np.flatnonzero(other.counts < self.counts[index])
+        replaced = np.flatnonzero(other.counts < self.counts[index])
         counts, first = self.counts, self.starts[:-1].copy()
-        counts[index[taken]] = other.counts[taken]
-        first[index[taken]] = self.values_dpt.size + other.starts[:-1][taken]
+        counts[index[replaced]] = other.counts[replaced]
+        first[index[replaced]] = self.values_dpt.size + other.starts[:-1][replaced]
         at = np.arange(counts.sum()) + np.repeat(
             first - (np.cumsum(counts) - counts), counts
         )
         values_dpt = np.concatenate([self.values_dpt, other.values_dpt])[at]
-        return RaggedNodes.joined(values_dpt, counts), taken
+        return RaggedNodes.joined(values_dpt, counts), replaced
 
     @property
     def counts(self) -> NDArray[np.int64]:
@@ -85,7 +85,7 @@ class RaggedNodes:
         return np.repeat(np.arange(len(self.starts) - 1), self.counts)
 
     def group_at(self, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the groups (n,) of some nodes."""
+        """Return the group (n,) of each of some nodes."""
         return np.searchsorted(self.starts, nodes, side="right") - 1
 
     @cached_property
@@ -100,19 +100,19 @@ class RaggedNodes:
 
     @cached_property
     def keys_dpt(self) -> NDArray[np.float64]:
-        """Values (n,) shifted so that one search serves all groups, ascending."""
+        """Values (n,), shifted to ascend over all groups for a single search."""
         return self.values_dpt - self.lowest_dpt + self.span_dpt * self.group_of_node
 
     def bracket(
         self, groups: ArrayLike, t: ArrayLike
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Return the neighbors of values within their groups, clipped to their ends.
+        """Return the neighbors of values in their groups, clipped to their ends.
 
         Parameters
         ----------
         groups : (...) int
         t : (...)
-            Broadcast against each other.
+            Values; they broadcast with `groups`.
 
         Returns
         -------
@@ -146,11 +146,11 @@ class PlanPrediction:
         Time on `core_count` processor cores.
     core_count : int
     interpolation_db : float
-        PSNR of images filtered by interpolated PSFs against exact ones, over the
-        states that frames can request.
+        PSNR of images filtered with interpolated PSFs relative to exact ones, over the
+        states of frames.
     error_db_by_axis : dict
-        The same with one axis interpolated at a time: "defocus", "pupil",
-        "accommodation", "field".
+        The same with one axis interpolated at a time: "h", "v", "pupil",
+        "accommodation", "defocus"; axes with one node are missing.
     """
 
     psf_count: int
@@ -165,8 +165,7 @@ class PlanPrediction:
 class PlanAxes:
     """Nodes of a cache over field, pupil and accommodation.
 
-    Nodes of defocus follow from these for each pupil and accommodation; see
-    `planning.plan.NodePlanner`.
+    `planning.plan.NodePlanner` plans the nodes of defocus for each state.
 
     Attributes
     ----------
@@ -175,8 +174,8 @@ class PlanAxes:
     pupils_mm : (n_pupils,)
     accommodations_dpt : (n_accommodations,)
     defocus_error : float
-        Mean square error that interpolation in defocus may add; 0 where the nodes do
-        not depend on it.
+        Mean square error that interpolation in defocus may cause; 0 if the nodes do not
+        depend on it.
     """
 
     h_deg: NDArray[np.float64]
@@ -209,25 +208,26 @@ class PlanAxes:
 
 @dataclass(frozen=True)
 class PlanNodes:
-    """Nodes of total defocus of all field nodes, in one or several states of the eye.
+    """Nodes of total defocus of all field nodes, for one or several states.
 
     Attributes
     ----------
     defocus : RaggedNodes
-        Total defocus in dpt; a group is one field node [v, h] in one state.
+        Total defocus; a group is one field node [v, h] in one state.
     channel_shift_dpt : (n_groups, 3)
-        Channel c of a node at t is the kernel of total defocus t + shift.  The shift is
-        zero if a node is one defocus for all channels, and the chromatic difference if
-        a node is one object distance, as with few distances and in the paper's grids.
+        The kernel of channel c of a node at t has total defocus t + shift.  The shift
+        is zero if the node is the same defocus for all channels.  It is the chromatic
+        difference if the node is an object distance, as with few distances and in the
+        paper's grids.
     blur_px : (n_psfs,)
         Geometric blur of the nodes' PSFs, see `planning.node_blur`.
     is_limited : (n_groups,)
-        Groups that end where the blur reaches the largest allowed kernel.
+        Whether a group ends where the blur reaches the radius of the largest kernel.
     shrink_ratio : (n_groups,)
-        Factor by which wavefronts are scaled where even the sharpest blur of a group
-        exceeds that; one elsewhere.
+        Factor of the wavefronts of a group whose smallest blur exceeds that radius; one
+        for the others.
     wavefronts : NodeWavefronts
-        Wavefronts scaled by that factor.
+        Wavefronts, scaled by `shrink_ratio`.
     """
 
     defocus: RaggedNodes
@@ -239,7 +239,7 @@ class PlanNodes:
 
     @property
     def arrays(self) -> list[NDArray[Any]]:
-        """All arrays, for computing their size."""
+        """All arrays, to compute their size."""
         parts = (self, self.defocus, self.wavefronts)
         values = [value for part in parts for value in vars(part).values()]
         return [value for value in values if isinstance(value, np.ndarray)]
@@ -264,24 +264,27 @@ class PlanNodes:
 
 @dataclass(frozen=True)
 class CachePlan(PlanAxes):
-    """All nodes of a cache, before anything is computed.
+    """All nodes of a cache.
 
     Attributes
     ----------
     nodes : PlanNodes
         Groups in C order [pupil, accommodation, v, h].
     prediction : PlanPrediction, optional
-        None unless requested: it takes longer than the plan.
+        None unless requested, because it takes longer than the plan.
     """
 
-    nodes: PlanNodes | None = None
+    nodes: PlanNodes = field(kw_only=True)
     prediction: PlanPrediction | None = None
 
 
 def bracket_axis(
     nodes: ArrayLike, value: ArrayLike
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return neighbors of values (...) in sorted nodes; see `RaggedNodes.bracket`."""
+    """Return the neighbors of values (...) in sorted nodes.
+
+    The results are those of `RaggedNodes.bracket`.
+    """
     nodes = np.asarray(nodes, np.float64)
     last = nodes.size - 1
     value = np.clip(np.asarray(value, np.float64), nodes[0], nodes[-1])
@@ -306,7 +309,7 @@ def triangle(
     weights : (n, 3)
         Weights of the corner (0, 0), of the intermediate corner and of (1, 1).
     is_first : (n,)
-        Whether the intermediate corner is (1, 0), else (0, 1).
+        Whether the intermediate corner is (1, 0) and not (0, 1).
     """
     low, high = np.minimum(first, second), np.maximum(first, second)
     return np.stack([1.0 - high, high - low, low], axis=-1), first >= second

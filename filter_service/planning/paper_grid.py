@@ -1,8 +1,8 @@
-"""The paper's fixed grids, as plans of this cache.
+"""The paper's fixed grids as plans.
 
-Angles and distances are those of the released code.  Its nodes of focus become nodes of
-accommodation.  Its nodes of object distance become nodes of the total defocus of green
-light, with the other channels shifted by their chromatic differences.
+Angles and distances are those of the released code.  Its foci become nodes of
+accommodation.  Its object distances become nodes of the total defocus of green light,
+and the other channels are shifted by their chromatic differences.
 
 References
 ----------
@@ -33,11 +33,10 @@ DISTANCES_DPT = (0.125, 8.125)
 
 
 def paper_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
-    """Return azimuths, elevations, pupils and accommodations.
+    """Return the nodes of field, pupil and accommodation.
 
-    Pupils and foci outside the ranges in use are clamped to their ends.  Foci that the
-    eye meets with the same accommodation, as a myopic eye does beyond its far point,
-    are one node.
+    Pupils and foci are clamped to the ranges of the settings.  Foci with the same
+    accommodation, such as those of a myopic eye beyond its far point, are one node.
     """
     settings, mode = spec.settings, spec.settings.mode
     reach_deg = PAPER_REACH_DEG.get(mode, (0.0, 0.0))
@@ -49,7 +48,7 @@ def paper_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
     foci_dpt = np.clip(FOCI_DPT[mode], *settings.focus_range_dpt)
     usable_mm = np.unique([eye.usable_pupil_mm(pupil_mm) for pupil_mm in pupils_mm])
     widest_mm = float(usable_mm[-1])
-    used_dpt = np.unique(
+    accommodations_dpt = np.unique(
         [eye.accommodation_dpt(f, pupil_diameter_mm=widest_mm) for f in foci_dpt]
     )
     # The ends need other accommodations through smaller pupils.
@@ -57,13 +56,13 @@ def paper_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
         (float(foci_dpt[0]), float(foci_dpt[-1])),
         pupil_range_mm=(float(usable_mm[0]), widest_mm),
     )
-    used_dpt = np.unique([low_dpt, *used_dpt[1:-1], high_dpt])
+    accommodations_dpt = np.unique([low_dpt, *accommodations_dpt[1:-1], high_dpt])
     h_deg, v_deg = angles_deg
-    return PlanAxes(h_deg, v_deg, usable_mm, used_dpt)
+    return PlanAxes(h_deg, v_deg, usable_mm, accommodations_dpt)
 
 
 def paper_defocus(eye: EyeOptics, spec: GridSpec, groups: PupilStates) -> DefocusNodes:
-    """Return nodes of total defocus of groups, with the channels' shifts from them."""
+    """Return the nodes of total defocus of groups, with the shifts of the channels."""
     at_infinity_dpt = eye.total_defocus_dpt(
         h_deg=groups.h_deg[:, None],
         v_deg=groups.v_deg[:, None],

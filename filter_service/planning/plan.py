@@ -1,8 +1,8 @@
 """Choice of the PSFs in a cache, and prediction of their cost, before computing any.
 
-A frame reads total defocus t within the range of its objects, focus and channels, at
-the neighboring nodes of pupil and accommodation.  Only that range is planned, and for a
-stream only when a frame first reads those nodes.
+At the neighboring nodes of pupil and accommodation, a frame reads the total defocus of
+its objects, focus and channels.  Nodes cover only that range, and a stream plans the
+nodes of a state when a frame first reads it.
 """
 
 from collections.abc import Callable
@@ -49,20 +49,20 @@ from filter_service.planning.nodes import (
 from filter_service.planning.paper_grid import paper_axes, paper_defocus
 from filter_service.planning.readable import (
     ReadableDefocus,
+    accommodation_range_dpt,
     check_plan_defocus,
     joined_ranges,
     readable_defocus,
     usable_pupils_mm,
-    used_accommodations_dpt,
-)
-from filter_service.planning.sampled_use import (
-    AXES,
-    Use,
-    axis_error,
-    defocus_error,
-    sample_use,
 )
 from filter_service.planning.slopes import main_foci_dpt
+from filter_service.planning.state_samples import (
+    AXES,
+    StateSample,
+    axis_error,
+    defocus_error,
+    sample_states,
+)
 from filter_service.settings import TOLERANCES
 
 __all__ = [
@@ -76,8 +76,8 @@ __all__ = [
     "unchecked_plan",
 ]
 
-USE_SAMPLES = 96
-"""Number of states at which errors are predicted."""
+STATE_SAMPLES = 96
+"""Number of states for which errors are predicted."""
 
 
 class PlanTooLarge(ValueError):
@@ -99,21 +99,22 @@ class PlanTooLarge(ValueError):
 
 
 def plan_cache(eye: EyeOptics, spec: GridSpec) -> CachePlan:
-    """Return all nodes over field, pupil, accommodation and defocus for frames.
+    """Plan the nodes of all axes for the frames of a spec, and predict their cost.
 
     Raises
     ------
     ProfileError
         If the eye's defocus is beyond that of any eye.
     GridTooLarge
-        If one field position, pupil and accommodation alone needs too many PSFs.
+        If a single group needs too many PSFs.
     PlanTooLarge
         If the kernels exceed ``spec.memory_budget_mb``; the message proposes a change.
     """
-    plan = unchecked_plan(eye, spec)
-    if plan.prediction.memory_mb > spec.memory_budget_mb:
-        raise PlanTooLarge(spec, plan.prediction, _advice(eye, spec))
-    return plan
+    plan = unchecked_plan(eye, spec, predict=False)
+    prediction = _prediction(eye, spec, plan)
+    if prediction.memory_mb > spec.memory_budget_mb:
+        raise PlanTooLarge(spec, prediction, _advice(eye, spec))
+    return replace(plan, prediction=prediction)
 
 
 def unchecked_plan(
@@ -123,12 +124,12 @@ def unchecked_plan(
     target_db: float | None = None,
     predict: bool = True,
 ) -> CachePlan:
-    """Return a plan like `plan_cache`, without a limit of memory.
+    """Plan like `plan_cache`, without a limit on memory.
 
     Parameters
     ----------
     target_db : float, optional
-        PSNR to keep after interpolation; by default that of the spec's tolerance.
+        Lowest PSNR after interpolation; by default that of the spec's tolerance.
     predict : bool
         Predict the cost of the plan.
     """
@@ -140,24 +141,28 @@ def unchecked_plan(
     )
     if not predict:
         return plan
-    errors = _errors(sample_use(eye, spec, USE_SAMPLES), plan)
-    prediction = PlanPrediction(
+    return replace(plan, prediction=_prediction(eye, spec, plan))
+
+
+def _prediction(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> PlanPrediction:
+    """Predict the cost of a plan and its interpolation errors."""
+    errors = _errors(sample_states(eye, spec, STATE_SAMPLES), plan)
+    return PlanPrediction(
         **predicted_cost(eye, spec, plan),
         interpolation_db=psnr_db(combined_error(list(errors.values()))),
         error_db_by_axis={name: psnr_db(error) for name, error in errors.items()},
     )
-    return replace(plan, prediction=prediction)
 
 
 def plan_axes(
     eye: EyeOptics, spec: GridSpec, *, target_db: float | None = None
 ) -> PlanAxes:
-    """Return the nodes over field, pupil and accommodation for frames.
+    """Plan the nodes of field, pupil and accommodation.
 
     Parameters
     ----------
     target_db : float, optional
-        PSNR to keep after interpolation; by default that of the spec's tolerance.
+        Lowest PSNR after interpolation; by default that of the spec's tolerance.
 
     Raises
     ------
@@ -170,7 +175,7 @@ def plan_axes(
     if spec.settings.grid == "paper":
         axes = paper_axes(eye, spec)
     elif spec.follows_field:
-        axes = _field_axes(sample_use(eye, spec, USE_SAMPLES), allowed_error)
+        axes = _field_axes(sample_states(eye, spec, STATE_SAMPLES), allowed_error)
     else:
         axes = _central_axes(eye, spec)
     check_plan_defocus(eye, spec, axes)
@@ -178,9 +183,9 @@ def plan_axes(
 
 
 class NodePlanner:
-    """Planner of the nodes of total defocus for a plan's axes, state by state.
+    """Planner of the nodes of total defocus, state by state.
 
-    The plan of a state does not depend on states planned before.
+    The nodes of a state do not depend on the states planned before.
 
     Parameters
     ----------
@@ -191,33 +196,33 @@ class NodePlanner:
 
     def __init__(self, eye: EyeOptics, spec: GridSpec, axes: PlanAxes) -> None:
         self.eye, self.spec, self.axes = eye, spec, axes
-        self._known_dpt: dict[tuple[float, float], NDArray[np.float64]] = {}
+        self._cached_dpt: dict[tuple[float, float], NDArray[np.float64]] = {}
 
     def all_nodes(self) -> PlanNodes:
         """Return the nodes of all states, in C order [pupil, accommodation]."""
         return PlanNodes.joined(
             [
-                self.nodes(pupil, used)
+                self.nodes(pupil, accommodation)
                 for pupil in range(len(self.axes.pupils_mm))
-                for used in range(len(self.axes.accommodations_dpt))
+                for accommodation in range(len(self.axes.accommodations_dpt))
             ]
         )
 
-    def nodes(self, pupil: int, used: int) -> PlanNodes:
+    def nodes(self, pupil: int, accommodation: int) -> PlanNodes:
         """Return the nodes of one state.
 
         Parameters
         ----------
-        pupil, used : int
-            Indices of the state's nodes of pupil and accommodation.
+        pupil, accommodation : int
+            Indices of the nodes of the state.
 
         Raises
         ------
         GridTooLarge
-            If one field position needs too many PSFs.
+            If a group needs too many PSFs.
         """
         eye, spec, axes = self.eye, self.spec, self.axes
-        groups = self._groups(pupil, used)
+        groups = self._groups(pupil, accommodation)
         wavefronts = NodeWavefronts.of(eye, spec, groups, self._wavefronts_of)
         rays = GroupRays.of(wavefronts)
         if spec.settings.grid == "paper":
@@ -225,7 +230,7 @@ class NodePlanner:
         else:
             readable = readable_defocus(
                 *(eye, spec, axes, self._ranges, self._defocus_dpt),
-                *(pupil, used),
+                *(pupil, accommodation),
             )
             found = (
                 defocus_nodes(
@@ -236,7 +241,7 @@ class NodePlanner:
                 else _central_defocus(eye, spec, readable, axes.pupils_mm[pupil])
             )
         if np.any(found.shrink_ratio != 1.0):
-            wavefronts = wavefronts.flatter(found.shrink_ratio)
+            wavefronts = wavefronts.scaled(found.shrink_ratio)
         if spec.settings.lateral_color and spec.settings.chromatic:
             wavefronts = wavefronts.with_lateral_color(eye, spec, groups)
         return PlanNodes(
@@ -251,36 +256,36 @@ class NodePlanner:
             wavefronts=wavefronts,
         )
 
-    def _groups(self, pupil: int, used: int) -> PupilStates:
-        """Return the field nodes in a state, in green light without defocus."""
+    def _groups(self, pupil: int, accommodation: int) -> PupilStates:
+        """Return the field nodes of a state, in green light without defocus."""
         h_deg, v_deg = self.axes.field_nodes_deg
         return PupilStates.of(
             h_deg=h_deg,
             v_deg=v_deg,
             pupil_diameter_mm=self.axes.pupils_mm[pupil],
-            accommodation_dpt=self.axes.accommodations_dpt[used],
+            accommodation_dpt=self.axes.accommodations_dpt[accommodation],
             wavelength_nm=self.spec.channel_wavelengths_nm[GREEN],
             total_defocus_dpt=0.0,
         )
 
     @cached_property
     def _ranges(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Pupils and accommodations in use."""
+        """Ranges of pupils and accommodations that frames read."""
         return (
             usable_pupils_mm(self.eye, self.spec),
-            used_accommodations_dpt(self.eye, self.spec),
+            accommodation_range_dpt(self.eye, self.spec),
         )
 
     def _defocus_dpt(
         self, pupil_mm: float, accommodation_dpt: float
     ) -> NDArray[np.float64]:
-        """Return the total defocus (n_v, n_h, 3) of a state at infinity, memoized."""
+        """Return the total defocus (n_v, n_h, 3) for objects at infinity, memoized."""
         state = pupil_mm, accommodation_dpt
-        if state not in self._known_dpt:
-            self._known_dpt[state] = self._defocus_of(
+        if state not in self._cached_dpt:
+            self._cached_dpt[state] = self._defocus_of(
                 pupil_diameter_mm=pupil_mm, accommodation_dpt=accommodation_dpt
             ).reshape(len(self.axes.v_deg), len(self.axes.h_deg), -1)
-        return self._known_dpt[state]
+        return self._cached_dpt[state]
 
     @cached_property
     def _wavefronts_of(self) -> WavefrontsOf:
@@ -295,7 +300,7 @@ class NodePlanner:
         )
 
 
-def _errors(use: Use, plan: CachePlan) -> dict[str, float]:
+def _errors(sample: StateSample, plan: CachePlan) -> dict[str, float]:
     nodes = dict(
         zip(
             AXES,
@@ -304,9 +309,11 @@ def _errors(use: Use, plan: CachePlan) -> dict[str, float]:
         )
     )
     errors = {
-        axis: axis_error(use, axis, own) for axis, own in nodes.items() if len(own) > 1
+        axis: axis_error(sample, axis, own)
+        for axis, own in nodes.items()
+        if len(own) > 1
     }
-    return errors | {"defocus": defocus_error(use, plan)}
+    return errors | {"defocus": defocus_error(sample, plan)}
 
 
 def _central_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
@@ -320,14 +327,14 @@ def _central_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
     )
 
 
-def _field_axes(use: Use, allowed_error: float) -> PlanAxes:
-    """Return nodes of all axes but defocus, with the mean square error left to it.
+def _field_axes(sample: StateSample, allowed_error: float) -> PlanAxes:
+    """Return the nodes of all axes but defocus, and the error that is left to it.
 
-    Axes with few nodes stay below their share; the remainder goes to the others.
+    An axis with few nodes stays below its share; the other axes share the remainder.
     """
-    eye, spec = use.eye, use.spec
+    eye, spec = sample.eye, sample.spec
     ranges = {
-        "accommodation": used_accommodations_dpt(eye, spec),
+        "accommodation": accommodation_range_dpt(eye, spec),
         "pupil": usable_pupils_mm(eye, spec),
         "v": spec.field_range_deg[1],
         "h": spec.field_range_deg[0],
@@ -342,25 +349,26 @@ def _field_axes(use: Use, allowed_error: float) -> PlanAxes:
         share = equal_share(
             allowed_error, spent=spent, count=1 + len(open_) - len(spent)
         )
-        nodes[axis], error = axis_nodes(use, axis, range_, allowed_error=share)
+        nodes[axis], error = axis_nodes(sample, axis, range_, allowed_error=share)
         spent.append(error)
     left = equal_share(allowed_error, spent=spent, count=1)
-    h_deg, v_deg, pupils_mm, used_dpt = (nodes[axis] for axis in AXES[:-1])
-    return PlanAxes(h_deg, v_deg, pupils_mm, used_dpt, left)
+    h_deg, v_deg, pupils_mm, accommodations_dpt = (nodes[axis] for axis in AXES[:-1])
+    return PlanAxes(h_deg, v_deg, pupils_mm, accommodations_dpt, left)
 
 
 def _central_defocus(
     eye: EyeOptics, spec: GridSpec, readable: ReadableDefocus, pupil_mm: float
 ) -> DefocusNodes:
-    """Return nodes on axis: by blur radius alone, far denser than tolerances require.
+    """Return the nodes of the on-axis mode, spaced by blur radius alone.
 
-    One distance seen in one state needs only the exact PSF of each channel.
+    They are far denser than any tolerance requires.  A single distance seen in a single
+    state needs only the exact PSF of each channel.
     """
-    (exact_dpt,) = joined_ranges(readable.beside_shift_dpt)
+    (exact_dpt,) = joined_ranges(readable.without_shift_dpt)
     if np.ptp(exact_dpt) < EXACT_DPT:
         exact = RaggedNodes.of([exact_dpt[:1, 0]])
         return DefocusNodes.unlimited(exact, readable.shift_dpt)
-    (ranges_dpt,) = joined_ranges(readable.of_any_channel_dpt)
+    (ranges_dpt,) = joined_ranges(readable.all_channels_dpt)
     nodes = RaggedNodes.of([_nodes_by_blur(eye, spec, pupil_mm, ranges_dpt)])
     return DefocusNodes.unlimited(nodes, np.zeros_like(readable.shift_dpt))
 
@@ -383,9 +391,9 @@ def _nodes_by_blur(
 
 
 def _advice(eye: EyeOptics, spec: GridSpec) -> str:
-    """Return text on which change of settings makes the plan fit, and its memory."""
+    """Return a change of settings with which the plan fits, as text with its memory."""
     for words, smaller in _smaller_specs(spec):
-        found = unchecked_plan(eye, smaller).prediction
+        found = _prediction(eye, smaller, unchecked_plan(eye, smaller, predict=False))
         if found.memory_mb <= spec.memory_budget_mb:
             return f"{words} needs {_needs(found)}"
     return f"even {words} needs {_needs(found)}; use a smaller image"
@@ -400,7 +408,7 @@ def _mb(memory_mb: float) -> str:
 
 
 def _smaller_specs(spec: GridSpec) -> list[tuple[str, GridSpec]]:
-    """Return cumulative changes that make a plan smaller, least harmful first."""
+    """Return cumulative changes that make a plan smaller, the least harmful first."""
     steps: list[tuple[str, GridSpec]] = []
     words: list[str] = []
 

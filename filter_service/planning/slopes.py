@@ -1,7 +1,7 @@
 """Slopes of wavefronts over their pupils, in pixels, as geometric models of PSFs.
 
-The landing point of a ray is the slope of its wavefront; the difference of two PSFs is
-the distance between their rays at the same points of the pupil.
+The landing point of a ray is the slope of its wavefront.  The difference of two PSFs is
+the distance between their rays from the same points of the pupil.
 """
 
 from typing import Any
@@ -40,7 +40,7 @@ def state_frames(
     Parameters
     ----------
     pixel_from_mrad : (P, 2, 2), optional
-        Pixel scale; by default the one in which kernels of these states are stored.
+        Pixel scale; by default that of the stored kernels of these states.
     """
     if pixel_from_mrad is None:
         pixel_from_mrad = spec.node_pixel_from_mrad(states.h_deg, states.v_deg)
@@ -59,12 +59,12 @@ def state_frames(
 
 
 def state_survey(eye: EyeOptics, spec: GridSpec, states: PupilStates) -> PupilSurvey:
-    """Return slopes of states (P,) and the extent of their light, with lens rings."""
+    """Return the slopes of states (P,) and the extent of their light, with rings."""
     survey = survey_pupils(state_frames(eye, spec, states))
     if eye.rings is None:
         return survey
-    return survey.behind(
-        ScreenTables.of(
+    return survey.with_screen(
+        ScreenTables.from_screen(
             eye.rings.seen_from(states.h_deg, states.v_deg),
             half_width_um_per_px=survey.frames.half_width_um_per_px,
             pixel_from_mrad=spec.node_pixel_from_mrad(states.h_deg, states.v_deg),
@@ -75,11 +75,11 @@ def state_survey(eye: EyeOptics, spec: GridSpec, states: PupilStates) -> PupilSu
 
 
 LEAST_LIGHT = 0.02
-"""Smallest share of a focus in planning; smaller shares are raised to it."""
+"""Smallest share of light of a focus in planning; smaller shares are raised to it."""
 
 
 def main_foci_dpt(eye: EyeOptics, spec: GridSpec) -> NDArray[np.float64]:
-    """Return the total defocus (n,) at which some channel is sharp."""
+    """Return the total defocus (n,) of every focus of all channels."""
     if eye.rings is None:
         return np.zeros(1)
     channels_nm = np.unique(spec.channel_wavelengths_nm).tolist()
@@ -116,8 +116,9 @@ def _sample_slopes() -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
 WEIGHTS, _SLOPE_X, _SLOPE_Y = _sample_slopes()
 """Shares (n,) of the pupil that its sample points represent.
 
-They stay the same with the Stiles-Crawford effect: the points that move most then count
-for less, and blended PSFs measured 0.2 to 0.8 dB better than without (three presets).
+The planner uses the same weights with the Stiles-Crawford effect, which reduces the
+light of the points that move most.  Blended PSFs then measured 0.2 to 0.8 dB better
+than without the effect (three presets).
 """
 
 

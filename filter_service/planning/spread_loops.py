@@ -1,4 +1,4 @@
-"""Compiled loops that distribute nodes over ranges, for all groups of a plan."""
+"""Compiled loops of `defocus_nodes`: distribute nodes over the ranges of groups."""
 
 import math
 
@@ -14,7 +14,7 @@ from filter_service.planning.error_law import (
 )
 
 CHANGE = 1e-4
-"""Relative change of a squared difference at which its iteration ends."""
+"""Relative change of the squared difference at which the iteration ends."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -30,18 +30,18 @@ def needed_intervals(
     error,
     needed,
 ):
-    """Write the intervals (n, n_ladder) needed up to each step through ranges (n,).
+    """Write the number of intervals (n, n_samples) needed up to each sample of ranges.
 
     Twin: `error_law.allowed_difference_px` at the middle of each step.
 
     Parameters
     ----------
     covariance, unit_px, light_ratio, foci_dpt
-        Arrays of groups, see `defocus_nodes._Rays`.
+        Arrays of the groups, see `defocus_nodes._Rays`.
     index, lows, highs : (n,)
         Group and ends of each range.
     shifts : (n_shifts, n)
-        Shifts of channels, added to the defocus of nodes.
+        Chromatic shifts, added to the defocus of nodes.
     error : float
         RMS error half-way between nodes.
     """
@@ -78,17 +78,17 @@ def needed_intervals(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def spread_nodes(lows, highs, needed, exact):
-    """Return the nodes of all ranges, concatenated and ascending, and their counts.
+    """Return the nodes of all ranges, concatenated, and the number in each range.
 
     Parameters
     ----------
     lows, highs : (n,)
-    needed : (n, n_ladder)
-        Intervals needed up to each step through a range.
+    needed : (n, n_samples)
+        Number of intervals needed up to each sample of a range.
     exact : float
-        Ranges narrower than this have one node.
+        Ranges narrower than this get one node.
     """
-    n_ladder = needed.shape[1]
+    n_samples = needed.shape[1]
     counts = np.empty(lows.size, np.int64)
     for k in range(lows.size):
         if highs[k] - lows[k] < exact:
@@ -108,11 +108,11 @@ def spread_nodes(lows, highs, needed, exact):
             value = high
             if i < counts[k] - 1:
                 wanted = needed[k, -1] * i / (counts[k] - 1)
-                while step < n_ladder - 2 and needed[k, step + 1] < wanted:
+                while step < n_samples - 2 and needed[k, step + 1] < wanted:
                     step += 1
                 rise = needed[k, step + 1] - needed[k, step]
                 share = (wanted - needed[k, step]) / rise if rise > 0.0 else 0.0
-                value = low + (high - low) * (step + share) / (n_ladder - 1)
+                value = low + (high - low) * (step + share) / (n_samples - 1)
             if value > nodes[at - 1]:  # merges ends that differ by a rounding error
                 nodes[at] = value
                 at += 1

@@ -6,18 +6,32 @@ psf_engine       choice of the PSF engine: C or Python
 native_psfs      the engine in C
 boxes            boxes that kernels are cropped to
 pack             kernels cropped to boxes, in 16 bits
+pack_loops       compiled loops of pack
 store            the PSFs of an eye
 frame_layers     interpolation for a state, and the layers of a frame
 field_defocus    change of defocus over the field
 read_kernels     the cached kernels that a state reads, as plain arrays
 read_loops       compiled loops that read them
-layer_loops      placement of a frame's layers
+layer_loops      compiled loop that places a frame's layers
 store_cache      on-disk cache of eyes and nodes
 cache_folder     location of the on-disk cache
 cached_eyes      listing and erasing of cached eyes
 store_codec      objects as JSON and arrays
 store_file       file format of the on-disk cache
 picture          image of a kernel
+
+The terms of `filter_service.planning` apply here too.  The others are:
+
+kernel
+    A PSF integrated over pixels and cropped to a box, with unit sum.  The store holds
+    its weights in 16 bits, in steps of the largest weight.
+reach
+    The extent of a kernel's box: the columns left and right of the center element, and
+    the rows above and below it.
+rings
+    Zones of a diffractive, multifocal or lenslet correction.  They multiply the pupil
+    function by a complex amplitude, which depends on the distance from the nearest
+    center.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Boxes that kernels are cropped to: sizes, packed reaches, unpacking of kernels."""
+"""Boxes that kernels are cropped to: limits, sizes and packed reaches."""
 
 from typing import Any
 
@@ -6,9 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_REACH_PX = 255
-"""Limit of a reach, as four reaches share a word."""
+"""Limit of a reach, because four reaches share a word."""
 
 SIDES = 4
+
+MAX_CENTROID_SHIFT_RATIO = 0.005
+"""Largest shift of a kernel's centroid by cropping, relative to its spread or at least
+to a pixel.  `GridSpec.kept_energy_ratio` documents the total error of cropping."""
+
+CUT_STEPS = 7
+"""Number of times that the light to crop is halved until the shift of the centroid is
+small enough.  If it never is, nothing is cropped."""
 
 
 def box_sizes(reach_px: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -28,16 +36,3 @@ def unpack_reach(words: NDArray[np.uint32]) -> NDArray[np.uint8]:
     """Unpack four reaches (..., 4) from words (...)."""
     little = np.ascontiguousarray(words, "<u4")
     return little[..., None].view(np.uint8)
-
-
-def square_kernel(
-    weights: NDArray[np.uint16], offset: int, reach_px: NDArray[Any], radius_px: int
-) -> NDArray[np.float64]:
-    """Return a centered kernel (2 R + 1, 2 R + 1), in its quantization steps."""
-    left, right, up, down = (int(r) for r in reach_px)
-    width, height = left + right + 1, up + down + 1
-    square = np.zeros((2 * radius_px + 1,) * 2)
-    square[
-        radius_px - up : radius_px + down + 1, radius_px - left : radius_px + right + 1
-    ] = weights[offset : offset + width * height].reshape(height, width)
-    return square

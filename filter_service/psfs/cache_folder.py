@@ -9,9 +9,9 @@ CACHE_VARIABLE = "OCUFILTER_CACHE_DIR"
 
 
 def default_cache_dir() -> str:
-    """Return the default folder of the on-disk cache: none, unless the variable is set.
+    """Return the folder in `CACHE_VARIABLE`, or "" for no cache if it is not set.
 
-    The files reveal a person's eyes, so keeping them requires a decision.
+    The files contain medical data, so the cache must be enabled explicitly.
     """
     return os.environ.get(CACHE_VARIABLE, "")
 
@@ -25,6 +25,6 @@ def check_is_private(folder: Path) -> None:
     """
     if folder.stat().st_mode & 0o077:
         raise PermissionError(
-            f"other users can read {folder}, which holds medical data: chmod 700 "
-            f"{folder}"
+            f"other users can access {folder}, which contains medical data; run "
+            f"chmod 700 {folder}"
         )

@@ -6,7 +6,7 @@ import stat
 from dataclasses import dataclass
 from pathlib import Path
 
-from filter_service.psfs.store_cache import BETWEEN, SUFFIX
+from filter_service.psfs.store_cache import SEPARATOR, SUFFIX
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class CachedEye:
     name : str
         Hash of the eye's profile.
     n_files, size_bytes : int
-        Number and size of the files, one for each camera and setting.
+        Number and total size of the files, one for each camera and settings.
     used_s : float
         Time of the last use, in seconds since 1970.
     """
@@ -39,7 +39,7 @@ def cached_eyes(folder: Path) -> list[CachedEye]:
     found: dict[str, CachedEye] = {}
     for path in _stores(folder):
         status = path.lstat()
-        name = path.name.split(BETWEEN)[0]
+        name = path.name.split(SEPARATOR)[0]
         before = found.get(name, CachedEye(name, 0, 0, 0.0))
         found[name] = CachedEye(
             name,
@@ -53,7 +53,7 @@ def cached_eyes(folder: Path) -> list[CachedEye]:
 def erase_eyes(folder: Path, name: str = "") -> int:
     """Remove cached eyes whose names start with ``name``; return the number of files.
 
-    A service that is using such an eye continues until its client disconnects.
+    A service that uses such an eye continues to do so until its client disconnects.
     """
     removed = [path for path in _stores(folder) if path.name.startswith(name)]
     for path in removed:
@@ -63,13 +63,13 @@ def erase_eyes(folder: Path, name: str = "") -> int:
 
 def _stores(folder: Path) -> list[Path]:
     if not folder.is_dir():
-        raise FileNotFoundError(f"{folder} is no folder")
+        raise FileNotFoundError(f"{folder} is not a folder")
     return [path for path in folder.iterdir() if _is_store(path)]
 
 
 def _is_store(path: Path) -> bool:
-    """Return whether a path is a store, not a folder or link with such a name."""
+    """Return whether a path is a regular file with the suffix of a store."""
     try:
         return path.suffix == SUFFIX and stat.S_ISREG(path.lstat().st_mode)
-    except FileNotFoundError:  # a service has removed it
+    except FileNotFoundError:  # a service removed it
         return False

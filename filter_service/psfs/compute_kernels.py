@@ -1,4 +1,4 @@
-"""Computation of a store's kernels: from the wavefronts of nodes to packed PSFs."""
+"""Computation of packed kernels from the wavefronts of nodes."""
 
 import os
 from collections import Counter
@@ -31,26 +31,26 @@ def computed_kernels(
     engine: PsfEngine,
     rings: NodeRings | None = None,
 ) -> tuple[PackedKernels, Counter[str]]:
-    """Compute some PSFs of nodes.
+    """Compute the kernels of PSFs.
 
     Parameters
     ----------
     psfs : (n,)
-        Indices of PSFs: node n and channel c have PSF 3 n + c.
+        PSF indices.
     rings : NodeRings, optional
         Rings of the eye's lens at the nodes.
 
     Returns
     -------
     kernels : PackedKernels
-        Kernels of the n PSFs.
+        Kernels (n,), in the order of ``psfs``.
     methods : Counter
-        PSFs by the method that computed the larger share of each.
+        Number of PSFs by the method that computed the larger share of each.
 
     Raises
     ------
     PsfTooLarge
-        If a PSF blurs farther than ``spec.max_blur_radius_px``.
+        If a PSF is larger than ``spec.max_blur_radius_px``.
     ValueError
         If no light arrives within a kernel.
     """
@@ -58,14 +58,13 @@ def computed_kernels(
     total_dpt = nodes.defocus.values_dpt[psfs // RGB]
     total_dpt = total_dpt + nodes.channel_shift_dpt[groups, channels]
     wavefronts = nodes.wavefronts
-    asked = groups, channels, total_dpt
     generic = partial(generic_kernels, eye, spec, wavefronts, engine)
     native = engine.native
     if native is None or wavefronts.wavelength_nm.shape[1] > MAX_PRIMARIES:
-        return generic(*asked)
+        return generic(groups, channels, total_dpt)
     packed, methods, left = native.kernels(
         wavefronts,
-        *asked,
+        *(groups, channels, total_dpt),
         kept_energy_ratio=spec.kept_energy_ratio,
         max_radius_px=spec.max_blur_radius_px,
         diffraction=spec.settings.diffraction,
@@ -73,7 +72,7 @@ def computed_kernels(
         rings=rings,
     )
     if left.size:
-        others, more = generic(*(array[left] for array in asked))
+        others, more = generic(groups[left], channels[left], total_dpt[left])
         packed, methods = packed.with_kernels(left, others), methods + more
     return packed, methods
 
@@ -87,7 +86,7 @@ def generic_kernels(
     channels: NDArray[np.int64],
     total_dpt: NDArray[np.float64],
 ) -> tuple[PackedKernels, Counter[str]]:
-    """Compute PSFs (n,) in batches of whole kernels, and crop those afterward."""
+    """Compute whole kernels (n,) with `PsfEngine.compute`, and crop them afterward."""
     n_primaries = wavefronts.wavelength_nm.shape[1]
     each = np.repeat(groups, n_primaries)
     found = wavefronts.at(groups, channels, total_dpt)
@@ -122,7 +121,7 @@ os.register_at_fork(after_in_child=pack_pool.cache_clear)  # threads are not inh
 
 
 def _methods(batch: PsfBatch) -> Counter[str]:
-    """Count PSFs by the method that has the larger share in them."""
+    """Count PSFs by the method that computed the larger share of each."""
     by_rays = int(np.count_nonzero(batch.geometric_ratio > 0.5))
     counts = {"geometric": by_rays, batch.wave_method: len(batch) - by_rays}
     return Counter({name: number for name, number in counts.items() if number})
@@ -132,11 +131,7 @@ def mean_batch(batch: PsfBatch, count: int) -> PsfBatch:
     """Return a batch (P,) of means over ``count`` consecutive kernels each."""
     if count == 1:
         return batch
-
-    def of_each(values: np.ndarray) -> np.ndarray:
-        return values.reshape(-1, count)
-
-    radius_px = of_each(batch.radius_px).max(axis=1)
+    radius_px = batch.radius_px.reshape(-1, count).max(axis=1)
     sides = 2 * radius_px + 1
     offsets = np.concatenate([[0], np.cumsum(sides**2)])
     kernels = np.zeros(offsets[-1], np.float32)
@@ -152,7 +147,7 @@ def mean_batch(batch: PsfBatch, count: int) -> PsfBatch:
         flat_kernels=kernels,
         offset_count=offsets[:-1],
         radius_px=radius_px,
-        lost_energy_ratio=of_each(batch.lost_energy_ratio).mean(axis=1),
-        blur_radius_px=of_each(batch.blur_radius_px).mean(axis=1),
-        geometric_ratio=of_each(batch.geometric_ratio).mean(axis=1),
+        lost_energy_ratio=batch.lost_energy_ratio.reshape(-1, count).mean(axis=1),
+        blur_radius_px=batch.blur_radius_px.reshape(-1, count).mean(axis=1),
+        geometric_ratio=batch.geometric_ratio.reshape(-1, count).mean(axis=1),
     )

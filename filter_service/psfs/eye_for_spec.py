@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from estimator.corrections.progressive import ProgressiveLens
-from estimator.corrections.worn_lens import WornLens, turns_with_gaze
+from estimator.corrections.worn_lens import WornLens, depends_on_gaze
 from estimator.field.eye_optics import EyeOptics
 from estimator.field.prepare import prepare_eye
 from estimator.field.trace_range import FieldRange
@@ -14,12 +14,14 @@ from estimator.profiles.parse import EyeProfile
 from filter_service.errors import BuildCancelled
 from filter_service.planning.grid import GridSpec, pupil_nodes_mm
 
-NO_LATERAL_COLOR = "a measured wavefront holds no lateral color: it needs a traced eye"
-
+NO_LATERAL_COLOR = (
+    "settings.lateral_color has no effect on a measured wavefront; "
+    "it requires a traced eye"
+)
 
 ONE_GAZE = (
-    "the lens is that of the middle of settings.gaze_range_deg: "
-    "other gazes use the same part of it"
+    "the lens is evaluated for the middle of settings.gaze_range_deg; the "
+    "other gaze directions use the same part of the lens"
 )
 
 
@@ -35,12 +37,12 @@ def eye_for_spec(
     Parameters
     ----------
     cancelled : callable, optional
-        Called at every step.
+        Called at every step; returns whether to cancel.
 
     Raises
     ------
     ValueError
-        If light does not pass the eye.
+        If no light passes the eye.
     BuildCancelled
     """
 
@@ -52,13 +54,13 @@ def eye_for_spec(
 
     settings = spec.settings
     if isinstance(profile.correction, WornLens) and profile.correction.rings:
-        _check_diffracts(settings.diffraction)
+        _check_diffraction(settings.diffraction)
     if settings.age_years is not None:
         profile = replace(profile, age_years=settings.age_years)
     lens = profile.correction
-    if isinstance(lens, ProgressiveLens | WornLens) and turns_with_gaze(lens):
-        worn = lens.looking(settings.gaze_deg)
-        profile = replace(profile, correction=worn)
+    if isinstance(lens, ProgressiveLens | WornLens) and depends_on_gaze(lens):
+        lens = lens.with_gaze_offset(settings.gaze_deg)
+        profile = replace(profile, correction=lens)
     low_mm, high_mm = (min(p, MAX_PUPIL_MM) for p in settings.pupil_range_mm)
     eye, notes = prepare_eye(
         profile,
@@ -72,20 +74,20 @@ def eye_for_spec(
     )
     if settings.lateral_color and isinstance(eye, MeasuredWavefront):
         notes = (*notes, NO_LATERAL_COLOR)
-    if turns_with_gaze(profile.correction) and any(settings.gaze_range_deg):
+    if depends_on_gaze(profile.correction) and any(settings.gaze_range_deg):
         notes = (*notes, ONE_GAZE)
     return eye, notes
 
 
-def _check_diffracts(diffraction: bool) -> None:
+def _check_diffraction(diffraction: bool) -> None:
     if not diffraction:
         raise ValueError(
-            "settings.diffraction is false beside a lens with several foci: its rings "
-            "need diffraction; allowed: true"
+            "settings.diffraction is false, but the rings of a lens with several foci "
+            "require diffraction; allowed: true"
         )
 
 
 def _with_axis(ranges_deg: FieldRange) -> FieldRange:
-    """Return field ranges extended to contain the axis, where eyes focus."""
+    """Return field ranges extended to the axis, where the eye focuses."""
     (left, right), (down, up) = ranges_deg
     return (min(left, 0.0), max(right, 0.0)), (min(down, 0.0), max(up, 0.0))

@@ -1,4 +1,4 @@
-"""Change of defocus over the field of an eye in one state."""
+"""Change of total defocus over the field of an eye in one state."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,17 +15,18 @@ if TYPE_CHECKING:
 
 COLUMNS, ROWS = 17, 11
 """Number of directions at which the eye is evaluated.  Between them, over +-40 x 25 deg
-at 5 mm, the spline is within 0.011 dpt (emmetropia), 0.022 (keratoconus) and 0.030
-(myopia), worst in the corners, beyond where people were measured, and 99 % within
-0.008, 0.014 and 0.021.  With 13 x 9 it is 0.055 in myopia, and a new state takes 0.1 ms
+at 5 mm, the largest error of the spline is 0.011 dpt (emmetropia), 0.022 dpt
+(keratoconus) and 0.030 dpt (myopia).  It occurs in the corners, where no people were
+measured; 99 % of the field is within 0.008, 0.014 and 0.021 dpt.  With 13 x 9
+directions, the largest error is 0.055 dpt in myopia, and a new state takes 0.1 ms
 less."""
 
 
 class FieldAxes:
     """Directions at which the eye is evaluated, and the spline between them.
 
-    A spline through values is a linear combination of cardinal splines, which do not
-    depend on the values, so a new state costs a matrix product.
+    A spline is a linear combination of cardinal splines, which do not depend on its
+    values, so a new state costs one matrix product.
 
     Parameters
     ----------
@@ -56,10 +57,10 @@ class FieldAxes:
         h_deg, v_deg = np.broadcast_arrays(h_deg, v_deg)
         if self.shape == (1, 1):
             return np.ones((*h_deg.shape, 1)), np.ones((*h_deg.shape, 1))
-        of_rows, of_columns = self._splines
+        row_spline, column_spline = self._splines
         return (
-            of_rows(np.clip(v_deg, self.v_deg[0], self.v_deg[-1])),
-            of_columns(np.clip(h_deg, self.h_deg[0], self.h_deg[-1])),
+            row_spline(np.clip(v_deg, self.v_deg[0], self.v_deg[-1])),
+            column_spline(np.clip(h_deg, self.h_deg[0], self.h_deg[-1])),
         )
 
 
@@ -78,7 +79,7 @@ class FieldDefocus:
 
     @classmethod
     def none(cls) -> "FieldDefocus":
-        """Return the field defocus of an eye with constant defocus."""
+        """Return the field defocus of an eye without any change over the field."""
         return cls(FieldAxes(np.zeros(1), np.zeros(1)), np.zeros((1, 1)))
 
     @property
@@ -94,12 +95,12 @@ class FieldDefocus:
         self, weights: tuple[NDArray[Any], NDArray[Any]]
     ) -> NDArray[np.float64]:
         """Return the change (...) for weights of `FieldAxes.weights`."""
-        of_rows, of_columns = weights
-        return ((of_rows @ self.change_dpt) * of_columns).sum(axis=-1)
+        row_weights, column_weights = weights
+        return ((row_weights @ self.change_dpt) * column_weights).sum(axis=-1)
 
 
 class EyeDefocus:
-    """Defocus of an eye at field nodes and over the field, evaluated state by state.
+    """Total defocus of an eye at field nodes and over the field, state by state.
 
     Parameters
     ----------
@@ -138,9 +139,9 @@ class EyeDefocus:
     def state(
         self, *, pupil_diameter_mm: float, accommodation_dpt: float
     ) -> tuple[NDArray[np.float64], FieldDefocus]:
-        """Return the total defocus (n_fields, 3) at infinity, and that over the field.
+        """Return the total defocus (n_fields, 3) at infinity, and its field change.
 
-        The latter is that of green light.
+        The change over the field is that of green light.
         """
         at_infinity_dpt = self._defocus_dpt(
             pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=accommodation_dpt

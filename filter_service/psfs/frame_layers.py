@@ -19,28 +19,29 @@ from filter_service.psfs.store import PsfStore
 
 @dataclass(frozen=True)
 class FrameLayers:
-    """PSFs that one state of an eye reads, and the layers of its frames.
+    """Layers of the frames of one state of an eye, and the PSFs that they read.
 
     Attributes
     ----------
     layer_dpt : (n_layers,)
-        Object vergence plus the change of defocus over the field, ascending.  At one
-        layer, field nodes thus have the same defocus and are blended at equal blur.
+        Object vergence plus the change of defocus over the field, ascending.  All field
+        nodes thus have the same defocus in a layer and are blended at equal blur.
     vergence : ObjectVergence
         Conversion from object distances to vergences.
     field : FieldDefocus
-        Change of defocus; none in the paper's grids, whose nodes are object distances.
+        Change of defocus over the field; none in the paper's grids, whose nodes are
+        object distances.
     vergence_range_dpt : (low, high)
-        Vergences that the layers cover.
+        Object vergences that the layers cover.
     layer_zero_dpt : (n_fields, 3)
         Total defocus at layer 0 dpt, per field node and channel.
     reads : StateReads
-        Cached neighbors of the state.
+        Neighboring nodes of the state.
     layer_blur_px : (n_layers,)
         Largest geometric blur radius over field and channels.
     edge_reach_px : float
-        Reach of a kernel beyond the rays: the diffraction at the pupil's edge that
-        ``spec.kept_energy_ratio`` keeps.
+        Distance to which kernels extend beyond the rays: diffraction at the pupil's
+        edge that ``spec.kept_energy_ratio`` keeps.
     """
 
     layer_dpt: NDArray[np.float64]
@@ -57,7 +58,7 @@ class FrameLayers:
     notes: tuple[str, ...]
 
     def reach_px(self, low_dpt: float, high_dpt: float, *, max_px: int) -> int:
-        """Return a bound on the spread, px, of light from objects in a range."""
+        """Return an upper limit of the blur, px, of objects in a range."""
         low, high = (float(self.vergence.vergence_dpt(d)) for d in (low_dpt, high_dpt))
         change_low, change_high = self.field.range_dpt
         first, last = np.searchsorted(
@@ -76,22 +77,22 @@ def frame_layers(
     object_range_dpt: tuple[float, float] | None = None,
     step_ratio: float = 1.0,
 ) -> FrameLayers:
-    """Plan a frame's layers for a pupil and focus.
+    """Plan the layers of a frame for a pupil and focus.
 
     The pupil is clamped to the cache's range and the measured pupil, with a note.
 
     Parameters
     ----------
     object_range_dpt : (low, high), optional
-        Distances in the frame; the default and limit is the cache's range.
+        Object distances in the frame; by default those of the cache.
     step_ratio : float
-        Steps between layers, relative to the default.
+        Steps between layers relative to the default.
 
     References
     ----------
     Csoba & Kunkli 2023, section 6.4 (cached neighbors of pupil and focus) and 6.2.
     """
-    # Imported here: the service must be ready before numba is loaded.
+    # Imported here: the service must be ready before it loads numba.
     from filter_service.psfs.layer_loops import layer_distances_dpt
     from filter_service.psfs.read_loops import layer_blur_px
 
@@ -142,13 +143,13 @@ def frame_layers(
 
 
 def _edge_reach_px(spec: GridSpec, pupil_mm: float) -> float:
-    """Return the distance beyond the rays outside which kernels may drop the light.
+    """Return the distance from the rays beyond which kernels may drop the light.
 
     A circular pupil of diameter D sends 2 lambda / (pi² D r) of its light farther than
     r from the spot's edge.
     """
     if not spec.settings.diffraction:
-        return 1.0  # a pixel that a ray lands in
+        return 1.0  # the pixel that a ray lands in
     wavelength_um = float(spec.channel_wavelengths_nm.max()) / 1e3
     lost = max(1.0 - spec.kept_energy_ratio, 1e-6)
     reach_mrad = 2.0 * wavelength_um / (np.pi**2 * pupil_mm * lost)
@@ -156,7 +157,7 @@ def _edge_reach_px(spec: GridSpec, pupil_mm: float) -> float:
 
 
 def _plane_ends_dpt(store: PsfStore, change: FieldDefocus) -> NDArray[np.float64]:
-    """Return the ends of the layers of several planes; gaps have no PSFs."""
+    """Return the ends of the layers of several planes; the gaps have no PSFs."""
     ranges_dpt = store.spec.object_ranges_dpt
     if len(ranges_dpt) == 1:
         return np.zeros(0)
@@ -169,8 +170,8 @@ def _limit_notes(store: PsfStore, groups: NDArray[np.int64]) -> tuple[str, ...]:
     if not any(store.nodes.is_limited[g : g + count].any() for g in groups.tolist()):
         return ()
     return (
-        f"blur beyond {store.spec.max_blur_radius_px} px, in part of the field, is "
-        "drawn as that",
+        "in part of the field, blur exceeds the largest kernel and is limited to a "
+        f"radius of {store.spec.max_blur_radius_px} px",
     )
 
 
@@ -179,14 +180,14 @@ def _usable_pupil(
 ) -> tuple[float, tuple[str, ...]]:
     usable_mm = store.eye.usable_pupil_mm(pupil_diameter_mm)
     low_mm, high_mm = store.plan.pupils_mm[0], store.plan.pupils_mm[-1]
-    if low_mm == high_mm:  # one node for a range
+    if low_mm == high_mm:  # a single node, for a range of pupils
         low_mm, high_mm = usable_pupils_mm(store.eye, store.spec)
     clamped_mm = float(np.clip(usable_mm, low_mm, high_mm))
     if abs(clamped_mm - usable_mm) <= 1e-9:
         return clamped_mm, ()
     note = (
-        f"pupil {pupil_diameter_mm:g} mm is outside the prepared "
-        f"{low_mm:.3g} to {high_mm:.3g} mm: {clamped_mm:.3g} mm used"
+        f"pupil_diameter_mm {pupil_diameter_mm:g} is outside the prepared range of "
+        f"{low_mm:.3g} to {high_mm:.3g} mm; using {clamped_mm:.3g} mm"
     )
     return clamped_mm, (note,)
 
@@ -197,16 +198,22 @@ def _corners(
     """Return nodes of pupil and accommodation around a state, with their weights.
 
     They are the corners of a triangle as in `planning.nodes.triangle`, computed with
-    scalars, which takes a tenth of the time.
+    scalars in a tenth of the time.
     """
     pupil, next_pupil, part = _bracket(plan.pupils_mm, pupil_mm)
-    used, next_used, used_part = _bracket(plan.accommodations_dpt, accommodation_dpt)
-    low, high = min(part, used_part), max(part, used_part)
-    between = (next_pupil, used) if part >= used_part else (pupil, next_used)
+    accommodation, next_accommodation, other_part = _bracket(
+        plan.accommodations_dpt, accommodation_dpt
+    )
+    low, high = min(part, other_part), max(part, other_part)
+    between = (
+        (next_pupil, accommodation)
+        if part >= other_part
+        else (pupil, next_accommodation)
+    )
     corners = (
-        (pupil, used, 1.0 - high),
+        (pupil, accommodation, 1.0 - high),
         (*between, high - low),
-        (next_pupil, next_used, low),
+        (next_pupil, next_accommodation, low),
     )
     return tuple(corner for corner in corners if corner[-1] > 0.0)
 
@@ -224,7 +231,7 @@ def _bracket(nodes: NDArray[Any], value: float) -> tuple[int, int, float]:
 def _in_focus_dpt(
     store: PsfStore, at_infinity_dpt: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return vergences at which some channel is sharp, for all foci of the eye."""
+    """Return the vergences at which some channel is sharp, for all foci of the eye."""
     if store.eye.rings is None:
         return -at_infinity_dpt
     channels_nm = store.spec.channel_wavelengths_nm.tolist()
@@ -244,7 +251,7 @@ def _state_reads(
     if store.eye.rings is not None:  # foci are the same in any pupil
         scales = np.ones(len(corners))
     return StateReads(
-        groups=store.groups_of([(pupil, used) for pupil, used, _ in corners]),
+        groups=store.groups_of([corner[:2] for corner in corners]),
         scales=scales,
         weights=np.array([weight for _, _, weight in corners]),
     )

@@ -1,4 +1,4 @@
-"""Compiled loop that places the layers of a frame, run once for each new state."""
+"""Compiled loop that places the layers of a frame, once for each new state."""
 
 import math
 
@@ -24,15 +24,14 @@ def layer_distances_dpt(
     zero_dpt : (n_fields, 3)
         Total defocus of field nodes and channels at 0 dpt.
     ends_dpt : (n,)
-        Vergences that become layers themselves: those at which some channel is in
-        focus, so that the blur is monotonic between layers, and the ends of object
-        ranges.
+        Vergences that always are layers: the ends of object ranges, and vergences at
+        which some channel is in focus, so that the blur is monotonic between layers.
     blur_px_per_dpt : float
         Blur of a perfect eye.
     blur_ratio : float
         Blur step between layers, relative to the blur radius.
     pace : float
-        Factor of all steps, relative to the default.
+        Factor of all steps.
 
     References
     ----------
@@ -61,7 +60,7 @@ def layer_distances_dpt(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _steps(first_px, second_px, blur_ratio):
-    """Return the blur steps between two vergences, the most of any node and channel."""
+    """Return the largest number of blur steps of any node and channel."""
     most = 0.0
     for k in range(first_px.size):
         smaller_px = min(first_px[k], second_px[k])
@@ -72,7 +71,7 @@ def _steps(first_px, second_px, blur_ratio):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _between(at_dpt, steps_before, ends):
-    """Return vergences at most one step apart that include each end."""
+    """Return vergences that include each end and are at most one step apart."""
     found_dpt, first = [at_dpt[0]], 0
     for end in ends:
         low, high = steps_before[first], steps_before[end]

@@ -1,6 +1,6 @@
-"""Compiled PSF engine: from the wavefronts of nodes to packed kernels in one call.
+"""PSF engine in C: one call computes packed kernels from the wavefronts of nodes.
 
-`estimator.psf` computes the same in Python; tests compare the two.
+`estimator.psf` computes the same in Python, and tests compare the two.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from collections import Counter
 from dataclasses import dataclass, field
 from functools import cache
 from threading import Lock
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,12 +31,8 @@ from filter_service.native.records import (
     pointer_to,
 )
 from filter_service.planning.node_wavefronts import NodeWavefronts
-from filter_service.psfs.boxes import SIDES
-from filter_service.psfs.pack import (
-    CUT_STEPS,
-    MAX_CENTROID_SHIFT_RATIO,
-    PackedKernels,
-)
+from filter_service.psfs.boxes import CUT_STEPS, MAX_CENTROID_SHIFT_RATIO, SIDES
+from filter_service.psfs.pack import PackedKernels
 
 MAX_PRIMARIES = 16
 
@@ -46,9 +41,9 @@ FILTER_COUNT = 256
 pupils of 8 mm."""
 
 CORNERS_TWICE = 1.2
-"""Light beyond the four sides of a box, over the light outside the box, as light beyond
-a corner counts twice.  With 1.2, boxes lose 0.68 to 1.08 % where 1 % may be lost, like
-those of `pack_kernels`."""
+"""Ratio of the light beyond the four sides of a box to the light outside the box: light
+beyond a corner counts for two sides.  With 1.2, boxes lose 0.68 to 1.08 % of the light
+where 1 % is allowed, like those of `pack_kernels`."""
 
 VECTOR = 8
 
@@ -61,12 +56,12 @@ def fft_lengths() -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class NodeRings:
-    """Rings of a lens in the pupils of nodes, see `estimator.psf.screens`.
+    """Rings of a lens in the pupils of groups, see `estimator.psf.screens`.
 
     Attributes
     ----------
     offset_mm : (n_groups, 3, n_primaries, 2)
-        Center of the pupil, relative to the center of the rings.
+        Center of the pupil relative to the center of the rings.
     reach_mrad : (n_groups, 3, n_primaries)
         Distance beyond the rays to which the rings send light.
     amplitude_ratio : (3, n_primaries, TABLE_COUNT, 2), float32
@@ -85,7 +80,7 @@ class NodeRings:
 
     @classmethod
     def of(cls, rings: Rings, wavefronts: NodeWavefronts) -> NodeRings:
-        """Tabulate a lens for the pupils of nodes."""
+        """Tabulate a lens for the pupils of groups."""
         seen = rings.seen_from(wavefronts.h_deg, wavefronts.v_deg)
         center_mm = np.broadcast_to(seen.centre_mm, (wavefronts.h_deg.size, 2))
         ellipse = wavefronts.pupil_ellipse
@@ -136,7 +131,7 @@ class NativePsfs:
         stiles_crawford: StilesCrawford | None = None,
         rings: NodeRings | None = None,
     ) -> tuple[PackedKernels, Counter[str], NDArray[np.int64]]:
-        """Compute PSFs.
+        """Compute the kernels of PSFs (n,).
 
         Parameters
         ----------
@@ -144,9 +139,9 @@ class NativePsfs:
         groups, channels : (n,)
             Group and channel of each PSF.
         total_dpt : (n,)
-            Total defocus in the middle of the channel.
+            Total defocus at the middle wavelength of the channel.
         kept_energy_ratio : float
-            Share of a kernel's light that its box must hold.
+            Share of a kernel's light that its box must contain.
         max_radius_px : int
         diffraction : bool
         stiles_crawford : StilesCrawford, optional
@@ -155,15 +150,15 @@ class NativePsfs:
         Returns
         -------
         kernels : PackedKernels
-            Kernels; those in ``left`` have no texels.
+            Kernels (n,); those in ``left`` have no texels.
         methods : Counter
-            PSFs by the method that computed the larger share of each.
+            Number of PSFs by the method that computed the larger share of each.
         left : (m,)
-            Indices, among the n, of PSFs that `estimator.psf` has to compute or refuse.
+            Indices of the PSFs among the n that `estimator.psf` must compute or refuse.
         """
         count, primaries = groups.size, wavefronts.wavelength_nm.shape[1]
         sampling = ACCURACY["normal"]
-        arrays = {
+        inputs = {
             "zernike_um": wavefronts.zernike_um,
             "per_dpt_um": wavefronts.per_dpt_um,
             "circle_diameter_mm": wavefronts.circle_diameter_mm,
@@ -175,13 +170,14 @@ class NativePsfs:
         center_mm = (0.0, 0.0)
         if stiles_crawford is not None:
             per_mm2, _ = stiles_crawford.amplitude(wavefronts.wavelength_nm.ravel())
-            arrays["apodization_per_mm2"] = per_mm2
+            inputs["apodization_per_mm2"] = per_mm2
             center_mm = stiles_crawford.centre_mm
         if rings is not None:
-            arrays["ring_offset_mm"] = rings.offset_mm
-            arrays["ring_reach_mrad"] = rings.reach_mrad
-        arrays: dict[str, NDArray[Any]] = {
-            n: np.ascontiguousarray(a, np.float64) for n, a in arrays.items()
+            inputs["ring_offset_mm"] = rings.offset_mm
+            inputs["ring_reach_mrad"] = rings.reach_mrad
+        arrays: dict[str, NDArray[np.generic]] = {
+            name: np.ascontiguousarray(array, np.float64)
+            for name, array in inputs.items()
         }
         if rings is not None:
             arrays["ring_tables"] = rings.amplitude_ratio
@@ -246,7 +242,9 @@ def native_psfs() -> NativePsfs | None:
     return NativePsfs(library, library.new_threads(thread_count()))
 
 
-def _with_changes(table: NDArray[Any]) -> NDArray[np.float32]:
+def _with_changes(
+    table: NDArray[np.float32] | NDArray[np.float64],
+) -> NDArray[np.float32]:
     """Return entries (n, 2) of a table (n,): values, and differences to the next."""
     return np.stack([table, np.diff(table, append=table[-1])], axis=1).astype(
         np.float32
@@ -254,7 +252,7 @@ def _with_changes(table: NDArray[Any]) -> NDArray[np.float32]:
 
 
 @cache
-def _tables() -> tuple[PsfTables, dict[str, NDArray[Any]]]:
+def _tables() -> tuple[PsfTables, dict[str, NDArray[np.generic]]]:
     """Return the tables of `estimator.psf`, and the arrays that they point to."""
     half_width = ACCURACY["normal"].filter_half_width
     filters = [fourier.pixel_filter(k + 1, half_width) for k in range(FILTER_COUNT)]
@@ -272,7 +270,7 @@ def _tables() -> tuple[PsfTables, dict[str, NDArray[Any]]]:
         padded[:, :n_points] = values
         padded[:, n_points:] = values[:, -1:]
     fresnel = geometric.fresnel_table()
-    arrays = {
+    contents: dict[str, NDArray[np.generic]] = {
         "monomials": monomial_matrix(),
         "zernike_terms": np.linalg.inv(monomial_matrix()),
         "node_xy": pupil.NODES.T,
@@ -289,7 +287,7 @@ def _tables() -> tuple[PsfTables, dict[str, NDArray[Any]]]:
         "twiddle_first": first.astype(np.int32),
         "twiddles": twiddles.astype(np.float32),
     }
-    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    arrays = {name: np.ascontiguousarray(array) for name, array in contents.items()}
     tables = PsfTables(
         **{name: pointer_to(array) for name, array in arrays.items()},
         cosine=waves.COSINE_OF_TURNS,

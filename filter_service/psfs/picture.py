@@ -5,7 +5,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 DECADES = 4.0
-"""Powers of ten between white and black; the observer's own glare lies below."""
+"""Powers of ten between white and black.  The glare in the observer's own eye hides
+anything darker."""
 
 MIN_EDGE_PX = 384
 MARGIN_PX = 12
@@ -14,7 +15,7 @@ BAR_STEPS_ARCMIN = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 def half_light_radius_px(kernel: NDArray[np.float32]) -> float:
-    """Return the radius about the center element that holds half of the light, px.
+    """Return the radius about the center element that contains half of the light, px.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Choice of the PSF engine: C, or Python without a C compiler.
+"""Choice of the PSF engine: C, or Python if there was no C compiler.
 
-There is no GPU engine: 16 cores of a machine with an H200 compute the paper's set of
-201,825 PSFs in C in 0.64 s.  Compute shaders took 3.2 s, and three to five times the
-processor time, as each PSF has to be surveyed before it is dispatched.
+There is no GPU engine.  On a machine with an H200, 16 cores compute the paper's set of
+201,825 PSFs in C in 0.64 s.  Compute shaders took 3.2 s and three to five times the
+processor time, because each PSF must be surveyed before it is dispatched.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class PsfEngine:
     batch_count : int
         PSFs per batch.
     native : NativePsfs, optional
-        Engine that computes packed kernels instead, where it can.
+        Engine that computes packed kernels directly, for the PSFs that it supports.
     """
 
     compute: Callable[..., PsfBatch]

@@ -1,4 +1,4 @@
-"""Plain arrays from which `read_loops.py` interpolates the kernels of a state."""
+"""Plain arrays from which `read_loops` interpolates the kernels of a state."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from filter_service.constants import RGB
 from filter_service.planning.nodes import PlanNodes
 
-OF_PSFS = (
+PSF_TABLES = (
     *("offsets", "reach_words", "radius_px", "spread_px", "peak_ratio"),
     *("is_computed", "last_used"),
 )
-"""Tables that are filled when PSFs are computed."""
+"""Fields of `StoreTables` that are filled when PSFs are computed."""
 
 
 class StoreTables(NamedTuple):
-    """Data of a store that plans of frames read, as plain arrays of fixed layout.
+    """Data of a store from which frames are planned, as arrays of fixed layout.
 
     Attributes
     ----------
@@ -28,13 +28,13 @@ class StoreTables(NamedTuple):
     channel_shift_dpt : (n_groups, 3)
     offsets : (n_psfs,)
     reach_words : (n_psfs,)
-        Four reaches, one byte per side.
+        Four reaches, one byte each.
     radius_px, blur_px, spread_px, peak_ratio : (n_psfs,)
         See `PsfStore`.
     is_computed : (n_psfs,)
-        Whether there is a kernel; without one, everything but the blur is 0.
+        Whether there is a kernel; without one, all other fields but the blur are 0.
     last_used : (n_psfs,)
-        Number of the last frame that read it.
+        Number of the last frame that read the kernel.
     """
 
     values_dpt: NDArray[np.float64]
@@ -68,9 +68,9 @@ class StoreTables(NamedTuple):
         )
 
     def grown(self, nodes: PlanNodes) -> StoreTables:
-        """Return tables extended to ``nodes``, which start with the present ones.
+        """Return tables extended to ``nodes``, which start with those of the tables.
 
-        No PSF of the new nodes is computed.
+        The PSFs of the new nodes are not computed.
         """
         more = len(nodes.blur_px) - self.offsets.size
         return StoreTables(
@@ -81,18 +81,19 @@ class StoreTables(NamedTuple):
             **{
                 name: np.append(known, np.zeros(more, known.dtype))
                 for name, known in self._asdict().items()
-                if name in OF_PSFS
+                if name in PSF_TABLES
             },
         )
 
 
 class StateReads(NamedTuple):
-    """Cached neighbors in pupil and accommodation that a state reads.
+    """Neighboring nodes of pupil and accommodation that a state reads.
 
     Attributes
     ----------
     groups : (n_corners,)
-        Group of each neighbor at the first field node; the other field nodes follow.
+        Group of each neighbor at the first field node; those of the other field nodes
+        follow.
     scales : (n_corners,)
         Factors A / A_i of total defocus t.  Neighboring pupils are blended at equal
         geometric blur: the node of pupil A_i is read at total defocus t A / A_i, so

@@ -1,8 +1,8 @@
 """Compiled loops over field nodes and layers that interpolate the cache for a state.
 
-They read two nodes of defocus for each cached neighbor in pupil and accommodation.
-Arrays have a few thousand entries; the loops run once per frame whose pupil or focus
-has changed.
+They read two nodes of defocus for each neighbor in pupil and accommodation.  Arrays
+have a few thousand entries, and the loops run once per frame whose pupil or focus has
+changed.
 """
 
 import numpy as np
@@ -22,8 +22,8 @@ def bracket(tables, group, t, start):
     """Return the lower and upper node of a total defocus, and the share of the upper.
 
     The result is that of `RaggedNodes.bracket`.  The search is linear from ``start``,
-    the upper node of the previous, smaller t.  That is mostly the wanted node, whereas
-    the branches of a binary search are mispredicted half of the time.
+    the upper node of the previous, smaller t, which mostly is the result.  The
+    processor would mispredict half of the branches of a binary search.
     """
     values_dpt = tables.values_dpt
     first, last = tables.starts[group], tables.starts[group + 1] - 1
@@ -47,7 +47,7 @@ def layer_blur_px(tables, reads, zero_dpt, at_dpt):
             group = reads.groups[corner] + field
             weight, scale = reads.weights[corner], reads.scales[corner]
             for channel in range(RGB):
-                of_layer = found_px[field * RGB + channel]
+                row_px = found_px[field * RGB + channel]
                 zero = zero_dpt[field, channel]
                 shift_dpt = tables.channel_shift_dpt[group, channel]
                 upper = tables.starts[group]
@@ -56,8 +56,8 @@ def layer_blur_px(tables, reads, zero_dpt, at_dpt):
                     lower, upper, share = bracket(tables, group, t, upper)
                     low_px = tables.blur_px[RGB * lower + channel]
                     high_px = tables.blur_px[RGB * upper + channel]
-                    of_layer[k] += low_px * (weight * (1.0 - share))
-                    of_layer[k] += high_px * (weight * share)
+                    row_px[k] += low_px * (weight * (1.0 - share))
+                    row_px[k] += high_px * (weight * share)
     return found_px.T.copy()
 
 

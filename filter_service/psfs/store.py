@@ -1,7 +1,7 @@
 """The PSFs of one eye and camera, computed when frames first need them.
 
-The store holds plain arrays without GL; engines copy new ones
-(`PsfStore.added_since`).
+The store consists of plain arrays in main memory.  The GL engine copies new kernels to
+the GPU (`PsfStore.added_since`).
 """
 
 from __future__ import annotations
@@ -43,43 +43,50 @@ FIRST_TEXELS = 2**22
 """Initial capacity of a store, 8 MB; it grows by doubling."""
 
 KEPT_AFTER_EVICTION = 0.7
-"""Share of the limit that remains after an eviction.  The least recently used kernels
-are evicted together, because moving the others costs about 0.1 ms per megabyte."""
-
+"""Share of the memory limit that an eviction keeps.  Kernels are evicted together,
+because moving the others costs about 0.1 ms per megabyte."""
 
 State = tuple[int, int]
 """Indices of a plan's nodes of pupil and accommodation."""
 
 
+def no_psfs(reason: ValueError) -> BuildFailed:
+    """Return the error for an eye whose PSFs cannot be computed."""
+    return BuildFailed(
+        f"the PSFs of this eye cannot be computed: {reason}",
+        field="settings",
+        allowed="a camera and ranges of pupil, focus and distance that suit this eye",
+    )
+
+
 class PsfStore:
     """Kernels over field, pupil, accommodation, total defocus and channel.
 
-    Node n of ``nodes`` and channel c have PSF 3 n + c.  A node depends on eye, camera
-    and settings alone; its index depends on the states read before.  Kernels are
-    computed by `fill`.
+    The values of a node depend on eye, camera and settings alone.  Its index depends on
+    the order in which states are first read.  `fill` computes the kernels.
 
     Parameters
     ----------
     eye : EyeOptics
     spec : GridSpec
     plan : PlanAxes
-        Nodes of all axes but defocus; the defocus nodes of a state are planned when it
-        is first read (`groups_of`).  A `CachePlan` holds all of them.
+        Nodes of all axes but defocus.  `groups_of` plans the defocus nodes of a state
+        when it is first read.  A `CachePlan` contains those of all states.
     engine : PsfEngine, optional
-        Engine that computes the PSFs; by default that of `psf_engine`.
+        By default that of `psf_engine`.
 
     Attributes
     ----------
     nodes : PlanNodes
         Nodes of the states read so far; a state's groups [v, h] are adjacent.
     tables : StoreTables
-        For each PSF: whether it is computed, and the offset and size of its kernel.
+        Offset, size and statistics of each kernel, by PSF index.
     frame_number : int
-        Number of the frame being planned, incremented by the planner of frames.
+        Number of the current frame; the planner of frames increments it.
     generation : int
-        Incremented by evictions, which move kernels.
+        Number of evictions, which move kernels.
     methods : Counter
-        PSFs by the method that computed the larger share of each.
+        Number of computed PSFs by method.
     """
 
     nodes: PlanNodes
@@ -104,16 +111,17 @@ class PsfStore:
         self._words = np.empty(0, np.uint16)
         self._n_words = 0
         self._added: list[NDArray[np.int64]] = []
+        self._rings: NodeRings | None = None
         if isinstance(plan, CachePlan):
             self._add_nodes(self._states, plan.nodes)
 
     @property
     def parts(self) -> dict[str, Any]:
-        """Arguments that construct an equal store without kernels."""
+        """Arguments from which an equal store without kernels is constructed."""
         return {"eye": self.eye, "spec": self.spec, "plan": self.plan}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle the parts alone; everything else is computed again on demand."""
+        """Pickle the parts only; kernels are computed again on demand."""
         return partial(type(self), **self.parts), ()
 
     @classmethod
@@ -124,7 +132,7 @@ class PsfStore:
         plan: CachePlan,
         packed: PackedKernels,
     ) -> Self:
-        """Return a store with given kernels (n_psfs,)."""
+        """Return a store with the given kernels (n_psfs,)."""
         found = cls(eye, spec, plan)
         found._append(np.arange(found.psf_count), packed)
         return found
@@ -134,8 +142,8 @@ class PsfStore:
     @property
     def _states(self) -> list[State]:
         """All states of the plan, in the order of its groups."""
-        n_pupils, n_used = self.plan.group_shape[:2]
-        return list(product(range(n_pupils), range(n_used)))
+        n_pupils, n_accommodations = self.plan.group_shape[:2]
+        return list(product(range(n_pupils), range(n_accommodations)))
 
     @property
     def fields_count(self) -> int:
@@ -148,47 +156,49 @@ class PsfStore:
         Parameters
         ----------
         states : sequence of (pupil, accommodation)
-            Indices of nodes; states that are read for the first time are planned.
+            Indices of nodes.  States that are read for the first time are planned.
 
         Raises
         ------
         GridTooLarge
-            If a state needs too many PSFs at one field position.
+            If a group needs too many PSFs.
         BuildFailed
-            If no PSF can be computed for a state of this eye.
+            If no PSF can be computed for a state of the eye.
         """
         new = [state for state in states if state not in self._first_groups]
         if new:
-            with self._states_of_eye():
-                planned = [
-                    self._ahead.pop(state, None) or self._planner.nodes(*state)
-                    for state in new
-                ]
+            with self._client_errors():
+                planned = [self._nodes_of(state) for state in new]
             self._add_nodes(new, PlanNodes.joined(planned))
         return np.array([self._first_groups[state] for state in states])
+
+    def _nodes_of(self, state: State) -> PlanNodes:
+        """Return the nodes of a state that were planned ahead, or plan them."""
+        planned = self._ahead.pop(state, None)
+        return self._planner.nodes(*state) if planned is None else planned
 
     def planned_ahead(
         self, pupil_diameter_mm: float, focus_dpt: float
     ) -> Iterator[tuple[State, PlanNodes]]:
-        """Plan the nodes of states that frames may read, for `take` of an equal store.
+        """Plan states that no frame has read yet, for `take` of an equal store.
 
-        The worker process runs this; in the rendering process, a state adds 12 to 30 ms
-        to the first frame that reads it.
+        The worker process calls this.  In the rendering process, planning a state would
+        delay the first frame that reads it by 12 to 30 ms.
 
         Parameters
         ----------
         pupil_diameter_mm, focus_dpt : float
-            State from which planning proceeds outward.
+            State whose neighbors are planned first.
         """
         pupil_mm = pupil_diameter_mm
-        used_dpt = self.eye.accommodation_dpt(
+        accommodation_dpt = self.eye.accommodation_dpt(
             focus_dpt, pupil_diameter_mm=self.eye.usable_pupil_mm(pupil_mm)
         )
         plan = self.plan
         at = (
             np.interp(pupil_mm, plan.pupils_mm, np.arange(len(plan.pupils_mm))),
             np.interp(
-                used_dpt,
+                accommodation_dpt,
                 plan.accommodations_dpt,
                 np.arange(len(plan.accommodations_dpt)),
             ),
@@ -198,13 +208,13 @@ class PsfStore:
             yield state, self._planner.nodes(*state)
 
     def take(self, planned: tuple[State, PlanNodes]) -> None:
-        """Store nodes that were planned ahead until they are read."""
+        """Keep the nodes of a state that was planned ahead until a frame reads it."""
         state, nodes = planned
         if state not in self._first_groups:
             self._ahead[state] = nodes
 
     def plan_all(self) -> None:
-        """Plan the nodes of all states, including those that no frame has read yet."""
+        """Plan the nodes of all states."""
         self.groups_of(self._states)
 
     @cached_property
@@ -222,7 +232,7 @@ class PsfStore:
             first += self.fields_count
         # Frames in progress may still read the old arrays.
         self.nodes, self.tables = new, self.tables.grown(new)
-        self._rings: NodeRings | None = None
+        self._rings = None
 
     # Kernels
 
@@ -235,16 +245,16 @@ class PsfStore:
         between: Callable[[], None] | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> None:
-        """Compute the kernels of PSFs that have none.
+        """Compute missing kernels.
 
         Parameters
         ----------
         psfs : (n,), optional
-            Indices of PSFs; by default all.
+            PSF indices; by default all.
         until_s : float, optional
             Time of `time.monotonic` at which to stop, after the current batch.
         batch_count : int, optional
-            PSFs computed between checks of the time; by default the engine's.
+            PSFs per batch; by default that of the engine.
         between : callable, optional
             Called after each batch but the last.
         progress : callable, optional
@@ -253,14 +263,13 @@ class PsfStore:
         Raises
         ------
         NotPrepared
-            If some are missing at ``until_s``.
+            If kernels are missing at ``until_s``.
         GridTooLarge
-            If a kernel exceeds ``spec.max_blur_radius_px``; the message has the
-            numbers.
+            If a kernel exceeds ``spec.max_blur_radius_px``.
         BuildFailed
-            If no PSF can be computed for a state of this eye.
+            If no PSF can be computed for a state of the eye.
         OutOfMemory
-            If all together exceed ``spec.memory_budget_mb``.
+            If the kernels of a frame exceed ``spec.memory_budget_mb``.
         """
         from filter_service.psfs.compute_kernels import computed_kernels
         from filter_service.psfs.psf_engine import psf_engine
@@ -277,10 +286,11 @@ class PsfStore:
         step = batch_count or self.engine.batch_count
         batches = np.array_split(psfs, -(-psfs.size // step) or 1)
         for number, batch in enumerate(batches):
-            batch = batch[~self.tables.is_computed[batch]]  # frames between may do some
+            # `between` may have computed some of them.
+            batch = batch[~self.tables.is_computed[batch]]
             if not batch.size:
                 continue
-            with self._states_of_eye():
+            with self._client_errors():
                 packed, methods = computed_kernels(
                     *(self.eye, self.spec, self.nodes),
                     *(batch, self.engine, self._node_rings()),
@@ -300,7 +310,7 @@ class PsfStore:
         self.build_ms += 1e3 * (time.perf_counter() - started_s)
 
     def _node_rings(self) -> NodeRings | None:
-        """Return the rings of the eye's lens at the nodes, tabulated on first use."""
+        """Return the rings of the eye's lens, tabulated on first use, or None."""
         from filter_service.psfs.native_psfs import NodeRings
 
         if self._rings is None and self.eye.rings is not None:
@@ -308,8 +318,8 @@ class PsfStore:
         return self._rings
 
     @contextmanager
-    def _states_of_eye(self) -> Iterator[None]:
-        """Convert errors of states without PSFs into errors with advice for clients."""
+    def _client_errors(self) -> Iterator[None]:
+        """Convert errors of the PSF engines and the planner into errors for clients."""
         from estimator.psf.compute import PsfTooLarge
 
         try:
@@ -318,19 +328,15 @@ class PsfStore:
             raise GridTooLarge(
                 str(error),
                 field="settings.pupil_range_mm",
-                allowed="a smaller pupil, other objects or fewer pixels per degree",
+                allowed="smaller pupils, other distances or fewer pixels per degree",
             ) from error
         except ValueError as error:
-            raise BuildFailed(
-                f"no PSFs can be computed for this eye ({error})",
-                field="settings",
-                allowed="ranges, and a camera, that this eye can be seen through",
-            ) from error
+            raise no_psfs(error) from error
 
     def _append(self, psfs: NDArray[np.int64], packed: PackedKernels) -> None:
         """Add kernels (n,) of PSFs (n,), or of m PSFs that share each (m, n)."""
         tables, count = self.tables, packed.weights.size
-        self._make_room(count)
+        self._reserve(count)
         self._words[self._n_words : self._n_words + count] = packed.weights
         tables.offsets[psfs] = packed.offsets + self._n_words
         tables.reach_words[psfs] = pack_reach(packed.reach_px)
@@ -343,15 +349,15 @@ class PsfStore:
         lost = float(packed.lost_energy_ratio.max(initial=0.0))
         self.max_lost_energy_ratio = max(self.max_lost_energy_ratio, lost)
 
-    def _make_room(self, count: int) -> None:
+    def _reserve(self, count: int) -> None:
         needed = self._n_words + count
         if needed > self._max_words:
             self.evict(int(KEPT_AFTER_EVICTION * self._max_words) - count)
             needed = self._n_words + count
         if needed > self._max_words:
             raise OutOfMemory(
-                f"the PSFs of one frame take {BYTES_PER_TEXEL * needed / 1e6:.3g} MB",
-                allowed=f"{self.spec.memory_budget_mb:g} MB for one eye and camera",
+                f"the PSFs of one frame need {BYTES_PER_TEXEL * needed / 1e6:.3g} MB",
+                allowed=f"up to {self.spec.memory_budget_mb:g} MB per eye and camera",
             )
         if needed > self._words.size:
             grown = np.empty(max(needed, 2 * self._words.size, FIRST_TEXELS), np.uint16)
@@ -363,12 +369,12 @@ class PsfStore:
         return int(self.spec.memory_budget_mb * 1e6 / BYTES_PER_TEXEL)
 
     def evict(self, max_words: int) -> None:
-        """Evict the least recently used kernels, except those of the current frame.
+        """Evict the least recently used kernels, but none of the current frame.
 
         Parameters
         ----------
         max_words : int
-            Number of texels that may remain.
+            Largest number of texels to keep.
         """
         tables = self.tables
         own = np.flatnonzero(tables.is_computed)
@@ -393,12 +399,12 @@ class PsfStore:
             words[to : to + size] = self._words[start : start + size]
         # Frames in progress may still read the old arrays.
         tables = self.tables = tables._replace(offsets=tables.offsets.copy())
-        gone = by_use[~is_kept]
+        evicted = by_use[~is_kept]
         if not self.spec.settings.chromatic:
-            kept, gone = (p + np.arange(RGB)[:, None] for p in (kept, gone))
-        tables.is_computed[gone] = False
+            kept, evicted = (p + np.arange(RGB)[:, None] for p in (kept, evicted))
+        tables.is_computed[evicted] = False
         for name in ("offsets", "reach_words", "radius_px", "spread_px", "peak_ratio"):
-            getattr(tables, name)[gone] = 0
+            getattr(tables, name)[evicted] = 0
         tables.offsets[kept] = first
         self._words, self._n_words = words, int(sizes.sum())
         self._added = [kept.ravel()]
@@ -406,15 +412,15 @@ class PsfStore:
 
     def box_sizes_of(
         self, psfs: NDArray[np.int64]
-    ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return widths and heights (n,) of kernels."""
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the widths and heights (n,) of kernels."""
         left, right, up, down = np.moveaxis(
             unpack_reach(self.tables.reach_words[psfs]).astype(np.int64), -1, 0
         )
         return left + right + 1, up + down + 1
 
     def added_since(self, n_batches: int) -> tuple[int, NDArray[np.int64]]:
-        """Return the number of batches, and the PSFs added after the first ones."""
+        """Return the number of batches, and the PSFs of those after the first n."""
         later = self._added[n_batches:]
         found = np.concatenate(later) if later else np.zeros(0, np.int64)
         return len(self._added), found
@@ -423,22 +429,22 @@ class PsfStore:
 
     @cached_property
     def defocus(self) -> EyeDefocus:
-        """Defocus of the eye's states at the field nodes."""
+        """Total defocus of the eye at the field nodes and over the field."""
         h_deg, v_deg = self.plan.field_nodes_deg
         return EyeDefocus(self.eye, self.spec, h_deg=h_deg, v_deg=v_deg)
 
     @property
     def kernels(self) -> NDArray[np.uint16]:
-        """All computed kernels (n_texels,), concatenated, rows from top to bottom.
+        """All computed kernels (n_texels,), concatenated, with rows from top to bottom.
 
-        Weights are in steps of the kernel's peak over WEIGHT_MAX, which is finer than
-        half-precision floats and half the size of floats.
+        Weights are in steps of the kernel's peak over `WEIGHT_MAX`.  These steps are
+        finer than those of half-precision floats.
         """
         return self._words[: self._n_words]
 
     @property
     def words(self) -> NDArray[np.uint16]:
-        """Buffer of the kernels (>= n_texels,); replaced when it grows."""
+        """Buffer of the kernels (>= n_texels,), which is replaced when it grows."""
         return self._words
 
     @property
@@ -448,7 +454,7 @@ class PsfStore:
 
     @property
     def reach_px(self) -> NDArray[np.int64]:
-        """Columns left and right, and rows above and below (n_psfs, 4) the centers."""
+        """Reaches left, right, up and down (n_psfs, 4)."""
         return unpack_reach(self.tables.reach_words).astype(np.int64)
 
     @property
@@ -463,10 +469,10 @@ class PsfStore:
 
     @property
     def spread_px(self) -> NDArray[np.float32]:
-        """Radius (n_psfs,) of the disc with the kernel's sum of squares.
+        """Radius (n_psfs,) of the uniform disc with the kernel's sum of squares.
 
-        This is the effective blur; for a bright core in a wide skirt it is much less
-        than ``blur_px``.
+        It measures the effective blur.  For a kernel with a bright core and a wide
+        skirt, it is much smaller than ``blur_px``.
         """
         return self.tables.spread_px
 
@@ -492,11 +498,11 @@ class PsfStore:
 
     @property
     def tables_mb(self) -> float:
-        """Memory of the tables of all nodes, including those planned ahead."""
+        """Memory of the tables and nodes, including nodes that were planned ahead."""
         planned = [*self._ahead.values()]
         if self._first_groups:
             planned.append(self.nodes)
-        arrays: list[NDArray[Any]] = [
+        arrays: list[NDArray[np.generic]] = [
             *self.tables,
             *(a for nodes in planned for a in nodes.arrays),
         ]
@@ -511,12 +517,12 @@ def build_psf_store(
     engine: PsfEngine | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> PsfStore:
-    """Compute every PSF that frames of this camera, pupil and focus range can need.
+    """Compute every PSF that frames of a spec can read.
 
     Parameters
     ----------
     eye : EyeOptics or EyeProfile
-        A profile is used as the measured wavefront.
+        A profile is used as a measured wavefront.
     plan : CachePlan, optional
         Nodes; by default those of `planning.plan.plan_cache`.
     engine : PsfEngine
@@ -526,7 +532,7 @@ def build_psf_store(
     Raises
     ------
     GridTooLarge
-        If a kernel exceeds ``spec.max_blur_radius_px``; the message has the numbers.
+        If a kernel exceeds ``spec.max_blur_radius_px``.
     filter_service.planning.plan.PlanTooLarge
     """
     from estimator.profiles.measured_wavefront import MeasuredWavefront

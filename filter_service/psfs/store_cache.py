@@ -1,9 +1,10 @@
 """On-disk cache of estimated eyes and their nodes.
 
-The cache is a folder of files, each named by hashes of the profile, and of the grid and
-the code.  Several services may share it without a lock: files appear complete (see
-`store_file`), and a file being read stays intact if another process removes it.  Beyond
-a size limit, the least recently used files are removed.
+The cache is a folder of files.  A file's name consists of a hash of the profile and one
+of the grid and the code.  Several services may share the folder without a lock: files
+are written atomically (see `store_file`), and a process can finish reading a file that
+another one removes.  Beyond a size limit, the service removes the least recently used
+files.
 """
 
 from __future__ import annotations
@@ -37,10 +38,10 @@ from filter_service.psfs.store_file import (
 )
 
 SUFFIX = ".psfs"
-BETWEEN = "-"
+SEPARATOR = "-"
 KEY_BYTES = 16
 ABANDONED_S = 3600.0
-"""Age from which an unfinished file is taken for abandoned by its writer."""
+"""Age from which an unfinished file is considered abandoned by its writer."""
 
 MB = 1e6
 
@@ -68,14 +69,18 @@ class Stored:
 def code_version() -> str:
     """Return a hash of the files that determine the content of a store.
 
-    They are both packages and the PSF shaders: omitting a file that matters would serve
-    wrong images; including one that does not costs a build.
+    They are both packages and the PSF shaders.  Omitting a relevant file would produce
+    wrong images, whereas including an irrelevant one only costs a build.
     """
-    ours = Path(filter_service.__file__).parent
-    eyes = Path(estimator.__file__).parent
+    service_folder = Path(filter_service.__file__).parent
+    estimator_folder = Path(estimator.__file__).parent
     files = [
-        *(path for path in eyes.rglob("*") if path.suffix in (".py", ".json", ".onnx")),
-        *ours.rglob("*.py"),
+        *(
+            path
+            for path in estimator_folder.rglob("*")
+            if path.suffix in (".py", ".json", ".onnx")
+        ),
+        *service_folder.rglob("*.py"),
         *SHADER_ROOT.rglob("psf*"),
     ]
     digest = hashlib.blake2b(digest_size=16)
@@ -90,12 +95,12 @@ def store_key(profile: EyeProfile, spec: GridSpec) -> str:
     if not spec.follows_field:
         spec_tree["object"][1]["camera"] = list(spec.pixel_pitch_mrad)
     text = json.dumps([code_version(), spec_tree], sort_keys=True)
-    how = hashlib.blake2b(text.encode(), digest_size=KEY_BYTES).hexdigest()
-    return f"{eye_name(profile)}{BETWEEN}{how}"
+    grid_hash = hashlib.blake2b(text.encode(), digest_size=KEY_BYTES).hexdigest()
+    return f"{eye_name(profile)}{SEPARATOR}{grid_hash}"
 
 
 def eye_name(profile: EyeProfile) -> str:
-    """Return the common prefix of the names of all stores of an eye."""
+    """Return the hash of a profile, with which the names of all its stores start."""
     tree, arrays = pack(profile)
     digest = hashlib.blake2b(digest_size=KEY_BYTES)
     digest.update(json.dumps(tree, sort_keys=True).encode())
@@ -108,18 +113,18 @@ _logged: set[tuple[Path, str]] = set()
 
 
 def _log_once(path: Path, text: str) -> None:
-    """Log a problem with an entry, the first time only."""
+    """Log a problem with a file the first time only."""
     if (path, text) not in _logged:
         _logged.add((path, text))
-        log.warning("%s %s", path, text)
+        log.warning("%s: %s", path, text)
 
 
 def _remove(path: Path, reason: Exception) -> None:
-    """Remove a damaged entry; a folder with its name stays."""
+    """Remove a damaged file; a folder with its name stays."""
     try:
         path.unlink(missing_ok=True)
     except OSError:  # a folder, or no permission
-        _log_once(path, f"is passed over: {reason}")
+        _log_once(path, f"ignored: {reason}")
     else:
         log.warning("removed %s: %s", path, reason)
 
@@ -130,7 +135,8 @@ class StoreCache:
     Parameters
     ----------
     folder : str
-        Folder, created on first use for its owner only; ``""`` disables the cache.
+        Folder, created on first use with access for its owner only; ``""`` disables the
+        cache.
     max_mb : int
         Size limit of the folder.
     """
@@ -139,23 +145,23 @@ class StoreCache:
         self._folder = Path(folder).expanduser() if folder else None
         self._max_bytes = max_mb * MB
 
-    def load(self, key: str, *, go_on: Callable[[], None]) -> Stored | None:
-        """Return the entry of a key, or None; remove a damaged file.
+    def load(self, key: str, *, check_cancelled: Callable[[], None]) -> Stored | None:
+        """Return the store of a key, or None; remove a damaged file.
 
         A file that cannot be read or removed is ignored, and logged once.
 
         Parameters
         ----------
-        go_on : callable
+        check_cancelled : callable
             Called repeatedly; raises to cancel.
         """
         if self._folder is None:
             return None
         path = self._path(key)
         try:
-            stored = read_file(path, go_on=go_on)
+            stored = read_file(path, check_cancelled=check_cancelled)
             if not isinstance(stored, Stored):
-                raise DamagedFile(f"it holds a {type(stored).__name__}")
+                raise DamagedFile(f"expected a Stored, found a {type(stored).__name__}")
         except FileNotFoundError:
             return None
         except DamagedFile as error:
@@ -180,7 +186,7 @@ class StoreCache:
             self._evict()
         except (OSError, NotStorable) as error:
             reason = getattr(error, "strerror", None) or error
-            _log_once(self._path(key), f"cannot be kept: {reason}")
+            _log_once(self._path(key), f"cannot be written: {reason}")
             return
         log.info(
             "cached a store of %.0f MB, written in %.1f s",
@@ -189,13 +195,13 @@ class StoreCache:
         )
 
     def save_aside(self, key: str, stored: Stored) -> None:
-        """Write a store in a background thread, for which an exit does not wait.
+        """Write a store in a background thread that does not delay the exit.
 
-        The store is dropped while an older one is still being written; otherwise memory
-        would fill up with stores that wait for a slow disk.
+        If the previous store is still being written, this one is dropped.  Otherwise,
+        memory would fill up with stores that wait for a slow disk.
         """
         if not _WRITING.acquire(blocking=False):
-            log.info("a store was not cached: the previous one is still being written")
+            log.info("did not cache a store: the previous one is still being written")
             return
 
         def save() -> None:
@@ -211,16 +217,16 @@ class StoreCache:
         return self._folder / f"{key}{SUFFIX}"
 
     def _evict(self) -> None:
-        """Remove the least recently used files until the rest is within the limit."""
+        """Remove the least recently used files until the total is within the limit."""
         found = []
         assert self._folder is not None  # otherwise nothing is stored
         for path in self._folder.iterdir():
             try:
                 status = path.lstat()
             except FileNotFoundError:
-                continue  # another service has removed it
+                continue  # another service removed it
             if not stat.S_ISREG(status.st_mode):
-                continue  # a folder or a link, not one of our files
+                continue  # a folder or link, which the cache did not create
             if path.suffix == SUFFIX:
                 found.append((status.st_mtime, status.st_size, path))
             elif path.suffix == UNFINISHED:

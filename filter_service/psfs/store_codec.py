@@ -1,9 +1,9 @@
 """Serialization of project objects as JSON and plain arrays, without executing code.
 
-It covers the content of a PSF store: classes of this project whose state is numbers,
-strings, arrays, lists, dicts and other such classes.  Cached properties are omitted.
-A damaged file can at worst contain wrong numbers, whereas a pickle could contain a
-program.
+It supports the content of a PSF store: classes of this project whose state consists of
+numbers, strings, arrays, lists, dicts and other such classes.  Cached properties are
+omitted.  A damaged file can at worst contain wrong numbers, whereas a pickle can
+execute code.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 PACKAGES = ("estimator.", "filter_service.")
-"""Packages whose classes are written and instantiated; no others are."""
+"""Packages whose classes may be written and instantiated."""
 
 _PLAIN = (bool, int, float, str, type(None))
 
 
 class NotStorable(TypeError):
-    """An object contains a value that is not plain data."""
+    """An object contains a value that cannot be written."""
 
 
 def pack(value: object) -> tuple[Any, dict[str, NDArray[Any]]]:
@@ -32,19 +32,19 @@ def pack(value: object) -> tuple[Any, dict[str, NDArray[Any]]]:
     Raises
     ------
     NotStorable
-        If a value cannot be written; the message has its path in the object.
+        If a value cannot be written; the message contains its path in the object.
     """
     arrays: dict[str, NDArray[Any]] = {}
     return _packed(value, "", arrays, {}), arrays
 
 
 def unpack(tree: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
-    """Return the object of a tree; its arrays are those given, not copies.
+    """Return the object of a tree, with the given arrays and not copies of them.
 
     Raises
     ------
     ValueError, KeyError, TypeError, AttributeError, ImportError
-        If the tree was not made by this version of `pack`.
+        If the tree was not written by this version of `pack`.
     """
     if isinstance(tree, _PLAIN):
         return tree
@@ -59,7 +59,7 @@ def unpack(tree: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
         return {key: unpack(item, arrays) for key, item in content}
     name, state = content
     if kind != "object":
-        raise ValueError(f"{kind!r} is no kind of data")
+        raise ValueError(f"unknown kind {kind!r}; expected array, tuple, map or object")
     made: Any = object.__new__(_class_of(name))
     for field, item in state.items():
         object.__setattr__(made, field, unpack(item, arrays))
@@ -90,7 +90,9 @@ def _packed(
         }
     name = f"{type(value).__module__}:{type(value).__qualname__}"
     if not name.startswith(PACKAGES) or not hasattr(value, "__dict__"):
-        raise NotStorable(f"{path or 'it'} is {value!r}: no data")
+        raise NotStorable(
+            f"{path or 'the value'} is a {type(value).__name__}, which is not supported"
+        )
     state = {
         field: _packed(item, f"{path}.{field}", arrays, known)
         for field, item in vars(value).items()
@@ -101,7 +103,9 @@ def _packed(
 
 def _is_key(key: object, path: str) -> bool:
     if not isinstance(key, str | int):
-        raise NotStorable(f"{path} has the key {key!r}: neither text nor a number")
+        raise NotStorable(
+            f"{path} has the key {key!r}; expected a string or an integer"
+        )
     return True
 
 
@@ -111,9 +115,9 @@ def _array_name(
     arrays: dict[str, NDArray[Any]],
     known: dict[int, str],
 ) -> str:
-    """Return the name of an array; an array that occurs repeatedly is stored once."""
+    """Return the name of an array; repeated arrays are stored once."""
     if array.dtype.hasobject:
-        raise NotStorable(f"{path} is an array of objects")
+        raise NotStorable(f"{path} is an array of objects, which is not supported")
     if id(array) not in known:
         known[id(array)] = path.removeprefix(".") or "value"
         arrays[known[id(array)]] = array

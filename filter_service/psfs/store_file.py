@@ -1,7 +1,7 @@
-"""File format for an object and its arrays: written atomically, verified on reading.
+"""File format for an object and its arrays, written atomically and verified on reading.
 
-The layout is a preamble with sizes and checksums, a JSON header, and the arrays from a
-page boundary on.  No part of a file can execute code.
+A file consists of a preamble with sizes and checksums, a JSON header, and the arrays
+from a page boundary on.  No part of a file can execute code.
 """
 
 from __future__ import annotations
@@ -35,22 +35,24 @@ _MALFORMED = (
     *(ValueError, LookupError, TypeError, AttributeError, ImportError),
     *(OverflowError, RecursionError, MemoryError),
 )
-"""Errors that a foreign header may cause."""
+"""Errors that a header of another version may cause."""
 
-Look = Callable[[], None]
+CheckCancelled = Callable[[], None]
+"""Function that is called repeatedly and raises to cancel."""
 
 
 class DamagedFile(ValueError):
-    """The file differs from what was written."""
+    """The content of a file differs from what was written."""
 
 
-def write_file(path: Path, value: object, *, go_on: Look = lambda: None) -> int:
-    """Write an object to a file atomically; return the file's size.
+def write_file(
+    path: Path, value: object, *, check_cancelled: CheckCancelled = lambda: None
+) -> int:
+    """Write an object to a file atomically, and return the size of the file.
 
     Parameters
     ----------
-    go_on : callable, optional
-        Called repeatedly; raises to cancel.
+    check_cancelled : callable, optional
 
     Raises
     ------
@@ -70,7 +72,7 @@ def write_file(path: Path, value: object, *, go_on: Look = lambda: None) -> int:
             for block in _blocks(arrays):
                 file.write(block)
                 checksum = zlib.crc32(block, checksum)
-                go_on()
+                check_cancelled()
             file.seek(0)
             file.write(
                 PREAMBLE.pack(
@@ -89,7 +91,7 @@ def write_file(path: Path, value: object, *, go_on: Look = lambda: None) -> int:
     return start + n_bytes
 
 
-def read_file(path: Path, *, go_on: Look = lambda: None) -> Any:
+def read_file(path: Path, *, check_cancelled: CheckCancelled = lambda: None) -> Any:
     """Return the object of a file.
 
     Raises
@@ -102,42 +104,46 @@ def read_file(path: Path, *, go_on: Look = lambda: None) -> Any:
     with open(path, "rb", buffering=0, opener=_open_plain_file) as file:
         preamble = file.read(PREAMBLE.size)
         if len(preamble) < PREAMBLE.size:
-            raise DamagedFile("it is cut off")
+            raise DamagedFile("the preamble is truncated")
         magic, n_header, start, n_bytes, header_sum, data_sum = PREAMBLE.unpack(
             preamble
         )
         n_there = os.fstat(file.fileno()).st_size
         if magic != MAGIC or not PREAMBLE.size + n_header <= start <= n_there:
-            raise DamagedFile("its beginning was changed")
+            raise DamagedFile("the preamble is invalid")
         if n_there != start + n_bytes:
-            raise DamagedFile(f"it has {n_there} bytes, {start + n_bytes} were written")
+            raise DamagedFile(
+                f"the file has {n_there} bytes, expected {start + n_bytes}"
+            )
         header = file.read(n_header)
         if zlib.crc32(header) != header_sum:
-            raise DamagedFile("its header is damaged")
+            raise DamagedFile("the checksum of the header is wrong")
         file.seek(start)
         data, checksum = np.empty(n_bytes, np.uint8), 0
         for first in range(0, n_bytes, BLOCK_BYTES):
             block = data[first : first + BLOCK_BYTES].data
             if file.readinto(block) != len(block):
-                raise DamagedFile("it was cut off while it was read")
+                raise DamagedFile("the file was truncated during reading")
             checksum = zlib.crc32(block, checksum)
-            go_on()
+            check_cancelled()
     if checksum != data_sum:
-        raise DamagedFile("its arrays are damaged")
+        raise DamagedFile("the checksum of the arrays is wrong")
     try:
         content = json.loads(header)
         arrays = {key: _array(data, p) for key, p in content["arrays"].items()}
         return unpack(content["tree"], arrays)
     except _MALFORMED as error:
-        raise DamagedFile(f"it is of another version: {error!r:.200}") from error
+        raise DamagedFile(
+            f"the header is of another version: {error!r:.200}"
+        ) from error
 
 
 def _open_plain_file(path: str, flags: int) -> int:
-    """Open a regular file; refuse others, such as a FIFO, which would block reading."""
+    """Open a regular file; refuse others, such as a FIFO, which would block."""
     descriptor = os.open(path, flags | os.O_NONBLOCK | os.O_NOFOLLOW)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
-        raise DamagedFile("it is no plain file")
+        raise DamagedFile("not a regular file")
     return descriptor
 
 

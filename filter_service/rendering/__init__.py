@@ -1,22 +1,44 @@
 """Rendering: filter a frame with the PSFs of the cache.
 
+Terms, in addition to the rendering terms of ``CONVENTIONS.md``:
+
+- kernel: weights of one PSF in a box of pixels, for red, green and blue
+- reach: distance from a kernel's center to the left, right, upper and lower side of
+  its box, px
+- spread: radius of the uniform disc with the same sum of squared weights, px
+- node: field direction for which PSFs are cached
+- tap: one cached kernel in a weighted sum of kernels, as in a filter tap
+- cell: square of the image whose pixels share kernels
+- interval: range between two adjacent layers; fragments interpolate linearly between
+  the kernels at its two ends
+- pair: a cell and an interval; each pair that a frame uses has one kernel
+- merge: replace a square of 2, 4 or 8 similar pixels by one fragment
+- level: binary logarithm of a merged square's edge in px, as with mipmaps
+- texel, atlas: element of a kernel on the GPU; buffer or texture with the kernels of a
+  frame
+- block: the fragments of 8 x 8 pixels, stored together
+- window: rectangle of the blocks whose fragments may reach a bin
+- margin: amount that is added to a bound, against rounding
+
+Modules:
+
 engine           interface of the frame engines
 request_checks   checks of a request against its store
 filtered_view    result of a frame, for all engines
 white_level      reference light for contrast
 perfect_eye      store that changes nothing, for testing engines
-frame            preparation of a view: filled depth, extended edges
+frame            preparation of a view: missing depth, repeated edges
 gaze             gaze of a frame, clamped to the prepared range
 image_cells      cells of the image that share kernels
-cell_maps        maps from their pixels to those of stored kernels
+cell_maps        linear maps from their pixels to those of stored kernels
 map_loops        compiled loops of cell_maps
-frame_states     state kept while pupil, focus and gaze do not change
-frame_use        request of a frame, and the PSFs that it needs
-frame_kernels    recipes of a frame's kernels
+frame_states     cached plans for an unchanged pupil, focus and gaze
+sampled_frame    sampled depths of a frame, and the PSFs that it needs
+frame_kernels    plan of a frame's kernels
 kernel_loops     compiled loops of frame_kernels
 kernel_tables    kernel records in the layout of the passes
 table_loops      compiled loops of kernel_tables
-pair_loops       kernels that a frame uses, and those predicted for the next
+pair_loops       pairs that a frame uses, and those predicted for the next
 srgb             conversion between encoded images and linear light
 media_effects    effects of ocular media and spectacles
 haze             straylight of the ocular media

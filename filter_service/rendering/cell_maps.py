@@ -1,4 +1,4 @@
-"""Maps from the pixels of an image cell to those that kernels are stored in."""
+"""Linear maps from the pixels of an image cell to the pixels of stored kernels."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 class MapTables(NamedTuple):
-    """Maps of cells and quantities derived from them.
+    """Maps of cells, and quantities derived from the maps.
 
     Attributes
     ----------
@@ -22,7 +22,7 @@ class MapTables(NamedTuple):
     stretch_ratio : (n_cells, 3)
         Largest elongation of a kernel relative to its stored form.
     change_ratio : (n_cells, 3)
-        Displacement of light as a fraction of its distance from the center.
+        Displacement of light over its distance from the kernel's center.
     """
 
     node_from_cell: NDArray[np.float64]
@@ -37,13 +37,13 @@ class MapTables(NamedTuple):
 class CellMaps:
     """Maps of cells, each to its three field nodes.
 
-    A part of a kernel is mapped where `moves` is true; otherwise it is read as stored.
+    A part of a kernel is resampled by its map only if `map_loops.needs_map` is true.
 
     Attributes
     ----------
     node_from_cell : (n_cells, 3, 2, 2)
         Map from offsets in the cell's pixels (x right, y down) to offsets in the
-        pixels that a node's kernels are stored in.
+        pixels of a node's stored kernels.
     """
 
     node_from_cell: NDArray[np.float64]

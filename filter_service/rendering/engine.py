@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.rendering.filtered_view import FilteredView
-from filter_service.rendering.frame_use import FrameUse
+from filter_service.rendering.sampled_frame import SampledFrame
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
 
@@ -25,7 +25,7 @@ class LoadedStore(Protocol):
 
     def missing_psfs(  # noqa: D102
         self,
-        use: FrameUse | None = None,
+        frame: SampledFrame | None = None,
         *,
         state: tuple[float, float] | None = None,
     ) -> NDArray[np.int64]: ...
@@ -36,7 +36,7 @@ class LoadedStore(Protocol):
 
     def evict(self, max_mb: float) -> None: ...  # noqa: D102
 
-    def take(self, part: Any) -> None: ...  # noqa: D102
+    def add_part(self, part: Any) -> None: ...  # noqa: D102
 
     def release(self) -> None:
         """Free the engine's resources for this store; call it once."""
@@ -44,19 +44,19 @@ class LoadedStore(Protocol):
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """One view to filter: what is seen, through which eye in which state, and how.
+    """One view to filter, with the eye, its state and the options.
 
     Attributes
     ----------
     handle : LoadedStore
         PSFs of the eye, loaded by the engine.
     gaze_deg : (h, v), optional
-        Gaze in the image, clamped to the prepared range with a note; the store's by
-        default.
+        Gaze; by default that of the store.  A gaze outside the prepared range is
+        clamped, and the result has a note.
     out : array, optional
-        Output array of the shape and type of the image; an engine may use it.
+        Array of the shape and type of the output, which the engine may fill.
     until_s : float, optional
-        Deadline on the clock of `time.monotonic`; no PSFs are computed after it.
+        Deadline by `time.monotonic`; the engine computes no PSFs after it.
     """
 
     view: RgbdView
@@ -71,7 +71,7 @@ class ViewRequest:
 
 
 Pending = Callable[[], FilteredView]
-"""Waits for a view that was begun, and returns it."""
+"""Wait for a view that `FrameEngine.begin` has started, and return it."""
 
 
 class FrameEngine(Protocol):
@@ -85,21 +85,21 @@ class FrameEngine(Protocol):
         """Release buffers that frames reuse; called after an idle period."""
 
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
-        """Register a function to be called during frames, if this engine can.
+        """Register a callback for pauses during frames, if the engine has any.
 
-        The engine calls it at most once every ``interval_s``.  The function must not
+        The engine calls it at most once every ``interval_s``.  The callback must not
         raise; it may filter another frame or load a store.  Returns whether the engine
         will call it.
         """
 
     def load(self, store: Any) -> LoadedStore:
-        """Load a store; its kernels may all be computed later."""
+        """Load a store; its kernels may be computed later."""
 
     def begin(self, request: ViewRequest) -> Pending:
         """Start filtering a view; return a function that waits for the result.
 
-        Other views may be begun in between, such as that of the other eye.  An engine
-        without concurrency filters the view at once.
+        The caller may start other views before it calls that function, such as the
+        view of the other eye.  An engine without concurrency filters the view at once.
 
         Raises
         ------
@@ -108,19 +108,19 @@ class FrameEngine(Protocol):
         CameraMismatch
             The store is for another camera, see `camera.is_same_camera`.
         NotPrepared
-            Some PSFs that the frame needs were not computed by ``until_s``; the
-            returned function may raise it, too.
+            The deadline ``until_s`` passed before all required PSFs were computed.
+            The returned function may also raise it.
         RenderError
         """
 
 
 class OneView:
-    """Adds `render`, which takes the fields of a request by name, to an engine."""
+    """Mixin that adds the method `render` to an engine."""
 
     def render(
         self: FrameEngine, view: RgbdView, handle: Any, **values: Any
     ) -> FilteredView:
-        """Filter one view; options of `RenderOptions` are given by name, too."""
+        """Filter one view; ``values`` are fields of the request or its options."""
         names = {option.name for option in fields(RenderOptions)}
         options = {name: values.pop(name) for name in names & set(values)}
         request = ViewRequest(view, handle, options=RenderOptions(**options), **values)

@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, kw_only=True)
 class FrameCounts:
-    """Counts that users receive with a frame.
+    """Counters of a frame that users receive.
 
-    A new counter needs a line here, with the default 0, and a value from each engine.
-    A field of the same name in `Result` is filled with it and sent.
+    A new counter needs a field here, with the default 0, and a value from each engine.
+    If `Result` has a field of the same name, the service sends the counter.
 
     Attributes
     ----------
     missing_depth_count, clamped_depth_count, bad_color_count : int
-        Pixels whose depth was filled in, whose depth was outside the prepared
-        distances, and whose color was not finite (taken as black); the last two
-        include the pixels of a hidden layer that are not empty.
+        Pixels whose depth was missing and filled in, whose distance was outside the
+        prepared range, and whose color was not finite and became black.  The last two
+        include the hidden layer where it has depth.
     overflow_count : int
-        Entries dropped because their list was full; their light is missing.
+        Entries that did not fit a fragment list.  Their light is missing.
     """
 
     missing_depth_count: int
@@ -44,7 +44,7 @@ def summed_counts(counts: Sequence[FrameCounts]) -> dict[str, int]:
 
 @dataclass(frozen=True, kw_only=True)
 class FilteredView(FrameCounts):
-    """A filtered view with the parameters and statistics of its rendering.
+    """A filtered view, with the parameters and statistics of its rendering.
 
     Attributes
     ----------
@@ -53,15 +53,15 @@ class FilteredView(FrameCounts):
     stage_times_ms : dict
         Time by stage; their sum is the time spent in the engine.
     pupil_diameter_mm, focus_dpt : float
-        As used.
+        After clamping to the prepared ranges.
     gaze_deg : (h, v)
-        As used.
+        After clamping to the prepared range.
     fragment_count, merged_count, entry_count : int
-        Fragments, pixels merged into fragments, and entries of the bins' lists; rows
-        shared by two strips of a very large frame count twice, and with a hidden layer
-        the repeated border counts.
+        Fragments, pixels merged into fragments, and entries of the bins' fragment
+        lists.  Rows shared by two strips of a very large frame count twice.  With a
+        hidden layer, the border counts too.
     kernel_count, kernel_texel_count : int
-        Kernels in use, and texels of all their levels.
+        Kernels of the frame, and texels of all their levels.
     """
 
     color: NDArray[Any]
@@ -78,27 +78,27 @@ class FilteredView(FrameCounts):
     notes: list[str]
 
 
-SAMPLED_EVERY = 16
-"""Stride in rows and columns for the check of the depth unit: 25 us of a frame."""
+SAMPLE_STRIDE_PX = 16
+"""Stride of the check of the depth unit, which takes 25 us."""
 
-METERS_BELOW = 100.0
-"""Scenes with nothing nearer are rare; depth in centimeters or millimeters is not."""
+FAR_SCENE_M = 100.0
+"""If all depth exceeds this, the unit is probably centimeters or millimeters: scenes
+without a nearer object are rare."""
 
 
 def input_notes(
     depth_m: NDArray[np.float32], missing_depth_count: int, bad_color_count: int
 ) -> list[str]:
-    """Return notes on what was assumed about a view's depth and color.
-
-    The texts do not change from frame to frame: counts are reported separately.
-    """
+    """Return notes on missing depth, an implausible depth unit and invalid color."""
     notes = []
     if missing_depth_count == depth_m.size:
         notes.append("no pixel has depth; infinity is assumed")
-    sampled_m = depth_m[::SAMPLED_EVERY, ::SAMPLED_EVERY]
+    sampled_m = depth_m[::SAMPLE_STRIDE_PX, ::SAMPLE_STRIDE_PX]
     known_m = sampled_m[(sampled_m > 0.0) & (sampled_m < np.inf)]
-    if known_m.size and known_m.min() >= METERS_BELOW:
-        notes.append(f"all depth is beyond {METERS_BELOW:g} m: is it in meters?")
+    if known_m.size and known_m.min() >= FAR_SCENE_M:
+        notes.append(f"all depth is beyond {FAR_SCENE_M:g} m: is it in meters?")
     if bad_color_count:
-        notes.append(f"{bad_color_count} pixels with non-finite color taken as black")
+        notes.append(
+            f"{bad_color_count} pixels with non-finite color were set to black"
+        )
     return notes

@@ -1,11 +1,14 @@
-"""Preparation of a view for filtering: missing depth, borders, object distances."""
+"""Preparation of a view: missing depth, borders, object distances."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from math import ceil
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from filter_service.camera import Tangents
 from filter_service.constants import TILE_SIZE_PX
 from filter_service.psfs.boxes import MAX_REACH_PX
 from filter_service.psfs.frame_layers import FrameLayers
@@ -13,7 +16,7 @@ from filter_service.rendering.image_cells import ImageCells
 from filter_service.rgbd_view import LEAST_DEPTH_M, RgbdView
 from filter_service.settings import MAX_VERGENCE_DPT
 
-BORDER_ROOM_PX = 2
+BORDER_MARGIN_PX = 2
 
 IMAGES = ("color", "depth_m", "hidden_color", "hidden_depth_m")
 
@@ -42,23 +45,23 @@ def fill_missing_depth(
 
 
 def border_px_of(view: RgbdView, layers: FrameLayers, image: ImageCells) -> int:
-    """Return the border to add around a view with a hidden layer, in whole tiles.
+    """Return the width of the border around a view with a hidden layer, in whole tiles.
 
-    Near the border of the image part of a surface's light would come from beyond it.
-    Without that light, hidden surfaces would shine through.  So the edge of the image
-    is repeated.
+    Near the edge of the image, part of a surface's light comes from outside the image.
+    Without that light, hidden surfaces would become visible there.  The border
+    therefore repeats the edge of the image.
     """
     if view.surface_count == 1:
         return 0
-    reach_px = reach_px_of(view, layers, image) + BORDER_ROOM_PX
+    reach_px = reach_px_of(view, layers, image) + BORDER_MARGIN_PX
     return -(-reach_px // TILE_SIZE_PX) * TILE_SIZE_PX
 
 
 def reach_px_of(view: RgbdView, layers: FrameLayers, image: ImageCells) -> int:
-    """Bound the spread of a view's light, px, from its nearest and farthest depth.
+    """Return an upper bound on the kernel reach in a view, px, from its depth range.
 
-    The bound uses rays and the diffraction that kernels keep, so that it does not
-    depend on which PSFs have been computed.
+    The bound follows from ray tracing and from the diffraction inside the kernels'
+    boxes, and not from the PSFs that have been computed so far.
     """
     depths_m = [m[m >= LEAST_DEPTH_M] for m in view.surface_depths_m]
     far_m = max((float(m.max(initial=0.0)) for m in depths_m), default=0.0)
@@ -70,25 +73,44 @@ def reach_px_of(view: RgbdView, layers: FrameLayers, image: ImageCells) -> int:
     return ceil(image.maps.largest_stretch_ratio * reach_px)
 
 
+def map_images(
+    view: RgbdView,
+    change: Callable[[NDArray[Any]], NDArray[Any]],
+    tangents: Tangents,
+) -> RgbdView:
+    """Return a view with a function applied to each image, and with new tangents."""
+    images: dict[str, Any] = {
+        name: change(image)
+        for name in IMAGES
+        if (image := getattr(view, name)) is not None
+    }
+    return replace(view, **images, tangents=tangents)
+
+
+def drop_empty_layer(view: RgbdView) -> RgbdView:
+    """Return a view without its hidden layer if no pixel of the layer has depth."""
+    if view.hidden_depth_m is None or np.any(view.hidden_depth_m > 0.0):
+        return view
+    return replace(view, hidden_color=None, hidden_depth_m=None)
+
+
 def extended(view: RgbdView, border_px: int) -> RgbdView:
-    """Return a view extended on all sides by repeating its edge."""
+    """Return a view with a border on all sides that repeats its edge."""
     if border_px == 0:
         return view
     left, right, up, down = view.tangents
     across = (right - left) / view.width_px * border_px
     along = (up - down) / view.height_px * border_px
     sides = ((border_px, border_px), (border_px, border_px), (0, 0))
-    images = {
-        name: np.pad(image, sides[: image.ndim], mode="edge")
-        for name in IMAGES
-        if (image := getattr(view, name)) is not None
-    }
-    tangents = (left - across, right + across, up + along, down - along)
-    return replace(view, **images, tangents=tangents)
+    return map_images(
+        view,
+        lambda image: np.pad(image, sides[: image.ndim], mode="edge"),
+        (left - across, right + across, up + along, down - along),
+    )
 
 
 def radial_stretch(view: RgbdView) -> NDArray[np.float64]:
-    """Return the distance from the eye per unit of planar depth, (height, width)."""
+    """Return radial over planar depth of each pixel, (height, width)."""
     left, right, up, down = view.tangents
     x = left + (right - left) * (np.arange(view.width_px) + 0.5) / view.width_px
     y = up + (down - up) * (np.arange(view.height_px) + 0.5) / view.height_px
@@ -105,14 +127,14 @@ def object_dpt(view: RgbdView, depth_m: NDArray[np.float32]) -> NDArray[np.float
 def object_range_dpt(view: RgbdView) -> tuple[float, float]:
     """Return the farthest and nearest object distance of a view, as (low, high) dpt.
 
-    Missing depth is filled first, as in `fill_missing_depth`.  Hidden pixels that are
-    not empty count.  Both values are clamped to `MAX_VERGENCE_DPT`.
+    Missing depth is filled first, see `fill_missing_depth`.  The range includes the
+    hidden layer where it has depth.  Both values are clamped to `MAX_VERGENCE_DPT`.
     """
     filled_m, _ = fill_missing_depth(view.depth_m)
     distance_dpt = object_dpt(view, filled_m)
     if view.hidden_depth_m is not None:
-        holds = view.hidden_depth_m > 0.0
-        hidden_m = np.where(holds, view.hidden_depth_m, filled_m)
+        has_depth = view.hidden_depth_m > 0.0
+        hidden_m = np.where(has_depth, view.hidden_depth_m, filled_m)
         distance_dpt = np.stack([distance_dpt, object_dpt(view, hidden_m)])
     low_dpt, high_dpt = float(distance_dpt.min()), float(distance_dpt.max())
     return min(low_dpt, MAX_VERGENCE_DPT), min(high_dpt, MAX_VERGENCE_DPT)

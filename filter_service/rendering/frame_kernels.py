@@ -1,9 +1,10 @@
-"""Planning of a frame's kernels: which it needs, and how each is blended; CPU only.
+"""Plan of a frame's kernels: which kernels it needs, and the taps of each; CPU only.
 
-A frame has one kernel for each (image cell, layer interval) pair that its pixels use.
-A kernel holds both ends of its interval.  It is blended from node kernels, which are
-(field node, layer interval) pairs; node kernels are blended from the cache.  The
-compiled loops are imported when a frame first needs them: numba takes 0.3 s to import.
+A frame has one kernel for each (cell, interval) pair that its pixels use.  A kernel
+contains the weights at both ends of its interval.  It is a weighted sum of the node
+kernels of three field nodes, and each node kernel is a weighted sum of cached kernels.
+The compiled loops are imported when a frame first needs them: importing numba takes
+0.3 s.
 """
 
 from collections.abc import Callable
@@ -31,17 +32,18 @@ class NodeKernels:
     Attributes
     ----------
     near, far : (n,)
-        Recipes of the interval's two ends.
+        Recipes at the two ends of the interval.
     reach_px : (n, 4)
-        Reach of the interval: left, right, up, down.
+        Largest reach in the interval: left, right, up, down.
     radius_px : (n,)
     peak_ratio : (n,)
-        Bound on the weights of the interval.
+        Upper bound on the weights in the interval.
     recipes : (n_recipes, 3, 18), uint32
-        Per channel six kernel offsets, six reaches (a byte a side), six weights
-        (float bits) that turn steps of a cached kernel into its share of a layer.
+        Taps of a field node at a layer.  For each channel: six offsets of cached
+        kernels, their six reaches (one byte per side), and six factors (bits of a
+        float32) by which their 16-bit weights are multiplied.
     recipe_spread_px : (n_recipes,)
-        Smallest spread over the channels; limits merging.
+        Smallest spread of the three channels; it limits merging.
     """
 
     near: NDArray[np.int64]
@@ -60,22 +62,22 @@ class FrameKernels:
     Attributes
     ----------
     cells, intervals : (n,)
-        Pair that each kernel serves.
+        The pair of each kernel.
     parts : (n, 3)
-        Node kernels that each kernel is blended from.
+        Node kernels whose weighted sum is the kernel.
     weight_ratio : (n, 3)
-        Share of each part; if its map rotates or shears, multiplied by the area of a
-        mapped pixel over the area of a box with its sides.
+        Weight of each part.  If its map rotates or shears, the weight is multiplied by
+        the area of a mapped pixel over the area of a box with its sides.
     maps : (n, 3, 2, 2)
-        Maps from offsets in the image's pixels to those of the part; exactly the
+        Linear maps from offsets in pixels of the image to those of the part; the exact
         identity where the difference is negligible.
     reach_px : (n, 4)
         Left, right, up, down.
     radius_px : (n,)
     peak_ratio : (n,)
-        Bound on the weights.
+        Upper bound on the weights.
     spread_px : (n, 2)
-        Spread at both ends of the interval.
+        Spread at the two ends of the interval.
     """
 
     nodes: NodeKernels
@@ -96,7 +98,7 @@ class FrameKernels:
 
 
 def interval_count(layers: FrameLayers) -> int:
-    """Return the number of intervals between layers; a single layer counts as one."""
+    """Return the number of intervals; a single layer counts as one interval."""
     return max(len(layers.layer_dpt) - 1, 1)
 
 
@@ -116,20 +118,20 @@ def frame_kernels(
     store : PsfStore
     used : (n_cells, n_intervals)
     tables : StoreTables, optional
-        Tables of the store with other offsets, which are written to the recipes.
+        Tables to use instead of the store's; their offsets are written to the recipes.
     fill : callable, optional
         Function that computes missing PSFs (n,); `PsfStore.fill` by default.
 
     Raises
     ------
     NotPrepared
-        ``fill`` ran out of time.
+        The deadline of ``fill`` has passed.
     """
-    from filter_service.rendering.kernel_loops import fill_kernels, used_nodes
+    from filter_service.rendering.kernel_loops import fill_kernels, list_nodes
 
     n_fields, maps = len(layers.layer_zero_dpt), image.maps.tables
     weight_ratio = np.ascontiguousarray(image.weight_ratio)
-    cells, intervals, parts, *pairs = used_nodes(
+    cells, intervals, parts, *pairs = list_nodes(
         np.ascontiguousarray(used),
         np.ascontiguousarray(image.nodes),
         weight_ratio,
@@ -139,7 +141,7 @@ def frame_kernels(
         store, tables or store.tables, fill or store.fill, layers, *pairs
     )
     spread_px = nodes.recipe_spread_px[np.stack([nodes.near, nodes.far], axis=-1)]
-    made = {
+    arrays = {
         "weight_ratio": np.empty(parts.shape),
         "maps": np.empty((*parts.shape, 2, 2)),
         "reach_px": np.empty((cells.size, 4), np.int64),
@@ -153,10 +155,10 @@ def frame_kernels(
         cells,
         parts,
         (nodes.reach_px, nodes.radius_px, nodes.peak_ratio, spread_px),
-        tuple(made.values()),
+        tuple(arrays.values()),
     )
     return FrameKernels(
-        nodes=nodes, cells=cells, intervals=intervals, parts=parts, **made
+        nodes=nodes, cells=cells, intervals=intervals, parts=parts, **arrays
     )
 
 
@@ -166,10 +168,10 @@ def missing_psfs(
     image: ImageCells,
     used: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
-    """Return the missing PSFs (n,) of the kernels of used pairs."""
-    from filter_service.rendering.kernel_loops import used_nodes
+    """Return the PSFs (n,) of used pairs that are not computed yet."""
+    from filter_service.rendering.kernel_loops import list_nodes
 
-    *_, fields, intervals = used_nodes(
+    *_, fields, intervals = list_nodes(
         np.ascontiguousarray(used),
         np.ascontiguousarray(image.nodes),
         np.ascontiguousarray(image.weight_ratio),
@@ -194,9 +196,9 @@ def _node_kernels(
     fields: NDArray[Any],
     intervals: NDArray[Any],
 ) -> NodeKernels:
-    from filter_service.rendering.kernel_loops import fill_recipes, used_recipes
+    from filter_service.rendering.kernel_loops import fill_recipes, list_recipes
 
-    near, far, recipe_fields, recipe_layers = used_recipes(
+    near, far, recipe_fields, recipe_layers = list_recipes(
         fields, intervals, len(layers.layer_zero_dpt), len(layers.layer_dpt)
     )
     count = recipe_fields.size

@@ -1,4 +1,4 @@
-"""Parts of a frame that depend only on the eye's state, kept while it is unchanged."""
+"""Cached parts of a frame's plan that depend only on pupil, focus and gaze."""
 
 import math
 from contextlib import AbstractContextManager
@@ -13,12 +13,12 @@ from filter_service.errors import OutOfMemory
 from filter_service.psfs.field_defocus import FieldAxes
 from filter_service.psfs.frame_layers import FrameLayers, frame_layers
 from filter_service.psfs.store import PsfStore
-from filter_service.rendering.frame_use import FrameUse, psfs_for
 from filter_service.rendering.image_cells import ImageCells, image_cells, stored_scale
+from filter_service.rendering.sampled_frame import SampledFrame, missing_psfs_of
 
 LAYER_STEP_RATIOS = (0.2, 2.0)
-"""Finest and widest layer steps relative to the default; at the finest, the error of
-the layers is below that of the 16-bit kernels."""
+"""Smallest and largest layer step relative to the default.  With the smallest, layers
+add less error than the 16 bits of the kernels."""
 
 
 def layer_step_ratio(tolerance: float) -> float:
@@ -27,26 +27,26 @@ def layer_step_ratio(tolerance: float) -> float:
 
 
 CornerWeights = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Weights of the field's spline along h and v at the corners of cells."""
+"""Weights of the defocus spline along h and v at the corners of cells."""
 
 
 class Timer(Protocol):
     """Stage timer of an engine."""
 
     def wall(self, name: str) -> AbstractContextManager[None]:
-        """Return a context that adds its wall time to a stage."""
+        """Return a context manager that adds its wall time to a stage."""
 
 
 @dataclass(eq=False)
 class FrameStore:
-    """A PSF store with the image cells of its camera; engines extend it."""
+    """A PSF store with the image cells of its camera; base class of engines' stores."""
 
     store: PsfStore
     image: ImageCells
 
     @cached_property
     def node_scale(self) -> NDArray[np.float64]:
-        """Scale of the stored pixels, see `stored_scale`; it takes 3 ms to compute."""
+        """Scale of the stored pixels, see `stored_scale`; cached, as it takes 3 ms."""
         return stored_scale(self.store.spec, self.store.plan)
 
     @property
@@ -56,30 +56,30 @@ class FrameStore:
 
     @property
     def memory_mb(self) -> float:
-        """Memory of their kernels."""
+        """Memory of the computed kernels, MB."""
         return self.store.memory_mb
 
     def missing_psfs(
         self,
-        use: FrameUse | None = None,
+        frame: SampledFrame | None = None,
         *,
         state: tuple[float, float] | None = None,
     ) -> NDArray[np.int64]:
-        """Return the PSFs (n,) that a frame needs and that are not computed.
+        """Return the PSFs (n,) that a frame needs and that are not computed yet.
 
         Parameters
         ----------
-        use : FrameUse, optional
-            Request of the frame; by default everything that any frame may need.
+        frame : SampledFrame, optional
+            By default, PSFs that any frame may need are returned.
         state : (pupil_diameter_mm, focus_dpt), optional
-            State in place of the frame's.
+            State to use instead of the frame's.
 
         Raises
         ------
         OutOfMemory
-            All PSFs are requested, and some were evicted because memory ran out.
+            All PSFs were requested, but do not fit in memory.
         """
-        if use is None:
+        if frame is None:
             if self.store.generation:
                 raise OutOfMemory(
                     f"the PSFs of all ranges take more than {self.memory_mb:.0f} MB",
@@ -87,7 +87,7 @@ class FrameStore:
                 )
             self.store.plan_all()
             return np.flatnonzero(~self.store.tables.is_computed)
-        return psfs_for(self.store, use, self._cells_at, state=state)
+        return missing_psfs_of(self.store, frame, self._cells_at, state=state)
 
     def fill(
         self, psfs: NDArray[np.int64], *, until_s: float, batch_count: int
@@ -95,8 +95,8 @@ class FrameStore:
         """Compute PSFs, see `PsfStore.fill`."""
         self.store.fill(psfs, until_s=until_s, batch_count=batch_count)
 
-    def take(self, part: Any) -> None:
-        """Add a part that was planned ahead, see `PsfStore.take`."""
+    def add_part(self, part: Any) -> None:
+        """Add a part of the plan that the worker has prepared."""
         self.store.take(part)
 
     def evict(self, max_mb: float) -> None:
@@ -111,26 +111,25 @@ class FrameStore:
 
 
 class FrameStates:
-    """Layers of the last pupil and focus, cells of the last gaze, for one store.
+    """Cache of the layers and cells of the last frame, for one store.
 
-    The objects stay identical until the state changes, so that callers, such as the
-    kernels of a frame, can compare states by identity.  Stores that are no longer in
-    use are not kept alive.
+    The same objects are returned until the state changes, so that callers can compare
+    states by identity.  Another store replaces the cached one, which can then be freed.
     """
 
     def __init__(self) -> None:
-        self._start_anew(None)
+        self._reset(None)
 
-    def _start_anew(self, handle: FrameStore | None) -> None:
+    def _reset(self, handle: FrameStore | None) -> None:
         self._handle = handle
         self._layers: tuple[tuple[float, float, float], FrameLayers] | None = None
         self._image: tuple[tuple[Any, ...], ImageCells] | None = None
         self._change: tuple[FrameLayers, ImageCells, NDArray[Any]] | None = None
         self._corner_weights: tuple[FieldAxes, ImageCells, CornerWeights] | None = None
 
-    def _forget_others(self, handle: FrameStore) -> None:
+    def _reset_if_other(self, handle: FrameStore) -> None:
         if self._handle is not handle:
-            self._start_anew(handle)
+            self._reset(handle)
 
     def layers(
         self,
@@ -140,8 +139,8 @@ class FrameStates:
         focus_dpt: float,
         tolerance: float = 1.0,
     ) -> FrameLayers:
-        """Return the layers of a pupil and focus, at a rendering tolerance."""
-        self._forget_others(handle)
+        """Return the layers for a pupil, a focus and a rendering tolerance."""
+        self._reset_if_other(handle)
         state = (pupil_diameter_mm, focus_dpt, tolerance)
         if self._layers is None or self._layers[0] != state:
             with timer.wall("psf_plan_ms"):
@@ -163,8 +162,8 @@ class FrameStates:
         gaze_deg: tuple[float, float],
         cell_px: int | None = None,
     ) -> ImageCells:
-        """Return the cells of a gaze; ``cell_px`` requests larger cells than usual."""
-        self._forget_others(handle)
+        """Return the cells for a gaze; ``cell_px`` overrides the default cell size."""
+        self._reset_if_other(handle)
         spec, state = handle.store.spec, (gaze_deg, cell_px)
         if state == (spec.settings.gaze_deg, None):
             return handle.image
@@ -194,7 +193,7 @@ class FrameStates:
         return last[2]
 
     def _weights(self, layers: FrameLayers, image: ImageCells) -> CornerWeights:
-        """Return the corners' weights in the field's spline, the same in any state."""
+        """Return the spline weights at the corners; they are equal in all states."""
         axes, last = layers.field.axes, self._corner_weights
         if last is None or last[0] is not axes or last[1] is not image:
             weights = axes.weights(image.corner_h_deg, image.corner_v_deg)

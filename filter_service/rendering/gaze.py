@@ -1,4 +1,4 @@
-"""Gaze of a frame, clamped to the range that its PSFs were prepared for."""
+"""Gaze of a frame, clamped to the prepared range."""
 
 import math
 
@@ -8,15 +8,15 @@ from filter_service.planning.grid import GridSpec
 ROUNDING_DEG = 1e-6
 
 
-def usable_gaze(
+def clamped_gaze(
     spec: GridSpec, gaze_deg: tuple[float, float] | None
 ) -> tuple[tuple[float, float], tuple[str, ...]]:
-    """Return the gaze (h, v) that a frame uses, and a note if it was changed.
+    """Return a gaze (h, v) clamped to the prepared range, and a note if it changed.
 
     Parameters
     ----------
     gaze_deg : (h, v) or None
-        Requested gaze; None is the spec's.
+        Requested gaze; None stands for that of ``spec``.
 
     Raises
     ------
@@ -25,28 +25,35 @@ def usable_gaze(
     """
     if gaze_deg is None:
         return spec.settings.gaze_deg, ()
-    asked_deg = tuple(float(angle) for angle in gaze_deg)
-    if len(asked_deg) != 2 or not all(math.isfinite(angle) for angle in asked_deg):
+    requested_deg = tuple(float(angle) for angle in gaze_deg)
+    if len(requested_deg) != 2 or not all(
+        math.isfinite(angle) for angle in requested_deg
+    ):
         raise BadMessage(
             f"{gaze_deg}", field="gaze_deg", allowed="two finite angles (h, v)"
         )
     h_deg, v_deg = (
         min(max(angle, middle - reach), middle + reach)
         for angle, middle, reach in zip(
-            asked_deg, spec.settings.gaze_deg, spec.settings.gaze_range_deg, strict=True
+            requested_deg,
+            spec.settings.gaze_deg,
+            spec.settings.gaze_range_deg,
+            strict=True,
         )
     )
-    used_deg = h_deg, v_deg
+    clamped_deg = h_deg, v_deg
     if not spec.follows_field:
-        used_deg = spec.settings.gaze_deg
-    if math.dist(asked_deg, used_deg) <= ROUNDING_DEG:
-        return used_deg, ()
+        clamped_deg = spec.settings.gaze_deg
+    if math.dist(requested_deg, clamped_deg) <= ROUNDING_DEG:
+        return clamped_deg, ()
     reason = (
         "is outside what was prepared"
         if spec.follows_field
         else "is not followed in mode on-axis"
     )
-    return used_deg, (f"gaze {_text(asked_deg)} {reason}: {_text(used_deg)} used",)
+    return clamped_deg, (
+        f"gaze {_text(requested_deg)} {reason}: {_text(clamped_deg)} used",
+    )
 
 
 def _text(gaze_deg: tuple[float, float]) -> str:

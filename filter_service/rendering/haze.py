@@ -1,12 +1,12 @@
 """Straylight of the ocular media, added to a filtered image.
 
-Scattered light has no detail, so it is computed on a coarse grid of visual angle: the
-mean of the pixels in each cell is spread by the scatter function (a convolution by FFT)
-and interpolated back.  Rows and columns of the grid are evenly spaced in the angle
-along the axes of the image, so that each axis can be computed separately; in the corner
-of a field of 80 x 50 deg, distances along v are a fifth too long.  The surroundings of
-the image are assumed to be as bright as its edge, so that a uniform image does not
-change.
+Scattered light has no fine detail, so it is computed on a coarse grid of visual angle:
+the image is averaged over the cells of the grid, convolved with the scatter function
+(by FFT) and interpolated to pixels.  These cells are not those of `image_cells`.  Rows
+and columns of the grid are evenly spaced in the angle along the axes of the image, so
+that each axis can be computed separately; in the corner of a field of 80 x 50 deg,
+distances along v are a fifth too long.  The surroundings of the image are assumed to be
+as bright as its edge, so that a uniform image does not change.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from filter_service.camera import Camera
 from filter_service.constants import RGB
 
 CELL_DEG = 0.5
-"""Edge of a cell, unless there would be too many of them.
+"""Edge of a cell, unless that exceeds `MAX_CELLS`.
 
-Images of a cataract differ by 56 dB from those with cells of 0.125 deg.  Cells of 0.25
-deg reach 59 to 62 dB, but scattering takes twice as long: 11.5 instead of 4.9 ms at
-480x270, 30 instead of 16 at 1280x720.
+The PSNR of a cataract against cells of 0.125 deg is 56 dB.  Cells of 0.25 deg reach 59
+to 62 dB but take twice as long: 11.5 instead of 4.9 ms at 480x270, 30 instead of 16 at
+1280x720.
 """
 
-MOST_CELLS = 384
-"""Largest number of cells along one axis; wider fields have larger cells."""
+MAX_CELLS = 384
+"""Largest cell count along one axis; wider fields have larger cells."""
 
 SAMPLES = 4
-"""Points along each edge of a cell over which the scatter function is averaged."""
+"""Samples of the scatter function along each edge of a cell."""
 
 
 def add_haze(
@@ -48,27 +48,27 @@ def add_haze(
     straylight: Straylight,
     gain_ratio: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> None:
-    """Scatter linear light (height, width, 3) and apply the gains, in place."""
+    """Add straylight to linear light (height, width, 3) and apply gains, in place."""
     from filter_service.rendering.haze_loops import add_scattered, mean_light
 
     grid = haze_grid(camera, straylight)
     rows, columns = grid.rows, grid.columns
     coarse = np.empty((*grid.shape, RGB), np.float32)
     cells = (rows.first_px, rows.shares, columns.first_px, columns.shares)
-    in_threads(mean_light, rows.count, color, *cells, coarse)
-    in_threads(
+    run_in_threads(mean_light, rows.count, color, *cells, coarse)
+    run_in_threads(
         add_scattered,
         len(color),
         color,
         grid.scatter(coarse),
-        rows.place,
-        columns.place,
+        rows.position,
+        columns.position,
         1.0 - grid.fraction,
         np.array(gain_ratio),
     )
 
 
-def in_threads(loop: Callable[..., None], count: int, *arguments: Any) -> None:
+def run_in_threads(loop: Callable[..., None], count: int, *arguments: Any) -> None:
     """Run a loop over the range from 0 to a count, split between threads."""
     n = thread_count()
     edges = [count * k // n for k in range(n + 1)]
@@ -86,7 +86,7 @@ os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive 
 
 
 class HazeGrid:
-    """Cells of a camera's image, and the light that each scatters to the others.
+    """Convolution of a camera's image with the scatter function of an eye.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ class HazeGrid:
         self._outside = np.maximum(self.fraction - inside, 0.0)[..., None]
 
     def scatter(self, coarse: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the scattered light of a coarse image (n, m, 3) in each cell."""
+        """Return the light (n, m, 3) that is scattered into each cell."""
         beyond = self._outside * _edge_light(coarse)
         return (self._spread(coarse) + beyond).astype(np.float32)
 
@@ -129,7 +129,7 @@ class HazeGrid:
 
 @lru_cache(maxsize=8)
 def haze_grid(camera: Camera, straylight: Straylight) -> HazeGrid:
-    """Return the cached grid of a camera and an eye."""
+    """Return the grid of a camera and an eye, cached."""
     return HazeGrid(camera, straylight)
 
 
@@ -142,15 +142,15 @@ class _Axis:
     first_px : (n,)
         Pixel in which each cell begins.
     shares : (n, k)
-        Share of the cell that this pixel and the following ones cover.
-    place : (n_px,)
-        Coordinate of each pixel in cells; cell centers are at whole numbers.
+        Fraction of the cell that this pixel and the following ones cover.
+    position : (n_px,)
+        Pixel centers in units of cells; cell centers are at integers.
     cell_deg : float
     """
 
     first_px: NDArray[np.int64]
     shares: NDArray[np.float64]
-    place: NDArray[np.float64]
+    position: NDArray[np.float64]
     cell_deg: float
 
     @property
@@ -164,7 +164,7 @@ class _Axis:
         edges_deg = np.degrees(np.arctan(np.linspace(first, last, n_px + 1)))
         edges_deg = np.abs(edges_deg - edges_deg[0])
         span_deg = float(edges_deg[-1])
-        count = int(np.clip(round(span_deg / CELL_DEG), 1, MOST_CELLS))
+        count = int(np.clip(round(span_deg / CELL_DEG), 1, MAX_CELLS))
         count = min(count, n_px)
         cells_deg = np.linspace(0.0, span_deg, count + 1)
         starts = np.searchsorted(edges_deg, cells_deg[:-1], side="right") - 1
@@ -178,7 +178,7 @@ class _Axis:
         return cls(
             first_px=starts.astype(np.int64),
             shares=overlap_deg / overlap_deg.sum(axis=1, keepdims=True),
-            place=np.clip(middles_deg / span_deg * count - 0.5, 0.0, count - 1.0),
+            position=np.clip(middles_deg / span_deg * count - 0.5, 0.0, count - 1.0),
             cell_deg=span_deg / count,
         )
 
@@ -186,7 +186,7 @@ class _Axis:
 def _kernel(
     straylight: Straylight, counts: tuple[int, int], cell_deg: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Return the light (2 n - 1, 2 m - 1) that a cell of unit light sends around it."""
+    """Return the light (2 n - 1, 2 m - 1) that one cell scatters around it."""
     sub = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
     offsets = [
         (np.arange(1 - n, n)[:, None] + sub) * size
@@ -214,7 +214,7 @@ def _edge_light(coarse: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _wrapped(kernel: NDArray[Any], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return a kernel with its center at the first element, as an FFT expects."""
+    """Return a kernel padded and rolled, so that its center is the first element."""
     n, m = (kernel.shape[0] + 1) // 2, (kernel.shape[1] + 1) // 2
     found = np.zeros((max(shape[0], 2 * n - 1), max(shape[1], 2 * m - 1)))
     found[: kernel.shape[0], : kernel.shape[1]] = kernel

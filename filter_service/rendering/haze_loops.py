@@ -1,7 +1,7 @@
-"""Compiled loops of `haze.py`: to a coarse grid of angles and back.
+"""Compiled loops of `haze.py`: downsampling to a grid of angles, and upsampling.
 
-Each processes a range of rows, so that threads can share the work: numba's own threads
-may end a process in which two start at once.
+Each loop processes a range of rows, so that `haze` can run it in its own threads:
+numba's threads may crash a process in which two threads start them at the same time.
 """
 
 import numpy as np
@@ -10,14 +10,14 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mean_light(start, end, image, rows, row_shares, columns, column_shares, coarse):
-    """Fill coarse cells (n, m, 3) with the mean of the pixels that lie in them.
+    """Write the mean of the pixels of each coarse cell (n, m, 3).
 
     Parameters
     ----------
     rows, columns : (n,), (m,)
         First pixel of each cell.
     row_shares, column_shares : (n, k), (m, l)
-        Share of a cell that this pixel and the following ones cover; they sum to 1.
+        Fraction of a cell that this pixel and the following ones cover; the sum is 1.
     """
     for i in range(start, end):
         for j in range(coarse.shape[1]):
@@ -40,7 +40,9 @@ def mean_light(start, end, image, rows, row_shares, columns, column_shares, coar
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_scattered(start, end, image, coarse, row_at, column_at, kept, gains):
+def add_scattered(
+    start, end, image, coarse, row_at, column_at, unscattered_ratio, gains
+):
     """Attenuate an image (h, w, 3) and add the scattered light, in place.
 
     Parameters
@@ -48,8 +50,8 @@ def add_scattered(start, end, image, coarse, row_at, column_at, kept, gains):
     coarse : (n, m, 3)
         Scattered light.
     row_at, column_at : (h,), (w,)
-        Coordinates of pixels in cells; cell centers are at whole numbers.
-    kept : float
+        Pixel centers in units of cells; cell centers are at integers.
+    unscattered_ratio : float
         Fraction of the light that is not scattered.
     gains : (3,)
         Transmittance of the media in each channel.
@@ -68,13 +70,13 @@ def add_scattered(start, end, image, coarse, row_at, column_at, kept, gains):
                 under = coarse[below, j, c] + u * (
                     coarse[below, right, c] - coarse[below, j, c]
                 )
-                light = kept * image[y, x, c] + over + v * (under - over)
+                light = unscattered_ratio * image[y, x, c] + over + v * (under - over)
                 image[y, x, c] = np.float32(gains[c] * light)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def encode_srgb(start, end, image, table, encoded):
-    """Encode linear light (n,) as bytes (n,) by a table (size,) over 0 to 1."""
+    """Encode linear light (n,) as bytes (n,) by a lookup table (size,) over 0 to 1."""
     last = table.size - 1
     for k in range(start, end):
         light = image[k]

@@ -1,11 +1,11 @@
-"""Square cells of the image, each with one set of kernels.
+"""Square cells of the image, whose pixels share kernels.
 
-PSFs change slowly over the field, so all pixels of a cell share the kernels of the
-cell's central direction, blended from the three field nodes around it.  A frame then
-needs one lookup per fragment and pixel, on axis and off, where blending in the
-splatting loop needs four (paper section 6.3).  The fastest changes over the field are
-handled apart from the blend: each node's kernel is mapped from the pixels it is stored
-in to those of the cell, and every pixel has its own defocus through its layer.
+PSFs change slowly over the field, so all pixels of a cell use the kernels of the cell's
+center, a weighted sum of those of the three field nodes around it.  Splatting then
+needs one kernel lookup per fragment and pixel, on axis and off axis; blending inside
+the splatting loop needs four (paper section 6.3).  Two faster changes over the field
+are treated separately: a linear map converts each node's kernel from the pixels it is
+stored in to those of the cell, and each pixel has its own defocus, by its layer.
 """
 
 import math
@@ -22,20 +22,22 @@ from filter_service.rendering.cell_maps import CellMaps
 
 CELL_DEG = {"quality": 2.0, "dynamic": 4.0}
 """Largest edge of a cell on the camera's axis.  At 640x360 and nodes for 49 dB, cells
-of 8 and 16 px (1.2 and 2.4 degrees) leave 46.9 and 46.8 dB of myopia, 48.3 and 47.4 dB
-of keratoconus, 51.0 and 50.1 dB of cataract, whose kernels then take 611 and 268 MB."""
+of 8 and 16 px (1.2 and 2.4 degrees) result in a PSNR of 46.9 and 46.8 dB for myopia,
+48.3 and 47.4 dB for keratoconus, and 51.0 and 50.1 dB for cataract, whose kernels take
+611 and 268 MB."""
 
 TEXELS_PER_PIXEL = 10.0
-"""Texels of a frame's single kernels, per pixel; beyond this, cells are made twice as
-wide to save memory.  16 bytes a texel: 150 MB at 1280x720."""
+"""Largest number of texels of a frame's level-0 kernels, per pixel.  If there are more,
+the cells become twice as wide to save memory.  With 16 bytes per texel, the limit is
+150 MB at 1280x720."""
 
 MIN_CELL_PX = 4
 MAX_CELL_PX = 256
-"""Cell edges are powers of two, so that a merged square lies in one cell."""
+"""Cell edges are powers of two, so that each merged square lies within one cell."""
 
 
 class KernelsTooLarge(Exception):
-    """A frame's kernels take too much memory; those of larger cells take less."""
+    """A frame's kernels need too much memory; engines retry with larger cells."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +50,11 @@ class ImageCells:
         Edge of a cell; 0 if one cell is the whole image.
     grid : (columns, rows)
     nodes : (n_cells, 3)
-        Field nodes around each cell's center, as indices into [v, h] in C order.
+        Field nodes around each cell's center: indices into [v, h] in C order.
     weight_ratio : (n_cells, 3)
         Weights of the nodes; their sum is 1.
     maps : CellMaps
-        Maps to the pixels that the nodes' kernels are stored in.
+        Maps to the pixels of the nodes' stored kernels.
     corner_h_deg, corner_v_deg : (rows + 1, columns + 1)
         Field directions of the cells' corners.
     """
@@ -86,7 +88,7 @@ def image_cells(
     gaze_deg : (h, v), optional
         Gaze of the eye; the spec's by default.
     cell_px : int, optional
-        Edge of larger cells than the mode's; their kernels take less memory.
+        Edge of the cells, if larger than the default; their kernels need less memory.
     node_scale : (n_fields, 2, 2), optional
         `stored_scale` of the plan, if already computed.
     """
@@ -101,13 +103,13 @@ def image_cells(
             corner_v_deg=np.zeros((2, 2)),
         )
     gaze_deg = spec.settings.gaze_deg if gaze_deg is None else gaze_deg
-    cell_px = cell_px or usual_cell_px(spec)
+    cell_px = cell_px or default_cell_px(spec)
     camera = spec.camera
     grid = (-(-camera.width_px // cell_px), -(-camera.height_px // cell_px))
     x_px, y_px = np.meshgrid(
         *((np.arange(n) + 0.5) * cell_px for n in grid), indexing="xy"
     )
-    # The last cells may reach beyond the image.
+    # The last cells may extend beyond the image.
     h_deg, v_deg = field_deg(
         camera,
         np.minimum(x_px, camera.width_px).ravel(),
@@ -138,11 +140,11 @@ def image_cells(
 def _field_nodes(
     plan: PlanAxes, h_deg: NDArray[np.float64], v_deg: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return nodes and weights (n_cells, 3) of the triangle around each direction.
+    """Return nodes and barycentric weights (n_cells, 3) of each direction's triangle.
 
-    Each rectangle of nodes is cut along the diagonal that crosses the direction to the
-    axis, because kernels change fastest along that direction; with the other diagonal,
-    frames have 0.5 dB more error in the median.
+    Each rectangle of nodes is divided along the diagonal that is not radial, because
+    kernels change fastest in the radial direction.  With the other diagonal, the median
+    error of frames is 0.5 dB larger.
     """
     h_low, h_high, h_part = bracket_axis(plan.h_deg, h_deg)
     v_low, v_high, v_part = bracket_axis(plan.v_deg, v_deg)
@@ -163,12 +165,12 @@ def can_coarsen(image: ImageCells) -> bool:
 
 
 def check_texels(n_texels: int, image: ImageCells, spec: GridSpec) -> None:
-    """Check the texel count of a frame's single kernels.
+    """Check the texel count of a frame's level-0 kernels.
 
     Raises
     ------
     KernelsTooLarge
-        There are too many texels; wider cells have fewer, see `TEXELS_PER_PIXEL`.
+        There are more than `TEXELS_PER_PIXEL`, and wider cells are possible.
     """
     if not can_coarsen(image):
         return
@@ -176,25 +178,25 @@ def check_texels(n_texels: int, image: ImageCells, spec: GridSpec) -> None:
     if n_texels > allowed:
         raise KernelsTooLarge(
             f"the frame's kernels have {n_texels} texels; expected at most "
-            f"{TEXELS_PER_PIXEL:g} a pixel"
+            f"{TEXELS_PER_PIXEL:g} per pixel"
         )
 
 
 def stored_scale(spec: GridSpec, plan: PlanAxes) -> NDArray[np.float64]:
-    """Return the scale (n_fields, 2, 2) of the pixels of the nodes' stored kernels."""
+    """Return pixels per mrad (n_fields, 2, 2) of the nodes' stored kernels."""
     return spec.node_pixel_from_mrad(*plan.field_nodes_deg)
 
 
 def _node_from_cell(
     node_scale: NDArray[np.float64], cell_scale: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return maps (n_cells, 3, 2, 2) of offsets in pixels, y down."""
+    """Return maps (n_cells, 3, 2, 2) between offsets in pixels, y down."""
     upward = node_scale @ np.linalg.inv(cell_scale)[:, None]
     return upward * np.array([[1.0, -1.0], [-1.0, 1.0]])
 
 
-def usual_cell_px(spec: GridSpec) -> int:
-    """Return the edge of cells when their kernels are few or small enough."""
+def default_cell_px(spec: GridSpec) -> int:
+    """Return the edge of cells unless their kernels need too much memory."""
     pixel_deg = math.degrees(min(spec.pixel_pitch_mrad) / 1000.0)
     power = math.floor(math.log2(max(CELL_DEG[spec.settings.mode] / pixel_deg, 1.0)))
     return min(max(2**power, MIN_CELL_PX), MAX_CELL_PX)

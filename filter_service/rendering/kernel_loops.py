@@ -1,7 +1,6 @@
 """Compiled loops of `frame_kernels.py`, which plan a frame's kernels.
 
-They process a few thousand kernels, once per frame whose pupil, focus or gaze has
-changed.
+They process a few thousand kernels whenever pupil, focus or gaze changes.
 """
 
 import math
@@ -11,32 +10,43 @@ from numba import njit
 
 from filter_service.constants import FIELD_CORNERS, RGB, WEIGHT_MAX
 from filter_service.psfs.read_loops import channel_taps
-from filter_service.rendering.map_loops import MAX_REACH_PX, mapped_reach, moves
+from filter_service.rendering.map_loops import MAX_REACH_PX, mapped_reach, needs_map
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def number_used(place_of):
-    """Replace marks by consecutive numbers, in place; return the marked positions."""
+def number_marked(marks):
+    """Replace nonzero elements by consecutive numbers; return their positions.
+
+    Zeros are replaced by -1.
+    """
     count = 0
-    for place in range(place_of.size):
-        if place_of[place]:
-            place_of[place] = count
+    for position in range(marks.size):
+        if marks[position]:
+            marks[position] = count
             count += 1
         else:
-            place_of[place] = -1
-    places = np.empty(count, np.int64)
-    for place in range(place_of.size):
-        if place_of[place] >= 0:
-            places[place_of[place]] = place
-    return places
+            marks[position] = -1
+    positions = np.empty(count, np.int64)
+    for position in range(marks.size):
+        if marks[position] >= 0:
+            positions[marks[position]] = position
+    return positions
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def used_nodes(used, nodes, weight_ratio, n_fields):
-    """Return kernels' cells, intervals and parts, and nodes' fields and intervals.
+def list_nodes(used, nodes, weight_ratio, n_fields):
+    """List the kernels of used pairs, and the node kernels that they consist of.
 
-    Cells and intervals are (n,), parts (n, 3).  A node of zero weight is replaced by
-    the heaviest one.
+    A node with zero weight is replaced by the node with the largest weight.
+
+    Returns
+    -------
+    cells, intervals : (n,)
+        Pairs of the kernels.
+    parts : (n, 3)
+        Their node kernels.
+    fields, node_intervals : (m,)
+        Field node and interval of each node kernel.
     """
     n_intervals = used.shape[1]
     count = 0
@@ -57,7 +67,7 @@ def used_nodes(used, nodes, weight_ratio, n_fields):
                 parts[k, j] = node * n_intervals + interval
                 number[parts[k, j]] = 1
             k += 1
-    pairs = number_used(number)
+    pairs = number_marked(number)
     for k in range(count):
         for j in range(FIELD_CORNERS):
             parts[k, j] = number[parts[k, j]]
@@ -65,44 +75,51 @@ def used_nodes(used, nodes, weight_ratio, n_fields):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def used_recipes(fields, intervals, n_fields, n_layers):
-    """Return near and far recipes (n,) of nodes, and the recipes' fields and layers."""
+def list_recipes(fields, intervals, n_fields, n_layers):
+    """List the recipes of node kernels: one for each field node and layer.
+
+    Returns
+    -------
+    near, far : (n,)
+        Recipes of each node kernel.
+    recipe_fields, recipe_layers : (m,)
+        Field node and layer of each recipe.
+    """
     near, far = np.empty(fields.size, np.int64), np.empty(fields.size, np.int64)
     number = np.zeros(n_fields * n_layers, np.int64)
     for n in range(fields.size):
         near[n] = fields[n] * n_layers + min(intervals[n], n_layers - 1)
         far[n] = fields[n] * n_layers + min(intervals[n] + 1, n_layers - 1)
         number[near[n]] = number[far[n]] = 1
-    places = number_used(number)
+    positions = number_marked(number)
     for n in range(fields.size):
         near[n], far[n] = number[near[n]], number[far[n]]
-    return near, far, places // n_layers, places % n_layers
+    return near, far, positions // n_layers, positions % n_layers
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_recipes(
     tables, reads, fields, total_dpt, words, steps, sizes, missing, frame_number
 ):
-    """Write recipes, and the sizes of the kernels that they make.
+    """Write recipes, and the sizes of the resulting kernels.
 
-    Returns the number of missing PSFs; if it is not zero, the recipes are invalid until
-    those PSFs are computed.
+    Returns the number of missing PSFs.  If it is not zero, the recipes are not valid.
 
     Parameters
     ----------
     fields : (n,)
-        Grouped by field.
+        Field nodes; equal ones are adjacent.
     total_dpt : (n, 3)
-        Ascending within a field.
+        Ascending within a field node.
     words : (n, 3, 3, RECIPE_TAPS), uint32
         See `NodeKernels.recipes`.
     steps : (n, 3, 3, RECIPE_TAPS), float32
         The same memory.
     sizes : reach_px (n, 4), radius_px (n,), peak_ratio (n,), spread_px (n,)
     missing : (n_psfs,)
-        Output: indices of PSFs that have no kernel, each once.
+        Output: unique indices of the missing PSFs.
     frame_number : int
-        Number written to ``tables.last_used`` of each PSF that is read.
+        Written to ``tables.last_used`` of each PSF that is read.
     """
     reach_px, radius_px, peak_ratio, spread_px = sizes
     n_missing = 0
@@ -119,8 +136,8 @@ def fill_recipes(
         highest, narrowest_px = 0.0, np.inf
         for channel in range(RGB):
             total = total_dpt[n, channel]
-            taken = uppers[channel], psfs, weights
-            channel_taps(tables, reads, fields[n], channel, total, *taken)
+            outputs = uppers[channel], psfs, weights
+            channel_taps(tables, reads, fields[n], channel, total, *outputs)
             peak = spread = 0.0
             for tap in range(n_taps):
                 psf, weight = psfs[tap], weights[tap]
@@ -153,8 +170,8 @@ def fill_recipes(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_kernels(maps, weight_ratio, cells, parts, nodes, made):
-    """Fill in the maps, weights and sizes of kernels.
+def fill_kernels(maps, weight_ratio, cells, parts, nodes, outputs):
+    """Write the maps, weights and sizes of kernels.
 
     Parameters
     ----------
@@ -164,11 +181,11 @@ def fill_kernels(maps, weight_ratio, cells, parts, nodes, made):
     parts : (n, 3)
     nodes : reach_px (m, 4), radius_px (m,), peak_ratio (m,), spread_px (m, 2)
         Sizes of the node kernels.
-    made : weights, maps, reach_px, radius_px, peak_ratio, spread_px
+    outputs : weight_ratio, maps, reach_px, radius_px, peak_ratio, spread_px
         See `FrameKernels`.
     """
     node_reach_px, node_radius_px, node_peak, node_spread_px = nodes
-    part_ratio, part_maps, reach_px, radius_px, peak_ratio, spread_px = made
+    part_ratio, part_maps, reach_px, radius_px, peak_ratio, spread_px = outputs
     side_px = np.empty(4, np.int64)
     for k in range(cells.size):
         cell = cells[k]
@@ -180,12 +197,12 @@ def fill_kernels(maps, weight_ratio, cells, parts, nodes, made):
             for side in range(4):
                 side_px[side] = node_reach_px[part, side]
             area = box = 1.0
-            is_moved = moves(maps.change_ratio[cell, j], widest_px)
+            is_mapped = needs_map(maps.change_ratio[cell, j], widest_px)
             for row in range(2):
                 for column in range(2):
                     own = maps.node_from_cell[cell, j, row, column]
-                    part_maps[k, j, row, column] = own if is_moved else row == column
-            if is_moved:
+                    part_maps[k, j, row, column] = own if is_mapped else row == column
+            if is_mapped:
                 area, box = maps.area_ratio[cell, j], maps.box_ratio[cell, j]
                 mapped_reach(maps.cell_from_node, cell, j, side_px)
                 wider_px = maps.stretch_ratio[cell, j] * (widest_px + 1.0)

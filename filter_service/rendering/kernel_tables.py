@@ -1,4 +1,4 @@
-"""Kernel records of a frame in the layout of the passes: one array, uploaded at once.
+"""Records of a frame's kernels in the layout of the passes, in one array.
 
 The compiled loops are imported when a frame first needs them, as in `frame_kernels`.
 """
@@ -18,7 +18,7 @@ from filter_service.constants import (
 from filter_service.rendering.frame_kernels import FrameKernels, pair_index
 
 PART_ALIGNMENT_WORDS = 64
-"""256 bytes: a valid offset of a buffer part on every OpenGL device."""
+"""256 bytes: every OpenGL device accepts this alignment of a buffer range."""
 
 NODE_WORK = "node work"
 LEVEL_WORK = tuple(f"work of level {level}" for level in range(MAX_LEVEL + 1))
@@ -31,10 +31,10 @@ class KernelLevels:
     Attributes
     ----------
     sizes, starts, step_ratio : (n, levels)
-        Texel count of a kernel and of its sums over squares of 2, 4 and 8 pixels, first
-        texel, and quantization step.
+        Texel count, first texel and quantization step of a kernel and of its sums over
+        squares of 2, 4 and 8 pixels.
     texel_count : int
-        Total over all kernels and levels.
+        Total of all kernels and levels.
     """
 
     sizes: NDArray[np.int64]
@@ -51,10 +51,10 @@ class KernelTables:
     ----------
     words : (n,), uint32
     parts : dict
-        First word and number of words by name: ``NODES`` (n, 2, 4) and ``RECIPES``
-        for blend_psfs, ``PARTS`` (n, 5, 4) for blend_cells, ``KERNELS`` (n, 3, 4),
-        ``KERNEL_OF`` (n_cells, n_intervals), and the work groups (n, 2) of each pass:
-        kernel and first texel.
+        First word and word count by name: ``NODES`` (n, 2, 4) and ``RECIPES`` for
+        blend_psfs, ``PARTS`` (n, 5, 4) for blend_cells, ``KERNELS`` (n, 3, 4),
+        ``KERNEL_OF`` (n_cells, n_intervals), and, for each pass, the kernel and first
+        texel (n, 2) of its work groups.
     node_texel_count : int
     """
 
@@ -69,7 +69,7 @@ class KernelTables:
 
 
 def kernel_levels(kernels: FrameKernels) -> KernelLevels:
-    """Return the sizes of kernels and of their merged forms."""
+    """Return the sizes of kernels at all levels."""
     from filter_service.rendering.table_loops import fill_levels
 
     sizes = np.empty((kernels.count, MAX_LEVEL + 1), np.int64)
@@ -85,7 +85,7 @@ def kernel_levels(kernels: FrameKernels) -> KernelLevels:
 def kernel_tables(
     kernels: FrameKernels, levels: KernelLevels, shape: tuple[int, int]
 ) -> KernelTables:
-    """Return the records of kernels that serve pairs (n_cells, n_intervals)."""
+    """Return the records of kernels; ``shape`` is (n_cells, n_intervals)."""
     from filter_service.rendering.table_loops import (
         count_groups,
         fill_nodes,

@@ -4,23 +4,23 @@ import math
 
 from numba import njit
 
-UNMOVED_PX = 0.5
-"""Maps that would move light by less are not applied: interpolation between stored
-pixels would blur it by as much."""
+MIN_SHIFT_PX = 0.5
+"""Maps that would displace light by less are not applied: interpolation between stored
+pixels blurs light by as much."""
 
-UNMOVED_RATIO = 0.1
-"""Maps that change a kernel's size by less are not applied: the differences between the
-field nodes around a cell are blended away.  At 5 mm over the field of the demo the
-image then differs by 63 to 69 dB from the one with all maps (cataract, myopia,
-keratoconus), and the blend takes half of the time."""
+MIN_SHIFT_RATIO = 0.1
+"""Maps that change a kernel's size by less are not applied: blending the three field
+nodes averages such differences.  At 5 mm over the field of the demo, the PSNR against
+the image with all maps is 63 to 69 dB (cataract, myopia, keratoconus), and blending
+takes half of the time."""
 
 MAX_REACH_PX = 255
-"""One byte per side; light that a map moves beyond it is cut off."""
+"""Reaches are stored in one byte per side; light that a map moves farther is lost."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_ratios(maps, inverse, ratios):
-    """Fill in inverses of maps (n, 3, 2, 2), and ratios (4, n, 3) as in `MapTables`."""
+    """Write inverses of maps (n, 3, 2, 2) and the ratios (4, n, 3) of `MapTables`."""
     for cell in range(maps.shape[0]):
         for j in range(maps.shape[1]):
             a, b = maps[cell, j, 0, 0], maps[cell, j, 0, 1]
@@ -28,7 +28,7 @@ def fill_ratios(maps, inverse, ratios):
             area = a * d - b * c
             inverse[cell, j, 0, 0], inverse[cell, j, 0, 1] = d / area, -b / area
             inverse[cell, j, 1, 0], inverse[cell, j, 1, 1] = -c / area, a / area
-            # The largest singular value of the inverse is the map's over its area.
+            # Largest singular value of the inverse: that of the map over its area.
             longest = 0.5 * (math.hypot(a + d, b - c) + math.hypot(a - d, b + c))
             ratios[0, cell, j] = abs(area)
             ratios[1, cell, j] = abs(area) / abs(a * d)
@@ -38,16 +38,16 @@ def fill_ratios(maps, inverse, ratios):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def moves(change_ratio, radius_px):
-    """Return whether a map is worth applying to a kernel."""
-    return change_ratio > UNMOVED_RATIO and change_ratio * radius_px > UNMOVED_PX
+def needs_map(change_ratio, radius_px):
+    """Return whether a map changes a kernel noticeably."""
+    return change_ratio > MIN_SHIFT_RATIO and change_ratio * radius_px > MIN_SHIFT_PX
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mapped_reach(out, cell, corner, reach_px):
     """Convert reaches (left, right, up, down) to the image's pixels, in place.
 
-    Interpolated light ends one stored pixel beyond the last one.
+    Linear interpolation extends the light by one stored pixel.
     """
     left, right, up, down = reach_px
     for axis in range(2):

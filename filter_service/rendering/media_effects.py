@@ -1,6 +1,6 @@
 """Effects of the ocular media and of spectacles, if a profile requests them.
 
-Spectacles resample the view before it is filtered; the media change its light after.
+Spectacles resample the view before it is filtered; the media change the filtered image.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from estimator.profiles.parse import EyeProfile
 from filter_service.displays import display_wavelengths_nm
 from filter_service.rendering.engine import FrameEngine, Pending, ViewRequest
 from filter_service.rendering.filtered_view import FilteredView
-from filter_service.rendering.haze import add_haze, in_threads
+from filter_service.rendering.haze import add_haze, run_in_threads
 from filter_service.rendering.spectacles import (
     Matrix,
     seen_through,
@@ -40,7 +40,7 @@ class MediaEffects:
     ----------
     straylight : Straylight or None
     gain_ratio : (red, green, blue)
-        Gains of the media relative to the eye that images are made for.
+        Transmittance of the media relative to the eye that images are made for.
     magnification_ratio : (2, 2) or None
         Spectacle magnification, see `spectacles`.
     """
@@ -51,7 +51,7 @@ class MediaEffects:
 
     @classmethod
     def of(cls, profile: EyeProfile, display: str) -> MediaEffects | None:
-        """Return the effects that a profile requests, or None if there are none."""
+        """Return the effects of a profile, or None if it has none."""
         gain_ratio = UNCHANGED
         if profile.yellowing is not None and profile.age_years is not None:
             red, green, blue = channel_gains(
@@ -63,8 +63,8 @@ class MediaEffects:
         found = cls(profile.straylight, gain_ratio, spectacle_magnification(profile))
         return None if found == cls(None) else found
 
-    def change(self, color: NDArray[np.float32], view: RgbdView) -> None:
-        """Change the linear light (height, width, 3) of a filtered view in place."""
+    def apply(self, color: NDArray[np.float32], view: RgbdView) -> None:
+        """Apply the media to linear light (height, width, 3) of a view, in place."""
         if self.straylight is not None:
             add_haze(color, view.camera, self.straylight, self.gain_ratio)
         elif self.gain_ratio != UNCHANGED:
@@ -74,7 +74,7 @@ class MediaEffects:
 def begin_through_media(
     engine: FrameEngine, request: ViewRequest, effects: MediaEffects | None
 ) -> Pending:
-    """Start filtering a view as `FrameEngine.begin` does, with media effects if any."""
+    """Start filtering a view with media effects; see `FrameEngine.begin`."""
     if effects is None:
         return engine.begin(request)
     started_s = time.perf_counter()
@@ -83,10 +83,10 @@ def begin_through_media(
         view = seen_through(view, effects.magnification_ratio)
     before_s = time.perf_counter() - started_s
     begun = engine.begin(replace(request, view=view, output="linear", out=None))
-    return partial(_changed, begun, effects, view, output, before_s)
+    return partial(_finish, begun, effects, view, output, before_s)
 
 
-def _changed(
+def _finish(
     begun: Pending,
     effects: MediaEffects,
     view: RgbdView,
@@ -96,7 +96,7 @@ def _changed(
     rendered = begun()
     started_s = time.perf_counter()
     color = np.ascontiguousarray(rendered.color, dtype=np.float32)
-    effects.change(color, view)
+    effects.apply(color, view)
     color = encoded(color, output)
     media_ms = 1e3 * (time.perf_counter() - started_s + before_s)
     stages_ms = {**rendered.stage_times_ms, "media_ms": media_ms}
@@ -112,7 +112,7 @@ def encoded(color: NDArray[np.float32], output: str) -> NDArray[Any]:
     from filter_service.rendering.haze_loops import encode_srgb
 
     found = np.empty(color.shape, np.uint8)
-    in_threads(
+    run_in_threads(
         encode_srgb, color.size, color.reshape(-1), _encoding(), found.reshape(-1)
     )
     return found

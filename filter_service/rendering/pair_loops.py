@@ -1,6 +1,7 @@
-"""The (cell, interval) pairs that a frame uses, and a prediction for the next frame.
+"""Compiled loops over the (cell, interval) pairs that a frame uses.
 
-The GPU marks parts of intervals, `USED_PARTS` each, as bits in the words of a cell.
+The GPU divides each interval into `USED_PARTS` parts, and sets one bit in the words of
+a cell for each part that a pixel of the cell uses.
 """
 
 import numpy as np
@@ -10,8 +11,8 @@ from filter_service.constants import BITS_PER_WORD, USED_PARTS
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def used_pairs(words, interval_count):
-    """Return the used pairs (n_cells, n_intervals) of words (n_cells, n_words)."""
+def unpack_pairs(words, interval_count):
+    """Unpack bits (n_cells, n_words) to a mask of used pairs (n_cells, n_intervals)."""
     used = np.zeros((words.shape[0], interval_count), np.bool_)
     for cell in range(words.shape[0]):
         for k in range(words.shape[1]):
@@ -26,17 +27,19 @@ def used_pairs(words, interval_count):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def carry_over(words, edge_dpt, change_dpt, new_layer_dpt, new_change_dpt, margin_dpt):
-    """Return pairs (rows, columns, n_intervals) of the same scene in a new state.
+def predict_pairs(
+    words, edge_dpt, change_dpt, new_layer_dpt, new_change_dpt, margin_dpt
+):
+    """Return the mask (rows, columns, n_intervals) of a static scene in a new state.
 
     A pixel's position among the layers is its vergence plus the change of defocus over
-    the field, which is between the changes at its cell's corners.
+    the field.  The latter lies between its values at the corners of the cell.
 
     Parameters
     ----------
     words : (rows, columns, n_words)
     edge_dpt : (n_parts + 1,)
-        Edges of the parts of the intervals in the old state.
+        Bounds of the parts of all intervals in the old state.
     change_dpt, new_change_dpt : (rows + 1, columns + 1)
         Change of defocus at the corners of cells, in the old and in the new state.
     new_layer_dpt : (n_layers,)
@@ -73,8 +76,8 @@ def carry_over(words, edge_dpt, change_dpt, new_layer_dpt, new_change_dpt, margi
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def spread(used):
-    """Return pairs (rows, columns, n_intervals), spread to the eight cells around."""
+def dilate(used):
+    """Dilate a mask (rows, columns, n_intervals) by one cell in all directions."""
     rows, columns, count = used.shape
     found = np.zeros(used.shape, np.bool_)
     for row in range(rows):

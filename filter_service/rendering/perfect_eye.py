@@ -1,4 +1,4 @@
-"""The PSF store of a perfect eye, which leaves every image unchanged."""
+"""PSF store of a perfect eye, whose filter returns the image unchanged."""
 
 from typing import Any
 
@@ -27,11 +27,11 @@ VARIANTS: tuple[tuple[type[Any], Output, Accumulation], ...] = (
     (np.float32, "linear", "coverage"),
     (np.float16, "linear16", "coverage"),
 )
-"""Color type, output and accumulation rule for each code path of an engine."""
+"""Color type, output and accumulation rule of each code path of an engine."""
 
 
 def change_by_perfect_eye(engine: FrameEngine) -> float:
-    """Filter a tiny frame in every variant that clients may request.
+    """Filter a tiny frame once per code path of the engine.
 
     Returns
     -------
@@ -54,9 +54,9 @@ def change_by_perfect_eye(engine: FrameEngine) -> float:
 
 
 def perfect_store(camera: Camera) -> PsfStore:
-    """Return PSFs of one pixel at one pupil, focused at infinity, for 0 to 2 dpt.
+    """Return one-pixel PSFs for one pupil, focus at infinity, objects at 0 to 2 dpt.
 
-    Their nominal spread of 16 px is wide enough for every merging pass to run.
+    Their nominal spread of 16 px is large enough for all levels of merging.
     """
     spec = GridSpec(
         camera,
@@ -98,7 +98,7 @@ def perfect_store(camera: Camera) -> PsfStore:
 
 
 def _at_rest(spec: GridSpec) -> PupilStates:
-    """Return the only state of the perfect eye."""
+    """Return the single state of the perfect eye."""
     return PupilStates.of(
         h_deg=np.zeros(1),
         v_deg=0.0,

@@ -1,10 +1,8 @@
-"""Warm-up: plan a tiny frame, so that dependencies are loaded before the first client.
+"""Warm-up: plan a tiny frame, so that all dependencies are loaded in advance.
 
-Importing numba and SciPy and reading the compiled loops takes 1 s, which a service
-spends after it is ready; compiling them, once per machine, takes 10 s.
+Importing numba and SciPy and loading the compiled loops takes 1 s; the service does so
+after it is ready.  Compilation takes 10 s, once per machine.
 """
-
-from dataclasses import replace
 
 import numpy as np
 
@@ -13,6 +11,7 @@ from estimator.media.straylight import Straylight
 from estimator.wavefront.field_wavefronts import N_RIM
 from filter_service.camera import Camera
 from filter_service.constants import RGB
+from filter_service.planning.nodes import PlanAxes
 from filter_service.planning.plan import NodePlanner
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import PsfStore
@@ -24,7 +23,7 @@ from filter_service.rendering.frame_kernels import (
 from filter_service.rendering.image_cells import image_cells
 from filter_service.rendering.kernel_tables import kernel_levels, kernel_tables
 from filter_service.rendering.media_effects import MediaEffects, encoded
-from filter_service.rendering.pair_loops import carry_over, spread, used_pairs
+from filter_service.rendering.pair_loops import dilate, predict_pairs, unpack_pairs
 from filter_service.rendering.perfect_eye import (
     PUPIL_MM,
     SIDE_PX,
@@ -36,8 +35,8 @@ from filter_service.rgbd_view import RgbdView
 
 
 def plan_once() -> None:
-    """Run every loop that planning a frame may need, without the rendering."""
-    from scipy import interpolate  # noqa: F401  (changes over the field)
+    """Run every compiled loop of frame planning once, without rendering."""
+    from scipy import interpolate  # noqa: F401  (used by `FieldDefocus`)
 
     store = perfect_store(Camera(SIDE_PX, SIDE_PX, TANGENTS))
     layers = frame_layers(store, pupil_diameter_mm=PUPIL_MM, focus_dpt=0.0)
@@ -49,31 +48,37 @@ def plan_once() -> None:
     depth_m[0, 0] = np.nan
     fill_missing_depth(depth_m)
     _plan_nodes_once(store)
-    _tell_pairs_once()
+    _predict_pairs_once()
     _defocus_once()
     light = np.ones((SIDE_PX, SIDE_PX, RGB), np.float32)
     view = RgbdView(light, light[..., 0].copy(), store.spec.camera.tangents)
     seen_through(view, ((0.9, 0.0), (0.0, 0.9)))
-    MediaEffects(Straylight()).change(light, view)
+    MediaEffects(Straylight()).apply(light, view)
     encoded(light, "srgb8")
 
 
 def _plan_nodes_once(store: PsfStore) -> None:
-    """Plan the nodes of one state over the field, as frames do."""
-    spec = store.spec.with_settings(mode="dynamic")
-    axes = replace(store.plan, nodes=None, h_deg=np.arange(2.0), defocus_error=1e-3)
+    """Plan the nodes of one state over the field."""
+    spec, plan = store.spec.with_settings(mode="dynamic"), store.plan
+    axes = PlanAxes(
+        h_deg=np.arange(2.0),
+        v_deg=plan.v_deg,
+        pupils_mm=plan.pupils_mm,
+        accommodations_dpt=plan.accommodations_dpt,
+        defocus_error=1e-3,
+    )
     NodePlanner(store.eye, spec, axes).nodes(0, 0)
 
 
-def _tell_pairs_once() -> None:
+def _predict_pairs_once() -> None:
     words = np.ones((1, 1, 1), np.uint32)
     corners, layer_dpt = np.zeros((2, 2), np.float32), np.arange(3.0)
-    used_pairs(words[0], 1)
-    spread(carry_over(words, layer_dpt, corners, layer_dpt, corners, 0.0))
+    unpack_pairs(words[0], 1)
+    dilate(predict_pairs(words, layer_dpt, corners, layer_dpt, corners, 0.0))
 
 
 def _defocus_once() -> None:
-    """Run the defocus loops of a traced eye, as the perfect eye is only a wavefront."""
+    """Run the defocus loops of traced eyes; the perfect eye is a wavefront only."""
     count = N_DEGREES + N_RIM
     grid = np.arange(2.0, 4.0), np.ones(count), np.ones(1), np.ones((1, 1, 2, 1, count))
     index, sums = np.zeros(1, np.int64), np.zeros((1, N_DEGREES))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from filter_service.errors import BadMessage, CameraMismatch
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import ViewRequest
-from filter_service.rendering.gaze import usable_gaze
+from filter_service.rendering.gaze import clamped_gaze
 from filter_service.settings import Output, RenderOptions
 from filter_service.validation import checked
 
@@ -18,7 +18,7 @@ OUTPUT_DTYPES = {"linear": np.float32, "srgb8": np.uint8, "linear16": np.float16
 def check_request(
     request: ViewRequest, store: PsfStore
 ) -> tuple[tuple[float, float], tuple[str, ...]]:
-    """Check a request; return the gaze to use, with notes if it differs.
+    """Check a request; return the clamped gaze, and a note if it was changed.
 
     Raises
     ------
@@ -27,14 +27,15 @@ def check_request(
     CameraMismatch
         The store is for another camera, see `camera.is_same_camera`.
     """
-    checked(request.output, Output, "output")
+    output: Any = Output  # mypy takes only classes for types as arguments
+    checked(request.output, output, "output")
     checked(request.options.fields(), RenderOptions)
     if not store.spec.serves(request.view.camera):
         raise CameraMismatch(
-            f"PSFs are for {store.spec.camera}, the view's is {request.view.camera}",
+            f"the PSFs are for {store.spec.camera}, the view has {request.view.camera}",
             field="tangents",
         )
-    return usable_gaze(store.spec, request.gaze_deg)
+    return clamped_gaze(store.spec, request.gaze_deg)
 
 
 def output_array(request: ViewRequest) -> NDArray[Any]:
@@ -51,8 +52,8 @@ def output_array(request: ViewRequest) -> NDArray[Any]:
         return np.empty(shape, dtype)
     if out.shape != shape or out.dtype != dtype or not out.flags.carray:
         raise BadMessage(
-            f"an array {out.shape} of {out.dtype}",
+            f"it is {out.dtype} of shape {out.shape}",
             field="out",
-            allowed=f"{shape} of {dtype}, contiguous and writeable",
+            allowed=f"{dtype} of shape {shape}, contiguous and writeable",
         )
     return out

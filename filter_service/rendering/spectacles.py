@@ -1,10 +1,10 @@
-"""Spectacle magnification: a myope's spectacles make everything appear smaller.
+"""Spectacle magnification: spectacles for myopia make everything appear smaller.
 
-A thin lens of power F at L in front of the entrance pupil shows every direction at
-1 / (1 - L F) of its tangent: 0.92 at -6 dpt, 12 mm in front of the cornea.  A cylinder
-does so along its meridians.  The view is resampled at that size before it is filtered,
-because blur arises in the eye and does not shrink; the surroundings of the camera's
-image are its repeated edge.
+A thin lens of power F, at a distance L in front of the entrance pupil, scales the
+tangent of every direction by 1 / (1 - L F): by 0.92 at -6 dpt, 12 mm in front of the
+cornea.  A cylinder scales along its meridians.  The view is resampled before it is
+filtered, because blur arises in the eye and is not magnified.  Outside the camera's
+image, its edge is repeated.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from filter_service.rendering.srgb import linear_from_srgb
 from filter_service.rgbd_view import RgbdView
 
 ENTRANCE_PUPIL_MM = 3.05
-"""Distance behind the cornea, as always unless an eye model says otherwise."""
+"""Distance from the cornea, in eyes that are not described by surfaces."""
 
 MM_PER_M = 1e3
 Matrix = tuple[tuple[float, float], tuple[float, float]]
 
 
 def spectacle_magnification(profile: EyeProfile) -> Matrix | None:
-    """Return seen over actual tangents, or None if the profile does not request it."""
+    """Return apparent over actual tangents, or None if the profile omits it."""
     if not profile.spectacle_magnification or profile.correction is None:
         return None
     m, j0, j45 = rx.power_vector(replace(profile.correction, vertex_mm=0.0))
@@ -42,11 +42,11 @@ def spectacle_magnification(profile: EyeProfile) -> Matrix | None:
 
 def seen_through(view: RgbdView, magnification: Matrix) -> RgbdView:
     """Return the view as seen through spectacles, in linear light."""
-    from filter_service.rendering.spectacle_loops import draw_anew
+    from filter_service.rendering.spectacle_loops import resample
 
     left, right, up, down = view.tangents
     steps = (right - left) / view.width_px, (down - up) / view.height_px
-    place = np.array([left, up, *steps])
+    frame = np.array([left, up, *steps])
     to_source = np.linalg.inv(np.array(magnification))
     images: dict[str, Any] = {}
     for color, depth in (("color", "depth_m"), ("hidden_color", "hidden_depth_m")):
@@ -54,9 +54,9 @@ def seen_through(view: RgbdView, magnification: Matrix) -> RgbdView:
         if light is None:
             continue
         light = _linear(light)
-        drawn, deep = np.empty_like(light), np.empty_like(meters)
-        draw_anew(light, meters, place, to_source, drawn, deep)
-        images |= {color: drawn, depth: deep}
+        resampled, resampled_m = np.empty_like(light), np.empty_like(meters)
+        resample(light, meters, frame, to_source, resampled, resampled_m)
+        images |= {color: resampled, depth: resampled_m}
     return replace(view, **images)
 
 

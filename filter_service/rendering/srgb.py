@@ -1,4 +1,4 @@
-"""Conversion between encoded images and linear light: IEC 61966-2-1 and half floats."""
+"""Conversion between linear light and sRGB (IEC 61966-2-1) or half floats."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Compiled loops of `kernel_tables.py`, which write the passes' kernel records."""
+"""Compiled loops of `kernel_tables.py`, which write the kernel records."""
 
 import math
 
@@ -29,17 +29,17 @@ def box(reach_px, k):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def packed(reach_px, k):
-    """Pack four reaches as the bytes of a word."""
+    """Return the four reaches of a kernel as bytes of a word."""
     across = reach_px[k, 0] | reach_px[k, 1] << 8
     return across | reach_px[k, 2] << 16 | reach_px[k, 3] << 24
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_levels(reach_px, spread_px, peak_ratio, sizes, starts, scale):
-    """Fill in texel counts, first texels and steps (n, levels) of kernels.
+    """Write texel counts, first texels and quantization steps (n, levels) of kernels.
 
-    Levels are the kernel and its merged forms.  There are no texels above the level for
-    which a kernel is wide enough at one end.  Returns the total texel count.
+    A kernel has no texels at levels whose squares are too large for its spread.
+    Returns the total texel count.
     """
     start = 0
     for k in range(peak_ratio.size):
@@ -61,7 +61,10 @@ def fill_levels(reach_px, spread_px, peak_ratio, sizes, starts, scale):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_groups(node_reach_px, sizes, threads, counts):
-    """Count work groups (1 + levels) of nodes and of each level; return node texels."""
+    """Count the work groups of nodes and of each level; return the nodes' texel count.
+
+    ``counts`` has 1 + levels elements.
+    """
     counts[:] = 0
     texels = 0
     for k in range(node_reach_px.shape[0]):
@@ -76,7 +79,7 @@ def count_groups(node_reach_px, sizes, threads, counts):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_nodes(words, floats, first, nodes, threads, work):
-    """Write node records from word `first` on, and their work groups from `work` on."""
+    """Write node records from word ``first`` and work groups from word ``work`` on."""
     near, far, reach_px, peak_ratio = nodes
     start = 0
     for k in range(near.size):
@@ -94,7 +97,7 @@ def fill_nodes(words, floats, first, nodes, threads, work):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_records(words, floats, firsts, kernels, levels, threads, works):
-    """Write records of kernels and of their parts, and the work groups of each level.
+    """Write the records of kernels and parts, and the work groups of each level.
 
     Parameters
     ----------
@@ -105,7 +108,7 @@ def fill_records(words, floats, firsts, kernels, levels, threads, works):
     kernels : spread_px, radius_px, reach_px, parts, weights, maps
     levels : sizes, starts, scale
     works : (levels,)
-        First words of the groups; on return, their end.
+        First word of each level's work groups; on return, the word after the last.
     """
     spread_px, radius_px, reach_px, parts, weight_ratio, maps = kernels
     sizes, starts, scale = levels

@@ -1,4 +1,4 @@
-"""White level: the reference light for the contrast of pixels that may merge."""
+"""White level: reference of the contrast below which pixels merge."""
 
 from typing import Any
 
@@ -9,16 +9,14 @@ WHITE_STEP_PX = 8
 """Stride in pixels at which the white level is sampled."""
 
 WHITE_PERCENTILE, WHITE_RATIO = 90.0, 2.0
-"""The white level of a linear image is its brightest light, but at most this ratio
-times the 90th percentile of its lit pixels, so that a lamp or a window in a room does
-not set it."""
+"""The white level of a linear image is its maximum, but at most this ratio times the
+90th percentile of its lit pixels, so that a small light source does not set it."""
 
 
 def white_level(color: NDArray[Any]) -> float:
-    """Return the white level of an image: 1 for 8-bit input.
+    """Return the white level of an image; it is 1 for 8-bit images.
 
-    Linear light may have any unit, so merging, and with it the whole filter, must scale
-    with the light.
+    The unit of linear light is arbitrary, so the merging threshold must scale with it.
     """
     if color.dtype == np.uint8:
         return 1.0

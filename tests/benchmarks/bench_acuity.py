@@ -32,7 +32,7 @@ from estimator.acuity import (
 )
 from estimator.optics.prescription import zernike_from_power_vector
 from estimator.optics.zernike import rescale_pupil
-from estimator.periphery.people import load_people
+from estimator.periphery.measured_eyes import load_measured_eyes
 from estimator.profiles.typical_aberrations import (
     TYPICAL_PUPIL_MM,
     typical_zernike_um,
@@ -49,7 +49,7 @@ ASTIGMATISM_RATIO = 0.5
 
 PUPILS_MM = (2.0, 3.0, 4.0, 6.0)
 DEFOCUS_DPT = (1.0, 2.0, 3.0, 4.0, 6.0)
-YOUNG_LOG_MAR = -0.13
+YOUNG_ADULT_LOG_MAR = -0.13
 SMITH_ARCMIN = 0.65
 FOVEAL_CPD = 65.37
 
@@ -64,7 +64,7 @@ def _row(method, case, setting, n, times_ms, name, error, reference) -> Row:
 
 def measured_eyes(residual_dpt: float) -> list[NDArray[np.float64]]:
     """Return wavefronts (28,), um on 4 mm, of people's higher orders and a residue."""
-    axis_um = load_people(PEOPLE).axis_um
+    axis_um = load_measured_eyes(PEOPLE).axis_um
     axis_um = axis_um[np.isfinite(axis_um).all(axis=1)]
     noise = np.random.default_rng(0).standard_normal((len(axis_um), 3))
     noise *= residual_dpt * np.array([1.0, ASTIGMATISM_RATIO, ASTIGMATISM_RATIO])
@@ -130,7 +130,7 @@ def acuity_rows(pupils_mm, defocus_dpt) -> list[Row]:
             times_ms = [1e3 * (time.perf_counter() - start_s)]
             if error_dpt == 0.0:
                 method, reference = "in focus", "Elliott et al. 1995"
-                expected = YOUNG_LOG_MAR
+                expected = YOUNG_ADULT_LOG_MAR
             else:
                 method, reference = "out of focus", "Smith 1991"
                 expected = np.log10(SMITH_ARCMIN * pupil_mm * error_dpt)

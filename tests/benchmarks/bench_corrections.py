@@ -25,7 +25,7 @@ from functools import partial
 import numpy as np
 
 from estimator.corrections.progressive import ProgressiveLens
-from estimator.corrections.worn_lens import WornLens, own_polynomial
+from estimator.corrections.worn_lens import WornLens, aberration_polynomial
 from estimator.optics import prescription as rx
 from estimator.optics.zernike import index_from_nm
 from estimator.profiles.parse import parse_profile
@@ -171,7 +171,7 @@ def decentred_coma_um() -> float:
         decentration_mm=[0.5, 0.0],
     )
     return float(
-        zernike_from_polynomial(own_polynomial(lens), 3.0)[index_from_nm(3, 1)]
+        zernike_from_polynomial(aberration_polynomial(lens), 3.0)[index_from_nm(3, 1)]
     )
 
 

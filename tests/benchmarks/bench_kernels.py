@@ -22,7 +22,6 @@ from estimator.optics.units import SPHERE_PER_C20
 from filter_service.constants import RGB
 from filter_service.planning.node_wavefronts import NodeWavefronts
 from filter_service.planning.plan import plan_cache
-from filter_service.psfs.boxes import square_kernel
 from filter_service.psfs.compute_kernels import computed_kernels, generic_kernels
 from filter_service.psfs.pack import PackedKernels
 from filter_service.psfs.psf_engine import PYTHON, psf_engine
@@ -31,6 +30,7 @@ from tests.benchmarks.harness import Row, memory_mb, publish
 from tests.benchmarks.psf_rates import FOCUSES_DPT, PUPILS_MM, traced_slices
 from tests.benchmarks.published_figures import CONDITIONS
 from tests.numerical.plan_cases import spec_for, traced_eye
+from tests.reference.packed_kernels import square_kernel
 from tests.reference.psf_integral import reference_kernel
 
 COUNT = 3000

@@ -27,13 +27,14 @@ from estimator.optics.prescription import power_vectors_dpt
 from estimator.optics.units import SPHERE_PER_C20
 from estimator.optics.zernike import N_TERMS, nm_from_index, rescale_pupil
 from estimator.periphery.change import peripheral_change
+from estimator.periphery.measured_eyes import MeasuredEyes, load_measured_eyes
 from estimator.periphery.meridian import CIRCLE_MM, TERMS
-from estimator.periphery.people import People, load_over_field, load_people
 from estimator.periphery.population import Population, measured_population
 from estimator.profiles.parse import parse_profile, preset_names
 from filter_service.progress import Progress
 from tests.benchmarks.harness import RESULTS, Row, memory_mb, publish
 from tests.benchmarks.people_picture import plot_fields, show_scene
+from tests.measured_fields import load_measured_fields
 
 FILE = Path(__file__).parents[1] / "data" / "peripheral_wavefronts.npz"
 ANGLES_DEG = (-40.0, -30.0, -20.0, -10.0, 10.0, 20.0, 30.0, 40.0)
@@ -88,7 +89,9 @@ def told_change_um(profile, h_deg, v_deg=0.0) -> NDArray[np.float64]:
     return zernike_um[1:] - zernike_um[0]
 
 
-def folds(people: People, count: int, seed: int = SEED) -> Iterator[NDArray[np.bool_]]:
+def folds(
+    people: MeasuredEyes, count: int, seed: int = SEED
+) -> Iterator[NDArray[np.bool_]]:
     """Yield who is left out (n,), a share of the persons each time."""
     persons = np.random.default_rng(seed).permutation(np.unique(people.person))
     for k in range(count):
@@ -114,9 +117,9 @@ def fitted_ridge(inputs: NDArray, targets: NDArray, strength: float) -> Callable
 class Meridian:
     """What every method is judged by: changes of people at the angles."""
 
-    def __init__(self, people: People):
+    def __init__(self, people: MeasuredEyes):
         known = np.isfinite(people.axis_um).all(axis=-1)
-        self.people = people.of(known)
+        self.people = people.select(known)
         place = {float(h): k for k, h in enumerate(self.people.h_deg)}
         at = [place[-angle] for angle in ANGLES_DEG]
         self.change_um = self.people.change_um[:, at]
@@ -177,7 +180,7 @@ def meridian_predictions(
     for k, out in enumerate(folds(judged.people, fold_count)):
         for name in names:
             found[name][out] = judged.linear(name.removeprefix("linear, "), out)
-        with _population_of(judged.people.of(~out)):
+        with _population_of(judged.people.select(~out)):
             for name, options in (
                 ("people", {"given": False}),
                 ("people, +-20 deg given", {"given": True}),
@@ -205,7 +208,7 @@ def ratio_rows(judged: Meridian, fold_count: int, draws: int) -> Iterator[Row]:
         ours, linear = (np.full(judged.change_um.shape, np.nan) for _ in range(2))
         for out in folds(judged.people, fold_count, seed):
             linear[out] = judged.linear("M", out)
-            with _population_of(judged.people.of(~out)):
+            with _population_of(judged.people.select(~out)):
                 ours[out] = judged.ours(out, given=False)
         errors = [median_errors(told, judged.change_um)[0] for told in (ours, linear)]
         ratios.append(errors[0] / errors[1])
@@ -221,9 +224,9 @@ def ratio_rows(judged: Meridian, fold_count: int, draws: int) -> Iterator[Row]:
             )
 
 
-def _population_of(people: People):
+def _population_of(people: MeasuredEyes):
     """Return a context in which these people are the population."""
-    population = Population.of(people)
+    population = Population.fit(people)
     return patch("estimator.periphery.change.measured_population", lambda: population)
 
 
@@ -277,7 +280,7 @@ def direction_rows() -> Iterator[Row]:
 
 def field_rows() -> Iterator[Row]:
     """Errors over the whole field of five people that no population has seen."""
-    directions_deg, zernike_um = load_over_field(FILE)
+    directions_deg, zernike_um = load_measured_fields(FILE)
     h_deg, v_deg = directions_deg.T
     axis = int(np.flatnonzero((h_deg == 0.0) & (v_deg == 0.0))[0])
     on_disc = (h_deg >= 10.0) & (h_deg <= 20.0)  # the optic disc spoils these
@@ -336,7 +339,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print the report alone")
     parser.add_argument("--plot", action="store_true", help="fields of the presets")
     options = parser.parse_args()
-    judged = Meridian(load_people(FILE))
+    judged = Meridian(load_measured_eyes(FILE))
     measured_population()
     with Progress(quiet=options.json) as progress:
         task = progress.task("people", total=1.0, unit="%")

@@ -4,9 +4,9 @@
 
 Interpolation: PSNR of images of *Courtyard*'s spectrum, filtered with PSFs as a frame
 reads them from the plan against exactly computed ones, at random states of frames
-(`sample_use`: half of the objects in focus).  Memory and time: a cache really built, or
-for large ones a random part of its PSFs.  The paper's grids also at their nodes, where
-only storage errs, and half-way between nodes of all axes at once.
+(`sample_states`: half of the objects in focus).  Memory and time: a cache really built,
+or for large ones a random part of its PSFs.  The paper's grids also at their nodes,
+where only storage errs, and half-way between nodes of all axes at once.
 """
 
 import argparse
@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from estimator.psf.survey import survey_pupils
-from filter_service.planning.cost import cost_terms, sampled_states
+from filter_service.planning.cost import cost_terms, plan_states
 from filter_service.planning.nodes import CachePlan
 from filter_service.planning.plan import unchecked_plan
 from filter_service.planning.slopes import state_frames
@@ -82,12 +82,12 @@ class Built:
 
 def build_part(eye, spec, plan: CachePlan, count: int) -> Built:
     """Compute and pack PSFs of a plan; processor time over the cores it would use."""
-    states = sampled_states(spec, plan, count)
+    states = plan_states(spec, plan, count)
     total = plan.prediction.psf_count
     size, spent_s, done = 0, 0.0, 0
     with ThreadPoolExecutor(2) as pool:
         for first in range(0, states.h_deg.size, PART):
-            part = states.taken(slice(first, first + PART))
+            part = states.select(slice(first, first + PART))
             start_s = time.process_time()
             batch = exact_kernels(eye, spec, part)
             packed = pack_kernels(
@@ -198,10 +198,10 @@ def calibrate(n_psfs: int) -> dict[str, float]:
             for width_px in (480, 1280, 2000):
                 spec = spec_for(width_px, width_px * 9 // 16, mode="dynamic")
                 eye = traced_eye(name, spec)
-                states = sampled_states(spec, unchecked_plan(eye, spec), n_psfs)
+                states = plan_states(spec, unchecked_plan(eye, spec), n_psfs)
                 order = np.argsort(states.pupil_diameter_mm, kind="stable")
                 for rows in np.array_split(order, max(2, n_psfs // PART)):
-                    part = states.taken(rows)
+                    part = states.select(rows)
                     times_us = []
                     for _ in range(3):
                         start_s = time.process_time()

@@ -57,7 +57,7 @@ document.addEventListener("keydown",
 
 def pressed(page: PageUnderTest, name: str, key: str) -> dict[str, float]:
     """Move a slider by one step; return the times in ms to its pictures."""
-    page.slider(name).locator("[tabindex='0']").press(key)
+    page.slider(name).press(key)
     press = page.page.evaluate("window.pressed.at(-1)")
     page.settle(after=press["after"])
     newer = [entry for entry in page.drawn() if entry["number"] > press["after"]]
@@ -70,7 +70,7 @@ def pressed(page: PageUnderTest, name: str, key: str) -> dict[str, float]:
 
 def dragged(page: PageUnderTest, name: str) -> list[float]:
     """Move a slider to and fro; return the times between two pictures, ms."""
-    thumb = page.slider(name).locator("[tabindex='0']")
+    thumb = page.slider(name)
     first = page.number()
     end_s, step = time.monotonic() + DRAG_S, 0
     while time.monotonic() < end_s:

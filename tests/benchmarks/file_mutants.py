@@ -118,7 +118,7 @@ def kinds(folder: Path) -> list[Kind]:
 
     def store(path: Path) -> object:
         cache = StoreCache(str(path.parent), max_mb=100)
-        return cache.load(path.stem, go_on=lambda: None)
+        return cache.load(path.stem, check_cancelled=lambda: None)
 
     def of(*endings: str) -> dict[str, bytes]:
         return {k: v for k, v in pictures.items() if k.endswith(endings)}

@@ -2,7 +2,7 @@
 
     python -m tests.benchmarks.plan_law [--quick]
 
-States are drawn as `sample_use` draws them, neighbours at random distances along one
+States are drawn as `sample_states` draws them, neighbours at random distances along one
 axis, blended half and half; the error is that of frames of *Courtyard* filtered with
 the blend and with the exact PSF.  Writes results/plan_law.json.
 """
@@ -15,8 +15,8 @@ from scipy.optimize import least_squares
 
 from filter_service.planning import error_law as law
 from filter_service.planning.node_wavefronts import PupilStates
-from filter_service.planning.sampled_use import moved, sample_use
 from filter_service.planning.slopes import slopes_px, state_frames
+from filter_service.planning.state_samples import moved, sample_states
 from tests.benchmarks.harness import commit_id, machine_info, write_report
 from tests.numerical.plan_cases import (
     exact_kernels,
@@ -58,13 +58,13 @@ def frame_spectrum(image, side_px=512):
     return np.mean(parts, axis=0)
 
 
-def neighbours(use, axis, rng, limits):
+def neighbours(sample, axis, rng, limits):
     """Lower and upper neighbours of states, and which of them stay in the limits."""
-    count = use.vergence_dpt.size
+    count = sample.vergence_dpt.size
     low, high = STEPS[axis]
     step = np.exp(rng.uniform(math.log(low), math.log(high), count))
     if axis == "defocus":
-        columns = vars(use.states)
+        columns = vars(sample.states)
         total_dpt = columns["total_defocus_dpt"]
         pair = [
             PupilStates(**columns | {"total_defocus_dpt": total_dpt + sign * step})
@@ -72,19 +72,19 @@ def neighbours(use, axis, rng, limits):
         ]
         return pair, np.ones(count, bool)
     name = {"pupil": "pupil_diameter_mm", "accommodation": "accommodation_dpt"}
-    values = vars(use.states)[name.get(axis, f"{axis}_deg")]
+    values = vars(sample.states)[name.get(axis, f"{axis}_deg")]
     first, last = limits[axis]
     good = (values - step >= first) & (values + step <= last)
     step = np.where(good, step, 0.0)
-    return [moved(use, axis, values + sign * step) for sign in (-1.0, 1.0)], good
+    return [moved(sample, axis, values + sign * step) for sign in (-1.0, 1.0)], good
 
 
 def measured(name, width_px, axis, rng, count, spectrum):
     """Features and mean square errors of random neighbours along an axis."""
     spec = spec_for(width_px, width_px * 9 // 16, mode="dynamic")
     eye = traced_eye(name, spec)
-    use = sample_use(eye, spec, 4096)
-    use = use.taken(rng.choice(4096, count, replace=False))
+    sample = sample_states(eye, spec, 4096)
+    sample = sample.select(rng.choice(4096, count, replace=False))
     pupils_mm = tuple(eye.usable_pupil_mm(p) for p in spec.settings.pupil_range_mm)
     used_dpt = eye.accommodation_nodes_dpt(
         spec.settings.focus_range_dpt, pupil_range_mm=pupils_mm
@@ -95,10 +95,10 @@ def measured(name, width_px, axis, rng, count, spectrum):
         "pupil": pupils_mm,
         "accommodation": (used_dpt[0], used_dpt[-1]),
     }
-    pair, good = neighbours(use, axis, rng, limits)
+    pair, good = neighbours(sample, axis, rng, limits)
     low_px, high_px = (slopes_px(state_frames(eye, spec, states)) for states in pair)
-    good &= np.hypot(*np.moveaxis(use.exact_px, -1, 0)).max(axis=1) < 90.0
-    kernels = [exact_kernels(eye, spec, states) for states in (*pair, use.states)]
+    good &= np.hypot(*np.moveaxis(sample.exact_px, -1, 0)).max(axis=1) < 90.0
+    kernels = [exact_kernels(eye, spec, states) for states in (*pair, sample.states)]
     errors = np.full(count, np.nan)
     for k in np.flatnonzero(good):
         side = max(batch[k].kernel.shape[0] for batch in kernels)
@@ -109,12 +109,12 @@ def measured(name, width_px, axis, rng, count, spectrum):
             inner = slice(edge, side - edge)
             difference[inner, inner] += weight * kernel / kernel.sum(dtype=np.float64)
         errors[k] = image_error(difference, spectrum)
-    aside_px = 0.5 * (low_px + high_px) - use.exact_px
+    aside_px = 0.5 * (low_px + high_px) - sample.exact_px
     features = {
         "difference2": law.mean_square(high_px - low_px),
         "aside2": law.mean_square(aside_px),
-        "covariance": law.spot_covariance(use.exact_px),
-        "unit": use.unit_px,
+        "covariance": law.spot_covariance(sample.exact_px),
+        "unit": sample.unit_px,
     }
     return {k: v[good] for k, v in features.items()}, errors[good]
 

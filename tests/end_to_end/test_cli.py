@@ -108,7 +108,7 @@ def test_a_device_that_is_not_there_is_refused_with_those_that_are(scene):
     finished = run(*arguments, OCUFILTER_GL_DEVICE="7")
     assert finished.returncode != 0
     said = " ".join(finished.stderr.split())
-    assert "gl_device is 7; allowed: auto, or a device of EGL: 0 (" in said
+    assert "gl_device is 7; allowed: auto, or an EGL device: 0 (" in said
     refused = run("serve", "--gl-device", "7", "--bind", "tcp://127.0.0.1:*")
     assert refused.returncode == 1
     assert "gl_device is 7; allowed: auto" in " ".join(refused.stderr.split())

@@ -298,10 +298,10 @@ def test_rights_and_a_pair_that_does_not_fit_are_told(ring, tmp_path):
 
     server = ring.folder / "server.toml"
     ring.folder.chmod(0o777)
-    assert "has mode 0777: other users may change it; expected 0700" in refusal()
+    assert "has mode 0777: other users can change it; expected 0700" in refusal()
     ring.folder.chmod(0o700)
     server.chmod(0o644)
-    assert "has mode 0644: other users may read it; expected 0600" in refusal()
+    assert "has mode 0644: other users can read it; expected 0600" in refusal()
     server.chmod(0o600)
     other = KeyRing(tmp_path / "elsewhere").create()
     server.write_text(

@@ -395,7 +395,7 @@ def test_lateral_color_is_asked_of_a_traced_eye(real_client):
             settings=settings | {"eye_model": eye_model, "lateral_color": lateral},
             views=[view],
         )
-        holds_none = any("no lateral color" in note for note in ready.notes)
+        holds_none = any("lateral_color has no effect" in note for note in ready.notes)
         assert holds_none == (eye_model == "wavefront")
         images[eye_model, lateral] = real_client.filter(view, **SEE).color
     assert np.abs(images["traced", True] - images["traced", False]).max() > 0.005

@@ -19,10 +19,10 @@ from filter_service.planning.grid import pupil_nodes_mm
 from filter_service.planning.node_wavefronts import PupilStates
 from filter_service.planning.nodes import bracket_axis
 from filter_service.planning.paper_grid import DISTANCES_DPT
-from filter_service.planning.sampled_use import FIELD_OF_AXIS, sample_use
-from filter_service.psfs.boxes import square_kernel
+from filter_service.planning.state_samples import FIELD_OF_AXIS, sample_states
 from filter_service.psfs.pack import pack_kernels
 from tests.grid_specs import grid_spec
+from tests.reference.packed_kernels import square_kernel
 
 SPECTRUM_SIDE_PX = 256
 
@@ -232,11 +232,17 @@ def sampled_errors(eye, spec, plan, *, count, seed=0, axes=ALL_AXES, spectrum=No
         Which axes are interpolated: with "defocus" all must be; the others alone or
         together.
     """
-    use = sample_use(eye, spec, 4096)
+    sample = sample_states(eye, spec, 4096)
     chosen = np.random.default_rng(seed).choice(4096, count, replace=False)
-    use = use.taken(chosen)
+    sample = sample.select(chosen)
     return state_errors(
-        eye, spec, plan, use.states, use.vergence_dpt, axes=axes, spectrum=spectrum
+        eye,
+        spec,
+        plan,
+        sample.states,
+        sample.vergence_dpt,
+        axes=axes,
+        spectrum=spectrum,
     )
 
 

@@ -18,7 +18,11 @@ from filter_service.constants import (
 )
 from filter_service.planning.grid import BASE_OBJECT_STEP_DPT
 from filter_service.psfs.boxes import box_sizes, pack_reach
-from filter_service.rendering.map_loops import MAX_REACH_PX, UNMOVED_PX, UNMOVED_RATIO
+from filter_service.rendering.map_loops import (
+    MAX_REACH_PX,
+    MIN_SHIFT_PX,
+    MIN_SHIFT_RATIO,
+)
 
 
 def neighbors(store, reads, fields, total_dpt):
@@ -132,8 +136,8 @@ def frame_kernels(store, layers, image, used):
     spread_px = nodes["recipe_spread_px"][np.stack([nodes["near"], nodes["far"]], -1)]
     maps = image.maps.node_from_cell[cells]
     inverse, area, box, stretch, change = map_tables(maps)
-    is_moved = (change > UNMOVED_RATIO) & (
-        change * nodes["radius_px"][parts] > UNMOVED_PX
+    is_moved = (change > MIN_SHIFT_RATIO) & (
+        change * nodes["radius_px"][parts] > MIN_SHIFT_PX
     )
     area = np.where(is_moved, area, 1.0)
     reach_px, radius_px = mapped_sizes(

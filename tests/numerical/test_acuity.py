@@ -8,6 +8,7 @@ import pytest
 from estimator.acuity import (
     acuity_over_field,
     acuity_through_focus,
+    best_correction_um,
     mean_eye_transfer,
     optical_transfer,
     predict_acuity,
@@ -17,7 +18,7 @@ from estimator.acuity.sensitivity import contrast_sensitivity, perfect_transfer
 from estimator.field.field_table import field_table
 from estimator.optics.prescription import zernike_from_power_vector
 from estimator.optics.zernike import rescale_pupil, zernike_values
-from estimator.periphery.people import load_people
+from estimator.periphery.measured_eyes import load_measured_eyes
 from estimator.profiles.parse import parse_profile
 from estimator.profiles.typical_aberrations import (
     TYPICAL_PUPIL_MM,
@@ -50,6 +51,29 @@ def test_a_perfect_pupil_has_its_transfer_in_closed_form(pupil_mm, wavelength_nm
     )
     assert found.modulation(CPD) == pytest.approx(expected, abs=0.006)
     assert np.abs(found.transfer_ratio.imag).max() < 1e-12
+
+
+@pytest.mark.parametrize("pupil_mm", [3.0, 6.0])
+def test_the_best_correction_of_a_lens_is_its_opposite(pupil_mm):
+    zernike_um = np.zeros(28)
+    zernike_um[3:6] = 0.4, -1.1, 0.7
+    pupil = {"zernike_radius_mm": pupil_mm / 2, "wavelength_nm": 555.0}
+    found = best_correction_um(zernike_um, **pupil)
+    assert predict_acuity(found, **pupil).visual_strehl_ratio > 0.999
+    assert np.array_equal(found[6:], zernike_um[6:])
+
+
+def test_no_lens_of_a_grid_beats_the_best_correction():
+    pupil = {"zernike_radius_mm": 2.5, "wavelength_nm": 555.0}
+    zernike_um = typical(5.0)
+    zernike_um[[7, 12]] += 0.3, 0.1
+    best = predict_acuity(best_correction_um(zernike_um, **pupil), **pupil)
+    tried = zernike_um.copy()
+    for m_um in np.linspace(-0.6, 0.6, 5):
+        for j0_um in (-0.3, 0.0, 0.3):
+            tried[3:6] = 0.0, m_um, j0_um
+            other = predict_acuity(tried, **pupil)
+            assert other.visual_strehl_ratio < best.visual_strehl_ratio + 0.001
 
 
 def test_large_defocus_has_the_transfer_of_a_disc():
@@ -140,7 +164,7 @@ def test_a_perfect_eye_has_a_ratio_of_one_and_tilt_does_not_matter():
 def test_a_wavefront_too_steep_is_refused():
     steep = np.zeros(28)
     steep[4] = 200.0
-    with pytest.raises(ValueError, match="up to"):
+    with pytest.raises(ValueError, match="at most"):
         predict_acuity(steep, zernike_radius_mm=3.0)
     with pytest.raises(ValueError, match="finite"):
         predict_acuity(np.full(28, np.nan), zernike_radius_mm=3.0)
@@ -190,7 +214,7 @@ def test_people_pass_on_what_the_mean_eye_does():
     Terms of orders 3 and 4 alone pass far more; with what best correction leaves of
     sphere and cylinder (0.3 dpt from eye to eye) they pass what he found.
     """
-    axis = load_people(PEOPLE).axis_um
+    axis = load_measured_eyes(PEOPLE).axis_um
     axis = axis[np.isfinite(axis).all(axis=1)][::5]
     spread = np.random.default_rng(0).standard_normal((len(axis), 3))
     at_cpd = np.array([5.0, 10.0, 20.0, 30.0])

@@ -13,9 +13,16 @@ from tests.numerical.synthetic import Bench, texture
 from tests.shader_variants import Kind, renderer_variants
 
 MODULES = (kernel_loops, map_loops, pair_loops, table_loops, layer_loops, read_loops)
-INNER = {"clipped", "bracket", "channel_taps", "number_used", "mapped_reach", "moves"}
+INNER = {
+    "clipped",
+    "bracket",
+    "channel_taps",
+    "number_marked",
+    "mapped_reach",
+    "needs_map",
+}
 INNER |= {"layer_blur_px", "_steps", "_between", "box", "packed"}
-INNER |= {"carry_over", "spread"}  # a software renderer needs none; see `plan_once`
+INNER |= {"predict_pairs", "dilate"}  # a software renderer needs none; see `plan_once`
 """Called by other loops alone: where those are read from disk, they are not."""
 
 

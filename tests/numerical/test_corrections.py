@@ -13,7 +13,7 @@ from estimator.corrections.progressive import (
 from estimator.corrections.rings import DiffractiveRings, RefractiveZones
 from estimator.corrections.worn_lens import (
     WornLens,
-    own_polynomial,
+    aberration_polynomial,
     shifted_polynomial,
     worn_polynomial,
     worn_refraction,
@@ -167,12 +167,12 @@ def test_published_modulation_is_met():
 
 def test_a_lens_off_its_center_has_coma_and_keeps_its_power():
     lens = WornLens(0.0, spherical_aberration_um=0.3, centre_mm=(0.3, -0.4))
-    zernike_um = zernike_from_polynomial(own_polynomial(lens), 3.0)
+    zernike_um = zernike_from_polynomial(aberration_polynomial(lens), 3.0)
     per_mm = -0.3 / 3.0 * 2.0 * np.sqrt(10.0)
     assert zernike_um[index_from_nm(4, 0)] == pytest.approx(0.3)
     assert zernike_um[index_from_nm(3, 1)] == pytest.approx(0.3 * per_mm)
     assert zernike_um[index_from_nm(3, -1)] == pytest.approx(-0.4 * per_mm)
-    centered = own_polynomial(WornLens(0.0, spherical_aberration_um=0.3))
+    centered = aberration_polynomial(WornLens(0.0, spherical_aberration_um=0.3))
     through = zernike_from_polynomial(centered, 2.0)
     assert total_defocus_dpt(through, 2.0) == pytest.approx(0.0, abs=1e-12)
 
@@ -197,7 +197,7 @@ def test_refraction_of_a_lens_through_any_pupil():
     through = at_center_dpt + per_mm2 * 2.0**2
     paraxial_dpt = -3.0 / 1.009
     aside_dpt = total_defocus_dpt(
-        zernike_from_polynomial(own_polynomial(lens), 2.0), 2.0
+        zernike_from_polynomial(aberration_polynomial(lens), 2.0), 2.0
     )
     assert through == pytest.approx(paraxial_dpt - aside_dpt)
 
@@ -231,7 +231,7 @@ def test_the_powers_of_a_progressive_lens_are_those_of_one_surface():
 def test_a_progressive_lens_takes_off_what_spectacles_of_its_power_do():
     lens = ProgressiveLens.of(
         rx.Prescription(-4.0, -1.0, 30.0, 12.0), add_dpt=2.0, corridor_mm=14.0
-    ).looking((8.0, -20.0))
+    ).with_gaze_offset((8.0, -20.0))
     found = progressive_polynomial(lens, 0.0, 0.0, entrance_pupil_mm=3.0)
     expected = worn_polynomial(lens, entrance_pupil_mm=3.0)
     assert found == pytest.approx(expected, abs=1e-9)

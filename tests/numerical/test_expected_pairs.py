@@ -9,7 +9,7 @@ from filter_service.constants import USED_PARTS
 from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.gl.expected_pairs import MARGIN_DPT, part_edges_dpt
 from filter_service.rendering.gl.renderer import FilterRenderer
-from filter_service.rendering.pair_loops import carry_over, spread, used_pairs
+from filter_service.rendering.pair_loops import dilate, predict_pairs, unpack_pairs
 from tests.numerical.plan_cases import spec_for, traced_eye
 from tests.numerical.scene_frames import scene_view
 
@@ -63,14 +63,14 @@ def test_all_pairs_of_the_same_scene_are_told(new_count, rng):
     new_places_dpt, new_layer_dpt, new_change_dpt = scene.state(new_count)
     edge_dpt = part_edges_dpt(SimpleNamespace(layer_dpt=layer_dpt))
     words = words_of(noted(places_dpt, edge_dpt))
-    told = carry_over(
+    told = predict_pairs(
         words, edge_dpt, change_dpt, new_layer_dpt, new_change_dpt, MARGIN_DPT
     )
     ends_dpt = new_layer_dpt if new_count > 1 else np.array([-np.inf, np.inf])
     wanted = noted(new_places_dpt, ends_dpt)
     assert told.shape == wanted.shape
     assert not np.any(wanted & ~told)
-    wide = spread(told)
+    wide = dilate(told)
     for row in range(ROWS):
         for column in range(COLUMNS):
             around = told[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
@@ -79,7 +79,7 @@ def test_all_pairs_of_the_same_scene_are_told(new_count, rng):
 
 def test_parts_of_intervals_are_pairs(rng):
     parts = rng.random((1, 7, 29 * USED_PARTS)) < 0.05
-    used = used_pairs(words_of(parts)[0], 29)
+    used = unpack_pairs(words_of(parts)[0], 29)
     np.testing.assert_array_equal(used, parts[0].reshape(7, 29, -1).any(axis=2))
 
 
@@ -89,7 +89,7 @@ def test_the_same_state_tells_little_more_than_is_used(rng):
     edge_dpt = part_edges_dpt(SimpleNamespace(layer_dpt=layer_dpt))
     change_dpt = np.zeros((ROWS + 1, COLUMNS + 1))
     parts = rng.random((ROWS, COLUMNS, 29, USED_PARTS)) < 0.03
-    told = carry_over(
+    told = predict_pairs(
         words_of(parts.reshape(ROWS, COLUMNS, -1)),
         *(edge_dpt, change_dpt, layer_dpt, change_dpt, MARGIN_DPT),
     )

@@ -197,5 +197,5 @@ def test_a_frame_says_where_its_blur_is_limited():
     object.__setattr__(spec.settings, "object_range_dpt", (0.0, 40.0))
     eye = traced_eye("emmetropia", spec)
     store = build_psf_store(eye, spec)
-    assert "blur beyond 6 px" in " ".join(frame_layers(store, **STATE).notes)
+    assert "limited to a radius of 6 px" in " ".join(frame_layers(store, **STATE).notes)
     assert store.reach_px.max() <= 6

@@ -89,7 +89,7 @@ def test_gains_of_the_reference_are_one_and_adapted_white_keeps_its_luminance():
     old = channel_gains(display_nm, age_years=75.0, yellowing="adapted")
     assert old @ [0.2126, 0.7152, 0.0722] == pytest.approx(1.0)
     assert old[0] > old[1] > old[2]
-    with pytest.raises(ValueError, match="seen and adapted"):
+    with pytest.raises(ValueError, match="seen, adapted"):
         channel_gains(display_nm, age_years=75.0, yellowing="yes")
 
 

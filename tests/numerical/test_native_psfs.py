@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from estimator.corrections.kinoform import Kinoform
@@ -14,7 +14,6 @@ from estimator.psf.kernel_types import PsfTooLarge
 from estimator.psf.stiles_crawford import StilesCrawford
 from filter_service.native.library import Library, library_path
 from filter_service.planning.node_wavefronts import NodeWavefronts
-from filter_service.psfs.boxes import square_kernel
 from filter_service.psfs.compute_kernels import mean_batch, pack_pool
 from filter_service.psfs.native_psfs import (
     NativePsfs,
@@ -24,6 +23,7 @@ from filter_service.psfs.native_psfs import (
 )
 from filter_service.psfs.pack import pack_kernels
 from tests.numerical.psf_cases import CASE_NAMES, case_zernike_um
+from tests.reference.packed_kernels import square_kernel
 from tests.reference.psf_integral import reference_kernel
 
 RGB_NM = np.array([[610.0], [536.0], [460.0]])
@@ -122,6 +122,17 @@ def error_ratio(found, truth):
     return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
 
 
+def shared_error_ratio(found, truth):
+    """Relative error of the texels that are nonzero in both kernels."""
+    shared = (found > 0.0) & (truth > 0.0)
+    return error_ratio(found[shared], truth[shared])
+
+
+def unshared_light_ratio(first, second):
+    """Larger share of the light of a kernel in texels that are zero in the other."""
+    return max(first[second <= 0.0].sum(), second[first <= 0.0].sum())
+
+
 def random_zernike(rng, count, waves):
     """Wavefronts of random size: low orders dominate."""
     zernike_um = rng.standard_normal((count, 28))
@@ -139,6 +150,7 @@ def random_zernike(rng, count, waves):
     pupil_mm=st.sampled_from([1.0, 3.0, 5.0, 8.0]),
     pitch_mrad=st.sampled_from([0.3, 0.73, 2.0, 5.0]),
 )
+@example(seed=396, waves=6.0, pupil_mm=1.0, pitch_mrad=2.0)
 def test_random_wavefronts_have_the_kernels_of_the_python_engine(
     seed, waves, pupil_mm, pitch_mrad
 ):
@@ -163,7 +175,11 @@ def test_random_wavefronts_have_the_kernels_of_the_python_engine(
     assert not left.size
     assert methods.total() == 12
     for k in range(12):
-        assert error_ratio(kernel(ours, k), kernel(theirs, k)) <= 0.04, k
+        pair = kernel(ours, k), kernel(theirs, k)
+        # One engine may crop a row or column that the other keeps.  In the example,
+        # these texels contain 0.2 % of the light, but 5.5 % of the kernel's norm.
+        assert shared_error_ratio(*pair) <= 0.02, k
+        assert unshared_light_ratio(*pair) <= 0.01, k
         assert ours.spread_px[k] == pytest.approx(theirs.spread_px[k], rel=0.05)
         # what is kept differs by what is meant by the light outside
         assert ours.lost_energy_ratio[k] <= 1.4 * (1.0 - KEPT)

@@ -58,7 +58,7 @@ def test_eyes_in_turn_find_their_kernels_again(lanes, eyes):
 
 
 def test_of_many_eyes_those_used_last_are_kept(lanes, eyes, monkeypatch):
-    monkeypatch.setattr(eye_states, "MAX_KEPT", 2)
+    monkeypatch.setattr(eye_states, "MAX_EYES", 2)
     handles = [lanes.load(store) for store, _ in eyes]
 
     def blends(number):

@@ -21,7 +21,11 @@ from filter_service.planning.slopes import state_survey
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import PsfStore, build_psf_store
 from filter_service.rendering.frame_kernels import frame_kernels, interval_count
-from filter_service.rendering.frame_use import FrameUse, SampledView, first_frame
+from filter_service.rendering.sampled_frame import (
+    SampledFrame,
+    SampledView,
+    first_frame,
+)
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
 from tests.numerical.plan_cases import spec_for, traced_eye
@@ -302,7 +306,7 @@ def test_memory_is_limited(streamed, views):
         assert small.memory_mb <= limit_mb
     assert small.generation > 0
     tiny = PsfStore(eye, replace(spec, memory_budget_mb=0.001), plan)
-    with pytest.raises(OutOfMemory, match="one frame take"):
+    with pytest.raises(OutOfMemory, match="one frame need"):
         renderer.render(views[0], renderer.load(tiny), **STATES[0])
 
 
@@ -344,7 +348,7 @@ def test_what_is_computed_ahead_is_what_the_frame_needs(streamed, views):
         state = {k: state[k] for k in ("pupil_diameter_mm", "focus_dpt")}
         store, renderer = PsfStore(*streamed), NativeRenderer()
         handle = renderer.load(store)
-        use = FrameUse(0.0, *state.values(), None, (SampledView.of(view),))
+        use = SampledFrame(0.0, *state.values(), None, (SampledView.of(view),))
         ahead = handle.missing_psfs(use)
         handle.fill(ahead, until_s=time.monotonic() + 60.0, batch_count=512)
         assert store.computed_count == ahead.size

@@ -6,7 +6,8 @@ import pytest
 from estimator.field.field_table import field_table
 from estimator.optics.prescription import power_vectors_dpt
 from estimator.optics.zernike import N_TERMS, flip_horizontal, nm_from_index
-from estimator.periphery.change import FREE_UM, peripheral_change
+from estimator.periphery.change import OFF_MERIDIAN_UM, peripheral_change
+from estimator.periphery.measured_eyes import load_measured_eyes
 from estimator.periphery.meridian import (
     CIRCLE_MM,
     KNOTS_DEG,
@@ -16,7 +17,6 @@ from estimator.periphery.meridian import (
     field_terms,
     meridian_weights,
 )
-from estimator.periphery.people import load_over_field, load_people
 from estimator.periphery.population import Population, measured_population
 from estimator.profiles.parse import ProfileError, parse_profile
 from tests.benchmarks.bench_people import (
@@ -27,6 +27,7 @@ from tests.benchmarks.bench_people import (
     median_errors,
     profile_of,
 )
+from tests.measured_fields import load_measured_fields
 
 GRID_DEG = np.stack(
     np.meshgrid(np.linspace(-38.0, 38.0, 9), np.linspace(-24.0, 24.0, 7)), axis=-1
@@ -35,7 +36,7 @@ GRID_DEG = np.stack(
 
 @pytest.fixture(scope="module")
 def people():
-    return Meridian(load_people(FILE))
+    return Meridian(load_measured_eyes(FILE))
 
 
 def asked(profile, h_deg, v_deg=0.0, pupil_mm=4.0, **options):
@@ -100,7 +101,7 @@ def test_the_spline_ends_softly_where_nobody_was_measured():
 
 
 def test_the_file_holds_what_the_measured_people_give():
-    fitted = Population.of(load_people(FILE))
+    fitted = Population.fit(load_measured_eyes(FILE))
     shipped = measured_population()
     assert np.allclose(shipped.mean_um, fitted.mean_um, atol=1e-4)
     assert np.allclose(shipped.deviation_um, fitted.deviation_um, atol=1e-4)
@@ -128,7 +129,7 @@ def left_out(people):
         for name in ("ours", "M", "ours given", "linear given")
     }
     for out in folds(people.people, 5):
-        population = Population.of(people.people.of(~out))
+        population = Population.fit(people.people.select(~out))
         found["ours"][out] = predicted(people, out, population, given=False)
         found["ours given"][out] = predicted(people, out, population, given=True)
         found["M"][out] = people.linear("M", out)
@@ -156,7 +157,7 @@ def test_the_stated_uncertainty_is_that_of_people(people):
     measured_dpt = power_vectors_dpt(_all_terms(people.change_um), CIRCLE_MM)[..., 0]
     inside = []
     for out in folds(people.people, 5):
-        population = Population.of(people.people.of(~out))
+        population = Population.fit(people.people.select(~out))
         for eye in np.flatnonzero(out):
             change = peripheral_change(
                 profile_of(people.people.axis_um[eye]), population
@@ -241,11 +242,11 @@ def test_the_model_alone_stays_what_it_was():
     profile = preset("emmetropia", periphery="model")
     table = asked(profile, [-30.0, 30.0])
     assert table.power_dpt[0] == pytest.approx(table.power_dpt[1], abs=1e-3)
-    assert any("eye model's own" in note for note in table.notes)
+    assert any("from the eye model" in note for note in table.notes)
 
 
 def test_the_free_field_is_as_large_as_people_depart():
-    directions_deg, zernike_um = load_over_field(FILE)
+    directions_deg, zernike_um = load_measured_fields(FILE)
     h_deg, v_deg = directions_deg.T
     axis = np.flatnonzero((h_deg == 0.0) & (v_deg == 0.0))[0]
     judged = (np.abs(v_deg) == 25.0) & (np.abs(h_deg) <= 30.0)
@@ -259,7 +260,7 @@ def test_the_free_field_is_as_large_as_people_depart():
         for eye in zernike_um
     ]
     found_um = np.sqrt(np.mean(np.square(left_um), axis=(0, 1)))
-    assert list(FREE_UM.values()) == pytest.approx(found_um, abs=0.006)
+    assert list(OFF_MERIDIAN_UM.values()) == pytest.approx(found_um, abs=0.006)
 
 
 # ----- directions that were measured
@@ -307,7 +308,7 @@ def test_measurements_that_contradict_each_other_meet_in_the_middle_and_say_so()
     profile = measured_set([(20.0, 0.0, 2.0), (20.0, 0.0, -2.0)])
     table = asked(profile, [0.0, 20.0])
     assert table.power_dpt[1, 0] - table.power_dpt[0, 0] == pytest.approx(0.0, abs=0.3)
-    assert any("contradict" in note for note in table.notes)
+    assert any("misfit" in note for note in table.notes)
 
 
 # ----- hard cases

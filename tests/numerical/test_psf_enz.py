@@ -7,7 +7,12 @@ import pytest
 from scipy.special import eval_legendre, jv, spherical_jn
 
 from estimator.psf.compute import EnzOutsideDomain, compute_psf_batch, compute_psfs
-from estimator.psf.enz_series import enz_function, radial_polynomial, zernike_betas
+from estimator.psf.enz_series import (
+    hankel_table,
+    radial_nodes,
+    radial_polynomial,
+    zernike_betas,
+)
 from tests.numerical.psf_cases import (
     CASE_NAMES,
     case_zernike_um,
@@ -35,6 +40,19 @@ def enz(zernike_um, *, pupil_mm=3.0, method="enz", **options):
         method=method,
         **options,
     )[0]
+
+
+def enz_function(n, m, r, defocus_rad):
+    """V_n^|m|(r, f) (k,) by the quadrature of the series, r in lambda / radius."""
+    r = np.atleast_1d(np.asarray(r, np.float64))
+    rho, weight = radial_nodes(n, abs(defocus_rad), float(r.max(initial=0.0)))
+    weighted = np.zeros((rho.size, 2 * abs(m) + 1), np.complex128)
+    weighted[:, -1] = (
+        weight * rho * np.exp(1j * defocus_rad * rho**2) * radial_polynomial(n, m, rho)
+    )
+    out = np.empty((r.size, weighted.shape[1]), np.complex128)
+    hankel_table(r, rho, weighted, out)
+    return out[:, -1]
 
 
 @pytest.mark.parametrize(("n", "m"), TERMS)

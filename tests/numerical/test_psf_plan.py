@@ -21,7 +21,7 @@ from filter_service.planning.nodes import (
     bracket_axis,
 )
 from filter_service.planning.plan import PlanTooLarge, plan_cache, unchecked_plan
-from filter_service.planning.sampled_use import sample_use
+from filter_service.planning.state_samples import sample_states
 from filter_service.psfs.store import build_psf_store
 from tests.lens_truth import worn_eye
 from tests.numerical.plan_cases import (
@@ -162,14 +162,14 @@ def test_every_defocus_that_frames_read_lies_between_nodes(name, model, settings
     spec = spec_for(**settings)
     eye = measured_eye(name) if model == "wavefront" else traced_eye(name, spec)
     plan = plan_cache(eye, spec)
-    use = sample_use(eye, spec, 400)
-    states = use.states
+    sample = sample_states(eye, spec, 400)
+    states = sample.states
     channel = (states.wavelength_nm[:, None] == spec.channel_wavelengths_nm).argmax(
         axis=1
     )
     for v in bracket_axis(plan.v_deg, states.v_deg)[:2]:
         for h in bracket_axis(plan.h_deg, states.h_deg)[:2]:
-            total_dpt = use.vergence_dpt + eye.total_defocus_dpt(
+            total_dpt = sample.vergence_dpt + eye.total_defocus_dpt(
                 h_deg=plan.h_deg[h],
                 v_deg=plan.v_deg[v],
                 pupil_diameter_mm=states.pupil_diameter_mm,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filter_service.errors import BadMessage
-from filter_service.rendering.gaze import usable_gaze
+from filter_service.rendering.gaze import clamped_gaze
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec
 from tests.numerical.synthetic import tangents, texture
@@ -104,14 +104,14 @@ def spec_of(h_half_deg, **settings):
 
 def test_one_direction_for_the_whole_image_does_not_follow_the_gaze():
     spec = spec_of(20.0, mode="on-axis", gaze_range_deg=(30.0, 30.0))
-    used_deg, notes = usable_gaze(spec, (5.0, 0.0))
+    used_deg, notes = clamped_gaze(spec, (5.0, 0.0))
     assert used_deg == (0.0, 0.0)
     assert "on-axis" in notes[0]
 
 
 def test_a_range_of_gaze_keeps_the_image_within_the_field():
     spec_of(40.0, gaze_deg=(10.0, 0.0), gaze_range_deg=(29.0, 0.0))
-    with pytest.raises(ValueError, match=r"31 beside a field of -50 to 30.* 80"):
+    with pytest.raises(ValueError, match=r"31 deg with a field of -50 to 30.* 80"):
         spec_of(40.0, gaze_deg=(10.0, 0.0), gaze_range_deg=(31.0, 0.0))
     with pytest.raises(ValueError, match="gaze_range_deg"):
         spec_of(40.0, gaze_range_deg=(0.0, -1.0))

@@ -1,5 +1,7 @@
 """The bins' lists against their twin, at their limits, and what frames make of them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -43,13 +45,14 @@ def view(bench, rng):
 def new_passes(bench, *, paper_rule=False, surface_count=1):
     """Passes of a view, about to make its lists."""
     view = bench.view(np.zeros((HEIGHT, WIDTH, 3), np.float32), 1.0)
+    if surface_count == 2:
+        view = replace(view, hidden_color=view.color, hidden_depth_m=view.depth_m)
     strip = Strip(
         bench.gpu,
         view,
         StageTimer(bench.gpu),
         layers=bench.layers(),
         paper_rule=paper_rule,
-        surface_count=surface_count,
     )
     return ListPasses(strip, search_blocks=0)
 
@@ -98,7 +101,7 @@ def made_lists(passes, blocks, place, color, *, reach_px):
         passes.count_bins()
         totals = np.empty(constants.TOTAL_WORDS, np.uint32)
         gpu.read_into((*passes.totals, totals))
-        passes.take_totals(totals)
+        passes.record_totals(totals)
         passes.reserve_lists()
         assert len(passes.bands) == 1
         passes.make_lists(0, passes.strip.bin_count)
@@ -219,11 +222,11 @@ def test_a_list_that_overflows_keeps_its_first_entries_and_is_counted(
     assert bench.render(view).color.tobytes() == whole.color.tobytes()
 
 
-@pytest.mark.parametrize("limit", ["MAX_BAND_ENTRIES", "MAX_GROUPS"])
+@pytest.mark.parametrize("limit", ["MAX_BAND_ENTRIES", "MAX_BAND_BINS"])
 @pytest.mark.parametrize("rule", RULES)
 def test_bands_change_nothing(bench, view, monkeypatch, limit, rule):
     whole = bench.render(view, accumulation=rule)
-    few = 7 if limit == "MAX_GROUPS" else whole.entry_count // 7
+    few = 7 if limit == "MAX_BAND_BINS" else whole.entry_count // 7
     monkeypatch.setattr(list_bands, limit, few)
     banded = bench.render(view, accumulation=rule)
     assert (banded.entry_count, banded.overflow_count) == (whole.entry_count, 0)

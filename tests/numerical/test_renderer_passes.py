@@ -9,7 +9,7 @@ from filter_service.rendering.frame import fill_missing_depth
 from filter_service.rendering.gl import kernel_passes
 from filter_service.rendering.image_cells import image_cells
 from filter_service.rendering.kernel_tables import kernel_levels
-from filter_service.rendering.pair_loops import used_pairs
+from filter_service.rendering.pair_loops import unpack_pairs
 from tests.numerical.synthetic import Bench, depth_scene, texture
 from tests.reference import render_passes as reference
 
@@ -91,7 +91,7 @@ def made_kernels(bench, view, **state):
     layers, image = bench.layers(**state), image_cells(bench.spec, bench.store.plan)
     words = kernel_passes.words_per_cell(layers)
     used = read(bench, "USED", (image.count, words), np.uint32)
-    used = used_pairs(used, frame_kernels.interval_count(layers))
+    used = unpack_pairs(used, frame_kernels.interval_count(layers))
     return frame_kernels.frame_kernels(bench.store, layers, image, used)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filter_service.gl import copying
-from filter_service.gl.staging import FIRST_BYTES
+from filter_service.gl.staging import INITIAL_BYTES
 from tests.numerical.synthetic import Bench, depth_scene, texture
 
 SIZE = {"width_px": 150, "height_px": 101, "vertical_fov_deg": 8.0}
@@ -22,7 +22,7 @@ def staged(gpu, request):
         gpu.use_staging(was_staged)
 
 
-@pytest.mark.parametrize("count", [1, 3, 1000, FIRST_BYTES // 4 + 5])
+@pytest.mark.parametrize("count", [1, 3, 1000, INITIAL_BYTES // 4 + 5])
 def test_arrays_come_back_as_they_went(staged, rng, count):
     sent = rng.random((2, count)).astype(np.float32)
     with staged.context:
@@ -38,7 +38,7 @@ def test_arrays_come_back_as_they_went(staged, rng, count):
 @pytest.mark.parametrize("size", [0, 1, 1999, 2000, 4001, 12_345])
 @pytest.mark.parametrize("cores", [1, 4, 16])
 def test_threads_copy_every_byte_once(monkeypatch, rng, size, cores):
-    monkeypatch.setattr(copying, "PART_BYTES", 1000)
+    monkeypatch.setattr(copying, "MIN_PART_BYTES", 1000)
     monkeypatch.setattr(copying, "thread_count", lambda: cores)
     sent = rng.integers(0, 256, size, np.uint8)
     room = np.full(size + 2, 77, np.uint8)
@@ -48,7 +48,7 @@ def test_threads_copy_every_byte_once(monkeypatch, rng, size, cores):
 
 
 def test_a_copy_that_fails_says_so(monkeypatch):
-    monkeypatch.setattr(copying, "PART_BYTES", 10)
+    monkeypatch.setattr(copying, "MIN_PART_BYTES", 10)
     monkeypatch.setattr(copying, "thread_count", lambda: 4)
     locked = np.zeros(100, np.uint8)
     locked.setflags(write=False)
@@ -57,7 +57,7 @@ def test_a_copy_that_fails_says_so(monkeypatch):
 
 
 def test_a_full_block_starts_anew_without_losing_what_was_sent(staged, rng):
-    sent = [rng.integers(0, 2**32, FIRST_BYTES // 12, np.uint32) for _ in range(9)]
+    sent = [rng.integers(0, 2**32, INITIAL_BYTES // 12, np.uint32) for _ in range(9)]
     with staged.context:
         buffers = [
             staged.upload(f"staging test {n}", words) for n, words in enumerate(sent)

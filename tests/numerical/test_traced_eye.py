@@ -127,7 +127,7 @@ def test_a_focus_that_was_not_traced_is_said():
     for pupil_mm in PUPILS_MM:
         assert eye.notes(pupil_diameter_mm=pupil_mm, focus_dpt=1.9) == ()
         (note,) = eye.notes(pupil_diameter_mm=pupil_mm, focus_dpt=4.0)
-        assert "outside what was prepared" in note
+        assert "outside the prepared range" in note
         used_dpt = eye.reachable_focus_dpt(4.0, pupil_diameter_mm=pupil_mm)
         assert 1.98 < used_dpt < 3.0
 

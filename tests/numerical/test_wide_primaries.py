@@ -6,7 +6,7 @@ import pytest
 from estimator.profiles.parse import parse_profile
 from estimator.psf.compute import compute_psf_batch
 from filter_service.planning.grid import GridSpec
-from filter_service.planning.node_wavefronts import PupilStates, states_of_primaries
+from filter_service.planning.node_wavefronts import PupilStates, primary_states
 from filter_service.planning.plan import unchecked_plan
 from filter_service.psfs.compute_kernels import mean_batch
 from filter_service.psfs.store import build_psf_store
@@ -88,7 +88,7 @@ def test_wavelengths_of_a_primary_see_the_same_object(name):
             **own, total_defocus_dpt=eye.total_defocus_dpt(**own) + object_dpt
         )
 
-    found = states_of_primaries(eye, spec, of_object(middle_nm))
+    found = primary_states(eye, spec, of_object(middle_nm))
     width_nm = np.resize([14.0, 20.0, 13.0], count)
     for k, sign in enumerate((-1.0, 1.0)):
         expected = of_object(middle_nm + sign * width_nm)

@@ -19,7 +19,6 @@ from filter_service.constants import (
     PAPER_FAR_M,
     PAPER_TIE_BREAK_M,
 )
-from filter_service.psfs.boxes import square_kernel
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame import (
@@ -37,6 +36,7 @@ from filter_service.rendering.frame_kernels import (
 from filter_service.rendering.image_cells import ImageCells, image_cells
 from filter_service.rendering.srgb import linear_from_srgb
 from filter_service.rgbd_view import RgbdView
+from tests.reference.packed_kernels import square_kernel
 
 NOTHING = -1
 """Kernel index of an empty pixel."""

@@ -22,7 +22,11 @@ from training.datasets import (
     write_manifest,
 )
 from training.generate import generate
-from training.population import at_some_focus, population_eyes, population_ranges
+from training.population import (
+    partly_accommodated_eyes,
+    population_eyes,
+    population_ranges,
+)
 from training.tasks import DOMAINS, ellipse_matrix
 
 SMALL = Recipe("on_axis", 96, rows_per_shard=32, seed=5)
@@ -143,7 +147,7 @@ def test_a_population_is_the_prior_of_the_estimation():
 def test_half_of_the_population_accommodates_in_the_field():
     rows = np.random.default_rng(5).random((2000, 46))
     relaxed = population_eyes(rows[:, :45], rows[:, 45])
-    eyes = at_some_focus(relaxed, np.linspace(0.0, 1.0, 2000))
+    eyes = partly_accommodated_eyes(relaxed, np.linspace(0.0, 1.0, 2000))
     lens_mm = eyes[:, column("lens_diameter_mm")]
     is_relaxed = lens_mm == relaxed[:, column("lens_diameter_mm")]
     assert np.mean(is_relaxed) == pytest.approx(0.5, abs=0.01)

@@ -12,7 +12,7 @@ from estimator.optics.prescription import C20
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
 from estimator.optics.zernike import nm_from_index, zernike_values
 from training.datasets import Recipe, draw
-from training.eye_features import Shift, Turn
+from training.eye_features import Shift, ZernikeRotation
 from training.eye_prior import squared_deviation
 from training.features import (
     FieldFeatures,
@@ -108,7 +108,7 @@ def test_turning_terms_turns_the_surface():
     rng = np.random.default_rng(0)
     terms, angle_rad = rng.normal(size=(1, 27)), 0.7
     cosine, sine = (torch.tensor([f(angle_rad)]) for f in (np.cos, np.sin))
-    turned = Turn()(torch.from_numpy(terms), cosine, sine).numpy()
+    turned = ZernikeRotation()(torch.from_numpy(terms), cosine, sine).numpy()
     radius, theta = rng.uniform(0, 1, 50), rng.uniform(0, 6, 50)
 
     def surface(values, at):

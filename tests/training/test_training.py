@@ -20,7 +20,7 @@ from training.eye_prior import squared_deviation
 from training.generate import generate
 from training.losses import DiscriminatorLoss
 from training.models import ModelSettings, Network
-from training.optimizer import Lookahead, make_optimizer, pace
+from training.optimizer import Lookahead, make_optimizer, rate_factor
 from training.run_file import RunFileError, read_run
 from training.tasks import TASKS
 from training.train import CHECKPOINT, LOG, train
@@ -90,10 +90,10 @@ def test_weight_decay_is_decoupled():
 
 def test_the_pace_falls_by_a_factor_per_epoch_and_ends_at_zero():
     settings = {"n_epochs": 10, "decay_per_epoch": 0.8, "final_ratio": 0.2}
-    assert pace(0.0, **settings) == 1.0
-    assert pace(0.3, **settings) == pytest.approx(0.8**3)
-    assert pace(0.9, **settings) == pytest.approx(0.8**9 / 2)
-    assert pace(1.0, **settings) == pytest.approx(0.0)
+    assert rate_factor(0.0, **settings) == 1.0
+    assert rate_factor(0.3, **settings) == pytest.approx(0.8**3)
+    assert rate_factor(0.9, **settings) == pytest.approx(0.8**9 / 2)
+    assert rate_factor(1.0, **settings) == pytest.approx(0.0)
 
 
 @pytest.fixture
@@ -110,11 +110,11 @@ def stop_late(monkeypatch):
             calls.append(1)
             if len(calls) == 17:
                 raise Stop
-            return pace(*arguments, **named)
+            return rate_factor(*arguments, **named)
 
         with monkeypatch.context() as patch, pytest.raises(Stop):
             patch.setattr("training.train.CHECKPOINT_SECONDS", 0.0)
-            patch.setattr("training.train.pace", pace_and_stop)
+            patch.setattr("training.train.rate_factor", pace_and_stop)
             train(run)
         assert load_checkpoint(run.output_folder / CHECKPOINT)[1]["step"] == 16
 
@@ -164,7 +164,7 @@ def test_a_training_goes_on_with_as_many_processes(folder, stop_late, monkeypatc
     run = _run(folder, "alone")
     stop_late(run)
     monkeypatch.setattr("training.train._join", two_processes)
-    with pytest.raises(RunFileError, match=r"128 rows a step.*now they are 256"):
+    with pytest.raises(RunFileError, match=r"128 rows per step.*got 256"):
         train(run)
 
 
@@ -180,7 +180,7 @@ def test_data_of_another_recipe_are_refused(folder):
 def test_more_processes_than_rows_are_refused(folder):
     run = _run(folder, "many")
     rows = load_rows(run, run.data_folder)
-    with pytest.raises(DataError, match="fewer than the 12800 of a step of 100"):
+    with pytest.raises(DataError, match="a step of 100 processes requires 12800"):
         Batches(rows, run, rank=0, n_ranks=100, device=torch.device("cpu"))
 
 

@@ -80,7 +80,7 @@ def test_a_progressive_lens_is_what_the_gaze_goes_through():
     assert isinstance(ahead, ProgressiveLens)
     assert ahead.sphere_dpt == pytest.approx(-2.0, abs=0.05)
     assert power_vector(down)[0] == pytest.approx(0.0, abs=0.02)
-    assert ahead.looking((0.0, -35.0)) == down
+    assert ahead.with_gaze_offset((0.0, -35.0)) == down
 
 
 def test_lenslets_have_the_room_that_their_number_leaves():
@@ -89,7 +89,9 @@ def test_lenslets_have_the_room_that_their_number_leaves():
     cell_mm2 = lens.rings.pitch_mm**2 * np.sqrt(3.0) / 2.0
     zone_mm2 = np.pi * (lens.rings.outer_mm**2 - lens.rings.inner_mm**2)
     assert zone_mm2 / cell_mm2 == pytest.approx(396)
-    turned = lens.looking((0.0, -25.0)).rings.seen_from([0.0, 10.0], [0.0, 0.0])
+    turned = lens.with_gaze_offset((0.0, -25.0)).rings.seen_from(
+        [0.0, 10.0], [0.0, 0.0]
+    )
     x, y = np.transpose(turned.centre_mm)
     assert y == pytest.approx(25.5 * np.tan(np.radians(25.0)))
     assert x == pytest.approx([0.0, -15.05 * np.tan(np.radians(10.0))])

@@ -1,6 +1,7 @@
 """The figures' numbers, against what they stand for."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from clients.figures import (
     rms_by_order_um,
     rms_um,
     terms_figure,
+    through_focus_acuity_figure,
     through_focus_log_mar,
     wavefront_map_figure,
 )
@@ -222,6 +224,30 @@ def test_the_strongest_prescriptions_have_a_point(sphere_dpt):
     assert kernel.sum() == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.parametrize("pupil_mm", [3.0, 5.0])
+@pytest.mark.parametrize(
+    "profile",
+    [
+        "keratoconus",
+        "post_lasik",
+        {"kind": "prescription", "sphere_dpt": 0.0, "age_years": 70},
+        {"kind": "prescription", "sphere_dpt": -0.25, "age_years": 70},
+        {"kind": "prescription", "sphere_dpt": -20.0, "higher_order": "none"},
+    ],
+)
+def test_the_best_correction_is_not_worse_than_none(profile, pupil_mm):
+    seen = EyeStudy.of(profile).far(pupil_mm)
+    assert seen.best_corrected.is_as_good_as(seen)
+
+
+def test_an_irregular_cornea_is_corrected_by_more_than_least_squares(cone):
+    seen = cone.far(5.0)
+    flat_um = np.where((np.arange(28) < 3) | (np.arange(28) > 5), seen.zernike_um, 0.0)
+    best, flat = seen.best_corrected.predicted, replace(seen, zernike_um=flat_um)
+    assert best.log_mar < flat.predicted.log_mar - 0.5
+    assert best.visual_strehl_ratio > 2 * flat.predicted.visual_strehl_ratio
+
+
 def test_a_map_faces_the_person_and_has_the_wavefronts_height(cone):
     figure = wavefront_map_figure(cone)
     values = figure.axes[1].images[0].get_array()
@@ -268,6 +294,49 @@ def test_figures_of_a_left_eye_are_drawn(left, figure_of, axes_count, tmp_path):
     assert len(figure.axes) == axes_count
     figure.savefig(tmp_path / "figure.svg")
     assert (tmp_path / "figure.svg").stat().st_size > 5000
+
+
+def test_texts_of_distances_stay_within_the_axes(cone):
+    figure = through_focus_acuity_figure(cone)
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    right_px = axes.get_window_extent().x1
+    assert {text.get_text() for text in axes.texts} >= {" far", "20 cm"}
+    assert all(text.get_window_extent().x1 <= right_px + 1 for text in axes.texts)
+
+
+def _spread_on_retina_mm(body):
+    """Return the height of the spot that rays from far away leave on the retina."""
+    lines = cross_section_figure(EyeStudy.of(body)).axes[0].lines
+    rays = [line for line in lines if line.get_color() == "tab:red"]
+    assert len(rays) > 5
+    return np.ptp([line.get_ydata()[-1] for line in rays])
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        {"sphere_dpt": -5.0, "cylinder_dpt": -2.0, "axis_deg": 30.0, "vertex_mm": 12.0},
+        {
+            "kind": "contact_lens",
+            "sphere_dpt": -5.0 / 1.06,
+            "cylinder_dpt": -7.0 / 1.084 + 5.0 / 1.06,
+            "axis_deg": 30.0,
+        },
+    ],
+)
+def test_the_section_shows_the_correction_and_its_focus_on_the_retina(lens):
+    eye = {
+        "kind": "prescription",
+        "sphere_dpt": -5.0,
+        "cylinder_dpt": -2.0,
+        "axis_deg": 30.0,
+        "vertex_mm": 12.0,
+        "higher_order": "none",
+    }
+    bare_mm = _spread_on_retina_mm(eye)
+    assert bare_mm > 0.3
+    assert _spread_on_retina_mm(eye | {"correction": lens}) < 0.05 * bare_mm
 
 
 def test_figures_work_without_pyplot():

@@ -48,7 +48,7 @@ def test_hardware_is_tried_first_and_what_fails_is_in_the_log(three_devices, cap
         found = open_on_device("auto", opened)
     assert found == ("context 2", 2)
     assert "EGL device 1 (broken): no driver for it" in caplog.text
-    assert "works on EGL device 2 (good)" in caplog.text
+    assert "using EGL device 2 (good)" in caplog.text
 
 
 def test_the_first_that_works_says_nothing(three_devices, caplog):
@@ -69,7 +69,7 @@ def test_where_none_works_each_says_why(three_devices):
 def test_a_named_device_is_taken_or_refused_and_no_other_tried(three_devices):
     assert open_on_device("0", opened) == ("context 0", 0)
     there_are = r"0 \(software\), 1 \(broken\), 2 \(good\)"
-    with pytest.raises(RenderFailed, match=f"gl_device 1 gives no .*{there_are}"):
+    with pytest.raises(RenderFailed, match=f"gl_device 1 has no .*{there_are}"):
         open_on_device("1", opened)
     with pytest.raises(RenderFailed, match=f"gl_device is 3; allowed: .*{there_are}"):
         open_on_device("3", opened)
@@ -164,4 +164,4 @@ def test_names_are_asked_for_where_the_device_has_them():
     assert str(_described(0, {0x3055: SOFTWARE_EXTENSION.encode()}.get)) == (
         "0 (software)"
     )
-    assert str(_described(1, lambda what: None)) == "1 (no name)"
+    assert str(_described(1, lambda what: None)) == "1 (unnamed)"

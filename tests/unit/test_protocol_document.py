@@ -13,7 +13,8 @@ from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import PARAMETERS, EyeParameters
 from estimator.profiles import bodies, reference
 from estimator.profiles.correction_bodies import CorrectionBody
-from estimator.profiles.parse import KINDS, parse_profile, preset_names
+from estimator.profiles.given_bodies import KINDS, ProfileBody
+from estimator.profiles.parse import parse_profile, preset_names
 from filter_service import errors, messages
 from filter_service import protocol_schema as schema
 from filter_service.wire import replies
@@ -154,7 +155,7 @@ def test_the_presets_are_named():
 
 def test_the_tables_list_every_field_of_a_profile():
     tables = reference.profile_tables()
-    for kind in (*get_args(bodies.ProfileBody), *get_args(CorrectionBody)):
+    for kind in (*get_args(ProfileBody), *get_args(CorrectionBody)):
         for name in kind.__struct_fields__:
             assert f"| `{name}` |" in tables
 

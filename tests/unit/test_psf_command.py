@@ -95,5 +95,6 @@ def test_views_out_of_range_are_refused(refusal, option, value):
     assert option in refusal("emmetropia", option, value)
 
 
-def test_surfaces_do_not_accommodate(eye_file, refusal):
-    assert "does not accommodate" in refusal(str(eye_file), "--focus-dpt", "2")
+def test_surfaces_in_one_state_do_not_accommodate(eye_file, psf):
+    facts, _ = psf(eye_file, "--focus-dpt", 2)
+    assert "nearer than the near point" in " ".join(facts["notes"])

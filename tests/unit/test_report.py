@@ -4,6 +4,7 @@ import json
 import math
 import re
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 from importlib.metadata import version
 
@@ -29,14 +30,18 @@ from clients.report.blocks import (
     Words,
 )
 from clients.report.charts import picture_side_px
-from clients.report.correction_text import correction_text
+from clients.report.correction_text import correction_text, near_text
 from clients.report.facts import EyeFacts, facts_of
 from clients.report.html_page import STYLE, html_of
+from clients.report.labels import distinct_labels
 from clients.report.make import document_of, write_report
+from clients.report.method_text import entered_text, method_text
 from clients.report.numbers import Refraction, measured_numbers, spectacles_for
+from clients.report.origin import Record
 from clients.report.program import main
 from clients.report.provenance import provenance_table
 from clients.report.sources import SOURCES, Citations
+from clients.report.tables import change_text, refraction_table, vision_table
 from estimator import load_profile, parse_profile
 
 SPECTACLES = {"sphere_dpt": -4.0, "cylinder_dpt": -1.0, "axis_deg": 20.0}
@@ -143,7 +148,7 @@ def test_what_is_assumed_is_told_from_what_was_measured():
 
 def test_a_pupil_wider_than_the_measured_one_is_named():
     rows = _rows("post_lasik")
-    assert rows["Higher orders"][0] == "measured"
+    assert rows["Higher orders"][0] == "example"
     assert rows["Pupil of 5 mm"][0] == "assumed"
     assert "3 mm measured" in rows["Pupil of 5 mm"][1]
     assert "age not given" in rows["Accommodation"][1]
@@ -289,6 +294,33 @@ def test_two_eyes_make_one_document(myope, corrected, tmp_path):
     assert json.loads(json.dumps(both, allow_nan=False))["after"]["correction"]
 
 
+@pytest.mark.parametrize(
+    ("labels", "sides", "expected"),
+    [
+        (("", ""), ("OD", "OD"), ("first eye", "second eye")),
+        (("", ""), ("OS", "OD"), ("left eye", "right eye")),
+        (("eye", "eye"), ("OD", "OD"), ("eye (first)", "eye (second)")),
+        (("eye", "eye"), ("OD", "OS"), ("eye (right eye)", "eye (left eye)")),
+        (("", "after"), ("OD", "OD"), ("first eye", "after")),
+    ],
+)
+def test_two_eyes_have_distinct_labels(labels, sides, expected):
+    assert distinct_labels(labels, sides) == expected
+
+
+def test_a_report_of_two_inline_profiles_needs_no_names(capsys, tmp_path):
+    out = tmp_path / "eyes.html"
+    eye = {"kind": "prescription", "sphere_dpt": -1.0}
+    profiles = [json.dumps(eye), json.dumps(eye | {"sphere_dpt": -2.0})]
+    assert main([*profiles, "-o", str(out), "--no-charts"]) == 0
+    assert "<h1>Eye report: first eye → second eye</h1>" in out.read_text()
+
+
+def test_an_eye_without_a_name_is_titled_by_its_side(corrected):
+    title = document_of([replace(corrected, label="")]).title
+    assert title == "Eye report: left eye"
+
+
 def test_blocks_share_a_row_by_their_widths():
     row = Row((Words(("a",)), Table("t", (("b",),))), (2.0, 1.0))
     first, second = row.widths_mm
@@ -323,7 +355,7 @@ def test_a_pdf_is_tagged_and_starts_with_the_whole_summary(corrected, tmp_path):
     charts = {(p, d): gray for p in (3.0, 5.0) for d in (0.4, 1.0, 6.0)}
     shown = EyeFacts(corrected.study, "x", corrected.numbers, charts)
     out = tmp_path / "eye.pdf"
-    write_report([shown], out, reference="A-1047")
+    write_report([shown], out, Record(reference="A-1047"))
     read = PdfReader(out)
     assert read.root_object["/MarkInfo"]["/Marked"]
     assert "/StructTreeRoot" in read.root_object
@@ -331,7 +363,7 @@ def test_a_pdf_is_tagged_and_starts_with_the_whole_summary(corrected, tmp_path):
     first = read.pages[0].extract_text()
     assert "Reference A-1047" in first
     assert "6 m, 3 mm: logMAR" in first  # caption of the summary's last chart
-    assert "1 / 3" in first
+    assert "page 1 of 3" in first
     assert len(read.pages) == 3
 
 
@@ -343,7 +375,7 @@ def test_body_text_is_at_least_9_pt():
 
 
 def test_a_report_says_what_when_and_of_which_profile_it_is(myope, corrected):
-    text = html_of(document_of([myope], reference="<A-1047>"))
+    text = html_of(document_of([myope], Record(reference="<A-1047>")))
     digest = myope.study.profile.digest[:16]
     assert "<span>Reference &lt;A-1047&gt;</span>" in text
     assert f"<span>Profile {digest}</span>" in text
@@ -351,6 +383,121 @@ def test_a_report_says_what_when_and_of_which_profile_it_is(myope, corrected):
     assert re.search(r"<span>Date \d{4}-\d\d-\d\d \d\d:\d\d ", text)
     assert "Reference" not in html_of(document_of([myope]))
     assert corrected.study.profile.digest[:16] != digest
+
+
+def test_every_page_says_whose_report_it_is(corrected, tmp_path):
+    out = tmp_path / "eye.pdf"
+    record = Record(patient="P. Doe", examiner="E. Roe", reference="A-1047")
+    write_report([corrected], out, record)
+    pages = [page.extract_text() for page in PdfReader(out).pages]
+    for k, text in enumerate(pages):
+        assert "Eye report: worn · Patient P. Doe · Reference A-1047 · 20" in text
+        assert f"page {k + 1} of {len(pages)}" in text
+    assert "Examiner E. Roe" in pages[0]
+
+
+def test_a_text_that_is_too_long_is_refused(capsys, tmp_path):
+    out = str(tmp_path / "eye.pdf")
+    assert main(["myopia", "-o", out, "--patient", "x" * 61]) == 2
+    assert "patient has 61 characters; allowed: at most 60" in capsys.readouterr().err
+
+
+def test_the_first_page_says_where_entered_powers_are_measured(myope):
+    note = refraction_table(myope).note
+    assert note.startswith("Entered: −4.00 −1.00 x 20 at 12 mm, −3.82 ")
+    bare = {"kind": "prescription", "sphere_dpt": -3.5, "cylinder_dpt": -1.25}
+    text = entered_text(parse_profile(bare | {"axis_deg": 20}))
+    assert text == "Entered: −3.50 −1.25 x 20 at the cornea, no vertex distance given."
+    assert entered_text(load_profile("keratoconus")) == ""
+
+
+def test_a_star_is_explained_only_where_it_stands(myope, corrected):
+    def notes(*facts):
+        table = document_of(list(facts)).sections[0].rows[1 - (len(facts) == 1)]
+        return table.blocks[-1].note
+
+    lasik = facts_of("post_lasik", has_charts=False)
+    assert "*" not in notes(myope, corrected)
+    assert "*" in notes(lasik)
+    assert "*" in notes(myope, lasik)
+
+
+def test_a_change_is_that_of_the_numbers_shown():
+    assert change_text(-4.074, 0.004) == "+4.07"
+    assert change_text(1.0, 1.004) == "0.00"
+
+
+def test_accommodation_is_the_distance_of_both_points_shown():
+    facts = facts_of("keratoconus", has_charts=False)
+    rows = {row[0]: row for row in vision_table(facts).rows}
+    for k, pupil in enumerate(facts.numbers["pupils"]):
+        reach_dpt = pupil["near_point_dpt"] - pupil["far_point_dpt"]
+        assert rows["accommodation, dpt"][k + 1] == f"{reach_dpt:.1f}"
+    assert "accommodates" not in refraction_table(facts).note
+    document = document_of([replace(facts, label="Right eye")])
+    assert document.title == "Eye report: Right eye, keratoconus"
+    assert "example eye (preset keratoconus)" in document.subtitle
+    assert refraction_table(facts).head[1] == "example"
+
+
+def test_a_measurement_named_like_a_preset_is_no_example():
+    body = {
+        "kind": "zernike",
+        "name": "cataract",
+        "pupil_diameter_mm": 5.0,
+        "wavelength_nm": 555.0,
+        "zernike_um": {"2,0": 1.0},
+    }
+    study = EyeStudy.of(body)
+    assert study.source_word == "measured"
+
+
+def test_the_method_is_told_without_options_and_program_text(myope):
+    text = " ".join(method_text(myope.study))
+    assert "±" in text
+    assert "µm" in text
+    for word in (" ms", "+-", " um", "e-0", "higher_order", "vertex_mm"):
+        assert word not in text
+
+
+def test_rows_of_a_chart_have_sizes_and_the_smallest_read_is_marked(myope):
+    gray = np.full((8, 8, 3), 128, np.uint8)
+    charts = {(p, d): gray for p in (3.0, 5.0) for d in (0.4, 1.0, 6.0)}
+    numbers = myope.numbers | {
+        "charts": [entry | {"log_mar": 0.43} for entry in myope.numbers["charts"]]
+    }
+    shown = replace(myope, numbers=numbers, charts=charts)
+    picture = document_of([shown]).sections[0].rows[3].blocks[0]
+    assert len(picture.marks) == 13
+    assert picture.marks[0].text == "1.0 · 0.10"
+    assert [m.text for m in picture.marks if m.is_emphasized] == ["0.4 · 0.40"]
+    text = html_of(document_of([shown]))
+    assert text.count('class="read"') == 6
+    assert "◂ 0.4 · 0.40" in text
+
+
+def test_a_progressive_lens_is_named_beside_the_near_chart():
+    lens = {"kind": "progressive", "sphere_dpt": -2, "add_dpt": 2, "vertex_mm": 12}
+    body = {"kind": "prescription", "sphere_dpt": 0.0, "correction": lens}
+    said = near_text(parse_profile(body).correction)
+    assert said == "; straight ahead through −1.95 dpt sph"
+    assert near_text(None) == ""
+
+
+def test_what_two_eyes_share_is_told_once(myope, corrected):
+    document = document_of([myope, corrected])
+    known = next(s for s in document.sections if s.title == "What is known")
+    parts = [row[0] for row in known.rows[0].blocks[0].rows]
+    assert parts.count("Higher orders") == 1
+    assert parts.count("Correction worn") == 1
+    assert "spectacles −4.00 dpt sph −1.00 cyl x 20° at 12 mm" in document.subtitle
+    note = document.sections[0].rows[0].blocks[0].note
+    assert note.count("As spectacles at 12 mm: −4.00 dpt sph") == 2
+
+
+def test_the_disclaimer_of_a_page_follows_its_content(myope):
+    text = html_of(document_of([myope]))
+    assert text.index("<footer>") > text.rindex("</section>")
 
 
 def test_a_digest_is_that_of_the_eye_and_not_of_its_name_or_format(tmp_path):

@@ -75,7 +75,7 @@ def path(cache, stored):
 
 
 def test_a_store_comes_back_whole_and_its_eye_answers_the_same(cache, stored, path):
-    again = cache.load(key_of(1), go_on=nothing)
+    again = cache.load(key_of(1), check_cancelled=nothing)
     assert is_same(again, stored)
     assert again.parts["spec"] == stored.parts["spec"]
     assert again.notes == ("a note",)
@@ -83,7 +83,7 @@ def test_a_store_comes_back_whole_and_its_eye_answers_the_same(cache, stored, pa
     assert again.parts["eye"].total_defocus_dpt(**state) == pytest.approx(
         stored.parts["eye"].total_defocus_dpt(**state), abs=0
     )
-    assert cache.load(key_of(2), go_on=nothing) is None
+    assert cache.load(key_of(2), check_cancelled=nothing) is None
 
 
 def test_the_folder_is_for_its_owner_only_and_holds_no_pickle(path):
@@ -98,7 +98,7 @@ def test_a_truncated_file_is_removed_with_a_word(cache, path, caplog, kept_ratio
     with path.open("r+b") as file:
         file.truncate(int(kept_ratio * path.stat().st_size))
     with caplog.at_level(logging.WARNING):
-        assert cache.load(key_of(1), go_on=nothing) is None
+        assert cache.load(key_of(1), check_cancelled=nothing) is None
     assert not path.exists()
     assert path.name in caplog.text
 
@@ -110,7 +110,7 @@ def test_a_changed_file_is_removed(cache, path, at_ratio):
         was = file.read(1)
         file.seek(-1, os.SEEK_CUR)
         file.write(bytes([was[0] ^ 0x40]))
-    assert cache.load(key_of(1), go_on=nothing) is None
+    assert cache.load(key_of(1), check_cancelled=nothing) is None
     assert not path.exists()
 
 
@@ -124,7 +124,7 @@ def test_a_file_cannot_name_other_code_than_ours(cache, path, stored, monkeypatc
 
     monkeypatch.setattr(store_file, "pack", forged)
     cache.save(key_of(1), stored)
-    assert cache.load(key_of(1), go_on=nothing) is None
+    assert cache.load(key_of(1), check_cancelled=nothing) is None
     assert not path.exists()
 
 
@@ -159,7 +159,7 @@ def test_a_crash_while_writing_leaves_nothing_that_is_read(cache, tmp_path, stor
     writer.join(10.0)
     (left,) = folder.iterdir()
     assert left.suffix == store_file.UNFINISHED
-    assert cache.load(key_of(3), go_on=nothing) is None
+    assert cache.load(key_of(3), check_cancelled=nothing) is None
     os.utime(left, (time.time() - 2 * store_cache.ABANDONED_S,) * 2)
     cache.save(key_of(4), stored)
     assert [p.name for p in folder.iterdir()] == [f"{key_of(4)}.psfs"]
@@ -170,7 +170,7 @@ def test_a_cancelled_load_stops_and_leaves_the_file(cache, path):
         raise BuildCancelled("replaced by a newer profile")
 
     with pytest.raises(BuildCancelled):
-        cache.load(key_of(1), go_on=cancel)
+        cache.load(key_of(1), check_cancelled=cancel)
     assert path.exists()
 
 
@@ -180,7 +180,7 @@ def test_a_full_folder_loses_what_was_used_longest_ago(tmp_path, stored):
     for number in range(3):
         cache.save(key_of(number), stored)
         os.utime(cache._path(key_of(number)), (1000 + number,) * 2)
-    cache.load(key_of(0), go_on=nothing)
+    cache.load(key_of(0), check_cancelled=nothing)
     cache.save(key_of(3), stored)
     there = {p.stem for p in cache._folder.iterdir()}
     assert there == {key_of(0), key_of(2), key_of(3)}
@@ -193,7 +193,7 @@ def test_without_a_folder_nothing_is_kept(stored, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     cache = StoreCache("", max_mb=100)
     cache.save(key_of(1), stored)
-    assert cache.load(key_of(1), go_on=nothing) is None
+    assert cache.load(key_of(1), check_cancelled=nothing) is None
     assert list(tmp_path.iterdir()) == []
 
 
@@ -201,7 +201,7 @@ def test_a_folder_that_cannot_be_written_costs_a_log_line(tmp_path, stored, capl
     taken = tmp_path / "taken"
     taken.write_text("a file")
     StoreCache(str(taken), max_mb=100).save(key_of(1), stored)
-    assert "cannot be kept" in caplog.text
+    assert "cannot be written" in caplog.text
 
 
 def _save_and_load(folder, seed, failures):
@@ -218,7 +218,7 @@ def _save_and_load(folder, seed, failures):
     for _ in range(60):
         n = int(rng.integers(6))
         store_file.pack = lambda value, n=n: real({"n": n, "kernels": values[n]})
-        found = cache.load(key_of(n), go_on=nothing)
+        found = cache.load(key_of(n), check_cancelled=nothing)
         if found is None:
             cache.save(key_of(n), Stored(Small(), ()))
         elif found["n"] != n or not (found["kernels"] == n).all():
@@ -365,7 +365,7 @@ def test_all_eyes_are_erased_at_once(kept):
         (["erase", "myopia", "--all"], "one of"),
         (["erase", "--name", "*"], "allowed"),
         (["erase", "--name", ""], "allowed"),
-        (["list", "--dir", "/no/such/folder"], "no folder"),
+        (["list", "--dir", "/no/such/folder"], "is not a folder"),
         (["list"], "no cache folder"),
     ],
 )
@@ -392,7 +392,7 @@ def test_a_folder_under_an_entrys_name_is_passed_over_and_logged_once(
     path.mkdir()
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
-            assert cache.load(key_of(1), go_on=nothing) is None
+            assert cache.load(key_of(1), check_cancelled=nothing) is None
             cache.save(key_of(1), stored)
     told = [record for record in caplog.records if str(path) in record.getMessage()]
     assert len(told) == 2, caplog.text  # one of reading, one of writing
@@ -405,7 +405,7 @@ def test_a_link_is_not_followed(cache, path, tmp_path):
     moved = tmp_path / "moved"
     path.rename(moved)
     path.symlink_to(moved)
-    assert cache.load(key_of(1), go_on=nothing) is None
+    assert cache.load(key_of(1), check_cancelled=nothing) is None
     assert moved.is_file()
 
 
@@ -425,7 +425,7 @@ def test_a_link_is_not_followed(cache, path, tmp_path):
 def test_an_entry_with_another_content_is_removed(cache, path, monkeypatch, tree):
     monkeypatch.setattr(store_file, "pack", lambda value: (tree, {}))
     store_file.write_file(path, None)
-    assert cache.load(key_of(1), go_on=nothing) is None
+    assert cache.load(key_of(1), check_cancelled=nothing) is None
     assert not path.exists()
 
 
@@ -435,5 +435,5 @@ def test_an_entry_nested_too_deep_is_removed(cache, path):
     sums = zlib.crc32(header), zlib.crc32(b"")
     preamble = (store_file.MAGIC, len(header), start, 0, *sums)
     path.write_bytes(store_file.PREAMBLE.pack(*preamble) + header)
-    assert cache.load(key_of(1), go_on=nothing) is None
+    assert cache.load(key_of(1), check_cancelled=nothing) is None
     assert not path.exists()

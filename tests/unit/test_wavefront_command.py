@@ -103,13 +103,17 @@ def _refused(capsys, *arguments):
         (["--wavelength-nm", "555"], "--stop-mm, --pupil-mm: allowed: exactly one"),
         (["--stop-mm", "4", "--wavelength-nm", "300"], "--wavelength-nm is 300"),
         ([*VIEW, "--h-deg", "90"], "--h-deg is 90; allowed: -75 to 75"),
-        ([*VIEW, "--focus-dpt", "2"], "does not accommodate"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(eye_file, capsys, arguments, message):
     code, text = _refused(capsys, eye_file, *arguments)
     assert code == 2
     assert message in text
+
+
+def test_surfaces_in_one_state_do_not_accommodate(eye_file, capsys):
+    facts = _json(capsys, eye_file, *VIEW, "--focus-dpt", "2")
+    assert "nearer than the near point" in " ".join(facts["notes"])
 
 
 def test_a_wrong_surface_is_named(eye_file, capsys):

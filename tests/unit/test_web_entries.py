@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from clients.web.chart import chart_picture
 from clients.web.correction_form import (
     AXIS,
     DESIGNS,
@@ -13,8 +14,9 @@ from clients.web.correction_form import (
     first_texts,
 )
 from clients.web.eye_form import EyeForm, preset_titles
-from clients.web.numbers import distance_text
-from clients.web.page_state import AGE, FOCUS, GAZE_V, PageState
+from clients.web.numbers import distance_text, prescription_texts
+from clients.web.page_state import AGE, DISTANCE, FOCUS, GAZE_V, PageState
+from clients.web.shared_entries import fragment_of, restore
 from estimator import parse_profile, preset_names
 from tests.unit.web_parts import a_picture
 
@@ -146,9 +148,12 @@ def test_every_preset_may_be_chosen(name):
 
 
 def test_a_file_is_taken_as_what_it_is():
-    form = EyeForm("OD")
+    state = PageState()
+    form = state.eyes["OD"]
     body = {"kind": "prescription", "sphere_dpt": -3, "age_years": 52}
-    assert form.take_file("p.json", json.dumps(body).encode()) == 52
+    assert state.take_file("OD", "p.json", json.dumps(body).encode()) == "OD"
+    assert state.values[AGE.name] == 52
+    assert (form.source, form.loaded_name) == ("prescription", "p.json")
     assert (form.source, form.texts["sphere_dpt"]) == ("prescription", "-3.00")
     wave = {
         "kind": "zernike",
@@ -156,7 +161,7 @@ def test_a_file_is_taken_as_what_it_is():
         "wavelength_nm": 555,
         "zernike_um": {"2,0": 1.0},
     }
-    form.take_file("w.json", json.dumps(wave).encode())
+    state.take_file("OD", "w.json", json.dumps(wave).encode())
     assert (form.source, form.file_name) == ("file", "w.json")
     assert form.body(age_years=30.0)["zernike_um"] == {"2,0": 1.0}
 
@@ -177,17 +182,17 @@ def test_a_file_is_taken_as_what_it_is():
     ],
 )
 def test_a_file_that_is_no_profile_changes_nothing(name, content, said):
-    form = EyeForm("OD")
+    state = PageState()
     with pytest.raises(ValueError, match=said) as refused:
-        form.take_file(name, content)
-    assert form == EyeForm("OD")
+        state.take_file("OD", name, content)
+    assert state == PageState()
     assert "/ocufilter-" not in str(refused.value)
 
 
 def test_coefficients_are_called_as_their_file_is():
-    form = EyeForm("OD")
-    form.take_file("my eye.abp", b"Ap = 6\nWa = 555\nZ[2, 0] = 1")
-    assert form.body(age_years=30.0)["name"] == "my eye.abp"
+    state = PageState()
+    state.take_file("OD", "my eye.abp", b"Ap = 6\nWa = 555\nZ[2, 0] = 1")
+    assert state.eyes["OD"].body(age_years=30.0)["name"] == "my eye.abp"
 
 
 def test_a_wrong_entry_leaves_the_eye_as_it_was_and_the_sliders_alive():
@@ -211,3 +216,120 @@ def test_both_eyes_are_asked_for_with_the_age_of_the_person():
         "OS": "OS",
     }
     assert {body["age_years"] for body in bodies.values()} == {61.0}
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("-3.5 -1.25 x 80", ("-3.5", "-1.25", "80")),
+        ("−3,50/−1,25×80°", ("-3.50", "-1.25", "80")),
+        ("+2 -0.75 axis 5", ("+2", "-0.75", "5")),
+        ("-3.5-1.25@180", ("-3.5", "-1.25", "180")),
+        ("-3.5", None),
+        ("-3.5 -1.25", None),
+        ("-3.5 x 80", None),
+        ("a b c", None),
+    ],
+)
+def test_a_whole_prescription_is_read(text, found):
+    assert prescription_texts(text) == found
+
+
+def test_correcting_fully_keeps_the_kind_of_lens_and_its_addition():
+    form = EyeForm("OD", wears_correction=True)
+    form.texts.update(sphere_dpt="-3", cylinder_dpt="-1", axis_deg="20")
+    form.worn.kind = "progressive"
+    form.worn.texts["add_dpt"] = "+2.50"
+    form.correct_fully()
+    worn = form.body(age_years=60.0)["correction"]
+    assert (worn["kind"], worn["add_dpt"]) == ("progressive", 2.5)
+    assert (worn["sphere_dpt"], worn["cylinder_dpt"], worn["axis_deg"]) == (-3, -1, 20)
+
+
+def test_a_contact_lens_that_corrects_fully_has_the_powers_at_the_cornea():
+    form = EyeForm("OD", wears_correction=True)
+    form.texts.update(sphere_dpt="-10", cylinder_dpt="-2", vertex_mm="12")
+    form.worn.kind = "contact_lens"
+    form.correct_fully()
+    worn = form.body(age_years=30.0)["correction"]
+    # 1 / (1 / -10 - 0.012) = -8.93 and 1 / (1 / -12 - 0.012) = -10.49
+    assert worn["sphere_dpt"] == pytest.approx(-8.93)
+    assert worn["cylinder_dpt"] == pytest.approx(-1.56)
+
+
+def test_progressive_spectacles_start_from_the_prescription():
+    form = EyeForm("OD", wears_correction=True)
+    form.texts.update(sphere_dpt="-3", cylinder_dpt="-1", axis_deg="20")
+    form.choose_worn("progressive")
+    assert form.worn.texts["sphere_dpt"] == "-3"
+    form.worn.texts["sphere_dpt"] = "-2.50"  # typed: another kind keeps it
+    form.choose_worn("lenslets")
+    assert form.worn.texts["sphere_dpt"] == "-2.50"
+
+
+def test_looking_to_read_turns_the_gaze_to_the_addition():
+    state = PageState(picture=a_picture())
+    form = state.eyes["OD"]
+    form.wears_correction, form.worn.kind = True, "progressive"
+    state.request()
+    state.look(is_reading=True)
+    # the corridor of 14 mm ends 25.5 mm before the center of rotation
+    assert state.values[GAZE_V.name] == -29.0
+    seen = parse_profile(state.looking_body("OD")).correction
+    assert seen.sphere_dpt == pytest.approx(2.0, abs=0.05)
+    state.look(is_reading=False)
+    assert (state.values[GAZE_V.name], state.values[FOCUS.name]) == (0.0, 0.0)
+
+
+def test_a_chart_stays_on_the_line_of_sight():
+    state = PageState(picture=chart_picture(0.25))
+    form = state.eyes["OD"]
+    form.wears_correction, form.worn.kind = True, "progressive"
+    state.move(GAZE_V.name, -29.0)
+    request = state.request()
+    assert request.gaze_deg == state.picture_gaze_deg == (0.0, 0.0)
+    assert request.bodies["OD"]["correction"]["gaze_deg"] == [0.0, -29.0]
+    state.set_picture(a_picture())
+    assert state.request().gaze_deg == (0.0, -29.0)
+
+
+def test_the_focus_follows_the_distance_until_it_is_set():
+    state = PageState()
+    state.set_picture(chart_picture(0.25))
+    assert state.values[FOCUS.name] == 0.25
+    state.move(DISTANCE.name, 2.5)
+    assert state.values[FOCUS.name] == 2.5
+    state.move(FOCUS.name, 1.0)
+    state.move(DISTANCE.name, 3.0)
+    assert state.values[FOCUS.name] == 1.0
+    again = PageState()
+    restore(again, fragment_of(state, "chart"))
+    again.set_picture(chart_picture(3.0))
+    assert again.values[FOCUS.name] == 1.0
+
+
+def test_a_click_focuses_on_a_rounded_distance():
+    state = PageState()
+    state.set_picture(a_picture())  # 2 m away on the axis
+    state.look_at(0.0, 0.0)
+    focus_dpt = state.values[FOCUS.name]
+    assert focus_dpt == round(focus_dpt, 2)
+    assert focus_dpt == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_file_of_the_other_eye_is_loaded_there():
+    state = PageState()
+    state.eyes["OD"].source = "file"
+    body = {"kind": "prescription", "sphere_dpt": -3, "eye_side": "OS"}
+    assert state.take_file("OD", "p.json", json.dumps(body).encode()) == "OS"
+    assert state.eyes["OS"].texts["sphere_dpt"] == "-3.00"
+    assert state.eyes["OD"] == EyeForm("OD")
+
+
+def test_a_link_sets_all_entries_also_those_that_it_leaves_out():
+    state = PageState()
+    state.eyes["OD"].texts["sphere_dpt"] = "-3"
+    state.shown = "both"
+    found = restore(state, fragment_of(PageState(), "courtyard"))
+    assert state == PageState()
+    assert (found.scene, found.problems) == ("courtyard", [])

@@ -49,7 +49,7 @@ def test_the_token_in_the_address_becomes_a_cookie_and_leaves_the_address():
     assert headers[b"location"] == b"/"
     assert headers[b"set-cookie"].startswith(b"ocufilter-8765=a-token; ")
     assert b"HttpOnly" in headers[b"set-cookie"]
-    assert b"SameSite=Strict" in headers[b"set-cookie"]
+    assert b"SameSite=Lax" in headers[b"set-cookie"]
 
 
 @pytest.mark.parametrize("kind", ["http", "websocket"])

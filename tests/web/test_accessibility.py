@@ -202,13 +202,13 @@ def test_the_smallest_line_read_is_marked(page):
     _chart(page)
     page.page.locator(".oc-marks .oc-read").wait_for()
     texts = page.page.locator(".oc-marks li").all_inner_texts()
-    assert [text.split(" ·")[0] for text in texts][:2] == ["0.8", "0.7"]
-    assert "0.0 · 1.00" in texts[8]
+    assert [text.split()[0] for text in texts[:3]] == ["logMAR", "1.0", "0.9"]
+    assert texts[11].split() == ["0.0", "1.00"]
     sharp = page.page.locator(".oc-marks .oc-read").inner_text()
     number = page.number()
     page.entry("sphere_dpt").fill("-3")
     page.settle(after=number)
-    # 3 dpt too strong an eye reads no row of 0.8 and smaller, or only the largest
+    # an eye too strong by 3 dpt reads at most the largest rows
     page.page.wait_for_function(
         "old => document.querySelector('.oc-marks .oc-read')?.innerText !== old",
         arg=sharp,

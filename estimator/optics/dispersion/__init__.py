@@ -2,11 +2,11 @@
 
 bounds    check of wavelengths against the range of a medium
 formulas  dispersion formulas
-values    constant index, index with Abbe number, table
+values    constant index, index and Abbe number, table
 
 A dispersion is a frozen dataclass with ``kind``, its name in files, and
 ``refractive_index(wavelength_nm)``, which raises ValueError outside its range.  To add
-one, write its class and add it to `DISPERSIONS`.
+a dispersion, write its class and add it to `DISPERSIONS`.
 """
 
 from typing import Protocol
@@ -26,10 +26,10 @@ from estimator.optics.dispersion.values import AbbeNumber, Constant, IndexTable
 
 
 class Dispersion(Protocol):
-    """What every dispersion of the table has."""
+    """Interface of the classes in `DISPERSIONS`."""
 
     def refractive_index(self, wavelength_nm: ArrayLike) -> NDArray[np.float64]:
-        """Return the index (...) at wavelengths (...)."""
+        """Return the refractive index (...) at wavelengths (...)."""
 
 
 DISPERSIONS = (

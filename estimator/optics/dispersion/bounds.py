@@ -7,12 +7,12 @@ from numpy.typing import ArrayLike, NDArray
 def bounded_nm(
     wavelength_nm: ArrayLike, limits_nm: tuple[float, float]
 ) -> NDArray[np.float64]:
-    """Return wavelengths as an array.
+    """Return wavelengths as an array (...).
 
     Raises
     ------
     ValueError
-        A wavelength outside the limits, or nan.
+        A wavelength is outside the limits or nan.
     """
     wavelength_nm = np.asarray(wavelength_nm, dtype=np.float64)
     low, high = limits_nm

@@ -1,4 +1,4 @@
-"""Refractive index by dispersion formulas.  L is the wavelength in micrometers."""
+"""Dispersion formulas.  L is the wavelength in micrometers."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -10,7 +10,7 @@ from estimator.optics.dispersion.bounds import bounded_nm
 from estimator.optics.units import NM_PER_UM
 
 VISIBLE_LIMITS_NM = (365.0, 1100.0)
-"""Range of a formula that states none."""
+"""Default range of the formulas."""
 
 _POLE_UM2 = 0.028
 
@@ -39,10 +39,11 @@ def _evaluated(squared_index: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class OcularHerzberger:
-    """Index of an ocular medium from four of its indices.
+    """Index of an ocular medium, interpolated between four measured indices.
 
-    n = a1 n1 + a2 n2 + a3 n3 + a4 n4, each a a sum over 1, L², 1/(L² - 0.028) and
-    1/(L² - 0.028)² (Navarro, Santamaria & Bescos 1985, after Herzberger).
+    n = a1 n1 + a2 n2 + a3 n3 + a4 n4, where each a is a linear combination of 1, L²,
+    1/(L² - 0.028) and 1/(L² - 0.028)² (Navarro, Santamaria & Bescos 1985, after
+    Herzberger).
 
     Attributes
     ----------
@@ -81,7 +82,7 @@ class Cauchy:
 
 @dataclass(frozen=True)
 class WavelengthPolynomial:
-    """n = a0 + a1 L + a2 L² + ..., as Liou & Brennan (1997) state it."""
+    """n = a0 + a1 L + a2 L² + ..., as in Liou & Brennan (1997)."""
 
     kind: ClassVar[str] = "wavelength_polynomial"
 
@@ -128,7 +129,7 @@ class Schott:
 
 @dataclass(frozen=True)
 class Sellmeier:
-    """n² = 1 + sum of k L² / (L² - l), as formula 1 of Zemax.
+    """n² = 1 + sum of k L² / (L² - l), the Sellmeier 1 formula of Zemax.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Refractive index from measured values: constant, index and Abbe number, table."""
+"""Refractive index by values: constant, index and Abbe number, table."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,7 +15,7 @@ D_LINE_NM, F_LINE_NM, C_LINE_NM = 587.5618, 486.1327, 656.2725
 
 @dataclass(frozen=True)
 class Constant:
-    """The same index at every wavelength."""
+    """The same refractive index at all wavelengths."""
 
     kind: ClassVar[str] = "constant"
 
@@ -28,14 +28,14 @@ class Constant:
 
 @dataclass(frozen=True)
 class AbbeNumber:
-    """n = A + B / L² with the given index at the d line and Abbe number.
+    """n = A + B / L², with A and B from the index at the d line and the Abbe number.
 
-    V = (n_d - 1) / (n_F - n_C) at 587.56, 486.13 and 656.27 nm.
+    The Abbe number is V = (n_d - 1) / (n_F - n_C), at 587.56, 486.13 and 656.27 nm.
 
     Raises
     ------
     ValueError
-        An Abbe number that is not positive.
+        The Abbe number is not positive.
     """
 
     kind: ClassVar[str] = "abbe_number"
@@ -60,12 +60,12 @@ class AbbeNumber:
 
 @dataclass(frozen=True)
 class IndexTable:
-    """Indices at wavelengths, interpolated linearly in 1 / L², never extrapolated.
+    """Indices at given wavelengths, with linear interpolation in 1 / L².
 
     Raises
     ------
     ValueError
-        Fewer than 2 entries, or wavelengths that do not increase.
+        There are fewer than 2 entries, or wavelengths do not increase.
     """
 
     kind: ClassVar[str] = "table"
@@ -77,7 +77,7 @@ class IndexTable:
         if len(self.wavelengths_nm) != len(self.indices) or len(self.indices) < 2:
             raise ValueError(
                 f"{len(self.wavelengths_nm)} wavelengths and {len(self.indices)} "
-                "indices: equal numbers of at least 2 are needed"
+                "indices: must be equal numbers, at least 2"
             )
         if not all(a < b for a, b in pairwise(self.wavelengths_nm)):
             raise ValueError(f"wavelengths {self.wavelengths_nm} nm: must increase")

@@ -1,6 +1,6 @@
-"""Forms of surfaces besides conics, biconics and offset terms, one file each.
+"""Surface forms other than conics, biconics and offset terms, one module each.
 
-base               compiled sag of a biconic and of offset terms, which forms build on
+base               compiled sag of a biconic and of offset terms
 even_asphere       even powers of the distance from the axis
 two_conics         biconic with a conic constant in each meridian
 toroid             conic profile revolved about an axis across it
@@ -11,16 +11,16 @@ A form is a frozen dataclass whose fields are numbers or tuples of numbers, with
 kind : str
     Its name in files.
 sag(packed, row, x, y, out) -> bool
-    Compiled; writes z, dz/dx, dz/dy in the axes of the surface and returns whether the
-    form is defined there.  It reads its numbers from column FORM_NUMBERS on.
+    Compiled function that writes z, dz/dx, dz/dy in the axes of the surface and returns
+    whether the form is defined at (x, y).  Its parameters start at column FORM_NUMBERS.
 numbers() -> tuple of float
-    At most N_FORM_NUMBERS of them.
+    The parameters, at most N_FORM_NUMBERS.
 added_curvature(curvatures) -> float
-    Mean curvature that the form adds at the vertex to that of the radii.
+    Mean curvature at the vertex in addition to that of the radii.
 
-To add a form, write its file and add its class to `FORMS`: compiled code, files and
-first-order optics read this table.  Delete numba's cache afterwards, which does not
-notice changes in other files (`find . -name '*.nb?' -delete`).
+To add a form, write its module and add its class to `FORMS`, the table that compiled
+code, files and paraxial optics use.  Afterwards delete numba's cache, which does not
+detect changes in other files (`find . -name '*.nb?' -delete`).
 """
 
 from typing import Any, ClassVar, Protocol
@@ -32,12 +32,12 @@ from estimator.optics.forms.two_conics import TwoConics
 
 
 class Form(Protocol):
-    """What every form of the table has."""
+    """Interface of the classes in `FORMS`."""
 
     sag: ClassVar[Any]
 
     def numbers(self) -> tuple[float, ...]:
-        """Return the numbers of the packed row."""
+        """Return the parameters for the packed row."""
 
     def added_curvature(self, curvatures: tuple[float, float]) -> float:
         """Return the mean curvature, 1/mm, that the form adds at the vertex."""

@@ -1,4 +1,4 @@
-"""Compiled: the biconic sag and the offset terms, which other forms build on."""
+"""Compiled: sag of a biconic, and of offset terms."""
 
 import math
 
@@ -11,17 +11,17 @@ _ORDER = 6
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def biconic_sag(packed, i, x, y, out):
-    """Write sag and gradient (z, zx, zy) of a biconic; return False outside."""
+    """Write sag and gradient (z, zx, zy) of a biconic; return False if undefined."""
     cx, cy, k1 = packed[i, CURVATURE_X], packed[i, CURVATURE_Y], 1.0 + packed[i, CONIC]
     radicand = 1.0 - k1 * (cx * cx * x * x + cy * cy * y * y)
     inside = radicand > 0.0
     root = math.sqrt(max(radicand, 1e-12))
-    top = cx * x * x + cy * y * y
-    below = 1.0 / (1.0 + root)
-    common = top * k1 * below * below / root
-    out[0] = top * below
-    out[1] = x * cx * (2.0 * below + common * cx)
-    out[2] = y * cy * (2.0 * below + common * cy)
+    numerator = cx * x * x + cy * y * y
+    inverse = 1.0 / (1.0 + root)
+    common = numerator * k1 * inverse * inverse / root
+    out[0] = numerator * inverse
+    out[1] = x * cx * (2.0 * inverse + common * cx)
+    out[2] = y * cy * (2.0 * inverse + common * cy)
     return inside
 
 

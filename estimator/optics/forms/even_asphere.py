@@ -26,12 +26,12 @@ def _sag(packed, i, x, y, out):
 
 @dataclass(frozen=True)
 class EvenAsphere:
-    """Coefficients a2, a4, a6, ... of z = biconic + a2 r² + a4 r⁴ + a6 r⁶ + ...
+    """z = biconic + a2 r² + a4 r⁴ + a6 r⁶ + ...
 
     Attributes
     ----------
     coefficients : tuple of at most 12 floats
-        mm^(1-n) for the power r^n, from r² on as in EVENASPH of Zemax.
+        (a2, a4, ...), in mm^(1-n) for r^n, as for the Even Asphere of Zemax.
     """
 
     kind: ClassVar[str] = "even_asphere"
@@ -40,7 +40,7 @@ class EvenAsphere:
     coefficients: tuple[float, ...]
 
     def numbers(self) -> tuple[float, ...]:
-        """Return the numbers of the packed row."""
+        """Return the parameters for the packed row."""
         return self.coefficients
 
     def added_curvature(self, curvatures: tuple[float, float]) -> float:

@@ -1,4 +1,4 @@
-"""Sum of a conic profile along x and one along y, the biconic of optiland."""
+"""Sum of two conic profiles, along x and along y: the biconic of optiland."""
 
 import math
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class SeparateProfiles:
     conic_constants: tuple[float, float]
 
     def numbers(self) -> tuple[float, ...]:
-        """Return the numbers of the packed row."""
+        """Return the parameters for the packed row."""
         return self.conic_constants
 
     def added_curvature(self, curvatures: tuple[float, float]) -> float:

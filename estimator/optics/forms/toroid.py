@@ -35,7 +35,7 @@ class Toroid:
     sag: ClassVar[Any] = staticmethod(_sag)
 
     def numbers(self) -> tuple[float, ...]:
-        """Return the numbers of the packed row."""
+        """Return the parameters for the packed row."""
         return ()
 
     def added_curvature(self, curvatures: tuple[float, float]) -> float:

@@ -1,7 +1,7 @@
-"""Biconic with a conic constant in each meridian, among them every ellipsoid.
+"""Biconic with a conic constant in each meridian; ellipsoids are a special case.
 
-An ellipsoid with semi-axes (ax, ay) across and az along the axis has the radii ax² / az
-and ay² / az and the conic constants ax² / az² - 1 and ay² / az² - 1.
+An ellipsoid with the semi-axes ax, ay and az has the radii ax² / az and ay² / az and
+the conic constants ax² / az² - 1 and ay² / az² - 1.
 """
 
 import math
@@ -19,11 +19,11 @@ def _sag(packed, i, x, y, out):
     kx, ky = 1.0 + packed[i, FORM_NUMBERS], 1.0 + packed[i, FORM_NUMBERS + 1]
     radicand = 1.0 - kx * cx * cx * x * x - ky * cy * cy * y * y
     root = math.sqrt(max(radicand, 1e-12))
-    top, below = cx * x * x + cy * y * y, 1.0 / (1.0 + root)
-    common = top * below * below / root
-    out[0] = top * below
-    out[1] = x * cx * (2.0 * below + common * kx * cx)
-    out[2] = y * cy * (2.0 * below + common * ky * cy)
+    numerator, inverse = cx * x * x + cy * y * y, 1.0 / (1.0 + root)
+    common = numerator * inverse * inverse / root
+    out[0] = numerator * inverse
+    out[1] = x * cx * (2.0 * inverse + common * kx * cx)
+    out[2] = y * cy * (2.0 * inverse + common * ky * cy)
     return radicand > 0.0
 
 
@@ -43,7 +43,7 @@ class TwoConics:
     conic_constants: tuple[float, float]
 
     def numbers(self) -> tuple[float, ...]:
-        """Return the numbers of the packed row."""
+        """Return the parameters for the packed row."""
         return self.conic_constants
 
     def added_curvature(self, curvatures: tuple[float, float]) -> float:

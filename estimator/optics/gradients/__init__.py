@@ -1,25 +1,25 @@
-"""Gradient-index media, one file each.
+"""Gradient-index media, one module each.
 
-polynomial          index: polynomial in the squared radius and the depth
-squared_polynomial  squared index: the same polynomial
-goncharov_dainty    the crystalline lens of Goncharov & Dainty
+polynomial          index is a polynomial in the squared radius and the depth
+squared_polynomial  squared index is such a polynomial
+goncharov_dainty    crystalline lens of Goncharov & Dainty
 
 A gradient is a frozen dataclass with
 
 kind : str
     Its name in files.
 index(media, start, x, y, z) -> 4 floats
-    Compiled; returns n² and n times the gradient of n at a point in the axes of the
-    surface in front of the medium.  ``media`` is the index row, in which the numbers of
-    the gradient start at ``start``.
+    Compiled function that returns n² and n times the gradient of n at a point, in the
+    axes of the surface in front of the medium.  ``media`` is the index row, in which
+    the parameters of the gradient start at ``start``.
 steps : int
-    Steps of the integration through the medium.
+    Number of integration steps through the medium.
 vertex_index(wavelength_nm) -> float
     Index at the vertex of the surface in front.
 numbers(wavelength_nm) -> tuple of float
-    Numbers of the index row, as many at every wavelength.
+    Parameters in the index row; their number is the same at all wavelengths.
 
-To add a gradient, write its file and add its class to `GRADIENTS`, and delete numba's
+To add a gradient, write its module, add its class to `GRADIENTS` and delete numba's
 cache (see `forms`).
 """
 
@@ -31,19 +31,19 @@ from estimator.optics.gradients.squared_polynomial import SquaredPolynomialGradi
 
 
 class Gradient(Protocol):
-    """What every gradient of the table has."""
+    """Interface of the classes in `GRADIENTS`."""
 
     index: ClassVar[Any]
 
     @property
     def steps(self) -> int:
-        """Steps of the integration through the medium."""
+        """Number of integration steps through the medium."""
 
     def vertex_index(self, wavelength_nm: float) -> float:
         """Return the index at r = z = 0."""
 
     def numbers(self, wavelength_nm: float) -> tuple[float, ...]:
-        """Return the numbers of the index row."""
+        """Return the parameters for the index row."""
 
 
 GRADIENTS: tuple[type[Gradient], ...] = (
@@ -53,4 +53,4 @@ GRADIENTS: tuple[type[Gradient], ...] = (
 )
 
 INDEX_FUNCTIONS: tuple[Any, ...] = tuple(dict.fromkeys(g.index for g in GRADIENTS))
-"""Compiled indices without repetition: each adds about 2 s to compiling all loops."""
+"""Distinct index functions; each adds about 2 s to the compilation of all loops."""

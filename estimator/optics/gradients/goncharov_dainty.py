@@ -1,7 +1,7 @@
-"""The gradient of Goncharov & Dainty (2007), one piece of a crystalline lens.
+"""Gradient of one half of the crystalline lens of Goncharov & Dainty (2007).
 
-The anterior piece starts at the lens surface with n0 = the index there; the posterior
-piece starts at the plane of the largest index with n0 = that index.
+n0 is the index at the lens surface for the anterior half, and the largest index, at the
+plane between the halves, for the posterior half.
 """
 
 from dataclasses import dataclass
@@ -43,5 +43,5 @@ class GoncharovDaintyGradient:
         return self._polynomial().vertex_index(wavelength_nm)
 
     def numbers(self, wavelength_nm: float) -> tuple[float, ...]:
-        """Return the numbers of the index row."""
+        """Return the parameters for the index row."""
         return self._polynomial().numbers(wavelength_nm)

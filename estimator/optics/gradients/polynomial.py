@@ -1,4 +1,4 @@
-"""Gradient index as a polynomial in the squared radius and the depth."""
+"""Gradient-index media whose index is a polynomial in squared radius and depth."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -9,15 +9,15 @@ from numba import njit
 from estimator.optics.dispersion import Dispersion
 
 DEFAULT_STEPS = 4
-"""Steps through a medium: 4 err by 2e-10 mm of path in the lens of Liou & Brennan."""
+"""Integration steps: 4 have a path error of 2e-10 mm in the lens of Liou & Brennan."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def polynomial(media, start, x, y, z):
-    """Return a polynomial in r² and z and its derivatives in x, y and z.
+    """Return a polynomial in r² and z and its derivatives by x, y and z.
 
-    The numbers are the count of powers of r², that of powers of z, and the coefficients
-    with the power of z changing fastest.
+    The parameters are the number of powers of r², the number of powers of z, and the
+    coefficients, where the power of z changes fastest.
     """
     n_radial, n_depth = int(media[start]), int(media[start + 1])
     squared = x * x + y * y
@@ -43,9 +43,9 @@ def _index(media, start, x, y, z):
 def polynomial_numbers(
     coefficients: tuple[tuple[float, ...], ...], *, first: float
 ) -> tuple[float, ...]:
-    """Return the numbers of `polynomial` with ``first`` as the constant term.
+    """Return the parameters of `polynomial`, with ``first`` as the constant term.
 
-    Rows may have different lengths; missing terms are zero.
+    Rows may have different lengths; missing coefficients are zero.
     """
     table = np.zeros((len(coefficients), max(len(row) for row in coefficients)))
     for i, row in enumerate(coefficients):
@@ -56,10 +56,10 @@ def polynomial_numbers(
 
 @dataclass(frozen=True)
 class PolynomialGradient:
-    """n(r, z) = sum over i, j of n_ij r^(2i) z^j, and its shift with wavelength.
+    """n(r, z) = sum over i, j of n_ij r^(2i) z^j, plus a shift with wavelength.
 
-    r and z are measured from the vertex of the surface in front of the medium, in that
-    surface's axes.
+    r and z are in the axes of the surface in front of the medium, with their origin at
+    its vertex.
 
     Attributes
     ----------
@@ -68,10 +68,9 @@ class PolynomialGradient:
     reference_wavelength_nm : float
         Wavelength of the coefficients.
     dispersion : Dispersion or None
-        n(r, z) shifts with wavelength as the index of this medium does; None: it does
-        not change.
+        Medium whose index shifts with wavelength by the same amount; no shift if None.
     steps : int
-        Steps of the integration (see `gradient_kernels`).
+        Number of integration steps; see `gradient_kernels`.
     """
 
     kind: ClassVar[str] = "polynomial_gradient"
@@ -92,6 +91,6 @@ class PolynomialGradient:
         return self.coefficients[0][0] + float(shift)
 
     def numbers(self, wavelength_nm: float) -> tuple[float, ...]:
-        """Return the numbers of the index row."""
+        """Return the parameters for the index row."""
         first = self.vertex_index(wavelength_nm)
         return polynomial_numbers(self.coefficients, first=first)

@@ -1,4 +1,4 @@
-"""Gradient whose squared index is a polynomial, as in rods and Luneburg's lens."""
+"""Gradient-index media whose squared index is a polynomial, such as GRIN rods."""
 
 import math
 from dataclasses import dataclass
@@ -23,14 +23,14 @@ def _index(media, start, x, y, z):
 class SquaredPolynomialGradient:
     """n²(r, z) = sum over i, j of m_ij r^(2i) z^j, at every wavelength.
 
-    r and z as for `PolynomialGradient`.
+    r and z are those of `PolynomialGradient`.
 
     Attributes
     ----------
     coefficients : tuple of tuples, mm^-(2i+j)
         Row i holds m_i0, m_i1, ...
     steps : int
-        Steps of the integration (see `gradient_kernels`).
+        Number of integration steps; see `gradient_kernels`.
     """
 
     kind: ClassVar[str] = "squared_polynomial_gradient"
@@ -45,6 +45,6 @@ class SquaredPolynomialGradient:
         return math.sqrt(self.coefficients[0][0])
 
     def numbers(self, wavelength_nm: float) -> tuple[float, ...]:
-        """Return the numbers of the index row."""
+        """Return the parameters for the index row."""
         del wavelength_nm
         return polynomial_numbers(self.coefficients, first=self.coefficients[0][0])

@@ -1,17 +1,18 @@
 """Frame engine of OpenGL compute shaders.
 
-renderer         the engine: stores, frames, results
-frame_run        one view, from start to result
+renderer         the engine
+gl_store         a PSF store with a copy of its kernels on the GPU
+frame_run        one view, from upload to result
 strips           division of a frame into strips that fit the buffers
 strip            size and buffers of a frame or strip
 fragment_passes  passes from pixels to fragments
-list_passes      passes that build, sort and splat the lists
-frame_passes     all passes of a strip, and the output image
+list_passes      passes that build, sort and splat the fragment lists
+frame_passes     all passes of a strip, and readback of the image
 kernel_passes    passes that blend a frame's kernels
-expected_pairs   prediction of kernels from the previous frame
-eye_states       state of two eyes kept between frames
-list_bands       division of lists into bands that fit a buffer
-compile_passes   compilation of every pass before the first frame
+expected_pairs   prediction of a frame's pairs from the previous frame
+eye_states       cached state of the two most recently used eyes
+list_bands       division of fragment lists into bands that fit a buffer
+compile_passes   compilation of all passes before the first frame
 """
 
 import lazy_loader

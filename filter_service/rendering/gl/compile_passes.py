@@ -1,7 +1,7 @@
-"""Warm-up: compile every pass before the first client by filtering a few pixels.
+"""Warm-up: compile every pass before the first client connects.
 
-A software renderer compiles a shader at its first dispatch; without this, the first
-frames of a new service stall by half a second.
+A software renderer compiles a shader at its first dispatch, which would delay the first
+frames of a new service by half a second.
 """
 
 from filter_service.rendering.gl.renderer import FilterRenderer
@@ -9,7 +9,7 @@ from filter_service.rendering.perfect_eye import change_by_perfect_eye
 
 
 def compile_passes(renderer: FilterRenderer) -> float:
-    """Render a tiny frame in every variant that clients may request.
+    """Filter a tiny frame in every variant that clients may request.
 
     Returns
     -------

@@ -1,29 +1,23 @@
-"""State of each eye kept between frames on the GPU, so that two eyes can alternate."""
+"""Cached state of the two most recently used eyes, so that they can alternate."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from filter_service.gl.gpu import Gpu
 from filter_service.rendering.frame_states import FrameStates
+from filter_service.rendering.gl.gl_store import GlStore
 from filter_service.rendering.gl.kernel_passes import KernelMaker
 
-MAX_KEPT = 2
-"""The two eyes of a stereo frame; each has its own kernel atlas."""
-
-
-class Released(Protocol):
-    """A loaded store that records whether it was released."""
-
-    is_released: bool
+MAX_EYES = 2
+"""Cache size: the two eyes of a stereo frame; each has its own kernel atlas."""
 
 
 @dataclass(eq=False)
 class EyeState:
-    """State of an eye's last frame that the next frame in the same state reuses."""
+    """Results of an eye's last frame that the next frame can reuse."""
 
-    handle: Released
+    handle: GlStore
     kernels: KernelMaker
     states: FrameStates = field(default_factory=FrameStates)
 
@@ -32,26 +26,26 @@ class EyeStates:
     """Cache of the most recently used eyes; older ones are evicted."""
 
     def __init__(self, gpu: Gpu) -> None:
-        self._free = [KernelMaker(gpu, slot) for slot in range(MAX_KEPT)]
-        self._kept: list[EyeState] = []  # most recently used last
+        self._free = [KernelMaker(gpu, slot) for slot in range(MAX_EYES)]
+        self._eyes: list[EyeState] = []  # most recently used last
 
-    def of(self, handle: Released) -> EyeState:
-        """Return the state of an eye, and mark it as most recently used."""
+    def of(self, handle: GlStore) -> EyeState:
+        """Return the state of an eye, which becomes the most recently used."""
         self.drop_released()
-        found = next((kept for kept in self._kept if kept.handle is handle), None)
-        others = [kept for kept in self._kept if kept is not found]
-        if found is None and len(others) == MAX_KEPT:
-            self._let_go(others.pop(0))
+        found = next((eye for eye in self._eyes if eye.handle is handle), None)
+        others = [eye for eye in self._eyes if eye is not found]
+        if found is None and len(others) == MAX_EYES:
+            self._recycle(others.pop(0))
         found = found or EyeState(handle, self._free.pop(0))
-        self._kept = [*others, found]
+        self._eyes = [*others, found]
         return found
 
     def drop_released(self) -> None:
-        """Drop the eyes whose stores were released."""
-        for kept in [kept for kept in self._kept if kept.handle.is_released]:
-            self._kept.remove(kept)
-            self._let_go(kept)
+        """Drop the state of eyes whose stores were released."""
+        for eye in [eye for eye in self._eyes if eye.handle.is_released]:
+            self._eyes.remove(eye)
+            self._recycle(eye)
 
-    def _let_go(self, kept: EyeState) -> None:
-        kept.kernels.forget()
-        self._free.append(kept.kernels)
+    def _recycle(self, eye: EyeState) -> None:
+        eye.kernels.reset()
+        self._free.append(eye.kernels)

@@ -1,4 +1,4 @@
-"""Passes that turn a frame, or a strip of it, into fragments."""
+"""Passes that convert a frame, or a strip of it, to fragments."""
 
 from typing import Any
 
@@ -29,11 +29,11 @@ COLOR_VARIANTS = {
     "float32": {"COLOR_IS_LINEAR": 1},
     "float16": {"COLOR_IS_HALF": 1},
 }
-"""Defines of `build_fragments` by the dtype of the color image."""
+"""Defines of ``build_fragments`` by the dtype of the color image."""
 
 
 class FragmentPasses:
-    """Fragments of one strip.
+    """Passes from the pixels of one strip to its fragments.
 
     Parameters
     ----------
@@ -43,31 +43,32 @@ class FragmentPasses:
     corner_change_dpt : (rows + 1, columns + 1), float32
         Change of defocus at the corners of the cells.
     tolerance : float
-        Merging error relative to the default; at 0 nothing merges.
+        Merging error relative to the default; 0 disables merging.
     first_row : int
         First row of the strip within the frame.
-    frame_pixel_count : int, optional
-        Pixel count of the whole frame, if it is larger than the strip.
-    image_size_px : (width, height), optional
-        Size of the whole image, if the frame has a border around it.
+    frame_pixel_count : int
+        Pixel count of the whole frame.
+    image_size_px : (width, height)
+        Size of the whole image without its border.
     border_px : int
         Columns and rows added on each side of the image.
-    counted_px : (left, top, right, bottom), optional
-        Part of the strip whose pixels are counted; all by default.
+    counted_px : (left, top, right, bottom)
+        Part of the strip whose pixels are counted.
     object_range_dpt : (low, high)
-        Prepared distances; pixels at others are counted.
+        Prepared distances; pixels outside are counted.
     white_level : float
-        Reference light for the contrast of a merged quad.
+        Reference of the contrast below which pixels merge.
     is_encoded : bool
-        Whether the image is for a display, where dark parts need finer steps.
+        Whether the output is encoded for a display, where contrast in dark areas is
+        more visible.
 
     Attributes
     ----------
     search_blocks : int
-        Distance at which a bin searches for fragments that reach it; known after
-        merging.
+        Distance, in blocks, within which a bin searches for fragments that reach it;
+        set by `merge_fragments`.
     stats : (STAT_LANES, STAT_WORDS), uint32
-        Counters of the passes; filled when the frame is fetched.
+        Counters of the passes, written by the readback.
     """
 
     def __init__(
@@ -77,27 +78,24 @@ class FragmentPasses:
         image: ImageCells,
         corner_change_dpt: NDArray[np.float32],
         tolerance: float,
-        first_row: int = 0,
-        frame_pixel_count: int | None = None,
-        image_size_px: tuple[int, int] | None = None,
-        border_px: int = 0,
-        counted_px: tuple[int, int, int, int] | None = None,
-        object_range_dpt: tuple[float, float] = (0.0, np.inf),
-        white_level: float = 1.0,
-        is_encoded: bool = False,
+        first_row: int,
+        frame_pixel_count: int,
+        image_size_px: tuple[int, int],
+        border_px: int,
+        counted_px: tuple[int, int, int, int],
+        object_range_dpt: tuple[float, float],
+        white_level: float,
+        is_encoded: bool,
     ):
         self.strip = strip
         self.image = image
         self.corner_change_dpt = corner_change_dpt
         self.tolerance = tolerance
         self.first_row = first_row
-        self.scan = (
-            first_row * strip.view.width_px,
-            frame_pixel_count or strip.pixel_count,
-        )
-        self.image_size_px = image_size_px or strip.size
+        self.scan = (first_row * strip.view.width_px, frame_pixel_count)
+        self.image_size_px = image_size_px
         self.border_px = border_px
-        self.counted_px = counted_px or (0, 0, *strip.size)
+        self.counted_px = counted_px
         self.object_range_dpt = object_range_dpt
         self.stats = np.zeros((STAT_LANES, STAT_WORDS), np.uint32)
         self.white_level = white_level
@@ -109,7 +107,7 @@ class FragmentPasses:
         self.used_words = np.zeros((0, 0), np.uint32)
 
     def upload(self) -> None:
-        """Upload the strip; bytes are padded to whole words."""
+        """Upload the strip, padded to whole words."""
         colors, depths_m = (
             self.strip.view.surface_colors,
             self.strip.view.surface_depths_m,
@@ -157,17 +155,17 @@ class FragmentPasses:
             )
 
     def wait_for_used(self) -> NDArray[np.bool_]:
-        """Read back the used pairs in the middle of the frame."""
+        """Wait for the GPU, and return the used pairs."""
         with self.strip.timer.wall("psf_plan_ms"):
             self.strip.gpu.read_into((self.strip.buffers["USED"], 0, self.used_words))
             return self.used
 
     @property
     def used(self) -> NDArray[np.bool_]:
-        """Return the used pairs (n_cells, n_intervals), once they have been read."""
-        from filter_service.rendering.pair_loops import used_pairs
+        """Return the used pairs (n_cells, n_intervals), after the readback."""
+        from filter_service.rendering.pair_loops import unpack_pairs
 
-        return used_pairs(self.used_words, interval_count(self.strip.layers))
+        return unpack_pairs(self.used_words, interval_count(self.strip.layers))
 
     @property
     def _common(self) -> dict[str, Any]:
@@ -182,10 +180,10 @@ class FragmentPasses:
         }
 
     def merge_fragments(self, kernels: KernelSet) -> None:
-        """Merge pixels into fragments, in blocks."""
+        """Merge pixels into fragments, and pack the fragments of each block."""
         slots = self.strip.block_count * THREADS
         largest_reach_px = int(kernels.kernels.reach_px.max()) + 1.5
-        self.strip.buffers.update(kernels.buffers)
+        self.strip.kernel_buffers = kernels.buffers
         self.kernel_count = kernels.kernels.count
         self.kernel_texel_count = kernels.texel_count
         self.atlas = kernels.atlas
@@ -219,15 +217,15 @@ class FragmentPasses:
 
     @property
     def _max_level(self) -> int:
-        """Highest merging level; the paper merges once."""
+        """Highest level of merging; the paper has one level."""
         if self.tolerance == 0.0:
             return 0
-        most = 1 if self.strip.paper_rule else MAX_LEVEL
+        highest = 1 if self.strip.paper_rule else MAX_LEVEL
         cell_px = self.image.cell_px
-        return min(most, cell_px.bit_length() - 1) if cell_px else most
+        return min(highest, cell_px.bit_length() - 1) if cell_px else highest
 
     def counts(self) -> dict[str, int]:
-        """Return counts of `FilteredView` by name, once the frame has been fetched."""
+        """Return the counts of `FilteredView` by name, after the readback."""
         stats = self.stats.sum(axis=0, dtype=np.int64).tolist()
         return {
             "missing_depth_count": stats[STAT_MISSING],

@@ -1,4 +1,4 @@
-"""All passes of a frame, or a strip of it, in order, and the output image."""
+"""All passes of a frame, or a strip of it, and the readback of the image."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,18 +16,17 @@ from filter_service.constants import (
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.kernel_passes import KernelSet
 from filter_service.rendering.gl.list_passes import ListPasses
-from filter_service.rendering.gl.strip import Strip, grid_of, group_count
+from filter_service.rendering.gl.strip import Strip, dispatch_grid, group_count
 
 ENCODERS = {
     "srgb8": ("encode_srgb", BYTES_PER_WORD, np.uint8),
     "linear16": ("encode_half", HALVES_PER_WORD, np.float16),
     "linear": ("encode_float", 1, np.float32),
 }
-"""Encoding of the image: pass, pixels per thread (for RGB words), dtype."""
-
+"""Encoding of the image: pass, pixels per thread (which writes whole words), dtype."""
 
 PASSES = "buffers of the passes"
-"""Name under which a caller claims the buffers, see `Gpu.claim`."""
+"""Name of the buffers in `Gpu.claim`."""
 
 
 class FramePasses:
@@ -43,86 +42,86 @@ class FramePasses:
     def __init__(self, strip: Strip, fragments: FragmentPasses):
         self.strip = strip
         self.fragments = fragments
-        self.lists: ListPasses | None = None
-        self._kept: KernelSet | None = None
+        self.lists: ListPasses  # set by `run`
+        self._predicted_kernels: KernelSet | None = None
         self._output = ""
-        self._arrived: Callable[[], None] = lambda: None
-        self._picture, self._totals = np.zeros(0), np.zeros(0, np.uint32)
+        self._wait: Callable[[], None] = lambda: None
+        self._image, self._totals = np.zeros(0), np.zeros(0, np.uint32)
 
     def run(
         self,
         kernels: Callable[[NDArray[np.bool_]], KernelSet],
         *,
-        expected: Callable[[], KernelSet | None] = lambda: None,
+        predicted: Callable[[], KernelSet | None] = lambda: None,
         used: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Filter the strip; `read_back` fetches the image.
+        """Filter the strip; `begin_read` and `end_read` return the image.
 
         Parameters
         ----------
         kernels : callable
-            Function that returns the kernels of used (cell, interval) pairs.
-        expected : callable, optional
-            Function that returns predicted kernels, or None.  With them nothing is
-            read back in the middle of the frame, and the prediction is checked at its
-            end.  They are computed while the GPU is busy.
+            Function that returns the kernels of used pairs.
+        predicted : callable, optional
+            Function that returns predicted kernels, or None; it is called while the
+            GPU works.  With a prediction, there is no readback in the middle of the
+            frame; `end_read` checks the prediction.
         used : (n_cells, n_intervals), optional
-            Used pairs, if known.
+            Used pairs, if they are known.
         """
         self.strip.gpu.claim(PASSES, self)
         self.fragments.upload()
         self.fragments.build_fragments()
-        self._kept = None if used is not None else expected()
-        if self._kept is None and used is None:
-            used = self.fragments.wait_for_used()
-        self.fragments.merge_fragments(self._kept or kernels(used))
+        self._predicted_kernels = None if used is not None else predicted()
+        if self._predicted_kernels is not None:
+            self.fragments.merge_fragments(self._predicted_kernels)
+        else:
+            if used is None:
+                used = self.fragments.wait_for_used()
+            self.fragments.merge_fragments(kernels(used))
         self.lists = ListPasses(
             self.strip, self.fragments.search_blocks, self.fragments.atlas
         )
         self.lists.run()
 
-    def read_back(self, output: str, room: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Fetch the filtered image in the requested encoding, and all counters."""
-        self.begin_read(output, room)
-        return self.end_read()
-
-    def begin_read(self, output: str, room: NDArray[Any] | None = None) -> None:
-        """Start the readback of the image (into ``room`` if given) and the counts."""
+    def begin_read(self, output: str, out: NDArray[Any] | None = None) -> None:
+        """Start the readback of the image (to ``out`` if given) and the counters."""
         self._output = output
         name, pixels_per_thread, dtype = ENCODERS[output]
         self._encode(name, pixels_per_thread)
         width, height = self.strip.size
-        if room is None:
-            room = np.empty((height, width, RGB), dtype)
-        self._picture = room
+        if out is None:
+            out = np.empty((height, width, RGB), dtype)
+        self._image = out
         self._totals = np.empty(TOTAL_WORDS, np.uint32)
         with self.strip.timer.wall("readback_ms"):
-            self._arrived = self.strip.gpu.begin_read(
-                (self.strip.buffers["COLOR_IN"], 0, self._picture),
+            self._wait = self.strip.gpu.begin_read(
+                (self.strip.buffers["COLOR_IN"], 0, self._image),
                 (*self.lists.totals, self._totals),
                 (self.strip.buffers["STATS"], 0, self.fragments.stats),
                 (self.strip.buffers["USED"], 0, self.fragments.used_words),
             )
 
     def end_read(self) -> NDArray[Any] | None:
-        """Return the image, or None if the strip must be filtered again.
+        """Wait for the image; return it, or None if the strip must be filtered again.
 
-        That is the case if a kernel was missing, or if the lists did not fit and other
-        passes have run since.
+        That is the case if a kernel was missing, or if the fragment lists did not fit
+        their buffer and another strip has overwritten the inputs since.
         """
         with self.strip.timer.wall("readback_ms"):
-            self._arrived()
-        if self._kept is not None and self._kept.lacks(self.fragments.used):
+            self._wait()
+        if self._predicted_kernels is not None and self._predicted_kernels.lacks(
+            self.fragments.used
+        ):
             return None
-        if self.lists.take_totals(self._totals):
-            return self._picture
+        if self.lists.record_totals(self._totals):
+            return self._image
         if not self.strip.gpu.is_owner(PASSES, self):
             return None
         self.lists.splat_bands()
-        self.begin_read(self._output, self._picture)
+        self.begin_read(self._output, self._image)
         with self.strip.timer.wall("readback_ms"):
-            self._arrived()
-        return self._picture
+            self._wait()
+        return self._image
 
     def _encode(self, name: str, pixels_per_thread: int) -> None:
         with self.strip.timer.stage("encode_ms"):
@@ -132,11 +131,11 @@ class FramePasses:
             )  # the input is no longer needed
             self.strip.run(
                 name,
-                grid_of(group_count(threads, THREADS)),
+                dispatch_grid(group_count(threads, THREADS)),
                 *("COLOR_OUT", "COLOR_IN"),
                 pixel_count=self.strip.pixel_count,
             )
 
     def counts(self) -> dict[str, int]:
-        """Return counts of `FilteredView` by name."""
+        """Return the counts of `FilteredView` by name."""
         return self.fragments.counts() | self.lists.counts()

@@ -1,9 +1,10 @@
-"""One view on the GPU: started first, and finished when its image is needed.
+"""One view on the GPU: started at once, and finished when the caller needs the image.
 
-In between, the processor is free for another view.
+In between, the CPU is free for another view.
 """
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -18,6 +19,7 @@ from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.frame import (
     border_px_of,
+    drop_empty_layer,
     extended,
     fill_missing_depth,
     reach_px_of,
@@ -28,7 +30,7 @@ from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.frame_passes import FramePasses
 from filter_service.rendering.gl.kernel_passes import KernelSet, words_per_cell
 from filter_service.rendering.gl.strip import Strip
-from filter_service.rendering.gl.strips import Rows, counted_px, cut_in_strips
+from filter_service.rendering.gl.strips import Rows, counted_px, split_into_strips
 from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
 from filter_service.rendering.white_level import white_level
 from filter_service.rgbd_view import RgbdView
@@ -38,7 +40,7 @@ Counts = dict[str, int]
 
 @dataclass(frozen=True)
 class _Plan:
-    """Plan shared by all strips of a frame."""
+    """Plan that all strips of a frame share."""
 
     whole: RgbdView
     border_px: int
@@ -50,17 +52,18 @@ class _Plan:
 class FrameRun:
     """Filtering of one view through an eye in one state.
 
-    The GPU counts the pixels without depth.  If a frame has some, it is filtered again
+    The GPU counts pixels without depth.  If there are any, the frame is filtered again
     with their depth filled in.
 
     Parameters
     ----------
     request : ViewRequest
-        With the gaze to use.
     out : (height, width, 3) array
         Output array, of the type of the output.
+    gaze_deg : (h, v)
+        Gaze of the eye, within the prepared range.
     fill_depth : bool
-        Whether to fill missing depth first, because the previous frame had some.
+        Whether to fill missing depth first, because the previous frame had any.
 
     Attributes
     ----------
@@ -70,40 +73,40 @@ class FrameRun:
     def __init__(
         self,
         gpu: Gpu,
-        kept: EyeState,
+        eye: EyeState,
         request: ViewRequest,
         out: NDArray[Any],
         *,
+        gaze_deg: tuple[float, float],
         fill_depth: bool,
     ):
         self.timer = StageTimer(gpu)
-        self._gpu, self._kept, self._request = gpu, kept, request
-        self._out, view = out, request.view
+        self._gpu, self._eye, self._request = gpu, eye, request
+        self._gaze_deg = gaze_deg
+        self._out = out
         self._cell_px: int | None = None
         self._missing_count: int | None = None
-        self.layers: FrameLayers = kept.states.layers(
+        self.layers: FrameLayers = eye.states.layers(
             self.timer,
-            kept.handle,
+            eye.handle,
             request.pupil_diameter_mm,
             request.focus_dpt,
             request.options.render_tolerance,
         )
         with self.timer.wall("prepare_ms"):
-            if view.surface_count > 1 and not (view.hidden_depth_m > 0.0).any():
-                view = replace(view, hidden_color=None, hidden_depth_m=None)
-        self._view = view
+            self._view = drop_empty_layer(request.view)
         if fill_depth:
             self._fill_depth()
         self._begun = self._begin()
 
     @property
     def depth_m(self) -> NDArray[np.float32]:
-        """Depth of the view, with missing pixels filled."""
+        """Depth of the view, with missing depth filled in."""
         return self._view.depth_m
 
     def finish(self) -> tuple[NDArray[Any], Counts]:
         """Return the image and the counts."""
-        picture, counts = self._begun_or_whole()
+        picture, counts = self._finish_begun()
         if self._missing_count is None and counts["missing_depth_count"]:
             self._fill_depth()
             picture, counts = self._whole()
@@ -117,7 +120,7 @@ class FrameRun:
             self._view = replace(self._view, depth_m=depth_m)
 
     def _begin(self) -> "_StripRun | None":
-        """Start a frame of one strip; frames of several strips run in `finish`."""
+        """Start a frame of one strip; `finish` runs frames of several strips."""
         plan = self._plan()
         if len(plan.strips) > 1:
             return None
@@ -129,7 +132,7 @@ class FrameRun:
             return None
         return begun
 
-    def _begun_or_whole(self) -> tuple[NDArray[Any], Counts]:
+    def _finish_begun(self) -> tuple[NDArray[Any], Counts]:
         begun, self._begun = self._begun, None
         if begun is not None:
             try:
@@ -139,7 +142,7 @@ class FrameRun:
         return self._whole()
 
     def _whole(self) -> tuple[NDArray[Any], Counts]:
-        """Filter the frame, with larger cells if its kernels take too much memory."""
+        """Filter the frame, with larger cells if its kernels need too much memory."""
         while True:
             plan = self._plan()
             runs = [_StripRun(self, plan, rows) for rows in plan.strips]
@@ -149,20 +152,18 @@ class FrameRun:
                 self._cell_px = 2 * plan.state.image.cell_px
 
     def _plan(self) -> _Plan:
-        kept, view = self._kept, self._view
-        image = kept.states.cells(
-            self.timer, kept.handle, self._request.gaze_deg, self._cell_px
-        )
+        eye, view = self._eye, self._view
+        image = eye.states.cells(self.timer, eye.handle, self._gaze_deg, self._cell_px)
         border_px = border_px_of(view, self.layers, image)
         with self.timer.wall("prepare_ms"):
             whole = extended(view, border_px)
-        change_dpt = kept.states.corner_change_dpt(self.timer, self.layers, image)
+        change_dpt = eye.states.corner_change_dpt(self.timer, self.layers, image)
         return _Plan(
             whole,
             border_px,
             FrameState(self.layers, image, change_dpt),
             white_level(view.color),
-            cut_in_strips(
+            split_into_strips(
                 whole,
                 partial(reach_px_of, view, self.layers, image),
                 self._gpu.max_block_bytes,
@@ -178,10 +179,10 @@ class FrameRun:
         used_words = np.zeros(shape, np.uint32)
         pictures = []
         for run in runs:
-            pictures.append(run.finish()[run.rows.kept])
+            pictures.append(run.finish()[run.rows.output_rows])
             counts.update(run.passes.counts())
             used_words |= run.passes.fragments.used_words
-        self._kept.kernels.note(plan.state, used_words)
+        self._eye.kernels.record_pairs(plan.state, used_words)
         if self.out_of(plan) is None:
             picture = pictures[0] if len(pictures) == 1 else np.concatenate(pictures)
             rows, columns = (
@@ -213,7 +214,7 @@ class FrameRun:
             image_size_px=(self._view.width_px, self._view.height_px),
             border_px=plan.border_px,
             counted_px=counted_px(rows, self._view, plan.border_px),
-            object_range_dpt=_prepared_range_dpt(self._kept.handle.store),
+            object_range_dpt=_prepared_range_dpt(self._eye.handle.store),
             white_level=plan.white_level,
             is_encoded=self.output == "srgb8",
         )
@@ -221,23 +222,23 @@ class FrameRun:
 
     def kernels(self, image: ImageCells, used: NDArray[np.bool_]) -> KernelSet:
         """Return the kernels of used pairs."""
-        return self._kept.kernels.kernels(
-            self._kept.handle, self.layers, image, used, self.timer, self._fill
+        return self._eye.kernels.kernels(
+            self._eye.handle, self.layers, image, used, self.timer, self._fill
         )
 
-    def expected(self, state: FrameState) -> KernelSet | None:
+    def predicted(self, state: FrameState) -> KernelSet | None:
         """Return the predicted kernels, or None."""
-        return self._kept.kernels.expected(
-            self._kept.handle, state, self.timer, self._fill
+        return self._eye.kernels.predicted(
+            self._eye.handle, state, self.timer, self._fill
         )
 
     def _fill(self, psfs: NDArray[np.int64]) -> None:
-        """Compute the missing PSFs of a frame, as one of its stages."""
+        """Compute the missing PSFs of a frame, timed as a stage of its own."""
         with self.timer.wall("psf_compute_ms"):
-            self._kept.handle.store.fill(psfs, until_s=self._request.until_s)
+            self._eye.handle.store.fill(psfs, until_s=self._request.until_s)
 
     def out_of(self, plan: _Plan) -> NDArray[Any] | None:
-        """Return the output array if a strip's image is the whole image, else None."""
+        """Return the output array if the frame is one strip without a border."""
         return None if plan.border_px or len(plan.strips) > 1 else self._out
 
     @property
@@ -256,7 +257,7 @@ class _StripRun:
 
     def begin(self) -> None:
         """Start the passes on the GPU and the readback of the image."""
-        self._run(self.passes, expected=lambda: self._frame.expected(self.plan.state))
+        self._run(self.passes, predicted=lambda: self._frame.predicted(self.plan.state))
         self.passes.begin_read(self._frame.output, self._out)
         self._is_begun = True
 
@@ -269,20 +270,31 @@ class _StripRun:
             used = self.passes.fragments.used
             self.passes = self._frame.passes_of(self.plan, self.rows)
             self._run(self.passes, used=used)
-            picture = self.passes.read_back(self._frame.output, self._out)
+            self.passes.begin_read(self._frame.output, self._out)
+            picture = self.passes.end_read()
+        assert picture is not None  # all kernels exist, and no other passes ran
         return picture
 
     @property
     def _out(self) -> NDArray[Any] | None:
         return self._frame.out_of(self.plan)
 
-    def _run(self, passes: FramePasses, **options) -> None:
-        image = self.plan.state.image
-        passes.run(lambda used: self._frame.kernels(image, used), **options)
+    def _run(
+        self,
+        passes: FramePasses,
+        *,
+        predicted: Callable[[], KernelSet | None] = lambda: None,
+        used: NDArray[np.bool_] | None = None,
+    ) -> None:
+        passes.run(
+            lambda pairs: self._frame.kernels(self.plan.state.image, pairs),
+            predicted=predicted,
+            used=used,
+        )
 
 
 def _prepared_range_dpt(store: PsfStore) -> tuple[float, float]:
-    """Return the prepared object distances of a store, with a margin for rounding."""
+    """Return the range of prepared object distances, with a margin for rounding."""
     low_dpt, high_dpt = store.spec.object_range_dpt
     margin = 1e-6 * max(high_dpt, 1.0)
     return low_dpt - margin, high_dpt + margin

@@ -1,7 +1,7 @@
-"""Passes that blend a frame's kernels from the cache, and keep them between frames."""
+"""Passes that blend a frame's kernels from cached PSFs; frames can reuse kernels."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,8 @@ from filter_service.rendering.frame_kernels import (
     interval_count,
 )
 from filter_service.rendering.gl.expected_pairs import ExpectedPairs, FrameState
-from filter_service.rendering.gl.strip import grid_of
+from filter_service.rendering.gl.gl_store import GlStore
+from filter_service.rendering.gl.strip import dispatch_grid
 from filter_service.rendering.image_cells import (
     ImageCells,
     KernelsTooLarge,
@@ -37,19 +38,9 @@ from filter_service.rendering.kernel_tables import (
 )
 
 MAX_KERNEL_TEXELS = 24 * 2**20
-"""Largest texel count of a frame: 400 MB at 16 bytes each."""
+"""Largest texel count of a frame's kernels: 400 MB at 16 bytes per texel."""
 
 _WORD_BYTES = 4
-
-
-class Handle(Protocol):
-    """A loaded store."""
-
-    store: PsfStore
-    pages: Pages
-
-    def sync(self) -> None:
-        """Copy the kernels that were computed since the last call."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +56,7 @@ class KernelSet:
         KERNELS and KERNEL_OF.
     atlas : Atlas
         Texels of the kernels.
-    have : (n_cells, n_intervals), bool
+    available : (n_cells, n_intervals), bool
         Pairs that have a kernel.
     """
 
@@ -73,66 +64,66 @@ class KernelSet:
     texel_count: int
     buffers: dict[str, BufferPart]
     atlas: Atlas
-    have: NDArray[np.bool_]
+    available: NDArray[np.bool_]
 
     def lacks(self, used: NDArray[np.bool_]) -> bool:
-        """Return whether a frame uses pairs that have no kernel."""
-        return bool(np.any(used & ~self.have))
+        """Return whether a frame uses pairs without a kernel."""
+        return bool(np.any(used & ~self.available))
 
 
 class KernelMaker:
-    """Blends the kernels that a frame uses; reuses those of the last frame if possible.
+    """Blend the kernels that frames use, and cache those of the last frame.
 
     Parameters
     ----------
     gpu : Gpu
     slot : int
-        Number of this maker in its context; each has its own memory.
+        Number of this instance in its context; each has its own atlas.
     """
 
     def __init__(self, gpu: Gpu, slot: int = 0):
         self._gpu, self._slot = gpu, slot
         self._memory = f"kernels {slot}"
         self._pairs = ExpectedPairs()
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Discard the last frame's kernels and the prediction."""
         self._made_for: tuple[Any, ...] | None = None
         self._set: KernelSet | None = None
-        self._pairs.forget()
+        self._pairs.reset()
 
-    def note(self, state: FrameState, words: NDArray[np.uint32]) -> None:
-        """Record the pairs that a whole frame used, to predict the next."""
-        self._pairs.note(state, words)
+    def record_pairs(self, state: FrameState, words: NDArray[np.uint32]) -> None:
+        """Record the pairs that a frame used, from which the next are predicted."""
+        self._pairs.record(state, words)
 
-    def expected(
-        self, handle: Handle, state: FrameState, timer: StageTimer, fill: Fill
+    def predicted(
+        self, handle: GlStore, state: FrameState, timer: StageTimer, fill: Fill
     ) -> KernelSet | None:
-        """Return predicted kernels of a frame: those of the last, or new ones.
+        """Return kernels for the predicted pairs of a frame.
 
-        Returns None if there is no prediction, or if reading back the used pairs is
-        cheaper, as on a software renderer.
+        Returns None if there is no prediction, or if a readback of the used pairs costs
+        nothing, as on a software renderer.
         """
-        kept = self.kept(handle, state.layers, state.image)
-        if kept is not None or self._gpu.is_software:
-            return kept
+        cached = self.cached(handle, state.layers, state.image)
+        if cached is not None or self._gpu.is_software:
+            return cached
         with timer.wall("psf_plan_ms"):
-            used = self._pairs.at(state)
+            used = self._pairs.predict(state)
         if used is None:
             return None
         try:
             return self.kernels(handle, state.layers, state.image, used, timer, fill)
         except KernelsTooLarge:
-            return None  # the pairs that are actually used may fit
+            return None  # the pairs that the frame actually uses may fit
 
-    def kept(
-        self, handle: Handle, layers: FrameLayers, image: ImageCells
+    def cached(
+        self, handle: GlStore, layers: FrameLayers, image: ImageCells
     ) -> KernelSet | None:
-        """Return the last frame's kernels if they were made for the same state.
+        """Return the last frame's kernels if they are for the same state.
 
-        They must also still exist: another renderer of this context uses memory of the
-        same name.
+        Another renderer of this context may have overwritten them, because it uses
+        buffers of the same names; None is returned then, too.
         """
         key = (handle, layers, image)
         if not self._gpu.is_owner(self._memory, self):
@@ -145,29 +136,31 @@ class KernelMaker:
 
     def kernels(
         self,
-        handle: Handle,
+        handle: GlStore,
         layers: FrameLayers,
         image: ImageCells,
         used: NDArray[np.bool_],
         timer: StageTimer,
         fill: Fill,
     ) -> KernelSet:
-        """Return kernels of all used (cell, interval) pairs (n_cells, n_intervals)."""
-        kept = self.kept(handle, layers, image)
-        if kept is not None and not kept.lacks(used):
-            return kept
+        """Return kernels for all used pairs (n_cells, n_intervals)."""
+        cached = self.cached(handle, layers, image)
+        if cached is not None and not cached.lacks(used):
+            return cached
         self._made_for = None  # remains None if the following fails
         with timer.wall("psf_plan_ms"):
             planned = None
-            if kept is not None:  # the next frame may use the last one's pairs
-                planned = _plan_if_they_fit(
-                    handle.store, layers, image, used | kept.have, fill
+            if (
+                cached is not None
+            ):  # the next frame may use the last frame's pairs again
+                planned = _plan_or_none(
+                    handle.store, layers, image, used | cached.available, fill
                 )
             plan = planned or _plan(handle.store, layers, image, used, fill)
-            handle.sync()
+            pages = handle.sync()
             tables = kernel_tables(plan.kernels, plan.levels, used.shape)
         with timer.stage("psf_blend_ms"):
-            self._set = self._blend(plan, tables, handle.pages)
+            self._set = self._blend(plan, tables, pages)
         self._made_for = (handle, layers, image)
         return self._set
 
@@ -188,7 +181,7 @@ class KernelMaker:
                 return
             gpu.passes.dispatch(
                 name,
-                grid_of(count),
+                dispatch_grid(count),
                 buffers={"WORK": parts[work], **{key: parts[key] for key in bindings}},
                 uniforms={"group_count": count, **options.pop("uniforms", {})},
                 **options,
@@ -210,13 +203,15 @@ class KernelMaker:
                 images={"ATLAS": atlas},
                 uniforms={"level": level},
             )
-        kept = {name: parts[name] for name in ("KERNELS", "KERNEL_OF")}
-        return KernelSet(plan.kernels, plan.levels.texel_count, kept, atlas, plan.used)
+        cached = {name: parts[name] for name in ("KERNELS", "KERNEL_OF")}
+        return KernelSet(
+            plan.kernels, plan.levels.texel_count, cached, atlas, plan.used
+        )
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """Kernels of the used pairs, and their sizes."""
+    """Kernels of used pairs, and their sizes."""
 
     used: NDArray[np.bool_]
     kernels: FrameKernels
@@ -235,20 +230,20 @@ def _plan(
     Raises
     ------
     KernelsTooLarge
-        There are too many texels; larger cells have fewer.
+        There are too many texels, and larger cells are possible.
     """
     kernels = frame_kernels(store, layers, image, used, fill=fill)
     levels = kernel_levels(kernels)
     check_texels(int(levels.sizes[:, 0].sum()), image, store.spec)
     if levels.texel_count > MAX_KERNEL_TEXELS and can_coarsen(image):
         raise KernelsTooLarge(
-            f"the frame's kernels need {levels.texel_count} texels; allowed are "
+            f"the frame's kernels have {levels.texel_count} texels; expected at most "
             f"{MAX_KERNEL_TEXELS}",
         )
     return _Plan(used, kernels, levels)
 
 
-def _plan_if_they_fit(*arguments: Any) -> _Plan | None:
+def _plan_or_none(*arguments: Any) -> _Plan | None:
     try:
         return _plan(*arguments)
     except KernelsTooLarge:
@@ -256,12 +251,12 @@ def _plan_if_they_fit(*arguments: Any) -> _Plan | None:
 
 
 def words_per_cell(layers: FrameLayers) -> int:
-    """Return the number of words for the used parts of a cell's intervals.
+    """Return the number of words with the bits of a cell's intervals.
 
     Raises
     ------
     GridTooLarge
-        There are more layers than a frame may have.
+        There are more than `MAX_LAYERS`.
     """
     if len(layers.layer_dpt) > MAX_LAYERS:
         raise GridTooLarge(

@@ -1,4 +1,4 @@
-"""Passes that build the lists of fragments, sort them and splat them."""
+"""Passes that build the fragment lists, sort them and splat the fragments."""
 
 from typing import Any
 
@@ -29,8 +29,8 @@ SOFTWARE_SPLAT = {
     "GROUP_ROWS": 1,
     "FRAGMENTS_A_TURN": 1,
 }
-"""2.8 times as many evaluations per second as with one pixel per thread on llvmpipe (8
-floats)."""
+"""On llvmpipe (8 floats per vector), 2.8 times as many evaluations per second as with
+one pixel per thread."""
 
 HARDWARE_SPLAT = {
     "PIXELS_PER_THREAD": 2,
@@ -39,26 +39,26 @@ HARDWARE_SPLAT = {
     "BATCH": 32,
     "HIT_WORDS": 1,
 }
-"""One warp per tile and little shared memory, so that many tiles are in flight while
-others wait for their fetches: on an H100 1.4 to 1.9 times as fast as groups of 64
-threads that stage 128 fragments and fetch one at a time."""
+"""One warp per tile and little shared memory, so that occupancy is high and hides the
+latency of fetches.  On an H100, this is 1.4 to 1.9 times as fast as groups of 64
+threads that load 128 fragments to shared memory and fetch one texel at a time."""
 
 HARDWARE_STRETCH_SLOTS = 16
-"""Slots of a block that a thread processes at a time, because there are more threads
-than blocks in reach; a software renderer processes whole blocks."""
+"""Slots of a block per thread.  A bin has more threads than blocks in its window, so
+that blocks are divided; a software renderer processes whole blocks."""
 
 SOFTWARE_LIST_THREADS = 8
-"""Threads that build and sort a bin's list on a software renderer: one vector."""
+"""Threads per bin on a software renderer: one vector."""
 
 
 class ListPasses:
-    """Lists of one strip's bins, from its fragments to light.
+    """Fragment lists of one strip's bins: building, sorting and splatting.
 
     Parameters
     ----------
     strip : Strip
     search_blocks : int
-        Distance at which a bin searches for fragments that reach it.
+        Distance, in blocks, within which a bin searches for fragments that reach it.
     atlas : Atlas, optional
         Texels of the fragments' kernels.
     """
@@ -71,38 +71,38 @@ class ListPasses:
         self.bands: list[tuple[int, int, int]] = []
 
     def run(self) -> None:
-        """Count, list, sort and splat, in the existing buffers.
+        """Build, sort and splat the lists in the existing buffers, without a readback.
 
-        Nothing is read back: if the lists do not fit, the passes after the count do
-        nothing, and `take_totals` returns False.
+        If the lists do not fit, the passes after the count do nothing, and
+        `record_totals` returns False.
         """
         self.strip.reserve(COLOR_OUT=16 * self.strip.pixel_count)
         self.count_bins()
-        if self.strip.bin_count <= list_bands.MAX_GROUPS:
+        if self.strip.bin_count <= list_bands.MAX_BAND_BINS:
             self._make_lists_and_splat(0, self.strip.bin_count, indirect=True)
 
     @property
     def totals(self) -> tuple[Buffer, int]:
-        """Location of the totals: a buffer, and the offset in bytes."""
+        """Location of the totals: buffer and offset in bytes."""
         return self.strip.buffers["BIN_OFFSETS"], 4 * self.strip.bin_count
 
-    def take_totals(self, words: NDArray[np.uint32]) -> bool:
-        """Record the totals; return whether the frame is complete.
+    def record_totals(self, words: NDArray[np.uint32]) -> bool:
+        """Record the totals that were read back; return whether all lists did fit.
 
-        If not, `splat_bands` completes it.
+        Otherwise `splat_bands` must run.
         """
         self.lists = list_bands.read_totals(words)
         entries, spare = self._capacities
         needs_spare = self.lists.longest > SORT_CAPACITIES[-1]
         return (
-            self.strip.bin_count <= list_bands.MAX_GROUPS
+            self.strip.bin_count <= list_bands.MAX_BAND_BINS
             and self.lists.entry_count <= entries
             and (not needs_spare or self.lists.entry_count <= spare)
         )
 
     @property
     def _capacities(self) -> tuple[int, int]:
-        """Capacities of the two list buffers in entries, as one band."""
+        """Capacities of the two list buffers, in entries, for a single band."""
         entries, spare = (
             min(
                 self.strip.buffers[name].size // ENTRY_BYTES,
@@ -113,7 +113,7 @@ class ListPasses:
         return entries, spare
 
     def count_bins(self) -> None:
-        """Compute the lengths and offsets of the lists."""
+        """Compute the lengths of the lists and, by a prefix sum, their offsets."""
         self.strip.reserve(
             BIN_COUNTS=16 * self.strip.bin_count,
             WINDOWS=16 * self.strip.bin_count,
@@ -128,7 +128,7 @@ class ListPasses:
                 "count_bins",
                 self.strip.bin_grid,
                 *("FRAGMENT_PLACE", "BLOCKS", "WINDOWS", "BIN_COUNTS"),
-                **self._walk,
+                **self._bin_uniforms,
                 order_always=int(self.strip.paper_rule),
                 defines=self._list_threads,
             )
@@ -142,8 +142,8 @@ class ListPasses:
             )
 
     @property
-    def _walk(self) -> dict[str, Any]:
-        """Uniforms of common/binning.glsl, and the capacity of a list."""
+    def _bin_uniforms(self) -> dict[str, Any]:
+        """Uniforms of ``common/binning.glsl``, and the capacity of a list."""
         return {
             "tile_grid": self.strip.grid,
             "search_blocks": self.search_blocks,
@@ -153,16 +153,16 @@ class ListPasses:
 
     @property
     def _list_limit(self) -> int:
-        """Capacity of a band, and of a single list, in entries."""
+        """Capacity of a band, and of one list, in entries."""
         fit = self.strip.gpu.max_block_bytes // ENTRY_BYTES
         return min(list_bands.MAX_BAND_ENTRIES, fit)
 
     def _plan_bands(self) -> list[tuple[int, int, int]]:
-        """Return bands as (first bin, bin count, entries), from the totals."""
+        """Return the bands as (first bin, bin count, entries)."""
         limit = self._list_limit
         if (
             self.lists.entry_count <= limit
-            and self.strip.bin_count <= list_bands.MAX_GROUPS
+            and self.strip.bin_count <= list_bands.MAX_BAND_BINS
         ):
             return [(0, self.strip.bin_count, self.lists.entry_count)]
         counts = self.strip.gpu.read(
@@ -175,7 +175,7 @@ class ListPasses:
         return bands
 
     def reserve_lists(self) -> None:
-        """Divide the lists into bands, and reserve buffers for the longest."""
+        """Divide the lists into bands, and allocate buffers for the longest."""
         with self.strip.timer.wall("plan_ms"):
             self.bands = self._plan_bands()
         n_bytes = ENTRY_BYTES * max(entries for _, _, entries in self.bands)
@@ -184,7 +184,7 @@ class ListPasses:
         self.strip.reserve(ENTRIES_SPARE=n_bytes if needs_spare else 0)
 
     def splat_bands(self) -> None:
-        """Scatter, sort and splat, band by band."""
+        """Build, sort and splat the lists, band by band."""
         self.reserve_lists()
         for first_bin, bin_count, _ in self.bands:
             self._make_lists_and_splat(first_bin, bin_count)
@@ -196,20 +196,20 @@ class ListPasses:
         self._splat(first_bin, bin_count, indirect=indirect)
 
     def _groups_on_gpu(self, index: int, indirect: bool) -> tuple[Buffer, int] | None:
-        """Return the location of a dispatch size that the scan has written."""
-        place = self.strip.buffers["DISPATCHES"], DISPATCH_BYTES * index
-        return place if indirect else None
+        """Return the location of a dispatch size that ``scan_bins`` has written."""
+        location = self.strip.buffers["DISPATCHES"], DISPATCH_BYTES * index
+        return location if indirect else None
 
     def make_lists(
         self, first_bin: int, bin_count: int, *, indirect: bool = False
     ) -> None:
-        """Scatter and sort the lists of a band."""
+        """Build and sort the lists of a band."""
         with self.strip.timer.stage("bin_ms"):
             self.strip.run(
                 "scatter_fragments",
                 (bin_count, 1),
                 *("FRAGMENT_PLACE", "BLOCKS", "WINDOWS", "BIN_OFFSETS", "ENTRIES"),
-                **self._walk,
+                **self._bin_uniforms,
                 bin_columns=self.strip.bin_grid[0],
                 first_bin=first_bin,
                 defines=self._list_threads,
@@ -274,7 +274,7 @@ class ListPasses:
         return {**(SOFTWARE_SPLAT if software else HARDWARE_SPLAT), **self._rule}
 
     def counts(self) -> dict[str, int]:
-        """Return counts of `FilteredView` by name."""
+        """Return the counts of `FilteredView` by name."""
         return {
             "entry_count": self.lists.entry_count,
             "overflow_count": self.lists.overflow_count,

@@ -1,44 +1,50 @@
-"""Division of a frame into strips of rows whose buffers fit the storage blocks."""
+"""Division of a frame into strips of rows whose buffers fit a storage block."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from filter_service.constants import BIN_SIZE_PX, TILE_SIZE_PX
 from filter_service.errors import OutOfGpuMemory
-from filter_service.rendering.frame import IMAGES
+from filter_service.rendering.frame import map_images
 from filter_service.rgbd_view import RgbdView
 
 BYTES_PER_PIXEL = 16
-"""Bytes per pixel and surface in the largest buffers, which must fit a block."""
+"""Bytes per pixel and surface in the largest buffers."""
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Rows of a frame that the passes process together.
+    """A strip: rows of a frame that the passes process together.
 
-    ``view`` contains all rows that send light to the ``kept`` ones, which are the
-    strip's part of the image.
+    Attributes
+    ----------
+    view : RgbdView
+        The strip's part of the image, with a halo: all rows whose light reaches it.
+    first_row : int
+        First row of ``view`` within the frame.
+    output_rows : slice
+        Rows of ``view`` without the halo.
     """
 
     view: RgbdView
     first_row: int
-    kept: slice
+    output_rows: slice
 
 
-def cut_in_strips(
+def split_into_strips(
     view: RgbdView, reach_of: Callable[[], int], max_block_bytes: int
 ) -> list[Rows]:
     """Divide a frame so that each strip's buffers fit a storage block.
 
-    Strips start on rows of bins, so that lists and merged squares are the same as in
-    the whole frame.
+    Strips start at multiples of a bin, so that fragment lists and merged squares are
+    those of the whole frame.
 
     Parameters
     ----------
     reach_of : callable
-        Function that returns the spread of light, px; called if the frame must be
+        Function that returns the largest reach, px; only called if the frame must be
         divided.
     """
     padded_width = -(-view.width_px // TILE_SIZE_PX) * TILE_SIZE_PX
@@ -51,8 +57,8 @@ def cut_in_strips(
     step = rows - 2 * halo
     if step < BIN_SIZE_PX:
         raise OutOfGpuMemory(
-            f"{view.width_px} px wide at {reach_px} px of blur: a strip does not fit "
-            f"a storage block of {max_block_bytes / 1e6:.0f} MB"
+            f"an image {view.width_px} px wide with {reach_px} px of blur: a strip "
+            f"does not fit a storage block of {max_block_bytes / 1e6:.0f} MB"
         )
     strips = []
     for top in range(0, view.height_px, step):
@@ -62,7 +68,7 @@ def cut_in_strips(
             Rows(
                 view=_rows_of(view, first, last),
                 first_row=first,
-                kept=slice(top - first, bottom - first),
+                output_rows=slice(top - first, bottom - first),
             )
         )
     return strips
@@ -72,23 +78,18 @@ def _rows_of(view: RgbdView, first: int, last: int) -> RgbdView:
     """Return rows first..last of a view, with the tangents of their edges."""
     left, right, up, down = view.tangents
     per_row = (down - up) / view.height_px
-    images = {
-        name: np.ascontiguousarray(image[first:last])
-        for name in IMAGES
-        if (image := getattr(view, name)) is not None
-    }
-    return replace(
+    return map_images(
         view,
-        **images,
-        tangents=(left, right, up + first * per_row, up + last * per_row),
+        lambda image: np.ascontiguousarray(image[first:last]),
+        (left, right, up + first * per_row, up + last * per_row),
     )
 
 
 def counted_px(rows: Rows, view: RgbdView, border_px: int) -> tuple[int, int, int, int]:
-    """Return the pixels (left, top, right, bottom) of a strip's part of the image."""
+    """Return the pixels (left, top, right, bottom) of a strip that are counted."""
     top, bottom = (
         border_px - rows.first_row,
         border_px + view.height_px - rows.first_row,
     )
-    first, last, _ = rows.kept.indices(rows.view.height_px)
+    first, last, _ = rows.output_rows.indices(rows.view.height_px)
     return border_px, max(top, first), border_px + view.width_px, min(bottom, last)

@@ -1,12 +1,12 @@
-"""Frame engine of compiled loops, for machines without a GPU.
+"""Frame engine of compiled loops (C), for machines without a GPU.
 
-renderer      the engine: stages, and state kept between frames
-lanes         two renderers, for small frames during large ones
-native_store  a store with its coarse kernels
-eye_states    state of each eye kept between frames
-kernel_plan   kernels that a frame needs
+renderer      the engine: stages of a frame, and state between frames
+lanes         two renderers, so that small frames can interrupt large ones
+native_store  a PSF store with additional kernels of coarse resolution
+eye_states    cached state of the most recently used eyes
+kernel_plan   plan of a frame's kernels
 frame_record  input record of the loops
-arrays        buffers reused by frames
+arrays        reusable buffers
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Buffers reused by frames."""
+"""Buffers that frames reuse."""
 
 from typing import Any
 
@@ -6,22 +6,25 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 SPARE_RATIO = 1.25
-"""Over-allocation for a next frame that needs a little more."""
+"""Over-allocation, so that slowly rising sizes do not reallocate in every frame."""
 
 
 class Arrays:
-    """Arrays by name; each grows when a frame needs more than the previous ones."""
+    """Named arrays that only grow."""
 
     def __init__(self) -> None:
         self._arrays: dict[str, NDArray[Any]] = {}
 
     def get(self, name: str, count: int, dtype: DTypeLike) -> NDArray[Any]:
-        """Return a named array of at least ``count`` elements, contents unchanged."""
-        held = self._arrays.get(name)
-        if held is None or held.size < count:
-            self._arrays.pop(name, None)  # before the new one is allocated
-            held = self._arrays[name] = np.empty(int(SPARE_RATIO * count) + 1, dtype)
-        return held
+        """Return a named array of at least ``count`` elements, not initialized.
+
+        Its contents are lost when it grows.
+        """
+        array = self._arrays.get(name)
+        if array is None or array.size < count:
+            self._arrays.pop(name, None)  # frees it before the next allocation
+            array = self._arrays[name] = np.empty(int(SPARE_RATIO * count) + 1, dtype)
+        return array
 
     def address(self, name: str, count: int, dtype: DTypeLike) -> int:
         """Return the address of a named array."""

@@ -1,4 +1,4 @@
-"""State of each eye kept between frames, so that several can alternate without loss."""
+"""Cached state of the most recently used eyes, so that several eyes can alternate."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from filter_service.rendering.native.frame_record import BlendSizes
 from filter_service.rendering.native.kernel_plan import KernelPlan
 from filter_service.rendering.native.native_store import NativeStore
 
-MAX_KEPT = 4
-"""Largest number of eyes: those of a stereo frame, and of clients that stream at the
-same time."""
+MAX_EYES = 4
+"""Cache size: the eyes of a stereo frame, and those of clients that stream at the same
+time."""
 
 
 @dataclass(eq=False)
 class EyeState:
-    """State of an eye's last frame that the next frame in the same state reuses.
+    """Results of an eye's last frame that the next frame can reuse.
 
     Attributes
     ----------
@@ -40,24 +40,22 @@ class EyeState:
 
 
 class EyeStates:
-    """States of the most recently used eyes; those of released stores are dropped."""
+    """Cache of the most recently used eyes; released stores are dropped."""
 
     def __init__(self) -> None:
-        self._kept: list[EyeState] = []
+        self._eyes: list[EyeState] = []
 
     def of(self, handle: NativeStore) -> EyeState:
-        """Return the state of an eye, and mark it as most recently used."""
-        found = next((kept for kept in self._kept if kept.handle is handle), None)
+        """Return the state of an eye, which becomes the most recently used."""
+        found = next((eye for eye in self._eyes if eye.handle is handle), None)
         others = [
-            kept
-            for kept in self._kept
-            if kept is not found and not kept.handle.is_released
+            eye for eye in self._eyes if eye is not found and not eye.handle.is_released
         ]
         found = found or EyeState(handle)
-        self._kept = [*others[1 - MAX_KEPT :], found]
+        self._eyes = [*others[1 - MAX_EYES :], found]
         return found
 
     @property
     def memory_mb(self) -> float:
         """Memory of all blended kernels, MB."""
-        return sum(kept.arrays.memory_mb for kept in self._kept)
+        return sum(eye.arrays.memory_mb for eye in self._eyes)

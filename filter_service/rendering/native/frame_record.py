@@ -27,16 +27,16 @@ from filter_service.rgbd_view import RgbdView
 
 COLOR_KINDS = {"uint8": 0, "float32": 1, "float16": 2}
 BLOCK_PIXELS = TILE_SIZE_PX**2
-BOXES_READ_BEYOND = 16
+BOX_PADDING_COUNT = 16
 CLAMP_MARGIN_RATIO = 1e-6
 COARSE_MARGIN_PX = 8.0
-"""Additional reach of the light of coarse kernels, see merge.h."""
+"""Additional reach of coarse kernels, see merge.h."""
 
 REACH_MARGIN_PX = 1.5
 
 
 class BlendSizes(NamedTuple):
-    """Sizes of the outputs of blending, as determined by `place`."""
+    """Output sizes of the stage `blend`, which the stage `place` computes."""
 
     recipe_texels: int
     kernel_texels: int
@@ -54,7 +54,7 @@ class BlendSizes(NamedTuple):
 
 @dataclass
 class FrameRecord:
-    """Record of one frame, with the arrays that it points to.
+    """Record of one frame, which keeps the arrays alive that it points to.
 
     Attributes
     ----------
@@ -64,26 +64,26 @@ class FrameRecord:
     c: Frame
     n_threads: int
     arrays: Arrays
-    eye_arrays: Arrays  # may be reused by the next frame of this eye
-    kept: list[NDArray[Any]]
+    eye_arrays: Arrays  # the next frame of this eye may reuse their contents
+    referenced: list[NDArray[Any]]
 
     @classmethod
     def new(
         cls, threads: int, n_threads: int, arrays: Arrays, eye_arrays: Arrays
     ) -> "FrameRecord":
-        """Return an empty record for loops on the given threads."""
+        """Return an empty record for loops on a pool of threads."""
         return cls(Frame(threads=threads), n_threads, arrays, eye_arrays, [])
 
-    def _keep(self, array: NDArray[Any]) -> int:
-        """Keep an array alive as long as the record; return its address."""
-        self.kept.append(array)
+    def _pointer_to(self, array: NDArray[Any]) -> int:
+        """Return the address of an array, and keep the array alive with the record."""
+        self.referenced.append(array)
         return int(array.ctypes.data)
 
-    def _room(self, name: str, count: int, dtype: DTypeLike = np.uint8) -> int:
+    def _buffer(self, name: str, count: int, dtype: DTypeLike = np.uint8) -> int:
         return self.arrays.address(name, count, dtype)
 
     def set_view(self, view: RgbdView, border_px: int) -> None:
-        """Set pointers to the images of a view that includes a border."""
+        """Set pointers to the images of a view, which may have a border."""
         c = self.c
         c.width, c.height = view.width_px, view.height_px
         c.surface_count, c.border_px = view.surface_count, border_px
@@ -95,13 +95,13 @@ class FrameRecord:
         for s, (color, depth_m) in enumerate(
             zip(view.surface_colors, view.surface_depths_m, strict=True)
         ):
-            c.color[s] = self._keep(np.ascontiguousarray(color))
-            c.depth_m[s] = self._keep(np.ascontiguousarray(depth_m))
+            c.color[s] = self._pointer_to(np.ascontiguousarray(color))
+            c.depth_m[s] = self._pointer_to(np.ascontiguousarray(depth_m))
         c.depth_is_planar = view.depth_kind == "planar"
         c.tangents[:] = view.tangents
         n_pixels = view.surface_count * view.width_px * view.height_px
-        c.dpt = self._room("dpt", n_pixels, np.float32)
-        c.position = self._room("position", n_pixels, np.float32)
+        c.dpt = self._buffer("dpt", n_pixels, np.float32)
+        c.position = self._buffer("position", n_pixels, np.float32)
 
     def set_state(
         self,
@@ -109,7 +109,7 @@ class FrameRecord:
         image: ImageCells,
         corner_change_dpt: NDArray[np.float32],
     ) -> NDArray[np.bool_]:
-        """Set pointers to layers and cells; return the array that marks used pairs."""
+        """Set pointers to layers and cells; return the array for the used pairs."""
         c = self.c
         far_dpt, near_dpt = layers.vergence_range_dpt
         c.vergence_low_dpt, c.vergence_high_dpt = far_dpt, near_dpt
@@ -118,52 +118,54 @@ class FrameRecord:
         c.vergence_offset_m = layers.vergence.offset_m
         c.blur_px_per_dpt = layers.blur_px_per_dpt
         layer_dpt = layers.layer_dpt.astype(np.float32)
-        c.layer_dpt = self._keep(layer_dpt)
+        c.layer_dpt = self._pointer_to(layer_dpt)
         steps_dpt = np.maximum(np.diff(layer_dpt), MIN_BLUR_RANGE)
-        c.layer_per_dpt = self._keep((1.0 / steps_dpt).astype(np.float32))
+        c.layer_per_dpt = self._pointer_to((1.0 / steps_dpt).astype(np.float32))
         c.layer_count = len(layers.layer_dpt)
         c.interval_count = interval_count(layers)
         c.cell_px, c.cell_columns = image.cell_px, image.grid[0]
-        c.corner_dpt = self._keep(np.ascontiguousarray(corner_change_dpt, np.float32))
-        c.row_scratch = self._room(
+        c.corner_dpt = self._pointer_to(
+            np.ascontiguousarray(corner_change_dpt, np.float32)
+        )
+        c.row_scratch = self._buffer(
             "row_scratch", self.n_threads * (c.cell_columns + 1), np.float32
         )
         if image.cell_px:
             column = np.clip(np.arange(c.width) - c.border_px, 0, c.image_width - 1)
             cell, place = np.divmod(column, image.cell_px)
-            c.column_cell = self._keep(cell.astype(np.int32))
+            c.column_cell = self._pointer_to(cell.astype(np.int32))
             share = (place + np.float32(0.5)) / np.float32(image.cell_px)
-            c.column_share = self._keep(share.astype(np.float32))
+            c.column_share = self._pointer_to(share.astype(np.float32))
         used = np.zeros((image.count, c.interval_count), np.bool_)
-        c.used = self._keep(used)
+        c.used = self._pointer_to(used)
         return used
 
     def set_kernels(self, plan: KernelPlan) -> None:
-        """Set pointers to planned kernels and to buffers for fragments."""
+        """Set pointers to the planned kernels and to buffers for fragments."""
         c = self.c
-        c.kernel_of = self._keep(plan.kernel_of)
-        c.shapes = self._keep(plan.shapes)
+        c.kernel_of = self._pointer_to(plan.kernel_of)
+        c.shapes = self._pointer_to(plan.shapes)
         c.kernel_count = plan.kernels.count
         reach_px = float(plan.kernels.reach_px.max())
         c.largest_reach_px = reach_px + REACH_MARGIN_PX + COARSE_MARGIN_PX
         n_blocks = c.surface_count * c.block_columns * c.block_rows
-        c.fragments = self._room("fragments", n_blocks * BLOCK_PIXELS, FRAGMENT)
-        c.lights = self._room("lights", n_blocks * BLOCK_PIXELS, FRAGMENT_LIGHT)
-        n_places = n_blocks * BLOCK_PIXELS + BOXES_READ_BEYOND
+        c.fragments = self._buffer("fragments", n_blocks * BLOCK_PIXELS, FRAGMENT)
+        c.lights = self._buffer("lights", n_blocks * BLOCK_PIXELS, FRAGMENT_LIGHT)
+        n_places = n_blocks * BLOCK_PIXELS + BOX_PADDING_COUNT
         for side in range(4):
-            c.boxes[side] = self._room(f"boxes {side}", n_places, np.int16)
-        c.blocks = self._room("blocks", n_blocks, BLOCK)
+            c.boxes[side] = self._buffer(f"boxes {side}", n_places, np.int16)
+        c.blocks = self._buffer("blocks", n_blocks, BLOCK)
         names = ("kernel_cells", "kernel_parts", "node_near", "node_far")
         for name, array in zip(
             (*names, "part_weights", "part_maps", "recipes"), plan.sources, strict=True
         ):
-            setattr(c, name, self._keep(array))
+            setattr(c, name, self._pointer_to(array))
         c.recipe_count = len(plan.kernels.nodes.recipes)
         n_images = RESOLUTIONS * c.recipe_count
-        eye_room = self.eye_arrays.address
+        eye_buffer = self.eye_arrays.address
         n_bytes = n_images * RECIPE_IMAGE_BYTES
-        c.recipe_images = eye_room("recipe_images", n_bytes, np.uint8)
-        c.kernels = eye_room("kernels", c.kernel_count * KERNEL_IMAGE_BYTES, np.uint8)
+        c.recipe_images = eye_buffer("recipe_images", n_bytes, np.uint8)
+        c.kernels = eye_buffer("kernels", c.kernel_count * KERNEL_IMAGE_BYTES, np.uint8)
 
     def set_merging(
         self,
@@ -173,7 +175,7 @@ class FrameRecord:
         white_level: float,
         is_encoded: bool,
     ) -> None:
-        """Set the options of merging and accumulation; the paper merges once."""
+        """Set the options of merging and accumulation; the paper has one level."""
         c = self.c
         c.paper_rule, c.white_level = paper_rule, white_level
         c.is_encoded = is_encoded and white_level > 0.0
@@ -189,21 +191,21 @@ class FrameRecord:
     def set_store(self, handle: NativeStore) -> None:
         """Set pointers to the cached kernels."""
         for r, stored in enumerate(handle.resolutions):
-            self.c.store[r] = self._keep(stored.words)
-            self.c.store_first[r] = self._keep(stored.first_texel)
-            self.c.store_reach[r] = self._keep(stored.reach)
+            self.c.store[r] = self._pointer_to(stored.words)
+            self.c.store_first[r] = self._pointer_to(stored.first_texel)
+            self.c.store_reach[r] = self._pointer_to(stored.reach)
 
-    def set_blend_room(self, sizes: BlendSizes) -> None:
-        """Set pointers to blended kernels, or to buffers for them."""
+    def set_blend_buffers(self, sizes: BlendSizes) -> None:
+        """Set pointers to buffers for blended kernels, or with such kernels."""
         c = self.c
-        room = self.eye_arrays.address
-        c.recipe_texels = room("recipe_texels", 4 * sizes.recipe_texels, np.float32)
-        c.kernel_texels = room("kernel_texels", 4 * sizes.kernel_texels, np.uint32)
+        buffer = self.eye_arrays.address
+        c.recipe_texels = buffer("recipe_texels", 4 * sizes.recipe_texels, np.float32)
+        c.kernel_texels = buffer("kernel_texels", 4 * sizes.kernel_texels, np.uint32)
         c.blend_scratch_floats = sizes.scratch_floats
         n_floats = self.n_threads * sizes.scratch_floats
-        c.blend_scratch = self._room("blend_scratch", n_floats, np.float32)
+        c.blend_scratch = self._buffer("blend_scratch", n_floats, np.float32)
 
     def set_picture(self, picture: NDArray[Any]) -> None:
         """Set the pointer to the output image."""
-        self.c.picture = self._keep(picture)
+        self.c.picture = self._pointer_to(picture)
         self.c.output_kind = COLOR_KINDS[picture.dtype.name]

@@ -1,4 +1,4 @@
-"""Plan of a frame's kernels for the compiled loops, kept between frames."""
+"""Plan of a frame's kernels for the compiled loops, cached between frames."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -29,16 +29,16 @@ class KernelPlan:
     Attributes
     ----------
     state : (NativeStore, FrameLayers, ImageCells)
-        State that the kernels are for.
+        State that the kernels belong to.
     used : (n_cells, n_intervals), bool
         Pairs that have a kernel.
     kernels : FrameKernels
     kernel_of : (n_cells, n_intervals), uint32
     shapes : (n,), KERNEL_SHAPE
-        `levels_used` is filled in by merging.
+        The stage `merge` writes `levels_used`.
     sources : tuple of arrays
-        Contiguous inputs of blending: cells, parts, near and far recipes, weights,
-        maps, recipes.
+        Contiguous inputs of the stage `blend`: cells, parts, near and far recipes,
+        weights, maps, recipes.
     """
 
     state: tuple[NativeStore, FrameLayers, ImageCells]
@@ -49,7 +49,7 @@ class KernelPlan:
     sources: tuple[NDArray[Any], ...]
 
     def serves(self, state: tuple[object, ...], used: NDArray[np.bool_]) -> bool:
-        """Return whether the plan has all kernels of a frame's state and pairs."""
+        """Return whether the plan is for this state and has a kernel for each pair."""
         if any(own is not other for own, other in zip(self.state, state, strict=True)):
             return False
         return not np.any(used & ~self.used)
@@ -67,9 +67,9 @@ def plan_kernels(
     Raises
     ------
     KernelsTooLarge
-        There are too many texels; larger cells have fewer.
+        There are too many texels, and larger cells are possible.
     NotPrepared
-        ``fill`` ran out of time.
+        The deadline of ``fill`` has passed.
     """
     kernels = frame_kernels(
         handle.store, layers, image, used, tables=handle.tables, fill=fill

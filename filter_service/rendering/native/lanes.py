@@ -1,4 +1,4 @@
-"""Two renderers on one processor, so that small frames can interrupt large ones."""
+"""Two renderers in one thread, so that small frames can interrupt large ones."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from filter_service.rendering.native.renderer import NativeRenderer
 
 
 class NativeLanes(OneView):
-    """The native engine of a service; functions of `call_between` may reenter it.
+    """Reentrant native engine: the callback of `call_between` may use it.
 
-    Everything runs in the caller's thread: while one renderer pauses, the other may
-    filter a frame or load a store.
+    Everything runs in the caller's thread.  While the callback pauses one renderer, the
+    other may filter a frame or load a store.
     """
 
     def __init__(self) -> None:
@@ -25,11 +25,6 @@ class NativeLanes(OneView):
     def name(self) -> str:
         """Instruction set of the compiled loops, and their number of threads."""
         return self._main.name
-
-    @property
-    def memory_mb(self) -> float:
-        """Memory of the buffers that frames reuse, MB."""
-        return self._main.memory_mb + self._other.memory_mb
 
     def trim(self) -> None:
         """Release the buffers that frames reuse."""
@@ -42,12 +37,12 @@ class NativeLanes(OneView):
         self._other.close()
 
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
-        """Register a function to be called during frames; it may filter another."""
+        """Register a callback for pauses during frames; it may use this engine."""
         self._main.call_between(function, interval_s)
         return True
 
     def load(self, store: PsfStore) -> NativeStore:
-        """Load a store; its kernels may all be computed later."""
+        """Load a store; its kernels may be computed later."""
         return self._other.load(store)
 
     def begin(self, request: ViewRequest) -> Pending:

@@ -1,4 +1,4 @@
-"""A PSF store of the native engine, with additional coarse kernels."""
+"""A PSF store of the native engine, with additional kernels of coarse resolution."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.image_cells import image_cells
 
 COARSE_SPREAD_PX = (0.0, 24.0, 48.0)
-"""Smallest spread of a kernel whose merged squares are splatted onto pixels of 1, 2 and
-4 px.  At -6 dpt and kernels of 74 px to each side, the image is within 77 dB of the one
-without, in 81 % of its time.  From 12 and 24 px on, 37 px took 88 %, but astigmatism
-and cataract had 0.1 dB more error at 1280x720."""
+"""Smallest spread of kernels that are splatted onto coarse pixels of 1, 2 and 4 px.  At
+-6 dpt and a reach of 74 px, the PSNR against full resolution is 77 dB, in 81 % of the
+time.  With limits of 12 and 24 px, a reach of 37 px took 88 %, but astigmatism and
+cataract had 0.1 dB more error at 1280x720."""
 
-KEPT_SPREAD_RATIO = 0.25
-"""Cached kernels with at least this fraction of the smallest spread have coarse forms,
-because a kernel of the frame is blended from wider and narrower ones.  The coarse form
-of a narrower one is a single pixel."""
+COARSE_SPREAD_RATIO = 0.25
+"""Cached kernels are downsampled if their spread is at least this fraction of the
+limit: a frame's kernel is a weighted sum of wider and narrower ones.  Narrower cached
+kernels become a single coarse pixel."""
 
 
 class StoredKernels(NamedTuple):
-    """Cached kernels in one resolution.
+    """Cached kernels at one resolution.
 
     Attributes
     ----------
@@ -43,8 +43,8 @@ class StoredKernels(NamedTuple):
     first_texel: NDArray[np.uint64]
     reach: NDArray[np.uint32]
 
-    def with_room(self, count: int) -> StoredKernels:
-        """Return the kernels with space for ``count`` more."""
+    def with_space_for(self, count: int) -> StoredKernels:
+        """Return the kernels with tables for ``count`` more PSFs."""
         return self._replace(
             first_texel=np.append(self.first_texel, np.zeros(count, np.uint64)),
             reach=np.append(self.reach, np.zeros(count, np.uint32)),
@@ -52,25 +52,25 @@ class StoredKernels(NamedTuple):
 
 
 class NativeStore(FrameStore):
-    """A store with its kernels in all resolutions.
+    """A store with its kernels at all resolutions.
 
     Attributes
     ----------
     resolutions : list of StoredKernels
-        Kernels added so far by `sync`, in each resolution.
+        Kernels at each resolution; `sync` adds new ones.
     is_released : bool
-        Whether the store was released and nothing of it may be kept.
+        Whether the store was released; the engine then drops all state of it.
     """
 
     def __init__(self, store: PsfStore) -> None:
         super().__init__(store, image_cells(store.spec, store.plan))
-        self._numbers = np.zeros(0, np.uint32)
+        self._psf_numbers = np.zeros(0, np.uint32)
         self.is_released = False
-        self._start_anew()
+        self._reset()
         _ = store.defocus  # computed here and not by the first frame
 
-    def _start_anew(self) -> None:
-        """Discard all kernels; current readers keep references to their arrays."""
+    def _reset(self) -> None:
+        """Discard all kernels; frames in progress have their own references."""
         self._generation, self._n_seen = self.store.generation, 0
         self._n_texels = [0] * RESOLUTIONS
         self.resolutions = [
@@ -85,31 +85,31 @@ class NativeStore(FrameStore):
     @property
     def tables(self) -> StoreTables:
         """Tables of the store, with kernel numbers in place of offsets."""
-        if self._numbers.size != self.store.psf_count:
-            self._numbers = np.arange(self.store.psf_count, dtype=np.uint32)
-        return self.store.tables._replace(offsets=self._numbers)
+        if self._psf_numbers.size != self.store.psf_count:
+            self._psf_numbers = np.arange(self.store.psf_count, dtype=np.uint32)
+        return self.store.tables._replace(offsets=self._psf_numbers)
 
     @property
     def memory_mb(self) -> float:
-        """Memory of the kernels in all resolutions, MB."""
+        """Memory of the kernels at all resolutions, MB."""
         return self.store.memory_mb + 2.0 * sum(self._n_texels[1:]) / 1e6
 
     def release(self) -> None:
-        """Mark the store as released; its memory is freed with the last reference."""
+        """Mark the store as released; the last reference frees its memory."""
         self.is_released = True
 
     def sync(self, library: Library, threads: int) -> None:
         """Add the kernels that were computed since the last call.
 
-        This uses the threads of the current renderer, as the one that loaded the store
+        The caller passes its own threads, because the renderer that loaded the store
         may no longer exist.
         """
         store = self.store
         if store.generation != self._generation:
-            self._start_anew()
+            self._reset()
         more = store.psf_count - self.resolutions[0].reach.size
-        if more:  # nodes of a state that is used for the first time
-            self.resolutions = [own.with_room(more) for own in self.resolutions]
+        if more:  # nodes of a state that frames use for the first time
+            self.resolutions = [own.with_space_for(more) for own in self.resolutions]
         self._n_seen, added = store.added_since(self._n_seen)
         psfs = np.ascontiguousarray(added, np.int64)
         if not psfs.size:
@@ -124,20 +124,19 @@ class NativeStore(FrameStore):
     def _shrink_job(
         self, resolution: int, psfs: NDArray[np.int64], threads: int
     ) -> ShrinkJob:
-        """Return the job that makes coarse forms of kernels (n,), and allocate them.
+        """Return a job that downsamples kernels (n,), and allocate its output.
 
-        Narrow kernels have one texel.  The job points to arrays of the store and to
-        ``psfs``.
+        The job points to arrays of the store and to ``psfs``.
         """
         store, coarse = self.store, self.resolutions[resolution]
         size_px = 2**resolution
         reach_px = unpack_reach(store.tables.reach_words[psfs]).astype(np.int64)
         reach_px = (reach_px + size_px // 2) // size_px
-        is_kept = (
+        is_wide = (
             store.tables.spread_px[psfs]
-            >= KEPT_SPREAD_RATIO * COARSE_SPREAD_PX[resolution]
+            >= COARSE_SPREAD_RATIO * COARSE_SPREAD_PX[resolution]
         )
-        reach_px = np.where(is_kept[:, None], reach_px, 0)
+        reach_px = np.where(is_wide[:, None], reach_px, 0)
         widths, heights = box_sizes(reach_px)
         ends = np.cumsum(widths * heights)
         first, count = self._n_texels[resolution], int(ends[-1])

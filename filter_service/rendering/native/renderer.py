@@ -1,4 +1,4 @@
-"""The native frame engine: stages of a frame, and state kept between frames."""
+"""The native frame engine: stages of a frame, and state between frames."""
 
 import time
 import weakref
@@ -17,7 +17,12 @@ from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import OneView, Pending, ViewRequest
 from filter_service.rendering.filtered_view import FilteredView, input_notes
-from filter_service.rendering.frame import border_px_of, extended, fill_missing_depth
+from filter_service.rendering.frame import (
+    border_px_of,
+    drop_empty_layer,
+    extended,
+    fill_missing_depth,
+)
 from filter_service.rendering.frame_kernels import Fill
 from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
 from filter_service.rendering.native.arrays import Arrays
@@ -31,21 +36,19 @@ from filter_service.rgbd_view import RgbdView
 
 
 class NativeRenderer(OneView):
-    """Runs the compiled loops on one view at a time; not thread-safe.
-
-    The loops release Python's global interpreter lock.
+    """Frame engine of compiled loops, which release the GIL; not thread-safe.
 
     Parameters
     ----------
     loops : Library, optional
-        Compiled loops; by default the fastest for this machine.
+        Compiled loops; by default the fastest ones that this CPU supports.
     n_threads : int, optional
-        Number of threads; by default one per core.
+        Thread count; by default one per core.
 
     Raises
     ------
     RenderFailed
-        The loops were not built on this machine.
+        The compiled loops are missing.
     """
 
     def __init__(self, loops: Library | None = None, n_threads: int | None = None):
@@ -54,53 +57,53 @@ class NativeRenderer(OneView):
         self._n_threads = self._loops.thread_count(self._threads)
         self._end = weakref.finalize(self, self._loops.end_threads, self._threads)
         self._between: object = None
-        self._rest_between: Callable[[], None] | None = None
+        self._pause_callback: Callable[[], None] | None = None
         self._is_syncing = False
-        self._rested_s = 0.0  # total
-        self._kept = EyeStates()
+        self._paused_s = 0.0  # total
+        self._eyes = EyeStates()
         self._arrays = Arrays()
 
     @property
     def name(self) -> str:
-        """Instruction set of the compiled loops, and their number of threads."""
+        """Instruction set and thread count of the compiled loops."""
         return f"native ({self._loops.variant}, {self._n_threads} threads)"
 
     @property
     def memory_mb(self) -> float:
         """Memory of the buffers that frames reuse, MB."""
-        return self._arrays.memory_mb + self._kept.memory_mb
+        return self._arrays.memory_mb + self._eyes.memory_mb
 
     def trim(self) -> None:
-        """Release the buffers that frames reuse; the next frame allocates its own.
+        """Release the buffers that frames reuse.
 
-        After a frame of 4096x4096 they take a gigabyte.
+        They take a gigabyte after a frame of 4096x4096.
         """
         self._arrays = Arrays()
-        self._kept = EyeStates()
+        self._eyes = EyeStates()
 
     def close(self) -> None:
         """Stop the threads; the renderer cannot be used afterward."""
         self._end()
 
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
-        """Register a function to be called during frames, at most every ``interval_s``.
+        """Register a callback for pauses during frames, at most one per ``interval_s``.
 
-        It must neither raise nor use this renderer.
+        The callback must not raise or use this renderer.
         """
 
-        def rest() -> None:
-            if self._is_syncing:  # a frame would find an incomplete store
+        def pause() -> None:
+            if self._is_syncing:  # another frame would read an incomplete store
                 return
             started_s = time.perf_counter()
             function()
-            self._rested_s += time.perf_counter() - started_s
+            self._paused_s += time.perf_counter() - started_s
 
-        self._between = self._loops.call_between(self._threads, rest, interval_s)
-        self._rest_between = rest
+        self._between = self._loops.call_between(self._threads, pause, interval_s)
+        self._pause_callback = pause
         return True
 
     def load(self, store: PsfStore) -> NativeStore:
-        """Load a store; its kernels may all be computed later."""
+        """Load a store; its kernels may be computed later."""
         return NativeStore(store)
 
     def begin(self, request: ViewRequest) -> Pending:
@@ -109,14 +112,13 @@ class NativeRenderer(OneView):
         Raises
         ------
         RenderFailed
-            Memory ran out; besides those of `FrameEngine.begin`.
+            Out of memory; in addition to the errors of `FrameEngine.begin`.
         """
         handle = request.handle
         gaze_deg, gaze_notes = check_request(request, handle.store)
-        request = replace(request, gaze_deg=gaze_deg)
-        timer = StageTimes(lambda: self._rested_s)
-        kept = self._kept.of(handle)
-        layers = kept.states.layers(
+        timer = StageTimes(lambda: self._paused_s)
+        eye = self._eyes.of(handle)
+        layers = eye.states.layers(
             timer,
             handle,
             request.pupil_diameter_mm,
@@ -126,33 +128,37 @@ class NativeRenderer(OneView):
         fill = partial(self._fill, timer, handle, request.until_s)
         cell_px = None
         while True:
-            image = kept.states.cells(timer, handle, gaze_deg, cell_px)
+            image = eye.states.cells(timer, handle, gaze_deg, cell_px)
             try:
-                found = self._render(timer, request, kept, layers, image, fill)
-                notes = [*layers.notes, *gaze_notes, *found.notes]
-                found = replace(found, notes=notes)
-                return lambda: found
+                rendered = self._render(
+                    timer, request, gaze_deg, eye, layers, image, fill
+                )
+                break
             except KernelsTooLarge:
                 cell_px = 2 * image.cell_px
+        notes = [*layers.notes, *gaze_notes, *rendered.notes]
+        rendered = replace(rendered, notes=notes)
+        return lambda: rendered
 
     def _render(
         self,
         timer: "StageTimes",
         request: ViewRequest,
-        kept: EyeState,
+        gaze_deg: tuple[float, float],
+        eye: EyeState,
         layers: FrameLayers,
         image: ImageCells,
         fill: Fill,
     ) -> FilteredView:
         view, options = request.view, request.options
         frame = FrameRecord.new(
-            self._threads, self._n_threads, self._arrays, kept.arrays
+            self._threads, self._n_threads, self._arrays, eye.arrays
         )
-        missing_count, used = self._pixels(timer, frame, view, kept, layers, image)
+        missing_count, used = self._pixels(timer, frame, view, eye, layers, image)
         with timer.wall("psf_plan_ms"):
-            plan = self._planned(kept, layers, image, used, fill)
+            plan = self._planned(eye, layers, image, used, fill)
             frame.set_kernels(plan)
-            frame.set_store(kept.handle)
+            frame.set_store(eye.handle)
         with timer.wall("merge_ms"):
             frame.set_merging(
                 tolerance=options.render_tolerance if options.merge else 0.0,
@@ -161,13 +167,13 @@ class NativeRenderer(OneView):
                 is_encoded=request.output == "srgb8",
             )
             self._loops.run("merge", frame.c)
-        sizes = self._blend(timer, frame, plan, kept)
+        sizes = self._blend(timer, frame, plan, eye)
         with timer.wall("splat_ms"):
             picture = output_array(request)
             frame.set_picture(picture)
             self._loops.run("splat", frame.c)
         if frame.c.failed:
-            raise RenderFailed("memory ran out for the lists of a frame")
+            raise RenderFailed("out of memory for the fragment lists of a frame")
         return FilteredView(
             color=picture,
             stage_times_ms=timer.result_ms(),
@@ -176,7 +182,7 @@ class NativeRenderer(OneView):
             bad_color_count=frame.c.bad_color_count,
             pupil_diameter_mm=layers.pupil_diameter_mm,
             focus_dpt=layers.focus_dpt,
-            gaze_deg=request.gaze_deg,
+            gaze_deg=gaze_deg,
             fragment_count=frame.c.fragment_count,
             merged_count=frame.c.merged_count,
             entry_count=frame.c.entry_count,
@@ -191,19 +197,17 @@ class NativeRenderer(OneView):
         timer: "StageTimes",
         frame: FrameRecord,
         view: RgbdView,
-        kept: EyeState,
+        eye: EyeState,
         layers: FrameLayers,
         image: ImageCells,
     ) -> tuple[int, NDArray[np.bool_]]:
-        """Compute the pixels; return the count of filled depths and the used pairs."""
+        """Compute the pixels; return the missing depth count and the used pairs."""
         with timer.wall("prepare_ms"):
             filled_m, missing_count = fill_missing_depth(view.depth_m)
-            whole = replace(view, depth_m=filled_m)
-            if view.surface_count > 1 and not (view.hidden_depth_m > 0.0).any():
-                whole = replace(whole, hidden_color=None, hidden_depth_m=None)
+            whole = drop_empty_layer(replace(view, depth_m=filled_m))
             border_px = border_px_of(whole, layers, image)
             whole = extended(whole, border_px)
-        change_dpt = kept.states.corner_change_dpt(timer, layers, image)
+        change_dpt = eye.states.corner_change_dpt(timer, layers, image)
         with timer.wall("fragments_ms"):
             frame.set_view(whole, border_px)
             used = frame.set_state(layers, image, change_dpt)
@@ -212,23 +216,23 @@ class NativeRenderer(OneView):
 
     def _planned(
         self,
-        kept: EyeState,
+        eye: EyeState,
         layers: FrameLayers,
         image: ImageCells,
         used: NDArray[np.bool_],
         fill: Fill,
     ) -> KernelPlan:
-        """Return the last frame's kernels if they suffice; otherwise plan new ones."""
-        state = (kept.handle, layers, image)
-        if kept.plan is None or not kept.plan.serves(state, used):
-            kept.plan = None  # remains None if the following fails
-            kept.plan = plan_kernels(kept.handle, layers, image, used, fill)
+        """Return the last frame's plan if it serves this frame, else a new one."""
+        state = (eye.handle, layers, image)
+        if eye.plan is None or not eye.plan.serves(state, used):
+            eye.plan = None  # remains None if the following fails
+            eye.plan = plan_kernels(eye.handle, layers, image, used, fill)
             self._is_syncing = True
             try:
-                kept.handle.sync(self._loops, self._threads)
+                eye.handle.sync(self._loops, self._threads)
             finally:
                 self._is_syncing = False
-        return kept.plan
+        return eye.plan
 
     def _fill(
         self,
@@ -237,57 +241,57 @@ class NativeRenderer(OneView):
         until_s: float | None,
         psfs: NDArray[np.int64],
     ) -> None:
-        """Compute the missing PSFs of a frame, as one of its stages."""
+        """Compute the missing PSFs of a frame, timed as a stage of its own."""
         with timer.inner("psf_compute_ms"):
-            handle.store.fill(psfs, until_s=until_s, between=self._rest_between)
+            handle.store.fill(psfs, until_s=until_s, between=self._pause_callback)
 
     def _blend(
-        self, timer: "StageTimes", frame: FrameRecord, plan: KernelPlan, kept: EyeState
+        self, timer: "StageTimes", frame: FrameRecord, plan: KernelPlan, eye: EyeState
     ) -> BlendSizes:
-        """Blend the kernels that fragments use, unless they already exist."""
+        """Blend the kernels at the levels that fragments use, unless they exist."""
         levels = plan.shapes["levels_used"]
-        if kept.blended is not None:
-            of_plan, made, sizes = kept.blended
+        if eye.blended is not None:
+            of_plan, made, sizes = eye.blended
             if of_plan is plan and not np.any(levels & ~made):
-                frame.set_blend_room(sizes)
+                frame.set_blend_buffers(sizes)
                 return sizes
-        kept.blended = None
+        eye.blended = None
         with timer.wall("psf_blend_ms"):
             self._loops.run("place", frame.c)
             sizes = BlendSizes.of(frame.c)
-            frame.set_blend_room(sizes)
+            frame.set_blend_buffers(sizes)
             self._loops.run("blend", frame.c)
-        kept.blended = plan, levels.copy(), sizes
+        eye.blended = plan, levels.copy(), sizes
         return sizes
 
 
 class StageTimes:
-    """Wall times of named stages, ms, without the pauses between their parts."""
+    """Wall times of named stages, ms, without pauses."""
 
-    def __init__(self, rested_s: Callable[[], float]) -> None:
+    def __init__(self, paused_s: Callable[[], float]) -> None:
         self._ms: dict[str, float] = {}
         self._inner_ms = 0.0
-        self._rested_s = rested_s
-        self._before_s = rested_s()
+        self._paused_s = paused_s
+        self._before_s = paused_s()
 
     @contextmanager
     def wall(self, name: str) -> Iterator[None]:
-        """Time a stage; times of the same name add up."""
-        started_s, inner_ms = time.perf_counter() - self._rested_s(), self._inner_ms
+        """Time a stage; the times of equal names are added."""
+        started_s, inner_ms = time.perf_counter() - self._paused_s(), self._inner_ms
         yield
-        elapsed_ms = 1e3 * (time.perf_counter() - self._rested_s() - started_s)
+        elapsed_ms = 1e3 * (time.perf_counter() - self._paused_s() - started_s)
         elapsed_ms -= self._inner_ms - inner_ms
         self._ms[name] = self._ms.get(name, 0.0) + elapsed_ms
 
     @contextmanager
     def inner(self, name: str) -> Iterator[None]:
-        """Time a stage within another, and exclude it from the outer stage's time."""
+        """Time a nested stage, which does not count toward the outer stage."""
         before_ms = sum(self._ms.values())
         with self.wall(name):
             yield
         self._inner_ms += sum(self._ms.values()) - before_ms
 
     def result_ms(self) -> dict[str, float]:
-        """Return times by stage, and the total of the pauses if there were any."""
-        rests_ms = 1e3 * (self._rested_s() - self._before_s)
-        return dict(self._ms) | ({"rests_ms": rests_ms} if rests_ms else {})
+        """Return the times by stage, with the total of the pauses if there were any."""
+        pauses_ms = 1e3 * (self._paused_s() - self._before_s)
+        return dict(self._ms) | ({"rests_ms": pauses_ms} if pauses_ms else {})

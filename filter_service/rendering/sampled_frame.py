@@ -1,4 +1,4 @@
-"""Request of a frame, and the PSFs that it needs."""
+"""Sampled depths of a frame, and the PSFs that the frame needs."""
 
 from __future__ import annotations
 
@@ -18,25 +18,26 @@ from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
 
 STEP_PX = 4
-"""Stride in pixels at which a view is sampled; frames themselves find the rest."""
+"""Stride at which depth is sampled.  PSFs that only other pixels need are computed
+while the frame is filtered."""
 
 FIRST_PUPIL_MM, FIRST_FOCUS_DPT, FIRST_OBJECT_DPT = 4.0, 0.0, (0.0, 2.0)
-"""Assumed state and distances before the first frame."""
+"""State and object distances that are assumed before the first frame."""
 
-FIRST_DISTANCES = 9
+FIRST_DISTANCE_COUNT = 9
 
 ImageCellsOf = Callable[[tuple[float, float]], ImageCells]
 
 
 @dataclass(frozen=True)
 class SampledView:
-    """Depths of a view at a sample of its pixels.
+    """Object distances at every `STEP_PX`-th row and column of a view.
 
     Attributes
     ----------
     object_dpt : (rows, columns)
     hidden_dpt : (rows, columns) or None
-        Distances of its hidden layer; NaN where nothing is hidden.
+        Distances in the hidden layer; NaN where it is empty.
     """
 
     camera: Camera
@@ -45,10 +46,10 @@ class SampledView:
 
     @classmethod
     def of(cls, view: RgbdView) -> SampledView:
-        """Sample a view; its memory may be reused afterward."""
+        """Sample a view; the result does not share memory with it."""
         depths_m = [m[::STEP_PX, ::STEP_PX] for m in view.surface_depths_m]
         filled_m, _ = fill_missing_depth(np.ascontiguousarray(depths_m[0]))
-        few = RgbdView(
+        sample = RgbdView(
             np.zeros((*filled_m.shape, 3), np.uint8),
             filled_m,
             view.tangents,
@@ -56,14 +57,14 @@ class SampledView:
         )
         hidden_dpt = None
         if len(depths_m) > 1:
-            held_m = np.where(depths_m[1] > 0.0, depths_m[1], np.nan)
-            hidden_dpt = object_dpt(few, held_m)
-        return cls(view.camera, object_dpt(few, filled_m), hidden_dpt)
+            hidden_m = np.where(depths_m[1] > 0.0, depths_m[1], np.nan)
+            hidden_dpt = object_dpt(sample, hidden_m)
+        return cls(view.camera, object_dpt(sample, filled_m), hidden_dpt)
 
 
 @dataclass(frozen=True)
-class FrameUse:
-    """Request of one frame."""
+class SampledFrame:
+    """State of the eye in one frame, and its sampled views."""
 
     at_s: float
     pupil_diameter_mm: float
@@ -72,8 +73,8 @@ class FrameUse:
     views: tuple[SampledView, ...]
 
 
-def first_frame(camera: Camera, settings: FilterSettings) -> FrameUse:
-    """Return the frame to prepare for before the first one arrives."""
+def first_frame(camera: Camera, settings: FilterSettings) -> SampledFrame:
+    """Return the frame that the service prepares for before the first one arrives."""
     pupil_mm = float(np.clip(FIRST_PUPIL_MM, *settings.pupil_range_mm))
     focus_dpt = float(np.clip(FIRST_FOCUS_DPT, *settings.focus_range_dpt))
     low_dpt, high_dpt = np.clip(FIRST_OBJECT_DPT, *settings.object_range_dpt)
@@ -83,54 +84,56 @@ def first_frame(camera: Camera, settings: FilterSettings) -> FrameUse:
             settings.object_planes_dpt[-1],
         )
     rows, columns = -(-camera.height_px // STEP_PX), -(-camera.width_px // STEP_PX)
-    # Every cell of the field contains every distance.
-    column = np.linspace(low_dpt, high_dpt, FIRST_DISTANCES)
-    every_dpt = np.resize(column, (rows, columns))
-    return FrameUse(0.0, pupil_mm, focus_dpt, None, (SampledView(camera, every_dpt),))
+    # Each cell of the image must contain each distance.
+    column = np.linspace(low_dpt, high_dpt, FIRST_DISTANCE_COUNT)
+    distances_dpt = np.resize(column, (rows, columns))
+    return SampledFrame(
+        0.0, pupil_mm, focus_dpt, None, (SampledView(camera, distances_dpt),)
+    )
 
 
-def psfs_for(
+def missing_psfs_of(
     store: PsfStore,
-    use: FrameUse,
+    frame: SampledFrame,
     image_of: ImageCellsOf,
     *,
     state: tuple[float, float] | None = None,
 ) -> NDArray[np.int64]:
-    """Return the PSFs (n,) of a store that a frame needs and that are not computed.
+    """Return the PSFs (n,) that a frame needs and that are not computed yet.
 
     Parameters
     ----------
     image_of : callable
         Function that returns the cells of the image at a gaze.
     state : (pupil_diameter_mm, focus_dpt), optional
-        State in place of the frame's.
+        State to use instead of the frame's.
     """
-    pupil_mm, focus_dpt = state or (use.pupil_diameter_mm, use.focus_dpt)
+    pupil_mm, focus_dpt = state or (frame.pupil_diameter_mm, frame.focus_dpt)
     settings = store.spec.settings
     layers = frame_layers(
         store,
         pupil_diameter_mm=float(np.clip(pupil_mm, *settings.pupil_range_mm)),
         focus_dpt=float(np.clip(focus_dpt, *settings.focus_range_dpt)),
     )
-    gaze_deg = use.gaze_deg or settings.gaze_deg
+    gaze_deg = frame.gaze_deg or settings.gaze_deg
     image = image_of(gaze_deg)
     used = np.zeros((image.count, interval_count(layers)), bool)
-    for view in use.views:
+    for view in frame.views:
         if not store.spec.serves(view.camera):
             continue
         for distances_dpt in (view.object_dpt, view.hidden_dpt):
             if distances_dpt is not None:
-                _note_used(used, distances_dpt, layers, image)
+                _mark_used(used, distances_dpt, layers, image)
     return missing_psfs(store, layers, image, used)
 
 
-def _note_used(
+def _mark_used(
     used: NDArray[np.bool_],
     distances_dpt: NDArray[np.float64],
     layers: FrameLayers,
     image: ImageCells,
 ) -> None:
-    """Mark the (cell, interval) pairs that the sampled distances use."""
+    """Mark the (cell, interval) pairs of the sampled distances."""
     rows, columns = distances_dpt.shape
     vergences_dpt = np.clip(
         layers.vergence.vergence_dpt(distances_dpt), *layers.vergence_range_dpt
@@ -152,6 +155,8 @@ def _note_used(
         upper = corner[0] * (1.0 - x) + corner[1] * x
         lower = corner[2] * (1.0 - x) + corner[3] * x
         vergences_dpt = vergences_dpt + upper * (1.0 - y[:, None]) + lower * y[:, None]
-    holds = ~np.isnan(vergences_dpt)
-    interval = np.searchsorted(layers.layer_dpt, vergences_dpt[holds], side="right") - 1
-    used[cells[holds], np.clip(interval, 0, used.shape[1] - 1)] = True
+    is_known = ~np.isnan(vergences_dpt)
+    interval = (
+        np.searchsorted(layers.layer_dpt, vergences_dpt[is_known], side="right") - 1
+    )
+    used[cells[is_known], np.clip(interval, 0, used.shape[1] - 1)] = True

@@ -1,7 +1,6 @@
-"""Sampled states of the frames of a cache, and the errors of blended PSFs there."""
+"""Sampled states of the frames of a cache, and the errors of PSFs blended for them."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,20 +29,20 @@ _PLASTIC = 1.1127756842787055
 
 
 @dataclass(frozen=True)
-class Use:
-    """Sampled states of frames, with their exact PSFs.
+class StateSample:
+    """Sampled states of frames, with the slopes of their exact PSFs.
 
     Attributes
     ----------
     states : PupilStates
     vergence_dpt : (P,)
-        Vergence of the object, at the cornea.
+        Vergence of the object, in the plane of the entrance pupil.
     pixel_from_mrad : (P, 2, 2) or None
         Local scale of the image, if frames map stored kernels to it.  None without a
         range of gaze: between the nodes around a pixel the scale changes so little that
-        mapping a kernel costs as much as it gains.
+        mapping a kernel causes as much error as it removes.
     exact_px : (P, n, 2)
-        Slopes of the exact PSFs, px.
+        Slopes of the exact PSFs.
     """
 
     eye: EyeOptics
@@ -55,14 +54,14 @@ class Use:
 
     @property
     def unit_px(self) -> NDArray[np.float64]:
-        """Lambda over pupil diameter (P,), px."""
+        """Wavelength over pupil diameter (P,), px."""
         return unit_px(self.spec, self.states)
 
-    def taken(self, index: NDArray[np.int64]) -> "Use":
-        """Return a selection of the states, in any order."""
+    def select(self, index: NDArray[np.int64]) -> "StateSample":
+        """Return the states at the given indices."""
         return replace(
             self,
-            states=self.states.taken(index),
+            states=self.states.select(index),
             vergence_dpt=self.vergence_dpt[index],
             pixel_from_mrad=(
                 None if self.pixel_from_mrad is None else self.pixel_from_mrad[index]
@@ -72,34 +71,34 @@ class Use:
 
 
 def unit_px(spec: GridSpec, states: PupilStates) -> NDArray[np.float64]:
-    """Return lambda over pupil diameter (P,) in pixels of the camera's axis."""
+    """Return wavelength over pupil diameter (P,) in pixels on the camera's axis."""
     unit_mrad = states.wavelength_nm / 1e3 / states.pupil_diameter_mm  # um/mm
     return unit_mrad / min(spec.pixel_pitch_mrad)
 
 
-def sample_use(eye: EyeOptics, spec: GridSpec, count: int) -> Use:
-    """Sample states evenly: image positions, pupils, foci, distances and channels.
+def sample_states(eye: EyeOptics, spec: GridSpec, count: int) -> StateSample:
+    """Sample image positions, pupils, foci, object distances and channels evenly.
 
-    Half of the objects are in focus, where interpolation errors are most visible; the
-    others are anywhere in the range.
+    Half of the objects are in focus, where interpolation errors are most visible.  The
+    others are spread over the range of distances.
     """
     steps = 1.0 / _PLASTIC ** np.arange(1, 7)
     unit = (0.5 + np.arange(1, count + 1)[:, None] * steps) % 1.0
     x, y, pupil, focus, distance, channel = unit.T
-    h_deg, v_deg, scale = _seen_directions(spec, x, y)
+    h_deg, v_deg, scale = _image_directions(spec, x, y)
     low_mm, high_mm = (eye.usable_pupil_mm(p) for p in spec.settings.pupil_range_mm)
     foci_dpt = (
         spec.settings.focus_range_dpt[0] + np.ptp(spec.settings.focus_range_dpt) * focus
     )
     pupils_mm = low_mm + (high_mm - low_mm) * pupil
-    used_dpt, focused_dpt = (
+    accommodations_dpt, focused_dpt = (
         np.array(
             [
-                answer(focus_dpt, pupil_diameter_mm=pupil_mm)
+                evaluate(focus_dpt, pupil_diameter_mm=pupil_mm)
                 for focus_dpt, pupil_mm in zip(foci_dpt, pupils_mm, strict=True)
             ]
         )
-        for answer in (eye.accommodation_dpt, eye.reachable_focus_dpt)
+        for evaluate in (eye.accommodation_dpt, eye.reachable_focus_dpt)
     )
     vergence_dpt = eye.vergence.vergence_dpt(
         np.where(
@@ -113,20 +112,21 @@ def sample_use(eye: EyeOptics, spec: GridSpec, count: int) -> Use:
         "h_deg": h_deg,
         "v_deg": v_deg,
         "pupil_diameter_mm": pupils_mm,
-        "accommodation_dpt": used_dpt,
+        "accommodation_dpt": accommodations_dpt,
         "wavelength_nm": wavelengths_nm[(channel * len(wavelengths_nm)).astype(int)],
     }
     states = PupilStates(
         **known, total_defocus_dpt=eye.total_defocus_dpt(**known) + vergence_dpt
     )
-    if not any(spec.settings.gaze_range_deg):
-        scale = None
-    exact_px = slopes_px(state_frames(eye, spec, states, pixel_from_mrad=scale))
-    return Use(eye, spec, states, vergence_dpt, scale, exact_px)
+    pixel_from_mrad = scale if any(spec.settings.gaze_range_deg) else None
+    exact_px = slopes_px(
+        state_frames(eye, spec, states, pixel_from_mrad=pixel_from_mrad)
+    )
+    return StateSample(eye, spec, states, vergence_dpt, pixel_from_mrad, exact_px)
 
 
 def _nearest_object_dpt(
-    spec: GridSpec, focused_dpt: NDArray[Any]
+    spec: GridSpec, focused_dpt: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the object distances (P,) nearest to the eye's focus."""
     ranges_dpt = np.array(spec.object_ranges_dpt)
@@ -135,7 +135,7 @@ def _nearest_object_dpt(
     return found[np.arange(best.size), best]
 
 
-def _objects_dpt(spec: GridSpec, share: NDArray[Any]) -> NDArray[np.float64]:
+def _objects_dpt(spec: GridSpec, share: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the object distances (P,) at shares of the concatenated ranges."""
     ranges_dpt = np.array(spec.object_ranges_dpt)
     steps = share * len(ranges_dpt)
@@ -144,12 +144,12 @@ def _objects_dpt(spec: GridSpec, share: NDArray[Any]) -> NDArray[np.float64]:
     return low_dpt + (high_dpt - low_dpt) * (steps - number)
 
 
-def _seen_directions(
-    spec: GridSpec, x: NDArray[Any], y: NDArray[Any]
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return field directions (P,) and scales at image positions in 0..1.
+def _image_directions(
+    spec: GridSpec, x: NDArray[np.float64], y: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return field directions (P,) and local scales at image positions from 0 to 1.
 
-    The positions cycle through the gaze directions that frames may have.
+    Positions alternate between the gaze directions that frames may have.
     """
     if not spec.follows_field:
         zeros = np.zeros(x.size)
@@ -172,56 +172,61 @@ def _seen_directions(
     return h_deg, v_deg, scale
 
 
-def moved(use: Use, axis: str, to: NDArray[np.float64]) -> PupilStates:
-    """Return the states (P,) at which a frame's states are read along an axis.
+def moved(sample: StateSample, axis: str, to: NDArray[np.float64]) -> PupilStates:
+    """Return the states (P,) that frames read at other values of an axis.
 
-    Along the field and accommodation the total defocus is kept; along the pupil the
-    geometric blur, or with several foci the defocus.  The paper's grids are read at the
-    distance of the object.
+    Field and accommodation are read at the same total defocus, the pupil at the same
+    geometric blur, or with several foci at the same total defocus.  The paper's grids
+    are read at the distance of the object.
     """
-    columns = vars(use.states) | {FIELD_OF_AXIS[axis]: to}
+    columns = vars(sample.states) | {FIELD_OF_AXIS[axis]: to}
     total_dpt = columns.pop("total_defocus_dpt")
     if axis == "pupil":
-        total_dpt = total_dpt * _blur_scale(use, to)
-    elif axis in ("h", "v") and not use.spec.blends_at_equal_blur:
-        total_dpt = use.eye.total_defocus_dpt(**columns) + use.vergence_dpt
+        total_dpt = total_dpt * _blur_scale(sample, to)
+    elif axis in ("h", "v") and not sample.spec.blends_at_equal_blur:
+        total_dpt = sample.eye.total_defocus_dpt(**columns) + sample.vergence_dpt
     return PupilStates(**columns, total_defocus_dpt=total_dpt)
 
 
-def _blur_scale(use: Use, pupils_mm: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the ratio (P,) of the defocus at which pupils are read to the states'."""
-    if use.eye.rings is not None:  # foci are the same in any pupil
+def _blur_scale(
+    sample: StateSample, pupils_mm: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the ratio (P,) of the defocus read at other pupils to the states' own."""
+    if sample.eye.rings is not None:  # foci are the same in any pupil
         return np.ones(pupils_mm.shape)
-    return use.states.pupil_diameter_mm / pupils_mm
+    return sample.states.pupil_diameter_mm / pupils_mm
 
 
-def axis_error(use: Use, axis: str, nodes: NDArray[Any]) -> float:
-    """Return the mean square error when one axis is interpolated between nodes."""
-    return axis_errors(use, axis, [nodes])[0]
+def axis_error(sample: StateSample, axis: str, nodes: NDArray[np.float64]) -> float:
+    """Return the mean square error of interpolating one axis between nodes."""
+    return axis_errors(sample, axis, [nodes])[0]
 
 
-def axis_errors(use: Use, axis: str, choices: list[NDArray[Any]]) -> list[float]:
-    """Return `axis_error` of several choices of nodes, evaluating the eye once."""
+def axis_errors(
+    sample: StateSample, axis: str, choices: list[NDArray[np.float64]]
+) -> list[float]:
+    """Return `axis_error` of several choices of nodes with one call of the eye."""
     found = [
-        bracket_axis(nodes, vars(use.states)[FIELD_OF_AXIS[axis]]) for nodes in choices
+        bracket_axis(nodes, vars(sample.states)[FIELD_OF_AXIS[axis]])
+        for nodes in choices
     ]
     ends = [nodes[low] for nodes, (low, _, _) in zip(choices, found, strict=True)]
     ends += [nodes[high] for nodes, (_, high, _) in zip(choices, found, strict=True)]
-    count = use.vergence_dpt.size
-    repeated = use.taken(np.tile(np.arange(count), 2 * len(choices)))
+    count = sample.vergence_dpt.size
+    repeated = sample.select(np.tile(np.arange(count), 2 * len(choices)))
     neighbors = moved(repeated, axis, np.concatenate(ends))
-    own = use.taken(np.tile(np.arange(count), len(choices)))
+    own = sample.select(np.tile(np.arange(count), len(choices)))
     share = np.concatenate([share for _, _, share in found])
-    errors = _errors_of(own, neighbors, share).reshape(len(choices), count)
+    errors = _square_errors(own, neighbors, share).reshape(len(choices), count)
     return (AXIS_FACTOR[axis] * errors.mean(axis=1)).tolist()
 
 
-def defocus_error(use: Use, plan: CachePlan) -> float:
-    """Return the mean square error when defocus is interpolated within its groups.
+def defocus_error(sample: StateSample, plan: CachePlan) -> float:
+    """Return the mean square error of interpolating defocus within groups.
 
-    Each state reads the group of its nearest field, pupil and accommodation.
+    Each state reads the group of its nearest nodes of field, pupil and accommodation.
     """
-    states = use.states
+    states = sample.states
     corner = [
         np.abs(nodes - values[:, None]).argmin(axis=1)
         for nodes, values in (
@@ -233,70 +238,83 @@ def defocus_error(use: Use, plan: CachePlan) -> float:
     ]
     groups = np.ravel_multi_index(corner, plan.group_shape)
     own_dpt = np.zeros(states.h_deg.size)
-    if not use.spec.blends_at_equal_blur:  # a group holds the range of its own field
+    if not sample.spec.blends_at_equal_blur:  # a group covers distances at its own node
         node = PupilStates(
             **vars(states)
             | {"h_deg": plan.h_deg[corner[3]], "v_deg": plan.v_deg[corner[2]]}
         )
-        own_dpt += use.vergence_dpt - states.total_defocus_dpt
-        own_dpt += _at_infinity_dpt(use, node)
+        own_dpt += sample.vergence_dpt - states.total_defocus_dpt
+        own_dpt += _at_infinity_dpt(sample, node)
     channel = np.argmin(
-        np.abs(use.spec.channel_wavelengths_nm - states.wavelength_nm[:, None]), axis=1
+        np.abs(sample.spec.channel_wavelengths_nm - states.wavelength_nm[:, None]),
+        axis=1,
     )
     shift_dpt = plan.nodes.channel_shift_dpt[groups, channel]
-    scale = _blur_scale(use, plan.pupils_mm[corner[0]])
+    scale = _blur_scale(sample, plan.pupils_mm[corner[0]])
     read_dpt = (states.total_defocus_dpt + own_dpt) * scale - shift_dpt
     defocus = plan.nodes.defocus
     lower, upper, share = defocus.bracket(groups, read_dpt)
-    columns = vars(states.taken(np.tile(np.arange(share.size), 2)))
+    columns = vars(states.select(np.tile(np.arange(share.size), 2)))
     columns["total_defocus_dpt"] = np.concatenate(
         [
             (defocus.values_dpt[index] + shift_dpt) / scale - own_dpt
             for index in (lower, upper)
         ]
     )
-    return AXIS_FACTOR["defocus"] * _error(use, PupilStates(**columns), share)
+    return AXIS_FACTOR["defocus"] * _error(sample, PupilStates(**columns), share)
 
 
-def _at_infinity_dpt(use: Use, states: PupilStates) -> NDArray[np.float64]:
+def _at_infinity_dpt(sample: StateSample, states: PupilStates) -> NDArray[np.float64]:
     columns = dict(vars(states))
     del columns["total_defocus_dpt"]
-    return use.eye.total_defocus_dpt(**columns)
+    return sample.eye.total_defocus_dpt(**columns)
 
 
-def _error(use: Use, neighbors: PupilStates, share: NDArray[Any]) -> float:
-    """Return the mean square error; neighbors are all lower, then all upper ones."""
-    return float(_errors_of(use, neighbors, share).mean())
+def _error(
+    sample: StateSample, neighbors: PupilStates, share: NDArray[np.float64]
+) -> float:
+    """Return the mean square error of `_square_errors`."""
+    return float(_square_errors(sample, neighbors, share).mean())
 
 
-def _errors_of(
-    use: Use, neighbors: PupilStates, share: NDArray[Any]
+def _square_errors(
+    sample: StateSample, neighbors: PupilStates, share: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return square errors (P,); neighbors are all lower, then all upper ones."""
+    """Return the square errors (P,) of blending neighbors.
+
+    Parameters
+    ----------
+    neighbors : PupilStates
+        Lower neighbors (P,), followed by the upper ones (P,).
+    share : (P,)
+        Share of the upper neighbor.
+    """
     found = np.zeros(share.size)
-    for light_ratio, added_dpt in light_of_foci(use):
+    for light_ratio, added_dpt in focus_light(sample):
         lower_px, upper_px = np.split(
-            focus_slopes_px(use, neighbors, np.tile(added_dpt, 2)), 2
+            focus_slopes_px(sample, neighbors, np.tile(added_dpt, 2)), 2
         )
         found += light_ratio**2 * blend_error(
             lower_px,
             upper_px,
-            use.exact_px
-            if use.eye.rings is None
-            else focus_slopes_px(use, use.states, added_dpt),
+            sample.exact_px
+            if sample.eye.rings is None
+            else focus_slopes_px(sample, sample.states, added_dpt),
             share_ratio=share,
-            unit_px=use.unit_px,
+            unit_px=sample.unit_px,
         )
     return found
 
 
-def light_of_foci(use: Use) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return the light and power, dpt, (P,) of each focus of an eye.
+def focus_light(
+    sample: StateSample,
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Return the share of light (P,) and the power (P,), dpt, of each focus of an eye.
 
-    The blending error of an image is that of each focus times its light, as amplitudes:
-    where one focus is sharp, the others contribute little.
+    The error of each focus is weighted by its light, as an amplitude: where one focus
+    is sharp, the others contribute little.
     """
-    states, rings = use.states, use.eye.rings
+    states, rings = sample.states, sample.eye.rings
     if rings is None:
         return [(np.ones(states.h_deg.size), np.zeros(states.h_deg.size))]
     found: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []
@@ -312,15 +330,17 @@ def light_of_foci(use: Use) -> list[tuple[NDArray[np.float64], NDArray[np.float6
 
 
 def focus_slopes_px(
-    use: Use, states: PupilStates, added_dpt: NDArray[Any]
+    sample: StateSample, states: PupilStates, added_dpt: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return slopes (m P, n, 2), px, of light for a focus, in pixels of the states."""
-    count = states.h_deg.size // use.states.h_deg.size
-    scale = use.pixel_from_mrad
+    """Return slopes (m P, n, 2), px, of the light of a focus in the sample's pixels."""
+    count = states.h_deg.size // sample.states.h_deg.size
+    scale = sample.pixel_from_mrad
     if scale is not None:
         scale = np.tile(scale, (count, 1, 1))
     total_dpt = states.total_defocus_dpt - added_dpt
     columns = vars(states) | {"total_defocus_dpt": total_dpt}
     return slopes_px(
-        state_frames(use.eye, use.spec, PupilStates(**columns), pixel_from_mrad=scale)
+        state_frames(
+            sample.eye, sample.spec, PupilStates(**columns), pixel_from_mrad=scale
+        )
     )

@@ -1,0 +1,63 @@
+"""How an eye was computed, in words for a reader of the report."""
+
+from __future__ import annotations
+
+from clients.figures import EyeStudy
+from estimator import EyeProfile
+
+COMPUTED_BY = ("eye estimated", "eye as given", "focus traced", "aberrations traced")
+"""Starts of notes on the computation, which `_of_eye` replaces."""
+POORLY = "eye estimated poorly"
+
+WORDS = {
+    "+-": "±",
+    " um": " µm",
+    " deg ": "° ",
+    "vertex_mm is missing: the powers of spectacles need it, usually 12 to 14 mm": (
+        "no vertex distance was given; powers of spectacles usually refer to a lens "
+        "12 to 14 mm in front of it"
+    ),
+}
+OPTION_HINT = '; "higher_order"'
+"""Start of the part of a note that names an option of the profile."""
+
+
+def method_text(study: EyeStudy) -> tuple[str, ...]:
+    """Return sentences on how the eye was computed and what its powers refer to."""
+    notes = (n for n in study.field.notes if not n.startswith(COMPUTED_BY))
+    return (_of_eye(study), *map(_plain, notes))
+
+
+def entered_text(profile: EyeProfile) -> str:
+    """Return a prescription's powers as entered and where they refer to, or ""."""
+    for note in profile.notes:
+        name, _, text = note.partition(": ")
+        if name == "prescription":
+            powers, _, missing = text.partition("; ")
+            hint = ", no vertex distance given" if missing else ""
+            return f"Entered: {powers}{hint}.".replace("-", "−")
+    return ""
+
+
+def um_text(value_um: float) -> str:
+    """Return a small error in µm."""
+    return "less than 0.001 µm" if value_um < 0.001 else f"{value_um:.3f} µm"
+
+
+def _of_eye(study: EyeStudy) -> str:
+    found = study.found
+    if study.profile.is_given:
+        return "the eye is the one that the profile gives"
+    is_poor = any(note.startswith(POORLY) for note in study.notes)
+    poor = "poor fit: " if is_poor else ""
+    return (
+        f"{poor}the eye model reproduces the coefficients of the wavefront to "
+        f"{um_text(found.mean_abs_error_um)} on average"
+    )
+
+
+def _plain(note: str) -> str:
+    text = note.partition(OPTION_HINT)[0]
+    for word, plain in WORDS.items():
+        text = text.replace(word, plain)
+    return text.replace(" -", " −")
