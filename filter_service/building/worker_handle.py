@@ -16,10 +16,10 @@ from typing import Any
 
 from estimator.threads import THREADS_VARIABLE
 from filter_service.building.helper_process import (
-    end,
-    how_it_ended,
+    describe_exit,
     import_path,
     is_stopped,
+    wait_or_kill,
 )
 from filter_service.building.jobs import BuildJob, BuiltStore
 from filter_service.errors import (
@@ -157,7 +157,7 @@ class WorkerHandle:
             return
         self._worker.pipe.close()
         self._worker.process.terminate()
-        end(self._worker.process, STOP_GRACE_S)
+        wait_or_kill(self._worker.process, STOP_GRACE_S)
         self._worker = None
 
     @property
@@ -269,7 +269,7 @@ class WorkerHandle:
 
     def _after_crash(self, worker: _Worker) -> list[BuildEvent]:
         """Start a new process; the running build is lost, queued ones are not."""
-        how = how_it_ended(end(worker.process, STOP_GRACE_S))
+        how = describe_exit(wait_or_kill(worker.process, STOP_GRACE_S))
         was_cancelled = self._kill_at_s is not None
         was_ready = self._is_ready
         tickets = [] if self._running is None else [self._running]

@@ -205,7 +205,7 @@ def test_memory_has_bounds(start_service, raw_client):
     raw.ask(Hello("raw"))
     given = [raw.ask(Share(800_000)) for _ in range(5)]
     assert [g.slot is not None for g in given] == [True] * 3 + [False] * 2
-    assert "allowed: 2500000 in all" in given[-1].reason
+    assert "allowed: 2500000 in total" in given[-1].reason
     answer = raw.ask(Share(2**40))
     assert answer.slot is None
     many = [raw.ask(Share(64)) for _ in range(20)]

@@ -52,13 +52,13 @@ def test_credit_counts_unanswered_frames_and_the_newest_waits():
     session = Session(1, b"a", "", credit=2)
     view = (ViewHeader.of(SMALL),)
     frames = [WaitingFrame(Frame(i, view, 4.0, 0.0), 0.0, 0.0) for i in range(3)]
-    assert session.take_in(frames[0]) is None
-    assert session.take_in(frames[1]) is frames[0]
+    assert session.enqueue(frames[0]) is None
+    assert session.enqueue(frames[1]) is frames[0]
     with pytest.raises(CreditExceeded, match="2 frames are unanswered"):
-        session.take_in(frames[2])
+        session.enqueue(frames[2])
     assert session.waiting is frames[1]
     session.n_unanswered -= 1
-    assert session.take_in(frames[2]) is frames[1]
+    assert session.enqueue(frames[2]) is frames[1]
 
 
 def test_a_frame_needs_a_profile():
