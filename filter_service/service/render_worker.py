@@ -54,7 +54,7 @@ from filter_service.service.shared_memory_frame import filter_in_slots
 from filter_service.shared_memory import Slot
 
 IDLE_WAIT_S = 0.5
-ATTENTION_WAIT_S = 0.1
+WORKER_POLL_S = 0.1
 STATE_INTERVAL_S = 0.5
 INTERRUPTION_INTERVAL_S = 0.01
 """Minimum time between two interruptions of a frame."""
@@ -182,8 +182,8 @@ class RenderWorker:
     def _wait_s(self) -> float:
         if self._builder.is_warming:
             return 0.0
-        if self._builder.worker.needs_attention_soon:
-            return ATTENTION_WAIT_S
+        if self._builder.worker.needs_poll:
+            return WORKER_POLL_S
         return IDLE_WAIT_S
 
     def _run_once(self, *, is_short: bool = False) -> None:

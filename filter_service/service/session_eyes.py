@@ -135,8 +135,8 @@ class SessionEyes:
         return Accepted(
             request.profile_id,
             accepted.generation,
-            is_building=bool(accepted.wanted),
-            n_cameras=len(accepted.wanted),
+            is_building=bool(accepted.requested),
+            n_cameras=len(accepted.requested),
             eye=request.eye,
         )
 

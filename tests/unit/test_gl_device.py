@@ -153,9 +153,9 @@ def test_a_named_device_asks_for_gl(monkeypatch):
         choose_engine, "_gl", lambda closing, reason, **_: asked.append(reason)
     )
     choose_engine.open_engine("auto", None)
-    assert asked == ["its device is named"]
+    assert asked == ["a device is selected"]
     monkeypatch.setattr(choose_engine, "_native", lambda closing, reason: reason)
-    assert choose_engine.open_engine("native", None) == "as asked"
+    assert choose_engine.open_engine("native", None) == "as requested"
 
 
 def test_names_are_asked_for_where_the_device_has_them():

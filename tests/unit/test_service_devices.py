@@ -53,7 +53,9 @@ def test_too_many_and_engines_told_twice_are_refused():
     with pytest.raises(ValueError, match="devices has 9 items; allowed: up to 8"):
         ServiceConfig(devices=("native",) * 9)
     for name, value in (("engine", "gl"), ("gl_device", "1")):
-        with pytest.raises(ValueError, match=f"{name} is '{value}', but devices select"):
+        with pytest.raises(
+            ValueError, match=f"{name} is '{value}', but devices select"
+        ):
             ServiceConfig(devices=("native",), **{name: value})
 
 
