@@ -34,7 +34,7 @@ from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
 from filter_service.building.background_warm_up import BackgroundWarmUp
 from filter_service.building.jobs import Build, BuildJob
 from filter_service.errors import BuildCancelled, BuildFailed, FilterError
-from filter_service.log_lines import start_log
+from filter_service.log_lines import configure_logging
 
 PROGRESS_INTERVAL_S = 0.1
 IDLE_S = 3.0
@@ -58,7 +58,7 @@ def serve_builds(pipe: Connection, build_name: str, warm_up_name: str = "") -> N
     """Serve build requests until the pipe closes."""
     # Ctrl-C signals the whole process group; the parent stops the worker itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    start_log("worker")
+    configure_logging("worker")
     try:
         build, warm_up = _import_function(build_name), None
         pipe.send(("ready",))

@@ -9,7 +9,7 @@ from typing import Any
 from filter_service.constants import ENGINES
 from filter_service.errors import RenderFailed
 from filter_service.gl.hardware import may_have_gpu
-from filter_service.gl_device import is_device_named
+from filter_service.gl_device import is_device_selected
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def open_engine(
         return _native(closing, "as requested")
     if choice == "gl":
         return _gl(closing, "as requested", warm_up=warm_up)
-    if is_device_named():
+    if is_device_selected():
         return _gl(closing, "a device is selected", warm_up=warm_up)
     return _automatic(closing, warm_up=warm_up)
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import partial
 
 from filter_service.atomic_files import write_atomically
-from filter_service.log_lines import FORMAT_VARIABLE, start_log
+from filter_service.log_lines import FORMAT_VARIABLE, configure_logging
 from filter_service.service.config import ServiceConfig
 from filter_service.service.supervisor import OPEN_BUILDER, ServiceFailed, Supervisor
 
@@ -40,7 +40,7 @@ def run(
         If the service cannot start, or has failed for too long.
     """
     os.environ[FORMAT_VARIABLE] = config.log_format  # for all processes
-    start_log("service")
+    configure_logging("service")
     supervisor = Supervisor(
         config,
         open_builder=open_builder,

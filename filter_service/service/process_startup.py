@@ -8,7 +8,7 @@ import signal
 import sys
 from typing import Any
 
-from filter_service.log_lines import start_log
+from filter_service.log_lines import configure_logging
 from filter_service.service.config import ServiceConfig
 from filter_service.service.process_channel import Link
 
@@ -36,7 +36,7 @@ def start_process(name: str) -> tuple[Link, ServiceConfig, list[tuple[Any, list[
     # Ctrl-C signals the whole process group; the supervisor stops its processes itself.
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    start_log(name)
+    configure_logging(name)
     supervisor = Link.from_descriptor(int(sys.argv[1]))
     (first, _), *others = supervisor.wait()
     kind, config = first

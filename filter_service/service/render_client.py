@@ -24,7 +24,7 @@ from filter_service.service.image_positions import result_sizes
 from filter_service.service.process_channel import Link, LinkClosed
 from filter_service.service.router import Tracker
 from filter_service.service.session import Session, WaitingFrame
-from filter_service.shared_memory import Slot, SlotPool, starts_of
+from filter_service.shared_memory import Slot, SlotPool, aligned_starts
 
 MS_PER_S = 1000.0
 
@@ -200,7 +200,7 @@ class RenderClient:
     def release(self, *slots: Slot) -> None:
         """Return slots to the pool, for other frames."""
         for slot in slots:
-            self._slots.give_back(slot)
+            self._slots.release(slot)
 
     def trim(self) -> None:
         """Free the unused slots of the pool."""
@@ -218,7 +218,7 @@ class RenderClient:
         return left
 
     def _slot_for(self, size_bytes: int) -> Slot:
-        slot, is_new = self._slots.take(size_bytes)
+        slot, is_new = self._slots.acquire(size_bytes)
         if is_new:
             self._send_slot(slot)
         return slot
@@ -270,8 +270,8 @@ class RenderClient:
     def _copy_images(self, frame: Frame) -> tuple[SharedPlaces, tuple[Slot, ...]]:
         """Copy the images of a frame to slots of the pool."""
         images = frame.parts()
-        starts, n_in = starts_of([image.nbytes for image in images])
-        result_starts, n_out = starts_of(result_sizes(frame))
+        starts, n_in = aligned_starts([image.nbytes for image in images])
+        result_starts, n_out = aligned_starts(result_sizes(frame))
         slot = self._slot_for(n_in)
         try:
             result_slot = self._slot_for(n_out)
