@@ -280,7 +280,7 @@ def test_slots_have_a_limit_to_their_number():
     pool = SlotPool(10**6, 3)
     for _ in range(3):
         pool.create(10)
-    with pytest.raises(OutOfMemory, match="3 blocks of shared memory are in use"):
+    with pytest.raises(OutOfMemory, match="3 slots of shared memory are in use"):
         pool.create(10)
 
 
