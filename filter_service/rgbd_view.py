@@ -177,5 +177,5 @@ def _check_views(color: object) -> None:
             raise BadMessage(
                 f"a {type(color).__name__}{inside}",
                 field="color",
-                allowed="an array (height, width, 3), an RgbdView or several",
+                allowed="an array (height, width, 3), an RgbdView, or several",
             )
