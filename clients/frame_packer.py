@@ -25,7 +25,7 @@ from filter_service.messages import (
     encoded_depth,
 )
 from filter_service.settings import DepthKind
-from filter_service.shared_memory import starts_of
+from filter_service.shared_memory import aligned_starts
 
 LEND_WAIT_S = 0.1
 
@@ -82,8 +82,8 @@ class FramePacker:
         memory = self._link.memory
         if not memory.is_offered:
             return None
-        starts, n_in = starts_of([image.nbytes for image in images])
-        result_starts, n_out = starts_of(
+        starts, n_in = aligned_starts([image.nbytes for image in images])
+        result_starts, n_out = aligned_starts(
             [v.camera.pixel_count * frame.output.bytes_per_pixel for v in frame.views]
         )
         slot = memory.holding(images)
@@ -116,7 +116,7 @@ class FramePacker:
         """Return an empty view to render into; see `FilterClient.lend_view`."""
         shape = (camera.height_px, camera.width_px)
         shapes = ((*shape, 3), np.dtype(dtype)), (shape, np.dtype(np.float32))
-        starts, size_bytes = starts_of(
+        starts, size_bytes = aligned_starts(
             [int(np.prod(shape)) * kind.itemsize for shape, kind in shapes]
         )
         memory = self._link.memory

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.messages import Share, Shared, Unshare
-from filter_service.shared_memory import PAGE_BYTES, Slot, starts_of
+from filter_service.shared_memory import PAGE_BYTES, Slot, aligned_starts
 
 KEPT_RATIO = 4
 MAX_SLOTS = 12
@@ -101,7 +101,7 @@ class SharedMemory:
 
     def holding(self, images: Sequence[NDArray[Any]]) -> ClientSlot | None:
         """Return the slot that already contains the images at the expected offsets."""
-        starts, _ = starts_of([image.nbytes for image in images])
+        starts, _ = aligned_starts([image.nbytes for image in images])
         for held in self._slots:
             base = held.slot.array(0, (1,), np.dtype(np.uint8)).ctypes.data
             if all(

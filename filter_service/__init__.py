@@ -1,5 +1,6 @@
-"""The filter: images as a person's eye sees them, in process or as a service.
+"""The filter: computes the retinal image of RGB-D frames, in process or as a service.
 
+`EyeFilter` filters in process; `service` serves clients by the wire protocol.
 Importing this package loads no submodules, which keeps clients light.
 
     settings         definition of every setting of a filter
@@ -11,9 +12,9 @@ Importing this package loads no submodules, which keeps clients light.
     protocol_schema  JSON Schema of the message headers
     errors           exceptions
     keys             keys of clients on other machines
-    shared_memory    shared memory
+    shared_memory    shared memory for images
     log_lines        log of the service
-    validation       validation against annotated types
+    validation       validation of values against annotated types
     progress         progress of long tasks on stderr
     constants        constants shared by Python and GLSL
     image_files      color and depth files
@@ -26,11 +27,11 @@ Importing this package loads no submodules, which keeps clients light.
     native/          compiled loops in C
     planning/        PSFs that an eye needs for a given error
     psfs/            the PSF cache
-    rendering/       from a frame and the cache to the output image
-    building/        worker process that builds caches
-    filtering/       `EyeFilter`: streams of frames through eyes
-    wire/            messages, field by field
-    service/         sockets, sessions and the scheduler
+    rendering/       the renderer: from a frame and PSFs to the output image
+    building/        the build worker, which estimates eyes
+    filtering/       `EyeFilter`: streams of frames, in process
+    wire/            the types of messages
+    service/         front end, render workers and supervisor
 """
 
 import lazy_loader

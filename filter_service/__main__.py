@@ -3,5 +3,5 @@
 import importlib
 
 if __name__ == "__main__":
-    # By name, as no module of this package imports the clients.
+    # By name, because this package must not import the clients.
     importlib.import_module("clients.commands.program").main()

@@ -9,20 +9,21 @@ from pathlib import Path
 
 
 def write_atomically(path: Path, text: str, *, is_new: bool = False) -> None:
-    """Write a text file for its owner only, atomically through a temporary file.
+    """Write a text file atomically, readable by its owner only.
 
-    The temporary name is new and unpredictable, so that a link planted there is never
-    followed.
+    The temporary file has an unpredictable name, so that no planted link is followed.
 
     Parameters
     ----------
+    path : Path
+    text : str
     is_new : bool
         Whether to refuse to replace an existing file.
 
     Raises
     ------
     FileExistsError
-        The file exists, and `is_new` is set.
+        If the file exists, and `is_new` is set.
     OSError
     """
     descriptor, unfinished = tempfile.mkstemp(
@@ -32,7 +33,7 @@ def write_atomically(path: Path, text: str, *, is_new: bool = False) -> None:
         with os.fdopen(descriptor, "w", encoding="utf-8") as file:
             file.write(text)
         if is_new:
-            os.link(unfinished, path)  # unlike a rename it never replaces a file
+            os.link(unfinished, path)  # unlike a rename, this never replaces a file
         else:
             os.replace(unfinished, path)
     finally:

@@ -1,9 +1,9 @@
-"""Image decoders with memory limits, checked before anything is decoded.
+"""Image decoders with memory limits, which are checked before decoding.
 
 Pillow decodes PNG, JPEG, PPM, PGM, PFM, TIFF and WebP, and the OpenEXR library decodes
 its own format; ``.npy`` files are read here, because NumPy's reader evaluates the text
 of the header.  The limits keep the peak memory of any file below 1 GB
-(`ocufilter bench files`).  Every exception of a decoder becomes `InvalidFile`.
+(`ocufilter bench files`).  Exceptions of decoders become `InvalidFile`.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ MAX_DECODED_BYTES = 4096 * 4096 * 3 * 8
 The float32 array made of it exists at the same time."""
 
 MAX_FILE_BYTES = 1 << 29
-"""More than any format needs for the decoded bytes; the rest is left for metadata."""
+"""More than any format needs for the decoded bytes, which leaves space for metadata."""
 
 MAX_SCANNED_PIXELS = 1 << 30
 """Pixels of a JPEG times its scans, each of which visits all of them.  A progressive
 camera image has 10 scans."""
 
 MAX_PNG_CHUNKS = 200_000
-"""Pillow takes some microseconds for each; encoders make one for 8 kB."""
+"""Pillow takes a few microseconds for each; encoders write one per 8 kB."""
 
 MAX_TIFF_VALUES = 1_000_000
 """Values of one numeric tag: they become Python numbers, 36 bytes each."""
@@ -101,13 +101,14 @@ _NPY_FIELD = re.compile(
     r"""(?:['"]([<>|=][a-z]\d{1,2})['"]|(True|False)|\(([\d,\sL]*)\))\s*(?:,|(?=\}))"""
 )
 
-_KEPT_BYTES = 100_000
-_WARNINGS = threading.RLock()
-"""Warning filters are global to the process: two readers would restore each other's."""
+_MAX_CAPTURED_BYTES = 100_000
+_GLOBALS_LOCK = threading.RLock()
+"""Warning filters, stdout and stderr are global to the process: concurrent readers
+would restore each other's."""
 
 _PIXEL_LIMIT = f"at most {MAX_PIXELS:,} pixels, as 8192x8192"
 
-# Otherwise Python writes its records to stderr, in addition to the error's one line.
+# Otherwise Python writes Pillow's log records to stderr.
 logging.getLogger("PIL").addHandler(logging.NullHandler())
 
 Source = Path | bytes
@@ -132,7 +133,7 @@ def read_picture_rgb(
     option : str
         Option that requested it, for error messages.
     upright : bool
-        Whether to apply the EXIF orientation; textures are read as stored.
+        Whether to apply the EXIF orientation.
     formats : sequence of str
         Pillow's names of the accepted formats, regardless of the file's suffix.
 
@@ -140,12 +141,12 @@ def read_picture_rgb(
     ------
     InvalidFile
     """
-    with _opened_picture(source, name, option, formats) as image:
+    with _open_image(source, name, option, formats) as image:
         if image.mode.startswith(("I", "F")):
-            raise _Refused(f"mode {image.mode}", "8 bits per channel")
+            raise _InvalidImage(f"mode {image.mode}", "8 bits per channel")
         image.load()
         picture = ImageOps.exif_transpose(image) if upright else image
-        return _rows_as_rgb(picture)
+        return _to_rgb(picture)
 
 
 def read_picture_values(
@@ -157,7 +158,7 @@ def read_picture_values(
     ------
     InvalidFile
     """
-    with _opened_picture(source, name, option) as image:
+    with _open_image(source, name, option) as image:
         image.load()
         return np.asarray(ImageOps.exif_transpose(image))
 
@@ -169,12 +170,12 @@ def check_picture(source: Source, *, name: str = "", option: str = "") -> int:
     ------
     InvalidFile
     """
-    with _opened_picture(source, name, option) as image:
+    with _open_image(source, name, option) as image:
         return image.width * image.height
 
 
-class _Refused(Exception):
-    """A rejected file: the value found and the allowed one."""
+class _InvalidImage(Exception):
+    """An image was rejected: what was found, and what is allowed."""
 
     def __init__(self, found: str, allowed: str) -> None:
         super().__init__(found, allowed)
@@ -182,13 +183,15 @@ class _Refused(Exception):
 
 
 @contextmanager
-def _opened_picture(
+def _open_image(
     source: Source, name: str, option: str, formats: Sequence[str] = FORMATS
 ) -> Iterator[Image.Image]:
     """Open an image within the limits; convert all errors to `InvalidFile`."""
     named = name or str(source if isinstance(source, Path) else "picture")
-    with _WARNINGS, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about sizes, which are checked here
+    with _GLOBALS_LOCK, warnings.catch_warnings():
+        warnings.simplefilter(
+            "ignore"
+        )  # Pillow warns about sizes, which are checked here
         try:
             file = (
                 io.BytesIO(source) if isinstance(source, bytes) else open(source, "rb")  # noqa: SIM115
@@ -198,54 +201,60 @@ def _opened_picture(
                 file.seek(0)
                 with Image.open(file, formats=tuple(formats)) as image:
                     _check_picture(image, file)
-                    with _quiet_library() if image.format == "TIFF" else nullcontext():
+                    with (
+                        _captured_output() if image.format == "TIFF" else nullcontext()
+                    ):
                         yield image
         except InvalidFile:
             raise
-        except _Refused as error:
+        except _InvalidImage as error:
             raise InvalidFile(named, error.found, error.allowed, option) from None
         except FileNotFoundError:
-            _refuse(named, "no such file", "a file that exists", option)
+            _raise_invalid(named, "no such file", "a file that exists", option)
         except UnidentifiedImageError:
             found = "cannot be read (unknown image format)"
-            _refuse(named, found, "PNG, JPEG, PPM, TIFF or WebP", option)
+            _raise_invalid(named, found, "PNG, JPEG, PPM, TIFF or WebP", option)
         except Exception as error:  # Pillow's decoders raise nearly anything
-            found = f"cannot be read ({_text_of(error)})"
-            _refuse(named, found, "an intact picture", option)
+            found = f"cannot be read ({_error_text(error)})"
+            _raise_invalid(named, found, "an intact picture", option)
 
 
 @contextmanager
-def _quiet_library() -> Iterator[list[str]]:
+def _captured_output() -> Iterator[list[str]]:
     """Capture a library's output on stdout and stderr; the list holds it afterward.
 
-    Both streams are global to the process, so the caller holds the lock `_WARNINGS`.
+    The caller must hold `_GLOBALS_LOCK`.
     """
-    said: list[str] = []
+    captured: list[str] = []
     printed = io.StringIO()
-    with tempfile.TemporaryFile() as kept, redirect_stdout(printed):
+    with tempfile.TemporaryFile() as stderr_file, redirect_stdout(printed):
         with ExitStack() as stack:
             with suppress(OSError):  # stderr may not exist
                 own = os.dup(2)
                 stack.callback(os.close, own)
                 stack.callback(os.dup2, own, 2)
-                os.dup2(kept.fileno(), 2)
-            yield said
-        kept.seek(0)
-        said.append(kept.read(_KEPT_BYTES).decode("utf-8", "replace"))
-        said.append(printed.getvalue())
+                os.dup2(stderr_file.fileno(), 2)
+            yield captured
+        stderr_file.seek(0)
+        captured.append(
+            stderr_file.read(_MAX_CAPTURED_BYTES).decode("utf-8", "replace")
+        )
+        captured.append(printed.getvalue())
 
 
-def _text_of(error: BaseException) -> str:
-    """Return the message of a decoder, without addresses of Python objects."""
+def _error_text(error: BaseException) -> str:
+    """Return the message of a decoder's exception, without memory addresses."""
     return re.sub(r"<[^>]* at 0x[0-9a-f]+>", "it", reason_of(error))
 
 
-def _refuse(named: str | Path, found: str, allowed: str, option: str) -> NoReturn:
+def _raise_invalid(
+    named: str | Path, found: str, allowed: str, option: str
+) -> NoReturn:
     raise InvalidFile(named, found, allowed, option) from None
 
 
-def _rows_as_rgb(image: Image.Image) -> NDArray[np.uint8]:
-    """Convert some rows at a time; otherwise the image would be held three times."""
+def _to_rgb(image: Image.Image) -> NDArray[np.uint8]:
+    """Convert to RGB, some rows at a time to limit memory."""
     width, height = image.size
     rgb = np.empty((height, width, 3), np.uint8)
     step = max(1, (1 << 22) // max(1, width))
@@ -261,7 +270,9 @@ def _rows_as_rgb(image: Image.Image) -> NDArray[np.uint8]:
 def _check_container(file: BinaryIO) -> None:
     size_bytes = _size_of(file)
     if size_bytes > MAX_FILE_BYTES:
-        raise _Refused(f"{size_bytes:,} bytes", f"at most {MAX_FILE_BYTES:,} bytes")
+        raise _InvalidImage(
+            f"{size_bytes:,} bytes", f"at most {MAX_FILE_BYTES:,} bytes"
+        )
     head = file.read(64)
     if head.startswith(b"\x89PNG\r\n\x1a\n"):
         _check_png(file, size_bytes)
@@ -272,7 +283,7 @@ def _check_container(file: BinaryIO) -> None:
         width, height = _webp_size(head)
         if width * height > MAX_WEBP_PIXELS:
             allowed = f"at most {MAX_WEBP_PIXELS:,} pixels of a WebP"
-            raise _Refused(f"{width}x{height} px", allowed)
+            raise _InvalidImage(f"{width}x{height} px", allowed)
 
 
 def _size_of(file: BinaryIO) -> int:
@@ -291,7 +302,9 @@ def _check_png(file: BinaryIO, size_bytes: int) -> None:
             return  # truncated: the decoder reports it
         count += 1
         if count > MAX_PNG_CHUNKS:
-            raise _Refused(f"more than {count - 1:,} chunks", f"{MAX_PNG_CHUNKS:,}")
+            raise _InvalidImage(
+                f"more than {count - 1:,} chunks", f"{MAX_PNG_CHUNKS:,}"
+            )
         at += 12 + int.from_bytes(head, "big")
 
 
@@ -312,7 +325,7 @@ def _check_tiff(file: BinaryIO, head: bytes) -> None:
         (n_tags,) = counted.unpack(file.read(counted.size))
         tags = struct.Struct(order + entry)
         if n_tags > 4096:
-            raise _Refused(f"{n_tags} tags", "at most 4096")
+            raise _InvalidImage(f"{n_tags} tags", "at most 4096")
         content = file.read(n_tags * tags.size)
         entries = list(
             tags.iter_unpack(content[: len(content) // tags.size * tags.size])
@@ -322,7 +335,7 @@ def _check_tiff(file: BinaryIO, head: bytes) -> None:
     for tag, kind, n_values in entries:
         if kind in _TIFF_NUMERIC and n_values > MAX_TIFF_VALUES:
             found = f"tag {tag} with {n_values:,} values"
-            raise _Refused(found, f"at most {MAX_TIFF_VALUES:,}")
+            raise _InvalidImage(found, f"at most {MAX_TIFF_VALUES:,}")
 
 
 def _webp_size(head: bytes) -> tuple[int, int]:
@@ -347,12 +360,12 @@ def _check_picture(image: Image.Image, file: BinaryIO) -> None:
     width, height = image.size
     n_pixels = width * height
     if n_pixels > MAX_PIXELS:
-        raise _Refused(f"{width}x{height} px", _PIXEL_LIMIT)
+        raise _InvalidImage(f"{width}x{height} px", _PIXEL_LIMIT)
     if image.format in ("JPEG", "MPO"):
         n_scans = _count(file, b"\xff\xda")
         if n_scans * n_pixels > MAX_SCANNED_PIXELS:
             allowed = f"at most {MAX_SCANNED_PIXELS:,} pixels in all scans"
-            raise _Refused(f"{width}x{height} px in {n_scans} scans", allowed)
+            raise _InvalidImage(f"{width}x{height} px in {n_scans} scans", allowed)
     elif image.format == "TIFF":
         _check_tiles(image)
     elif image.format == "PPM" and (tiles := getattr(image, "tile", None)):
@@ -363,7 +376,7 @@ def _check_picture(image: Image.Image, file: BinaryIO) -> None:
                 f"at most {MAX_SLOW_SAMPLES:,} samples in plain text or of another "
                 "maximum than 255 or 65535"
             )
-            raise _Refused(f"{n_samples:,} samples", allowed)
+            raise _InvalidImage(f"{n_samples:,} samples", allowed)
 
 
 def _check_tiles(image: Image.Image) -> None:
@@ -371,7 +384,7 @@ def _check_tiles(image: Image.Image) -> None:
     tags = image.tag_v2  # type: ignore[attr-defined]
     tile_width, tile_height = (int(tags.get(tag, 0)) for tag in (322, 323))
     if tile_width * tile_height > MAX_PIXELS:
-        raise _Refused(f"tiles of {tile_width}x{tile_height} px", _PIXEL_LIMIT)
+        raise _InvalidImage(f"tiles of {tile_width}x{tile_height} px", _PIXEL_LIMIT)
 
 
 def _count(file: BinaryIO, marker: bytes) -> int:
@@ -402,7 +415,7 @@ def read_npy(path: Path, *, option: str = "") -> NDArray[Any]:
     try:
         with open(path, "rb") as file:
             return _npy_array(file, _size_of(file))
-    except _Refused as error:
+    except _InvalidImage as error:
         raise InvalidFile(path, error.found, error.allowed, option) from None
     except (OSError, ValueError, MemoryError) as error:
         found = f"cannot be read ({reason_of(error)})"
@@ -417,10 +430,10 @@ def _npy_array(file: BinaryIO, size_bytes: int) -> NDArray[Any]:
     n_there = size_bytes - file.tell()
     if n_bytes > n_there:
         found = f"cannot be read ({claimed} in {n_there:,} bytes)"
-        raise _Refused(found, f"a file with all of its {n_bytes:,} bytes")
+        raise _InvalidImage(found, f"a file with all of its {n_bytes:,} bytes")
     if n_bytes > MAX_DECODED_BYTES:
         allowed = f"at most {MAX_DECODED_BYTES:,} bytes"
-        raise _Refused(f"{claimed}, {n_bytes:,} bytes", allowed)
+        raise _InvalidImage(f"{claimed}, {n_bytes:,} bytes", allowed)
     array = np.fromfile(file, dtype, n_values)
     return array.reshape(shape, order="F" if is_fortran else "C")
 
@@ -430,12 +443,12 @@ def _npy_header(file: BinaryIO) -> tuple[np.dtype, tuple[int, ...], bool]:
     intact = "a .npy file of bool, integers or floats"
     magic = file.read(8)
     if magic[:6] != NPY_MAGIC or magic[6:7] not in (b"\1", b"\2", b"\3"):
-        raise _Refused("cannot be read (not a .npy file)", intact)
+        raise _InvalidImage("cannot be read (not a .npy file)", intact)
     width = 2 if magic[6] == 1 else 4
     n_header = int.from_bytes(file.read(width), "little")
     if n_header > MAX_NPY_HEADER_BYTES:
         found = f"a header of {n_header:,} bytes"
-        raise _Refused(found, f"at most {MAX_NPY_HEADER_BYTES:,} bytes")
+        raise _InvalidImage(found, f"at most {MAX_NPY_HEADER_BYTES:,} bytes")
     header = file.read(n_header)
     text = header.decode("latin-1" if magic[6] < 3 else "utf-8").strip()
     fields: dict[str, tuple[str, ...]] = {}
@@ -445,23 +458,27 @@ def _npy_header(file: BinaryIO) -> tuple[np.dtype, tuple[int, ...], bool]:
         at = match.end()
     is_whole = len(header) == n_header and text[at:].strip() == "}"
     if not is_whole or set(fields) != {"descr", "fortran_order", "shape"}:
-        raise _Refused("cannot be read (another header than a plain array's)", intact)
+        raise _InvalidImage(
+            "cannot be read (another header than a plain array's)", intact
+        )
     descr, order, shape = (
         fields[name][k] for k, name in enumerate(("descr", "fortran_order", "shape"))
     )
     if descr is None or order is None or shape is None:
-        raise _Refused("cannot be read (another header than a plain array's)", intact)
+        raise _InvalidImage(
+            "cannot be read (another header than a plain array's)", intact
+        )
     try:
         dtype = np.dtype(descr)
         sides = tuple(
             int(side.rstrip("L")) for side in shape.split(",") if side.strip()
         )
     except (TypeError, ValueError):
-        raise _Refused(
+        raise _InvalidImage(
             f"cannot be read ({descr} of shape ({shape:.40}))", intact
         ) from None
     if dtype.kind not in "buif" or len(sides) > 8:
-        raise _Refused(f"cannot be read ({dtype} of shape {sides})", intact)
+        raise _InvalidImage(f"cannot be read ({dtype} of shape {sides})", intact)
     return dtype, sides, order == "True"
 
 
@@ -476,7 +493,7 @@ def read_exr_channels(
     Parameters
     ----------
     choose : callable
-        Function that returns the channels to read, or raises.
+        Returns the channels to read, of those in the file, or raises.
 
     Raises
     ------
@@ -488,11 +505,11 @@ def read_exr_channels(
         with open(path, "rb") as stream:
             size_bytes = _size_of(stream)
             if stream.read(4) != EXR_MAGIC:  # the library would write to stderr
-                _refuse(path, "not an OpenEXR file", "OpenEXR", option)
+                _raise_invalid(path, "not an OpenEXR file", "OpenEXR", option)
         if size_bytes > MAX_FILE_BYTES:
             allowed = f"at most {MAX_FILE_BYTES:,} bytes"
-            _refuse(path, f"{size_bytes:,} bytes", allowed, option)
-        with _WARNINGS, _quiet_library() as said:
+            _raise_invalid(path, f"{size_bytes:,} bytes", allowed, option)
+        with _GLOBALS_LOCK, _captured_output() as captured:
             how = {"separate_channels": True}
             with OpenEXR.File(str(path), header_only=True, **how) as file:
                 _check_exr(file.parts)
@@ -500,17 +517,19 @@ def read_exr_channels(
                 channels = file.channels()
                 wanted = choose(set(channels))
                 found = {k: np.asarray(channels[k].pixels, np.float32) for k in wanted}
-        text = "".join(said)
+        text = "".join(captured)
         if EXR_INCOMPLETE in text:  # the library continues with the intact part
             reason = text[text.index(EXR_INCOMPLETE) :].split("\n")[0].split(" - ")[-1]
-            raise _Refused(f"cannot be read ({reason:.100})", "an intact OpenEXR file")
+            raise _InvalidImage(
+                f"cannot be read ({reason:.100})", "an intact OpenEXR file"
+            )
         return found
     except InvalidFile:
         raise
-    except _Refused as error:
+    except _InvalidImage as error:
         raise InvalidFile(path, error.found, error.allowed, option) from None
     except Exception as error:  # bindings raise nearly anything on damaged files
-        problem = f"cannot be read ({_text_of(error)})"
+        problem = f"cannot be read ({_error_text(error)})"
         raise InvalidFile(path, problem, "an intact OpenEXR file", option) from None
 
 
@@ -527,23 +546,23 @@ def _check_exr(parts: list[Any]) -> None:
     """Reject files that would need too much memory, by the headers of all parts."""
     n_bytes = 0
     if not parts:
-        raise _Refused("no parts", "a part with pixels")
+        raise _InvalidImage("no parts", "a part with pixels")
     for part in parts:
         low, high = part.header["dataWindow"]
         width, height = (int(b) - int(a) + 1 for a, b in zip(low, high, strict=True))
         if width < 1 or height < 1:
-            raise _Refused(f"{width}x{height} px", "1x1 px or more")
+            raise _InvalidImage(f"{width}x{height} px", "1x1 px or more")
         if width * height > MAX_PIXELS:
-            raise _Refused(f"{width}x{height} px", _PIXEL_LIMIT)
+            raise _InvalidImage(f"{width}x{height} px", _PIXEL_LIMIT)
         if "deep" in str(part.header.get("type", "")):
-            raise _Refused("deep pixels", "one value of each channel for a pixel")
+            raise _InvalidImage("deep pixels", "one value of each channel for a pixel")
         # 4 bytes per value: half floats become float32
         row_bytes = 4 * width * len(part.header["channels"])
         n_bytes += row_bytes * height
         chunk_bytes = row_bytes * min(height, _exr_chunk_rows(part.header))
         if chunk_bytes > MAX_EXR_CHUNK_BYTES:
             found = f"{chunk_bytes:,} bytes in a chunk"
-            raise _Refused(found, f"at most {MAX_EXR_CHUNK_BYTES:,} bytes")
+            raise _InvalidImage(found, f"at most {MAX_EXR_CHUNK_BYTES:,} bytes")
     if n_bytes > MAX_DECODED_BYTES:
         allowed = f"at most {MAX_DECODED_BYTES:,} bytes as float32"
-        raise _Refused(f"{n_bytes:,} bytes in all channels", allowed)
+        raise _InvalidImage(f"{n_bytes:,} bytes in all channels", allowed)

@@ -1,8 +1,8 @@
-"""A pinhole camera, and which cameras can share one PSF store.
+"""A pinhole camera, and whether two cameras can share a PSF store.
 
-An on-axis store depends only on the size of a camera's pixels.  A store that follows
-the visual field holds kernels for directions in one image, mapped by its local scale,
-so it serves that image only.
+An on-axis store depends only on the pixel pitch of a camera.  A store with PSFs that
+vary over the visual field contains kernels for directions in one image, transformed by
+its local scale, so it fits only cameras with the same view.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def tangents_from_fov(
     Raises
     ------
     ValueError
-        The field of view is impossible for a pinhole.
+        If the field of view is impossible for a pinhole.
     """
     if not 0 < vertical_fov_deg < 174:
         raise ValueError(f"vertical_fov_deg is {vertical_fov_deg}; allowed: 0 to 174")
@@ -48,19 +48,19 @@ def tangents_from_fov(
 
 
 def read_intrinsics(text: str) -> tuple[float, float, float, float]:
-    """Return focal lengths and principal point, px, from an option ``--intrinsics``.
+    """Return focal lengths and principal point, px, from the option ``--intrinsics``.
 
     Raises
     ------
     ValueError
-        There are not four numbers, or a focal length is not positive; names the option.
+        If there are not four numbers, or a focal length is not positive.
     """
     try:
         fx, fy, cx, cy = (float(part) for part in text.split(","))
     except ValueError:
         fx = fy = cx = cy = math.nan
     if not (min(fx, fy) > 0.0 and all(map(math.isfinite, (fx, fy, cx, cy)))):
-        raise ValueError(f"--intrinsics '{text}': allowed is FX,FY,CX,CY in px")
+        raise ValueError(f"--intrinsics is {text!r}; allowed: FX,FY,CX,CY in px")
     return fx, fy, cx, cy
 
 
@@ -78,7 +78,7 @@ class Camera(Record):
     Raises
     ------
     BadMessage
-        A size or tangent is out of range, or edges are on the wrong sides.
+        If a size or tangent is out of range, or edges are on the wrong sides.
     """
 
     width_px: SidePx
@@ -110,7 +110,7 @@ class Camera(Record):
         Raises
         ------
         ValueError
-            The field of view or size is impossible for a pinhole.
+            If the field of view or size is impossible for a pinhole.
         """
         tangents = tangents_from_fov(vertical_fov_deg, width_px, height_px)
         return cls(width_px, height_px, tangents)
@@ -140,7 +140,7 @@ class Camera(Record):
         Raises
         ------
         BadMessage
-            The size or edges are impossible for a pinhole.
+            If the size or edges are impossible for a pinhole.
         """
         tangents = (
             -(center_x_px + 0.5) / focal_x_px,
@@ -152,7 +152,7 @@ class Camera(Record):
 
     @property
     def corner_distance_ratio(self) -> float:
-        """Distance from the eye to the farthest corner, per unit of planar depth."""
+        """Return the distance of the farthest corner per unit of planar depth."""
         left, right, up, down = self.tangents
         across, along = max(abs(left), abs(right)), max(abs(up), abs(down))
         return math.sqrt(1.0 + across**2 + along**2)
@@ -173,20 +173,20 @@ class Camera(Record):
 
 
 def is_same_camera(first: Camera, second: Camera, *, follows_field: bool) -> bool:
-    """Return whether one PSF store serves both cameras.
+    """Return whether both cameras can share a PSF store.
 
     Parameters
     ----------
     follows_field : bool
-        Whether the store's kernels differ over the visual field.
+        Whether the PSFs of the store vary over the visual field.
     """
     pitches = zip(first.pixel_pitch_mrad, second.pixel_pitch_mrad, strict=True)
     if any(abs(a / b - 1.0) > SAME_RATIO for a, b in pitches):
         return False
-    return not follows_field or _shows_the_same(first, second)
+    return not follows_field or _has_same_view(first, second)
 
 
-def _shows_the_same(first: Camera, second: Camera) -> bool:
+def _has_same_view(first: Camera, second: Camera) -> bool:
     if (first.width_px, first.height_px) != (second.width_px, second.height_px):
         return False
     left, right, up, down = second.tangents

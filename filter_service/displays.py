@@ -1,7 +1,7 @@
 """Wavelengths of a display's red, green and blue: one or two for each primary.
 
-The eye blurs every wavelength differently.  A primary's PSF is that of the single
-wavelength that best represents its spectrum, weighted by what people see of it.
+The eye blurs each wavelength differently.  A primary's PSF is that of the single
+wavelength that best represents its spectrum, weighted by the color-matching functions.
 Accuracy for a white point through 5 mm on six measured displays, against 31 wavelengths
 with the color-matching functions of CIE 1931: with "common" 51 to 58 dB in linear light
 and 47.6 to 49.8 dB encoded, with a display's own wavelengths 54 to 58 and 48.3 to 49.8
@@ -48,34 +48,44 @@ Triple = tuple[float, float, float]
 
 
 def display_wavelengths_nm(display: str) -> Triple:
-    """Return the wavelengths of red, green and blue of a display, by name or explicit.
+    """Return the wavelengths of red, green and blue of a display.
+
+    Parameters
+    ----------
+    display : str
+        Name, or wavelengths as in the setting.
 
     Raises
     ------
     BadMessage
-        The name is unknown, or wavelengths are out of range.
+        If the name is unknown, or wavelengths are out of range.
     """
-    return DISPLAYS[display] if display in DISPLAYS else _given_nm(display)[0]
+    return (
+        DISPLAYS[display] if display in DISPLAYS else _parse_wavelengths_nm(display)[0]
+    )
 
 
 def display_widths_nm(display: str) -> Triple:
-    """Return the standard deviations of the primaries; those of "common" by default.
+    """Return the standard deviations of red, green and blue; by default of "common".
 
     Raises
     ------
     BadMessage
+        If the name is unknown, or wavelengths are out of range.
     """
-    return WIDTHS_NM[display] if display in DISPLAYS else _given_nm(display)[1]
+    return (
+        WIDTHS_NM[display] if display in DISPLAYS else _parse_wavelengths_nm(display)[1]
+    )
 
 
-def _given_nm(display: str) -> tuple[Triple, Triple]:
+def _parse_wavelengths_nm(display: str) -> tuple[Triple, Triple]:
     """Return wavelengths and standard deviations given as numbers."""
     try:
         parts = [[float(n) for n in part.split(":")] for part in display.split(",")]
     except ValueError:
-        raise _refused(display) from None
+        raise _invalid_display(display) from None
     if len(parts) != 3 or any(len(part) > 2 for part in parts):
-        raise _refused(display)
+        raise _invalid_display(display)
     usual_nm = WIDTHS_NM["common"]
     red, green, blue = (
         (part[0], part[1] if len(part) == 2 else width_nm)
@@ -84,11 +94,11 @@ def _given_nm(display: str) -> tuple[Triple, Triple]:
     low_nm, high_nm = LIMITS_NM
     for at_nm, width_nm in (red, green, blue):
         if not (low_nm <= at_nm <= high_nm and 0.0 <= width_nm <= MAX_WIDTH_NM):
-            raise _refused(display)
+            raise _invalid_display(display)
     return (red[0], green[0], blue[0]), (red[1], green[1], blue[1])
 
 
-def _refused(display: str) -> BadMessage:
+def _invalid_display(display: str) -> BadMessage:
     return BadMessage(f"it is {display!r:.60}", field="display", allowed=ALLOWED)
 
 
@@ -97,9 +107,8 @@ def primaries_of_spectra(
 ) -> tuple[Triple, Triple]:
     """Return the wavelengths and widths that best represent measured primaries.
 
-    They are the centroid and standard deviation of each primary's spectrum, weighted by
-    the share of each wavelength that is matched by the same primary when the display's
-    primaries are matched to it.
+    They are the centroid and standard deviation of each primary's spectrum, weighted at
+    each wavelength by the amount of that primary in a color match with the display.
 
     Parameters
     ----------
@@ -115,22 +124,28 @@ def primaries_of_spectra(
     Raises
     ------
     ValueError
-        Shapes do not match, or the spectra are not three independent colors.
+        If shapes do not match, or the spectra are not three independent colors.
     """
     at_nm = np.asarray(wavelengths_nm, dtype=np.float64)
     power = np.asarray(spectra, dtype=np.float64)
     if at_nm.ndim != 1 or power.shape != (at_nm.size, 3):
-        raise ValueError(f"spectra {power.shape}: must be ({at_nm.size}, 3)")
+        raise ValueError(
+            f"spectra have shape {power.shape}; expected ({at_nm.size}, 3)"
+        )
     try:
         shares = primary_shares(at_nm, power)
     except np.linalg.LinAlgError:
-        raise ValueError("spectra: red, green and blue must be three colors") from None
+        raise ValueError(
+            "spectra of red, green and blue are not three independent colors"
+        ) from None
     own = np.stack([shares[k, k] / shares[k, k].sum() for k in range(3)])
     found_nm = own @ at_nm
     variance = np.sum(own * (at_nm - found_nm[:, None]) ** 2, axis=1)
     widths_nm = np.sqrt(np.clip(variance, 0.0, MAX_WIDTH_NM**2))
     if not np.isfinite(found_nm).all():
-        raise ValueError("spectra: red, green and blue must be three colors")
+        raise ValueError(
+            "spectra of red, green and blue are not three independent colors"
+        )
     red, green, blue = zip(found_nm.tolist(), widths_nm.tolist(), strict=True)
     return (red[0], green[0], blue[0]), (red[1], green[1], blue[1])
 
@@ -138,7 +153,7 @@ def primaries_of_spectra(
 def primary_shares(
     wavelengths_nm: NDArray[np.float64], spectra: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the share (3, 3, n) of a wavelength of primary k seen as primary j.
+    """Return the share (3, 3, n) of light of primary k that is seen as primary j.
 
     The sum over wavelengths is the identity.
     """

@@ -10,7 +10,7 @@
     ├── SessionError             valid message that this session cannot process
     │   ├── NoSession            message before hello, or after the service restarted
     │   ├── TooManySessions      the service has reached its limit of clients
-    │   ├── NotAllowed           the client's key is not on the service's list
+    │   ├── NotAllowed           the client's key is not in the service's key folder
     │   ├── NoProfile            frame before any profile
     │   ├── UnknownProfile       the profile's body is invalid or incomplete
     │   ├── GridTooLarge         the profile needs more PSFs than the service allows
@@ -42,7 +42,7 @@ class FilterError(Exception):
     Parameters
     ----------
     message : str
-        One sentence with the offending value.
+        One sentence with the invalid value.
     field : str, optional
         Path of the invalid message or profile field, as in ``views[0].width_px``.
     allowed : str, optional
@@ -114,7 +114,7 @@ class TooManySessions(SessionError):
 
 
 class NotAllowed(SessionError):
-    """The client's key is not on the service's list."""
+    """The client's key is not in the service's key folder."""
 
     code = "not_allowed"
 

@@ -1,7 +1,7 @@
 """Selection of the EGL device for OpenGL.
 
-The service passes its setting ``gl_device`` to its child processes through the
-environment, where every command reads it too.
+The service passes its setting ``gl_device`` to its processes in an environment
+variable, which commands read too.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import os
 
 GL_DEVICE_VARIABLE = "OCUFILTER_GL_DEVICE"
 BACKEND_VARIABLE = "GLCONTEXT_DEVICE_INDEX"
-"""Variable read by the package that opens contexts."""
+"""Variable of the glcontext package, which opens contexts."""
 
 AUTO = "auto"
 
@@ -21,7 +21,7 @@ def checked_gl_device(wanted: str, name: str = "gl_device") -> str:
     Raises
     ------
     ValueError
-        The value is neither.
+        If the value is neither.
     """
     if wanted == AUTO or (wanted.isascii() and wanted.isdecimal()):
         return wanted
@@ -31,8 +31,8 @@ def checked_gl_device(wanted: str, name: str = "gl_device") -> str:
     )
 
 
-def is_device_named() -> bool:
-    """Return whether the environment names one device, which implies OpenGL."""
+def is_device_selected() -> bool:
+    """Return whether the environment selects a device, which implies OpenGL."""
     return wanted_gl_device() != AUTO and bool(os.environ.get(GL_DEVICE_VARIABLE))
 
 
@@ -42,7 +42,7 @@ def wanted_gl_device() -> str:
     Raises
     ------
     ValueError
-        The variable is neither ``auto`` nor an index.
+        If the variable is neither ``auto`` nor an index.
     """
     for variable in (GL_DEVICE_VARIABLE, BACKEND_VARIABLE):
         wanted = os.environ.get(variable, "")

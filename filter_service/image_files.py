@@ -1,9 +1,9 @@
 """Reading of color and depth files, and writing of filtered images.
 
 Color is uint8 sRGB (8-bit PNG, JPEG, ``.npy``) or float linear (``.npy``, ``.exr``);
-negative and non-finite values are passed on to the filter.  OpenEXR is the reference
-library of the format, maintained by its foundation, and is available as a wheel; Pillow
-reads and writes the rest, including 32-bit float TIFF and PFM.
+negative and non-finite values are passed on to the filter.  The OpenEXR
+library reads and writes its format, Pillow the others, including 32-bit float TIFF and
+PFM.
 """
 
 import math
@@ -50,8 +50,8 @@ def read_color(path: Path, *, option: str = "color") -> NDArray[Any]:
     Raises
     ------
     InvalidFile
-        The file is missing, of unknown format, damaged or too large, or its pixels are
-        unsuitable.
+        If the file is missing, of unknown format, damaged or too large, or its pixels
+        have an unsupported type or shape.
     """
     suffix = _known_suffix(option, path, COLOR_SUFFIXES)
     pixels: NDArray[Any]
@@ -73,7 +73,7 @@ def read_depth(
     ----------
     depth_scale : float, optional
         Meters per stored unit; by default 0.001 for integers and 1 for floats.
-        Required for 8 bits, which are an image of depth and seldom millimeters.
+        Required for 8-bit files, which are seldom in millimeters.
     option : str
         Option that requested it, for error messages; empty if there is none.
 
@@ -85,10 +85,10 @@ def read_depth(
     Raises
     ------
     InvalidFile
-        The file is missing, of unknown format, damaged or too large, has several
+        If the file is missing, of unknown format, damaged or too large, has several
         channels, or has 8 bits and no scale is given.
     ValueError
-        The scale is not positive.
+        If the scale is not positive.
     """
     suffix = _known_suffix(option, path, DEPTH_SUFFIXES)
     if suffix == ".exr":
@@ -101,14 +101,14 @@ def read_depth(
         stored = stored[:, :, 0]
     if stored.ndim != 2 or stored.size == 0 or stored.dtype.kind not in "uif":
         found = f"{stored.dtype} of shape {stored.shape}"
-        _refuse(option, path, found, "one channel, integer or float")
+        _raise_invalid(option, path, found, "one channel, integer or float")
     if depth_scale is None:
         if stored.dtype == np.uint8:  # in mm it would end at 25 cm
             allowed = "16 bits in mm, 32-bit float in m; with --depth-scale also 8 bits"
-            _refuse(option, path, "8 bits deep", allowed)
+            _raise_invalid(option, path, "8 bits deep", allowed)
         depth_scale = 1.0 if stored.dtype.kind == "f" else METERS_PER_INTEGER_STEP
     if not (math.isfinite(depth_scale) and depth_scale > 0.0):
-        raise ValueError(f"--depth-scale {depth_scale}: allowed is a positive number")
+        raise ValueError(f"--depth-scale is {depth_scale}; allowed: a positive number")
     return _scaled(stored, depth_scale)
 
 
@@ -132,13 +132,13 @@ def check_output(path: Path, suffixes: tuple[str, ...] = OUTPUT_SUFFIXES) -> Non
     Raises
     ------
     ValueError
-        The format is unknown, or the folder does not exist.
+        If the format is unknown, or the folder does not exist.
     """
     if path.suffix.lower() not in suffixes:
         found = f"'{path.suffix}' is not a kind of output"
-        _refuse("out", path, found, "a name that ends in " + ", ".join(suffixes))
+        _raise_invalid("out", path, found, "a name that ends in " + ", ".join(suffixes))
     if not path.absolute().parent.is_dir():
-        _refuse("out", path, "its folder does not exist", "an existing folder")
+        _raise_invalid("out", path, "its folder does not exist", "an existing folder")
 
 
 def write_image(path: Path, image: NDArray[Any], *, png_level: int = 6) -> None:
@@ -147,20 +147,20 @@ def write_image(path: Path, image: NDArray[Any], *, png_level: int = 6) -> None:
     Parameters
     ----------
     png_level : int, 0 to 9
-        Compression level of a PNG: 1 takes a quarter of the time of 6, and a fifth more
-        space.
+        Compression level of a PNG: 1 takes a quarter of the time of 6, and the file is
+        a fifth larger.
 
     Raises
     ------
     ValueError
-        The dtype does not match the format.
+        If the dtype does not match the format.
     """
     suffix = path.suffix.lower()
     is_linear = suffix in LINEAR_SUFFIXES
     wanted = (np.float32, np.float16) if is_linear else (np.uint8,)
     if image.dtype not in wanted:
         names = " or ".join(np.dtype(kind).name for kind in wanted)
-        raise ValueError(f"{path}: got {image.dtype}, needs {names}")
+        raise ValueError(f"{path}: got {image.dtype}, expected {names}")
     if suffix == ".npy":
         np.save(path, image)
     elif suffix == ".exr":
@@ -172,7 +172,7 @@ def write_image(path: Path, image: NDArray[Any], *, png_level: int = 6) -> None:
 # --- file formats ------------------------------------------------------------
 
 
-def _refuse(field: str, path: Path, found: str, allowed: str) -> NoReturn:
+def _raise_invalid(field: str, path: Path, found: str, allowed: str) -> NoReturn:
     raise InvalidFile(path, found, allowed, field)
 
 
@@ -180,13 +180,13 @@ def _known_suffix(field: str, path: Path, suffixes: tuple[str, ...]) -> str:
     suffix = path.suffix.lower()
     if suffix not in suffixes:
         found = f"'{path.suffix}' is not a kind it reads"
-        _refuse(field, path, found, ", ".join(suffixes))
+        _raise_invalid(field, path, found, ", ".join(suffixes))
     try:
         is_file = path.is_file()
     except (OSError, ValueError):  # a null byte, or a name that is too long
         is_file = False
     if not is_file:
-        _refuse(field, path, "no such file", "a file that exists")
+        _raise_invalid(field, path, "no such file", "a file that exists")
     return suffix
 
 
@@ -194,13 +194,15 @@ def _exr_color(path: Path, option: str) -> NDArray[np.float32]:
     def choose(names: set[str]) -> tuple[str, ...]:
         if not set("RGB") <= names:
             found = f"channels {', '.join(sorted(names))}"
-            _refuse(option, path, found[:200], "channels R, G and B")
+            _raise_invalid(option, path, found[:200], "channels R, G and B")
         return tuple("RGB")
 
     channels = read_exr_channels(path, choose, option=option)
     shapes = {channel.shape for channel in channels.values()}
     if len(shapes) > 1:
-        _refuse(option, path, "channels of different sizes", "R, G and B alike")
+        _raise_invalid(
+            option, path, "channels of different sizes", "R, G and B of one size"
+        )
     rgb = np.empty((*shapes.pop(), 3), np.float32)
     for k, name in enumerate("RGB"):
         rgb[:, :, k] = channels.pop(name)
@@ -213,7 +215,7 @@ def _exr_depth(path: Path, option: str) -> NDArray[np.float32]:
             if name in names:
                 return (name,)
         found = f"channels {', '.join(sorted(names))}"
-        _refuse(option, path, found[:200], "a channel Z, Y or R")
+        _raise_invalid(option, path, found[:200], "a channel Z, Y or R")
 
     return read_exr_channels(path, choose, option=option).popitem()[1]
 
@@ -232,12 +234,14 @@ def _write_exr(path: Path, linear_rgb: NDArray[Any]) -> None:
 
 def _checked_color(pixels: NDArray[Any], path: Path, option: str) -> NDArray[Any]:
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or pixels.size == 0:
-        _refuse(option, path, f"shape {pixels.shape}", "(height, width, 3 or 4)")
+        _raise_invalid(option, path, f"shape {pixels.shape}", "(height, width, 3 or 4)")
     pixels = np.ascontiguousarray(pixels[:, :, :3])
     if pixels.dtype == np.uint8:
         return pixels
     if pixels.dtype.kind != "f":
-        _refuse(option, path, f"type {pixels.dtype}", "uint8 sRGB or float linear")
+        _raise_invalid(
+            option, path, f"type {pixels.dtype}", "uint8 sRGB or float linear"
+        )
     if pixels.dtype == np.float16:
         return pixels
     with np.errstate(over="ignore"):  # infinity is handled by the filter

@@ -12,10 +12,10 @@ LOG_FORMATS = ("text", "json")
 TEXT = "%(asctime)s ocufilter {name} %(levelname)s: %(message)s"
 
 MAX_REPEATS = 10
-"""Limit of lines with the same text per second; a hostile client causes thousands."""
+"""Maximum number of similar lines per second; a hostile client can cause thousands."""
 
 ONCE_A_SECOND = {"max_repeats": 1}
-"""`extra` of a log call whose line appears at most once a second."""
+"""`extra` argument of log calls that are written at most once a second."""
 
 
 class JsonLines(logging.Formatter):
@@ -41,33 +41,33 @@ class JsonLines(logging.Formatter):
 
 
 class RepeatFilter(logging.Filter):
-    """Drops lines that repeat too often; the next one reports how many."""
+    """Drops lines that repeat too often; the next one written reports how many."""
 
     def __init__(self) -> None:
         super().__init__()
         self._ends_s = 0.0
         self._counts: dict[str, int] = {}
-        self._left_out: dict[str, int] = {}
+        self._omitted: dict[str, int] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether a record is written."""
-        now_s, wording = time.monotonic(), str(record.msg)
+        now_s, template = time.monotonic(), str(record.msg)
         if now_s >= self._ends_s:
             self._ends_s = now_s + 1.0
             self._counts.clear()
-        count = self._counts[wording] = self._counts.get(wording, 0) + 1
+        count = self._counts[template] = self._counts.get(template, 0) + 1
         if count > getattr(record, "max_repeats", MAX_REPEATS):
-            self._left_out[wording] = self._left_out.get(wording, 0) + 1
+            self._omitted[template] = self._omitted.get(template, 0) + 1
             return False
-        n_left_out = self._left_out.pop(wording, 0)
-        if n_left_out:
+        n_omitted = self._omitted.pop(template, 0)
+        if n_omitted:
             text = record.getMessage()
-            record.msg = f"{text} ({n_left_out} similar lines omitted)"
+            record.msg = f"{text} ({n_omitted} similar lines omitted)"
             record.args = None
         return True
 
 
-def start_log(process_name: str) -> None:
+def configure_logging(process_name: str) -> None:
     """Log to stderr, in the format that the environment selects."""
     handler = logging.StreamHandler()
     if os.environ.get(FORMAT_VARIABLE) == "json":

@@ -169,13 +169,13 @@ REPLIES: dict[str, type[Message]] = {
 def encode(message: Message) -> list[Any]:
     """Return the parts of a message: the header's bytes, then its images or body.
 
-    Images are not copied (unless they are not contiguous), so a caller that sends
-    without copying must not modify them until they are sent.
+    Contiguous images are not copied, so a caller that sends without copying must not
+    modify them until they are sent.
 
     Raises
     ------
     ValueError
-        The header would be too long, or an image does not match its description.
+        If the header is too long, or an image does not match its header.
     """
     header = {"type": message.type_name, "version": PROTOCOL_VERSION}
     packed = msgpack.packb(header | message.fields())
@@ -196,22 +196,22 @@ def is_bye(parts: Sequence[Part]) -> bool:
 
 
 def decode_request(parts: Sequence[Part], limits: Limits | None = None) -> Message:
-    """Return a client's message, validated field by field.
+    """Decode and validate a message of a client.
 
     Raises
     ------
     BadMessage, UnknownType, VersionMismatch
-        The message is invalid; names the field and the allowed values.
+        If the message is invalid; the error names the field and the allowed values.
     """
     limits = limits or Limits()
     try:
         return _decoded(parts, REQUESTS, limits)
     except BadMessage as error:
-        raise limits.narrowed(error) from None
+        raise limits.with_limits(error) from None
 
 
 def decode_reply(parts: Sequence[Part]) -> Message:
-    """Return a message of the service; raises like `decode_request`."""
+    """Decode and validate a message of the service; raises as `decode_request` does."""
     return _decoded(parts, REPLIES, Limits())
 
 
@@ -236,9 +236,9 @@ def _decoded(
 
 
 def peek_ids(parts: Sequence[Part]) -> tuple[int | None, int | None]:
-    """Return (frame_id, profile_id) of a message that may otherwise be invalid.
+    """Return (frame_id, profile_id) of a message that may be invalid.
 
-    An error reply can then still name its frame.
+    An id that is missing or invalid is None.
     """
     try:
         header = unpack_header(parts[0])

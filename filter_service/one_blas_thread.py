@@ -1,7 +1,7 @@
-"""Import before NumPy to keep its matrix products on the calling thread.
+"""Limits BLAS to one thread; import before NumPy.
 
-They are small.  With several threads, each one spins while waiting for cores that are
-rendering frames: planning a grid during a stream took four times the processor time.
+Matrix products here are small, and idle BLAS threads spin.  With several threads,
+planning a grid during a stream took four times the processor time.
 """
 
 import os

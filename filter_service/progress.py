@@ -1,11 +1,10 @@
-"""Progress of long tasks: bars on a terminal, plain lines in a file.
+"""Progress of long tasks: bars on a terminal, plain lines elsewhere.
 
     with Progress() as progress:
         task = progress.task("Rendering", total=60)
         task.advance()
 
-Lines are written when a task begins or its stage changes, and every few seconds, even
-without progress, so that a log shows that the program is alive.
+Lines are written when a task starts or its stage changes, and every few seconds.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ INTERVAL_S = 5.0
 STAGE_NAMES = {"psfs": "PSFs"}
 """Display names of stages, where they differ from the names in messages."""
 
-SURE_AFTER_S = 2.0
-"""Time before which the remaining time is not estimated."""
+MIN_ESTIMATE_S = 2.0
+"""Minimum duration for an estimate of the remaining time."""
 
 
 class Task:
@@ -35,7 +34,7 @@ class Task:
         self._progress = progress
 
     def advance(self) -> None:
-        """Count one more."""
+        """Add one to the count."""
         self.update(self.done + 1.0)
 
     def update(self, done: float, stage: str | None = None) -> None:
@@ -48,13 +47,13 @@ class Task:
 
     @property
     def name(self) -> str:
-        """Title and stage."""
+        """Return the title and the stage."""
         stage = STAGE_NAMES.get(self.stage, self.stage)
         return f"{self.title}: {stage}" if stage else self.title
 
     @property
     def count(self) -> str:
-        """Completed part and estimated remaining time, as text."""
+        """Return the completed part and the estimated remaining time."""
         if not self.total:
             return ""
         if self.unit == "%":
@@ -62,11 +61,11 @@ class Task:
         return f"{self.done:.0f}/{self.total:.0f} {self.unit}{self._time_left()}"
 
     def _time_left(self) -> str:
-        """Estimate from the rate since the first update, excluding preparation."""
+        """Estimate the remaining time from the rate since the first update."""
         if self._first is None:
             return ""
         done, spent_s = self.done - self._first[0], time.monotonic() - self._first[1]
-        if done <= 0.0 or self.done >= self.total or spent_s < SURE_AFTER_S:
+        if done <= 0.0 or self.done >= self.total or spent_s < MIN_ESTIMATE_S:
             return ""
         return f", {spent_s * (self.total - self.done) / done:.0f} s left"
 
@@ -81,7 +80,7 @@ class Progress:
     quiet : bool
         Whether to write nothing.
     as_lines : bool
-        Whether to write lines on a terminal too, if others also write there.
+        Whether to write lines on a terminal, too.
     stream : file, optional
         Stream in place of stderr.
     interval_s : float
@@ -109,7 +108,7 @@ class Progress:
         self._ended = threading.Event()
 
     def __enter__(self) -> Self:
-        """Start the bars or lines, and return this."""
+        """Start the output."""
         if self._has_bars:
             self._bars = _Bars(self._stream)
         elif not self._is_quiet:
@@ -122,15 +121,15 @@ class Progress:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Stop; write the last task's count once more if it has changed."""
+        """Stop the output; write the final count."""
         self._ended.set()
         if self._bars is not None:
             self._bars.close()
         elif self._task is not None and kind is None:
-            self._say(self._task)
+            self._write_line(self._task)
 
     def task(self, title: str, *, total: float = 0.0, unit: str = "frames") -> Task:
-        """Begin a task; without a total nothing is counted.
+        """Start a task; a total of 0 shows no count.
 
         Parameters
         ----------
@@ -138,34 +137,34 @@ class Progress:
             Unit of the count; "%" shows a percentage of the total.
         """
         if self._task is not None and self._bars is None:
-            self._say(self._task)
+            self._write_line(self._task)
         self._task = task = Task(self, title, total, unit)
         if self._bars is not None:
             self._bars.add(task)
         else:
-            self._say(task)
+            self._write_line(task)
         return task
 
     def _changed(self, task: Task, is_new_stage: bool) -> None:
         if self._bars is not None:
             self._bars.show(task)
         elif is_new_stage and task is self._task:
-            self._say(task)
+            self._write_line(task)
 
     def _repeat(self) -> None:
         """Write a line whenever none has been written for the interval."""
         while not self._ended.wait(self._interval_s / 10.0):
             task, silent_s = self._task, time.monotonic() - self._last[1]
             if task is not None and silent_s >= self._interval_s:
-                self._say(task, even_the_same=True)
+                self._write_line(task, force=True)
 
-    def _say(self, task: Task, *, even_the_same: bool = False) -> None:
+    def _write_line(self, task: Task, *, force: bool = False) -> None:
         if self._is_quiet:
             return
         with self._lock:
             text = ", ".join(filter(None, (task.name, task.count)))
             now_s = time.monotonic()
-            if text == self._last[0] and not even_the_same:
+            if text == self._last[0] and not force:
                 return
             self._last = (text, now_s)
             spent_s = now_s - self._started_s
@@ -174,7 +173,7 @@ class Progress:
 
 
 class _Bars:
-    """Bars of rich, which takes 0.1 s to import and is needed on terminals only."""
+    """Bars by rich, imported only on terminals because that takes 0.1 s."""
 
     def __init__(self, stream: TextIO) -> None:
         from rich.console import Console
@@ -192,7 +191,7 @@ class _Bars:
         self._bars.start()
 
     def add(self, task: Task) -> None:
-        """Draw one more bar; without a count it moves to and fro."""
+        """Add a bar; without a total it is indeterminate."""
         total = task.total or None
         self._numbers[task] = self._bars.add_task(task.title, total=total, count="")
         self.show(task)
@@ -207,5 +206,5 @@ class _Bars:
         )
 
     def close(self) -> None:
-        """Stop updating the bars and leave them on the screen."""
+        """Stop the bars; they stay on the screen."""
         self._bars.stop()

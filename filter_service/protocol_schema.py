@@ -4,8 +4,8 @@
 
 writes ``protocol.schema.json`` (headers of all messages) and ``profile.schema.json``
 (bodies of profiles) for clients in other languages, and the tables in section 10 of
-``PROTOCOL.md``.  Rules that a schema cannot express (an edge on the wrong side, the
-size of a part) are in PROTOCOL.md.
+``PROTOCOL.md``.  PROTOCOL.md states rules that a schema cannot express, such as the
+size of a part.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ TABLES_START, TABLES_END = (
     "<!-- profile tables: end -->",
 )
 SECTION = re.compile(r"\n\n\w+\n-{3,}\n")
-"""Start of a docstring's numpydoc sections, which concern Python only."""
+"""Start of a docstring's numpydoc sections, which are not part of descriptions."""
 
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def protocol_schema() -> dict[str, Any]:
-    """Return the schema of a header: one of the messages, distinguished by ``type``."""
+    """Return the schema of a header, which ``type`` distinguishes."""
     kinds = [*REQUESTS.values(), *REPLIES.values()]
     _, parts = msgspec.json.schema_components(kinds, ref_template="#/$defs/{name}")
     for kind in kinds:
@@ -61,7 +61,7 @@ def protocol_schema() -> dict[str, Any]:
 
 
 def generated_files() -> dict[Path, str]:
-    """Return the text of every generated file; of PROTOCOL.md, all of it."""
+    """Return the text of every file with generated content."""
     document = DOCUMENT.read_text(encoding="utf-8")
     before, rest = document.split(TABLES_START)
     after = rest.split(TABLES_END)[1]

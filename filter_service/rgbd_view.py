@@ -1,7 +1,7 @@
 """One view of a scene: color, depth and camera, for clients and engines.
 
-A view may have a second, hidden layer: what the camera would see with the visible
-surface removed.  Its light passes blurred edges.
+A view may have a *hidden layer*: what the camera would see without the visible surface.
+Its light is needed where the edges of that surface are blurred.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from filter_service.settings import DEPTH_KINDS, DepthKind
 ColorImage = NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float16]
 """(height, width, 3): 8-bit sRGB, or linear light."""
 
-LEAST_DEPTH_M = 1e-6
-"""Smaller depth is missing: no surface can be nearer than a micrometer, and the
-reciprocals of much smaller numbers are beyond float32."""
+MIN_DEPTH_M = 1e-6
+"""Smaller depth counts as missing: no surface is nearer than a micrometer, and the
+reciprocals of much smaller numbers exceed float32."""
 
 COLOR_DTYPES = (np.uint8, np.float32, np.float16)
 
@@ -37,7 +37,7 @@ class RgbdView:
         uint8 sRGB; or float32 or float16 linear light, including values above 1 and
         below 0.
     depth_m : (height, width), float32
-        +inf is infinity; NaN and less than `LEAST_DEPTH_M` are missing.
+        +inf is infinity; NaN and less than `MIN_DEPTH_M` are missing.
     tangents : (left, right, up, down)
         Tangents of the angles to the image edges, left < right and down < up.
     depth_kind : "planar" or "radial"
@@ -49,7 +49,7 @@ class RgbdView:
     Raises
     ------
     BadMessage
-        The arrays are not a valid RGB-D image; also a ValueError.
+        If the arrays are not a valid RGB-D image (a ValueError, too).
     """
 
     color: ColorImage
@@ -150,15 +150,15 @@ def as_views(
     Raises
     ------
     BadMessage
-        Arrays come without depth or camera, views come with separate depth, or the
-        input is something else.
+        If arrays have no depth or camera, views come with separate depth, or the input
+        has another type.
     """
     if isinstance(color, np.ndarray):
         if depth_m is None:
             raise BadMessage("it is missing", field="depth", allowed="depth in meters")
         if camera is None:
             raise BadMessage(
-                "it is not known", field="camera", allowed="a camera, or an RgbdView"
+                "it is missing", field="camera", allowed="a camera, or an RgbdView"
             )
         return (RgbdView(color, depth_m, camera.tangents),)
     _check_views(color)

@@ -1,7 +1,7 @@
-"""The settings of a filter: each is defined once, with range, default and meaning.
+"""Settings and frame options of a filter: each is defined once.
 
-Commands, protocol, planner and store read the same object.  A new setting needs a line
-here and a line in PROTOCOL.md, besides the code that reads it.
+The definition has range, default and meaning; commands, protocol, planner and store use
+the same object.  CONTRIBUTING.md describes how to add one.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ MAX_PUPIL_MM = 9.0
 MAX_VERGENCE_DPT = 20.0
 MAX_RENDER_TOLERANCE = 8.0
 MAX_PLANES = 4
-PLANE_ROOM_DPT = 0.005
-"""Half thickness assumed for a plane: at most a tenth of a pixel of blur."""
+PLANE_HALF_THICKNESS_DPT = 0.005
+"""Half thickness assumed for an object plane: at most a tenth of a pixel of blur."""
 MAX_GAZE_DEG = 60.0  # an eye turns by 50 degrees at most
 
 PupilMm = Annotated[float, Meta(ge=MIN_PUPIL_MM, le=MAX_PUPIL_MM)]
@@ -56,14 +56,11 @@ OUTPUTS: tuple[str, ...] = get_args(Output)
 class RenderOptions(Record):
     """Options of one frame, in process and on the wire.
 
-    A new option needs a line here, one in `RenderOptionValues`, and the code of each
-    engine that reads it.
-
     Attributes
     ----------
     accumulation : "coverage" or "paper"
-        Combination of light from several distances: nearer surfaces hide what they
-        cover, or the published sum.
+        Combination of light from several distances: nearer surfaces occlude farther
+        ones, or the published sum.
     merge : bool
         Whether similar pixels share a splat; off is slower.
     render_tolerance : float, 0 to 8
@@ -93,12 +90,12 @@ def _doc(text: str, **more: Any) -> Meta:
 
 @dataclass(frozen=True, kw_only=True)
 class FilterSettings(Record):
-    """How the PSFs of an eye are computed, and what frames may ask of them.
+    """How the PSFs of an eye are computed, and the states that frames may have.
 
     Raises
     ------
     BadMessage
-        A value is out of range; names the setting.
+        If a value is out of range; the error names the setting.
     """
 
     mode: Annotated[
@@ -218,7 +215,7 @@ class FilterSettings(Record):
 
     @property
     def follows_field(self) -> bool:
-        """Return whether PSFs differ over the visual field."""
+        """Return whether PSFs vary over the visual field."""
         return self.mode != "on-axis"
 
     def covering(
@@ -228,7 +225,7 @@ class FilterSettings(Record):
         foci_dpt: tuple[float, ...] = (),
         objects_dpt: tuple[float, ...] = (),
     ) -> FilterSettings:
-        """Return settings whose ranges also include these values."""
+        """Return settings whose ranges are extended to include these values."""
 
         def widened(
             span: tuple[float, float], values: tuple[float, ...]
@@ -254,12 +251,12 @@ def setting_types() -> dict[str, Any]:
 
 
 def as_settings(settings: FilterSettings | Mapping[str, Any]) -> FilterSettings:
-    """Return settings, which may be given as a mapping of some of them by name.
+    """Return settings, given as an object or as a mapping by name.
 
     Raises
     ------
     BadMessage
-        The type is wrong, a name is unknown, or a value is out of range.
+        If the type is wrong, a name is unknown, or a value is out of range.
     """
     if isinstance(settings, FilterSettings):
         return settings
@@ -272,7 +269,7 @@ def as_settings(settings: FilterSettings | Mapping[str, Any]) -> FilterSettings:
     for name in settings:
         if name not in setting_types():
             raise BadMessage(
-                f"{name!r} is unknown",
+                f"unknown setting {name!r}",
                 field="settings",
                 allowed=", ".join(setting_types()),
             )

@@ -1,8 +1,8 @@
 """Shared memory for images between two processes.
 
-A slot is an anonymous file in memory.  All its pages are allocated from the start and
-its size is sealed, so that neither low memory nor the other process can turn an access
-into a bus error.  It is freed with the last process that holds it, however that ends.
+A *slot* is an anonymous file in memory.  Its pages are allocated at creation and its
+size is sealed, so that neither low memory nor the other process can cause a bus error.
+The system frees it when no process has it open.
 """
 
 from __future__ import annotations
@@ -20,16 +20,15 @@ from numpy.typing import NDArray
 from filter_service.errors import OutOfMemory
 
 PAGE_BYTES = mmap.PAGESIZE
-KEPT_RATIO = 4
-"""Largest ratio of a slot's size to the requested one for reuse."""
-
+MAX_REUSE_RATIO = 4
+"""Maximum ratio of a reused slot's size to the requested one."""
 
 ALIGNMENT_BYTES = 64
 """Alignment of each image in a slot."""
 
 
-def starts_of(sizes: Sequence[int]) -> tuple[list[int], int]:
-    """Return the start of each image, and the total size."""
+def aligned_starts(sizes: Sequence[int]) -> tuple[list[int], int]:
+    """Return the aligned start of each image, and the total size, in bytes."""
     starts, end = [], 0
     for size in sizes:
         starts.append(end)
@@ -43,7 +42,7 @@ class Slot:
     Attributes
     ----------
     number : int
-        Number by which both processes identify it.
+        Identifier that both processes use.
     size_bytes : int
     descriptor : int
         File descriptor.
@@ -62,7 +61,7 @@ class Slot:
         Raises
         ------
         OutOfMemory
-            The system cannot allocate that much.
+            If the system cannot allocate that much.
         """
         size_bytes = -(-max(size_bytes, 1) // PAGE_BYTES) * PAGE_BYTES
         flags = os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING
@@ -80,7 +79,7 @@ class Slot:
             if descriptor >= 0:
                 os.close(descriptor)
             raise OutOfMemory(
-                f"{size_bytes / 1e6:.0f} MB of shared memory are not available: "
+                f"{size_bytes / 1e6:.0f} MB of shared memory are unavailable: "
                 f"{error.strerror}"
             ) from None
 
@@ -96,13 +95,13 @@ class Slot:
         Raises
         ------
         ValueError
-            The file is not a sealed slot of that size.
+            If the file is not a sealed slot of that size.
         """
         seals = fcntl.fcntl(descriptor, fcntl.F_GET_SEALS)
         if not seals & fcntl.F_SEAL_SHRINK:
             raise ValueError(f"slot {number} is not sealed")
         if os.fstat(descriptor).st_size != size_bytes:
-            raise ValueError(f"slot {number} has another size than {size_bytes} bytes")
+            raise ValueError(f"slot {number} does not have {size_bytes} bytes")
         return cls(number, size_bytes, descriptor)
 
     def part(self, start: int, size_bytes: int) -> memoryview:
@@ -111,7 +110,7 @@ class Slot:
         Raises
         ------
         ValueError
-            The part extends beyond the slot.
+            If the part extends beyond the slot.
         """
         if not 0 <= start <= start + size_bytes <= self.size_bytes:
             raise ValueError(
@@ -122,17 +121,17 @@ class Slot:
     def array(
         self, start: int, shape: tuple[int, ...], dtype: np.dtype[Any]
     ) -> NDArray[Any]:
-        """Return a part of the memory as an array."""
+        """Return a part of the memory as an array; raises as `part` does."""
         size_bytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
         part = self.part(start, size_bytes)
         return np.frombuffer(part, dtype=dtype).reshape(shape)
 
     def put(self, images: Sequence[NDArray[Any]], starts: Sequence[int]) -> None:
-        """Copy images to their positions."""
+        """Copy images to their starts; skip those that are already there."""
         for start, image in zip(starts, images, strict=True):
-            place = self.array(start, image.shape, image.dtype)
-            if place.ctypes.data != image.ctypes.data:  # unless already in place
-                np.copyto(place, image)
+            target = self.array(start, image.shape, image.dtype)
+            if target.ctypes.data != image.ctypes.data:
+                np.copyto(target, image)
 
     def close(self) -> None:
         """Close the file; the memory is freed with the last reference to a part."""
@@ -151,7 +150,7 @@ class SlotPool:
     max_count : int
         Largest number of slots; each takes a file descriptor.
     reserve : callable, optional
-        Function that returns a context in which this process may open descriptors.
+        Returns a context in which this process may open descriptors.
     """
 
     def __init__(
@@ -167,21 +166,24 @@ class SlotPool:
         self._next_number = 1
 
     @property
-    def held_bytes(self) -> int:
+    def total_bytes(self) -> int:
         """Return the total size of all slots."""
         return sum(slot.size_bytes for slot in self._slots.values())
 
-    def take(self, size_bytes: int) -> tuple[Slot, bool]:
+    def acquire(self, size_bytes: int) -> tuple[Slot, bool]:
         """Return a slot of at least this size, and whether it is new.
 
         Raises
         ------
         OutOfMemory
+            If a limit is reached, or the system has no memory left.
         """
         fitting = [
             slot
             for slot in self._free
-            if size_bytes <= slot.size_bytes <= KEPT_RATIO * max(size_bytes, PAGE_BYTES)
+            if size_bytes
+            <= slot.size_bytes
+            <= MAX_REUSE_RATIO * max(size_bytes, PAGE_BYTES)
         ]
         if fitting:
             slot = min(fitting, key=lambda found: found.size_bytes)
@@ -195,17 +197,18 @@ class SlotPool:
         Raises
         ------
         OutOfMemory
+            If a limit is reached, or the system has no memory left.
         """
-        if self.held_bytes + size_bytes > self.max_bytes:
+        if self.total_bytes + size_bytes > self.max_bytes:
             raise OutOfMemory(
-                f"{size_bytes / 1e6:.0f} MB more than the {self.held_bytes / 1e6:.0f} "
-                "MB in use are asked for",
-                allowed=f"{self.max_bytes / 1e6:.0f} MB for images in all",
+                f"{size_bytes / 1e6:.0f} MB requested in addition to "
+                f"{self.total_bytes / 1e6:.0f} MB in use",
+                allowed=f"{self.max_bytes / 1e6:.0f} MB for images in total",
             )
         if len(self._slots) >= self.max_count:
             raise OutOfMemory(
-                f"{len(self._slots)} blocks of shared memory are in use",
-                allowed=f"{self.max_count} in all",
+                f"{len(self._slots)} slots of shared memory are in use",
+                allowed=f"{self.max_count} in total",
             )
         with self._reserve():
             slot = Slot.create(self._next_number, size_bytes)
@@ -213,7 +216,7 @@ class SlotPool:
         self._next_number += 1
         return slot
 
-    def give_back(self, slot: Slot) -> None:
+    def release(self, slot: Slot) -> None:
         """Return a slot to the pool."""
         self._free.append(slot)
 

@@ -1,7 +1,7 @@
-"""Check of numba's threading layer, which can terminate the service if it is unsafe.
+"""Check of numba's threading layer.
 
-Without OpenMP (libgomp1) or TBB, numba falls back to its work queue, which terminates
-the process when two threads start parallel kernels at once.
+Without OpenMP (libgomp1) or TBB, numba falls back to its work queue, which aborts the
+process when two threads start parallel kernels at the same time.
 """
 
 import numba
@@ -26,14 +26,14 @@ def require_safe_threading_layer() -> str:
     Raises
     ------
     RenderFailed
-        Only the work queue is available; names what to install.
+        If only the work queue is available; the message says what to install.
     """
     numba.config.THREADING_LAYER = "threadsafe"
     try:
         _count(8)
     except ValueError as error:
         raise RenderFailed(
-            "numba has no thread layer that two threads may share; "
+            "numba has no thread-safe threading layer; "
             "install libgomp1 (apt-get install libgomp1) or tbb (pip install tbb)"
         ) from error
     return str(threading_layer())

@@ -1,9 +1,9 @@
 """Validation of values against annotated types, with informative errors.
 
-`msgspec` validates; here its error becomes a `BadMessage` that names the field's path,
-the offending value and the allowed values.  Types are dataclasses and
-``Annotated[float, Meta(ge=..., le=...)]``; numbers that must not decrease are marked
-``Meta(extra=RISING)``.
+`msgspec` validates; its error is converted to a `BadMessage` with the field's path, the
+invalid value and the allowed values.  Types are dataclasses and
+``Annotated[float, Meta(ge=..., le=...)]``; ``Meta(extra=RISING)`` marks sequences of
+numbers that must not decrease.
 """
 
 from __future__ import annotations
@@ -81,6 +81,7 @@ def checked(value: object, kind: type[_T], path: str = "") -> _T:
     Raises
     ------
     BadMessage
+        If the value does not have the type.
     """
     try:
         return msgspec.convert(value, kind)
@@ -88,7 +89,7 @@ def checked(value: object, kind: type[_T], path: str = "") -> _T:
         native = _native(value)
         if native is not value:  # NumPy numbers are accepted like Python's
             return checked(native, kind, path)
-        raise _explained(error, value, kind, path) from None
+        raise _to_bad_message(error, value, kind, path) from None
 
 
 def _native(value: object) -> object:
@@ -104,13 +105,13 @@ def _native(value: object) -> object:
     return value
 
 
-def _explained(
+def _to_bad_message(
     error: msgspec.ValidationError, value: object, kind: Any, path: str
 ) -> BadMessage:
-    """Return an error that names the place, the value and the allowed values."""
+    """Convert an error of msgspec."""
     found = _AT_PATH.fullmatch(str(error))
     text, where = found.groups() if found else (str(error), "")
-    described: kinds.Type | None = _described(kind)
+    described: kinds.Type | None = _type_info(kind)
     for name, number in _STEP.findall(where):
         value, described = _step(value, described, name, number)
         path += f"[{number}]" if number else f".{name}" if path else name
@@ -126,8 +127,8 @@ def _explained(
 
 
 @cache
-def _described(kind: Any) -> kinds.Type:
-    """Return the description of a type; for a frame it takes most of a millisecond."""
+def _type_info(kind: Any) -> kinds.Type:
+    """Return msgspec's description of a type; cached, because it takes up to 1 ms."""
     return kinds.type_info(kind)
 
 
@@ -136,9 +137,9 @@ def _step(
 ) -> tuple[Any, kinds.Type | None]:
     """Follow one step of a path, in the type and, if possible, in the value.
 
-    msgspec does not name the key of a map's value; the whole map is shown then.
+    msgspec does not name the key of a map's value, so the value is the whole map then.
     """
-    described = _bare(described) if described is not None else None
+    described = _unwrap(described) if described is not None else None
     if name:
         fields = getattr(described, "fields", ())
         inner = next((f.type for f in fields if f.encode_name == name), None)
@@ -151,13 +152,13 @@ def _step(
     return item, getattr(described, "item_type", None)
 
 
-def _bare(described: kinds.Type) -> kinds.Type:
+def _unwrap(described: kinds.Type) -> kinds.Type:
     """Return a type without its annotations and without an optional ``None``."""
     if isinstance(described, kinds.Metadata):
-        return _bare(described.type)
+        return _unwrap(described.type)
     if isinstance(described, kinds.UnionType):
         rest = [t for t in described.types if not isinstance(t, kinds.NoneType)]
-        return _bare(rest[0])
+        return _unwrap(rest[0])
     return described
 
 
@@ -169,15 +170,15 @@ def _extras(described: kinds.Type) -> Iterator[dict[str, Any]]:
 
 
 def allowed_values(kind: Any) -> str:
-    """Return what an annotated type accepts, in words."""
-    return _allowed(_described(kind)) or ""
+    """Describe the values that an annotated type accepts."""
+    return _allowed(_type_info(kind)) or ""
 
 
 def _allowed(described: kinds.Type | None) -> str | None:
-    """Return what a type accepts, in words, or None if it is unknown."""
+    """Describe the values that a type accepts; None if it is unknown."""
     if described is None:
         return None
-    kind = _bare(described)
+    kind = _unwrap(described)
     match kind:
         case kinds.IntType():
             return f"an integer {kind.ge} to {kind.le}"
@@ -192,7 +193,7 @@ def _allowed(described: kinds.Type | None) -> str | None:
         case kinds.TupleType():
             count = len(kind.item_types)
             words = _NUMBERS.get(count, f"a list of {count} items")
-            item = _bare(kind.item_types[0])
+            item = _unwrap(kind.item_types[0])
             if isinstance(item, kinds.FloatType) and item.ge is not None:
                 words += f" of {item.ge:g} to {item.le:g}"
             is_rising = any(extra == RISING for extra in _extras(described))
@@ -206,13 +207,13 @@ def _allowed(described: kinds.Type | None) -> str | None:
 
 @cache
 def _is_rising(kind: Any) -> bool:
-    return any(extra == RISING for extra in _extras(_described(kind)))
+    return any(extra == RISING for extra in _extras(_type_info(kind)))
 
 
 def check_rising(value: Any, kind: Any, path: str) -> None:
-    """Reject decreasing numbers if their type is marked as `RISING`."""
+    """Raise BadMessage for decreasing numbers if their type is marked as `RISING`."""
     if not _is_rising(kind):
         return
     if any(first > last for first, last in pairwise(value)):
-        allowed = _allowed(_described(kind))
+        allowed = _allowed(_type_info(kind))
         raise BadMessage(f"it is {show(value)}", field=path, allowed=allowed)

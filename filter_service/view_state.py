@@ -1,4 +1,4 @@
-"""The eye through which a view is seen, and its state."""
+"""The eye that a view is filtered for, and its state."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EYE_NAMES: tuple[EyeName, ...] = get_args(EyeName)
 def body_of_eye(body: Mapping[str, Any], eye: EyeName) -> dict[str, Any]:
     """Return a profile's body for an eye.
 
-    The body of the left one gets ``eye_side`` "OS", unless it sets the side itself.
+    The left eye gets ``eye_side`` "OS", unless the body sets the side.
     """
     return ({"eye_side": "OS"} if eye == "left" else {}) | dict(body)
 
@@ -64,7 +64,7 @@ class ViewState(Record):
 def check_states(
     states: Sequence[ViewState], pupil_diameter_mm: float, focus_dpt: float
 ) -> None:
-    """Reject different pupils or focuses for one eye, and invalid states.
+    """Check that views of one eye have the same pupil and focus.
 
     Parameters
     ----------
@@ -76,15 +76,15 @@ def check_states(
     Raises
     ------
     BadMessage
-        A state is invalid; names the view.
+        If they differ, or an item is not a ViewState; the error names the view.
     """
-    usual = {"pupil_diameter_mm": pupil_diameter_mm, "focus_dpt": focus_dpt}
+    defaults = {"pupil_diameter_mm": pupil_diameter_mm, "focus_dpt": focus_dpt}
     first_of: dict[EyeName, ViewState] = {}
     for i, state in enumerate(states):
         if not isinstance(state, ViewState):
             raise BadMessage(f"{state!r}", field=f"states[{i}]", allowed="a ViewState")
         first = first_of.setdefault(state.eye, state)
-        for name, of_frame in usual.items():
+        for name, of_frame in defaults.items():
             wanted, found = (
                 of_frame if own is None else own
                 for own in (getattr(first, name), getattr(state, name))

@@ -15,7 +15,7 @@ from typing import Any
 
 from estimator.threads import thread_count
 from filter_service.gl.hardware import is_software_renderer
-from filter_service.gl_device import GL_DEVICE_VARIABLE, is_device_named
+from filter_service.gl_device import GL_DEVICE_VARIABLE, is_device_selected
 from filter_service.threads import UNSAFE_THREADING_LAYER
 
 SERVICE_PACKAGES = (
@@ -276,7 +276,7 @@ def check_native(native: dict[str, Any]) -> Check:
 def check_engine(gl: dict[str, Any], native: dict[str, Any]) -> Check:
     """Report which engine filters frames by default, and why."""
     renderer = gl.get("info", {}).get("renderer", "")
-    if is_device_named():
+    if is_device_selected():
         fix = "" if renderer else f"unset {GL_DEVICE_VARIABLE}"
         detail = f"gl: {GL_DEVICE_VARIABLE} selects its device"
         return Check("engine", bool(renderer), detail, fix)

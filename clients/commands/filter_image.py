@@ -444,9 +444,9 @@ def _summary(
 
 def _depth_words(depth_m: "NDArray[Any]", missing_count: int) -> str:
     """Return the depth range and the percentage of filled pixels, as text."""
-    from filter_service.rgbd_view import LEAST_DEPTH_M
+    from filter_service.rgbd_view import MIN_DEPTH_M
 
-    known_m = depth_m[depth_m >= LEAST_DEPTH_M]
+    known_m = depth_m[depth_m >= MIN_DEPTH_M]
     if not known_m.size:
         return "no depth; infinity is assumed"
     low, high = (

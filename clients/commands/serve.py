@@ -80,7 +80,7 @@ def serve(
         ready_file=ready_file,
         store_cache_dir=None if keep_eyes is None else str(keep_eyes.absolute()),
     )
-    serving.run(load(), read_again=load)
+    serving.run(load(), reload_config=load)
 
 
 def prepare(json_output: Json = False) -> None:

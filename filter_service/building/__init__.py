@@ -1,14 +1,18 @@
-"""Builder: the worker process that turns profiles into eyes and nodes of their PSFs.
+"""The build worker: a process that estimates eyes and plans the nodes of their PSFs.
+
+A *build* turns a profile, settings and a camera into a *store*: the estimated eye and
+the nodes (states of pupil and focus, field directions, defocus) of its PSFs.  A
+*ticket* identifies a build.
 
 jobs                requests and results of the worker
 limits              limits of every build
 read_profile        validation of a profile's body
 from_profile        the build itself
 worker              main program of the worker process
-worker_handle       the service's interface to the worker process
-inline_worker       a worker without a process
+worker_handle       starts the process, queues builds, recovers from crashes
+inline_worker       the same interface, without a process
 background_warm_up  warm-up before the first build
-compile_builds      compilation of all loops before the first build
+compile_builds      compilation of numba loops before the first build
 helper_process      subprocesses that end with their parent
 """
 

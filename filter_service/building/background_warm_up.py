@@ -1,4 +1,4 @@
-"""Warm-up work that a process starts before the first request that needs it."""
+"""Warm-up that runs in a thread before the first build."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from filter_service.errors import BuildCancelled
 
 COMPILING_STAGE = "compiling"
 QUIET_S = 1.0
-"""Time without a report; reading compiled code takes less."""
+"""Delay before the warm-up is reported; reading compiled code takes less."""
 
 POLL_S = 0.1
 
@@ -20,9 +20,13 @@ log = logging.getLogger("ocufilter.worker")
 
 
 class BackgroundWarmUp:
-    """Warm-up call that runs in a thread, and for which the first build waits.
+    """Runs a warm-up function in a thread; the first build waits for it.
 
     Failures are only logged; the build then does the remaining work.
+
+    Parameters
+    ----------
+    work : callable
     """
 
     def __init__(self, work: Callable[[], None]):
@@ -31,7 +35,7 @@ class BackgroundWarmUp:
         threading.Thread(target=self._run, daemon=True).start()
 
     def _run(self) -> None:
-        late = threading.Timer(QUIET_S, self._say_why)
+        late = threading.Timer(QUIET_S, self._log_reason)
         late.daemon = True
         late.start()
         try:
@@ -43,13 +47,16 @@ class BackgroundWarmUp:
             self._done.set()
 
     @staticmethod
-    def _say_why() -> None:
-        log.info("compiling, which takes up to a minute; the result is cached")
+    def _log_reason() -> None:
+        log.info("compiling loops, which takes up to a minute; the result is cached")
 
-    def before(self, progress: Progress, cancelled: Callable[[], bool]) -> Progress:
+    def wrap_progress(
+        self, progress: Progress, cancelled: Callable[[], bool]
+    ) -> Progress:
         """Return a ``progress`` function that first waits for the warm-up.
 
-        A build that is read from the disk reports no progress, so it does not wait.
+        A build that finds its result in the on-disk cache reports no progress, so it
+        does not wait.
         """
 
         def waited(fraction: float, stage: str) -> None:
@@ -64,6 +71,7 @@ class BackgroundWarmUp:
         Raises
         ------
         BuildCancelled
+            If the build is canceled meanwhile.
         """
         if self._done.wait(QUIET_S):
             return

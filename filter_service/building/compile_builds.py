@@ -1,7 +1,7 @@
-"""Warm-up that compiles the loops of tracing and integration before the first build.
+"""Warm-up: compiles the numba loops of builds before the first one.
 
-numba compiles them at their first call on a machine and caches them on disk: a minute
-of one core, then 0.5 s to read them.  Both happen while the worker is idle.
+numba compiles loops at their first call on a machine, which takes a minute on one core,
+and caches them on disk; reading them takes 0.5 s.  The worker does this while idle.
 """
 
 from dataclasses import replace
@@ -14,9 +14,9 @@ from filter_service.camera import Camera
 from filter_service.psfs.store import PsfStore
 from filter_service.settings import FilterSettings
 
-FEW_PSFS = BuildJob(
+SAMPLE_JOB = BuildJob(
     profile=parse_profile({"kind": "prescription", "sphere_dpt": -2.0}),
-    # blurred and sharp distances: PSFs by rays and by waves
+    # Blurred and sharp distances: PSFs by ray tracing and by diffraction.
     settings=FilterSettings(
         pupil_range_mm=(3.0, 5.0),
         focus_range_dpt=(2.0, 2.0),
@@ -26,16 +26,16 @@ FEW_PSFS = BuildJob(
 )
 
 HELPER = ("filter_service.filtering.compile_loops", "psfs", "frames")
-"""Module and arguments of the process that helps compiling, in another order than
-`build_a_few`."""
+"""Module and arguments of the helper process, which compiles in another order than
+`build_sample`."""
 
 HELP_AFTER_S = 1.0
 """Delay before the helper starts; reading compiled code takes less."""
 
 
-def build_a_few() -> None:
-    """Estimate an eye and compute some 200 PSFs, with every compiled loop; 0.2 s."""
-    _built(FEW_PSFS).fill()
+def build_sample() -> None:
+    """Estimate an eye and compute about 200 PSFs, with every compiled loop; 0.2 s."""
+    _built(SAMPLE_JOB).fill()
 
 
 def _built(job: BuildJob) -> PsfStore:
@@ -44,22 +44,22 @@ def _built(job: BuildJob) -> PsfStore:
     return found
 
 
-def build_a_few_with_help() -> None:
-    """Run `build_a_few`; if it has to compile, a second process helps from the end.
+def warm_up() -> None:
+    """Run `build_sample`; if it has to compile, a second process helps.
 
-    The two processes meet, as each reads what the other has compiled.
+    The helper starts with the last loops; each process reads what the other compiled.
     """
     with HelperProcess(*HELPER, after_s=HELP_AFTER_S):
-        build_a_few()
+        build_sample()
 
 
-def trace_an_eye() -> None:
-    """Estimate, trace and plan for one eye: compiles the first half of the loops."""
-    _built(FEW_PSFS).plan_all()
+def compile_tracing() -> None:
+    """Estimate and plan one traced eye, which compiles the first half of the loops."""
+    _built(SAMPLE_JOB).plan_all()
 
 
-def build_without_tracing() -> None:
-    """Build PSFs of a given wavefront: compiles the second half of the loops."""
-    settings = replace(FEW_PSFS.settings, eye_model="wavefront", mode="on-axis")
-    job = replace(FEW_PSFS, settings=settings)
+def compile_psfs() -> None:
+    """Build PSFs of a given wavefront, which compiles the second half of the loops."""
+    settings = replace(SAMPLE_JOB.settings, eye_model="wavefront", mode="on-axis")
+    job = replace(SAMPLE_JOB, settings=settings)
     _built(job).fill()

@@ -1,4 +1,4 @@
-"""Python subprocesses: started on demand, and ended with their parent."""
+"""Python subprocesses that end with their parent."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from typing import Self
 
 
 class HelperProcess:
-    """Context manager that runs ``python -m`` with arguments if its body takes long.
+    """Context manager that runs ``python -m`` while its body takes long.
 
     Parameters
     ----------
+    *arguments : str
+        Module and its arguments.
     after_s : float
-        Time after which the process starts, unless the body has finished.
+        Delay after which the process starts, unless the body has finished.
     """
 
     def __init__(self, *arguments: str, after_s: float) -> None:
@@ -27,12 +29,12 @@ class HelperProcess:
         self._timer.daemon = True
 
     def __enter__(self) -> Self:
-        """Start the timer."""
+        """Start the timer of the process."""
         self._timer.start()
         return self
 
     def __exit__(self, *exc_info: object) -> None:
-        """Kill the process, finished or not."""
+        """Kill the process, if it was started."""
         self._timer.cancel()
         self._timer.join()
         if self._process is not None:
@@ -56,23 +58,23 @@ def start_module(*arguments: str) -> subprocess.Popen[bytes]:
 
 
 def import_path() -> list[str]:
-    """Return the import path of this process, without entries that are not strings."""
+    """Return the import path of this process, for PYTHONPATH."""
     return [entry or os.getcwd() for entry in sys.path if isinstance(entry, str)]
 
 
-def end(process: subprocess.Popen[bytes], patience_s: float) -> int:
+def wait_or_kill(process: subprocess.Popen[bytes], timeout_s: float) -> int:
     """Wait for a process to end, and kill it after a timeout; return its exit code."""
     try:
-        return process.wait(patience_s)
+        return process.wait(timeout_s)
     except subprocess.TimeoutExpired:
         process.kill()
         return process.wait()
 
 
-def how_it_ended(exit_code: int) -> str:
-    """Return a description of a process's exit code."""
+def describe_exit(exit_code: int) -> str:
+    """Describe an exit code, as in "exited with code 1"."""
     if exit_code >= 0:
-        return f"ended with code {exit_code}"
+        return f"exited with code {exit_code}"
     try:
         return f"was killed by {signal.Signals(-exit_code).name}"
     except ValueError:
@@ -89,7 +91,7 @@ def is_stopped(pid: int) -> bool:
 
 
 def end_with_parent() -> None:
-    """End this process when the parent that ran `start_module` ends."""
+    """Exit when the parent that ran `start_module` exits."""
 
     def wait() -> None:
         while os.read(sys.stdin.fileno(), 1):

@@ -1,7 +1,6 @@
-"""Worker without a process: it estimates an eye when polled.
+"""Worker without a process, which builds when polled.
 
-It is for programs that have nothing else to do meanwhile: starting a process takes
-longer than estimating most eyes.
+For programs that filter one image: starting a process takes longer than most builds.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ log = logging.getLogger("ocufilter.worker")
 
 
 class InlineWorker:
-    """Implementation of `WorkerHandle`'s interface in the caller's thread."""
+    """`WorkerHandle`'s interface in the calling thread."""
 
     file_descriptor = None
     is_busy = False
-    needs_attention_soon = False
+    needs_poll = False
     n_restarts = 0
 
     def __init__(self) -> None:
@@ -41,7 +40,7 @@ class InlineWorker:
         self._queue.clear()
 
     def submit(self, job: BuildJob) -> int:
-        """Put a job at the end of the queue; return its ticket."""
+        """Queue a job; return its ticket."""
         ticket = self._next_ticket
         self._next_ticket += 1
         self._queue.append((ticket, job))
@@ -52,7 +51,7 @@ class InlineWorker:
         self._queue = deque(item for item in self._queue if item[0] != ticket)
 
     def poll(self) -> list[BuildEvent]:
-        """Run the first queued job; return its events."""
+        """Run the first queued job and return its events."""
         from filter_service.building.from_profile import build
 
         if not self._queue:
@@ -67,7 +66,7 @@ class InlineWorker:
             built = build(job, progress=progress, cancelled=lambda: False)
         except Exception as error:
             if not isinstance(error, FilterError):
-                log.exception("an eye could not be estimated")
+                log.exception("a build failed unexpectedly")
                 error = BuildFailed(f"{type(error).__name__}: {error}")
             return [*events, BuildError(ticket, error)]
         return [*events, BuildDone(ticket, built)]

@@ -1,4 +1,4 @@
-"""Requests and results of the worker, as plain data."""
+"""Requests and results of the build worker."""
 
 from __future__ import annotations
 
@@ -11,35 +11,39 @@ from filter_service.building.limits import BuildLimits
 from filter_service.camera import Camera
 from filter_service.settings import FilterSettings
 
-USUAL_LIMITS = BuildLimits()
+DEFAULT_LIMITS = BuildLimits()
 
 
 @dataclass(frozen=True)
 class BuildJob:
-    """Request to estimate one eye for one camera.
+    """Request to build one eye for one camera.
 
     Attributes
     ----------
+    profile : EyeProfile
+    settings : FilterSettings
+    camera : Camera
+    limits : BuildLimits
     near : (pupil_diameter_mm, focus_dpt), optional
-        State around which nodes are planned after the eye is sent; by default none are.
+        State around which nodes are planned once the store is sent; by default none.
     """
 
     profile: EyeProfile
     settings: FilterSettings
     camera: Camera
-    limits: BuildLimits = USUAL_LIMITS
+    limits: BuildLimits = DEFAULT_LIMITS
     near: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
 class BuiltStore:
-    """An estimated eye with the nodes of its PSFs, for an engine's ``load``."""
+    """Result of a build: a store for an engine's ``load``, and notes for the user."""
 
     store: Any
     notes: tuple[str, ...] = ()
 
     def parts_ahead(self, job: BuildJob) -> Iterator[Any]:
-        """Yield parts of the store that frames will need, for its ``take``."""
+        """Yield parts that frames will need, for ``take`` of the loaded store."""
         planned = getattr(self.store, "planned_ahead", None)
         if planned is not None and job.near is not None:
             yield from planned(*job.near)

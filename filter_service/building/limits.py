@@ -1,4 +1,4 @@
-"""Limits of every build of a service."""
+"""Limits that apply to every build."""
 
 from __future__ import annotations
 
@@ -11,10 +11,18 @@ __all__ = ["BuildLimits", "default_cache_dir"]
 
 @dataclass(frozen=True)
 class BuildLimits:
-    """Limits from the service's configuration that apply to every build.
+    """Limits of builds, from the service's settings.
 
-    ``max_stores_mb`` limits all loaded stores together, ``max_store_mb`` each of them.
-    ``store_cache_dir`` is empty if there is no on-disk cache.
+    Attributes
+    ----------
+    max_blur_radius_px : int
+        Largest kernel radius.
+    max_store_mb, max_stores_mb : int
+        Memory of one loaded store, and of all of them, 10^6 bytes.
+    store_cache_dir : str
+        Folder of the on-disk cache; empty without one.
+    store_cache_max_mb : int
+        Maximum size of that folder, 10^6 bytes.
     """
 
     max_blur_radius_px: int = 255

@@ -1,4 +1,4 @@
-"""Parsing of a profile's body, with errors of the service."""
+"""Parsing of a profile's body, with the service's exceptions."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from filter_service.errors import UnknownProfile
 
 
 def read_profile(body: dict[str, Any]) -> EyeProfile:
-    """Return the profile that a body describes, without tracing it.
+    """Parse the body of a profile.
 
     Raises
     ------
     UnknownProfile
-        If the body is invalid; the error has the field and the allowed values.
+        If the body is invalid; the error names the field and the allowed values.
     """
     try:
         return parse_profile(body)
@@ -24,5 +24,5 @@ def read_profile(body: dict[str, Any]) -> EyeProfile:
 
 
 def unknown_profile(error: ProfileError) -> UnknownProfile:
-    """Convert an error; the field and the allowed values become separate attributes."""
+    """Convert an exception of the parser."""
     return UnknownProfile(error.problem, field=error.field, allowed=error.allowed)

@@ -1,14 +1,21 @@
-"""Worker process that estimates eyes and plans the nodes of their PSFs.
+"""Main program of the build worker.
 
-It is a process, not a thread, because estimating holds the GIL for tenths of a second,
+It is a process, not a thread, because a build holds the GIL for tenths of a second,
 which would delay frames.
 
-Messages from the parent: ``("build", ticket, job)``, ``("cancel", ticket)``.  Messages
-from the worker: ``("ready",)``, ``("progress", ticket, fraction, stage)``; at the end
-``("result", ticket, built)`` or ``("failed", ticket, code, message, field, allowed)``.
-The parts of a result follow it as ``("part", ticket, part)``, until a new message
-arrives.  A result has 0.3 to 2 MB, a part 0.2 to 1.  The pipe connects two processes of
-this service, so it may carry pickles; no external data is unpickled.
+Messages from the parent:
+
+- ``("build", ticket, job)``, ``("cancel", ticket)``
+
+Messages to the parent:
+
+- ``("ready",)``, the first one
+- ``("progress", ticket, fraction, stage)``
+- ``("result", ticket, built)``, 0.3 to 2 MB, followed by ``("part", ticket, part)``,
+  0.2 to 1 MB each, until a new message arrives
+- ``("failed", ticket, code, message, field, allowed)``
+
+Messages are pickled, which is safe because both processes belong to the service.
 """
 
 from __future__ import annotations
@@ -27,7 +34,7 @@ from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
 from filter_service.building.background_warm_up import BackgroundWarmUp
 from filter_service.building.jobs import Build, BuildJob
 from filter_service.errors import BuildCancelled, BuildFailed, FilterError
-from filter_service.log_lines import start_log
+from filter_service.log_lines import configure_logging
 
 PROGRESS_INTERVAL_S = 0.1
 IDLE_S = 3.0
@@ -36,8 +43,8 @@ IDLE_S = 3.0
 log = logging.getLogger("ocufilter.worker")
 
 
-class ParentGone(Exception):
-    """The service has ended, so the worker ends too."""
+class ParentExited(Exception):
+    """The parent has exited."""
 
 
 def main() -> None:
@@ -49,26 +56,27 @@ def main() -> None:
 
 def serve_builds(pipe: Connection, build_name: str, warm_up_name: str = "") -> None:
     """Serve build requests until the pipe closes."""
-    # Ctrl-C goes to the whole process group; the service ends the worker itself.
+    # Ctrl-C signals the whole process group; the parent stops the worker itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    start_log("worker")
+    configure_logging("worker")
     try:
-        build, warm_up = _named(build_name), None
+        build, warm_up = _import_function(build_name), None
         pipe.send(("ready",))
-        # After a restart of the service, clients reconnect at once, possibly for a
-        # store from the disk; the warm-up must not compete with them for the processor.
+        # After a restart of the service, clients reconnect at once, often for a store
+        # in the on-disk cache; the warm-up must not compete with them for the
+        # processor.
         if warm_up_name and not pipe.poll(IDLE_S):
-            warm_up = BackgroundWarmUp(_named(warm_up_name))
+            warm_up = BackgroundWarmUp(_import_function(warm_up_name))
         while True:
             message = pipe.recv()
             if message[0] == "build":
                 ticket, job = message[1:]
                 _build_one(pipe, build, warm_up, ticket=ticket, job=job)
-    except (EOFError, OSError, ParentGone):
+    except (EOFError, OSError, ParentExited):
         return
 
 
-def _named(name: str) -> Callable[..., Any]:
+def _import_function(name: str) -> Callable[..., Any]:
     module, _, function = name.partition(":")
     named: Callable[..., Any] = getattr(importlib.import_module(module), function)
     return named
@@ -88,10 +96,10 @@ def _build_one(
         return _is_cancelled(pipe, ticket)
 
     if warm_up is not None:
-        progress = warm_up.before(progress, cancelled)
+        progress = warm_up.wrap_progress(progress, cancelled)
     try:
         built = build(job, progress=progress, cancelled=cancelled)
-    except ParentGone:
+    except ParentExited:
         raise
     except Exception as error:
         _send_failure(pipe, ticket, error)
@@ -103,9 +111,9 @@ def _build_one(
                 return
             pipe.send(("part", ticket, part))
     except OSError:
-        raise ParentGone from None
-    except Exception as error:  # a frame that needs it fails and tells its client
-        log.info("nodes ahead of frames: %s", error)
+        raise ParentExited from None
+    except Exception as error:  # a frame that needs the part reports it
+        log.info("nodes could not be planned ahead: %s", error)
 
 
 def _throttled_progress(pipe: Connection, ticket: int) -> Callable[[float, str], None]:
@@ -114,7 +122,7 @@ def _throttled_progress(pipe: Connection, ticket: int) -> Callable[[float, str],
     def progress(fraction: float, stage: str) -> None:
         nonlocal next_s, last_stage
         now_s = time.monotonic()
-        # The first message of a stage is never dropped: a short stage has no second.
+        # Always send the first message of a stage; a short stage has no other one.
         if now_s >= next_s or stage != last_stage:
             next_s, last_stage = now_s + PROGRESS_INTERVAL_S, stage
             pipe.send(("progress", ticket, min(max(float(fraction), 0.0), 1.0), stage))
@@ -123,12 +131,12 @@ def _throttled_progress(pipe: Connection, ticket: int) -> Callable[[float, str],
 
 
 def _is_cancelled(pipe: Connection, ticket: int) -> bool:
-    """Return whether the parent canceled this ticket (2 us if it did not)."""
+    """Return whether the parent has canceled a build; takes 2 us if not."""
     while pipe.poll(0):
         try:
             message = pipe.recv()
         except (EOFError, OSError):
-            raise ParentGone from None
+            raise ParentExited from None
         if message == ("cancel", ticket):
             return True
     return False

@@ -1,4 +1,4 @@
-"""The service's interface to the worker process: a build queue with crash recovery."""
+"""Interface to the build worker: queues builds and recovers from crashes."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from typing import Any
 
 from estimator.threads import THREADS_VARIABLE
 from filter_service.building.helper_process import (
-    end,
-    how_it_ended,
+    describe_exit,
     import_path,
     is_stopped,
+    wait_or_kill,
 )
 from filter_service.building.jobs import BuildJob, BuiltStore
 from filter_service.errors import (
@@ -29,15 +29,19 @@ from filter_service.errors import (
     error_from_code,
 )
 
-RECEIVE_BUDGET_S = 0.004  # time of the render worker for one call of poll
-RESTART_DELAY_S = 1.0  # after a worker that never became ready
+RECEIVE_BUDGET_S = 0.004
+"""Time limit of one call of `poll`, which delays frames."""
+
+RESTART_DELAY_S = 1.0
+"""Delay of a restart after a worker that never became ready."""
+
 STOP_GRACE_S = 1.0
 WATCH_INTERVAL_S = 0.5
 STOPPED_LIMIT_S = 3.0
 """Time after which a worker stopped by a signal is killed."""
 
 BUILD = "filter_service.building.from_profile:build"
-WARM_UP = "filter_service.building.compile_builds:build_a_few_with_help"
+WARM_UP = "filter_service.building.compile_builds:warm_up"
 NICENESS = 5
 
 log = logging.getLogger("ocufilter.worker")
@@ -81,7 +85,7 @@ BuildEvent = BuildProgress | BuildDone | BuildPart | BuildError
 
 @dataclass(frozen=True)
 class _Worker:
-    """A process and the pipe to it, which exist together."""
+    """A running process and the pipe to it."""
 
     process: subprocess.Popen[bytes]
     pipe: Connection
@@ -95,15 +99,15 @@ class WorkerHandle:
     ----------
     build : str
         ``module:function`` of ``build(job, *, progress, cancelled)``, which returns a
-        `BuiltStore`.  It is a name because importing the function here would delay the
-        start of the process.
+        `BuiltStore`; a name, because importing the function here would delay the start
+        of the process.
     cancel_grace_s : float
         Time after which a canceled build that is still running is killed with its
         process.
     build_limit_s : float
         Time after which a build is killed with its process.
     warm_up : str
-        ``module:function`` that the process runs until the first job arrives.
+        ``module:function`` that the process runs while it waits for the first job.
     niceness : int
         Niceness of the process.  While a new eye is estimated on two busy cores, 91 to
         96 % of a stream's frames are complete with 0, and 95 to 98 % with 5; with 10,
@@ -144,7 +148,7 @@ class WorkerHandle:
             ],
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,
-            # One thread: a second one saved no time, and cost the frames 0.4 s.
+            # A second thread saved no time, and delayed frames by 0.4 s.
             env=os.environ
             | {"PYTHONPATH": os.pathsep.join(import_path()), THREADS_VARIABLE: "1"},
         )
@@ -157,12 +161,12 @@ class WorkerHandle:
             return
         self._worker.pipe.close()
         self._worker.process.terminate()
-        end(self._worker.process, STOP_GRACE_S)
+        wait_or_kill(self._worker.process, STOP_GRACE_S)
         self._worker = None
 
     @property
     def file_descriptor(self) -> int | None:
-        """Descriptor to poll for reading; it changes when the worker restarts."""
+        """Return the descriptor to poll for reading; it changes with a restart."""
         return None if self._worker is None else self._worker.pipe.fileno()
 
     @property
@@ -171,12 +175,12 @@ class WorkerHandle:
         return self._running is not None or bool(self._queue)
 
     @property
-    def needs_attention_soon(self) -> bool:
+    def needs_poll(self) -> bool:
         """Return whether `poll` has work to do even if the pipe is silent."""
         return self._worker is None or self._kill_at_s is not None
 
     def submit(self, job: BuildJob) -> int:
-        """Put a job at the end of the queue; return its ticket."""
+        """Queue a job; return its ticket."""
         ticket = self._next_ticket
         self._next_ticket += 1
         self._queue.append((ticket, job))
@@ -184,14 +188,14 @@ class WorkerHandle:
         return ticket
 
     def cancel(self, ticket: int) -> None:
-        """Cancel a build; no event follows for a ticket that was still queued."""
+        """Cancel a build; a build that was still queued causes no event."""
         self._queue = deque(item for item in self._queue if item[0] != ticket)
         if ticket == self._running and self._kill_at_s is None:
             self._kill_at_s = time.monotonic() + self.cancel_grace_s
-            self._tell(("cancel", ticket))
+            self._send(("cancel", ticket))
 
     def poll(self) -> list[BuildEvent]:
-        """Return new events; this takes at most a few milliseconds."""
+        """Return new events, within a few milliseconds."""
         events: list[BuildEvent] = []
         now_s = time.monotonic()
         worker = self._worker
@@ -200,7 +204,7 @@ class WorkerHandle:
                 self.start()
             return events
         if self._kill_at_s is not None and now_s > self._kill_at_s:
-            log.warning("a cancelled build did not stop; ending its process")
+            log.warning("a canceled build did not stop; killing its process")
             worker.process.kill()
         self._watch(worker, now_s)
         try:
@@ -209,24 +213,26 @@ class WorkerHandle:
                 if time.monotonic() - now_s > RECEIVE_BUDGET_S:
                     break
         except (EOFError, OSError, pickle.UnpicklingError):
-            events += self._after_crash(worker)
+            events += self._recover(worker)
         self._start_next()
         return events
 
     def _watch(self, worker: _Worker, now_s: float) -> None:
-        """Kill a worker that is stopped, or whose build exceeds its limit."""
+        """Kill a worker that a signal has stopped, or whose build takes too long."""
         if now_s < self._next_watch_s:
             return
         self._next_watch_s = now_s + WATCH_INTERVAL_S
         if self._running is not None and now_s - self._began_s > self.build_limit_s:
-            log.error("a build took longer than %g s; ending it", self.build_limit_s)
+            log.error(
+                "a build took longer than %g s; killing its process", self.build_limit_s
+            )
             worker.process.kill()
         if not is_stopped(worker.process.pid):
             self._stopped_since_s = None
         elif self._stopped_since_s is None:
             self._stopped_since_s = now_s
         elif now_s - self._stopped_since_s > STOPPED_LIMIT_S:
-            log.error("the build worker does not respond; ending it")
+            log.error("the build worker does not respond; killing it")
             worker.process.kill()
 
     def _receive(self, pipe: Connection, events: list[BuildEvent]) -> None:
@@ -257,19 +263,19 @@ class WorkerHandle:
             ticket, job = self._queue.popleft()
             self._running = ticket
             self._began_s = time.monotonic()
-            self._tell(("build", ticket, job))
+            self._send(("build", ticket, job))
 
-    def _tell(self, message: tuple[Any, ...]) -> None:
+    def _send(self, message: tuple[Any, ...]) -> None:
         if self._worker is None:
             return  # closed
         try:
             self._worker.pipe.send(message)
         except OSError:
-            log.debug("the worker ended; poll will report it")
+            log.debug("the worker exited; poll will report it")
 
-    def _after_crash(self, worker: _Worker) -> list[BuildEvent]:
-        """Start a new process; the running build is lost, queued ones are not."""
-        how = how_it_ended(end(worker.process, STOP_GRACE_S))
+    def _recover(self, worker: _Worker) -> list[BuildEvent]:
+        """Start a new process; report the running build as failed, keep queued ones."""
+        how = describe_exit(wait_or_kill(worker.process, STOP_GRACE_S))
         was_cancelled = self._kill_at_s is not None
         was_ready = self._is_ready
         tickets = [] if self._running is None else [self._running]
@@ -284,7 +290,7 @@ class WorkerHandle:
             error = WorkerCrashed(f"the process that computes PSFs {how}")
             log.error("%s; starting a new one", error.message)
         if not was_ready:
-            # No job was the cause, so queued ones would wait forever.
+            # The cause was not a job; queued ones would wait forever.
             tickets += [ticket for ticket, _ in self._queue]
             self._queue.clear()
             self._start_at_s = time.monotonic() + RESTART_DELAY_S

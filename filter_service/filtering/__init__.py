@@ -1,16 +1,21 @@
-"""Streams of frames through eyes that may change during the stream.
+"""`EyeFilter`: filters streams of frames through eyes, in process.
 
-eye_filter        `EyeFilter`: one stream; the public API
+A *stream* is the frames of one filter.  Its profile may change: an *accepted profile*
+is built in the build worker, its first PSFs are computed, and then it is *ready* and
+replaces the previous one.  A *store* is the PSF cache of one eye for one camera.  The
+*builder* advances the builds of all streams of a process.
+
+eye_filter        `EyeFilter`: one stream
 planned_frame     a frame whose eye is prepared
-several_eyes      a frame whose views have different eyes
-filtered          a filtered frame, and events of an eye
-accepted_profile  one profile and its stores
-stream_eyes       the eyes of a stream: requested, building, ready
-predicted_states  prediction of the next frames' states
+several_eyes      `plan_views`: a frame whose views use different eyes
+filtered          `Filtered` frames, and events of a profile
+accepted_profile  a profile and its stores
+stream_eyes       the profiles of a stream and their states
+predicted_states  prediction of pupil and focus of the next frames
 builder           builder and engine shared by all streams
 shared_builder    builders shared within a process
 choose_engine     choice of the engine, with the reason
-compile_loops     compilation of all loops, on all cores
+compile_loops     compilation of all numba loops, on all cores
 """
 
 import lazy_loader

@@ -18,7 +18,7 @@ from filter_service.settings import FilterSettings
 
 @dataclass(eq=False)
 class PreparedStore:
-    """A loaded store and the camera that it was built for.
+    """A store that an engine has loaded, and the camera that it was built for.
 
     Attributes
     ----------
@@ -29,15 +29,15 @@ class PreparedStore:
     notes : tuple of str
         Notes about the eye, in sentences.
     is_ready : bool
-        Whether the PSFs of a first frame are computed; from then on frames use it.
-    used_s : float
+        Whether the PSFs of a first frame are computed, so that frames use the store.
+    last_used_s : float
         Time when a frame last used it, or when it was loaded.
     pending : (n,)
-        Indices of a first frame's PSFs that are being computed.
+        Indices of the PSFs of a first frame that are being computed.
     next_progress_s : float
         Earliest time of the next progress event.
     n_checks : int
-        Number of times that missing PSFs of a first frame were found and computed.
+        Number of completed checks for missing PSFs of a first frame.
     ticket : int
         Ticket of its build.
     """
@@ -47,7 +47,7 @@ class PreparedStore:
     started_s: float
     notes: tuple[str, ...] = ()
     is_ready: bool = False
-    used_s: float = field(default_factory=time.monotonic)
+    last_used_s: float = field(default_factory=time.monotonic)
     pending: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     next_progress_s: float = 0.0
     n_checks: int = 0
@@ -58,50 +58,72 @@ class PreparedStore:
 class AcceptedProfile:
     """An accepted profile and its stores.
 
-    ``generation`` counts the accepted profiles of a session; every result names it.
-    Stores are in order of last use, at most one for each camera.
+    Attributes
+    ----------
+    generation : int
+        Number of the profile in its stream; results return it.
+    profile_id : int
+        The caller's identifier of the profile.
+    profile : EyeProfile
+    settings : FilterSettings
+    requested : tuple of Camera
+        Cameras for which no store is ready yet.
+    stores : list of PreparedStore
+        Stores in order of last use, at most one for each camera.
+    was_ready : bool
+        Whether a store has been ready at any time.
+    failures : list of (Camera, FilterError)
+        Failed builds.
+    accepted_s : float
+        Time of acceptance.
     """
 
     generation: int
     profile_id: int
     profile: EyeProfile
     settings: FilterSettings
-    wanted: tuple[Camera, ...] = ()  # cameras whose first frame would wait
+    requested: tuple[Camera, ...] = ()
     stores: list[PreparedStore] = field(default_factory=list)
-    was_ready: bool = False  # for any camera, at any time
+    was_ready: bool = False
     failures: list[tuple[Camera, FilterError]] = field(default_factory=list)
     accepted_s: float = field(default_factory=time.monotonic)
 
-    def is_same(self, first: Camera, second: Camera) -> bool:
-        """Return whether one store of this eye fits both cameras."""
+    def shares_store(self, first: Camera, second: Camera) -> bool:
+        """Return whether both cameras can share a store of this eye."""
         return is_same_camera(first, second, follows_field=self.settings.follows_field)
 
     def store_for(self, camera: Camera) -> PreparedStore | None:
         """Return the store for a camera, if there is one."""
-        return next((s for s in self.stores if self.is_same(s.camera, camera)), None)
+        return next(
+            (s for s in self.stores if self.shares_store(s.camera, camera)), None
+        )
 
-    def note_use(self, camera: Camera) -> None:
-        """Mark a camera's store as the last used."""
+    def mark_used(self, camera: Camera) -> None:
+        """Mark a camera's store as the last one used."""
         found = self.store_for(camera)
         if found is not None:
-            found.used_s = time.monotonic()
-        self.stores.sort(key=lambda prepared: self.is_same(prepared.camera, camera))
+            found.last_used_s = time.monotonic()
+        self.stores.sort(
+            key=lambda prepared: self.shares_store(prepared.camera, camera)
+        )
 
     def failure_for(self, camera: Camera) -> FilterError | None:
-        """Return the error of a failed build for a camera, if any."""
-        return next((e for c, e in self.failures if self.is_same(c, camera)), None)
+        """Return the error of the failed build for a camera, if there is one."""
+        return next((e for c, e in self.failures if self.shares_store(c, camera)), None)
 
-    def want(self, cameras: Iterable[Camera]) -> None:
-        """Request stores for cameras that have none, except for failed ones."""
+    def request(self, cameras: Iterable[Camera]) -> None:
+        """Request stores for cameras that have neither a store nor a failed build."""
         new = [
             camera
             for camera in cameras
             if self.store_for(camera) is None and self.failure_for(camera) is None
         ]
-        self.wanted = distinct_cameras(
-            [*self.wanted, *new], follows_field=self.settings.follows_field
+        self.requested = distinct_cameras(
+            [*self.requested, *new], follows_field=self.settings.follows_field
         )
 
-    def want_no_more(self, camera: Camera) -> None:
+    def withdraw(self, camera: Camera) -> None:
         """Withdraw the request for a camera."""
-        self.wanted = tuple(c for c in self.wanted if not self.is_same(c, camera))
+        self.requested = tuple(
+            c for c in self.requested if not self.shares_store(c, camera)
+        )

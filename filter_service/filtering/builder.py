@@ -1,7 +1,7 @@
-"""Builder: one build worker and one engine, shared by all streams of a process.
+"""Builder: prepares the eyes of all streams of a process.
 
-Profiles of all streams go through the worker to the engine; the streams receive events
-about them.
+The build worker estimates the eye of a profile, the engine loads it, and the PSFs of a
+first frame are computed in small batches between frames.  Streams receive events.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ from filter_service.errors import (
 )
 from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
 from filter_service.filtering.filtered import BuildingEye, EyeFailed, EyeReady
-from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes, Wanted
+from filter_service.filtering.stream_eyes import BuildTarget, RenderPlan, StreamEyes
 from filter_service.rendering.engine import FrameEngine
 from filter_service.rendering.sampled_frame import first_frame
 from filter_service.settings import FilterSettings
 
 MS_PER_S = 1e3
 
-EYE_SHARE = 0.3
-"""Progress at which the eye is estimated and its nodes are known."""
+EYE_PROGRESS = 0.3
+"""Progress at which the eye is estimated and the nodes of its PSFs are known."""
 
-KEPT_SHARE = 0.8
-"""Share of its memory limit that an eye keeps at eviction, to leave free space."""
+EVICTION_SHARE = 0.8
+"""Eviction reduces an eye's PSFs to this share of its limit, so that it is rare."""
 
 FIRST_RANGE_S, FIRST_SHARE = (0.004, 0.08), 1.0
-"""Time between two frames for the first PSFs of a new eye: the duration of a frame,
-within the range.  During a stream of 1280x720 that takes both cores, with a worker of
-niceness 0, new eyes appeared after 0.7 to 1.5 s; with half of the time, and at most
-0.03 s, after 1.1 to 2.5 s."""
+"""Time between two frames for the first PSFs of a new eye: this share of a frame's
+duration, within the range.  During a stream of 1280x720 that takes both cores, with a
+worker of niceness 0, new eyes appeared after 0.7 to 1.5 s; with half of the time, and
+at most 0.03 s, after 1.1 to 2.5 s."""
 
 AHEAD_RANGE_S, AHEAD_SHARE = (0.004, 0.03), 0.5
-"""The same for PSFs that the next frames may need: half of a frame's time, so that they
-never delay a stream by a whole frame."""
+"""The same for predicted PSFs: half of a frame's duration, so that they never delay a
+stream by a whole frame."""
 
 WARM_BATCH = 256
 """PSFs per batch, 5 ms on two cores; the deadline is checked after each batch."""
@@ -65,9 +65,9 @@ on.  A new eye is ready once a check finds no more than allowed; a pupil that ke
 moving needs new PSFs at every check."""
 
 BUSY_SHARE = 0.4
-"""Share of the frame interval beyond which a frame time stops the computation of PSFs
-ahead.  At 0.8, on two cores, 26 to 52 % of the frames were complete instead of 49 to
-73: the next frame waited for the current batch."""
+"""If frames take more than this share of the frame interval, no PSFs are predicted.  At
+0.8, on two cores, 26 to 52 % of the frames were complete instead of 49 to 73: the next
+frame waited for the current batch."""
 
 PROGRESS_INTERVAL_S = 0.1
 """Minimum interval between two progress events of an eye."""
@@ -76,12 +76,12 @@ log = logging.getLogger("ocufilter")
 
 
 class Builder:
-    """Estimates eyes in the build worker, and computes PSFs before frames need them.
+    """Builds eyes in the build worker, and computes PSFs before frames need them.
 
     Parameters
     ----------
     worker : WorkerHandle
-        Build worker, started by the first `advance` if necessary; ended by `close`.
+        Build worker, started by the first `advance` if necessary; closed by `close`.
     engine : FrameEngine
     limits : BuildLimits
     engine_name : str
@@ -103,12 +103,12 @@ class Builder:
         self.frame_s = 0.0  # duration of the last frame
         self._limits = limits
         self._released: list[Any] = []
-        self._going: list[Any] = []
+        self._dropping: list[Any] = []
         self._is_warming = False
 
     @property
     def stores_mb(self) -> float:
-        """Return the memory of all streams' PSFs."""
+        """Return the memory of all streams' PSFs, 10^6 bytes."""
         return sum(prepared.store.memory_mb for prepared in self._prepared())
 
     def _prepared(self) -> list[PreparedStore]:
@@ -121,7 +121,7 @@ class Builder:
 
     @property
     def is_warming(self) -> bool:
-        """Return whether `advance` has immediate work."""
+        """Return whether `advance` has work that does not wait for an event."""
         return self._is_warming
 
     def accept(
@@ -133,9 +133,11 @@ class Builder:
         *,
         profile_id: int | None = None,
     ) -> AcceptedProfile:
-        """Accept a profile; cancel the build of an older one that is still running."""
-        # This includes a profile accepted in the same pass: its build has not started,
-        # but its sender also expects an outcome.
+        """Accept a profile; cancel an older one that is not ready.
+
+        The parameters are those of `StreamEyes.add_profile`.
+        """
+        # Also one whose build has not started: its sender expects an outcome.
         building = stream.building
         replaced = [building.eye] if building is not None else []
         unfinished = stream.unfinished_eye()
@@ -144,9 +146,7 @@ class Builder:
         self.cancel(stream)
         for old in replaced:
             newer = "a newer profile" if profile_id is None else f"profile {profile_id}"
-            error = BuildCancelled(
-                f"{newer} took the place of profile {old.profile_id}"
-            )
+            error = BuildCancelled(f"{newer} replaced profile {old.profile_id}")
             stream.on_event(EyeFailed(old, error))
         eye = stream.add_profile(profile, settings, cameras, profile_id=profile_id)
         self.free_retired(stream)
@@ -161,13 +161,13 @@ class Builder:
         self.free_retired(stream)
 
     def close(self) -> None:
-        """End all streams and the worker."""
+        """End all streams and close the worker."""
         for stream in list(self.streams):
             self.end(stream)
         self.worker.close()
 
     def cancel(self, stream: StreamEyes) -> None:
-        """Cancel the running build of a stream."""
+        """Cancel the current build of a stream, if there is one."""
         if stream.ticket is not None:
             self.worker.cancel(stream.ticket)
         stream.ticket = stream.building = None
@@ -180,34 +180,34 @@ class Builder:
         stream.retired = []
 
     def _drop_released(self) -> None:
-        """Drop released stores one iteration later, in a thread.
+        """Free released stores in a thread, one iteration later.
 
-        Returning half a gigabyte to the system takes 0.2 s; by then the renderer has
-        dropped them, too.
+        Returning half a gigabyte to the system takes 0.2 s.  By the next iteration the
+        renderer has dropped its references.
         """
-        dropped, self._going = self._going, self._released
+        dropped, self._dropping = self._dropping, self._released
         self._released = []
         if dropped:
             threading.Thread(target=dropped.clear, daemon=True).start()
 
     def advance(self, *, ahead: bool = True) -> None:
-        """Process the worker's events, then compute PSFs ahead for a limited time.
+        """Process the worker's events, then compute PSFs for a limited time.
 
-        The limits are `FIRST_SHARE` and `AHEAD_SHARE` of a frame's time.
+        `FIRST_SHARE` and `AHEAD_SHARE` define the limits.
 
         Parameters
         ----------
         ahead : bool
-            Whether to also predict what the next frames of eyes in use need; otherwise
-            only PSFs of new eyes are computed.
+            Whether to also compute predicted PSFs of eyes in use; otherwise only PSFs
+            of new eyes.
         """
         self._drop_released()
         for event in self.worker.poll():
             if isinstance(event, BuildPart):
-                self._take_part(event)
+                self._add_part(event)
                 continue
             stream = next((s for s in self.streams if s.ticket == event.ticket), None)
-            # If there is none, the stream has ended or requested something newer.
+            # If there is none, the stream has ended or has a newer profile.
             if stream is not None:
                 self._handle(stream, event)
         for stream in list(self.streams):
@@ -220,7 +220,7 @@ class Builder:
                         settings=following.eye.settings,
                         camera=following.camera,
                         limits=self._limits,
-                        near=_state_near(stream, following),
+                        near=_likely_state(stream, following),
                     )
                 )
         self._warm_first_frames()
@@ -231,36 +231,36 @@ class Builder:
     def _handle(self, stream: StreamEyes, event: BuildEvent) -> None:
         if stream.building is None:
             return  # a late event of a canceled build
-        wanted = stream.building
+        target = stream.building
         if isinstance(event, BuildProgress):
-            fraction = EYE_SHARE * event.fraction
-            stream.on_event(BuildingEye(wanted.eye, fraction, event.stage))
+            fraction = EYE_PROGRESS * event.fraction
+            stream.on_event(BuildingEye(target.eye, fraction, event.stage))
         elif isinstance(event, BuildDone):
             stream.ticket = stream.building = None
             try:
                 loaded = self.engine.load(event.built.store)
             except Exception as error:
-                self._fail(stream, wanted, _as_filter_error(error))
+                self._fail(stream, target, _to_filter_error(error))
                 return
             prepared = PreparedStore(
-                *(wanted.camera, loaded, wanted.eye.accepted_s, event.built.notes),
+                *(target.camera, loaded, target.eye.accepted_s, event.built.notes),
                 ticket=event.ticket,
             )
-            stream.put_in_place(wanted.eye, prepared)
+            stream.add_store(target.eye, prepared)
             self.free_retired(stream)
         elif isinstance(event, BuildError):
-            self._fail(stream, wanted, event.error)
+            self._fail(stream, target, event.error)
 
-    def _take_part(self, event: BuildPart) -> None:
-        """Pass a part from the worker to its store, if that is still in use."""
+    def _add_part(self, event: BuildPart) -> None:
+        """Add a part from the worker to its store, if that still exists."""
         for prepared in self._prepared():
             if prepared.ticket == event.ticket:
                 prepared.store.add_part(event.part)
 
-    # PSFs ahead of frames
+    # PSFs that are computed before frames need them
 
     def _share_of_frame_s(self, share: float, range_s: tuple[float, float]) -> float:
-        """Return a share of a frame's time, within a range."""
+        """Return a share of a frame's duration, within a range."""
         low_s, high_s = range_s
         return min(max(share * self.frame_s, low_s), high_s)
 
@@ -269,19 +269,19 @@ class Builder:
         until_s = time.monotonic() + self._share_of_frame_s(FIRST_SHARE, FIRST_RANGE_S)
         self._is_warming = False
         for stream in list(self.streams):
-            while (found := stream.warming()) is not None:
+            while (found := stream.store_to_warm()) is not None:
                 is_over = self._warm_first(stream, *found, until_s)
                 if time.monotonic() > until_s:
                     self._is_warming |= not is_over
                     break
 
     def _warm_ahead_of_streams(self) -> None:
-        """Compute PSFs that the next frames of eyes in use may need."""
+        """Compute predicted PSFs of eyes in use, for a limited time."""
         until_s = time.monotonic() + self._share_of_frame_s(AHEAD_SHARE, AHEAD_RANGE_S)
         for stream in self.streams:
             if self._is_warming or time.monotonic() > until_s:
                 return
-            if stream.warming() is None:
+            if stream.store_to_warm() is None:
                 self._warm_ahead(stream, until_s)
 
     def _warm_first(
@@ -291,15 +291,15 @@ class Builder:
         prepared: PreparedStore,
         until_s: float,
     ) -> bool:
-        """Compute the PSFs of a first frame; return whether this is finished."""
-        store, use = prepared.store, stream.use.last
+        """Compute the PSFs of a first frame; return whether the store is finished."""
+        store, use = prepared.store, stream.history.last
         is_all = eye.settings.prepare == "ranges"
         try:
             if not prepared.pending.size:
                 use = use or first_frame(prepared.camera, eye.settings)
                 prepared.pending = store.missing_psfs(None if is_all else use)
                 if prepared.pending.size:
-                    self._tell_progress(stream, eye, prepared)
+                    self._report_progress(stream, eye, prepared)
             n_pending = prepared.pending.size
             if n_pending:
                 store.fill(prepared.pending, until_s=until_s, batch_count=WARM_BATCH)
@@ -309,16 +309,16 @@ class Builder:
                 if n_pending > WARM_BATCH * CHECK_GROWTH ** (prepared.n_checks - 1):
                     return False
         except NotPrepared:
-            self._tell_progress(stream, eye, prepared)
+            self._report_progress(stream, eye, prepared)
             return False
-        except Exception as error:  # other streams continue
-            wanted = Wanted(eye, prepared.camera)
-            self._fail(stream, wanted, _as_filter_error(error))
+        except Exception as error:  # must not affect other streams
+            target = BuildTarget(eye, prepared.camera)
+            self._fail(stream, target, _to_filter_error(error))
             return True
         self._set_ready(stream, eye, prepared)
         return True
 
-    def _tell_progress(
+    def _report_progress(
         self, stream: StreamEyes, eye: AcceptedProfile, prepared: PreparedStore
     ) -> None:
         now_s = time.monotonic()
@@ -327,10 +327,10 @@ class Builder:
         prepared.next_progress_s = now_s + PROGRESS_INTERVAL_S
         n_computed = prepared.store.computed_count
         share = n_computed / (n_computed + prepared.pending.size)
-        fraction = EYE_SHARE + (1.0 - EYE_SHARE) * share
+        fraction = EYE_PROGRESS + (1.0 - EYE_PROGRESS) * share
         stream.on_event(BuildingEye(eye, fraction, "psfs"))
 
-    def note_served(self, stream: StreamEyes, plan: RenderPlan) -> None:
+    def mark_rendered(self, stream: StreamEyes, plan: RenderPlan) -> None:
         """Mark the stores that a frame was rendered with as ready."""
         for prepared in list(plan.eye.stores):
             if not prepared.is_ready and prepared.store in plan.stores:
@@ -353,51 +353,57 @@ class Builder:
         )
 
     def _warm_ahead(self, stream: StreamEyes, until_s: float) -> None:
-        """Compute PSFs of the next frames, if pupil and focus keep their speed."""
-        prepared, last = stream.serving(), stream.use.last
-        if prepared is None or last is None or last is stream.use.warmed:
+        """Compute the PSFs of a stream's predicted states."""
+        prepared, last = stream.store_in_use(), stream.history.last
+        if prepared is None or last is None or last is stream.history.last_warmed:
             return
-        if self.frame_s > BUSY_SHARE * stream.use.interval_s:
+        if self.frame_s > BUSY_SHARE * stream.history.interval_s:
             return
         store = prepared.store
         try:
-            for state in stream.use.predicted_states():
+            for state in stream.history.predicted_states():
                 left = store.missing_psfs(last, state=state)
                 if left.size:
                     store.fill(left, until_s=until_s, batch_count=WARM_BATCH)
         except NotPrepared:
             self._is_warming = True
             return
-        except Exception as error:  # others continue; a frame that needs it fails
-            log.info("PSFs ahead of frames: %s", _as_filter_error(error))
-        stream.use.warmed = last
+        except Exception as error:  # a frame that needs the PSFs reports it
+            log.info(
+                "predicted PSFs could not be computed: %s", _to_filter_error(error)
+            )
+        stream.history.last_warmed = last
 
     def _limit_memory(self) -> None:
         """Evict PSFs of the least recently used eyes beyond ``max_stores_mb``."""
-        beyond_mb = self.stores_mb - self._limits.max_stores_mb
-        for prepared in sorted(self._prepared(), key=lambda own: own.used_s):
-            if beyond_mb <= 0.0:
+        excess_mb = self.stores_mb - self._limits.max_stores_mb
+        for prepared in sorted(
+            self._prepared(), key=lambda prepared: prepared.last_used_s
+        ):
+            if excess_mb <= 0.0:
                 return
             before_mb = prepared.store.memory_mb
-            prepared.store.evict(KEPT_SHARE * max(before_mb - beyond_mb, 0.0))
-            beyond_mb -= before_mb - prepared.store.memory_mb
+            prepared.store.evict(EVICTION_SHARE * max(before_mb - excess_mb, 0.0))
+            excess_mb -= before_mb - prepared.store.memory_mb
 
-    def _fail(self, stream: StreamEyes, wanted: Wanted, error: FilterError) -> None:
-        """Fail the preparation of an eye for a camera."""
+    def _fail(
+        self, stream: StreamEyes, target: BuildTarget, error: FilterError
+    ) -> None:
+        """Record and report that an eye cannot be prepared for a camera."""
         self.cancel(stream)
-        stream.fail_build(wanted.eye, wanted.camera, error)
+        stream.fail_build(target.eye, target.camera, error)
         self.free_retired(stream)
-        stream.on_event(EyeFailed(wanted.eye, error))
+        stream.on_event(EyeFailed(target.eye, error))
 
 
-def _state_near(stream: StreamEyes, wanted: Wanted) -> tuple[float, float]:
+def _likely_state(stream: StreamEyes, target: BuildTarget) -> tuple[float, float]:
     """Return the likely pupil and focus of the next frame."""
-    use = stream.use.last or first_frame(wanted.camera, wanted.eye.settings)
+    use = stream.history.last or first_frame(target.camera, target.eye.settings)
     return use.pupil_diameter_mm, use.focus_dpt
 
 
-def _as_filter_error(error: Exception) -> FilterError:
-    """Convert an error for clients; log an unexpected one."""
+def _to_filter_error(error: Exception) -> FilterError:
+    """Return an error for clients; log an unexpected one."""
     if isinstance(error, FilterError):
         return error
     log.error("an eye could not be prepared", exc_info=error)

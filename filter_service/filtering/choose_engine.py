@@ -9,7 +9,7 @@ from typing import Any
 from filter_service.constants import ENGINES
 from filter_service.errors import RenderFailed
 from filter_service.gl.hardware import may_have_gpu
-from filter_service.gl_device import is_device_named
+from filter_service.gl_device import is_device_selected
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class ChosenEngine:
     name : "gl" or "native"
     engine : FrameEngine
     reason : str
-        Reason for the choice, in a few words.
+        Reason for the choice, a phrase.
     """
 
     name: str
@@ -37,7 +37,7 @@ def open_engine(
     Parameters
     ----------
     choice : "auto", "gl" or "native"
-        "auto" selects gl on a hardware GPU or if a device is named, otherwise native.
+        "auto" selects gl on a hardware GPU or for a selected device, otherwise native.
     closing : ExitStack
         Closes the engine.
     warm_up : bool
@@ -48,16 +48,16 @@ def open_engine(
     ValueError
         For an unknown choice.
     RenderFailed
-        If the engine does not work on this machine; the message names what to install.
+        If the engine does not work on this machine; the message says what to install.
     """
     if choice not in ENGINES:
-        raise ValueError(f"engine {choice!r}; allowed: {', '.join(ENGINES)}")
+        raise ValueError(f"unknown engine {choice!r}; allowed: {', '.join(ENGINES)}")
     if choice == "native":
-        return _native(closing, "as asked")
+        return _native(closing, "as requested")
     if choice == "gl":
-        return _gl(closing, "as asked", warm_up=warm_up)
-    if is_device_named():
-        return _gl(closing, "its device is named", warm_up=warm_up)
+        return _gl(closing, "as requested", warm_up=warm_up)
+    if is_device_selected():
+        return _gl(closing, "a device is selected", warm_up=warm_up)
     return _automatic(closing, warm_up=warm_up)
 
 
@@ -98,7 +98,7 @@ def _gl(
     gpu = Gpu()
     closing.callback(gpu.close)
     if hardware_only and gpu.is_software:
-        raise RenderFailed(f"{gpu.info['renderer']} is software")
+        raise RenderFailed(f"{gpu.info['renderer']} is a software renderer")
     renderer = FilterRenderer(gpu)
     if warm_up:
         compile_passes(renderer)

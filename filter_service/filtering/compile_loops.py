@@ -1,11 +1,11 @@
-"""Compiles every loop of the service, once per machine, on all cores.
+"""Compile all numba loops of the service, once per machine, on all cores.
 
     python -m filter_service.filtering.compile_loops
 
-`setup.sh` runs it while packages are installed, and `ocufilter prepare` after a wheel
-is installed; otherwise the build worker does it when first idle.  numba caches the
-results beside the sources, or in the user's cache if it cannot write there.  The halves
-share hardly any loop, so two processes take half the time.
+`setup.sh` runs it during an installation from source, `ocufilter prepare` after the
+installation of a wheel; otherwise the build worker compiles when it is first idle.
+numba caches the results next to the sources, or in the user's cache folder if it cannot
+write there.  The parts share hardly any loop, so two processes take half the time.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from filter_service.progress import Progress, Task
 
 MODULE = "filter_service.filtering.compile_loops"
 PARTS = {"tracing": "eyes", "psfs": "PSFs", "frames": "frames"}
-"""Parts that a process can compile, longest first, and the purpose of their loops."""
+"""Parts that one process compiles, longest first, and what their loops compute."""
 
 POLL_S = 0.1
 
@@ -32,7 +32,7 @@ def compile_loops(progress: Progress) -> None:
     Raises
     ------
     BuildFailed
-        If a process has failed; it has printed the reason.
+        If a process failed; it has printed the reason.
     """
     waiting, running = list(PARTS), dict[str, subprocess.Popen[bytes]]()
     task = progress.task(
@@ -43,7 +43,7 @@ def compile_loops(progress: Progress) -> None:
             while waiting and len(running) < thread_count():
                 part = waiting.pop(0)
                 running[part] = start_module(MODULE, part)
-            _take_finished(running, task)
+            _collect_finished(running, task)
             time.sleep(POLL_S)
     finally:
         for process in running.values():
@@ -51,7 +51,7 @@ def compile_loops(progress: Progress) -> None:
             process.communicate()
 
 
-def _take_finished(running: dict[str, subprocess.Popen[bytes]], task: Task) -> None:
+def _collect_finished(running: dict[str, subprocess.Popen[bytes]], task: Task) -> None:
     for part, process in list(running.items()):
         code = process.poll()
         if code is None:
@@ -66,13 +66,13 @@ def _take_finished(running: dict[str, subprocess.Popen[bytes]], task: Task) -> N
 def compile_part(part: str) -> None:
     """Compile one part in this process, or load it from numba's cache."""
     if part == "tracing":
-        from filter_service.building.compile_builds import trace_an_eye
+        from filter_service.building.compile_builds import compile_tracing
 
-        trace_an_eye()
+        compile_tracing()
     elif part == "psfs":
-        from filter_service.building.compile_builds import build_without_tracing
+        from filter_service.building.compile_builds import compile_psfs
 
-        build_without_tracing()
+        compile_psfs()
     else:
         from filter_service.rendering.plan_once import plan_once
 
@@ -80,7 +80,7 @@ def compile_part(part: str) -> None:
 
 
 def main(arguments: list[str]) -> None:
-    """Compile the named parts one after the other, or all parts in parallel."""
+    """Compile the named parts one after the other, or all of them in parallel."""
     if arguments:
         end_with_parent()
         for part in arguments:

@@ -1,10 +1,10 @@
-"""`EyeFilter`: images as a person's eye sees them, in this process.
+"""`EyeFilter`: filters frames through one eye, in this process.
 
     camera = Camera.from_fov(50, width_px=480, height_px=270)
     with EyeFilter("keratoconus", camera) as eye_filter:
         seen = eye_filter.filter(color, depth_m, pupil_diameter_mm=4, focus_dpt=0)
 
-The service uses one for each eye of a session.
+The service uses one filter for each eye of a session.
 """
 
 from __future__ import annotations
@@ -49,12 +49,13 @@ Profile = EyeProfile | Mapping[str, Any] | str | Path
 
 
 def as_profile(profile: Profile) -> EyeProfile:
-    """Convert a parsed profile, a mapping, a preset's name or a file to a profile.
+    """Return a parsed profile, given as one, as a mapping, a preset's name or a file.
 
     Raises
     ------
     ValueError
-        Names the field, the invalid value and the allowed ones.
+        If the profile is invalid; the message names the field, the value and the
+        allowed values.
     """
     if isinstance(profile, Mapping):
         return parse_profile(profile)
@@ -68,34 +69,34 @@ def _as_cameras(cameras: Camera | Sequence[Camera]) -> tuple[Camera, ...]:
     for camera in found:
         if not isinstance(camera, Camera):
             raise BadMessage(
-                f"{camera!r}", field="camera", allowed="a Camera, or several"
+                f"{camera!r}", field="camera", allowed="a Camera, or a sequence of them"
             )
     return found
 
 
 class EyeFilter:
-    """One stream of frames through one person's eye, which may change during it.
+    """Filters a stream of frames through one eye, which may change during the stream.
 
-    Every frame shows the state that it asks for: missing PSFs are computed before it is
-    rendered, and kept.  A change of profile does not stop the stream: frames go through
-    the old eye until a first frame through the new one would not have to wait.  By
-    default all filters of a process share a build worker and an engine, which only one
-    thread at a time may use.
+    Every frame shows the requested pupil and focus: missing PSFs are computed before it
+    is rendered, and cached.  A new profile does not interrupt the stream: frames use
+    the previous eye until the PSFs of a first frame through the new one are computed.
+    By default all filters of a process share a build worker and an engine, which only
+    one thread at a time may use.
 
     Parameters
     ----------
     profile : EyeProfile, mapping, str or Path, optional
         A parsed profile, its JSON object, a preset's name, or a file.
-    camera : Camera, or several, optional
+    camera : Camera or sequence of Camera, optional
         Cameras to prepare for; others are prepared for when their frames arrive.
         Frames given as arrays use the first one.
     settings : FilterSettings or mapping, optional
     on_event : callable, optional
-        Called with every `BuildingEye`, `EyeReady` and `EyeFailed`.
+        Called with each `BuildingEye`, `EyeReady` and `EyeFailed` event.
     builder : Builder, optional
-        Builder and engine; by default those shared by all filters of the process.
+        Builder with its engine; by default shared by all filters of the process.
     max_cameras : int
-        Number of cameras that are kept prepared.
+        Number of cameras for which the eye stays prepared.
     first_generation : int
         Generation of the first profile.
     engine : "auto", "gl" or "native"
@@ -128,9 +129,9 @@ class EyeFilter:
         self._on_event = on_event
         self._pid = os.getpid()
         self._shared = shared(engine) if builder is None else None
-        self._builder: Builder | None = builder or shared(engine).take()
+        self._builder: Builder | None = builder or shared(engine).acquire()
         self._eyes = StreamEyes(
-            self._take_event,
+            self._handle_event,
             max_cameras,
             self.cameras,
             first_generation=first_generation,
@@ -138,13 +139,13 @@ class EyeFilter:
         self._builder.streams.append(self._eyes)
         self._newest: AcceptedProfile | None = None
         self._failure: EyeFailed | None = None
-        self.is_extending = False  # only PSFs of the last frame are missing
+        self.is_extending = False  # whether the last frame only lacked PSFs
         self.ready: EyeReady | None = None
         if first is not None:
             try:
                 self.set_profile(first, cameras=self.cameras)
             except BaseException:
-                self.close()  # the caller has no filter to close
+                self.close()  # the caller gets no filter that it could close
                 raise
 
     def __enter__(self) -> Self:
@@ -156,12 +157,12 @@ class EyeFilter:
         self.close()
 
     def close(self) -> None:
-        """Release the filter's resources; closing twice is allowed."""
+        """Release the filter's resources; further calls do nothing."""
         if self._builder is None or self._pid != os.getpid():
             return
         self._builder.end(self._eyes)
         if self._shared is not None:
-            self._shared.give_back()
+            self._shared.release()
         self._builder = None
 
     @property
@@ -171,8 +172,7 @@ class EyeFilter:
         Raises
         ------
         ValueError
-            If the filter is closed, or was made in the process that this one was forked
-            from.
+            If the filter is closed, or was created before this process was forked.
         """
         if self._builder is None:
             raise ValueError("this EyeFilter is closed")
@@ -198,17 +198,22 @@ class EyeFilter:
         cameras: Sequence[Camera] = (),
         profile_id: int | None = None,
     ) -> AcceptedProfile:
-        """Change the eye; frames go through the old one until it is ready.
+        """Change the eye; frames use the previous one until the new one is ready.
 
         Parameters
         ----------
+        profile : EyeProfile, mapping, str or Path
         settings : FilterSettings or mapping, optional
             Settings of the eye; by default those of the filter.
         cameras : sequence of Camera, optional
             Cameras to prepare for; by default those of the last frame, otherwise those
             of the eye in use.
         profile_id : int, optional
-            The caller's own number, returned with results; by default the generation.
+            Identifier that results return; by default the generation.
+
+        Returns
+        -------
+        AcceptedProfile
 
         Raises
         ------
@@ -224,8 +229,8 @@ class EyeFilter:
         )
         return self._newest
 
-    def keep_going(self) -> None:
-        """Advance builds of new eyes if the shared builder is used."""
+    def advance_builds(self) -> None:
+        """Advance builds of new eyes, if the filter uses the shared builder."""
         if self._shared is not None:
             self.builder.advance(ahead=False)
 
@@ -234,12 +239,13 @@ class EyeFilter:
         self.builder.advance()
 
     def wait(self, timeout_s: float = 120.0) -> EyeReady:
-        """Wait until the newest eye is ready for all cameras requested of it.
+        """Wait until the newest eye is ready for all requested cameras.
 
         Raises
         ------
         FilterError
-            The error of the eye's build, or `ServiceTimeout`.
+            If the eye's build failed.
+        ServiceTimeout
         BadMessage
             If there is no profile, or no camera to prepare for.
         """
@@ -251,21 +257,21 @@ class EyeFilter:
             failure, self._failure = self._failure, None
             if failure is not None and failure.eye is self._newest:
                 raise failure.error
-            if not self._newest.wanted:
-                return self._ending(self._newest)
+            if not self._newest.requested:
+                return self._outcome(self._newest)
             self._wait_for_worker(deadline_s, "the eye to be ready")
 
-    def _ending(self, eye: AcceptedProfile) -> EyeReady:
-        """Return or raise the outcome of an eye whose builds are finished."""
+    def _outcome(self, eye: AcceptedProfile) -> EyeReady:
+        """Return or raise the outcome of an eye whose builds have finished."""
         if self.ready is not None and self.ready.eye is eye and self.ready.is_complete:
             return self.ready
-        if eye.failures:  # reported before, and unchanged
+        if eye.failures:  # reported before
             raise eye.failures[-1][1].with_traceback(None)
         raise BadMessage(
-            "it is not known", field="camera", allowed="a camera to prepare for"
+            "it is missing", field="camera", allowed="a camera to prepare for"
         )
 
-    def _take_event(self, event: EyeEvent) -> None:
+    def _handle_event(self, event: EyeEvent) -> None:
         if isinstance(event, EyeFailed):
             self._failure = event
         elif isinstance(event, EyeReady):
@@ -276,11 +282,13 @@ class EyeFilter:
     def _wait_for_worker(self, deadline_s: float, what: str) -> None:
         remaining_s = deadline_s - time.monotonic()
         if remaining_s <= 0.0:
-            raise ServiceTimeout(f"waited in vain for {what}")
+            raise ServiceTimeout(f"timed out while waiting for {what}")
         descriptor = self.builder.worker.file_descriptor
         watched = [] if descriptor is None else [descriptor]
         if not self.builder.is_warming:
-            wait(watched, min(remaining_s, WAIT_SLICE_S))  # select fails above 1024
+            wait(
+                watched, min(remaining_s, WAIT_SLICE_S)
+            )  # select() fails above descriptor 1024
 
     # Frames
 
@@ -297,30 +305,30 @@ class EyeFilter:
         timeout_s: float = 120.0,
         **options: Unpack[RenderOptionValues],
     ) -> Filtered:
-        """Filter one frame, computing the PSFs that it lacks.
+        """Filter one frame; compute missing PSFs first.
 
         Parameters
         ----------
-        color : (height, width, 3) array, RgbdView, or several views
+        color : (height, width, 3) array, RgbdView, or sequence of RgbdView
             uint8 sRGB, or float32 or float16 linear light.
         depth_m : (height, width) float32
-            View-space z in meters, with an array of color; otherwise part of the view.
+            View-space z in meters, if ``color`` is an array.
         pupil_diameter_mm : float, 0.5 to 9
-            Entrance pupil.
+            Diameter of the entrance pupil.
         focus_dpt : float, 0 to 20
-            Distance that the person wants to focus on; 0 is infinity.
+            Distance of intended focus; 0 is infinity.
         gaze_deg : (h, v), optional
-            Gaze direction in the image; by default that of the settings.
+            Gaze in the image; by default that of the settings.
         output : "srgb8", "linear" or "linear16"
             8-bit sRGB, or linear light in float32 or float16.
         whole : bool
-            Whether to wait for the newest eye, for single pictures; a stream uses the
-            previous eye until then.
+            Whether to wait until the newest eye is ready, instead of using the previous
+            one meanwhile.
         timeout_s : float
             Timeout for estimating the eye and computing its PSFs.
         **options
             Fields of `RenderOptions`: ``accumulation="coverage"`` or ``"paper"``
-            (nearer surfaces hide what they cover, or the published sum), ``merge=True``
+            (nearer surfaces occlude farther ones, or the published sum), ``merge=True``
             (similar pixels share a splat; off is slower), and ``render_tolerance=1.0``
             (0 is exact, 1 leaves no visible difference, up to 8 is faster).
 
@@ -379,7 +387,7 @@ class EyeFilter:
         until_s : float, optional
             Time of `time.monotonic` after which no more PSFs are computed.  If some are
             missing then, this returns None and sets `is_extending`; the computed ones
-            are kept, so that the next frame continues from there.
+            stay cached for the next frame.
         out : sequence of arrays, optional
             Output arrays that may be used; only the returned arrays are valid.
 
@@ -392,7 +400,7 @@ class EyeFilter:
         RenderError
             If the engine failed.
         """
-        self.keep_going()
+        self.advance_builds()
         if gaze_deg is not None:
             gaze_deg = checked(gaze_deg, tuple[GazeDeg, GazeDeg], "gaze_deg")
         planned = self.plan(
@@ -425,15 +433,15 @@ class EyeFilter:
         gaze_deg: tuple[float, float] | None = None,
         newest_only: bool = False,
     ) -> PlannedFrame | None:
-        """Return a frame that is ready to be rendered, before any other request.
+        """Return a frame that is ready to be rendered, or None.
 
-        Returns None and raises as `try_filter` does.  The frames of a person's two eyes
-        are both planned before one is rendered, so that both are being prepared.
-        `keep_going` may free the stores of a plan.
+        The parameters and errors are those of `try_filter`.  To prepare two eyes at the
+        same time, plan the frames of both before you render one.  Render a plan before
+        the next call of this filter, which may free the plan's stores.
         """
         pupil_diameter_mm = checked(pupil_diameter_mm, PupilMm, "pupil_diameter_mm")
         focus_dpt = checked(focus_dpt, VergenceDpt, "focus_dpt")
-        self._eyes.use.note(
+        self._eyes.history.record(
             views,
             pupil_diameter_mm=pupil_diameter_mm,
             focus_dpt=focus_dpt,

@@ -1,4 +1,4 @@
-"""A filtered frame, and events during the preparation of its eye."""
+"""A filtered frame, and events of a profile."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from filter_service.view_state import EyeName
 
 
 @dataclass(frozen=True)
-class PictureOfEye:
-    """One picture, and the eye and state that it was filtered through.
+class ViewResult:
+    """One output image, and the eye and state that it was filtered with.
 
     Attributes
     ----------
@@ -25,15 +25,15 @@ class PictureOfEye:
         uint8 sRGB, or float32 or float16 linear light.
     eye : "both", "left" or "right"
     profile_id : int
-        The caller's number of the profile, by default the generation.
+        The caller's identifier of the profile; by default the generation.
     generation : int
-        Number of the profile, counted by the filter.
+        Number of the profile in its stream.
     pupil_diameter_mm, focus_dpt
-        Values used: a profile may cap the pupil, and an eye can only add power.
+        Values used.  A profile may limit the pupil, and an eye can only add power.
     gaze_deg : (h, v)
         Gaze used.
     is_complete : bool
-        Always true: every frame shows the state that it asks for.
+        Always true; false in earlier versions, which had previews.
     """
 
     color: NDArray[Any]
@@ -48,25 +48,26 @@ class PictureOfEye:
 
 @dataclass(frozen=True, kw_only=True)
 class Filtered(FrameCounts):
-    """A filtered frame with everything that determines how it looks.
+    """A filtered frame, and the eyes and states that it was filtered with.
 
-    `color`, `profile_id`, `generation`, `pupil_diameter_mm`, `focus_dpt` and `gaze_deg`
-    are those of the first view.
+    The properties `color`, `profile_id`, `generation`, `pupil_diameter_mm`, `focus_dpt`
+    and `gaze_deg` are those of the first view.
 
     Attributes
     ----------
-    views : tuple of PictureOfEye
+    views : tuple of ViewResult
         One for each view of the frame.
     missing_depth_count, clamped_depth_count, bad_color_count, overflow_count : int
-        Number of pixels whose depth was filled in, was outside the prepared distances,
-        or whose color was not finite; number of light shares lost to full buffers.
+        Number of pixels whose depth was missing and filled in; whose depth was outside
+        the prepared range; whose color was not finite; and number of list entries lost
+        to full buffers.
     notes : tuple of str
-        Notes for the user, in sentences; those of a left or right eye name it.
+        Notes for the user; those about a left or right eye name it.
     stage_times_ms : dict
-        Time of each stage of the frame.
+        Duration of each stage.
     """
 
-    views: tuple[PictureOfEye, ...]
+    views: tuple[ViewResult, ...]
     notes: tuple[str, ...]
     stage_times_ms: dict[str, float]
 
@@ -76,8 +77,15 @@ class Filtered(FrameCounts):
         by_eye: Mapping[EyeName, Filtered],
         indices: Mapping[EyeName, tuple[int, ...]],
     ) -> Filtered:
-        """Return a frame of several eyes; ``indices`` are those of each eye's views."""
-        views: dict[int, PictureOfEye] = {}
+        """Merge the frames of several eyes.
+
+        Parameters
+        ----------
+        by_eye : mapping of Filtered
+        indices : mapping of tuple of int
+            Index of each view of an eye in the whole frame.
+        """
+        views: dict[int, ViewResult] = {}
         for eye, seen in by_eye.items():
             named = (replace(view, eye=eye) for view in seen.views)
             views |= zip(indices[eye], named, strict=True)
@@ -94,12 +102,12 @@ class Filtered(FrameCounts):
 
     @property
     def color(self) -> NDArray[Any]:
-        """Return the first view's picture, (height, width, 3)."""
+        """Return the first view's image, (height, width, 3)."""
         return self.views[0].color
 
     @property
     def colors(self) -> tuple[NDArray[Any], ...]:
-        """Return the pictures of all views."""
+        """Return the images of all views."""
         return tuple(view.color for view in self.views)
 
     @property
@@ -114,7 +122,7 @@ class Filtered(FrameCounts):
 
     @property
     def profile_id(self) -> int:
-        """Return the number of the first view's profile."""
+        """Return the identifier of the first view's profile."""
         return self.views[0].profile_id
 
     @property
@@ -124,7 +132,7 @@ class Filtered(FrameCounts):
 
     @property
     def pupil_diameter_mm(self) -> float:
-        """Return the pupil used for the first view."""
+        """Return the pupil diameter used for the first view."""
         return self.views[0].pupil_diameter_mm
 
     @property
@@ -134,12 +142,12 @@ class Filtered(FrameCounts):
 
     @property
     def is_complete(self) -> bool:
-        """Return true: every frame shows the state that it asks for."""
+        """Return true; false in earlier versions, which had previews."""
         return all(view.is_complete for view in self.views)
 
 
 def summed_times(times_ms: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """Return the sum of each stage's times."""
+    """Return the total duration of each stage."""
     found: dict[str, float] = {}
     for stages_ms in times_ms:
         for name, value_ms in stages_ms.items():
@@ -158,7 +166,7 @@ class BuildingEye:
 
 @dataclass(frozen=True)
 class EyeReady:
-    """A first frame of a camera would not have to wait for a profile's PSFs.
+    """The PSFs for a first frame of a camera are computed.
 
     Attributes
     ----------
@@ -167,11 +175,11 @@ class EyeReady:
     psf_count : int
         Number of computed PSFs.
     memory_mb : float
-        Their memory, 10^6 bytes.
+        Memory of the PSFs, 10^6 bytes.
     notes : tuple of str
-        Notes for the user, in sentences.
+        Notes for the user.
     is_complete : bool
-        Always true.
+        Always true; false in earlier versions, which had previews.
     """
 
     eye: AcceptedProfile

@@ -1,4 +1,4 @@
-"""Rendering of a frame whose eye is prepared."""
+"""Rendering of a frame whose eye is ready."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from filter_service.filtering.builder import Builder
-from filter_service.filtering.filtered import Filtered, PictureOfEye, summed_times
+from filter_service.filtering.filtered import Filtered, ViewResult, summed_times
 from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
 from filter_service.rendering.engine import Pending, ViewRequest
 from filter_service.rendering.filtered_view import summed_counts
@@ -24,7 +24,7 @@ GazeDegrees = tuple[float, float] | None
 
 @dataclass(frozen=True)
 class PlannedFrame:
-    """Views that one eye sees in one state, and the stores prepared for them."""
+    """Views of one eye in one state, and the stores that render them."""
 
     builder: Builder  # the filter may be closed during the frame
     stream: StreamEyes
@@ -42,11 +42,11 @@ class PlannedFrame:
         out: Sequence[NDArray[Any] | None] | None = None,
         until_s: float | None = None,
     ) -> Filtered:
-        """Filter the frame; `EyeFilter.filter` explains the arguments.
+        """Filter the frame; `EyeFilter.filter` describes the other parameters.
 
         Parameters
         ----------
-        gazes_deg : one (h, v) for each view, or None
+        gazes_deg : sequence of (h, v) or None, one for each view
         out : sequence of arrays, optional
             Output arrays that may be used; only the returned arrays are valid.
         until_s : float, optional
@@ -74,10 +74,10 @@ class PlannedFrame:
         out: Sequence[NDArray[Any] | None] | None = None,
         **values: Any,
     ) -> Callable[[], Filtered]:
-        """Begin the frame; the returned function finishes it.
+        """Start rendering; return a function that waits for the result.
 
-        It takes the arguments of `render`.  Frames of other eyes may be begun before
-        this one is finished.
+        The parameters are those of `render`.  Frames of other eyes may be started
+        before this one is finished.
         """
         plan = self.plan
         arrays = out or [None] * len(self.views)
@@ -106,11 +106,11 @@ class PlannedFrame:
     def _finish(self, begun: Sequence[Pending], started_s: float) -> Filtered:
         rendered = [finish() for finish in begun]
         self.builder.frame_s = time.monotonic() - started_s
-        self.builder.note_served(self.stream, self.plan)
+        self.builder.mark_rendered(self.stream, self.plan)
         eye = self.plan.eye
         return Filtered(
             views=tuple(
-                PictureOfEye(
+                ViewResult(
                     view.color,
                     "both",
                     eye.profile_id,

@@ -1,7 +1,7 @@
-"""The last frames of a stream, and the predicted states of its next ones.
+"""Prediction of pupil and focus of the next frames, from the last ones.
 
-Computing PSFs ahead while idle saves time in the next frame and cannot change a
-picture, because a frame computes whatever it lacks.
+PSFs of predicted states are computed between frames, which saves time in the next one.
+A wrong prediction cannot change an image, because a frame computes missing PSFs.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ SPEED_S = 0.25
 """Interval over which the speed of pupil and focus is measured."""
 
 LEAD_S = (0.1, 0.3)
-"""Prediction horizons: the next frame, and those after it."""
+"""Prediction horizons: the next frame, and later ones."""
 
 
-class StreamUse:
+class FrameHistory:
     """The last frames of a stream."""
 
     def __init__(self) -> None:
         self._states: deque[tuple[float, float, float]] = deque()
         self.last: SampledFrame | None = None
-        self.warmed: SampledFrame | None = None  # last one that is fully warmed
+        self.last_warmed: SampledFrame | None = None  # last with computed predictions
 
-    def note(
+    def record(
         self,
         views: Sequence[RgbdView],
         *,
@@ -36,7 +36,7 @@ class StreamUse:
         gaze_deg: tuple[float, float] | None,
         at_s: float,
     ) -> None:
-        """Record a frame."""
+        """Add a frame that arrived at ``at_s``."""
         seen = tuple(SampledView.of(view) for view in views)
         self.last = SampledFrame(at_s, pupil_diameter_mm, focus_dpt, gaze_deg, seen)
         self._states.append((at_s, pupil_diameter_mm, focus_dpt))
@@ -45,13 +45,13 @@ class StreamUse:
 
     @property
     def interval_s(self) -> float:
-        """Mean time between the last frames; 0 before the second."""
+        """Return the mean interval of the last frames; 0 before the second."""
         if len(self._states) < 2:
             return 0.0
         return (self._states[-1][0] - self._states[0][0]) / (len(self._states) - 1)
 
     def predicted_states(self) -> list[tuple[float, float]]:
-        """Return predicted states (pupil_diameter_mm, focus_dpt), one per horizon."""
+        """Return the linearly extrapolated pupil and focus at each horizon."""
         if len(self._states) < 2:
             return []
         (first_s, *first), (last_s, *last) = self._states[0], self._states[-1]

@@ -1,7 +1,9 @@
-"""One frame through several eyes, each view through the eye that it names.
+"""A frame whose views use different eyes.
 
-eyes = {"left": EyeFilter("myopia", left_camera),
-"right": EyeFilter("keratoconus", right_camera)}
+eyes = {
+"left": EyeFilter("myopia", left_camera),
+"right": EyeFilter("keratoconus", right_camera),
+}
 states = [ViewState("left"), ViewState("right", gaze_deg=(3.0, 0.0))]
 planned = plan_views(eyes.__getitem__, [left, right], states, ...)
 """
@@ -31,7 +33,7 @@ from filter_service.view_state import EyeName, ViewState, check_states
 
 @dataclass(frozen=True)
 class PlannedViews:
-    """A frame for which every eye is prepared."""
+    """A frame whose eyes are all ready."""
 
     by_eye: Mapping[EyeName, PlannedFrame]
     indices: Mapping[EyeName, tuple[int, ...]]  # indices of their views
@@ -45,9 +47,9 @@ class PlannedViews:
         until_s: float | None = None,
         **options: Unpack[RenderOptionValues],
     ) -> Filtered:
-        """Filter the frame; all eyes are begun before one is finished.
+        """Filter the frame; start all eyes before waiting for one.
 
-        See `EyeFilter.filter`.
+        The parameters are those of `PlannedFrame.render`.
 
         Raises
         ------
@@ -77,9 +79,9 @@ def plan_views(
     focus_dpt: float,
     gaze_deg: tuple[float, float] | None = None,
 ) -> PlannedViews | None:
-    """Plan a frame through the eyes of its views; return None while one is estimated.
+    """Plan a frame for the eyes of its views; return None while one is being prepared.
 
-    The frame is planned for every eye, so that all of them are being prepared.
+    All eyes are prepared at the same time.
 
     Parameters
     ----------
@@ -94,7 +96,7 @@ def plan_views(
     Raises
     ------
     BadMessage
-        If an argument is out of range, or one eye has two pupils.
+        If an argument is out of range, or views of one eye have different states.
     SessionError
         If an eye has no profile (field ``views[i].eye``), or its build failed.
     """
@@ -111,8 +113,8 @@ def plan_views(
     for eye, own in indices.items():
         found = filter_of(eye)
         if found is None:
-            raise _of_eye(NoProfile("there is no filter"), eye, own[0])
-        found.keep_going()
+            raise _with_eye_name(NoProfile("there is no filter"), eye, own[0])
+        found.advance_builds()
     planned: dict[EyeName, PlannedFrame] = {}
     gazes_deg = tuple(_gaze(state.gaze_deg or gaze_deg) for state in states)
     failure: SessionError | None = None
@@ -123,12 +125,14 @@ def plan_views(
         try:
             frame = eye_filter.plan(
                 [views[i] for i in own],
-                pupil_diameter_mm=_first(state.pupil_diameter_mm, pupil_diameter_mm),
-                focus_dpt=_first(state.focus_dpt, focus_dpt),
+                pupil_diameter_mm=_or_default(
+                    state.pupil_diameter_mm, pupil_diameter_mm
+                ),
+                focus_dpt=_or_default(state.focus_dpt, focus_dpt),
                 gaze_deg=gazes_deg[own[0]],
             )
         except SessionError as error:
-            failure = failure or _of_eye(error, eye, own[0])
+            failure = failure or _with_eye_name(error, eye, own[0])
             continue
         if frame is not None:
             planned[eye] = frame
@@ -139,8 +143,8 @@ def plan_views(
     return PlannedViews(planned, indices, gazes_deg)
 
 
-def _of_eye(error: SessionError, eye: EyeName, view: int) -> SessionError:
-    """Return the error with the name of an eye that has no profile."""
+def _with_eye_name(error: SessionError, eye: EyeName, view: int) -> SessionError:
+    """Name the eye in an error about a missing profile."""
     if not isinstance(error, NoProfile):
         return error
     return NoProfile(
@@ -150,8 +154,8 @@ def _of_eye(error: SessionError, eye: EyeName, view: int) -> SessionError:
     )
 
 
-def _first(own: float | None, of_frame: float) -> float:
-    return of_frame if own is None else own
+def _or_default(value: float | None, default: float) -> float:
+    return default if value is None else value
 
 
 def _gaze(gaze_deg: tuple[float, float] | None) -> GazeDegrees:

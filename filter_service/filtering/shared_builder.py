@@ -1,4 +1,4 @@
-"""Builders shared by the filters of a process, one for each choice of engine."""
+"""Builders that the filters of a process share, one for each engine setting."""
 
 from __future__ import annotations
 
@@ -25,10 +25,14 @@ def open_builder(
     *,
     engine: str = "auto",
 ) -> Builder:
-    """Start the build worker and the engine at the same time; ``closing`` ends both.
+    """Start the build worker and the engine at the same time.
 
     Parameters
     ----------
+    worker : WorkerHandle or InlineWorker
+    limits : BuildLimits
+    closing : ExitStack
+        Closes both.
     engine : "auto", "gl" or "native"
         Engine that filters frames.
 
@@ -39,20 +43,20 @@ def open_builder(
     """
     closing.callback(worker.close)
     worker.start()
-    # Slow imports run in this process and in the worker at the same time.
+    # Imports take long; this process and the worker run them at the same time.
     from filter_service.filtering.choose_engine import open_engine
 
     chosen = open_engine(engine, closing, warm_up=True)
-    # Here mypy checks that the chosen engine is a `FrameEngine`.
+    # mypy checks here that the engine implements `FrameEngine`.
     builder = Builder(worker, chosen.engine, limits, engine_name=chosen.name)
     closing.callback(builder.close)
     return builder
 
 
 def open_inline_builder(closing: ExitStack, *, engine: str = "auto") -> Builder:
-    """Open a builder that estimates eyes in the caller's thread.
+    """Open a builder that estimates eyes in the calling thread.
 
-    For a program that filters one picture, starting a process would take longer.
+    For programs that filter one image: starting a worker process would take longer.
 
     Raises
     ------
@@ -63,7 +67,7 @@ def open_inline_builder(closing: ExitStack, *, engine: str = "auto") -> Builder:
 
 
 class _Shared:
-    """One builder and the number of its users."""
+    """A reference-counted builder."""
 
     def __init__(self, engine: str) -> None:
         self._engine = engine
@@ -72,8 +76,8 @@ class _Shared:
         self._n_users = 0
         atexit.register(self._closing.close)
 
-    def take(self) -> Builder:
-        """Return the builder for one more user; the first user starts it."""
+    def acquire(self) -> Builder:
+        """Return the builder and add a reference; the first reference opens it."""
         if self._builder is None:
             limits = BuildLimits(store_cache_dir=default_cache_dir())
             with ExitStack() as closing:
@@ -84,16 +88,16 @@ class _Shared:
         self._n_users += 1
         return self._builder
 
-    def give_back(self) -> None:
-        """Release one user; the last one closes the builder."""
+    def release(self) -> None:
+        """Remove a reference; removing the last one closes the builder."""
         self._n_users -= 1
         if self._n_users == 0:
             self._builder = None
             self._closing.close()
 
-    def leave_to_parent(self) -> None:
-        """Leave everything open after a fork: the worker belongs to the parent."""
-        self._parents = self._closing.pop_all()  # kept, so that nothing is freed
+    def abandon(self) -> None:
+        """Abandon the builder in a forked process: the worker belongs to the parent."""
+        self._parents = self._closing.pop_all()  # a reference, so that nothing is freed
 
 
 _opened: list[_Shared] = []
@@ -101,26 +105,25 @@ _opened: list[_Shared] = []
 
 @cache
 def shared(engine: str) -> _Shared:
-    """Return the builder that filters of an engine share."""
+    """Return the shared builder of an engine setting."""
     _opened.append(_Shared(engine))
     return _opened[-1]
 
 
-def _begin_anew() -> None:
-    """Make a forked process open builders of its own."""
+def _reset_after_fork() -> None:
+    """Make a forked process open its own builders."""
     for builders in _opened:
-        builders.leave_to_parent()
+        builders.abandon()
     shared.cache_clear()
 
 
-os.register_at_fork(after_in_child=_begin_anew)
+os.register_at_fork(after_in_child=_reset_after_fork)
 
 
 def preload() -> None:
-    """Load the code that frames need, in a thread, before the first client.
+    """Load the code that frames need, in a thread, before the first frame.
 
-    Python's imports let other threads run every 5 ms, so clients hardly notice; an
-    earlier frame waits for what it needs.
+    Imports let other threads run every 5 ms, so the thread hardly delays clients.
     """
 
     def load() -> None:
@@ -128,7 +131,7 @@ def preload() -> None:
             from filter_service.rendering.plan_once import plan_once
 
             plan_once()
-        except Exception:  # the first frame reports the error
+        except Exception:  # the first frame reports it to the client
             log.exception("could not preload")
 
     threading.Thread(target=load, name="preload", daemon=True).start()

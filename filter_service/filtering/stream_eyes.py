@@ -1,7 +1,7 @@
-"""The eyes of one stream of frames: the eye in use, and the eyes to be estimated.
+"""The eyes of one stream: the newest one, and the previous one until it is ready.
 
-A profile is requested, then building, then ready.  This module keeps the state only,
-without GL or processes; `builder` acts on it.
+A profile is requested, then building, then ready.  This module only holds the state;
+`builder` acts on it.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from filter_service.camera import Camera
 from filter_service.errors import FilterError, NoProfile
 from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
 from filter_service.filtering.filtered import EyeEvent
-from filter_service.filtering.predicted_states import StreamUse
+from filter_service.filtering.predicted_states import FrameHistory
 from filter_service.rendering.engine import LoadedStore
 from filter_service.settings import FilterSettings
 
 
 @dataclass(frozen=True)
 class RenderPlan:
-    """The eye that renders a frame, with one store for each view."""
+    """The eye that renders a frame, and the store of each view."""
 
     eye: AcceptedProfile
     stores: tuple[LoadedStore, ...]
 
 
-class Wanted(NamedTuple):
-    """An eye to be estimated for a camera."""
+class BuildTarget(NamedTuple):
+    """An eye and the camera to build it for."""
 
     eye: AcceptedProfile
     camera: Camera
@@ -42,13 +42,24 @@ class StreamEyes:
     Parameters
     ----------
     on_event : callable
-        Called with every `EyeEvent`.
+        Called with each `EyeEvent`.
     max_cameras : int
         Maximum number of stores of one eye.
     first_cameras : tuple of Camera
-        Cameras to prepare for before the first frame.
+        Cameras to prepare for until a frame arrives.
     first_generation : int
         Generation of the first profile.
+
+    Attributes
+    ----------
+    ticket, building : int and BuildTarget, optional
+        Current build in the worker.
+    eyes : list of AcceptedProfile
+        The newest one and, while that is not ready, the previous one.
+    retired : list of LoadedStore
+        Stores to be released.
+    history : FrameHistory
+        Last frames.
     """
 
     on_event: Callable[[EyeEvent], None]
@@ -56,41 +67,44 @@ class StreamEyes:
     first_cameras: tuple[Camera, ...] = ()
     first_generation: int = 1
     ticket: int | None = None
-    building: Wanted | None = None
-    eyes: list[AcceptedProfile] = field(default_factory=list)  # newest first; two
-    retired: list[LoadedStore] = field(default_factory=list)  # stores to be freed
-    use: StreamUse = field(default_factory=StreamUse)
+    building: BuildTarget | None = None
+    eyes: list[AcceptedProfile] = field(default_factory=list)
+    retired: list[LoadedStore] = field(default_factory=list)
+    history: FrameHistory = field(default_factory=FrameHistory)
     _n_accepted: int = 0
     _last_cameras: tuple[Camera, ...] = ()
 
     def plan(self, cameras: Sequence[Camera]) -> RenderPlan | None:
-        """Return how to render a frame; None while its eye is being estimated.
+        """Return how to render a frame; None while no eye can render it.
 
-        This requests the frame's cameras of the newest eye.  Until that eye is ready,
-        the previous one stays in use; it is released as soon as the newest is used.
+        This requests stores of the newest eye for the frame's cameras.  Frames use the
+        previous eye until the newest is ready; then the previous one is retired.
 
         Raises
         ------
-        NoProfile, BuildFailed and other session errors
+        NoProfile
+            If no profile was accepted.
+        FilterError
+            If the build of the newest eye failed for one of the cameras.
         """
         self._last_cameras = tuple(cameras)
         if not self.eyes:
             raise NoProfile("no profile was sent", allowed="a profile before frames")
         newest = self.eyes[0]
-        newest.want(cameras)
+        newest.request(cameras)
         found = {
             eye.generation: [
                 s for camera in cameras if (s := eye.store_for(camera)) is not None
             ]
             for eye in self.eyes
         }
-        serving = [e for e in self.eyes if len(found[e.generation]) == len(cameras)]
-        ready = [e for e in serving if all(s.is_ready for s in found[e.generation])]
-        for eye in (*ready, *serving):
+        usable = [e for e in self.eyes if len(found[e.generation]) == len(cameras)]
+        ready = [e for e in usable if all(s.is_ready for s in found[e.generation])]
+        for eye in (*ready, *usable):
             for camera in cameras:
-                eye.note_use(camera)
+                eye.mark_used(camera)
             if eye is newest and eye in ready:
-                self._keep_only_newest()
+                self._retire_older()
             return RenderPlan(eye, tuple(s.store for s in found[eye.generation]))
         for camera in cameras:
             failure = newest.failure_for(camera)
@@ -112,8 +126,15 @@ class StreamEyes:
     ) -> AcceptedProfile:
         """Make a profile the newest eye; the eye in use stays until it is ready.
 
-        It is prepared for the given cameras, by default for those of the last frame,
-        otherwise for those of the eye in use.
+        Parameters
+        ----------
+        profile : EyeProfile
+        settings : FilterSettings
+        cameras : sequence of Camera
+            Cameras to prepare for; by default those of the last frame, otherwise those
+            of the eye in use.
+        profile_id : int, optional
+            Identifier that results return; by default the generation.
         """
         generation = self.first_generation + self._n_accepted
         self._n_accepted += 1
@@ -123,7 +144,7 @@ class StreamEyes:
         cameras = cameras or self.first_cameras
         own_id = generation if profile_id is None else profile_id
         eye = AcceptedProfile(generation, own_id, profile, settings)
-        eye.want(cameras)
+        eye.request(cameras)
         for old in self.eyes:
             if old not in in_use:
                 self._retire(old)
@@ -131,37 +152,37 @@ class StreamEyes:
         return eye
 
     def unfinished_eye(self) -> AcceptedProfile | None:
-        """Return the newest eye if its profile is neither ready nor failed."""
+        """Return the newest eye if it is neither ready nor failed."""
         if not self.eyes or self.eyes[0].was_ready:
             return None
         newest = self.eyes[0]
-        return newest if newest.wanted or not newest.failures else None
+        return newest if newest.requested or not newest.failures else None
 
-    def next_build(self) -> Wanted | None:
-        """Return the next eye and camera to estimate, if any."""
+    def next_build(self) -> BuildTarget | None:
+        """Return the next eye and camera to build, if there are any."""
         if not self.eyes:
             return None
         eye = self.eyes[0]
-        camera = next((c for c in eye.wanted if eye.store_for(c) is None), None)
-        return None if camera is None else Wanted(eye, camera)
+        camera = next((c for c in eye.requested if eye.store_for(c) is None), None)
+        return None if camera is None else BuildTarget(eye, camera)
 
-    def warming(self) -> tuple[AcceptedProfile, PreparedStore] | None:
-        """Return the newest eye and a store of it that is not ready, if any."""
+    def store_to_warm(self) -> tuple[AcceptedProfile, PreparedStore] | None:
+        """Return the newest eye and one of its stores that is not ready, if any."""
         if not self.eyes:
             return None
         eye = self.eyes[0]
         store = next((s for s in eye.stores if not s.is_ready), None)
         return None if store is None else (eye, store)
 
-    def serving(self) -> PreparedStore | None:
+    def store_in_use(self) -> PreparedStore | None:
         """Return the newest eye's store for the last frame, if it is ready."""
         if not self.eyes or not self._last_cameras:
             return None
         found = self.eyes[0].store_for(self._last_cameras[0])
         return found if found is not None and found.is_ready else None
 
-    def put_in_place(self, eye: AcceptedProfile, prepared: PreparedStore) -> None:
-        """Add a loaded store; evict the least recently used one."""
+    def add_store(self, eye: AcceptedProfile, prepared: PreparedStore) -> None:
+        """Add a loaded store; retire the least recently used ones beyond the limit."""
         replaced = eye.store_for(prepared.camera)
         if replaced is not None:
             eye.stores.remove(replaced)
@@ -173,13 +194,13 @@ class StreamEyes:
     def set_ready(self, eye: AcceptedProfile, prepared: PreparedStore) -> None:
         """Mark a store as ready for frames."""
         prepared.is_ready = eye.was_ready = True
-        eye.want_no_more(prepared.camera)
+        eye.withdraw(prepared.camera)
 
     def fail_build(
         self, eye: AcceptedProfile, camera: Camera, error: FilterError
     ) -> None:
-        """Record a failed build; the old eye replaces one that never worked."""
-        eye.want_no_more(camera)
+        """Record a failed build; drop the newest eye if it was never ready."""
+        eye.withdraw(camera)
         eye.failures.append((camera, error))
         failed = eye.store_for(camera)
         if failed is not None:
@@ -189,12 +210,12 @@ class StreamEyes:
             self._retire(self.eyes.pop(0))
 
     def end(self) -> None:
-        """Retire all eyes; `retired` then holds all stores."""
+        """Retire all eyes."""
         for eye in self.eyes:
             self._retire(eye)
         self.eyes = []
 
-    def _keep_only_newest(self) -> None:
+    def _retire_older(self) -> None:
         for old in self.eyes[1:]:
             self._retire(old)
         self.eyes = self.eyes[:1]

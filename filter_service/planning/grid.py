@@ -26,7 +26,7 @@ from filter_service.planning.field_directions import (
     nearest_inside_deg,
     pixel_from_mrad,
 )
-from filter_service.settings import DEFAULTS, PLANE_ROOM_DPT, FilterSettings
+from filter_service.settings import DEFAULTS, PLANE_HALF_THICKNESS_DPT, FilterSettings
 
 GREEN = 1
 """Reference channel, which lateral color does not shift."""
@@ -210,8 +210,8 @@ class GridSpec:
         corner_ratio = self.camera.corner_distance_ratio
         return [
             (
-                max(plane_dpt - PLANE_ROOM_DPT, 0.0) / corner_ratio,
-                plane_dpt + PLANE_ROOM_DPT,
+                max(plane_dpt - PLANE_HALF_THICKNESS_DPT, 0.0) / corner_ratio,
+                plane_dpt + PLANE_HALF_THICKNESS_DPT,
             )
             for plane_dpt in planes_dpt
         ]

@@ -13,7 +13,7 @@ from filter_service.constants import TILE_SIZE_PX
 from filter_service.psfs.boxes import MAX_REACH_PX
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.image_cells import ImageCells
-from filter_service.rgbd_view import LEAST_DEPTH_M, RgbdView
+from filter_service.rgbd_view import MIN_DEPTH_M, RgbdView
 from filter_service.settings import MAX_VERGENCE_DPT
 
 BORDER_MARGIN_PX = 2
@@ -26,11 +26,11 @@ def fill_missing_depth(
 ) -> tuple[NDArray[np.float32], int]:
     """Fill missing pixels with the depth of the nearest valid pixel, and count them.
 
-    Depth is missing if it is NaN or less than `LEAST_DEPTH_M`.
+    Depth is missing if it is NaN or less than `MIN_DEPTH_M`.
     Nearest means by Euclidean distance in the image; if no pixel is valid, all are at
     infinity.
     """
-    missing = ~(depth_m >= LEAST_DEPTH_M)
+    missing = ~(depth_m >= MIN_DEPTH_M)
     count = int(np.count_nonzero(missing))
     if count == 0:
         return depth_m, 0
@@ -63,7 +63,7 @@ def reach_px_of(view: RgbdView, layers: FrameLayers, image: ImageCells) -> int:
     The bound follows from ray tracing and from the diffraction inside the kernels'
     boxes, and not from the PSFs that have been computed so far.
     """
-    depths_m = [m[m >= LEAST_DEPTH_M] for m in view.surface_depths_m]
+    depths_m = [m[m >= MIN_DEPTH_M] for m in view.surface_depths_m]
     far_m = max((float(m.max(initial=0.0)) for m in depths_m), default=0.0)
     near_m = min((float(m.min(initial=np.inf)) for m in depths_m), default=np.inf)
     stretch_ratio = radial_stretch(view).max() if view.depth_kind == "planar" else 1.0

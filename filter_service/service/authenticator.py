@@ -24,12 +24,12 @@ class Authenticator:
     Parameters
     ----------
     context : zmq.Context
-        Context of the guarded socket, which must be bound after this handler exists.
+        Context of the secured socket, which must be bound after this handler exists.
     keys : KeyRing, optional
         Allowed keys; if None, every connection is admitted.
-    before_numbering : callable
-        Called when a connection has sent its request and has no number yet; by then
-        the socket's monitor has reported that the connection was accepted.
+    on_request : callable
+        Called when a connection requests admission, before it is numbered; by then the
+        socket's monitor has reported that the connection was accepted.
 
     Attributes
     ----------
@@ -41,15 +41,15 @@ class Authenticator:
         self,
         context: zmq.Context[zmq.Socket[bytes]],
         keys: KeyRing | None,
-        before_numbering: Callable[[], None],
+        on_request: Callable[[], None],
     ) -> None:
-        self._keys, self._before_numbering = keys, before_numbering
+        self._keys, self._on_request = keys, on_request
         self.next_number = 1
         self.socket = context.socket(zmq.REP)
         self.socket.linger = 0
         self.socket.bind(ENDPOINT)
 
-    def guard(self, socket: zmq.Socket[bytes]) -> None:
+    def secure(self, socket: zmq.Socket[bytes]) -> None:
         """Enable authentication on a socket that is not bound yet."""
         socket.zap_domain = DOMAIN
         if self._keys is not None:
@@ -58,14 +58,14 @@ class Authenticator:
             socket.curve_secretkey = pair.secret.encode()
             socket.curve_publickey = pair.public.encode()
 
-    def answer(self) -> None:
-        """Answer pending requests."""
+    def handle_requests(self) -> None:
+        """Reply to pending ZAP requests."""
         for _ in range(MAX_REQUESTS_PER_TURN):
             try:
                 request = self.socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
                 return
-            self._before_numbering()
+            self._on_request()
             self.socket.send_multipart(self._reply(request))
 
     def accepts(self, key: str) -> bool:
@@ -78,10 +78,10 @@ class Authenticator:
         if self._keys is not None:
             key = z85.encode(credentials[0]).decode() if credentials else ""
             if mechanism != b"CURVE" or not self.accepts(key):
-                log.warning("a client at %s has no allowed key", address.decode())
-                return [
-                    *(VERSION, request_id, b"400", b"no key that is allowed", b"", b"")
-                ]
+                log.warning(
+                    "rejected a client at %s: its key is not allowed", address.decode()
+                )
+                return [*(VERSION, request_id, b"400", b"key is not allowed", b"", b"")]
         user_id = f"{self.next_number} {key}".strip()
         self.next_number += 1
         return [VERSION, request_id, b"200", b"OK", user_id.encode(), b""]
@@ -91,7 +91,7 @@ class Authenticator:
         self.socket.close(linger=0)
 
 
-def connection_of(user_id: str) -> tuple[int, str]:
+def parse_user_id(user_id: str) -> tuple[int, str]:
     """Return a connection's number and key, parsed from its ``User-Id``."""
     number, _, key = user_id.partition(" ")
     return int(number), key

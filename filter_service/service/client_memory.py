@@ -23,17 +23,17 @@ class ClientMemory:
     config : ServiceConfig
     endpoint : str
         Endpoint that clients connect to.
-    render_of : callable
-        Returns the render client of a session's device, which owns the memory.
+    render_client_of : callable
+        Returns the render client of a session's device, which owns the shared memory.
     """
 
     def __init__(
         self,
         config: ServiceConfig,
         endpoint: str,
-        render_of: Callable[[Session], RenderClient],
+        render_client_of: Callable[[Session], RenderClient],
     ) -> None:
-        self._render_of = render_of
+        self._render_client_of = render_client_of
         self._limits = config.limits
         is_local = endpoint.startswith("ipc://") or any(
             endpoint.startswith(f"tcp://{host}:") for host in LOOPBACK_HOSTS
@@ -43,23 +43,23 @@ class ClientMemory:
     def share(self, session: Session, request: Share) -> Shared:
         """Allocate a slot for a client, or reply with the reason for refusal."""
         limits = self._limits
-        most = MAX_PARTS_PER_VIEW * limits.max_views * limits.max_part_bytes
+        max_bytes = MAX_PARTS_PER_VIEW * limits.max_views * limits.max_part_bytes
         if not self.is_offered:
             return Shared(
                 reason="this service does not offer shared memory over this transport"
             )
         if len(session.shared) >= MAX_SHARED_SLOTS:
             return Shared(reason=f"{MAX_SHARED_SLOTS} slots are in use")
-        if request.size_bytes > most:
+        if request.size_bytes > max_bytes:
             return Shared(
-                reason=f"{request.size_bytes} bytes are more than a frame has"
+                reason=f"size_bytes is {request.size_bytes}; allowed: up to {max_bytes}"
             )
-        render = self._render_of(session)
-        held_bytes = sum(slot.size_bytes for slot in session.shared.values())
-        if held_bytes + request.size_bytes > render.session_quota_bytes:
+        render = self._render_client_of(session)
+        shared_bytes = sum(slot.size_bytes for slot in session.shared.values())
+        if shared_bytes + request.size_bytes > render.session_quota_bytes:
             return Shared(
-                reason=f"{request.size_bytes} bytes more than the {held_bytes} that "
-                f"this session has; allowed: {render.session_quota_bytes} in all"
+                reason=f"size_bytes is {request.size_bytes}, and this session has "
+                f"{shared_bytes}; allowed: {render.session_quota_bytes} in total"
             )
         try:
             slot = render.share(request.size_bytes)
@@ -74,17 +74,18 @@ class ClientMemory:
         Raises
         ------
         BadMessage
+            If the session has no such slot, or a frame uses it.
         """
-        if request.slot not in session.shared or request.slot in session.lent:
+        if request.slot not in session.shared or request.slot in session.slots_in_use:
             raise BadMessage(
                 f"it is {request.slot}",
                 field="slot",
                 allowed="a slot of this session that no frame uses",
             )
-        self._render_of(session).drop(session.shared.pop(request.slot))
+        self._render_client_of(session).drop(session.shared.pop(request.slot))
 
-    def end(self, session: Session) -> None:
-        """Free the slots of a client that is gone."""
+    def free(self, session: Session) -> None:
+        """Free all slots of a session."""
         for slot in session.shared.values():
-            self._render_of(session).drop(slot)
-        session.shared, session.lent = {}, set()
+            self._render_client_of(session).drop(slot)
+        session.shared, session.slots_in_use = {}, set()

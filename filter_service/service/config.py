@@ -56,8 +56,8 @@ class ServiceConfig:
         Devices that filter, each in a process of its own behind the one socket: up to
         eight of ``native``, ``native:THREADS``, ``gl``, ``gl:INDEX`` and ``auto``, as
         in ``devices = ["gl:0", "gl:1"]``.  A new session is assigned to the least busy
-        device; a device that cannot be restarted is given up.  Empty: one process, set
-        by ``engine`` and ``gl_device``.
+        device; a device that cannot be restarted is taken out of service.  Empty: one
+        process, configured by ``engine`` and ``gl_device``.
     max_cameras : int
         Cameras that one session keeps prepared.
     store_cache_dir : str
@@ -69,7 +69,7 @@ class ServiceConfig:
         CPU threads; 0 uses the cores available to this process, capped by a container's
         quota.  Devices share them, except those that specify a number of their own.
     build_niceness : int
-        Niceness of the process that estimates eyes beside the render workers.
+        Niceness of the process that estimates eyes while render workers filter.
     cancel_grace_s : float
         Time after which a canceled build that is still running is killed.
     build_limit_s : float
@@ -77,16 +77,16 @@ class ServiceConfig:
     alive_interval_s : float
         Interval between ``alive`` messages, which detect vanished clients.
     session_keep_s : float
-        Time within which a disconnected client may resume its session.
+        Time for which a disconnected client may resume its session.
     frame_limit_s : float
-        Maximum time for filtering one frame, or for anything else in a render worker;
-        a worker that takes longer is considered hung and restarted.
+        Timeout of a render worker, for filtering one frame or anything else; a worker
+        that does not respond for longer is restarted.
     give_up_after_s : float
-        Time after which the service ends with an error if one of its processes keeps
-        ending; 0: never.  The process is restarted after pauses of up to a minute.
+        Time after which the service exits with an error if one of its processes keeps
+        exiting; 0: never.  The process is restarted after pauses of up to a minute.
     standby : bool
         Keep a second render worker on standby for each device: after a fault of the
-        first, frames resume a second sooner.  It takes some hundred megabytes.
+        first, frames resume a second sooner.  It takes a few hundred megabytes.
     max_image_mb : int
         Memory for the images of all frames and results, divided equally among the
         devices.
@@ -160,7 +160,7 @@ class ServiceConfig:
         """Return the names of the devices; a single one is named after its engine."""
         return self.devices or (self.engine,)
 
-    def of_device(self, index: int) -> ServiceConfig:
+    def for_device(self, index: int) -> ServiceConfig:
         """Return the settings for one device's process."""
         if not self.devices:
             return self
@@ -234,8 +234,8 @@ CHANGEABLE = (
     *("credit", "max_sessions", "max_width_px", "max_height_px"),
     *("alive_interval_s", "session_keep_s", "frame_limit_s", "give_up_after_s"),
 )
-"""Settings that a running service reads again at SIGHUP.  A session keeps the values
-that it was told at its start."""
+"""Settings that a running service reloads at SIGHUP.  A session keeps the values that
+``welcome`` reported."""
 
 
 REMOVED = {"psf_engine": "PSFs are computed on the processor, in C"}
@@ -282,11 +282,10 @@ def _check_bind(bind: object, *, has_keys: bool) -> None:
     if host not in LOOPBACK_HOSTS and not has_keys:
         raise ValueError(
             f"bind is {bind!r}, which other machines can reach: anyone who connects "
-            "could use other people's sessions and exhaust this machine's memory. "
+            "could use sessions of other clients and exhaust this machine's memory. "
             "Listen on tcp://127.0.0.1:PORT and let clients connect through an SSH "
             "tunnel, or create keys (`ocufilter keys add NAME`) and set keys_dir in "
-            "the "
-            "configuration file"
+            "the configuration file"
         )
 
 
@@ -296,7 +295,8 @@ def load_config(path: Path | str | None = None, **overrides: Any) -> ServiceConf
     Raises
     ------
     ValueError
-        For an unknown setting, a wrong type or a value out of range, which is named.
+        For an unknown setting, a wrong type or a value out of range; the message names
+        the setting.
     OSError
         If the file cannot be read.
     """
@@ -305,17 +305,17 @@ def load_config(path: Path | str | None = None, **overrides: Any) -> ServiceConf
         try:
             settings = tomllib.loads(Path(path).read_text(encoding="utf-8"))
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise ValueError(f"{path} is no TOML file: {error}") from None
+            raise ValueError(f"{path} is not a valid TOML file: {error}") from None
     settings |= {name: value for name, value in overrides.items() if value is not None}
     return ServiceConfig(**_typed(settings))
 
 
-def _words(name: str, value: object) -> tuple[str, ...]:
-    """Return the words of a list, or of a comma-separated text."""
+def _string_items(name: str, value: object) -> tuple[str, ...]:
+    """Return the items of a list, or of a comma-separated string."""
     words = [w.strip() for w in value.split(",")] if isinstance(value, str) else value
     if isinstance(words, list | tuple) and all(type(word) is str for word in words):
         return tuple(words)
-    raise ValueError(f"{name} is {value!r}; allowed: a list of texts")
+    raise ValueError(f"{name} is {value!r}; allowed: a list of strings")
 
 
 def _typed(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -341,7 +341,7 @@ def _typed(settings: Mapping[str, Any]) -> dict[str, Any]:
         if name == "gl_device" and type(value) is int:
             value = str(value)
         if name == "devices":
-            value = _words(name, value)
+            value = _string_items(name, value)
         if type(value) is not wanted:
             raise ValueError(f"{name} is {value!r}; allowed: {wanted.__name__}")
         typed[name] = value

@@ -23,7 +23,7 @@ from filter_service.service.rate_limit import RateLimit
 
 MAX_UNREAD_BYTES = 262_144
 """Bytes that a connection without a session may send without completing a message.  It
-needs no large ones, and libzmq buffers incomplete messages without exposing them."""
+sends no large ones, and libzmq buffers incomplete messages without exposing them."""
 
 CHECK_INTERVAL_S = 0.01
 MAX_CHECKED = 64
@@ -80,7 +80,7 @@ class Connection:
     address: str
     first_number: int
     number: int | None = None
-    is_ended: bool = False
+    is_shut_down: bool = False
     has_had_session: bool = False
     counted_bytes: int | None = None  # received when its last message was complete
     rates: RateLimit = field(default_factory=RateLimit)
@@ -91,7 +91,7 @@ class Connections:
 
     When too many are open, the oldest ones without a session are closed: first those
     that have not sent a greeting, from the address that has most of them.  A client
-    sends hello within milliseconds of connecting, so it is rarely crowded out.
+    sends hello within milliseconds of connecting, so it is rarely evicted.
 
     Parameters
     ----------
@@ -99,8 +99,8 @@ class Connections:
     with_session : collection of int
         Numbers of the connections that have a session now (a live view).
     family : socket.AddressFamily
-        Address family of all connections.  Querying it each time took a third of the
-        total cost of a connection.
+        Address family of all connections.  Querying it for each connection took a third
+        of the connection's total cost.
 
     Attributes
     ----------
@@ -119,10 +119,10 @@ class Connections:
         self._with_session = with_session
         self._open: dict[int, Connection] = {}  # by descriptor, oldest first
         self._numbered: dict[int, Connection] = {}
-        # By address and descriptor, oldest first: connections without a known greeting,
-        # and the others.
-        self._silent: dict[str, dict[int, Connection]] = {}
-        self._greeted: dict[str, dict[int, Connection]] = {}
+        # Connections by address and descriptor, oldest first: those whose greeting has
+        # not been seen, and the others.
+        self._without_greeting: dict[str, dict[int, Connection]] = {}
+        self._with_greeting: dict[str, dict[int, Connection]] = {}
         self._next_check_s = 0.0
         self._to_check: list[Connection] = []
         self._n_ending = 0  # shut down, not yet reported as ended
@@ -147,34 +147,34 @@ class Connections:
         self.remove(descriptor)
         connection = Connection(descriptor, inode, address, next_number)
         self._open[descriptor] = connection
-        self._silent.setdefault(address, {})[descriptor] = connection
+        self._without_greeting.setdefault(address, {})[descriptor] = connection
 
     def remove(self, descriptor: int) -> int | None:
         """Remove a connection that has ended; return its number if it has one."""
         connection = self._open.pop(descriptor, None)
         if connection is None:
             return None
-        self._n_ending -= connection.is_ended
-        self._forget_candidate(connection)
+        self._n_ending -= connection.is_shut_down
+        self._remove_candidate(connection)
         if connection.number is not None:
             self._numbered.pop(connection.number, None)
         return connection.number
 
-    def _forget_candidate(self, connection: Connection) -> None:
-        for groups in (self._silent, self._greeted):
+    def _remove_candidate(self, connection: Connection) -> None:
+        for groups in (self._without_greeting, self._with_greeting):
             group = groups.get(connection.address, {})
             group.pop(connection.descriptor, None)
             if not group:
                 groups.pop(connection.address, None)
 
-    def of_message(self, number: int, descriptor: int) -> Connection | None:
-        """Return the connection of a message; None if it has ended since.
+    def find(self, number: int, descriptor: int) -> Connection | None:
+        """Return the connection that sent a message; None if it has ended since.
 
         Parameters
         ----------
         number, descriptor : int
-            As attached to the message by libzmq.  Another connection, with a higher
-            number, may have the descriptor by now.
+            As attached to the message by libzmq.  A connection with a higher number may
+            have reused the descriptor.
         """
         found = self._numbered.get(number)
         if found is None:
@@ -184,25 +184,25 @@ class Connections:
             found.number = number
             self._numbered[number] = found
         found.counted_bytes = None
-        return None if found.is_ended else found
+        return None if found.is_shut_down else found
 
     def is_open(self, number: int) -> bool:
         """Return whether a connection that has sent a message is still open."""
         found = self._numbered.get(number)
-        return found is not None and not found.is_ended
+        return found is not None and not found.is_shut_down
 
-    def note_refusal(self, number: int) -> None:
-        """Count a message that another process refused."""
+    def count_refusal(self, number: int) -> None:
+        """Count a message that a render worker refused."""
         found = self._numbered.get(number)
         if found is not None:
-            found.rates.note_refusal()
+            found.rates.count_refusal()
 
-    def close(self, number: int, why: str) -> None:
+    def close(self, number: int, reason: str) -> None:
         """Close a connection that violates the protocol."""
         found = self._numbered.get(number)
-        if found is not None and not found.is_ended:
+        if found is not None and not found.is_shut_down:
             self._shut_down(found)
-            log.warning("a connection from %s is closed: %s", found.address, why)
+            log.warning("closed a connection from %s: %s", found.address, reason)
 
     def evict(self) -> None:
         """Close surplus connections that have no session."""
@@ -210,31 +210,35 @@ class Connections:
         if n_surplus <= 0:
             return
         for _ in range(n_surplus):
-            if not (self._evict_silent() or self._evict_greeted()):
+            if not (self._evict_without_greeting() or self._evict_with_greeting()):
                 break
             self.n_evicted += 1
         log.warning(
-            "%d connections are open, of %d; the oldest without a session are closed",
+            "%d connections are open (limit %d); closed the oldest without a session",
             *(len(self._open), self.max_count),
             extra=ONCE_A_SECOND,
         )
 
-    def _evict_silent(self) -> bool:
-        """Close the oldest connection without a greeting; return whether any was."""
-        while self._silent:
-            address = max(self._silent, key=lambda a: len(self._silent[a]))
-            connection = next(iter(self._silent[address].values()))
+    def _evict_without_greeting(self) -> bool:
+        """Close the oldest connection without a greeting; return whether one exists."""
+        while self._without_greeting:
+            address = max(
+                self._without_greeting, key=lambda a: len(self._without_greeting[a])
+            )
+            connection = next(iter(self._without_greeting[address].values()))
             has_session = connection.number in self._with_session
             if not has_session and self._bytes_received(connection) < GREETING_BYTES:
                 self._shut_down(connection)
                 return True
-            self._forget_candidate(connection)
-            self._greeted.setdefault(address, {})[connection.descriptor] = connection
+            self._remove_candidate(connection)
+            self._with_greeting.setdefault(address, {})[connection.descriptor] = (
+                connection
+            )
         return False
 
-    def _evict_greeted(self) -> bool:
-        """Close the oldest one with a greeting but no session; return likewise."""
-        by_size = sorted(self._greeted.values(), key=len, reverse=True)
+    def _evict_with_greeting(self) -> bool:
+        """Close the oldest connection that has sent a greeting but has no session."""
+        by_size = sorted(self._with_greeting.values(), key=len, reverse=True)
         for connection in chain.from_iterable(group.values() for group in by_size):
             if connection.number not in self._with_session:
                 self._shut_down(connection)
@@ -242,7 +246,7 @@ class Connections:
         return False
 
     def check_unread(self, now_s: float) -> None:
-        """Close connections that fill libzmq's memory before they send hello."""
+        """Close connections without a session that send too much of a message."""
         if now_s < self._next_check_s:
             return
         self._next_check_s = now_s + CHECK_INTERVAL_S
@@ -252,7 +256,7 @@ class Connections:
         del self._to_check[-MAX_CHECKED:]
         for connection in checked:
             connection.has_had_session |= connection.number in self._with_session
-            if connection.has_had_session or connection.is_ended:
+            if connection.has_had_session or connection.is_shut_down:
                 continue
             n_bytes = self._bytes_received(connection)
             if connection.counted_bytes is None:
@@ -260,16 +264,16 @@ class Connections:
             elif n_bytes - connection.counted_bytes > MAX_UNREAD_BYTES:
                 self._shut_down(connection)
                 log.warning(
-                    "a connection from %s is closed: it sent %d bytes and no message",
+                    "closed a connection from %s: it sent %d bytes and no message",
                     *(connection.address, n_bytes),
                 )
 
     def _shut_down(self, connection: Connection) -> None:
         """Shut a connection down; libzmq then closes the descriptor itself."""
-        connection.is_ended = True
+        connection.is_shut_down = True
         self._n_ending += 1
-        self._forget_candidate(connection)
-        end = self._borrowed(connection)
+        self._remove_candidate(connection)
+        end = self._borrow_socket(connection)
         if end is not None:
             with suppress(OSError):
                 end.shutdown(socket.SHUT_RDWR)
@@ -277,7 +281,7 @@ class Connections:
 
     def _bytes_received(self, connection: Connection) -> int:
         """Return the bytes received on a TCP connection; 0 for other kinds."""
-        end = self._borrowed(connection)
+        end = self._borrow_socket(connection)
         if end is None:
             return 0
         try:
@@ -288,8 +292,11 @@ class Connections:
         finally:
             end.detach()
 
-    def _borrowed(self, connection: Connection) -> socket.socket | None:
-        """Return libzmq's socket, to be detached; None if the descriptor was reused."""
+    def _borrow_socket(self, connection: Connection) -> socket.socket | None:
+        """Return a socket object for libzmq's descriptor; None if that was reused.
+
+        The caller must detach it.
+        """
         try:
             if os.fstat(connection.descriptor).st_ino != connection.inode:
                 return None

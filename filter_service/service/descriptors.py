@@ -8,19 +8,18 @@ new processes.
 from __future__ import annotations
 
 import errno
-import os
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-WANTED = 4096
-"""Descriptors to request if the hard limit exceeds the soft one."""
+TARGET_COUNT = 4096
+"""Soft limit to request, up to the hard limit."""
 
 RESERVE = 32
 """Descriptors that only the front end itself may open."""
 
-BASE = 96
-"""The reserve, plus the descriptors open before the first client connects (30)."""
+BASE_COUNT = 96
+"""The reserve, plus the descriptors that are open without clients (30), rounded up."""
 
 OUT_OF_RESOURCES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 """Errors of the system when descriptors or kernel memory are exhausted."""
@@ -32,7 +31,7 @@ class DescriptorLimit:
     Parameters
     ----------
     max_sessions : int
-        Clients that must be served, with two descriptors each.
+        Number of sessions that must fit.
 
     Attributes
     ----------
@@ -49,16 +48,16 @@ class DescriptorLimit:
 
     def __init__(self, max_sessions: int) -> None:
         soft, self._hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-        most = max(soft, WANTED) if soft >= 0 else WANTED
+        most = max(soft, TARGET_COUNT) if soft >= 0 else TARGET_COUNT
         self._most = most if self._hard < 0 else min(most, self._hard)
-        least = BASE + 3 * max_sessions
+        least = BASE_COUNT + 3 * max_sessions
         if self._most < least:
             raise OSError(
                 f"this process may open {self._most} files; expected at least {least} "
                 f"for {max_sessions} sessions: raise the limit (ulimit -n {least}, or "
                 f"LimitNOFILE={least} of a systemd unit), or lower max_sessions"
             )
-        free = self._most - BASE
+        free = self._most - BASE_COUNT
         self.max_slots = max(max_sessions, free // 4)
         self.max_connections = free - self.max_slots
         self._set(self._most - RESERVE)
@@ -68,14 +67,9 @@ class DescriptorLimit:
 
     @contextmanager
     def reserve(self) -> Iterator[None]:
-        """Raise the limit by the reserve while the block runs."""
+        """Return a context in which the reserve may be used."""
         self._set(self._most)
         try:
             yield
         finally:
             self._set(self._most - RESERVE)
-
-
-def open_count() -> int:
-    """Return the number of open descriptors of this process (Linux)."""
-    return len(os.listdir("/proc/self/fd")) - 1

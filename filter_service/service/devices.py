@@ -1,4 +1,4 @@
-"""Names of the devices that filter, each in a process of its own.
+"""Device names in the settings; each device filters in a process of its own.
 
 ``native`` and ``native:2`` are the compiled loops, with a share of all threads or with
 the given number; ``gl`` and ``gl:1`` are OpenGL on the first EGL device that works, or
@@ -42,6 +42,7 @@ def device_named(text: str) -> Device:
     Raises
     ------
     ValueError
+        If the name is invalid.
     """
     engine, colon, number = text.partition(":")
     is_number = number.isascii() and number.isdecimal()
@@ -51,7 +52,7 @@ def device_named(text: str) -> Device:
         return Device(engine, gl_device=number)
     if engine == "native" and is_number and 1 <= int(number) <= MAX_THREADS:
         return Device(engine, threads=int(number))
-    raise ValueError(f"devices has {text!r}; allowed: {ALLOWED}")
+    raise ValueError(f"unknown device {text!r} in devices; allowed: {ALLOWED}")
 
 
 def check_devices(names: tuple[str, ...], *, engine: str, gl_device: str) -> None:
@@ -60,14 +61,16 @@ def check_devices(names: tuple[str, ...], *, engine: str, gl_device: str) -> Non
     Raises
     ------
     ValueError
+        If there are too many names, one is invalid, or ``engine`` or ``gl_device`` is
+        set as well.
     """
     if len(names) > MAX_DEVICES:
-        raise ValueError(f"devices are {len(names)}; allowed: {ALLOWED}")
+        raise ValueError(f"devices has {len(names)} items; allowed: {ALLOWED}")
     for name in names:
         device_named(name)
     for setting, value in (("engine", engine), ("gl_device", gl_device)):
         if names and value != "auto":
             raise ValueError(
-                f"{setting} is {value!r}, and devices name one each; allowed beside "
-                "devices: auto"
+                f"{setting} is {value!r}, but devices select their own engines; "
+                "allowed with devices: auto"
             )

@@ -22,9 +22,7 @@ CALLS = ("init", "recv", "more", "close")
 class _ZmqCalls(ctypes.Structure):
     """Addresses of the libzmq functions that `drop_parts.c` calls."""
 
-    _fields_ = tuple(
-        (name, ctypes.c_void_p) for name in ("init", "recv", "more", "close")
-    )
+    _fields_ = tuple((name, ctypes.c_void_p) for name in CALLS)
 
 
 def drop_parts(socket: zmq.Socket[Any], max_count: int) -> tuple[int, bool]:
@@ -33,7 +31,7 @@ def drop_parts(socket: zmq.Socket[Any], max_count: int) -> tuple[int, bool]:
     Parameters
     ----------
     socket : zmq.Socket
-        Socket in the middle of a message: the last part received had `more` set.
+        Socket of which a message was read in part: its last part had `more` set.
     max_count : int
         Maximum number of parts to drop.
 
@@ -57,7 +55,7 @@ def drop_parts(socket: zmq.Socket[Any], max_count: int) -> tuple[int, bool]:
 
 
 def drop_parts_in_python(socket: zmq.Socket[Any], max_count: int) -> tuple[int, bool]:
-    """Do the same as `drop_parts`, without the compiled loop."""
+    """Implement `drop_parts` without the compiled loop."""
     receive = socket.recv
     for count in range(1, max_count + 1):
         if not receive(copy=False).more:

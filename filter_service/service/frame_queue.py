@@ -1,6 +1,6 @@
-"""Queue of frames: from the clients to the render worker, and the replies back.
+"""Queue of frames to one render worker, and their replies.
 
-Every frame is answered once.  The order depends on the time that each client has used.
+Every frame gets one reply.  The order depends on the time that each client has used.
 """
 
 from __future__ import annotations
@@ -15,17 +15,25 @@ from filter_service.service.connections import Peer
 from filter_service.service.fair_queue import FairQueue
 from filter_service.service.image_positions import check_positions
 from filter_service.service.load import Load
-from filter_service.service.render_client import Held, RenderClient, Unsent, completed
+from filter_service.service.render_client import (
+    InFlightFrame,
+    RenderClient,
+    UnsentResults,
+    completed,
+)
 from filter_service.service.router import Tracker
 from filter_service.service.session import Session, WaitingFrame
 
-MAX_UNSENT_RESULTS = 4  # large replies that a client has not read; bounds memory
-MARK_SENT_S = 0.03  # less than most frames take to filter
-SOON_S = 0.002
+MAX_UNSENT_RESULTS = 4  # results that a client has not read; limits memory
+SENT_GRACE_S = 0.03
+"""Time in which pyzmq's thread may mark results as sent before their client counts as a
+slow consumer; most frames take longer to filter."""
+
+RECHECK_INTERVAL_S = 0.002
 RETRY_AFTER_MS = 100.0
 """Delay after which a client may retry a dropped frame."""
 
-Answer = Result | Dropped | ErrorReply
+FrameReply = Result | Dropped | ErrorReply
 
 
 class FrameQueue:
@@ -34,10 +42,10 @@ class FrameQueue:
     Parameters
     ----------
     sessions : callable
-        Returns the sessions on this device that have a client.
+        Returns the sessions on this device with a connected client.
     render : RenderClient
     send : callable
-        ``send(peer, reply)`` returns the tracker of a large reply.
+        ``send(peer, reply)`` sends a reply, and returns a tracker if it is large.
 
     Attributes
     ----------
@@ -61,80 +69,84 @@ class FrameQueue:
         self._render = render
         self._send = send
         self._queue: FairQueue[str] = FairQueue()
-        self._leaving: Unsent = []  # results sent to clients that are gone
+        self._orphaned: UnsentResults = []  # being sent to vanished clients
 
     def wait_s(self, now_s: float) -> float | None:
-        """Return the time until a frame may be handed over; None if no frame waits."""
-        takeable = [s for s in self._sessions() if self._is_takeable(s)]
-        if any(self._is_ready(session, now_s) for session in takeable):
+        """Return the time until a frame may be submitted; None if none is queued."""
+        ready_for_worker = [s for s in self._sessions() if self._can_submit(s)]
+        if any(self._is_ready(session, now_s) for session in ready_for_worker):
             return 0.0
-        return SOON_S if takeable else None
+        return RECHECK_INTERVAL_S if ready_for_worker else None
 
     @property
     def is_idle(self) -> bool:
-        """Return whether no frame waits or is being filtered."""
+        """Return whether no frame is queued or being filtered."""
         waits = any(session.waiting for session in self._sessions())
-        return not waits and not self._render.held
+        return not waits and not self._render.in_flight
 
-    def tidy(self) -> None:
+    def reclaim_sent(self) -> None:
         """Reclaim the memory of results that have been sent."""
-        self._leaving = self._render.still_unsent(self._leaving)
+        self._orphaned = self._render.release_sent(self._orphaned)
 
-    def leave(self, session: Session) -> None:
-        """Handle a vanished client, which may never read the results being sent."""
-        self._leaving += session.unsent
+    def disconnect(self, session: Session) -> None:
+        """Keep results for a vanished client until libzmq has released them."""
+        self._orphaned += session.unsent
         session.unsent = []
 
     def forget(self, session: Session) -> None:
         """Forget the time that a session has used."""
         self._queue.forget(session.key)
 
-    def take_in(
+    def enqueue(
         self, session: Session, frame: Frame, received_s: float
     ) -> Frame | None:
-        """Queue a frame as its client's newest; return the frame that it supersedes."""
+        """Queue a frame as its client's newest; return the frame that it supersedes.
+
+        Raises
+        ------
+        BadMessage
+            If its positions in shared memory are invalid.
+        CreditExceeded
+            If the client has too many unanswered frames.
+        """
         check_positions(session, frame)
         waiting = WaitingFrame(frame, received_s, time.monotonic())
-        superseded = session.take_in(waiting)
-        session.lend(frame)
-        self._queue.arrive(session.key)
+        superseded = session.enqueue(waiting)
+        session.mark_in_use(frame)
+        self._queue.mark_waiting(session.key)
         return None if superseded is None else superseded.frame
 
-    def _is_takeable(self, session: Session) -> bool:
+    def _can_submit(self, session: Session) -> bool:
         waiting = session.waiting
-        return waiting is not None and self._render.takes(session, waiting.frame)
+        return waiting is not None and self._render.can_accept(session, waiting.frame)
 
     def _is_ready(self, session: Session, now_s: float) -> bool:
-        """Return whether to hand a session's frame over, or to drop it.
-
-        A pyzmq thread marks results as sent.  It is given a moment before the client
-        counts as a slow consumer.
-        """
-        session.unsent = self._render.still_unsent(session.unsent)
-        if not self._is_behind(session):
-            session.behind_since_s = None
+        """Return whether to submit or drop a session's frame now."""
+        session.unsent = self._render.release_sent(session.unsent)
+        if not self._is_slow_consumer(session):
+            session.slow_since_s = None
             return True
-        if session.behind_since_s is None:
-            session.behind_since_s = now_s
-        return now_s - session.behind_since_s > MARK_SENT_S
+        if session.slow_since_s is None:
+            session.slow_since_s = now_s
+        return now_s - session.slow_since_s > SENT_GRACE_S
 
-    def _is_behind(self, session: Session) -> bool:
-        """Return whether a client has too many unread results to get another."""
+    def _is_slow_consumer(self, session: Session) -> bool:
+        """Return whether a client has too many unread results."""
         n_bytes = sum(slot.size_bytes for _, slot in session.unsent)
         return (
             len(session.unsent) >= MAX_UNSENT_RESULTS
             or n_bytes > self._render.session_quota_bytes
         )
 
-    def submit_one(self) -> None:
-        """Hand over the next frame by fair queuing, if any may be handed over."""
+    def submit_next(self) -> None:
+        """Submit the next frame to the worker, or drop it, if one is ready."""
         now_s = time.monotonic()
         ready = {
             s.key: s
             for s in self._sessions()
-            if self._is_takeable(s) and self._is_ready(s, now_s)
+            if self._can_submit(s) and self._is_ready(s, now_s)
         }
-        key = self._queue.next_of(ready)
+        key = self._queue.pop_next(ready)
         if key is None:
             return
         session = ready[key]
@@ -142,80 +154,90 @@ class FrameQueue:
         if waiting is None:
             return
         frame = waiting.frame
-        if self._is_behind(session):
+        if self._is_slow_consumer(session):
             dropped = Dropped(frame.frame_id, "slow_consumer")
-            self.answer(session, frame, dropped)
+            self.reply(session, frame, dropped)
             return
         try:
             self._render.submit(session, waiting)
         except OutOfMemory as error:
             failed = ErrorReply.from_exception(error, frame_id=frame.frame_id)
-            self.answer(session, frame, failed)
+            self.reply(session, frame, failed)
 
     def accept_result(
         self,
         number: int,
-        reply: Answer,
+        reply: FrameReply,
         started_s: float,
         ended_s: float,
         used_s: float,
         blocks_bytes: Sequence[int],
     ) -> None:
-        """Pass a reply of the render worker on to its client."""
-        held = self._render.take_back(number)
-        if held is None:
+        """Forward a reply of the render worker to its client."""
+        submitted = self._render.pop_frame(number)
+        if submitted is None:
             return
-        # A frame filtered during another one delayed nobody.
-        here_s = started_s if self._render.held else held.waiting.decoded_s
-        self._queue.note(held.session.key, used_s, here_s, started_s, ended_s)
+        # A frame that is filtered during another one delays no client.
+        queued_since_s = (
+            started_s if self._render.in_flight else submitted.waiting.decoded_s
+        )
+        self._queue.record_frame(
+            submitted.session.key, used_s, queued_since_s, started_s, ended_s
+        )
         self.filtered_s += used_s
-        self.load.note(used_s, ended_s)
+        self.load.add(used_s, ended_s)
         if isinstance(reply, Result):
-            reply = completed(reply, held, started_s, blocks_bytes)
+            reply = completed(reply, submitted, started_s, blocks_bytes)
         elif isinstance(reply, Dropped):
             reply = replace(reply, retry_after_ms=RETRY_AFTER_MS)
-        tracker = self._answer_held(held, reply)
-        if not held.own_slots:
+        tracker = self._reply_in_flight(submitted, reply)
+        if not submitted.pool_slots:
             return
-        slot, result_slot = held.own_slots
-        self._render.give_back(slot)
+        slot, result_slot = submitted.pool_slots
+        self._render.release(slot)
         if tracker is None:
-            self._render.give_back(result_slot)
-        elif held.session.peer is None:
-            self._leaving.append((tracker, result_slot))
+            self._render.release(result_slot)
+        elif submitted.session.peer is None:
+            self._orphaned.append((tracker, result_slot))
         else:
-            held.session.unsent.append((tracker, result_slot))
+            submitted.session.unsent.append((tracker, result_slot))
 
-    def _answer_held(self, held: Held, answer: Answer) -> Tracker | None:
-        """Answer a frame if its client is still on the same connection."""
-        if held.peer is None or held.session.peer != held.peer:
+    def _reply_in_flight(
+        self, submitted: InFlightFrame, reply: FrameReply
+    ) -> Tracker | None:
+        """Reply to a submitted frame if its client is still on the same connection."""
+        if submitted.peer is None or submitted.session.peer != submitted.peer:
             return None
-        return self.answer(held.session, held.waiting.frame, answer)
+        return self.reply(submitted.session, submitted.waiting.frame, reply)
 
-    def answer(self, session: Session, frame: Frame, answer: Answer) -> Tracker | None:
-        """Answer a frame that counts against the credit."""
+    def reply(
+        self, session: Session, frame: Frame, reply: FrameReply
+    ) -> Tracker | None:
+        """Reply to a frame, and return its credit to the client."""
         if session.peer is None:
-            return None  # its client is away
+            return None  # its client has disconnected
         session.n_unanswered = max(0, session.n_unanswered - 1)
-        session.get_back(frame)
-        if isinstance(answer, Result):
+        session.mark_free(frame)
+        if isinstance(reply, Result):
             self.n_rendered += 1
         else:
             self.n_dropped += 1
-        return self._send(session.peer, answer)
+        return self._send(session.peer, reply)
 
-    def lose_waiting(self, session: Session) -> None:
-        """Answer a session's waiting frame with an error: its device is gone."""
+    def fail_waiting(self, session: Session) -> None:
+        """Reply to a session's queued frame with an error: its device has failed."""
         waiting, session.waiting = session.waiting, None
         if waiting is not None:
-            error = RenderFailed("the device that filtered these frames failed")
+            error = RenderFailed("the device of this session failed")
             frame = waiting.frame
             failed = ErrorReply.from_exception(error, frame_id=frame.frame_id)
-            self.answer(session, frame, failed)
+            self.reply(session, frame, failed)
 
-    def lose_held(self) -> None:
-        """Answer the frames that were lost with a render worker."""
-        for lost in self._render.lose():
-            error = RenderFailed("the render worker ended and is being restarted")
+    def fail_in_flight(self) -> None:
+        """Reply with an error to the frames that were lost with a render worker."""
+        for lost in self._render.disconnect():
+            error = RenderFailed("the render worker exited and is being restarted")
             frame_id = lost.waiting.frame.frame_id
-            self._answer_held(lost, ErrorReply.from_exception(error, frame_id=frame_id))
+            self._reply_in_flight(
+                lost, ErrorReply.from_exception(error, frame_id=frame_id)
+            )

@@ -1,4 +1,4 @@
-"""The reply to a frame."""
+"""Filtering of a frame, and its reply."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from filter_service.wire.images import OUTPUT_OF_FORMAT
 MS_PER_S = 1000.0
 
 PSF_BUDGET_S = 1.0
-"""Time limit of a frame for computing PSFs; beyond it the frame is dropped; the next
-one continues.  A first frame of 1280x720 takes 0.3 to 0.7 s of two cores."""
+"""Time limit of a frame for computing PSFs, beyond which it is dropped.  The next frame
+keeps what was computed.  A first frame of 1280x720 takes 0.3 to 0.7 s of two cores."""
 
 log = logging.getLogger("ocufilter")
 
@@ -40,8 +40,15 @@ def frame_reply(
 ) -> Result | Dropped | ErrorReply:
     """Filter a frame and return the reply; any failure becomes an error reply.
 
-    The pictures may have been written to ``out``.  The caller sets ``total_ms``,
-    because it knows when the frame arrived.
+    The caller sets ``total_ms``, because it knows when the frame arrived.
+
+    Parameters
+    ----------
+    filter_of : callable
+        Returns the filter of an eye.
+    frame : Frame
+    out : sequence of arrays, optional
+        Output arrays, (height, width, 3) each, that the engine may write to.
     """
     started_s = time.monotonic()
     try:
@@ -58,7 +65,7 @@ def frame_reply(
         )
         if planned is None:
             return Dropped(frame.frame_id, "preparing")
-        seen = planned.render(
+        filtered = planned.render(
             output=OUTPUT_OF_FORMAT[frame.output],
             out=out,
             until_s=started_s + PSF_BUDGET_S,
@@ -69,47 +76,47 @@ def frame_reply(
     except FilterError as error:
         return ErrorReply.from_exception(error, frame_id=frame.frame_id)
     except Exception as error:
-        # The worker serves other clients too, so one frame must not end it.
+        # One frame must not stop the worker, which serves other clients too.
         log.exception("frame %d could not be filtered", frame.frame_id)
         failure = RenderFailed(f"{type(error).__name__}: {error}")
         return ErrorReply.from_exception(failure, frame_id=frame.frame_id)
     total_ms = MS_PER_S * (time.monotonic() - started_s)
-    return _result(frame, seen, total_ms)
+    return _result(frame, filtered, total_ms)
 
 
-def _result(frame: Frame, seen: Filtered, total_ms: float) -> Result:
-    stages_ms = dict(seen.stage_times_ms)
+def _result(frame: Frame, filtered: Filtered, total_ms: float) -> Result:
+    stages_ms = dict(filtered.stage_times_ms)
     stages_ms["filter_other_ms"] = total_ms - sum(stages_ms.values())
-    sent = {field.name for field in fields(Result)}
-    counts: dict[str, Any] = {n: c for n, c in seen.counts.items() if n in sent}
+    names = {field.name for field in fields(Result)}
+    counts: dict[str, Any] = {n: c for n, c in filtered.counts.items() if n in names}
     return Result(
         frame_id=frame.frame_id,
-        profile_id=seen.profile_id,
-        generation=seen.generation,
+        profile_id=filtered.profile_id,
+        generation=filtered.generation,
         views=tuple(
             ResultView(
-                asked.width_px,
-                asked.height_px,
+                header.width_px,
+                header.height_px,
                 frame.output,
-                asked.eye,
+                header.eye,
                 profile_id=found.profile_id,
                 generation=found.generation,
                 is_complete=found.is_complete,
                 pupil_diameter_mm=found.pupil_diameter_mm,
                 focus_dpt=found.focus_dpt,
                 gaze_deg=found.gaze_deg,
-                pose=asked.pose,
+                pose=header.pose,
             )
-            for asked, found in zip(frame.views, seen.views, strict=True)
+            for header, found in zip(frame.views, filtered.views, strict=True)
         ),
-        pupil_diameter_mm=seen.pupil_diameter_mm,
-        focus_dpt=seen.focus_dpt,
-        gaze_deg=seen.gaze_deg,
+        pupil_diameter_mm=filtered.pupil_diameter_mm,
+        focus_dpt=filtered.focus_dpt,
+        gaze_deg=filtered.gaze_deg,
         total_ms=0.0,
         stage_times_ms=stages_ms,
-        notes=seen.notes,
-        is_complete=seen.is_complete,
+        notes=filtered.notes,
+        is_complete=filtered.is_complete,
         display_time_ns=frame.display_time_ns,
-        colors=seen.colors,
+        colors=filtered.colors,
         **counts,
     )

@@ -1,14 +1,14 @@
-"""Main program of the front end; run with ``python -m`` and the link's descriptor."""
+"""Main program of the front end: ``python -m`` with the link's descriptor."""
 
 from __future__ import annotations
 
 import logging
 import resource
 
-import estimator.bounded_files  # noqa: F401  read now: later no file may be opened
+import estimator.bounded_files  # noqa: F401  (later, no descriptor may be free to read it)
 from filter_service.service.front_end import FrontEnd
-from filter_service.service.metrics import NoMetrics
-from filter_service.service.process_startup import begin
+from filter_service.service.metrics import MetricsUnavailable
+from filter_service.service.process_startup import start_process
 
 MB = 10**6
 
@@ -17,9 +17,9 @@ log = logging.getLogger("ocufilter")
 
 def main() -> None:
     """Serve clients until the supervisor sends stop."""
-    supervisor, config, others = begin("front-end")
-    # Parts of incomplete messages are invisible here.  Beyond the limit libzmq ends the
-    # process, which frees its memory; sessions continue.
+    supervisor, config, others = start_process("front-end")
+    # libzmq does not report the size of incomplete messages.  Beyond the limit it
+    # aborts the process, which frees the memory; sessions survive.
     limit = config.max_socket_mb * MB
     try:
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
@@ -27,12 +27,12 @@ def main() -> None:
         log.warning("max_socket_mb has no effect on this system: %s", error)
     try:
         front_end = FrontEnd(config, supervisor)
-    except (OSError, NoMetrics) as error:
+    except (OSError, MetricsUnavailable) as error:
         supervisor.send(("failed", str(error)))
         raise SystemExit(1) from None
     supervisor.send(("ready", front_end.endpoint))
     for message, descriptors in others:
-        front_end.take_control(message, descriptors)
+        front_end.handle_control(message, descriptors)
     front_end.run()
 
 

@@ -19,20 +19,24 @@ def check_positions(session: Session, frame: Frame) -> None:
     Raises
     ------
     BadMessage
+        If a slot is unknown or in use, or images overlap or exceed it.
     """
-    places = frame.memory
-    if places is None:
+    positions = frame.memory
+    if positions is None:
         return
-    for name, number in (("slot", places.slot), ("result_slot", places.result_slot)):
-        if number not in session.shared or number in session.lent:
+    for name, number in (
+        ("slot", positions.slot),
+        ("result_slot", positions.result_slot),
+    ):
+        if number not in session.shared or number in session.slots_in_use:
             raise BadMessage(
                 f"it is {number}",
                 field=f"memory.{name}",
                 allowed="a slot of this session that no other frame uses",
             )
-    if places.slot == places.result_slot:
+    if positions.slot == positions.result_slot:
         raise BadMessage(
-            f"it is {places.slot}, too",
+            f"it is {positions.slot}, too",
             field="memory.result_slot",
             allowed="another than memory.slot",
         )
@@ -41,13 +45,13 @@ def check_positions(session: Session, frame: Frame) -> None:
         for view in frame.views
         for _, shape, dtype in view.images
     ]
-    _check_bounds(session.shared[places.slot], places.starts, sizes, "starts")
-    slot, sizes = session.shared[places.result_slot], result_sizes(frame)
-    _check_bounds(slot, places.result_starts, sizes, "result_starts")
+    _check_bounds(session.shared[positions.slot], positions.starts, sizes, "starts")
+    slot, sizes = session.shared[positions.result_slot], result_sizes(frame)
+    _check_bounds(slot, positions.result_starts, sizes, "result_starts")
 
 
 def result_sizes(frame: Frame) -> list[int]:
-    """Return the maximum size of each view's picture in bytes."""
+    """Return the maximum size of each view's output image in bytes."""
     bytes_per_pixel = frame.output.bytes_per_pixel
     sizes = [view.camera.pixel_count * bytes_per_pixel for view in frame.views]
     if frame.compression == "none":

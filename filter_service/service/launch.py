@@ -1,4 +1,4 @@
-"""Startup of the service: signal handlers and the ready message."""
+"""Startup of the service: signal handlers and readiness."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import partial
 
 from filter_service.atomic_files import write_atomically
-from filter_service.log_lines import FORMAT_VARIABLE, start_log
+from filter_service.log_lines import FORMAT_VARIABLE, configure_logging
 from filter_service.service.config import ServiceConfig
 from filter_service.service.supervisor import OPEN_BUILDER, ServiceFailed, Supervisor
 
@@ -20,17 +20,18 @@ def run(
     config: ServiceConfig,
     *,
     open_builder: str = OPEN_BUILDER,
-    read_again: Callable[[], ServiceConfig] | None = None,
+    reload_config: Callable[[], ServiceConfig] | None = None,
 ) -> None:
-    """Serve until SIGINT or SIGTERM; print one line when ready.
+    """Run the service until SIGINT or SIGTERM; print one line when ready.
 
-    Must run in the main thread.
+    Call it from the main thread.
 
     Parameters
     ----------
+    config : ServiceConfig
     open_builder : str
         ``module:function`` that opens the builder, see `render_worker_process`.
-    read_again : callable, optional
+    reload_config : callable, optional
         Returns the current settings; called at SIGHUP.
 
     Raises
@@ -39,17 +40,17 @@ def run(
         If the service cannot start, or has failed for too long.
     """
     os.environ[FORMAT_VARIABLE] = config.log_format  # for all processes
-    start_log("service")
+    configure_logging("service")
     supervisor = Supervisor(
         config,
         open_builder=open_builder,
-        when_ready=Announcement(config).ready,
-        when_not_ready=partial(_remove_ready_file, config),
-        read_again=read_again,
+        on_ready=ReadyAnnouncement(config).ready,
+        on_not_ready=partial(_remove_ready_file, config),
+        reload_config=reload_config,
     )
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: supervisor.stop())
-    signal.signal(signal.SIGHUP, lambda *_: supervisor.ask_to_read_again())
+    signal.signal(signal.SIGHUP, lambda *_: supervisor.request_reload())
     signal.set_wakeup_fd(supervisor.wake_file_descriptor, warn_on_full_buffer=False)
     try:
         supervisor.run()
@@ -60,7 +61,7 @@ def run(
         _remove_ready_file(config)
 
 
-class Announcement:
+class ReadyAnnouncement:
     """Reports that the service is ready: once on stdout, and in the ready file."""
 
     def __init__(self, config: ServiceConfig) -> None:

@@ -1,25 +1,29 @@
-"""The listening socket, created here where the system offers more than libzmq uses."""
+"""The listening socket, with TCP options that libzmq does not set."""
 
 from __future__ import annotations
 
 import socket
 from pathlib import Path
 
-# Larger than libzmq's 100, so that the first packet of a client is not lost when many
-# connect at once: the system resends it only after a second.
 BACKLOG = 4096
+"""Larger than libzmq's 100: when many clients connect at once, a full backlog loses
+their first packets, which the system resends only after a second."""
+
 DEFER_ACCEPT_S = 5
-"""Minimum time that silent TCP connections wait in the kernel; a ZeroMQ client speaks
-first.  1,500 of them that keep reconnecting then cause at most 200 accepted connections
-per second instead of 5,000."""
+"""Minimum time for which the kernel holds back TCP connections that have sent no data;
+a ZeroMQ client sends first.  1,500 silent clients that keep reconnecting then cause at
+most 200 accepted connections per second instead of 5,000."""
 
 TCP_DEFER_ACCEPT: int | None = getattr(socket, "TCP_DEFER_ACCEPT", None)
 
 
 def check_path_is_free(bind: str) -> None:
-    """Raise FileExistsError if an ``ipc://`` path is a file or a live endpoint.
+    """Check that an ``ipc://`` path is free or a stale socket, which binding replaces.
 
-    Binding removes whatever is at the path, so only a stale socket may be there.
+    Raises
+    ------
+    FileExistsError
+        If it is another file, or a service listens on it.
     """
     if not bind.startswith("ipc://"):
         return
@@ -46,7 +50,7 @@ def socket_family(bind: str) -> socket.AddressFamily:
 def deferring_listener(bind: str) -> socket.socket | None:
     """Return a TCP socket that accepts connections once their clients have sent data.
 
-    Return None for other transports, and for interface names, which only libzmq knows.
+    Return None for other transports, and for interface names, which libzmq resolves.
 
     Raises
     ------

@@ -8,20 +8,20 @@ WINDOW_S = 10.0
 
 
 class Load:
-    """Exponentially decaying sum of the time used."""
+    """Exponentially decaying sum of the time that a device was busy."""
 
     def __init__(self) -> None:
-        self._used_s = 0.0
+        self._busy_s = 0.0
         self._at_s = 0.0
 
-    def note(self, used_s: float, now_s: float) -> None:
-        """Add time that was used until now."""
-        self._used_s = self._left_s(now_s) + used_s
+    def add(self, busy_s: float, now_s: float) -> None:
+        """Add busy time that ended now."""
+        self._busy_s = self._decayed_s(now_s) + busy_s
         self._at_s = now_s
 
     def busy_ratio(self, now_s: float) -> float:
-        """Return the used share of the last seconds, 0 to 1."""
-        return min(1.0, self._left_s(now_s) / WINDOW_S)
+        """Return the busy share of about the last `WINDOW_S`, 0 to 1."""
+        return min(1.0, self._decayed_s(now_s) / WINDOW_S)
 
-    def _left_s(self, now_s: float) -> float:
-        return self._used_s * math.exp(min(0.0, self._at_s - now_s) / WINDOW_S)
+    def _decayed_s(self, now_s: float) -> float:
+        return self._busy_s * math.exp(min(0.0, self._at_s - now_s) / WINDOW_S)

@@ -12,33 +12,40 @@ REQUEST_LIMIT_S = 1.0
 METRICS = {
     # name: description; a suffix _total marks a counter
     "ocufilter_ready": "1 while frames can be filtered",
-    "ocufilter_degraded": "1 while a process keeps ending or a device is unavailable",
+    "ocufilter_degraded": "1 while a process keeps exiting or a device is unavailable",
     "ocufilter_connections": "open connections, with a session or without",
-    "ocufilter_connections_evicted_total": "closed because too many were open",
+    "ocufilter_connections_evicted_total": "connections closed beyond the limit",
     "ocufilter_sessions": "sessions with a client",
-    "ocufilter_sessions_away": "sessions whose client disconnected and may reconnect",
-    "ocufilter_frames_filtered_total": "frames answered with a picture",
-    "ocufilter_frames_dropped_total": "frames answered without",
-    "ocufilter_filter_seconds_total": "time in which frames were filtered",
-    "ocufilter_messages_unheard_total": "messages ignored from clients that sent too "
-    "many invalid ones",
+    "ocufilter_sessions_away": "sessions whose client disconnected and may resume",
+    "ocufilter_frames_filtered_total": "frames that were filtered",
+    "ocufilter_frames_dropped_total": "frames that were dropped or failed",
+    "ocufilter_filter_seconds_total": "time spent on filtering frames",
+    "ocufilter_messages_unheard_total": "messages ignored because of the rate limit",
     "ocufilter_faults_total": "unexpected errors of the service",
-    "ocufilter_memory_bytes": "memory of the door and the process that filters",
-    "ocufilter_psfs_bytes": "of that, the PSFs of all clients",
-    "ocufilter_render_silent_seconds": "since the last heartbeat of the render worker",
+    "ocufilter_memory_bytes": "memory of the front end and the render workers",
+    "ocufilter_psfs_bytes": "part of it that is used by PSFs",
+    "ocufilter_render_silent_seconds": "time since the last worker heartbeat",
 }
 
 
-class NoMetrics(Exception):
-    """The Prometheus client is not installed, or the port is taken."""
+class MetricsUnavailable(Exception):
+    """The Prometheus client is not installed, or the port is in use."""
 
 
 def serve_metrics(port: int, values: Callable[[], dict[str, float]]) -> Any:
     """Serve the values of `METRICS` in a thread; return the server.
 
+    Parameters
+    ----------
+    port : int
+        Port on 127.0.0.1.
+    values : callable
+        Returns the current values by name; called from the thread.
+
     Raises
     ------
-    NoMetrics
+    MetricsUnavailable
+        If prometheus-client is not installed, or the port is in use.
     """
     try:
         from wsgiref.simple_server import WSGIRequestHandler, make_server
@@ -46,7 +53,7 @@ def serve_metrics(port: int, values: Callable[[], dict[str, float]]) -> Any:
         from prometheus_client import CollectorRegistry, make_wsgi_app
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
     except ImportError:
-        raise NoMetrics(
+        raise MetricsUnavailable(
             "metrics_port is set, but prometheus-client is not installed: "
             "pip install 'ocufilter[metrics]'"
         ) from None
@@ -72,6 +79,6 @@ def serve_metrics(port: int, values: Callable[[], dict[str, float]]) -> Any:
         # anyone who connects could use up descriptors and memory.
         server = make_server(HOST, port, make_wsgi_app(registry), handler_class=Handler)
     except OSError as error:
-        raise NoMetrics(f"metrics_port is {port}: {error.strerror}") from None
+        raise MetricsUnavailable(f"metrics_port is {port}: {error.strerror}") from None
     threading.Thread(target=server.serve_forever, daemon=True).start()
     return server

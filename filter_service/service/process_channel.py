@@ -1,6 +1,6 @@
 """Messages, with file descriptors, between two processes of the service.
 
-Neither side waits for the other: what the socket does not accept stays in a queue.
+Sending never blocks: what the socket does not accept stays in a queue.
 Messages are pickled, which is safe because both processes belong to the service.
 """
 
@@ -21,11 +21,11 @@ READ_BYTES = 1 << 18
 
 
 class LinkClosed(Exception):
-    """The other process is gone."""
+    """The other process has closed its end, usually because it exited."""
 
 
 class Link:
-    """One end of a link.
+    """One end of a link between two processes.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class Link:
 
     @classmethod
     def pair(cls) -> tuple[Self, socket.socket]:
-        """Return our end as a link, and the other one as a socket for a new process."""
+        """Return one end as a link, and the other as a socket for a new process."""
         ours, theirs = socket.socketpair()
         return cls(ours), theirs
 
@@ -72,12 +72,13 @@ class Link:
         Raises
         ------
         LinkClosed
+            If the other end is closed.
         """
         body = pickle.dumps(message, protocol=5)
         data = memoryview(HEAD.pack(len(body), len(descriptors)) + body)
         if not self._unsent:
             # Most messages are sent at once, and duplicating a descriptor may fail.
-            count = self._sent(data, descriptors)
+            count = self._send_some(data, descriptors)
             if count == len(data):
                 return
             data, descriptors = data[count:], () if count else descriptors
@@ -89,10 +90,11 @@ class Link:
         Raises
         ------
         LinkClosed
+            If the other end is closed.
         """
         while self._unsent:
             data, descriptors = self._unsent[0]
-            count = self._sent(data, descriptors)
+            count = self._send_some(data, descriptors)
             if count == 0:
                 return
             for descriptor in descriptors:
@@ -102,13 +104,8 @@ class Link:
             else:
                 self._unsent.popleft()
 
-    def _sent(self, data: memoryview, descriptors: Sequence[int]) -> int:
-        """Send as much of a message as the socket accepts; return the number of bytes.
-
-        Raises
-        ------
-        LinkClosed
-        """
+    def _send_some(self, data: memoryview, descriptors: Sequence[int]) -> int:
+        """Send what the socket accepts of a message; return the number of bytes."""
         try:
             if descriptors:
                 return socket.send_fds(self._socket, [data], descriptors)
@@ -127,7 +124,7 @@ class Link:
             If the other end closed the connection and all its messages were returned.
         """
         is_closed = self._read()
-        messages = self._complete()
+        messages = self._pop_messages()
         if is_closed and not messages:
             raise LinkClosed("the other end closed the connection")
         return messages
@@ -148,21 +145,21 @@ class Link:
                 return True
             self._received += data
 
-    def _complete(self) -> list[tuple[Any, list[int]]]:
+    def _pop_messages(self) -> list[tuple[Any, list[int]]]:
         messages = []
-        start, held = 0, memoryview(self._received)
-        while len(held) - start >= HEAD.size:
-            length, count = HEAD.unpack_from(held, start)
+        start, view = 0, memoryview(self._received)
+        while len(view) - start >= HEAD.size:
+            length, count = HEAD.unpack_from(view, start)
             end = start + HEAD.size + length
-            if len(held) < end:
+            if len(view) < end:
                 break
-            if len(self._descriptors) < count:  # the system had no free ones
-                raise LinkClosed("descriptors of a message are lost")
-            message = pickle.loads(held[start + HEAD.size : end])
+            if len(self._descriptors) < count:  # this process had none free
+                raise LinkClosed("descriptors of a message were lost")
+            message = pickle.loads(view[start + HEAD.size : end])
             descriptors = [self._descriptors.popleft() for _ in range(count)]
             messages.append((message, descriptors))
             start = end
-        held.release()
+        view.release()
         del self._received[:start]
         return messages
 

@@ -25,7 +25,7 @@ def resident_memory_mb() -> float:
     return pages * resource.getpagesize() / 1e6
 
 
-def give_memory_back() -> None:
+def trim_heap() -> None:
     """Return freed memory to the system (glibc; does nothing elsewhere)."""
     with suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

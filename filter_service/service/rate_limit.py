@@ -1,4 +1,4 @@
-"""Rate limits of a connection, beyond which it is ignored or closed."""
+"""Rate limit of a connection, beyond which it is ignored, then closed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ MAX_REFUSALS = 100
 """Refused messages per window, beyond which the rest of the window is ignored."""
 
 MAX_REQUESTS = 200
-"""Likewise for messages other than frames; each costs the front end about 0.1 ms."""
+"""The same for messages other than frames; each takes the front end about 0.1 ms."""
 
 MAX_IGNORED = 400
 """Ignored messages per window, beyond which the connection is closed.  Reading and
@@ -42,13 +42,13 @@ class RateLimit:
         return Verdict.IGNORE if self._n_ignored <= MAX_IGNORED else Verdict.CLOSE
 
     def exhaust(self) -> None:
-        """Make the next message within the window close the connection."""
+        """Exhaust the limit: the next message in the window closes the connection."""
         self._n_refusals, self._n_ignored = MAX_REFUSALS, MAX_IGNORED
 
-    def note_refusal(self) -> None:
-        """Count a message that was refused, here or by another process."""
+    def count_refusal(self) -> None:
+        """Count a refused message."""
         self._n_refusals += 1
 
-    def note_request(self) -> None:
+    def count_request(self) -> None:
         """Count a message other than a frame."""
         self._n_requests += 1

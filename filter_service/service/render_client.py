@@ -1,7 +1,8 @@
-"""Render client: the front end's link to a render worker, with memory and frames.
+"""Render client: the front end's side of a render worker.
 
-Messages of the worker come from `receive`.  Messages sent while there is no worker are
-lost; the front end sends their content again to the next one.
+It sends frames and profiles over a link, and allocates the shared memory of images.
+Messages that are sent while no worker is running are lost; the front end sends their
+content again to the next worker.
 """
 
 from __future__ import annotations
@@ -23,35 +24,35 @@ from filter_service.service.image_positions import result_sizes
 from filter_service.service.process_channel import Link, LinkClosed
 from filter_service.service.router import Tracker
 from filter_service.service.session import Session, WaitingFrame
-from filter_service.shared_memory import Slot, SlotPool, starts_of
+from filter_service.shared_memory import Slot, SlotPool, aligned_starts
 
 MS_PER_S = 1000.0
 
-SMALLER_RATIO = 4
-"""Ratio of pixels from which a frame may be filtered during a larger one."""
+MIN_PIXEL_RATIO = 4
+"""A frame may be filtered during one with at least this many times its pixels."""
 
 SESSION_QUOTA = 0.25
-"""Share of the image memory that one session may share, or leave unread."""
+"""Largest share of the image memory for one session's slots, or its unread results."""
 
 SHARED_QUOTA = 0.5
-"""Share of it that all clients may share; the rest is for frames sent as parts."""
+"""Largest share for the slots of all sessions; the rest is for frames sent as parts."""
 
 MB = 1e6
 
-Unsent = list[tuple[Tracker, Slot]]
+UnsentResults = list[tuple[Tracker, Slot]]
 
 
 @dataclass(frozen=True)
-class Held:
-    """A frame that the render worker has."""
+class InFlightFrame:
+    """A frame that the render worker has not answered yet."""
 
     number: int
     session: Session
     peer: Peer | None
     waiting: WaitingFrame
     places: SharedPlaces
-    own_slots: tuple[Slot, ...]  # the service's: sent, then returned to the pool
-    handed_s: float
+    pool_slots: tuple[Slot, ...]  # from the pool, for images sent as parts
+    submitted_s: float
 
 
 class RenderClient:
@@ -65,48 +66,51 @@ class RenderClient:
 
     Attributes
     ----------
-    held : dict of Held
-        Frames being filtered, by number: one, or a large one and a small one that is
+    in_flight : dict of InFlightFrame
+        Frames in the worker, by number: one, or a large one and a small one that is
         filtered during it.
-    may_rest : bool
+    can_interrupt : bool
         Whether the worker can filter a small frame during a large one.
     is_ready : bool
-        Whether the worker has reported its eyes and received the others.
+        Whether the worker has reported its eyes and received the missing ones.
     """
 
     def __init__(self, max_image_bytes: int, descriptors: DescriptorLimit) -> None:
-        self.held: dict[int, Held] = {}
+        self.in_flight: dict[int, InFlightFrame] = {}
         self.is_ready = False
-        self.may_rest = False
+        self.can_interrupt = False
         self._link: Link | None = None
         self._slots = SlotPool(
             max_image_bytes, descriptors.max_slots, descriptors.reserve
         )
-        self._shared: set[int] = set()  # numbers of the clients' slots
+        self._shared: set[int] = set()  # numbers of slots that clients use
         self._next_number = 1
-        self._heard_s = self._excused_s = time.monotonic()
+        self._last_heard_s = self._timeout_from_s = time.monotonic()
 
     # The link
 
     @property
     def is_up(self) -> bool:
-        """Return whether there is a render worker."""
+        """Return whether a render worker is connected."""
         return self._link is not None
 
     @property
     def silent_s(self) -> float:
         """Return the seconds since the worker's last heartbeat."""
-        return time.monotonic() - self._heard_s
+        return time.monotonic() - self._last_heard_s
 
     @property
-    def stuck_s(self) -> float:
-        """Return how long the worker has been silent, or has had a frame."""
-        begins_s = [self._heard_s, *(held.handed_s for held in self.held.values())]
-        return time.monotonic() - max(min(begins_s), self._excused_s)
+    def unresponsive_s(self) -> float:
+        """Return how long the worker has been silent, or busy with one frame."""
+        begins_s = [
+            self._last_heard_s,
+            *(frame.submitted_s for frame in self.in_flight.values()),
+        ]
+        return time.monotonic() - max(min(begins_s), self._timeout_from_s)
 
-    def excuse(self) -> None:
-        """Restart the timeout, because the stuck worker is being handled."""
-        self._excused_s = self._heard_s = time.monotonic()
+    def restart_timeout(self) -> None:
+        """Restart the timeout while a hung worker is being restarted."""
+        self._timeout_from_s = self._last_heard_s = time.monotonic()
 
     def descriptors(self) -> tuple[set[int], set[int]]:
         """Return the descriptors to poll for reading and for writing."""
@@ -115,11 +119,11 @@ class RenderClient:
         found = {self._link.fileno()}
         return found, found if self._link.has_unsent else set()
 
-    def join(self, link: Link) -> None:
+    def connect(self, link: Link) -> None:
         """Connect to a new render worker and send it all slots."""
         self._link = link
         self.is_ready = False
-        self.excuse()
+        self.restart_timeout()
         for slot in self._slots:
             self._send_slot(slot)
 
@@ -129,29 +133,29 @@ class RenderClient:
         Raises
         ------
         LinkClosed
-            If the worker is gone; the caller then calls `lose`.
+            If the worker has exited; the caller then calls `disconnect`.
         """
         if self._link is None:
             return []
         self._link.flush()
         messages = [message for message, _ in self._link.receive()]
         if messages:
-            self._heard_s = time.monotonic()
+            self._last_heard_s = time.monotonic()
         return messages
 
-    def lose(self) -> list[Held]:
+    def disconnect(self) -> list[InFlightFrame]:
         """Close the link; return the frames that are lost with it."""
         if self._link is not None:
             self._link.close()
             self._link = None
         self.is_ready = False
-        lost, self.held = list(self.held.values()), {}
-        for held in lost:
-            self.give_back(*held.own_slots)
+        lost, self.in_flight = list(self.in_flight.values()), {}
+        for frame in lost:
+            self.release(*frame.pool_slots)
         return lost
 
-    def tell(self, *message: Any) -> None:
-        """Send a message; ignores a closed link, which `receive` reports."""
+    def send(self, *message: Any) -> None:
+        """Send a message; ignore a closed link, which `receive` reports."""
         if self._link is not None:
             with contextlib.suppress(LinkClosed):
                 self._link.send(message)
@@ -160,28 +164,28 @@ class RenderClient:
 
     @property
     def session_quota_bytes(self) -> int:
-        """Return the memory that one session may hold between its frames, bytes."""
+        """Return the size limit of one session's slots, or of its unread results."""
         return int(SESSION_QUOTA * self._slots.max_bytes)
 
     def share(self, size_bytes: int) -> Slot:
-        """Return a slot that no other client has had.
+        """Return a new slot for a client; memory is never passed between clients.
 
         Raises
         ------
         OutOfMemory
-            Also if only the memory reserved for frames sent as parts is left.
+            If the limit of shared memory is reached, or the system has none left.
         """
-        held = [slot for slot in self._slots if slot.number in self._shared]
+        shared = [slot for slot in self._slots if slot.number in self._shared]
         most_bytes = int(SHARED_QUOTA * self._slots.max_bytes)
-        held_bytes = sum(slot.size_bytes for slot in held)
-        if held_bytes + size_bytes > most_bytes:
+        shared_bytes = sum(slot.size_bytes for slot in shared)
+        if shared_bytes + size_bytes > most_bytes:
             raise OutOfMemory(
-                f"{size_bytes / MB:.0f} MB more than the {held_bytes / MB:.0f} MB that "
-                "clients share are asked for",
-                allowed=f"{most_bytes / MB:.0f} MB in all",
+                f"{size_bytes / MB:.0f} MB requested in addition to "
+                f"{shared_bytes / MB:.0f} MB that clients share",
+                allowed=f"{most_bytes / MB:.0f} MB in total",
             )
-        if len(held) >= self._slots.max_count * SHARED_QUOTA:
-            raise OutOfMemory(f"{len(held)} blocks of memory are already shared")
+        if len(shared) >= self._slots.max_count * SHARED_QUOTA:
+            raise OutOfMemory(f"all {len(shared)} slots of shared memory are in use")
         slot = self._slots.create(size_bytes)
         self._shared.add(slot.number)
         self._send_slot(slot)
@@ -191,30 +195,30 @@ class RenderClient:
         """Free a slot permanently."""
         self._shared.discard(slot.number)
         self._slots.drop(slot)
-        self.tell("drop_slot", slot.number)
+        self.send("drop_slot", slot.number)
 
-    def give_back(self, *slots: Slot) -> None:
+    def release(self, *slots: Slot) -> None:
         """Return slots to the pool, for other frames."""
         for slot in slots:
-            self._slots.give_back(slot)
+            self._slots.release(slot)
 
     def trim(self) -> None:
         """Free the unused slots of the pool."""
         for slot in self._slots.trim():
-            self.tell("drop_slot", slot.number)
+            self.send("drop_slot", slot.number)
 
-    def still_unsent(self, unsent: Unsent) -> Unsent:
-        """Return results that libzmq is still reading; free the slots of the others."""
+    def release_sent(self, unsent: UnsentResults) -> UnsentResults:
+        """Release the slots of results that were sent; return the other results."""
         left = []
         for tracker, slot in unsent:
             if tracker.done:
-                self.give_back(slot)
+                self.release(slot)
             else:
                 left.append((tracker, slot))
         return left
 
     def _slot_for(self, size_bytes: int) -> Slot:
-        slot, is_new = self._slots.take(size_bytes)
+        slot, is_new = self._slots.acquire(size_bytes)
         if is_new:
             self._send_slot(slot)
         return slot
@@ -229,14 +233,14 @@ class RenderClient:
 
     # Frames
 
-    def takes(self, session: Session, frame: Frame) -> bool:
+    def can_accept(self, session: Session, frame: Frame) -> bool:
         """Return whether the worker can accept a frame now."""
-        if not self.is_ready or len(self.held) >= (2 if self.may_rest else 1):
+        if not self.is_ready or len(self.in_flight) >= (2 if self.can_interrupt else 1):
             return False
         return all(
-            held.session is not session
-            and SMALLER_RATIO * frame.pixel_count <= held.waiting.frame.pixel_count
-            for held in self.held.values()
+            other.session is not session
+            and MIN_PIXEL_RATIO * frame.pixel_count <= other.waiting.frame.pixel_count
+            for other in self.in_flight.values()
         )
 
     def submit(self, session: Session, waiting: WaitingFrame) -> None:
@@ -245,33 +249,34 @@ class RenderClient:
         Raises
         ------
         OutOfMemory
+            If no slot for its images can be allocated.
         """
         frame = waiting.frame
         places = frame.memory
-        own_slots: tuple[Slot, ...] = ()
+        pool_slots: tuple[Slot, ...] = ()
         if places is None:
-            places, own_slots = self._copied_in(frame)
+            places, pool_slots = self._copy_images(frame)
         number, self._next_number = self._next_number, self._next_number + 1
-        self._heard_s = now_s = time.monotonic()
-        self.held[number] = Held(
-            *(number, session, session.peer, waiting, places, own_slots),
-            handed_s=now_s,
+        self._last_heard_s = now_s = time.monotonic()
+        self.in_flight[number] = InFlightFrame(
+            *(number, session, session.peer, waiting, places, pool_slots),
+            submitted_s=now_s,
         )
         arrays = [array for images in frame.images for array in images.arrays]
         sizes_bytes = [array.nbytes for array in arrays]
         bare = replace(frame, images=(), memory=None)
-        self.tell("frame", number, session.key, bare, places, sizes_bytes)
+        self.send("frame", number, session.key, bare, places, sizes_bytes)
 
-    def _copied_in(self, frame: Frame) -> tuple[SharedPlaces, tuple[Slot, ...]]:
-        """Copy the images of a frame to the service's own slots."""
+    def _copy_images(self, frame: Frame) -> tuple[SharedPlaces, tuple[Slot, ...]]:
+        """Copy the images of a frame to slots of the pool."""
         images = frame.parts()
-        starts, n_in = starts_of([image.nbytes for image in images])
-        result_starts, n_out = starts_of(result_sizes(frame))
+        starts, n_in = aligned_starts([image.nbytes for image in images])
+        result_starts, n_out = aligned_starts(result_sizes(frame))
         slot = self._slot_for(n_in)
         try:
             result_slot = self._slot_for(n_out)
         except OutOfMemory:
-            self.give_back(slot)
+            self.release(slot)
             raise
         slot.put(images, starts)
         places = SharedPlaces(
@@ -279,23 +284,23 @@ class RenderClient:
         )
         return places, (slot, result_slot)
 
-    def take_back(self, number: int) -> Held | None:
-        """Return the frame that a reply belongs to, or None if it is not expected."""
-        return self.held.pop(number, None)
+    def pop_frame(self, number: int) -> InFlightFrame | None:
+        """Return the frame of a reply; None if it was given up meanwhile."""
+        return self.in_flight.pop(number, None)
 
 
 def completed(
-    result: Result, held: Held, started_s: float, blocks_bytes: Sequence[int]
+    result: Result, frame: InFlightFrame, started_s: float, blocks_bytes: Sequence[int]
 ) -> Result:
-    """Return a result with its pictures and the times known to the front end."""
-    if held.own_slots:
-        _, slot = held.own_slots
+    """Return a result with its images and the times known to the front end."""
+    if frame.pool_slots:
+        _, slot = frame.pool_slots
         result = replace(
-            result, colors=_pictures(result, slot, held.places, blocks_bytes)
+            result, colors=_output_images(result, slot, frame.places, blocks_bytes)
         )
     else:
         result = replace(result, in_memory=True)
-    waiting = held.waiting
+    waiting = frame.waiting
     stages_ms = {
         "decode_ms": MS_PER_S * (waiting.decoded_s - waiting.received_s),
         "queue_ms": MS_PER_S * (started_s - waiting.decoded_s),
@@ -306,7 +311,7 @@ def completed(
     return replace(result, total_ms=total_ms, stage_times_ms=stages_ms)
 
 
-def _pictures(
+def _output_images(
     result: Result, slot: Slot, places: SharedPlaces, blocks_bytes: Sequence[int]
 ) -> tuple[NDArray[Any], ...]:
     if result.compression != "none":

@@ -1,15 +1,24 @@
-"""Event loop of the render worker: a filter for each eye, linked to the front end.
+"""Event loop of a render worker, which filters frames that the front end sends.
 
-The front end owns the socket and the sessions' credit, the worker their eyes.  Neither
-waits for the other, and each survives the other: a new front end is sent the sessions.
+The front end owns the socket and the sessions, the worker the eyes of the sessions.
+Sending never blocks.  Each process survives a restart of the other: the worker reports
+its eyes to a new front end.
 
-From the front end: ``("slot", number, size)`` with its descriptor, ``("drop_slot",
-number)``, ``("open", key, session_id, generations)`` of eyes, ``("profile", key,
-request)``, ``("frame", number, key, frame, places, sizes)``, ``("close",
-key)``.
-To the front end: ``("here", server, eyes, may_rest)`` first, ``("tell", key, eye,
-reply)``, ``("answer", number, reply, started_s, ended_s, used_s, blocks_bytes)`` and
-``("state", memory_mb, stores_mb, is_building)``.  Sizes are those of compressed parts.
+Messages from the front end:
+
+- ``("slot", number, size)`` with a descriptor; ``("drop_slot", number)``
+- ``("open", key, session_id, generations)``, where ``generations`` are those of the
+  session's eyes; ``("close", key)``
+- ``("profile", key, request)``
+- ``("frame", number, key, frame, places, sizes)``, where ``sizes`` are those of
+  compressed parts
+
+Messages to the front end:
+
+- ``("started", server, eyes, can_interrupt)``, the first one
+- ``("profile_reply", key, eye, reply)``
+- ``("frame_reply", number, reply, started_s, ended_s, used_s, blocks_bytes)``
+- ``("state", memory_mb, stores_mb, is_building)``
 """
 
 from __future__ import annotations
@@ -36,20 +45,22 @@ from filter_service.messages import (
 )
 from filter_service.service.process_channel import Link, LinkClosed
 from filter_service.service.process_info import (
-    give_memory_back,
     package_version,
     resident_memory_mb,
+    trim_heap,
 )
 from filter_service.service.session_eyes import SessionEyes
-from filter_service.service.shared_memory_frame import reply_in_slots
+from filter_service.service.shared_memory_frame import filter_in_slots
 from filter_service.shared_memory import Slot
 
 IDLE_WAIT_S = 0.5
-ATTENTION_WAIT_S = 0.1
+WORKER_POLL_S = 0.1
 STATE_INTERVAL_S = 0.5
-BETWEEN_S = 0.01
+INTERRUPTION_INTERVAL_S = 0.01
+"""Minimum time between two interruptions of a frame."""
+
 LONG_FRAME_S = 0.2
-"""Frame time from which interruptions of the frame also prepare eyes."""
+"""Duration of a frame after which its interruptions also advance builds of eyes."""
 
 TRIM_AFTER_S = 10.0
 """Time without a frame after which frame memory is returned to the system."""
@@ -63,11 +74,11 @@ class RenderWorker:
     Parameters
     ----------
     builder : Builder
-        Builder of all sessions' eyes; the loop closes it.
+        Builder of all sessions' eyes; closed at the end of `run`.
     read_profile : callable
-        ``read_profile(body)`` returns a parsed profile, or raises a FilterError.
+        ``read_profile(body)`` returns a parsed profile, or raises `FilterError`.
     max_cameras : int
-        Number of cameras that one session keeps prepared.
+        Number of cameras for which each eye stays prepared.
     """
 
     def __init__(
@@ -87,45 +98,49 @@ class RenderWorker:
         self._next_state_s = 0.0
         self._trim_at_s: float | None = None  # None while frames hold no memory
         self._frame_since_s: float | None = None  # start of the current frame
-        self._rested_s = 0.0  # interruptions of it
-        self._next_rest_s = 0.0
+        self._interrupted_s = 0.0  # total duration of its interruptions
+        self._next_interruption_s = 0.0
         self._listen: Callable[[], None] = lambda: None
-        self._is_over = False
-        self._may_rest = builder.engine.call_between(self._rest, BETWEEN_S)
+        self._is_stopping = False
+        self._can_interrupt = builder.engine.call_between(
+            self._interrupt, INTERRUPTION_INTERVAL_S
+        )
 
     def run(
-        self, control: Link, take_control: Callable[[Any, list[int]], bool]
+        self, control: Link, handle_control: Callable[[Any, list[int]], bool]
     ) -> None:
-        """Serve until the control link sends stop or closes.
+        """Serve until the supervisor sends stop or exits.
 
         Parameters
         ----------
-        take_control : callable
-            Handles a message of the control link; returns whether to go on.
+        control : Link
+            Link to the supervisor.
+        handle_control : callable
+            Handles a message of the supervisor; returns whether to continue.
         """
         selector = selectors.DefaultSelector()
         selector.register(control, selectors.EVENT_READ)
 
         def listen() -> None:
             for message, descriptors in control.receive():
-                if not take_control(message, descriptors):
-                    self._is_over = True
+                if not handle_control(message, descriptors):
+                    self._is_stopping = True
 
         self._listen = listen
         try:
             self._builder.worker.start()
-            while not self._is_over:
+            while not self._is_stopping:
                 self._watch(selector, control)
                 selector.select(self._wait_s())
                 listen()
                 self._run_once()
         except LinkClosed:
-            log.error("the parent process ended")
+            log.error("the supervisor exited")
         finally:
             self._close()
 
-    def join(self, front_end: Link) -> None:
-        """Serve a new front end; the previous one is gone."""
+    def connect(self, front_end: Link) -> None:
+        """Connect to a new front end after the previous one has exited."""
         if self._front_end is not None:
             self._front_end.close()
         self._front_end = front_end
@@ -138,10 +153,10 @@ class RenderWorker:
             "version": package_version(),
             "engine": self._builder.engine_name,
             "renderer": self._builder.engine.name,
-            "gl_renderer": self._builder.engine.name,  # its old name
+            "gl_renderer": self._builder.engine.name,  # for older clients
         }
         eyes = [(key, session.profiles) for key, session in self._sessions.items()]
-        self._send(("here", server, eyes, self._may_rest))
+        self._send(("started", server, eyes, self._can_interrupt))
 
     # Event loop
 
@@ -167,8 +182,8 @@ class RenderWorker:
     def _wait_s(self) -> float:
         if self._builder.is_warming:
             return 0.0
-        if self._builder.worker.needs_attention_soon:
-            return ATTENTION_WAIT_S
+        if self._builder.worker.needs_poll:
+            return WORKER_POLL_S
         return IDLE_WAIT_S
 
     def _run_once(self, *, is_short: bool = False) -> None:
@@ -180,7 +195,7 @@ class RenderWorker:
                 while self._inbox:
                     self._handle(*self._inbox.popleft())
             except LinkClosed:
-                log.warning("the front end ended; sessions wait for its replacement")
+                log.warning("the front end exited; waiting for its replacement")
                 if self._front_end is not None:
                     self._front_end.close()
                 self._front_end = None
@@ -190,33 +205,33 @@ class RenderWorker:
         if self._frame_since_s is None and self._is_time_to_trim:
             self._trim_at_s = None
             self._builder.engine.trim()
-            give_memory_back()
+            trim_heap()
         self._send_state()
 
     @property
     def _is_time_to_trim(self) -> bool:
         return self._trim_at_s is not None and time.monotonic() > self._trim_at_s
 
-    def _rest(self) -> None:
+    def _interrupt(self) -> None:
         """Interrupt a frame to handle messages, which may filter a smaller frame.
 
-        Interruptions take at most half of the time.  The resources of the frame stay in
-        memory until it is done, whatever is requested meanwhile.
+        The pause after an interruption is at least as long as the interruption.  The
+        frame holds references to its resources, so no message can free them.
         """
         begin_s = time.monotonic()
         since_s = self._frame_since_s
-        if since_s is None or begin_s < self._next_rest_s:
+        if since_s is None or begin_s < self._next_interruption_s:
             return
         try:
             self._listen()
             self._run_once(is_short=begin_s < since_s + LONG_FRAME_S)
         except LinkClosed:
-            self._is_over = True
+            self._is_stopping = True
         except Exception:  # must not propagate through the compiled loops
-            log.exception("a task between the stages of a frame failed")
+            log.exception("an interruption of a frame failed")
         end_s = time.monotonic()
-        self._rested_s += end_s - begin_s
-        self._next_rest_s = end_s + (end_s - begin_s)
+        self._interrupted_s += end_s - begin_s
+        self._next_interruption_s = end_s + (end_s - begin_s)
 
     def _send_state(self, *, is_due: bool = False) -> None:
         now_s = time.monotonic()
@@ -237,7 +252,7 @@ class RenderWorker:
 
     def _close(self) -> None:
         for key in list(self._sessions):
-            self._end_session(key)
+            self._close_session(key)
         self._builder.close()
         self._drop_slots()
         if self._front_end is not None:
@@ -250,11 +265,11 @@ class RenderWorker:
         if kind == "frame":
             self._filter(*rest)
         elif kind == "profile":
-            self._take_profile(*rest)
+            self._accept_profile(*rest)
         elif kind == "open":
-            self._begin_session(*rest)
+            self._open_session(*rest)
         elif kind == "close":
-            self._end_session(*rest)
+            self._close_session(*rest)
         elif kind == "slot":
             number, size_bytes = rest
             self._slots[number] = Slot.received(number, size_bytes, *descriptors)
@@ -268,32 +283,34 @@ class RenderWorker:
 
     # Sessions
 
-    def _begin_session(
+    def _open_session(
         self, key: str, session_id: int, generations: dict[EyeName, int]
     ) -> None:
-        self._end_session(key)
+        self._close_session(key)
         self._sessions[key] = SessionEyes(
             session_id,
             self._builder,
-            partial(self._tell, key),
+            partial(self._send_profile_reply, key),
             max_cameras=self._max_cameras,
             generations=generations,
         )
 
-    def _end_session(self, key: str) -> None:
+    def _close_session(self, key: str) -> None:
         session = self._sessions.pop(key, None)
         if session is not None:
             session.close()
 
-    def _take_profile(self, key: str, request: ProfileRequest) -> None:
-        """Accept a profile; events report its progress."""
+    def _accept_profile(self, key: str, request: ProfileRequest) -> None:
+        """Accept or reject a profile; its progress follows as events."""
         session = self._sessions.get(key)
         if session is not None:
-            self._tell(key, request.eye, session.take(request, self._read_profile))
+            self._send_profile_reply(
+                key, request.eye, session.accept_profile(request, self._read_profile)
+            )
             self._send_state(is_due=True)
 
-    def _tell(self, key: str, eye: EyeName, reply: Reply) -> None:
-        self._send(("tell", key, eye, reply))
+    def _send_profile_reply(self, key: str, eye: EyeName, reply: Reply) -> None:
+        self._send(("profile_reply", key, eye, reply))
 
     # Frames
 
@@ -305,24 +322,24 @@ class RenderWorker:
         places: SharedPlaces,
         sizes_bytes: Sequence[int],
     ) -> None:
-        """Filter a frame; one that is filtered during another is not interrupted."""
+        """Filter a frame; a frame that interrupts another is not interrupted itself."""
         started_s = time.monotonic()
         is_first = self._frame_since_s is None
         if is_first:
-            self._frame_since_s, self._rested_s = started_s, 0.0
+            self._frame_since_s, self._interrupted_s = started_s, 0.0
         try:
-            reply, blocks_bytes = self._answer_to(key, frame, places, sizes_bytes)
+            reply, blocks_bytes = self._reply_to(key, frame, places, sizes_bytes)
         finally:
-            rested_s = self._rested_s if is_first else 0.0
+            interrupted_s = self._interrupted_s if is_first else 0.0
             if is_first:
                 self._frame_since_s = None
         ended_s = time.monotonic()
         self._trim_at_s = ended_s + TRIM_AFTER_S
-        used_s = ended_s - started_s - rested_s
+        used_s = ended_s - started_s - interrupted_s
         times_s = (started_s, ended_s, used_s)
-        self._send(("answer", number, reply, *times_s, blocks_bytes))
+        self._send(("frame_reply", number, reply, *times_s, blocks_bytes))
 
-    def _answer_to(
+    def _reply_to(
         self, key: str, frame: Frame, places: SharedPlaces, sizes_bytes: Sequence[int]
     ) -> tuple[Reply, list[int]]:
         """Return the reply to a frame; any failure becomes an error reply."""
@@ -330,11 +347,11 @@ class RenderWorker:
             session = self._sessions.get(key)
             if session is None:
                 raise NoSession("the session has ended")
-            # During the frame the front end may drop them.
+            # References, because the front end may drop the slots during the frame.
             slots = self._slots[places.slot], self._slots[places.result_slot]
-            return reply_in_slots(session.filter_of, frame, slots, places, sizes_bytes)
+            return filter_in_slots(session.filter_of, frame, slots, places, sizes_bytes)
         except Exception as error:
             if not isinstance(error, FilterError):
-                log.exception("no reply could be made for a frame")
+                log.exception("a frame could not be filtered")
                 error = RenderFailed(f"{type(error).__name__}: {error}")
             return ErrorReply.from_exception(error, frame_id=frame.frame_id), []

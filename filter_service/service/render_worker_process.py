@@ -1,8 +1,9 @@
-"""Main program of a render worker; run with ``python -m``.
+"""Main program of a render worker, run with ``python -m``.
 
 Its arguments are the link's descriptor, the ``module:function`` that opens the builder,
 and the process's name in the log.  ``function(config, closing)`` returns the builder, a
-function that reads profiles, and one to call when all is ready.  Tests use their own.
+function that parses profiles, and a function to call when the worker is ready.  Tests
+replace it.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from filter_service.errors import FilterError
 from filter_service.gl_device import AUTO, GL_DEVICE_VARIABLE
 from filter_service.service.config import ServiceConfig
 from filter_service.service.process_channel import Link
-from filter_service.service.process_startup import begin
+from filter_service.service.process_startup import start_process
 
 if TYPE_CHECKING:
     from estimator.profiles.parse import EyeProfile
@@ -34,10 +35,12 @@ if TYPE_CHECKING:
 log = logging.getLogger("ocufilter")
 
 
-def open_real_builder(config: ServiceConfig, closing: ExitStack) -> Opened:
-    """Open the builder with the real engine and PSFs."""
+def open_configured_builder(config: ServiceConfig, closing: ExitStack) -> Opened:
+    """Open the build worker and the engine that the settings select."""
     if config.threads:
-        os.environ[THREADS_VARIABLE] = str(config.threads)  # the worker's, too
+        os.environ[THREADS_VARIABLE] = str(
+            config.threads
+        )  # inherited by the build worker
     if config.gl_device != AUTO:
         os.environ[GL_DEVICE_VARIABLE] = config.gl_device  # likewise
     worker = WorkerHandle(
@@ -46,7 +49,7 @@ def open_real_builder(config: ServiceConfig, closing: ExitStack) -> Opened:
         niceness=config.build_niceness,
     )
     closing.callback(worker.close)
-    worker.start()  # slow imports run in both processes at once
+    worker.start()  # imports take long; both processes run them at the same time
     from filter_service.building.read_profile import read_profile
     from filter_service.filtering.shared_builder import open_builder, preload
 
@@ -56,12 +59,12 @@ def open_real_builder(config: ServiceConfig, closing: ExitStack) -> Opened:
 
 def main() -> None:
     """Filter frames until the supervisor sends stop."""
-    supervisor, config, others = begin(sys.argv[3])
+    supervisor, config, others = start_process(sys.argv[3])
     module, _, function = sys.argv[2].partition(":")
     open_builder = getattr(importlib.import_module(module), function)
     with ExitStack() as closing:
         try:
-            builder, read_profile, when_ready = open_builder(config, closing)
+            builder, read_profile, on_ready = open_builder(config, closing)
         except (FilterError, ValueError, OSError) as error:
             supervisor.send(("failed", str(error)))
             raise SystemExit(1) from None
@@ -69,18 +72,18 @@ def main() -> None:
 
         loop = RenderWorker(builder, read_profile, max_cameras=config.max_cameras)
         supervisor.send(("ready", ""))
-        when_ready()
+        on_ready()
         for message, descriptors in others:
-            take_control(loop, message, descriptors)
-        loop.run(supervisor, lambda *said: take_control(loop, *said))
+            handle_control(loop, message, descriptors)
+        loop.run(supervisor, lambda *message: handle_control(loop, *message))
 
 
-def take_control(
+def handle_control(
     loop: RenderWorker, message: tuple[Any, ...], descriptors: list[int]
 ) -> bool:
-    """Handle a message of the supervisor; return whether to go on."""
+    """Handle a message of the supervisor; return whether to continue."""
     if message[0] == "link":
-        loop.join(Link.from_descriptor(descriptors[0]))
+        loop.connect(Link.from_descriptor(descriptors[0]))
     return bool(message[0] != "stop")
 
 

@@ -1,4 +1,4 @@
-"""The ROUTER socket of the service: messages, replies and connection events."""
+"""The ROUTER socket: receives messages, sends replies, tracks connections."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Any
 import zmq
 
 from filter_service.keys import KeyRing
-from filter_service.service.authenticator import Authenticator, connection_of
+from filter_service.service.authenticator import Authenticator, parse_user_id
 from filter_service.service.connections import Connection, Connections, Peer
 from filter_service.service.dropped_parts import drop_parts
 from filter_service.service.listening_socket import (
@@ -27,20 +27,23 @@ from filter_service.service.listening_socket import (
 )
 
 COPY_BELOW_BYTES = 65536  # pyzmq copies smaller parts in any case
-# With fewer than about 64, libzmq drops replies of a ROUTER although one is in flight.
+
 SEND_HIGH_WATER_MARK = 128
-# Counted in messages, this bounds memory: with the default of 1000, an overload of 720p
-# frames took 1.5 GB.  Further messages wait in the kernel and apply back-pressure.
+"""With less than about 64, a ROUTER drops replies even if only one is in flight."""
+
 RECEIVE_HIGH_WATER_MARK = 4
+"""Limits memory: with libzmq's default of 1000 messages, an overload of 720p frames
+took 1.5 GB.  Further messages stay in the kernel, which applies back-pressure."""
+
 HANDSHAKE_LIMIT_MS = 10_000
 RETRY_S = 0.001
 KEEPALIVE_IDLE_S = 20
 MAX_PARTS_DROPPED = 200_000
-"""Parts of an oversized message dropped before other work continues (20 ms)."""
+"""Number of surplus parts dropped per iteration of the event loop (20 ms)."""
 
 MONITOR_PAUSE_S = 0.005
-"""Minimum interval between reads of connection events while idle: otherwise thousands
-of them per second would wake the front end one by one."""
+"""Minimum interval between wake-ups by connection events; thousands per second would
+otherwise wake the front end one by one."""
 
 MONITOR_ENDPOINT = "inproc://ocufilter.monitor"
 EVENT = struct.Struct("=HI")  # event and descriptor
@@ -58,8 +61,8 @@ class Outcome(enum.Enum):
     STALLED = "stalled"  # the client does not read
 
 
-class Refused(Exception):
-    """A message from a client whose key is no longer allowed."""
+class KeyRemoved(Exception):
+    """A message was received from a client whose key has been removed."""
 
     def __init__(self, peer: Peer) -> None:
         super().__init__("the key was removed")
@@ -74,21 +77,21 @@ class Received:
     ----------
     peer : Peer
     connection : Connection, optional
-        None if it has ended since.
+        None if it has been closed since.
     parts : list of memoryview
         Message parts, not copied.
-    n_left_out : int
-        Number of parts beyond the maximum, which were dropped unread.
+    n_dropped_parts : int
+        Number of surplus parts that were dropped unread.
     """
 
     peer: Peer
     connection: Connection | None
     parts: list[memoryview]
-    n_left_out: int = 0
+    n_dropped_parts: int = 0
 
 
 class Router:
-    """A bound ROUTER socket that never blocks and never drops messages silently.
+    """A bound ROUTER socket that never blocks and reports replies that it cannot send.
 
     Parameters
     ----------
@@ -106,8 +109,8 @@ class Router:
     Attributes
     ----------
     is_dropping : bool
-        Whether the rest of an oversized message is being dropped; nothing else is
-        received until then.
+        Whether surplus parts of a message are being dropped; until the end of that
+        message, nothing else is received.
     """
 
     def __init__(
@@ -137,8 +140,8 @@ class Router:
         socket.handshake_ivl = HANDSHAKE_LIMIT_MS
         # The service sends no heartbeats: libzmq aborts the process
         # (stream_engine_base.cpp) when one is due on a connection that has ended while
-        # more of its messages wait than the mark above.  `Alive` and the monitor detect
-        # vanished clients, and clients' heartbeats are answered all the same.
+        # more of its messages are queued than the high-water mark.  `Alive` and the
+        # monitor detect vanished clients; libzmq still answers heartbeats of clients.
         socket.heartbeat_ivl = 0
         socket.tcp_keepalive = 1
         socket.tcp_keepalive_idle = KEEPALIVE_IDLE_S
@@ -146,19 +149,19 @@ class Router:
             socket.ipv6 = 1
         self._monitor = self._context.socket(zmq.PAIR)
         self._monitor.linger = 0
-        # Unlimited, because libzmq's thread would block on a full queue.
+        # Unlimited: libzmq's I/O thread would block on a full queue.
         self._monitor.rcvhwm = 0
         try:
             socket.monitor(MONITOR_ENDPOINT, MONITORED)
             self._monitor.connect(MONITOR_ENDPOINT)
-            self._authenticator.guard(socket)
+            self._authenticator.secure(socket)
             check_path_is_free(bind)
             listener = deferring_listener(bind)
             if listener is not None:
                 socket.use_fd = listener.fileno()
             socket.bind(bind)
             if listener is not None:
-                listener.detach()  # it is libzmq's now
+                listener.detach()  # libzmq owns the descriptor now
         except (zmq.ZMQError, OSError, ValueError) as error:
             self.close()
             raise OSError(f"cannot listen on {bind}: {error}") from None
@@ -173,11 +176,11 @@ class Router:
 
     @property
     def is_dropping(self) -> bool:
-        """Return whether the rest of an oversized message is being dropped."""
+        """Return whether surplus parts of a message are being dropped."""
         return self._oversized is not None
 
     def watch(self, readable: set[int], writable: set[int]) -> None:
-        """Make `wait` also return when one of these is readable or writable."""
+        """Set the other descriptors for which `wait` returns."""
         for gone in self._watched - readable - writable:
             self._poller.unregister(gone)
         for descriptor in readable | writable:
@@ -187,7 +190,7 @@ class Router:
         self._watched = readable | writable
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until there is something to read, or for the timeout."""
+        """Wait for messages, connection events or watched descriptors, or a timeout."""
         pause_s = self._next_monitored_s - time.monotonic()
         if pause_s > 0.0:
             self._poller.modify(self._monitor, 0)
@@ -196,10 +199,10 @@ class Router:
         if pause_s > 0.0:
             self._poller.modify(self._monitor, zmq.POLLIN)
         self._read_monitor()
-        self._authenticator.answer()
+        self._authenticator.handle_requests()
         self._connections.check_unread(time.monotonic())
 
-    def take_ended(self) -> list[int]:
+    def pop_ended(self) -> list[int]:
         """Return the numbers of the connections that have ended since the last call."""
         ended, self._ended = self._ended, []
         return ended
@@ -210,7 +213,7 @@ class Router:
         try:
             while True:
                 event, descriptor = EVENT.unpack(receive(zmq.NOBLOCK))
-                receive()  # the endpoint, which is ours
+                receive()  # the endpoint
                 count += 1
                 if event == zmq.EVENT_ACCEPTED:
                     number = self._authenticator.next_number
@@ -226,41 +229,41 @@ class Router:
     def receive(self) -> Received | None:
         """Return the next complete message, or None.
 
-        All parts of a message are taken off the socket, however many it has: the rest
-        would be read as the next message.
+        All parts of a message are read from the socket, however many there are: the
+        remaining ones would be read as the next message.
 
         Raises
         ------
-        Refused
+        KeyRemoved
             If the sender's key is no longer allowed.
         """
         if self._oversized is not None:
-            return self._drop_rest(self._oversized)
+            return self._drop_surplus(self._oversized)
         try:
             frame = self._socket.recv(zmq.NOBLOCK, copy=False)
         except zmq.Again:
             return None
-        routing_id, (number, key) = frame.bytes, connection_of(str(frame["User-Id"]))
+        routing_id, (number, key) = frame.bytes, parse_user_id(str(frame["User-Id"]))
         descriptor = int(frame.get(zmq.SRCFD))
-        connection = self._connections.of_message(number, descriptor)
+        connection = self._connections.find(number, descriptor)
         received = Received(Peer(routing_id, number, key), connection, [])
         parts = received.parts
         while frame.more and len(parts) < self._max_parts:
             frame = self._socket.recv(copy=False)
             parts.append(frame.buffer)
         if frame.more:
-            return self._drop_rest(received)
+            return self._drop_surplus(received)
         if not self._authenticator.accepts(key):
-            raise Refused(received.peer)
+            raise KeyRemoved(received.peer)
         return received
 
-    def _drop_rest(self, received: Received) -> Received | None:
-        """Drop surplus parts of a message in slices, since it may have millions.
+    def _drop_surplus(self, received: Received) -> Received | None:
+        """Drop some surplus parts of a message, which may have millions.
 
-        Only the allowed parts are held meanwhile.
+        Return the message, with its allowed parts, once all are dropped.
         """
         count, has_more = drop_parts(self._socket, MAX_PARTS_DROPPED)
-        received = replace(received, n_left_out=received.n_left_out + count)
+        received = replace(received, n_dropped_parts=received.n_dropped_parts + count)
         self._oversized = received if has_more else None
         return None if has_more else received
 
@@ -269,10 +272,10 @@ class Router:
     ) -> tuple[Outcome, zmq.MessageTracker | None]:
         """Send a message; large parts are not copied and must not change.
 
-        Another client may have taken the routing id of one that has just gone.  libzmq
-        chooses the connection when it gets the routing id.  By then its monitor has
-        reported the end of the previous connection, so the monitor is read afterward.
-        In that case the reply is not sent; the other client receives one empty part.
+        A new client may have the routing id of one that has just disconnected.  libzmq
+        selects the connection when it gets the routing id.  By then its monitor has
+        reported the end of the previous connection, so this reads the monitor afterward
+        and sends only an empty part if the connection has changed.
 
         Returns
         -------
@@ -305,7 +308,15 @@ class Router:
         return Outcome.SENT, tracker
 
     def _send_routing_id(self, routing_id: bytes) -> None:
-        """Send the routing id; fails if the receiver cannot accept a message."""
+        """Send the routing id.
+
+        Raises
+        ------
+        zmq.Again
+            If the send queue of the client is full.
+        zmq.ZMQError
+            If the client is not connected.
+        """
         flags = zmq.NOBLOCK | zmq.SNDMORE
         try:
             self._socket.send(routing_id, flags)
@@ -326,10 +337,10 @@ class Router:
 
 
 def _seed_random() -> None:
-    """Seed libzmq's routing ids with an unpredictable number.
+    """Seed the generator of libzmq's routing ids with an unpredictable number.
 
-    libzmq takes them from the C library's generator, which it never seeds: the first
-    routing id of every process was the same.
+    libzmq uses the C library's generator and never seeds it, so the first routing id
+    would be the same in every process.
     """
     seed = os.environ.get(SEED_VARIABLE)
     ctypes.CDLL(None).srand(int(seed) if seed else secrets.randbits(32))

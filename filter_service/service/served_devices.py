@@ -1,6 +1,7 @@
-"""The devices as the front end sees them: frames, memory and state of each.
+"""The front end's state of each device: its render client and frame queue.
 
-A session stays on one device, with its eyes and memory, as long as the device exists.
+A session, with its eyes and shared memory, stays on its device until the device is
+taken out of service.
 """
 
 from __future__ import annotations
@@ -20,11 +21,12 @@ from filter_service.service.session_table import SessionTable
 
 
 class ServedDevice:
-    """One device, as the front end sees it.
+    """The front end's state of one device.
 
     Parameters
     ----------
     index : int
+        Index in the settings.
     name : str
         Name of the device in the settings.
     max_image_bytes : int
@@ -32,6 +34,7 @@ class ServedDevice:
     descriptors : DescriptorLimit
         Descriptor limit of this process.
     sessions : SessionTable
+        Sessions of all devices.
     send : callable
         See `FrameQueue`.
 
@@ -41,11 +44,12 @@ class ServedDevice:
     frames : FrameQueue
         Frames of its sessions.
     server : dict, optional
-        Description reported by its process; None until then.
-    memory_mb, stores_mb, is_building
-        State last reported by that process.
+        Description reported by its render worker; None until then.
+    memory_mb, stores_mb : float
+    is_building : bool
+        State last reported by its render worker.
     is_lost : bool
-        Whether it was given up; then no session is on it.
+        Whether it is out of service; then no session is on it.
     """
 
     def __init__(
@@ -60,18 +64,20 @@ class ServedDevice:
         self.index = index
         self.name = name
         self.render = RenderClient(max_image_bytes, descriptors)
-        self.frames = FrameQueue(partial(sessions.present_on, index), self.render, send)
+        self.frames = FrameQueue(
+            partial(sessions.connected_on, index), self.render, send
+        )
         self.server: dict[str, str] | None = None
         self.memory_mb = self.stores_mb = 0.0
         self.is_building = self.is_lost = False
 
-    def give_up(self) -> None:
-        """Mark the device as given up."""
+    def mark_lost(self) -> None:
+        """Mark the device as out of service."""
         self.is_lost, self.is_building = True, False
         self.memory_mb = self.stores_mb = 0.0
 
     def state(self, sessions: Sequence[Session]) -> DeviceState:
-        """Return the device's state for `pong`, given its sessions with a client."""
+        """Return the device's state for `pong`, given its connected sessions."""
         return DeviceState(
             name=self.name,
             renderer=(self.server or {}).get("renderer", ""),
@@ -80,8 +86,9 @@ class ServedDevice:
             n_rendered=self.frames.n_rendered,
             memory_mb=self.memory_mb,
             is_ready=self.render.is_ready,
-            is_filtering=bool(self.render.held),
-            is_building=self.is_building or any(s.asks for s in sessions),
+            is_filtering=bool(self.render.in_flight),
+            is_building=self.is_building
+            or any(s.has_pending_profile for s in sessions),
             is_lost=self.is_lost,
             render_silent_s=self.render.silent_s,
         )
@@ -94,7 +101,7 @@ class ServedDevices:
     ----------
     names : sequence of str
     max_image_bytes : int
-        Image memory of all devices, divided equally so that none can exhaust another's.
+        Image memory of all devices, divided equally among them.
     descriptors, sessions, send
         See `ServedDevice`.
     """
@@ -128,22 +135,22 @@ class ServedDevices:
         """Return a device by its index."""
         return self._devices[index]
 
-    def of(self, session: Session) -> ServedDevice:
+    def device_of(self, session: Session) -> ServedDevice:
         """Return the device of a session."""
         return self._devices[session.device]
 
     def least_busy(self) -> ServedDevice:
         """Return the device for a new session.
 
-        Ready devices precede those that are starting, then the fewest sessions with a
-        client count, then the lowest recent load.
+        Ready devices come first, then those with the fewest connected sessions, then
+        those with the lowest recent load.
         """
         now_s = time.monotonic()
         return min(
-            self._left,
+            self._available,
             key=lambda device: (
                 not device.render.is_ready,
-                len(self._sessions.present_on(device.index)),
+                len(self._sessions.connected_on(device.index)),
                 device.frames.load.busy_ratio(now_s),
             ),
         )
@@ -151,32 +158,32 @@ class ServedDevices:
     def states(self) -> tuple[DeviceState, ...]:
         """Return the states of all devices for `pong`."""
         return tuple(
-            device.state(self._sessions.present_on(device.index)) for device in self
+            device.state(self._sessions.connected_on(device.index)) for device in self
         )
 
     @property
-    def _left(self) -> list[ServedDevice]:
-        """Return the devices that were not given up, at least one."""
+    def _available(self) -> list[ServedDevice]:
+        """Return the devices that are in service, at least one."""
         return [device for device in self._devices if not device.is_lost]
 
     @property
-    def are_known(self) -> bool:
-        """Return whether all devices have reported."""
-        return all(device.server is not None for device in self._left)
+    def have_reported(self) -> bool:
+        """Return whether the workers of all devices in service have reported."""
+        return all(device.server is not None for device in self._available)
 
     @property
     def are_ready(self) -> bool:
-        """Return whether frames of all sessions can be filtered."""
-        return all(device.render.is_ready for device in self._left)
+        """Return whether all devices in service can filter frames."""
+        return all(device.render.is_ready for device in self._available)
 
     @property
     def silent_s(self) -> float:
-        """Return the seconds since the last heartbeat of the most silent device."""
-        return max(device.render.silent_s for device in self._left)
+        """Return the longest time since the last heartbeat of a worker."""
+        return max(device.render.silent_s for device in self._available)
 
     @property
     def memory_mb(self) -> float:
-        """Return the memory of all devices' processes."""
+        """Return the total resident memory of the render workers, 10^6 bytes."""
         return sum(device.memory_mb for device in self)
 
     def descriptors(self) -> tuple[set[int], set[int]]:
@@ -185,6 +192,6 @@ class ServedDevices:
         return set().union(*(r for r, _ in pairs)), set().union(*(w for _, w in pairs))
 
     def wait_s(self, now_s: float) -> float | None:
-        """Return the time until a frame may be handed over; None if no frame waits."""
-        soon_s = [device.frames.wait_s(now_s) for device in self]
-        return min((s for s in soon_s if s is not None), default=None)
+        """Return the time until a frame may be submitted; None if none is queued."""
+        waits_s = [device.frames.wait_s(now_s) for device in self]
+        return min((s for s in waits_s if s is not None), default=None)

@@ -1,6 +1,6 @@
-"""State of one client's session: waiting frame, credit and profiles of its eyes.
+"""State of one client's session: queued frame, credit and profiles of its eyes.
 
-This module uses no sockets; `front_end` acts on the state.
+This module contains no I/O; the front end acts on the state.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from filter_service.shared_memory import Slot
 
 KEY_BYTES = 16
 MAX_RECORDED_BYTES = 65_536
-"""Largest JSON body of a profile that is recorded: 100 measurements of 28 coefficients
-take 60,000 bytes.  A client sends a larger one again if the service has lost it."""
+"""Largest JSON body of a profile that survives a restart of the front end: 100
+measurements of 28 coefficients take 60,000 bytes.  A client sends a larger one again if
+the service has lost it."""
 
 
 @dataclass(frozen=True)
 class WaitingFrame:
-    """A frame with the times needed for its stage times."""
+    """A queued frame, and the times at which it was received and decoded."""
 
     frame: Frame
     received_s: float
@@ -31,23 +32,37 @@ class WaitingFrame:
 
 
 def new_key() -> str:
-    """Return a random key."""
+    """Return a random session key."""
     return secrets.token_hex(KEY_BYTES)
 
 
 @dataclass
 class EyeProfiles:
-    """The profiles of one eye: the last accepted one, and those in progress."""
+    """The profiles of one eye.
 
-    profile: ProfileRequest | None = None  # last accepted
-    asked_profile: ProfileRequest | None = None  # sent to the render worker
-    next_profile: ProfileRequest | None = None  # waits for the one sent
+    Attributes
+    ----------
+    profile : ProfileRequest, optional
+        Last one that the render worker accepted.
+    sent_profile : ProfileRequest, optional
+        Sent to the render worker, which has not accepted it yet.
+    queued_profile : ProfileRequest, optional
+        Newest one, to be sent next.
+    profile_id, generation : int
+        Those of the last accepted profile.
+    next_send_s : float
+        Earliest time to send the queued profile.
+    """
+
+    profile: ProfileRequest | None = None
+    sent_profile: ProfileRequest | None = None
+    queued_profile: ProfileRequest | None = None
     profile_id: int | None = None
     generation: int = 0
-    next_ask_s: float = 0.0  # earliest time to send another
+    next_send_s: float = 0.0
 
     def record(self) -> EyeProfiles:
-        """Return a record of the accepted profile; only the numbers of a large one."""
+        """Return a copy with the accepted profile only; without it if it is large."""
         profile = self.profile
         if profile is not None and len(profile.parts()[0]) > MAX_RECORDED_BYTES:
             profile = None
@@ -58,7 +73,7 @@ class EyeProfiles:
 
 @dataclass(frozen=True)
 class SessionRecord:
-    """State of a session that the supervisor keeps in case the front end ends."""
+    """State of a session that the supervisor stores for a restart of the front end."""
 
     session_id: int
     key: str
@@ -77,18 +92,18 @@ class Session:
     ----------
     session_id : int
     peer : Peer, optional
-        The client's connection; None while it is away.
+        The client's connection; None while it is disconnected.
     client : str
-        Name that the client gives itself.
+        Name of the client, from hello.
     credit : int
         Maximum number of unanswered frames.
     key : str
         Session key, which resumes the session.
     owner : str
-        CURVE key of the client that started the session and that alone may resume it;
-        empty if the service has no keys.
+        CURVE key of the client that started the session; only a client with this key
+        may resume it.  Empty if the service has no keys.
     device : int
-        Index of the device that has its eyes.
+        Index of its device.
     """
 
     session_id: int
@@ -100,11 +115,11 @@ class Session:
     device: int = 0
     n_unanswered: int = 0
     waiting: WaitingFrame | None = None
-    unsent: list[tuple[Tracker, Slot]] = field(default_factory=list)  # large replies
-    behind_since_s: float | None = None  # since there have been too many of them
-    shared: dict[int, Slot] = field(default_factory=dict)  # slots of the client
-    lent: set[int] = field(default_factory=set)  # slots in use by frames
-    away_since_s: float | None = None
+    unsent: list[tuple[Tracker, Slot]] = field(default_factory=list)  # being sent
+    slow_since_s: float | None = None  # since when too many are unsent
+    shared: dict[int, Slot] = field(default_factory=dict)  # by number
+    slots_in_use: set[int] = field(default_factory=set)  # numbers; used by frames
+    disconnected_since_s: float | None = None
     last_connection: int = 0
     eyes: dict[EyeName, EyeProfiles] = field(default_factory=dict)
 
@@ -113,7 +128,7 @@ class Session:
         return self.eyes.setdefault(name, EyeProfiles())
 
     def record(self) -> SessionRecord:
-        """Return the state that survives a restart of this process."""
+        """Return the state that survives a restart of the front end."""
         return SessionRecord(
             *(self.session_id, self.key, self.owner, self.client, self.credit),
             *(self.device, {name: eye.record() for name, eye in self.eyes.items()}),
@@ -121,7 +136,7 @@ class Session:
 
     @classmethod
     def restored(cls, record: SessionRecord, now_s: float) -> Self:
-        """Return a session from its record; its client is away."""
+        """Return a session from its record, disconnected."""
         session = cls(
             *(record.session_id, None, record.client, record.credit),
             key=record.key,
@@ -129,7 +144,7 @@ class Session:
             device=record.device,
             eyes=dict(record.eyes),
         )
-        session.leave(now_s)
+        session.disconnect(now_s)
         return session
 
     @property
@@ -142,17 +157,17 @@ class Session:
         }
 
     @property
-    def asks(self) -> bool:
+    def has_pending_profile(self) -> bool:
         """Return whether the render worker has yet to accept a profile."""
-        return any(eye.asked_profile is not None for eye in self.eyes.values())
+        return any(eye.sent_profile is not None for eye in self.eyes.values())
 
-    def take_in(self, waiting: WaitingFrame) -> WaitingFrame | None:
-        """Store a frame as the newest; return the one that it supersedes.
+    def enqueue(self, waiting: WaitingFrame) -> WaitingFrame | None:
+        """Queue a frame; return the older one that it supersedes.
 
         Raises
         ------
         CreditExceeded
-            If the client has too many unanswered frames; this one is then discarded.
+            If the client has too many unanswered frames; the frame is then discarded.
         """
         if self.n_unanswered >= self.credit:
             raise CreditExceeded(
@@ -164,28 +179,28 @@ class Session:
         superseded, self.waiting = self.waiting, waiting
         return superseded
 
-    def lend(self, frame: Frame) -> None:
-        """Mark the client's slots that a frame uses."""
+    def mark_in_use(self, frame: Frame) -> None:
+        """Mark the slots of a frame as in use."""
         if frame.memory is not None:
-            self.lent |= {frame.memory.slot, frame.memory.result_slot}
+            self.slots_in_use |= {frame.memory.slot, frame.memory.result_slot}
 
-    def get_back(self, frame: Frame) -> None:
-        """Unmark the client's slots that a frame has used."""
+    def mark_free(self, frame: Frame) -> None:
+        """Mark the slots of a frame as free."""
         if frame.memory is not None:
-            self.lent -= {frame.memory.slot, frame.memory.result_slot}
+            self.slots_in_use -= {frame.memory.slot, frame.memory.result_slot}
 
-    def leave(self, now_s: float) -> None:
-        """Mark the client as away; discard its waiting frame and reset its credit."""
+    def disconnect(self, now_s: float) -> None:
+        """Detach the client; discard its queued frame and reset its credit."""
         if self.peer is not None:
             self.last_connection = self.peer.connection
         self.peer = None
-        self.away_since_s = now_s
+        self.disconnected_since_s = now_s
         self.waiting = None
         self.n_unanswered = 0
 
     def reconnect(self, peer: Peer, client: str) -> None:
-        """Attach a reconnected client, or one that takes the session over."""
+        """Attach a client that resumes the session."""
         self.peer, self.client = peer, client
-        self.away_since_s = None
+        self.disconnected_since_s = None
         self.waiting = None
         self.n_unanswered = 0

@@ -1,4 +1,4 @@
-"""The eyes of one session, each with a filter that is created on first use."""
+"""The eyes of one session, each with an `EyeFilter` that is created on first use."""
 
 from __future__ import annotations
 
@@ -37,37 +37,37 @@ class _Eye:
 
 
 class SessionEyes:
-    """The filters of one session.
+    """The eyes of one session.
 
     Parameters
     ----------
     session_id : int
     builder : Builder
         Builder of the eyes.
-    tell : callable
-        ``tell(eye, reply)`` is called with replies about the profile of an eye.
+    send_reply : callable
+        ``send_reply(eye, reply)`` sends a reply about the profile of an eye.
     max_cameras : int
-        Number of cameras that each eye keeps prepared.
+        Number of cameras for which each eye stays prepared.
     generations : mapping
-        Number of earlier profiles of each eye.
+        Generation of the last accepted profile of each eye.
     """
 
     def __init__(
         self,
         session_id: int,
         builder: Builder,
-        tell: Callable[[EyeName, Reply], None],
+        send_reply: Callable[[EyeName, Reply], None],
         *,
         max_cameras: int,
         generations: Mapping[EyeName, int],
     ) -> None:
         self.session_id = session_id
         self._builder = builder
-        self._tell = tell
+        self._send_reply = send_reply
         self._max_cameras = max_cameras
         self._generations = generations
         self._eyes: dict[EyeName, _Eye] = {}
-        self._is_over = False
+        self._is_closed = False
 
     @property
     def profiles(self) -> dict[EyeName, tuple[int | None, int]]:
@@ -78,7 +78,7 @@ class SessionEyes:
 
     def close(self) -> None:
         """Release all eyes."""
-        self._is_over = True
+        self._is_closed = True
         for eye in self._eyes.values():
             eye.eye_filter.close()
 
@@ -93,7 +93,7 @@ class SessionEyes:
         return self._eye(name).eye_filter
 
     def _eye(self, name: EyeName) -> _Eye:
-        if self._is_over:
+        if self._is_closed:
             raise NoSession("the session has ended")
         if name not in self._eyes:
             eye_filter = EyeFilter(
@@ -105,12 +105,19 @@ class SessionEyes:
             self._eyes[name] = _Eye(eye_filter)
         return self._eyes[name]
 
-    def take(
+    def accept_profile(
         self,
         request: ProfileRequest,
         read_profile: Callable[[dict[str, Any]], EyeProfile],
     ) -> Reply:
-        """Return the reply to a profile: accepted, or an error."""
+        """Set a profile; return the reply, accepted or an error.
+
+        Parameters
+        ----------
+        request : ProfileRequest
+        read_profile : callable
+            ``read_profile(body)`` returns a parsed profile, or raises `FilterError`.
+        """
         try:
             eye = self._eye(request.eye)
             accepted = eye.eye_filter.set_profile(
@@ -128,13 +135,13 @@ class SessionEyes:
         return Accepted(
             request.profile_id,
             accepted.generation,
-            is_building=bool(accepted.wanted),
-            n_cameras=len(accepted.wanted),
+            is_building=bool(accepted.requested),
+            n_cameras=len(accepted.requested),
             eye=request.eye,
         )
 
     def _send_event(self, name: EyeName, event: EyeEvent) -> None:
-        """Report an event of a profile."""
+        """Convert an event of a profile to a reply and send it."""
         profile_id, generation = event.eye.profile_id, event.eye.generation
         reply: Reply
         if isinstance(event, BuildingEye):
@@ -155,4 +162,4 @@ class SessionEyes:
             )
         else:
             reply = ErrorReply.from_exception(event.error, profile_id=profile_id)
-        self._tell(name, reply)
+        self._send_reply(name, reply)

@@ -1,4 +1,4 @@
-"""Filtering of a frame with its input and output images in shared memory."""
+"""Filtering of a frame whose input and output images are in shared memory."""
 
 from __future__ import annotations
 
@@ -20,27 +20,34 @@ from filter_service.wire.images import ViewImages
 MS_PER_S = 1e3
 
 
-def reply_in_slots(
+def filter_in_slots(
     filter_of: Callable[[EyeName], EyeFilter],
     frame: Frame,
     slots: tuple[Slot, Slot],
     places: SharedPlaces,
     sizes_bytes: Sequence[int],
 ) -> tuple[Reply, list[int]]:
-    """Filter a frame; return the reply and the size of each picture in bytes.
+    """Filter a frame; return the reply and the size of each output image in bytes.
 
     Parameters
     ----------
     filter_of : callable
         Returns the filter of an eye.
     frame : Frame
-        The frame without its images.
+        Frame without its images.
     slots : (Slot, Slot)
-        Slots of the images and of the pictures.
+        Slots of the input and output images.
     places : SharedPlaces
         Positions in these slots.
     sizes_bytes : sequence of int
-        Sizes of the images if they are compressed.
+        Sizes of the input images if they are compressed.
+
+    Returns
+    -------
+    reply : Result, Dropped or ErrorReply
+        Without images, which are in the second slot.
+    sizes_bytes : list of int
+        Empty if there is no result.
 
     Raises
     ------
@@ -54,8 +61,8 @@ def reply_in_slots(
     frame = with_images(frame, slot, places.starts, sizes_bytes)
     unpack_ms = MS_PER_S * (time.monotonic() - begin_s)
     is_packed = frame.compression != "none"
-    rooms = None if is_packed else rooms_in(result_slot, frame, places)
-    reply = frame_reply(filter_of, frame, rooms)
+    out = None if is_packed else output_arrays(result_slot, frame, places)
+    reply = frame_reply(filter_of, frame, out)
     if not isinstance(reply, Result):
         return reply, []
     begin_s = time.monotonic()
@@ -63,7 +70,7 @@ def reply_in_slots(
         colors = [packed(color) for color in reply.colors]
     else:
         colors = [np.ascontiguousarray(color) for color in reply.colors]
-    if rooms is None or any(a is not b for a, b in zip(colors, rooms, strict=True)):
+    if out is None or any(a is not b for a, b in zip(colors, out, strict=True)):
         result_slot.put(colors, places.result_starts)
     stages_ms = dict(reply.stage_times_ms)
     stages_ms["copy_out_ms"] = MS_PER_S * (time.monotonic() - begin_s)
@@ -75,7 +82,7 @@ def reply_in_slots(
     return reply, [color.nbytes for color in colors]
 
 
-def rooms_in(slot: Slot, frame: Frame, places: SharedPlaces) -> list[NDArray[Any]]:
+def output_arrays(slot: Slot, frame: Frame, places: SharedPlaces) -> list[NDArray[Any]]:
     """Return the output arrays of a frame in a slot, (height, width, 3) each."""
     dtype = np.dtype(frame.output.dtype)
     return [
@@ -87,13 +94,13 @@ def rooms_in(slot: Slot, frame: Frame, places: SharedPlaces) -> list[NDArray[Any
 def with_images(
     frame: Frame, slot: Slot, starts: Sequence[int], sizes_bytes: Sequence[int]
 ) -> Frame:
-    """Return a frame with its images from a slot; see `reply_in_slots`."""
-    waiting = iter(zip(starts, sizes_bytes or starts, strict=True))
+    """Return a frame with its images from a slot; see `filter_in_slots`."""
+    positions = iter(zip(starts, sizes_bytes or starts, strict=True))
     found = []
     for view in frame.views:
         arrays = []
         for _, shape, dtype in view.images:
-            start, size_bytes = next(waiting)
+            start, size_bytes = next(positions)
             if frame.compression != "none":
                 shape, dtype = (size_bytes,), "uint8"
             array = slot.array(start, shape, np.dtype(dtype))

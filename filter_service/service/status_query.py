@@ -17,6 +17,13 @@ def query_status(
 ) -> dict[str, Any]:
     """Ping a service and return the fields of its reply.
 
+    Parameters
+    ----------
+    endpoint : str
+    key_file : Path, optional
+        Key file of a client; required if the service has keys.
+    timeout_s : float
+
     Raises
     ------
     ServiceTimeout

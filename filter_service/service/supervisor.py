@@ -1,11 +1,10 @@
-"""The supervisor: starts the processes of the service and restarts those that end.
+"""The supervisor: starts the processes of the service and restarts those that exit.
 
-The front end owns the socket, and each device has a render worker that owns its eyes.
-The processes survive each other: a new one gets links to the others, and a new front
-end gets the existing sessions.  A process that hangs or was stopped is killed and
-restarted.  Once the service has been ready, no fault ends it.  A process that keeps
-ending is restarted after increasing pauses.  Meanwhile its device, if there are others,
-is given up, so that its sessions move to another one.
+A new process gets links to the others, and a new front end gets the sessions of the
+previous one.  A process that hangs or was stopped by a signal is killed and restarted.
+A process that keeps exiting is restarted after increasing pauses; meanwhile its device
+is out of service, if there are others, and its clients start sessions on those.  Once
+the service has been ready, it keeps running whatever fails.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 from filter_service.building.helper_process import (
-    end,
-    how_it_ended,
+    describe_exit,
     import_path,
     is_stopped,
+    wait_or_kill,
 )
 from filter_service.service.config import ServiceConfig, changed_while_running
 from filter_service.service.process_channel import Link, LinkClosed
@@ -33,16 +32,16 @@ from filter_service.service.process_channel import Link, LinkClosed
 FRONT_END_MODULE = "filter_service.service.front_end_process"
 RENDER_MODULE = "filter_service.service.render_worker_process"
 FRONT_END, RENDER = "front-end", "render"
-OPEN_BUILDER = "filter_service.service.render_worker_process:open_real_builder"
+OPEN_BUILDER = "filter_service.service.render_worker_process:open_configured_builder"
 STABLE_S = 60.0
-"""Run time after which the count of consecutive deaths starts again."""
+"""Run time after which the count of consecutive exits starts again."""
 
 FIRST_PAUSE_S, MAX_PAUSE_S = 1.0, 60.0
-"""Pause before a restart: none the first two times, then doubled each time."""
+"""Pause before a restart: none for the first two, then doubled each time."""
 
-DEATHS_WITHOUT_PAUSE = 2
-GIVE_UP_DEVICE_DEATHS = 4
-"""Consecutive deaths after which a device's sessions move to other devices, if any."""
+EXITS_WITHOUT_PAUSE = 2
+GIVE_UP_DEVICE_EXITS = 4
+"""Consecutive exits after which a device is out of service, if there are others."""
 
 CHECK_INTERVAL_S = 0.5
 STOPPED_LIMIT_S = 3.0
@@ -51,14 +50,14 @@ STOPPED_LIMIT_S = 3.0
 STOP_GRACE_S = 2.0
 
 STANDBY_AFTER_S = 5.0
-"""Delay between the last start of a process and that of a standby worker: until then
-that process, or its client, needs the processor."""
+"""Delay between the last start of a process and that of a standby worker, so that they
+do not compete for the processor."""
 
 log = logging.getLogger("ocufilter")
 
 
 class ServiceFailed(Exception):
-    """A process of the service cannot start, or has kept ending for too long."""
+    """A process of the service cannot start, or has kept exiting for too long."""
 
 
 @dataclass
@@ -72,37 +71,37 @@ class _Process:
     started_s: float = field(default_factory=time.monotonic)
 
     def send(self, message: object, descriptors: Sequence[int] = ()) -> None:
-        """Send a message; ignores a closed link, which the next receive reports."""
+        """Send a message; ignore a closed link, which the next receive reports."""
         if self.link is not None:
             with suppress(LinkClosed):
                 self.link.send(message, descriptors)
 
     def end(self) -> str:
-        """End the process, by force after a grace period; return how it ended."""
-        how = "gone"
+        """Stop the process, by force after a grace period; describe its exit."""
+        outcome = "did not start"
         if self.process is not None:
-            how = how_it_ended(end(self.process, STOP_GRACE_S))
+            outcome = describe_exit(wait_or_kill(self.process, STOP_GRACE_S))
         if self.link is not None:
             self.link.close()
-        return how
+        return outcome
 
 
 @dataclass
 class _Restarts:
-    """Consecutive deaths of one process, and the time of its next start."""
+    """Consecutive exits of one process, and the time of its next start."""
 
-    n_deaths: int = 0  # in a row
+    n_exits: int = 0
     failing_since_s: float | None = None
     due_s: float | None = None
 
-    def note_death(self, started_s: float, now_s: float) -> float:
-        """Count a death; return the pause before the restart."""
+    def record_exit(self, started_s: float, now_s: float) -> float:
+        """Count an exit; return the pause before the restart."""
         if now_s - started_s > STABLE_S:
-            self.n_deaths, self.failing_since_s = 0, None
-        self.n_deaths += 1
+            self.n_exits, self.failing_since_s = 0, None
+        self.n_exits += 1
         if self.failing_since_s is None:
             self.failing_since_s = now_s
-        n_paused = self.n_deaths - DEATHS_WITHOUT_PAUSE
+        n_paused = self.n_exits - EXITS_WITHOUT_PAUSE
         doubled_s = FIRST_PAUSE_S * 2.0 ** min(n_paused - 1, 10)
         pause_s = min(doubled_s, MAX_PAUSE_S) if n_paused > 0 else 0.0
         self.due_s = now_s + pause_s
@@ -110,19 +109,18 @@ class _Restarts:
 
 
 class Supervisor:
-    """Supervises the front end and a render worker for each device.
+    """Runs the front end and a render worker for each device.
 
     Parameters
     ----------
     config : ServiceConfig
     open_builder : str
         ``module:function`` that opens the builder, see `render_worker_process`.
-    when_ready : callable
-        Called with the endpoint when the service becomes ready for frames, also after
-        an interruption.
-    when_not_ready : callable
-        Called when a process has ended and is not restarted at once.
-    read_again : callable, optional
+    on_ready : callable
+        Called with the endpoint whenever the service becomes ready for frames.
+    on_not_ready : callable
+        Called when a process has exited and is not restarted at once.
+    reload_config : callable, optional
         Returns the current settings.
     """
 
@@ -131,16 +129,16 @@ class Supervisor:
         config: ServiceConfig,
         *,
         open_builder: str = OPEN_BUILDER,
-        when_ready: Callable[[str], None],
-        when_not_ready: Callable[[], None] = lambda: None,
-        read_again: Callable[[], ServiceConfig] | None = None,
+        on_ready: Callable[[str], None],
+        on_not_ready: Callable[[], None] = lambda: None,
+        reload_config: Callable[[], ServiceConfig] | None = None,
     ) -> None:
         self._config = config
         self._open_builder = open_builder
-        self._when_ready, self._when_not_ready = when_ready, when_not_ready
+        self._on_ready, self._on_not_ready = on_ready, on_not_ready
         self._was_ready = self._is_announced = False
-        self._read_again = read_again
-        self._is_to_read_again = False
+        self._reload_config = reload_config
+        self._is_reload_requested = False
         self._endpoint = ""
         self._is_stopping = False
         n_devices = len(config.device_names)
@@ -152,8 +150,8 @@ class Supervisor:
         )
         self._processes = {name: _Process() for name in (FRONT_END, *self._devices)}
         self._standbys: dict[str, _Process] = {}
-        self._lost: set[int] = set()  # devices given up for now
-        self._met: set[int] = set()  # devices connected to the front end
+        self._lost: set[int] = set()  # devices that are out of service
+        self._connected: set[int] = set()  # devices connected to the front end
         self._spawned_s = 0.0  # last start of any process
         self._restarts = {name: _Restarts() for name in self._processes}
         self._sessions: dict[str, object] = {}  # by key, for the next front end
@@ -170,40 +168,41 @@ class Supervisor:
         """Make `run` return; may be called from a signal handler."""
         self._is_stopping = True
 
-    def ask_to_read_again(self) -> None:
-        """Request that settings be read again; may be called from a signal handler."""
-        self._is_to_read_again = True
+    def request_reload(self) -> None:
+        """Request a reload of the settings; may be called from a signal handler."""
+        self._is_reload_requested = True
 
     def run(self) -> None:
-        """Serve until `stop`.
+        """Run until `stop` is called.
 
         Raises
         ------
         ServiceFailed
-            If a process cannot start the first time, or keeps ending for longer than
+            If a process cannot start the first time, or keeps exiting for longer than
             `give_up_after_s`.
         """
         try:
-            for name in (*self._devices, FRONT_END):  # the fastest starts last
+            for name in (*self._devices, FRONT_END):  # last, because it starts fastest
                 self._start(name)
             while not self._is_stopping:
                 try:
                     self._run_once()
                 except OSError as error:
-                    self._bear(error)
+                    self._tolerate(error)
         finally:
-            self._end_all()
+            self._stop_all()
 
-    def _bear(self, error: OSError) -> None:
-        """Log an error of the system and continue, once the service has been ready.
+    def _tolerate(self, error: OSError) -> None:
+        """Log an error of the operating system, if the service has been ready before.
 
         Raises
         ------
         ServiceFailed
+            If it has not been ready yet.
         """
         if not self._was_ready:
             raise ServiceFailed(str(error)) from None
-        log.error("the system refused a request (%s)", error)
+        log.error("a system call failed: %s", error)
         time.sleep(CHECK_INTERVAL_S)
 
     def _run_once(self) -> None:
@@ -215,11 +214,11 @@ class Supervisor:
             selector.select(self._wait_s())
         with suppress(BlockingIOError):
             self._wake_reader.recv(4096)
-        if self._is_to_read_again:
-            self._is_to_read_again = False
-            self._change_settings()
+        if self._is_reload_requested:
+            self._is_reload_requested = False
+            self._apply_settings()
         for name, process in list(self._processes.items()):
-            self._listen(name, process)
+            self._receive(name, process)
             self._check_stopped(name, process)
         for name, restarts in self._restarts.items():
             if restarts.due_s is not None and time.monotonic() >= restarts.due_s:
@@ -227,7 +226,7 @@ class Supervisor:
                 self._start(name)
         if self._config.standby:
             for name in list(self._devices):
-                self._keep_standby(name)
+                self._maintain_standby(name)
 
     def _wait_s(self) -> float:
         now_s = time.monotonic()
@@ -241,25 +240,27 @@ class Supervisor:
         return [*self._processes.values(), *self._standbys.values()]
 
     def _start(self, name: str) -> None:
-        """Start a process, or replace it by its standby."""
+        """Start a process, or promote its standby."""
         standby = self._standbys.pop(name, None)
         try:
-            self._processes[name] = standby or self._spawned(name)
-            self._join(name)
+            self._processes[name] = standby or self._spawn(name)
+            self._connect(name)
         except OSError as error:  # out of memory, processes or descriptors
             if not self._was_ready:
                 raise ServiceFailed(f"its {name} process: {error}") from None
             self._processes[name].end()
-            self._note_death(name, time.monotonic(), f"cannot be started ({error})")
+            self._schedule_restart(
+                name, time.monotonic(), f"cannot be started ({error})"
+            )
 
-    def _spawned(self, name: str) -> _Process:
+    def _spawn(self, name: str) -> _Process:
         self._spawned_s = time.monotonic()
         link, theirs = Link.pair()
         # A new front end listens on the endpoint of the previous one.
         config = replace(self._config, bind=self._endpoint or self._config.bind)
         module, arguments = FRONT_END_MODULE, [str(theirs.fileno())]
         if name in self._devices:
-            config = config.of_device(self._devices[name])
+            config = config.for_device(self._devices[name])
             module, arguments = RENDER_MODULE, [*arguments, self._open_builder, name]
         started = subprocess.Popen(
             # Without -P, files in the current folder would shadow modules of the same
@@ -276,13 +277,13 @@ class Supervisor:
             process.send(("sessions", list(self._sessions.values())))
         return process
 
-    def _keep_standby(self, name: str) -> None:
-        """Keep a standby render worker ready, with a build worker of its own."""
+    def _maintain_standby(self, name: str) -> None:
+        """Keep a standby render worker running, with a build worker of its own."""
         standby = self._standbys.get(name)
         if standby is None:
             is_quiet = time.monotonic() - self._spawned_s > STANDBY_AFTER_S
             if is_quiet and self._processes[name].is_ready:
-                self._standbys[name] = self._spawned(name)
+                self._standbys[name] = self._spawn(name)
             return
         try:
             if standby.link is not None:
@@ -294,18 +295,18 @@ class Supervisor:
             del self._standbys[name]
             log.error("the standby process %s; starting a new one", standby.end())
 
-    def _change_settings(self) -> None:
-        """Apply changed settings; warn about those that require a restart."""
-        if self._read_again is None:
+    def _apply_settings(self) -> None:
+        """Reload the settings; warn about changes that require a restart."""
+        if self._reload_config is None:
             return
         try:
-            wanted = self._read_again()
+            wanted = self._reload_config()
         except (ValueError, OSError) as error:
             log.error("the settings are unchanged: %s", error)
             return
         self._config, changed, others = changed_while_running(self._config, wanted)
         for name in changed:
-            log.info("%s is %s now", name, getattr(self._config, name))
+            log.info("%s is now %s", name, getattr(self._config, name))
         if others:
             log.warning(
                 "%s: takes effect after a restart of the service", ", ".join(others)
@@ -313,13 +314,13 @@ class Supervisor:
         if changed:
             self._processes[FRONT_END].send(("config", self._config))
 
-    def _join(self, new: str) -> None:
-        """Link a new worker to the front end, or a new front end to all workers."""
+    def _connect(self, new: str) -> None:
+        """Connect a new worker to the front end, or a new front end to all workers."""
         if self._processes[FRONT_END].link is None:
             return
         for name, index in self._devices.items():
             if new in (FRONT_END, name) and self._processes[name].link is not None:
-                self._met.discard(index)
+                self._connected.discard(index)
                 ours, theirs = socket.socketpair()
                 self._processes[name].send(("link", index), [ours.fileno()])
                 self._processes[FRONT_END].send(("link", index), [theirs.fileno()])
@@ -330,7 +331,7 @@ class Supervisor:
                 self._processes[FRONT_END].send(("lost", index))
             self._report_degraded()
 
-    def _listen(self, name: str, process: _Process) -> None:
+    def _receive(self, name: str, process: _Process) -> None:
         try:
             if process.link is None:
                 return
@@ -339,8 +340,8 @@ class Supervisor:
                     process.is_ready = True
                     self._endpoint = rest[0] or self._endpoint
                     self._report_ready(name)
-                elif kind == "met":
-                    self._met.add(rest[0])
+                elif kind == "connected":
+                    self._connected.add(rest[0])
                     self._announce()
                 elif kind == "failed":
                     self._fail(name, process, rest[0])
@@ -348,11 +349,11 @@ class Supervisor:
                 elif kind == "hung":
                     self._kill_device(rest[0])
                 elif kind == "session":
-                    self._keep_session(*rest)
+                    self._store_session(*rest)
         except LinkClosed:
             self._restart(name, process)
 
-    def _keep_session(self, key: str, record: object | None) -> None:
+    def _store_session(self, key: str, record: object | None) -> None:
         if record is None:
             self._sessions.pop(key, None)
         else:
@@ -362,42 +363,44 @@ class Supervisor:
         index = self._devices.get(name)
         if index in self._lost:
             self._lost.discard(index)
-            self._processes[FRONT_END].send(("found", index))
+            self._processes[FRONT_END].send(("recovered", index))
             log.info("the %s process is running again", name)
         self._report_degraded()
         self._announce()
 
     def _announce(self) -> None:
-        """Report that the service is ready, once the front end agrees."""
+        """Report that the service is ready, once all processes are connected."""
         if (
             not self._is_announced
             and all(process.is_ready for process in self._processes.values())
-            and self._met == set(self._devices.values())
+            and self._connected == set(self._devices.values())
         ):
             self._is_announced = True
-            self._when_ready(self._endpoint)
+            self._on_ready(self._endpoint)
             self._was_ready = True
 
     def _report_degraded(self) -> None:
-        """Tell the front end whether a process is down for longer than a restart."""
+        """Tell the front end whether a process has been down for several restarts."""
         is_degraded = bool(self._lost) or any(
-            restarts.n_deaths > DEATHS_WITHOUT_PAUSE
+            restarts.n_exits > EXITS_WITHOUT_PAUSE
             and not self._processes[name].is_ready
             for name, restarts in self._restarts.items()
         )
         self._processes[FRONT_END].send(("degraded", is_degraded))
 
     def _restart(self, name: str, process: _Process) -> None:
-        """Clean up after a process that has ended, and schedule its restart."""
-        how = process.end()
+        """Clean up after a process that has exited, and schedule its restart."""
+        outcome = process.end()
         if name in self._standbys:
-            log.error("the %s process %s; the standby process takes over", name, how)
+            log.error(
+                "the %s process %s; the standby process takes over", name, outcome
+            )
             self._restarts[name].due_s = time.monotonic()
             self._processes[name] = _Process()
             return
-        self._note_death(name, process.started_s, how)
+        self._schedule_restart(name, process.started_s, outcome)
 
-    def _note_death(self, name: str, started_s: float, how: str) -> None:
+    def _schedule_restart(self, name: str, started_s: float, outcome: str) -> None:
         """Schedule the restart of a process.
 
         Raises
@@ -406,37 +409,37 @@ class Supervisor:
             If the service has never been ready, or `give_up_after_s` has passed.
         """
         now_s, restarts = time.monotonic(), self._restarts[name]
-        pause_s = restarts.note_death(started_s, now_s)
+        pause_s = restarts.record_exit(started_s, now_s)
         self._processes[name] = _Process()
         failing_s = now_s - (restarts.failing_since_s or now_s)
         limit_s = self._config.give_up_after_s
         if not self._was_ready:
-            raise ServiceFailed(f"its {name} process {how} before it was ready")
+            raise ServiceFailed(f"its {name} process {outcome} before it was ready")
         if limit_s and failing_s > limit_s:
             raise ServiceFailed(
-                f"its {name} process {how}; it has not stayed for {failing_s:.0f} s "
+                f"its {name} process {outcome}, repeatedly for {failing_s:.0f} s "
                 f"(give_up_after_s is {limit_s:g})"
             )
         when = f"in {pause_s:g} s" if pause_s else "now"
-        log.error("the %s process %s; starting a new one %s", name, how, when)
+        log.error("the %s process %s; starting a new one %s", name, outcome, when)
         if pause_s and self._is_announced:
             self._is_announced = False
-            self._when_not_ready()
+            self._on_not_ready()
         index = self._devices.get(name)
-        if index is not None and restarts.n_deaths >= GIVE_UP_DEVICE_DEATHS:
+        if index is not None and restarts.n_exits >= GIVE_UP_DEVICE_EXITS:
             self._give_up_device(name, index)
         self._report_degraded()
 
     def _give_up_device(self, name: str, index: int) -> None:
-        """Move the sessions of a device to other devices, if there are any."""
+        """Take a device out of service, if there are others."""
         if index in self._lost or len(self._lost) + 1 >= len(self._devices):
             return
         log.error("the %s process is disabled until it stays up", name)
         self._lost.add(index)
         self._processes[FRONT_END].send(("lost", index))
 
-    def _fail(self, name: str, process: _Process, why: str) -> None:
-        """Handle a process that reports that it cannot work.
+    def _fail(self, name: str, process: _Process, reason: str) -> None:
+        """Handle a process that reports that it cannot run.
 
         Raises
         ------
@@ -444,12 +447,12 @@ class Supervisor:
             If the service has not been ready yet.
         """
         if not self._was_ready:
-            raise ServiceFailed(why)
+            raise ServiceFailed(reason)
         process.end()
         restarts = self._restarts[name]
         # An immediate restart would fail again.
-        restarts.n_deaths = max(restarts.n_deaths, GIVE_UP_DEVICE_DEATHS - 1)
-        self._note_death(name, time.monotonic(), f"cannot work ({why})")
+        restarts.n_exits = max(restarts.n_exits, GIVE_UP_DEVICE_EXITS - 1)
+        self._schedule_restart(name, time.monotonic(), f"cannot run ({reason})")
 
     def _check_stopped(self, name: str, process: _Process) -> None:
         """Kill a process that has been stopped by a signal for too long."""
@@ -460,16 +463,16 @@ class Supervisor:
         if process.stopped_since_s is None:
             process.stopped_since_s = now_s
         elif now_s - process.stopped_since_s > STOPPED_LIMIT_S:
-            log.error("the %s process does not respond", name)
+            log.error("the %s process does not respond; killing it", name)
             process.process.kill()
 
     def _kill_device(self, index: int) -> None:
-        for name, of_index in self._devices.items():
+        for name, device_index in self._devices.items():
             process = self._processes[name].process
-            if of_index == index and process is not None:
+            if device_index == index and process is not None:
                 process.kill()
 
-    def _end_all(self) -> None:
+    def _stop_all(self) -> None:
         """Stop all processes, by force after a grace period."""
         for process in self._all_processes:
             process.send(("stop",))

@@ -1,10 +1,13 @@
 """Messages of the wire protocol; `filter_service.messages` is their public API.
 
-message    base class of messages, limits
-images     images, formats, views
-depths     depth encodings
+A *message* has a *header*, a msgpack map of its fields, and *parts*, which are images
+or the body of a profile.  PROTOCOL.md is authoritative.
+
+message      base class of messages; limits
+images       image formats, headers of views, image parts
+depths       depth encodings
 compression  lossless compression of parts
-requests   messages from the client
-replies    messages from the service
-unpacking  bounded unpacking of untrusted bytes
+requests     messages from the client
+replies      messages from the service
+unpacking    bounded unpacking of untrusted bytes
 """

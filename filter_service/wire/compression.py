@@ -1,7 +1,7 @@
 """Lossless compression of message parts, for slow networks.
 
-Each part is one LZ4 block without a frame.  The header gives the size of the image, so
-a block can never expand to more memory than that.
+Each part is one LZ4 block without frame format.  The message header defines the size of
+the image, which limits the memory of decompression.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def unpacked(
     Raises
     ------
     BadMessage
-        If it is not an LZ4 block, or its image has another size.
+        If it is not an LZ4 block, or has another decompressed size.
     """
     from lz4 import block
 
@@ -57,7 +57,7 @@ def unpacked(
         ) from None
     if len(data) != size_bytes:
         raise BadMessage(
-            f"the block holds {len(data)} bytes",
+            f"the block decompresses to {len(data)} bytes",
             field=path,
             allowed=f"{size_bytes} bytes, shape {tuple(shape)} of {dtype}",
         )
@@ -65,11 +65,19 @@ def unpacked(
 
 
 def block_from_part(part: Any, size_bytes: int, path: str) -> NDArray[np.uint8]:
-    """Return an array over a part that may be the block of this many bytes.
+    """Return an array over a part that is a block, without decompressing it.
+
+    Parameters
+    ----------
+    size_bytes : int
+        Decompressed size.
+    path : str
+        Path of the image in error messages.
 
     Raises
     ------
     BadMessage
+        If the part is empty, or too large for that size.
     """
     most = largest_block_bytes(size_bytes)
     n_bytes = memoryview(part).nbytes

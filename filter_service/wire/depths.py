@@ -1,7 +1,7 @@
-"""Encodings of depth, with their errors, for slow networks.
+"""Encodings of depth, for slow networks.
 
 Depth in a frame is in meters, float32; on the wire it may take half as many bytes.
-Missing depth stays missing and infinity stays infinity in every encoding.
+All encodings preserve missing depth and infinity.
 """
 
 from __future__ import annotations
@@ -47,16 +47,16 @@ def encoded_depth(depth_m: NDArray[np.float32], encoding: str) -> NDArray[Any]:
     return np.where(is_missing, MISSING_MM, near_mm).astype(np.uint16)
 
 
-def decoded_depth(sent: NDArray[Any], encoding: str) -> NDArray[np.float32]:
+def decoded_depth(encoded: NDArray[Any], encoding: str) -> NDArray[np.float32]:
     """Decode depth to meters; 0 is missing."""
     if encoding == "float32":
-        return sent
+        return encoded
     if encoding == "float16":
-        return sent.astype(np.float32)
+        return encoded.astype(np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
         if encoding == "dpt16":
-            near_m = 1.0 / np.abs(sent.astype(np.float32))  # -0 is infinity, too
-            return np.where(sent >= 0.0, near_m, np.float32(0.0)).astype(np.float32)
-    found = sent.astype(np.float32) / np.float32(MM_PER_M)
-    found[sent == INFINITE_MM] = np.inf
+            near_m = 1.0 / np.abs(encoded.astype(np.float32))  # -0 is infinity, too
+            return np.where(encoded >= 0.0, near_m, np.float32(0.0)).astype(np.float32)
+    found = encoded.astype(np.float32) / np.float32(MM_PER_M)
+    found[encoded == INFINITE_MM] = np.inf
     return found

@@ -24,7 +24,7 @@ from filter_service.wire.compression import (
 from filter_service.wire.depths import WIRE_DTYPES, DepthEncoding, decoded_depth
 from filter_service.wire.message import Limits, Part, expect_parts
 
-USUAL_STATE = ViewState()
+DEFAULT_STATE = ViewState()
 
 DType = Literal["uint8", "float32", "float16"]
 Space = Literal["srgb", "linear"]
@@ -44,7 +44,7 @@ class ImageFormat(Record):
     space: Space
 
     def __post_init__(self) -> None:
-        """Check that the pair is valid: 8 bits are sRGB, floats are linear."""
+        """Check that 8 bits are sRGB, and floats linear."""
         wanted = SPACE_OF_DTYPE[self.dtype]
         if self.space != wanted:
             raise BadMessage(
@@ -79,7 +79,7 @@ OUTPUT_OF_FORMAT: dict[ImageFormat, Output] = {
 
 @dataclass(frozen=True)
 class DepthFormat(Record):
-    """Meaning of depth, view-space z or distance, and its encoding."""
+    """Kind of depth, view-space z or distance from the eye, and its encoding."""
 
     kind: DepthKind = "planar"
     encoding: DepthEncoding = "float32"
@@ -114,7 +114,7 @@ class ViewHeader(Record):
         *,
         has_hidden: bool = False,
         depth_encoding: DepthEncoding = "float32",
-        state: ViewState = USUAL_STATE,
+        state: ViewState = DEFAULT_STATE,
     ) -> ViewHeader:
         """Return the header of a camera's view."""
         size_px = (camera.width_px, camera.height_px)
@@ -126,7 +126,7 @@ class ViewHeader(Record):
         cls,
         view: RgbdView,
         depth_encoding: DepthEncoding = "float32",
-        state: ViewState = USUAL_STATE,
+        state: ViewState = DEFAULT_STATE,
     ) -> ViewHeader:
         """Return the header that describes a view."""
         return cls.of(
@@ -139,7 +139,7 @@ class ViewHeader(Record):
         )
 
     def view(self, images: ViewImages) -> RgbdView:
-        """Return the view of these images, with depth in meters."""
+        """Return a view with these images, with depth decoded to meters."""
         hidden = images.hidden_depth_m
         encoding = self.depth.encoding
         return RgbdView(
@@ -153,7 +153,7 @@ class ViewHeader(Record):
 
     @property
     def state(self) -> ViewState:
-        """Return the eye that sees the view, and its state."""
+        """Return the view's eye and its state."""
         return ViewState(
             self.eye, self.pupil_diameter_mm, self.focus_dpt, self.gaze_deg, self.pose
         )
@@ -186,9 +186,11 @@ class ViewHeader(Record):
 class ViewImages:
     """The images of one view: the visible surface, and optionally the hidden layer.
 
+    Attributes
+    ----------
     color : (height, width, 3) uint8 sRGB, or float32 or float16 linear
         The renderer replaces non-finite values by black and reports them.
-    depth_m : (height, width) float32, meters, or as the header's encoding has it
+    depth_m : (height, width) float32, meters, or in the header's encoding
         0, negative and NaN are missing.
     hidden_color, hidden_depth_m : like color and depth_m, optional
         Depth of 0, negative or NaN: nothing is hidden here.
@@ -223,9 +225,9 @@ class ViewImages:
                 f"has_hidden is {view.has_hidden}, but there is "
                 f"{'a' if self.has_hidden else 'no'} hidden layer"
             )
-        parts = [as_sent(self.color, view.color), self.depth_m]
+        parts = [to_wire_image(self.color, view.color), self.depth_m]
         if self.hidden_color is not None and self.hidden_depth_m is not None:
-            parts += [as_sent(self.hidden_color, view.color), self.hidden_depth_m]
+            parts += [to_wire_image(self.hidden_color, view.color), self.hidden_depth_m]
         return parts
 
 
@@ -236,8 +238,8 @@ else:  # sent as separate parts, which msgspec does not decode
     Images = Pictures = tuple
 
 
-def as_sent(image: NDArray[Any], color: ImageFormat) -> NDArray[Any]:
-    """Return the image contiguous and little-endian, after checking its format.
+def to_wire_image(image: NDArray[Any], color: ImageFormat) -> NDArray[Any]:
+    """Return an image contiguous and little-endian, after checking its format.
 
     Raises
     ------
@@ -246,7 +248,7 @@ def as_sent(image: NDArray[Any], color: ImageFormat) -> NDArray[Any]:
     """
     if image.dtype != np.dtype(color.dtype) or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(
-            f"an image of shape {image.shape} and {image.dtype} was to be sent as "
+            f"an image of shape {image.shape} and {image.dtype} cannot be sent as "
             f"(height, width, 3) {color.dtype}"
         )
     return np.ascontiguousarray(image, dtype=np.dtype(color.dtype).newbyteorder("<"))
@@ -255,7 +257,13 @@ def as_sent(image: NDArray[Any], color: ImageFormat) -> NDArray[Any]:
 def image_from_part(
     part: Part, shape: tuple[int, ...], dtype: str, path: str
 ) -> NDArray[Any]:
-    """Return a read-only array over a message part whose size must be exact."""
+    """Return a read-only array over a message part.
+
+    Raises
+    ------
+    BadMessage
+        If the part does not have exactly the size of the image.
+    """
     expected_bytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
     size_bytes = memoryview(part).nbytes
     if size_bytes != expected_bytes:
@@ -278,7 +286,12 @@ def images_from_parts(
 ) -> tuple[ViewImages, ...]:
     """Return arrays over the parts of a frame's views, without copying.
 
-    Compressed parts give arrays of bytes, see `unpacked_images`.
+    Compressed parts become arrays of bytes; see `unpacked_images`.
+
+    Raises
+    ------
+    BadMessage
+        If the number or size of parts is wrong.
     """
     expect_parts(parts, sum(view.part_count for view in views))
     waiting = iter(parts)

@@ -1,4 +1,4 @@
-"""Base class of messages: header fields from annotated types, and parts."""
+"""Base class of messages: header fields with annotated types, and parts."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ DEFAULT_ENDPOINT = "tcp://127.0.0.1:5577"
 
 Part = bytes | bytearray | memoryview
 
-MAX_ID = 2**53 - 1  # ids survive a trip through a double, as in JSON or JavaScript
+MAX_ID = 2**53 - 1  # exact as a double, as in JSON and JavaScript
 MAX_NOTES = 8
 MAX_NOTE_BYTES = 200
 MAX_DEVICES = 8
 
 Id = Annotated[int, Meta(ge=0, le=MAX_ID)]
 Count = Id
-Word = Annotated[str, Meta(max_length=100)]
+ShortText = Annotated[str, Meta(max_length=100)]
 Text = Annotated[str, Meta(max_length=2048)]
 Notes = Annotated[tuple[Text, ...], Meta(max_length=MAX_NOTES)]
 Milliseconds = Annotated[float, Meta(ge=0.0, le=1e12)]
-Moment = Annotated[float, Meta(ge=-1e18, le=1e18)]
+Timestamp = Annotated[float, Meta(ge=-1e18, le=1e18)]
 Megabytes = Annotated[float, Meta(ge=0.0, le=1e9)]
 Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Size = Annotated[int, Meta(ge=1, le=2**40)]
@@ -42,8 +42,8 @@ class Limits(Record):
     max_part_bytes: Size = 100_000_000  # 3840 x 2160 linear float32 color fits
     max_profile_bytes: Size = 2**20
 
-    def narrowed(self, error: BadMessage) -> BadMessage:
-        """Return the error with this service's limit in place of the protocol's."""
+    def with_limits(self, error: BadMessage) -> BadMessage:
+        """Return the error with this service's limits instead of the protocol's."""
         name, allowed = (error.field or "").rpartition(".")[2], error.allowed
         if allowed and allowed.startswith(("an integer", "a list")):
             allowed = {
@@ -86,7 +86,7 @@ class Message(Record):
         Raises
         ------
         BadMessage
-            Names the field, the invalid value and the allowed ones.
+            If a field is invalid; the error has its path, value and allowed values.
         """
         given = {name: value for name, value in header.items() if name != cls.payload}
         return checked(given, cls).with_parts(parts, limits)
@@ -111,7 +111,7 @@ def expect_parts(parts: Sequence[Part], count: int) -> None:
 
 
 def clip(text: str, max_bytes: int) -> str:
-    """Return the text, shortened with dots if its UTF-8 form is too long."""
+    """Return a text, truncated with "..." if its UTF-8 form is too long."""
     encoded = text.encode("utf-8", "replace")
     if len(encoded) <= max_bytes:
         return encoded.decode("utf-8")
@@ -119,5 +119,5 @@ def clip(text: str, max_bytes: int) -> str:
 
 
 def clip_notes(notes: Sequence[str], most: int = MAX_NOTES) -> tuple[str, ...]:
-    """Return the notes that fit into a header."""
+    """Return the first notes, truncated to fit into a header."""
     return tuple(clip(note, MAX_NOTE_BYTES) for note in notes[:most])

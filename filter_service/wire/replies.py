@@ -18,8 +18,8 @@ from filter_service.wire.images import (
     SRGB8,
     ImageFormat,
     Pictures,
-    as_sent,
     image_from_part,
+    to_wire_image,
 )
 from filter_service.wire.message import (
     MAX_DEVICES,
@@ -31,13 +31,13 @@ from filter_service.wire.message import (
     Megabytes,
     Message,
     Milliseconds,
-    Moment,
     Nanoseconds,
     Notes,
     Part,
+    ShortText,
     Size,
     Text,
-    Word,
+    Timestamp,
     clip,
     clip_notes,
     expect_parts,
@@ -59,7 +59,7 @@ MAX_RENDERER_BYTES = 80
 
 
 def _clipped(reply: Message, /, **limits: int) -> None:
-    """Shorten texts of a new message to fit into a header."""
+    """Truncate texts of a new message to fit into a header."""
     for name, max_bytes in limits.items():
         value = getattr(reply, name)
         if value is not None:
@@ -70,7 +70,7 @@ def _clipped(reply: Message, /, **limits: int) -> None:
 class Welcome(Message):
     """The reply to hello: the service's description, limits and credit.
 
-    If ``is_resumed``, the session of the key continues: ``profile_id`` is the last
+    If ``is_resumed``, the session of the key was resumed: ``profile_id`` is the last
     accepted profile of the eye ``both``, and ``profile_ids`` those of all its eyes.
     """
 
@@ -78,8 +78,8 @@ class Welcome(Message):
     server: dict[str, Text]
     limits: Limits
     credit: Annotated[int, Meta(ge=1, le=1000)]
-    transports: Annotated[tuple[Word, ...], Meta(max_length=8)] = ("tcp",)
-    session_key: Word = ""
+    transports: Annotated[tuple[ShortText, ...], Meta(max_length=8)] = ("tcp",)
+    session_key: ShortText = ""
     session_keep_s: Annotated[float, Meta(ge=0.0, le=1e9)] = 0.0
     is_resumed: bool = False
     profile_id: Id | None = None
@@ -97,7 +97,7 @@ class Welcome(Message):
 
 @dataclass(frozen=True)
 class Accepted(Message):
-    """A profile is well formed; ``is_building`` is false while no camera is known.
+    """A profile was accepted; ``is_building`` is false while no camera is known.
 
     ``n_cameras`` is the number of cameras that it is being prepared for.
     """
@@ -117,7 +117,7 @@ class Progress(Message):
 
     profile_id: Id
     generation: Id
-    stage: Word
+    stage: ShortText
     fraction: Annotated[float, Meta(ge=0.0, le=1.0)]
     eye: EyeName = "both"
 
@@ -154,9 +154,9 @@ class Ready(Message):
         object.__setattr__(self, "notes", clip_notes(self.notes))
 
 
-Angle = Annotated[float, Meta(ge=-360.0, le=360.0)]
-UsedPupil = Annotated[float, Meta(ge=0.0, le=100.0)]
-UsedFocus = Annotated[float, Meta(ge=-100.0, le=100.0)]
+AngleDeg = Annotated[float, Meta(ge=-360.0, le=360.0)]
+ResultPupilMm = Annotated[float, Meta(ge=0.0, le=100.0)]
+ResultFocusDpt = Annotated[float, Meta(ge=-100.0, le=100.0)]
 
 
 @dataclass(frozen=True)
@@ -170,9 +170,9 @@ class ResultView(Record):
     profile_id: Id | None = None
     generation: Id | None = None
     is_complete: bool | None = None
-    pupil_diameter_mm: UsedPupil | None = None
-    focus_dpt: UsedFocus | None = None
-    gaze_deg: tuple[Angle, Angle] | None = None
+    pupil_diameter_mm: ResultPupilMm | None = None
+    focus_dpt: ResultFocusDpt | None = None
+    gaze_deg: tuple[AngleDeg, AngleDeg] | None = None
     pose: Pose | None = None
 
 
@@ -188,13 +188,13 @@ class Result(Message):
     profile_id: Id
     generation: Id
     views: Annotated[tuple[ResultView, ...], Meta(min_length=1, max_length=16)]
-    pupil_diameter_mm: UsedPupil
-    focus_dpt: UsedFocus
+    pupil_diameter_mm: ResultPupilMm
+    focus_dpt: ResultFocusDpt
     missing_depth_count: Count
     clamped_depth_count: Count
     total_ms: Milliseconds
     stage_times_ms: dict[str, Annotated[float, Meta(ge=-1e12, le=1e12)]]
-    gaze_deg: tuple[Angle, Angle] = (0.0, 0.0)
+    gaze_deg: tuple[AngleDeg, AngleDeg] = (0.0, 0.0)
     overflow_count: Count = 0
     notes: Notes = ()
     is_complete: bool = True
@@ -218,7 +218,7 @@ class Result(Message):
         if self.compression != "none":
             return list(self.colors)
         pairs = zip(self.colors, self.views, strict=True)
-        return [as_sent(color, view.color) for color, view in pairs]
+        return [to_wire_image(color, view.color) for color, view in pairs]
 
     def with_parts(self, parts: Sequence[Part], limits: Limits) -> Self:
         """Return the result with arrays over its parts."""
@@ -242,7 +242,7 @@ class Result(Message):
 
 @dataclass(frozen=True)
 class Shared(Message):
-    """Shared memory for a client of the same user and machine, or why there is none.
+    """Shared memory for a client of the same user and machine, or a refusal.
 
     The client opens and maps ``path`` like a file.  The memory belongs to the session
     until it is returned or the connection ends.
@@ -250,7 +250,7 @@ class Shared(Message):
 
     slot: Id | None = None
     size_bytes: Size | None = None
-    path: Word = ""
+    path: ShortText = ""
     reason: Text = ""
 
     type_name: ClassVar[str] = "shared"
@@ -258,13 +258,13 @@ class Shared(Message):
 
 @dataclass(frozen=True)
 class Dropped(Message):
-    """A frame that was not filtered, and why; unknown reasons are accepted.
+    """A frame was not filtered, with the reason; clients accept unknown reasons.
 
     ``retry_after_ms`` is the time after which a next frame may succeed, if known.
     """
 
     frame_id: Id
-    reason: Word
+    reason: ShortText
     retry_after_ms: Milliseconds | None = None
 
     type_name: ClassVar[str] = "dropped"
@@ -274,7 +274,7 @@ class Dropped(Message):
 class ErrorReply(Message):
     """An error: what was wrong, in which field, and what is allowed."""
 
-    code: Word
+    code: ShortText
     message: Text
     field: Text | None = None
     allowed: Text | None = None
@@ -316,11 +316,11 @@ class ErrorReply(Message):
 class DeviceState(Record):
     """State of one device in `pong`.
 
-    ``busy_ratio`` is the share of about the last ten seconds in which it filtered.
-    ``is_lost`` means that it was given up because it could not be restarted.
+    ``busy_ratio`` is the share of about the last ten seconds spent filtering.
+    ``is_lost`` means that it is out of service because it could not be restarted.
     """
 
-    name: Word
+    name: ShortText
     renderer: Text = ""
     n_sessions: Count = 0
     busy_ratio: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
@@ -345,8 +345,8 @@ class Pong(Message):
     several workers, the longest such time.
     """
 
-    t: Moment
-    server_time_s: Moment
+    t: Timestamp
+    server_time_s: Timestamp
     memory_mb: Megabytes = 0.0
     n_sessions: Count = 0
     n_rendered: Count = 0
@@ -364,9 +364,9 @@ class Pong(Message):
 
 @dataclass(frozen=True)
 class Closing(Message):
-    """The owner ends the service, which may be started again later."""
+    """The service is shutting down; it may be started again later."""
 
-    reason: Word = "shutdown"
+    reason: ShortText = "shutdown"
 
     type_name: ClassVar[str] = "closing"
 

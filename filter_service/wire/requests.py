@@ -38,11 +38,11 @@ from filter_service.wire.message import (
     Id,
     Limits,
     Message,
-    Moment,
     Nanoseconds,
     Part,
+    ShortText,
     Size,
-    Word,
+    Timestamp,
     expect_parts,
 )
 from filter_service.wire.unpacking import unpack_profile
@@ -54,18 +54,17 @@ MAX_VIEWS = 8
 class Hello(Message):
     """The first message of a client; a session key resumes an earlier session."""
 
-    client: Word = ""
-    session_key: Word = ""
+    client: ShortText = ""
+    session_key: ShortText = ""
 
     type_name: ClassVar[str] = "hello"
 
 
 @dataclass(frozen=True)
 class ProfileRequest(Message):
-    """Request for a new eye; the body is a separate part.
+    """Sets the profile of an eye; the body is a separate part.
 
-    ``views`` are cameras to prepare for.  ``eye`` selects one of the session's eyes,
-    which views of a frame refer to.
+    ``views`` are cameras to prepare for.  ``eye`` names one of the session's eyes.
     """
 
     profile_id: Id
@@ -92,7 +91,7 @@ class ProfileRequest(Message):
 
 @dataclass(frozen=True, kw_only=True)
 class FrameOptions(RenderOptions):
-    """Options of a frame on the wire: those of rendering, and deprecated ones."""
+    """Options of a frame on the wire: rendering options, and deprecated ones."""
 
     prepared_only: bool = False
 
@@ -106,7 +105,7 @@ class FrameOptions(RenderOptions):
 class SharedPlaces(Record):
     """Positions in shared memory of a frame's images and of its result.
 
-    ``starts`` and ``result_starts`` are in the order that the parts would have.
+    ``starts`` and ``result_starts`` are in the order of parts.
     """
 
     slot: Id
@@ -161,6 +160,7 @@ class Frame(Message):
         Raises
         ------
         BadMessage
+            If a block is invalid.
         """
         if self.compression == "none":
             return self
@@ -228,7 +228,7 @@ class Unshare(Message):
 class Ping(Message):
     """Requests the state of the service; ``t`` is returned unchanged."""
 
-    t: Moment = 0.0
+    t: Timestamp = 0.0
 
     type_name: ClassVar[str] = "ping"
 

@@ -26,8 +26,8 @@ MAX_ITEMS = 16_384
 coefficients have 3,400.  Refusing a megabyte with more takes 1 ms; parsing it took
 300."""
 
-# Nested arrays are the expensive input: 64 KiB of them cost 98 ms without a bound on
-# their length and 0.03 ms with one of 64.
+# Nested arrays are the most expensive input: 64 KiB of them took 98 ms without a limit
+# of their length, and 0.03 ms with a limit of 64.
 _HEADER_BOUNDS = {
     "max_str_len": 2048,
     "max_bin_len": 0,
@@ -35,7 +35,7 @@ _HEADER_BOUNDS = {
     "max_map_len": 64,
     "max_ext_len": 0,
 }
-# A profile may hold a set of measurements (28 coefficients at some hundred angles).
+# A profile may contain measurements: 28 coefficients at a few hundred angles.
 _PROFILE_BOUNDS = {
     "max_str_len": MAX_TEXT,
     "max_bin_len": 0,
@@ -70,7 +70,7 @@ def unpack_header(data: bytes | bytearray | memoryview) -> dict[str, Any]:
         raise BadMessage(
             f"it is {show(header)}", field="header", allowed="a msgpack map"
         )
-    _refuse_strange_values(header, "header")
+    _check_values(header, "header")
     return header
 
 
@@ -79,8 +79,7 @@ def unpack_profile(
 ) -> dict[str, Any]:
     """Return the profile map from its part, JSON or msgpack.
 
-    The two are unambiguous: a JSON object begins with ``{``, perhaps after white space,
-    and no msgpack map begins with any of these bytes.
+    A JSON object starts with ``{`` or white space; a msgpack map starts with neither.
 
     Raises
     ------
@@ -104,7 +103,7 @@ def unpack_profile(
         raise BadMessage(
             f"it is {show(profile)}", field="profile", allowed="a JSON or msgpack map"
         )
-    _refuse_strange_values(profile, "profile", finite=True)
+    _check_values(profile, "profile", finite=True)
     return profile
 
 
@@ -119,12 +118,12 @@ class _Items:
         if self._count > MAX_ITEMS:
             raise ValueError(f"it has more than {MAX_ITEMS} items")
 
-    def of_list(self, items: list[object]) -> list[object]:
+    def count_list(self, items: list[object]) -> list[object]:
         """Count a list."""
         self._add(len(items))
         return items
 
-    def of_map(self, pairs: list[tuple[object, object]]) -> dict[str, object]:
+    def count_map(self, pairs: list[tuple[object, object]]) -> dict[str, object]:
         """Count the pairs of a map, and return the map."""
         self._add(len(pairs))
         return _unique_keys(pairs)
@@ -140,9 +139,9 @@ def _unpacked(
             raw=False,
             use_list=True,
             strict_map_key=False,  # the error of _unique_keys includes the key
-            list_hook=items.of_list,
-            object_pairs_hook=items.of_map,
-            ext_hook=_refuse_extension,
+            list_hook=items.count_list,
+            object_pairs_hook=items.count_map,
+            ext_hook=_reject_extension,
             **bounds,
         )
     except (ValueError, msgpack.UnpackException) as error:
@@ -166,8 +165,8 @@ def _unique_keys(pairs: list[tuple[object, object]]) -> dict[str, object]:
     return result
 
 
-def _refuse_extension(code: int, _data: bytes) -> object:
-    raise ValueError(f"extension type {code} is not used here")
+def _reject_extension(code: int, _data: bytes) -> object:
+    raise ValueError(f"extension type {code} is not supported")
 
 
 def _load_json(body: bytes) -> object:
@@ -185,14 +184,14 @@ def _load_json(body: bytes) -> object:
 
 
 _Path = tuple[Any, Any]
-"""Path of a value: the path of the map or list that holds it, and its key there."""
+"""Path of a value: the path of its map or list, and its key there."""
 
 
-def _refuse_strange_values(root: object, name: str, *, finite: bool = False) -> None:
+def _check_values(root: object, name: str, *, finite: bool = False) -> None:
     """Raise BadMessage for values nested too deep and for too large texts or integers.
 
-    With ``finite``, raise also for NaN and infinity.  This does not recurse, and it
-    formats a path only for a refused value.
+    With ``finite``, raise also for NaN and infinity.  This does not recurse, and
+    formats a path only for an invalid value.
     """
     waiting: list[tuple[_Path, object, int]] = [((None, name), root, 1)]
     while waiting:
@@ -217,25 +216,25 @@ def _refuse_strange_values(root: object, name: str, *, finite: bool = False) -> 
                 if len(item) > MAX_TEXT:
                     raise BadMessage(
                         f"it has {len(item)} characters",
-                        field=_as_text((path, key)),
+                        field=_format_path((path, key)),
                         allowed=f"at most {MAX_TEXT} characters",
                     )
             elif isinstance(item, float):
                 if finite and not math.isfinite(item):
                     raise BadMessage(
                         f"it is {item!r}",
-                        field=_as_text((path, key)),
+                        field=_format_path((path, key)),
                         allowed="a finite number",
                     )
             elif isinstance(item, int) and item.bit_length() > MAX_BITS:
                 raise BadMessage(
                     f"it is an integer of {item.bit_length()} bits",
-                    field=_as_text((path, key)),
+                    field=_format_path((path, key)),
                     allowed=f"at most {MAX_BITS} bits",
                 )
 
 
-def _as_text(path: _Path | None) -> str:
+def _format_path(path: _Path | None) -> str:
     steps: list[str] = []
     while path is not None:
         path, key = path

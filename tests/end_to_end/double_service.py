@@ -49,7 +49,7 @@ def main():
     run(
         load(),
         open_builder="tests.end_to_end.double_service:open_builder",
-        read_again=load,
+        reload_config=load,
     )
 
 

@@ -265,7 +265,7 @@ def test_a_camera_is_told_by_its_angle_its_focal_length_or_its_calibration(scene
         (("--distance-m", 0.001), "--distance-m is 0.001; allowed:"),
         (("--distance-m", "nan"), "--distance-m is nan; allowed:"),
         (("--distance-m", 1), "--fov-deg, --focal-px, --intrinsics: none is given"),
-        (("--distance-m", 1, "--intrinsics", "1,2"), "allowed is FX,FY,CX,CY"),
+        (("--distance-m", 1, "--intrinsics", "1,2"), "allowed: FX,FY,CX,CY"),
         (("--distance-m", 1, "--focal-px", 0), "--focal-px is 0; allowed:"),
         (
             ("--distance-m", 1, "--fov-deg", 50, "--focal-px", 9),

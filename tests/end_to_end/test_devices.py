@@ -225,7 +225,7 @@ def test_none_uses_up_the_memory_of_another(start_service, raw_client):
     assert first.ask(Share(2_000_000)).path
     refused = first.ask(Share(2_000_000))
     assert not refused.path
-    assert "allowed: 2500000 in all" in refused.reason
+    assert "allowed: 2500000 in total" in refused.reason
     assert second.ask(Share(2_000_000)).path
 
 

@@ -108,7 +108,7 @@ def test_a_wait_ends_where_nothing_more_will_come(eye_filter, builder):
         with pytest.raises(BuildFailed, match="told to fail"):
             eye_filter.wait(10.0)
     with EyeFilter(eye(1), builder=builder) as blind:
-        with pytest.raises(BadMessage, match="camera: it is not known"):
+        with pytest.raises(BadMessage, match="camera: it is missing"):
             blind.wait(10.0)
 
 
@@ -204,7 +204,7 @@ def test_what_is_missing_or_wrong_is_named(eye_filter, builder):
     with pytest.raises(BadMessage, match=r"settings: .*'mod'"):
         EyeFilter(eye(1), CAMERA, {"mod": "quality"}, builder=builder)
     with EyeFilter(eye(1), builder=builder) as blind:
-        with pytest.raises(BadMessage, match="camera: it is not known"):
+        with pytest.raises(BadMessage, match="camera: it is missing"):
             blind.filter(COLOR, DEPTH_M, **SEE)
     with pytest.raises(ValueError, match="is closed"):
         blind.set_profile(eye(1))

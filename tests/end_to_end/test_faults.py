@@ -151,7 +151,7 @@ def test_a_frame_without_an_end_is_ended(start_service):
     view = make_view()
     with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
         client.set_profile(EYE, views=[view])
-        with pytest.raises(FilterError, match="the render worker ended"):
+        with pytest.raises(FilterError, match="the render worker exited"):
             client.filter(view, **SEE)
     assert "has not responded for 1 s" in service.log
 
@@ -227,7 +227,7 @@ def test_a_session_ends_when_its_client_stays_away(start_service, raw_client):
     first, second = raw_client(service), raw_client(service)
     key = first.begin().session_key
     first.close()
-    wait_until(lambda: "its client did not reconnect" in service.log)
+    wait_until(lambda: "the client did not reconnect" in service.log)
     assert not second.ask(Hello("late", key)).is_resumed
 
 

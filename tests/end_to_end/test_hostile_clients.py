@@ -145,7 +145,7 @@ def test_a_routing_id_opens_no_session(start_service, named):
     victim = named(service, b"camera")
     welcome = victim.begin(mark=7)
     victim.socket.close(linger=0)  # without a word
-    wait_until(lambda: "its client disconnected" in service.log)
+    wait_until(lambda: "client disconnected" in service.log)
     thief = named(service, b"camera")
     refused = thief.ask(small_frame(1))
     assert (refused.code, refused.frame_id) == ("no_session", 1)
@@ -192,7 +192,7 @@ def test_a_session_key_is_worth_nothing_with_another_client_s_key(
     victim = named(service, b"one", tmp_path / "lab.toml")
     key = victim.begin(mark=7).session_key
     victim.socket.close(linger=0)
-    wait_until(lambda: "its client disconnected" in service.log)
+    wait_until(lambda: "client disconnected" in service.log)
     thief = named(service, b"one", tmp_path / "other.toml")
     assert not thief.ask(Hello("thief", key)).is_resumed
     assert thief.ask(small_frame(1)).code == "no_profile"
@@ -344,7 +344,7 @@ def test_a_flooding_connection_is_ignored_and_then_closed(start_service, raw_cli
     parts = [bytes(part) for part in encode(Ping(1.0))]
     for _ in range(1000):
         raw.socket.send_multipart(parts)
-    wait_until(lambda: "is closed: too many messages" in service.log)
+    wait_until(lambda: ": too many messages" in service.log)
     assert other.ask(Ping(2.0)).t == 2.0
 
 
@@ -356,7 +356,7 @@ def test_one_session_cannot_take_all_memory(start_service, raw_client):
     while (reply := hoarder.ask(Share(10 * 10**6))).slot is not None:
         taken_mb += 10
     assert taken_mb == 40
-    assert "allowed: 50000000 in all" in reply.reason
+    assert "allowed: 50000000 in total" in reply.reason
     other.begin(mark=3)
     assert other.ask(small_frame(1)).colors[0][0, 0, 0] == 3
     assert other.ask(Share(10 * 10**6)).slot is not None

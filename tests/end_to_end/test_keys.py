@@ -92,7 +92,7 @@ def test_who_has_no_key_is_told_so_at_once(start_service, ring, tmp_path):
                 client.hello(timeout_s=TIMEOUT_S)
         finally:
             client.close()
-    assert "no allowed key" in service.log
+    assert "its key is not allowed" in service.log
 
 
 def test_keys_may_be_given_and_taken_while_the_service_runs(

@@ -94,11 +94,11 @@ def test_limits_change_while_clients_are_served(start_service):
         ):
             pass
         hang_up(
-            *(service, "max_sessions = 1", "max_sessions = 2"), "max_sessions is 2 now"
+            *(service, "max_sessions = 1", "max_sessions = 2"), "max_sessions is now 2"
         )
         with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as other:
             other.ping()
-            hang_up(service, "width_px = 640", "width_px = 1280", "px is 1280 now")
+            hang_up(service, "width_px = 640", "width_px = 1280", "px is now 1280")
         with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as other:
             assert other.welcome.limits.max_width_px == 1280
         client.filter(view, **SEE)

@@ -40,7 +40,7 @@ class RestingEngine(EngineDouble):
 
 
 class FrontEnd:
-    """The door's end of a link, and what the loop has said."""
+    """The front end's end of a link, and what the loop has said."""
 
     def __init__(self, engine):
         worker = WorkerHandle("tests.end_to_end.doubles:build", warm_up="")
@@ -49,7 +49,7 @@ class FrontEnd:
         self.link, theirs = Link.pair()
         self.control, control = Link.pair()
         self.theirs = Link(theirs), Link(control)
-        loop.join(self.theirs[0])
+        loop.connect(self.theirs[0])
         self.said = []
         self.thread = threading.Thread(
             target=loop.run, args=(self.theirs[1], lambda message, _: False)
@@ -73,7 +73,7 @@ class FrontEnd:
         raise AssertionError(f"waited in vain among {[m[0] for m in self.said]}")
 
     def answer_to(self, number):
-        return self.await_one(lambda m: m[0] == "answer" and m[1] == number)[2]
+        return self.await_one(lambda m: m[0] == "frame_reply" and m[1] == number)[2]
 
     def frame(self, number, key, places=PLACES):
         self.tell("frame", number, key, small_frame(number, images=()), places, ())
@@ -104,7 +104,7 @@ def front_end(resting):
     camera = small_frame(0).views[0].camera
     body = {"kind": "double", "mark": 3}
     front_end.tell("profile", "a", ProfileRequest(0, body, views=(camera,)))
-    front_end.await_one(lambda m: m[0] == "tell" and m[3].type_name == "ready")
+    front_end.await_one(lambda m: m[0] == "profile_reply" and m[3].type_name == "ready")
     yield front_end
     front_end.stop()
 

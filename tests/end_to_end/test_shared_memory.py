@@ -11,7 +11,7 @@ import pytest
 
 from clients.filter_client import FilterClient
 from filter_service.messages import Hello, Share, SharedPlaces, Unshare, encode
-from filter_service.shared_memory import Slot, SlotPool, starts_of
+from filter_service.shared_memory import Slot, SlotPool, aligned_starts
 from tests.end_to_end.conftest import TIMEOUT_S, make_view, small_frame
 from tests.end_to_end.test_faults import filtered_again
 from tests.end_to_end.test_lifecycle import wait_until
@@ -205,7 +205,7 @@ def test_memory_has_bounds(start_service, raw_client):
     raw.ask(Hello("raw"))
     given = [raw.ask(Share(800_000)) for _ in range(5)]
     assert [g.slot is not None for g in given] == [True] * 3 + [False] * 2
-    assert "allowed: 2500000 in all" in given[-1].reason
+    assert "allowed: 2500000 in total" in given[-1].reason
     answer = raw.ask(Share(2**40))
     assert answer.slot is None
     many = [raw.ask(Share(64)) for _ in range(20)]
@@ -232,14 +232,14 @@ def test_a_slot_is_sealed_and_full_from_the_start():
 
 def test_a_pool_uses_slots_again_and_not_for_what_is_much_smaller():
     pool = SlotPool(100_000)
-    slot, is_new = pool.take(20_000)
+    slot, is_new = pool.acquire(20_000)
     assert is_new
-    pool.give_back(slot)
-    assert pool.take(19_000) == (slot, False)
-    pool.give_back(slot)
-    small, is_new = pool.take(1000)
+    pool.release(slot)
+    assert pool.acquire(19_000) == (slot, False)
+    pool.release(slot)
+    small, is_new = pool.acquire(1000)
     assert is_new
-    pool.give_back(small)
+    pool.release(small)
     assert {s.number for s in pool.trim()} == {slot.number, small.number}
-    assert pool.held_bytes == 0
-    assert starts_of([1, 64, 65]) == ([0, 64, 128], 256)
+    assert pool.total_bytes == 0
+    assert aligned_starts([1, 64, 65]) == ([0, 64, 128], 256)

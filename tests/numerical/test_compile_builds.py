@@ -11,7 +11,7 @@ from numba.core.registry import CPUDispatcher
 from estimator.profiles.parse import parse_profile
 from filter_service.messages import Camera, FilterSettings
 from filter_service.building.from_profile import build
-from filter_service.building.compile_builds import FEW_PSFS, build_a_few
+from filter_service.building.compile_builds import SAMPLE_JOB, build_sample
 from filter_service.filtering.compile_loops import compile_part
 
 def compiled():
@@ -26,7 +26,7 @@ compile_part("tracing")
 compile_part("psfs")
 before = compiled()
 assert len(before) > 8, before
-build_a_few()
+build_sample()
 camera = Camera(160, 90, (-0.5, 0.5, 0.28, -0.28))
 for sphere_dpt in (0.0, -6.0):
     body = {"kind": "prescription", "sphere_dpt": sphere_dpt, "cylinder_dpt": -1.0,
@@ -37,7 +37,7 @@ for sphere_dpt in (0.0, -6.0):
                      dict(stiles_crawford=True),
                      dict(gaze_range_deg=(5.0, 5.0))):
         settings = FilterSettings(**dict(tolerance="loose") | settings)
-        job = replace(FEW_PSFS, profile=parse_profile(body), settings=settings,
+        job = replace(SAMPLE_JOB, profile=parse_profile(body), settings=settings,
                       camera=camera)
         found = build(job, progress=lambda *_: None, cancelled=lambda: False)
         found.store.plan_all()

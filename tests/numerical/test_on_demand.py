@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filter_service.building.compile_builds import FEW_PSFS
+from filter_service.building.compile_builds import SAMPLE_JOB
 from filter_service.building.worker_handle import (
     BuildDone,
     BuildError,
@@ -152,9 +152,9 @@ def test_nodes_planned_ahead_serve_frames_as_they_would_plan_them(
 def test_the_worker_plans_ahead_until_it_is_asked_for_something_else():
     worker = WorkerHandle(warm_up="")
     settings = replace(
-        FEW_PSFS.settings, pupil_range_mm=(2.0, 7.0), focus_range_dpt=(0, 4)
+        SAMPLE_JOB.settings, pupil_range_mm=(2.0, 7.0), focus_range_dpt=(0, 4)
     )
-    job = replace(FEW_PSFS, settings=settings, near=(4.0, 2.0))
+    job = replace(SAMPLE_JOB, settings=settings, near=(4.0, 2.0))
     try:
         worker.start()
         stores, parts, deadline_s = {}, [], time.monotonic() + 60.0

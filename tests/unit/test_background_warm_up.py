@@ -37,7 +37,7 @@ def test_a_build_waits_and_says_why(release, caplog):
 
 def test_what_takes_no_progress_waits_for_nothing(release):
     said = []
-    progress = BackgroundWarmUp(release.wait).before(
+    progress = BackgroundWarmUp(release.wait).wrap_progress(
         lambda *of: said.append(of), lambda: 0
     )
     assert not said

@@ -284,7 +284,7 @@ def test_without_a_calibration_the_field_of_view_is_asked_for(tmp_path):
         list_frames(tmp_path, "auto", LayoutOptions())
     with pytest.raises(ValueError, match=r"--fov-deg is 400; allowed: 1 to 150"):
         optics_of(400.0, None)
-    with pytest.raises(ValueError, match=r"--intrinsics '1,2': allowed is FX,FY"):
+    with pytest.raises(ValueError, match=r"--intrinsics is '1,2'; allowed: FX,FY"):
         optics_of(None, "1,2")
 
 

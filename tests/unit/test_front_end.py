@@ -14,9 +14,9 @@ from filter_service.atomic_files import write_atomically
 from filter_service.errors import BadMessage, OutOfMemory
 from filter_service.log_lines import ONCE_A_SECOND, RepeatFilter
 from filter_service.service.connections import Connections
-from filter_service.service.descriptors import BASE, DescriptorLimit
+from filter_service.service.descriptors import BASE_COUNT, DescriptorLimit
 from filter_service.service.dropped_parts import drop_parts, drop_parts_in_python
-from filter_service.service.fair_queue import MAX_CLAIM_S, MAX_DEBT_S, FairQueue
+from filter_service.service.fair_queue import MAX_CATCH_UP_S, MAX_CHARGE_S, FairQueue
 from filter_service.service.rate_limit import (
     MAX_IGNORED,
     MAX_REFUSALS,
@@ -81,7 +81,7 @@ def test_the_oldest_connections_without_session_or_greeting_are_closed(clients):
         held.append(client)
         connections.add(descriptor, number)
     time.sleep(0.05)  # until the greeting has arrived
-    assert connections.of_message(0, clients.ends[1].fileno()) is not None
+    assert connections.find(0, clients.ends[1].fileno()) is not None
     with_session.add(0)
     connections.evict()
     for client in held:
@@ -94,21 +94,21 @@ def test_a_descriptor_that_was_given_again_is_not_taken_for_the_old_connection(c
     connections = Connections(9, set())
     _, descriptor = clients.connect()
     connections.add(descriptor, 1)
-    assert connections.of_message(1, descriptor) is not None
+    assert connections.find(1, descriptor) is not None
     assert connections.remove(descriptor) == 1
     _, other = clients.connect()
     os.dup2(other, descriptor)  # as the system gives a number again
     connections.add(descriptor, 2)
-    assert connections.of_message(1, descriptor) is None, "of the connection before"
+    assert connections.find(1, descriptor) is None, "of the connection before"
     assert not connections.is_open(1)
-    assert connections.of_message(2, descriptor) is not None
+    assert connections.find(2, descriptor) is not None
 
 
 def test_a_file_that_has_the_descriptor_now_is_left_alone(clients):
     connections = Connections(9, set())
     _, descriptor = clients.connect()
     connections.add(descriptor, 1)
-    connections.of_message(1, descriptor)
+    connections.find(1, descriptor)
     _, other = clients.connect()
     os.dup2(other, descriptor)
     connections.close(1, "it misbehaves")
@@ -123,7 +123,7 @@ def test_what_is_sent_without_a_session_is_limited(clients):
     for number in (1, 2):
         client, descriptor = clients.connect()
         connections.add(descriptor, number)
-        connections.of_message(number, descriptor)
+        connections.find(number, descriptor)
         held.append((client, descriptor))
     connections.check_unread(1.0)
     for client, descriptor in held:
@@ -148,12 +148,12 @@ def test_refusals_and_requests_are_counted_by_the_second():
     rates = RateLimit()
     for _ in range(MAX_REFUSALS):
         assert rates.verdict(0.0) is Verdict.HANDLE
-        rates.note_refusal()
+        rates.count_refusal()
     assert rates.verdict(0.5) is Verdict.IGNORE
     assert rates.verdict(WINDOW_S) is Verdict.HANDLE
     for _ in range(MAX_REQUESTS):
         assert rates.verdict(1.5) is Verdict.HANDLE
-        rates.note_request()
+        rates.count_request()
     verdicts = [rates.verdict(1.6) for _ in range(MAX_IGNORED + 1)]
     assert verdicts == [Verdict.IGNORE] * MAX_IGNORED + [Verdict.CLOSE]
 
@@ -193,21 +193,21 @@ def simulated(costs_s, duration_s):
     used_s, waits_s = dict.fromkeys(costs_s, 0.0), {name: [] for name in costs_s}
     since_s, now_s = dict.fromkeys(costs_s, 0.0), 0.0
     for name in costs_s:
-        queue.arrive(name)
+        queue.mark_waiting(name)
     while now_s < duration_s:
-        chosen = queue.next_of(costs_s)
+        chosen = queue.pop_next(costs_s)
         started_s = now_s + IDLE_S
         waits_s[chosen].append(started_s - since_s[chosen])
         now_s = started_s + costs_s[chosen]
-        queue.note(chosen, costs_s[chosen], since_s[chosen], started_s, now_s)
+        queue.record_frame(chosen, costs_s[chosen], since_s[chosen], started_s, now_s)
         used_s[chosen] += IDLE_S + costs_s[chosen]
         since_s[chosen] = now_s
-        queue.arrive(chosen)
+        queue.mark_waiting(chosen)
     return used_s, waits_s
 
 
 def note(queue, name, used_s):
-    queue.note(name, used_s, 0.0, 0.0, 0.0)
+    queue.record_frame(name, used_s, 0.0, 0.0, 0.0)
 
 
 def test_heavy_and_light_sessions_that_wait_have_equal_time():
@@ -221,36 +221,38 @@ def test_heavy_and_light_sessions_that_wait_have_equal_time():
 def test_who_asked_for_nothing_has_little_claim():
     queue = FairQueue()
     for name in ("busy", "idle"):
-        queue.arrive(name)
-    assert queue.next_of(["idle"]) == "idle"
+        queue.mark_waiting(name)
+    assert queue.pop_next(["idle"]) == "idle"
     note(queue, "idle", 0.01)
     for _ in range(10):
-        queue.arrive("busy")
-        assert queue.next_of(["busy"]) == "busy"
+        queue.mark_waiting("busy")
+        assert queue.pop_next(["busy"]) == "busy"
         note(queue, "busy", 1.0)
-    queue.arrive("idle")  # after ten seconds
-    queue.arrive("busy")
+    queue.mark_waiting("idle")  # after ten seconds
+    queue.mark_waiting("busy")
     served_s = 0.0
-    while queue.next_of(["busy", "idle"]) == "idle":
+    while queue.pop_next(["busy", "idle"]) == "idle":
         note(queue, "idle", 0.1)
-        queue.arrive("idle")
+        queue.mark_waiting("idle")
         served_s += 0.1
-    assert served_s <= 1.0 + MAX_CLAIM_S + 0.2, "its frame's worth, and the claim"
+    assert served_s <= 1.0 + MAX_CATCH_UP_S + 0.2, (
+        "its frame's worth, and what it caught up"
+    )
 
 
 def test_a_frame_that_hung_is_not_owed_for_ever():
     queue = FairQueue()
     for name in ("hung", "other"):
-        queue.arrive(name)
-    assert queue.next_of(["hung"]) == "hung"
+        queue.mark_waiting(name)
+    assert queue.pop_next(["hung"]) == "hung"
     note(queue, "hung", 600.0)
-    queue.arrive("hung")
+    queue.mark_waiting("hung")
     served_s = 0.0
-    while queue.next_of(["hung", "other"]) == "other":
+    while queue.pop_next(["hung", "other"]) == "other":
         note(queue, "other", 1.0)
-        queue.arrive("other")
+        queue.mark_waiting("other")
         served_s += 1.0
-    assert served_s <= MAX_DEBT_S + 1.0
+    assert served_s <= MAX_CHARGE_S + 1.0
 
 
 # Descriptors and memory
@@ -264,7 +266,7 @@ def test_descriptors_are_reserved_for_the_front_end(monkeypatch):
     monkeypatch.setattr(resource, "setrlimit", lambda _, pair: limits.append(pair))
     limit = DescriptorLimit(8)
     assert limits[-1] == (268, 300)
-    assert BASE + limit.max_connections + limit.max_slots == 300
+    assert BASE_COUNT + limit.max_connections + limit.max_slots == 300
     with limit.reserve():
         assert limits[-1] == (300, 300)
     assert limits[-1] == (268, 300)
@@ -278,7 +280,7 @@ def test_slots_have_a_limit_to_their_number():
     pool = SlotPool(10**6, 3)
     for _ in range(3):
         pool.create(10)
-    with pytest.raises(OutOfMemory, match="3 blocks of shared memory are in use"):
+    with pytest.raises(OutOfMemory, match="3 slots of shared memory are in use"):
         pool.create(10)
 
 
@@ -361,9 +363,9 @@ def test_an_atomic_write_follows_no_link_and_can_refuse_to_replace(tmp_path):
 
 def test_pauses_before_restarts_grow_to_a_minute_and_end_with_a_stable_process():
     restarts = _Restarts()
-    pauses_s = [restarts.note_death(float(i), float(i)) for i in range(11)]
+    pauses_s = [restarts.record_exit(float(i), float(i)) for i in range(11)]
     assert pauses_s == [0, 0, 1, 2, 4, 8, 16, 32, 60, 60, 60]
-    assert restarts.note_death(100.0, 161.0) == 0.0
+    assert restarts.record_exit(100.0, 161.0) == 0.0
 
 
 # The socket
@@ -393,7 +395,7 @@ def test_a_connection_that_comes_between_is_known_before_it_has_a_number(
     """It was not, on a busy machine: its client was never answered."""
     context = zmq.Context()
     dealer = context.socket(zmq.DEALER)
-    answer = router._authenticator.answer
+    answer = router._authenticator.handle_requests
     calls = []
 
     def late():
@@ -404,7 +406,7 @@ def test_a_connection_that_comes_between_is_known_before_it_has_a_number(
         calls.append(1)
         answer()
 
-    monkeypatch.setattr(router._authenticator, "answer", late)
+    monkeypatch.setattr(router._authenticator, "handle_requests", late)
     try:
         message = received_within(router)
         assert bytes(message.parts[0]) == b"hello"
@@ -427,7 +429,7 @@ def test_a_reply_to_a_connection_that_has_ended_is_not_sent(router):
     thief = context.socket(zmq.DEALER)
     try:
         end_s = time.monotonic() + 5.0
-        while not router.take_ended():
+        while not router.pop_ended():
             assert time.monotonic() < end_s
             router.wait(0.05)
         thief.setsockopt(zmq.IDENTITY, b"camera")

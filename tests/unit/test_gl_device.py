@@ -22,7 +22,7 @@ from filter_service.gl_device import (
     BACKEND_VARIABLE,
     GL_DEVICE_VARIABLE,
     checked_gl_device,
-    is_device_named,
+    is_device_selected,
     wanted_gl_device,
 )
 from filter_service.service.config import load_config
@@ -126,13 +126,13 @@ def test_the_environment_names_it(monkeypatch):
     monkeypatch.delenv(GL_DEVICE_VARIABLE, raising=False)
     monkeypatch.delenv(BACKEND_VARIABLE, raising=False)
     assert wanted_gl_device() == "auto"
-    assert not is_device_named()
+    assert not is_device_selected()
     monkeypatch.setenv(BACKEND_VARIABLE, "1")
     assert wanted_gl_device() == "1"
-    assert not is_device_named()
+    assert not is_device_selected()
     monkeypatch.setenv(GL_DEVICE_VARIABLE, "0")
     assert wanted_gl_device() == "0"
-    assert is_device_named()
+    assert is_device_selected()
     monkeypatch.setenv(GL_DEVICE_VARIABLE, "x")
     with pytest.raises(ValueError, match=f"{GL_DEVICE_VARIABLE} is 'x'"):
         wanted_gl_device()
@@ -153,9 +153,9 @@ def test_a_named_device_asks_for_gl(monkeypatch):
         choose_engine, "_gl", lambda closing, reason, **_: asked.append(reason)
     )
     choose_engine.open_engine("auto", None)
-    assert asked == ["its device is named"]
+    assert asked == ["a device is selected"]
     monkeypatch.setattr(choose_engine, "_native", lambda closing, reason: reason)
-    assert choose_engine.open_engine("native", None) == "as asked"
+    assert choose_engine.open_engine("native", None) == "as requested"
 
 
 def test_names_are_asked_for_where_the_device_has_them():

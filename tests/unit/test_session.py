@@ -34,7 +34,7 @@ def load_one(stream):
     """Load what the stream asks for next; return its eye and the prepared store."""
     following = stream.next_build()
     prepared = PreparedStore(following.camera, Store(), 0.0)
-    stream.put_in_place(following.eye, prepared)
+    stream.add_store(following.eye, prepared)
     return following.eye, prepared
 
 
@@ -52,13 +52,13 @@ def test_credit_counts_unanswered_frames_and_the_newest_waits():
     session = Session(1, b"a", "", credit=2)
     view = (ViewHeader.of(SMALL),)
     frames = [WaitingFrame(Frame(i, view, 4.0, 0.0), 0.0, 0.0) for i in range(3)]
-    assert session.take_in(frames[0]) is None
-    assert session.take_in(frames[1]) is frames[0]
+    assert session.enqueue(frames[0]) is None
+    assert session.enqueue(frames[1]) is frames[0]
     with pytest.raises(CreditExceeded, match="2 frames are unanswered"):
-        session.take_in(frames[2])
+        session.enqueue(frames[2])
     assert session.waiting is frames[1]
     session.n_unanswered -= 1
-    assert session.take_in(frames[2]) is frames[1]
+    assert session.enqueue(frames[2]) is frames[1]
 
 
 def test_a_frame_needs_a_profile():
@@ -150,17 +150,17 @@ def test_the_old_eye_serves_until_a_first_frame_through_the_new_one_is_prepared(
     eye, prepared = load_one(stream)
     assert eye is new
     assert stream.next_build() is None
-    assert stream.warming() == (new, prepared)
+    assert stream.store_to_warm() == (new, prepared)
     assert stream.unfinished_eye() is new
     plan = planned(stream, SMALL)
     assert (plan.eye, plan.stores) == (old, (old_store,))
     stream.set_ready(new, prepared)
-    assert stream.warming() is None
+    assert stream.store_to_warm() is None
     assert stream.unfinished_eye() is None
     plan = planned(stream, SMALL)
     assert (plan.eye, plan.stores) == (new, (prepared.store,))
     assert stream.retired == [old_store]
-    assert stream.serving() is prepared
+    assert stream.store_in_use() is prepared
 
 
 def test_without_an_old_eye_frames_go_through_the_one_that_is_being_prepared():
@@ -169,7 +169,7 @@ def test_without_an_old_eye_frames_go_through_the_one_that_is_being_prepared():
     assert planned(stream, SMALL) is None
     _, prepared = load_one(stream)
     assert planned(stream, SMALL).stores == (prepared.store,)
-    assert stream.serving() is None
+    assert stream.store_in_use() is None
 
 
 def test_an_eye_that_fails_while_it_is_prepared_gives_way_to_the_old_one():
@@ -203,6 +203,6 @@ def test_the_second_view_of_a_pair_needs_its_own_store_over_the_field_only():
     ):
         stream = make_stream()
         eye = add(stream, 1, left, right, settings=settings)
-        assert eye.wanted == cameras
+        assert eye.requested == cameras
         build_all(stream)
         assert planned(stream, left, right) is not None

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filter_service.camera import Camera
-from filter_service.filtering.predicted_states import LEAD_S, SPEED_S, StreamUse
+from filter_service.filtering.predicted_states import LEAD_S, SPEED_S, FrameHistory
 from filter_service.rendering.sampled_frame import STEP_PX, SampledView, first_frame
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
@@ -18,29 +18,29 @@ def view_of(depth_m, **more):
 
 
 def noted(states, interval_s=0.05):
-    use = StreamUse()
+    history = FrameHistory()
     view = view_of(np.ones((12, 16)))
     for number, (pupil_mm, focus_dpt) in enumerate(states):
-        use.note(
+        history.record(
             [view],
             pupil_diameter_mm=pupil_mm,
             focus_dpt=focus_dpt,
             gaze_deg=None,
             at_s=10.0 + number * interval_s,
         )
-    return use
+    return history
 
 
 def test_states_go_on_at_their_speed():
-    use = noted([(4.0 + 0.1 * k, 2.0 - 0.05 * k) for k in range(20)])
+    history = noted([(4.0 + 0.1 * k, 2.0 - 0.05 * k) for k in range(20)])
     expected = [(5.9 + 2.0 * lead_s, 1.05 - 1.0 * lead_s) for lead_s in LEAD_S]
-    np.testing.assert_allclose(use.predicted_states(), expected, rtol=1e-9)
+    np.testing.assert_allclose(history.predicted_states(), expected, rtol=1e-9)
 
 
 def test_only_the_last_frames_tell_the_speed():
     n_last = int(SPEED_S / 0.05) + 2
-    use = noted([(2.0, 0.0), (7.0, 5.0)] * 10 + [(4.0, 1.0)] * n_last)
-    np.testing.assert_allclose(use.predicted_states(), [(4.0, 1.0)] * len(LEAD_S))
+    history = noted([(2.0, 0.0), (7.0, 5.0)] * 10 + [(4.0, 1.0)] * n_last)
+    np.testing.assert_allclose(history.predicted_states(), [(4.0, 1.0)] * len(LEAD_S))
 
 
 def test_the_interval_is_that_of_the_last_frames():
