@@ -5,11 +5,11 @@
     ocufilter report before.json after.json -o surgery.pdf
 
 A profile is a preset's name, a .json, .abp, .csv or .zmx file, or a JSON object.  The
-report begins with a summary: refraction, acuity, wavefront, point images, contrast, a letter
-chart near and far.  Then it shows the visual field, acuity by distance, the estimated
-eye, which data were measured or assumed, and the literature references.  The HTML file
-is self-contained and prints on A4.  The PDF is tagged for screen readers; it needs the
-packages of ocufilter[report].
+report begins with a summary: refraction, acuity, wavefront, point images, contrast, a
+letter chart near and far.  Then it shows the visual field, acuity by distance, the
+estimated eye, which data were measured or assumed, and the literature references.  The
+HTML file is self-contained and prints on A4.  The PDF is tagged for screen readers; it
+needs the packages of ocufilter[report].
 """
 
 from __future__ import annotations

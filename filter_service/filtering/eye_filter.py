@@ -234,6 +234,10 @@ class EyeFilter:
         if self._shared is not None:
             self.builder.advance(ahead=False)
 
+    def keep_going(self) -> None:
+        """Call `advance_builds`; deprecated, goes with version 0.3."""
+        self.advance_builds()
+
     def advance(self) -> None:
         """Advance builds of new eyes between frames, and compute PSFs ahead."""
         self.builder.advance()

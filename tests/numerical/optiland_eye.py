@@ -1,14 +1,19 @@
 """Random eyes traced by optiland, an independent package.
 
-    python -m tests.numerical.optiland_eye     writes tests/data/optiland_eye.json and
-                                               tests/data/optiland_forms.json
+    python -m tests.numerical.optiland_eye     writes tests/data/optiland_eye.json,
+                                               optiland_forms.json and
+                                               optiland_files.json
 
 optiland brings VTK and 0.5 GB with it, so it is an extra of its own
 (`pip install -c constraints.txt -e .[crosscheck]`): its rays are kept in that file, and
 where it is installed a test traces new eyes with it too.
 """
 
+import contextlib
+import itertools
 import json
+import tempfile
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +25,7 @@ from tests.numerical.surface_bodies import parsed_eye
 
 FROZEN = Path(__file__).parents[1] / "data" / "optiland_eye.json"
 FROZEN_FORMS = FROZEN.with_name("optiland_forms.json")
+FROZEN_FILES = FROZEN.with_name("optiland_files.json")
 SEED = 20231
 WAVELENGTH_NM = 555.0
 
@@ -183,15 +189,13 @@ def _optiland_shape(surface):
     return {"radius": rx_mm, "conic": conic}
 
 
-def trace_with_optiland(body, rays):
-    """Points (n, 6, 3), directions and paths (n, 6) at the five surfaces and stop."""
+def optic_of(body, start_z):
+    """The eye as an optic of optiland."""
     from optiland.materials import IdealMaterial
     from optiland.optic import Optic
-    from optiland.rays import RealRays
 
     eye = parsed_eye(body)
     optic = Optic()
-    start_z = float(rays[0, 2])
     optic.surfaces.add(index=0, z=start_z, radius=np.inf, comment="start")
     index = 1
     for surface in eye.surfaces:
@@ -223,6 +227,14 @@ def trace_with_optiland(body, rays):
         material=IdealMaterial(n=eye.indices["vitreous"]),
     )
     optic.add_wavelength(value=WAVELENGTH_NM / 1000.0, is_primary=True)
+    return optic
+
+
+def trace_with_optiland(body, rays):
+    """Points (n, 6, 3), directions and paths (n, 6) at the five surfaces and stop."""
+    from optiland.rays import RealRays
+
+    eye, optic = parsed_eye(body), optic_of(body, float(rays[0, 2]))
     count = len(rays)
     bundle = RealRays(*rays.T, np.ones(count), np.full(count, WAVELENGTH_NM / 1000.0))
     optic.surfaces.trace(bundle, skip=1)
@@ -244,6 +256,29 @@ def _traced(body, rays):
     }
 
 
+def saved_files(body):
+    """The files that optiland writes of an eye: its JSON, and .zmx where it can."""
+    from optiland.fileio import save_optiland_file, save_zemax_file
+
+    optic = optic_of(body, -20.0)
+    optic.set_aperture("EPD", 4.0)
+    optic.set_field_type("angle")
+    optic.add_field(y=0)
+    for before, behind in itertools.pairwise(optic.surfaces):
+        # the .zmx writer reads thicknesses, which optiland leaves 0 beside positions
+        before.thickness = float(behind.geometry.cs.z - before.geometry.cs.z)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "eye.json"
+        save_optiland_file(optic, str(path))
+        found = {"json": json.loads(path.read_text(encoding="utf-8"))}
+        with contextlib.suppress(NotImplementedError), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of glasses without a catalog
+            path = path.with_suffix(".zmx")
+            save_zemax_file(optic, str(path))
+            found["zmx"] = path.read_text(encoding="latin-1")
+    return found
+
+
 def main():
     """Write the frozen eyes, rays and optiland's answer."""
     head = {
@@ -259,6 +294,9 @@ def main():
     eyes = {name: _traced(body, random_rays(rng, 12)) for name, body in bodies.items()}
     text = json.dumps({**head, "eyes": eyes})
     FROZEN_FORMS.write_text(text + "\n", encoding="utf-8")
+    files = {name: saved_files(body) for name, body in bodies.items()}
+    text = json.dumps({**head, "files": files})
+    FROZEN_FILES.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,176 @@
+"""Eyes in lens files that optiland wrote, against the rays that it traced."""
+
+import json
+
+import numpy as np
+import pytest
+
+from estimator.bounded_files import InvalidFile
+from estimator.optics.raytrace import RayStatus, trace_rays
+from estimator.profiles.files import load_profile
+from tests.numerical.optiland_eye import FROZEN_FILES, FROZEN_FORMS, WAVELENGTH_NM
+
+FILES = json.loads(FROZEN_FILES.read_text(encoding="utf-8"))["files"]
+TRACED = json.loads(FROZEN_FORMS.read_text(encoding="utf-8"))["eyes"]
+
+
+def loaded(tmp_path, name, kind):
+    path = tmp_path / f"eye.{kind}"
+    content = FILES[name][kind]
+    path.write_text(content if kind == "zmx" else json.dumps(content), encoding="utf-8")
+    return load_profile(path)
+
+
+def assert_same_rays(eye, name, limit_mm):
+    kept = TRACED[name]
+    rays, points = np.array(kept["rays"]), np.array(kept["points_mm"], float)
+    complete = np.isfinite(points).all(axis=(1, 2))
+    found = trace_rays(
+        eye,
+        start_mm=rays[complete, :3],
+        direction=rays[complete, 3:],
+        wavelength_nm=WAVELENGTH_NM,
+    )
+    assert np.all(found.status_index == RayStatus.TRACED)
+    assert np.abs(found.points_mm - points[complete]).max() < limit_mm
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_an_eye_saved_by_optiland_has_its_rays(tmp_path, name):
+    """Tilts, decentrations, even aspheres, toroids, biconics and Zernike sags."""
+    eye = loaded(tmp_path, name, "json").surfaces.relaxed
+    assert len(eye.surfaces) == 4
+    assert_same_rays(eye, name, 1e-12)
+
+
+def test_a_zemax_file_of_optiland_has_its_rays(tmp_path):
+    eye = loaded(tmp_path, "even asphere, centered", "zmx").surfaces.relaxed
+    for name, medium in eye.media.items():
+        # optiland writes constant indices with the Abbe number 99.99
+        eye.media[name] = type(medium)(medium.d_line_index, 1e9)
+    assert_same_rays(eye, "even asphere, centered", 1e-9)
+
+
+ZMX = """\
+MODE SEQ
+NAME Schematic eye
+UNIT MM X W X CM MR CPMM
+SURF 0
+  TYPE STANDARD
+  CURV 0.0
+  DISZ INFINITY
+SURF 1
+  COMM in front of the eye
+  TYPE STANDARD
+  CURV 0.0
+  DISZ 10
+SURF 2
+  TYPE STANDARD
+  CURV 0.1282051 0 0 0 0
+  DISZ 3.6
+  CONI -0.25
+  GLAS ___BLANK 1 0 1.3375 0 0 0 0 0 0 0
+SURF 3
+  STOP
+  TYPE STANDARD
+  CURV 0.0
+  DISZ 0.1
+  DIAM 2 1 0 0 1 ""
+  GLAS ___BLANK 1 0 1.3375 0 0 0 0 0 0 0
+SURF 4
+  TYPE COORDBRK
+  PARM 1 0.2
+  PARM 2 -0.1
+  DISZ 0
+SURF 5
+  TYPE STANDARD
+  CURV 0.1
+  DISZ 3.9
+  GLAS ___BLANK 1 0 1.42 50 0 0 0 0 0 0
+SURF 6
+  TYPE STANDARD
+  CURV -0.16667
+  DISZ 16.4
+  GLAS ___BLANK 1 0 1.336 0 0 0 0 0 0 0
+SURF 7
+  TYPE STANDARD
+  CURV -0.08
+  DISZ 0
+"""
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "latin-1"])
+def test_dummy_surfaces_are_dropped_and_the_stop_is_kept(tmp_path, encoding):
+    path = tmp_path / "eye.zmx"
+    path.write_bytes(ZMX.encode(encoding))
+    profile = load_profile(path)
+    eye = profile.surfaces.relaxed
+    assert profile.name == "Schematic eye"
+    assert [s.z_mm for s in eye.surfaces] == pytest.approx([0.0, 3.7, 7.6])
+    assert eye.stop_z_mm == pytest.approx(3.6)
+    assert eye.surfaces[0].conic_constant == -0.25
+    assert eye.surfaces[1].decentration_mm == (0.2, -0.1)
+    assert eye.retina.z_mm == pytest.approx(24.0)
+    assert eye.retina.radius_mm == pytest.approx((-12.5, -12.5))
+    lens = eye.media[eye.surfaces[1].medium_after]
+    assert (lens.d_line_index, lens.abbe_number) == (1.42, 50.0)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ("MODE SEQ", "MODE NSC", "MODE.*'NSC' is not sequential"),
+        ("UNIT MM", "UNIT IN", "UNIT.*'IN'"),
+        ("TYPE STANDARD\n  CURV 0.1\n", "TYPE BICONICX\n  CURV 0.1\n", "'BICONICX'"),
+        ("PARM 1 0.2", "PARM 3 5", "COORDBRK tilts"),
+        ("CURV 0.1\n", "CURV 0.1\n  XDAT 1 2\n", "operand 'XDAT'"),
+        ("CURV 0.1\n", "CURV nan\n", "CURV 'nan' is not a number"),
+        ("___BLANK 1 0 1.42", "N-BK7 0 0 1.5", "'N-BK7' is in a catalog"),
+        ("___BLANK 1 0 1.42", "MIRROR 0 0 1.5", "'MIRROR' is in a catalog"),
+        ("  STOP\n", "", "the file has no stop"),
+        ("DISZ 3.9", "DISZ 900", r"z_mm.*out of range"),
+    ],
+)
+def test_what_is_not_understood_is_refused_by_name(tmp_path, before, after, message):
+    path = tmp_path / "eye.zmx"
+    assert before in ZMX
+    path.write_text(ZMX.replace(before, after), encoding="utf-8")
+    with pytest.raises(InvalidFile, match=message):
+        load_profile(path)
+
+
+@pytest.mark.parametrize("name", ["tilted conic", "toroid"])
+def test_tilts_in_zemax_files_are_refused(tmp_path, name):
+    with pytest.raises(InvalidFile, match="COORDBRK"):
+        loaded(tmp_path, name, "zmx")
+
+
+def _change(surface, **parts):
+    def apply(data):
+        entry = data["surface_group"]["surfaces"][surface]
+        for name, value in parts.items():
+            entry[name] = {**entry[name], **value} if isinstance(value, dict) else value
+        return data
+
+    return apply
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_change(1, type="ParaxialSurface"), "surface 1.*'ParaxialSurface'"),
+        (_change(1, geometry={"type": "ForbesGeometry"}), "'ForbesGeometry'"),
+        (_change(2, material_post={"type": "Material"}), "surface 2.*'Material'"),
+        (_change(2, interaction_model={"is_reflective": True}), "surface 2"),
+        (_change(1, geometry={"cs": None}), "surface_group.*is incomplete"),
+        (_change(1, geometry={"radius": "7"}), "surface_group.*is incomplete"),
+        (lambda d: {"surface_group": 3}, "surface_group.*is incomplete"),
+        (lambda d: {"surface_group": {"surfaces": []}}, "the file has 0"),
+    ],
+)
+def test_an_optic_that_is_not_understood_is_refused(tmp_path, change, message):
+    data = json.loads(json.dumps(FILES["tilted conic"]["json"]))
+    path = tmp_path / "eye.json"
+    path.write_text(json.dumps(change(data)), encoding="utf-8")
+    with pytest.raises(InvalidFile, match=message):
+        load_profile(path)
