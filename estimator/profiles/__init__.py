@@ -6,6 +6,8 @@ correction_bodies    the same for corrections
 surface_bodies       the same for surfaces, their forms and media
 implant_bodies       the same for implants and biometry
 validation           conversion of plain data to these types, and its errors
+eye_profile          the parsed profile
+common_fields        from the fields that all types share to those of a profile
 parse                from a typed profile to an `EyeProfile`
 correction           from a typed correction to a lens
 given_eyes           from a typed profile to an eye given by its surfaces

@@ -4,17 +4,15 @@ import math
 from dataclasses import replace
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from estimator.corrections.worn_lens import replaces_lens
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.surface_model import SurfaceModel
-from estimator.optics.surfaces import media_indices, pack_eye
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.profiles import bodies, given_bodies
+from estimator.profiles.common_fields import coefficients_um, common_fields
 from estimator.profiles.correction_bodies import IntraocularBody
-from estimator.profiles.parse import EyeProfile, coefficients_um, common_fields
+from estimator.profiles.eye_profile import SURFACES_PUPIL_MM, EyeProfile
 from estimator.profiles.pseudophakic import pseudophakic_model
 from estimator.profiles.published import published_eye
 from estimator.profiles.surfaces import surface_model
@@ -24,10 +22,6 @@ IMPLANT_NOTE = (
     "the eye is traced through its implant: wavefronts measured before surgery are not "
     "part of it"
 )
-
-SURFACES_PUPIL_MM = 4.0
-"""Entrance pupil at which the wavefront of such an eye is represented: less than that
-of the 45 parameters, because its lens may be smaller."""
 
 
 def parse_given_eye(data: object) -> EyeProfile:
@@ -93,27 +87,3 @@ def _with_surfaces(
         surfaces=surfaces,
         **common,
     )
-
-
-def surfaces_zernike_um(model: SurfaceModel) -> NDArray[np.float64]:
-    """Return the wavefront (28,), um, of the relaxed eye on axis, at the cornea.
-
-    Raises
-    ------
-    ProfileError
-        Light does not pass the eye.
-    """
-    from estimator.wavefront.aberrations import on_axis_zernike  # loads slowly
-
-    zernike_um: NDArray[np.float64] = on_axis_zernike(
-        pack_eye(model.relaxed)[None],
-        media_indices(model.relaxed, REFERENCE_WAVELENGTH_NM),
-        zernike_radius_mm=SURFACES_PUPIL_MM / 2.0,
-    )[0][0]
-    if not np.isfinite(zernike_um).all():
-        raise ProfileError(
-            "surfaces",
-            f"light does not pass the eye at {SURFACES_PUPIL_MM:g} mm",
-            f"an eye that light crosses at a {SURFACES_PUPIL_MM:g} mm pupil",
-        )
-    return zernike_um

@@ -5,35 +5,22 @@ a CSV file of coefficients.  It is parsed to an `EyeProfile` in the eye frame (x
 person's right, y up).
 """
 
-import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from estimator.corrections.worn_lens import replaces_lens
 from estimator.eye.checked_fields import ProfileError
-from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters, RetinaShape
-from estimator.media.straylight import CATARACTS, DEFAULT_AGE_YEARS, Straylight
+from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters
 from estimator.optics import prescription as rx
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
-from estimator.optics.zernike import (
-    MAX_RADIAL_ORDER,
-    N_TERMS,
-    flip_horizontal,
-    index_from_nm,
-)
 from estimator.profiles import bodies
-from estimator.profiles.correction import parse_correction, prescription, vertex_notes
+from estimator.profiles.common_fields import coefficients_um, common_fields
+from estimator.profiles.correction import prescription
+from estimator.profiles.eye_profile import EYE_PUPIL_MM, EyeProfile, Measurement
 from estimator.profiles.validation import KIND, convert
-
-if TYPE_CHECKING:
-    from estimator.eye.surface_model import SurfaceModel
 
 __all__ = [
     "EyeProfile",
@@ -45,144 +32,6 @@ __all__ = [
 
 PRESCRIPTION_RADIUS_MM = 3.0
 """Circle on which a prescription is represented; it is exact on every other."""
-
-EYE_PUPIL_MM = 6.0
-"""Entrance pupil at which the wavefront of a given eye is represented."""
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """One wavefront in the eye frame, with its field direction.
-
-    ``zernike_um`` (28,) is on the circle of ``pupil_diameter_mm`` about the chief ray.
-    ``h_deg`` and ``v_deg`` point to the source as the person sees it, independent of
-    the frame of the input.
-    """
-
-    zernike_um: NDArray[np.float64]
-    pupil_diameter_mm: float
-    wavelength_nm: float
-    h_deg: float = 0.0
-    v_deg: float = 0.0
-
-    @property
-    def is_on_axis(self) -> bool:
-        """Return whether the field is the eye's axis."""
-        return self.h_deg == 0.0 and self.v_deg == 0.0
-
-
-@dataclass(frozen=True)
-class EyeProfile:
-    """Measured wavefront of one eye in the eye frame, with its limits and options.
-
-    Attributes
-    ----------
-    eye_side : str
-        OD or OS.
-    pupil_diameter_mm, wavelength_nm : float
-        Pupil and wavelength of the leading wavefront.
-    age_years : float or None
-        Age, which limits accommodation; None if unknown.
-    max_pupil_diameter_mm : float
-        Largest pupil covered by the data (infinite for a prescription).
-    correction : Prescription or None
-        Spectacles worn during the simulation; a `WornLens` for a lens on or in the eye.
-    add_dpt : float
-        Near addition; limits the amplitude of accommodation when above zero.
-    measurements : tuple of Measurement
-        All measurements, the leading one first.  Empty for a given eye.
-    eye : EyeParameters or None
-        The eye itself, for kind ``eye``.
-    surfaces : SurfaceModel or None
-        The eye itself, for kinds ``surfaces`` and ``published``.
-    retina : RetinaShape or None
-        Retina that replaces the sphere of radius eye length / 2.
-    straylight : Straylight or None
-        Scatter in the media; None to omit it.
-    yellowing : {"seen", "adapted"} or None
-        Absorption of the aging lens; None to omit it.
-    spectacle_magnification : bool
-        Whether to apply the magnification of the correction.
-    periphery : {"people", "model"}
-        Source of a traced eye's periphery; a given eye, and one with a retina of its
-        own, has the model's.
-    higher_order : {"typical", "none"}
-        Aberrations added to a traced eye (`typical_aberrations`); only a prescription
-        requests any.
-    notes : tuple of str
-        Notes on powers at their distance from the cornea, and at the cornea.
-    """
-
-    name: str
-    kind: str
-    eye_side: str
-    pupil_diameter_mm: float
-    wavelength_nm: float
-    max_pupil_diameter_mm: float
-    age_years: float | None = None
-    add_dpt: float = 0.0
-    correction: rx.Prescription | None = None
-    measurements: tuple[Measurement, ...] = ()
-    eye: EyeParameters | None = None
-    retina: RetinaShape | None = None
-    higher_order: str = "none"
-    periphery: str = "people"
-    straylight: Straylight | None = None
-    yellowing: str | None = None
-    spectacle_magnification: bool = False
-    notes: tuple[str, ...] = ()
-    surfaces: "SurfaceModel | None" = None
-
-    @property
-    def is_given(self) -> bool:
-        """Return whether the profile gives the eye itself instead of measurements."""
-        return self.eye is not None or self.surfaces is not None
-
-    @cached_property
-    def compared_measurements(self) -> tuple[Measurement, ...]:
-        """Return the measurements that the eye model is fitted to, the leading first.
-
-        With people's periphery, measurements off the axis are part of that instead.
-        """
-        if self.periphery == "model":
-            return self.measurements
-        return tuple(m for m in self.measurements if m.is_on_axis)
-
-    @cached_property
-    def digest(self) -> str:
-        """Return the SHA-256 of the profile's content, apart from its name and notes.
-
-        Profiles that describe the same eye in different formats have the same digest.
-        """
-        content = replace(self, name="", notes=())
-        encoded = msgspec.json.encode(
-            replace(content, surfaces=None),
-            order="deterministic",
-            enc_hook=lambda array: array.tolist(),
-        )
-        if self.surfaces is not None:
-            encoded += self.surfaces.digest.encode()
-        return hashlib.sha256(encoded).hexdigest()
-
-    @cached_property
-    def zernike_um(self) -> NDArray[np.float64]:
-        """Return the leading wavefront (28,), um; a given eye is traced once for it.
-
-        It is on the circle of ``pupil_diameter_mm``, at ``wavelength_nm``, with
-        accommodation relaxed; the correction is *not* yet subtracted.
-
-        Raises
-        ------
-        ProfileError
-            Light does not pass the given eye.
-        """
-        if self.surfaces is not None:
-            from estimator.profiles.given_eyes import surfaces_zernike_um
-
-            return surfaces_zernike_um(self.surfaces)
-        if self.eye is not None:
-            return _traced_zernike_um(self.eye, self.retina)
-        return self.measurements[0].zernike_um
 
 
 def parse_profile(data: object) -> EyeProfile:
@@ -223,72 +72,6 @@ def published_names() -> tuple[str, ...]:
 def _preset(body: bodies.PresetBody, data: Mapping[str, Any]) -> EyeProfile:
     own = {name: value for name, value in data.items() if name != "kind"}
     return _zernike(convert({**bodies.PRESETS[body.name], **own}, bodies.ZernikeBody))
-
-
-def common_fields(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
-    age_years = None if body.age_years is msgspec.UNSET else body.age_years
-    if body.yellowing is not None and age_years is None:
-        raise ProfileError("age_years", "is required with yellowing", "3 to 120")
-    if body.spectacle_magnification and body.correction is None:
-        raise ProfileError(
-            "correction", "is required with spectacle_magnification", "an object"
-        )
-    retina = None
-    if isinstance(body.retina, bodies.RetinaBody):
-        retina = RetinaShape(
-            radius_mm=body.retina.radius_mm, conic_constant=body.retina.conic_constant
-        )
-    is_prescription = isinstance(body, bodies.PrescriptionBody)
-    return {
-        "name": kind if body.name is msgspec.UNSET else str(body.name),
-        "eye_side": body.eye_side,
-        "age_years": age_years,
-        "correction": parse_correction(body.correction, has_cornea=not is_prescription),
-        "retina": retina,
-        "periphery": _periphery(body),
-        "straylight": _straylight(body.straylight, age_years),
-        "yellowing": body.yellowing,
-        "spectacle_magnification": body.spectacle_magnification,
-        "notes": vertex_notes(
-            body if isinstance(body, bodies.PrescriptionBody) else None,
-            body.correction,
-        ),
-    }
-
-
-def _periphery(body: bodies.CommonBody) -> str:
-    is_measured = isinstance(body, bodies.MeasuredBody)
-    is_model = (
-        body.retina is not None or isinstance(body, bodies.EyeBody) or not is_measured
-    )
-    if body.periphery is msgspec.UNSET:
-        return "model" if is_model else "people"
-    if is_model and body.periphery != "model":
-        raise ProfileError(
-            "periphery",
-            "is 'people', but the profile defines the eye's surfaces",
-            "model, for the kinds of given eyes and with 'retina'",
-        )
-    return body.periphery
-
-
-def _straylight(
-    body: bodies.StraylightBody | None, age_years: float | None
-) -> Straylight | None:
-    if body is None:
-        return None
-    log_s = None if body.log_s is msgspec.UNSET else body.log_s
-    if body.cataract is not msgspec.UNSET:
-        if log_s is not None:
-            raise ProfileError(
-                "straylight.log_s", "cannot be combined with cataract", "one of the two"
-            )
-        log_s = CATARACTS[body.cataract]
-    return Straylight(
-        age_years=DEFAULT_AGE_YEARS if age_years is None else age_years,
-        pigment_ratio=body.pigmentation,
-        log_s=log_s,
-    )
 
 
 def _prescription(body: bodies.PrescriptionBody) -> EyeProfile:
@@ -391,58 +174,3 @@ def _eye(body: bodies.EyeBody) -> EyeProfile:
         eye=EyeParameters.from_vector(vector),
         **common_fields(body, "eye"),
     )
-
-
-def _traced_zernike_um(
-    eye: EyeParameters, retina: RetinaShape | None
-) -> NDArray[np.float64]:
-    from estimator.eye.tracing import (  # compiled: loads slowly
-        TraceFailed,
-        on_axis_zernike_um,
-    )
-
-    try:
-        return on_axis_zernike_um(
-            eye,
-            retina=retina,
-            pupil_diameter_mm=EYE_PUPIL_MM,
-            wavelength_nm=REFERENCE_WAVELENGTH_NM,
-        )
-    except TraceFailed as error:
-        raise ProfileError(
-            "parameters",
-            str(error),
-            f"an eye that light crosses at a {EYE_PUPIL_MM:g} mm pupil",
-        ) from None
-
-
-def coefficients_um(
-    entries: Mapping[str, float], frame: str, *, path: str, name: str = "zernike_um"
-) -> NDArray[np.float64]:
-    """Return coefficients (28,) in the eye frame."""
-    zernike_um = np.zeros(N_TERMS)
-    named: dict[int, str] = {}
-    for key, value_um in entries.items():
-        field = f"{path}{name}.{key}"
-        j = _term_index(key, field)
-        if j in named:
-            problem = f"names the same term as {named[j]!r}"
-            raise ProfileError(field, problem, "each term once")
-        named[j] = key
-        zernike_um[j] = value_um
-    return flip_horizontal(zernike_um) if frame == "examiner" else zernike_um
-
-
-def _term_index(key: str, name: str) -> int:
-    allowed = bodies.COEFFICIENTS_ALLOWED
-    try:
-        n, m = (int(part) for part in key.split(","))
-    except ValueError:
-        raise ProfileError(name, "is not of the form 'n,m'", allowed) from None
-    try:
-        j = index_from_nm(n, m)
-    except ValueError as error:
-        raise ProfileError(name, str(error), allowed) from None
-    if n > MAX_RADIAL_ORDER:
-        raise ProfileError(name, f"radial order {n}", allowed)
-    return j

@@ -75,7 +75,7 @@ def test_merged_squares_under_the_widest_kernel_lose_nothing(engine):
 
 
 def test_a_kernel_beyond_the_cap_is_refused_with_its_radius(engine):
-    with pytest.raises(GridTooLarge, match="at most 255 px"):
+    with pytest.raises(GridTooLarge, match="up to 255 px"):
         Bench(
             engine,
             {"kind": "prescription", "sphere_dpt": -6.0},

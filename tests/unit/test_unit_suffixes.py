@@ -130,7 +130,7 @@ def _all_quantities():
 def test_every_quantity_names_its_unit():
     found = list(_all_quantities())
     files = {file for file, _, _ in found}
-    assert "estimator/profiles/parse.py" in files  # the walk sees the eye,
+    assert "estimator/profiles/eye_profile.py" in files  # the walk sees the eye,
     assert any(file.startswith("filter_service/wire/") for file in files)  # the wire
     wrong = [where for _, name, where in found if not has_unit(name)]
     assert not wrong, "\n".join(wrong)
