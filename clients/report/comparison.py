@@ -147,7 +147,7 @@ def _moments(before: EyeFacts, after: EyeFacts) -> tuple[str, str]:
 
 def _limits(before: EyeFacts, after: EyeFacts) -> tuple[tuple[str, ...], ...]:
     """Return the limitations that lenses impose on the report, each once."""
-    of_all = [limits_text(f.study.profile.correction) for f in (before, after)]
+    of_all = [limits_text(f.study.profile) for f in (before, after)]
     return tuple(dict.fromkeys(limits for limits in of_all if limits))
 
 

@@ -105,17 +105,20 @@ def subtitle(study: EyeStudy) -> str:
     if profile.age_years is not None:
         age = f"{profile.age_years:g} years"
     side = f"{SIDE_NAMES[profile.eye_side]} ({profile.eye_side})"
-    source = f"from a {KIND_WORDS[profile.kind]}"
+    source = f"from {KIND_WORDS[profile.kind]}"
     if study.is_example:
         source = f"example eye (preset {profile.name})"
     return f"{side}, {age}, {source}{subtitle_text(profile)}"
 
 
 KIND_WORDS = {
-    "prescription": "prescription",
-    "zernike": "measured wavefront",
-    "zernike_set": "set of measured wavefronts",
-    "eye": "given eye model",
+    "prescription": "a prescription",
+    "zernike": "a measured wavefront",
+    "zernike_set": "a set of measured wavefronts",
+    "eye": "a given eye model",
+    "surfaces": "a given eye, by its surfaces",
+    "pseudophakic": "biometry and the geometry of an implant",
+    "published": "a schematic eye of the literature",
 }
 
 
@@ -149,7 +152,7 @@ def summary(facts: EyeFacts) -> Section:
             Row((maps, orders), (2.0, 1.0)),
             Row((points, contrast), (1.0, 1.4)),
             chart_row(facts, DAY_MM),
-            Row((Words((legend(study), *limits_text(study.profile.correction))),)),
+            Row((Words((legend(study), *limits_text(study.profile))),)),
         ),
     )
 

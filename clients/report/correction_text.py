@@ -145,18 +145,21 @@ def near_text(lens: Prescription | None) -> str:
     if not isinstance(lens, ProgressiveLens):
         return ""
     gaze = gaze_text(lens.gaze_deg).removeprefix("looking ")
-    return f"; {gaze} through {written(lens)}"
+    return f"; {gaze}"
 
 
-def limits_text(lens: Prescription | None) -> tuple[str, ...]:
-    """Return the limitations that a lens imposes on a report."""
+def limits_text(profile: EyeProfile) -> tuple[str, ...]:
+    """Return the limitations that a correction imposes on a report."""
+    lens = profile.correction
     if isinstance(lens, ProgressiveLens):
         return (
             f"Progressive lens: all of this report is for {_of_gaze(lens.gaze_deg)}; "
             "elsewhere the lens has another power.",
         )
     if isinstance(lens, WornLens) and lens.replaces_lens:
-        return (IMPLANT_LIMITS, *_rings_limits(lens))
+        # the implant of a pseudophakic eye is traced by its surfaces
+        limits = () if profile.surfaces is not None else (IMPLANT_LIMITS,)
+        return (*limits, *_rings_limits(lens))
     return _rings_limits(lens)
 
 
