@@ -8,6 +8,7 @@ const SPLIT_STEPS = { ArrowLeft: -2, ArrowDown: -2, ArrowRight: 2, ArrowUp: 2,
 const POINT_MS = 90; // between two reports of where the pointer is
 const RECONNECT_MS = 1000;
 const LINE_PX = 16; // height of a label beside a row of the chart
+const LABELS_EM = 7; // width of the labels, in their own font size
 const LEAST_LINE_PX = 11; // below it labels cannot be read: the caption remains
 
 export default {
@@ -26,7 +27,7 @@ export default {
             <template v-if="labels.length">
               <svg class="oc-leaders" :style="clip" aria-hidden="true">
                 <line v-for="mark in labels" :x1="100 * mark.x + 1 + '%'" :y1="100 * mark.y + '%'"
-                      x2="78.5%" :y2="mark.top + line / 2"></line>
+                      :x2="labelsStart" :y2="mark.top + line / 2"></line>
               </svg>
               <ol class="oc-marks" :style="{ ...clip, fontSize: 0.75 * line + 'px', lineHeight: line + 'px' }">
                 <li class="oc-marks-head"><span>logMAR</span> <span>dec.</span></li>
@@ -62,7 +63,7 @@ export default {
   props: { address: String, eyes: Array, aspect: Number, scene: String, alts: Object, marks: Array,
     captions: Object, empty: String },
   data() {
-    return { hasScene: false, height: 0, split: 50, held: false, dragging: false, point: null, states: {}, down: null };
+    return { hasScene: false, height: 0, width: 0, split: 50, held: false, dragging: false, point: null, states: {}, down: null };
   },
   computed: {
     frame() {
@@ -79,6 +80,9 @@ export default {
     },
     line() {
       return Math.min(LINE_PX, this.height / (this.marks.length + 1));
+    },
+    labelsStart() { // px from the left, short of the labels
+      return Math.max(0, this.width - LABELS_EM * 0.75 * this.line - 4);
     },
     labels() {
       // beside their rows; where rows are closer than lines, moved up or down
@@ -122,7 +126,9 @@ export default {
       return LABELS[eye];
     },
     measure() {
-      this.height = this.$el.querySelector(".oc-view")?.clientHeight;
+      const view = this.$el.querySelector(".oc-view");
+      this.height = view?.clientHeight;
+      this.width = view?.clientWidth;
     },
     state(eye) {
       if (this.empty) return { kind: "wait", text: this.empty };
