@@ -61,10 +61,10 @@ def off_center(edges, *, near, far, ahead, ndc):
 
 
 CONVENTIONS = {
-    # name: ahead, ndc of near and far plane, from where ndc begins, far, meters a unit
+    # name: ahead, ndc of near and far plane, z_ndc_min, far, meters a unit
     "OpenGL": (-1.0, (-1.0, 1.0), -1.0, FAR_M, 1.0),
     "Unity, Direct3D, Vulkan, Metal": (-1.0, (1.0, 0.0), 0.0, FAR_M, 1.0),
-    "Direct3D, usual": (1.0, (0.0, 1.0), 0.0, FAR_M, 1.0),
+    "Direct3D, conventional": (1.0, (0.0, 1.0), 0.0, FAR_M, 1.0),
     "Unreal": (1.0, (1.0, 0.0), 0.0, np.inf, 0.01),
     "Godot": (-1.0, (1.0, 0.0), 0.0, FAR_M, 1.0),
     "Godot, Compatibility": (-1.0, (1.0, -1.0), -1.0, FAR_M, 1.0),
@@ -111,7 +111,7 @@ def test_meters_come_back_from_any_depth_buffer(
     elif ndc[0] > ndc[1]:
         by_name = names["depth_reversed_m"](buffer, n, f)
     else:
-        by_name = names["depth_usual_m"](buffer, n, f)
+        by_name = names["depth_conventional_m"](buffer, n, f)
     assert_allclose(unit_m * by_name, points_m[:, 2], rtol=1e-9)
 
 
@@ -121,7 +121,7 @@ def test_unitys_shader_function_is_the_pages_formula():
     names = printed()
     for x, y, formula in (
         (ratio - 1.0, 1.0, names["depth_reversed_m"]),
-        (1.0 - ratio, ratio, names["depth_usual_m"]),
+        (1.0 - ratio, ratio, names["depth_conventional_m"]),
     ):
         eye_m = 1.0 / (x / FAR_M * d + y / FAR_M)
         assert_allclose(formula(d, NEAR_M, FAR_M), eye_m)
@@ -130,7 +130,7 @@ def test_unitys_shader_function_is_the_pages_formula():
 def test_diopters_are_linear_in_the_buffer_and_16_bits_are_enough():
     d = np.linspace(0.0, 1.0, 2**16)
     names = printed()
-    for formula in (names["depth_reversed_m"], names["depth_usual_m"]):
+    for formula in (names["depth_reversed_m"], names["depth_conventional_m"]):
         steps_dpt = np.diff(1.0 / formula(d, NEAR_M, FAR_M))
         assert_allclose(np.abs(steps_dpt), 0.00015, atol=5e-6)
 
@@ -142,7 +142,7 @@ def test_the_sky_is_infinite_where_the_far_plane_is():
     assert_array_equal(names["depth_m"](sky, matrix, 0.0, 0.01), np.inf)
     assert_array_equal(names["depth_infinite_m"](sky, 10.0), np.inf)
     assert names["depth_reversed_m"](0.0, NEAR_M, FAR_M) == pytest.approx(FAR_M)
-    assert names["depth_usual_m"](1.0, NEAR_M, FAR_M) == pytest.approx(FAR_M)
+    assert names["depth_conventional_m"](1.0, NEAR_M, FAR_M) == pytest.approx(FAR_M)
 
 
 @BY_CONVENTION
