@@ -1,7 +1,7 @@
 """Sampling density of the retina, which limits acuity in the periphery.
 
 The retina does not resolve detail finer than the spacing of midget ganglion cells of
-one type (on or off).
+one type (ON or OFF).
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ FOVEAL_MIDGET_RATIO = 1.0 / 1.12
 MIDGET_SCALE_DEG = 41.03
 
 MERIDIANS = {
-    # of the visual field: weight of the first term, and scales of both terms, deg
+    # Visual-field meridian: weight of the first term, and scales of both terms, deg
     "temporal": (0.9851, 1.058, 22.14),
     "superior": (0.9935, 1.035, 16.35),
     "nasal": (0.9729, 1.084, 7.633),
@@ -27,7 +27,7 @@ ARCMIN_PER_DEG = 60.0
 def midget_density_per_deg2(
     eccentricity_deg: ArrayLike, meridian: str
 ) -> NDArray[np.float64]:
-    """Return the density (...) of midget receptive fields, on and off together.
+    """Return the density of ON and OFF midget receptive fields combined.
 
     Parameters
     ----------
@@ -35,15 +35,20 @@ def midget_density_per_deg2(
     meridian : {"temporal", "superior", "nasal", "inferior"}
         Meridian of the visual field.
 
+    Returns
+    -------
+    (...)
+        Receptive fields per square degree.
+
     References
     ----------
     Watson, J. Vision 14(7):15, 2014, equations 4, 7 and 8, table 1.
     """
-    share, square_deg, exponential_deg = MERIDIANS[meridian]
+    weight, square_deg, exponential_deg = MERIDIANS[meridian]
     r = np.asarray(eccentricity_deg, dtype=np.float64)
     all_cells = PEAK_PER_DEG2 * (
-        share * (1.0 + r / square_deg) ** -2
-        + (1.0 - share) * np.exp(-r / exponential_deg)
+        weight * (1.0 + r / square_deg) ** -2
+        + (1.0 - weight) * np.exp(-r / exponential_deg)
     )
     return all_cells * FOVEAL_MIDGET_RATIO / (1.0 + r / MIDGET_SCALE_DEG)
 
@@ -51,13 +56,18 @@ def midget_density_per_deg2(
 def retina_nyquist_cpd(
     h_deg: ArrayLike, v_deg: ArrayLike, *, eye_side: str
 ) -> NDArray[np.float64]:
-    """Return the Nyquist frequency (...) of cells of one type, cycles per degree.
+    """Return the Nyquist frequency of midget cells of one type.
 
     Parameters
     ----------
     h_deg, v_deg : (...)
         Directions in the visual field, to the person's right and up.
     eye_side : "OD" or "OS"
+
+    Returns
+    -------
+    (...)
+        Cycles per degree.
 
     Notes
     -----
@@ -89,17 +99,28 @@ def retina_nyquist_cpd(
 def retina_log_mar(
     h_deg: ArrayLike, v_deg: ArrayLike, *, eye_side: str
 ) -> NDArray[np.float64]:
-    """Return the acuity (...), logMAR, with perfect optics.
+    """Return the acuity with perfect optics.
 
-    The gap is half a cycle at the Nyquist frequency.  The arguments are those of
-    `retina_nyquist_cpd`.
+    The Landolt C gap (critical detail) is taken as half a cycle at the Nyquist
+    frequency.  The arguments are those of `retina_nyquist_cpd`.
+
+    Returns
+    -------
+    (...)
+        logMAR.
     """
     nyquist_cpd = retina_nyquist_cpd(h_deg, v_deg, eye_side=eye_side)
     return np.log10(ARCMIN_PER_DEG / 2.0 / nyquist_cpd)
 
 
 def _spacing_deg(eccentricity_deg: ArrayLike, meridian: str) -> NDArray[np.float64]:
-    """Return the spacing (...) of cells of one type in a hexagonal lattice."""
+    """Return the spacing of cells of one type in a hexagonal lattice.
+
+    Returns
+    -------
+    (...)
+        Distance between the centers of neighboring cells, deg.
+    """
     one_type = midget_density_per_deg2(eccentricity_deg, meridian) / 2.0
     spacing_deg: NDArray[np.float64] = np.sqrt(2.0 / (np.sqrt(3.0) * one_type))
     return spacing_deg
