@@ -34,12 +34,12 @@ class Prescription:
 
 
 def power_at_cornea_dpt(power_dpt: float, *, vertex_mm: float) -> float:
-    """Convert a lens power F at a vertex distance d to the cornea: F / (1 - d F)."""
+    """Convert a power F at vertex distance d to the corneal plane: F / (1 - d F)."""
     return power_dpt / (1.0 - vertex_mm / MM_PER_M * power_dpt)
 
 
 def at_cornea(lens: Prescription) -> Prescription:
-    """Convert a prescription to the cornea."""
+    """Convert a prescription to the corneal plane."""
     other_dpt = lens.sphere_dpt + lens.cylinder_dpt
     sphere_dpt, other_dpt = (
         power_at_cornea_dpt(power_dpt, vertex_mm=lens.vertex_mm)
@@ -48,7 +48,7 @@ def at_cornea(lens: Prescription) -> Prescription:
     return Prescription(sphere_dpt, other_dpt - sphere_dpt, lens.axis_deg)
 
 
-def written(lens: Prescription) -> str:
+def format_prescription(lens: Prescription) -> str:
     """Format a prescription as "sphere cylinder x axis"."""
     text = f"{lens.sphere_dpt:+.2f}"
     if abs(lens.cylinder_dpt) >= 0.005:
@@ -59,7 +59,7 @@ def written(lens: Prescription) -> str:
 def power_vector(
     prescription: Prescription, *, depth_mm: float = 0.0
 ) -> tuple[float, float, float]:
-    """Return the power vector M, J0, J45, dpt, in the eye's frame.
+    """Convert a prescription to a power vector (M, J0, J45) in the eye's frame.
 
     The examiner faces the person, so the axis A becomes 180 - A, which changes the sign
     of J45.
@@ -69,6 +69,10 @@ def power_vector(
     prescription : Prescription
     depth_mm : float
         Depth behind the cornea of the plane to which the powers are converted.
+
+    Returns
+    -------
+    m_dpt, j0_dpt, j45_dpt : float
 
     References
     ----------
@@ -87,21 +91,43 @@ def power_vector(
 def zernike_from_power_vector(
     m_dpt: float, j0_dpt: float, j45_dpt: float, *, zernike_radius_mm: float
 ) -> NDArray[np.float64]:
-    """Return the coefficients (28,), um, of a spherocylindrical refraction."""
+    """Convert a power vector to Zernike coefficients.
+
+    Parameters
+    ----------
+    m_dpt, j0_dpt, j45_dpt : float
+    zernike_radius_mm : float
+        Normalization radius of the coefficients.
+
+    Returns
+    -------
+    (28,)
+        Coefficients, um.
+    """
     zernike_um = np.zeros(N_TERMS)
-    area = zernike_radius_mm**2
-    zernike_um[C20] = -m_dpt * area / SPHERE_PER_C20
-    zernike_um[C22] = -j0_dpt * area / ASTIGMATISM_PER_C22
-    zernike_um[C2M2] = -j45_dpt * area / ASTIGMATISM_PER_C22
+    radius_squared_mm2 = zernike_radius_mm**2
+    zernike_um[C20] = -m_dpt * radius_squared_mm2 / SPHERE_PER_C20
+    zernike_um[C22] = -j0_dpt * radius_squared_mm2 / ASTIGMATISM_PER_C22
+    zernike_um[C2M2] = -j45_dpt * radius_squared_mm2 / ASTIGMATISM_PER_C22
     return zernike_um
 
 
 def power_vector_from_zernike(
     zernike_um: NDArray[np.float64], *, zernike_radius_mm: float
 ) -> tuple[float, float, float]:
-    """Return least-squares M, J0, J45, dpt, of coefficients (28,).
+    """Convert Zernike coefficients to a least-squares power vector (M, J0, J45).
 
-    They follow from the second-order coefficients alone (Thibos, Wheeler & Horner).
+    It depends on the second-order coefficients alone (Thibos, Wheeler & Horner 1997).
+
+    Parameters
+    ----------
+    zernike_um : (28,)
+    zernike_radius_mm : float
+        Normalization radius of the coefficients.
+
+    Returns
+    -------
+    m_dpt, j0_dpt, j45_dpt : float
     """
     m, j0, j45 = power_vectors_dpt(np.asarray(zernike_um), zernike_radius_mm).tolist()
     return m, j0, j45
@@ -110,9 +136,18 @@ def power_vector_from_zernike(
 def power_vectors_dpt(
     zernike_um: NDArray[np.float64], zernike_radius_mm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return least-squares M, J0, J45 (..., 3), dpt, of coefficients (..., 28), um.
+    """Convert Zernike coefficients to least-squares power vectors (M, J0, J45).
 
-    ``zernike_radius_mm`` (...) is the radius of their circle.
+    Parameters
+    ----------
+    zernike_um : (..., 28)
+    zernike_radius_mm : (...)
+        Normalization radius of the coefficients.
+
+    Returns
+    -------
+    (..., 3)
+        Power vectors, dpt.
     """
     second = zernike_um[..., [C20, C22, C2M2]]
     per_um = -np.array([SPHERE_PER_C20, ASTIGMATISM_PER_C22, ASTIGMATISM_PER_C22])
@@ -122,7 +157,7 @@ def power_vectors_dpt(
 def prescription_from_power_vector(
     m_dpt: float, j0_dpt: float, j45_dpt: float
 ) -> Prescription:
-    """Return the minus-cylinder prescription, at the cornea, of a power vector."""
+    """Convert a power vector to a minus-cylinder prescription at the corneal plane."""
     cylinder_dpt = -2.0 * math.hypot(j0_dpt, j45_dpt)
     axis_deg = 180.0 - math.degrees(math.atan2(j45_dpt, j0_dpt)) / 2.0
     axis_deg = axis_deg % 180.0

@@ -133,11 +133,11 @@ def _vertex_note(name: str, body: "VertexBody") -> str:
     if strongest_dpt < SHOWN_DPT:
         return ""
     if lens.vertex_mm:
-        at_cornea = rx.written(rx.at_cornea(lens))
+        at_cornea = rx.format_prescription(rx.at_cornea(lens))
         place = f"at {lens.vertex_mm:g} mm, {at_cornea} at the cornea"
     else:
         place = "at the cornea"
-    note = f"{name}: {rx.written(lens)} {place}"
+    note = f"{name}: {rx.format_prescription(lens)} {place}"
     if body.vertex_mm is UNSET and strongest_dpt >= ASKS_FROM_DPT:
         note += (
             "; vertex_mm is missing: the powers of spectacles need it, usually "
