@@ -3,7 +3,7 @@
     python -m training.table11 [--rows N] [--json OUT.json]
 
 Draws N eyes of Table 2 and labels them several times: as in our data sets, and with the
-known properties of the published data sets added one by one (`published_chain`). These
+known properties of the published data sets added one by one (`published_labels`). These
 properties explain a difference if the last row of a group agrees with the paper.
 """
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from training.command import make_parser, run_command
 from training.datasets import Recipe, draw
-from training.published_chain import (
+from training.published_labels import (
     FIELD_STEPS,
     ON_AXIS_STEPS,
     label_field_as_published,

@@ -1,11 +1,11 @@
-"""The published statistics: met with the published chain, missed without it."""
+"""The published statistics: reproduced with the published labels, not with ours."""
 
 import numpy as np
 import pytest
 
 from estimator.optics.zernike import zernike_gradient
 from training.datasets import Recipe, draw
-from training.published_chain import (
+from training.published_labels import (
     FIELD_STEPS,
     ON_AXIS_STEPS,
     label_field_as_published,
@@ -30,7 +30,7 @@ def _published(name):
     return {g: dict(zip(ROWS, v, strict=True)) for g, v in PUBLISHED[name].items()}
 
 
-def test_the_published_chain_explains_the_published_spread_on_axis():
+def test_the_published_labels_explain_the_published_spread_on_axis():
     inputs = draw(Recipe("on_axis", N_EYES, N_EYES), 0)
     ours = _statistics("on_axis", DOMAINS["on_axis"].label(inputs))
     chain = label_on_axis_as_published(narrow_posterior_conic(inputs), ON_AXIS_STEPS)

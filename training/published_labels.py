@@ -1,4 +1,4 @@
-"""Known properties of the published data sets, for a comparison of statistics.
+"""Labels computed as in the published data sets, for a comparison of statistics.
 
 The authors' framework (see its published sources and `lens_shape.compat_lens_shape`)
 differs from this one: circles have the size of the stop, the lens has another shape
