@@ -298,7 +298,7 @@ class FilterClient:
         self._next_profile_id += 1
         self._link.profiles[request.eye] = request
         if self.welcome is not None:  # otherwise `_begin` sends it after hello
-            self._link.say(parts)
+            self._link.queue_message(parts)
 
     def _await_profile(
         self,
@@ -553,7 +553,7 @@ class FilterClient:
         self.hello(limit_s)
         self._link.pongs.clear()
         start_s = time.monotonic()
-        self._link.say(encode(Ping(start_s)))
+        self._link.queue_message(encode(Ping(start_s)))
         self._link.wait_until(
             lambda: bool(self._link.pongs), limit_s, "a reply to ping"
         )

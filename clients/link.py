@@ -45,7 +45,7 @@ from filter_service.messages import (
 )
 
 MAX_KEPT_PROGRESS = 1000
-RETRY_SEND_S = 0.002  # a connection accepts messages shortly after its event
+RETRY_SEND_S = 0.002  # the socket accepts messages only shortly after the connect event
 
 _Found = TypeVar("_Found")
 
@@ -85,7 +85,7 @@ Event = FilteredFrame | Dropped | ErrorReply | Ready | Progress | Accepted
 
 @dataclass
 class Outgoing:
-    """A packed frame that waits to be sent, or that is in flight."""
+    """A serialized frame waiting to be sent or in flight."""
 
     frame_id: int
     parts: list[Any]
@@ -110,7 +110,7 @@ class Outgoing:
 
 
 class ServiceLink:
-    """Session of a client.
+    """Client session with the service.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ class ServiceLink:
         self._connection = Connection(endpoint, key)
         self._session_key = ""
         self._wants_memory = shared_memory
-        self.memory = SharedMemory(lambda message: self.say(encode(message)))
+        self.memory = SharedMemory(lambda message: self.queue_message(encode(message)))
         self._outbox: list[list[Any]] = []
         self._events: list[Event] = []
         self._refusal: FilterError | None = None
@@ -158,12 +158,12 @@ class ServiceLink:
             self._connection.send(encode(Bye()))
         self._connection.close()
 
-    def say(self, parts: list[Any]) -> None:
+    def queue_message(self, parts: list[Any]) -> None:
         """Queue a control message; the queue is sent in order."""
         self._outbox.append(parts)
 
     def submit(self, outgoing: Outgoing) -> None:
-        """Queue a frame as the next to send, in place of one that is still queued."""
+        """Queue a frame to send next, replacing any frame still queued."""
         if self.pending is not None:
             self.n_superseded += 1
             self._drop(self.pending, "superseded")
@@ -199,7 +199,7 @@ class ServiceLink:
         Raises
         ------
         ServiceTimeout
-            After ``timeout_s``; the message says that it waited for ``what``.
+            After ``timeout_s``; the message includes ``what``.
         """
         deadline_s = time.monotonic() + timeout_s
         self.pump(0.0)
@@ -219,9 +219,8 @@ class ServiceLink:
         self.pump(min(remaining_s, 0.5))
         if self._connection.has_failed_handshake:
             raise AuthenticationFailed(
-                f"{self._connection.endpoint} and this client do not accept each "
-                "other's keys; expected the key file of an added client "
-                "(`ocufilter keys add NAME`)"
+                f"key exchange with {self._connection.endpoint} failed; expected a "
+                "key file created with `ocufilter keys add NAME`"
             )
         if self._refusal is not None:
             refusal, self._refusal = self._refusal, None
@@ -233,14 +232,14 @@ class ServiceLink:
         self._connection.wait(min(timeout_s, RETRY_SEND_S) if is_due else timeout_s)
         for is_up in self._connection.changes():
             if is_up:
-                self.greet()
+                self.send_hello()
             else:
                 self._lose_connection()
         while (parts := self._connection.receive()) is not None:
             self._handle(decode_reply([part.buffer for part in parts]))
         self._send_waiting()
 
-    def greet(self) -> None:
+    def send_hello(self) -> None:
         """Send hello, on every new connection.
 
         The session key resumes the client's session.  `_begin` then sends the profiles
@@ -309,7 +308,7 @@ class ServiceLink:
         known |= welcome.profile_ids
         for eye, profile in self.profiles.items():
             if known.get(eye) != profile.profile_id:
-                self.say(encode(profile))
+                self.queue_message(encode(profile))
 
     def _bound_progress(self) -> None:
         """Discard the oldest progress event if the program does not poll."""
@@ -375,4 +374,4 @@ class ServiceLink:
         if frame_id is not None and frame_id in self.in_flight:
             self._drop(self.in_flight.pop(frame_id), "connection_lost")
         if self.welcome is not None:
-            self.greet()
+            self.send_hello()

@@ -296,7 +296,7 @@ def test_a_storm_of_profiles_mixes_no_eyes_and_ends_with_the_newest(start_servic
                 1000 + mark, EYE | {"mark": mark}, views=(view.camera,)
             )
             accepted.profile = request
-            accepted.say(encode(request))
+            accepted.queue_message(encode(request))
             marks[request.profile_id] = mark
             client.submit(view, **SEE)
             for event in client.poll(0.01):

@@ -277,7 +277,7 @@ def test_what_comes_with_the_acceptance_is_not_lost(client):
         replace(first, profile_id=first.profile_id + 1),
     ]
     link = client._link
-    link.say = lambda parts: link._events.extend(together)
+    link.queue_message = lambda parts: link._events.extend(together)
     accepted = client.set_profile(double(63), views=[view], wait=False)
     assert accepted == together[0]
     assert client.poll(0.0) == together[1:]
