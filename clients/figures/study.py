@@ -40,7 +40,7 @@ FIELD_V_DEG = np.arange(-20.0, 21.0, 5.0)
 FIELD_PUPIL_MM = 4.0
 
 Profile = EyeProfile | Mapping[str, Any] | str | Path
-Report = Callable[[float, str], None]
+ProgressCallback = Callable[[float, str], None]
 
 
 def profile_of(profile: Profile) -> EyeProfile:
@@ -79,7 +79,7 @@ class EyeStudy:
     notes: tuple[str, ...]
 
     @classmethod
-    def of(cls, profile: Profile, *, progress: Report | None = None) -> Self:
+    def of(cls, profile: Profile, *, progress: ProgressCallback | None = None) -> Self:
         """Estimate and trace an eye.
 
         Parameters
@@ -90,7 +90,7 @@ class EyeStudy:
         Raises
         ------
         ValueError
-            If the profile is invalid, or light does not pass the eye.
+            If the profile is invalid, or no light passes through the eye.
         """
         parsed = profile_of(profile)
         optics, notes = prepare_eye(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.figures import EyeStudy
-from clients.figures.study import PUPILS_MM, Profile, Report
+from clients.figures.study import PUPILS_MM, Profile, ProgressCallback
 from clients.report.charts import DISTANCES_M, Chart, charts_of
 from clients.report.labels import own_name
 from clients.report.numbers import chart_numbers, eye_numbers
@@ -57,7 +57,7 @@ def facts_of(
     *,
     label: str = "",
     has_charts: bool = True,
-    progress: Report | None = None,
+    progress: ProgressCallback | None = None,
 ) -> EyeFacts:
     """Compute the content of a report on an eye.
 
@@ -66,14 +66,14 @@ def facts_of(
     label : str
         Name to use instead of the profile's.
     has_charts : bool
-        Whether to filter letter charts, which takes a quarter of the time.
+        Whether to filter letter charts (about a quarter of the run time).
     progress : callable, optional
         Called with a fraction and a stage.
 
     Raises
     ------
     ValueError
-        If the profile is invalid, or light does not pass the eye.
+        If the profile is invalid, or no light passes through the eye.
     """
 
     def say(done: float, stage: str) -> None:

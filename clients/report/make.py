@@ -6,25 +6,25 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from clients.figures.study import Profile, Report
+from clients.figures.study import Profile, ProgressCallback
 from clients.report.blocks import Document
 from clients.report.comparison import comparison_document
 from clients.report.content import eye_document
 from clients.report.facts import EyeFacts, facts_of
 from clients.report.html_page import html_of
 from clients.report.labels import distinct_labels
-from clients.report.origin import Record, origin_of, running_text
+from clients.report.origin import Record, origin_of, running_footer
 
 SUFFIXES = (".html", ".pdf")
 PANGO_PACKAGES = ("libpango-1.0-0", "libpangoft2-1.0-0", "libharfbuzz-subset0")
 """Debian packages of the system libraries that WeasyPrint loads."""
 
-WRITING_AT = 0.85
-"""Progress at which the eyes are computed and writing begins."""
+WRITING_START_FRACTION = 0.85
+"""Progress fraction at which computation ends and writing begins."""
 
 
 class ReportError(RuntimeError):
-    """A report that cannot be written here."""
+    """Raised when a dependency for writing a report is missing."""
 
 
 def report_html(
@@ -37,34 +37,34 @@ def report_html(
     patient: str = "",
     examiner: str = "",
     has_charts: bool = True,
-    progress: Report | None = None,
+    progress: ProgressCallback | None = None,
 ) -> str:
-    """Return the report of one or two eyes as the text of one HTML file.
+    """Return a report on one or two eyes as a single HTML document.
 
-    Letter charts use the process's `EyeFilter`s: call this in the thread that uses
-    them, or without charts.
+    Letter charts use `EyeFilter` instances shared by the process.  Call this from the
+    thread that uses them, or pass ``has_charts=False``.
 
     Parameters
     ----------
-    profile, after : EyeProfile, mapping, preset's name or file
+    profile, after : EyeProfile, mapping, preset name or path
         With ``after``, the report starts with the differences.
     label, after_label : str
         Names of the eyes, instead of their profiles' names.
     reference, patient, examiner : str
-        Identifier of a record or an order, and names, shown in the header; 60
-        characters at most.
+        Record or order number, patient name and examiner name, shown in the header; at
+        most 60 characters each.
     has_charts : bool
-        Whether to filter letter charts, which takes a quarter of the time.
+        Whether to filter letter charts (about a quarter of the run time).
     progress : callable, optional
         Called with a fraction and a stage.
 
     Raises
     ------
     ValueError
-        If a profile is invalid, light does not pass an eye, or a text is too long.
+        If a profile is invalid, no light passes through an eye, or a text is too long.
     """
     record = Record(patient=patient, examiner=examiner, reference=reference)
-    eyes = eyes_of(
+    eyes = compute_eye_facts(
         [profile] if after is None else [profile, after],
         labels=(label, after_label),
         has_charts=has_charts,
@@ -76,27 +76,29 @@ def report_html(
     return text
 
 
-def eyes_of(
+def compute_eye_facts(
     profiles: list[Profile],
     *,
     labels: tuple[str, ...] = ("", ""),
     has_charts: bool = True,
-    progress: Report | None = None,
+    progress: ProgressCallback | None = None,
 ) -> list[EyeFacts]:
     """Compute the content of a report on one or two eyes."""
-    share = WRITING_AT / len(profiles)
+    share = WRITING_START_FRACTION / len(profiles)
 
-    def along(k: int) -> Report | None:
+    def share_of_progress(k: int) -> ProgressCallback | None:
         if progress is None:
             return None
-        return lambda done, stage: progress((k + done) * share, stage)
+        return lambda fraction, stage: progress((k + fraction) * share, stage)
 
     eyes = [
-        facts_of(profile, label=label, has_charts=has_charts, progress=along(k))
+        facts_of(
+            profile, label=label, has_charts=has_charts, progress=share_of_progress(k)
+        )
         for k, (profile, label) in enumerate(zip(profiles, labels, strict=False))
     ]
     if progress is not None:
-        progress(WRITING_AT, "writing")
+        progress(WRITING_START_FRACTION, "writing")
     if len(eyes) == 1:
         return eyes
     before, after = eyes
@@ -108,11 +110,11 @@ def eyes_of(
 
 
 def document_of(eyes: list[EyeFacts], record: Record | None = None) -> Document:
-    """Return the document of one eye, or of the comparison of two."""
+    """Return the report document for one eye, or a comparison of two."""
     document = eye_document(*eyes) if len(eyes) == 1 else comparison_document(*eyes)
     origin = origin_of(eyes, record or Record())
     return replace(
-        document, origin=origin, running=running_text(document.title, origin)
+        document, origin=origin, running=running_footer(document.title, origin)
     )
 
 
@@ -124,45 +126,45 @@ def write_report(
     Raises
     ------
     ReportError
-        If WeasyPrint, or the system library Pango that it needs, is missing.
+        If PDF output is unavailable (missing dependency).
     OSError
         If the file cannot be written.
     """
     text = html_of(document_of(eyes, record))
     if path.suffix.lower() == ".pdf":
-        path.write_bytes(_pdf_of(text))
+        path.write_bytes(_render_pdf(text))
     else:
         path.write_text(text, encoding="utf-8")
 
 
 def check_pdf() -> None:
-    """Raise an error if PDFs cannot be written here.
+    """Raise an error if PDF output is unavailable.
 
     Raises
     ------
     ReportError
-        If WeasyPrint, or the system library Pango that it needs, is missing.
+        If PDF output is unavailable (missing dependency).
     """
     try:
         import weasyprint  # noqa: F401
     except ImportError:
         raise ReportError(
-            "PDF needs WeasyPrint: pip install 'ocufilter[report]'; "
-            "an .html report needs nothing more"
+            "PDF output requires WeasyPrint: `pip install 'ocufilter[report]'`. HTML "
+            "reports need no extra packages."
         ) from None
     except OSError as error:
         raise ReportError(
-            f"PDF needs the system library Pango ({error}): apt-get install "
-            f"{' '.join(PANGO_PACKAGES)}; an .html report needs nothing more"
+            f"PDF output requires the system library Pango ({error}): `apt-get install "
+            f"{' '.join(PANGO_PACKAGES)}`. HTML reports need no extra packages."
         ) from None
 
 
-def _pdf_of(text: str) -> bytes:
+def _render_pdf(text: str) -> bytes:
     check_pdf()
     from weasyprint import HTML
 
-    written: bytes = HTML(string=text).write_pdf(pdf_variant="pdf/ua-1")
-    return written
+    pdf: bytes = HTML(string=text).write_pdf(pdf_variant="pdf/ua-1")
+    return pdf
 
 
 def report_numbers(eyes: list[EyeFacts]) -> dict[str, Any]:

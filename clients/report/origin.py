@@ -53,8 +53,8 @@ def origin_of(eyes: list[EyeFacts], record: Record) -> tuple[tuple[str, str], ..
     return tuple((name, value) for name, value in entries if value)
 
 
-def running_text(title: str, origin: tuple[tuple[str, str], ...]) -> str:
-    """Return what identifies a report on each of its pages."""
+def running_footer(title: str, origin: tuple[tuple[str, str], ...]) -> str:
+    """Return the text in the footer of every page, which identifies the report."""
     shown = [
         value if name == "Date" else f"{name} {value}"
         for name, value in origin

@@ -27,7 +27,7 @@ from clients.report.make import (
     SUFFIXES,
     ReportError,
     check_pdf,
-    eyes_of,
+    compute_eye_facts,
     report_numbers,
     write_report,
 )
@@ -114,7 +114,7 @@ def run(options: argparse.Namespace) -> str:
     started_s = time.monotonic()
     with Progress(quiet=options.json) as progress:
         task = progress.task("Report", total=1.0, unit="%")
-        eyes = eyes_of(
+        eyes = compute_eye_facts(
             list(profiles),
             labels=labels,
             has_charts=not options.no_charts and options.out is not None,
