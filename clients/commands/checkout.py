@@ -52,7 +52,7 @@ def paper(
     fresh: Annotated[
         bool,
         typer.Option(
-            "--fresh", help="Run the benchmarks first; prints how long that takes."
+            "--fresh", help="Run the benchmarks first; prints the estimated time."
         ),
     ] = False,
     quick: Annotated[

@@ -19,14 +19,14 @@ class CommandFailed(Exception):
     """A failure that is reported in one line on stderr, with exit code 1."""
 
 
-def say(line: str = "") -> None:
-    """Print one line of the report."""
+def print_line(line: str = "") -> None:
+    """Print one line to stdout."""
     sys.stdout.write(line + "\n")
 
 
 def print_json(data: dict[str, Any]) -> None:
     """Print the JSON object of a ``--json`` run."""
-    say(json.dumps(data, allow_nan=False))
+    print_line(json.dumps(data, allow_nan=False))
 
 
 def check_range(option: str, value: float, limits: tuple[float, float]) -> None:

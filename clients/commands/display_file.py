@@ -36,7 +36,7 @@ def display_of_file(name: str) -> str:
             [
                 [float(part) for part in line.split(",")]
                 for number, line in enumerate(lines)
-                if line.strip() and not (number == 0 and _is_words(line))
+                if line.strip() and not (number == 0 and _is_header(line))
             ]
         )
         columns = table[:, 0], table[:, 1:]
@@ -61,7 +61,7 @@ def _refuse(name: str, found: str, allowed: str) -> NoReturn:
     raise InvalidFile(name, found, allowed, "display") from None
 
 
-def _is_words(line: str) -> bool:
+def _is_header(line: str) -> bool:
     try:
         float(line.split(",")[0])
     except ValueError:

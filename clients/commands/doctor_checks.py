@@ -282,12 +282,12 @@ def check_engine(gl: dict[str, Any], native: dict[str, Any]) -> Check:
         return Check("engine", bool(renderer), detail, fix)
     if renderer and not is_software_renderer(renderer):
         return Check("engine", True, f"gl: {renderer} is a hardware GPU")
-    lacks = f"{renderer} is a software renderer" if renderer else "no OpenGL"
+    reason = f"{renderer} is a software renderer" if renderer else "no OpenGL"
     if "error" not in native:
-        return Check("engine", True, f"native: {lacks}")
+        return Check("engine", True, f"native: {reason}")
     if renderer:
         return Check(
-            "engine", True, f"gl, slow: {lacks}, and there are no compiled loops"
+            "engine", True, f"gl, slow: {reason}, and there are no compiled loops"
         )
     return Check(
         "engine", False, "none: neither OpenGL nor compiled loops", FIX_COMPILER
@@ -334,7 +334,7 @@ def check_display() -> Check:
 
 
 def what_works(ok: dict[str, bool]) -> dict[str, bool]:
-    """Return which purposes work, from the checks that each of them requires."""
+    """Return for each purpose whether it works, from the checks that it requires."""
     psf = ok["python"] and ok["service packages"]
     shaders = ok["gl"] and ok["compute"] and ok["shaders"]
     filters = psf and (ok["native"] or shaders)

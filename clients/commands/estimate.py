@@ -11,7 +11,7 @@ from clients.commands.console import (
     Json,
     check_range,
     print_json,
-    say,
+    print_line,
 )
 
 if TYPE_CHECKING:
@@ -108,14 +108,14 @@ def _summary(found: "EstimatedEye") -> dict[str, Any]:
 
 def _report(summary: dict[str, Any], plot: Path | None) -> None:
     for note in summary["notes"]:
-        say(f"note: {note}")
-    say(f"{'parameter':<38}{'value':>11}  determined")
+        print_line(f"note: {note}")
+    print_line(f"{'parameter':<38}{'value':>11}  determined")
     for name, value in summary["parameters"].items():
         ratio = summary["determined_ratio"].get(name)
         known = "" if ratio is None else f"{100.0 * ratio:5.0f} %"
         bound = "  at its bound" if name in summary["on_bound"] else ""
-        say(f"{name:<38}{value:>11.5g}  {known}{bound}")
-    say(
+        print_line(f"{name:<38}{value:>11.5g}  {known}{bound}")
+    print_line(
         f"{summary['profile']}, {summary['method']}: mean error "
         f"{summary['mean_abs_error_um']:.2g} um over 25 terms, "
         f"{summary['time_ms']:.0f} ms, {summary['n_evaluations']} eyes traced; "
@@ -123,4 +123,4 @@ def _report(summary: dict[str, Any], plot: Path | None) -> None:
         f"accommodation {summary['amplitude_dpt']:.1f} dpt"
     )
     if plot is not None:
-        say(f"wrote the cross-section to {plot}")
+        print_line(f"wrote the cross-section to {plot}")

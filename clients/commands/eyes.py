@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from clients.commands.console import Json, print_json, say
+from clients.commands.console import Json, print_json, print_line
 from filter_service.psfs.cache_folder import CACHE_VARIABLE
 
 MB = 1e6
@@ -40,7 +40,7 @@ def _folder(given: Path | None) -> Path:
 
 
 @eyes.command(name="list")
-def list_kept(folder: Folder = None, json_output: Json = False) -> None:
+def list_cached(folder: Folder = None, json_output: Json = False) -> None:
     """List the cached eyes by profile hash, most recently used first.
 
     ocufilter eyes list --dir ~/.cache/ocufilter
@@ -58,7 +58,7 @@ def list_kept(folder: Folder = None, json_output: Json = False) -> None:
             f"{eye.size_bytes / MB:8.1f} MB  used {used}"
         )
     if not found:
-        print("no eye is cached")
+        print("no eyes are cached")
 
 
 @eyes.command()
@@ -86,16 +86,16 @@ def erase(
         raise ValueError(
             "no eye or several selected; allowed: one of PROFILE, --name HASH and --all"
         )
-    begin = name or ""
+    prefix = name or ""
     if profile is not None:
         from estimator.profiles.files import load_profile
         from filter_service.psfs.store_cache import eye_name
 
-        begin = eye_name(load_profile(profile))
+        prefix = eye_name(load_profile(profile))
     elif name is not None and (not name or name.strip("0123456789abcdef")):
         raise ValueError(f"--name is {name!r}; allowed: a hash printed by `eyes list`")
-    n_files = erase_eyes(_folder(folder), begin)
+    n_files = erase_eyes(_folder(folder), prefix)
     if json_output:
         print_json({"erased_files": n_files})
     else:
-        say(f"{n_files} files erased" if n_files else "nothing was cached")
+        print_line(f"{n_files} files erased" if n_files else "nothing was cached")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from clients.commands.console import Json, check_range, print_json, say
+from clients.commands.console import Json, check_range, print_json, print_line
 from clients.commands.wavefront import (
     FOCUS_LIMITS_DPT,
     PUPIL_LIMITS_MM,
@@ -166,8 +166,10 @@ def _report(found: "FieldTable", notes: list[str]) -> None:
     import numpy as np
 
     for note in notes:
-        say(f"note: {note}")
-    say("  h deg   v deg    M dpt   J0 dpt  J45 dpt   coma um  RMS 3-6 um  circle mm")
+        print_line(f"note: {note}")
+    print_line(
+        "  h deg   v deg    M dpt   J0 dpt  J45 dpt   coma um  RMS 3-6 um  circle mm"
+    )
     coma_um = np.hypot(*found.zernike_um[:, [7, 8]].T)
     higher_um = np.linalg.norm(found.zernike_um[:, 6:], axis=1)
     rows = zip(
@@ -176,7 +178,7 @@ def _report(found: "FieldTable", notes: list[str]) -> None:
         strict=True,
     )
     for h, v, m, j0, j45, coma, higher, radius in rows:
-        say(
+        print_line(
             f"{h:7.1f} {v:7.1f} {m:+8.2f} {j0:+8.2f} {j45:+8.2f} {coma:9.3f} "
             f"{higher:11.3f} {radius:10.3f}"
         )

@@ -14,10 +14,10 @@ from clients.commands.console import (
     Json,
     check_range,
     print_json,
+    print_line,
     progress_bar,
-    say,
 )
-from clients.commands.plan_text import say_plan
+from clients.commands.plan_text import print_plan
 from clients.commands.setting_options import with_setting_options
 from filter_service.camera import Camera, read_intrinsics
 from filter_service.settings import (
@@ -198,7 +198,7 @@ def filter_image(
         pupils_mm=(pupil_mm,), foci_dpt=(focus_dpt,), objects_dpt=object_dpt
     )
     if plan:
-        say_plan(_planned(eye, view, whole), json_output=json_output)
+        print_plan(_planned(eye, view, whole), json_output=json_output)
         return
     started_s = time.perf_counter()
     with (
@@ -379,8 +379,8 @@ def _read_hidden(
     if color_path is None and depth_path is None:
         return None, None
     if color_path is None or depth_path is None:
-        lacking = "--hidden-color" if color_path is None else "--hidden-depth"
-        raise ValueError(f"{lacking} is not given; allowed: both files or neither")
+        missing = "--hidden-color" if color_path is None else "--hidden-depth"
+        raise ValueError(f"{missing} is not given; allowed: both files or neither")
     hidden = read_color(color_path, option="hidden-color")
     _check_size("hidden-color", color_path, hidden, color)
     if hidden.dtype != color.dtype:
@@ -434,7 +434,7 @@ def _summary(
         "stage_times_ms": dict(seen.stage_times_ms),
         "psf_count": filtered.psf_count,
         "object_range_dpt": list(object_dpt),
-        "depth": _depth_words(view.depth_m, seen.missing_depth_count),
+        "depth": _describe_depth(view.depth_m, seen.missing_depth_count),
         "engine": filtered.engine,
         "renderer": filtered.renderer,
         "settings": vars(settings),
@@ -442,7 +442,7 @@ def _summary(
     }
 
 
-def _depth_words(depth_m: "NDArray[Any]", missing_count: int) -> str:
+def _describe_depth(depth_m: "NDArray[Any]", missing_count: int) -> str:
     """Return the depth range and the percentage of filled pixels, as text."""
     from filter_service.rgbd_view import MIN_DEPTH_M
 
@@ -453,19 +453,21 @@ def _depth_words(depth_m: "NDArray[Any]", missing_count: int) -> str:
         f"{value_m:.3g} m" if value_m < float("inf") else "infinity"
         for value_m in (known_m.min(), known_m.max())
     )
-    words = f"depth {low} to {high}" if low != high else f"depth {low}"
+    text = f"depth {low} to {high}" if low != high else f"depth {low}"
     if not missing_count:
-        return words
+        return text
     share = 100.0 * missing_count / depth_m.size
-    return f"{words}, {share:.2g} % missing, filled from neighbors"
+    return f"{text}, {share:.2g} % missing, filled from neighbors"
 
 
 def _report(summary: dict[str, Any]) -> None:
     for note in summary["notes"]:
-        say(f"note: {note}")
+        print_line(f"note: {note}")
     if count := summary["clamped_depth_count"]:
-        say(f"note: {count} pixels are nearer or farther than the prepared distances")
-    say(summary["depth"])
+        print_line(
+            f"note: {count} pixels are nearer or farther than the prepared distances"
+        )
+    print_line(summary["depth"])
     settings = summary["settings"]
     ranges = ", ".join(
         f"{name} {settings[key][0]:g} to {settings[key][1]:.3g} {unit}"
@@ -475,11 +477,11 @@ def _report(summary: dict[str, Any]) -> None:
             ("objects", "object_range_dpt", "dpt"),
         )
     )
-    say(
+    print_line(
         f"mode {settings['mode']}, grid {settings['grid']}, tolerance "
         f"{settings['tolerance']}, eye model {settings['eye_model']}; {ranges}"
     )
-    say(
+    print_line(
         f"{summary['out']}: {summary['width_px']}x{summary['height_px']} through "
         f"{summary['profile']}, pupil {summary['pupil_diameter_mm']:g} mm, "
         f"focus {round(summary['focus_dpt'], 3) + 0.0:.3g} dpt; "

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from clients.commands.console import Json, print_json, say
+from clients.commands.console import Json, print_json, print_line
 
 if TYPE_CHECKING:
     from filter_service.keys import KeyRing
@@ -63,7 +63,9 @@ def add(
     if json_output:
         print_json({"name": name, "public": key.pair.public, "file": str(file)})
         return
-    say(f"{name} may connect with {file}; the service needs keys_dir = '{ring.folder}'")
+    print_line(
+        f"{name} may connect with {file}; the service needs keys_dir = '{ring.folder}'"
+    )
 
 
 @keys.command()
@@ -76,7 +78,7 @@ def remove(name: Name, folder: Folder = None, json_output: Json = False) -> None
     if json_output:
         print_json({"removed": name})
     else:
-        say(f"{name} can no longer connect")
+        print_line(f"{name} can no longer connect")
 
 
 @keys.command(name="list")

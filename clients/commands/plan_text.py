@@ -1,13 +1,13 @@
-"""A PSF plan as text and as JSON."""
+"""Output of a PSF plan as text and as JSON."""
 
 from typing import TYPE_CHECKING, Any
 
-from clients.commands.console import print_json, say
+from clients.commands.console import print_json, print_line
 
 if TYPE_CHECKING:
     from filter_service.planning.nodes import CachePlan
 
-AXIS_WORDS = {"h": "azimuth", "v": "elevation"}
+AXIS_NAMES = {"h": "azimuth", "v": "elevation"}
 
 
 def plan_summary(plan: "CachePlan") -> dict[str, Any]:
@@ -30,7 +30,7 @@ def plan_summary(plan: "CachePlan") -> dict[str, Any]:
     }
 
 
-def say_plan(plan: "CachePlan", *, json_output: bool) -> None:
+def print_plan(plan: "CachePlan", *, json_output: bool) -> None:
     """Print a plan as text or as JSON."""
     summary = plan_summary(plan)
     if json_output:
@@ -38,17 +38,17 @@ def say_plan(plan: "CachePlan", *, json_output: bool) -> None:
         return
     low_dpt, high_dpt = summary["defocus_range_dpt"]
     fewest, most = summary["defocus_counts"]
-    defocus_words = f"{fewest}" if fewest == most else f"{fewest} to {most}"
-    say(_axis("azimuths", summary["h_deg"], "deg"))
-    say(_axis("elevations", summary["v_deg"], "deg"))
-    say(_axis("pupils", summary["pupils_mm"], "mm"))
-    say(_axis("accommodations", summary["accommodations_dpt"], "dpt"))
-    say(f"{defocus_words} defoci from {low_dpt:.2f} to {high_dpt:.2f} dpt at each")
+    count_text = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+    print_line(_axis("azimuths", summary["h_deg"], "deg"))
+    print_line(_axis("elevations", summary["v_deg"], "deg"))
+    print_line(_axis("pupils", summary["pupils_mm"], "mm"))
+    print_line(_axis("accommodations", summary["accommodations_dpt"], "dpt"))
+    print_line(f"{count_text} defoci from {low_dpt:.2f} to {high_dpt:.2f} dpt at each")
     parts = ", ".join(
-        f"{AXIS_WORDS.get(axis, axis)} {db:.0f}"
+        f"{AXIS_NAMES.get(axis, axis)} {db:.0f}"
         for axis, db in summary["error_db_by_axis"].items()
     )
-    say(
+    print_line(
         f"{summary['psf_count']} PSFs, {summary['memory_mb']:.1f} MB, "
         f"{summary['build_s']:.1f} s on {summary['core_count']} cores; "
         f"interpolation at {summary['interpolation_db']:.0f} dB ({parts})"

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from clients.commands.console import CommandFailed, Json, print_json, say
+from clients.commands.console import CommandFailed, Json, print_json, print_line
 from clients.extra import what_to_install
 
 
@@ -116,18 +116,22 @@ def doctor(json_output: Json = False) -> None:
 
 def _print_diagnosis(report: dict[str, Any]) -> None:
     machine = report["machine"]
-    say(f"{machine['system']}, {machine['processor']}, {machine['n_cores']} cores")
+    print_line(
+        f"{machine['system']}, {machine['processor']}, {machine['n_cores']} cores"
+    )
     for check in report["checks"]:
-        say(f"  {'ok ' if check['ok'] else 'NO '} {check['name']}: {check['detail']}")
+        print_line(
+            f"  {'ok ' if check['ok'] else 'NO '} {check['name']}: {check['detail']}"
+        )
     for name, value in report["gl"]["limits"].items():
-        say(f"      {name}: {value}")
+        print_line(f"      {name}: {value}")
     for device in report["gl"]["devices"]:
         found = device["renderer"] or f"no context: {device['error']}"
-        say(f"      EGL device {device['index']} ({device['name']}): {found}")
+        print_line(f"      EGL device {device['index']} ({device['name']}): {found}")
     works = [name for name, ok in report["works"].items() if ok]
     fails = [name for name, ok in report["works"].items() if not ok]
-    say("works here: " + (", ".join(works) or "nothing"))
+    print_line("works here: " + (", ".join(works) or "nothing"))
     if fails:
-        say("does not work here: " + ", ".join(fails))
+        print_line("does not work here: " + ", ".join(fails))
     for command in report["install"]:
-        say(f"install: {command}")
+        print_line(f"install: {command}")

@@ -13,7 +13,7 @@ from clients.commands.console import (
     Json,
     check_range,
     print_json,
-    say,
+    print_line,
 )
 from clients.commands.wavefront import (
     FIELD_LIMITS_DEG,
@@ -204,7 +204,10 @@ def _traced(source: str, focus_dpt: float | None, **view: Any) -> _State:
     if not found.rms_residual_um >= 0.0:
         raise CommandFailed(
             f"{name}, h {view['h_deg']:g} v {view['v_deg']:g} deg: "
-            + ("; ".join(found.notes) or "too few rays pass the pupil for a fit")
+            + (
+                "; ".join(found.notes)
+                or "too few rays pass through the pupil for a fit"
+            )
         )
     return _State(
         name=name,
@@ -284,9 +287,9 @@ def _write(out: Path, computed: "Psf", *, pixel_arcmin: float) -> None:
 
 def _report(summary: dict[str, Any]) -> None:
     for note in summary["notes"]:
-        say(f"note: {note}")
+        print_line(f"note: {note}")
     arcmin = summary["pixel_arcmin"]
-    say(
+    print_line(
         f"{summary['out']}: {summary['profile']}, {summary['method']} method, pupil "
         f"{summary['pupil_diameter_mm']:g} mm, {summary['wavelength_nm']:g} nm; radius "
         f"{summary['radius_px']} px ({summary['radius_px'] * arcmin:.3g} arcmin), half "

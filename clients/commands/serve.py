@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from clients.commands.console import Json, print_json, say
+from clients.commands.console import Json, print_json, print_line
 from filter_service.settings import Engine
 
 
@@ -65,7 +65,7 @@ def serve(
 
     ocufilter serve --bind tcp://127.0.0.1:5577
     """
-    from filter_service.service import launch as serving
+    from filter_service.service import launch as service_launch
     from filter_service.service.config import load_config
 
     if config is not None and not config.is_file():
@@ -80,7 +80,7 @@ def serve(
         ready_file=ready_file,
         store_cache_dir=None if keep_eyes is None else str(keep_eyes.absolute()),
     )
-    serving.run(load(), reload_config=load)
+    service_launch.run(load(), reload_config=load)
 
 
 def prepare(json_output: Json = False) -> None:
@@ -103,4 +103,4 @@ def prepare(json_output: Json = False) -> None:
     if json_output:
         print_json({"ok": True, "seconds": round(spent_s, 1)})
     else:
-        say(f"prepared in {spent_s:.0f} s")
+        print_line(f"prepared in {spent_s:.0f} s")

@@ -18,7 +18,7 @@ from filter_service.errors import BadMessage
 from filter_service.settings import DEFAULTS, setting_help, setting_types
 from filter_service.validation import checked
 
-HELP_OF_SIDE = {"h": "to the right", "v": "upward"}
+DIRECTION_HELP = {"h": "to the right", "v": "upward"}
 
 
 def with_setting_options(
@@ -62,10 +62,10 @@ def with_setting_options(
 def _options(name: str, default: Any) -> list[inspect.Parameter]:
     """Return the typer parameters of one setting."""
     kind = get_args(setting_types()[name])[0]
-    words = setting_help(name)
+    help_text = setting_help(name)
     if isinstance(default, bool):
         flag = f"--{'no-' if default else ''}{name.replace('_', '-')}"
-        return [_option(name, bool, default=False, words=words, flags=(flag,))]
+        return [_option(name, bool, default=False, help_text=help_text, flags=(flag,))]
     if isinstance(default, tuple):
         stem, _, unit = name.rpartition("_")
         return [
@@ -73,21 +73,21 @@ def _options(name: str, default: Any) -> list[inspect.Parameter]:
                 f"{stem}_{side}_{unit}",
                 float,
                 default=value,
-                words=f"{words}  This is the angle {HELP_OF_SIDE[side]}.",
+                help_text=f"{help_text}  This is the angle {DIRECTION_HELP[side]}.",
             )
-            for side, value in zip(HELP_OF_SIDE, default, strict=True)
+            for side, value in zip(DIRECTION_HELP, default, strict=True)
         ]
-    return [_option(name, _plain_type(kind), default=default, words=words)]
+    return [_option(name, _plain_type(kind), default=default, help_text=help_text)]
 
 
 def _option(
-    name: str, kind: Any, *, default: Any, words: str, flags: tuple[str, ...] = ()
+    name: str, kind: Any, *, default: Any, help_text: str, flags: tuple[str, ...] = ()
 ) -> inspect.Parameter:
     return inspect.Parameter(
         name,
         inspect.Parameter.KEYWORD_ONLY,
         default=default,
-        annotation=Annotated[kind, typer.Option(*flags, help=words)],
+        annotation=Annotated[kind, typer.Option(*flags, help=help_text)],
     )
 
 
@@ -112,7 +112,7 @@ def _settings(given: dict[str, Any]) -> dict[str, Any]:
     found = {}
     for name, kind in setting_types().items():
         stem, _, unit = name.rpartition("_")
-        sides = [f"{stem}_{side}_{unit}" for side in HELP_OF_SIDE]
+        sides = [f"{stem}_{side}_{unit}" for side in DIRECTION_HELP]
         if name in given:
             value = given[name]
             if isinstance(getattr(DEFAULTS, name), bool) and getattr(DEFAULTS, name):

@@ -43,10 +43,10 @@ def status(
         print(f"  {name:<16} {'yes' if found[name] else 'no'}")
     print(f"  {'render_silent_s':<16} {found['render_silent_s']:.2f}")
     for index, device in enumerate(found["devices"]):
-        print(f"  {f'device {index}':<16} {_of_device(device)}")
+        print(f"  {f'device {index}':<16} {_describe_device(device)}")
 
 
-def _of_device(device: dict[str, Any]) -> str:
+def _describe_device(device: dict[str, Any]) -> str:
     """Return one line with the name, state and load of a device."""
     is_ready = "ready" if device["is_ready"] else "not ready"
     if device["is_lost"]:

@@ -10,7 +10,7 @@ from clients.commands.console import (
     Json,
     check_range,
     print_json,
-    say,
+    print_line,
 )
 
 if TYPE_CHECKING:
@@ -93,7 +93,10 @@ def wavefront(
     if not found.rms_residual_um >= 0.0:
         raise CommandFailed(
             f"{name}, h {h_deg:g} v {v_deg:g} deg: "
-            + ("; ".join(found.notes) or "too few rays pass the pupil for a fit")
+            + (
+                "; ".join(found.notes)
+                or "too few rays pass through the pupil for a fit"
+            )
         )
     summary = {
         **_facts(found),
@@ -204,14 +207,14 @@ def _report(summary: dict[str, Any]) -> None:
     from estimator.optics.zernike import nm_from_index
 
     for note in summary["notes"]:
-        say(f"note: {note}")
-    say("  j  (n, m)        um")
+        print_line(f"note: {note}")
+    print_line("  j  (n, m)        um")
     for j, value in enumerate(summary["zernike_um"]):
         n, m = nm_from_index(j)
         if j > 0:
-            say(f"{j:>3}  ({n},{m:>2})  {value:>+12.6f}")
+            print_line(f"{j:>3}  ({n},{m:>2})  {value:>+12.6f}")
     ellipse = summary["pupil_ellipse"]
-    say(
+    print_line(
         f"{summary['eye']}, {summary['wavelength_nm']:g} nm, h {summary['h_deg']:g} "
         f"v {summary['v_deg']:g} deg: circle of {summary['zernike_radius_mm']:.4f} mm, "
         f"pupil {ellipse['semi_major_mm']:.4f} x {ellipse['semi_minor_mm']:.4f} mm, "

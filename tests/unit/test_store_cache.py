@@ -349,7 +349,7 @@ def test_a_person_s_eye_is_erased_and_no_other(kept, tmp_path):
     assert (
         "1 file" in eyes_command("erase", "--name", left.name[:9], "--dir", kept).output
     )
-    assert "no eye is cached" in eyes_command("list", "--dir", kept).output
+    assert "no eyes are cached" in eyes_command("list", "--dir", kept).output
 
 
 def test_all_eyes_are_erased_at_once(kept):
