@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from clients.figures.pupil_wavefront import PupilWavefront
 from estimator import EyeOptics, log_mar_of
 
-STEP_COUNT, WITHIN_COUNT = 11, 3
+STEP_COUNT, ACCOMMODATED_COUNT = 11, 3
 """Number of distances of a curve, and of its part within the accommodation range."""
 
 FINE_STEP_DPT = 0.25
@@ -22,11 +22,11 @@ PAST_LAST_FOCUS_DPT = 1.0
 NEAREST_DPT = 5.0
 PAST_FAR_POINT_DPT = 2.0
 HIGHEST_DPT = 20.0
-LEAST_REACH_DPT = 1e-6
-"""Smallest accommodation range; an eye with less does not accommodate."""
+MIN_ACCOMMODATION_DPT = 1e-6
+"""Smallest accommodation range; an eye with less is treated as fixed-focus."""
 
 
-class Seeing(Protocol):
+class Eye(Protocol):
     """The interface required of an eye, which `EyeStudy` implements."""
 
     @property
@@ -60,7 +60,7 @@ class AcuityByDistance:
     near_log_mar: NDArray[np.float64]
 
 
-def acuity_by_distance(study: Seeing, pupil_diameter_mm: float) -> AcuityByDistance:
+def acuity_by_distance(study: Eye, pupil_diameter_mm: float) -> AcuityByDistance:
     """Return the acuity of an eye from far to 20 cm, or past its far point."""
     object_dpt = distances_dpt(study, pupil_diameter_mm)
     far = through_focus_log_mar(study, pupil_diameter_mm, object_dpt)
@@ -81,7 +81,7 @@ def acuity_log_mar(wavefront: PupilWavefront) -> float:
         return np.inf
 
 
-def distances_dpt(study: Seeing, pupil_diameter_mm: float) -> NDArray[np.float64]:
+def distances_dpt(study: Eye, pupil_diameter_mm: float) -> NDArray[np.float64]:
     """Return the distances (n,) of a curve: far to 20 cm, and past the far point."""
     pupil_mm = study.optics.usable_pupil_mm(pupil_diameter_mm)
     far_dpt, _ = study.optics.focus_limits_dpt(pupil_mm)
@@ -100,7 +100,7 @@ def distances_dpt(study: Seeing, pupil_diameter_mm: float) -> NDArray[np.float64
 
 
 def through_focus_log_mar(
-    study: Seeing, pupil_diameter_mm: float, object_dpt: NDArray[np.float64]
+    study: Eye, pupil_diameter_mm: float, object_dpt: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the acuity (n,) of an eye focused far, logMAR, at distances (n,)."""
     return np.array(
@@ -112,7 +112,7 @@ def through_focus_log_mar(
 
 
 def accommodated_log_mar(
-    study: Seeing,
+    study: Eye,
     pupil_diameter_mm: float,
     object_dpt: NDArray[np.float64],
     far_log_mar: NDArray[np.float64],
@@ -129,10 +129,10 @@ def accommodated_log_mar(
     """
     pupil_mm = study.optics.usable_pupil_mm(pupil_diameter_mm)
     far_dpt, near_dpt = study.optics.focus_limits_dpt(pupil_mm)
-    if near_dpt - far_dpt < LEAST_REACH_DPT:
+    if near_dpt - far_dpt < MIN_ACCOMMODATION_DPT:
         return far_log_mar.copy()
 
-    def seen(distances: NDArray[np.float64]) -> NDArray[np.float64]:
+    def predict(distances: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.array(
             [
                 acuity_log_mar(study.wavefront(pupil_mm, object_dpt=d, focus_dpt=d))
@@ -142,9 +142,11 @@ def accommodated_log_mar(
 
     found = far_log_mar.copy()
     is_near = object_dpt > near_dpt
-    found[is_near] = seen(object_dpt[is_near])
+    found[is_near] = predict(object_dpt[is_near])
     within = object_dpt[(object_dpt >= max(far_dpt, 0.0)) & ~is_near]
     if within.size:
-        told = np.unique(np.linspace(within[0], within[-1], WITHIN_COUNT))
-        found[np.isin(object_dpt, within)] = np.interp(within, told, seen(told))
+        sampled_dpt = np.unique(np.linspace(within[0], within[-1], ACCOMMODATED_COUNT))
+        found[np.isin(object_dpt, within)] = np.interp(
+            within, sampled_dpt, predict(sampled_dpt)
+        )
     return found

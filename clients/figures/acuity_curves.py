@@ -18,18 +18,18 @@ from clients.figures.style import (
     PUPIL_COLORS,
     SMALL_PT,
     SOFT,
-    dress,
     legend_below,
+    mark_unknown,
     new_figure,
-    raise_unknown,
+    style_axes,
     with_grid,
 )
 
 WORST_LOG_MAR, BEST_LOG_MAR = 1.6, -0.3
 ACCOMMODATING: dict[str, Any] = {"linestyle": "-", "linewidth": LINE_PT}
-LOOKING_FAR: dict[str, Any] = {"linestyle": "--", "linewidth": LINE_PT}
+FOCUSED_FAR: dict[str, Any] = {"linestyle": "--", "linewidth": LINE_PT}
 EDGE_RATIO = 0.95
-"""Place along the axis from which a centered text would cross its end."""
+"""Position along the axis beyond which a centered text would cross its end."""
 
 MARKS = {0.0: " far", 1.0: "1 m", 2.5: "40 cm", 5.0: "20 cm", 10.0: "10 cm"}
 
@@ -42,13 +42,13 @@ def draw_through_focus_acuity(
     for pupil_mm, color in colors.items():
         found = study.acuity(pupil_mm)
         axes.plot(found.object_dpt, found.near_log_mar, color=color, **ACCOMMODATING)
-        axes.plot(found.object_dpt, found.far_log_mar, color=color, **LOOKING_FAR)
+        axes.plot(found.object_dpt, found.far_log_mar, color=color, **FOCUSED_FAR)
     looks = [(f"{pupil_mm:g} mm", {"color": c}) for pupil_mm, c in colors.items()]
-    styles = {"accommodating": ACCOMMODATING, "looking far": LOOKING_FAR}
+    styles = {"accommodating": ACCOMMODATING, "focused far": FOCUSED_FAR}
     black = [(name, {"color": INK} | style) for name, style in styles.items()]
     _finish(axes, found.object_dpt[-1], [*looks, *black], "Acuity by distance")
     if np.isnan(found.far_log_mar[0]):
-        raise_unknown(axes)
+        mark_unknown(axes)
 
 
 def draw_acuity_of_several(
@@ -66,7 +66,7 @@ def draw_acuity_of_several(
     title = f"Acuity by distance, accommodating, {pupil_mm:g} mm"
     _finish(axes, nearest_dpt, looks, title)
     if not is_known:
-        raise_unknown(axes)
+        mark_unknown(axes)
 
 
 def _finish(
@@ -75,7 +75,7 @@ def _finish(
     looks: Sequence[tuple[str, dict[str, Any]]],
     title: str,
 ) -> None:
-    dress(axes, title=title, x="distance of the chart, dpt", y="acuity, logMAR")
+    style_axes(axes, title=title, x="distance of the chart, dpt", y="acuity, logMAR")
     axes.set_xlim(0.0, nearest_dpt)
     axes.set_ylim(WORST_LOG_MAR, BEST_LOG_MAR)  # better is higher, as on charts
     axes.set_yticks(np.arange(-0.2, 1.61, 0.2))
@@ -89,11 +89,11 @@ def _finish(
     legend_below(axes, looks)
 
 
-def _alignment(place_ratio: float) -> str:
-    """Return the alignment that keeps a text at a place along an axis within it."""
-    if place_ratio == 0.0:
+def _alignment(position_ratio: float) -> str:
+    """Return the text alignment that keeps a label within the axis."""
+    if position_ratio == 0.0:
         return "left"
-    return "center" if place_ratio < EDGE_RATIO else "right"
+    return "center" if position_ratio < EDGE_RATIO else "right"
 
 
 def through_focus_acuity_figure(study: EyeStudy) -> Figure:

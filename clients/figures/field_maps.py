@@ -15,11 +15,11 @@ from clients.figures.style import (
     SOFT,
     TEXT_PT,
     color_bar,
-    dress,
     new_figure,
+    style_axes,
 )
 
-LEAST_RANGE_DPT = 0.25
+MIN_RANGE_DPT = 0.25
 ARCMIN_PER_MRAD = 60.0 * 180.0 / np.pi / 1000.0
 LEVEL_COUNT = 14
 
@@ -27,7 +27,7 @@ LEVEL_COUNT = 14
 def blur_arcmin(study: EyeStudy) -> NDArray[np.float64]:
     """Return the blur (n,) of each direction for an eye focused far, arcmin.
 
-    It is the RMS radius of a far point's blur by the second order.
+    It is the RMS radius of a far point's blur from second-order aberrations.
     """
     m_dpt, j0_dpt, j45_dpt = study.field.power_dpt.T
     m_dpt = m_dpt - study.far_accommodation_dpt
@@ -55,7 +55,7 @@ def draw_field_map(
     levels: int | NDArray[np.float64]
     levels, colors = LEVEL_COUNT, SEQUENTIAL
     if middle is not None:
-        reach = max(float(np.abs(grid - middle).max()), LEAST_RANGE_DPT)
+        reach = max(float(np.abs(grid - middle).max()), MIN_RANGE_DPT)
         levels = np.linspace(middle - reach, middle + reach, LEVEL_COUNT + 1)
         colors = DIVERGING
     elif np.ptp(grid) < 1e-6:
@@ -63,7 +63,7 @@ def draw_field_map(
     drawn = axes.contourf(FIELD_H_DEG, FIELD_V_DEG, grid, levels=levels, cmap=colors)
     axes.plot(0.0, 0.0, "+", color="k", markersize=5, markeredgewidth=0.7)
     axes.set_aspect("equal")
-    dress(axes, title=title, x="", y="")
+    style_axes(axes, title=title, x="", y="")
     color_bar(axes, drawn, label=label)
 
 
@@ -74,7 +74,7 @@ def draw_field_maps(panel: FigureBase, study: EyeStudy) -> None:
         "M": (m_dpt, "dpt", float(m_dpt[m_dpt.size // 2])),
         "J0": (j0_dpt, "dpt", 0.0),
         "J45": (j45_dpt, "dpt", 0.0),
-        "Blur, looking far": (blur_arcmin(study), "arcmin, RMS", None),
+        "Blur, focused far": (blur_arcmin(study), "arcmin, RMS", None),
     }
     grid = panel.subplots(2, 2, sharex=True, sharey=True)
     for axes, (name, (values, label, middle)) in zip(

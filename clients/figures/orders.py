@@ -17,18 +17,18 @@ from clients.figures.style import (
     INK,
     SMALL_PT,
     SOFT,
-    dress,
     legend_above,
     new_figure,
+    style_axes,
     with_grid,
 )
 from estimator import nm_from_index, rescale_pupil
 
 ORDERS = (2, 3, 4, 5, 6)
-LEAST_TOP_UM = 0.1
+MIN_AXIS_LIMIT_UM = 0.1
 """Smallest upper limit of an axis; smaller aberrations are negligible."""
 
-FIRST_SEEN, FIRST_HIGHER = 2, 3
+LOWEST_BLURRING_ORDER, LOWEST_HIGHER_ORDER = 2, 3
 """Lowest order that blurs, and lowest order that spectacles do not correct."""
 
 
@@ -46,7 +46,9 @@ def rms_by_order_um(zernike_um: NDArray[np.float64]) -> dict[int, float]:
     return {n: float(np.linalg.norm(zernike_um[order_range(n)])) for n in ORDERS}
 
 
-def rms_um(zernike_um: NDArray[np.float64], *, from_order: int = FIRST_HIGHER) -> float:
+def rms_um(
+    zernike_um: NDArray[np.float64], *, from_order: int = LOWEST_HIGHER_ORDER
+) -> float:
     """Return the RMS of an order and all above it, µm."""
     return float(np.linalg.norm(zernike_um[order_range(from_order).start :]))
 
@@ -66,13 +68,13 @@ def draw_rms_by_order(
     """
     radius_mm = min(study.found.zernike_radius_mm for study in studies)
     names = [*(str(n) for n in ORDERS[1:]), "3-6"]
-    width, places = 0.8 / len(studies), np.arange(len(names))
+    width, positions = 0.8 / len(studies), np.arange(len(names))
     seconds = []
     for k, (study, color) in enumerate(zip(studies, (BLUE, GREEN), strict=False)):
         wavefront_um = on_circle_um(study, radius_mm)
         by_order = rms_by_order_um(wavefront_um)
         values = [*(by_order[n] for n in ORDERS[1:]), rms_um(wavefront_um)]
-        at = places + (k - 0.5 * (len(studies) - 1)) * width
+        at = positions + (k - 0.5 * (len(studies) - 1)) * width
         label = labels[k] if labels else None
         bars = axes.bar(at, values, width * 0.92, color=color, label=label)
         axes.bar_label(
@@ -84,12 +86,12 @@ def draw_rms_by_order(
             rotation=0 if len(studies) == 1 else 90,
         )
         seconds.append(f"{by_order[2]:.2f}")
-    axes.set_xticks(places, names)
+    axes.set_xticks(positions, names)
     axes.margins(y=0.4 if labels else 0.18)  # labels are above the bars
-    axes.set_ylim(0.0, max(axes.get_ylim()[1], LEAST_TOP_UM))
+    axes.set_ylim(0.0, max(axes.get_ylim()[1], MIN_AXIS_LIMIT_UM))
     note = f"{2 * radius_mm:.1f} mm pupil; order 2: {', '.join(seconds)} µm"
     title = f"RMS by radial order{studies[0].assumed_suffix}"
-    dress(axes, title=title, x=f"radial order\n{note}", y="RMS, µm")
+    style_axes(axes, title=title, x=f"radial order\n{note}", y="RMS, µm")
     axes.xaxis.label.set_fontsize(SMALL_PT)
     if labels:
         axes.figure.legend(
@@ -107,18 +109,18 @@ def rms_by_order_figure(studies: Sequence[EyeStudy], **options: Any) -> Figure:
 
 def draw_terms(axes: Axes, study: EyeStudy) -> None:
     """Draw each higher-order coefficient: measured, and of the estimated eye."""
-    index = np.arange(order_range(FIRST_HIGHER).start, study.measured_um.size)
+    index = np.arange(order_range(LOWEST_HIGHER_ORDER).start, study.measured_um.size)
     measured, eye = study.measured_um[index], study.found.zernike_um[index]
-    source = "assumed" if study.has_assumed_aberrations else study.source_word
+    source = "assumed" if study.has_assumed_aberrations else study.source_label
     axes.bar(index - 0.2, measured, 0.4, color=SOFT, label=source)
     axes.bar(index + 0.2, eye, 0.4, color=BLUE, label="estimated eye")
     names = [
         "{},{:+d}".format(*nm_from_index(int(j))).replace("+0", "0") for j in index
     ]
     axes.set_xticks(index, names, rotation=90)
-    reach_um = max(1.1 * np.abs([measured, eye]).max(), LEAST_TOP_UM)
+    reach_um = max(1.1 * np.abs([measured, eye]).max(), MIN_AXIS_LIMIT_UM)
     axes.set_ylim(-reach_um, reach_um)
-    dress(axes, title="Coefficients by order and frequency", x="n, m", y="µm, RMS")
+    style_axes(axes, title="Coefficients by order and frequency", x="n, m", y="µm, RMS")
     axes.axhline(0.0, color=SOFT, linewidth=0.6)
     with_grid(axes)
     legend_above(axes)

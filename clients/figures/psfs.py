@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from clients.figures.pupil_wavefront import TILTS, PupilWavefront
 from clients.figures.study import PUPILS_MM, EyeStudy
-from clients.figures.style import SMALL_PT, TEXT_PT, bare, new_figure
+from clients.figures.style import SMALL_PT, TEXT_PT, new_figure, style_image_axes
 from clients.figures.wavefront import in_circle, wavefront_values_um
 from estimator import compute_psfs
 
 SIDE_PX = 161
-LEAST_SIDE_ARCMIN = 20.0
-ROOM_RATIO = 1.25
+MIN_SIDE_ARCMIN = 20.0
+SIDE_RATIO = 1.25
 """Ratio of the image's side to the diameter of the blur."""
 
 ARCMIN_PER_MRAD = 60.0 * math.degrees(1e-3)
@@ -77,7 +77,7 @@ def psf_picture(
         "radius_px": SIDE_PX // 2,
         "accuracy": "fine",
     }
-    try:  # a mix with ray optics shows seams on a logarithmic scale
+    try:  # combined with ray optics, it shows seams on a logarithmic scale
         found = compute_psfs(
             wavefront.zernike_um[None],
             method="fourier",
@@ -100,7 +100,7 @@ def draw_psf(
         light, cmap="inferno", vmin=-DECADES, vmax=0.0,
         extent=(-half, half, -half, half), interpolation="bilinear",
     )  # fmt: skip
-    bare(axes, title=title)
+    style_image_axes(axes, title=title)
     _draw_scale(axes, side_arcmin)
 
 
@@ -115,7 +115,7 @@ def _draw_scale(axes: Axes, side_arcmin: float) -> None:
 
 
 def psf_sides_arcmin(studies: Sequence[EyeStudy]) -> tuple[float, float]:
-    """Return the sides of images that hold the PSFs of all studies.
+    """Return the image sides that contain the PSFs of all studies.
 
     Returns
     -------
@@ -127,7 +127,7 @@ def psf_sides_arcmin(studies: Sequence[EyeStudy]) -> tuple[float, float]:
 
 def _side_arcmin(states: list[dict[str, list[PupilWavefront]]], name: str) -> float:
     reaches_arcmin = (centered(seen)[1] for state in states for seen in state[name])
-    return max(LEAST_SIDE_ARCMIN, 2.0 * ROOM_RATIO * max(reaches_arcmin))
+    return max(MIN_SIDE_ARCMIN, 2.0 * SIDE_RATIO * max(reaches_arcmin))
 
 
 def _states(study: EyeStudy) -> dict[str, list[PupilWavefront]]:
@@ -151,7 +151,7 @@ def draw_psfs(
     ----------
     sides_arcmin : (float, float), optional
         Sides of the images of both rows, to compare eyes at one scale; by default those
-        that hold the PSFs of this eye.
+        that contain the PSFs of this eye.
     """
     rows = _states(study)
     if sides_arcmin is None:

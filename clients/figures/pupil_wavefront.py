@@ -25,7 +25,7 @@ TILTS = slice(1, 3)
 
 @dataclass(frozen=True)
 class PupilWavefront:
-    """The wavefront of a point and its pupil.
+    """The wavefront of a point source and its pupil.
 
     Attributes
     ----------

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from clients.figures.study import FIELD_PUPIL_MM, EyeStudy
-from clients.figures.style import dress, new_figure
+from clients.figures.style import new_figure, style_axes
 from estimator import WornLens, draw_section
 
 
@@ -20,10 +20,10 @@ def draw_cross_section(axes: Axes, study: EyeStudy) -> None:
         lens = None
     draw_section(axes, focused.surfaces, pupil_diameter_mm=FIELD_PUPIL_MM, lens=lens)
     length_mm = study.found.eye_length_mm
-    worn = "" if lens is None else ", corrected"
-    dress(
+    suffix = "" if lens is None else ", corrected"
+    style_axes(
         axes,
-        title=f"Vertical section, {length_mm:.2f} mm long{worn}",
+        title=f"Vertical section, {length_mm:.2f} mm long{suffix}",
         x="mm into the eye",
         y="mm, up",
     )

@@ -109,7 +109,7 @@ class EyeStudy:
 
     @cached_property
     def is_example(self) -> bool:
-        """Return whether the eye is a preset, which is nobody's own measurement."""
+        """Return whether the eye is a preset, not the measurement of a person."""
         if self.profile.name not in preset_names():
             return False
         preset = load_profile(self.profile.name)
@@ -119,8 +119,8 @@ class EyeStudy:
         )
 
     @property
-    def source_word(self) -> str:
-        """Return where the wavefront comes from: entered, measured or an example."""
+    def source_label(self) -> str:
+        """Return the source of the wavefront: entered, measured or example."""
         if self.profile.kind in ("prescription", "eye"):
             return "entered"
         return "example" if self.is_example else "measured"
@@ -133,7 +133,7 @@ class EyeStudy:
 
     @property
     def assumed_suffix(self) -> str:
-        """Return what figures of assumed higher orders append to their title."""
+        """Return the suffix for titles of figures with assumed higher orders."""
         return ", assumed" if self.has_assumed_aberrations else ""
 
     @property

@@ -36,7 +36,7 @@ def new_figure(width_mm: float, height_mm: float) -> Figure:
     return Figure(figsize=size, layout="constrained", facecolor="white")
 
 
-def dress(axes: Axes, *, title: str = "", x: str = "", y: str = "") -> None:
+def style_axes(axes: Axes, *, title: str = "", x: str = "", y: str = "") -> None:
     """Set title and labels of axes, and apply the common style."""
     if title:
         axes.set_title(title, fontsize=TITLE_PT, color=INK, loc="left")
@@ -78,17 +78,17 @@ def legend_below(axes: Axes, entries: Sequence[tuple[str, dict[str, Any]]]) -> N
     )  # fmt: skip
 
 
-def raise_unknown(axes: Axes) -> None:
-    """Write in the middle of axes why there are no curves."""
+def mark_unknown(axes: Axes) -> None:
+    """Write the reason for missing curves in the middle of axes."""
     axes.text(
         0.5, 0.5, "not known through lenslets", fontsize=SMALL_PT, color=SOFT,
         ha="center", transform=axes.transAxes,
     )  # fmt: skip
 
 
-def bare(axes: Axes, *, title: str = "") -> None:
+def style_image_axes(axes: Axes, *, title: str = "") -> None:
     """Remove ticks and spines from an image's axes."""
-    dress(axes, title=title)
+    style_axes(axes, title=title)
     axes.set_xticks([])
     axes.set_yticks([])
     for spine in axes.spines.values():

@@ -18,10 +18,10 @@ from clients.figures.style import (
     LINE_PT,
     PUPIL_COLORS,
     SOFT,
-    dress,
     legend_below,
+    mark_unknown,
     new_figure,
-    raise_unknown,
+    style_axes,
     with_grid,
 )
 from estimator import perfect_transfer
@@ -59,13 +59,13 @@ def modulation(
 
 
 def draw_mtf(axes: Axes, study: EyeStudy) -> None:
-    """Draw transfer functions through 3 and 5 mm, and those of perfect pupils."""
+    """Draw MTFs through 3 and 5 mm pupils, and the diffraction limit."""
     colors = dict(zip(PUPILS_MM, PUPIL_COLORS, strict=True))
     for pupil_mm, color in colors.items():
         _draw_states(axes, study, pupil_mm, color)
         axes.plot(FREQUENCY_CPD, _perfect(pupil_mm), color=color, **PERFECT)
     looks = [(f"{pupil_mm:g} mm", {"color": c}) for pupil_mm, c in colors.items()]
-    _finish(axes, looks, "Contrast passed on (MTF), far object, 555 nm")
+    _finish(axes, looks, "Contrast transfer (MTF), far object, 555 nm")
 
 
 def draw_mtf_of_several(
@@ -77,7 +77,7 @@ def draw_mtf_of_several(
         looks.append((label, {"color": color}))
         _draw_states(axes, study, pupil_mm, color)
     axes.plot(FREQUENCY_CPD, _perfect(pupil_mm), color=SOFT, **PERFECT)
-    _finish(axes, looks, f"Contrast passed on (MTF), far object, {pupil_mm:g} mm")
+    _finish(axes, looks, f"Contrast transfer (MTF), far object, {pupil_mm:g} mm")
 
 
 def _draw_states(axes: Axes, study: EyeStudy, pupil_mm: float, color: str) -> None:
@@ -85,7 +85,7 @@ def _draw_states(axes: Axes, study: EyeStudy, pupil_mm: float, color: str) -> No
         values = modulation(study, pupil_mm, is_corrected=is_corrected)
         axes.plot(FREQUENCY_CPD, values, color=color, **looks)
     if not study.far(pupil_mm).is_readable:
-        raise_unknown(axes)
+        mark_unknown(axes)
 
 
 def _perfect(pupil_mm: float) -> NDArray[np.float64]:
@@ -97,7 +97,7 @@ def _perfect(pupil_mm: float) -> NDArray[np.float64]:
 def _finish(
     axes: Axes, looks: Sequence[tuple[str, dict[str, Any]]], title: str
 ) -> None:
-    dress(axes, title=title, x="cycles per degree", y="modulation")
+    style_axes(axes, title=title, x="cycles per degree", y="modulation")
     axes.set_xlim(0.0, FREQUENCY_CPD[-1])
     axes.set_ylim(0.0, 1.0)
     with_grid(axes)

@@ -1,4 +1,4 @@
-"""Maps of a wavefront over the pupil, as the examiner sees the eye."""
+"""Maps of a wavefront over the pupil, as seen by the examiner."""
 
 from __future__ import annotations
 
@@ -8,21 +8,28 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
-from clients.figures.orders import FIRST_HIGHER, FIRST_SEEN, rms_um
+from clients.figures.orders import LOWEST_BLURRING_ORDER, LOWEST_HIGHER_ORDER, rms_um
 from clients.figures.study import EyeStudy
-from clients.figures.style import DIVERGING, SMALL_PT, SOFT, bare, color_bar, new_figure
+from clients.figures.style import (
+    DIVERGING,
+    SMALL_PT,
+    SOFT,
+    color_bar,
+    new_figure,
+    style_image_axes,
+)
 from estimator import zernike_values
 
 SIDE_COUNT = 161
 LEVEL_COUNT = 13
-FLAT_UM = 0.05
+MIN_RANGE_UM = 0.05
 """Smallest half range of the colors; below a tenth of a wave there is no shape."""
 
 
 def wavefront_values_um(
     zernike_um: NDArray[np.float64],
     *,
-    from_order: int = FIRST_SEEN,
+    from_order: int = LOWEST_BLURRING_ORDER,
     n: int = SIDE_COUNT,
 ) -> NDArray[np.float64]:
     """Return a wavefront's values (n, n) on the circle's square, top row first.
@@ -50,7 +57,7 @@ def draw_wavefront_map(
     *,
     radius_mm: float,
     eye_side: str,
-    from_order: int = FIRST_SEEN,
+    from_order: int = LOWEST_BLURRING_ORDER,
     title: str = "",
 ) -> None:
     """Draw a map, facing the person: a right eye's temporal side is on the left.
@@ -61,7 +68,7 @@ def draw_wavefront_map(
         Coefficients in the eye's frame, x to the person's right.
     """
     values = wavefront_values_um(zernike_um, from_order=from_order)[:, ::-1]
-    top = max(float(np.abs(values[in_circle(SIDE_COUNT)]).max()), FLAT_UM)
+    top = max(float(np.abs(values[in_circle(SIDE_COUNT)]).max()), MIN_RANGE_UM)
     drawn = axes.imshow(
         values,
         extent=(-radius_mm, radius_mm) * 2,
@@ -81,7 +88,7 @@ def draw_wavefront_map(
     rim = Circle((0.0, 0.0), radius_mm, transform=axes.transData)
     drawn.set_clip_path(rim)
     lines.set_clip_path(rim)
-    bare(axes, title=title)
+    style_image_axes(axes, title=title)
     sides = ("T", "N") if eye_side == "OD" else ("N", "T")
     for x_mm, side in zip((-1.12, 1.12), sides, strict=True):
         axes.text(
@@ -100,7 +107,7 @@ def draw_wavefront_maps(panel: FigureBase, study: EyeStudy) -> None:
     """Draw the measured wavefront: all orders, and the higher orders."""
     for axes, from_order, title in zip(
         panel.subplots(1, 2),
-        (FIRST_SEEN, FIRST_HIGHER),
+        (LOWEST_BLURRING_ORDER, LOWEST_HIGHER_ORDER),
         ("All orders", f"Higher orders (3 to 6){study.assumed_suffix}"),
         strict=True,
     ):

@@ -65,7 +65,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Words:
+class Text:
     """Paragraphs, or the items of a list, in one or more columns."""
 
     paragraphs: tuple[str, ...]
@@ -74,7 +74,7 @@ class Words:
     n_columns: int = 1
 
 
-Block = Table | Plot | Picture | Words
+Block = Table | Plot | Picture | Text
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The report of two eyes, or of one eye before and after surgery, lenses or years."""
+"""The report comparing two eyes, or one eye at two times or with two corrections."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from clients.figures import (
     draw_rms_by_order,
     draw_wavefront_map,
 )
-from clients.figures.orders import FIRST_HIGHER, on_circle_um
+from clients.figures.orders import LOWEST_HIGHER_ORDER, on_circle_um
 from clients.figures.psfs import psf_sides_arcmin
 from clients.figures.study import PUPILS_MM
 from clients.figures.style import TITLE_PT
@@ -25,7 +25,7 @@ from clients.report.blocks import (
     Row,
     Section,
     Table,
-    Words,
+    Text,
 )
 from clients.report.content import (
     KNOWN_TITLE,
@@ -96,14 +96,14 @@ def _difference(before: EyeFacts, after: EyeFacts) -> Section:
             *(Row((table,)) for table in tables),
             Row((*(_map(*pair, studies) for pair in pairs), bars)),
             Row(tuple(_psfs(*pair, psf_sides_arcmin(studies)) for pair in pairs)),
-            Row((Words((legend(after.study),)),)),
-            *(Row((Words(limits),)) for limits in _limits(before, after)),
+            Row((Text((legend(after.study),)),)),
+            *(Row((Text(limits),)) for limits in _limits(before, after)),
         ),
     )
 
 
 def _known(before: EyeFacts, after: EyeFacts, cite: Citations) -> Section:
-    """Return what is known of both eyes: what they share once."""
+    """Return the section on known and assumed data; shared entries appear once."""
     studies, labels = (before.study, after.study), (before.label, after.label)
     methods = [method_text(study) for study in studies]
     shared = [text for text in methods[0] if text in methods[1]]
@@ -138,7 +138,7 @@ def _field(before: EyeFacts, after: EyeFacts) -> Section:
 
 
 def _moments(before: EyeFacts, after: EyeFacts) -> tuple[str, str]:
-    """Return what tables call the eyes: before and after, or their sides."""
+    """Return the names of the eyes in tables: before and after, or their sides."""
     sides = [facts.study.profile.eye_side for facts in (before, after)]
     if sides[0] == sides[1]:
         return "before", "after"
@@ -170,7 +170,7 @@ def _map(study: EyeStudy, label: str, studies: tuple[EyeStudy, ...]) -> Plot:
             on_circle_um(study, radius_mm),
             radius_mm=radius_mm,
             eye_side=study.profile.eye_side,
-            from_order=FIRST_HIGHER,
+            from_order=LOWEST_HIGHER_ORDER,
             title=f"{label}\norders 3 to 6{study.assumed_suffix}",
         ),
         MAP_MM,
@@ -233,8 +233,8 @@ def _vision_table(before: EyeFacts, after: EyeFacts) -> Table:
     groups = tuple((f"{_pair_text(pair)} pupil", 2) for pair in of_pupils)
     head = ("far object, 555 nm", *_moments(before, after) * len(of_pupils))
     rows = tuple(
-        (word, *(words(numbers) for pair in of_pupils for numbers in pair))
-        for word, words in VISION_ROWS.items()
+        (label, *(format_value(numbers) for pair in of_pupils for numbers in pair))
+        for label, format_value in VISION_ROWS.items()
     )
     return Table(
         "Vision on the axis",
@@ -253,7 +253,7 @@ def _pair_text(pair: tuple[dict[str, Any], dict[str, Any]]) -> str:
 def _curves(before: EyeFacts, after: EyeFacts) -> Section:
     studies, labels = (before.study, after.study), (before.label, after.label)
 
-    def by_pupil(draw: Callable[..., None], told: str) -> tuple[Plot, ...]:
+    def by_pupil(draw: Callable[..., None], alt: str) -> tuple[Plot, ...]:
         return tuple(
             on_axes(
                 cast(
@@ -263,7 +263,7 @@ def _curves(before: EyeFacts, after: EyeFacts) -> Section:
                     ),
                 ),
                 CURVES_MM,
-                f"{told}, {pupil_mm:g} mm",
+                f"{alt}, {pupil_mm:g} mm",
             )
             for pupil_mm in PUPILS_MM
         )

@@ -27,7 +27,7 @@ from clients.report.blocks import (
     Plot,
     Row,
     Section,
-    Words,
+    Text,
 )
 from clients.report.charts import DISTANCES_M, chart_rows
 from clients.report.correction_text import limits_text, near_text, subtitle_text
@@ -105,13 +105,13 @@ def subtitle(study: EyeStudy) -> str:
     if profile.age_years is not None:
         age = f"{profile.age_years:g} years"
     side = f"{SIDE_NAMES[profile.eye_side]} ({profile.eye_side})"
-    source = f"from {KIND_WORDS[profile.kind]}"
+    source = f"from {KIND_LABELS[profile.kind]}"
     if study.is_example:
         source = f"example eye (preset {profile.name})"
     return f"{side}, {age}, {source}{subtitle_text(profile)}"
 
 
-KIND_WORDS = {
+KIND_LABELS = {
     "prescription": "a prescription",
     "zernike": "a measured wavefront",
     "zernike_set": "a set of measured wavefronts",
@@ -152,7 +152,7 @@ def summary(facts: EyeFacts) -> Section:
             Row((maps, orders), (2.0, 1.0)),
             Row((points, contrast), (1.0, 1.4)),
             chart_row(facts, DAY_MM),
-            Row((Words((legend(study), *limits_text(study.profile))),)),
+            Row((Text((legend(study), *limits_text(study.profile))),)),
         ),
     )
 
@@ -162,7 +162,7 @@ def legend(study: EyeStudy) -> str:
     return (
         "Wavefront at the cornea, without a correction, as the examiner faces the eye "
         "(T temporal, N nasal). Point images and charts as the person sees them; light "
-        "on a logarithmic scale of two decades. “As it is”: looking far away, "
+        "on a logarithmic scale of two decades. “As it is”: focused far, "
         "accommodating where that helps"
         + (", through the worn correction" if study.profile.correction else "")
         + ". “Best corrected”: with the sphere and cylinder of the highest visual "
@@ -184,7 +184,7 @@ def on_axes(draw: Callable[[Any], None], height_mm: float, alt: str) -> Plot:
 def chart_row(facts: EyeFacts, pupil_mm: float, *, name: str = "") -> Row:
     """Return the charts at all distances through one pupil."""
     if not facts.charts:
-        return Row((Words((f"No letter charts: {facts.chart_problem}.",)),))
+        return Row((Text((f"No letter charts: {facts.chart_problem}.",)),))
     start, unit = (f"{name}, ", "") if name else ("", "logMAR ")
     pictures: list[Block] = []
     for distance_m in DISTANCES_M:
@@ -230,7 +230,7 @@ def _distance_row(facts: EyeFacts) -> Row:
     acuity = on_axes(
         lambda axes: draw_through_focus_acuity(axes, study),
         CURVE_MM,
-        "Acuity by distance, looking far and accommodating",
+        "Acuity by distance, focused far and accommodating",
     )
     return Row((acuity, section_plot(study)))
 
@@ -240,13 +240,13 @@ def section_plot(study: EyeStudy, *, height_mm: float = CURVE_MM) -> Plot:
     return on_axes(
         lambda axes: draw_cross_section(axes, study),
         height_mm,
-        "Vertical section of the eye found, with rays from far away",
+        "Vertical section of the estimated eye, with rays from infinity",
     )
 
 
 def method_row(*texts: str) -> Row:
     """Return the list of how eyes were computed."""
-    return Row((Words(texts, "How it was computed", is_list=True),))
+    return Row((Text(texts, "How it was computed", is_list=True),))
 
 
 def _coefficient_rows(facts: EyeFacts) -> tuple[Row, ...]:
@@ -255,11 +255,11 @@ def _coefficient_rows(facts: EyeFacts) -> tuple[Row, ...]:
     terms = on_axes(
         lambda axes: draw_terms(axes, study),
         TERMS_MM,
-        "Coefficients of orders 3 to 6, as they came and of the eye",
+        "Coefficients of orders 3 to 6, measured and of the estimated eye",
     )
     return Row((terms,)), Row((coefficient_table(facts),))
 
 
 def sources(cite: Citations) -> Section:
     """Return the section of cited papers."""
-    return Section("Sources", (Row((Words((" ".join(cite.listed()),), n_columns=2),)),))
+    return Section("Sources", (Row((Text((" ".join(cite.listed()),), n_columns=2),)),))

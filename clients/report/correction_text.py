@@ -1,4 +1,4 @@
-"""Descriptions of a person's correction, in plain words."""
+"""Plain-language descriptions of a person's correction."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from clients.report.numbers import written
+from clients.report.numbers import format_prescription
 from estimator import (
     DiffractiveRings,
     EyeProfile,
@@ -35,7 +35,7 @@ IMPLANT_LIMITS = (
 
 
 def short_text(lens: Prescription) -> str:
-    """Return the type of a correction, in two or three words."""
+    """Return the type of a correction as a short phrase."""
     if isinstance(lens, ProgressiveLens):
         return "progressive spectacles"
     if not isinstance(lens, WornLens):
@@ -52,12 +52,14 @@ def correction_text(lens: Prescription) -> str:
     if isinstance(lens, ProgressiveLens):
         own, more = lens.distance, _progressive(lens)
     elif isinstance(lens, WornLens):
-        own, more = lens, _seated(lens)
+        own, more = lens, _alignment(lens)
     else:
         own, more = lens, ()
     if isinstance(lens, WornLens) and lens.replaces_lens:
         return ", ".join([short_text(lens), *_own_power(lens), *more])
-    return ", ".join([f"{short_text(lens)} {written(own)}{_where(own)}", *more])
+    return ", ".join(
+        [f"{short_text(lens)} {format_prescription(own)}{_where(own)}", *more]
+    )
 
 
 def _own_power(lens: WornLens) -> tuple[str, ...]:
@@ -68,7 +70,7 @@ def _own_power(lens: WornLens) -> tuple[str, ...]:
         lens.axis_deg,
     )
     has_power = abs(own.sphere_dpt) + abs(own.cylinder_dpt) >= 0.005
-    return (f"{written(own)} beyond the eye's need",) if has_power else ()
+    return (f"{format_prescription(own)} beyond the eye's need",) if has_power else ()
 
 
 def _where(lens: Prescription) -> str:
@@ -77,7 +79,7 @@ def _where(lens: Prescription) -> str:
     return f" at {lens.vertex_mm:g} mm" if lens.vertex_mm else " at the cornea"
 
 
-def _seated(lens: WornLens) -> tuple[str, ...]:
+def _alignment(lens: WornLens) -> tuple[str, ...]:
     parts = []
     rings = lens.rings
     if isinstance(rings, Lenslets):
@@ -108,12 +110,12 @@ def design_adds_dpt(rings: DiffractiveRings) -> list[float]:
 
 
 def _progressive(lens: ProgressiveLens) -> tuple[str, ...]:
-    words = (
+    parts = (
         f"add {_power(lens.add_dpt)} dpt",
         f"corridor {lens.corridor_mm:g} mm",
         gaze_text(lens.gaze_deg),
     )
-    return (*words[:2], f"{words[2]} through {written(lens)}")
+    return (*parts[:2], f"{parts[2]} through {format_prescription(lens)}")
 
 
 def gaze_text(gaze_deg: tuple[float, float]) -> str:
@@ -141,7 +143,7 @@ def subtitle_text(profile: EyeProfile) -> str:
 
 
 def near_text(lens: Prescription | None) -> str:
-    """Return what a caption of a near chart says about a progressive lens."""
+    """Return the end of a near chart's caption, for a progressive lens."""
     if not isinstance(lens, ProgressiveLens):
         return ""
     gaze = gaze_text(lens.gaze_deg).removeprefix("looking ")
@@ -153,8 +155,9 @@ def limits_text(profile: EyeProfile) -> tuple[str, ...]:
     lens = profile.correction
     if isinstance(lens, ProgressiveLens):
         return (
-            f"Progressive lens: all of this report is for {_of_gaze(lens.gaze_deg)}; "
-            "elsewhere the lens has another power.",
+            "Progressive lens: this report applies to "
+            f"{_eye_at_gaze(lens.gaze_deg)}; elsewhere "
+            "the lens has another power.",
         )
     if isinstance(lens, WornLens) and lens.replaces_lens:
         # the implant of a pseudophakic eye is traced by its surfaces
@@ -168,9 +171,9 @@ def _rings_limits(lens: Prescription | None) -> tuple[str, ...]:
         return ()
     if isinstance(lens.rings, Lenslets):
         return (
-            f"Lenslets: all of this report is for {_of_gaze(lens.rings.gaze_deg)}. "
-            "Where they lie before the pupil, acuity and contrast are not told: no "
-            "model of how people read through them is known; wavefronts and field "
+            f"Lenslets: this report applies to {_eye_at_gaze(lens.rings.gaze_deg)}. "
+            "Where they lie before the pupil, acuity and contrast are not "
+            "reported: no model of reading through them is known; wavefronts and field "
             "maps are those of the spectacles without them.",
         )
     return (
@@ -180,5 +183,5 @@ def _rings_limits(lens: Prescription | None) -> tuple[str, ...]:
     )
 
 
-def _of_gaze(gaze_deg: tuple[float, float]) -> str:
+def _eye_at_gaze(gaze_deg: tuple[float, float]) -> str:
     return f"an eye that is {gaze_text(gaze_deg)}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,8 +15,8 @@ from clients.report.labels import own_name
 from clients.report.numbers import chart_numbers, eye_numbers
 from filter_service import FilterError
 
-NUMBERS_AT, CHARTS_AT = 0.1, 0.5
-"""Progress at which numbers and charts begin."""
+NUMBERS_START_FRACTION, CHARTS_START_FRACTION = 0.1, 0.5
+"""Progress fractions at which numbers and charts begin."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +28,8 @@ class EyeFacts:
     label : str
         Name of the eye in this report; empty if it has none.
     charts : dict
-        Images (height, width, 3) by pupil, mm, and distance, m; if they could not be
-        made, empty, and ``chart_problem`` gives the reason.
+        Images (height, width, 3) by pupil, mm, and distance, m.  Empty if they could
+        not be computed; ``chart_problem`` gives the reason.
     """
 
     study: EyeStudy
@@ -76,34 +75,35 @@ def facts_of(
         If the profile is invalid, or no light passes through the eye.
     """
 
-    def say(done: float, stage: str) -> None:
+    def report_progress(fraction: float, stage: str) -> None:
         if progress is not None:
-            progress(done, stage)
+            progress(fraction, stage)
 
-    say(0.0, "eye")
+    report_progress(0.0, "eye")
     study = EyeStudy.of(profile)
-    say(NUMBERS_AT, "numbers")
+    report_progress(NUMBERS_START_FRACTION, "numbers")
     numbers = eye_numbers(study)
     numbers["charts"] = [
         chart_numbers(study, pupil_mm, distance_m)
         for pupil_mm in PUPILS_MM
         for distance_m in DISTANCES_M
     ]
-    charts, problem = _charts(study, has_charts, say)
+    charts, problem = _charts(study, has_charts, report_progress)
     return EyeFacts(study, label or own_name(study.profile), numbers, charts, problem)
 
 
 def _charts(
-    study: EyeStudy, has_charts: bool, say: Callable[[float, str], None]
+    study: EyeStudy, has_charts: bool, report_progress: ProgressCallback
 ) -> tuple[dict[Chart, NDArray[np.uint8]], str]:
     if not has_charts:
-        return {}, "not asked for"
-    say(CHARTS_AT, "letter charts")
+        return {}, "not requested"
+    report_progress(CHARTS_START_FRACTION, "letter charts")
 
-    def along(done: float) -> None:
-        say(CHARTS_AT + (1.0 - CHARTS_AT) * done, "letter charts")
+    def report_charts(fraction: float) -> None:
+        done = CHARTS_START_FRACTION + (1.0 - CHARTS_START_FRACTION) * fraction
+        report_progress(done, "letter charts")
 
     try:
-        return charts_of(study, progress=along), ""
+        return charts_of(study, progress=report_charts), ""
     except FilterError as error:  # the report is useful without them
         return {}, str(error)

@@ -21,7 +21,7 @@ from clients.report.blocks import (
     Row,
     Section,
     Table,
-    Words,
+    Text,
 )
 
 JPEG_QUALITY = 88
@@ -75,17 +75,17 @@ footer { border-top: .4pt solid #4c5866; margin-top: 4mm; padding-top: 1.5mm;
   h2, h3 { break-after: avoid; } .row, tr, figure { break-inside: avoid; }
   .row.list { break-inside: auto; } footer { display: none; } }
 """
-"""Style of screen and paper; the margins of a page have the footer of the screen."""
+"""Style for screen and paper.  On paper, the footer is in the page margins."""
 
 MARK_MM = 16.5
-"""Width beside an image that holds its marks."""
+"""Width of the marks beside an image."""
 
 MARK_LINE_MM = 3.2
 """Height of a mark's line."""
 
 
 def html_of(document: Document) -> str:
-    """Return a document as the text of an HTML file."""
+    """Return a document as a single HTML file."""
     sections = "\n".join(_section(section) for section in document.sections)
     origin = " ".join(
         f"<span>{escape(name)} {escape(value)}</span>"
@@ -115,7 +115,7 @@ def _row(row: Row) -> str:
         _block(block, width_mm)
         for block, width_mm in zip(row.blocks, row.widths_mm, strict=True)
     )
-    is_list = all(isinstance(block, Words) and block.is_list for block in row.blocks)
+    is_list = all(isinstance(block, Text) and block.is_list for block in row.blocks)
     kind = "row list" if is_list else "row"
     style = f"grid-template-columns:{columns}"
     return f'<div class="{kind}" style="{style}">\n{blocks}\n</div>'
@@ -124,8 +124,8 @@ def _row(row: Row) -> str:
 def _block(block: Block, width_mm: float) -> str:
     if isinstance(block, Table):
         return _table(block)
-    if isinstance(block, Words):
-        return _words(block)
+    if isinstance(block, Text):
+        return _text(block)
     if isinstance(block, Picture):
         return _picture(block, width_mm)
     return _plot(block, width_mm)
@@ -158,15 +158,15 @@ def _table(table: Table) -> str:
     )
 
 
-def _words(words: Words) -> str:
-    title = f"<h3>{escape(words.title)}</h3>" if words.title else ""
-    if words.is_list:
-        items = "".join(f"<li>{escape(text)}</li>" for text in words.paragraphs)
+def _text(block: Text) -> str:
+    title = f"<h3>{escape(block.title)}</h3>" if block.title else ""
+    if block.is_list:
+        items = "".join(f"<li>{escape(text)}</li>" for text in block.paragraphs)
         return f"<div>{title}<ul>{items}</ul></div>"
-    texts = "".join(f'<p class="plain">{escape(text)}</p>' for text in words.paragraphs)
+    texts = "".join(f'<p class="plain">{escape(text)}</p>' for text in block.paragraphs)
     columns = ""
-    if words.n_columns > 1:
-        columns = f' style="columns:{words.n_columns};column-gap:5mm"'
+    if block.n_columns > 1:
+        columns = f' style="columns:{block.n_columns};column-gap:5mm"'
     return f"<div{columns}>{title}{texts}</div>"
 
 
@@ -175,7 +175,7 @@ def _picture(picture: Picture, width_mm: float) -> str:
     image = f'<img alt="{caption}" src="{_jpeg(picture.image)}">'
     if picture.marks:
         height, width = picture.image.shape[:2]
-        marks = _apart(picture.marks, (width_mm - MARK_MM) * height / width)
+        marks = _without_overlap(picture.marks, (width_mm - MARK_MM) * height / width)
         items = "".join(map(_mark, marks))
         image = f'<div class="marked">{image}<ul class="marks">{items}</ul></div>'
     return f'<figure class="picture">{image}<figcaption>{caption}</figcaption></figure>'
@@ -183,11 +183,11 @@ def _picture(picture: Picture, width_mm: float) -> str:
 
 def _mark(mark: Mark) -> str:
     kind, sign = (' class="read"', "◂ ") if mark.is_emphasized else ("", "")
-    place = f"top:{100 * mark.y_ratio:.1f}%"
-    return f'<li{kind} style="{place}">{sign}{escape(mark.text)}</li>'
+    position = f"top:{100 * mark.y_ratio:.1f}%"
+    return f'<li{kind} style="{position}">{sign}{escape(mark.text)}</li>'
 
 
-def _apart(marks: tuple[Mark, ...], height_mm: float) -> list[Mark]:
+def _without_overlap(marks: tuple[Mark, ...], height_mm: float) -> list[Mark]:
     """Return the marks that do not overlap; emphasized ones come first."""
     kept: list[Mark] = []
     for mark in sorted(marks, key=lambda mark: not mark.is_emphasized):
@@ -204,13 +204,13 @@ def _plot(plot: Plot, width_mm: float) -> str:
 
 
 def _svg(figure: Figure) -> str:
-    """Return a figure as an SVG data URI, so that ids of figures do not clash."""
-    written = io.BytesIO()
-    figure.savefig(written, format="svg", metadata={"Date": None})
-    return "data:image/svg+xml;base64," + base64.b64encode(written.getvalue()).decode()
+    """Return a figure as an SVG data URI, so that the ids of figures cannot collide."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    return "data:image/svg+xml;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def _jpeg(image: NDArray[Any]) -> str:
-    written = io.BytesIO()
-    Image.fromarray(image).save(written, "JPEG", quality=JPEG_QUALITY, subsampling=0)
-    return "data:image/jpeg;base64," + base64.b64encode(written.getvalue()).decode()
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "JPEG", quality=JPEG_QUALITY, subsampling=0)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()

@@ -1,4 +1,4 @@
-"""How an eye was computed, in words for a reader of the report."""
+"""Description of how an eye was computed, for a reader of the report."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from clients.figures import EyeStudy
 from estimator import EyeProfile
 
 COMPUTED_BY = ("eye estimated", "eye as given", "focus traced", "aberrations traced")
-"""Starts of notes on the computation, which `_of_eye` replaces."""
-POORLY = "eye estimated poorly"
+"""Prefixes of notes on the computation, which `_model_text` replaces."""
+POOR_FIT = "eye estimated poorly"
 
-WORDS = {
+REPLACEMENTS = {
     "+-": "±",
     " um": " µm",
     " deg ": "° ",
@@ -25,7 +25,7 @@ OPTION_HINT = '; "higher_order"'
 def method_text(study: EyeStudy) -> tuple[str, ...]:
     """Return sentences on how the eye was computed and what its powers refer to."""
     notes = (n for n in study.field.notes if not n.startswith(COMPUTED_BY))
-    return (_of_eye(study), *map(_plain, notes))
+    return (_model_text(study), *map(_plain_text, notes))
 
 
 def entered_text(profile: EyeProfile) -> str:
@@ -44,11 +44,11 @@ def um_text(value_um: float) -> str:
     return "less than 0.001 µm" if value_um < 0.001 else f"{value_um:.3f} µm"
 
 
-def _of_eye(study: EyeStudy) -> str:
+def _model_text(study: EyeStudy) -> str:
     found = study.found
     if study.profile.is_given:
-        return "the eye is the one that the profile gives"
-    is_poor = any(note.startswith(POORLY) for note in study.notes)
+        return "the eye model comes from the profile"
+    is_poor = any(note.startswith(POOR_FIT) for note in study.notes)
     poor = "poor fit: " if is_poor else ""
     return (
         f"{poor}the eye model reproduces the coefficients of the wavefront to "
@@ -56,8 +56,8 @@ def _of_eye(study: EyeStudy) -> str:
     )
 
 
-def _plain(note: str) -> str:
+def _plain_text(note: str) -> str:
     text = note.partition(OPTION_HINT)[0]
-    for word, plain in WORDS.items():
-        text = text.replace(word, plain)
+    for technical, plain in REPLACEMENTS.items():
+        text = text.replace(technical, plain)
     return text.replace(" -", " −")

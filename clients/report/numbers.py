@@ -24,13 +24,13 @@ from estimator import (
 )
 
 PRESCRIBED_PUPIL_MM = 4.0
-"""Pupil of reported refractions, if the measured pupil is as wide."""
+"""Pupil of reported refractions, unless the measured pupil is smaller."""
 
 SPECTACLE_VERTEX_MM = 12.0
 """Usual distance of spectacles from the cornea."""
 
-TOLD_CPD = (10.0, 20.0, 30.0)
-FIELD_TOLD_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
+REPORTED_CPD = (10.0, 20.0, 30.0)
+REPORTED_FIELD_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
 
 
 @dataclass(frozen=True)
@@ -43,12 +43,12 @@ class Refraction:
 
     @property
     def prescription(self) -> Prescription:
-        """Return the prescription in minus cylinder, axis as the examiner writes it."""
+        """Return the prescription in minus cylinder, axis as seen by the examiner."""
         return prescription_from_power_vector(self.m_dpt, self.j0_dpt, self.j45_dpt)
 
-    def written(self) -> str:
+    def format_prescription(self) -> str:
         """Return the prescription in the usual notation."""
-        return written(self.prescription)
+        return format_prescription(self.prescription)
 
     def as_mapping(self) -> dict[str, float]:
         """Return all numbers as a mapping."""
@@ -63,7 +63,7 @@ class Refraction:
         }
 
 
-def written(lens: Prescription) -> str:
+def format_prescription(lens: Prescription) -> str:
     """Return a lens in the usual notation: sphere, cylinder, axis."""
     text = f"{_signed(lens.sphere_dpt)} dpt sph"
     if abs(lens.cylinder_dpt) >= 0.005:
@@ -98,9 +98,9 @@ def refraction_pupil_mm(study: EyeStudy) -> float:
 def refraction_of(study: EyeStudy, zernike_um: NDArray[np.float64]) -> Refraction:
     """Return the refraction of coefficients on the study's circle, at 555 nm."""
     radius_mm = study.found.zernike_radius_mm
-    told_mm = refraction_pupil_mm(study) / 2.0
-    on_told = rescale_pupil(zernike_um, radius_ratio=told_mm / radius_mm)
-    m, j0, j45 = power_vector_from_zernike(on_told, zernike_radius_mm=told_mm)
+    reported_mm = refraction_pupil_mm(study) / 2.0
+    on_reported = rescale_pupil(zernike_um, radius_ratio=reported_mm / radius_mm)
+    m, j0, j45 = power_vector_from_zernike(on_reported, zernike_radius_mm=reported_mm)
     measured_nm = study.found.wavelength_nm
     to_555_dpt = chromatic_refraction_dpt(WAVELENGTH_NM) - chromatic_refraction_dpt(
         measured_nm
@@ -136,13 +136,13 @@ def state_numbers(seen: PupilWavefront) -> dict[str, Any]:
             "modulation": None,
             "is_told": seen.is_readable,
         }
-    modulation = seen.transfer().modulation(np.array(TOLD_CPD))
+    modulation = seen.transfer().modulation(np.array(REPORTED_CPD))
     return {
         "log_mar": found.log_mar,
         "visual_strehl_ratio": found.visual_strehl_ratio,
         "modulation": {
             f"{cpd:g}_cpd": float(v)
-            for cpd, v in zip(TOLD_CPD, modulation, strict=True)
+            for cpd, v in zip(REPORTED_CPD, modulation, strict=True)
         },
         "is_told": True,
     }
@@ -242,7 +242,7 @@ def _named(zernike_um: NDArray[np.float64]) -> dict[str, float]:
 def _field_numbers(study: EyeStudy) -> list[dict[str, float]]:
     """Return the relaxed refraction along the horizontal meridian."""
     table = study.field
-    on_meridian = np.isin(table.h_deg, FIELD_TOLD_DEG) & (table.v_deg == 0.0)
+    on_meridian = np.isin(table.h_deg, REPORTED_FIELD_DEG) & (table.v_deg == 0.0)
     return [
         {"h_deg": h, "v_deg": 0.0, "M_dpt": m, "J0_dpt": j0, "J45_dpt": j45}
         for h, (m, j0, j45) in zip(

@@ -12,12 +12,12 @@ SHOWN_DIGITS = 16
 """Digits of a profile's digest that are shown: 64 bits."""
 
 MAX_TEXT_LENGTH = 60
-"""Longest text that the margin of a page holds beside the others."""
+"""Maximum length of a text, so that all texts fit in the page margin."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """What the user identifies a report by; empty texts are left out.
+    """Identification of a report entered by the user; empty texts are omitted.
 
     Raises
     ------

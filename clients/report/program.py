@@ -1,10 +1,10 @@
-"""Write a report of one eye, or of an eye before and after.
+"""Write a report on one eye, or a comparison of two.
 
     ocufilter report keratoconus -o eye.html
     ocufilter report eye.json -o eye.pdf
     ocufilter report before.json after.json -o surgery.pdf
 
-A profile is a preset's name, a .json, .abp, .csv or .zmx file, or a JSON object.  The
+A profile is a preset name, a .json, .abp, .csv or .zmx file, or a JSON object.  The
 report begins with a summary: refraction, acuity, wavefront, point images, contrast, a
 letter chart near and far.  Then it shows the visual field, acuity by distance, the
 estimated eye, which data were measured or assumed, and the literature references.  The
@@ -40,7 +40,7 @@ class _Parser(argparse.ArgumentParser):
     """Argument parser that reports errors in one line, like other errors."""
 
     def error(self, message: str) -> NoReturn:
-        raise ValueError(f"{message}; --help says more")
+        raise ValueError(f"{message}; see --help")
 
 
 def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -52,32 +52,39 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "profile", help="preset's name, .json, .abp, .csv or .zmx file, or JSON object"
+        "profile", help="preset name, .json, .abp, .csv or .zmx file, or JSON object"
     )
     parser.add_argument(
-        "after", nargs="?", help="the eye afterward: after surgery, with spectacles"
+        "after",
+        nargs="?",
+        help="profile to compare with, such as after surgery or with spectacles",
     )
     parser.add_argument(
         "-o", "--out", type=Path, metavar="OUT", help="file to write: .html or .pdf"
     )
-    parser.add_argument("--name", default="", help="name of the eye in the report")
     parser.add_argument(
-        "--after-name", default="", help="name of the eye afterward in the report"
+        "--name", default="", help="name of the first eye in the report"
+    )
+    parser.add_argument(
+        "--after-name", default="", help="name of the second eye in the report"
     )
     parser.add_argument(
         "--reference",
         default="",
         metavar="TEXT",
-        help="identifier of a record or an order, shown on each page",
+        help="record or order number, shown on each page",
     )
     parser.add_argument(
-        "--patient", default="", metavar="TEXT", help="patient, shown on each page"
+        "--patient", default="", metavar="TEXT", help="patient name, shown on each page"
     )
     parser.add_argument(
-        "--examiner", default="", metavar="TEXT", help="examiner, shown in the header"
+        "--examiner",
+        default="",
+        metavar="TEXT",
+        help="examiner name, shown in the header",
     )
     parser.add_argument(
-        "--no-charts", action="store_true", help="leave out the letter charts (faster)"
+        "--no-charts", action="store_true", help="omit the letter charts (faster)"
     )
     parser.add_argument(
         "--json", action="store_true", help="print the numbers as one JSON object"
@@ -91,9 +98,9 @@ def run(options: argparse.Namespace) -> str:
     Raises
     ------
     ValueError
-        If a profile, a text or a file name cannot be used.
+        If a profile, a text or a file name is invalid.
     ReportError
-        If PDFs cannot be written here.
+        If PDF output is unavailable (missing dependency).
     """
     _check_out(options)
     record = Record(
@@ -104,9 +111,9 @@ def run(options: argparse.Namespace) -> str:
     if options.out is not None and options.out.suffix.lower() == ".pdf":
         check_pdf()
     sources = [options.profile] + ([options.after] if options.after else [])
-    profiles = [profile_of(source) for source in sources]  # fail before any work
+    profiles = [profile_of(source) for source in sources]  # fail early
     labels = tuple(
-        name or _called(source)
+        name or _default_name(source)
         for name, source in zip(
             (options.name, options.after_name), sources, strict=False
         )
@@ -136,15 +143,15 @@ def _check_out(options: argparse.Namespace) -> None:
     out = options.out
     if out is None:
         if not options.json:
-            raise ValueError("--out is missing: allowed is a .html or .pdf file")
+            raise ValueError("--out is missing; expected a .html or .pdf file")
         return
     if out.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"--out '{out}': allowed is a .html or .pdf file")
+        raise ValueError(f"--out '{out}': expected a .html or .pdf file")
     if not out.absolute().parent.is_dir():
-        raise ValueError(f"--out '{out}': there is no folder {out.parent}")
+        raise ValueError(f"--out '{out}': folder {out.parent} does not exist")
 
 
-def _called(source: str) -> str:
+def _default_name(source: str) -> str:
     """Return a file's name without its suffix, or a preset's name; empty for JSON."""
     if source.lstrip().startswith("{"):
         return ""

@@ -1,4 +1,4 @@
-"""Provenance of a report's data: measured, entered, or typical, and of which people."""
+"""Provenance of a report's data: measured, entered or typical of a population."""
 
 from __future__ import annotations
 

@@ -9,15 +9,19 @@ from clients.figures.study import WAVELENGTH_NM
 from clients.report.blocks import Table
 from clients.report.facts import EyeFacts
 from clients.report.method_text import entered_text, um_text
-from clients.report.numbers import SPECTACLE_VERTEX_MM, spectacles_for, written
+from clients.report.numbers import (
+    SPECTACLE_VERTEX_MM,
+    format_prescription,
+    spectacles_for,
+)
 
 N_COLUMNS, N_JOINT_COLUMNS = 4, 3
 """Columns of the coefficients of one eye, and of two."""
 
 COEFFICIENTS_TITLE = "Coefficients, µm (OSA; x to the person's right, y up)"
 
-THROUGH_LENSLETS = "not known"
-"""Text in place of an acuity; the summary gives the reason."""
+UNKNOWN_ACUITY = "not known"
+"""Text in place of an acuity through lenslets; the summary gives the reason."""
 
 REFRACTION_ROWS = {
     "sphere, dpt": "sphere_dpt",
@@ -44,12 +48,12 @@ def refraction_table(facts: EyeFacts) -> Table:
     return Table(
         "Refraction",
         tuple(
-            (word, *(refraction_text(pair, name) for pair in pairs))
-            for word, name in REFRACTION_ROWS.items()
+            (label, *(refraction_text(pair, name) for pair in pairs))
+            for label, name in REFRACTION_ROWS.items()
         ),
         head=(
             "at the cornea, 555 nm",
-            facts.study.source_word,
+            facts.study.source_label,
             "estimated",
         ),
         note=_refraction_note(facts),
@@ -79,7 +83,7 @@ def _refraction_note(facts: EyeFacts) -> str:
 def spectacles_text(facts: EyeFacts) -> str:
     """Return the spectacles that correct an eye."""
     lens = spectacles_for(facts.numbers["eye"]["refraction"])
-    return f"As spectacles at {SPECTACLE_VERTEX_MM:g} mm: {written(lens)}"
+    return f"As spectacles at {SPECTACLE_VERTEX_MM:g} mm: {format_prescription(lens)}"
 
 
 def change_text(before: float, after: float) -> str:
@@ -99,7 +103,10 @@ def vision_table(facts: EyeFacts) -> Table:
     pupils = facts.numbers["pupils"]
     return Table(
         "Vision on the axis",
-        tuple((word, *map(words, pupils)) for word, words in VISION_ROWS.items()),
+        tuple(
+            (label, *map(format_value, pupils))
+            for label, format_value in VISION_ROWS.items()
+        ),
         head=("far object, 555 nm", *(pupil_text(p) for p in pupils)),
         note=vision_note(pupils),
     )
@@ -162,7 +169,7 @@ def _modulations(values: dict[str, Any] | None) -> str:
 
 def acuity_text(state: dict[str, Any]) -> str:
     """Return the acuity of a state, or that it is not known."""
-    return acuity_range_text(state["log_mar"]) if state["is_told"] else THROUGH_LENSLETS
+    return acuity_range_text(state["log_mar"]) if state["is_told"] else UNKNOWN_ACUITY
 
 
 def acuity_range_text(log_mar: float | None) -> str:

@@ -27,7 +27,7 @@ from clients.report.blocks import (
     Row,
     Section,
     Table,
-    Words,
+    Text,
 )
 from clients.report.charts import picture_side_px
 from clients.report.correction_text import correction_text, near_text
@@ -126,9 +126,11 @@ def test_rms_by_order_and_coefficients_are_the_profiles():
 
 
 def test_an_axis_is_written_as_the_examiner_does():
-    text = Refraction(-2.25, 0.25 * math.cos(2.0), 0.25 * math.sin(2.0)).written()
+    text = Refraction(
+        -2.25, 0.25 * math.cos(2.0), 0.25 * math.sin(2.0)
+    ).format_prescription()
     assert text == "−2.00 dpt sph −0.50 cyl x 123°"
-    assert Refraction(1.0, 0.0, 0.0).written() == "+1.00 dpt sph"
+    assert Refraction(1.0, 0.0, 0.0).format_prescription() == "+1.00 dpt sph"
 
 
 def _rows(profile) -> dict[str, tuple[str, str]]:
@@ -247,7 +249,7 @@ def test_a_report_through_lenslets_says_what_is_not_known():
     assert facts.numbers["charts"][0]["log_mar"] is None
     text = html_of(document_of([facts]))
     assert text.count("<td>not known</td>") >= 4
-    assert "no model of how people read through them is known" in text
+    assert "no model of reading through them is known" in text
     assert "an eye that is looking 25° down" in text
     json.dumps(facts.numbers, allow_nan=False)
 
@@ -291,14 +293,14 @@ def test_html_is_one_file_that_names_what_its_pictures_show(myope):
     assert "left eye (OS), 60 years" in text
     sphere = f"{AT_CORNEA[0]:.2f}".replace("-", "−")
     assert text.count(f"<td>{sphere}</td>") >= 2
-    assert "No letter charts: not asked for." in text
+    assert "No letter charts: not requested." in text
     cited = {n for mark in re.findall(r"\[([\d, ]+)\]", text) for n in mark.split(", ")}
     assert cited == {str(n + 1) for n in range(len(cited))}
 
 
 def test_what_a_profile_is_called_cannot_break_the_page():
     table = Table("<b>", (("<b>&</b>",),), note="<b>")
-    section = Section("<b>", (Row((table, Words(("<b>",)))),))
+    section = Section("<b>", (Row((table, Text(("<b>",)))),))
     text = html_of(Document("<b>", "<b>", (section,), "<b>"))
     assert "<b>" not in text
     assert "&lt;b&gt;&amp;&lt;/b&gt;" in text
@@ -344,7 +346,7 @@ def test_an_eye_without_a_name_is_titled_by_its_side(corrected):
 
 
 def test_blocks_share_a_row_by_their_widths():
-    row = Row((Words(("a",)), Table("t", (("b",),))), (2.0, 1.0))
+    row = Row((Text(("a",)), Table("t", (("b",),))), (2.0, 1.0))
     first, second = row.widths_mm
     assert first == pytest.approx(2 * second)
     assert first + second == pytest.approx(186.0 - 5.0)
@@ -471,7 +473,7 @@ def test_a_measurement_named_like_a_preset_is_no_example():
         "zernike_um": {"2,0": 1.0},
     }
     study = EyeStudy.of(body)
-    assert study.source_word == "measured"
+    assert study.source_label == "measured"
 
 
 def test_the_method_is_told_without_options_and_program_text(myope):
@@ -574,9 +576,9 @@ def test_a_missing_pdf_library_is_named_before_any_work(monkeypatch, capsys, tmp
         ),
         ([], "report: the following arguments are required: profile"),
         (["myopia", "-o", "a.pdf", "--fast"], "unrecognized arguments: --fast"),
-        (["myopia"], "report: --out is missing: allowed is a .html or .pdf file"),
-        (["myopia", "-o", "eye.docx"], "allowed is a .html or .pdf file"),
-        (["myopia", "-o", "nowhere/eye.pdf"], "there is no folder nowhere"),
+        (["myopia"], "report: --out is missing; expected a .html or .pdf file"),
+        (["myopia", "-o", "eye.docx"], "expected a .html or .pdf file"),
+        (["myopia", "-o", "nowhere/eye.pdf"], "folder nowhere does not exist"),
         (["myopia", "gone.json", "-o", "eye.pdf"], "file 'gone.json' does not exist"),
     ],
 )
