@@ -1,7 +1,7 @@
 """Interactive page in the browser: `ocufilter web`.
 
 program           the command
-server            NiceGUI behind a guard and limits, and a websocket for pictures
+server            HTTP server: app, token authentication, limits, image websocket
 guard             access control by token
 bounds            limits on requests
 connections       limits on connections
@@ -22,11 +22,11 @@ picture           a picture with depth, at full and preview size
 chart             a letter chart as a picture
 scene_file        a scene rendered in a child process
 picture_view      scene and filtered picture with a split, with picture_view.js
-figure_panel      the point under the pointer, and figures of the eye
-eye_figures       those figures
+figure_panel      point-spread function under the pointer, and figures of the eye
+eye_figures       figures of the eye as PNG
 point_spread      point-spread function of one point, in color
 figure_worker     worker process that draws them
-filter_thread     filter thread; the newest request wins
+filter_thread     filter thread; newer requests replace older ones
 eye_view          one eye: a fast preview, then the full picture
 picture_requests  the requested state, and the pictures returned
 picture_sender    sends pictures to the browser

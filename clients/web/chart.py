@@ -14,15 +14,15 @@ ROWS = tuple(round(1.0 - 0.1 * k, 1) for k in range(12))
 """LogMAR, from 1.0 to -0.1."""
 
 WIDTH_DEG = 13.6
-"""The largest row takes 7.5 deg; beside it is room for the labels."""
+"""The largest row takes 7.5 deg, which leaves space for the labels beside it."""
 
 SIZE_PX = (1200, 675)
-HEIGHTS = 4.5
-"""Half of a row's width, in heights of its letters: five letters and their gaps."""
+HALF_WIDTH_HEIGHTS = 4.5
+"""Half of a row's width in letter heights: five letters and their gaps."""
 
 
 def chart_picture(distance_dpt: float) -> Picture:
-    """Return a chart of the same visual angle at every distance."""
+    """Return a chart that has the same visual angle at every distance."""
     camera = camera_of(WIDTH_DEG, width_px=SIZE_PX[0], height_px=SIZE_PX[1])
     chart = letter_chart(camera, distance_m=math.inf, log_mar=ROWS)
     picture = picture_of("Letter chart", chart.view, distance_dpt=0.0)
@@ -31,7 +31,7 @@ def chart_picture(distance_dpt: float) -> Picture:
         ChartRow(
             row.log_mar,
             row.y_px / SIZE_PX[1],
-            0.5 + letter_height(row.log_mar) * HEIGHTS / half_width / 2.0,
+            0.5 + letter_height(row.log_mar) * HALF_WIDTH_HEIGHTS / half_width / 2.0,
         )
         for row in chart.rows
     )
@@ -40,13 +40,13 @@ def chart_picture(distance_dpt: float) -> Picture:
 
 
 def marks_of(
-    rows: Sequence[ChartRow], read: Mapping[str, int | None]
+    rows: Sequence[ChartRow], smallest_rows: Mapping[str, int | None]
 ) -> list[dict[str, Any]]:
     """Return the labels of a chart's rows.
 
     Parameters
     ----------
-    read : index of the smallest row that each eye reads, or None
+    smallest_rows : index of the smallest row that each eye can read, or None
     """
     return [
         {
@@ -54,14 +54,14 @@ def marks_of(
             "x": row.end_ratio,
             "log_mar": row_texts(row.log_mar)[0],
             "decimal": row_texts(row.log_mar)[1],
-            "eyes": [eye for eye, smallest in read.items() if smallest == k],
+            "eyes": [eye for eye, smallest in smallest_rows.items() if smallest == k],
         }
         for k, row in enumerate(rows)
     ]
 
 
 def caption(rows: Sequence[ChartRow], smallest: int | None) -> str:
-    """Return the smallest row that an eye reads in words."""
+    """Describe the smallest row that an eye can read."""
     found = "none of these rows"
     if smallest is not None:
         found = "logMAR {}, decimal {}".format(*row_texts(rows[smallest].log_mar))

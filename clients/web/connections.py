@@ -1,6 +1,6 @@
 """HTTP connections with a request timeout and a limited number.
 
-uvicorn itself limits neither the time that a request's head takes nor, with httptools,
+uvicorn itself does not limit the time to receive a request's head, nor, with httptools,
 its size.
 """
 
@@ -11,7 +11,7 @@ import asyncio
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 MAX_HEAD_BYTES = 32_768
-"""Size of a request line with its headers; for `uvicorn.Config`."""
+"""Size limit of a request line with its headers, for `uvicorn.Config`."""
 
 
 class BoundedConnection(H11Protocol):
@@ -20,19 +20,20 @@ class BoundedConnection(H11Protocol):
     Attributes
     ----------
     head_s : float
-        Time until the head of the next request is complete.
-    most : int
-        Connections at the same time, websockets included; a page takes up to 8.
+        Time limit for receiving the head of the next request.
+    max_connections : int
+        Maximum number of concurrent connections, including websockets; a page takes up
+        to 8.
     """
 
     head_s = 10.0
-    most = 256
+    max_connections = 256
     _deadline: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:
         """Accept the connection, unless there are too many."""
         super().connection_made(transport)
-        if len(self.connections) > self.most:
+        if len(self.connections) > self.max_connections:
             transport.abort()
         else:
             self._watch()

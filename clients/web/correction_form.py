@@ -1,4 +1,4 @@
-"""Entries of a correction, and the profile fields that they give."""
+"""Entries of a correction, and the profile fields that result from them."""
 
 from __future__ import annotations
 
@@ -29,15 +29,13 @@ DESIGNS = {
     "edof": "Extended depth of focus",
 }
 HINTS: dict[WornKind, str] = {
-    "progressive": "Look: Reading turns the gaze to the end of the corridor; the gaze "
-    "sliders reach other parts of the lens.",
+    "progressive": "“Look: Reading” turns the gaze to the end of the corridor; use the "
+    "gaze sliders to look through other parts of the lens.",
     "lenslets": "396 lenslets around a clear center; use the gaze sliders to look "
     "through other parts.",
-    "iol": "Replaces the eye's own lens: enter the refraction that remains after "
-    "surgery "
-    "above. Accommodation and age-typical aberrations are not applied. Powers are "
-    "those "
-    "of the lens.",
+    "iol": "Replaces the natural lens: enter the refraction that remains after surgery "
+    "above. Accommodation and age-typical aberrations are not applied. Powers apply at "
+    "the lens.",
 }
 
 SPHERE = NumberField("sphere_dpt", "Sphere", "dpt", -30.0, 30.0, 0.25, is_signed=True)
@@ -65,7 +63,7 @@ ABERRATION = NumberField(
     is_signed=True,
 )
 
-OF_KIND: dict[WornKind, tuple[NumberField, ...]] = {
+FIELDS_BY_KIND: dict[WornKind, tuple[NumberField, ...]] = {
     "spectacles": PRESCRIPTION,
     "progressive": (*PRESCRIPTION, PROGRESSIVE_ADD, CORRIDOR),
     "lenslets": PRESCRIPTION,
@@ -73,18 +71,18 @@ OF_KIND: dict[WornKind, tuple[NumberField, ...]] = {
     "iol": (*PRESCRIPTION[:3], ABERRATION),
     "file": (),
 }
-OF_DESIGN: dict[str, tuple[NumberField, ...]] = {
+FIELDS_BY_DESIGN: dict[str, tuple[NumberField, ...]] = {
     "monofocal": (),
     "bifocal": (BIFOCAL_ADD,),
     "trifocal": (MIDDLE_ADD, NEAR_ADD),
     "edof": (EDOF_ADD,),
 }
 TRIFOCAL_LIGHT = (0.43, 0.17, 0.26)
-"""Light shares of a trifocal lens, far, intermediate, near: 50:20:30 of 86 %."""
+"""Light of a trifocal lens at far, intermediate and near: 50:20:30 of 86 %."""
 
 
-def first_texts() -> dict[str, str]:
-    """Return the initial texts of the entries."""
+def default_texts() -> dict[str, str]:
+    """Return the default texts of the entries."""
     return {
         "sphere_dpt": "0.00",
         "cylinder_dpt": "0.00",
@@ -101,7 +99,7 @@ def first_texts() -> dict[str, str]:
 DISTANCE_KINDS: tuple[WornKind, ...] = (
     *("spectacles", "progressive", "lenslets", "contact_lens"),
 )
-"""Kinds whose distance powers can be those of the prescription."""
+"""Kinds that can take their distance powers from the prescription."""
 
 MM_PER_M = 1000.0
 ROTATION_CENTER_MM = 13.5
@@ -120,17 +118,17 @@ def reading_gaze_deg(profile: Mapping[str, Any]) -> float | None:
     return math.floor(-math.degrees(math.atan2(worn["corridor_mm"], depth_mm)))
 
 
-def turns_with_gaze(profile: Mapping[str, Any]) -> bool:
-    """Return whether the part of the correction looked through depends on the gaze."""
+def depends_on_gaze(profile: Mapping[str, Any]) -> bool:
+    """Return whether the gaze selects the part of the correction in use."""
     worn = profile.get("correction") or {}
     return worn.get("kind") in ("progressive", "lenslets")
 
 
-def looking(
+def profile_for_gaze(
     profile: Mapping[str, Any], gaze_deg: tuple[float, float]
 ) -> dict[str, Any]:
     """Return a profile with its correction at a gaze."""
-    if not turns_with_gaze(profile):
+    if not depends_on_gaze(profile):
         return dict(profile)
     worn = dict(profile["correction"])
     own_deg = worn.get("gaze_deg", (0.0, 0.0))
@@ -151,19 +149,19 @@ class CorrectionForm:
 
     kind: WornKind = "spectacles"
     design: str = "monofocal"
-    texts: dict[str, str] = field(default_factory=first_texts)
+    texts: dict[str, str] = field(default_factory=default_texts)
     file_body: dict[str, Any] | None = None
 
     @property
     def kinds(self) -> dict[WornKind, str]:
-        """Return the available kinds."""
+        """Return the kinds that can be selected."""
         return KINDS if self.file_body is None else {**KINDS, "file": AS_IN_FILE}
 
     @property
     def entries(self) -> tuple[NumberField, ...]:
         """Return the entries in use."""
-        more = OF_DESIGN[self.design] if self.kind == "iol" else ()
-        return (*more, *OF_KIND[self.kind])
+        more = FIELDS_BY_DESIGN[self.design] if self.kind == "iol" else ()
+        return (*more, *FIELDS_BY_KIND[self.kind])
 
     def body(self) -> dict[str, Any]:
         """Return the correction.
@@ -171,7 +169,7 @@ class CorrectionForm:
         Raises
         ------
         ValueError
-            Names the entry, its value and what is allowed.
+            If an entry is invalid; the message names it, its value and the range.
         """
         if self.kind == "file":
             return dict(self.file_body or {})
@@ -182,7 +180,7 @@ class CorrectionForm:
         if self.kind != "iol":
             return found
         if self.design == "trifocal":
-            adds = [found.pop(entry.name) for entry in OF_DESIGN["trifocal"]]
+            adds = [found.pop(entry.name) for entry in FIELDS_BY_DESIGN["trifocal"]]
             found |= {"adds_dpt": adds, "light_ratio": list(TRIFOCAL_LIGHT)}
         return found | {"design": self.design}
 
@@ -207,7 +205,7 @@ class CorrectionForm:
         values = dict(body)
         names: list[str] | set[str]
         if design == "trifocal" and values.pop("light_ratio", 0) == [*TRIFOCAL_LIGHT]:
-            names = [entry.name for entry in OF_DESIGN["trifocal"]]
+            names = [entry.name for entry in FIELDS_BY_DESIGN["trifocal"]]
             values |= dict(zip(names, values.pop("adds_dpt", ()), strict=False))
         known = (
             CorrectionForm(kind, design)
@@ -222,7 +220,7 @@ class CorrectionForm:
         missing = {"vertex_mm": 0.0} if "vertex_mm" in names else {}
         for entry in known.entries:
             value = values.get(entry.name, missing.get(entry.name))
-            text = first_texts()[entry.name] if value is None else entry.show(value)
+            text = default_texts()[entry.name] if value is None else entry.show(value)
             self.texts[entry.name] = text
 
     def copied(self) -> CorrectionForm:
@@ -254,7 +252,8 @@ def read_numbers(
     Raises
     ------
     ValueError
-        Names the entry, its value and what is allowed.
+        If an entry is invalid; the message names the entry, its value and the allowed
+        range.
     """
     values = {}
     for entry in entries:

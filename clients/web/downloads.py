@@ -10,51 +10,60 @@ from nicegui import ui
 
 from clients.report import report_html
 from clients.web.eye_form import SIDES, EyeSide
-from clients.web.figure_worker import FigureWorker, StudyFailed
+from clients.web.figure_worker import FigureFailed, FigureWorker
 from clients.web.page_state import PageState
 from clients.web.picture_sender import PictureSender
 
 READY_S = 120.0
-"""Longest time that a download waits for the full picture."""
+"""Maximum time that a download waits for the full picture."""
 
 
 class Downloads:
-    """Buttons that download what the page shows.
+    """Buttons that download the picture, the profile and the report.
 
     Parameters
     ----------
     page : str
         Page that owns the requests.
-    ready : whether the full picture of each eye is shown
-    no_scene : returns why there is no picture, or an empty text
+    ready : events that are set while the full picture of each eye is shown
+    empty_reason : returns why there is no picture, or an empty string
     """
 
     def __init__(
         self,
         page: str,
         state: PageState,
-        out: PictureSender,
+        sender: PictureSender,
         figure_worker: FigureWorker,
         *,
         ready: Mapping[EyeSide, asyncio.Event],
-        no_scene: Callable[[], str],
+        empty_reason: Callable[[], str],
     ) -> None:
-        self._page, self._state, self._out = page, state, out
+        self._page, self._state, self._sender = page, state, sender
         self._figure_worker, self._ready = figure_worker, ready
-        self._no_scene = no_scene
+        self._empty_reason = empty_reason
 
     def build(self, on_copy: Callable[[], None]) -> None:
-        """Build the buttons, and the one that copies the link."""
+        """Build the download buttons and the button that copies the link."""
         with ui.element("nav").classes("oc-downloads").props("aria-label=Downloads"):
             for label, icon, tip, act in (
-                ("Picture", "download", "What the eye sees, PNG", self._picture),
+                (
+                    "Picture",
+                    "download",
+                    "The image that the eye sees, PNG",
+                    self._picture,
+                ),
                 ("Profile", "download", "The eye's profile, JSON", self._profile),
                 (
-                    *("Report", "download", "What this eye sees and why, HTML"),
+                    *("Report", "download", "Report on this eye, HTML"),
                     self._report,
                 ),
                 (
-                    *("Copy link", "link", "Link to these entries, with access"),
+                    *(
+                        "Copy link",
+                        "link",
+                        "Link to these entries, including the access token",
+                    ),
                     on_copy,
                 ),
             ):
@@ -63,11 +72,11 @@ class Downloads:
                 ).classes("oc-download").tooltip(tip)
 
     async def _picture(self) -> None:
-        if self._no_scene():
-            ui.notify(self._no_scene(), type="warning", position="top")
+        if self._empty_reason():
+            ui.notify(self._empty_reason(), type="warning", position="top")
             return
         sides = self._state.sides
-        for side in sides:  # a click while the eye is prepared waits for it
+        for side in sides:  # wait for an eye that is still being prepared
             try:
                 await asyncio.wait_for(self._ready[side].wait(), READY_S)
             except TimeoutError:
@@ -76,18 +85,18 @@ class Downloads:
                 )
                 return
         for side in sides:
-            seen = self._out.last(side)
+            seen = self._sender.last(side)
             if seen is not None and seen.kind == "full":
                 ui.download(seen.data, f"ocufilter_{side}.png")
 
     async def _report(self) -> None:
         for side in self._state.sides:
-            body = self._state.looking_body(side)
+            body = self._state.profile_at_gaze(side)
             if body is None:
                 continue
             title = SIDES[side]
             waiting = ui.notification(
-                f"Writing the report: {title.lower()} …",
+                f"Writing the report on the {title.lower()}…",
                 spinner=True,
                 timeout=None,
                 position="top",
@@ -96,7 +105,7 @@ class Downloads:
                 text = await self._figure_worker.ask(
                     self._page, f"report {side}", report_html, body, label=title
                 )
-            except StudyFailed as error:
+            except FigureFailed as error:
                 ui.notify(str(error), type="negative", position="top")
                 continue
             finally:

@@ -61,7 +61,7 @@ def eye_figure(
 def predicted_log_mar(
     body: str, *, pupil_diameter_mm: float, focus_dpt: float, object_dpt: float
 ) -> float:
-    """Return the acuity of an eye at a distance; not finite if it is not known."""
+    """Return the acuity of an eye at a distance; not finite if it is unknown."""
     seen = _study(body).wavefront(
         pupil_diameter_mm, object_dpt=object_dpt, focus_dpt=focus_dpt
     )
@@ -69,7 +69,7 @@ def predicted_log_mar(
 
 
 def _field_figure(study: EyeStudy) -> Figure:
-    """Return refraction and blur over the visual field, as the person sees it."""
+    """Return refraction and blur over the visual field, from the person's view."""
     figure = Figure(figsize=_size(90.0, 98.0), layout="constrained")
     upper, lower = figure.subplots(2, 1)
     m_dpt = study.field.power_dpt.T[0]
@@ -81,7 +81,7 @@ def _field_figure(study: EyeStudy) -> Figure:
         middle=float(m_dpt[m_dpt.size // 2]),
     )
     blur = blur_arcmin(study)
-    draw_field_map(lower, blur, title="Blur, looking far", label="arcmin, RMS")
+    draw_field_map(lower, blur, title="Blur, focused far", label="arcmin, RMS")
     for axes in (upper, lower):
         axes.set_ylabel("up, deg", fontsize=AXIS_PT)
     lower.set_xlabel("right, deg", fontsize=AXIS_PT)
@@ -110,6 +110,6 @@ def _wavefront_figure(
         seen.zernike_um,
         radius_mm=seen.circle_diameter_mm / 2.0,
         eye_side=study.profile.eye_side,
-        title=f"Looking at {focus_dpt:.2f} dpt",
+        title=f"Focused at {focus_dpt:.2f} dpt",
     )
     return figure

@@ -52,7 +52,7 @@ def preset_titles() -> dict[str, str]:
 
 
 class NoFile(ValueError):
-    """The entries are those of a file, and none was chosen yet."""
+    """Raised when the source is a file and no file was uploaded."""
 
 
 @dataclass
@@ -62,14 +62,14 @@ class EyeForm:
     Attributes
     ----------
     side : "OD" or "OS"
-    source : which of the three kinds of entries is used
+    source : kind of entries in use
     texts : the prescription as typed, by field name
-    has_higher_order : whether it has the typical aberrations of its age
-    preset : name
+    has_higher_order : whether to add the typical aberrations of the age
+    preset : preset name
     file_body : profile from a file, or None
     file_name : name of that file
-    loaded_name : name of the file that the other entries come from, or empty
-    wears_correction : whether `worn` is used
+    loaded_name : name of the file that the entries were loaded from, or empty
+    wears_correction : whether `worn` applies
     """
 
     side: EyeSide
@@ -89,7 +89,7 @@ class EyeForm:
         Raises
         ------
         ValueError
-            An invalid entry: its value and the allowed ones.
+            If an entry is invalid; the message contains its value and the range.
         """
         body = {**self._source_body(), "age_years": age_years, "eye_side": self.side}
         if self.wears_correction:
@@ -113,14 +113,14 @@ class EyeForm:
         }
 
     def correct_fully(self) -> None:
-        """Wear the prescription; the kind of lens and its addition stay."""
+        """Wear the prescription, keeping the kind of lens and its addition."""
         if not self.wears_correction or self.worn.kind not in DISTANCE_KINDS:
             self.worn.kind = "spectacles"
         self.worn.fill_distance(self.texts)
         self.wears_correction = True
 
     def choose_worn(self, kind: WornKind) -> None:
-        """Wear another kind of lens; a lens without power gets the prescription's."""
+        """Select a kind of lens; without power, it takes that of the prescription."""
         self.worn.kind = kind
         is_graded = kind in ("progressive", "lenslets")
         if is_graded and self.source == "prescription" and self.worn.is_plano:
@@ -131,8 +131,8 @@ class EyeForm:
         new = EyeForm(self.side, file_body=self.file_body, file_name=self.file_name)
         vars(self).update(vars(new))
 
-    def take_body(self, body: Mapping[str, Any], name: str) -> None:
-        """Set the entries from a profile."""
+    def load_body(self, body: Mapping[str, Any], name: str) -> None:
+        """Load the entries from a profile."""
         body = dict(body)
         self.loaded_name = name if Path(name).suffix in PROFILE_SUFFIXES else ""
         correction = body.pop("correction", None)
@@ -154,7 +154,7 @@ def read_profile_file(name: str, content: bytes) -> dict[str, Any]:
     Raises
     ------
     InvalidFile
-        Another kind of file, too large, or not a profile.
+        If the file is of another kind, too large or not a profile.
     """
     suffix, shown = Path(name).suffix.lower(), Path(name).name[:60]
     if suffix not in PROFILE_SUFFIXES:
@@ -168,10 +168,10 @@ def read_profile_file(name: str, content: bytes) -> dict[str, Any]:
         path.write_bytes(content)
         try:
             body = profile_body(path)
-            load_profile(path)  # checks its fields
+            load_profile(path)  # validates the fields
         except InvalidFile as error:
             raise InvalidFile(shown, error.found, error.allowed) from None
-    if body.get("name") == path.name:  # coefficients take the name of their file
+    if body.get("name") == path.name:  # coefficient files are named after the file
         body["name"] = shown
     return body
 

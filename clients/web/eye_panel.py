@@ -30,23 +30,23 @@ from clients.web.upload_entry import upload_entry
 
 SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
 SLIDER_REACH_DPT = 10.0
-"""Range of the slider beside the sphere; typed values may go further."""
+"""Range of the sphere slider; typed values may exceed it."""
 
 SPHERE_SLIDER = replace(
     SPHERE, name="sphere_slider_dpt", low=-SLIDER_REACH_DPT, high=SLIDER_REACH_DPT
 )
 
 TYPING_MS = 400
-"""Pause after which a typed number counts: half of one is another eye."""
+"""Pause after which a typed number is used; an incomplete one would be another eye."""
 
 
 class EyePanel:
-    """Entries of one eye, which keep its form up to date.
+    """Entries of one eye, which update its form.
 
     Parameters
     ----------
     on_change : called when the entries have changed and are valid
-    on_file : called with this eye, and the name and the content of a profile file
+    on_file : called with the eye, and the name and content of an uploaded profile file
     """
 
     def __init__(
@@ -114,19 +114,19 @@ class EyePanel:
         """Return an entry for one number, with validation."""
         is_pasted = False
 
-        def take(event: events.ValueChangeEventArguments) -> None:
+        def store(event: events.ValueChangeEventArguments) -> None:
             nonlocal is_pasted
             texts[number.name] = event.value or ""
             if is_pasted and number is SPHERE and prescription_texts(event.value or ""):
                 # nicegui sends no value for an entry while it handles the entry's event
-                asyncio.get_running_loop().call_soon(leave)
+                asyncio.get_running_loop().call_soon(normalize)
             else:
                 self._on_change()  # an invalid entry is reported
             is_pasted = False
 
-        def leave() -> None:
+        def normalize() -> None:
             text = entry.value or ""
-            if not self._spread(number, text, is_worn):
+            if not self._split_prescription(number, text, is_worn):
                 entry.set_value(number.normalized(text))
 
         def paste() -> None:
@@ -137,7 +137,7 @@ class EyePanel:
             number.label,
             value=texts[number.name],
             validation=lambda text: number.problem(text or ""),
-            on_change=take,
+            on_change=store,
         )
         entry.props(
             f'outlined dense suffix="{number.unit}" inputmode="text" '
@@ -145,7 +145,7 @@ class EyePanel:
         ).classes("oc-entry")
         entry.props["data-name"] = number.name
         self._entries[number.name, is_worn] = entry
-        entry.on("blur", leave)
+        entry.on("blur", normalize)
         entry.on("paste", paste)
         for key, steps in (("up", 1), ("down", -1)):
             entry.on(
@@ -156,7 +156,9 @@ class EyePanel:
             )
         return entry
 
-    def _spread(self, number: NumberField, text: str, is_worn: bool) -> bool:
+    def _split_prescription(
+        self, number: NumberField, text: str, is_worn: bool
+    ) -> bool:
         """Set sphere, cylinder and axis from a whole prescription in the sphere."""
         found = prescription_texts(text) if number is SPHERE else None
         if found is None:
@@ -184,11 +186,11 @@ class EyePanel:
                 value=form.wears_correction,
                 on_change=self._switch_correction,
             ).props("dense").classes("oc-switch")
-            keeps = not form.wears_correction or form.worn.kind in DISTANCE_KINDS
-            if form.source == "prescription" and keeps:
+            can_correct = not form.wears_correction or form.worn.kind in DISTANCE_KINDS
+            if form.source == "prescription" and can_correct:
                 ui.button("Correct fully", on_click=self._correct_fully).props(
                     "flat dense no-caps size=sm"
-                ).tooltip("Wear the prescription above; kind of lens and addition stay")
+                ).tooltip("Wear the prescription above; keep kind of lens and addition")
         if form.wears_correction:
             self._worn()
 

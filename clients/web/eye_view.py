@@ -1,7 +1,7 @@
 """One eye as the page shows it: a fast preview, then the full picture.
 
-The preview uses the eye's wavefront on its axis, from a formula, and takes some
-hundredths of a second; the full picture uses the eye traced over its field.
+The preview uses the on-axis wavefront from a formula and takes some hundredths of a
+second; the full picture uses the eye ray-traced over its field.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from clients.web.correction_form import turns_with_gaze
+from clients.web.correction_form import depends_on_gaze
 from clients.web.eye_form import EyeSide
 from clients.web.picture import coarser
 from clients.web.picture_files import jpeg_of, png_of
@@ -20,31 +20,31 @@ from filter_service import EyeFilter, Filtered, FilterError, FilterSettings, Rgb
 
 MS_PER_S = 1e3
 PSF_SLICE_S = 0.05
-"""Time limit for computing PSFs before the page checks for newer entries."""
+"""Time limit for computing PSFs between checks for newer requests."""
 
 FULL = FilterSettings()
 QUICK = FULL.changed(mode="on-axis", eye_model="wavefront")
-LEAST_WIDTH_PX = 200
+MIN_WIDTH_PX = 200
 """If the blur is too wide for the filter, pictures are reduced, down to this width."""
 
 
 @dataclass
 class _ProfiledFilter:
-    """A filter with the profile that it was last given."""
+    """A filter and the profile set last."""
 
     filter: EyeFilter
-    given: Any = None
+    profile_key: Any = None
 
-    def give(
+    def set_profile(
         self, body: Mapping[str, Any], settings: FilterSettings, view: RgbdView
     ) -> None:
         """Set the profile if it has changed."""
-        given = (body, settings, view.camera)
-        if given != self.given:
-            self.given = given
+        profile_key = (body, settings, view.camera)
+        if profile_key != self.profile_key:
+            self.profile_key = profile_key
             self.filter.set_profile(body, settings=settings, cameras=[view.camera])
 
-    def see(
+    def filter_view(
         self, view: RgbdView, request: PictureRequest, *, gaze_deg: tuple[float, float]
     ) -> Filtered | None:
         """Return the picture through the newest eye; None while the eye is prepared."""
@@ -59,7 +59,7 @@ class _ProfiledFilter:
             newest_only=True,
             until_s=time.monotonic() + PSF_SLICE_S,
         )
-        self.filter.advance()  # by now it knows what this frame needs
+        self.filter.advance()  # this frame has requested its PSFs
         return seen
 
 
@@ -75,7 +75,7 @@ class EyeView:
         self.side = side
         self._quick: _ProfiledFilter | None = None
         self._full: _ProfiledFilter | None = None
-        self._merged = 1
+        self._merge_factor = 1
         self.seen: dict[Kind, int] = {"preview": 0, "full": 0}
 
     def preview(self, request: PictureRequest) -> SentPicture | None:
@@ -84,9 +84,9 @@ class EyeView:
         if self._quick is None:
             self._quick = _ProfiledFilter(EyeFilter())
         settings = QUICK.covering(foci_dpt=(request.focus_dpt,))
-        if turns_with_gaze(request.bodies[self.side]):
+        if depends_on_gaze(request.bodies[self.side]):
             settings = settings.changed(gaze_deg=request.gaze_deg)
-        return self._look(
+        return self._filter(
             self._quick, "preview", request, settings, request.picture.small
         )
 
@@ -98,36 +98,36 @@ class EyeView:
             gaze_deg=request.gaze_deg
         )
         view = request.picture.view
-        if self._merged > 1:
-            view = coarser(view, self._merged)
-        return self._look(self._full, "full", request, settings, view)
+        if self._merge_factor > 1:
+            view = coarser(view, self._merge_factor)
+        return self._filter(self._full, "full", request, settings, view)
 
     def _stop_other(self, request: PictureRequest) -> None:
         """Cancel the full eye if it is outdated, to free the worker."""
         full = self._full
-        if full is None or full.given is None:
+        if full is None or full.profile_key is None:
             return
-        body, settings, _ = full.given
+        body, settings, _ = full.profile_key
         if (body, settings.gaze_deg) != (request.bodies[self.side], request.gaze_deg):
             full.filter.close()
-            self._full, self._merged = None, 1
+            self._full, self._merge_factor = None, 1
 
-    def _look(
+    def _filter(
         self,
-        through: _ProfiledFilter,
+        eye_filter: _ProfiledFilter,
         kind: Kind,
         request: PictureRequest,
         settings: FilterSettings,
         view: RgbdView,
     ) -> SentPicture | None:
-        began_s = time.monotonic()
+        start_s = time.monotonic()
         try:
-            through.give(request.bodies[self.side], settings, view)
-            seen = through.see(view, request, gaze_deg=settings.gaze_deg)
+            eye_filter.set_profile(request.bodies[self.side], settings, view)
+            seen = eye_filter.filter_view(view, request, gaze_deg=settings.gaze_deg)
         except FilterError as error:
-            through.given = None
-            if kind == "full" and view.width_px >= 2 * LEAST_WIDTH_PX:
-                self._merged *= 2
+            eye_filter.profile_key = None
+            if kind == "full" and view.width_px >= 2 * MIN_WIDTH_PX:
+                self._merge_factor *= 2
                 return None
             self.seen[kind] = request.number
             return SentPicture(
@@ -142,14 +142,14 @@ class EyeView:
             self.side,
             request.number,
             encode(seen.color),
-            _facts(seen, request, MS_PER_S * (time.monotonic() - began_s)),
+            _facts(seen, request, MS_PER_S * (time.monotonic() - start_s)),
         )
 
     def close(self) -> None:
         """Close the filters."""
-        for through in (self._quick, self._full):
-            if through is not None:
-                through.filter.close()
+        for eye_filter in (self._quick, self._full):
+            if eye_filter is not None:
+                eye_filter.filter.close()
         self._quick = self._full = None
 
 

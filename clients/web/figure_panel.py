@@ -13,7 +13,7 @@ from nicegui import events, ui
 from clients.scenes.letter_chart import smallest_row
 from clients.web.eye_figures import FIGURE_TITLES, eye_figure, predicted_log_mar
 from clients.web.eye_form import SIDES, EyeSide
-from clients.web.figure_worker import FigureWorker, StudyFailed
+from clients.web.figure_worker import FigureFailed, FigureWorker
 from clients.web.numbers import distance_text
 from clients.web.page_state import DISTANCE, FOCUS, PUPIL, PageState
 from clients.web.point_spread import PointState, point_spread
@@ -28,7 +28,7 @@ WIDTHS_ARCMIN = {
     "three fingers at arm's length": 300.0,
     "a fist at arm's length": 600.0,
 }
-"""Visual angles of familiar things."""
+"""Visual angles of familiar objects."""
 
 
 def data_url(png: bytes) -> str:
@@ -48,33 +48,33 @@ class FigurePanel:
     def __init__(
         self, page: str, state: PageState, figure_worker: FigureWorker
     ) -> None:
-        self._page, self._state, self._studying = page, state, figure_worker
+        self._page, self._state, self._worker = page, state, figure_worker
         self._side: EyeSide = "OD"
         self._at = (0.5, 0.5)
         self._figure = next(iter(FIGURE_TITLES))
-        self._drawn: Any = None
+        self._drawn_request: Any = None
         self._enlarged = ui.dialog().props('aria-label="Figure"')
         with self._enlarged, ui.card().classes("oc-enlarged"):
             self._large = ui.html("", sanitize=False)
             ui.button("Close", on_click=self._enlarged.close).props("flat no-caps")
 
     def build_point(self) -> None:
-        """Build the card of the point-spread function."""
+        """Build the point-spread function card."""
         with (
             ui.element("section")
             .classes("oc-card oc-point")
             .props("aria-label='Point of light'")
         ):
-            ui.html("A point of light here", tag="h2", sanitize=False).classes(
-                "oc-title"
-            )
+            ui.html(
+                "How a point of light looks here", tag="h2", sanitize=False
+            ).classes("oc-title")
             self._psf = self._picture_button("oc-psf", "the point of light")
-            self._told = ui.label("Move the pointer over the picture.").classes(
-                "oc-hint"
-            )
+            self._message_label = ui.label(
+                "Move the pointer over the picture."
+            ).classes("oc-hint")
 
     def build_figure(self) -> None:
-        """Build the card of the figures."""
+        """Build the figure card."""
         with ui.element("section").classes("oc-card").props("aria-label=Figures"):
             self._title = ui.html("Figures", tag="h2", sanitize=False).classes(
                 "oc-title"
@@ -85,18 +85,18 @@ class FigurePanel:
             self._image = self._picture_button("oc-figure", "the figure")
 
     def _picture_button(self, kind: str, what: str) -> ui.html:
-        """Return the place of an image, which enlarges on a click."""
+        """Create a placeholder for an image that opens enlarged when clicked."""
         with ui.element("div").classes(kind):
             with ui.element("button").classes("oc-enlarge") as button:
                 button.props(f'type=button aria-label="Enlarge {what}"')
-                place = ui.html("", sanitize=False)
-            ui.label("computing …").classes("oc-hint oc-computing")
-        button.on("click", lambda: self._enlarge(place))
-        return place
+                image_slot = ui.html("", sanitize=False)
+            ui.label("Computing…").classes("oc-hint oc-computing")
+        button.on("click", lambda: self._enlarge(image_slot))
+        return image_slot
 
-    def _enlarge(self, place: ui.html) -> None:
-        if place.content:
-            self._large.content = place.content
+    def _enlarge(self, image_slot: ui.html) -> None:
+        if image_slot.content:
+            self._large.content = image_slot.content
             self._enlarged.open()
 
     async def point(self, side: EyeSide, x: float, y: float) -> None:
@@ -104,7 +104,7 @@ class FigurePanel:
         self._side, self._at = side, (x, y)
         await self._show_point()
 
-    async def renew(self) -> None:
+    async def refresh(self) -> None:
         """Redraw everything after a change of the eye or its state."""
         if self._side not in self._state.sides:
             self._side = self._state.sides[0]
@@ -118,27 +118,29 @@ class FigurePanel:
     async def _ask(
         self, kind: str, function: Callable[..., Any], *args: Any, **options: Any
     ) -> Any:
-        """Ask the worker process; return None if it failed or a newer request came."""
+        """Run a function in the worker.
+
+        Return None if it fails or a newer request supersedes it.
+        """
         try:
-            return await self._studying.ask(
-                self._page, kind, function, *args, **options
-            )
-        except StudyFailed as error:
-            self._told.text = str(error)
+            return await self._worker.ask(self._page, kind, function, *args, **options)
+        except FigureFailed as error:
+            self._message_label.text = str(error)
             return None
 
     def _body(self) -> str | None:
-        body = self._state.looking_body(self._side)
+        body = self._state.profile_at_gaze(self._side)
         return None if body is None else json.dumps(body, sort_keys=True)
 
     async def _show_point(self) -> None:
-        body, place = self._body(), self._state.place(*self._at)
-        if body is None or place is None:
+        body = self._body()
+        scene_point = self._state.scene_point(*self._at)
+        if body is None or scene_point is None:
             return
         values = self._state.values
         point = PointState(
-            direction_deg=place.direction_deg(self._state.picture_gaze_deg),
-            object_dpt=place.distance_dpt,
+            direction_deg=scene_point.direction_deg(self._state.picture_gaze_deg),
+            object_dpt=scene_point.distance_dpt,
             pupil_diameter_mm=values[PUPIL.name],
             focus_dpt=values[FOCUS.name],
         )
@@ -146,19 +148,22 @@ class FigurePanel:
         if answer is None:
             return
         png, facts = answer
-        self._psf.content = f'<img src="{data_url(png)}" alt="Light of the point">'
-        self._told.text = point_words(facts)
+        self._psf.content = (
+            f'<img src="{data_url(png)}" alt="Image of the point of light">'
+        )
+        self._message_label.text = describe_point(facts)
 
     async def smallest_rows(self) -> dict[EyeSide, int | None] | None:
-        """Return the smallest row of the chart that each eye reads, None for no row.
+        """Return the smallest chart row that each eye can read; None if it reads none.
 
-        None if the worker is behind.  An eye whose acuity is unknown is left out.
+        Return None if a request failed or was superseded.  An eye whose acuity is
+        unknown is omitted.
         """
         picture, values = self._state.picture, self._state.values
         rows = [row.log_mar for row in picture.chart_rows] if picture else []
         found: dict[EyeSide, int | None] = {}
         for side in self._state.sides if rows else ():
-            body = self._state.looking_body(side)
+            body = self._state.profile_at_gaze(side)
             if body is None:
                 continue
             log_mar = await self._ask(
@@ -179,33 +184,39 @@ class FigurePanel:
         self._title.content = f"Figures: {SIDES[self._side].lower()}"
         body, values = self._body(), self._state.values
         state = {name: values[name] for name in (PUPIL.name, FOCUS.name)}
-        wanted = (self._figure, body, *(state.values() if self._is_of_state else ()))
-        if body is None or wanted == self._drawn:
+        request = (
+            self._figure,
+            body,
+            *(state.values() if self._depends_on_eye_state else ()),
+        )
+        if body is None or request == self._drawn_request:
             return
         png = await self._ask("figure", eye_figure, self._figure, body, **state)
         if png is not None:
-            self._drawn = wanted
+            self._drawn_request = request
             title = FIGURE_TITLES[self._figure]
             self._image.content = f'<img src="{data_url(png)}" alt="{title}">'
 
     @property
-    def _is_of_state(self) -> bool:
+    def _depends_on_eye_state(self) -> bool:
         return self._figure in ("wavefront", "acuity")
 
 
-def point_words(facts: dict[str, float]) -> str:
-    """Describe a point's position and the width of its light."""
-    across = f"{abs(facts['h_deg']):.1f}° {'right' if facts['h_deg'] >= 0 else 'left'}"
-    along = f"{abs(facts['v_deg']):.1f}° {'up' if facts['v_deg'] >= 0 else 'down'}"
+def describe_point(facts: dict[str, float]) -> str:
+    """Describe a point's position and the width of its image."""
+    h_deg, v_deg = facts["h_deg"], facts["v_deg"]
+    across = f"{abs(h_deg):.1f}° {'right' if h_deg >= 0 else 'left'} of"
+    along = f"{abs(v_deg):.1f}° {'above' if v_deg >= 0 else 'below'}"
     return (
-        f"{across}, {along} of the gaze, at {distance_text(facts['object_dpt'])}. "
-        f"Half of its light lies within {facts['half_light_arcmin']:.1f} arcmin of its "
-        f"center: a spot about as wide as {width_words(facts['half_light_arcmin'])}."
+        f"{across} and {along} the gaze direction, at "
+        f"{distance_text(facts['object_dpt'])}. Half of the point's light lies within "
+        f"{facts['half_light_arcmin']:.1f} arcmin of its center: a spot about as wide "
+        f"as {nearest_familiar_object(facts['half_light_arcmin'])}."
     )
 
 
-def width_words(radius_arcmin: float) -> str:
-    """Return the familiar thing whose width is nearest to a spot's, by ratio."""
+def nearest_familiar_object(radius_arcmin: float) -> str:
+    """Return the familiar object closest in angular size to the spot (by ratio)."""
     diameter_arcmin = 2.0 * radius_arcmin
     return min(
         WIDTHS_ARCMIN.items(),

@@ -1,7 +1,7 @@
 """Worker process for figures and point-spread functions.
 
-Estimating and tracing an eye holds Python's global lock for tenths of a second: in the
-page's own process that would block its event loop and its frames.
+Estimating and tracing an eye holds the GIL for tenths of a second, which in the page's
+own process would block its event loop and its frames.
 """
 
 from __future__ import annotations
@@ -19,24 +19,27 @@ NICENESS = 10
 """Pictures have priority over figures."""
 
 
-class StudyFailed(Exception):
-    """There is no answer; the message says why."""
+class FigureFailed(Exception):
+    """Raised when the function fails or the worker process ends."""
 
 
 class FigureWorker:
-    """One worker process; of waiting requests per kind and page, the newest wins."""
+    """One worker process.
+
+    A newer request of the same page and kind replaces one that is still waiting.
+    """
 
     def __init__(self) -> None:
         self._newest: dict[tuple[str, str], int] = {}
-        self._turn = asyncio.Lock()
+        self._lock = asyncio.Lock()
         self._is_over = False
         self._start()
 
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")
-        self._line, theirs = context.Pipe()
+        self._connection, theirs = context.Pipe()
         # not a daemon: a report starts a worker of its own
-        self._process = context.Process(target=_answer_all, args=(theirs,))
+        self._process = context.Process(target=_serve_requests, args=(theirs,))
         self._process.start()
         theirs.close()
 
@@ -48,36 +51,36 @@ class FigureWorker:
         *args: Any,
         **options: Any,
     ) -> Any:
-        """Return the function's result; None if a newer request came.
+        """Return the function's result; None if a newer request superseded it.
 
         Raises
         ------
-        StudyFailed
-            The function failed, or the process ended.
+        FigureFailed
+            If the function failed or the process ended.
         """
         key = (page, kind)
         number = self._newest.get(key, 0) + 1
         self._newest[key] = number
-        async with self._turn:  # one by one, so that waiting requests can be dropped
+        async with self._lock:  # one at a time, so that waiting requests can be dropped
             if self._newest.get(key) != number:
                 return None
-            return await asyncio.to_thread(self._answer, (function, args, options))
+            return await asyncio.to_thread(self._exchange, (function, args, options))
 
-    def _answer(
-        self, question: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
+    def _exchange(
+        self, request: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
     ) -> Any:
         try:
-            self._line.send(question)
-            answer, failure = self._line.recv()
+            self._connection.send(request)
+            result, error_text = self._connection.recv()
         except (EOFError, OSError):
             if not self._is_over:
                 self._start()
-            raise StudyFailed(
+            raise FigureFailed(
                 "The process that draws figures ended and was restarted"
             ) from None
-        if failure is not None:
-            raise StudyFailed(failure)
-        return answer
+        if error_text is not None:
+            raise FigureFailed(error_text)
+        return result
 
     def forget(self, page: str) -> None:
         """Drop a page's requests."""
@@ -91,20 +94,20 @@ class FigureWorker:
         self._process.join()
 
 
-def _answer_all(line: Connection) -> None:
-    """Handle requests until the page's process is gone."""
+def _serve_requests(connection: Connection) -> None:
+    """Handle requests until the parent process ends."""
     os.nice(NICENESS)
     from clients.web import eye_figures, point_spread  # noqa: F401  (loads slowly)
 
     while True:
         try:
-            function, args, options = line.recv()
-            line.send(_answer_to(function, args, options))
+            function, args, options = connection.recv()
+            connection.send(_call(function, args, options))
         except (EOFError, OSError):
             return
 
 
-def _answer_to(
+def _call(
     function: Callable[..., Any], args: tuple[Any, ...], options: dict[str, Any]
 ) -> tuple[Any, str | None]:
     """Return a result, or an error message, as some exceptions cannot be pickled."""

@@ -1,4 +1,4 @@
-"""Access control: a client needs the token that was printed with the address.
+"""Access control: a client needs the token in the address that the program prints.
 
 An ASGI layer around the whole application, files and websockets alike. The first visit
 with the token in the address sets a cookie and redirects to the address without the
@@ -29,8 +29,8 @@ padding:.1em .35em;border-radius:4px}}</style>
 FORBIDDEN_PAGE = PAGE.format(
     title="This page needs its token",
     text="<p>Open the whole address that <code>ocufilter web</code> printed when it "
-    "started; it ends with <code>?token=...</code>.  After a restart the token is "
-    "another one.</p>",
+    "started; it ends with <code>?token=...</code>.  The token changes with every "
+    "restart.</p>",
 ).encode()
 HEADERS = [
     (b"content-security-policy", b"frame-ancestors 'none'"),
@@ -55,9 +55,9 @@ class Guard:
     token : str
     cookie : str
         Name of the cookie; it should contain the port, which cookies ignore.
-    opening : str, optional
-        A token that works once, for a browser's command line, which other users of the
-        machine can read.
+    one_time_token : str, optional
+        A token that works once.  It goes on the browser's command line, which other
+        users of the machine can read.
     hosts : collection of str, optional
         Host names that requests may be addressed to; any if not given.
     """
@@ -68,12 +68,12 @@ class Guard:
         *,
         token: str,
         cookie: str,
-        opening: str | None = None,
+        one_time_token: str | None = None,
         hosts: Collection[str] | None = None,
     ) -> None:
         self.app = app
         self._token, self._cookie = token, cookie
-        self._opening, self._hosts = opening, hosts
+        self._one_time_token, self._hosts = one_time_token, hosts
 
     async def __call__(self, scope: Any, receive: Any, send: Send) -> None:
         """Handle one connection."""
@@ -81,9 +81,9 @@ class Guard:
         if kind not in ("http", "websocket"):  # lifespan events of the server
             await self.app(scope, receive, send)
         elif not self._is_addressed_to_us(scope):
-            await _refuse(kind, receive, send, 421, page_of("There is no such host"))
+            await _refuse(kind, receive, send, 421, page_of("Unknown host"))
         elif kind == "http" and self._has_token(scope):
-            await self._welcome(send)
+            await self._redirect_with_cookie(send)
         elif self._has_cookie(scope) and is_from_here(scope):
             await self.app(scope, receive, _with_headers(send))
         else:
@@ -101,9 +101,9 @@ class Guard:
         given = parse_qs(query).get("token", [""])[0]
         if _is_same(given, self._token):
             return True
-        if self._opening is None or not _is_same(given, self._opening):
+        if self._one_time_token is None or not _is_same(given, self._one_time_token):
             return False
-        self._opening = None
+        self._one_time_token = None
         return True
 
     def _has_cookie(self, scope: Scope) -> bool:
@@ -115,7 +115,7 @@ class Guard:
             for name, _, value in pairs
         )
 
-    async def _welcome(self, send: Send) -> None:
+    async def _redirect_with_cookie(self, send: Send) -> None:
         # not Strict: after a link on another site, a browser would not send it to the
         # address that it is redirected to
         cookie = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Lax"

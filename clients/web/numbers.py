@@ -1,4 +1,4 @@
-"""Numeric entries with limits; error messages say what is allowed."""
+"""Numeric entries with limits; error messages contain the allowed range."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class NumberField:
     Attributes
     ----------
     name : str
-        As in a profile, with its unit.
+        Profile field, with its unit.
     label, unit : str
         As displayed.
     low, high : float
@@ -58,7 +58,8 @@ class NumberField:
         Raises
         ------
         ValueError
-            Not a number, or out of range: the text and what is allowed.
+            If it is not a number or out of range; the message contains the text and the
+        allowed range.
         """
         shown = text.strip()
         if not shown:
@@ -80,7 +81,7 @@ class NumberField:
         return float(min(max(sent, self.low), self.high))
 
     def problem(self, text: str) -> str | None:
-        """Return the error in a text, or None."""
+        """Return the error message for a text, or None."""
         try:
             self.read(text)
         except ValueError as error:
@@ -104,7 +105,7 @@ class NumberField:
         return f"{text}{'' if self.unit == DEGREE else ' '}{self.unit}"
 
     def stepped(self, text: str, steps: int) -> str:
-        """Return the text changed by some steps, clamped to the range."""
+        """Return the text of the value changed by some steps, within the range."""
         try:
             value = self.read(text)
         except ValueError:
@@ -118,8 +119,8 @@ def distance_text(vergence_dpt: float) -> str:
     if vergence_dpt < 0.005:
         return "0 dpt · far away"
     meters = 1.0 / vergence_dpt
-    told = f"{100 * meters:.0f} cm" if meters < 1.0 else f"{meters:.1f} m"
-    return f"{vergence_dpt:.2f} dpt · {told}"
+    distance = f"{100 * meters:.0f} cm" if meters < 1.0 else f"{meters:.1f} m"
+    return f"{vergence_dpt:.2f} dpt · {distance}"
 
 
 def prescription_texts(text: str) -> tuple[str, str, str] | None:

@@ -19,14 +19,14 @@ from clients.web.figure_worker import FigureWorker
 from clients.web.filter_thread import FilterThread
 from clients.web.numbers import NumberField, distance_text
 from clients.web.page_link import PageLink
-from clients.web.page_state import AGE, DISTANCE, FOCUS, LOOKS, PUPIL, PageState
+from clients.web.page_state import AGE, CONDITIONS, DISTANCE, FOCUS, PUPIL, PageState
 from clients.web.picture import Picture
 from clients.web.picture_files import png_of
 from clients.web.picture_requests import SentPicture
 from clients.web.picture_sender import PictureSender
 from clients.web.picture_view import PictureView
 from clients.web.scene_file import SceneNotRendered, scene_picture
-from clients.web.scene_panel import FIRST, ScenePanel
+from clients.web.scene_panel import DEFAULT_SCENE, ScenePanel
 from clients.web.shared_entries import SCENES, restore
 from clients.web.slider_row import SliderRow
 
@@ -36,15 +36,15 @@ if TYPE_CHECKING:
 
 STYLE = (Path(__file__).parent / "style.css").read_text(encoding="utf-8")
 SHOWN = {"OD": "Right eye", "OS": "Left eye", "both": "Both"}
-FIGURES_REST_S = 0.35
-"""Time after the last change until figures are redrawn."""
+FIGURES_DELAY_S = 0.35
+"""Delay after the last change before figures are redrawn."""
 
-FIRST_ASPECT = 960 / 540
-STATUS_REST_S = 0.3
-"""Time after which an eye that is being prepared is announced: most are quicker."""
+DEFAULT_ASPECT = 960 / 540
+STATUS_DELAY_S = 0.3
+"""Delay before the preparation of an eye is announced; most eyes are ready sooner."""
 
-FIRST_S = 1.5
-"""Longest time that a page waits for its first scene before it opens without one."""
+SCENE_WAIT_S = 1.5
+"""Maximum time that a page waits for the default scene before it opens without one."""
 
 CONNECT_S = 30.0
 
@@ -65,7 +65,7 @@ class SharedResources:
     def __init__(self) -> None:
         self.filter_thread = FilterThread()
         self.figure_worker = FigureWorker()
-        self.out: dict[str, PictureSender] = {}
+        self.picture_senders: dict[str, PictureSender] = {}
 
     def close(self) -> None:
         """Stop the thread and the process; closing twice is allowed."""
@@ -90,20 +90,20 @@ class Page:
         self.state = PageState()
         if profile is not None:
             self._set_profile(*profile)
-        self.out = resources.out[self.name] = PictureSender()
+        self.sender = resources.picture_senders[self.name] = PictureSender()
         self._loop = asyncio.get_running_loop()
-        self._renewal: asyncio.Task[None] | None = None
-        self._announcing: asyncio.Task[None] | None = None
+        self._figure_refresh: asyncio.Task[None] | None = None
+        self._announcement: asyncio.Task[None] | None = None
         self._ready: dict[EyeSide, asyncio.Event] = {s: asyncio.Event() for s in SIDES}
-        self._empty = ""
+        self._empty_reason = ""
         resources.filter_thread.open(self.name, self._from_thread)
         self.downloads = Downloads(
             self.name,
             self.state,
-            self.out,
+            self.sender,
             resources.figure_worker,
             ready=self._ready,
-            no_scene=lambda: self._empty,
+            empty_reason=lambda: self._empty_reason,
         )
         self._build()
         self.link = PageLink(
@@ -111,37 +111,37 @@ class Page:
             token,
             scene=lambda: self.scene.kind,
             on_fragment=self._restore,
-            place=self.view,
+            element=self.view,
         )
 
     def _set_profile(self, body: Mapping[str, Any], name: str) -> None:
         for form in self.state.eyes.values():
-            form.take_body(body, name)
+            form.load_body(body, name)
         self.state.values[AGE.name] = body.get(AGE.name, self.state.values[AGE.name])
 
-    def show_first(self, picture: asyncio.Future[Picture]) -> None:
-        """Show the first scene, or why it cannot be rendered."""
+    def show_default_scene(self, picture: asyncio.Future[Picture]) -> None:
+        """Show the default scene, or the reason that it cannot be rendered."""
         try:
             self._set_picture(picture.result())
         except SceneNotRendered as error:
-            self._said.text = str(error)
+            self._scene_problem.text = str(error)
 
     async def start(self) -> None:
-        """Set the entries of the address's fragment; the browser must be connected."""
+        """Restore the entries from the address; the browser must be connected."""
         fragment = await self.link.read()
         if fragment:
             self._restore(fragment)
         else:
-            self.link.renew()
+            self.link.schedule_update()
 
     def _restore(self, fragment: str) -> None:
-        """Set the entries from a fragment of the address."""
+        """Restore the entries from a fragment of the address."""
         found = restore(self.state, fragment)
         self._show_entries()
-        self._said.text = " ".join(found.problems)
+        self._scene_problem.text = " ".join(found.problems)
         scene = found.scene if found.scene in SCENES else None
-        # a photo is in no link: it stays where the link names no other scene
-        if scene == FIRST and self.scene.kind not in SCENES:
+        # links never contain a photo: keep it unless the link selects another scene
+        if scene == DEFAULT_SCENE and self.scene.kind not in SCENES:
             scene = None
         if scene is not None and scene != self.scene.kind:
             self.scene.choose(scene)
@@ -189,10 +189,10 @@ class Page:
             .props("aria-label=Picture")
         ):
             self.scene = ScenePanel(
-                self.state, self._set_picture, self._set_empty, FIRST
+                self.state, self._set_picture, self._set_empty, DEFAULT_SCENE
             )
             self.view = PictureView(
-                PICTURES_PATH + self.name, list(self.state.sides), FIRST_ASPECT
+                PICTURES_PATH + self.name, list(self.state.sides), DEFAULT_ASPECT
             )
             self.view.on("point", self._point)
             self.view.on("look", self._focus)
@@ -200,7 +200,7 @@ class Page:
                 ui.label("").classes("oc-status").props("role=status aria-live=polite")
             )
             self._note = ui.label("").classes("oc-note").props("aria-live=polite")
-            self._said = ui.label("").classes("oc-problem").props("role=alert")
+            self._scene_problem = ui.label("").classes("oc-problem").props("role=alert")
             self._notes: dict[EyeSide, str] = {}
 
     def _sliders_card(self) -> None:
@@ -209,7 +209,7 @@ class Page:
             .classes("oc-card oc-sliders")
             .props('aria-label="Viewing conditions"')
         ):
-            for number in LOOKS:
+            for number in CONDITIONS:
                 if number is not AGE:
                     self._slider(number)
             with (
@@ -227,7 +227,7 @@ class Page:
             number,
             self.state.values[name],
             lambda value: self._slide(name, value),
-            words=distance_text if number in (FOCUS, DISTANCE) else None,
+            format_value=distance_text if number in (FOCUS, DISTANCE) else None,
         )
 
     def _eyes_card(self) -> None:
@@ -235,7 +235,7 @@ class Page:
             with ui.element("div").classes("oc-line"):
                 ui.html("The eye", tag="h2", sanitize=False).classes("oc-title")
                 self._copy = ui.button(
-                    "copy to the other", on_click=self._copy_eye
+                    "Copy to the other eye", on_click=self._copy_eye
                 ).props("flat dense no-caps size=sm")
             self._shown = (
                 ui.toggle(SHOWN, value=self.state.shown, on_change=self._show)
@@ -264,36 +264,36 @@ class Page:
         """Request a picture for the current entries; report invalid entries."""
         request = self.state.request()
         problems = self.state.problems()
-        if problems and self.state.right:
+        if problems and self.state.valid_profiles:
             problems.append("The pictures show the last valid entries.")
         self._problem.text = "\n".join(problems)
         if request is None:
             return
         self._prepare()
-        self.link.renew()
+        self.link.schedule_update()
         self.resources.filter_thread.request(self.name, request)
-        if self._renewal is not None:
-            self._renewal.cancel()
-        self._renewal = asyncio.create_task(self._renew_figures())
+        if self._figure_refresh is not None:
+            self._figure_refresh.cancel()
+        self._figure_refresh = asyncio.create_task(self._refresh_figures())
 
     def _prepare(self) -> None:
-        """Note that the eyes shown are being prepared; announce it if it takes time."""
+        """Mark the eyes shown as being prepared; announce it after a delay."""
         for side in self.state.sides:
             self._ready[side].clear()
         titles = " and ".join(SIDES[s].lower() for s in self.state.sides)
         alts = {side: self._alt(side) for side in self.state.sides}
         self.view.describe(alts)
-        if self._announcing is not None:
-            self._announcing.cancel()
-        self._announcing = asyncio.create_task(
+        if self._announcement is not None:
+            self._announcement.cancel()
+        self._announcement = asyncio.create_task(
             self._announce(
-                f"Preparing the {titles}: estimating it and computing its "
-                "point-spread functions …"
+                f"Preparing the {titles}: estimating the eye model and computing "
+                "point-spread functions…"
             )
         )
 
     async def _announce(self, text: str) -> None:
-        await asyncio.sleep(STATUS_REST_S)
+        await asyncio.sleep(STATUS_DELAY_S)
         self._status.text = text
 
     def _alt(self, side: EyeSide) -> str:
@@ -306,14 +306,14 @@ class Page:
             f"{distance_text(values[FOCUS.name])}"
         )
 
-    async def _renew_figures(self) -> None:
-        await asyncio.sleep(FIGURES_REST_S)
-        self._renewal = None  # from here on it is not canceled: newer ones wait
+    async def _refresh_figures(self) -> None:
+        await asyncio.sleep(FIGURES_DELAY_S)
+        self._figure_refresh = None  # not canceled from here on: newer refreshes wait
         await self._mark_rows()
-        await self.figures.renew()
+        await self.figures.refresh()
 
     async def _mark_rows(self) -> None:
-        """Label the rows of a chart, and the smallest one that each eye reads."""
+        """Label the rows of a chart; mark the smallest one that each eye can read."""
         picture = self.state.picture
         rows = picture.chart_rows if picture is not None else ()
         read = await self.figures.smallest_rows() if rows else {}
@@ -336,26 +336,27 @@ class Page:
         self.request()
 
     async def _take_file(self, side: EyeSide, name: str, content: bytes) -> None:
-        taken = self.state.take_file(side, name, content)
+        loaded_side = self.state.load_file(side, name, content)
         self.rows[AGE.name].show(self.state.values[AGE.name])
         for panel in self.panels.values():
             panel.show()
-        if taken == side:
+        if loaded_side == side:
             self.request()
             return
         ui.notify(
-            f"{name} is a profile of the {SIDES[taken].lower()} and was loaded there",
+            f"{name} is a profile of the {SIDES[loaded_side].lower()} and "
+            "was loaded there",
             position="top",
             timeout=6000,
         )
         if self.state.shown == "both":
             self.request()
         else:
-            self._shown.value = taken  # requests it
+            self._shown.value = loaded_side  # requests it
 
     def _set_empty(self, text: str) -> None:
         """Show a text in place of the picture."""
-        self._empty = text
+        self._empty_reason = text
         self.view.show_empty(text)
         self._status.set_visibility(not text)
         self._note.set_visibility(not text)
@@ -371,7 +372,7 @@ class Page:
         self.view.show_scene(picture.title, picture.aspect_ratio)
         self.view.mark_rows(marks_of(picture.chart_rows, {}), {})
         number = self.state.number + 1
-        self.out.put(
+        self.sender.put(
             SentPicture(
                 "scene",
                 None,
@@ -406,10 +407,10 @@ class Page:
 
     async def _point(self, event: events.GenericEventArguments) -> None:
         if event.args["eye"] in SIDES:
-            await self.figures.point(event.args["eye"], *_share(event))
+            await self.figures.point(event.args["eye"], *_position(event))
 
     def _focus(self, event: events.GenericEventArguments) -> None:
-        self.state.look_at(*_share(event))
+        self.state.look_at(*_position(event))
         self.rows[FOCUS.name].show(self.state.values[FOCUS.name])
         self.request()
 
@@ -419,25 +420,25 @@ class Page:
         self._loop.call_soon_threadsafe(self._show_picture, seen)
 
     def _show_picture(self, seen: SentPicture) -> None:
-        self.out.put(seen)
+        self.sender.put(seen)
         if seen.kind in ("full", "failed"):
             assert seen.eye is not None
             notes = seen.facts.get("notes") or [seen.facts.get("error", "")]
-            told = [_sentence(note) for note in notes if note]
-            if any("accommodation stops" in note for note in told):
-                told.append(AMPLITUDE)
-            self._notes[seen.eye] = " ".join(told)
+            sentences = [_sentence(note) for note in notes if note]
+            if any("accommodation stops" in note for note in sentences):
+                sentences.append(AMPLITUDE)
+            self._notes[seen.eye] = " ".join(sentences)
             self._show_notes()
             if seen.number == self.state.number:
                 self._finish(seen.eye, is_full=seen.kind == "full")
 
     def _finish(self, side: EyeSide, *, is_full: bool) -> None:
-        """Note that an eye's full picture is shown, or could not be made."""
+        """Record that an eye's full picture is shown or has failed."""
         self._ready[side].set()
         if not all(self._ready[s].is_set() for s in self.state.sides):
             return
-        if self._announcing is not None:
-            self._announcing.cancel()
+        if self._announcement is not None:
+            self._announcement.cancel()
         titles = " and ".join(SIDES[s].lower() for s in self.state.sides).capitalize()
         self._status.text = f"{titles}: " + (
             "full picture." if is_full else "no picture."
@@ -448,21 +449,21 @@ class Page:
         if len(lines) == 1:
             self._note.text = lines[0][1] or ""
         else:
-            told = [f"{title}: {text}" for title, text in lines if text]
-            self._note.text = "\n".join(told)
+            notes = [f"{title}: {text}" for title, text in lines if text]
+            self._note.text = "\n".join(notes)
 
     def close(self) -> None:
         """Release the page's resources."""
         self.link.close()
-        for task in (self._renewal, self._announcing):
+        for task in (self._figure_refresh, self._announcement):
             if task is not None:
                 task.cancel()
         self.resources.filter_thread.forget(self.name)
         self.resources.figure_worker.forget(self.name)
-        self.resources.out.pop(self.name, None)
+        self.resources.picture_senders.pop(self.name, None)
 
 
-def _share(event: events.GenericEventArguments) -> tuple[float, float]:
+def _position(event: events.GenericEventArguments) -> tuple[float, float]:
     """Return a position in the picture, clamped to 0, 0 to 1, 1."""
     x, y = (min(max(float(event.args[name]), 0.0), 1.0) for name in "xy")
     return x, y
@@ -479,13 +480,13 @@ def add_page(
 
     @ui.page("/", title="ocufilter")
     async def _page(client: Client) -> None:
-        # rendered while the server started, so that the page usually opens with it
-        first = asyncio.ensure_future(run.io_bound(scene_picture, FIRST))
-        await asyncio.wait({first}, timeout=FIRST_S)
+        # usually available already, because it is rendered when the server starts
+        first = asyncio.ensure_future(run.io_bound(scene_picture, DEFAULT_SCENE))
+        await asyncio.wait({first}, timeout=SCENE_WAIT_S)
         page = Page(resources, profile, token)
         client.on_delete(page.close)
         if first.done():
-            page.show_first(first)
+            page.show_default_scene(first)
         try:
             await client.connected(timeout=CONNECT_S)
         except TimeoutError:  # the browser has left
@@ -493,7 +494,7 @@ def add_page(
         with client:
             if not first.done():
                 await asyncio.wait({first})
-                page.show_first(first)
+                page.show_default_scene(first)
             await page.start()
 
     app.on_shutdown(resources.close)

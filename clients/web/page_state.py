@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from clients.web.correction_form import looking, reading_gaze_deg
+from clients.web.correction_form import profile_for_gaze, reading_gaze_deg
 from clients.web.eye_form import SIDES, EyeForm, EyeSide, NoFile, read_profile_file
 from clients.web.numbers import NumberField
-from clients.web.picture import Picture, Place
+from clients.web.picture import Picture, ScenePoint
 from clients.web.picture_requests import PictureRequest
 
 Shown = Literal["OD", "OS", "both"]
@@ -21,12 +21,12 @@ DISTANCE = NumberField("distance_dpt", "Distance", "dpt", 0.0, 6.0, 0.05)
 GAZE_H = NumberField("gaze_h_deg", "Gaze, right", "°", -20.0, 20.0, 1.0, digits=0)
 GAZE_V = NumberField("gaze_v_deg", "Gaze, up", "°", -45.0, 30.0, 1.0, digits=0)
 AGE = NumberField("age_years", "Age", "years", 5.0, 90.0, 1.0, digits=0)
-LOOKS = (PUPIL, FOCUS, DISTANCE, AGE, GAZE_H, GAZE_V)
-"""In the order of the page."""
+CONDITIONS = (PUPIL, FOCUS, DISTANCE, AGE, GAZE_H, GAZE_V)
+"""Viewing conditions, in the order of the page."""
 
 READING_DPT = 2.5
 READING_GAZE_DEG = -30.0
-"""Of an eye without a progressive lens."""
+"""Vertical gaze for reading without a progressive lens."""
 
 
 def first_values() -> dict[str, float]:
@@ -48,9 +48,9 @@ class PageState:
     Attributes
     ----------
     picture : the scene; None until one is ready
-    right : the last valid profile of each eye
+    valid_profiles : the last valid profile of each eye
     shown : which eye, or both
-    is_focus_set : whether the focus stays when the distance changes
+    is_focus_set : whether the user set the focus, so that it ignores the distance
     """
 
     eyes: dict[EyeSide, EyeForm] = field(
@@ -61,7 +61,7 @@ class PageState:
     picture: Picture | None = None
     shown: Shown = "OD"
     number: int = 0
-    right: dict[EyeSide, Mapping[str, Any]] = field(default_factory=dict)
+    valid_profiles: dict[EyeSide, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
     def sides(self) -> tuple[EyeSide, ...]:
@@ -85,7 +85,7 @@ class PageState:
             try:
                 self.body(side)
             except NoFile:
-                continue  # nobody erred: the upload says what is allowed
+                continue  # not an error: the upload shows what is allowed
             except ValueError as error:
                 found.append(f"{SIDES[side]}: {error}")
         return found
@@ -101,13 +101,13 @@ class PageState:
         follows = self.picture is not None and self.picture.follows_gaze
         return (0.0, 0.0) if follows else self.gaze_deg
 
-    def looking_body(self, side: EyeSide) -> dict[str, Any] | None:
-        """Return an eye's last valid profile, with the correction at the gaze."""
-        body = self.right.get(side)
-        return None if body is None else looking(body, self.gaze_deg)
+    def profile_at_gaze(self, side: EyeSide) -> dict[str, Any] | None:
+        """Return an eye's last valid profile, with its correction at the gaze."""
+        body = self.valid_profiles.get(side)
+        return None if body is None else profile_for_gaze(body, self.gaze_deg)
 
     def set_picture(self, picture: Picture) -> None:
-        """Set the picture; the first one also sets the state that it suggests."""
+        """Set the picture; the first one also sets its initial focus and pupil."""
         if self.picture is None:
             for number, value in (
                 (FOCUS, picture.focus_dpt),
@@ -129,7 +129,7 @@ class PageState:
     def move(self, name: str, value: float) -> None:
         """Set a viewing condition.
 
-        The focus follows the distance of a flat picture until it is set itself.
+        The focus follows the distance of a flat picture until the user sets it.
         """
         self.values[name] = value
         if name == FOCUS.name:
@@ -139,7 +139,7 @@ class PageState:
 
     def look(self, *, is_reading: bool) -> None:
         """Look straight ahead and far, or down at a reading distance."""
-        bodies = (self.right.get(side, {}) for side in self.sides)
+        bodies = (self.valid_profiles.get(side, {}) for side in self.sides)
         turns_deg = [turn for body in bodies if (turn := reading_gaze_deg(body))]
         gaze_deg = max(min([*turns_deg, 0.0]) or READING_GAZE_DEG, GAZE_V.low)
         distance_dpt = READING_DPT if is_reading else 0.0
@@ -151,12 +151,12 @@ class PageState:
         }
         self.is_focus_set = False
 
-    def take_file(self, side: EyeSide, name: str, content: bytes) -> EyeSide:
-        """Read a profile file into the eye that it names, by default into `side`.
+    def load_file(self, side: EyeSide, name: str, content: bytes) -> EyeSide:
+        """Load a profile file into the eye that it names, by default into `side`.
 
         Returns
         -------
-        The eye that has it.
+        The eye that was loaded.
 
         Raises
         ------
@@ -164,12 +164,12 @@ class PageState:
             Not a profile; nothing has changed.
         """
         body = read_profile_file(name, content)
-        taken: EyeSide = body.get("eye_side", side)
-        self.eyes[taken].take_body(body, Path(name).name)
-        if taken != side and self.eyes[side].file_body is None:
+        loaded_side: EyeSide = body.get("eye_side", side)
+        self.eyes[loaded_side].load_body(body, Path(name).name)
+        if loaded_side != side and self.eyes[side].file_body is None:
             self.eyes[side].source = "prescription"
         self.values[AGE.name] = body.get(AGE.name, self.values[AGE.name])
-        return taken
+        return loaded_side
 
     def reset(self) -> None:
         """Set the initial entries; picture and uploaded files stay available."""
@@ -185,15 +185,21 @@ class PageState:
         """
         for side in self.sides:
             try:
-                self.right[side] = self.body(side)
+                self.valid_profiles[side] = self.body(side)
             except ValueError:
                 continue
-        bodies = {side: self.right[side] for side in self.sides if side in self.right}
+        bodies = {
+            side: self.valid_profiles[side]
+            for side in self.sides
+            if side in self.valid_profiles
+        }
         if self.picture is None or not bodies:
             return None
         self.picture = self.picture.at(self.values[DISTANCE.name])
         if self.picture.follows_gaze:
-            bodies = {s: looking(body, self.gaze_deg) for s, body in bodies.items()}
+            bodies = {
+                s: profile_for_gaze(body, self.gaze_deg) for s, body in bodies.items()
+            }
         self.number += 1
         return PictureRequest(
             number=self.number,
@@ -204,13 +210,13 @@ class PageState:
             gaze_deg=self.picture_gaze_deg,
         )
 
-    def place(self, x: float, y: float) -> Place | None:
-        """Return the place at a position in the picture."""
-        return None if self.picture is None else self.picture.place(x, y)
+    def scene_point(self, x: float, y: float) -> ScenePoint | None:
+        """Return the scene point at a position in the picture."""
+        return None if self.picture is None else self.picture.scene_point(x, y)
 
     def look_at(self, x: float, y: float) -> None:
-        """Focus on the place at a position in the picture."""
-        place = self.place(x, y)
-        if place is not None:
-            focus_dpt = round(place.distance_dpt, FOCUS.digits)
+        """Focus on the scene point at a position in the picture."""
+        point = self.scene_point(x, y)
+        if point is not None:
+            focus_dpt = round(point.distance_dpt, FOCUS.digits)
             self.move(FOCUS.name, min(focus_dpt, FOCUS.high))

@@ -18,19 +18,19 @@ from filter_service.bounded_images import read_picture_rgb
 from filter_service.image_files import read_depth
 
 MAX_WIDTH_PX, MAX_HEIGHT_PX = 960, 720
-"""Size of the full picture; larger ones are reduced."""
+"""Size limit of the full picture; larger pictures are reduced."""
 
 SMALL_WIDTH_PX = 480
 """Maximum width of a preview."""
 
-LEAST_SIDE_PX = 16
+MIN_SIDE_PX = 16
 MAX_SIDE_RATIO = 100
-"""Ratio of the longer side to the shorter; beyond it nothing is left in a preview."""
+"""Maximum ratio of the longer side to the shorter; a preview of more has no rows."""
 
 MAX_PHOTO_BYTES = 60_000_000
 PHOTO_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
-"""By content, not by name: other formats run programs (EPS) or have rarely used
-readers."""
+"""Checked by content, not by name.  Other formats run programs (EPS) or have rarely
+used decoders."""
 
 DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff", ".exr")
 FAR_DPT = 0.0
@@ -51,13 +51,13 @@ class Picture:
 
     Attributes
     ----------
-    title : as shown
+    title : as displayed
     view : at full size
-    small : the same with fewer pixels
+    small : reduced size for previews
     distance_dpt : distance of a flat picture; None if it has its own depth
     focus_dpt, pupil_diameter_mm : an initial state, or None
     chart_rows : the rows of a chart, from the top
-    follows_gaze : whether its center is always on the line of sight
+    follows_gaze : whether its center stays on the line of sight
     """
 
     title: str
@@ -85,8 +85,8 @@ class Picture:
             distance_dpt=distance_dpt,
         )
 
-    def place(self, x: float, y: float) -> Place:
-        """Return the place at a position, from 0, 0 at the top left to 1, 1."""
+    def scene_point(self, x: float, y: float) -> ScenePoint:
+        """Return the point at a position, from (0, 0) at the top left to (1, 1)."""
         view = self.view
         column = min(int(x * view.width_px), view.width_px - 1)
         row = min(int(y * view.height_px), view.height_px - 1)
@@ -96,12 +96,12 @@ class Picture:
         if view.depth_kind == "planar":
             depth_m *= math.sqrt(1.0 + tangents[0] ** 2 + tangents[1] ** 2)
         is_known = depth_m > 0.0 and not math.isinf(depth_m)
-        return Place(tangents, 1.0 / depth_m if is_known else FAR_DPT)
+        return ScenePoint(tangents, 1.0 / depth_m if is_known else FAR_DPT)
 
 
 @dataclass(frozen=True)
-class Place:
-    """A place in a picture: its direction and its distance."""
+class ScenePoint:
+    """A point of the scene: its direction and its distance."""
 
     tangents: tuple[float, float]
     distance_dpt: float
@@ -202,7 +202,7 @@ def photo_picture(
     Raises
     ------
     InvalidFile
-        A file is not a picture, or the depth has another shape.
+        If a file is not a picture, or the depth has another shape.
     """
     color = _photo_color(name, content)
     height_px, width_px = color.shape[:2]
@@ -238,7 +238,7 @@ def _resized(
 
 
 def _photo_color(name: str, content: bytes) -> NDArray[np.uint8]:
-    allowed = "a JPEG, PNG, WebP or TIFF picture of 8 bits"
+    allowed = "an 8-bit JPEG, PNG, WebP or TIFF picture"
     _check_size(name, content)
     try:
         color = read_picture_rgb(content, name=name[:60], formats=PHOTO_FORMATS)
@@ -247,9 +247,9 @@ def _photo_color(name: str, content: bytes) -> NDArray[np.uint8]:
             raise InvalidFile(name[:60], "not a picture", allowed) from None
         raise
     shorter, longer = sorted(color.shape[:2])
-    if shorter < LEAST_SIDE_PX or longer > MAX_SIDE_RATIO * shorter:
+    if shorter < MIN_SIDE_PX or longer > MAX_SIDE_RATIO * shorter:
         size = f"{color.shape[1]} × {color.shape[0]} px"
-        allowed = f"{LEAST_SIDE_PX} or more, and at most {MAX_SIDE_RATIO} to 1"
+        allowed = f"{MIN_SIDE_PX} or more, and at most {MAX_SIDE_RATIO} to 1"
         raise InvalidFile(name[:60], size, allowed)
     return color
 
@@ -261,7 +261,7 @@ def _photo_depth(
     suffix = Path(name).suffix.lower()
     if suffix not in DEPTH_SUFFIXES:
         allowed = ", ".join(DEPTH_SUFFIXES)
-        raise ValueError(f"“{name:.60}” is not depth; allowed: {allowed}")
+        raise ValueError(f"“{name:.60}” is not a depth file; allowed: {allowed}")
     with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
         path = Path(folder) / f"depth{suffix}"
         path.write_bytes(content)

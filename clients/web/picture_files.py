@@ -10,7 +10,7 @@ from PIL import Image
 
 PREVIEW_QUALITY = 92
 PNG_LEVEL = 1
-"""Of nine: the fastest, as the file is not sent far."""
+"""Fastest compression level; the file usually stays on this machine."""
 
 
 def png_of(color: NDArray[np.uint8], *, level: int = PNG_LEVEL) -> bytes:

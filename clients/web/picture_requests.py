@@ -51,8 +51,8 @@ class SentPicture:
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def place(self) -> str:
-        """Return where it is shown; a newer picture replaces an older one there."""
+    def slot(self) -> str:
+        """Return the eye or layer that shows it; one picture is shown in each."""
         return self.eye or self.kind
 
     def packed(self) -> bytes:

@@ -1,4 +1,4 @@
-"""Send pictures to a browser over a websocket, the newest of each place."""
+"""Send the newest picture of each slot to a browser over a websocket."""
 
 from __future__ import annotations
 
@@ -11,48 +11,50 @@ from clients.web.picture_requests import SentPicture
 
 
 class PictureSender:
-    """Pictures of one page waiting to be sent; for the event loop's thread.
+    """Queue of the pictures of one page; use it on the event loop's thread.
 
-    A newer picture replaces a waiting one of the same place, so that a slow connection
-    is late by one picture and not by many.
+    A newer picture replaces a queued one of the same slot, so that a slow connection
+    lags by one picture at most.
     """
 
     def __init__(self) -> None:
-        self._waiting: dict[str, SentPicture] = {}
+        self._queued: dict[str, SentPicture] = {}
         self._last: dict[str, SentPicture] = {}
-        self._came = asyncio.Event()
+        self._new_picture = asyncio.Event()
 
     def put(self, seen: SentPicture) -> None:
         """Queue a picture."""
-        self._waiting[seen.place] = self._last[seen.place] = seen
-        self._came.set()
+        self._queued[seen.slot] = self._last[seen.slot] = seen
+        self._new_picture.set()
 
-    def last(self, place: str) -> SentPicture | None:
-        """Return the picture last shown at a place."""
-        return self._last.get(place)
+    def last(self, slot: str) -> SentPicture | None:
+        """Return the last picture of a slot."""
+        return self._last.get(slot)
 
     async def serve(self, socket: WebSocket) -> None:
         """Send pictures until the client disconnects; resend all after a reconnect."""
         await socket.accept()
-        self._waiting = dict(self._last)
-        self._came.set()
-        gone = asyncio.ensure_future(_gone(socket))
+        self._queued = dict(self._last)
+        self._new_picture.set()
+        disconnected = asyncio.ensure_future(_wait_for_disconnect(socket))
         try:
-            while not gone.done():
-                came = asyncio.ensure_future(self._came.wait())
-                await asyncio.wait({came, gone}, return_when=asyncio.FIRST_COMPLETED)
-                came.cancel()
-                self._came.clear()
-                while self._waiting and not gone.done():
-                    place = next(iter(self._waiting))
-                    await socket.send_bytes(self._waiting.pop(place).packed())
+            while not disconnected.done():
+                new_picture = asyncio.ensure_future(self._new_picture.wait())
+                await asyncio.wait(
+                    {new_picture, disconnected}, return_when=asyncio.FIRST_COMPLETED
+                )
+                new_picture.cancel()
+                self._new_picture.clear()
+                while self._queued and not disconnected.done():
+                    slot = next(iter(self._queued))
+                    await socket.send_bytes(self._queued.pop(slot).packed())
         except WebSocketDisconnect:
-            pass  # it disconnected during a send
+            pass  # the client disconnected during a send
         except RuntimeError:
-            if _is_open(socket) and not gone.done():
+            if _is_open(socket) and not disconnected.done():
                 raise  # any other error is ours
         finally:
-            gone.cancel()
+            disconnected.cancel()
 
 
 def _is_open(socket: WebSocket) -> bool:
@@ -60,7 +62,7 @@ def _is_open(socket: WebSocket) -> bool:
     return all(state is WebSocketState.CONNECTED for state in states)
 
 
-async def _gone(socket: WebSocket) -> None:
+async def _wait_for_disconnect(socket: WebSocket) -> None:
     """Wait until the client disconnects; it sends nothing else."""
     while (await socket.receive())["type"] != "websocket.disconnect":
         pass

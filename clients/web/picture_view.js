@@ -1,15 +1,15 @@
-// The pictures: the scene on the left of a split that is dragged, the eye's on the right.
+// The scene and the filtered picture, left and right of a draggable split.
 //
-// They come over a websocket of their own, as bytes: a JSON header and a picture's file.
-// Drawn is what came last; `window.ocufilter.drawn` says what was drawn, and when.
+// Pictures arrive over a separate websocket as a JSON header and an encoded image.  Only
+// the newest is drawn; `window.ocufilter.drawn` lists what was drawn, and when.
 const LABELS = { OD: "Right eye", OS: "Left eye" };
 const SPLIT_STEPS = { ArrowLeft: -2, ArrowDown: -2, ArrowRight: 2, ArrowUp: 2,
   PageDown: -20, PageUp: 20, Home: -100, End: 100 }; // percent
-const POINT_MS = 90; // between two reports of where the pointer is
+const POINT_MS = 90; // between two reports of the pointer position
 const RECONNECT_MS = 1000;
 const LINE_PX = 16; // height of a label beside a row of the chart
 const LABELS_EM = 7; // width of the labels, in their own font size
-const LEAST_LINE_PX = 11; // below it labels cannot be read: the caption remains
+const LEAST_LINE_PX = 11; // smaller labels are illegible; only the caption is shown
 
 export default {
   template: `
@@ -81,14 +81,14 @@ export default {
     line() {
       return Math.min(LINE_PX, this.height / (this.marks.length + 1));
     },
-    labelsStart() { // px from the left, short of the labels
+    labelsStart() { // px from the left to the labels
       return Math.max(0, this.width - LABELS_EM * 0.75 * this.line - 4);
     },
     labels() {
-      // beside their rows; where rows are closer than lines, moved up or down
+      // beside their rows; moved up or down where rows are closer than lines
       if (this.isEmpty || this.line < LEAST_LINE_PX) return [];
       const tops = [];
-      let next = this.line; // below the heads
+      let next = this.line; // below the headings
       for (const mark of this.marks) {
         tops.push(Math.max(mark.y * this.height - this.line / 2, next));
         next = tops.at(-1) + this.line;
@@ -102,7 +102,7 @@ export default {
     },
   },
   created() {
-    this.latest = {}; // the newest message of each place, for canvases that come later
+    this.latest = {}; // the newest message of each slot, for canvases created later
     this.queue = Promise.resolve();
     window.ocufilter = { drawn: [], split: () => this.split };
   },
@@ -132,7 +132,7 @@ export default {
     },
     state(eye) {
       if (this.empty) return { kind: "wait", text: this.empty };
-      const waiting = this.hasScene ? "preparing …" : "rendering the scene …";
+      const waiting = this.hasScene ? "Preparing…" : "Rendering the scene…";
       return this.states[eye] ?? { kind: "wait", text: waiting };
     },
     connect() {
@@ -157,14 +157,14 @@ export default {
     },
     async draw(message) {
       const { header, data } = message;
-      const place = header.eye ?? "scene";
-      if (this.latest[place] !== message) return; // a newer one has come meanwhile
+      const slot = header.eye ?? "scene";
+      if (this.latest[slot] !== message) return; // a newer one has arrived
       if (header.kind === "failed") {
-        this.states[place] = { kind: "failed", text: header.error };
+        this.states[slot] = { kind: "failed", text: header.error };
         return;
       }
       const bitmap = await createImageBitmap(new Blob([data]));
-      if (this.latest[place] !== message) return bitmap.close();
+      if (this.latest[slot] !== message) return bitmap.close();
       const eyes = header.eye ? [header.eye] : this.eyes;
       for (const eye of eyes) {
         const canvas = this.$refs[(header.eye ? "after" : "before") + eye]?.[0];
@@ -178,14 +178,14 @@ export default {
         this.hasScene = true;
         return this.clear();
       }
-      const text = header.kind === "full" ? `full picture · ${header.width_px} × ${header.height_px}` : "preview";
-      this.states[place] = { kind: header.kind, text };
+      const text = header.kind === "full" ? `Full picture · ${header.width_px} × ${header.height_px}` : "Preview";
+      this.states[slot] = { kind: header.kind, text };
       const drawn = window.ocufilter.drawn;
       drawn.push({ ...header, at_ms: performance.now() });
       if (drawn.length > 500) drawn.shift();
     },
     clear() {
-      // what the eye saw of another scene is no longer shown
+      // remove filtered pictures of the previous scene
       for (const eye of this.eyes) {
         const message = this.latest[eye];
         if (message && message.header.number >= this.latest.scene.header.number) continue;
@@ -195,16 +195,16 @@ export default {
         delete this.states[eye];
       }
     },
-    where(event) {
+    position(event) {
       const box = event.currentTarget.getBoundingClientRect();
-      const part = (value) => Math.min(Math.max(value, 0), 1);
+      const clamp = (value) => Math.min(Math.max(value, 0), 1);
       return {
-        x: part((event.clientX - box.left) / box.width),
-        y: part((event.clientY - box.top) / box.height),
+        x: clamp((event.clientX - box.left) / box.width),
+        y: clamp((event.clientY - box.top) / box.height),
       };
     },
     onDown(event, eye) {
-      const { x } = this.where(event);
+      const { x } = this.position(event);
       const box = event.currentTarget.getBoundingClientRect();
       this.down = { x: event.clientX, y: event.clientY };
       if (Math.abs(x - this.split / 100) * box.width < 22) {
@@ -214,13 +214,13 @@ export default {
       }
     },
     onMove(event, eye) {
-      const { x, y } = this.where(event);
+      const { x, y } = this.position(event);
       if (this.dragging) this.split = 100 * x;
       else if (!this.isEmpty) this.report(eye, x, y);
     },
     onUp(event, eye) {
       const moved = this.down && Math.hypot(event.clientX - this.down.x, event.clientY - this.down.y);
-      const { x, y } = this.where(event);
+      const { x, y } = this.position(event);
       if (!this.dragging && !this.isEmpty && this.down && moved < 5) this.$emit("look", { eye, x, y });
       this.dragging = false;
       this.down = null;

@@ -23,19 +23,19 @@ WAVELENGTHS_NM = (618.0, 536.0, 453.0)
 PUPILS_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0)
 FOCUS_RANGE_DPT = (0.0, 8.0)
 FIELD_DEG = ((-45.0, 45.0), (-35.0, 35.0))
-LEAST_SIDE_ARCMIN = 12.0
-ROOM_RATIO = 3.2
-"""Ratio of the picture's side to the radius of the blur."""
+MIN_SIDE_ARCMIN = 12.0
+SIDE_RATIO = 3.2
+"""Ratio of the image side to the radius of the blur."""
 
-RINGS_ROOM_RATIO = 2.2
-"""Ratio of the picture's side to the radius of the light of another focus."""
+RINGS_SIDE_RATIO = 2.2
+"""Ratio of the image side to the radius of the light of another focus."""
 
 GAMMA = 0.45
 """Exponent of the displayed light, which makes faint parts visible."""
 
 WHITE_PERCENT = 99.9
-"""Percentile of the light that is shown as white: scaled to a single peak, the rest
-would be black."""
+"""Percentile of the light that is shown as white; scaled to the peak, the rest would be
+black."""
 
 ARCMIN_PER_MRAD = 60.0 * math.degrees(1e-3)
 NICE_ARCMIN = (1, 2, 5, 10, 20, 30, 60, 120, 300)
@@ -69,7 +69,7 @@ def _eye(body: str) -> EyeOptics:
 
 
 def point_spread(body: str, state: PointState) -> tuple[bytes, dict[str, Any]]:
-    """Return a picture (PNG) of the point's light, and its figures.
+    """Return an image (PNG) of the point-spread function, and its measures.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def _kernels(
         min(max(angle, low), high)
         for angle, (low, high) in zip(state.direction_deg, FIELD_DEG, strict=True)
     )
-    place: dict[str, Any] = {
+    state_in_field: dict[str, Any] = {
         "h_deg": h_deg,
         "v_deg": v_deg,
         "pupil_diameter_mm": pupil_mm,
@@ -108,13 +108,13 @@ def _kernels(
         ),
         "wavelength_nm": np.array(WAVELENGTHS_NM),
     }
-    defocus_dpt = eye.total_defocus_dpt(**place)
+    defocus_dpt = eye.total_defocus_dpt(**state_in_field)
     defocus_dpt = defocus_dpt + eye.vergence.vergence_dpt(state.object_dpt)
-    waves = eye.wavefronts(**place, total_defocus_dpt=defocus_dpt)
+    waves = eye.wavefronts(**state_in_field, total_defocus_dpt=defocus_dpt)
     rings = eye.rings and eye.rings.seen_from(h_deg, v_deg)
-    reach_mrad = _rings_reach_mrad(rings, pupil_mm / 2.0)
+    rings_mrad = _rings_reach_mrad(rings, pupil_mm / 2.0)
     side_arcmin = _side_arcmin(
-        waves.zernike_um, waves.circle_diameter_mm, more_mrad=reach_mrad
+        waves.zernike_um, waves.circle_diameter_mm, rings_mrad=rings_mrad
     )
     pixel_pitch_mrad = side_arcmin / SIDE_PX / ARCMIN_PER_MRAD
     return [
@@ -132,7 +132,7 @@ def _kernels(
 
 
 def _rings_reach_mrad(rings: Rings | None, radius_mm: float) -> float:
-    """Return the deflection by rings toward their foci, or by lenslets in all."""
+    """Return the deflection by rings toward their foci, or the total by lenslets."""
     if rings is None:
         return 0.0
     if rings.lattice_mm is not None:
@@ -145,21 +145,21 @@ def _kernel(
 ) -> NDArray[np.float32]:
     """Return one PSF, by the wave method where possible.
 
-    A mix of waves and rays has visible seams where light is faint.
+    A combination of both methods has visible seams where light is faint.
     """
     try:
         found = compute_psfs(
             zernike_um, method="fourier", accuracy="fine", pupil_screen=rings, **state
         )
-    except ValueError:  # too steep: the blur is far wider than what rings add
+    except ValueError:  # too steep: the blur is far wider than the effect of rings
         found = compute_psfs(zernike_um, **state)
     return found[0].kernel
 
 
 def _side_arcmin(
-    zernike_um: NDArray[Any], diameter_mm: NDArray[Any], *, more_mrad: float
+    zernike_um: NDArray[Any], diameter_mm: NDArray[Any], *, rings_mrad: float
 ) -> float:
-    """Return the picture's side for the widest color, rounded up to a fixed scale.
+    """Return the image side for the widest color, rounded up to a fixed scale.
 
     The blur's radius at the edge of the pupil is about that of its RMS slope: sqrt(2)
     times the slope that the second-order terms make.
@@ -167,14 +167,14 @@ def _side_arcmin(
     radius_mm = np.asarray(diameter_mm) / 2.0
     spread = np.sqrt((np.asarray(zernike_um)[:, 3:] ** 2).sum(axis=1))
     reach_mrad = 4.0 * math.sqrt(3.0) * spread / radius_mm
-    widest_mrad = ROOM_RATIO * float(reach_mrad.max())
-    wanted = max(widest_mrad, RINGS_ROOM_RATIO * more_mrad) * ARCMIN_PER_MRAD
-    steps = math.ceil(4.0 * math.log2(max(wanted, LEAST_SIDE_ARCMIN)))
+    widest_mrad = SIDE_RATIO * float(reach_mrad.max())
+    wanted = max(widest_mrad, RINGS_SIDE_RATIO * rings_mrad) * ARCMIN_PER_MRAD
+    steps = math.ceil(4.0 * math.log2(max(wanted, MIN_SIDE_ARCMIN)))
     return 2.0 ** (steps / 4.0)
 
 
 def half_light_px(kernel: NDArray[np.float32]) -> float:
-    """Return the radius about the centroid that holds half of the light, px."""
+    """Return the radius about the centroid that contains half of the light, px."""
     y, x = np.indices(kernel.shape)
     total = kernel.sum()
     middle_x, middle_y = (x * kernel).sum() / total, (y * kernel).sum() / total

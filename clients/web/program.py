@@ -3,8 +3,8 @@
     ocufilter web
     ocufilter web --profile myopia --port 8080 --no-browser
 
-Serves this machine only, with a token in the address that it prints; `--host` admits
-other machines.
+Prints an address that contains an access token.  Only this machine can connect, unless
+`--host` is given.
 """
 
 from __future__ import annotations
@@ -43,29 +43,32 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
         "--port",
         type=int,
         default=DEFAULT_PORT,
-        help=f"0 takes a free one (default: {DEFAULT_PORT})",
+        help=f"port; 0 selects a free one (default: {DEFAULT_PORT})",
     )
     parser.add_argument(
         "--host",
         default="127.0.0.1",
-        help="address to serve; 0.0.0.0 or an address of a network lets other machines "
-        "in, unencrypted, with the token (default: 127.0.0.1)",
+        help="address to listen on; with 0.0.0.0 or a network address, other machines "
+        "can connect with the token, unencrypted (default: 127.0.0.1)",
     )
     parser.add_argument(
         "--proxy-host",
         action="append",
         default=[],
         metavar="HOST",
-        help="host name that a proxy on this machine leaves in requests; may be "
-        "repeated.  Without --host only localhost and these names are answered",
+        help="host name in requests from a proxy on this machine; may be repeated.  "
+        "Without --host, only requests for localhost and these names are accepted",
     )
     parser.add_argument(
-        "--no-browser", action="store_true", help="print the address and open nothing"
+        "--no-browser",
+        action="store_true",
+        help="print the address without opening a browser",
     )
     parser.add_argument(
         "--profile",
         metavar="P",
-        help="both eyes at first: a preset's name, or a .json, .abp, .csv or .zmx file",
+        help="initial profile of both eyes: preset name, or a .json, .abp, .csv or "
+        ".zmx file",
     )
     parser.add_argument(
         "--json", action="store_true", help="print the address as a JSON object"
@@ -98,19 +101,20 @@ def open_socket(host: str, port: int) -> socket.socket:
     ValueError
         Invalid port or empty host.
     OSError
-        The port is taken, or the address is not this machine's; the message says what
-        helps.
+        The port is in use, or the address does not belong to this machine; the message
+        suggests a fix.
     """
     if not 0 <= port <= 65535:
         raise ValueError(f"--port is {port}; allowed: 0 to 65535")
-    if not host:  # the system would take it for all addresses
-        raise ValueError("--host is empty; expected an address, as 127.0.0.1")
+    if not host:  # the system would listen on all addresses
+        raise ValueError("--host is empty; expected an address such as 127.0.0.1")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family)
     except OSError as error:
         raise OSError(
-            f"{host} port {port}: {error.strerror or error}; --port 0 takes a free one"
+            f"{host} port {port}: {error.strerror or error}; "
+            "--port 0 selects a free one"
         ) from None
 
 
@@ -137,24 +141,24 @@ def hosts_of(listening: socket.socket, names: Sequence[str]) -> set[str] | None:
 
 
 def serve(options: argparse.Namespace) -> int:
-    """Serve until the end; return the exit code."""
+    """Serve until interrupted; return the exit code."""
     profile = read_profile(options.profile)
     listening = open_socket(options.host, options.port)
     port = listening.getsockname()[1]
     hosts = hosts_of(listening, options.proxy_host)
     if hosts is None:
         print(EXPOSED, file=sys.stderr, flush=True)
-    token, opening = (secrets.token_urlsafe(TOKEN_BYTES) for _ in range(2))
+    token, one_time_token = (secrets.token_urlsafe(TOKEN_BYTES) for _ in range(2))
     from clients.web.server import make_server
 
-    addresses = [address_of(options.host, port, t) for t in (token, opening)]
+    addresses = [address_of(options.host, port, t) for t in (token, one_time_token)]
     server = make_server(
         token,
         port,
         profile,
-        opening=None if options.no_browser else opening,
+        one_time_token=None if options.no_browser else one_time_token,
         hosts=hosts,
-        on_ready=lambda: _tell(*cast(tuple[str, str], addresses), options),
+        on_ready=lambda: _announce(*cast(tuple[str, str], addresses), options),
     )
     # the server shuts down by itself and raises the signal again: exit cleanly
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
@@ -162,13 +166,15 @@ def serve(options: argparse.Namespace) -> int:
     return 0
 
 
-def _tell(address: str, opening: str, options: argparse.Namespace) -> None:
+def _announce(address: str, one_time_address: str, options: argparse.Namespace) -> None:
     if options.json:
         print(json.dumps({"address": address}), flush=True)
     else:
-        print(f"Open {address}\nCtrl-C ends it.", flush=True)
+        print(f"Open {address}\nPress Ctrl-C to stop.", flush=True)
     if not options.no_browser:  # may wait for the browser
-        threading.Thread(target=webbrowser.open, args=[opening], daemon=True).start()
+        threading.Thread(
+            target=webbrowser.open, args=[one_time_address], daemon=True
+        ).start()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,7 +1,7 @@
-// A native range input: its role, its keys and touch come from the browser.
+// A native range input, so that the browser provides its role, keys and touch.
 //
-// It keeps its own value while it is dragged: an answer of the page to an older value
-// must not move it back.
+// It keeps its own value while it is dragged, so that the server's response to an older
+// value does not move it back.
 const THROTTLE_MS = 30; // between two reported values
 const PAGE_STEPS = 10; // steps of a Page key
 

@@ -32,7 +32,7 @@ MAX_GLTF_BYTES = 200_000_000
 _GLB_HEADER = struct.Struct("<4sIIII")
 TITLES = {"courtyard": "Courtyard", "primitives": "Primitives"}
 _CHECKOUT = Path(__file__).resolve().parents[2]
-# From the checkout `-m` finds our packages; installed packages are found anyway.
+# In a checkout, `-m` requires this folder; installed packages need none.
 _FOLDER = _CHECKOUT if (_CHECKOUT / "pyproject.toml").is_file() else None
 
 
@@ -41,7 +41,7 @@ _SCENES_LOCK = threading.Lock()
 
 
 class SceneNotRendered(Exception):
-    """A scene could not be rendered; the message says why."""
+    """Raised when a scene cannot be rendered; the message gives the reason."""
 
 
 @cache
@@ -65,13 +65,13 @@ def gltf_picture(name: str, content: bytes) -> Picture:
     Raises
     ------
     InvalidFile
-        Another kind of file.
+        If the file is of another kind.
     SceneNotRendered
-        The file is damaged or cannot be rendered here.
+        If the file is damaged or cannot be rendered here.
     """
     suffix = Path(name).suffix.lower()
     if suffix not in GLTF_SUFFIXES:
-        allowed = f"{', '.join(GLTF_SUFFIXES)}, with its pictures and meshes inside"
+        allowed = f"{', '.join(GLTF_SUFFIXES)} with embedded textures and meshes"
         raise InvalidFile(name[:60], "not a scene", allowed)
     _check_is_self_contained(name, content)
     with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
@@ -86,7 +86,7 @@ def gltf_picture(name: str, content: bytes) -> Picture:
 
 
 def _check_is_self_contained(name: str, content: bytes) -> None:
-    """Reject a glTF file that references others, which would be on this machine.
+    """Reject a glTF file that references other files, which would be on the server.
 
     The reader checks whether the file is valid.
     """
@@ -98,12 +98,12 @@ def _check_is_self_contained(name: str, content: bytes) -> None:
         header = json.loads(text)
         uris = _uris(header)
     except (ValueError, RecursionError):
-        raise ValueError(f"“{name:.60}” is no glTF 2 file") from None
+        raise ValueError(f"“{name:.60}” is not a glTF 2 file") from None
     for uri in uris:
         if not uri.startswith("data:"):
             raise ValueError(
                 f"“{name:.60}” refers to another file, “{uri:.60}”; expected a .glb, "
-                "or a .gltf with its pictures and meshes inside"
+                "or a .gltf with embedded textures and meshes"
             )
 
 
@@ -131,7 +131,9 @@ def _rendered(source: str, title: str, folder: Path) -> Picture:
             timeout=TIMEOUT_S,
         )
     except subprocess.TimeoutExpired:
-        raise SceneNotRendered(f"{title}: not done in {TIMEOUT_S:.0f} s") from None
+        raise SceneNotRendered(
+            f"{title}: rendering timed out after {TIMEOUT_S:.0f} s"
+        ) from None
     if not file.is_file():
         lines = done.stderr.strip().splitlines() or [f"ended with {done.returncode}"]
         raise SceneNotRendered(lines[-1])
@@ -159,13 +161,13 @@ def main(source: str, file: str, size: str) -> int:
     from clients.scenes.paths import PATHS, path_moments
 
     try:
-        is_ours = source in PATHS
-        scene = build_scene(source) if is_ours else load_gltf(source)
+        is_built_in = source in PATHS
+        scene = build_scene(source) if is_built_in else load_gltf(source)
     except ValueError as error:
         sys.stderr.write(f"{error}\n")
         return 2
     state: tuple[float, ...] = ()
-    if is_ours:
+    if is_built_in:
         (moment,) = path_moments(PATHS[source], 1)
         state = (moment.pupil_diameter_mm, moment.focus_dpt)
     with SceneRenderer(scene, read_size_px(size)) as renderer:

@@ -25,29 +25,29 @@ from clients.web.scene_file import (
     gltf_picture,
     scene_picture,
 )
-from clients.web.upload_entry import Taking, upload_entry
+from clients.web.upload_entry import UploadHandler, upload_entry
 
 KINDS = {**TITLES, "chart": "Letter chart", "photo": "Photo", "gltf": "3D file"}
 PHOTO_WIDTHS_DEG = {20: "20° wide", 35: "35° wide", 50: "50° wide", 70: "70° wide"}
-FIRST = "courtyard"
+DEFAULT_SCENE = "courtyard"
 NamedFile = tuple[str, bytes]
 
 MAX_AT_ONCE = 2
-"""Pictures made at the same time; a photo of 64 Mpx takes 0.6 GB."""
+"""Pictures computed at the same time; a photo of 64 Mpx takes 0.6 GB."""
 
 MAX_WAITING = 4
-"""Pictures of one page that are being made or queued, each with its file."""
+"""Limit on pictures of one page that are computed or queued, each with its file."""
 
-_turns = asyncio.Semaphore(MAX_AT_ONCE)
+_picture_slots = asyncio.Semaphore(MAX_AT_ONCE)
 
 
 class ScenePanel:
-    """Selects the scene; pictures are made outside of the event loop.
+    """Select the scene; pictures are computed outside the event loop.
 
     Parameters
     ----------
     on_picture : called with each new picture
-    on_empty : called with a text if the chosen scene has no file yet
+    on_empty : called with a text if the selected scene has no file yet
     kind : first scene, one of `KINDS`
     """
 
@@ -99,30 +99,32 @@ class ScenePanel:
                     label="Field of view of the photo",
                 ).props("outlined dense options-dense")
                 ui.label(
-                    f"Depth: {DEPTH_HELP}.  Without depth the photo stands flat at a "
+                    f"Depth: {DEPTH_HELP}.  Without depth, the whole photo is at one "
                     "distance."
                 ).classes("oc-hint")
                 self._used = ui.label().classes("oc-note")
-                self._in_use()
+                self._show_files()
 
-    def _upload(self, label: str, accept: str, most_bytes: int, take: Taking) -> None:
-        upload_entry(label, accept, most_bytes, take).mark(label)
+    def _upload(
+        self, label: str, accept: str, max_bytes: int, take: UploadHandler
+    ) -> None:
+        upload_entry(label, accept, max_bytes, take).mark(label)
 
-    def _in_use(self) -> None:
+    def _show_files(self) -> None:
         """Show the names of the files in use."""
         names = [file[0] for file in (self._photo, self._depth) if file is not None]
         text = f"In use: {', '.join(names)}" if names else ""
         if names and self._photo is None:
-            text += ". Now upload the photo of this depth."
+            text += ". Now upload the photo that this depth belongs to."
         self._used.text = text
 
     @property
     def kind(self) -> str:
-        """Return the chosen scene."""
+        """Return the selected scene."""
         return self._kind
 
     def choose(self, kind: str) -> None:
-        """Show another scene, as a press on its button does."""
+        """Select a scene, like a click on its button."""
         self._kinds.value = kind
 
     async def _choose(self, event: events.ValueChangeEventArguments) -> None:
@@ -131,9 +133,9 @@ class ScenePanel:
         self._uploads.refresh()
         try:
             if self._kind in TITLES:
-                await self._make(scene_picture, self._kind)
+                await self._compute(scene_picture, self._kind)
             elif self._kind == "chart":
-                await self._make(chart_picture, self._state.values[DISTANCE.name])
+                await self._compute(chart_picture, self._state.values[DISTANCE.name])
             elif self._kind == "photo":
                 if self._photo is None:
                     self._on_empty("No photo yet: upload one")
@@ -146,7 +148,7 @@ class ScenePanel:
             self._problem.text = str(error)
 
     async def _take_gltf(self, name: str, content: bytes) -> None:
-        self._gltf = await self._make(gltf_picture, name, content)
+        self._gltf = await self._compute(gltf_picture, name, content)
 
     async def _take_photo(self, name: str, content: bytes) -> None:
         # A depth file uploaded first belongs to this photo, any other to the last one.
@@ -155,14 +157,14 @@ class ScenePanel:
             await self._show_photo((name, content), depth)
         except ValueError:
             if self._photo is None:
-                self._depth = None  # it may be the file that was refused
-                self._in_use()
+                self._depth = None  # it may be the rejected file
+                self._show_files()
             raise
 
     async def _take_depth(self, name: str, content: bytes) -> None:
         if self._photo is None:
             self._depth = name, content
-            self._in_use()
+            self._show_files()
             return
         await self._show_photo(self._photo, (name, content))
 
@@ -178,8 +180,8 @@ class ScenePanel:
             await self._show_photo(self._photo, self._depth)
 
     async def _show_photo(self, photo: NamedFile, depth: NamedFile | None) -> None:
-        """Show a photo; if one of its files is refused, keep the previous ones."""
-        await self._make(
+        """Show a photo; if one of its files is rejected, keep the previous ones."""
+        await self._compute(
             photo_picture,
             *photo,
             width_deg=self._width_deg,
@@ -187,17 +189,17 @@ class ScenePanel:
             depth=depth,
         )
         self._photo, self._depth = photo, depth
-        self._in_use()
+        self._show_files()
 
-    async def _make(
+    async def _compute(
         self, make: Callable[..., Picture], *args: Any, **options: Any
     ) -> Picture:
-        """Show the picture that a function makes; return it.
+        """Compute a picture with a function, show it and return it.
 
         Raises
         ------
         ValueError
-            The picture cannot be made.
+            If the picture cannot be computed.
         """
         if self._n_waiting >= MAX_WAITING:
             raise ValueError("Still rendering; try again")
@@ -206,13 +208,15 @@ class ScenePanel:
         self._busy.set_visibility(True)
         self._n_waiting += 1
         try:
-            async with _turns:
+            async with _picture_slots:
                 picture = await run.io_bound(make, *args, **options)
         except SceneNotRendered as error:
             raise ValueError(str(error)) from None
         finally:
             self._n_waiting -= 1
             self._busy.set_visibility(self._n_waiting > 0)
-        if picture is not None and kind == self._kind:  # else another was chosen
+        if (
+            picture is not None and kind == self._kind
+        ):  # otherwise another scene was selected
             self._on_picture(picture)
         return picture

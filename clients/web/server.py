@@ -1,4 +1,8 @@
-"""HTTP server: NiceGUI behind a guard and limits, and a websocket for pictures."""
+"""HTTP server.
+
+It serves the NiceGUI app with token authentication and request limits, and a websocket
+for images.
+"""
 
 from __future__ import annotations
 
@@ -17,17 +21,17 @@ from clients.web.connections import MAX_HEAD_BYTES, BoundedConnection
 from clients.web.guard import POLICY_VIOLATION, Guard
 from clients.web.page import PICTURES_PATH, SharedResources, add_page
 from clients.web.scene_file import SceneNotRendered, scene_picture
-from clients.web.scene_panel import FIRST
+from clients.web.scene_panel import DEFAULT_SCENE
 
 MESSAGE_HISTORY = 50
-"""Messages kept for a browser that reconnects; figures are large."""
+"""Messages buffered for a reconnecting browser; kept low because figures are large."""
 
-FAREWELL_S = 2
+SHUTDOWN_TIMEOUT_S = 2
 
 
-def _render_first() -> None:
-    with suppress(SceneNotRendered):  # the page says what is missing
-        scene_picture(FIRST)
+def _render_default_scene() -> None:
+    with suppress(SceneNotRendered):  # the page shows the error
+        scene_picture(DEFAULT_SCENE)
 
 
 def make_server(
@@ -35,22 +39,22 @@ def make_server(
     port: int,
     profile: tuple[Mapping[str, Any], str] | None,
     *,
-    opening: str | None = None,
+    one_time_token: str | None = None,
     hosts: Collection[str] | None = None,
     on_ready: Callable[[], None],
 ) -> uvicorn.Server:
-    """Return the server; pass its sockets to its `run`.
+    """Return the server.  Pass the listening sockets to its `run` method.
 
     Parameters
     ----------
-    opening, hosts : as in `Guard`
+    one_time_token, hosts : as in `Guard`
     """
     resources: list[SharedResources] = []
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        # rendered before somebody opens the page, which then opens with it
-        threading.Thread(target=_render_first, daemon=True).start()
+        # render the default scene now, so that the first page load can show it at once
+        threading.Thread(target=_render_default_scene, daemon=True).start()
         on_ready()
         yield
 
@@ -60,11 +64,11 @@ def make_server(
 
     @application.websocket(PICTURES_PATH + "{page}")
     async def _pictures(socket: WebSocket, page: str) -> None:
-        out = resources[0].out.get(page)
-        if out is None:
+        sender = resources[0].picture_senders.get(page)
+        if sender is None:
             await socket.close(POLICY_VIOLATION)
         else:
-            await out.serve(socket)
+            await sender.serve(socket)
 
     resources.append(SharedResources())
     add_page(resources[0], profile, token)
@@ -80,19 +84,21 @@ def make_server(
     )
     # NiceGUI's own handler creates a page for each unknown address
     app.add_exception_handler(404, http_exception_handler)
-    bounded = Bounds(application, is_full=lambda: len(resources[0].out) >= MAX_PAGES)
+    bounded = Bounds(
+        application, is_full=lambda: len(resources[0].picture_senders) >= MAX_PAGES
+    )
     guarded = Guard(
         bounded,
         token=token,
         cookie=f"ocufilter-{port}",
-        opening=opening,
+        one_time_token=one_time_token,
         hosts=hosts,
     )
     return uvicorn.Server(
         uvicorn.Config(
             guarded,
             log_level="warning",
-            timeout_graceful_shutdown=FAREWELL_S,
+            timeout_graceful_shutdown=SHUTDOWN_TIMEOUT_S,
             http=BoundedConnection,
             h11_max_incomplete_event_size=MAX_HEAD_BYTES,
             ws_max_size=MAX_MESSAGE_BYTES,

@@ -1,7 +1,7 @@
 """The entries of a page as text, for reloads and for links.
 
-The text is the fragment of the page's address, which browsers do not send.  It holds
-what differs from a new page, and never the content of a file.
+The text is the fragment of the page's address, which browsers do not send.  It contains
+the entries that differ from a new page, and never the content of a file.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import Any, get_args
 
 from clients.web.correction_form import DESIGNS, KINDS, CorrectionForm
 from clients.web.eye_form import SIDES, EyeForm, preset_titles
-from clients.web.page_state import LOOKS, PageState, Shown
+from clients.web.page_state import CONDITIONS, PageState, Shown
 
 VERSION = 1
 MAX_CHARACTERS = 8000
-"""Length of a fragment; one with every entry of both eyes has 1,600 characters."""
+"""Length limit of a fragment; every entry of both eyes takes 1,600 characters."""
 
 MAX_ENTRY_CHARACTERS = 40
 SCENES = ("courtyard", "primitives", "chart")
@@ -32,9 +32,9 @@ class Restored:
     Attributes
     ----------
     scene : str or None
-        Scene to show; None if the fragment has no entries of a page.
+        Scene to show; None if the fragment contains no entries for a page.
     problems : list of str
-        Sentences on what the link contains and the page does not accept.
+        Sentences about rejected entries of the link.
     """
 
     scene: str | None = None
@@ -85,15 +85,17 @@ def _eye(form: EyeForm, new: EyeForm) -> dict[str, Any]:
 
 
 def restore(state: PageState, fragment: str) -> Restored:
-    """Set a page's entries from a fragment; report what it does not accept.
+    """Set a page's entries from a fragment; report rejected entries.
 
-    Entries are checked like typed ones. Invalid and absent ones get their initial
+    Entries are validated like typed ones.  Invalid and missing ones get their initial
     values.
     """
     found = Restored()
     entries = _read(fragment)
     if entries is None:
-        found.problems.append("The link has no entries of this page: it is incomplete.")
+        found.problems.append(
+            "The link contains no entries for this page; it may be incomplete."
+        )
         return found
     state.reset()
     state.is_focus_set = entries.get("focus_set") is True
@@ -102,7 +104,7 @@ def restore(state: PageState, fragment: str) -> Restored:
     scene = entries.get("scene")
     found.scene = scene if scene in SCENES else SCENES[0]
     values = _mapping(entries.get("values"))
-    for number in LOOKS:
+    for number in CONDITIONS:
         if number.name not in values:
             continue
         value = values[number.name]

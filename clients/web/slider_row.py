@@ -1,4 +1,4 @@
-"""A slider with its name and its formatted value."""
+"""A slider with a label and a formatted value."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ class SliderRow(Element, component="range_slider.js"):  # type: ignore[call-arg]
     number : its name, label, range and step
     value : initial value
     on_move : called with each value
-    words : formats a value; by default the number with its unit
-    is_titled : whether label and value are shown; assistive technology has them anyway
+    format_value : formats a value; by default the number with its unit
+    is_titled : whether label and value are visible; always available to assistive
+        technology
     """
 
     def __init__(
@@ -28,15 +29,17 @@ class SliderRow(Element, component="range_slider.js"):  # type: ignore[call-arg]
         value: float,
         on_move: Callable[[float], None],
         *,
-        words: Callable[[float], str] | None = None,
+        format_value: Callable[[float], str] | None = None,
         is_titled: bool = True,
     ) -> None:
         super().__init__()
         self.number = number
-        self._words = words or (lambda v: number.with_unit(number.show(v)))
+        self._format_value = format_value or (
+            lambda v: number.with_unit(number.show(v))
+        )
         self._on_move = on_move
         self._is_titled = is_titled
-        self._why_not: str | None = None
+        self._disabled_text: str | None = None
         self._props.update(
             {
                 "name": number.name,
@@ -60,12 +63,16 @@ class SliderRow(Element, component="range_slider.js"):  # type: ignore[call-arg]
         """Show a value."""
         self._value = value
         self._props["value"] = value
-        text = self._words(value) if self._why_not is None else self._why_not
+        text = (
+            self._format_value(value)
+            if self._disabled_text is None
+            else self._disabled_text
+        )
         self._props["text"] = text if self._is_titled else ""
         self.update()
 
-    def enable(self, is_on: bool, why_not: str = "") -> None:
-        """Enable the slider, or disable it and show why."""
+    def enable(self, is_on: bool, disabled_text: str = "") -> None:
+        """Enable the slider, or disable it and show a text in place of the value."""
         self._props["disabled"] = not is_on
-        self._why_not = None if is_on else why_not
+        self._disabled_text = None if is_on else disabled_text
         self.show(self._value)

@@ -1,4 +1,4 @@
-"""File upload that reports files of another kind."""
+"""File upload that reports rejected files."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ HEADER = """
          aria-label="Choose a file: LABEL"></q-btn>
   <span style="display: none"><q-uploader-add-trigger></q-uploader-add-trigger></span>
 </div>"""
-"""Head of an upload; the buttons of Quasar's own have no accessible names."""
+"""Header of an upload; the buttons of Quasar's default have no accessible names."""
 
-Taking = Callable[[str, bytes], Awaitable[None]]
+UploadHandler = Callable[[str, bytes], Awaitable[None]]
 
 
 class _Upload(ui.upload):
@@ -35,47 +35,49 @@ class _Upload(ui.upload):
         await super().handle_uploads(files)
 
 
-def upload_entry(label: str, accept: str, most_bytes: int, take: Taking) -> ui.element:
-    """Return a file upload; what is wrong with a file is written below it.
+def upload_entry(
+    label: str, accept: str, max_bytes: int, on_file: UploadHandler
+) -> ui.element:
+    """Return a file upload that shows errors below it.
 
     Parameters
     ----------
     accept : as in HTML; the browser rejects other files itself, without a message
-    most_bytes : a larger file is refused before it is in memory
-    take : called with the name and the content of each file; a ValueError is shown
+    max_bytes : size limit, checked before the file is in memory
+    on_file : called with the name and content of each file; a ValueError is shown
     """
     allowed = "a picture" if accept == "image/*" else accept.replace(",", ", ")
-    allowed += f", up to {most_bytes / 1e6:g} MB"
+    allowed += f", up to {max_bytes / 1e6:g} MB"
 
-    def say(text: str) -> None:
+    def show_problem(text: str) -> None:
         problem.text = text
 
-    def refuse() -> None:
-        say(f"{label}: not such a file; allowed: {allowed}")
+    def reject() -> None:
+        show_problem(f"{label}: not such a file; allowed: {allowed}")
 
     async def check(event: events.UploadEventArguments) -> None:
         event.sender.reset()  # ready for the next file
-        if event.file.size() > most_bytes:  # the browser should have rejected it
-            refuse()
+        if event.file.size() > max_bytes:  # the browser should have rejected it
+            reject()
             return
-        say("")
+        show_problem("")
         name = plain_name(event.file.name)
         try:
-            await take(name, await event.file.read())
+            await on_file(name, await event.file.read())
         except ValueError as error:
             text = str(error)
-            say(text if name in text else f"{name}: {text}")
+            show_problem(text if name in text else f"{name}: {text}")
         except RuntimeError:
-            if not entry.is_deleted:  # otherwise its page was closed meanwhile
+            if not entry.is_deleted:  # otherwise the page was closed meanwhile
                 raise
 
     with ui.element("div").classes("oc-upload-entry") as box:
         entry = _Upload(
             auto_upload=True,
             label=label,
-            max_file_size=most_bytes,
+            max_file_size=max_bytes,
             on_upload=check,
-            on_rejected=refuse,
+            on_rejected=reject,
         ).props(f'accept="{accept}" flat bordered')
         entry.classes("oc-upload")
         entry.add_slot("header", HEADER.replace("LABEL", label))

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from clients.web.eye_figures import eye_figure
-from clients.web.figure_worker import FigureWorker, StudyFailed
+from clients.web.figure_worker import FigureFailed, FigureWorker
 from clients.web.point_spread import PointState, point_spread
 
 MYOPE = json.dumps({"kind": "prescription", "sphere_dpt": -3.0, "eye_side": "OD"})
@@ -37,7 +37,7 @@ def test_answers_failures_and_newer_questions():
             await figure_worker.ask("a", "figure", eye_figure, name, MYOPE, **state)
             for name in ("wavefront", "section")
         ]
-        with pytest.raises(StudyFailed, match="'cat' is unknown"):
+        with pytest.raises(FigureFailed, match="'cat' is unknown"):
             await figure_worker.ask(
                 "a", "figure", point_spread, '{"kind": "cat"}', None
             )
@@ -47,7 +47,7 @@ def test_answers_failures_and_newer_questions():
         ]
         answers = await asyncio.gather(*waiting)
         figure_worker._process.kill()
-        with pytest.raises(StudyFailed, match="was restarted"):
+        with pytest.raises(FigureFailed, match="was restarted"):
             await figure_worker.ask("a", "n", divmod, 7, 2)
         return pictures, answers, await figure_worker.ask("a", "n", divmod, 7, 2)
 

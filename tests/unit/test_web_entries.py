@@ -11,7 +11,7 @@ from clients.web.correction_form import (
     KINDS,
     SPHERE,
     CorrectionForm,
-    first_texts,
+    default_texts,
 )
 from clients.web.eye_form import EyeForm, preset_titles
 from clients.web.numbers import distance_text, prescription_texts
@@ -95,7 +95,7 @@ def test_every_lens_of_the_page_is_one_that_a_profile_may_have(kind, design, sou
     body = form.body(age_years=70.0)
     assert parse_profile(body).correction is not None
     again = EyeForm("OD")
-    again.take_body(body, "p.json")
+    again.load_body(body, "p.json")
     assert again.worn == form.worn
 
 
@@ -107,7 +107,7 @@ def test_a_lens_that_the_page_has_no_entries_for_stays_as_it_is():
     assert form.body() == zones
     assert "file" in form.kinds
     assert form.entries == ()
-    assert "file" not in CorrectionForm(texts=first_texts()).kinds
+    assert "file" not in CorrectionForm(texts=default_texts()).kinds
 
 
 def test_additions_that_no_lens_can_have_are_told():
@@ -132,12 +132,12 @@ def test_the_gaze_slider_turns_a_progressive_lens_of_the_figures():
     state.values[GAZE_V.name] = -15.0
     request = state.request()
     assert "gaze_deg" not in request.bodies["OD"]["correction"]  # the settings have it
-    seen = parse_profile(state.looking_body("OD")).correction
+    seen = parse_profile(state.profile_at_gaze("OD")).correction
     # 25.5 mm before the center of rotation 15 deg are 6.8 mm, half of the corridor
     assert seen.sphere_dpt == pytest.approx(2.0 / 2, abs=0.15)
     form.worn.kind = "contact_lens"
     state.request()
-    assert state.looking_body("OD") == state.right["OD"]
+    assert state.profile_at_gaze("OD") == state.valid_profiles["OD"]
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -151,7 +151,7 @@ def test_a_file_is_taken_as_what_it_is():
     state = PageState()
     form = state.eyes["OD"]
     body = {"kind": "prescription", "sphere_dpt": -3, "age_years": 52}
-    assert state.take_file("OD", "p.json", json.dumps(body).encode()) == "OD"
+    assert state.load_file("OD", "p.json", json.dumps(body).encode()) == "OD"
     assert state.values[AGE.name] == 52
     assert (form.source, form.loaded_name) == ("prescription", "p.json")
     assert (form.source, form.texts["sphere_dpt"]) == ("prescription", "-3.00")
@@ -161,7 +161,7 @@ def test_a_file_is_taken_as_what_it_is():
         "wavelength_nm": 555,
         "zernike_um": {"2,0": 1.0},
     }
-    state.take_file("OD", "w.json", json.dumps(wave).encode())
+    state.load_file("OD", "w.json", json.dumps(wave).encode())
     assert (form.source, form.file_name) == ("file", "w.json")
     assert form.body(age_years=30.0)["zernike_um"] == {"2,0": 1.0}
 
@@ -184,14 +184,14 @@ def test_a_file_is_taken_as_what_it_is():
 def test_a_file_that_is_no_profile_changes_nothing(name, content, said):
     state = PageState()
     with pytest.raises(ValueError, match=said) as refused:
-        state.take_file("OD", name, content)
+        state.load_file("OD", name, content)
     assert state == PageState()
     assert "/ocufilter-" not in str(refused.value)
 
 
 def test_coefficients_are_called_as_their_file_is():
     state = PageState()
-    state.take_file("OD", "my eye.abp", b"Ap = 6\nWa = 555\nZ[2, 0] = 1")
+    state.load_file("OD", "my eye.abp", b"Ap = 6\nWa = 555\nZ[2, 0] = 1")
     assert state.eyes["OD"].body(age_years=30.0)["name"] == "my eye.abp"
 
 
@@ -275,7 +275,7 @@ def test_looking_to_read_turns_the_gaze_to_the_addition():
     state.look(is_reading=True)
     # the corridor of 14 mm ends 25.5 mm before the center of rotation
     assert state.values[GAZE_V.name] == -29.0
-    seen = parse_profile(state.looking_body("OD")).correction
+    seen = parse_profile(state.profile_at_gaze("OD")).correction
     assert seen.sphere_dpt == pytest.approx(2.0, abs=0.05)
     state.look(is_reading=False)
     assert (state.values[GAZE_V.name], state.values[FOCUS.name]) == (0.0, 0.0)
@@ -321,7 +321,7 @@ def test_a_file_of_the_other_eye_is_loaded_there():
     state = PageState()
     state.eyes["OD"].source = "file"
     body = {"kind": "prescription", "sphere_dpt": -3, "eye_side": "OS"}
-    assert state.take_file("OD", "p.json", json.dumps(body).encode()) == "OS"
+    assert state.load_file("OD", "p.json", json.dumps(body).encode()) == "OS"
     assert state.eyes["OS"].texts["sphere_dpt"] == "-3.00"
     assert state.eyes["OD"] == EyeForm("OD")
 

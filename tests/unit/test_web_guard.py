@@ -164,7 +164,7 @@ def test_an_empty_host_does_not_let_other_machines_in():
 
 
 def test_the_token_of_the_browsers_command_line_works_once():
-    guard = Guard(_inside, token=TOKEN, cookie="ocufilter-8765", opening="once")
+    guard = Guard(_inside, token=TOKEN, cookie="ocufilter-8765", one_time_token="once")
     start, _ = _asked("http", b"token=once", guard=guard)
     assert start["status"] == 303
     assert dict(start["headers"])[b"set-cookie"].startswith(b"ocufilter-8765=a-token;")

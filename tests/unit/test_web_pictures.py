@@ -64,7 +64,11 @@ def test_a_photo_with_depth_keeps_it(color):
     ("photo", "depth", "said"),
     [
         (("n.png", NARROW), None, "'n.png': 16 × 3200 px; allowed: 16 or more"),
-        (("p.png", b"no picture"), None, "'p.png': not a picture; allowed: a JPEG"),
+        (
+            ("p.png", b"no picture"),
+            None,
+            "'p.png': not a picture; allowed: an 8-bit JPEG",
+        ),
         (None, ("d.npy", b"junk"), "d.npy"),
         (None, ("d.txt", b"1"), r"allowed.*\.npy"),
         (
@@ -119,14 +123,14 @@ def test_fewer_pixels_keep_light_nearest_depth_and_directions():
 def test_a_place_has_a_direction_for_the_eye_that_looks():
     picture = a_picture()
     right = picture.view.tangents[1]
-    middle = picture.place(0.5, 0.5)
+    middle = picture.scene_point(0.5, 0.5)
     assert middle.direction_deg((0.0, 0.0)) == pytest.approx((0.0, 0.0))
-    edge = picture.place(1.0, 0.5)
+    edge = picture.scene_point(1.0, 0.5)
     assert edge.direction_deg((0.0, 0.0))[0] == pytest.approx(
         math.degrees(math.atan(right))
     )
     # an eye that looks there has it in the middle of its field
-    top = picture.place(0.8, 0.1)
+    top = picture.scene_point(0.8, 0.1)
     h_deg, v_deg = top.direction_deg((0.0, 0.0))
     assert top.direction_deg((h_deg, v_deg)) == pytest.approx((0.0, 0.0), abs=1e-9)
     assert middle.distance_dpt == pytest.approx(0.5)
@@ -158,7 +162,7 @@ def test_a_photo_is_known_by_its_content(color):
     for kind in ("eps", "pcx", "ppm", "ico"):
         file = io.BytesIO()
         Image.fromarray(color).save(file, kind)
-        with pytest.raises(ValueError, match=r"not a picture; allowed: a JPEG"):
+        with pytest.raises(ValueError, match=r"not a picture; allowed: an 8-bit JPEG"):
             photo_picture("photo.png", file.getvalue(), **FLAT)
 
 
@@ -172,7 +176,7 @@ def test_a_photo_of_few_bytes_and_many_pixels_is_not_read():
 
 @pytest.mark.parametrize("name", ["d.png\0.npy\0", "d." + 300 * "x", "d", "d./../x"])
 def test_a_depth_of_another_name_is_not_written(color, name):
-    with pytest.raises(ValueError, match=r"is not depth; allowed: \.npy, \.png"):
+    with pytest.raises(ValueError, match=r"is not a depth file; allowed: \.npy, \.png"):
         photo_picture("p.png", _png(color), depth=(name, b"1"), **FLAT)
 
 
@@ -213,5 +217,5 @@ def test_a_scene_does_not_read_other_files(uri, part):
 )
 def test_a_scene_that_is_none_is_refused_before_anything_is_started(text):
     for name, content in (("s.gltf", text), ("s.glb", _glb(text))):
-        with pytest.raises(ValueError, match="is no glTF 2 file"):
+        with pytest.raises(ValueError, match="is not a glTF 2 file"):
             gltf_picture(name, content)

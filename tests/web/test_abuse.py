@@ -413,7 +413,7 @@ def test_a_request_that_does_not_come_is_not_waited_for(first):
 
 
 def test_connections_are_limited_and_free_again():
-    with serving(head_s=0.5, most=4) as connect:
+    with serving(head_s=0.5, max_connections=4) as connect:
         idle = [connect() for _ in range(4)]
         with connect() as fifth:
             assert _refused(fifth) == b""

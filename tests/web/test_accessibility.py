@@ -246,9 +246,9 @@ def _opened(browser, page, address, link):
 @pytest.mark.parametrize(
     ("fragment", "said"),
     [
-        ("e30", "The link has no entries of this page"),
-        ("%%%", "The link has no entries of this page"),
-        ("A" * 20_000, "The link has no entries of this page"),
+        ("e30", "The link contains no entries for this page"),
+        ("%%%", "The link contains no entries for this page"),
+        ("A" * 20_000, "The link contains no entries for this page"),
         (
             {"v": 1, "values": {"pupil_diameter_mm": 99}},
             "Pupil: 99 is out of range; allowed: 2 to 7 mm",

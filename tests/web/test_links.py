@@ -52,7 +52,7 @@ def test_a_fragment_edited_in_the_open_page_is_taken(page):
     assert page.slider("pupil_diameter_mm").input_value() == "6"
     assert page.entry("sphere_dpt").input_value() == "0.00"
     page.page.evaluate("location.hash = 'e30'")
-    page.page.get_by_text("The link has no entries of this page").wait_for()
+    page.page.get_by_text("The link contains no entries for this page").wait_for()
     assert page.slider("pupil_diameter_mm").input_value() == "6"
 
 
@@ -64,7 +64,7 @@ def test_a_copied_link_works_in_another_browser(browser, address):
     page.entry("sphere_dpt").fill("-3.5")
     page.settle(after=number)
     page.choose("Copy link")
-    page.page.get_by_text("Whoever has it can use this page").wait_for()
+    page.page.get_by_text("Anyone who has it can use this page").wait_for()
     link = page.page.evaluate("navigator.clipboard.readText()")
     assert link.startswith(address + "#")
     context.close()

@@ -132,7 +132,9 @@ def test_a_click_focuses_on_what_is_there(page):
 def test_the_point_under_the_pointer_is_drawn(page):
     box = page.box()
     page.page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 0.5 * box["height"])
-    page.page.get_by_text(re.compile(r"Half of its light lies within")).wait_for()
+    page.page.get_by_text(
+        re.compile(r"Half of the point's light lies within")
+    ).wait_for()
     png = page.page.locator(".oc-psf img").get_attribute("src")
     assert png.startswith("data:image/png;base64,")
 
