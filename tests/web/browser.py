@@ -8,6 +8,8 @@ from PIL import Image
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 WAIT_MS = 90_000
+REST_MS = 300
+"""Time without another picture after which one is final."""
 DRAWN = "window.ocufilter?.drawn ?? []"
 
 
@@ -69,12 +71,17 @@ class PageUnderTest:
         Newest: no preview of a later wish came before it.
         """
         wanted = f"""({DRAWN}).filter(d => d.eye === '{eye}').at(-1)"""
-        self.page.wait_for_function(
-            f"(() => {{ const last = {wanted}; return last && last.kind === 'full' "
-            f"&& last.number > {after}; }})()",
-            timeout=WAIT_MS,
-        )
-        return self.page.evaluate(wanted)
+        while True:
+            self.page.wait_for_function(
+                f"(() => {{ const last = {wanted}; return last && last.kind === 'full' "
+                f"&& last.number > {after}; }})()",
+                timeout=WAIT_MS,
+            )
+            found = self.page.evaluate(wanted)
+            # an entry may send two requests: a preview of the second follows at once
+            self.page.wait_for_timeout(REST_MS)
+            if self.page.evaluate(wanted) == found:
+                return found
 
     def seen(self, eye: str = "OD", layer: str = "after"):
         """Return the pixels that are drawn for an eye, (h, w, 3)."""
