@@ -1,14 +1,14 @@
-"""Difference of the population's periphery from that of an estimated eye, as a phase.
+"""Phase that converts an estimated eye's peripheral wavefronts into the population's.
 
-An estimated eye has the on-axis wavefront of the person, but not the periphery: the
-lens of the model is homogeneous and its retina is a sphere, and neither follows from
-the axis.  Wavefronts of the population with this on-axis wavefront (`periphery`), minus
-those of the eye model, are added to the traced ones.  On the axis, the difference is
-zero.
+An estimated eye reproduces the person's on-axis wavefront but not the peripheral ones.
+Its lens is homogeneous and its retina spherical, and the true lens gradient and retinal
+shape cannot be inferred from the on-axis wavefront.  The phase is the wavefront of the
+population for this on-axis wavefront (`periphery`), minus that of the eye model.  It is
+added to the traced wavefronts, and it is zero on the axis.
 
-An eye outside the range of the population, for example with keratoconus, gets the
-difference of the eye whose on-axis wavefront is clamped to this range.  Its own
-difference from that eye is traced.
+For an eye outside the population's range (for example keratoconus), the phase is
+computed for an eye whose on-axis wavefront is clamped to that range.  How the actual
+eye deviates from the clamped eye comes from ray tracing.
 """
 
 from dataclasses import replace
@@ -38,8 +38,8 @@ from estimator.wavefront.field_wavefronts import (
 from estimator.wavefront.moved_plane import moved_polynomial
 
 WIDEST_RATIO = 1.5
-"""Ratio to the measured pupil above which the third and fourth orders are stretched,
-because polynomials diverge outside the measured pupil."""
+"""Ratio of pupil radius to `CIRCLE_MM` above which third- and fourth-degree terms are
+scaled down, because polynomials diverge outside the measured pupil."""
 
 
 class PeripheralResidual:
@@ -111,13 +111,19 @@ class PeripheralResidual:
 
 
 def stretch_ratio(radius_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return factors (n, 28) of monomials of the phase, for pupils of radii (n,)."""
+    """Return the factors (n, 28) that scale the phase's monomial coefficients.
+
+    ``radius_mm`` contains pupil radii (n,).
+    """
     ratio = np.minimum(WIDEST_RATIO * CIRCLE_MM / radius_mm, 1.0)
     return ratio[:, None] ** np.maximum(DEGREE - 2, 0)
 
 
 def clamped_eye(change: PeripheralChange, eye: EstimatedEye) -> EstimatedEye:
-    """Return an eye with the axis of a change: ``eye`` itself if it is not clamped."""
+    """Return an eye with the on-axis wavefront of ``change``.
+
+    This is ``eye`` itself unless that wavefront was clamped.
+    """
     if change.is_in_population:
         return eye
     zernike_um = np.zeros(N_TERMS)
@@ -140,7 +146,10 @@ def _with_axis(profile: EyeProfile, zernike_um: NDArray[Any]) -> EyeProfile:
 
 
 def _on_circle(eye: EstimatedEye) -> NDArray[np.float64]:
-    """Return the wavefront (28,) of an eye at the cornea, on `meridian`'s circle."""
+    """Return the wavefront (28,) of an eye at the cornea.
+
+    Its normalization radius is `CIRCLE_MM`.
+    """
     return on_axis_zernike_um(
         eye.parameters,
         retina=eye.retina,

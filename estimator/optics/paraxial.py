@@ -1,8 +1,9 @@
 """Paraxial optics of an eye about its axis: power, cardinal points, entrance pupil.
 
-Astigmatic surfaces are represented by their mean curvature, offset terms by their mean
-curvature and their height at the vertex.  Conic constants, tilts and decentrations have
-no effect to first order.  Positions are in mm from the corneal apex, powers in dpt.
+Astigmatic surfaces are represented by their mean curvature, polynomial sag terms by
+their mean curvature and their sag at the vertex.  Conic constants, tilts and
+decentrations have no effect to first order.  Positions are in mm from the corneal apex,
+powers in dpt.
 """
 
 from dataclasses import dataclass
@@ -76,7 +77,7 @@ class CardinalPoints:
 def _offset_part(
     packed: NDArray[np.float64], *exponents: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """Return the sum of offset coefficients per surface; zero without offset terms."""
+    """Return the sum of polynomial sag coefficients per surface; zero without any."""
     order = [tuple(e) for e in EXPONENTS[horner_order()].tolist()]
     total = sum(packed[:, OFFSET + order.index(e)] for e in exponents)
     has_offset = (packed[:, FORM] == WITH_OFFSET) | (packed[:, HAS_OFFSET] != 0.0)
@@ -90,7 +91,7 @@ def _mean_curvatures(packed: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _vertices_mm(packed: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the axial positions of the surfaces, with their offset at the vertex."""
+    """Return the axial positions of the surfaces, with polynomial sag at the vertex."""
     return packed[:, VERTEX + 2] + _offset_part(packed, (0, 0))
 
 
@@ -111,7 +112,10 @@ def _gap(
 def _index_behind(
     packed: NDArray[Any], indices: NDArray[Any], i: int, z_mm: float
 ) -> float:
-    """Return the index on the axis behind surface ``i`` (-1: in front), at ``z_mm``."""
+    """Return the on-axis refractive index at ``z_mm`` behind surface ``i``.
+
+    ``i = -1`` is the medium in front of the first surface.
+    """
     if i < 0 or packed[i, GRADIENT] == 0.0:
         return float(indices[i + 1])
     depth_mm = z_mm - packed[i, VERTEX + 2]
@@ -203,7 +207,7 @@ def cardinal_points(eye: EyeSurfaces, *, wavelength_nm: float) -> CardinalPoints
     object_focus, image_focus = front_mm + n_air * d / c, back_mm - n_last * a / c
     object_focal, image_focal = n_air / c, -n_last / c
     pupil_mm, ratio = _entrance_pupil(packed, indices, eye.stop_z_mm)
-    # Slope over height, in air, of the rays that the eye focuses on the retina's pole.
+    # Negative slope over height, in air, of the rays that focus at the posterior pole.
     reach = (retina_mm - back_mm) / n_last
     refraction = MM_PER_M * (a + c * reach) / (b + d * reach)
     return CardinalPoints(

@@ -68,7 +68,7 @@ def power_vector(
     ----------
     prescription : Prescription
     depth_mm : float
-        Depth behind the cornea of the plane to which the powers are converted.
+        Distance behind the cornea, mm, of the plane to which the powers are converted.
 
     Returns
     -------
