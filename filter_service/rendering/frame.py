@@ -60,8 +60,8 @@ def border_px_of(view: RgbdView, layers: FrameLayers, image: ImageCells) -> int:
 def reach_px_of(view: RgbdView, layers: FrameLayers, image: ImageCells) -> int:
     """Return an upper bound on the kernel reach in a view, px, from its depth range.
 
-    The bound follows from ray tracing and from the diffraction inside the kernels'
-    boxes, and not from the PSFs that have been computed so far.
+    The bound is computed from ray tracing plus diffraction within the box to which
+    kernels are cropped.  It does not depend on which PSFs have been computed.
     """
     depths_m = [m[m >= MIN_DEPTH_M] for m in view.surface_depths_m]
     far_m = max((float(m.max(initial=0.0)) for m in depths_m), default=0.0)

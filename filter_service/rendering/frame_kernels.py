@@ -168,7 +168,7 @@ def missing_psfs(
     image: ImageCells,
     used: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
-    """Return the PSFs (n,) of used pairs that are not computed yet."""
+    """Return the indices (n,) of needed PSFs that have not been computed yet."""
     from filter_service.rendering.kernel_loops import list_nodes
 
     *_, fields, intervals = list_nodes(

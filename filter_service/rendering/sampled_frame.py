@@ -74,7 +74,10 @@ class SampledFrame:
 
 
 def first_frame(camera: Camera, settings: FilterSettings) -> SampledFrame:
-    """Return the frame that the service prepares for before the first one arrives."""
+    """Return the frame that is assumed until the first real frame arrives.
+
+    The service computes PSFs for it.
+    """
     pupil_mm = float(np.clip(FIRST_PUPIL_MM, *settings.pupil_range_mm))
     focus_dpt = float(np.clip(FIRST_FOCUS_DPT, *settings.focus_range_dpt))
     low_dpt, high_dpt = np.clip(FIRST_OBJECT_DPT, *settings.object_range_dpt)
@@ -99,7 +102,7 @@ def missing_psfs_of(
     *,
     state: tuple[float, float] | None = None,
 ) -> NDArray[np.int64]:
-    """Return the PSFs (n,) that a frame needs and that are not computed yet.
+    """Return the indices (n,) of needed PSFs that have not been computed yet.
 
     Parameters
     ----------
