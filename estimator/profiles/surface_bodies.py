@@ -18,7 +18,7 @@ from msgspec import UNSET, Meta, UnsetType
 from estimator.optics.dispersion import DISPERSIONS
 from estimator.optics.forms import FORMS
 from estimator.optics.gradients import GRADIENTS
-from estimator.optics.surfaces import MAX_STEPS, MAX_SURFACES, OFFSET_RADIUS_MM
+from estimator.optics.surfaces import MAX_SURFACES, OFFSET_RADIUS_MM
 from estimator.optics.zernike import N_TERMS
 from estimator.profiles.correction_bodies import Body
 from estimator.profiles.validation import ALLOWED
@@ -31,7 +31,10 @@ MAX_POWERS = 12
 """Largest number of powers of the squared radius and of the depth in a gradient."""
 
 MAX_STATES = 8
-MAX_MEDIA = 40
+MAX_STEPS = 64
+"""Largest number of integration steps through all gradients of an eye: 4 for each
+gradient err by 2e-10 mm, and the time of tracing grows with their number."""
+
 SMALLEST_RADIUS_MM = 0.5
 
 RADIUS_ALLOWED = (

@@ -117,6 +117,13 @@ def _check_traceable(eye: EyeSurfaces) -> None:
     check_order(eye)
     if eye.media:
         media_indices(eye, REFERENCE_WAVELENGTH_NM)
+        behind = [eye.media.get(surface.medium_after) for surface in eye.surfaces]
+        steps = sum(getattr(medium, "steps", 0) for medium in behind)
+        if steps > surface_bodies.MAX_STEPS:
+            raise ValueError(
+                f"{steps} steps of the integration through gradients: allowed are up "
+                f"to {surface_bodies.MAX_STEPS} in total"
+            )
 
 
 def _surface(body: SurfaceBody, path: str, media: list[str]) -> Surface:
