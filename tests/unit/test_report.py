@@ -148,25 +148,16 @@ def test_what_is_assumed_is_told_from_what_was_measured():
     assert none["Higher orders"][1].startswith("none")
 
 
-@pytest.mark.parametrize(
-    ("profile", "source"),
-    [
-        ({"kind": "published", "name": "arizona"}, "a schematic eye"),
-        (
-            {
-                "kind": "pseudophakic",
-                "axial_length_mm": 23.6,
-                "keratometry_dpt": [43, 43],
-                "lens_center_mm": 4.9,
-                "implant": {"power_dpt": 21},
-            },
-            "the geometry of an implant",
-        ),
-    ],
-)
-def test_an_eye_given_by_its_surfaces_has_a_report(profile, source):
+def test_an_eye_given_by_its_surfaces_has_a_report():
+    profile = {
+        "kind": "pseudophakic",
+        "axial_length_mm": 23.6,
+        "keratometry_dpt": [43, 43],
+        "lens_center_mm": 4.9,
+        "implant": {"power_dpt": 21},
+    }
     text = html_of(document_of([facts_of(profile, label="eye", has_charts=False)]))
-    assert source in text
+    assert "the geometry of an implant" in text
     assert "dispersion of the media" in text
 
 
@@ -332,6 +323,7 @@ def test_two_eyes_have_distinct_labels(labels, sides, expected):
     assert distinct_labels(labels, sides) == expected
 
 
+@pytest.mark.slow
 def test_a_report_of_two_inline_profiles_needs_no_names(capsys, tmp_path):
     out = tmp_path / "eyes.html"
     eye = {"kind": "prescription", "sphere_dpt": -1.0}
