@@ -52,6 +52,53 @@ def edge_width_px(color):
     return int(np.count_nonzero((row > 0.05) & (row < 0.95)))
 
 
+SURFACES = {
+    "kind": "surfaces",
+    "surfaces": [
+        {"radius_mm": 7.8, "z_mm": 0, "medium_after": "cornea"},
+        {"radius_mm": 6.5, "z_mm": 0.55, "medium_after": "aqueous"},
+        {"radius_mm": 10.2, "z_mm": 3.6, "medium_after": "lens"},
+        {"radius_mm": -6, "z_mm": 7.6, "medium_after": "vitreous"},
+    ],
+    "stop_z_mm": 3.6,
+    "retina": {"radius_mm": 12, "z_mm": 24.2},
+}
+IMPLANT = {
+    "kind": "pseudophakic",
+    "axial_length_mm": 23.5,
+    "keratometry_dpt": [43.5, 43.5],
+    "lens_center_mm": 4.9,
+    "implant": {"power_dpt": 21},
+}
+
+
+def test_eyes_given_by_surfaces_are_filtered_and_a_blocked_one_is_refused(real_client):
+    view = edge_view()
+    widths_px = {}
+    for name, profile in (
+        ("arizona", {"kind": "published", "name": "arizona"}),
+        ("gradient", {"kind": "published", "name": "atchison_2006"}),
+        ("surfaces", SURFACES),
+        ("implant", IMPLANT),
+        ("strong implant", IMPLANT | {"implant": {"power_dpt": 30}}),
+    ):
+        ready = real_client.set_profile(profile, settings=NARROW, views=[view])
+        assert "as given by its surfaces" in " ".join(ready.notes)
+        found = real_client.filter(view, **SEE | {"focus_dpt": 0.5})
+        widths_px[name] = edge_width_px(found.color)
+    blurred = widths_px.pop("strong implant")
+    # -6.6 dpt: three columns of 0.25 deg, as a prescription of that power
+    assert max(widths_px.values()) < 2 <= blurred
+    blocked = [{**s, "clear_radius_mm": 0.3} for s in SURFACES["surfaces"]]
+    with pytest.raises(
+        errors.FilterError, match=r"surfaces\[\d\]: outside a clear radius"
+    ):
+        real_client.set_profile(
+            SURFACES | {"surfaces": blocked}, settings=NARROW, views=[view]
+        )
+    assert real_client.filter(view, **SEE).color.shape == view.color.shape
+
+
 def test_a_myopic_eye_blurs_a_far_edge_and_a_normal_one_does_not(real_client):
     view = edge_view()
     widths_px = []
