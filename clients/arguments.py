@@ -6,11 +6,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from estimator import InvalidFile, profile_body, published_names
+from estimator import PROFILE_SUFFIXES, InvalidFile, profile_body, published_names
 from estimator.bounded_files import loads_bounded
 
 MAX_ARGUMENT_BYTES = 1_000_000
-PROFILE_SUFFIXES = (".json", ".abp", ".csv", ".zmx")
 
 
 def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:

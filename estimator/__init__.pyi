@@ -34,6 +34,8 @@ from .optics.prescription import (
 from .optics.zernike import nm_from_index as nm_from_index
 from .optics.zernike import rescale_pupil as rescale_pupil
 from .optics.zernike import zernike_values as zernike_values
+from .profiles.files import MAX_PROFILE_BYTES as MAX_PROFILE_BYTES
+from .profiles.files import PROFILE_SUFFIXES as PROFILE_SUFFIXES
 from .profiles.files import load_profile as load_profile
 from .profiles.files import profile_body as profile_body
 from .profiles.parse import EyeProfile as EyeProfile

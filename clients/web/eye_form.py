@@ -19,6 +19,8 @@ from clients.web.correction_form import (
     read_numbers,
 )
 from estimator import (
+    MAX_PROFILE_BYTES,
+    PROFILE_SUFFIXES,
     InvalidFile,
     load_profile,
     parse_profile,
@@ -30,8 +32,6 @@ EyeSide = Literal["OD", "OS"]
 Source = Literal["prescription", "preset", "file"]
 
 SIDES: dict[EyeSide, str] = {"OD": "Right eye", "OS": "Left eye"}
-PROFILE_SUFFIXES = (".json", ".csv", ".abp", ".zmx")
-MAX_PROFILE_BYTES = 2_000_000
 
 PRESET_TITLES = {
     "emmetropia": "Emmetropia (normal)",

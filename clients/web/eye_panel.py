@@ -18,8 +18,6 @@ from clients.web.correction_form import (
     SPHERE,
 )
 from clients.web.eye_form import (
-    MAX_PROFILE_BYTES,
-    PROFILE_SUFFIXES,
     EyeForm,
     EyeSide,
     preset_titles,
@@ -27,6 +25,7 @@ from clients.web.eye_form import (
 from clients.web.numbers import NumberField, prescription_texts
 from clients.web.slider_row import SliderRow
 from clients.web.upload_entry import upload_entry
+from estimator import MAX_PROFILE_BYTES, PROFILE_SUFFIXES
 
 SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
 SLIDER_REACH_DPT = 10.0

@@ -28,6 +28,7 @@ from estimator.profiles.parse import (
     preset_names,
 )
 
+PROFILE_SUFFIXES = (".json", ".abp", ".csv", ".zmx")
 MAX_PROFILE_BYTES = 2_000_000
 """Size limit of a profile file: 28 coefficients at 400 field directions take 0.3 MB of
 JSON."""
@@ -129,13 +130,8 @@ def profile_body(
     if not _is_path(source):
         return _inline(str(source))
     path = Path(source)
-    readers = {
-        ".json": _read_json,
-        ".abp": _read_abp,
-        ".csv": _read_csv,
-        ".zmx": _read_zmx,
-    }
-    reader = readers.get(path.suffix.lower())
+    readers = (_read_json, _read_abp, _read_csv, _read_zmx)
+    reader = dict(zip(PROFILE_SUFFIXES, readers, strict=True)).get(path.suffix.lower())
     allowed = (
         f"a preset ({', '.join(preset_names())}), a schematic eye "
         f"({', '.join(PUBLISHED_NAMES)}), a .json, .abp, .csv or .zmx "

@@ -310,7 +310,7 @@ def _with(**changes):
     return {**BODY, "surfaces": [surface], **changes}
 
 
-def test_an_explicit_eye_takes_every_documented_form():
+def test_an_eye_by_surfaces_takes_every_documented_form():
     plain = parsed_eye(BODY)
     assert plain.surfaces[0].radius_mm == (7.8, 7.8)
     assert plain.indices is None
@@ -336,6 +336,6 @@ def test_an_explicit_eye_takes_every_documented_form():
         (_with(stop_z_mm=-3), "surfaces"),
     ],
 )
-def test_a_wrong_explicit_eye_is_refused_by_field(body, field):
+def test_a_wrong_eye_by_surfaces_is_refused_by_field(body, field):
     with pytest.raises(ValueError, match=field):
         parsed_eye(body)

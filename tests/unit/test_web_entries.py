@@ -169,7 +169,7 @@ def test_a_file_is_taken_as_what_it_is():
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("p.exe", b"", r"'p.exe': not a profile; allowed: .json, .csv, .abp"),
+        ("p.exe", b"", r"'p.exe': not a profile; allowed: .json, .abp, .csv, .zmx"),
         ("p.json", b"{", r"not JSON.*allowed: one JSON object"),
         (
             "p.json",
