@@ -121,11 +121,11 @@ def _named(media: dict[str, Medium], medium: Medium | None) -> str:
 # --- Zemax --------------------------------------------------------------------------
 
 WITHOUT_EFFECT = {
-    *("BLNK", "CLAP", "COFN", "COMM", "DIAM", "ELEM", "FCMI", "FIMP", "FLAP"),
+    *("BLNK", "COFN", "COMM", "DIAM", "ELEM", "FCMI", "FIMP", "FLAP"),
     *("HIDE", "MEMA", "MIRR", "OEMA", "POPS", "PPAR", "QOFF", "SLAB", "TRAC"),
 }
-"""Operands of a surface that are ignored: display, coatings, semi-diameters, comments.
-Of apertures, only the stop counts."""
+"""Operands of a surface that are ignored: display, coatings, semi-diameters and
+comments."""
 
 EVEN_TERMS = 8
 
@@ -194,7 +194,7 @@ def _zmx_elements(
     for number, (block, parms) in enumerate(zip(blocks, parameters, strict=True)):
         kind = (block.get("TYPE") or ["STANDARD"])[0]
         thickness = (block.get("DISZ") or ["0"])[0]
-        known = {"TYPE", "CURV", "DISZ", "CONI", "GLAS", "STOP"}
+        known = {"TYPE", "CURV", "DISZ", "CONI", "GLAS", "STOP", "CLAP"}
         unknown = sorted(set(block) - known - WITHOUT_EFFECT)
         if number == 0:  # the object
             continue
@@ -231,6 +231,13 @@ def _zmx_element(
     conic = _number((block.get("CONI") or ["0"])[0], number, "CONI")
     if conic:
         element.shape["conic_constant"] = conic
+    if "CLAP" in block and not element.is_stop:
+        inner_mm, outer_mm = (
+            _number(v, number, "CLAP") for v in (*block["CLAP"], "0", "0")[:2]
+        )
+        if inner_mm != 0.0 or outer_mm <= 0.0:
+            raise refused(number, "CLAP with an inner radius", "CLAP 0 and a radius")
+        element.shape["clear_radius_mm"] = outer_mm
     if kind == "EVENASPH":
         terms = [parms.get(i, 0.0) for i in range(1, EVEN_TERMS + 1)]
         if any(terms):

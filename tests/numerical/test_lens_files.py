@@ -1,6 +1,7 @@
 """Eyes in lens files that optiland wrote, against the rays that it traced."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -86,6 +87,7 @@ SURF 5
   TYPE STANDARD
   CURV 0.1
   DISZ 3.9
+  CLAP 0 4.5 0
   GLAS ___BLANK 1 0 1.42 50 0 0 0 0 0 0
 SURF 6
   TYPE STANDARD
@@ -110,6 +112,7 @@ def test_dummy_surfaces_are_dropped_and_the_stop_is_kept(tmp_path, encoding):
     assert eye.stop_z_mm == pytest.approx(3.6)
     assert eye.surfaces[0].conic_constant == -0.25
     assert eye.surfaces[1].decentration_mm == (0.2, -0.1)
+    assert [s.clear_radius_mm for s in eye.surfaces] == [math.inf, 4.5, math.inf]
     assert eye.retina.z_mm == pytest.approx(24.0)
     assert eye.retina.radius_mm == pytest.approx((-12.5, -12.5))
     lens = eye.media[eye.surfaces[1].medium_after]
@@ -123,6 +126,7 @@ def test_dummy_surfaces_are_dropped_and_the_stop_is_kept(tmp_path, encoding):
         ("UNIT MM", "UNIT IN", "UNIT.*'IN'"),
         ("TYPE STANDARD\n  CURV 0.1\n", "TYPE BICONICX\n  CURV 0.1\n", "'BICONICX'"),
         ("PARM 1 0.2", "PARM 3 5", "COORDBRK tilts"),
+        ("CLAP 0 4.5", "CLAP 1 4.5", "CLAP with an inner radius"),
         ("CURV 0.1\n", "CURV 0.1\n  XDAT 1 2\n", "operand 'XDAT'"),
         ("CURV 0.1\n", "CURV nan\n", "CURV 'nan' is not a number"),
         ("___BLANK 1 0 1.42", "N-BK7 0 0 1.5", "'N-BK7' is in a catalog"),
