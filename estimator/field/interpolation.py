@@ -189,6 +189,15 @@ class FieldInterpolation:
         # matrix products.
         self._values = np.ascontiguousarray(np.moveaxis(values, 4, 2))
 
+    def add(self, phase_um: NDArray[np.float64]) -> None:
+        """Add a phase to the wavefronts of all pupils and wavelengths.
+
+        Parameters
+        ----------
+        phase_um : (n_h, n_v, n_accommodations, 28), um/mm^degree
+        """
+        self._values[..., :N_TERMS] += phase_um[:, :, None, None]
+
     @staticmethod
     def is_open(grid: AberrationGrid) -> NDArray[np.bool_]:
         """Return whether pupils are unvignetted, for all nodes of a grid."""

@@ -19,6 +19,7 @@ from estimator.corrections.progressive import (
 from estimator.corrections.worn_lens import rings_of, worn_polynomial
 from estimator.estimate.given_surfaces import EyeModel
 from estimator.eye.focusing import FocusingEye
+from estimator.field.accommodated_periphery import held_refraction_um
 from estimator.field.aberration_grid import AberrationGrid, aberration_grid
 from estimator.field.fixed_defocus import FixedDefocus
 from estimator.field.interpolation import (
@@ -190,13 +191,18 @@ class TracedEye(FocusingEye):
             **states,
             progress=scaled_progress(progress, axis_share, 1.0),
         )
+        periphery = peripheral_residual(eye, traced_range_deg)
+        if periphery is not None:
+            phase_um = held_refraction_um(eye, field.grid, periphery)
+            if np.isfinite(phase_um).all():
+                field.add(phase_um)
         return cls(
             eye,
             axis,
             field,
             field_range_deg=field_range_deg,
             traced_range_deg=traced_range_deg,
-            periphery=peripheral_residual(eye, traced_range_deg),
+            periphery=periphery,
         )
 
     def refraction_at_dpt(
