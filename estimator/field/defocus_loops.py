@@ -61,14 +61,13 @@ def fill_defocus(pupil_mm, field, axis, state, added, found_dpt):
     state : (number, channel, open_mm)
         Index of the field, index of the wavelength and unvignetted pupil, mm, of each
         of the n requests.
-    added : (always, fading, fading_mm, stretched, stretched_mm)
-        Sums (n, 3) to add: constant ones; those of a phase that is stretched in pupils
-        with a radius above ``fading_mm``; and those of a phase whose orders above the
-        second are stretched in pupils with a radius above ``stretched_mm``.
+    added : (always, fading, fading_mm)
+        Sums (n, 3) to add: constant ones, and those of a phase that is stretched in
+        pupils with a radius above ``fading_mm``.
     found_dpt : (n,) out
     """
     number, channel, open_mm = state
-    always, fading, fading_mm, stretched, stretched_mm = added
+    always, fading, fading_mm = added
     values = np.empty(N_DEGREES + N_RIM)
     weight, own_weight = np.empty(values.size), np.empty(values.size)
     lower = _pupil_weights(pupil_mm, field, weight)
@@ -85,12 +84,10 @@ def fill_defocus(pupil_mm, field, axis, state, added, found_dpt):
         _scale_rim(values, own_mm, own_scale)
         radius_mm = _circumscribed_mm(values[N_DEGREES:])
         fade = min(2.0 * fading_mm / own_mm, 1.0)
-        stop = min(2.0 * stretched_mm / own_mm, 1.0)
         total = 0.0
         for d in range(N_DEGREES):
             degree = 2 * d + 2
             part = values[d] + always[k, d] + fading[k, d] * fade**degree
-            part += stretched[k, d] * stop ** (degree - 2)
             total += part * radius_mm ** (degree - 2)
         found_dpt[k] = -SPHERE_PER_C20 * total
 

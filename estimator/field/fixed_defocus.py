@@ -8,10 +8,8 @@ from numpy.typing import NDArray
 
 from estimator.estimate.measured_residual import MeasuredResidual
 from estimator.field.interpolation import POWER, FieldInterpolation, FieldValues
-from estimator.field.peripheral_residual import WIDEST_RATIO
 from estimator.optics.prescription import C20
 from estimator.optics.zernike import N_TERMS, monomial_matrix
-from estimator.periphery.meridian import CIRCLE_MM
 from estimator.wavefront.field_wavefronts import DEGREE
 
 DEGREES = (2, 4, 6)
@@ -29,8 +27,6 @@ class FixedDefocus:
         Residual of the estimate.
     residual_weight : (n,)
         Weight of the residual.
-    periphery_um : (n, 28), optional
-        Phase of the population's periphery.
     added_um : (n, 28)
         Phase that does not depend on the pupil.
     open_mm : (n,), optional
@@ -44,7 +40,6 @@ class FixedDefocus:
         residual: MeasuredResidual,
         *,
         residual_weight: NDArray[np.float64],
-        periphery_um: NDArray[np.float64] | None,
         added_um: NDArray[np.float64],
         open_mm: NDArray[np.float64] | None,
     ):
@@ -53,15 +48,11 @@ class FixedDefocus:
         count = values.field.size
         open_mm = np.full(count, np.inf) if open_mm is None else open_mm
         self._state = values.field, values.channel, np.ascontiguousarray(open_mm)
-        if periphery_um is None:
-            periphery_um = np.zeros((count, N_TERMS))
         fading = residual_weight[:, None] * sums_by_degree(residual.residue_um)
         self._added = (
             sums_by_degree(added_um),
             np.ascontiguousarray(fading),
             float(residual.radius_mm),
-            sums_by_degree(periphery_um),
-            WIDEST_RATIO * CIRCLE_MM,
         )
 
     def at(

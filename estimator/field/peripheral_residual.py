@@ -9,6 +9,10 @@ added to the traced wavefronts, and it is zero on the axis.
 For an eye outside the population's range (for example keratoconus), the phase is
 computed for an eye whose on-axis wavefront is clamped to that range.  How the actual
 eye deviates from the clamped eye comes from ray tracing.
+
+The population was measured through `CIRCLE_MM`.  Wider pupils have the same polynomial:
+one that grows more slowly beyond 6 mm gives M a kink of 0.1 to 0.5 dpt/mm there, and
+makes the far periphery of a myope up to 1 dpt more myopic at 7 mm than at 6 mm.
 """
 
 from dataclasses import replace
@@ -31,15 +35,10 @@ from estimator.periphery.change import PeripheralChange
 from estimator.periphery.meridian import CIRCLE_MM, TERMS
 from estimator.profiles.parse import EyeProfile, Measurement
 from estimator.wavefront.field_wavefronts import (
-    DEGREE,
     polynomial_in_mm,
     zernike_from_polynomial,
 )
 from estimator.wavefront.moved_plane import moved_polynomial
-
-WIDEST_RATIO = 1.5
-"""Ratio of pupil radius to `CIRCLE_MM` above which third- and fourth-degree terms are
-scaled down, because polynomials diverge outside the measured pupil."""
 
 
 class PeripheralResidual:
@@ -108,15 +107,6 @@ class PeripheralResidual:
         known = np.isin(np.arange(N_TERMS), TERMS)
         difference_um = remove_central_tilt(np.where(known, difference_um, 0.0))
         return polynomial_in_mm(difference_um, CIRCLE_MM)
-
-
-def stretch_ratio(radius_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the factors (n, 28) that scale the phase's monomial coefficients.
-
-    ``radius_mm`` contains pupil radii (n,).
-    """
-    ratio = np.minimum(WIDEST_RATIO * CIRCLE_MM / radius_mm, 1.0)
-    return ratio[:, None] ** np.maximum(DEGREE - 2, 0)
 
 
 def clamped_eye(change: PeripheralChange, eye: EstimatedEye) -> EstimatedEye:

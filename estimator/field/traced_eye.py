@@ -19,8 +19,8 @@ from estimator.corrections.progressive import (
 from estimator.corrections.worn_lens import rings_of, worn_polynomial
 from estimator.estimate.given_surfaces import EyeModel
 from estimator.eye.focusing import FocusingEye
-from estimator.field.accommodated_periphery import held_refraction_um
 from estimator.field.aberration_grid import AberrationGrid, aberration_grid
+from estimator.field.accommodated_periphery import held_refraction_um
 from estimator.field.fixed_defocus import FixedDefocus
 from estimator.field.interpolation import (
     FieldInterpolation,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from estimator.estimate.measured_residual import MeasuredResidual
 from estimator.field.fixed_defocus import FixedDefocus
 from estimator.field.interpolation import FieldInterpolation
-from estimator.field.peripheral_residual import PeripheralResidual, stretch_ratio
+from estimator.field.peripheral_residual import PeripheralResidual
 from estimator.wavefront.field_wavefronts import (
     circumscribed_radius_mm,
     distinct_rows,
@@ -85,14 +85,11 @@ class TracedFields:
             h_deg=h_deg, v_deg=v_deg, wavelength_nm=wavelength_nm, **pupils
         )
         self._residual = residual
-        self._residual_weight, self._periphery_um = (
-            residual.left_share(h_deg, v_deg),
-            None,
-        )
+        self._residual_weight = residual.left_share(h_deg, v_deg)
+        self._added_um = residual.color_um(wavelength_nm) - correction_um
         if periphery is not None:
             self._residual_weight = np.ones(h_deg.size)
-            self._periphery_um = _evaluate_distinct(periphery.at, h_deg, v_deg)
-        self._added_um = residual.color_um(wavelength_nm) - correction_um
+            self._added_um += _evaluate_distinct(periphery.at, h_deg, v_deg)
         zeros = np.zeros(h_deg.size)
         self._axis_states = on_axis.values(
             h_deg=zeros, v_deg=zeros, wavelength_nm=wavelength_nm, **pupils
@@ -119,8 +116,6 @@ class TracedFields:
         rim_mm = rim_mm * self._rim_scale(pupil_mm, accommodation_dpt)[:, None]
         radius_mm = circumscribed_radius_mm(rim_mm)
         residue_um = self._residual.residues_um(pupil_mm / 2.0, self._residual_weight)
-        if self._periphery_um is not None:
-            residue_um += self._periphery_um * stretch_ratio(pupil_mm / 2.0)
         zernike_um = zernike_from_polynomial(
             polynomial_um + self._added_um + residue_um, radius_mm
         )
@@ -133,7 +128,6 @@ class TracedFields:
             (self._on_axis, self._axis_states),
             self._residual,
             residual_weight=self._residual_weight,
-            periphery_um=self._periphery_um,
             added_um=self._added_um,
             open_mm=self._open_mm,
         )
