@@ -15,18 +15,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.estimate.estimation import EstimatedEye
+from estimator.estimate.given_surfaces import EyeModel
 from estimator.field.aberration_grid import (
     FIELD_AZIMUTHS,
     FIELD_RINGS,
     AberrationGrid,
-    aberration_grid,
 )
 from estimator.field.peripheral_residual import PeripheralResidual
 from estimator.optics.prescription import C2M2, C20, C22
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import N_TERMS
 from estimator.periphery.meridian import CIRCLE_MM
+from estimator.wavefront.aberrations import wavefront_grid
 from estimator.wavefront.field_wavefronts import (
     polynomial_in_mm,
     zernike_from_polynomial,
@@ -41,13 +41,13 @@ the third, the refraction is held to 1e-6 dpt."""
 
 
 def held_refraction_um(
-    eye: EstimatedEye, grid: AberrationGrid, periphery: PeripheralResidual
+    eye: EyeModel, grid: AberrationGrid, periphery: PeripheralResidual
 ) -> NDArray[np.float64]:
     """Return the phase at the nodes of a grid, in the plane of the entrance pupil.
 
     Parameters
     ----------
-    eye : EstimatedEye
+    eye : EyeModel
     grid : AberrationGrid
         Grid over the field, whose fields and accommodations are used.
     periphery : PeripheralResidual
@@ -59,23 +59,24 @@ def held_refraction_um(
         Second-degree monomials; NaN where the eye could not be traced.
     """
     h_deg, v_deg = np.meshgrid(grid.h_deg, grid.v_deg, indexing="ij")
-    added_um = eye.rest([REFERENCE_WAVELENGTH_NM]).on_axis_um(2.0 * CIRCLE_MM)[0]
-    states_dpt = np.append(0.0, grid.accommodations_dpt)
-    axis_um = added_um + _traced_um(eye, states_dpt, h_deg=[0.0], v_deg=[0.0])
-    changed_um = periphery.at(h_deg.ravel(), v_deg.ravel())
-    field_um = (
-        added_um
-        + changed_um.reshape(*h_deg.shape, 1, N_TERMS)
-        + _traced_um(eye, states_dpt, h_deg=grid.h_deg, v_deg=grid.v_deg)
+    shape = *h_deg.shape, 1 + grid.accommodations_dpt.size, N_TERMS
+    directions_deg = np.stack([h_deg.ravel(), v_deg.ravel()], axis=-1)
+    traced_um = _traced_um(
+        eye,
+        accommodations_dpt=np.append(0.0, grid.accommodations_dpt),
+        directions_deg=np.append(directions_deg, [[0.0, 0.0]], axis=0),
     )
+    traced_um += eye.rest([REFERENCE_WAVELENGTH_NM]).on_axis_um(2.0 * CIRCLE_MM)
+    changed_um = periphery.at(*directions_deg.T)
+    field_um = (traced_um[:-1] + changed_um[:, None]).reshape(shape)
     depth_mm = eye.accommodating.entrance_pupil_mm
 
     def at_cornea_um(polynomial_um: NDArray[Any]) -> NDArray[np.float64]:
         moved_um = moved_polynomial(polynomial_um, depth_mm=-depth_mm)
         return zernike_from_polynomial(moved_um, CIRCLE_MM)[..., SECOND_ORDER]
 
-    on_axis_um = at_cornea_um(axis_um)
-    wanted_um = at_cornea_um(field_um[:, :, :1]) + on_axis_um - on_axis_um[:, :, :1]
+    on_axis_um = at_cornea_um(traced_um[-1])
+    wanted_um = at_cornea_um(field_um[:, :, :1]) + on_axis_um - on_axis_um[0]
     phase_um = np.zeros_like(field_um)
     for _ in range(ITERATIONS):
         missing_um = np.zeros_like(field_um)
@@ -87,17 +88,24 @@ def held_refraction_um(
 
 
 def _traced_um(
-    eye: EstimatedEye, states_dpt: NDArray[Any], **fields_deg: Any
+    eye: EyeModel,
+    *,
+    accommodations_dpt: NDArray[np.float64],
+    directions_deg: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return traced monomials (n_h, n_v, n_states, 28) on `CIRCLE_MM`."""
-    traced = aberration_grid(
-        eye,
-        pupil_diameters_mm=[2.0 * CIRCLE_MM],
-        accommodations_dpt=states_dpt,
-        wavelengths_nm=[REFERENCE_WAVELENGTH_NM],
-        n_rings=FIELD_RINGS,
-        n_azimuths=FIELD_AZIMUTHS,
-        **fields_deg,
-    )
-    polynomial_um = polynomial_in_mm(traced.zernike_um, traced.zernike_radius_mm)
-    return polynomial_um[:, :, 0, :, 0]
+    """Return traced monomials (n_directions, n_accommodations, 28) on `CIRCLE_MM`."""
+    found_um = []
+    for state in eye.accommodating.states_at(accommodations_dpt):
+        traced = wavefront_grid(
+            state.surfaces,
+            fields_deg=directions_deg,
+            wavelengths_nm=[REFERENCE_WAVELENGTH_NM],
+            pupil_diameters_mm=[2.0 * CIRCLE_MM],
+            plane="pupil",
+            n_rings=FIELD_RINGS,
+            n_azimuths=FIELD_AZIMUTHS,
+        )
+        found_um.append(
+            polynomial_in_mm(traced.zernike_um, traced.zernike_radius_mm)[:, 0, 0]
+        )
+    return np.stack(found_um, axis=1)

@@ -192,7 +192,7 @@ class TracedEye(FocusingEye):
             progress=scaled_progress(progress, axis_share, 1.0),
         )
         periphery = peripheral_residual(eye, traced_range_deg)
-        if periphery is not None:
+        if periphery is not None and field.grid.accommodations_dpt.any():
             phase_um = held_refraction_um(eye, field.grid, periphery)
             if np.isfinite(phase_um).all():
                 field.add(phase_um)
