@@ -29,6 +29,8 @@ def periphery_note(eye: TracedEye) -> str:
     source = "mean of measured eyes with similar on-axis wavefronts"
     if change.measured_count:
         source = f"measured in {change.measured_count} directions off the axis"
+    if change.sample is not None:
+        source = f"drawn from measured eyes with sample {change.sample}"
     note = f"periphery: {source}; M at 10, 20, 30 deg known to +-{known} dpt"
     if change.misfit_um > MAX_MISFIT_UM:
         note += f"; RMS misfit of the measurements {change.misfit_um:.2f} um"

@@ -1,15 +1,19 @@
 """Change of the wavefront of one eye from its axis to the periphery.
 
 The normal distribution of measured eyes (`population`) is conditioned on the axis of
-this eye and on all other measured directions.  Off the horizontal meridian,
-measurements may deviate from the model of `meridian`; a Gaussian process that is zero
-on the meridian represents the deviation.
+this eye and on all other measured directions; the result is the most probable change,
+or one drawn from the conditional distribution.  Off the horizontal meridian,
+eyes deviate from the model of `meridian`; a Gaussian process that is zero on the
+meridian represents the deviation.  It follows measurements, and draws.  Its deviations
+are those of the five eyes of Polans 2015, because the population was measured on the
+meridian alone.  Orders above the fourth, which the population does not contain, are
+those of the axis in all directions.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,7 +39,11 @@ NOISE_UM = 0.02
 repeatability of instruments, and the residual of the spline between knots."""
 
 PRESCRIPTION_TERMS = (3, 4, 5)
-"""Terms on the axis that a prescription determines."""
+"""Terms on the axis that a prescription determines; typical ones tell nothing about the
+periphery, but those of a drawn person are that person's."""
+
+FIRST_HIGHER = 6
+"""OSA index of the first higher-order term."""
 
 MAX_DISTANCE = 4.6
 """Mahalanobis distance on the axis (twelve terms) that 95 % of eyes do not exceed.
@@ -53,8 +61,59 @@ and down and within 30 deg to the sides."""
 
 OFF_MERIDIAN_AT_DEG, CORRELATION_LENGTH_DEG = 25.0, 20.0
 
+FIELD_STREAM = 1
+"""Second seed of drawn changes; the axis has another (`typical_aberrations`)."""
+
+N_FEATURES = 256
+"""Number of cosines of a drawn Gaussian process."""
+
+RELATIVE_JITTER = 1e-6
+"""Added to variances, whose matrix is singular but for rounding."""
+
 MAX_MISFIT_UM = 0.1
 """Largest RMS misfit of measurements that is not reported."""
+
+
+class OffMeridianDraw(NamedTuple):
+    """A function drawn from the Gaussian process, as a sum of random cosines.
+
+    Attributes
+    ----------
+    frequencies : (N_FEATURES, 2)
+        Angular frequencies, rad/deg.
+    phases_rad : (N_FEATURES,)
+    amplitudes_um : (N_FEATURES, 12)
+
+    References
+    ----------
+    Rahimi & Recht 2007 (NIPS 20): random Fourier features.
+    """
+
+    frequencies: NDArray[np.float64]
+    phases_rad: NDArray[np.float64]
+    amplitudes_um: NDArray[np.float64]
+
+    @classmethod
+    def draw(cls, random: np.random.RandomState) -> "OffMeridianDraw":
+        """Draw a function."""
+        return cls(
+            random.standard_normal((N_FEATURES, 2)) / CORRELATION_LENGTH_DEG,
+            random.uniform(0.0, 2.0 * math.pi, N_FEATURES),
+            math.sqrt(2.0 / N_FEATURES)
+            * random.standard_normal((N_FEATURES, len(TERMS)))
+            * list(OFF_MERIDIAN_UM.values()),
+        )
+
+    def at_um(
+        self, h_deg: NDArray[np.float64], v_deg: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the deviation (n, 12) in directions (n,)."""
+        directions_deg = np.stack([h_deg, v_deg], axis=-1)
+        cosines = np.cos(directions_deg @ self.frequencies.T + self.phases_rad)
+        found_um: NDArray[np.float64] = (
+            v_deg[:, None] / OFF_MERIDIAN_AT_DEG * (cosines @ self.amplitudes_um)
+        )
+        return found_um
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +140,10 @@ class PeripheralChange:
         Weights of the Gaussian process at these directions.
     misfit_um : float
         RMS misfit of the measurements; 0 if there are none.
+    sample : int or None
+        Seed, if the change is drawn.
+    off_meridian_draw : OffMeridianDraw or None
+        Function of a drawn change, to which the weighted process is added.
     """
 
     eye_side: str
@@ -92,6 +155,8 @@ class PeripheralChange:
     off_meridian_v_deg: NDArray[np.float64]
     off_meridian_um: NDArray[np.float64]
     misfit_um: float
+    sample: int | None = None
+    off_meridian_draw: OffMeridianDraw | None = None
 
     @property
     def measured_count(self) -> int:
@@ -111,13 +176,19 @@ class PeripheralChange:
         found_um[:, TERMS[0] : TERMS[-1] + 1] = (
             field_terms(h_deg, v_deg, knots_um) + covariance @ weights_um
         )
+        if self.off_meridian_draw is not None:
+            found_um[:, TERMS[0] : TERMS[-1] + 1] += self.off_meridian_draw.at_um(
+                h_deg, v_deg
+            )
         return found_um if self.eye_side == "OD" else flip_horizontal(found_um)
 
 
 def peripheral_change(
     profile: EyeProfile, population: Population | None = None
 ) -> PeripheralChange:
-    """Return the most probable change of the eye of a profile.
+    """Return the change of the eye of a profile: drawn if it has a ``sample``.
+
+    Without one, it is the most probable change.
 
     Parameters
     ----------
@@ -135,6 +206,7 @@ def peripheral_change(
         axis=(clamped_um, noise_um),
         others=[_as_right_eye(m, profile.eye_side) for m in others],
         measured_axis_um=axis_um,
+        sample=profile.sample,
     )
 
 
@@ -171,7 +243,8 @@ def _axis(profile: EyeProfile) -> tuple[NDArray[np.float64], NDArray[np.float64]
         profile.zernike_um, profile.pupil_diameter_mm, profile.wavelength_nm
     )
     axis_um, noise_um = _as_right_eye(first, profile.eye_side)[2:]
-    if profile.kind == "prescription":
+    is_drawn = profile.sample is not None and profile.zernike_um[FIRST_HIGHER:].any()
+    if profile.kind == "prescription" and not is_drawn:
         is_prescribed = np.isin(TERMS, PRESCRIPTION_TERMS)
         noise_um = np.where(is_prescribed, noise_um, 1e3)
     return axis_um, noise_um
@@ -198,8 +271,13 @@ def _conditioned(
     axis: tuple[NDArray[np.float64], NDArray[np.float64]],
     others: Sequence[tuple[float, float, NDArray[np.float64], NDArray[np.float64]]],
     measured_axis_um: NDArray[np.float64],
+    sample: int | None = None,
 ) -> PeripheralChange:
-    """Condition the population on the axis and on all other directions."""
+    """Condition the population on the axis and on all other directions.
+
+    A change is drawn by Matheron's rule: an eye drawn from the population is corrected
+    by the difference of its simulated measurements from the actual ones.
+    """
     axis_um, axis_noise_um = axis
     mean_um = population.mean_um
     n_places = mean_um.shape[1]
@@ -222,12 +300,23 @@ def _conditioned(
     )
     total = observation @ covariance @ observation.T + np.diag(noise_um2)
     total[len(TERMS) :, len(TERMS) :] += off_meridian_um2
-    innovation_um = measured_um - observation @ mean_um.ravel()
-    weights: NDArray[Any] = np.linalg.solve(total, innovation_um)
-    gain = np.linalg.solve(total, observation @ covariance)
-    found_um = mean_um.ravel() + weights @ (observation @ covariance)
-    posterior_um2 = np.diag(covariance - (observation @ covariance).T @ gain)
+    prior_um, draw = mean_um.ravel(), None
+    weights: NDArray[Any] = np.linalg.solve(total, measured_um - observation @ prior_um)
     residual_um = (noise_um2 * weights)[len(TERMS) :]
+    if sample is not None:
+        # The stream of `RandomState` is the same in all versions of NumPy.
+        random = np.random.RandomState([sample, FIELD_STREAM])
+        jitter = np.diag(RELATIVE_JITTER * scale**2)
+        root = np.linalg.cholesky(covariance + jitter)
+        prior_um = prior_um + root @ random.standard_normal(scale.size)
+        draw = OffMeridianDraw.draw(random)
+        simulated_um = observation @ prior_um
+        simulated_um += np.sqrt(noise_um2) * random.standard_normal(noise_um2.size)
+        simulated_um[len(TERMS) :] += draw.at_um(h_deg, v_deg).ravel()
+        weights = np.linalg.solve(total, measured_um - simulated_um)
+    gain = np.linalg.solve(total, observation @ covariance)
+    found_um = prior_um + weights @ (observation @ covariance)
+    posterior_um2 = np.diag(covariance - (observation @ covariance).T @ gain)
     return PeripheralChange(
         eye_side=eye_side,
         axis_um=axis_um,
@@ -238,6 +327,8 @@ def _conditioned(
         off_meridian_v_deg=v_deg,
         off_meridian_um=weights[len(TERMS) :].reshape(-1, len(TERMS)),
         misfit_um=float(np.sqrt(np.mean(residual_um**2))) if others else 0.0,
+        sample=sample,
+        off_meridian_draw=draw,
     )
 
 

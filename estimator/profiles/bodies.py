@@ -150,13 +150,33 @@ class CommonBody(Body, kw_only=True):
     ] = False
 
 
-class PresetBody(CommonBody, kw_only=True, tag_field="kind", tag="preset"):
+class WavefrontBody(CommonBody, kw_only=True):
+    """Fields of every kind whose profile tells the wavefront on the axis."""
+
+    sample: (
+        Annotated[
+            int,
+            Meta(
+                ge=0,
+                le=2**32 - 1,
+                description="seed of a person drawn from the population, with "
+                "everything that the profile does not tell: the periphery and, with a "
+                "prescription, the higher orders. By default, these are typical",
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
+
+
+class PresetBody(WavefrontBody, kw_only=True, tag_field="kind", tag="preset"):
     """A preset eye by its name."""
 
     name: Literal[tuple(PRESETS)]  # type: ignore[valid-type]  # read from a file
 
 
-class PrescriptionBody(CommonBody, kw_only=True, tag_field="kind", tag="prescription"):
+class PrescriptionBody(
+    WavefrontBody, kw_only=True, tag_field="kind", tag="prescription"
+):
     """An eye that a prescription corrects."""
 
     sphere_dpt: SphereDpt
@@ -183,7 +203,7 @@ class PrescriptionBody(CommonBody, kw_only=True, tag_field="kind", tag="prescrip
     ) = UNSET
 
 
-class ZernikeBody(CommonBody, kw_only=True, tag_field="kind", tag="zernike"):
+class ZernikeBody(WavefrontBody, kw_only=True, tag_field="kind", tag="zernike"):
     """A measured wavefront on the axis."""
 
     zernike_um: CoefficientsUm
@@ -204,7 +224,7 @@ class MeasurementBody(Body, kw_only=True):
     v_deg: FieldAngleDeg = 0.0
 
 
-class ZernikeSetBody(CommonBody, kw_only=True, tag_field="kind", tag="zernike_set"):
+class ZernikeSetBody(WavefrontBody, kw_only=True, tag_field="kind", tag="zernike_set"):
     """Wavefronts of one eye in several directions or through several pupils."""
 
     measurements: Annotated[

@@ -53,6 +53,7 @@ def common_fields(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
         "correction": parse_correction(body.correction, has_cornea=not is_prescription),
         "retina": retina,
         "periphery": _periphery(body),
+        "sample": _sample(body),
         "straylight": _straylight(body.straylight, age_years),
         "yellowing": body.yellowing,
         "spectacle_magnification": body.spectacle_magnification,
@@ -77,6 +78,20 @@ def _periphery(body: bodies.CommonBody) -> str:
             "model, for the kinds of given eyes and with 'retina'",
         )
     return body.periphery
+
+
+def _sample(body: bodies.CommonBody) -> int | None:
+    if not isinstance(body, bodies.WavefrontBody) or body.sample is msgspec.UNSET:
+        return None
+    is_prescription = isinstance(body, bodies.PrescriptionBody)
+    if _periphery(body) == "model" and not is_prescription:
+        raise ProfileError(
+            "sample",
+            "draws nothing, because the profile tells the axis and the periphery is "
+            "that of the model",
+            "'periphery' people, without 'retina'",
+        )
+    return body.sample
 
 
 def _straylight(

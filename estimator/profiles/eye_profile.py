@@ -86,6 +86,9 @@ class EyeProfile:
     higher_order : {"typical", "none"}
         Aberrations added to a traced eye (`typical_aberrations`); only a prescription
         requests any.
+    sample : int or None
+        Seed of a person drawn from the population (`typical_aberrations`, `periphery`);
+        None for the typical aberrations and the most probable periphery.
     notes : tuple of str
         Notes on powers at their distance from the cornea, and at the cornea.
     """
@@ -109,6 +112,7 @@ class EyeProfile:
     spectacle_magnification: bool = False
     notes: tuple[str, ...] = ()
     surfaces: "SurfaceModel | None" = None
+    sample: int | None = None
 
     @property
     def is_given(self) -> bool:
