@@ -158,7 +158,7 @@ class WavefrontBody(CommonBody, kw_only=True):
             int,
             Meta(
                 ge=0,
-                le=2**32 - 1,
+                le=999_999,
                 description="seed of a person drawn from the population, with "
                 "everything that the profile does not tell: the periphery and, with a "
                 "prescription, the higher orders. By default, these are typical",

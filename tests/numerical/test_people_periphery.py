@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 
 from estimator.field.field_table import field_table
+from estimator.field.prepare import prepare_eye
 from estimator.optics.prescription import power_vectors_dpt
-from estimator.optics.zernike import N_TERMS, flip_horizontal, nm_from_index
+from estimator.optics.units import SPHERE_PER_C20
+from estimator.optics.zernike import (
+    N_TERMS,
+    flip_horizontal,
+    nm_from_index,
+    rescale_pupil,
+)
 from estimator.periphery.change import OFF_MERIDIAN_UM, peripheral_change
 from estimator.periphery.measured_eyes import load_measured_eyes
 from estimator.periphery.meridian import (
@@ -52,6 +59,160 @@ def asked(profile, h_deg, v_deg=0.0, pupil_mm=4.0, **options):
 
 def preset(name, **more):
     return parse_profile({"kind": "preset", "name": name, **more})
+
+
+# ----- accommodation and pupils
+
+
+def relative(profile, focus_dpt, pupil_mm):
+    """Return M, J0, J45 (2, 3) and horizontal coma (2,) at -30 and 30 deg."""
+    table = asked(profile, [0.0, -30.0, 30.0], pupil_mm=pupil_mm, focus_dpt=focus_dpt)
+    zernike_um = np.array(
+        [
+            rescale_pupil(row, radius_ratio=pupil_mm / 2.0 / radius_mm)
+            for row, radius_mm in zip(
+                table.zernike_um, table.zernike_radius_mm, strict=True
+            )
+        ]
+    )
+    power_dpt = power_vectors_dpt(zernike_um, pupil_mm / 2.0)
+    return power_dpt[1:] - power_dpt[0], zernike_um[1:, 8] - zernike_um[0, 8]
+
+
+@pytest.mark.parametrize("name", ["emmetropia", "keratoconus"])
+@pytest.mark.parametrize("focus_dpt", [2.0, 6.0])
+def test_refraction_off_the_axis_is_that_of_the_relaxed_eye(name, focus_dpt):
+    profile = preset(name, age_years=20)
+    relaxed_dpt, _ = relative(profile, None, 4.0)
+    found_dpt, _ = relative(profile, focus_dpt, 4.0)
+    assert found_dpt == pytest.approx(relaxed_dpt, abs=5e-3)
+
+
+@pytest.mark.parametrize("pupil_mm", [2.0, 6.0])
+def test_other_pupils_and_coma_change_no_more_than_in_people(pupil_mm):
+    profile = preset("emmetropia", age_years=20)
+    found = [relative(profile, dpt, pupil_mm) for dpt in (None, 2.0, 4.0, 6.0)]
+    sphere_dpt = np.array([power_dpt[:, 0] for power_dpt, _ in found])
+    # studies: none, or 0.1 to 0.5 dpt more myopic over several diopters
+    assert np.all(sphere_dpt[-1] - sphere_dpt[0] < 0.35)
+    assert np.all(sphere_dpt[-1] - sphere_dpt[0] > -0.65)
+    steps_um = np.diff([coma_um for _, coma_um in found], axis=0)
+    assert np.all(np.abs(steps_um) < 0.2 * (pupil_mm / 6.0) ** 3)
+
+
+def test_the_eye_model_alone_turns_hyperopic():
+    """Why the refraction is held: 0.28 dpt per diopter at 30 deg."""
+    profile = preset("emmetropia", age_years=20, periphery="model")
+    relaxed_dpt, _ = relative(profile, None, 4.0)
+    near_dpt, _ = relative(profile, 6.0, 4.0)
+    assert np.all(near_dpt[:, 0] - relaxed_dpt[:, 0] > 1.2)
+
+
+def test_the_slope_of_the_refraction_over_the_pupil_is_continuous():
+    eye, _ = prepare_eye(
+        preset("myopia"),
+        pupil_diameters_mm=np.arange(2.0, 8.1),
+        wavelengths_nm=[555.0],
+        field_range_deg=((-40.0, 40.0), (-1.0, 1.0)),
+    )
+    jumps = []
+    for step_mm in (0.05, 0.1):
+        pupils_mm = np.arange(2.0, 8.0 + step_mm / 2.0, step_mm)
+        found_dpt = eye.total_defocus_dpt(
+            h_deg=np.array([0.0, -40.0, -20.0, 20.0, 40.0])[:, None],
+            pupil_diameter_mm=np.minimum(pupils_mm, eye.max_pupil_diameter_mm),
+            accommodation_dpt=0.0,
+            wavelength_nm=555.0,
+        )
+        change = np.abs(np.diff(found_dpt, 2, axis=1)) / step_mm
+        jumps.append(change[:, :: round(0.1 / step_mm)].max())
+    # a curvature's share shrinks with the step; that of a kink does not
+    assert 2.0 * jumps[0] - jumps[1] < 0.03
+
+
+# ----- drawn persons
+
+
+def test_drawn_peripheries_have_the_mean_and_the_spread_of_people():
+    told = peripheral_change(preset("emmetropia"))
+    drawn_um = np.array(
+        [peripheral_change(preset("emmetropia", sample=k)).knots_um for k in range(300)]
+    )
+    sphere_um = drawn_um.reshape(300, len(TERMS), -1)[:, TERMS.index(4)]
+    mean_um = told.knots_um.reshape(len(TERMS), -1)[TERMS.index(4)]
+    deviation_um = told.sphere_deviation_dpt * CIRCLE_MM**2 / SPHERE_PER_C20
+    assert sphere_um.mean(axis=0) == pytest.approx(mean_um, abs=0.12)
+    assert sphere_um.std(axis=0) == pytest.approx(deviation_um, rel=0.12)
+    # off the meridian: between the people of Polans 2015 and the meridian's spread
+    off_um = np.array(
+        [
+            peripheral_change(preset("emmetropia", sample=k)).zernike_um(0.0, 25.0)[0]
+            for k in range(300)
+        ]
+    ) - told.zernike_um(0.0, 25.0)
+    for term, deviation in OFF_MERIDIAN_UM.items():
+        assert off_um[:, term].std() > 0.85 * deviation
+
+
+def test_what_was_measured_is_not_drawn(people):
+    azimuths_deg = (-20.0, 20.0)
+    eye = int(np.flatnonzero(people.has_given)[0])
+    others = {-angle: people.given_um[eye, k] for k, angle in enumerate((-20.0, 20.0))}
+    told = [
+        peripheral_change(
+            profile_of(people.people.axis_um[eye], others, sample=k)
+        ).zernike_um([*azimuths_deg, 40.0], 0.0)[:, list(TERMS)]
+        for k in range(30)
+    ]
+    deviation_um = np.std(told, axis=0)
+    assert deviation_um[:2].max() < 0.03  # the noise of a measurement is 0.02 um
+    assert deviation_um[2].max() > 0.2
+    table = asked(profile_of(people.people.axis_um[eye], others, sample=3), [0.0])
+    axis_um = rescale_pupil(
+        table.zernike_um[0], radius_ratio=CIRCLE_MM / table.zernike_radius_mm[0]
+    )[list(TERMS)]
+    assert axis_um == pytest.approx(people.people.axis_um[eye], abs=2e-3)
+
+
+def test_a_drawn_left_eye_is_a_right_eye_in_the_mirror():
+    right = peripheral_change(preset("emmetropia", sample=5))
+    mirrored = {
+        "kind": "zernike",
+        "pupil_diameter_mm": 6.0,
+        "wavelength_nm": 555.0,
+        "sample": 5,
+    }
+    terms_um = preset("emmetropia").zernike_um
+    left_um = {
+        "{},{}".format(*nm_from_index(j)): float(um)
+        for j, um in enumerate(flip_horizontal(terms_um))
+    }
+    right_um = {
+        "{},{}".format(*nm_from_index(j)): float(um) for j, um in enumerate(terms_um)
+    }
+    right, left = (
+        peripheral_change(
+            parse_profile({**mirrored, "zernike_um": um, "eye_side": side})
+        )
+        for um, side in ((right_um, "OD"), (left_um, "OS"))
+    )
+    h_deg, v_deg = GRID_DEG.T
+    assert left.zernike_um(-h_deg, v_deg) == pytest.approx(
+        flip_horizontal(right.zernike_um(h_deg, v_deg)), abs=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {"kind": "preset", "name": "myopia", "periphery": "model"},
+        {"kind": "preset", "name": "myopia", "retina": {"radius_mm": 11.0}},
+    ],
+)
+def test_a_sample_that_draws_nothing_is_refused(body):
+    with pytest.raises(ProfileError, match="draws nothing") as caught:
+        parse_profile({**body, "sample": 1})
+    assert caught.value.field == "sample"
 
 
 # ----- from the meridian to the field

@@ -16,6 +16,7 @@ from estimator.optics.zernike import flip_horizontal, index_from_nm, rescale_pup
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import ProfileError, parse_profile, preset_names
 from estimator.profiles.typical_aberrations import (
+    drawn_zernike_um,
     typical_note,
     typical_zernike_um,
     with_typical_aberrations,
@@ -48,16 +49,69 @@ def test_a_young_adult_s_spherical_aberration_is_the_population_s_mean():
     assert term_um(4, 0, 25.0) == term_um(4, 0)
 
 
-def test_sizes_of_coma_and_trefoil_are_those_of_other_people_too():
-    # mean absolute values of Salmon & van de Pol, adults of all ages; two decimals
-    assert abs(term_um(3, -1)) == pytest.approx(0.14, abs=5e-3)
-    assert abs(term_um(3, -3)) == pytest.approx(0.11, abs=0.02)
-    assert term_um(4, 0, MEAN_AGE_YEARS) == pytest.approx(0.13, abs=5e-3)
-    # means and standard deviations of Wang & Koch; theirs hold more terms
-    assert rms_um(MEAN_AGE_YEARS, COMA) == pytest.approx(0.170, abs=0.02)
-    assert rms_um(MEAN_AGE_YEARS, SPHERICAL) == pytest.approx(0.128, abs=0.005)
+POOLED_RMS_UM = {3.0: 0.045, 4.0: 0.100, 5.0: 0.186, 6.0: 0.327}
+"""Mean higher-order RMS by pupil diameter, mm, of 2,560 eyes (Salmon & van de Pol)."""
+
+DEVIATION_RATIO = 0.43, 0.48
+"""Deviation of this RMS over its mean, at 6 and 3 mm, of 200 eyes (Thibos et al.)."""
+
+PERSONS = 1000
+
+FROZEN_UM = [0.03743, -0.15390, 0.13920]
+"""C(3,-1), C(3,1) and C(4,0) of sample 7 at 40 years."""
+
+
+def pupil_rms_um(zernike_um, pupil_mm):
+    rescaled_um = rescale_pupil(zernike_um, radius_ratio=pupil_mm / 6.0)
+    return float(np.linalg.norm(rescaled_um[6:]))
+
+
+@pytest.fixture(scope="module")
+def drawn_um():
+    return [drawn_zernike_um(k, None, eye_side="OD") for k in range(PERSONS)]
+
+
+@pytest.mark.parametrize(("pupil_mm", "pooled_um"), POOLED_RMS_UM.items())
+def test_the_rms_of_a_typical_eye_is_that_of_people(pupil_mm, pooled_um):
+    typical_um = typical_zernike_um(None, eye_side="OD")
+    assert pupil_rms_um(typical_um, pupil_mm) == pytest.approx(pooled_um, rel=0.05)
+
+
+@pytest.mark.parametrize(("pupil_mm", "pooled_um"), POOLED_RMS_UM.items())
+def test_drawn_persons_have_the_rms_of_people(drawn_um, pupil_mm, pooled_um):
+    rms_um = np.array([pupil_rms_um(person, pupil_mm) for person in drawn_um])
+    assert rms_um.mean() == pytest.approx(pooled_um, rel=0.05)
+    low, high = DEVIATION_RATIO
+    assert low - 0.03 < rms_um.std() / rms_um.mean() < high + 0.03
+    # "at least 90 % of the sample had less than double the mean" (Salmon & van de Pol)
+    assert (rms_um < 2.0 * rms_um.mean()).mean() > 0.9
+
+
+def test_drawn_persons_have_the_terms_of_people(drawn_um):
+    terms_um = np.array(drawn_um)
+    coma_um, spherical_um = terms_um[:, index_from_nm(3, -1)], terms_um[:, SPHERICAL]
+    # mean absolute values of Salmon & van de Pol; two decimals
+    assert np.abs(coma_um).mean() == pytest.approx(0.14, abs=0.015)
+    assert np.abs(spherical_um).mean() == pytest.approx(0.13, abs=0.015)
+    assert spherical_um.mean() == pytest.approx(1.15 * 0.094, abs=0.012)
+    assert np.all(terms_um[:, :6] == 0.0)
+
+
+def test_a_sample_is_one_person():
+    same, other = (drawn_zernike_um(k, 40.0, eye_side="OD") for k in (7, 8))
+    assert np.array_equal(same, drawn_zernike_um(7, 40.0, eye_side="OD"))
+    assert np.array_equal(
+        drawn_zernike_um(7, 40.0, eye_side="OS"), flip_horizontal(same)
+    )
+    assert not np.allclose(same, other, atol=0.02)
+    # frozen: a person must not change with the version of NumPy
+    assert same[[7, 8, 12]] == pytest.approx(FROZEN_UM, abs=5e-5)
+
+
+def test_terms_of_a_typical_eye_are_within_the_spread_of_people():
+    # Wang & Koch: mean and deviation of the RMS of 532 eyes, 41 years on average
     assert rms_um(MEAN_AGE_YEARS) == pytest.approx(0.305, abs=0.095)
-    assert 0.8 * 0.305 < rms_um(MEAN_AGE_YEARS) < 0.305
+    assert rms_um(MEAN_AGE_YEARS, SPHERICAL) == pytest.approx(0.128, abs=0.005)
 
 
 def test_signs_are_those_of_the_population_in_the_eye_frame():
@@ -93,7 +147,7 @@ def test_aberrations_grow_with_age_as_published():
     # older emmetropes of Mathur et al. through 5 mm
     assert old[SPHERICAL] == pytest.approx(0.08, abs=0.02)
     # all of it at 6 mm, Seo et al.: 0.003 um a year
-    assert (rms_um(77.0) - rms_um(20.0)) / 57.0 == pytest.approx(0.003, abs=5e-4)
+    assert (rms_um(77.0) - rms_um(20.0)) / 57.0 == pytest.approx(0.003, abs=1e-3)
     ages = [20.0, 30.0, 45.0, 60.0, 77.0]
     assert np.all(np.diff([term_um(4, 0, age) for age in ages]) > 0.01)
 
@@ -139,7 +193,7 @@ def test_every_method_finds_the_eye_with_them(method):
         len(found.notes) - 1
     )
     if method != "search":  # it has no time here to come near
-        assert found.mean_abs_error_um < 5e-3
+        assert found.mean_abs_error_um < (5e-3 if method == "refined" else 2e-2)
         assert found.zernike_um[SPHERICAL] == pytest.approx(0.128, abs=0.02)
 
 
@@ -171,12 +225,30 @@ def test_the_reply_says_it_with_its_size_and_how_to_switch_it_off():
     _, said = prepare_eye(profile(age_years=60), **few)
     (note,) = [note for note in said if NOTE in note]
     assert "60 years of age" in note
-    assert "RMS 0.31 um at 6 mm" in note
+    assert "RMS 0.40 um at 6 mm" in note
     assert '"higher_order": "none"' in note
     assert "young adult" in typical_note(profile())
     assert len(typical_note(profile(age_years=33.25))) < 200  # a part of a header
     _, said = prepare_eye(profile(age_years=60, higher_order="none"), **few)
     assert not any(NOTE in note for note in said)
+
+
+def test_a_drawn_person_has_the_prescription_and_a_note():
+    given = profile(**CYLINDER, sample=7)
+    drawn = with_typical_aberrations(given)
+    ours, theirs = (
+        rx.power_vector_from_zernike(
+            rescale_pupil(eye.zernike_um, radius_ratio=4.0 / eye.pupil_diameter_mm),
+            zernike_radius_mm=2.0,
+        )
+        for eye in (drawn, given)
+    )
+    assert ours == pytest.approx(theirs, abs=1e-9)
+    assert np.array_equal(
+        drawn.zernike_um[6:], drawn_zernike_um(7, None, eye_side="OD")[6:]
+    )
+    assert "of a person drawn with sample 7" in typical_note(given)
+    assert given.digest != profile(**CYLINDER).digest
 
 
 def test_a_worn_correction_has_none():
