@@ -1,7 +1,7 @@
 """Accommodation: the lens diameter and chamber depth that focus an eye at a distance.
 
 `lens_change` describes the change of the lens.  The eye is focused at f dpt when its
-ray-traced least-squares refraction M, from C(2,0) at the given pupil and 555 nm, is -f.
+ray-traced least-squares refraction M at 555 nm, over the given pupil, is -f.
 """
 
 import math
@@ -133,6 +133,7 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
         diameters_mm, refractions_dpt = self._refraction_table()
         self._bare_dpt = float(refractions_dpt[0])
         self._rest = rest
+        self._last_taken_off = (0.0, 0.0)
         at_cornea_dpt = 0.0
         if correction is not None:
             at_cornea_dpt, *_ = rx.power_vector(correction)
@@ -140,7 +141,7 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
             correction, entrance_pupil_mm=self.entrance_pupil_mm
         )
         self.bare_refraction_dpt = refraction_at_cornea_dpt(
-            self._bare_dpt + float(self._rest_dpt(pupil_diameter_mm)),
+            self._bare_dpt + float(self._rest_dpt(pupil_diameter_mm)[0]),
             entrance_pupil_mm=self.entrance_pupil_mm,
         )
         self.refraction_dpt = self.bare_refraction_dpt - at_cornea_dpt
@@ -150,18 +151,33 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
         self._age_amplitude_dpt = amplitude_dpt
         self.amplitude_dpt = min(amplitude_dpt, self.lens_range_dpt)
 
-    def _rest_dpt(self, pupil_diameter_mm: float) -> NDArray[np.float64]:
-        """Return M of the residual on a round pupil."""
+    def _rest_dpt(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
+        """Return M (n,) of the residual on round pupils (n,)."""
+        radius_mm = np.atleast_1d(pupil_diameter_mm) / 2.0
         if self._rest is None:
-            return np.zeros(())
-        radius_mm = pupil_diameter_mm / 2.0
+            return np.zeros(radius_mm.size)
         rest_um = self._rest.on_axis_um(pupil_diameter_mm)
         zernike_um = zernike_from_polynomial(rest_um, radius_mm)
-        rest_dpt: NDArray[np.float64] = total_defocus_dpt(zernike_um, radius_mm)[0]
-        return rest_dpt
+        return total_defocus_dpt(zernike_um, radius_mm)
+
+    def _taken_off_dpt(self, pupil_diameter_mm: float) -> float:
+        """Return M of the correction minus that of the residual, on a round pupil.
+
+        That of the last pupil is cached: a frame asks for one pupil several times.
+        """
+        last = self._last_taken_off
+        if last[0] != pupil_diameter_mm:
+            taken_off_dpt = super()._taken_off_dpt(pupil_diameter_mm)
+            taken_off_dpt -= float(self._rest_dpt(pupil_diameter_mm)[0])
+            self._last_taken_off = last = pupil_diameter_mm, taken_off_dpt
+        return last[1]
 
     def _new_focus_table(self) -> FocusTable:
-        """Trace the table; omit pupils that light does not fill in every state."""
+        """Trace the table, without M of the residual on a round pupil.
+
+        In wide pupils the residual is stretched, so its M is no polynomial over the
+        pupil.  The table holds only its difference between the pupil and a round one.
+        """
         pupils_mm = np.array(table_pupils_mm(self.pupil_diameter_mm))
         some = np.unique(
             np.linspace(0, self._diameters_mm.size - 1, N_FOCUS).astype(int)
@@ -178,10 +194,8 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
             pupil_diameter_mm=np.repeat(pupils_mm, len(states)),
             added_um=np.repeat(rest_um, len(states), axis=0),
         ).reshape(pupils_mm.size, len(states))
-        usable = np.isfinite(found_dpt).all(axis=1)
-        return FocusTable(
-            pupils_mm[usable], self._accommodations_dpt[some], found_dpt[usable]
-        )
+        found_dpt -= self._rest_dpt(pupils_mm)[:, None]
+        return FocusTable(pupils_mm, self._accommodations_dpt[some], found_dpt)
 
     def _cornea_table(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return accommodations of the table, and M at the cornea of the traced eye.

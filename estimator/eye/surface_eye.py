@@ -120,7 +120,7 @@ class SurfaceEye(TabulatedFocusing[FocusedSurfaces]):
         )
 
     def _new_focus_table(self) -> FocusTable:
-        """Trace the table; omit pupils that light does not fill in every state."""
+        """Trace the table."""
         pupils_mm = np.array(table_pupils_mm(self.pupil_diameter_mm))
         some = np.unique(
             np.linspace(0, self._nominal_dpt.size - 1, N_FOCUS).astype(int)
@@ -137,15 +137,12 @@ class SurfaceEye(TabulatedFocusing[FocusedSurfaces]):
                 )
             )
         found_dpt = np.stack(columns, axis=1)
-        usable = np.isfinite(found_dpt).all(axis=1)
-        if not usable.any():
+        if not np.isfinite(found_dpt).all(axis=1).any():
             raise TraceFailed(
                 f"light does not fill a pupil of {pupils_mm[0]:g} mm in every state"
                 + _reason(self.model.relaxed, pupils_mm[0])
             )
-        return FocusTable(
-            pupils_mm[usable], self._accommodations_dpt[some], found_dpt[usable]
-        )
+        return FocusTable(pupils_mm, self._accommodations_dpt[some], found_dpt)
 
     def _nominals_dpt(
         self, accommodations_dpt: NDArray[np.float64]

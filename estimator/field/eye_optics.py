@@ -84,7 +84,8 @@ class EyeOptics(Protocol):
         """Return the least-squares refraction, dpt, for an object at infinity.
 
         It has the broadcast shape, includes the correction and is on the circle of the
-        pupil.
+        pupil.  `accommodation_dpt` focuses over the pupil itself, so at the focus of a
+        decentered pupil the total defocus is not 0: see "Focus" in CONVENTIONS.md.
 
         Raises
         ------

@@ -83,16 +83,15 @@ def test_aberrations_move_the_focus_as_the_pupil_opens():
 def test_reach_through_a_pupil_is_what_is_traced_there(name):
     estimated = estimate_eye(parse_profile({"kind": "preset", "name": name}))
     eye = estimated.accommodating
-    limit_dpt = 0.1 if name == "cataract" else 0.01
     for pupil_mm in (2.0, 3.3, 5.2):
         far_dpt, near_dpt = eye.focus_limits_dpt(pupil_mm)
         rest_um = estimated.rest(555.0).on_axis_um(pupil_mm)
         relaxed = refraction_dpt(eye.parameters, pupil_mm, added_um=rest_um)
-        assert far_dpt == pytest.approx(-relaxed, abs=limit_dpt)
+        assert far_dpt == pytest.approx(-relaxed, abs=0.01)
         nearest = eye.focused(50.0, pupil_diameter_mm=pupil_mm)
         assert near_dpt == pytest.approx(nearest.focus_dpt, abs=1e-9)
         traced = refraction_dpt(nearest.parameters, pupil_mm, added_um=rest_um)
-        assert near_dpt == pytest.approx(-traced, abs=limit_dpt)
+        assert near_dpt == pytest.approx(-traced, abs=0.01)
         assert near_dpt - far_dpt <= 10.0 + 1e-3  # the amplitude without an age
         assert "near point" in nearest.notes[0]
 
