@@ -34,6 +34,13 @@ from estimator.wavefront.moved_plane import moved_polynomial
 FADE_DEG = 15.0
 """Angle from the axis at which 1/e of the residual is left."""
 
+OVERSHOOT = 0.03
+"""Fraction of the measured pupil beyond it to which the residual is followed.
+
+A stretch that starts abruptly at the measured pupil is a kink: in a wavefront with a
+large residual, the slope of M over the pupil jumped by 0.2 dpt/mm.
+"""
+
 _BOWL = np.where((EXPONENTS == [2, 0]).all(1) | (EXPONENTS == [0, 2]).all(1), -0.5, 0.0)
 """(28,): monomials of one diopter of refraction, um."""
 
@@ -47,8 +54,8 @@ class MeasuredResidual:
     residue_um : (28,), um/mm^degree
         Measurement minus the eye, at the measured wavelength.
     radius_mm : float
-        Radius of the measured pupil.  In a wider one the residual is stretched:
-        polynomials diverge beyond the measured pupil.
+        Radius of the measured pupil.  In a wider one the residual is stretched (see
+        `stretch_ratio`): polynomials diverge beyond the measured pupil.
     wavelengths_nm, color_dpt : (n,)
         Refraction that corrects the eye's longitudinal color, relative to the measured
         wavelength, to that of measured eyes (`chromatic`).
@@ -111,7 +118,7 @@ class MeasuredResidual:
         self, radius_mm: NDArray[np.float64], share: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return monomials (n, 28) of the residual in pupils (n,), scaled by shares."""
-        stretch = np.minimum(self.radius_mm / radius_mm, 1.0)[..., None]
+        stretch = stretch_ratio(radius_mm / self.radius_mm)[..., None]
         return share[..., None] * self.residue_um * stretch**DEGREE
 
     @staticmethod
@@ -125,6 +132,23 @@ class MeasuredResidual:
         radius_mm = np.atleast_1d(np.asarray(pupil_diameter_mm, dtype=np.float64)) / 2
         color_um = self.color_um(np.full(radius_mm.size, REFERENCE_WAVELENGTH_NM))
         return self.residues_um(radius_mm, np.ones(radius_mm.size)) + color_um
+
+
+def stretch_ratio(pupil_ratio: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the factors (n,) that scale pupil coordinates before the residual.
+
+    Parameters
+    ----------
+    pupil_ratio : (n,)
+        Pupil over the measured pupil.  Up to 1, the factor is 1.  From
+        1 + 2 `OVERSHOOT` on, the rim of any pupil has the residual at 1 + `OVERSHOOT`
+        times the measured radius; in between, that multiple is a parabola with
+        continuous slope.
+    """
+    beyond = np.clip(pupil_ratio - 1.0, 0.0, 2.0 * OVERSHOOT)
+    rim = np.minimum(pupil_ratio, 1.0) + beyond - beyond**2 / (4.0 * OVERSHOOT)
+    ratio: NDArray[np.float64] = rim / pupil_ratio
+    return ratio
 
 
 def _traced_um(

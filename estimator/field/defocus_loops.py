@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
+from estimator.estimate.measured_residual import OVERSHOOT
 from estimator.optics.units import SPHERE_PER_C20
 from estimator.wavefront.field_wavefronts import (
     N_NEWTON_STEPS,
@@ -83,13 +84,21 @@ def fill_defocus(pupil_mm, field, axis, state, added, found_dpt):
             _between(number[k], channel[k], field, own_lower, own_weight, values)
         _scale_rim(values, own_mm, own_scale)
         radius_mm = _circumscribed_mm(values[N_DEGREES:])
-        fade = min(2.0 * fading_mm / own_mm, 1.0)
+        fade = _stretch_ratio(0.5 * own_mm / fading_mm)
         total = 0.0
         for d in range(N_DEGREES):
             degree = 2 * d + 2
             part = values[d] + always[k, d] + fading[k, d] * fade**degree
             total += part * radius_mm ** (degree - 2)
         found_dpt[k] = -SPHERE_PER_C20 * total
+
+
+@njit(**_OPTIONS)
+def _stretch_ratio(pupil_ratio):
+    """Return the factor of pupil coordinates; see `measured_residual.stretch_ratio`."""
+    beyond = min(max(pupil_ratio - 1.0, 0.0), 2.0 * OVERSHOOT)
+    rim = min(pupil_ratio, 1.0) + beyond - beyond**2 / (4.0 * OVERSHOOT)
+    return rim / pupil_ratio
 
 
 @njit(**_OPTIONS)
