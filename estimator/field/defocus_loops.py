@@ -70,7 +70,7 @@ def fill_defocus(pupil_mm, field, axis, state, added, found_dpt):
     number, channel, open_mm = state
     always, fading, fading_mm = added
     values = np.empty(N_DEGREES + N_RIM)
-    weight, own_weight = np.empty(values.size), np.empty(values.size)
+    weight, own_weight = np.empty((2, values.size)), np.empty((2, values.size))
     lower = _pupil_weights(pupil_mm, field, weight)
     scale = _scales(pupil_mm, axis)
     for k in range(number.size):
@@ -104,7 +104,8 @@ def _stretch_ratio(pupil_ratio):
 @njit(**_OPTIONS)
 def _scales(pupil_mm, axis):
     """Return ratios (n_channels,) of the requested to the traced pupil, on axis."""
-    values, weight = np.empty(N_DEGREES + N_RIM), np.empty(N_DEGREES + N_RIM)
+    values = np.empty(N_DEGREES + N_RIM)
+    weight = np.empty((2, values.size))
     scale = np.empty(axis[3].shape[1])
     lower = _pupil_weights(pupil_mm, axis, weight)
     for channel in range(scale.size):
@@ -116,18 +117,33 @@ def _scales(pupil_mm, axis):
 
 @njit(**_OPTIONS)
 def _pupil_weights(pupil_mm, grid, weight):
-    """Return the index of the next smaller pupil; write weights (8,) of the larger."""
+    """Return the index of the first pupil; write weights (2, 8) of the next ones.
+
+    See `interpolation.pupil_weights`.
+    """
     nodes_mm, powers = grid[0], grid[1]
     weight[:] = 0.0
     if nodes_mm.size == 1:
+        return 0
+    if nodes_mm.size == 3:
+        largest_mm = nodes_mm[2]
+        first, middle = nodes_mm[0] / largest_mm, nodes_mm[1] / largest_mm
+        here = pupil_mm / largest_mm
+        for k in range(powers.size):
+            low, high = powers[k], powers[k] + 2.0
+            a, b = middle**low - first**low, middle**high - first**high
+            c, d = 1.0 - first**low, 1.0 - first**high
+            e, f = here**low - first**low, here**high - first**high
+            weight[0, k] = (e * d - f * c) / (a * d - b * c)
+            weight[1, k] = (a * f - b * e) / (a * d - b * c)
         return 0
     lower = 0
     while lower < nodes_mm.size - 2 and nodes_mm[lower + 1] <= pupil_mm:
         lower += 1
     high_mm = nodes_mm[lower + 1]
-    for k in range(weight.size):
+    for k in range(powers.size):
         least = (nodes_mm[lower] / high_mm) ** powers[k]
-        weight[k] = ((pupil_mm / high_mm) ** powers[k] - least) / (1.0 - least)
+        weight[0, k] = ((pupil_mm / high_mm) ** powers[k] - least) / (1.0 - least)
     return lower
 
 
@@ -135,13 +151,19 @@ def _pupil_weights(pupil_mm, grid, weight):
 def _between(number, channel, grid, lower, weight, found):
     """Interpolate sums and rim (8,) between pupils and accommodations."""
     weights, values = grid[2], grid[3]
-    upper = min(lower + 1, values.shape[2] - 1)
+    last = values.shape[2] - 1
+    upper, third = min(lower + 1, last), min(lower + 2, last)
+    is_smooth = values.shape[2] == 3
     for k in range(found.size):
-        low, high = 0.0, 0.0
+        low, high, highest = 0.0, 0.0, 0.0
         for a in range(weights.size):
             low += weights[a] * values[number, channel, lower, a, k]
             high += weights[a] * values[number, channel, upper, a, k]
-        found[k] = low + weight[k] * (high - low)
+            if is_smooth:
+                highest += weights[a] * values[number, channel, third, a, k]
+        found[k] = low + weight[0, k] * (high - low)
+        if is_smooth:
+            found[k] += weight[1, k] * (highest - low)
 
 
 @njit(**_OPTIONS)
