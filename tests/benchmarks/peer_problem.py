@@ -6,7 +6,7 @@ the state stays.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -41,10 +41,13 @@ class Problem:
     ----------
     profile : dict
         As a client sends it.
+    settings : dict
+        Settings that differ from those of an on-axis stream.
     """
 
     view: RgbdView
     profile: dict
+    settings: dict = field(default_factory=dict)
 
     @cached_property
     def spec(self) -> GridSpec:
@@ -58,7 +61,8 @@ class Problem:
             self.view.camera,
             **{
                 **RANGES,
-                "object_range_dpt": (0.0, float(DISTANCE_STEP_DPT * nearest)),
+                "object_range_dpt": (0.0, float(DISTANCE_STEP_DPT * max(nearest, 1))),
+                **self.settings,
                 **settings,
             },
         )
@@ -94,10 +98,14 @@ class Problem:
 
     def disc_radius_px(self, state: EyeState, distance_dpt) -> NDArray[np.float64]:
         """Blur radius of green light by geometrical optics."""
+        defocus_dpt = self.defocus_dpt(state) + distance_dpt
+        return np.abs(defocus_dpt) * self.spec.blur_px_per_dpt(state.pupil_diameter_mm)
+
+    def defocus_dpt(self, state: EyeState) -> float:
+        """Total defocus of green light from infinity."""
         zero = np.zeros(1)
         at_infinity = state.wavefront_arguments(zero, zero, zero)
-        defocus_dpt = at_infinity["total_defocus_dpt"][1] + distance_dpt
-        return np.abs(defocus_dpt) * self.spec.blur_px_per_dpt(state.pupil_diameter_mm)
+        return float(at_infinity["total_defocus_dpt"][1])
 
 
 @dataclass(frozen=True)

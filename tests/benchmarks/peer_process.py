@@ -1,0 +1,90 @@
+"""Peers that run in an environment of their own, and how a benchmark asks them.
+
+optiland and DeepLens need packages that the project does not use (VTK, torch and, for
+DeepLens, Python 3.12), so `sh setup.sh peers` installs them into ``.peers``.  A script
+there answers one request a line; pictures travel as files.  The process waits while
+other methods run, and it measures its own times, so that exchanging files costs it
+nothing.
+"""
+
+import json
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.benchmarks.harness import ROOT
+from tests.benchmarks.peer_problem import NotInstalled
+
+PYTHON = ROOT / ".peers" / "bin" / "python"
+
+
+def require(package: str, module: str, python: Path = PYTHON) -> None:
+    """Raise `NotInstalled` unless the environment of the peers has a module."""
+    missing = NotInstalled(f"{package} (sh setup.sh peers)")
+    if not python.exists():
+        raise missing
+    find = f"import importlib.util as u, sys; sys.exit(u.find_spec({module!r}) is None)"
+    if subprocess.run((python, "-c", find), check=False).returncode != 0:
+        raise missing
+
+
+class PeerProcess:
+    """A script that answers requests (`peer_answers`), one after the other.
+
+    Parameters
+    ----------
+    script : Path
+    python : Path
+        Interpreter of the environment.
+    """
+
+    def __init__(self, script: Path, python: Path = PYTHON):
+        self._folder = tempfile.TemporaryDirectory()
+        self._errors = tempfile.TemporaryFile("w+")
+        self._process = subprocess.Popen(
+            (python, script),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            text=True,
+        )
+
+    def ask(self, task: str, **arguments) -> dict:
+        """Return the answer to a request.
+
+        Raises
+        ------
+        RuntimeError
+            The script failed; the message ends with what it wrote to stderr.
+        """
+        line = json.dumps({"task": task, "folder": self._folder.name, **arguments})
+        try:
+            self._process.stdin.write(line + "\n")
+            self._process.stdin.flush()
+            answer = self._process.stdout.readline()
+        except BrokenPipeError:
+            answer = ""
+        if not answer:
+            self._process.wait()
+            self._errors.seek(0)
+            raise RuntimeError(f"{task}: {self._errors.read()[-2000:]}")
+        return json.loads(answer)
+
+    def write(self, name: str, values: NDArray) -> None:
+        """Write an array for the script to read."""
+        np.save(Path(self._folder.name) / name, values)
+
+    def read(self, name: str) -> NDArray:
+        """Read an array that the script wrote."""
+        return np.load(Path(self._folder.name) / name)
+
+    def close(self) -> None:
+        """End the script and delete its files."""
+        self._process.stdin.close()
+        self._process.wait()
+        self._process.stdout.close()
+        self._errors.close()
+        self._folder.cleanup()
