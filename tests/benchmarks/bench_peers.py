@@ -2,15 +2,27 @@
 
     python -m tests.benchmarks.bench_peers [--quick] [--json] [--engines NAME ...]
 
-*Courtyard* at 1280x720 (320x180), a pupil of 5 mm that looks at 0.5 dpt, all on the
-axis: eyes of -6 dpt and of none.  Errors are linear PSNR against the dense reference of
-that state.  All methods run in this process or from it, one after the other and round
-after round (A B C, A B C), after a warm-up.  In the first rounds pupil and focus change
-with every frame (`frame_runs`), so that PSFs or kernels are made anew; the "frozen"
-rounds repeat the last state.  Peers are given linear light and dioptres, which ours
-makes from its input within its time.
+All methods run one after the other and round after round (A B C, A B C), after a
+warm-up.  In the first rounds, pupil and focus change with every frame (`frame_runs`),
+so that PSFs or kernels are computed anew; the "frozen" rounds repeat the last state.
+A method that takes seconds per frame takes part in one round of each kind.  Peers are
+given linear light and diopters, which ours computes from its input within its time.
 
-A row says what its method does otherwise; one that is not installed has a row too.
+*Courtyard* at 1280x720 (320x180), a pupil of 5 mm that looks at 0.5 dpt, on the axis:
+eyes of -6 dpt and of none, and an eye of -6 dpt without color and diffraction, whose
+PSFs are even discs, for peers that have nothing else.  Errors are linear PSNR against
+the dense reference of that state.
+
+The same picture at 640x360 (320x180) on a wall at infinity, through a schematic eye
+whose PSFs change over the visual field: ours and optiland.  Both compute PSFs from the
+same surfaces, and each is compared with its own dense reference and the other's.
+
+PSFs that ISETBio distributed, and ours of the same Zernike coefficients: the share of
+the light that is elsewhere.
+
+A row says what its method does otherwise, or more; one that is not installed has a row
+too, and one that only its authors can measure has the figures that they printed.
+`sh setup.sh peers` installs what can be installed.
 """
 
 import argparse
@@ -19,6 +31,7 @@ import sys
 import time
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
@@ -29,10 +42,20 @@ from tests.benchmarks.frame_runs import WARM_UPS, states_towards
 from tests.benchmarks.harness import machine_info, report, write_report
 from tests.benchmarks.image_measures import channel_psnr_db
 from tests.benchmarks.peer_blender import blender
+from tests.benchmarks.peer_deeplens import deeplens
 from tests.benchmarks.peer_ffmpeg import FRAMES, varblur
+from tests.benchmarks.peer_isetbio import moved_light, our_psf, published_psfs
 from tests.benchmarks.peer_layers import fft_layers, opencv_layers
+from tests.benchmarks.peer_optiland import EYE, Optiland, flat_problem, optiland_peers
 from tests.benchmarks.peer_problem import LAYER_COUNT, NotInstalled, Peer, Problem
-from tests.benchmarks.peer_renderers import VARIANTS, ours, sorted_gather
+from tests.benchmarks.peer_process import peer_versions
+from tests.benchmarks.peer_published import PRINTED
+from tests.benchmarks.peer_renderers import (
+    FIELD_VARIANTS,
+    VARIANTS,
+    ours,
+    sorted_gather,
+)
 from tests.numerical.scene_frames import scene_view
 
 STATE = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.5}
@@ -40,10 +63,20 @@ EYES = {
     "-6 dpt": {"kind": "prescription", "sphere_dpt": -6.0, "higher_order": "none"},
     "emmetropia": {"kind": "preset", "name": "emmetropia"},
 }
-SIZE, QUICK_SIZE = (1280, 720), (320, 180)
+DISC_CASE = "-6 dpt, disc"
+DISC_SETTINGS = {"chromatic": False, "diffraction": False}
+SIZE, FLAT_SIZE, QUICK_SIZE = (1280, 720), (640, 360), (320, 180)
 REPEATS, QUICK_REPEATS = 5, 3
 
+SLOW_MS = 5000.0
+"""A method whose warm-up takes longer runs once in a new state and once in the same."""
+
+EDGE_RATIO = 1 / 9
+"""Of the height, left out along the edges of the flat scene, beyond which the methods
+assume different light."""
+
 PACKAGES = ("opencv-python-headless", "imageio-ffmpeg")
+PEER_PACKAGES = ("optiland", "deeplens-core", "torch")
 
 ON_AXIS_ONLY = "no field"
 PEERS = (
@@ -61,30 +94,30 @@ PEERS = (
     ),
     Peer(
         "OpenCV disc",
-        f"{LAYER_COUNT} layers, even discs by geometry, over; no PSF, colour or field",
+        f"{LAYER_COUNT} layers, even discs by geometry, over; no PSF, color or field",
         opencv_layers("disc"),
     ),
     Peer(
         "OpenCV Gaussian",
-        f"{LAYER_COUNT} layers, Gaussians, over; no PSF, colour or field",
+        f"{LAYER_COUNT} layers, Gaussians, over; no PSF, color or field",
         opencv_layers("gaussian"),
     ),
     Peer(
         "ffmpeg varblur",
         "gathers boxes of each pixel's own radius, never under 2 px; no occlusion, "
-        f"PSF, colour or field; a process of {FRAMES} frames, its start in their time",
+        f"PSF, color or field; a process of {FRAMES} frames, its start in their time",
         varblur,
         frames_per_call=FRAMES,
     ),
     Peer(
         "Blender Bokeh",
         "gathers discs of each pixel's own radius in whole px; no occlusion, PSF, "
-        "colour or field; without Blender's start",
+        "color or field; without Blender's start",
         blender("bokeh"),
     ),
     Peer(
         "Blender Defocus",
-        "gathers discs, less of nearer into farther ones; no PSF, colour or field; "
+        "gathers discs, less of nearer into farther ones; no PSF, color or field; "
         "without Blender's start",
         blender("defocus"),
     ),
@@ -95,6 +128,27 @@ PEERS = (
     ),
 )
 
+THIN_LENS = (
+    "of a thin lens, over; no PSF, color or field. Does more: gradients, dual pixels"
+)
+THIN_LENSES = (
+    Peer(
+        "DeepLens render_rgbd",
+        f"16 layers, Gaussians within the circle of confusion {THIN_LENS}",
+        deeplens("render_rgbd", 16),
+    ),
+    Peer(
+        "DeepLens discs",
+        "8 layers, which gave the smallest error, discs without antialiasing, divided "
+        f"by their coverage; {THIN_LENS}",
+        deeplens("pillbox", 8),
+    ),
+)
+DISC_PEERS = (
+    *(peer for peer in PEERS if peer.name != "sorted gather"),
+    *THIN_LENSES,
+)
+
 
 @dataclass(frozen=True)
 class PeerRow:
@@ -102,16 +156,24 @@ class PeerRow:
 
     Attributes
     ----------
+    n : int
+        Frames in new states; 0 if nothing was measured here.
     min_ms, median_ms : float or None
         Of frames in new states.
     frozen_min_ms, frozen_median_ms : float or None
         Of frames in the state of the frame before.
     error : float or None
-        Linear PSNR against the dense reference.
+        In the measure that ``error_name`` says, against ``reference``.
     differs : str
-        What the method does otherwise, and cannot do.
+        What the method does otherwise, cannot do, or does beyond ours.
     missing : str or None
         What is not installed.
+    prepare_s : float or None
+        Time before the first frame: of ours, the PSFs of all states.
+    other_error, other_reference : float or None, str or None
+        The same against the reference of the other side.
+    published : str or None
+        Where time and error are printed, if they are not measured here.
     """
 
     bench: str
@@ -128,6 +190,10 @@ class PeerRow:
     reference: str
     differs: str
     missing: str | None
+    prepare_s: float | None = None
+    other_error: float | None = None
+    other_reference: str | None = None
+    published: str | None = None
 
 
 def our_peers(engines, variants=VARIANTS) -> list[Peer]:
@@ -155,10 +221,12 @@ def measured(problem: Problem, peers: list[Peer], repeats: int) -> list[dict]:
     found, frames = [], {}
     for peer in peers:
         line = {"peer": peer, "times_ms": [], "frozen_ms": [], "missing": None}
+        start_s = time.perf_counter()
         try:
             frames[peer.name] = peer.open(problem)
         except NotInstalled as missing:
             line["missing"] = str(missing)
+        line["prepare_s"] = time.perf_counter() - start_s
         found.append(line)
     count = WARM_UPS + repeats
     states = [
@@ -166,73 +234,198 @@ def measured(problem: Problem, peers: list[Peer], repeats: int) -> list[dict]:
     ]
     rounds = [(state, "times_ms") for state in states]
     rounds += [(states[-1], "frozen_ms")] * repeats
-    for state, kind in rounds:
+    for number, (state, kind) in enumerate(rounds):
+        # the warm-up, the last new state and the first repeated one are for all
+        for_all = number < WARM_UPS or number in (count - 1, count)
         for line in found:
             peer = line["peer"]
-            if peer.name in frames:
-                frame, start_s = frames[peer.name], time.perf_counter()
-                line["color"] = frame(state)
-                taken_ms = 1e3 * (time.perf_counter() - start_s)
-                taken_ms = getattr(frame, "own_ms", taken_ms)
-                line[kind].append(taken_ms / peer.frames_per_call)
+            is_slow = any(ms > SLOW_MS for ms in line["times_ms"][:WARM_UPS])
+            if peer.name not in frames or (is_slow and not for_all):
+                continue
+            frame, start_s = frames[peer.name], time.perf_counter()
+            line["color"] = frame(state)
+            taken_ms = 1e3 * (time.perf_counter() - start_s)
+            taken_ms = getattr(frame, "own_ms", taken_ms)
+            line[kind].append(taken_ms / peer.frames_per_call)
     for line in found:
         del line["times_ms"][:WARM_UPS]
+    for frame in frames.values():
+        if hasattr(frame, "close"):
+            frame.close()
     return found
+
+
+def row_of(line: dict, **given) -> PeerRow:
+    """Row of a measured line; ``given`` are the fields that it does not have."""
+    is_there = line["missing"] is None
+    times, frozen = line["times_ms"], line["frozen_ms"]
+    return PeerRow(
+        bench="peers",
+        method=line["peer"].name,
+        n=len(times),
+        min_ms=min(times) if is_there else None,
+        median_ms=float(np.median(times)) if is_there else None,
+        frozen_min_ms=min(frozen) if is_there else None,
+        frozen_median_ms=float(np.median(frozen)) if is_there else None,
+        error_name="psnr_db",
+        differs=line["peer"].differs,
+        missing=line["missing"],
+        prepare_s=line["prepare_s"] if is_there else None,
+        **given,
+    )
 
 
 def peer_rows(problem: Problem, case: str, peers: list[Peer], repeats) -> list[PeerRow]:
     """Rows of one eye."""
     truth = dense_reference(problem.view, problem.state(**STATE), bins=True)
     size = f"{problem.view.width_px}x{problem.view.height_px}"
+    return [
+        row_of(
+            line,
+            case=case,
+            setting=f"courtyard {size} on axis, 5 mm, 0.5 dpt",
+            error=None if line["missing"] else channel_psnr_db(line["color"], truth),
+            reference="dense, on the axis, bins of 0.005 dpt",
+        )
+        for line in measured(problem, peers, repeats)
+    ]
+
+
+OWN_REFERENCE = "dense, bins of 0.2 deg"
+OPTILAND_REFERENCE = "dense, PSFs of optiland at points 20 px apart"
+
+
+def flat_rows(view, engines: dict, repeats: int) -> list[PeerRow]:
+    """Rows of a flat scene through PSFs that change over the visual field.
+
+    Parameters
+    ----------
+    engines : dict
+        Renderers by name.
+    """
+    problem = flat_problem(view)
+    state = problem.state(**STATE)
+    own = dense_reference(problem.view, state, bins=True)
+    optiland = other = None
+    with suppress(NotInstalled):
+        optiland = Optiland(problem)
+        other = optiland.reference(state)
+    edge_px = round(EDGE_RATIO * view.height_px)
+    inner = (slice(edge_px, -edge_px),) * 2
+
+    def error(line: dict, truth) -> float | None:
+        if line["missing"] is not None or truth is None:
+            return None
+        return channel_psnr_db(line["color"][inner], truth[inner])
+
     rows = []
+    ours_first = our_peers(engines, FIELD_VARIANTS)
+    peers = [*ours_first, *optiland_peers(optiland)]
     for line in measured(problem, peers, repeats):
-        is_there = line["missing"] is None
-        times = [line["times_ms"], line["frozen_ms"]]
+        sides = [(own, OWN_REFERENCE), (other, OPTILAND_REFERENCE)]
+        if line["peer"] not in ours_first:
+            sides.reverse()
+        rows.append(
+            row_of(
+                line,
+                case=EYE["name"],
+                setting=f"courtyard on a wall {view.width_px}x{view.height_px}, "
+                "30 deg, 5 mm",
+                error=error(line, sides[0][0]),
+                reference=sides[0][1],
+                other_error=error(line, sides[1][0]),
+                other_reference=sides[1][1],
+            )
+        )
+    if optiland is not None:
+        optiland.close()
+    return rows
+
+
+def psf_rows() -> list[PeerRow]:
+    """Rows of ISETBio's PSFs: our time and how much light is elsewhere."""
+    rows = []
+    for published in published_psfs():
+        psf, residual_um, taken_ms = our_psf(published)
         rows.append(
             PeerRow(
                 bench="peers",
-                method=line["peer"].name,
-                case=case,
-                setting=f"courtyard {size} on axis, 5 mm, 0.5 dpt",
-                n=len(line["times_ms"]),
-                min_ms=min(times[0]) if is_there else None,
-                median_ms=float(np.median(times[0])) if is_there else None,
-                frozen_min_ms=min(times[1]) if is_there else None,
-                frozen_median_ms=float(np.median(times[1])) if is_there else None,
-                error_name="psnr_db",
-                error=channel_psnr_db(line["color"], truth) if is_there else None,
-                reference="dense, on the axis, bins of 0.005 dpt",
-                differs=line["peer"].differs,
-                missing=line["missing"],
+                method="ours, PSF",
+                case=published.label,
+                setting=f"{published.psf.shape[0]} samples of "
+                f"{published.sample_arcmin:.3f} arcmin, 550 nm",
+                n=1,
+                min_ms=taken_ms,
+                median_ms=taken_ms,
+                frozen_min_ms=None,
+                frozen_median_ms=None,
+                error_name="moved_light_ratio",
+                error=moved_light(psf, published.psf),
+                reference="PSF of ISETBio, from a pupil raster of 0.081 mm",
+                differs=f"28 of 65 Zernike terms, {residual_um:.4f} um RMS left out. "
+                "ISETBio does more: full spectra, cones and retinal circuits",
+                missing=None,
             )
         )
     return rows
 
 
+def printed_rows() -> list[PeerRow]:
+    """Rows of methods that only their authors could measure."""
+    return [
+        PeerRow(
+            bench="peers",
+            method=peer.name,
+            case="as printed",
+            setting="not measured here",
+            n=0,
+            min_ms=None,
+            median_ms=peer.at_most_ms,
+            frozen_min_ms=None,
+            frozen_median_ms=None,
+            error_name="psnr_db",
+            error=peer.psnr_db[0],
+            reference="the authors' own",
+            differs=peer.differs,
+            missing=None,
+            published=peer.source,
+        )
+        for peer in PRINTED
+    ]
+
+
 def installed_versions() -> dict[str, str | None]:
-    """Versions of the extra `peers`; None of what is missing."""
+    """Versions of what `setup.sh peers` installs; None of what is missing."""
     found: dict[str, str | None] = dict.fromkeys(PACKAGES)
     for name in PACKAGES:
         with suppress(PackageNotFoundError):
             found[name] = version(name)
-    return found
+    return found | peer_versions(PEER_PACKAGES)
 
 
 HEADER = (
-    f"{'eye':<12}{'method':<20}{'min':>8}{'median':>8}{'frozen: min':>13}{'median':>8}"
-    f"{'dB':>7}  what differs"
+    f"{'eye':<27}{'method':<28}{'min':>9}{'median':>9}{'frozen: min':>13}{'median':>9}"
+    f"{'error':>8}{'other':>7}  what differs"
 )
 
 
 def line_of(row: PeerRow) -> str:
-    """One line of the table."""
-    start = f"{row.case:<12}{row.method:<20}"
+    """One line of the table; errors are dB, or shares of light."""
+    start = f"{row.case:<27}{row.method:<28}"
     if row.missing is not None:
         return f"{start}not installed: {row.missing}"
-    return (
-        f"{start}{row.min_ms:8.1f}{row.median_ms:8.1f}{row.frozen_min_ms:13.1f}"
-        f"{row.frozen_median_ms:8.1f}{row.error:7.1f}  {row.differs}"
-    )
+    times = [row.min_ms, row.median_ms, row.frozen_min_ms, row.frozen_median_ms]
+    cells = [
+        f"{'' if ms is None else f'{ms:.1f}':>{width}}"
+        for ms, width in zip(times, (9, 9, 13, 9), strict=True)
+    ]
+    digits = 1 if row.error_name == "psnr_db" else 3
+    cells += [
+        f"{'' if error is None else f'{error:.{digits}f}':>{width}}"
+        for error, width in ((row.error, 8), (row.other_error, 7))
+    ]
+    source = "" if row.published is None else f" ({row.published})"
+    return f"{start}{''.join(cells)}  {row.differs}{source}"
 
 
 def main() -> None:
@@ -246,11 +439,22 @@ def main() -> None:
     repeats = QUICK_REPEATS if arguments.quick else REPEATS
     view = scene_view("courtyard", width_px=width_px, height_px=height_px)
     engines = {name: open_renderer(name) for name in arguments.engines}
-    peers = [*our_peers(engines), *PEERS]
+    flat_size = QUICK_SIZE if arguments.quick else FLAT_SIZE
+    flat_view = scene_view("courtyard", width_px=flat_size[0], height_px=flat_size[1])
+    ours_first = our_peers(engines)
+    cases = [
+        (case, Problem(view, profile), [*ours_first, *PEERS])
+        for case, profile in EYES.items()
+    ]
+    disc = Problem(view, EYES["-6 dpt"], DISC_SETTINGS)
+    cases.append((DISC_CASE, disc, [*ours_first, *DISC_PEERS]))
+    parts = [partial(peer_rows, p, case, peers, repeats) for case, p, peers in cases]
+    parts.append(partial(flat_rows, flat_view, engines, repeats))
     rows = []
-    for case, profile in EYES.items():
-        rows += peer_rows(Problem(view, profile), case, peers, repeats)
-        print(*map(line_of, rows[-len(peers) :]), sep="\n", file=sys.stderr)
+    for part in (*parts, psf_rows, printed_rows):
+        found = part()
+        rows += found
+        print(*map(line_of, found), sep="\n", file=sys.stderr, flush=True)
     names = {name: renderer.name for name, renderer in engines.items()}
     machine = {**machine_info(), "renderers": names, **installed_versions()}
     content = report(rows, machine=machine)

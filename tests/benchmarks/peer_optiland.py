@@ -1,4 +1,4 @@
-"""optiland among the peers: a flat scene through an eye whose PSF varies with the field.
+"""optiland among the peers: a flat scene through PSFs that vary with the field.
 
 Both sides get the same surfaces, pupil and camera.  Each computes its own PSFs, so each
 has a dense reference of its own, which shows what its interpolation costs, and is
@@ -27,12 +27,9 @@ SCRIPT = Path(__file__).with_name("peer_optiland_script.py")
 
 EYE = {"kind": "published", "name": "escudero_sanz_navarro_1999"}
 HALF_HEIGHT_DEG = 8.6
-"""Of the image, whose left edge is then at 15 deg: the eye's astigmatism there is as
-large as its defocus.  A multiple of the dense reference's bins, so that none of them
-is outside the image."""
-
-EDGE_PX = 40
-"""Left out of errors: beyond the image's edge, the methods assume different light."""
+"""Of the image, whose left edge is then at 15 deg, where the PSF is twice as wide in one
+direction as on the axis.  A multiple of the dense reference's bins, so that none of
+them is outside the image."""
 
 BASES = (((3, 3), 3), ((5, 5), 3), ((5, 5), 8), ((9, 9), 16))
 """Field points, and how many eigen-PSFs; optiland's own default is (5, 5) and 3."""

@@ -43,7 +43,7 @@ class PeerProcess:
 
     def __init__(self, script: Path, python: Path = PYTHON):
         self._folder = tempfile.TemporaryDirectory()
-        self._errors = tempfile.TemporaryFile("w+")
+        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 (see `close`)
         self._process = subprocess.Popen(
             (python, script),
             stdin=subprocess.PIPE,
@@ -88,3 +88,18 @@ class PeerProcess:
         self._process.stdout.close()
         self._errors.close()
         self._folder.cleanup()
+
+
+def peer_versions(packages, python: Path = PYTHON) -> dict[str, str | None]:
+    """Versions of packages in the environment; None of what is missing."""
+    if not python.exists():
+        return dict.fromkeys(packages)
+    script = (
+        "import importlib.metadata as m, json, sys\n"
+        "have = {d.metadata['Name']: d.version for d in m.distributions()}\n"
+        "print(json.dumps({name: have.get(name) for name in sys.argv[1:]}))"
+    )
+    answer = subprocess.run(
+        (python, "-c", script, *packages), check=True, capture_output=True, text=True
+    )
+    return json.loads(answer.stdout)

@@ -47,6 +47,16 @@ VARIANTS = (
     ),
 )
 
+FINE = {"mode": "quality", "tolerance": "fine"}
+
+FIELD_VARIANTS = (
+    Variant("dynamic", {"mode": "dynamic"}),
+    Variant("quality", {"mode": "quality"}),
+    Variant("quality, fine", FINE),
+    Variant("fine, wider", {**FINE, **UNCUT}),
+)
+"""For PSFs that follow the visual field, whose spacing decides on time and error."""
+
 
 def ours(renderer, variant: Variant):
     """Open a renderer with a store for all pupils and foci."""
