@@ -13,7 +13,7 @@ NO_TESTS := test $$? -eq 5 # pytest's exit status if ARGS selects none of these 
 BENCHES := $(filter-out gpu soak witness,$(patsubst tests/benchmarks/bench_%.py,%,$(sort $(wildcard tests/benchmarks/bench_*.py))))
 
 .DEFAULT_GOAL := help
-.PHONY: demo docs web test test-training test-examples test-batch-ray test-headset test-web validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-witness
+.PHONY: demo docs web test test-training test-examples test-batch-ray test-headset test-web validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-witness setup-peers peers
 
 demo: setup  ## filter two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
@@ -64,6 +64,9 @@ validate: setup-test setup-web  ## run the slow tests and every benchmark; write
 witness: setup-witness  ## compare frames with a path tracer that renders through the same eyes
 	$(PYTHON) -m tests.benchmarks.bench_witness $(ARGS)
 
+peers: setup-peers  ## compare with alternatives such as optiland and DeepLens (6 GB)
+	$(PYTHON) -m tests.benchmarks.bench_peers $(ARGS)
+
 gpu-kit: setup  ## build a kit for a GPU machine without a network; writes out/gpu_kit/
 	@PYTHON=$(PYTHON) PYTHON_VERSION="$(PYTHON_VERSION)" WITH="$(WITH)" \
 	    sh tests/gpu_kit/make.sh $(ARGS)
@@ -80,7 +83,7 @@ check: setup  ## check style, formatting and types; compile every shader with gl
 	$(PYTHON) -m tests.shader_check
 
 clean:  ## remove generated files, including .venv but not out/
-	rm -rf .venv .witness .batch_ray .docs .examples .gl_witness .headset build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules tests/web/node_modules
+	rm -rf .venv .witness .batch_ray .docs .peers .examples .gl_witness .headset build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules tests/web/node_modules
 	find filter_service -name '_*.so' -delete
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -113,3 +116,6 @@ setup-web:
 
 setup-witness:
 	@sh setup.sh witness
+
+setup-peers:
+	@sh setup.sh peers

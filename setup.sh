@@ -9,6 +9,7 @@
 #   sh setup.sh web        also those packages and a browser for the web tests
 #   sh setup.sh docs       also a separate environment with MkDocs
 #   sh setup.sh witness    also a separate environment with a path tracer
+#   sh setup.sh peers      also the alternatives that `ocufilter bench peers` compares
 #   sh setup.sh examples   only a separate environment with the package and Jupyter
 #
 # Running the script again takes a fraction of a second: it reinstalls the environment
@@ -31,6 +32,10 @@ WITNESS_LLVM_PACKAGES="libllvm19 libllvm18 libllvm17 libllvm16"
 WITNESS_VENV=.witness
 RAY_VENV=.batch_ray
 DOCS_VENV=.docs
+# for `ocufilter bench peers`; DeepLens requires Python 3.12
+PEERS_VENV=.peers
+PEERS_PACKAGES="optiland"
+PEERS_312_PACKAGES="deeplens-core torch torchvision"
 EXAMPLES_VENV=.examples
 # for `make docs`
 DOCS_PACKAGES="mkdocs-material mkdocstrings[python]"
@@ -246,6 +251,24 @@ install_witness() { # Mitsuba, the path tracer that frames are compared with
         install $WITNESS_PACKAGES
 }
 
+install_peers() { # optiland and, with Python 3.12, DeepLens in a separate environment
+    $VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install -c constraints.txt --no-build-isolation -e '.[peers]'
+    if cmp -s constraints.txt $PEERS_VENV/constraints.txt; then return; fi
+    python=${PEERS_PYTHON:-python3.12} packages="$PEERS_PACKAGES $PEERS_312_PACKAGES"
+    if ! "$python" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))' \
+        2>/dev/null; then
+        say "no Python 3.12, which DeepLens requires: installing the others;" \
+            "to name it:  PEERS_PYTHON=/path/to/python3.12 sh setup.sh peers"
+        python=$(find_python) packages=$PEERS_PACKAGES
+    fi
+    say "installing $packages into $PEERS_VENV (with torch for CUDA, 6 GB)"
+    "$python" -m venv --clear $PEERS_VENV
+    $PEERS_VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install -c constraints.txt $packages
+    cp constraints.txt $PEERS_VENV/constraints.txt
+}
+
 install_examples() { # the package as users install it, without the checkout
     wanted=$(pwd; cksum setup.sh setup.py pyproject.toml constraints.txt
         find estimator filter_service clients shaders -type f ! -name '*.so' \
@@ -281,3 +304,4 @@ if [ "${1:-}" = web ]; then
     install_node_packages tests/web "the accessibility checks of the web tests"
 fi
 if [ "${1:-}" = witness ]; then install_witness; fi
+if [ "${1:-}" = peers ]; then install_peers; fi

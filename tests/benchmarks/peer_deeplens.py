@@ -21,7 +21,7 @@ class DefocusFrames:
     """
 
     def __init__(self, problem: Problem, mode: str, layers: int):
-        require("deeplens-core", "deeplens")
+        require("deeplens-core")
         self._problem = problem
         self._arguments = {"mode": mode, "layers": layers}
         self._process = PeerProcess(SCRIPT)

@@ -27,8 +27,8 @@ SCRIPT = Path(__file__).with_name("peer_optiland_script.py")
 
 EYE = {"kind": "published", "name": "escudero_sanz_navarro_1999"}
 HALF_HEIGHT_DEG = 8.6
-"""Of the image, whose left edge is then at 15 deg, where the PSF is twice as wide in one
-direction as on the axis.  A multiple of the dense reference's bins, so that none of
+"""Of the image, whose left edge is then at 15 deg, where the PSF is twice as wide in
+one direction as on the axis.  A multiple of the dense reference's bins, so that none of
 them is outside the image."""
 
 BASES = (((3, 3), 3), ((5, 5), 3), ((5, 5), 8), ((9, 9), 16))
@@ -98,7 +98,7 @@ class Optiland:
     """
 
     def __init__(self, problem: Problem):
-        require("optiland", "optiland")
+        require("optiland")
         camera = problem.spec.camera
         eye = parse_profile(problem.profile).surfaces.relaxed
         wavelengths_nm = [float(w) for w in problem.spec.channel_wavelengths_nm]
@@ -160,7 +160,7 @@ def optiland_peers(optiland: Optiland | None) -> list[Peer]:
     def opened(shape, n_components):
         def frames(problem: Problem):
             if optiland is None:
-                require("optiland", "optiland")
+                require("optiland")
             return _EigenFrames(optiland, shape, n_components)
 
         return frames

@@ -21,14 +21,10 @@ from tests.benchmarks.peer_problem import NotInstalled
 PYTHON = ROOT / ".peers" / "bin" / "python"
 
 
-def require(package: str, module: str, python: Path = PYTHON) -> None:
-    """Raise `NotInstalled` unless the environment of the peers has a module."""
-    missing = NotInstalled(f"{package} (sh setup.sh peers)")
-    if not python.exists():
-        raise missing
-    find = f"import importlib.util as u, sys; sys.exit(u.find_spec({module!r}) is None)"
-    if subprocess.run((python, "-c", find), check=False).returncode != 0:
-        raise missing
+def require(package: str) -> None:
+    """Raise `NotInstalled` unless the environment of the peers has a package."""
+    if peer_versions([package])[package] is None:
+        raise NotInstalled(f"{package} (sh setup.sh peers)")
 
 
 class PeerProcess:
@@ -37,15 +33,13 @@ class PeerProcess:
     Parameters
     ----------
     script : Path
-    python : Path
-        Interpreter of the environment.
     """
 
-    def __init__(self, script: Path, python: Path = PYTHON):
+    def __init__(self, script: Path):
         self._folder = tempfile.TemporaryDirectory()
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 (see `close`)
         self._process = subprocess.Popen(
-            (python, script),
+            (PYTHON, script),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
@@ -90,9 +84,9 @@ class PeerProcess:
         self._folder.cleanup()
 
 
-def peer_versions(packages, python: Path = PYTHON) -> dict[str, str | None]:
+def peer_versions(packages) -> dict[str, str | None]:
     """Versions of packages in the environment; None of what is missing."""
-    if not python.exists():
+    if not PYTHON.exists():
         return dict.fromkeys(packages)
     script = (
         "import importlib.metadata as m, json, sys\n"
@@ -100,6 +94,6 @@ def peer_versions(packages, python: Path = PYTHON) -> dict[str, str | None]:
         "print(json.dumps({name: have.get(name) for name in sys.argv[1:]}))"
     )
     answer = subprocess.run(
-        (python, "-c", script, *packages), check=True, capture_output=True, text=True
+        (PYTHON, "-c", script, *packages), check=True, capture_output=True, text=True
     )
     return json.loads(answer.stdout)

@@ -6,9 +6,21 @@ import numpy as np
 import pytest
 
 from filter_service.rendering.native import NativeRenderer
-from tests.benchmarks.bench_peers import EYES, PEERS, line_of, our_peers, peer_rows
+from tests.benchmarks import peer_process
+from tests.benchmarks.bench_peers import (
+    DISC_CASE,
+    DISC_SETTINGS,
+    EYES,
+    PEERS,
+    THIN_LENSES,
+    flat_rows,
+    line_of,
+    measured,
+    our_peers,
+    peer_rows,
+)
 from tests.benchmarks.peer_layers import drawn_disc
-from tests.benchmarks.peer_problem import KeptForState, Problem
+from tests.benchmarks.peer_problem import KeptForState, Peer, Problem
 from tests.benchmarks.peer_renderers import VARIANTS, Variant
 from tests.numerical.scene_frames import scene_view
 
@@ -93,6 +105,57 @@ def test_what_is_missing_is_named_and_the_rest_measured(problem, monkeypatch):
     assert all(found[name].error is None for name in PACKAGES)
     assert found["FFT over"].missing is None
     assert found["FFT over"].error > 30.0
+
+
+def test_a_slow_method_runs_once_in_a_new_state_and_once_in_the_same(problem):
+    pupils_mm = []
+
+    class Slow:
+        own_ms = 1e6
+
+        def __call__(self, state):
+            pupils_mm.append(state.pupil_diameter_mm)
+            return problem.color
+
+    (line,) = measured(problem, [Peer("slow", "", lambda _: Slow())], repeats=4)
+    assert (len(line["times_ms"]), len(line["frozen_ms"])) == (1, 1)
+    assert pupils_mm[1:] == [5.0, 5.0]
+    assert pupils_mm[0] != 5.0
+
+
+THIN_LENS_DB = {"DeepLens render_rgbd": (25.0, 34.0), "DeepLens discs": (33.0, 42.0)}
+
+
+def test_thin_lenses_defocus_like_the_eye(problem):
+    disc = Problem(problem.view, problem.profile, DISC_SETTINGS)
+    for row in peer_rows(disc, DISC_CASE, THIN_LENSES, 1):
+        if row.missing is not None:
+            pytest.skip(f"not installed: {row.missing}")
+        low_db, high_db = THIN_LENS_DB[row.method]
+        assert low_db <= row.error <= high_db
+
+
+def test_two_sides_agree_about_a_flat_scene(problem):
+    rows = flat_rows(problem.view, {"native": NativeRenderer()}, 1)
+    for row in rows:
+        if row.missing is not None:
+            pytest.skip(f"not installed: {row.missing}")
+        assert row.error > 40.0
+        assert row.other_error > 38.0
+    # more field points and components are nearer to the same PSFs at all points
+    theirs_db = [row.error for row in rows if row.method.startswith("optiland")]
+    assert theirs_db == sorted(theirs_db)
+
+
+def test_ours_is_measured_where_the_other_side_is_missing(
+    problem, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(peer_process, "PYTHON", tmp_path / "python")
+    rows = flat_rows(problem.view, {"native": NativeRenderer()}, 1)
+    ours = [row for row in rows if row.method.startswith("ours")]
+    assert all(row.error > 40.0 and row.other_error is None for row in ours)
+    missing = {row.missing for row in rows if row not in ours}
+    assert missing == {"optiland (sh setup.sh peers)"}
 
 
 def test_what_a_state_needs_is_made_when_the_state_is_new(problem):
