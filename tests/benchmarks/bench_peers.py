@@ -17,8 +17,9 @@ The same picture at 640x360 (320x180) on a wall at infinity, through a schematic
 whose PSFs change over the visual field: ours and optiland.  Both compute PSFs from the
 same surfaces, and each is compared with its own dense reference and the other's.
 
-PSFs that ISETBio distributed, and ours of the same Zernike coefficients: the share of
-the light that is elsewhere.
+Single PSFs: those that ISETBio distributed, and ours of the same Zernike coefficients;
+and that of the schematic eye on its axis, by rays, which DeepLens traces too.  Their
+error is the share of the light that is elsewhere.
 
 A row says what its method does otherwise, or more; one that is not installed has a row
 too, and one that only its authors can measure has the figures that they printed.
@@ -42,7 +43,7 @@ from tests.benchmarks.frame_runs import WARM_UPS, states_towards
 from tests.benchmarks.harness import machine_info, report, write_report
 from tests.benchmarks.image_measures import channel_psnr_db
 from tests.benchmarks.peer_blender import blender
-from tests.benchmarks.peer_deeplens import deeplens
+from tests.benchmarks.peer_deeplens import deeplens, traced_psf
 from tests.benchmarks.peer_ffmpeg import FRAMES, varblur
 from tests.benchmarks.peer_isetbio import moved_light, our_psf, published_psfs
 from tests.benchmarks.peer_layers import fft_layers, opencv_layers
@@ -74,6 +75,9 @@ SLOW_MS = 5000.0
 EDGE_RATIO = 1 / 9
 """Of the height, left out along the edges of the flat scene, beyond which the methods
 assume different light."""
+
+RAYS = 8192
+"""Of a traced PSF: DeepLens's default."""
 
 PACKAGES = ("opencv-python-headless", "imageio-ffmpeg")
 PEER_PACKAGES = ("optiland", "deeplens-core", "torch")
@@ -342,24 +346,33 @@ def flat_rows(view, engines: dict, repeats: int) -> list[PeerRow]:
     return rows
 
 
-def psf_rows() -> list[PeerRow]:
-    """Rows of ISETBio's PSFs: our time and how much light is elsewhere."""
+def psf_row(*, taken_ms: float | None, error: float | None, **given) -> PeerRow:
+    """Row of one PSF, whose error is the share of the light that is elsewhere."""
+    return PeerRow(
+        bench="peers",
+        n=0 if taken_ms is None else 1,
+        min_ms=taken_ms,
+        median_ms=taken_ms,
+        frozen_min_ms=None,
+        frozen_median_ms=None,
+        error_name="moved_light_ratio",
+        error=error,
+        **given,
+    )
+
+
+def isetbio_rows() -> list[PeerRow]:
+    """Rows of ISETBio's PSFs and ours."""
     rows = []
     for published in published_psfs():
         psf, residual_um, taken_ms = our_psf(published)
         rows.append(
-            PeerRow(
-                bench="peers",
+            psf_row(
                 method="ours, PSF",
                 case=published.label,
                 setting=f"{published.psf.shape[0]} samples of "
                 f"{published.sample_arcmin:.3f} arcmin, 550 nm",
-                n=1,
-                min_ms=taken_ms,
-                median_ms=taken_ms,
-                frozen_min_ms=None,
-                frozen_median_ms=None,
-                error_name="moved_light_ratio",
+                taken_ms=taken_ms,
                 error=moved_light(psf, published.psf),
                 reference="PSF of ISETBio, from a pupil raster of 0.081 mm",
                 differs=f"28 of 65 Zernike terms, {residual_um:.4f} um RMS left out. "
@@ -368,6 +381,53 @@ def psf_rows() -> list[PeerRow]:
             )
         )
     return rows
+
+
+def traced_rows(view) -> list[PeerRow]:
+    """Rows of a PSF that DeepLens traces, and ours of the same eye."""
+    problem = flat_problem(view, diffraction=False)
+    state, axis = problem.state(**STATE), np.zeros(1)
+    missing = None
+    times_ms = {"ours": None, "DeepLens": None}
+    psfs = {}
+    for _ in range(2):  # the first warms up
+        start_s = time.perf_counter()
+        kernel = state.exact_psfs(axis, axis, axis)[1].kernel
+        times_ms["ours"] = 1e3 * (time.perf_counter() - start_s)
+    psfs["ours"] = kernel / kernel.sum()
+    try:
+        found, times_ms["DeepLens"] = traced_psf(
+            problem, state, side_px=kernel.shape[0], rays=RAYS
+        )
+        psfs["DeepLens"] = found / found.sum()
+    except NotInstalled as error:
+        missing = str(error)
+    moved = None if missing else moved_light(*psfs.values())
+    shared = {
+        "case": f"{EYE['name']}, axis",
+        "setting": f"{kernel.shape[0]} px of {problem.spec.pixel_pitch_mrad[0]:.2f} mrad, "
+        "5 mm, no diffraction",
+        "error": moved,
+    }
+    return [
+        psf_row(
+            method="ours, PSF",
+            taken_ms=times_ms["ours"],
+            reference="DeepLens",
+            differs="three colors, and the wavefront that they come from",
+            missing=None,
+            **shared,
+        ),
+        psf_row(
+            method="DeepLens GeoLens, PSF",
+            taken_ms=times_ms["DeepLens"],
+            reference="ours",
+            differs=f"one color, {RAYS} rays, flat sensor, stop at a surface. Does "
+            "more: gradients for lens design, distortion, coherent light",
+            missing=missing,
+            **shared,
+        ),
+    ]
 
 
 def printed_rows() -> list[PeerRow]:
@@ -451,7 +511,8 @@ def main() -> None:
     parts = [partial(peer_rows, p, case, peers, repeats) for case, p, peers in cases]
     parts.append(partial(flat_rows, flat_view, engines, repeats))
     rows = []
-    for part in (*parts, psf_rows, printed_rows):
+    parts.append(partial(traced_rows, view))
+    for part in (*parts, isetbio_rows, printed_rows):
         found = part()
         rows += found
         print(*map(line_of, found), sep="\n", file=sys.stderr, flush=True)

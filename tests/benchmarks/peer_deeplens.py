@@ -4,6 +4,8 @@ from pathlib import Path
 
 from numpy.typing import NDArray
 
+from estimator.profiles.parse import parse_profile
+from tests.benchmarks.peer_optiland import eye_request
 from tests.benchmarks.peer_problem import Problem
 from tests.benchmarks.peer_process import PeerProcess, require
 from tests.benchmarks.view_sources import EyeState
@@ -48,6 +50,35 @@ class DefocusFrames:
     def close(self) -> None:
         """End the process."""
         self._process.close()
+
+
+def traced_psf(problem: Problem, state: EyeState, *, side_px: int, rays: int):
+    """Trace the green PSF on the axis of a centered eye.
+
+    Returns
+    -------
+    psf : (side, side)
+    taken_ms : float
+    """
+    require("deeplens-core")
+    camera = problem.spec.camera
+    left, right, _, _ = camera.tangents
+    eye = parse_profile(problem.profile).surfaces.relaxed
+    wavelength_nm = float(problem.spec.channel_wavelengths_nm[1])
+    process = PeerProcess(SCRIPT)
+    try:
+        answer = process.ask(
+            "psf",
+            eye=eye_request(eye, wavelength_nm),
+            wavelength_nm=wavelength_nm,
+            pupil_mm=state.pupil_diameter_mm,
+            pitch=(right - left) / camera.width_px,
+            side_px=side_px,
+            rays=rays,
+        )
+        return process.read("out.npy"), 1e3 * answer["seconds"]
+    finally:
+        process.close()
 
 
 def deeplens(mode: str, layers: int):

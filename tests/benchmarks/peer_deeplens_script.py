@@ -3,8 +3,13 @@
 ``render_rgbd`` is the method of `deeplens.DefocusLens`, whose PSF is a Gaussian cut off
 at the circle of confusion.  "pillbox" calls what that method calls, with the library's
 even discs and layers that are uniform in diopters, which is nearer to an eye.
+
+``psf`` traces rays through the surfaces of an eye, as a `deeplens.GeoLens`.  It treats
+what is behind an aperture as air and its sensor is flat, so the stop must be at the
+vertex of a surface, and only the axis is right.
 """
 
+import json
 import math
 import time
 from pathlib import Path
@@ -13,6 +18,9 @@ import numpy as np
 
 FOCAL_LENGTH_MM = 17.0
 """Any: the sensor is scaled so that the angles are those of the eye."""
+
+CLEAR_RADIUS_MM = 4.0
+"""Of surfaces without the stop."""
 
 FARTHEST_MM = 1e6
 """Distance of what is farther, so that disparities are finite."""
@@ -46,6 +54,64 @@ def lens_numbers(focus_dpt, pupil_mm, pitch, size_px):
 def kernel_side_px(circle_mm, pixel_mm):
     """Smallest odd side that holds a circle of confusion of this diameter."""
     return 2 * math.ceil(circle_mm / pixel_mm / 2) + 1
+
+
+def lens_file(surfaces, stop_z_mm, retina, stop_radius_mm, pixel_mm, side_px):
+    """Content of a lens file of DeepLens; see `peer_optiland.eye_request`."""
+    if stop_z_mm not in [s["z_mm"] for s in surfaces]:
+        raise ValueError("the stop must be at the vertex of a surface")
+    ends_mm = [s["z_mm"] for s in surfaces[1:]] + [retina["z_mm"]]
+    rows = []
+    for surface, end_mm in zip(surfaces, ends_mm, strict=True):
+        is_stop = surface["z_mm"] == stop_z_mm
+        rows.append(
+            {
+                "type": "Aspheric",
+                "roc": surface["radius_mm"],
+                "k": surface["conic_constant"],
+                "ai": [],
+                "r": stop_radius_mm if is_stop else CLEAR_RADIUS_MM,
+                "is_aperture": is_stop,
+                "d": surface["z_mm"],
+                "d_next": end_mm - surface["z_mm"],
+                # index and Abbe number, the second so large that it has no effect
+                "mat2": f"{surface['index_after']:.9f}/1e9",
+            }
+        )
+    return {
+        "surfaces": rows,
+        "obj_depth": -FARTHEST_MM,
+        "r_sensor": pixel_mm * side_px / math.sqrt(2.0),
+        "sensor_res": [side_px, side_px],
+    }
+
+
+def traced_psf(folder, eye, wavelength_nm, pupil_mm, pitch, side_px, rays):
+    """PSF of a point on the axis, by rays, and the seconds that it took."""
+    import torch
+    from deeplens import GeoLens
+
+    def lens(stop_radius_mm, pixel_mm):
+        path = Path(folder) / "lens.json"
+        content = lens_file(
+            **eye, stop_radius_mm=stop_radius_mm, pixel_mm=pixel_mm, side_px=side_px
+        )
+        path.write_text(json.dumps(content))
+        return GeoLens(str(path), device="cpu")
+
+    first = lens(pupil_mm / 2, pitch * FOCAL_LENGTH_MM)
+    focal_length_mm = float(first.foclen) / eye["surfaces"][-1]["index_after"]
+    stop_radius_mm = (pupil_mm / 2) ** 2 / float(first.entr_pupilr)
+    opened = lens(stop_radius_mm, pitch * focal_length_mm)
+    point = torch.tensor([[0.0, 0.0, -FARTHEST_MM]])
+    seconds = []
+    for _ in range(2):  # the first warms up
+        start_s = time.perf_counter()
+        with torch.no_grad():
+            psf = opened.psf(point, ks=side_px, wvln=wavelength_nm / 1000.0, spp=rays)
+        seconds.append(time.perf_counter() - start_s)
+    np.save(Path(folder) / "out.npy", psf[0].numpy())
+    return {"seconds": seconds[1]}
 
 
 class Defocus:
@@ -100,4 +166,4 @@ if __name__ == "__main__":
     from peer_answers import answer_requests
 
     defocus = Defocus()
-    answer_requests({"open": defocus.open, "frame": defocus.frame})
+    answer_requests({"open": defocus.open, "frame": defocus.frame, "psf": traced_psf})

@@ -10,8 +10,12 @@ from estimator.optics.zernike import N_TERMS, zernike_values
 from estimator.profiles.parse import parse_profile
 from filter_service.planning.field_directions import pixel_from_mrad
 from tests.benchmarks import peer_process
-from tests.benchmarks.bench_peers import line_of, printed_rows, psf_rows
-from tests.benchmarks.peer_deeplens_script import kernel_side_px, lens_numbers
+from tests.benchmarks.bench_peers import isetbio_rows, line_of, printed_rows
+from tests.benchmarks.peer_deeplens_script import (
+    kernel_side_px,
+    lens_file,
+    lens_numbers,
+)
 from tests.benchmarks.peer_isetbio import fitted_zernike_um, zernike_term
 from tests.benchmarks.peer_optiland import EYE, eye_request
 from tests.benchmarks.peer_optiland_script import (
@@ -121,6 +125,17 @@ def test_a_thin_lens_blurs_by_the_angle_of_the_eye(focus_dpt):
     assert circle_mm / (width_mm / 36) == pytest.approx(angle / CAMERA.pitch, rel=1e-5)
 
 
+def test_the_lens_file_has_the_stop_at_its_surface():
+    eye = eye_request(parse_profile(EYE).surfaces.relaxed, 543.0)
+    given = {"stop_radius_mm": 2.2, "pixel_mm": 0.01, "side_px": 25}
+    rows = lens_file(**eye, **given)["surfaces"]
+    assert [row["is_aperture"] for row in rows] == [False, False, True, False]
+    assert rows[2]["r"] == 2.2
+    assert sum(row["d_next"] for row in rows) == pytest.approx(23.9203)
+    with pytest.raises(ValueError, match="at the vertex of a surface"):
+        lens_file(**{**eye, "stop_z_mm": 3.0}, **given)
+
+
 def test_kernels_hold_the_circle_and_have_a_center():
     assert kernel_side_px(0.0, 0.01) == 1
     assert kernel_side_px(0.06, 0.01) == 7
@@ -145,7 +160,7 @@ def test_a_wavefront_of_65_terms_is_fitted_over_a_smaller_circle():
 
 
 def test_our_psfs_are_those_of_isetbio():
-    errors = {row.case: row.error for row in psf_rows()}
+    errors = {row.case: row.error for row in isetbio_rows()}
     # their pupil is a raster of 37 samples; an exact sum is as far from them
     assert errors["subject 1, 3 mm, +0 dpt"] < 0.03
     assert errors["subject 4, 3 mm, +0 dpt"] < 0.03
