@@ -403,9 +403,10 @@ def traced_rows(view) -> list[PeerRow]:
     except NotInstalled as error:
         missing = str(error)
     moved = None if missing else moved_light(*psfs.values())
+    pitch_mrad, _ = problem.spec.pixel_pitch_mrad
     shared = {
         "case": f"{EYE['name']}, axis",
-        "setting": f"{kernel.shape[0]} px of {problem.spec.pixel_pitch_mrad[0]:.2f} mrad, "
+        "setting": f"{kernel.shape[0]} px of {pitch_mrad:.2f} mrad, "
         "5 mm, no diffraction",
         "error": moved,
     }
@@ -464,14 +465,14 @@ def installed_versions() -> dict[str, str | None]:
 
 
 HEADER = (
-    f"{'eye':<27}{'method':<28}{'min':>9}{'median':>9}{'frozen: min':>13}{'median':>9}"
+    f"{'eye':<34}{'method':<28}{'min':>9}{'median':>9}{'frozen: min':>13}{'median':>9}"
     f"{'error':>8}{'other':>7}  what differs"
 )
 
 
 def line_of(row: PeerRow) -> str:
     """One line of the table; errors are dB, or shares of light."""
-    start = f"{row.case:<27}{row.method:<28}"
+    start = f"{row.case:<34}{row.method:<28}"
     if row.missing is not None:
         return f"{start}not installed: {row.missing}"
     times = [row.min_ms, row.median_ms, row.frozen_min_ms, row.frozen_median_ms]
