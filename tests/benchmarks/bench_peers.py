@@ -30,7 +30,7 @@ import argparse
 import json
 import sys
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -308,12 +308,20 @@ def flat_rows(view, engines: dict, repeats: int) -> list[PeerRow]:
         Renderers by name.
     """
     problem = flat_problem(view)
-    state = problem.state(**STATE)
-    own = dense_reference(problem.view, state, bins=True)
-    optiland = other = None
-    with suppress(NotInstalled):
+    try:
         optiland = Optiland(problem)
-        other = optiland.reference(state)
+    except NotInstalled:
+        return _flat_rows(problem, engines, repeats, None)
+    with closing(optiland):
+        return _flat_rows(problem, engines, repeats, optiland)
+
+
+def _flat_rows(
+    problem: Problem, engines: dict, repeats: int, optiland: Optiland | None
+) -> list[PeerRow]:
+    view, state = problem.view, problem.state(**STATE)
+    own = dense_reference(view, state, bins=True)
+    other = None if optiland is None else optiland.reference(state)
     edge_px = round(EDGE_RATIO * view.height_px)
     inner = (slice(edge_px, -edge_px),) * 2
 
@@ -341,8 +349,6 @@ def flat_rows(view, engines: dict, repeats: int) -> list[PeerRow]:
                 other_reference=sides[1][1],
             )
         )
-    if optiland is not None:
-        optiland.close()
     return rows
 
 
