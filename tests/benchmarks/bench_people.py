@@ -1,6 +1,6 @@
 """Peripheral aberrations of people who were held out: prediction error.
 
-    python -m tests.benchmarks.bench_people [--quick] [--json] [--plot]
+    python -m tests.benchmarks.bench_people [--quick] [--json] [--plot] [--people N]
 
 129 eyes of 65 people along the horizontal meridian (4 mm), in folds that keep a
 person's eyes together.  Ours is `field_table` of a profile that has the axis alone, or
@@ -10,12 +10,22 @@ with the shipped population.  Error is the median over eyes of the length of the
 in (M, J0, J45), dpt, of the change from the axis; beside it stands that of the RMS of
 all terms from the second to the fourth order, um.  Who falls into which fold moves an
 angle's median by some per cent, so ours over the regression on M is drawn `DRAWS` times
-and averaged, with its deviation between draws.  Writes results/people.json.
+and averaged, with its deviation between draws.
+
+A second table compares our eyes with published measurements of people: the typical eye
+of a prescription of 0 dpt, and N persons drawn with its prescription.  `people_optics`
+and `people_vision` describe the measures, `tests/human_data.py` the sources.  A
+modulation is the mean of modulations of eyes, never that of a mean eye.  Columns are
+ours, theirs, the difference, what a residual refraction and, in double passes,
+scattered light take from ours, the difference that is left, and the range of 80 % of
+our eyes.
+
+Writes results/people.json and results/people_measures.png.
 """
 
 import argparse
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from unittest.mock import patch
 
@@ -30,10 +40,28 @@ from estimator.periphery.change import peripheral_change
 from estimator.periphery.measured_eyes import MeasuredEyes, load_measured_eyes
 from estimator.periphery.meridian import CIRCLE_MM, TERMS
 from estimator.periphery.population import Population, measured_population
-from estimator.profiles.parse import parse_profile, preset_names
+from estimator.profiles.parse import ProfileError, parse_profile, preset_names
 from filter_service.progress import Progress
-from tests.benchmarks.harness import RESULTS, Row, memory_mb, publish
+from tests.benchmarks.harness import OUT, RESULTS, Row, memory_mb, publish
+from tests.benchmarks.people_findings import Finding, print_findings
+from tests.benchmarks.people_measures_picture import plot_findings
+from tests.benchmarks.people_modulation import REFRACTIONS
+from tests.benchmarks.people_optics import (
+    Curves,
+    drawn_person,
+    emmetrope,
+    higher_order_findings,
+    modulation_findings,
+    near_findings,
+    own_field_findings,
+    refraction_findings,
+)
 from tests.benchmarks.people_picture import plot_fields, show_scene
+from tests.benchmarks.people_vision import (
+    PUPILS_MM,
+    acuity_findings,
+    straylight_findings,
+)
 from tests.measured_fields import load_measured_fields
 
 FILE = Path(__file__).parents[1] / "data" / "peripheral_wavefronts.npz"
@@ -51,6 +79,21 @@ RIDGES = {"M": 1.0, "all central terms": 100.0, "axis and +-20 deg": 10.0}
 """Of standardised inputs; each is the best of 1, 3, 10, 30, 100."""
 
 WAVELENGTH_NM = 555.0
+
+PEOPLE, QUICK_PEOPLE = 50, 4
+"""Drawn persons."""
+
+ACUITY_PEOPLE, QUICK_ACUITY_PEOPLE = 8, 0
+"""Of them, those who read: half a second for each acuity."""
+
+QUICK_PUPILS_MM = (4.0,)
+
+FIELDS, QUICK_FIELDS = 10, 2
+"""Peripheries drawn for each measured axis."""
+
+FIELD_ANGLES_DEG = (-20.0, -10.0, -5.0, 5.0, 10.0, 20.0)
+QUICK_STEP = 6
+"""Of measured eyes, one in so many."""
 
 
 def profile_of(zernike_um: NDArray, others: dict[float, NDArray] | None = None, **more):
@@ -312,6 +355,94 @@ def field_rows() -> Iterator[Row]:
         )
 
 
+def field_findings(
+    people: MeasuredEyes, fold_count: int, fields: int, step: int, curves: Curves
+) -> Iterator[Finding]:
+    """Compare modulations of predicted fields with those of the same people's own."""
+    angles = list(FIELD_ANGLES_DEG)
+    at = [int(np.flatnonzero(people.h_deg == h)[0]) for h in angles]
+    own_um = people.zernike_um[::step, at]
+    seeds = {"most probable periphery": [None], "drawn peripheries": range(fields)}
+    predicted_um = {
+        method: np.full((len(draws), *own_um.shape), np.nan)
+        for method, draws in seeds.items()
+        if len(draws)
+    }
+    times_ms = dict.fromkeys(predicted_um, 0.0)
+    for out in folds(people, fold_count):
+        judged = np.flatnonzero(out[::step])
+        with _population_of(people.select(~out)):
+            for method, found_um in predicted_um.items():
+                start_s = time.perf_counter()
+                for k, seed in enumerate(seeds[method]):
+                    more = {} if seed is None else drawn_person(seed)
+                    for eye in judged:
+                        axis_um = people.axis_um[::step][eye]
+                        change_um = told_change_um(profile_of(axis_um, **more), angles)
+                        found_um[k, eye] = axis_um + change_um
+                elapsed_ms = 1e3 * (time.perf_counter() - start_s)
+                times_ms[method] += elapsed_ms / found_um[:, :, 0, 0].size
+    yield from own_field_findings(
+        own_um,
+        predicted_um,
+        people.axis_um[::step],
+        angles,
+        times_ms,
+        curves,
+        REFRACTIONS,
+    )
+
+
+def found_beside_people(
+    people: MeasuredEyes,
+    seeds: Sequence[int],
+    quick: bool,
+    curves: Curves,
+    task: Callable[[float, str], None],
+) -> list[Finding]:
+    """Return all that is compared with published measurements."""
+    step = QUICK_STEP if quick else 1
+    readers = QUICK_ACUITY_PEOPLE if quick else ACUITY_PEOPLE
+    fields = QUICK_FIELDS if quick else FIELDS
+    sections = {
+        "modulation": lambda: modulation_findings(
+            seeds, people.select(_every(step, people)), curves
+        ),
+        "same people": lambda: field_findings(
+            people,
+            QUICK_FOLDS if quick else FOLDS,
+            fields if seeds else 0,
+            step,
+            curves,
+        ),
+        "higher orders": lambda: higher_order_findings(seeds, people),
+        "near periphery": lambda: near_findings(seeds),
+        "refraction": lambda: refraction_findings(seeds, people),
+        "acuity": lambda: acuity_findings(
+            seeds[:readers], QUICK_PUPILS_MM if quick else PUPILS_MM
+        ),
+        "straylight": straylight_findings,
+    }
+    found: list[Finding] = []
+    for k, (name, section) in enumerate(sections.items()):
+        task(k / len(sections), name)
+        found += section()
+    return found
+
+
+def can_draw() -> bool:
+    """Return whether profiles can draw a person."""
+    try:
+        emmetrope(**drawn_person(0))
+    except ProfileError:
+        return False
+    return True
+
+
+def _every(step: int, people: MeasuredEyes) -> NDArray[np.bool_]:
+    return np.arange(len(people.person)) % step == 0
+
+
 def print_table(rows: list[Row]) -> None:
     """Print errors over the retina, a method a line."""
     print(f"{'retina, deg':34s}" + "".join(f"{a:+7.0f}" for a in ANGLES_DEG))
@@ -338,6 +469,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="two folds")
     parser.add_argument("--json", action="store_true", help="print the report alone")
     parser.add_argument("--plot", action="store_true", help="fields of the presets")
+    parser.add_argument("--people", type=int, metavar="N", help="drawn persons")
     options = parser.parse_args()
     judged = Meridian(load_measured_eyes(FILE))
     measured_population()
@@ -350,14 +482,32 @@ def main() -> None:
         task.update(1.0, "ratios")
         draws = QUICK_DRAWS if options.quick else DRAWS
         ratios = list(ratio_rows(judged, count, draws))
+        persons = options.people
+        if persons is None:
+            persons = QUICK_PEOPLE if options.quick else PEOPLE
+        if not can_draw():
+            persons = 0
+        curves: Curves = {}
+        findings = found_beside_people(
+            judged.people,
+            range(persons),
+            options.quick,
+            curves,
+            lambda done, name: task.update(done, name),
+        )
     rows = [*meridian_rows(judged, predictions), *ratios]
     rows += [*field_rows(), *direction_rows()]
+    rows += [row for found in findings for row in found.rows()]
     if not options.json:
         print_table(rows)
+        print_findings(findings)
+    whole = not options.quick and options.people is None
+    folder = RESULTS if whole else OUT
+    plot_findings(folder / "people_measures.png", findings, curves)
     if options.plot:
         plot_fields(RESULTS / "people.png")
         show_scene(RESULTS / "people_scene.jpg")
-    publish("people", rows, as_json=options.json, is_whole=not options.quick)
+    publish("people", rows, as_json=options.json, is_whole=whole)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,103 @@
+"""What a comparison with people found: ours, theirs and the part of the instrument."""
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.benchmarks.harness import Row, memory_mb
+
+BAND = (10.0, 90.0)
+"""Percentiles of people that bands show."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One figure of our eyes beside that of people.
+
+    Attributes
+    ----------
+    measure, eyes, setting : str
+        What was measured, of which of our eyes, and how.
+    ours, theirs : float
+    unit : str
+    source : str
+        The study.
+    count : int
+        How many eyes of ours.
+    time_ms : float
+        For each of them.
+    with_residual, with_halo : float
+        Ours behind the refraction of the study, and then with the light that scatters
+        in a double pass; nan where the study has none.
+    band : (float, float)
+        `BAND` of our eyes; nan for a single one.
+    """
+
+    measure: str
+    eyes: str
+    setting: str
+    ours: float
+    theirs: float
+    unit: str
+    source: str
+    count: int = 1
+    time_ms: float = 0.0
+    with_residual: float = math.nan
+    with_halo: float = math.nan
+    band: tuple[float, float] = (math.nan, math.nan)
+
+    @property
+    def difference(self) -> float:
+        """Return ours less theirs."""
+        return self.ours - self.theirs
+
+    def rows(self) -> Iterator[Row]:
+        """Yield the row of the figure, and those of ours through the instrument."""
+        values = {
+            "": self.ours,
+            ", residual refraction": self.with_residual,
+            ", residual refraction and halo": self.with_halo,
+        }
+        for suffix, value in values.items():
+            if math.isfinite(value):
+                yield Row(
+                    *("people", self.measure, self.eyes),
+                    f"{self.setting}{suffix}: {value:.3f}",
+                    *(self.count, self.time_ms, self.time_ms, memory_mb()),
+                    *(self.unit, value - self.theirs, self.source),
+                )
+
+
+def band_of(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Return `BAND` of values (n,); nan if there is but one."""
+    if len(values) < 2:
+        return math.nan, math.nan
+    low, high = np.nanpercentile(values, BAND).tolist()
+    return low, high
+
+
+def print_findings(findings: Iterable[Finding]) -> None:
+    """Print ours, theirs, the difference, and what the instrument adds and leaves."""
+    print(
+        f"\n{'measure':<25}{'eyes':<25}{'setting':<32}{'ours':>8}{'theirs':>8}"
+        f"{'diff':>8}{'residu':>8}{'halo':>8}{'left':>8}  {'10 to 90 %':<16}source"
+    )
+    for found in findings:
+        left = (
+            found.with_halo if math.isfinite(found.with_halo) else found.with_residual
+        )
+        cells = (
+            *(found.ours, found.theirs, found.difference),
+            *(found.with_residual - found.ours, found.with_halo - found.with_residual),
+            left - found.theirs,
+        )
+        texts = [f"{c:8.3f}" if math.isfinite(c) else f"{'-':>8}" for c in cells]
+        low, high = found.band
+        band = f"{low:.3f} {high:.3f}" if math.isfinite(low) else "-"
+        print(
+            f"{found.measure:<25}{found.eyes:<25}{found.setting:<32}"
+            f"{''.join(texts)}  {band:<16}{found.source}"
+        )

@@ -1,0 +1,436 @@
+"""Modulation, higher orders and peripheral refraction of our eyes beside people's.
+
+Foci are least-squares foci everywhere: nothing is searched for the highest modulation.
+Off the axis, both sides of the field are averaged, and pupils are the circle about the
+chief ray in which wavefronts are stated.
+"""
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.acuity.sensitivity import MEAN_EYE_NM, mean_eye_transfer
+from estimator.field.field_table import field_table
+from estimator.optics.prescription import power_vectors_dpt
+from estimator.optics.zernike import N_TERMS, index_from_nm, rescale_pupil
+from estimator.periphery.measured_eyes import MeasuredEyes
+from estimator.periphery.meridian import CIRCLE_MM, TERMS
+from estimator.profiles.parse import EyeProfile, parse_profile
+from tests import human_data
+from tests.benchmarks.people_findings import Finding, band_of
+from tests.benchmarks.people_modulation import (
+    AT_CPD,
+    modulation,
+    refracted,
+    residual_refraction_um,
+    with_halo,
+)
+
+HIGHER_ORDERS = slice(6, N_TERMS)
+SIDES = (-1.0, 1.0)
+RESIDUAL_DRAWS = 32
+WATSON_PUPILS_MM = (2.0, 3.0, 4.0, 5.0, 6.0)
+NEAR_FOCI_DPT, NEAR_PUPILS_MM, NEAR_ANGLE_DEG = (
+    (0.0, 2.0, 4.0, 6.0),
+    (2.0, 4.0, 6.0),
+    30,
+)
+SPHERES_DPT = (0.0, -2.0, -4.0, -6.0)
+MATHUR_ANGLE_DEG = 20.0
+LARGEST_PUPIL_MM = 6.0
+
+
+def drawn_person(seed: int) -> dict[str, int]:
+    """Return the fields of a profile that draw a person instead of the typical one."""
+    return {"sample": seed}
+
+
+def emmetrope(sphere_dpt: float = 0.0, **more) -> EyeProfile:
+    """Return the profile of a prescription."""
+    return parse_profile({"kind": "prescription", "sphere_dpt": sphere_dpt, **more})
+
+
+def emmetropes(seeds: Sequence[int]) -> dict[str, list[EyeProfile]]:
+    """Return the typical eye, and drawn persons, if any."""
+    eyes = {"typical eye": [emmetrope()]}
+    if seeds:
+        eyes["drawn persons"] = [emmetrope(**drawn_person(seed)) for seed in seeds]
+    return eyes
+
+
+def on_circle_um(
+    profile: EyeProfile,
+    h_deg,
+    *,
+    pupil_diameter_mm: float,
+    focus_dpt: float | None = None,
+) -> NDArray[np.float64]:
+    """Return wavefronts (n, 28) on the circle of the pupil, at the cornea."""
+    table = field_table(
+        profile,
+        h_deg=h_deg,
+        v_deg=0.0,
+        pupil_diameter_mm=pupil_diameter_mm,
+        wavelength_nm=MEAN_EYE_NM,
+        focus_dpt=focus_dpt,
+    )
+    return rescale_pupil(
+        table.zernike_um,
+        radius_ratio=pupil_diameter_mm / 2.0 / table.zernike_radius_mm,
+    )
+
+
+Curves = dict[tuple[str, float], NDArray[np.float64]]
+"""Modulations (n, 30) of eyes by their name and angle, for the picture."""
+
+
+def all_terms(terms_um: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return coefficients (..., 28) of `TERMS` (..., 12)."""
+    zernike_um = np.zeros((*terms_um.shape[:-1], N_TERMS))
+    zernike_um[..., list(TERMS)] = terms_um
+    return zernike_um
+
+
+def known_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return means (n, 30) over directions (n, k, 30); nan where none is known."""
+    known = np.isfinite(values)
+    total = np.where(known, values, 0.0).sum(axis=1)
+    mean: NDArray[np.float64] = np.divide(
+        *(total, known.sum(axis=1)),
+        out=np.full(total.shape, np.nan),
+        where=known.any(axis=1),
+    )
+    return mean
+
+
+# ----- modulation transfer
+
+
+def modulation_findings(
+    seeds: Sequence[int], people: MeasuredEyes, curves: Curves
+) -> Iterator[Finding]:
+    """Modulation of the typical eye, of drawn persons and of measured people."""
+    pupil_mm, wavelength_nm = human_data.NAVARRO_PUPIL_MM, human_data.NAVARRO_NM
+    angles_deg = [float(angle) for angle in human_data.NAVARRO]
+    h_deg = np.array([side * angle for angle in angles_deg for side in SIDES])
+    kinds: dict[str, tuple[NDArray, float]] = {}
+    for eyes, profiles in emmetropes(seeds).items():
+        start_s = time.perf_counter()
+        fields_um = [
+            on_circle_um(
+                profile,
+                h_deg,
+                pupil_diameter_mm=pupil_mm,
+                focus_dpt=human_data.NAVARRO_FOCUS_DPT,
+            )
+            for profile in profiles
+        ]
+        elapsed_ms = 1e3 * (time.perf_counter() - start_s) / len(profiles)
+        kinds[eyes] = np.array(fields_um), elapsed_ms
+    at = [int(np.flatnonzero(people.h_deg == h)[0]) for h in h_deg]
+    kinds["people's own wavefronts"] = all_terms(people.zernike_um[:, at]), 0.0
+    for eyes, (fields_um, elapsed_ms) in kinds.items():
+        corrected_um = refracted(fields_um, fields_um[:, 0], "at the fovea")
+        plain, blurred = _and_residual(corrected_um, pupil_mm, wavelength_nm)
+        for k, angle in enumerate(angles_deg):
+            both = slice(2 * k, 2 * k + 2)
+            of_eyes = known_mean(plain[:, both])
+            of_eyes = of_eyes[np.isfinite(of_eyes[:, 0])]
+            curves[eyes, angle] = of_eyes
+            theirs = human_data.navarro_modulation(AT_CPD, int(angle)).mean()
+            yield Finding(
+                *("modulation", eyes, f"{angle:g} deg, {pupil_mm:g} mm"),
+                *(float(of_eyes.mean()), float(theirs), "mean of 1 to 30 cpd"),
+                *("Navarro 1993", len(of_eyes), elapsed_ms),
+                with_residual=float(np.nanmean(blurred[:, both])),
+                with_halo=float(np.nanmean(with_halo(blurred[:, both]))),
+                band=band_of(of_eyes.mean(axis=1)),
+            )
+    yield from _foveal_findings(seeds, people)
+
+
+def _and_residual(
+    zernike_um: NDArray, pupil_mm: float, wavelength_nm: float
+) -> tuple[NDArray, NDArray]:
+    """Return modulations (n, k, 30), and (m, k, 30) with residual refractions."""
+    optics = {"pupil_diameter_mm": pupil_mm, "wavelength_nm": wavelength_nm}
+    plain = modulation(zernike_um, **optics)
+    copies = math.ceil(RESIDUAL_DRAWS / len(zernike_um))
+    zernike_um = np.repeat(zernike_um, copies, axis=0)
+    residual_um = residual_refraction_um(len(zernike_um), pupil_mm)
+    return plain, modulation(zernike_um + residual_um[:, None], **optics)
+
+
+def _foveal_findings(seeds: Sequence[int], people: MeasuredEyes) -> Iterator[Finding]:
+    """Modulation at the fovea, refracted, beside two more studies."""
+    studies: list[tuple[str, float, float, NDArray, bool]] = [
+        (
+            *("Williams 1994", human_data.WILLIAMS_PUPIL_MM, human_data.WILLIAMS_NM),
+            *(human_data.williams_modulation(AT_CPD), True),
+        )
+    ]
+    for pupil_mm in WATSON_PUPILS_MM:
+        theirs = mean_eye_transfer(AT_CPD, pupil_diameter_mm=pupil_mm)
+        studies.append(("Watson 2013", pupil_mm, MEAN_EYE_NM, theirs, False))
+    axes_um = {
+        eyes: np.array(
+            [
+                on_circle_um(profile, 0.0, pupil_diameter_mm=LARGEST_PUPIL_MM)[0]
+                for profile in profiles
+            ]
+        )
+        for eyes, profiles in emmetropes(seeds).items()
+    }
+    axes_um["people's own wavefronts"] = all_terms(people.axis_um)
+    for source, pupil_mm, wavelength_nm, theirs, halo in studies:
+        for eyes, axis_um in axes_um.items():
+            is_measured = eyes.startswith("people")
+            of_mm = 2.0 * CIRCLE_MM if is_measured else LARGEST_PUPIL_MM
+            if pupil_mm > of_mm:
+                continue
+            scaled_um = rescale_pupil(axis_um, radius_ratio=pupil_mm / of_mm)
+            corrected_um = refracted(scaled_um[:, None], scaled_um, "at each angle")
+            plain, blurred = _and_residual(corrected_um, pupil_mm, wavelength_nm)
+            yield Finding(
+                *("modulation", eyes, f"fovea, {pupil_mm:g} mm"),
+                *(float(plain.mean()), float(theirs.mean()), "mean of 1 to 30 cpd"),
+                *(source, len(axis_um)),
+                with_residual=float(blurred.mean()),
+                with_halo=float(with_halo(blurred).mean()) if halo else math.nan,
+                band=band_of(plain.mean(axis=(1, 2))),
+            )
+
+
+def own_field_findings(
+    own_um: NDArray[np.float64],
+    predicted_um: dict[str, NDArray[np.float64]],
+    axis_um: NDArray[np.float64],
+    angles_deg: Sequence[float],
+    times_ms: dict[str, float],
+    curves: Curves,
+    refractions: Sequence[str],
+) -> Iterator[Finding]:
+    """Modulation of predicted fields less that of the same people's own.
+
+    Parameters
+    ----------
+    own_um : (n, k, 12)
+        Measured wavefronts; nan where a direction was not measured.
+    predicted_um : dict of (m, n, k, 12)
+        Predictions of each method, m for each person.
+    axis_um : (n, 12)
+    angles_deg : (k,)
+    """
+    optics = {
+        "pupil_diameter_mm": 2.0 * CIRCLE_MM,
+        "wavelength_nm": MEAN_EYE_NM,
+    }
+    axis_um = all_terms(axis_um)
+    for refraction in refractions:
+
+        def seen(terms_um: NDArray, refraction: str = refraction) -> NDArray:
+            corrected_um = refracted(all_terms(terms_um), axis_um, refraction)
+            return modulation(corrected_um, **optics)
+
+        own = seen(own_um)
+        is_foveal = refraction == "at the fovea"
+        for method, draws_um in predicted_um.items():
+            draws = np.array([seen(terms_um) for terms_um in draws_um])
+            draws = np.where(np.isfinite(own), draws, np.nan)
+            for angle in np.unique(np.abs(angles_deg)).tolist():
+                at = np.abs(angles_deg) == angle
+                theirs = known_mean(own[:, at])
+                ours = np.array([known_mean(drawn[:, at]) for drawn in draws])
+                known = np.isfinite(theirs[:, 0])
+                theirs, ours = theirs[known], ours[:, known]
+                ours = ours.reshape(-1, AT_CPD.size)
+                if is_foveal:
+                    curves[method, angle] = ours
+                    curves["their own fields", angle] = theirs
+                yield Finding(
+                    *("modulation, same people", method),
+                    f"{angle:g} deg, refracted {refraction}",
+                    *(float(ours.mean()), float(theirs.mean()), "mean of 1 to 30 cpd"),
+                    *("Jaeken & Artal 2012", int(known.sum()), times_ms[method]),
+                    band=band_of(ours.mean(axis=1)),
+                )
+
+
+# ----- higher orders
+
+
+def higher_order_findings(
+    seeds: Sequence[int], people: MeasuredEyes
+) -> Iterator[Finding]:
+    """RMS of orders 3 to 6 on the axis; orders 3 and 4 of measured people."""
+    kinds: dict[str, Callable[[float], tuple[NDArray, float]]] = {}
+    for eyes, profiles in emmetropes(seeds).items():
+
+        def rms_um(pupil_mm: float, profiles=profiles) -> tuple[NDArray, float]:
+            start_s = time.perf_counter()
+            waves_um = [
+                on_circle_um(profile, 0.0, pupil_diameter_mm=pupil_mm)[0]
+                for profile in profiles
+            ]
+            elapsed_ms = 1e3 * (time.perf_counter() - start_s) / len(profiles)
+            higher_um = np.array(waves_um)[:, HIGHER_ORDERS]
+            return np.linalg.norm(higher_um, axis=1), elapsed_ms
+
+        kinds[eyes] = rms_um
+
+    def measured_um(pupil_mm: float) -> tuple[NDArray, float]:
+        ratio = pupil_mm / (2.0 * CIRCLE_MM)
+        waves_um = rescale_pupil(all_terms(people.axis_um), radius_ratio=ratio)
+        return np.linalg.norm(waves_um[:, HIGHER_ORDERS], axis=1), 0.0
+
+    kinds["people's own wavefronts"] = measured_um
+    for eyes, rms in kinds.items():
+        for pupil_mm, theirs_um in human_data.SALMON_RMS_UM.items():
+            if eyes.startswith("people") and pupil_mm > 2.0 * CIRCLE_MM:
+                continue
+            found_um, elapsed_ms = rms(pupil_mm)
+            same = (len(found_um), elapsed_ms)
+            yield Finding(
+                *("higher-order RMS", eyes, f"mean, {pupil_mm:g} mm"),
+                *(float(found_um.mean()), theirs_um, "um", "Salmon & van de Pol 2006"),
+                *same,
+                band=band_of(found_um),
+            )
+            if len(found_um) > 1:
+                below = float(np.mean(found_um < 2.0 * theirs_um))
+                yield Finding(
+                    *("higher-order RMS", eyes),
+                    f"below twice theirs, {pupil_mm:g} mm",
+                    *(below, human_data.SALMON_TWICE_RATIO, "ratio, at least"),
+                    *("Salmon & van de Pol 2006", *same),
+                )
+
+
+# ----- peripheral refraction
+
+
+def near_findings(seeds: Sequence[int]) -> Iterator[Finding]:
+    """Change of the periphery, relative to the axis, by accommodation."""
+    sides_deg = np.array([-NEAR_ANGLE_DEG, NEAR_ANGLE_DEG], dtype=np.float64)
+    for eyes, profiles in emmetropes(seeds).items():
+        for pupil_mm in NEAR_PUPILS_MM:
+            relative = {
+                focus: np.array(
+                    [_relative(p, sides_deg, pupil_mm, focus) for p in profiles]
+                )
+                for focus in NEAR_FOCI_DPT
+            }
+            far = relative[NEAR_FOCI_DPT[0]]
+            for focus in NEAR_FOCI_DPT[1:]:
+                changes = relative[focus] - far
+                yield from _near_rows(eyes, pupil_mm, focus, changes)
+        yield from _mathur(eyes, profiles)
+
+
+def _relative(
+    profile: EyeProfile, h_deg: NDArray, pupil_mm: float, focus_dpt: float
+) -> NDArray[np.float64]:
+    """Return M, J0, J45 and C(3,1) (n, 4) less those of the axis."""
+    zernike_um = on_circle_um(
+        profile, [0.0, *h_deg], pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt
+    )
+    power_dpt = power_vectors_dpt(zernike_um, pupil_mm / 2.0)
+    values = np.c_[power_dpt, zernike_um[:, index_from_nm(3, 1)]]
+    return values[1:] - values[0]
+
+
+def _near_rows(
+    eyes: str, pupil_mm: float, focus_dpt: float, changes: NDArray
+) -> Iterator[Finding]:
+    """Yield changes (n, 2, 4) of both sides: of M beside studies, and others."""
+    setting = f"{focus_dpt:g} dpt, {pupil_mm:g} mm"
+    of_sides = changes.mean(axis=1)
+    for source, ratio in human_data.NEAR_PERIPHERY_RATIO.items():
+        yield Finding(
+            *("near periphery, M", eyes, setting),
+            *(float(of_sides[:, 0].mean()), ratio * focus_dpt, "dpt", source),
+            count=len(changes),
+            band=band_of(of_sides[:, 0]),
+        )
+    # Coma is odd over the field: its change is that of its slope.
+    odd = 0.5 * (changes[:, 1] - changes[:, 0])
+    for name, values, unit in (
+        ("J0", of_sides[:, 1], "dpt"),
+        ("J45", of_sides[:, 2], "dpt"),
+        ("coma x", odd[:, 3], "um"),
+    ):
+        yield Finding(
+            *(f"near periphery, {name}", eyes, setting),
+            *(float(values.mean()), 0.0, unit, "Mathur 2009"),
+            count=len(changes),
+            band=band_of(values),
+        )
+
+
+def _mathur(eyes: str, profiles: Sequence[EyeProfile]) -> Iterator[Finding]:
+    """Yield the change of C(4,0) by accommodation, on the axis and off it."""
+    far_dpt, near_dpt = human_data.MATHUR_FOCUS_DPT
+    pupil_mm = human_data.MATHUR_PUPIL_MM
+    h_deg = np.array([0.0, -MATHUR_ANGLE_DEG, MATHUR_ANGLE_DEG])
+    c40 = index_from_nm(4, 0)
+    change_um = np.array(
+        [
+            on_circle_um(p, h_deg, pupil_diameter_mm=pupil_mm, focus_dpt=near_dpt)
+            - on_circle_um(p, h_deg, pupil_diameter_mm=pupil_mm, focus_dpt=far_dpt)
+            for p in profiles
+        ]
+    )[..., c40]
+    for angle, values_um in (
+        (0.0, change_um[:, 0]),
+        (MATHUR_ANGLE_DEG, change_um[:, 1:].mean(axis=1)),
+    ):
+        yield Finding(
+            *("near periphery, C40", eyes),
+            f"{far_dpt:g} to {near_dpt:g} dpt, {angle:g} deg, {pupil_mm:g} mm",
+            *(float(values_um.mean()), human_data.MATHUR_C40_UM, "um", "Mathur 2009"),
+            count=len(profiles),
+            band=band_of(values_um),
+        )
+
+
+def refraction_findings(
+    seeds: Sequence[int], people: MeasuredEyes
+) -> Iterator[Finding]:
+    """Relative peripheral M by refraction, beside a regression on measured eyes."""
+    places = [
+        int(np.flatnonzero(people.h_deg == side * NEAR_ANGLE_DEG)[0]) for side in SIDES
+    ]
+    at_um = all_terms(people.zernike_um[:, places])
+    axis_dpt = power_vectors_dpt(all_terms(people.axis_um), CIRCLE_MM)[:, 0]
+    relative_dpt = power_vectors_dpt(at_um, CIRCLE_MM)[..., 0] - axis_dpt[:, None]
+    for k, side in enumerate(SIDES):
+        known = np.isfinite(relative_dpt[:, k])
+        line = np.polyfit(axis_dpt[known], relative_dpt[known, k], 1)
+        for sphere_dpt in SPHERES_DPT:
+            bodies = {"typical eye": [{}]}
+            if seeds:
+                bodies["drawn persons"] = [drawn_person(seed) for seed in seeds]
+            for eyes, fields in bodies.items():
+                found_dpt = np.array(
+                    [
+                        _relative(
+                            emmetrope(sphere_dpt, **more),
+                            np.array([side * NEAR_ANGLE_DEG]),
+                            2.0 * CIRCLE_MM,
+                            -60.0,
+                        )[0, 0]
+                        for more in fields
+                    ]
+                )
+                yield Finding(
+                    *("relative periphery, M", eyes),
+                    f"{sphere_dpt:g} dpt, {side * NEAR_ANGLE_DEG:+.0f} deg, 4 mm",
+                    float(found_dpt.mean()),
+                    float(np.polyval(line, sphere_dpt)),
+                    *("dpt", "Jaeken & Artal 2012"),
+                    count=len(found_dpt),
+                    band=band_of(found_dpt),
+                )

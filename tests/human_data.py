@@ -1,0 +1,118 @@
+"""Published measurements of human eyes, as closed formulas and tables."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.acuity.sensitivity import perfect_transfer
+
+NAVARRO_PUPIL_MM, NAVARRO_NM, NAVARRO_FOCUS_DPT = 4.0, 632.8, 3.0
+"""Conditions of Navarro, Artal & Williams 1993."""
+
+NAVARRO = {
+    # eccentricity, deg: A and B, deg; C
+    0: (0.172, 0.037, 0.22),
+    5: (0.245, 0.041, 0.20),
+    10: (0.245, 0.041, 0.20),
+    20: (0.328, 0.038, 0.14),
+    30: (0.606, 0.064, 0.12),
+    40: (0.82, 0.064, 0.09),
+}
+"""Coefficients of `navarro_modulation` up to 40 deg."""
+
+WILLIAMS_PUPIL_MM, WILLIAMS_NM = 3.0, 632.8
+WILLIAMS = (0.3481, 0.6519, 0.1212)
+
+SALMON_RMS_UM = {3.0: 0.045, 4.0: 0.100, 5.0: 0.186, 6.0: 0.327}
+"""Mean RMS of orders 3 to 6 by pupil diameter, mm: 2560 eyes of 1433 adults (Salmon &
+van de Pol, J Cataract Refract Surg 32:2064, 2006)."""
+
+SALMON_TWICE_RATIO = 0.9
+"""Proportion of these eyes, at least, with less than twice the mean."""
+
+SMITH_ARCMIN = 0.65
+"""For each mm of pupil and dpt of defocus (Smith, Optom Vis Sci 68:491, 1991; the
+constant as later papers cite it)."""
+
+DRIVERS_LOG_S = {7.0: 0.87, 10.0: 0.90}
+"""Straylight parameter log s of the young by angle, deg: 2422 European drivers (van den
+Berg et al., Am J Ophthalmol 144:358, 2007).  Its standard deviation is 0.10."""
+
+CATARACT_LOG_S = {"nuclear": 1.22, "cortical": 1.26, "posterior_subcapsular": 1.48}
+"""Mean log s before surgery (J Ophthalmol 2017, 5649532), with standard deviations of
+0.20, 0.23 and 0.34."""
+
+NEAR_PERIPHERY_RATIO = {
+    "Calver 2007, Davies & Mallen 2009": 0.0,
+    "Whatham 2009, Lundstrom 2009": -0.3 / 4.0,
+}
+"""Change of M at +-30 deg, relative to the fovea, for each dpt of accommodation.
+
+Calver et al. (Ophthalmic Physiol Opt 27:584) compared targets at 2.5 and 0.4 m, Davies
+& Mallen (Br J Ophthalmol 93, 2009) targets up to 3 dpt; neither found an effect.
+Whatham et al. (J Vis 9(3):14) and Lundstrom et al. (J Vis 9(6):17) found 0.1 to 0.5 dpt
+more myopia over several dpt; -0.3 over 4 dpt is the middle of that."""
+
+MATHUR_FOCUS_DPT, MATHUR_PUPIL_MM, MATHUR_C40_UM = (0.3, 4.0), 5.0, -0.10
+"""Change of C(4,0) in all of 38 directions within 21 deg: 9 emmetropes (Mathur,
+Atchison & Charman, J Vis 9(12):20, 2009).  Relative refraction, astigmatism and other
+higher orders hardly changed."""
+
+
+def navarro_modulation(
+    frequency_cpd: ArrayLike, eccentricity_deg: int
+) -> NDArray[np.float64]:
+    """Return the double-pass modulation transfer (...) at an angle of `NAVARRO`.
+
+    References
+    ----------
+    Navarro, Artal & Williams, JOSA A 10:201, 1993.
+    """
+    fast_deg, slow_deg, slow_part = NAVARRO[eccentricity_deg]
+    cpd = np.asarray(frequency_cpd, dtype=np.float64)
+    fast, slow = np.exp(-fast_deg * cpd), np.exp(-slow_deg * cpd)
+    modulation: NDArray[np.float64] = (1.0 - slow_part) * fast + slow_part * slow
+    return modulation
+
+
+def williams_modulation(frequency_cpd: ArrayLike) -> NDArray[np.float64]:
+    """Return the modulation transfer (...) of the fovea through 3 mm.
+
+    References
+    ----------
+    Williams, Brainard, McMahon & Navarro, JOSA A 11:3123, 1994.
+    """
+    constant, decaying, decay_deg = WILLIAMS
+    cpd = np.asarray(frequency_cpd, dtype=np.float64)
+    perfect = perfect_transfer(
+        cpd, pupil_diameter_mm=WILLIAMS_PUPIL_MM, wavelength_nm=WILLIAMS_NM
+    )
+    return perfect * (constant + decaying * np.exp(-decay_deg * cpd))
+
+
+def smith_log_mar(pupil_diameter_mm: float, defocus_dpt: ArrayLike) -> NDArray:
+    """Return the acuity (...), logMAR, of defocused eyes by Smith's law."""
+    return np.log10(SMITH_ARCMIN * pupil_diameter_mm * np.asarray(defocus_dpt))
+
+
+def blendowske_lost_log_mar(defocus_dpt: ArrayLike) -> NDArray[np.float64]:
+    """Return what defocus (...) costs, logMAR, with natural pupils of 2 to 5 mm.
+
+    References
+    ----------
+    Blendowske, Optom Vis Sci 92:e121, 2015: seven sets of data, adjusted R² 0.99.
+    """
+    lost: NDArray[np.float64] = np.log10(1.0 + np.square(defocus_dpt))
+    return lost
+
+
+def drivers_log_s(angle_deg: float, age_years: ArrayLike) -> NDArray[np.float64]:
+    """Return the straylight parameter log s (...) of healthy eyes by age.
+
+    Parameters
+    ----------
+    angle_deg : {7, 10}
+    age_years : (...)
+    """
+    growth = 1.0 + (np.asarray(age_years, dtype=np.float64) / 65.0) ** 4
+    log_s: NDArray[np.float64] = DRIVERS_LOG_S[angle_deg] + np.log10(growth)
+    return log_s
