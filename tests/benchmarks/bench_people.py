@@ -24,6 +24,7 @@ Writes results/people.json and results/people_measures.png.
 """
 
 import argparse
+import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -40,7 +41,7 @@ from estimator.periphery.change import peripheral_change
 from estimator.periphery.measured_eyes import MeasuredEyes, load_measured_eyes
 from estimator.periphery.meridian import CIRCLE_MM, TERMS
 from estimator.periphery.population import Population, measured_population
-from estimator.profiles.parse import ProfileError, parse_profile, preset_names
+from estimator.profiles.parse import parse_profile, preset_names
 from filter_service.progress import Progress
 from tests.benchmarks.harness import OUT, RESULTS, Row, memory_mb, publish
 from tests.benchmarks.people_findings import Finding, print_findings
@@ -49,7 +50,6 @@ from tests.benchmarks.people_modulation import REFRACTIONS
 from tests.benchmarks.people_optics import (
     Curves,
     drawn_person,
-    emmetrope,
     higher_order_findings,
     modulation_findings,
     near_findings,
@@ -362,11 +362,11 @@ def field_findings(
     angles = list(FIELD_ANGLES_DEG)
     at = [int(np.flatnonzero(people.h_deg == h)[0]) for h in angles]
     own_um = people.zernike_um[::step, at]
-    seeds = {"most probable periphery": [None], "drawn peripheries": range(fields)}
+    counts = {"most probable periphery": 1, "drawn peripheries": fields}
     predicted_um = {
-        method: np.full((len(draws), *own_um.shape), np.nan)
-        for method, draws in seeds.items()
-        if len(draws)
+        method: np.full((count, *own_um.shape), np.nan)
+        for method, count in counts.items()
+        if count
     }
     times_ms = dict.fromkeys(predicted_um, 0.0)
     for out in folds(people, fold_count):
@@ -374,12 +374,14 @@ def field_findings(
         with _population_of(people.select(~out)):
             for method, found_um in predicted_um.items():
                 start_s = time.perf_counter()
-                for k, seed in enumerate(seeds[method]):
-                    more = {} if seed is None else drawn_person(seed)
-                    for eye in judged:
-                        axis_um = people.axis_um[::step][eye]
-                        change_um = told_change_um(profile_of(axis_um, **more), angles)
-                        found_um[k, eye] = axis_um + change_um
+                for k, eye in itertools.product(range(len(found_um)), judged.tolist()):
+                    more = {}
+                    if method == "drawn peripheries":
+                        # Of their own: draws of one seed depart alike in all eyes.
+                        more = drawn_person(k * len(own_um) + eye)
+                    axis_um = people.axis_um[::step][eye]
+                    change_um = told_change_um(profile_of(axis_um, **more), angles)
+                    found_um[k, eye] = axis_um + change_um
                 elapsed_ms = 1e3 * (time.perf_counter() - start_s)
                 times_ms[method] += elapsed_ms / found_um[:, :, 0, 0].size
     yield from own_field_findings(
@@ -430,15 +432,6 @@ def found_beside_people(
     return found
 
 
-def can_draw() -> bool:
-    """Return whether profiles can draw a person."""
-    try:
-        emmetrope(**drawn_person(0))
-    except ProfileError:
-        return False
-    return True
-
-
 def _every(step: int, people: MeasuredEyes) -> NDArray[np.bool_]:
     return np.arange(len(people.person)) % step == 0
 
@@ -485,8 +478,6 @@ def main() -> None:
         persons = options.people
         if persons is None:
             persons = QUICK_PEOPLE if options.quick else PEOPLE
-        if not can_draw():
-            persons = 0
         curves: Curves = {}
         findings = found_beside_people(
             judged.people,
