@@ -38,7 +38,7 @@ def modulation(
     """Return modulation transfers (..., 30) at `AT_CPD`, averaged over orientations.
 
     `optical_transfer` gives the same, one wavefront at a time and on a grid of
-    frequencies that is three times as fine, in 50 times as long.
+    frequencies that is three times as fine, in 20 times as long.
 
     Parameters
     ----------

@@ -140,13 +140,14 @@ def modulation_findings(
             of_eyes = known_mean(plain[:, both])
             of_eyes = of_eyes[np.isfinite(of_eyes[:, 0])]
             curves[eyes, angle] = of_eyes
+            seen = known_mean(blurred[:, both])
             theirs = human_data.navarro_modulation(AT_CPD, int(angle)).mean()
             yield Finding(
                 *("modulation", eyes, f"{angle:g} deg, {pupil_mm:g} mm"),
                 *(float(of_eyes.mean()), float(theirs), "mean of 1 to 30 cpd"),
                 *("Navarro 1993", len(of_eyes), elapsed_ms),
-                with_residual=float(np.nanmean(blurred[:, both])),
-                with_halo=float(np.nanmean(with_halo(blurred[:, both]))),
+                with_residual=float(np.nanmean(seen)),
+                with_halo=float(np.nanmean(with_halo(seen))),
                 band=band_of(of_eyes.mean(axis=1)),
             )
     yield from _foveal_findings(seeds, people)
