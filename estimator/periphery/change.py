@@ -64,6 +64,12 @@ OFF_MERIDIAN_AT_DEG, CORRELATION_LENGTH_DEG = 25.0, 20.0
 FIELD_STREAM = 1
 """Second seed of drawn changes; the axis has another (`typical_aberrations`)."""
 
+FREEDOM = 5
+"""Degrees of freedom of the multivariate t-distribution of drawn deviations from the
+most probable change.  Those of people are heavy-tailed: the excess kurtosis of M is 7
+to 3 between 20 deg nasal and 10 deg temporal.  With a normal distribution, the MTF of
+drawn peripheries at 10 deg is 0.045 below that of the same people."""
+
 N_FEATURES = 256
 """Number of cosines of a drawn Gaussian process."""
 
@@ -94,12 +100,13 @@ class OffMeridianDraw(NamedTuple):
     amplitudes_um: NDArray[np.float64]
 
     @classmethod
-    def draw(cls, random: np.random.RandomState) -> "OffMeridianDraw":
-        """Draw a function."""
+    def draw(cls, random: np.random.RandomState, size: float) -> "OffMeridianDraw":
+        """Draw a function, scaled by ``size``."""
         return cls(
             random.standard_normal((N_FEATURES, 2)) / CORRELATION_LENGTH_DEG,
             random.uniform(0.0, 2.0 * math.pi, N_FEATURES),
-            math.sqrt(2.0 / N_FEATURES)
+            size
+            * math.sqrt(2.0 / N_FEATURES)
             * random.standard_normal((N_FEATURES, len(TERMS)))
             * list(OFF_MERIDIAN_UM.values()),
         )
@@ -276,7 +283,8 @@ def _conditioned(
     """Condition the population on the axis and on all other directions.
 
     A change is drawn by Matheron's rule: an eye drawn from the population is corrected
-    by the difference of its simulated measurements from the actual ones.
+    by the difference of its simulated measurements from the actual ones.  One size for
+    all of its deviations makes the distribution a t-distribution.
     """
     axis_um, axis_noise_um = axis
     mean_um = population.mean_um
@@ -308,10 +316,11 @@ def _conditioned(
         random = np.random.RandomState([sample, FIELD_STREAM])
         jitter = np.diag(RELATIVE_JITTER * scale**2)
         root = np.linalg.cholesky(covariance + jitter)
-        prior_um = prior_um + root @ random.standard_normal(scale.size)
-        draw = OffMeridianDraw.draw(random)
-        simulated_um = observation @ prior_um
-        simulated_um += np.sqrt(noise_um2) * random.standard_normal(noise_um2.size)
+        size = math.sqrt((FREEDOM - 2) / random.chisquare(FREEDOM))
+        prior_um = prior_um + size * (root @ random.standard_normal(scale.size))
+        draw = OffMeridianDraw.draw(random, size)
+        noise_um = np.sqrt(noise_um2) * random.standard_normal(noise_um2.size)
+        simulated_um = observation @ prior_um + size * noise_um
         simulated_um[len(TERMS) :] += draw.at_um(h_deg, v_deg).ravel()
         weights = np.linalg.solve(total, measured_um - simulated_um)
     gain = np.linalg.solve(total, observation @ covariance)
