@@ -82,6 +82,6 @@ def _defocus_once() -> None:
     count = N_DEGREES + N_RIM
     grid = np.arange(2.0, 4.0), np.ones(count), np.ones(1), np.ones((1, 1, 2, 1, count))
     index, sums = np.zeros(1, np.int64), np.zeros((1, N_DEGREES))
-    fields, added = (index, index, np.ones(1)), (sums, sums, 1.0, sums, 1.0)
+    fields, added = (index, index, np.ones(1)), (sums, sums, 1.0)
     weights_at(np.zeros(1), 0.0)
     fill_defocus(2.0, grid, grid, fields, added, np.empty(1))
