@@ -20,6 +20,8 @@ from .estimate.given_surfaces import eye_model as eye_model
 from .estimate.plot import draw_section as draw_section
 from .eye.checked_fields import ProfileError as ProfileError
 from .eye.parameters import EyeParameters as EyeParameters
+from .field.drawn_fields import DrawnFields as DrawnFields
+from .field.drawn_fields import drawn_fields as drawn_fields
 from .field.eye_optics import EyeOptics as EyeOptics
 from .field.field_table import FieldTable as FieldTable
 from .field.field_table import field_table as field_table
@@ -34,6 +36,11 @@ from .optics.prescription import (
 from .optics.zernike import nm_from_index as nm_from_index
 from .optics.zernike import rescale_pupil as rescale_pupil
 from .optics.zernike import zernike_values as zernike_values
+from .profiles.drawn_people import PEOPLE_LIMITS as PEOPLE_LIMITS
+from .profiles.drawn_people import drawn_profiles as drawn_profiles
+from .profiles.drawn_people import drawn_text as drawn_text
+from .profiles.drawn_people import draws_axis as draws_axis
+from .profiles.drawn_people import draws_periphery as draws_periphery
 from .profiles.files import MAX_PROFILE_BYTES as MAX_PROFILE_BYTES
 from .profiles.files import PROFILE_SUFFIXES as PROFILE_SUFFIXES
 from .profiles.files import load_profile as load_profile

@@ -1,6 +1,7 @@
 """`ocufilter field`: aberrations of an eye over its visual field."""
 
 import math
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,10 +15,19 @@ from clients.commands.wavefront import (
 )
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from estimator.field.drawn_fields import DrawnFields
     from estimator.field.field_table import FieldTable
+    from estimator.profiles.eye_profile import EyeProfile
 
 FIELD_LIMIT_DEG = 60.0
 MAX_DIRECTIONS = 10_000
+MAX_DRAWN_DIRECTIONS = 1_000_000
+"""Largest number of persons times directions, whose quantities take 50 MB."""
+
+PERCENTILES = (5, 50, 95)
 HORIZONTAL, VERTICAL = "-40,-30,-20,-10,0,10,20,30,40", "0"
 
 
@@ -44,6 +54,14 @@ def field(
             metavar="OUT.png", help="Plot maps of M, astigmatism, coma and blur."
         ),
     ] = None,
+    people: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Number of persons to draw from the population, 2 to 1000; prints the "
+            "median and the 5th to 95th percentile (0.05 to 0.1 s per person).",
+        ),
+    ] = None,
     json_output: Json = False,
 ) -> None:
     """Print refraction and aberrations over a grid of visual field directions.
@@ -53,6 +71,9 @@ def field(
     J45 are the least-squares refraction.  Off-axis values are those measured in the
     profile, or those of a measured population with the same on-axis values; with
     "periphery": "model" in the profile, they are those of the eye model.
+
+    With --people, the table describes persons drawn from the population: people with
+    this prescription or this wavefront on the axis differ in everything else.
 
     ocufilter field keratoconus --pupil-mm 4 --wavelength-nm 555 --v-deg=-20,0,20
     """
@@ -67,6 +88,20 @@ def field(
             f"allowed: at most {MAX_DIRECTIONS}"
         )
 
+    from estimator.profiles.drawn_people import (
+        PEOPLE_LIMITS,
+        drawn_profiles,
+        drawn_text,
+    )
+
+    if people is not None:
+        check_range("--people", people, PEOPLE_LIMITS)
+        if people * len(azimuths) * len(elevations) > MAX_DRAWN_DIRECTIONS:
+            raise ValueError(
+                f"--people: {people} persons x {len(azimuths) * len(elevations)} "
+                f"directions; allowed: at most {MAX_DRAWN_DIRECTIONS}"
+            )
+
     import numpy as np
 
     from estimator.corrections.worn_lens import rings_of
@@ -77,20 +112,27 @@ def field(
     if plot is not None:
         check_output(plot, (".png",))
     eye = load_profile(profile)
+    if people is not None:
+        drawn_profiles(eye, people)  # fail early
     across, along = np.meshgrid(azimuths, elevations)
-    found = field_table(
-        eye,
-        h_deg=across.ravel(),
-        v_deg=along.ravel(),
-        pupil_diameter_mm=pupil_mm,
-        wavelength_nm=wavelength_nm,
-        focus_dpt=focus_dpt,
-    )
+    states: dict[str, Any] = {
+        "h_deg": across.ravel(),
+        "v_deg": along.ravel(),
+        "pupil_diameter_mm": pupil_mm,
+        "wavelength_nm": wavelength_nm,
+        "focus_dpt": focus_dpt,
+    }
+    found, drawn = field_table(eye, **states), None
+    title = f"{eye.name}, {pupil_mm:g} mm"
+    notes = list(found.notes)
+    if people is not None:
+        drawn = _drawn(eye, people, states, quiet=json_output)
+        title += f", {people} drawn persons: median, 5th to 95th percentile"
+        notes.append(f"{people} persons: {drawn_text(eye)}")
     if plot is not None:
         from estimator.field.plot import plot_field
 
-        plot_field(found, plot, title=f"{eye.name}, {pupil_mm:g} mm")
-    notes = list(found.notes)
+        plot_field(found, plot, title=title, drawn=drawn)
     if eye.correction is not None:
         notes.append("seen through the correction")
     if rings_of(eye.correction) is not None:
@@ -99,9 +141,62 @@ def field(
             "they describe its distance power"
         )
     if json_output:
-        print_json({"directions": _directions(found), "notes": notes})
+        printed: dict[str, Any] = {"directions": _directions(found), "notes": notes}
+        if drawn is not None:
+            printed["people"] = people
+            for direction, numbers in zip(
+                printed["directions"], _percentiles(drawn), strict=True
+            ):
+                direction["percentiles"] = numbers
+        print_json(printed)
+        return
+    for note in notes:
+        print_line(f"note: {note}")
+    if drawn is None:
+        _print_table(found)
     else:
-        _report(found, notes)
+        _print_drawn(found, drawn)
+
+
+def _drawn(
+    eye: "EyeProfile", people: int, states: dict[str, Any], *, quiet: bool
+) -> "DrawnFields":
+    """Return the fields of drawn persons; show progress on a terminal."""
+    from estimator.field.drawn_fields import drawn_fields
+    from filter_service.progress import Progress
+
+    with Progress(quiet=quiet or not sys.stderr.isatty()) as progress:
+        task = progress.task("Drawn persons", total=people, unit="persons")
+        return drawn_fields(eye, people, progress=task.advance, **states)
+
+
+def _quantities(drawn: "DrawnFields") -> dict[str, "NDArray[np.float64]"]:
+    """Return the quantities (N, n) of drawn persons by name."""
+    return {
+        "M_dpt": drawn.power_dpt[..., 0],
+        "J0_dpt": drawn.power_dpt[..., 1],
+        "J45_dpt": drawn.power_dpt[..., 2],
+        "coma_um": drawn.coma_um,
+        "higher_order_rms_um": drawn.higher_order_rms_um,
+    }
+
+
+def _percentiles(drawn: "DrawnFields") -> list[dict[str, dict[str, float]]]:
+    """Return the percentiles of each quantity in each direction."""
+    import numpy as np
+
+    found = {
+        name: np.percentile(values, PERCENTILES, axis=0).T.tolist()
+        for name, values in _quantities(drawn).items()
+    }
+    names = [str(percentile) for percentile in PERCENTILES]
+    return [
+        {
+            name: dict(zip(names, numbers, strict=True))
+            for name, numbers in zip(found, direction, strict=True)
+        }
+        for direction in zip(*found.values(), strict=True)
+    ]
 
 
 def _angles(option: str, text: str) -> list[float]:
@@ -162,19 +257,13 @@ def _ellipse(
     )
 
 
-def _report(found: "FieldTable", notes: list[str]) -> None:
-    import numpy as np
-
-    for note in notes:
-        print_line(f"note: {note}")
+def _print_table(found: "FieldTable") -> None:
     print_line(
         "  h deg   v deg    M dpt   J0 dpt  J45 dpt   coma um  RMS 3-6 um  circle mm"
     )
-    coma_um = np.hypot(*found.zernike_um[:, [7, 8]].T)
-    higher_um = np.linalg.norm(found.zernike_um[:, 6:], axis=1)
     rows = zip(
         *(found.h_deg, found.v_deg, *found.power_dpt.T),
-        *(coma_um, higher_um, found.zernike_radius_mm),
+        *(found.coma_um, found.higher_order_rms_um, found.zernike_radius_mm),
         strict=True,
     )
     for h, v, m, j0, j45, coma, higher, radius in rows:
@@ -182,3 +271,26 @@ def _report(found: "FieldTable", notes: list[str]) -> None:
             f"{h:7.1f} {v:7.1f} {m:+8.2f} {j0:+8.2f} {j45:+8.2f} {coma:9.3f} "
             f"{higher:11.3f} {radius:10.3f}"
         )
+
+
+def _print_drawn(found: "FieldTable", drawn: "DrawnFields") -> None:
+    """Print the median and the range of drawn persons in each direction."""
+    print_line(f"median and 5th..95th percentile of {len(drawn.coma_um)} persons")
+    print_line(
+        "  h deg   v deg               M dpt              J0 dpt             J45 dpt"
+        "          coma um       RMS 3-6 um"
+    )
+    for h, v, numbers in zip(
+        found.h_deg, found.v_deg, _percentiles(drawn), strict=True
+    ):
+        cells = [
+            f"{values['50']:+7.2f} {_range_text(values, '+.2f'):>12}"
+            if name.endswith("_dpt")
+            else f"{values['50']:6.2f} {_range_text(values, '.2f'):>10}"
+            for name, values in numbers.items()
+        ]
+        print_line(f"{h:7.1f} {v:7.1f}{''.join(cells)}")
+
+
+def _range_text(values: dict[str, float], form: str) -> str:
+    return f"{values['5']:{form}}..{values['95']:{form}}"

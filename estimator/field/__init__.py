@@ -13,6 +13,7 @@ defocus_loops           compiled loop of fixed_defocus
 traced_eye              an estimated eye, ray-traced over the field
 prepare                 entry point: from a profile to such an eye
 field_table             wavefronts in many directions, at the cornea
+drawn_fields            these of drawn persons
 plot                    maps of a field table
 notes                   notes on how an eye was computed
 

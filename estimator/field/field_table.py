@@ -19,6 +19,9 @@ from estimator.wavefront.moved_plane import moved_polynomial
 RELAXED_DPT = -60.0
 """Focus distance at which every eye is relaxed."""
 
+COMA = [7, 8]
+FIRST_HIGHER = 6
+
 LEAST_EXTENT_DEG = 1.0
 """Smallest half extent of the traced field about the axis."""
 
@@ -48,6 +51,19 @@ class FieldTable:
     power_dpt: NDArray[np.float64]
     pupil_ellipse: NDArray[np.float64]
     notes: tuple[str, ...]
+
+    @property
+    def coma_um(self) -> NDArray[np.float64]:
+        """Return the magnitude (n,) of C(3,-1) and C(3,1)."""
+        return np.hypot(*self.zernike_um[:, COMA].T)
+
+    @property
+    def higher_order_rms_um(self) -> NDArray[np.float64]:
+        """Return the root mean square (n,) of orders 3 to 6."""
+        rms_um: NDArray[np.float64] = np.linalg.norm(
+            self.zernike_um[:, FIRST_HIGHER:], axis=1
+        )
+        return rms_um
 
 
 def field_table(

@@ -20,6 +20,7 @@ lens_files           eyes in Zemax and optiland files
 presets.json         the six presets
 measured_wavefront   a measurement used in closed form, without an eye model
 typical_aberrations  higher-order aberrations added to a prescription, by age
+drawn_people         profiles of persons drawn from the population
 """
 
 import lazy_loader

@@ -1,3 +1,4 @@
+from .drawn_people import drawn_profiles as drawn_profiles
 from .files import load_profile as load_profile
 from .measured_wavefront import MeasuredWavefront as MeasuredWavefront
 from .parse import EyeProfile as EyeProfile
