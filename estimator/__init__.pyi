@@ -22,6 +22,7 @@ from .eye.checked_fields import ProfileError as ProfileError
 from .eye.parameters import EyeParameters as EyeParameters
 from .field.drawn_fields import DrawnFields as DrawnFields
 from .field.drawn_fields import drawn_fields as drawn_fields
+from .field.drawn_fields import percentiles_of as percentiles_of
 from .field.eye_optics import EyeOptics as EyeOptics
 from .field.field_table import FieldTable as FieldTable
 from .field.field_table import field_table as field_table

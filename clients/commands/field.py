@@ -15,9 +15,6 @@ from clients.commands.wavefront import (
 )
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from estimator.field.drawn_fields import DrawnFields
     from estimator.field.field_table import FieldTable
     from estimator.profiles.eye_profile import EyeProfile
@@ -26,8 +23,6 @@ FIELD_LIMIT_DEG = 60.0
 MAX_DIRECTIONS = 10_000
 MAX_DRAWN_DIRECTIONS = 1_000_000
 """Largest number of persons times directions, whose quantities take 50 MB."""
-
-PERCENTILES = (5, 50, 95)
 HORIZONTAL, VERTICAL = "-40,-30,-20,-10,0,10,20,30,40", "0"
 
 
@@ -123,16 +118,14 @@ def field(
         "focus_dpt": focus_dpt,
     }
     found, drawn = field_table(eye, **states), None
-    title = f"{eye.name}, {pupil_mm:g} mm"
     notes = list(found.notes)
     if people is not None:
         drawn = _drawn(eye, people, states, quiet=json_output)
-        title += f", {people} drawn persons: median, 5th to 95th percentile"
         notes.append(f"{people} persons: {drawn_text(eye)}")
     if plot is not None:
         from estimator.field.plot import plot_field
 
-        plot_field(found, plot, title=title, drawn=drawn)
+        plot_field(found, plot, title=f"{eye.name}, {pupil_mm:g} mm", drawn=drawn)
     if eye.correction is not None:
         notes.append("seen through the correction")
     if rings_of(eye.correction) is not None:
@@ -145,7 +138,7 @@ def field(
         if drawn is not None:
             printed["people"] = people
             for direction, numbers in zip(
-                printed["directions"], _percentiles(drawn), strict=True
+                printed["directions"], drawn.percentiles(), strict=True
             ):
                 direction["percentiles"] = numbers
         print_json(printed)
@@ -168,35 +161,6 @@ def _drawn(
     with Progress(quiet=quiet or not sys.stderr.isatty()) as progress:
         task = progress.task("Drawn persons", total=people, unit="persons")
         return drawn_fields(eye, people, progress=task.advance, **states)
-
-
-def _quantities(drawn: "DrawnFields") -> dict[str, "NDArray[np.float64]"]:
-    """Return the quantities (N, n) of drawn persons by name."""
-    return {
-        "M_dpt": drawn.power_dpt[..., 0],
-        "J0_dpt": drawn.power_dpt[..., 1],
-        "J45_dpt": drawn.power_dpt[..., 2],
-        "coma_um": drawn.coma_um,
-        "higher_order_rms_um": drawn.higher_order_rms_um,
-    }
-
-
-def _percentiles(drawn: "DrawnFields") -> list[dict[str, dict[str, float]]]:
-    """Return the percentiles of each quantity in each direction."""
-    import numpy as np
-
-    found = {
-        name: np.percentile(values, PERCENTILES, axis=0).T.tolist()
-        for name, values in _quantities(drawn).items()
-    }
-    names = [str(percentile) for percentile in PERCENTILES]
-    return [
-        {
-            name: dict(zip(names, numbers, strict=True))
-            for name, numbers in zip(found, direction, strict=True)
-        }
-        for direction in zip(*found.values(), strict=True)
-    ]
 
 
 def _angles(option: str, text: str) -> list[float]:
@@ -281,7 +245,7 @@ def _print_drawn(found: "FieldTable", drawn: "DrawnFields") -> None:
         "          coma um       RMS 3-6 um"
     )
     for h, v, numbers in zip(
-        found.h_deg, found.v_deg, _percentiles(drawn), strict=True
+        found.h_deg, found.v_deg, drawn.percentiles(), strict=True
     ):
         cells = [
             f"{values['50']:+7.2f} {_range_text(values, '+.2f'):>12}"

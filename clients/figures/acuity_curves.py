@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from clients.figures.study import PUPILS_MM, EyeStudy
 from clients.figures.style import (
@@ -18,6 +19,7 @@ from clients.figures.style import (
     PUPIL_COLORS,
     SMALL_PT,
     SOFT,
+    draw_band,
     legend_below,
     mark_unknown,
     new_figure,
@@ -35,14 +37,27 @@ MARKS = {0.0: " far", 1.0: "1 m", 2.5: "40 cm", 5.0: "20 cm", 10.0: "10 cm"}
 
 
 def draw_through_focus_acuity(
-    axes: Axes, study: EyeStudy, *, pupils_mm: Sequence[float] = PUPILS_MM
+    axes: Axes,
+    study: EyeStudy,
+    *,
+    pupils_mm: Sequence[float] = PUPILS_MM,
+    drawn_log_mar: Mapping[float, NDArray[np.float64]] | None = None,
 ) -> None:
-    """Draw acuity by distance through several pupils: focused far and accommodating."""
+    """Draw acuity by distance through several pupils: focused far and accommodating.
+
+    Parameters
+    ----------
+    drawn_log_mar : mapping, optional
+        Acuity (N, n) of N drawn persons who accommodate, at the distances of the
+        study, by pupil, to draw as bands.
+    """
     colors = dict(zip(pupils_mm, PUPIL_COLORS, strict=False))
     for pupil_mm, color in colors.items():
         found = study.acuity(pupil_mm)
         axes.plot(found.object_dpt, found.near_log_mar, color=color, **ACCOMMODATING)
         axes.plot(found.object_dpt, found.far_log_mar, color=color, **FOCUSED_FAR)
+        if drawn_log_mar and pupil_mm in drawn_log_mar:
+            draw_band(axes, found.object_dpt, drawn_log_mar[pupil_mm], color=color)
     looks = [(f"{pupil_mm:g} mm", {"color": c}) for pupil_mm, c in colors.items()]
     styles = {"accommodating": ACCOMMODATING, "focused far": FOCUSED_FAR}
     black = [(name, {"color": INK} | style) for name, style in styles.items()]

@@ -76,6 +76,20 @@ class PupilWavefront:
             if tried is self or tried.is_as_good_as(self)
         )
 
+    def near_best_corrected(self, *, n_samples: int) -> PupilWavefront:
+        """Return the wavefront with the best sphere and cylinder near least squares.
+
+        Without large higher orders it is that of `best_corrected`, in less time.
+
+        Parameters
+        ----------
+        n_samples : int
+            Samples across the pupil.
+        """
+        start_um = self._least_squares.zernike_um
+        zernike_um = best_correction_um(start_um, n_samples=n_samples, **self._pupil)
+        return replace(self, zernike_um=zernike_um)
+
     def _corrections(self) -> Iterator[PupilWavefront]:
         """Yield the states to choose the best correction from, the best first."""
         zernike_um = best_correction_um(self.zernike_um, **self._pupil)
@@ -109,8 +123,13 @@ class PupilWavefront:
             "pupil_screen": self.rings,
         }
 
-    def transfer(self) -> Transfer:
+    def transfer(self, **options: Any) -> Transfer:
         """Return the optical transfer function.
+
+        Parameters
+        ----------
+        **options
+            ``frequency_step_cpd``; see `optical_transfer`.
 
         Raises
         ------
@@ -119,4 +138,4 @@ class PupilWavefront:
         """
         zernike_um = self.zernike_um.copy()
         zernike_um[TILTS] = 0.0  # the image's position is irrelevant
-        return optical_transfer(zernike_um, **self._pupil)
+        return optical_transfer(zernike_um, **self._pupil, **options)

@@ -8,11 +8,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import ScaledTranslation
+from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
@@ -53,6 +55,20 @@ def with_grid(axes: Axes) -> None:
     """Draw a faint grid."""
     axes.set_axisbelow(True)
     axes.grid(color=GRID, linewidth=0.5)
+
+
+def draw_band(
+    axes: Axes,
+    at: NDArray[np.float64],
+    values: NDArray[np.float64],
+    *,
+    color: str,
+    percentiles: tuple[float, float] = (5.0, 95.0),
+    alpha: float = 0.18,
+) -> None:
+    """Draw the range of values (N, n) of N persons along an axis as a band."""
+    low, high = np.percentile(values, percentiles, axis=0)
+    axes.fill_between(at, low, high, color=color, alpha=alpha, linewidth=0.0)
 
 
 def legend_above(axes: Axes) -> None:

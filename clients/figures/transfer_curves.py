@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from clients.figures.style import (
     LINE_PT,
     PUPIL_COLORS,
     SOFT,
+    draw_band,
     legend_below,
     mark_unknown,
     new_figure,
@@ -58,12 +59,26 @@ def modulation(
         return np.full(at_cpd.shape, np.nan)
 
 
-def draw_mtf(axes: Axes, study: EyeStudy) -> None:
-    """Draw MTFs through 3 and 5 mm pupils, and the diffraction limit."""
+def draw_mtf(
+    axes: Axes,
+    study: EyeStudy,
+    *,
+    drawn_modulation: Mapping[float, NDArray[np.float64]] | None = None,
+) -> None:
+    """Draw MTFs through 3 and 5 mm pupils, and the diffraction limit.
+
+    Parameters
+    ----------
+    drawn_modulation : mapping, optional
+        Best corrected MTFs (N, n) of N drawn persons by pupil, to draw as bands.
+    """
     colors = dict(zip(PUPILS_MM, PUPIL_COLORS, strict=True))
     for pupil_mm, color in colors.items():
         _draw_states(axes, study, pupil_mm, color)
         axes.plot(FREQUENCY_CPD, _perfect(pupil_mm), color=color, **PERFECT)
+        if drawn_modulation:
+            values = drawn_modulation[pupil_mm]
+            draw_band(axes, FREQUENCY_CPD, values, color=color)
     looks = [(f"{pupil_mm:g} mm", {"color": c}) for pupil_mm, c in colors.items()]
     _finish(axes, looks, "Contrast transfer (MTF), far object, 555 nm")
 

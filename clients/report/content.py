@@ -10,6 +10,7 @@ from matplotlib.figure import FigureBase
 from clients.figures import (
     EyeStudy,
     draw_cross_section,
+    draw_field_line,
     draw_field_maps,
     draw_mtf,
     draw_psfs,
@@ -33,13 +34,14 @@ from clients.report.charts import DISTANCES_M, chart_rows
 from clients.report.correction_text import limits_text, near_text, subtitle_text
 from clients.report.facts import EyeFacts
 from clients.report.labels import SIDE_NAMES
-from clients.report.method_text import method_text
+from clients.report.method_text import method_text, people_text
 from clients.report.provenance import provenance_table
 from clients.report.sources import Citations
 from clients.report.tables import (
     acuity_text,
     coefficient_table,
     field_table_block,
+    people_table,
     refraction_table,
     vision_table,
 )
@@ -71,15 +73,16 @@ def eye_document(facts: EyeFacts) -> Document:
                 FIELD_TITLE,
                 (
                     field_row(facts),
+                    *_people_rows(facts),
                     _distance_row(facts),
                     chart_row(facts, DUSK_MM),
-                    method_row(*method_text(facts.study)),
+                    method_row(*method_text(facts.study), *people_text(facts)),
                 ),
             ),
             Section(
                 KNOWN_TITLE,
                 (
-                    Row((provenance_table(facts.study, cite),)),
+                    Row((provenance_table(facts.study, cite, facts.people),)),
                     *_coefficient_rows(facts),
                 ),
             ),
@@ -141,7 +144,11 @@ def summary(facts: EyeFacts) -> Section:
         "Point-spread functions through 3 and 5 mm, as it is and best corrected",
     )
     contrast = on_axes(
-        lambda axes: draw_mtf(axes, study),
+        lambda axes: draw_mtf(
+            axes,
+            study,
+            drawn_modulation=facts.people.modulation if facts.people else None,
+        ),
         PSF_MM,
         "Modulation transfer functions through 3 and 5 mm",
     )
@@ -224,11 +231,26 @@ def field_row(facts: EyeFacts, *, name: str = "", height_mm: float = FIELD_MM) -
     return Row((maps, field_table_block(facts, name=name)), (2.4, 1.0))
 
 
+def _people_rows(facts: EyeFacts) -> tuple[Row, ...]:
+    """Return the refraction of drawn persons along the horizontal meridian."""
+    people = facts.people
+    if people is None:
+        return ()
+    line = on_axes(
+        lambda axes: draw_field_line(axes, facts.study, people),
+        CURVE_MM,
+        "M along the horizontal meridian, median and bands of drawn persons",
+    )
+    return (Row((line, people_table(facts)), (1.3, 1.0)),)
+
+
 def _distance_row(facts: EyeFacts) -> Row:
     """Return acuity by distance, and the section of an eye."""
     study = facts.study
     acuity = on_axes(
-        lambda axes: draw_through_focus_acuity(axes, study),
+        lambda axes: draw_through_focus_acuity(
+            axes, study, drawn_log_mar=facts.people.log_mar if facts.people else None
+        ),
         CURVE_MM,
         "Acuity by distance, focused far and accommodating",
     )

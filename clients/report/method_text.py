@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from clients.figures import EyeStudy
-from estimator import EyeProfile
+from clients.figures.drawn_people import ACUITY_PUPIL_MM
+from clients.report.facts import EyeFacts
+from estimator import EyeProfile, drawn_text, draws_axis
 
 COMPUTED_BY = ("eye estimated", "eye as given", "focus traced", "aberrations traced")
 """Prefixes of notes on the computation, which `_model_text` replaces."""
@@ -26,6 +28,26 @@ def method_text(study: EyeStudy) -> tuple[str, ...]:
     """Return sentences on how the eye was computed and what its powers refer to."""
     notes = (n for n in study.field.notes if not n.startswith(COMPUTED_BY))
     return (_model_text(study), *map(_plain_text, notes))
+
+
+def people_text(facts: EyeFacts) -> tuple[str, ...]:
+    """Return a sentence on the bands of drawn persons; empty without them."""
+    people, profile = facts.people, facts.study.profile
+    if people is None:
+        return ()
+    text = (
+        f"bands are from the 5th to the 95th percentile of {people.count} persons: "
+        f"{drawn_text(profile)}"
+    )
+    if people.modulation:
+        return (
+            f"{text}; the bands of contrast are best corrected, that of acuity is "
+            f"accommodating through {ACUITY_PUPIL_MM:g} mm",
+        )
+    reason = "the axis is not drawn"
+    if draws_axis(profile):
+        reason = "they are not known through lenslets"
+    return (f"{text}; contrast and acuity have no bands, because {reason}",)
 
 
 def entered_text(profile: EyeProfile) -> str:

@@ -9,14 +9,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clients.figures import EyeStudy, PupilWavefront, acuity_log_mar, rms_by_order_um
+from clients.figures import (
+    DrawnPeople,
+    EyeStudy,
+    PupilWavefront,
+    acuity_log_mar,
+    rms_by_order_um,
+)
 from clients.figures.orders import rms_um
-from clients.figures.study import PUPILS_MM, WAVELENGTH_NM
+from clients.figures.study import FIELD_H_DEG, PUPILS_MM, WAVELENGTH_NM
+from clients.figures.transfer_curves import FREQUENCY_CPD
 from estimator import (
     EyeProfile,
     Prescription,
     chromatic_refraction_dpt,
     nm_from_index,
+    percentiles_of,
     power_vector,
     power_vector_from_zernike,
     prescription_from_power_vector,
@@ -251,3 +259,36 @@ def _field_numbers(study: EyeStudy) -> list[dict[str, float]]:
             strict=True,
         )
     ]
+
+
+def people_numbers(people: DrawnPeople) -> dict[str, Any]:
+    """Return the percentiles of drawn persons, ready for JSON."""
+    return {
+        "count": people.count,
+        "pupils": [
+            {
+                "pupil_diameter_mm": pupil_mm,
+                "higher_order_rms_um": percentiles_of(rms[:, None])[0],
+                "modulation_best_corrected": {
+                    f"{cpd:g}_cpd": numbers
+                    for cpd, numbers in zip(
+                        REPORTED_CPD,
+                        percentiles_of(_at_reported_cpd(people.modulation[pupil_mm])),
+                        strict=True,
+                    )
+                },
+            }
+            for pupil_mm, rms in people.higher_order_rms_um.items()
+        ],
+        "field": [
+            {"h_deg": h_deg, "v_deg": 0.0, **numbers}
+            for h_deg, numbers in zip(
+                FIELD_H_DEG.tolist(), people.field.percentiles(), strict=True
+            )
+            if h_deg in REPORTED_FIELD_DEG
+        ],
+    }
+
+
+def _at_reported_cpd(modulation: NDArray[np.float64]) -> NDArray[np.float64]:
+    return modulation[:, np.isin(FREQUENCY_CPD, REPORTED_CPD)]

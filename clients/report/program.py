@@ -3,6 +3,7 @@
     ocufilter report keratoconus -o eye.html
     ocufilter report eye.json -o eye.pdf
     ocufilter report before.json after.json -o surgery.pdf
+    ocufilter report myopia -o eye.html --people 20
 
 A profile is a preset name, a .json, .abp, .csv or .zmx file, or a JSON object.  The
 report begins with a summary: refraction, acuity, wavefront, point images, contrast, a
@@ -10,6 +11,10 @@ letter chart near and far.  Then it shows the visual field, acuity by distance, 
 estimated eye, which data were measured or assumed, and the literature references.  The
 HTML file is self-contained and prints on A4.  The PDF is tagged for screen readers; it
 needs the packages of ocufilter[report].
+
+With --people, the report of one eye shows how people with this prescription, or with
+this wavefront on the axis, differ: bands around curves from the 5th to the 95th
+percentile of persons drawn from the population.
 """
 
 from __future__ import annotations
@@ -87,6 +92,13 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
         "--no-charts", action="store_true", help="omit the letter charts (faster)"
     )
     parser.add_argument(
+        "--people",
+        type=int,
+        metavar="N",
+        help="persons to draw for bands around the curves, 2 to 1000; takes 0.3 s per "
+        "person on two cores, 0.1 s with a wavefront measured on the axis",
+    )
+    parser.add_argument(
         "--json", action="store_true", help="print the numbers as one JSON object"
     )
     return parser.parse_args(argv)
@@ -125,6 +137,7 @@ def run(options: argparse.Namespace) -> str:
             list(profiles),
             labels=labels,
             has_charts=not options.no_charts and options.out is not None,
+            people=options.people,
             progress=task.update,
         )
         if options.out is not None:

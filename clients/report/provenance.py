@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from clients.figures import EyeStudy
+from clients.figures import DrawnPeople, EyeStudy
 from clients.figures.study import PUPILS_MM
 from clients.report.blocks import Table
 from clients.report.correction_text import correction_text
 from clients.report.numbers import is_beyond_measured
 from clients.report.sources import Citations
-from estimator import GivenSurfaces, Prescription, WornLens
+from estimator import (
+    GivenSurfaces,
+    Prescription,
+    WornLens,
+    drawn_text,
+    draws_axis,
+    draws_periphery,
+)
 
 WELL_DETERMINED = 0.5
 """Fraction of the prior's variance that a measurement must remove."""
@@ -16,9 +23,12 @@ WELL_DETERMINED = 0.5
 MEASURED, TYPICAL, STATED, EXAMPLE = "measured", "assumed", "entered", "example"
 
 
-def provenance_table(study: EyeStudy, cite: Citations) -> Table:
-    """Return the source of each part of the eye."""
-    return _table(_rows(study, cite))
+def provenance_table(
+    study: EyeStudy, cite: Citations, people: DrawnPeople | None = None
+) -> Table:
+    """Return the source of each part of the eye, and of drawn persons."""
+    rows = _rows(study, cite)
+    return _table(rows if people is None else (*rows, _drawn(study, cite, people)))
 
 
 def joint_provenance_table(
@@ -106,6 +116,19 @@ def _higher_orders(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
         whose = f"people of {profile.age_years:g} years"
     text = f"mean size in {whose}; this eye's own differ {cite('typical', 'growth')}"
     return ("Higher orders", TYPICAL, text)
+
+
+def _drawn(study: EyeStudy, cite: Citations, people: DrawnPeople) -> tuple[str, ...]:
+    names = [
+        name
+        for name, is_drawn in (
+            ("typical", draws_axis(study.profile)),
+            ("periphery", draws_periphery(study.profile)),
+        )
+        if is_drawn
+    ]
+    text = f"{people.count} persons: {drawn_text(study.profile)} {cite(*names)}"
+    return ("Bands and ranges", "drawn", text)
 
 
 def _pupils(study: EyeStudy) -> tuple[str, ...]:

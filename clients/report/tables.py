@@ -20,6 +20,8 @@ N_COLUMNS, N_JOINT_COLUMNS = 4, 3
 
 COEFFICIENTS_TITLE = "Coefficients, µm (OSA; x to the person's right, y up)"
 
+RANGE_NAME = "median (5th to 95th percentile)"
+
 UNKNOWN_ACUITY = "not known"
 """Text in place of an acuity through lenslets; the summary gives the reason."""
 
@@ -101,14 +103,21 @@ def signed(value: float) -> str:
 def vision_table(facts: EyeFacts) -> Table:
     """Return the vision through both pupils, as it is and best corrected."""
     pupils = facts.numbers["pupils"]
+    rows = [
+        (label, *map(format_value, pupils))
+        for label, format_value in VISION_ROWS.items()
+    ]
+    note = vision_note(pupils)
+    drawn = facts.numbers.get("people", {"pupils": []})
+    if drawn["pupils"]:
+        texts = (range_text(p["higher_order_rms_um"]) for p in drawn["pupils"])
+        rows.insert(1, ("the same, drawn persons", *texts))
+        note += f" Drawn persons: {RANGE_NAME} of {drawn['count']}."
     return Table(
         "Vision on the axis",
-        tuple(
-            (label, *map(format_value, pupils))
-            for label, format_value in VISION_ROWS.items()
-        ),
+        tuple(rows),
         head=("far object, 555 nm", *(pupil_text(p) for p in pupils)),
-        note=vision_note(pupils),
+        note=note,
     )
 
 
@@ -244,7 +253,7 @@ def field_table_block(facts: EyeFacts, *, name: str = "") -> Table:
     """Return the refraction along the horizontal meridian."""
     rows = tuple(
         (
-            f"{entry['h_deg']:+.0f}".replace("-", "−") if entry["h_deg"] else "0",
+            _angle_text(entry["h_deg"]),
             signed(entry["M_dpt"]),
             signed(entry["J0_dpt"]),
         )
@@ -256,3 +265,34 @@ def field_table_block(facts: EyeFacts, *, name: str = "") -> Table:
         head=("h, deg", "M, dpt", "J0, dpt"),
         note="Relaxed, 4 mm pupil, at the cornea; h to the person's right.",
     )
+
+
+def people_table(facts: EyeFacts) -> Table:
+    """Return the refraction of drawn persons along the horizontal meridian."""
+    drawn = facts.numbers["people"]
+    return Table(
+        f"{drawn['count']} drawn persons along the horizontal",
+        tuple(
+            (
+                _angle_text(entry["h_deg"]),
+                range_text(entry["M_dpt"], signed),
+                range_text(entry["J0_dpt"], signed),
+            )
+            for entry in drawn["field"]
+        ),
+        head=("h, deg", "M, dpt", "J0, dpt"),
+        note=f"{RANGE_NAME.capitalize()}. Relaxed, 4 mm pupil, at the cornea.",
+    )
+
+
+def range_text(
+    percentiles: dict[str, float],
+    format_value: Callable[[float], str] = "{:.2f}".format,
+) -> str:
+    """Return the median, and the 5th to 95th percentile in parentheses."""
+    low, median, high = (format_value(percentiles[name]) for name in ("5", "50", "95"))
+    return f"{median} ({low} to {high})"
+
+
+def _angle_text(h_deg: float) -> str:
+    return f"{h_deg:+.0f}".replace("-", "−") if h_deg else "0"

@@ -43,6 +43,7 @@ def best_correction_um(
     wavelength_nm: float,
     pupil_ellipse: NDArray[np.float64] | None = None,
     pupil_screen: PupilScreen | None = None,
+    n_samples: int = N_SAMPLES,
 ) -> NDArray[np.float64]:
     """Return a wavefront (28,) with sphere and cylinder that maximize visual Strehl.
 
@@ -53,6 +54,8 @@ def best_correction_um(
     zernike_um : (28,)
     pupil_ellipse, pupil_screen : optional
         See `optical_transfer`.
+    n_samples : int
+        Number of samples across the circle.
     """
     ratio_of = _visual_strehl(
         zernike_um,
@@ -60,12 +63,13 @@ def best_correction_um(
         wavelength_nm=wavelength_nm,
         pupil_ellipse=pupil_ellipse,
         pupil_screen=pupil_screen,
+        n_samples=n_samples,
     )
     um_per_dpt = zernike_radius_mm**2 / (4.0 * np.sqrt(3.0))
-    found = [
-        _peak(ratio_of, start_um, um_per_dpt)
-        for start_um in (np.zeros(3), zernike_um[SECOND_ORDER])
-    ]
+    starts_um = [np.zeros(3)]
+    if np.any(zernike_um[SECOND_ORDER]):
+        starts_um.append(zernike_um[SECOND_ORDER])
+    found = [_peak(ratio_of, start_um, um_per_dpt) for start_um in starts_um]
     best_um = np.array(zernike_um, dtype=np.float64)
     best_um[SECOND_ORDER] = max(found, key=ratio_of)
     return best_um
@@ -102,15 +106,16 @@ def _visual_strehl(
     wavelength_nm: float,
     pupil_ellipse: NDArray[np.float64] | None,
     pupil_screen: PupilScreen | None,
+    n_samples: int,
 ) -> Callable[[NDArray[Any]], float]:
     """Return the visual Strehl ratio of a wavefront as a function of its second order.
 
     It is proportional to the integral of the point-spread function times the transform
     of the neural sensitivity, which needs one Fourier transform instead of two.
     """
-    step_mm = 2.0 * radius_mm / N_SAMPLES
+    step_mm = 2.0 * radius_mm / n_samples
     along_mm = np.asarray(
-        (np.arange(N_SAMPLES) + 0.5) * step_mm - radius_mm, dtype=np.float64
+        (np.arange(n_samples) + 0.5) * step_mm - radius_mm, dtype=np.float64
     )
     clear = clear_pupil(
         along_mm,
@@ -120,7 +125,7 @@ def _visual_strehl(
         pupil_screen=pupil_screen,
     )
     per_mm_cpd = np.radians(1.0) * NM_PER_MM / wavelength_nm
-    padded = (2 * N_SAMPLES,) * 2
+    padded = (2 * n_samples,) * 2
     along_cpd = fft.fftfreq(padded[0], 1.0 / padded[0]) * step_mm * per_mm_cpd
     radial_cpd = np.hypot(along_cpd[:, None], along_cpd)
     weight = np.where(radial_cpd <= HIGHEST_CPD, neural_sensitivity(radial_cpd), 0.0)

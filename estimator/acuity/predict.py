@@ -14,7 +14,7 @@ observer that requires correct phase up to the limit reads 0.3 logMAR worse.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,9 @@ YOUNG_ADULT_LOG_MAR, YOUNG_ADULT_PUPIL_MM = -0.13, 4.0
 """Best-corrected acuity at 18 to 24 years (Elliott, Yang & Whitaker 1995)."""
 
 LOG_MAR_LIMITS = (-0.7, 2.5)
+BISECTIONS = 14
+"""Halvings of this range: acuity to 0.0001 logMAR."""
+
 TRIALS, SEED = 4000, 7
 HIGHEST_CPD = 60.0
 """Nyquist frequency of the foveal cones."""
@@ -113,8 +116,15 @@ def predict_acuity(
     )
 
 
-def log_mar_of(transfer: Transfer) -> float:
-    """Return the acuity, logMAR, of an optical transfer function."""
+def log_mar_of(transfer: Transfer, *, n_bisections: int = BISECTIONS) -> float:
+    """Return the acuity, logMAR, of an optical transfer function.
+
+    Parameters
+    ----------
+    transfer : Transfer
+    n_bisections : int
+        Halvings of the range of acuity, 3.2 logMAR.
+    """
 
     def interpolated(
         x_cpd: NDArray[Any], y_cpd: NDArray[Any]
@@ -127,7 +137,7 @@ def log_mar_of(transfer: Transfer) -> float:
         values: NDArray[np.complex128] = real + 1j * imaginary
         return values
 
-    return _threshold_log_mar(interpolated, _observer_noise())
+    return _threshold_log_mar(interpolated, _observer_noise(), n_bisections)
 
 
 @cache
@@ -149,10 +159,12 @@ def _observer_noise() -> float:
     return noise
 
 
-def _threshold_log_mar(transfer: TransferFunction, noise: float) -> float:
+def _threshold_log_mar(
+    transfer: TransferFunction, noise: float, n_bisections: int = BISECTIONS
+) -> float:
     """Return the logarithm of the gap, minutes of arc, read at `CORRECT_RATIO`."""
     low, high = LOG_MAR_LIMITS
-    for _ in range(14):
+    for _ in range(n_bisections):
         middle = 0.5 * (low + high)
         if _correct_ratio(transfer, 10.0**middle, noise) > CORRECT_RATIO:
             high = middle
@@ -165,18 +177,14 @@ def _correct_ratio(
     transfer: TransferFunction, gap_arcmin: float, noise: float
 ) -> float:
     """Return the proportion of correct responses to rings with the given gap."""
-    x, y, spectra = _rings()
-    per_degree = 60.0 / gap_arcmin
-    x_cpd, y_cpd = x * per_degree, y * per_degree
-    radial_cpd = np.hypot(x_cpd, y_cpd)
-    neural = np.where(radial_cpd <= HIGHEST_CPD, neural_sensitivity(radial_cpd), 0.0)
-    mean_eye = mean_eye_transfer(radial_cpd, pupil_diameter_mm=YOUNG_ADULT_PUPIL_MM)
-    templates = (spectra * mean_eye * neural).reshape(DIRECTIONS, -1)
-    images = (spectra * transfer(x_cpd, y_cpd) * neural).reshape(DIRECTIONS, -1)
+    frequencies, spectra = _seen_half(gap_arcmin)
+    frequencies_cpd = frequencies * (60.0 / gap_arcmin)
+    neural, mean_eye = _observer(np.hypot(*frequencies_cpd))
+    templates = spectra * (mean_eye * neural)
+    images = spectra * (transfer(*frequencies_cpd) * neural)
     # Per solid angle: a spectrum grows with the area, and its grid cell shrinks.
     signals = (images @ templates.conj().T).real * gap_arcmin**2
-    covariance = (templates @ templates.conj().T).real * gap_arcmin**2
-    noises = np.sqrt(noise) * _trials() @ _square_root(covariance).T
+    noises = np.sqrt(noise) * _trials() @ _noise_root(gap_arcmin).T
     correct = 0.0
     for shown in range(DIRECTIONS):
         scores = noises + signals[shown]
@@ -184,8 +192,53 @@ def _correct_ratio(
     return correct / DIRECTIONS
 
 
-def _square_root(covariance: NDArray[Any]) -> NDArray[np.float64]:
-    """Return a matrix A with A A^T equal to a covariance."""
+def _observer(
+    radial_cpd: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the neural sensitivity and the transfer of the mean eye, (...)."""
+    neural = np.where(radial_cpd <= HIGHEST_CPD, neural_sensitivity(radial_cpd), 0.0)
+    mean_eye = mean_eye_transfer(radial_cpd, pupil_diameter_mm=YOUNG_ADULT_PUPIL_MM)
+    return neural, mean_eye
+
+
+def _seen_half(gap_arcmin: float) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the frequencies (2, n) of `_half_rings` that matter, and spectra (8, n).
+
+    Frequencies above `HIGHEST_CPD`, for small rings nine of ten, have no weight.
+    """
+    frequencies, radius, spectra = _half_rings()
+    count = np.searchsorted(radius, HIGHEST_CPD * gap_arcmin / 60.0, side="right")
+    return frequencies[:, :count], spectra[:, :count]
+
+
+@cache
+def _half_rings() -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Return `_rings` for half a plane: frequencies (2, n), radii (n,), spectra (8, n).
+
+    The other half is conjugate to it; spectra are scaled by the root of 2 to represent
+    both.  Radii ascend.
+    """
+    x, y, spectra = _rings()
+    is_origin = (x == 0.0) & (y == 0.0)
+    is_half = (y > 0.0) | ((y == 0.0) & (x > 0.0)) | is_origin
+    spectra = spectra * np.where(is_origin, 1.0, np.sqrt(2.0))
+    radius = np.hypot(x, y)[is_half]
+    order = np.argsort(radius, kind="stable")
+    frequencies = np.stack([x[is_half], y[is_half]])
+    return frequencies[:, order], radius[order], spectra[:, is_half][:, order]
+
+
+@lru_cache(maxsize=4096)
+def _noise_root(gap_arcmin: float) -> NDArray[np.float64]:
+    """Return a matrix A (8, 8) with A A^T equal to the covariance of the noise.
+
+    It depends on the gap alone, and bisections share most of their gaps.
+    """
+    x, y, spectra = _rings()
+    per_degree = 60.0 / gap_arcmin
+    neural, mean_eye = _observer(np.hypot(x * per_degree, y * per_degree))
+    templates = (spectra * mean_eye * neural).reshape(DIRECTIONS, -1)
+    covariance = (templates @ templates.conj().T).real * gap_arcmin**2
     values, vectors = np.linalg.eigh(covariance)
     root: NDArray[np.float64] = vectors * np.sqrt(np.maximum(values, 0.0))
     return root

@@ -93,6 +93,7 @@ def optical_transfer(
     wavelength_nm: float,
     pupil_ellipse: NDArray[np.float64] | None = None,
     pupil_screen: PupilScreen | None = None,
+    frequency_step_cpd: float = FREQUENCY_STEP_CPD,
 ) -> Transfer:
     """Return the monochromatic optical transfer function of a wavefront.
 
@@ -107,6 +108,8 @@ def optical_transfer(
         the whole circle by default.
     pupil_screen : PupilScreen, optional
         Complex amplitude of a multifocal lens, such as the ``rings`` of an eye.
+    frequency_step_cpd : float
+        Largest frequency step.
 
     Raises
     ------
@@ -122,7 +125,7 @@ def optical_transfer(
     count = max(
         _samples(zernike_um, wavelength_nm, pupil_screen, zernike_radius_mm),
         fft.next_fast_len(
-            math.ceil(2.0 * zernike_radius_mm * per_mm_cpd / FREQUENCY_STEP_CPD)
+            math.ceil(2.0 * zernike_radius_mm * per_mm_cpd / frequency_step_cpd)
         ),
     )
     step_mm = 2.0 * zernike_radius_mm / count

@@ -11,6 +11,8 @@ from estimator.field.field_table import FieldTable, field_table
 from estimator.profiles.drawn_people import drawn_profiles
 from estimator.profiles.parse import EyeProfile
 
+PERCENTILES = (5, 50, 95)
+
 
 @dataclass(frozen=True)
 class DrawnFields:
@@ -28,6 +30,30 @@ class DrawnFields:
     coma_um: NDArray[np.float64]
     higher_order_rms_um: NDArray[np.float64]
     zernike_radius_mm: NDArray[np.float64]
+
+    def percentiles(self) -> list[dict[str, dict[str, float]]]:
+        """Return the percentiles of each quantity in each direction, for JSON."""
+        quantities = {
+            "M_dpt": self.power_dpt[..., 0],
+            "J0_dpt": self.power_dpt[..., 1],
+            "J45_dpt": self.power_dpt[..., 2],
+            "coma_um": self.coma_um,
+            "higher_order_rms_um": self.higher_order_rms_um,
+        }
+        found = {name: percentiles_of(values) for name, values in quantities.items()}
+        return [
+            {name: numbers[k] for name, numbers in found.items()}
+            for k in range(self.coma_um.shape[1])
+        ]
+
+
+def percentiles_of(values: NDArray[np.float64]) -> list[dict[str, float]]:
+    """Return `PERCENTILES` of each of n values (N, n) of N persons, by name."""
+    names = [str(percentile) for percentile in PERCENTILES]
+    return [
+        dict(zip(names, numbers, strict=True))
+        for numbers in np.percentile(values, PERCENTILES, axis=0).T.tolist()
+    ]
 
 
 def drawn_fields(

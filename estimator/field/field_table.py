@@ -55,7 +55,8 @@ class FieldTable:
     @property
     def coma_um(self) -> NDArray[np.float64]:
         """Return the magnitude (n,) of C(3,-1) and C(3,1)."""
-        return np.hypot(*self.zernike_um[:, COMA].T)
+        coma_um: NDArray[np.float64] = np.hypot(*self.zernike_um[:, COMA].T)
+        return coma_um
 
     @property
     def higher_order_rms_um(self) -> NDArray[np.float64]:

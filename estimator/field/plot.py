@@ -48,6 +48,8 @@ def field_figure(
     from matplotlib.figure import Figure  # loads slowly
 
     figure = Figure(figsize=(10, 6.5), layout="constrained")
+    if drawn is not None:
+        title += f"; {len(drawn.coma_um)} drawn persons: {_band_text(table)}"
     figure.suptitle(title)
     maps = _maps(table if drawn is None else drawn)
     for axes, (name, values) in zip(
@@ -78,19 +80,28 @@ def _maps(table: "FieldTable | DrawnFields") -> dict[str, NDArray[np.float64]]:
     }
 
 
+def _is_line(table: "FieldTable") -> bool:
+    return np.unique(table.h_deg).size < 2 or np.unique(table.v_deg).size < 2
+
+
+def _band_text(table: "FieldTable") -> str:
+    if _is_line(table):
+        return "median, 25th to 75th and 5th to 95th percentile"
+    return "median; white: half the width from the 5th to the 95th percentile"
+
+
 def _draw(
     figure: "Figure", axes: "Axes", table: "FieldTable", values: NDArray[Any]
 ) -> None:
     """Draw values (n,), or those (N, n) of N drawn persons."""
     h_deg, v_deg = np.unique(table.h_deg), np.unique(table.v_deg)
-    is_line = h_deg.size < 2 or v_deg.size < 2
     axes.set_xlabel("v, deg" if h_deg.size < 2 <= v_deg.size else "h, deg")
     order = np.lexsort((table.h_deg, table.v_deg))
     values = values[..., order]
     shown = values
     if values.ndim == 2:
         p5, p25, shown, p75, p95 = np.percentile(values, BAND_PERCENTILES, axis=0)
-    if is_line:
+    if _is_line(table):
         along = (table.h_deg if h_deg.size > 1 else table.v_deg)[order]
         axes.plot(along, shown, "o-")
         if values.ndim == 2:
