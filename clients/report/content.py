@@ -159,7 +159,13 @@ def summary(facts: EyeFacts) -> Section:
             Row((maps, orders), (2.0, 1.0)),
             Row((points, contrast), (1.0, 1.4)),
             chart_row(facts, DAY_MM),
-            Row((Text((legend(study), *limits_text(study.profile))),)),
+            Row(
+                (
+                    Text(
+                        (legend(study) + _band_text(facts), *limits_text(study.profile))
+                    ),
+                )
+            ),
         ),
     )
 
@@ -176,6 +182,16 @@ def legend(study: EyeStudy) -> str:
         "Strehl ratio through that pupil, and an acuity not below “as it is”. Charts: "
         "the eye tries to focus on each; rows in logMAR and decimal, ◂ the smallest "
         "read."
+    )
+
+
+def _band_text(facts: EyeFacts) -> str:
+    """Return the explanation of bands in the summary; empty without them."""
+    if facts.people is None or not facts.people.modulation:
+        return ""
+    return (
+        " Bands: best corrected, from the 5th to the 95th percentile of "
+        f"{facts.people.count} persons drawn from the population."
     )
 
 
