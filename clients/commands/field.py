@@ -23,6 +23,7 @@ FIELD_LIMIT_DEG = 60.0
 MAX_DIRECTIONS = 10_000
 MAX_DRAWN_DIRECTIONS = 1_000_000
 """Largest number of persons times directions, whose quantities take 50 MB."""
+
 HORIZONTAL, VERTICAL = "-40,-30,-20,-10,0,10,20,30,40", "0"
 
 

@@ -152,6 +152,7 @@ def summary(facts: EyeFacts) -> Section:
         PSF_MM,
         "Modulation transfer functions through 3 and 5 mm",
     )
+    texts = legend(study) + _band_text(facts), *limits_text(study.profile)
     return Section(
         "Summary",
         (
@@ -159,13 +160,7 @@ def summary(facts: EyeFacts) -> Section:
             Row((maps, orders), (2.0, 1.0)),
             Row((points, contrast), (1.0, 1.4)),
             chart_row(facts, DAY_MM),
-            Row(
-                (
-                    Text(
-                        (legend(study) + _band_text(facts), *limits_text(study.profile))
-                    ),
-                )
-            ),
+            Row((Text(texts),)),
         ),
     )
 

@@ -9,6 +9,7 @@ from estimator.acuity import (
     acuity_over_field,
     acuity_through_focus,
     best_correction_um,
+    log_mar_of,
     mean_eye_transfer,
     optical_transfer,
     predict_acuity,
@@ -287,3 +288,18 @@ def test_over_the_field_the_retina_limits_sharp_eyes():
     # Gratings at 20 degrees are resolved up to 5 to 10 cycles a degree.
     assert np.all((found.log_mar[1:] > 0.3) & (found.log_mar[1:] < 1.0))
     assert fractions[-1] == 1.0
+
+
+def test_fewer_bisections_are_as_near_as_their_step():
+    wavefront_um = np.zeros(28)
+    wavefront_um[[4, 7, 12]] = 0.3, 0.1, 0.05
+    pupil = {"zernike_radius_mm": 1.5, "wavelength_nm": 555.0}
+    transfer = optical_transfer(wavefront_um, **pupil)
+    exact = log_mar_of(transfer)
+    for n_bisections in (4, 8):
+        half_step = 3.2 / 2.0 ** (n_bisections + 1)
+        found = log_mar_of(transfer, n_bisections=n_bisections)
+        assert 1e-4 < abs(found - exact) <= half_step + 1e-4
+    coarse = optical_transfer(wavefront_um, **pupil, frequency_step_cpd=0.5)
+    assert coarse.frequency_cpd.size < transfer.frequency_cpd.size
+    assert log_mar_of(coarse) == pytest.approx(exact, abs=0.005)
