@@ -14,7 +14,7 @@ orders          RMS by radial order, coefficients
 psfs            images of point-spread functions
 transfer_curves  contrast by spatial frequency
 field_maps      refraction and blur over the visual field
-drawn_people    curves of persons drawn from the population
+drawn_curves    curves of persons drawn from the population
 field_lines     their refraction along the horizontal meridian
 acuity          visual acuity by distance
 acuity_curves   curves of visual acuity

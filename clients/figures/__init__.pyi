@@ -5,8 +5,8 @@ from .acuity import through_focus_log_mar as through_focus_log_mar
 from .acuity_curves import draw_acuity_of_several as draw_acuity_of_several
 from .acuity_curves import draw_through_focus_acuity as draw_through_focus_acuity
 from .acuity_curves import through_focus_acuity_figure as through_focus_acuity_figure
-from .drawn_people import DrawnPeople as DrawnPeople
-from .drawn_people import drawn_people as drawn_people
+from .drawn_curves import DrawnPeople as DrawnPeople
+from .drawn_curves import drawn_people as drawn_people
 from .field_lines import draw_field_line as draw_field_line
 from .field_maps import draw_field_maps as draw_field_maps
 from .field_maps import field_maps_figure as field_maps_figure

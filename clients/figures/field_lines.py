@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from clients.figures.drawn_people import DrawnPeople
+from clients.figures.drawn_curves import DrawnPeople
 from clients.figures.study import FIELD_H_DEG, EyeStudy
 from clients.figures.style import (
     BLUE,

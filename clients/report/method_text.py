@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from clients.figures import EyeStudy
-from clients.figures.drawn_people import ACUITY_PUPIL_MM
+from clients.figures.drawn_curves import ACUITY_PUPIL_MM
 from clients.report.facts import EyeFacts
 from estimator import EyeProfile, drawn_text, draws_axis
 

@@ -180,15 +180,15 @@ def _correct_ratio(
     frequencies, spectra = _seen_half(gap_arcmin)
     frequencies_cpd = frequencies * (60.0 / gap_arcmin)
     neural, mean_eye = _observer(np.hypot(*frequencies_cpd))
-    templates = spectra * (mean_eye * neural)
-    images = spectra * (transfer(*frequencies_cpd) * neural)
+    # Images are seen through the transfer, templates through the mean eye.
+    images = spectra * (transfer(*frequencies_cpd) * mean_eye * neural**2)
     # Per solid angle: a spectrum grows with the area, and its grid cell shrinks.
-    signals = (images @ templates.conj().T).real * gap_arcmin**2
-    noises = np.sqrt(noise) * _trials() @ _noise_root(gap_arcmin).T
+    signals = (images @ spectra.conj().T).real * gap_arcmin**2
+    noises = np.sqrt(noise) * _noise_root(gap_arcmin) @ _trials().T
     correct = 0.0
     for shown in range(DIRECTIONS):
-        scores = noises + signals[shown]
-        correct += float(np.mean(np.argmax(scores, axis=1) == shown))
+        scores = noises + signals[shown][:, None]
+        correct += float(np.mean(scores[shown] == scores.max(axis=0)))
     return correct / DIRECTIONS
 
 
