@@ -19,6 +19,10 @@ from estimator.wavefront.field_wavefronts import (
     NEWTON_STEP_RAD,
 )
 
+SMOOTH_NODES = 3
+"""Number of traced pupils whose interpolation is smooth; see
+`interpolation.pupil_weights`."""
+
 N_DEGREES = 3
 """Degrees 2, 4 and 6, which contribute to C(2,0)."""
 
@@ -125,7 +129,7 @@ def _pupil_weights(pupil_mm, grid, weight):
     weight[:] = 0.0
     if nodes_mm.size == 1:
         return 0
-    if nodes_mm.size == 3:
+    if nodes_mm.size == SMOOTH_NODES:
         largest_mm = nodes_mm[2]
         first, middle = nodes_mm[0] / largest_mm, nodes_mm[1] / largest_mm
         here = pupil_mm / largest_mm
@@ -153,7 +157,7 @@ def _between(number, channel, grid, lower, weight, found):
     weights, values = grid[2], grid[3]
     last = values.shape[2] - 1
     upper, third = min(lower + 1, last), min(lower + 2, last)
-    is_smooth = values.shape[2] == 3
+    is_smooth = values.shape[2] == SMOOTH_NODES
     for k in range(found.size):
         low, high, highest = 0.0, 0.0, 0.0
         for a in range(weights.size):

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.eye.tracing import OPEN_RATIO
 from estimator.field.aberration_grid import AberrationGrid
-from estimator.field.defocus_loops import all_weights
+from estimator.field.defocus_loops import SMOOTH_NODES, all_weights
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.field_wavefronts import (
     DEGREE,
@@ -48,10 +48,6 @@ POWER = np.concatenate([8 - DEGREE - DEGREE % 2, np.full(N_RIM, 2.3)])
 order 8 (7 if odd), which adds a part proportional to A^(8 - degree) to monomials of the
 same parity.  Rims deviate from their paraxial form with A² and, to a lesser degree,
 A⁴."""
-
-
-SMOOTH_NODES = 3
-"""Number of traced pupils whose interpolation is smooth; see `pupil_weights`."""
 
 
 def stretched(angle_deg: ArrayLike) -> NDArray[np.float64]:
@@ -129,7 +125,9 @@ def pupil_weights(
         Weights of the k next pupils; k is 0 for one traced pupil, otherwise 1 or 2.
     """
     if nodes_mm.size == 1:
-        return np.zeros(pupil_mm.size, np.int64), np.zeros((pupil_mm.size, 0, 33))
+        return np.zeros(pupil_mm.size, np.int64), np.zeros(
+            (pupil_mm.size, 0, POWER.size)
+        )
     if nodes_mm.size == SMOOTH_NODES:
         ratio = nodes_mm / nodes_mm[-1]
 

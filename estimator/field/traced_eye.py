@@ -196,6 +196,8 @@ class TracedEye(FocusingEye):
             phase_um = held_refraction_um(eye, field.grid, periphery)
             if np.isfinite(phase_um).all():
                 field.add(phase_um)
+            else:  # light does not pass 4 mm everywhere; `periphery_note` reports it
+                periphery = None
         return cls(
             eye,
             axis,

@@ -6,8 +6,9 @@ if the profile has a ``sample``, those of a person drawn from the population.
 
 The mean *eye* would have hardly any coma or trefoil: their signs differ from one person
 to the next and cancel in the mean.  A typical eye therefore has the root mean square of
-each term.  Terms of azimuthal order 0 have their mean: with their root mean square,
-refraction would change with the pupil more than it does in people.
+each term, which makes its coma 1.2 times the mean coma of people (0.23 and 0.19 um).
+Terms of azimuthal order 0 have their mean: with their root mean square, refraction
+would change with the pupil more than it does in people.
 
 Means and deviations by term are those of 200 eyes (Thibos et al. 2002, JOSA A 19:2329;
 Thibos, Bradley & Hong 2002, OPO 22:427), growth with age is from Berrio et al. 2010 (J

@@ -17,6 +17,7 @@ from clients.service_process import CHECKOUT, ServiceProcess
 from filter_service import EyeFilter, FilterSettings, ViewState, errors
 from filter_service.camera import tangents_from_fov
 from filter_service.messages import Camera, Dropped, body_of_eye
+from tests.numerical.surface_bodies import RELAXED
 
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0, "output": "linear"}
 # A narrow range of pupils and distances keeps the builds of these tests short.
@@ -52,17 +53,6 @@ def edge_width_px(color):
     return int(np.count_nonzero((row > 0.05) & (row < 0.95)))
 
 
-SURFACES = {
-    "kind": "surfaces",
-    "surfaces": [
-        {"radius_mm": 7.8, "z_mm": 0, "medium_after": "cornea"},
-        {"radius_mm": 6.5, "z_mm": 0.55, "medium_after": "aqueous"},
-        {"radius_mm": 10.2, "z_mm": 3.6, "medium_after": "lens"},
-        {"radius_mm": -6, "z_mm": 7.6, "medium_after": "vitreous"},
-    ],
-    "stop_z_mm": 3.6,
-    "retina": {"radius_mm": 12, "z_mm": 24.2},
-}
 IMPLANT = {
     "kind": "pseudophakic",
     "axial_length_mm": 23.5,
@@ -78,7 +68,7 @@ def test_eyes_given_by_surfaces_are_filtered_and_a_blocked_one_is_refused(real_c
     for name, profile in (
         ("arizona", {"kind": "published", "name": "arizona"}),
         ("gradient", {"kind": "published", "name": "atchison_2006"}),
-        ("surfaces", SURFACES),
+        ("surfaces", RELAXED),
         ("implant", IMPLANT),
         ("strong implant", IMPLANT | {"implant": {"power_dpt": 30}}),
     ):
@@ -89,12 +79,12 @@ def test_eyes_given_by_surfaces_are_filtered_and_a_blocked_one_is_refused(real_c
     blurred = widths_px.pop("strong implant")
     # -6.6 dpt: three columns of 0.25 deg, as a prescription of that power
     assert max(widths_px.values()) < 2 <= blurred
-    blocked = [{**s, "clear_radius_mm": 0.3} for s in SURFACES["surfaces"]]
+    blocked = [{**s, "clear_radius_mm": 0.3} for s in RELAXED["surfaces"]]
     with pytest.raises(
         errors.FilterError, match=r"surfaces\[\d\]: outside a clear radius"
     ):
         real_client.set_profile(
-            SURFACES | {"surfaces": blocked}, settings=NARROW, views=[view]
+            RELAXED | {"surfaces": blocked}, settings=NARROW, views=[view]
         )
     assert real_client.filter(view, **SEE).color.shape == view.color.shape
 

@@ -263,7 +263,8 @@ def test_through_focus_is_best_where_the_eye_looks():
     assert at_dpt[np.argmin(log_mar)] == at_dpt[np.argmax(ratio)] == 2.0
     off = at_dpt != 2.0
     law = np.log10(0.65 * 3.0 * np.abs(at_dpt[off] - 2.0))
-    assert log_mar[off] == pytest.approx(law, abs=0.25)
+    # The law has no aberrations; those of the typical eye cost up to 0.22.
+    assert log_mar[off] == pytest.approx(law, abs=0.23)
 
 
 def test_over_the_field_the_retina_limits_sharp_eyes():

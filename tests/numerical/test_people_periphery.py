@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from estimator.field import traced_eye
 from estimator.field.field_table import field_table
 from estimator.field.prepare import prepare_eye
 from estimator.optics.prescription import power_vectors_dpt
@@ -96,8 +97,25 @@ def test_other_pupils_and_coma_change_no_more_than_in_people(pupil_mm):
     # studies: none, or 0.1 to 0.5 dpt more myopic over several diopters
     assert np.all(sphere_dpt[-1] - sphere_dpt[0] < 0.35)
     assert np.all(sphere_dpt[-1] - sphere_dpt[0] > -0.65)
+    # Coma is proportional to the cube of the pupil; its largest step of 2 dpt is the
+    # last one, 0.05 um through 4 mm.
     steps_um = np.diff([coma_um for _, coma_um in found], axis=0)
     assert np.all(np.abs(steps_um) < 0.2 * (pupil_mm / 6.0) ** 3)
+
+
+def test_a_refraction_that_cannot_be_held_leaves_the_model_and_says_so(monkeypatch):
+    """Light that 4 mm do not let pass; no preset at 12 years and 60 deg has any."""
+    monkeypatch.setattr(
+        traced_eye,
+        "held_refraction_um",
+        lambda eye, grid, periphery: np.full(
+            (grid.h_deg.size, grid.v_deg.size, grid.accommodations_dpt.size, N_TERMS),
+            np.nan,
+        ),
+    )
+    table = asked(preset("emmetropia", age_years=20), [0.0, 30.0], focus_dpt=4.0)
+    assert np.isfinite(table.power_dpt).all()
+    assert any("periphery: from the eye model" in note for note in table.notes)
 
 
 def test_the_eye_model_alone_turns_hyperopic():

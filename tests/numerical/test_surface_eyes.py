@@ -26,19 +26,8 @@ from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
 from tests.benchmarks.dense_reference import dense_reference
 from tests.benchmarks.view_sources import EyeState
+from tests.numerical.surface_bodies import RELAXED
 from tests.numerical.synthetic import psnr_db, texture
-
-RELAXED = {
-    "kind": "surfaces",
-    "surfaces": [
-        {"radius_mm": 7.8, "z_mm": 0, "medium_after": "cornea"},
-        {"radius_mm": 6.5, "z_mm": 0.55, "medium_after": "aqueous"},
-        {"radius_mm": 10.2, "z_mm": 3.6, "medium_after": "lens"},
-        {"radius_mm": -6, "z_mm": 7.6, "medium_after": "vitreous"},
-    ],
-    "stop_z_mm": 3.6,
-    "retina": {"radius_mm": 12, "z_mm": 24.2},
-}
 
 
 def body_of(eye):

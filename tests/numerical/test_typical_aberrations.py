@@ -39,6 +39,11 @@ def term_um(n, m, age_years=None, eye_side="OD"):
     return typical_zernike_um(age_years, eye_side=eye_side)[index_from_nm(n, m)]
 
 
+def power_vector_through_4_mm(eye):
+    scaled_um = rescale_pupil(eye.zernike_um, radius_ratio=4.0 / eye.pupil_diameter_mm)
+    return rx.power_vector_from_zernike(scaled_um, zernike_radius_mm=2.0)
+
+
 def rms_um(age_years, terms=slice(None)):
     zernike_um = typical_zernike_um(age_years, eye_side="OD")[terms]
     return float(np.sqrt(np.sum(zernike_um**2)))
@@ -108,7 +113,11 @@ def test_a_sample_is_one_person():
     assert same[[7, 8, 12]] == pytest.approx(FROZEN_UM, abs=5e-5)
 
 
-def test_terms_of_a_typical_eye_are_within_the_spread_of_people():
+def test_terms_of_a_typical_eye_are_within_the_spread_of_people(drawn_um):
+    # Each term has the root mean square of people, so coma is above their mean: Wang &
+    # Koch 0.170 um, and 0.19 um of drawn persons.
+    coma_um = np.linalg.norm(np.array(drawn_um)[:, COMA], axis=1)
+    assert coma_um.mean() < rms_um(25.0, COMA) < coma_um.mean() + 0.5 * coma_um.std()
     # Wang & Koch: mean and deviation of the RMS of 532 eyes, 41 years on average
     assert rms_um(MEAN_AGE_YEARS) == pytest.approx(0.305, abs=0.095)
     assert rms_um(MEAN_AGE_YEARS, SPHERICAL) == pytest.approx(0.128, abs=0.005)
@@ -146,7 +155,8 @@ def test_aberrations_grow_with_age_as_published():
     assert yearly_um[COMA] == pytest.approx([0.0, 0.0017], abs=1e-12)
     # older emmetropes of Mathur et al. through 5 mm
     assert old[SPHERICAL] == pytest.approx(0.08, abs=0.02)
-    # all of it at 6 mm, Seo et al.: 0.003 um a year
+    # All of it at 6 mm, Seo et al.: 0.003 um a year; here 0.0023, because terms that
+    # do not grow are larger than in their eyes.
     assert (rms_um(77.0) - rms_um(20.0)) / 57.0 == pytest.approx(0.003, abs=1e-3)
     ages = [20.0, 30.0, 45.0, 60.0, 77.0]
     assert np.all(np.diff([term_um(4, 0, age) for age in ages]) > 0.01)
@@ -164,14 +174,8 @@ def test_through_4_mm_the_refraction_is_the_prescription(body, age_years):
     typical = with_typical_aberrations(given)
     assert typical.pupil_diameter_mm == 6.0
     assert typical.wavelength_nm == 555.0
-    ours, theirs = (
-        rx.power_vector_from_zernike(
-            rescale_pupil(eye.zernike_um, radius_ratio=4.0 / eye.pupil_diameter_mm),
-            zernike_radius_mm=2.0,
-        )
-        for eye in (typical, given)
-    )
-    assert ours == pytest.approx(theirs, abs=1e-9)
+    theirs = power_vector_through_4_mm(given)
+    assert power_vector_through_4_mm(typical) == pytest.approx(theirs, abs=1e-9)
     wide_dpt, *_ = rx.power_vector_from_zernike(
         typical.zernike_um, zernike_radius_mm=3.0
     )
@@ -193,7 +197,9 @@ def test_every_method_finds_the_eye_with_them(method):
         len(found.notes) - 1
     )
     if method != "search":  # it has no time here to come near
-        assert found.mean_abs_error_um < (5e-3 if method == "refined" else 2e-2)
+        # The networks were trained with smaller aberrations.
+        limit_um = 1.2e-2 if method == "network" else 5e-3
+        assert found.mean_abs_error_um < limit_um
         assert found.zernike_um[SPHERICAL] == pytest.approx(0.128, abs=0.02)
 
 
@@ -236,14 +242,9 @@ def test_the_reply_says_it_with_its_size_and_how_to_switch_it_off():
 def test_a_drawn_person_has_the_prescription_and_a_note():
     given = profile(**CYLINDER, sample=7)
     drawn = with_typical_aberrations(given)
-    ours, theirs = (
-        rx.power_vector_from_zernike(
-            rescale_pupil(eye.zernike_um, radius_ratio=4.0 / eye.pupil_diameter_mm),
-            zernike_radius_mm=2.0,
-        )
-        for eye in (drawn, given)
+    assert power_vector_through_4_mm(drawn) == pytest.approx(
+        power_vector_through_4_mm(given), abs=1e-9
     )
-    assert ours == pytest.approx(theirs, abs=1e-9)
     assert np.array_equal(
         drawn.zernike_um[6:], drawn_zernike_um(7, None, eye_side="OD")[6:]
     )
