@@ -12,13 +12,13 @@ all terms from the second to the fourth order, um.  Who falls into which fold mo
 angle's median by some per cent, so ours over the regression on M is drawn `DRAWS` times
 and averaged, with its deviation between draws.
 
-A second table compares our eyes with published measurements of people: the typical eye
-of a prescription of 0 dpt, and N persons drawn with its prescription.  `people_optics`
-and `people_vision` describe the measures, `tests/human_data.py` the sources.  A
-modulation is the mean of modulations of eyes, never that of a mean eye.  Columns are
-ours, theirs, the difference, what a residual refraction and, in double passes,
-scattered light take from ours, the difference that is left, and the range of 80 % of
-our eyes.
+A second table compares the typical eye of a prescription of 0 dpt, and N persons drawn
+with this prescription, with published measurements of people.  `people_optics` and
+`people_vision` define the measures, `tests/human_data.py` contains the sources.  The
+modulation of a group is the mean over its eyes, not that of the mean wavefront.
+Columns: value of the modeled eyes, published value, difference, change by residual
+refraction, change by scattered light (double pass only), remaining difference, and the
+range of 80 % of the modeled eyes.
 
 Writes results/people.json and results/people_measures.png.
 """
@@ -49,7 +49,6 @@ from tests.benchmarks.people_measures_picture import plot_findings
 from tests.benchmarks.people_modulation import REFRACTIONS
 from tests.benchmarks.people_optics import (
     Curves,
-    drawn_person,
     higher_order_findings,
     modulation_findings,
     near_findings,
@@ -84,7 +83,7 @@ PEOPLE, QUICK_PEOPLE = 50, 4
 """Drawn persons."""
 
 ACUITY_PEOPLE, QUICK_ACUITY_PEOPLE = 8, 0
-"""Of them, those who read: half a second for each acuity."""
+"""Drawn persons whose acuity is predicted, which takes 0.5 s per value."""
 
 QUICK_PUPILS_MM = (4.0,)
 
@@ -93,7 +92,7 @@ FIELDS, QUICK_FIELDS = 10, 2
 
 FIELD_ANGLES_DEG = (-20.0, -10.0, -5.0, 5.0, 10.0, 20.0)
 QUICK_STEP = 6
-"""Of measured eyes, one in so many."""
+"""With ``--quick``, every sixth measured eye is used."""
 
 
 def profile_of(zernike_um: NDArray, others: dict[float, NDArray] | None = None, **more):
@@ -377,8 +376,8 @@ def field_findings(
                 for k, eye in itertools.product(range(len(found_um)), judged.tolist()):
                     more = {}
                     if method == "drawn peripheries":
-                        # Of their own: draws of one seed depart alike in all eyes.
-                        more = drawn_person(k * len(own_um) + eye)
+                        # Draws with the same seed deviate equally in all eyes.
+                        more = {"sample": k * len(own_um) + eye}
                     axis_um = people.axis_um[::step][eye]
                     change_um = told_change_um(profile_of(axis_um, **more), angles)
                     found_um[k, eye] = axis_um + change_um
@@ -402,7 +401,7 @@ def found_beside_people(
     curves: Curves,
     task: Callable[[float, str], None],
 ) -> list[Finding]:
-    """Return all that is compared with published measurements."""
+    """Return the results of all comparisons with published measurements."""
     step = QUICK_STEP if quick else 1
     readers = QUICK_ACUITY_PEOPLE if quick else ACUITY_PEOPLE
     fields = QUICK_FIELDS if quick else FIELDS

@@ -1,4 +1,4 @@
-"""DeepLens among the peers: its thin-lens defocus with the eye's focus and pupil."""
+"""The peer DeepLens: thin-lens defocus with the focus and pupil of the eye."""
 
 from pathlib import Path
 

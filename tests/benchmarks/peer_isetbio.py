@@ -1,4 +1,4 @@
-"""Our PSFs beside those that ISETBio distributed as test data of its wavefront code.
+"""PSFs that ISETBio distributed as test data, compared with those of this project.
 
 tests/data/isetbio_psfs.npz contains PSFs of ISETBio (MIT license) at 550 nm without the
 Stiles-Crawford effect, from isettools/wavefront/data/ver121data at commit 66d7ef61,
@@ -154,5 +154,5 @@ def our_psf(published: PublishedPsf) -> tuple[NDArray[np.float64], float, float]
 
 
 def moved_light(psf: NDArray, other: NDArray) -> float:
-    """Share of the light that is elsewhere in the other PSF, from 0 to 1."""
+    """Return the fraction of the light whose position differs between two PSFs."""
     return float(np.abs(psf - other).sum() / 2.0)

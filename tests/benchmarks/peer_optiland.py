@@ -1,4 +1,4 @@
-"""optiland among the peers: a flat scene through PSFs that vary with the field.
+"""The peer optiland: a flat scene filtered with PSFs that vary over the field.
 
 Both sides get the same surfaces, pupil and camera.  Each computes its own PSFs, so each
 has a dense reference of its own, which shows what its interpolation costs, and is
@@ -155,7 +155,7 @@ class _EigenFrames:
 
 
 def optiland_peers(optiland: Optiland | None) -> list[Peer]:
-    """The rows of optiland; they say that it is not installed if there is none."""
+    """Return the rows of optiland, or rows that it is not installed."""
 
     def opened(shape, n_components):
         def frames(problem: Problem):

@@ -1,4 +1,4 @@
-"""Peers that run in an environment of their own, and how a benchmark asks them.
+"""Peers that run as separate processes in an environment of their own.
 
 optiland and DeepLens need packages that the project does not use (VTK, torch and, for
 DeepLens, Python 3.12), so `sh setup.sh peers` installs them into ``.peers``.  A script
@@ -85,7 +85,7 @@ class PeerProcess:
 
 
 def peer_versions(packages) -> dict[str, str | None]:
-    """Versions of packages in the environment; None of what is missing."""
+    """Return versions of packages in the environment; None if missing."""
     if not PYTHON.exists():
         return dict.fromkeys(packages)
     script = (

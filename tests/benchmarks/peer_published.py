@@ -1,11 +1,11 @@
-"""Figures that authors printed of methods without public code."""
+"""Published figures of methods without public code."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class PrintedPeer:
-    """A method as its authors describe it; nothing of it is measured here.
+    """A published method that is not measured here.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What a comparison with people found: ours, theirs and the part of the instrument."""
+"""Results of comparisons between modeled eyes and measurements of people."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -15,25 +15,26 @@ BAND = (10.0, 90.0)
 
 @dataclass(frozen=True)
 class Finding:
-    """One figure of our eyes beside that of people.
+    """A value of modeled eyes, with the published value for people.
 
     Attributes
     ----------
     measure, eyes, setting : str
-        What was measured, of which of our eyes, and how.
+        Measured quantity, group of modeled eyes, and conditions.
     ours, theirs : float
     unit : str
     source : str
         The study.
     count : int
-        How many eyes of ours.
+        Number of modeled eyes.
     time_ms : float
-        For each of them.
+        Computation time per eye.
     with_residual, with_halo : float
-        Ours behind the refraction of the study, and then with the light that scatters
-        in a double pass; nan where the study has none.
+        Value of the modeled eyes with the residual refraction of the subjects, and in
+        addition with the light that scatters in a double pass; NaN if the study has
+        none.
     band : (float, float)
-        `BAND` of our eyes; nan for a single one.
+        `BAND` of the modeled eyes; NaN for a single eye.
     """
 
     measure: str
@@ -51,11 +52,11 @@ class Finding:
 
     @property
     def difference(self) -> float:
-        """Return ours less theirs."""
+        """Return the value of modeled eyes minus the published one."""
         return self.ours - self.theirs
 
     def rows(self) -> Iterator[Row]:
-        """Yield the row of the figure, and those of ours through the instrument."""
+        """Yield a row of the value, and rows with the effects of the instrument."""
         values = {
             "": self.ours,
             ", residual refraction": self.with_residual,
@@ -72,7 +73,7 @@ class Finding:
 
 
 def band_of(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Return `BAND` of values (n,); nan if there is but one."""
+    """Return `BAND` of values (n,); NaN for a single value."""
     if len(values) < 2:
         return math.nan, math.nan
     low, high = np.nanpercentile(values, BAND).tolist()
@@ -80,7 +81,7 @@ def band_of(values: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def print_findings(findings: Iterable[Finding]) -> None:
-    """Print ours, theirs, the difference, and what the instrument adds and leaves."""
+    """Print modeled and published values, and the effects of the instrument."""
     print(
         f"\n{'measure':<25}{'eyes':<25}{'setting':<32}{'ours':>8}{'theirs':>8}"
         f"{'diff':>8}{'residu':>8}{'halo':>8}{'left':>8}  {'10 to 90 %':<16}source"

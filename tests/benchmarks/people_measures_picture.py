@@ -1,4 +1,4 @@
-"""Our eyes beside published measurements of people, in one picture."""
+"""Figure of modeled eyes and published measurements of people."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,7 +33,7 @@ OFFSET = 0.12
 
 
 def plot_findings(file: Path, findings: Sequence[Finding], curves: Curves) -> None:
-    """Draw modulation, then figures with bands of 80 % of our eyes."""
+    """Draw modulation and the other measures, with bands of 80 % of the eyes."""
     figure = Figure(figsize=(13.0, 10.0), layout="constrained")
     panels = figure.subplots(3, 4)
     for axes, angle in zip(panels[0], NAVARRO_ANGLES_DEG, strict=False):
@@ -70,7 +70,7 @@ def _curves(axes: Axes, curves: Curves, angle: float, kinds: Sequence[str]) -> N
 
 
 def _figures(axes: Axes, findings: Sequence[Finding], without: str) -> None:
-    """Draw ours with bands, and theirs; labels lack what the title says."""
+    """Draw modeled values with bands, and published values."""
     settings = list(dict.fromkeys((f.setting, f.source) for f in findings))
     for k, eyes in enumerate(dict.fromkeys(f.eyes for f in findings)):
         of_eyes = [f for f in findings if f.eyes == eyes]

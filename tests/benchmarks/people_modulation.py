@@ -1,4 +1,4 @@
-"""Modulation transfer of many wavefronts, and what instruments take from it."""
+"""Modulation transfer of many wavefronts, and its loss in measurements."""
 
 import math
 from functools import cache
@@ -101,7 +101,7 @@ def _ring_mean(size: int, radii: NDArray[np.float64]) -> sparse.csr_array:
 def refracted(
     zernike_um: NDArray[np.float64], axis_um: NDArray[np.float64], refraction: str
 ) -> NDArray[np.float64]:
-    """Return wavefronts (n, k, 28) behind the lens of a refraction.
+    """Return wavefronts (n, k, 28) corrected by a refraction.
 
     It nulls the least-squares M, J0 and J45 of the pupil: those of the axis ("at the
     fovea"), those of each direction ("at each angle"), or none ("nowhere").
@@ -122,7 +122,7 @@ def refracted(
 
 
 def residual_refraction_um(count: int, pupil_diameter_mm: float) -> NDArray[np.float64]:
-    """Return wavefronts (n, 28) of what refractions leave, one for each person.
+    """Return wavefronts (n, 28) of random residual refractions, one per person.
 
     Errors of sphere, J0 and J45 are normally distributed with `RESIDUAL_DPT`, and half
     of it for astigmatism.

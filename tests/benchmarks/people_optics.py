@@ -1,8 +1,8 @@
-"""Modulation, higher orders and peripheral refraction of our eyes beside people's.
+"""Modulation, higher orders and peripheral refraction of modeled and measured eyes.
 
-Foci are least-squares foci everywhere: nothing is searched for the highest modulation.
-Off the axis, both sides of the field are averaged, and pupils are the circle about the
-chief ray in which wavefronts are stated.
+All eyes have the least-squares focus; no focus is optimized for modulation.  Off the
+axis, values are means of both sides of the field, and the pupil is the circle about the
+chief ray on which the wavefronts are given.
 """
 
 import math
@@ -43,11 +43,6 @@ MATHUR_ANGLE_DEG = 20.0
 LARGEST_PUPIL_MM = 6.0
 
 
-def drawn_person(seed: int) -> dict[str, int]:
-    """Return the fields of a profile that draw a person instead of the typical one."""
-    return {"sample": seed}
-
-
 def emmetrope(sphere_dpt: float = 0.0, **more) -> EyeProfile:
     """Return the profile of a prescription."""
     return parse_profile({"kind": "prescription", "sphere_dpt": sphere_dpt, **more})
@@ -57,7 +52,7 @@ def emmetropes(seeds: Sequence[int]) -> dict[str, list[EyeProfile]]:
     """Return the typical eye, and drawn persons, if any."""
     eyes = {"typical eye": [emmetrope()]}
     if seeds:
-        eyes["drawn persons"] = [emmetrope(**drawn_person(seed)) for seed in seeds]
+        eyes["drawn persons"] = [emmetrope(sample=seed) for seed in seeds]
     return eyes
 
 
@@ -95,7 +90,7 @@ def all_terms(terms_um: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def known_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return means (n, 30) over directions (n, k, 30); nan where none is known."""
+    """Return means (n, 30) over directions (n, k, 30); NaN where none is known."""
     known = np.isfinite(values)
     total = np.where(known, values, 0.0).sum(axis=1)
     mean: NDArray[np.float64] = np.divide(
@@ -413,7 +408,7 @@ def refraction_findings(
         for sphere_dpt in SPHERES_DPT:
             bodies = {"typical eye": [{}]}
             if seeds:
-                bodies["drawn persons"] = [drawn_person(seed) for seed in seeds]
+                bodies["drawn persons"] = [{"sample": seed} for seed in seeds]
             for eyes, fields in bodies.items():
                 found_dpt = np.array(
                     [

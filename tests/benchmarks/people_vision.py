@@ -1,4 +1,4 @@
-"""Acuity out of focus and straylight of our eyes beside people's."""
+"""Acuity under defocus and straylight of modeled eyes and of people."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -47,7 +47,7 @@ def log_mar(axis_um: NDArray[np.float64], pupil_mm: float) -> NDArray[np.float64
 def acuity_findings(
     seeds: Sequence[int], pupils_mm: Sequence[float] = PUPILS_MM
 ) -> Iterator[Finding]:
-    """Mean difference from each law, and the squared correlation with it."""
+    """Yield the mean difference from, and the squared correlation with, each law."""
     for eyes, profiles in emmetropes(seeds).items():
         axes_um = [
             on_circle_um(profile, 0.0, pupil_diameter_mm=LARGEST_PUPIL_MM)[0]
@@ -80,7 +80,7 @@ def acuity_findings(
 
 
 def straylight_findings() -> Iterator[Finding]:
-    """Straylight parameter by age, at two angles, and by cataract."""
+    """Yield the straylight parameter by age, at two angles, and by cataract."""
     for age_years in AGES_YEARS:
         for angle_deg in human_data.DRIVERS_LOG_S:
             profile = _with_straylight({}, age_years=age_years)
