@@ -11,7 +11,7 @@ import numpy as np
 
 from filter_service import constants
 from filter_service.gl.gpu import ATLAS_TEXEL_BYTES, Gpu
-from filter_service.gl.passes import Buffer, Passes
+from filter_service.gl.passes import Buffer, BufferPart, Passes
 from filter_service.rendering.gl.compile_passes import compile_passes
 from filter_service.rendering.gl.renderer import FilterRenderer
 
@@ -90,6 +90,12 @@ class _NoGpu(Gpu):
     def write(self, buffer, data, *, offset=0):
         pass
 
+    def own_parts(self, **arrays):
+        return {
+            name: BufferPart(_Memory(name, array.nbytes), 0, array.nbytes)
+            for name, array in arrays.items()
+        }
+
     def pages(self, n_words):
         return _Anything()
 
@@ -102,9 +108,8 @@ class _NoGpu(Gpu):
         return _Anything()
 
     def begin_read(self, *parts):
-        """All pairs of cell and interval are used, so that kernels are made."""
-        for buffer, _, out in parts:
-            out.reshape(-1).view(np.uint8)[:] = 255 if buffer.name == "USED" else 0
+        for _, _, out in parts:
+            out.reshape(-1).view(np.uint8)[:] = 0
         return lambda: None
 
     def acquire_query(self):
@@ -123,6 +128,9 @@ class _Memory(Buffer):
     @property
     def size(self):
         return self.n_bytes
+
+    def release(self):
+        pass
 
     def bind_to_storage_buffer(self, binding=0, *, offset=0, size=-1):
         assert binding in constants.BINDINGS.values()

@@ -13,8 +13,14 @@ from filter_service.errors import OutOfGpuMemory, RenderFailed
 from filter_service.gl.choose_device import open_on_device
 from filter_service.gl.copying import copy_bytes
 from filter_service.gl.hardware import is_software_renderer
-from filter_service.gl.passes import Atlas, Buffer, Pages, Passes
-from filter_service.gl.staging import ALIGNMENT, Staging, gl_calls, has_buffer_storage
+from filter_service.gl.passes import Atlas, Buffer, BufferPart, Pages, Passes
+from filter_service.gl.staging import (
+    ALIGNMENT,
+    Group,
+    Staging,
+    gl_calls,
+    has_buffer_storage,
+)
 from filter_service.gl_device import checked_gl_device, wanted_gl_device
 
 Query = moderngl.Query
@@ -28,7 +34,10 @@ ATLAS_TEXEL_BYTES = 16
 ATLAS_BYTES = 1 << 30
 """Upper bound on the size of an atlas: twice the kernels of a frame."""
 
-PASS_BLOCKS = 9
+PART_ALIGNMENT = 256
+"""Alignment of the parts of a buffer, which every OpenGL device accepts."""
+
+PASS_BLOCKS = 14
 """Largest number of storage blocks that a pass binds, including its atlases."""
 
 
@@ -94,8 +103,8 @@ class Gpu:
             for atlas in self._atlases.values():
                 atlas.release()
             self.passes.release()
-            for block in (self._staging or {}).values():
-                block.release()
+            for ring in (self._staging or {}).values():
+                ring.release()
         self._buffers.clear()
         self._atlases.clear()
         self.context.release()
@@ -140,6 +149,27 @@ class Gpu:
             start += data.nbytes
         return buffer
 
+    def upload_parts(self, name: str, **arrays: NDArray[Any]) -> dict[str, BufferPart]:
+        """Copy arrays to a named buffer in one transfer; return the part of each."""
+        words, places = _joined(arrays)
+        return _parts(self.upload(name, words), places)
+
+    def own_parts(self, **arrays: NDArray[Any]) -> dict[str, BufferPart]:
+        """Copy arrays to a new buffer, which the caller releases; return the parts.
+
+        Raises
+        ------
+        OutOfGpuMemory
+        """
+        words, places = _joined(arrays)
+        try:
+            buffer = self.context.buffer(words)
+        except moderngl.Error as error:
+            raise OutOfGpuMemory(
+                f"cannot allocate {words.nbytes} bytes: {error}"
+            ) from error
+        return _parts(buffer, places)
+
     def write(self, buffer: Buffer, data: NDArray[Any], *, offset: int = 0) -> None:
         """Copy an array into a buffer."""
         if not data.nbytes:
@@ -148,10 +178,10 @@ class Gpu:
         if self._staging is None:
             buffer.write(words, offset=offset)
             return
-        block = self._staging["to"]
-        start, free = block.allocate(words.size)
+        ring = self._staging["to"]
+        start, free = ring.allocate(words.size)
         copy_bytes(free, words)
-        block.copy_to(buffer, start, offset, words.size)
+        ring.copy_to(buffer, start, offset, words.size)
 
     def pages(self, n_words: int) -> Pages:
         """Return a texture array of 16-bit words for data that outlives a frame.
@@ -257,19 +287,20 @@ class Gpu:
             for buffer, offset, out in parts:
                 buffer.read_into(_bytes_of(out), size=out.nbytes, offset=offset)
             return lambda: None
-        block = self._staging["from"]
+        ring = self._staging["from"]
         size = sum(out.nbytes + ALIGNMENT for _, _, out in parts)
-        if not block.has_space(size):
+        if not ring.has_space(size):
             for waiting in tuple(self._reads):
                 self._end_read(waiting)
-        start, free = block.allocate(size)
+        start, free = ring.allocate(size)
         targets, at = [], 0
         for buffer, offset, out in parts:
-            block.copy_from(buffer, offset, start + at, out.nbytes)
+            ring.copy_from(buffer, offset, start + at, out.nbytes)
             targets.append((_bytes_of(out), free[at : at + out.nbytes]))
             at += -(-out.nbytes // ALIGNMENT) * ALIGNMENT
-        waiting = _Read(block.fence(), targets)
+        waiting = _Read(ring.fence(), targets)
         self._reads.append(waiting)
+        self._staging["to"].fence(is_free=True)
         return partial(self._end_read, waiting)
 
     def _end_read(self, waiting: "_Read") -> None:
@@ -277,12 +308,11 @@ class Gpu:
             return
         assert self._staging is not None  # pending readbacks use it
         self._reads = [one for one in self._reads if one is not waiting]
-        self._staging["from"].wait(waiting.fence)
+        ring = self._staging["from"]
+        ring.wait(waiting.group)
         for target, source in waiting.targets:
             copy_bytes(target, source)
-        if not self._reads:
-            for block in self._staging.values():
-                block.reset()  # no readback is pending
+        ring.free(waiting.group)
 
     @property
     def memory_mb(self) -> float:
@@ -311,15 +341,34 @@ class Gpu:
 
 
 class _Read(NamedTuple):
-    """A pending readback: its fence, and arrays with their mapped memory."""
+    """A pending readback: its memory, and arrays with the part of each."""
 
-    fence: int
+    group: Group
     targets: list[tuple[NDArray[np.uint8], NDArray[np.uint8]]]
 
 
 def _context_on(index: int) -> moderngl.Context:
     settings: dict[str, Any] = {"backend": "egl", "device_index": index}
     return moderngl.create_context(standalone=True, require=430, **settings)
+
+
+def _joined(
+    arrays: dict[str, NDArray[Any]],
+) -> tuple[NDArray[np.uint8], dict[str, tuple[int, int]]]:
+    """Return arrays one after the other, aligned, and the place of each in bytes."""
+    places, end = {}, 0
+    for name, array in arrays.items():
+        places[name] = end, max(array.nbytes, PART_ALIGNMENT)
+        end += -(-places[name][1] // PART_ALIGNMENT) * PART_ALIGNMENT
+    joined = np.zeros(end, np.uint8)
+    for name, array in arrays.items():
+        first = places[name][0]
+        joined[first : first + array.nbytes] = _bytes_of(np.ascontiguousarray(array))
+    return joined, places
+
+
+def _parts(buffer: Buffer, places: dict[str, tuple[int, int]]) -> dict[str, BufferPart]:
+    return {name: BufferPart(buffer, *place) for name, place in places.items()}
 
 
 def _bytes_of(array: NDArray[Any]) -> NDArray[np.uint8]:

@@ -1,14 +1,16 @@
-"""Staging buffers: persistently mapped memory for uploads and readbacks.
+"""Staging rings: persistently mapped memory for uploads and readbacks.
 
 Drivers move buffers that are mapped for reading to host memory, and passes then access
 them over the bus.  The buffers of the passes are therefore never mapped; data is copied
-through a separate block.  This requires `glBufferStorage` (OpenGL 4.4 or
+through a separate ring.  This requires `glBufferStorage` (OpenGL 4.4 or
 ARB_buffer_storage), which moderngl does not offer; this module calls it by ctypes.
 """
 
 import ctypes
 import ctypes.util
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,8 +32,8 @@ ALIGNMENT = 256
 INITIAL_BYTES = 1 << 20
 
 MAX_BYTES = 1 << 29
-"""Largest size of a block.  Up to this size it grows for all transfers in flight; then
-it waits for them and starts over."""
+"""Largest size of a ring.  Up to this size it grows for all transfers in flight; then
+it waits for them."""
 
 GL_SYNC_GPU_COMMANDS_COMPLETE = 0x9117
 GL_SYNC_FLUSH_COMMANDS_BIT = 0x1
@@ -76,8 +78,27 @@ def has_buffer_storage(context: "moderngl.Context") -> bool:
     return context.version_code >= 440 or "GL_ARB_buffer_storage" in context.extensions
 
 
+@dataclass(eq=False)
+class Group:
+    """Consecutive allocations, followed by a fence.
+
+    Attributes
+    ----------
+    end : int
+        End of the last allocation, in bytes since the ring was mapped.
+    mark : int or None
+        The fence; None once the GPU has passed it.
+    is_free : bool
+        Whether the memory may be used again after the fence.
+    """
+
+    end: int
+    mark: int | None
+    is_free: bool
+
+
 class Staging:
-    """A linear allocator on mapped memory, which starts over when it is full.
+    """A ring of mapped memory, whose allocations are freed in their order.
 
     Parameters
     ----------
@@ -93,80 +114,127 @@ class Staging:
         self._calls = calls
         self._name = _uint(0)
         self._bytes: NDArray[np.uint8] = np.zeros(0, np.uint8)
-        self._used = 0
+        self._groups: deque[Group] = deque()
+        self._first = self._end = 0  # in use, in bytes since the ring was mapped
 
     @property
     def size(self) -> int:
-        """Size of the block in bytes."""
+        """Size of the ring in bytes."""
         return self._bytes.size
 
     def release(self) -> None:
-        """Free the block; its allocations must not be accessed afterward."""
+        """Free the ring; its allocations must not be accessed afterward."""
+        for group in self._groups:
+            if group.mark is not None:
+                self._calls["glDeleteSync"](group.mark)
+        self._groups.clear()
         if self._name.value:
             self._calls["glDeleteBuffers"](1, ctypes.byref(self._name))
-        self._name, self._bytes, self._used = _uint(0), np.zeros(0, np.uint8), 0
-
-    def reset(self) -> None:
-        """Free all allocations; the caller ensures that no copy is pending."""
-        self._used = 0
+        self._name, self._bytes = _uint(0), np.zeros(0, np.uint8)
+        self._first = self._end = 0
 
     def has_space(self, n_bytes: int) -> bool:
-        """Return whether the block has this many free bytes."""
-        return self._used + n_bytes <= self.size
+        """Return whether bytes can be allocated, if need be after their fences."""
+        while not self._fits(n_bytes):
+            if not self._groups or not self._groups[0].is_free:
+                return False
+            self._drop_oldest()
+        return True
 
-    def fence(self) -> int:
-        """Submit all commands so far, and return a fence that follows them."""
+    def _fits(self, n_bytes: int) -> bool:
+        return self._place(n_bytes) + n_bytes - self._first <= self.size
+
+    def _place(self, n_bytes: int) -> int:
+        """Return where an allocation would start: it does not cross the ring's end."""
+        if self.size and self._end % self.size + n_bytes > self.size:
+            return (self._end // self.size + 1) * self.size
+        return self._end
+
+    def _drop_oldest(self) -> None:
+        group = self._groups.popleft()
+        self.wait(group)
+        self._first = group.end
+        if self._first == self._end:  # empty: the whole ring is one piece
+            self._first = self._end = 0
+
+    def fence(self, *, is_free: bool = False) -> Group:
+        """Submit all commands so far, and return the allocations since the last fence.
+
+        Parameters
+        ----------
+        is_free : bool
+            Whether their memory may be used again after the fence, without `free`.
+        """
         mark = self._calls["glFenceSync"](GL_SYNC_GPU_COMMANDS_COMPLETE, 0)
         self._calls["glFlush"]()
-        return int(mark)
+        group = Group(self._end, int(mark), is_free)
+        self._groups.append(group)
+        return group
 
-    def wait(self, mark: int) -> None:
-        """Wait until the GPU has passed a fence, and delete the fence.
+    def free(self, group: Group) -> None:
+        """Allow the memory of allocations to be used again."""
+        group.is_free = True
+
+    def is_passed(self, group: Group) -> bool:
+        """Return whether the GPU has passed a fence, without waiting."""
+        return self._waits(group, 0)
+
+    def wait(self, group: Group) -> None:
+        """Wait until the GPU has passed a fence.
 
         Raises
         ------
         RenderFailed
             The driver has lost the GPU.
         """
-        found = GL_TIMEOUT_EXPIRED
-        while found == GL_TIMEOUT_EXPIRED:
-            found = self._calls["glClientWaitSync"](
-                mark, GL_SYNC_FLUSH_COMMANDS_BIT, WAIT_NS
-            )
-        self._calls["glDeleteSync"](mark)
+        while not self._waits(group, WAIT_NS):
+            pass
+
+    def _waits(self, group: Group, limit_ns: int) -> bool:
+        if group.mark is None:
+            return True
+        found = self._calls["glClientWaitSync"](
+            group.mark, GL_SYNC_FLUSH_COMMANDS_BIT, limit_ns
+        )
+        if found == GL_TIMEOUT_EXPIRED:
+            return False
+        self._calls["glDeleteSync"](group.mark)
+        group.mark = None
         if found == GL_WAIT_FAILED:
             raise RenderFailed("the OpenGL driver has lost the GPU")
+        return True
 
     def allocate(self, n_bytes: int) -> tuple[int, NDArray[np.uint8]]:
         """Allocate bytes; return their offset and an array of them.
 
-        If the block is full, this waits until the GPU has finished all copies.
+        If the ring is too small, this waits for the GPU and maps a larger one; the
+        caller has read what it still needs.
 
         Raises
         ------
         OutOfGpuMemory
-            The driver cannot map a block of the required size.
+            The driver cannot map a ring of the required size.
         """
         if not self.has_space(n_bytes):
             self._context.finish()
-            wanted = max(2 * (self._used + n_bytes), INITIAL_BYTES)
-            if n_bytes > self.size or wanted <= MAX_BYTES:
-                self._map_block(max(min(wanted, MAX_BYTES), n_bytes))
-            self._used = 0
-        start = self._used
-        self._used = -(-(start + n_bytes) // ALIGNMENT) * ALIGNMENT
+            wanted = 2 * (self._end - self._first + n_bytes)
+            wanted = min(max(wanted, INITIAL_BYTES), MAX_BYTES)
+            self._map_ring(max(wanted, n_bytes))
+        place = self._place(n_bytes)
+        self._end = -(-(place + n_bytes) // ALIGNMENT) * ALIGNMENT
+        start = place % self.size
         return start, self._bytes[start : start + n_bytes]
 
     def copy_to(
         self, buffer: "moderngl.Buffer", start: int, at: int, n_bytes: int
     ) -> None:
-        """Queue a copy of bytes from an offset of the block to a buffer."""
+        """Queue a copy of bytes from an offset of the ring to a buffer."""
         self._copy(self._name.value, buffer.glo, start, at, n_bytes)
 
     def copy_from(
         self, buffer: "moderngl.Buffer", at: int, start: int, n_bytes: int
     ) -> None:
-        """Queue a copy of bytes from a buffer to an offset of the block."""
+        """Queue a copy of bytes from a buffer to an offset of the ring."""
         self._copy(buffer.glo, self._name.value, at, start, n_bytes)
 
     def _copy(
@@ -179,7 +247,7 @@ class Staging:
             GL_COPY_READ_BUFFER, GL_COPY_WRITE_BUFFER, read_at, write_at, n_bytes
         )
 
-    def _map_block(self, n_bytes: int) -> None:
+    def _map_ring(self, n_bytes: int) -> None:
         self.release()
         calls = self._calls
         access = GL_MAP_READ_BIT | GL_MAP_WRITE_BIT

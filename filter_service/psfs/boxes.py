@@ -5,9 +5,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_REACH_PX = 255
-"""Limit of a reach, because four reaches share a word."""
-
 SIDES = 4
 
 MAX_CENTROID_SHIFT_RATIO = 0.005

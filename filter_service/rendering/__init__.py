@@ -36,9 +36,6 @@ frame_states     cached plans for an unchanged pupil, focus and gaze
 sampled_frame    sampled depths of a frame, and the PSFs that it needs
 frame_kernels    plan of a frame's kernels
 kernel_loops     compiled loops of frame_kernels
-kernel_tables    kernel records in the layout of the passes
-table_loops      compiled loops of kernel_tables
-pair_loops       pairs that a frame uses, and those predicted for the next
 srgb             conversion between encoded images and linear light
 media_effects    effects of ocular media and spectacles
 haze             straylight of the ocular media

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.camera import Tangents
-from filter_service.constants import TILE_SIZE_PX
-from filter_service.psfs.boxes import MAX_REACH_PX
+from filter_service.constants import MAX_REACH_PX, TILE_SIZE_PX
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.image_cells import ImageCells
 from filter_service.rgbd_view import MIN_DEPTH_M, RgbdView

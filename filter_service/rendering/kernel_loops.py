@@ -8,9 +8,9 @@ import math
 import numpy as np
 from numba import njit
 
-from filter_service.constants import FIELD_CORNERS, RGB, WEIGHT_MAX
+from filter_service.constants import FIELD_CORNERS, MAX_REACH_PX, RGB, WEIGHT_MAX
 from filter_service.psfs.read_loops import channel_taps
-from filter_service.rendering.map_loops import MAX_REACH_PX, mapped_reach, needs_map
+from filter_service.rendering.map_loops import mapped_reach, needs_map
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

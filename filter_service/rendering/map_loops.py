@@ -4,18 +4,7 @@ import math
 
 from numba import njit
 
-MIN_SHIFT_PX = 0.5
-"""Maps that would displace light by less are not applied: interpolation between stored
-pixels blurs light by as much."""
-
-MIN_SHIFT_RATIO = 0.1
-"""Maps that change a kernel's size by less are not applied: blending the three field
-nodes averages such differences.  At 5 mm over the field of the demo, the PSNR against
-the image with all maps is 63 to 69 dB (cataract, myopia, keratoconus), and blending
-takes half of the time."""
-
-MAX_REACH_PX = 255
-"""Reaches are stored in one byte per side; light that a map moves farther is lost."""
+from filter_service.constants import MAX_REACH_PX, MIN_SHIFT_PX, MIN_SHIFT_RATIO
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -21,9 +21,7 @@ from filter_service.rendering.frame_kernels import (
     interval_count,
 )
 from filter_service.rendering.image_cells import image_cells
-from filter_service.rendering.kernel_tables import kernel_levels, kernel_tables
 from filter_service.rendering.media_effects import MediaEffects, encoded
-from filter_service.rendering.pair_loops import dilate, predict_pairs, unpack_pairs
 from filter_service.rendering.perfect_eye import (
     PUPIL_MM,
     SIDE_PX,
@@ -42,13 +40,11 @@ def plan_once() -> None:
     layers = frame_layers(store, pupil_diameter_mm=PUPIL_MM, focus_dpt=0.0)
     image = image_cells(store.spec, store.plan)
     used = np.ones((image.count, interval_count(layers)), bool)
-    kernels = frame_kernels(store, layers, image, used)
-    kernel_tables(kernels, kernel_levels(kernels), used.shape)
+    frame_kernels(store, layers, image, used)
     depth_m = np.ones((2, 2), np.float32)
     depth_m[0, 0] = np.nan
     fill_missing_depth(depth_m)
     _plan_nodes_once(store)
-    _predict_pairs_once()
     _defocus_once()
     light = np.ones((SIDE_PX, SIDE_PX, RGB), np.float32)
     view = RgbdView(light, light[..., 0].copy(), store.spec.camera.tangents)
@@ -68,13 +64,6 @@ def _plan_nodes_once(store: PsfStore) -> None:
         defocus_error=1e-3,
     )
     NodePlanner(store.eye, spec, axes).nodes(0, 0)
-
-
-def _predict_pairs_once() -> None:
-    words = np.ones((1, 1, 1), np.uint32)
-    corners, layer_dpt = np.zeros((2, 2), np.float32), np.arange(3.0)
-    unpack_pairs(words[0], 1)
-    dilate(predict_pairs(words, layer_dpt, corners, layer_dpt, corners, 0.0))
 
 
 def _defocus_once() -> None:

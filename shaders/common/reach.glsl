@@ -9,6 +9,12 @@ Reach unpack_reach(uint word) {
     return Reach(sides.x, sides.y, sides.z, sides.w);
 }
 
+uint pack_reach(Reach reach) {
+    uvec4 shifts = uint(BYTE_BITS) * uvec4(0u, 1u, 2u, 1u + 2u);
+    uvec4 bytes = uvec4(reach.left, reach.right, reach.up, reach.down) << shifts;
+    return bytes.x | bytes.y | bytes.z | bytes.w;
+}
+
 int reach_width(Reach reach) { return reach.left + reach.right + 1; }
 
 int reach_height(Reach reach) { return reach.up + reach.down + 1; }

@@ -3,9 +3,9 @@
 // light of the stored pixels that it covers.
 // In:  the node atlas, NODES (as in blend_psfs), PARTS (three node kernels, three weights,
 //      three maps from offsets in the image to those in a node's kernel), KERNELS
-//      (common/kernels.glsl), WORK.
+//      (common/kernels.glsl), WORK, PLAN.
 // Out: the kernel atlas, single kernels.
-// Dispatch: one group of THREADS texels per item of WORK.
+// Dispatch: groups of THREADS texels take the items of WORK in turn.
 // Twin: reference.kernel_pairs.  Source: Csoba & Kunkli 2023, section 6.3.
 
 layout(local_size_x = THREADS) in;
@@ -14,6 +14,7 @@ layout(std430, binding = BINDING_NODES) readonly buffer Nodes { uvec4 nodes[]; }
 layout(std430, binding = BINDING_PARTS) readonly buffer Parts { uvec4 parts[]; };
 layout(std430, binding = BINDING_KERNELS) readonly buffer Kernels { uvec4 kernels[]; };
 layout(std430, binding = BINDING_WORK) readonly buffer Work { uvec2 work[]; };
+layout(std430, binding = BINDING_PLAN) readonly buffer Plan { uint plan[]; };
 #ifdef ATLAS_IS_BUFFER
 layout(std430, binding = BINDING_NODE_ATLAS) readonly buffer NodeAtlas { uvec4 node_atlas[]; };
 layout(std430, binding = BINDING_ATLAS) writeonly buffer Atlas { uvec4 atlas[]; };
@@ -63,10 +64,7 @@ void add_node(uint part, uint index, ivec2 at, inout vec3 near, inout vec3 far) 
     }
 }
 
-void main() {
-    uint kernel;
-    int texel;
-    if (!take_work(kernel, texel)) return;
+void blend(uint kernel, int texel) {
     Reach reach = unpack_reach(kernel_reach(kernel));
     if (texel >= reach_width(reach) * reach_height(reach)) return;
     ivec2 at = reach_offset(reach, texel);
@@ -77,4 +75,13 @@ void main() {
         add_node(part, index, at, near, far);
     uvec4 ends = pack_weights(near, far, kernel_scale(kernel, 0));
     ATLAS_STORE(atlas, int(kernel_offset(kernel, 0)) + texel, ends);
+}
+
+void main() {
+    uint count = work_count();
+    for (uint item = gl_WorkGroupID.x; item < count; item += gl_NumWorkGroups.x) {
+        int texel;
+        uint kernel = work_kernel(item, texel);
+        blend(kernel, texel);
+    }
 }

@@ -2,9 +2,9 @@
 // In:  the store (16-bit weights, a texture array addressed as one line), RECIPES (per
 //      layer and channel offsets, reaches and weights of six cached kernels: three nodes
 //      of pupil and accommodation x two of defocus), NODES (records: near recipe, far
-//      recipe, offset, reach; scale bits), WORK.
+//      recipe, first texel, reach; peak, ...), WORK, PLAN.
 // Out: the node atlas.
-// Dispatch: one group of THREADS texels per item of WORK.
+// Dispatch: groups of THREADS texels take the items of WORK in turn.
 // Twin: reference.recipe_kernels.  Source: Csoba & Kunkli 2023, section 6.4.
 
 layout(local_size_x = THREADS) in;
@@ -12,6 +12,7 @@ layout(local_size_x = THREADS) in;
 layout(std430, binding = BINDING_RECIPES) readonly buffer Recipes { uint recipes[]; };
 layout(std430, binding = BINDING_NODES) readonly buffer Nodes { uvec4 nodes[]; };
 layout(std430, binding = BINDING_WORK) readonly buffer Work { uvec2 work[]; };
+layout(std430, binding = BINDING_PLAN) readonly buffer Plan { uint plan[]; };
 layout(binding = TEXTURE_STORE) uniform usampler2DArray store;
 #ifdef ATLAS_IS_BUFFER
 layout(std430, binding = BINDING_NODE_ATLAS) writeonly buffer NodeAtlas { uvec4 node_atlas[]; };
@@ -51,10 +52,7 @@ vec3 recipe_weight(uint index, ivec2 at) {
                 blended(recipe + 2u * uint(RECIPE_WORDS), at));
 }
 
-void main() {
-    uint node;
-    int texel;
-    if (!take_work(node, texel)) return;
+void blend(uint node, int texel) {
     uvec4 place = nodes[node * uint(NODE_WORDS)];
     float scale = uintBitsToFloat(nodes[node * uint(NODE_WORDS) + 1u].x);
     Reach reach = unpack_reach(place.w);
@@ -62,4 +60,13 @@ void main() {
     ivec2 at = reach_offset(reach, texel);
     uvec4 ends = pack_weights(recipe_weight(place.x, at), recipe_weight(place.y, at), scale);
     ATLAS_STORE(node_atlas, int(place.z) + texel, ends);
+}
+
+void main() {
+    uint count = work_count();
+    for (uint item = gl_WorkGroupID.x; item < count; item += gl_NumWorkGroups.x) {
+        int texel;
+        uint node = work_kernel(item, texel);
+        blend(node, texel);
+    }
 }

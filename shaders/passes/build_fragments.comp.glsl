@@ -6,7 +6,7 @@
 //      DEPTH_IN (f32 meters; hidden pixels are empty unless it is above 0),
 //      LAYER_DPT, FIELD_DEFOCUS (change of defocus at the corners of the cells).
 // Out: PIXELS (linear RGB, vergence dpt; negative where nothing is hidden),
-//      PIXEL_LAYER (position), USED (a bit per cell and part of an interval), STATS
+//      PIXEL_LAYER (position), USED (a bit per cell and interval), STATS
 //      (pixels without depth, outside the prepared distances, and without a finite color,
 //      which becomes 0).
 // Dispatch: one thread per pixel, 8 x 8 groups, z is the surface.
@@ -44,7 +44,7 @@ uniform float vergence_offset_m;
 bool group_lies_in_one_cell() { return cell_px == 0 || cell_px >= TILE_SIZE_PX; }
 uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
 
-shared uint group_used[MAX_LAYERS * USED_PARTS / BITS_PER_WORD];
+shared uint group_used[MAX_LAYERS / BITS_PER_WORD];
 shared uint group_stats[STAT_FRAGMENTS];  // counters of this pass
 
 uint byte_at(uint index) {
@@ -138,10 +138,8 @@ float distance_of(uint pixel, uint seen, vec2 at) {
 
 void note_use(ivec2 at, float place) {
     int interval = position_interval(place, layer_count);
-    int part = interval * USED_PARTS;
-    part += clamp(int((place - float(interval)) * float(USED_PARTS)), 0, USED_PARTS - 1);
-    uint bit = 1u << uint(part % BITS_PER_WORD);
-    uint word = uint(part / BITS_PER_WORD);
+    uint bit = 1u << uint(interval % BITS_PER_WORD);
+    uint word = uint(interval / BITS_PER_WORD);
     if (group_lies_in_one_cell()) {
         atomicOr(group_used[word], bit);
         return;

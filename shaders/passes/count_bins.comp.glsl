@@ -1,6 +1,6 @@
 // Counts the fragments whose light reaches each bin, and marks the tiles in which two
 // surfaces meet, so that order matters.
-// In:  FRAGMENT_PLACE, BLOCKS.   Out: BIN_COUNTS (kept, a bit for each tile whose order
+// In:  FRAGMENT_PLACE, BLOCKS, PLAN.   Out: BIN_COUNTS (kept, a bit for each tile whose order
 //      matters, entries beyond the capacity of a list), WINDOWS (blocks that reach a bin).
 // Dispatch: one group of GROUP_THREADS per bin: 8 on a software renderer, so that its
 //      vectors are full, THREADS on hardware.
@@ -14,11 +14,11 @@ layout(local_size_x = GROUP_THREADS) in;
 
 layout(std430, binding = BINDING_FRAGMENT_PLACE) readonly buffer Place { uvec4 places[]; };
 layout(std430, binding = BINDING_BLOCKS) readonly buffer Blocks { uvec4 blocks[]; };
+layout(std430, binding = BINDING_PLAN) readonly buffer Plan { uint plan[]; };
 layout(std430, binding = BINDING_WINDOWS) writeonly buffer Windows { ivec4 windows[]; };
 layout(std430, binding = BINDING_BIN_COUNTS) writeonly buffer Counts { uvec4 counts[]; };
 
 uniform ivec2 tile_grid;
-uniform int search_blocks;        // reach of the widest blur of the frame
 uniform int surface_count;
 uniform uint list_capacity;
 uniform int order_always;
@@ -33,6 +33,9 @@ shared int window_high[2];
 // Searches for blocks in reach, up to the largest reach of the frame.  One wide blur thus
 // widens only the windows that it reaches; for others it costs only this search.
 ivec4 find_window(ivec2 bin) {
+    float reach = ceil(float(plan[PLAN_REACH]) + REACH_MARGIN_PX);
+    int search_blocks = min((int(reach) + TILE_SIZE_PX - 1) / TILE_SIZE_PX,
+                            max(tile_grid.x, tile_grid.y));
     ivec2 from = max(bin * BIN_TILES - search_blocks, 0);
     ivec2 size = min((bin + 1) * BIN_TILES + search_blocks, tile_grid) - from;
     ivec2 low = tile_grid;

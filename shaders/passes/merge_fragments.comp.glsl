@@ -2,8 +2,8 @@
 // whole block.  Packs the fragments of each 8 x 8 block, in scan order, to the front of
 // the block's slots.  One surface per dispatch; surfaces never merge with each other.
 // The hidden surface makes fragments only where an edge of the visible one is in reach.
-// In:  PIXELS, PIXEL_LAYER, KERNELS, KERNEL_OF (kernel of a cell and interval); for the
-//      hidden surface, BLOCKS of the visible one.
+// In:  PIXELS, PIXEL_LAYER, KERNELS, KERNEL_OF (kernel of a cell and interval), PLAN; for
+//      the hidden surface, BLOCKS of the visible one.
 // Out: FRAGMENT_COLOR, FRAGMENT_PLACE (THREADS slots per block), BLOCKS (count, largest
 //      reach bits, order matters, pixels merged), STATS (fragments, pixels merged).
 // Dispatch: one group per block, one thread per quad of pixels.
@@ -20,6 +20,7 @@ layout(std430, binding = BINDING_FRAGMENT_COLOR) writeonly buffer Color { vec4 c
 layout(std430, binding = BINDING_FRAGMENT_PLACE) writeonly buffer Place { uvec4 places[]; };
 layout(std430, binding = BINDING_BLOCKS) buffer Blocks { uvec4 blocks[]; };
 layout(std430, binding = BINDING_STATS) buffer Stats { uint stats[]; };
+layout(std430, binding = BINDING_PLAN) readonly buffer Plan { uint plan[]; };
 
 #include "common/layers.glsl"
 #include "common/cells.glsl"
@@ -37,7 +38,6 @@ uniform int max_level;            // 0: no merging
 uniform ivec2 scan_px;            // index of the first pixel, pixels of the whole frame
 uniform int paper_order;          // sort as in the paper: meters plus scan position
 uniform int surface;              // 0: visible, 1: hidden
-uniform float largest_reach_px;   // of all kernels of the frame
 
 shared uint alive[2];             // bit per pixel of the block: it has a fragment
 shared uint largest_reach_bits;   // reach is positive, so its bits are ordered like it
@@ -95,6 +95,7 @@ uint held_pixels(ivec2 at) {
 // Records whether an edge of the visible surface is so close that light from this hidden
 // block may pass it.
 void find_edge(ivec2 block, ivec2 grid, uint thread) {
+    float largest_reach_px = float(plan[PLAN_REACH]) + REACH_MARGIN_PX;
     int search = 2 * (int(largest_reach_px) / TILE_SIZE_PX + 1);
     int width = 2 * search + 1;
     for (int i = int(thread); i < width * width; i += QUADS) {

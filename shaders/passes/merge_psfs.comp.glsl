@@ -1,14 +1,15 @@
 // Sums kernels over the squares of merged fragments, level by level, so that a merged
 // fragment needs one lookup and loses no light.
-// In:  KERNELS, the kernel atlas (level below), WORK.
+// In:  KERNELS, the kernel atlas (level below), WORK, PLAN.
 // Out: the same (this level).
-// Dispatch: one group of THREADS texels per item of WORK.
+// Dispatch: groups of THREADS texels take the items of WORK in turn.
 // Twin: tests/numerical/test_renderer_passes.py (sums of reference.kernel_pairs).
 
 layout(local_size_x = THREADS) in;
 
 layout(std430, binding = BINDING_KERNELS) readonly buffer Kernels { uvec4 kernels[]; };
 layout(std430, binding = BINDING_WORK) readonly buffer Work { uvec2 work[]; };
+layout(std430, binding = BINDING_PLAN) readonly buffer Plan { uint plan[]; };
 #ifdef ATLAS_IS_BUFFER
 layout(std430, binding = BINDING_ATLAS) buffer Atlas { uvec4 atlas[]; };
 #else
@@ -22,10 +23,7 @@ layout(rgba32ui, binding = IMAGE_ATLAS) uniform uimage2D atlas;
 
 uniform int level;
 
-void main() {
-    uint kernel;
-    int texel;
-    if (!take_work(kernel, texel)) return;
+void sum_level(uint kernel, int texel) {
     float step_size = kernel_scale(kernel, level - 1) / WEIGHT_MAX;
     int half_side = 1 << (level - 1);
     Reach reach = unpack_reach(kernel_reach(kernel));
@@ -47,4 +45,13 @@ void main() {
     }
     uvec4 ends = pack_weights(near, far, kernel_scale(kernel, level));
     ATLAS_STORE(atlas, int(kernel_offset(kernel, level)) + texel, ends);
+}
+
+void main() {
+    uint count = work_count();
+    for (uint item = gl_WorkGroupID.x; item < count; item += gl_NumWorkGroups.x) {
+        int texel;
+        uint kernel = work_kernel(item, texel);
+        sum_level(kernel, texel);
+    }
 }

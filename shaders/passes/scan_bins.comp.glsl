@@ -1,9 +1,9 @@
 // Exclusive prefix sum of the bins' counts: the start of each list.
-// In:  BIN_COUNTS.   Out: BIN_OFFSETS (bin_count starts, then the totals: entries, the same
+// In:  BIN_COUNTS, PLAN.   Out: BIN_OFFSETS (bin_count starts, then the totals: entries, the same
 //      as float bits, which reveal a 32-bit overflow, dropped entries, and the length of
 //      the longest list), DISPATCHES (groups of the following passes: scatter, a sort for
-//      each size class, splat; zero if the lists do not fit their buffers, so that the
-//      caller can enlarge them and run the passes then).
+//      each size class, splat; zero if the lists or the kernels do not fit their buffers,
+//      so that the caller can enlarge them and run the passes then).
 // Dispatch: one group.
 // Twin: tests/numerical/tile_lists.py (numpy.cumsum).
 
@@ -13,10 +13,12 @@ layout(std430, binding = BINDING_BIN_COUNTS) readonly buffer Counts { uvec4 coun
 layout(std430, binding = BINDING_BIN_OFFSETS) writeonly buffer Offsets { uint offsets[]; };
 
 layout(std430, binding = BINDING_DISPATCHES) writeonly buffer Dispatches { uvec4 groups[]; };
+layout(std430, binding = BINDING_PLAN) readonly buffer Plan { uint plan[]; };
 
 uniform int bin_count;
 uniform uint entry_capacity;      // of ENTRIES
 uniform uint spare_capacity;      // of ENTRIES_SPARE
+uniform int needs_all_psfs;       // whether a frame without some PSFs is not shown
 
 shared uint sums[SCAN_THREADS];
 shared float float_sums[SCAN_THREADS];
@@ -66,6 +68,8 @@ void main() {
         offsets[bin_count + TOTAL_LONGEST] = longest;
         bool fits = start <= entry_capacity && float_start + float_sum < ENTRIES_EXACT
                  && (longest <= uint(SORT_LARGE) || start <= spare_capacity);
+        fits = fits && plan[PLAN_OVERFLOWS] == 0u
+            && (needs_all_psfs == 0 || plan[PLAN_MISSING] == 0u);
         uint bins = fits ? uint(bin_count) : 0u;
         groups[DISPATCH_SCATTER] = uvec4(bins, 1u, 1u, 0u);
         uvec3 before = uvec3(1u, uint(SORT_SMALL), uint(SORT_LARGE));

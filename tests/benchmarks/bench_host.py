@@ -4,9 +4,8 @@
 
 Frames are filtered once for real; then every dispatch gets no work groups, while all
 else runs as it is: checks, plans, copies to and from the driver, calls of it.  What the
-passes had written stays, and which kernels a frame uses is put in its place, so that
-plans are those of real frames.  The shaders' variants, mapped memory and the way a
-frame is planned are a hardware GPU's, whatever the driver.
+passes had written stays.  The shaders' variants and mapped memory are a hardware GPU's,
+whatever the driver.
 
 - ``all``: the frame;
 - ``image copies``: between the caller's arrays and the driver's memory, GB/s beside it;
@@ -94,36 +93,6 @@ class Clock:
         return call
 
 
-class NotedWords:
-    """What frames use, noted while they run for real and put in place afterwards."""
-
-    def __init__(self) -> None:
-        self.state = 0
-        self.is_real = True
-        self._words: dict[int, np.ndarray] = {}
-
-    def read(self, function):
-        """Return `Gpu.begin_read` that notes the words, or puts them in place."""
-
-        def begin(gpu, *parts):
-            arrive = function(gpu, *parts)
-            used = gpu._buffers.get("USED")
-            arrays = [out for buffer, _, out in parts if buffer is used]
-            state = self.state
-
-            def end():
-                arrive()
-                for words in arrays:
-                    if self.is_real:
-                        self._words[state] = words.copy()
-                    else:
-                        words[...] = self._words[state]
-
-            return end
-
-        return begin
-
-
 @contextmanager
 def empty_passes(clock: Clock) -> Iterator[None]:
     """Within, dispatches have no groups; copies are timed, calls are counted."""
@@ -180,19 +149,15 @@ def case_rows(case: Case, is_moving: bool, count: int) -> Iterator[Row]:
     """Times of an eye's frames on nothing."""
     spec = case.handles[0].store.spec
     states = states_towards(spec, PUPIL_MM, FOCUS_DPT, STATES if is_moving else 1)
-    words, clock = NotedWords(), Clock()
-    frames = []
-    with patch.object(Gpu, "begin_read", words.read(Gpu.begin_read)):
-        for words.state, state in enumerate(states):
-            case.frame(state)
-        words.is_real = False
-        with empty_passes(clock):
-            for k in range(WARM_FRAMES + count):
-                words.state = k % len(states)
-                clock.clear()
-                total_ms, stages_ms = case.frame(states[words.state])
-                if k >= WARM_FRAMES:
-                    frames.append((total_ms, clock.times_ms, stages_ms))
+    clock, frames = Clock(), []
+    for state in states:
+        case.frame(state)
+    with empty_passes(clock):
+        for k in range(WARM_FRAMES + count):
+            clock.clear()
+            total_ms, stages_ms = case.frame(states[k % len(states)])
+            if k >= WARM_FRAMES:
+                frames.append((total_ms, clock.times_ms, stages_ms))
     yield from _rows(case, is_moving, frames, clock)
 
 

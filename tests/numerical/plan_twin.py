@@ -1,7 +1,7 @@
 """How a frame is planned, stated plainly: arrays of everything, numpy alone.
 
-Twins of `psfs/read_kernels.py`, of `rendering` (`kernel_loops.py`, `table_loops.py`,
-`cell_maps.py`) and of the layers' distances.
+Twins of `psfs/read_kernels.py`, of `rendering` (`kernel_loops.py`, `cell_maps.py`), of
+the passes that plan kernels, and of the layers' distances.
 """
 
 import math
@@ -10,7 +10,10 @@ import numpy as np
 
 from filter_service.constants import (
     MAX_LEVEL,
+    MAX_REACH_PX,
     MERGE_MIN_SPREAD_PX,
+    MIN_SHIFT_PX,
+    MIN_SHIFT_RATIO,
     NO_LEVEL,
     RECIPE_TAPS,
     RGB,
@@ -18,11 +21,6 @@ from filter_service.constants import (
 )
 from filter_service.planning.grid import BASE_OBJECT_STEP_DPT
 from filter_service.psfs.boxes import box_sizes, pack_reach
-from filter_service.rendering.map_loops import (
-    MAX_REACH_PX,
-    MIN_SHIFT_PX,
-    MIN_SHIFT_RATIO,
-)
 
 
 def neighbors(store, reads, fields, total_dpt):
@@ -203,47 +201,3 @@ def kernel_levels(reach_px, spread_px, peak_ratio):
     scale = np.minimum(peak_ratio[:, None] * 4.0**levels, 1.0)
     scale[:, 0] = peak_ratio
     return sizes, np.where(sizes > 0, starts, NO_LEVEL), scale.astype(np.float32)
-
-
-def work_list(n_texels, threads):
-    groups = -(-n_texels // threads)
-    kernel = np.repeat(np.arange(groups.size), groups)
-    first = np.arange(kernel.size) - np.repeat(np.cumsum(groups) - groups, groups)
-    return np.stack([kernel, first * threads], axis=-1)
-
-
-def tables(kernels, levels, shape, threads):
-    """Records by name, as `kernel_tables` lays them out."""
-    nodes, (sizes, starts, scale) = kernels.nodes, levels
-    widths, heights = box_sizes(nodes.reach_px)
-    texels = widths * heights
-    node = np.zeros((nodes.near.size, 2, 4), np.uint32)
-    node[:, 0, 0], node[:, 0, 1] = nodes.near, nodes.far
-    node[:, 0, 2] = np.cumsum(texels) - texels
-    node[:, 0, 3] = pack_reach(nodes.reach_px)
-    node[:, 1, 0] = nodes.peak_ratio.astype(np.float32).view(np.uint32)
-    record = np.empty((kernels.count, 3, 4), np.uint32)
-    record[:, 0, :2] = kernels.spread_px.astype(np.float32).view(np.uint32)
-    record[:, 0, 2] = kernels.radius_px
-    record[:, 0, 3] = pack_reach(kernels.reach_px)
-    record[:, 1], record[:, 2] = starts, scale.view(np.uint32)
-    part = np.zeros((kernels.count, 5, 4), np.uint32)
-    part[:, 0, :3] = kernels.parts
-    part[:, 1, :3] = kernels.weight_ratio.astype(np.float32).view(np.uint32)
-    maps = kernels.maps.reshape(-1, 3, 4).astype(np.float32)
-    part[:, 2:] = maps.view(np.uint32)
-    pair = np.zeros(shape, np.uint32)
-    pair[kernels.cells, kernels.intervals] = np.arange(kernels.count)
-    work = {
-        f"work of level {level}": work_list(sizes[:, level], threads)
-        for level in range(MAX_LEVEL + 1)
-    }
-    return {
-        "NODES": node,
-        "RECIPES": nodes.recipes,
-        "KERNELS": record,
-        "PARTS": part,
-        "KERNEL_OF": pair,
-        "node work": work_list(texels, threads),
-        **work,
-    }

@@ -5,14 +5,14 @@ import numpy as np
 from filter_service.constants import SORT_CAPACITIES
 from filter_service.gl.gpu import Gpu
 from filter_service.psfs import layer_loops, read_loops
-from filter_service.rendering import kernel_loops, map_loops, pair_loops, table_loops
+from filter_service.rendering import kernel_loops, map_loops
 from filter_service.rendering.gl.compile_passes import compile_passes
 from filter_service.rendering.gl.renderer import FilterRenderer
 from tests.conftest import Engine
 from tests.numerical.synthetic import Bench, texture
 from tests.shader_variants import Kind, renderer_variants
 
-MODULES = (kernel_loops, map_loops, pair_loops, table_loops, layer_loops, read_loops)
+MODULES = (kernel_loops, map_loops, layer_loops, read_loops)
 INNER = {
     "clipped",
     "bracket",
@@ -21,8 +21,7 @@ INNER = {
     "mapped_reach",
     "needs_map",
 }
-INNER |= {"layer_blur_px", "_steps", "_between", "box", "packed"}
-INNER |= {"predict_pairs", "dilate"}  # a software renderer needs none; see `plan_once`
+INNER |= {"layer_blur_px", "_steps", "_between"}
 """Called by other loops alone: where those are read from disk, they are not."""
 
 

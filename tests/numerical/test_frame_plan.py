@@ -8,9 +8,8 @@ import pytest
 
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
-from filter_service.constants import RECIPE_TAPS, RGB, THREADS
+from filter_service.constants import RECIPE_TAPS, RGB
 from filter_service.planning.plan import unchecked_plan
-from filter_service.psfs.boxes import box_sizes
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.pack import PackedKernels
 from filter_service.psfs.read_loops import layer_blur_px
@@ -18,7 +17,6 @@ from filter_service.psfs.store import PsfStore
 from filter_service.rendering import frame_kernels
 from filter_service.rendering.cell_maps import CellMaps
 from filter_service.rendering.image_cells import image_cells
-from filter_service.rendering.kernel_tables import kernel_levels, kernel_tables
 from tests.numerical import plan_twin
 from tests.numerical.plan_cases import spec_for, traced_eye
 
@@ -180,31 +178,6 @@ def test_kernels_equal_the_plain_statement(case):
                 np.testing.assert_allclose(found, values, RTOL, RTOL, err_msg=name)
             else:
                 np.testing.assert_array_equal(found, values, err_msg=name)
-
-
-def test_tables_equal_the_plain_statement(case):
-    store, layers, image, used = case
-    kernels = frame_kernels.frame_kernels(store, layers, image, used)
-    levels = kernel_levels(kernels)
-    sizes, starts, scale = plan_twin.kernel_levels(
-        kernels.reach_px, kernels.spread_px, kernels.peak_ratio
-    )
-    np.testing.assert_array_equal(levels.sizes, sizes)
-    np.testing.assert_array_equal(levels.starts, starts)
-    np.testing.assert_array_equal(levels.step_ratio, scale)
-    assert levels.texel_count == sizes.sum()
-    tables = kernel_tables(kernels, levels, used.shape)
-    expected = plan_twin.tables(kernels, (sizes, starts, scale), used.shape, THREADS)
-    assert tables.parts.keys() == expected.keys()
-    end = 0
-    for name, words in expected.items():
-        first, count = tables.parts[name]
-        assert first % 64 == 0 and first >= end, name  # parts that any device binds
-        end = first + count
-        found = tables.of(name)
-        np.testing.assert_array_equal(found, words.ravel(), err_msg=name)
-    width_px, height_px = box_sizes(kernels.nodes.reach_px)
-    assert tables.node_texel_count == (width_px * height_px).sum()
 
 
 def test_a_measured_wavefront_has_one_defocus_over_the_field():

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from filter_service.constants import MAX_REACH_PX
 from filter_service.errors import GridTooLarge
-from filter_service.psfs.boxes import MAX_REACH_PX
 from tests.numerical.one_kernel import OneKernelBench, disc
 from tests.numerical.synthetic import Bench, psnr_db, texture
 from tests.reference import render_passes as reference

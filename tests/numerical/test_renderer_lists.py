@@ -54,7 +54,7 @@ def new_passes(bench, *, paper_rule=False, surface_count=1):
         layers=bench.layers(),
         paper_rule=paper_rule,
     )
-    return ListPasses(strip, search_blocks=0)
+    return ListPasses(strip)
 
 
 def random_buffers(rng, tile_count, columns, surface_count, *, reach_px):
@@ -97,7 +97,9 @@ def made_lists(passes, blocks, place, color, *, reach_px):
             ("FRAGMENT_COLOR", color),
         ):
             passes.strip.buffers[name] = gpu.upload(name, words)
-        passes.search_blocks = -(-(reach_px + 1) // constants.TILE_SIZE_PX)
+        plan = np.zeros(constants.PLAN_WORDS, np.uint32)
+        plan[constants.PLAN_REACH] = reach_px
+        passes.strip.buffers["PLAN"] = gpu.upload("plan of a test", plan)
         passes.count_bins()
         totals = np.empty(constants.TOTAL_WORDS, np.uint32)
         gpu.read_into((*passes.totals, totals))

@@ -8,8 +8,6 @@ from filter_service.rendering import frame_kernels
 from filter_service.rendering.frame import fill_missing_depth
 from filter_service.rendering.gl import kernel_passes
 from filter_service.rendering.image_cells import image_cells
-from filter_service.rendering.kernel_tables import kernel_levels
-from filter_service.rendering.pair_loops import unpack_pairs
 from tests.numerical.synthetic import Bench, depth_scene, texture
 from tests.reference import render_passes as reference
 
@@ -86,13 +84,17 @@ def test_atlases_in_buffers_make_the_same_frame(gl_engine, rng, monkeypatch, mod
 
 
 def made_kernels(bench, view, **state):
-    """Kernels that the renderer made for a view, planned again."""
-    bench.render(view, **state)
+    """Kernels that the renderer made for a view, planned again; and their records."""
+    count = bench.render(view, **state).kernel_count
     layers, image = bench.layers(**state), image_cells(bench.spec, bench.store.plan)
     words = kernel_passes.words_per_cell(layers)
-    used = read(bench, "USED", (image.count, words), np.uint32)
-    used = unpack_pairs(used, frame_kernels.interval_count(layers))
-    return frame_kernels.frame_kernels(bench.store, layers, image, used)
+    used = read(bench, "USED", (image.count, 4 * words), np.uint8)
+    used = np.unpackbits(used, axis=1, bitorder="little").astype(bool)
+    used = used[:, : frame_kernels.interval_count(layers)]
+    kernels = frame_kernels.frame_kernels(bench.store, layers, image, used)
+    kernel_of = read(bench, "KERNEL_OF 0", used.shape, np.uint32)
+    records = read(bench, "KERNELS 0", (count, constants.KERNEL_WORDS, 4), np.uint32)
+    return kernels, records[kernel_of[kernels.cells, kernels.intervals]]
 
 
 @pytest.mark.parametrize("mode", ["on-axis", "dynamic"])
@@ -100,9 +102,10 @@ def test_blended_kernels_equal_their_twin(gl_engine, rng, mode):
     field = {"mode": mode, "pupil_range_mm": (3.0, 4.0), "focus_range_dpt": (6, 8)}
     bench = Bench(gl_engine, MYOPIA, **{**SIZE, "vertical_fov_deg": 20.0}, **field)
     view = bench.view(texture(rng, 101, 150), depth_scene())
-    kernels = made_kernels(bench, view, pupil_diameter_mm=3.3, focus_dpt=7.0)
+    kernels, records = made_kernels(bench, view, pupil_diameter_mm=3.3, focus_dpt=7.0)
     expected = reference.kernel_pairs(bench.store, kernels)
-    stored = kernel_levels(kernels)
+    starts = records[:, 1]
+    step_ratio = np.ascontiguousarray(records[:, 2]).view(np.float32)
     line = atlas_line(bench.gpu, "kernels 0")
     largest, levels = expected.shape[2] // 2, set()
     assert kernels.count > (1 if mode == "on-axis" else 50)
@@ -112,14 +115,12 @@ def test_blended_kernels_equal_their_twin(gl_engine, rng, mode):
             slice(largest - to_top, largest + to_bottom + 1),
             slice(largest - to_left, largest + to_right + 1),
         )
-        steps = stored.step_ratio[k] / constants.WEIGHT_MAX
+        steps = step_ratio[k] / constants.WEIGHT_MAX
         height, width = to_top + to_bottom + 1, to_left + to_right + 1
         # half a step of the kernel, of up to four node kernels, and float32 sums
         nodes = kernels.nodes.peak_ratio[kernels.parts[k]] / constants.WEIGHT_MAX
         rounding = 0.501 * float((nodes * kernels.weight_ratio[k]).sum())
-        for level, (offset, step) in enumerate(
-            zip(stored.starts[k], steps, strict=True)
-        ):
+        for level, (offset, step) in enumerate(zip(starts[k], steps, strict=True)):
             if offset == constants.NO_LEVEL:
                 break
             edge = 2**level

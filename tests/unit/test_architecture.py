@@ -157,8 +157,6 @@ HOME = {
         "filter_service/rendering/haze_loops.py",
         "filter_service/rendering/spectacle_loops.py",
         "filter_service/rendering/kernel_loops.py",
-        "filter_service/rendering/table_loops.py",
-        "filter_service/rendering/pair_loops.py",
         "clients/commands/doctor_probes.py",  # asks which threads it runs on
         "filter_service/threads.py",
     ),

@@ -8,8 +8,7 @@ strip            size and buffers of a frame or strip
 fragment_passes  passes from pixels to fragments
 list_passes      passes that build, sort and splat the fragment lists
 frame_passes     all passes of a strip, and readback of the image
-kernel_passes    passes that blend a frame's kernels
-expected_pairs   prediction of a frame's pairs from the previous frame
+kernel_passes    passes that plan and blend an eye's kernels
 eye_states       cached state of the two most recently used eyes
 list_bands       division of fragment lists into bands that fit a buffer
 compile_passes   compilation of all passes before the first frame

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from filter_service.gl.gpu import Gpu
 from filter_service.rendering.frame_states import FrameStates
 from filter_service.rendering.gl.gl_store import GlStore
-from filter_service.rendering.gl.kernel_passes import KernelMaker
+from filter_service.rendering.gl.kernel_passes import KernelPasses
 
 MAX_EYES = 2
 """Cache size: the two eyes of a stereo frame; each has its own kernel atlas."""
@@ -18,7 +18,7 @@ class EyeState:
     """Results of an eye's last frame that the next frame can reuse."""
 
     handle: GlStore
-    kernels: KernelMaker
+    kernels: KernelPasses
     states: FrameStates = field(default_factory=FrameStates)
 
 
@@ -26,7 +26,7 @@ class EyeStates:
     """Cache of the most recently used eyes; older ones are evicted."""
 
     def __init__(self, gpu: Gpu) -> None:
-        self._free = [KernelMaker(gpu, slot) for slot in range(MAX_EYES)]
+        self._free = [KernelPasses(gpu, slot) for slot in range(MAX_EYES)]
         self._eyes: list[EyeState] = []  # most recently used last
 
     def of(self, handle: GlStore) -> EyeState:

@@ -3,7 +3,6 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from filter_service.constants import (
     BYTES_PER_WORD,
@@ -16,11 +15,8 @@ from filter_service.constants import (
     STAT_MISSING,
     STAT_WORDS,
     THREADS,
-    TILE_SIZE_PX,
 )
-from filter_service.gl.passes import Atlas
-from filter_service.rendering.frame_kernels import interval_count
-from filter_service.rendering.gl.kernel_passes import KernelSet, words_per_cell
+from filter_service.rendering.gl.kernel_passes import KernelRun, words_per_cell
 from filter_service.rendering.gl.strip import Strip, group_count
 from filter_service.rendering.image_cells import ImageCells
 
@@ -40,8 +36,6 @@ class FragmentPasses:
     strip : Strip
     image : ImageCells
         Cells of the whole frame.
-    corner_change_dpt : (rows + 1, columns + 1), float32
-        Change of defocus at the corners of the cells.
     tolerance : float
         Merging error relative to the default; 0 disables merging.
     first_row : int
@@ -64,9 +58,6 @@ class FragmentPasses:
 
     Attributes
     ----------
-    search_blocks : int
-        Distance, in blocks, within which a bin searches for fragments that reach it;
-        set by `merge_fragments`.
     stats : (STAT_LANES, STAT_WORDS), uint32
         Counters of the passes, written by the readback.
     """
@@ -76,7 +67,6 @@ class FragmentPasses:
         strip: Strip,
         *,
         image: ImageCells,
-        corner_change_dpt: NDArray[np.float32],
         tolerance: float,
         first_row: int,
         frame_pixel_count: int,
@@ -89,7 +79,6 @@ class FragmentPasses:
     ):
         self.strip = strip
         self.image = image
-        self.corner_change_dpt = corner_change_dpt
         self.tolerance = tolerance
         self.first_row = first_row
         self.scan = (first_row * strip.view.width_px, frame_pixel_count)
@@ -100,11 +89,6 @@ class FragmentPasses:
         self.stats = np.zeros((STAT_LANES, STAT_WORDS), np.uint32)
         self.white_level = white_level
         self.is_encoded = is_encoded and white_level > 0.0
-        self.search_blocks = 0
-        self.kernel_count = 0
-        self.kernel_texel_count = 0
-        self.atlas: Atlas | None = None
-        self.used_words = np.zeros((0, 0), np.uint32)
 
     def upload(self) -> None:
         """Upload the strip, padded to whole words."""
@@ -121,20 +105,11 @@ class FragmentPasses:
                 "DEPTH_IN", *depths_m
             )
 
-    def build_fragments(self) -> None:
+    def build_fragments(self, kernels: KernelRun) -> None:
         """Compute linear light, vergence and layer of pixels, and the used pairs."""
-        n_words = words_per_cell(self.strip.layers)
-        self.used_words = np.zeros((self.image.count, n_words), np.uint32)
         n_pixels = self.strip.surface_count * self.strip.pixel_count
         self.strip.reserve(PIXELS=16 * n_pixels, PIXEL_LAYER=4 * n_pixels)
-        self.strip.buffers["LAYER_DPT"] = self.strip.gpu.upload(
-            "LAYER_DPT", self.strip.layers.layer_dpt.astype(np.float32)
-        )
-        self.strip.buffers["FIELD_DEFOCUS"] = self.strip.gpu.upload(
-            "FIELD_DEFOCUS", self.corner_change_dpt
-        )
-        self.strip.buffers["USED"] = self.strip.gpu.upload("USED", self.used_words)
-        self.strip.buffers["STATS"] = self.strip.gpu.upload("STATS", self.stats)
+        self.strip.kernel_buffers = kernels.buffers
         with self.strip.timer.stage("fragments_ms"):
             self.strip.run(
                 "build_fragments",
@@ -142,7 +117,7 @@ class FragmentPasses:
                 *("COLOR_IN", "DEPTH_IN", "LAYER_DPT", "FIELD_DEFOCUS"),
                 *("PIXELS", "PIXEL_LAYER", "USED", "STATS"),
                 **self._common,
-                words_per_cell=n_words,
+                words_per_cell=words_per_cell(self.strip.layers),
                 tangents=self.strip.view.tangents,
                 vergence_range_dpt=self.strip.layers.vergence_range_dpt,
                 vergence_scale=self.strip.layers.vergence.scale_ratio,
@@ -153,19 +128,6 @@ class FragmentPasses:
                 counted_px=self.counted_px,
                 defines=COLOR_VARIANTS[self.strip.view.color.dtype.name],
             )
-
-    def wait_for_used(self) -> NDArray[np.bool_]:
-        """Wait for the GPU, and return the used pairs."""
-        with self.strip.timer.wall("psf_plan_ms"):
-            self.strip.gpu.read_into((self.strip.buffers["USED"], 0, self.used_words))
-            return self.used
-
-    @property
-    def used(self) -> NDArray[np.bool_]:
-        """Return the used pairs (n_cells, n_intervals), after the readback."""
-        from filter_service.rendering.pair_loops import unpack_pairs
-
-        return unpack_pairs(self.used_words, interval_count(self.strip.layers))
 
     @property
     def _common(self) -> dict[str, Any]:
@@ -179,14 +141,9 @@ class FragmentPasses:
             "image_size_px": self.image_size_px,
         }
 
-    def merge_fragments(self, kernels: KernelSet) -> None:
+    def merge_fragments(self) -> None:
         """Merge pixels into fragments, and pack the fragments of each block."""
         slots = self.strip.block_count * THREADS
-        largest_reach_px = int(kernels.kernels.reach_px.max()) + 1.5
-        self.strip.kernel_buffers = kernels.buffers
-        self.kernel_count = kernels.kernels.count
-        self.kernel_texel_count = kernels.texel_count
-        self.atlas = kernels.atlas
         self.strip.reserve(
             FRAGMENT_COLOR=16 * slots,
             FRAGMENT_PLACE=16 * slots,
@@ -198,7 +155,7 @@ class FragmentPasses:
                     "merge_fragments",
                     self.strip.grid,
                     *("PIXELS", "PIXEL_LAYER", "KERNELS", "KERNEL_OF"),
-                    *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BLOCKS", "STATS"),
+                    *("FRAGMENT_COLOR", "FRAGMENT_PLACE", "BLOCKS", "STATS", "PLAN"),
                     **self._common,
                     blur_px_per_dpt=self.strip.layers.blur_px_per_dpt,
                     max_level=self._max_level,
@@ -208,12 +165,7 @@ class FragmentPasses:
                     paper_order=int(self.strip.paper_rule),
                     scan_px=self.scan,
                     surface=surface,
-                    largest_reach_px=largest_reach_px,
                 )
-        self.search_blocks = min(
-            group_count(int(np.ceil(largest_reach_px)), TILE_SIZE_PX),
-            max(self.strip.grid),
-        )
 
     @property
     def _max_level(self) -> int:
@@ -233,6 +185,4 @@ class FragmentPasses:
             "bad_color_count": stats[STAT_BAD_COLOR],
             "fragment_count": stats[STAT_FRAGMENTS],
             "merged_count": stats[STAT_MERGED],
-            "kernel_count": self.kernel_count,
-            "kernel_texel_count": self.kernel_texel_count,
         }

@@ -14,7 +14,7 @@ from filter_service.constants import (
     TOTAL_WORDS,
 )
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
-from filter_service.rendering.gl.kernel_passes import KernelSet
+from filter_service.rendering.gl.kernel_passes import KernelRun
 from filter_service.rendering.gl.list_passes import ListPasses
 from filter_service.rendering.gl.strip import Strip, dispatch_grid, group_count
 
@@ -37,50 +37,40 @@ class FramePasses:
     strip : Strip
     fragments : FragmentPasses
         Fragments of the same strip.
+    begin_kernels : callable
+        Function that begins to plan the kernels of the strip.
+
+    Attributes
+    ----------
+    kernels : KernelRun
+    lists : ListPasses
+        Set by `run`, like the kernels.
     """
 
-    def __init__(self, strip: Strip, fragments: FragmentPasses):
+    def __init__(
+        self,
+        strip: Strip,
+        fragments: FragmentPasses,
+        begin_kernels: Callable[[], KernelRun],
+    ):
         self.strip = strip
         self.fragments = fragments
-        self.lists: ListPasses  # set by `run`
-        self._predicted_kernels: KernelSet | None = None
+        self._begin_kernels = begin_kernels
+        self.kernels: KernelRun
+        self.lists: ListPasses
         self._output = ""
         self._wait: Callable[[], None] = lambda: None
         self._image, self._totals = np.zeros(0), np.zeros(0, np.uint32)
 
-    def run(
-        self,
-        kernels: Callable[[NDArray[np.bool_]], KernelSet],
-        *,
-        predicted: Callable[[], KernelSet | None] = lambda: None,
-        used: NDArray[np.bool_] | None = None,
-    ) -> None:
-        """Filter the strip; `begin_read` and `end_read` return the image.
-
-        Parameters
-        ----------
-        kernels : callable
-            Function that returns the kernels of used pairs.
-        predicted : callable, optional
-            Function that returns predicted kernels, or None; it is called while the
-            GPU works.  With a prediction, there is no readback in the middle of the
-            frame; `end_read` checks the prediction.
-        used : (n_cells, n_intervals), optional
-            Used pairs, if they are known.
-        """
+    def run(self) -> None:
+        """Filter the strip; `begin_read` and `end_read` return the image."""
         self.strip.gpu.claim(PASSES, self)
         self.fragments.upload()
-        self.fragments.build_fragments()
-        self._predicted_kernels = None if used is not None else predicted()
-        if self._predicted_kernels is not None:
-            self.fragments.merge_fragments(self._predicted_kernels)
-        else:
-            if used is None:
-                used = self.fragments.wait_for_used()
-            self.fragments.merge_fragments(kernels(used))
-        self.lists = ListPasses(
-            self.strip, self.fragments.search_blocks, self.fragments.atlas
-        )
+        kernels = self.kernels = self._begin_kernels()
+        self.lists = ListPasses(self.strip, kernels.atlas)
+        self.fragments.build_fragments(kernels)
+        kernels.make()
+        self.fragments.merge_fragments()
         self.lists.run()
 
     def begin_read(self, output: str, out: NDArray[Any] | None = None) -> None:
@@ -97,21 +87,30 @@ class FramePasses:
             self._wait = self.strip.gpu.begin_read(
                 (self.strip.buffers["COLOR_IN"], 0, self._image),
                 (*self.lists.totals, self._totals),
-                (self.strip.buffers["STATS"], 0, self.fragments.stats),
-                (self.strip.buffers["USED"], 0, self.fragments.used_words),
+                *self.kernels.to_read(self.fragments.stats),
             )
 
-    def end_read(self) -> NDArray[Any] | None:
+    def end_read(
+        self, fill: Callable[[NDArray[np.int64]], None]
+    ) -> NDArray[Any] | None:
         """Wait for the image; return it, or None if the strip must be filtered again.
 
-        That is the case if a kernel was missing, or if the fragment lists did not fit
+        That is the case if kernels were missing, or if the fragment lists did not fit
         their buffer and another strip has overwritten the inputs since.
+
+        Parameters
+        ----------
+        fill : callable
+            Function that computes missing PSFs (n,).
+
+        Raises
+        ------
+        KernelsTooLarge, NotPrepared
+            As `KernelRun.is_complete`.
         """
         with self.strip.timer.wall("readback_ms"):
             self._wait()
-        if self._predicted_kernels is not None and self._predicted_kernels.lacks(
-            self.fragments.used
-        ):
+        if not self.kernels.is_complete(fill):
             return None
         if self.lists.record_totals(self._totals):
             return self._image
@@ -138,4 +137,6 @@ class FramePasses:
 
     def counts(self) -> dict[str, int]:
         """Return the counts of `FilteredView` by name."""
-        return self.fragments.counts() | self.lists.counts()
+        return (
+            self.fragments.counts() | self.kernels.frame_counts() | self.lists.counts()
+        )

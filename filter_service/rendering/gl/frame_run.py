@@ -4,7 +4,6 @@ In between, the CPU is free for another view.
 """
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -24,14 +23,13 @@ from filter_service.rendering.frame import (
     fill_missing_depth,
     reach_px_of,
 )
-from filter_service.rendering.gl.expected_pairs import FrameState
 from filter_service.rendering.gl.eye_states import EyeState
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.frame_passes import FramePasses
-from filter_service.rendering.gl.kernel_passes import KernelSet, words_per_cell
+from filter_service.rendering.gl.kernel_passes import FrameState
 from filter_service.rendering.gl.strip import Strip
 from filter_service.rendering.gl.strips import Rows, counted_px, split_into_strips
-from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
+from filter_service.rendering.image_cells import KernelsTooLarge
 from filter_service.rendering.white_level import white_level
 from filter_service.rgbd_view import RgbdView
 
@@ -125,11 +123,7 @@ class FrameRun:
         if len(plan.strips) > 1:
             return None
         begun = _StripRun(self, plan, plan.strips[0])
-        try:
-            begun.begin()
-        except KernelsTooLarge:
-            self._cell_px = 2 * plan.state.image.cell_px
-            return None
+        begun.begin()
         return begun
 
     def _finish_begun(self) -> tuple[NDArray[Any], Counts]:
@@ -175,14 +169,11 @@ class FrameRun:
     ) -> tuple[NDArray[Any], Counts]:
         """Finish the strips and join their images."""
         counts = Counter[str]()
-        shape = (plan.state.image.count, words_per_cell(self.layers))
-        used_words = np.zeros(shape, np.uint32)
         pictures = []
         for run in runs:
             pictures.append(run.finish()[run.rows.output_rows])
             counts.update(run.passes.counts())
-            used_words |= run.passes.fragments.used_words
-        self._eye.kernels.record_pairs(plan.state, used_words)
+        kernels = runs[-1].passes.kernels.frame_counts()  # of all strips
         if self.out_of(plan) is None:
             picture = pictures[0] if len(pictures) == 1 else np.concatenate(pictures)
             rows, columns = (
@@ -190,7 +181,7 @@ class FrameRun:
                 for n in (self._view.height_px, self._view.width_px)
             )
             np.copyto(self._out, picture[rows, columns])
-        return self._out, dict(counts)
+        return self._out, {**counts, **kernels}
 
     # ----- used by its strips
 
@@ -207,7 +198,6 @@ class FrameRun:
         fragments = FragmentPasses(
             strip,
             image=image,
-            corner_change_dpt=plan.state.change_dpt,
             tolerance=options.render_tolerance if options.merge else 0.0,
             first_row=rows.first_row,
             frame_pixel_count=plan.whole.width_px * plan.whole.height_px,
@@ -218,21 +208,14 @@ class FrameRun:
             white_level=plan.white_level,
             is_encoded=self.output == "srgb8",
         )
-        return FramePasses(strip, fragments)
-
-    def kernels(self, image: ImageCells, used: NDArray[np.bool_]) -> KernelSet:
-        """Return the kernels of used pairs."""
-        return self._eye.kernels.kernels(
-            self._eye.handle, self.layers, image, used, self.timer, self._fill
+        eye = self._eye
+        return FramePasses(
+            strip,
+            fragments,
+            lambda: eye.kernels.begin(eye.handle, plan.state, self.timer),
         )
 
-    def predicted(self, state: FrameState) -> KernelSet | None:
-        """Return the predicted kernels, or None."""
-        return self._eye.kernels.predicted(
-            self._eye.handle, state, self.timer, self._fill
-        )
-
-    def _fill(self, psfs: NDArray[np.int64]) -> None:
+    def fill(self, psfs: NDArray[np.int64]) -> None:
         """Compute the missing PSFs of a frame, timed as a stage of its own."""
         with self.timer.wall("psf_compute_ms"):
             self._eye.handle.store.fill(psfs, until_s=self._request.until_s)
@@ -248,7 +231,7 @@ class FrameRun:
 
 
 class _StripRun:
-    """A strip filtered with the predicted kernels; repeated if some are missing."""
+    """A strip that is filtered, and again if kernels or buffers were missing."""
 
     def __init__(self, frame: FrameRun, plan: _Plan, rows: Rows):
         self._frame, self.plan, self.rows = frame, plan, rows
@@ -257,40 +240,18 @@ class _StripRun:
 
     def begin(self) -> None:
         """Start the passes on the GPU and the readback of the image."""
-        self._run(self.passes, predicted=lambda: self._frame.predicted(self.plan.state))
-        self.passes.begin_read(self._frame.output, self._out)
+        self.passes.run()
+        self.passes.begin_read(self._frame.output, self._frame.out_of(self.plan))
         self._is_begun = True
 
     def finish(self) -> NDArray[Any]:
         """Return the image."""
         if not self._is_begun:
             self.begin()
-        picture = self.passes.end_read()
-        if picture is None:
-            used = self.passes.fragments.used
+        while (picture := self.passes.end_read(self._frame.fill)) is None:
             self.passes = self._frame.passes_of(self.plan, self.rows)
-            self._run(self.passes, used=used)
-            self.passes.begin_read(self._frame.output, self._out)
-            picture = self.passes.end_read()
-        assert picture is not None  # all kernels exist, and no other passes ran
+            self.begin()
         return picture
-
-    @property
-    def _out(self) -> NDArray[Any] | None:
-        return self._frame.out_of(self.plan)
-
-    def _run(
-        self,
-        passes: FramePasses,
-        *,
-        predicted: Callable[[], KernelSet | None] = lambda: None,
-        used: NDArray[np.bool_] | None = None,
-    ) -> None:
-        passes.run(
-            lambda pairs: self._frame.kernels(self.plan.state.image, pairs),
-            predicted=predicted,
-            used=used,
-        )
 
 
 def _prepared_range_dpt(store: PsfStore) -> tuple[float, float]:

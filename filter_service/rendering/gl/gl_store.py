@@ -3,9 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import STORE_SIDE
+from filter_service.constants import PSF_WORDS, STORE_SIDE
 from filter_service.gl.gpu import Gpu
-from filter_service.gl.passes import Pages
+from filter_service.gl.passes import BufferPart, Pages
+from filter_service.psfs.read_kernels import StoreTables
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.image_cells import image_cells
@@ -13,9 +14,11 @@ from filter_service.rendering.image_cells import image_cells
 INITIAL_WORDS = 2**20
 """Initial capacity of the copy on the GPU, 2 MB; it grows by doubling."""
 
+_WORD_BYTES = 4
+
 
 class GlStore(FrameStore):
-    """A store with a copy of its kernels on the GPU, which `sync` updates.
+    """A store with a copy of its kernels and tables on the GPU, which `sync` updates.
 
     Attributes
     ----------
@@ -30,18 +33,28 @@ class GlStore(FrameStore):
         self.is_released = False
         self._n_words = self._capacity = 0
         self._generation = store.generation
+        self._parts: dict[str, BufferPart] = {}
+        self._tables: StoreTables | None = None  # of which the parts are a copy
+        self._n_batches = 0
         with gpu.context:
             self.sync()
         _ = store.defocus  # computed here and not by the first frame
 
-    def sync(self) -> Pages:
-        """Upload the kernels computed since the last call; return the texture array.
+    def sync(self) -> tuple[Pages, dict[str, BufferPart]]:
+        """Upload what has changed since the last call.
 
         The caller makes the OpenGL context current.
+
+        Returns
+        -------
+        pages : Pages
+            Kernels.
+        parts : dict
+            Tables, by binding.
         """
         words, pages = self.store.kernels, self._pages
         if words.size > self._capacity or pages is None:
-            self._free()
+            self._free_pages()
             self._capacity = max(2 * words.size, INITIAL_WORDS)
             pages = self._pages = self._gpu.pages(self._capacity)
             self._n_words = 0
@@ -52,18 +65,60 @@ class GlStore(FrameStore):
             lines = _lines(words, first, -(-words.size // STORE_SIDE))
             self._gpu.write_pages(pages, first, lines)
             self._n_words = words.size
-        return pages
+        self._sync_tables()
+        return pages, self._parts
+
+    def _sync_tables(self) -> None:
+        store, tables = self.store, self.store.tables
+        if tables is not self._tables:
+            self._free_tables()
+            self._parts = self._gpu.own_parts(
+                STORE_VALUES=tables.values_dpt.astype(np.float32),
+                STORE_STARTS=tables.starts.astype(np.uint32),
+                STORE_SHIFTS=tables.channel_shift_dpt.astype(np.float32),
+                STORE_PSFS=_psf_records(tables, 0, store.psf_count),
+            )
+            self._tables, (self._n_batches, _) = tables, store.added_since(0)
+            return
+        self._n_batches, added = store.added_since(self._n_batches)
+        if added.size:
+            first, end = int(added.min()), int(added.max()) + 1
+            buffer, start, _ = self._parts["STORE_PSFS"]
+            self._gpu.write(
+                buffer,
+                _psf_records(tables, first, end),
+                offset=start + _WORD_BYTES * PSF_WORDS * first,
+            )
 
     def release(self) -> None:
         """Free the GPU copy."""
         self.is_released = True
         with self._gpu.context:  # without a context, the driver frees nothing
-            self._free()
+            self._free_pages()
+            self._free_tables()
 
-    def _free(self) -> None:
+    def _free_pages(self) -> None:
         if self._pages is not None:
             self._pages.release()
         self._pages = None
+
+    def _free_tables(self) -> None:
+        for part in self._parts.values():
+            part.buffer.release()  # the same for all
+            break
+        self._parts, self._tables = {}, None
+
+
+def _psf_records(tables: StoreTables, first: int, end: int) -> NDArray[np.uint32]:
+    """Return the records (n, PSF_WORDS) of PSFs; those not computed have no peak."""
+    part = slice(first, end)
+    records = np.empty((end - first, PSF_WORDS), np.uint32)
+    records[:, 0] = tables.offsets[part]
+    records[:, 1] = tables.reach_words[part]
+    records[:, 2] = tables.radius_px[part]
+    records[:, 3] = tables.spread_px[part].view(np.uint32)
+    records[:, 4] = tables.peak_ratio[part].view(np.uint32)
+    return records
 
 
 def _lines(words: NDArray[np.uint16], first: int, end: int) -> NDArray[np.uint16]:

@@ -1,253 +1,516 @@
-"""Passes that blend a frame's kernels from cached PSFs; frames can reuse kernels."""
+"""Passes that plan and blend the kernels of an eye from its cached PSFs.
 
-from dataclasses import dataclass
-from typing import Any
+The GPU itself finds which kernels a frame uses, so no frame waits for the CPU.  While
+the state of the eye stays, kernels are kept, and frames add those that they lack.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import BITS_PER_WORD, MAX_LAYERS, USED_PARTS
+from filter_service.constants import (
+    BITS_PER_WORD,
+    CELL_WORDS,
+    DISPATCH_BYTES,
+    FIELD_CORNERS,
+    KERNEL_WORDS,
+    MAX_LAYERS,
+    MAX_LEVEL,
+    NODE_WORDS,
+    PART_WORDS,
+    PLAN_BASE_TEXELS,
+    PLAN_FOR_KERNELS,
+    PLAN_FOR_NODES,
+    PLAN_FOR_WORK,
+    PLAN_KERNELS,
+    PLAN_NODE_TEXELS,
+    PLAN_NODES,
+    PLAN_OLD_NODES,
+    PLAN_OVERFLOWS,
+    PLAN_TEXELS,
+    PLAN_WORDS,
+    READ_WORDS,
+    RECIPE_WORDS,
+    RGB,
+    STAT_LANES,
+    STAT_WORDS,
+    THREADS,
+)
 from filter_service.errors import GridTooLarge
 from filter_service.gl.gpu import Gpu
-from filter_service.gl.passes import Atlas, BufferPart, Pages
+from filter_service.gl.passes import Atlas, Buffer, BufferPart, Pages
 from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.frame_layers import FrameLayers
-from filter_service.psfs.store import PsfStore
-from filter_service.rendering.frame_kernels import (
-    Fill,
-    FrameKernels,
-    frame_kernels,
-    interval_count,
-)
-from filter_service.rendering.gl.expected_pairs import ExpectedPairs, FrameState
+from filter_service.rendering.frame_kernels import interval_count
 from filter_service.rendering.gl.gl_store import GlStore
-from filter_service.rendering.gl.strip import dispatch_grid
+from filter_service.rendering.gl.strip import dispatch_grid, group_count
 from filter_service.rendering.image_cells import (
     ImageCells,
     KernelsTooLarge,
     can_coarsen,
     check_texels,
 )
-from filter_service.rendering.kernel_tables import (
-    LEVEL_WORK,
-    NODE_WORK,
-    KernelLevels,
-    KernelTables,
-    kernel_levels,
-    kernel_tables,
-)
 
 MAX_KERNEL_TEXELS = 24 * 2**20
 """Largest texel count of a frame's kernels: 400 MB at 16 bytes per texel."""
 
+FIRST_RECORDS = 2**14
+FIRST_TEXELS = 2**20
+"""Initial capacity: kernels and node kernels, and the texels of each."""
+
+HEADROOM = 1.25
+"""Capacity relative to the need of the frame that did not fit."""
+
+WORK_LISTS = MAX_LEVEL + 2
+
+SOFTWARE_THREADS = 8
+"""Threads per work group of the plans on a software renderer: one vector."""
+
 _WORD_BYTES = 4
+_UVEC4_BYTES = 16
 
 
-@dataclass(frozen=True)
-class KernelSet:
-    """Kernels on the GPU.
+class FrameState(NamedTuple):
+    """State of the eye that the kernels of a frame belong to.
 
     Attributes
     ----------
-    kernels : FrameKernels
-    texel_count : int
-        Total of all kernels, at all levels.
-    buffers : dict
-        KERNELS and KERNEL_OF.
-    atlas : Atlas
-        Texels of the kernels.
-    available : (n_cells, n_intervals), bool
-        Pairs that have a kernel.
+    layers : FrameLayers
+    image : ImageCells
+    change_dpt : (rows + 1, columns + 1), float32
+        Change of defocus at the corners of the cells.
     """
 
-    kernels: FrameKernels
-    texel_count: int
-    buffers: dict[str, BufferPart]
-    atlas: Atlas
-    available: NDArray[np.bool_]
-
-    def lacks(self, used: NDArray[np.bool_]) -> bool:
-        """Return whether a frame uses pairs without a kernel."""
-        return bool(np.any(used & ~self.available))
+    layers: FrameLayers
+    image: ImageCells
+    change_dpt: NDArray[np.float32]
 
 
-class KernelMaker:
-    """Blend the kernels that frames use, and cache those of the last frame.
+@dataclass(frozen=True)
+class Capacity:
+    """Capacities of an eye's kernel buffers.
+
+    Attributes
+    ----------
+    kernels, nodes : int
+        Records of kernels and of node kernels.
+    texels, node_texels : int
+        Texels of their atlases.
+    """
+
+    kernels: int
+    nodes: int
+    texels: int = FIRST_TEXELS
+    node_texels: int = FIRST_TEXELS
+
+    @property
+    def work_items(self) -> int:
+        """Items of a work list: one for each kernel is partly filled."""
+        texels = max(self.texels, self.node_texels)
+        return texels // THREADS + max(self.kernels, self.nodes)
+
+
+class KernelPasses:
+    """Kernels of one eye on the GPU.
 
     Parameters
     ----------
     gpu : Gpu
     slot : int
-        Number of this instance in its context; each has its own atlas.
+        Number of this instance in its context; each has its own memory.
     """
 
-    def __init__(self, gpu: Gpu, slot: int = 0):
-        self._gpu, self._slot = gpu, slot
+    def __init__(self, gpu: Gpu, slot: int = 0) -> None:
+        self.gpu, self._slot = gpu, slot
         self._memory = f"kernels {slot}"
-        self._pairs = ExpectedPairs()
+        self._capacity = Capacity(1, 1)
+        self._buffers: dict[str, Buffer | BufferPart] = {}
+        self._cells_of: ImageCells | None = None
         self.reset()
 
     def reset(self) -> None:
-        """Discard the last frame's kernels and the prediction."""
+        """Discard the kernels."""
         self._made_for: tuple[Any, ...] | None = None
-        self._set: KernelSet | None = None
-        self._pairs.reset()
 
-    def record_pairs(self, state: FrameState, words: NDArray[np.uint32]) -> None:
-        """Record the pairs that a frame used, from which the next are predicted."""
-        self._pairs.record(state, words)
+    def begin(
+        self, handle: GlStore, state: FrameState, timer: StageTimer
+    ) -> "KernelRun":
+        """Upload the state if it has changed, and clear the counters of a frame.
 
-    def predicted(
-        self, handle: GlStore, state: FrameState, timer: StageTimer, fill: Fill
-    ) -> KernelSet | None:
-        """Return kernels for the predicted pairs of a frame.
-
-        Returns None if there is no prediction, or if a readback of the used pairs costs
-        nothing, as on a software renderer.
+        Parameters
+        ----------
+        handle : GlStore
+        state : FrameState
+        timer : StageTimer
         """
-        cached = self.cached(handle, state.layers, state.image)
-        if cached is not None or self._gpu.is_software:
-            return cached
-        with timer.wall("psf_plan_ms"):
-            used = self._pairs.predict(state)
-        if used is None:
-            return None
-        try:
-            return self.kernels(handle, state.layers, state.image, used, timer, fill)
-        except KernelsTooLarge:
-            return None  # the pairs that the frame actually uses may fit
+        gpu, layers, image = self.gpu, state.layers, state.image
+        with timer.stage("upload_ms"):
+            pages, tables = handle.sync()
+        is_kept = self._keeps(handle, state)
+        if not is_kept:
+            self._made_for = None  # remains None if the following fails
+            gpu.claim(self._memory, self)
+            with timer.stage("upload_ms"):
+                self._upload_state(handle, state)
+            self._reserve(image.count, handle.store.fields_count, layers)
+            self._made_for = (handle, layers, image)
+        run = KernelRun(
+            self,
+            handle,
+            state,
+            timer,
+            capacity=self._capacity,
+            is_kept=is_kept,
+            buffers={
+                **self._buffers,
+                **tables,
+                "STATS": gpu.storage("STATS", _WORD_BYTES * STAT_LANES * STAT_WORDS),
+                "USED": gpu.storage("USED", _WORD_BYTES * used_word_count(state)),
+            },
+            atlas=gpu.atlas(self._memory, self._capacity.texels),
+            node_atlas=gpu.atlas(f"nodes {self._slot}", self._capacity.node_texels),
+            pages=pages,
+        )
+        run.clear()
+        return run
 
-    def cached(
-        self, handle: GlStore, layers: FrameLayers, image: ImageCells
-    ) -> KernelSet | None:
-        """Return the last frame's kernels if they are for the same state.
+    def _keeps(self, handle: GlStore, state: FrameState) -> bool:
+        """Return whether the kernels in memory are those of a state.
 
         Another renderer of this context may have overwritten them, because it uses
-        buffers of the same names; None is returned then, too.
+        buffers of the same names.
         """
-        key = (handle, layers, image)
-        if not self._gpu.is_owner(self._memory, self):
-            return None
-        if self._made_for is None or any(
-            a is not b for a, b in zip(self._made_for, key, strict=True)
-        ):
-            return None
-        return self._set
+        if self._made_for is None or not self.gpu.is_owner(self._memory, self):
+            return False
+        key = (handle, state.layers, state.image)
+        return all(a is b for a, b in zip(self._made_for, key, strict=True))
 
-    def kernels(
-        self,
-        handle: GlStore,
-        layers: FrameLayers,
-        image: ImageCells,
-        used: NDArray[np.bool_],
-        timer: StageTimer,
-        fill: Fill,
-    ) -> KernelSet:
-        """Return kernels for all used pairs (n_cells, n_intervals)."""
-        cached = self.cached(handle, layers, image)
-        if cached is not None and not cached.lacks(used):
-            return cached
-        self._made_for = None  # remains None if the following fails
-        with timer.wall("psf_plan_ms"):
-            planned = None
-            if (
-                cached is not None
-            ):  # the next frame may use the last frame's pairs again
-                planned = _plan_or_none(
-                    handle.store, layers, image, used | cached.available, fill
+    def _upload_state(self, handle: GlStore, state: FrameState) -> None:
+        layers, reads = state.layers, state.layers.reads
+        records = np.empty((reads.groups.size, READ_WORDS), np.uint32)
+        records[:, 0] = reads.groups
+        numbers = np.stack([reads.scales, reads.weights], axis=-1)
+        records[:, 1:] = numbers.astype(np.float32).view(np.uint32)
+        self._buffers |= self.gpu.upload_parts(
+            f"state {self._slot}",
+            LAYER_DPT=layers.layer_dpt.astype(np.float32),
+            FIELD_DEFOCUS=state.change_dpt,
+            NODE_DEFOCUS=layers.layer_zero_dpt.astype(np.float32),
+            READS=records,
+        )
+        name, image = f"cells {self._slot}", state.image
+        if self.gpu.is_owner(name, self) and self._cells_of is image:
+            return
+        self.gpu.claim(name, self)
+        self._buffers["CELLS"] = self.gpu.upload(name, cell_records(image))
+        self._cells_of = image
+
+    def _reserve(self, n_cells: int, n_fields: int, layers: FrameLayers) -> None:
+        """Allocate the buffers of a plan, at least for the first kernels."""
+        pairs, node_pairs = (n * interval_count(layers) for n in (n_cells, n_fields))
+        old = self._capacity
+        new = self._capacity = replace(
+            old,
+            kernels=max(old.kernels, min(pairs, FIRST_RECORDS)),
+            nodes=max(old.nodes, min(node_pairs, FIRST_RECORDS)),
+        )
+        own = {  # kept between frames, so each eye has its own
+            "PLAN": _WORD_BYTES * PLAN_WORDS,
+            "KERNEL_OF": _WORD_BYTES * pairs,
+            "NODE_OF": _WORD_BYTES * node_pairs,
+            "KERNELS": _UVEC4_BYTES * KERNEL_WORDS * new.kernels,
+            "NODES": _UVEC4_BYTES * NODE_WORDS * new.nodes,
+        }
+        shared = {
+            "KERNEL_PAIRS": 2 * _WORD_BYTES * new.kernels,
+            "NODE_PAIRS": 2 * _WORD_BYTES * new.nodes,
+            "PARTS": _UVEC4_BYTES * PART_WORDS * new.kernels,
+            "RECIPES": _WORD_BYTES * 2 * RGB * RECIPE_WORDS * new.nodes,
+            "WORK": 2 * _WORD_BYTES * WORK_LISTS * new.work_items,
+        }
+        for name, size in own.items():
+            self._buffers[name] = self.gpu.storage(f"{name} {self._slot}", size)
+        for name, size in shared.items():
+            self._buffers[name] = self.gpu.storage(name, size)
+
+    def grow(self, counts: NDArray[np.uint32]) -> None:
+        """Enlarge the buffers for a plan that did not fit, by its counters."""
+
+        def enlarged(capacity: int, index: int) -> int:
+            count = int(counts[index])
+            if count <= capacity:
+                return capacity
+            return int(HEADROOM * count) + 1
+
+        old = self._capacity
+        self._capacity = Capacity(
+            kernels=enlarged(old.kernels, PLAN_KERNELS),
+            nodes=enlarged(old.nodes, PLAN_NODES),
+            texels=enlarged(old.texels, PLAN_TEXELS),
+            node_texels=enlarged(old.node_texels, PLAN_NODE_TEXELS),
+        )
+        self.reset()
+
+
+@dataclass
+class KernelRun:
+    """Planning and blending of one frame's kernels.
+
+    Parameters
+    ----------
+    is_kept : bool
+        Whether the kernels of frames before are in memory.
+    buffers : dict
+        Buffers by binding.
+    atlas, node_atlas : Atlas
+        Texels of kernels and of node kernels.
+    pages : Pages
+        Cached PSFs.
+
+    Attributes
+    ----------
+    counts : (PLAN_WORDS,), uint32
+        Counters, after the readback.
+    read_words : (n,), uint32
+        A bit for each PSF that new kernels read, after the readback.
+    """
+
+    owner: KernelPasses
+    handle: GlStore
+    state: FrameState
+    timer: StageTimer
+    capacity: Capacity
+    is_kept: bool
+    buffers: dict[str, Buffer | BufferPart]
+    atlas: Atlas
+    node_atlas: Atlas
+    pages: Pages
+
+    def __post_init__(self) -> None:
+        """Allocate the arrays of the readback."""
+        n_read = group_count(self.handle.store.psf_count, BITS_PER_WORD)
+        self.counts = np.zeros(PLAN_WORDS, np.uint32)
+        self.read_words = np.zeros(n_read, np.uint32)
+        self.buffers["READ_PSFS"] = self.owner.gpu.storage(
+            "READ_PSFS", self.read_words.nbytes
+        )
+
+    def clear(self) -> None:
+        """Clear the marks and counters of a frame."""
+        layers, image = self.state.layers, self.state.image
+        pairs, node_pairs = (
+            count * interval_count(layers)
+            for count in (image.count, self.handle.store.fields_count)
+        )
+        used_words = used_word_count(self.state)
+        sizes = [used_words, self.read_words.size, STAT_LANES * STAT_WORDS, PLAN_WORDS]
+        if not self.is_kept:
+            sizes += [pairs, node_pairs]
+        with self.timer.stage("kernel_plan_ms"):
+            self._run(
+                "begin_plan",
+                *("PLAN", "USED", "STATS", "READ_PSFS", "KERNEL_OF", "NODE_OF"),
+                groups=dispatch_grid(group_count(max(sizes), THREADS)),
+                used_words=used_words,
+                read_words=self.read_words.size,
+                pair_count=pairs,
+                node_pair_count=node_pairs,
+                is_new=int(not self.is_kept),
+            )
+
+    def make(self) -> None:
+        """Plan and blend the kernels that the marked pairs lack."""
+        layers, capacity = self.state.layers, self.capacity
+        layer_count, used_words = len(layers.layer_dpt), used_word_count(self.state)
+        software = self.owner.gpu.is_software
+        group = {"GROUP_THREADS": SOFTWARE_THREADS if software else THREADS}
+        with self.timer.stage("kernel_plan_ms"):
+            self._run(
+                "list_kernels",
+                *("USED", "CELLS", "KERNEL_OF", "KERNEL_PAIRS"),
+                *("NODE_OF", "NODE_PAIRS", "PLAN"),
+                groups=dispatch_grid(group_count(used_words, THREADS)),
+                used_words=used_words,
+                words_per_cell=words_per_cell(layers),
+                layer_count=layer_count,
+                kernel_capacity=capacity.kernels,
+                node_capacity=capacity.nodes,
+            )
+            self._run(
+                "plan_nodes",
+                *("NODE_PAIRS", "LAYER_DPT", "NODE_DEFOCUS", "READS"),
+                *("STORE_VALUES", "STORE_STARTS", "STORE_SHIFTS", "STORE_PSFS"),
+                *("RECIPES", "NODES", "WORK", "READ_PSFS", "PLAN"),
+                dispatch=PLAN_FOR_NODES,
+                defines=group,
+                layer_count=layer_count,
+                neighbor_count=layers.reads.groups.size,
+                node_capacity=capacity.nodes,
+                texel_capacity=capacity.node_texels,
+                work_capacity=capacity.work_items,
+            )
+            self._run(
+                "plan_kernels",
+                *("KERNEL_PAIRS", "CELLS", "NODE_OF", "NODES"),
+                *("KERNELS", "PARTS", "WORK", "PLAN"),
+                dispatch=PLAN_FOR_KERNELS,
+                defines=group,
+                layer_count=layer_count,
+                kernel_capacity=capacity.kernels,
+                texel_capacity=capacity.texels,
+                work_capacity=capacity.work_items,
+            )
+        with self.timer.stage("psf_blend_ms"):
+            self._blend(
+                0,
+                "blend_psfs",
+                *("NODES", "RECIPES"),
+                images={"NODES": self.node_atlas},
+                textures={"STORE": self.pages},
+            )
+            self._blend(
+                1,
+                "blend_cells",
+                *("NODES", "PARTS", "KERNELS"),
+                images={"ATLAS": self.atlas},
+                textures={"NODES": self.node_atlas},
+            )
+            for level in range(1, MAX_LEVEL + 1):
+                images = {"ATLAS": self.atlas}
+                self._blend(
+                    1 + level, "merge_psfs", "KERNELS", images=images, level=level
                 )
-            plan = planned or _plan(handle.store, layers, image, used, fill)
-            pages = handle.sync()
-            tables = kernel_tables(plan.kernels, plan.levels, used.shape)
-        with timer.stage("psf_blend_ms"):
-            self._set = self._blend(plan, tables, pages)
-        self._made_for = (handle, layers, image)
-        return self._set
 
-    def _blend(self, plan: "_Plan", tables: KernelTables, pages: Pages) -> KernelSet:
-        gpu = self._gpu
-        node_atlas = gpu.atlas("nodes", tables.node_texel_count)
-        gpu.claim(self._memory, self)
-        atlas = gpu.atlas(self._memory, plan.levels.texel_count)
-        memory = gpu.upload(f"KERNELS {self._slot}", tables.words)
-        parts = {
-            name: BufferPart(memory, _WORD_BYTES * first, _WORD_BYTES * count)
-            for name, (first, count) in tables.parts.items()
+    def _blend(self, work_list: int, name: str, *bindings: str, **options: Any) -> None:
+        self._run(
+            name,
+            *(*bindings, "WORK", "PLAN"),
+            dispatch=PLAN_FOR_WORK + work_list,
+            work_list=work_list,
+            work_capacity=self.capacity.work_items,
+            **options,
+        )
+
+    def _run(
+        self,
+        name: str,
+        *bindings: str,
+        groups: tuple[int, ...] = (1, 1),
+        dispatch: int | None = None,
+        defines: dict[str, int] | None = None,
+        images: dict[str, Any] | None = None,
+        textures: dict[str, Any] | None = None,
+        **uniforms: Any,
+    ) -> None:
+        plan = self._plan
+        self.owner.gpu.passes.dispatch(
+            name,
+            groups,
+            buffers={binding: self.buffers[binding] for binding in bindings},
+            uniforms=uniforms,
+            defines=defines,
+            images=images,
+            textures=textures,
+            indirect=None if dispatch is None else (plan, DISPATCH_BYTES * dispatch),
+        )
+
+    @property
+    def _plan(self) -> Buffer:
+        plan = self.buffers["PLAN"]
+        assert isinstance(plan, Buffer)
+        return plan
+
+    def to_read(
+        self, stats: NDArray[np.uint32]
+    ) -> list[tuple[Buffer, int, NDArray[Any]]]:
+        """Return what to read back, for `Gpu.begin_read`, with the frame's counters."""
+        targets = {"STATS": stats, "PLAN": self.counts, "READ_PSFS": self.read_words}
+        found = []
+        for name, target in targets.items():
+            buffer = self.buffers[name]
+            assert isinstance(buffer, Buffer)
+            found.append((buffer, 0, target))
+        return found
+
+    def is_complete(self, fill: Callable[[NDArray[np.int64]], None]) -> bool:
+        """Return whether the frame had all its kernels, after the readback.
+
+        Otherwise this computes missing PSFs or enlarges buffers, and the frame must be
+        filtered again.
+
+        Parameters
+        ----------
+        fill : callable
+            Function that computes missing PSFs (n,).
+
+        Raises
+        ------
+        KernelsTooLarge
+            There are too many texels, and larger cells are possible.
+        NotPrepared
+            The deadline of ``fill`` has passed.
+        """
+        store, counts = self.handle.store, self.counts
+        if counts[PLAN_NODES] > counts[PLAN_OLD_NODES]:
+            psfs = marked(self.read_words)
+            store.frame_number += 1
+            store.tables.last_used[psfs] = store.frame_number
+            missing = psfs[~store.tables.is_computed[psfs]]
+            if missing.size:
+                self.owner.reset()  # recipes lack these PSFs
+                fill(missing)
+                return False
+        image, spec = self.state.image, store.spec
+        try:
+            check_texels(int(counts[PLAN_BASE_TEXELS]), image, spec)
+            if counts[PLAN_TEXELS] > MAX_KERNEL_TEXELS and can_coarsen(image):
+                raise KernelsTooLarge(
+                    f"the frame's kernels have {counts[PLAN_TEXELS]} texels; expected "
+                    f"at most {MAX_KERNEL_TEXELS}",
+                )
+        except KernelsTooLarge:
+            self.owner.reset()
+            if self.is_kept:  # without those of frames before, they may fit
+                return False
+            raise
+        if counts[PLAN_OVERFLOWS]:
+            if self.is_kept:
+                self.owner.reset()
+            else:
+                self.owner.grow(counts)
+            return False
+        return True
+
+    def frame_counts(self) -> dict[str, int]:
+        """Return the counts of `FilteredView` by name, after the readback."""
+        return {
+            "kernel_count": int(self.counts[PLAN_KERNELS]),
+            "kernel_texel_count": int(self.counts[PLAN_TEXELS]),
         }
 
-        def run(name: str, work: str, *bindings: str, **options: Any) -> None:
-            count = tables.parts[work][1] // 2
-            if not count:
-                return
-            gpu.passes.dispatch(
-                name,
-                dispatch_grid(count),
-                buffers={"WORK": parts[work], **{key: parts[key] for key in bindings}},
-                uniforms={"group_count": count, **options.pop("uniforms", {})},
-                **options,
-            )
 
-        run(
-            *("blend_psfs", NODE_WORK, "NODES", "RECIPES"),
-            images={"NODES": node_atlas},
-            textures={"STORE": pages},
-        )
-        run(
-            *("blend_cells", LEVEL_WORK[0], "NODES", "PARTS", "KERNELS"),
-            images={"ATLAS": atlas},
-            textures={"NODES": node_atlas},
-        )
-        for level, work in enumerate(LEVEL_WORK[1:], start=1):
-            run(
-                *("merge_psfs", work, "KERNELS"),
-                images={"ATLAS": atlas},
-                uniforms={"level": level},
-            )
-        cached = {name: parts[name] for name in ("KERNELS", "KERNEL_OF")}
-        return KernelSet(
-            plan.kernels, plan.levels.texel_count, cached, atlas, plan.used
-        )
+def marked(words: NDArray[np.uint32]) -> NDArray[np.int64]:
+    """Return the numbers (n,) of the bits that are set in words."""
+    return np.flatnonzero(np.unpackbits(words.view(np.uint8), bitorder="little"))
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """Kernels of used pairs, and their sizes."""
-
-    used: NDArray[np.bool_]
-    kernels: FrameKernels
-    levels: KernelLevels
-
-
-def _plan(
-    store: PsfStore,
-    layers: FrameLayers,
-    image: ImageCells,
-    used: NDArray[np.bool_],
-    fill: Fill,
-) -> _Plan:
-    """Plan the kernels of pairs.
-
-    Raises
-    ------
-    KernelsTooLarge
-        There are too many texels, and larger cells are possible.
-    """
-    kernels = frame_kernels(store, layers, image, used, fill=fill)
-    levels = kernel_levels(kernels)
-    check_texels(int(levels.sizes[:, 0].sum()), image, store.spec)
-    if levels.texel_count > MAX_KERNEL_TEXELS and can_coarsen(image):
-        raise KernelsTooLarge(
-            f"the frame's kernels have {levels.texel_count} texels; expected at most "
-            f"{MAX_KERNEL_TEXELS}",
-        )
-    return _Plan(used, kernels, levels)
+def cell_records(image: ImageCells) -> NDArray[np.uint32]:
+    """Return the records (n_cells, CELL_WORDS) of cells: nodes, weights and maps."""
+    count = image.count
+    records = np.empty((count, CELL_WORDS), np.uint32)
+    records[:, :FIELD_CORNERS] = image.nodes
+    numbers = records.view(np.float32)
+    numbers[:, FIELD_CORNERS : 2 * FIELD_CORNERS] = image.weight_ratio
+    numbers[:, 2 * FIELD_CORNERS :] = image.maps.node_from_cell.reshape(count, -1)
+    return records
 
 
-def _plan_or_none(*arguments: Any) -> _Plan | None:
-    try:
-        return _plan(*arguments)
-    except KernelsTooLarge:
-        return None
+def used_word_count(state: FrameState) -> int:
+    """Return the number of words with a bit for each cell and interval."""
+    return state.image.count * words_per_cell(state.layers)
 
 
 def words_per_cell(layers: FrameLayers) -> int:
@@ -264,4 +527,4 @@ def words_per_cell(layers: FrameLayers) -> int:
             f"{layers.layer_dpt[0]:g} and {layers.layer_dpt[-1]:g} dpt",
             allowed=f"{MAX_LAYERS} layers: a smaller pupil or fewer pixels per degree",
         )
-    return -(-interval_count(layers) * USED_PARTS // BITS_PER_WORD)
+    return group_count(interval_count(layers), BITS_PER_WORD)

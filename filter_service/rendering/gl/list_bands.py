@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import (
+    MAX_GROUPS,
     TOTAL_ENTRIES,
     TOTAL_ENTRIES_FLOAT,
     TOTAL_LONGEST,
     TOTAL_LOST,
 )
-from filter_service.rendering.gl.strip import MAX_GROUPS
 
 ENTRY_BYTES = 4
 MAX_BAND_ENTRIES = 16 * 2**20

@@ -57,16 +57,13 @@ class ListPasses:
     Parameters
     ----------
     strip : Strip
-    search_blocks : int
-        Distance, in blocks, within which a bin searches for fragments that reach it.
     atlas : Atlas, optional
         Texels of the fragments' kernels.
     """
 
-    def __init__(self, strip: Strip, search_blocks: int, atlas: Atlas | None = None):
+    def __init__(self, strip: Strip, atlas: Atlas | None = None):
         self.strip = strip
         self.atlas = atlas
-        self.search_blocks = search_blocks
         self.lists = list_bands.ListTotals()
         self.bands: list[tuple[int, int, int]] = []
 
@@ -127,7 +124,7 @@ class ListPasses:
             self.strip.run(
                 "count_bins",
                 self.strip.bin_grid,
-                *("FRAGMENT_PLACE", "BLOCKS", "WINDOWS", "BIN_COUNTS"),
+                *("FRAGMENT_PLACE", "BLOCKS", "WINDOWS", "BIN_COUNTS", "PLAN"),
                 **self._bin_uniforms,
                 order_always=int(self.strip.paper_rule),
                 defines=self._list_threads,
@@ -135,10 +132,11 @@ class ListPasses:
             self.strip.run(
                 "scan_bins",
                 (1, 1),
-                *("BIN_COUNTS", "BIN_OFFSETS", "DISPATCHES"),
+                *("BIN_COUNTS", "BIN_OFFSETS", "DISPATCHES", "PLAN"),
                 bin_count=self.strip.bin_count,
                 entry_capacity=entry_capacity,
                 spare_capacity=spare_capacity,
+                needs_all_psfs=1,
             )
 
     @property
@@ -146,7 +144,6 @@ class ListPasses:
         """Uniforms of ``common/binning.glsl``, and the capacity of a list."""
         return {
             "tile_grid": self.strip.grid,
-            "search_blocks": self.search_blocks,
             "surface_count": self.strip.surface_count,
             "list_capacity": self._list_limit,
         }

@@ -2,15 +2,12 @@
 
 from typing import Any
 
-from filter_service.constants import BIN_TILES, TILE_SIZE_PX
+from filter_service.constants import BIN_TILES, MAX_GROUPS, TILE_SIZE_PX
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.passes import Buffer, BufferPart
 from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rgbd_view import RgbdView
-
-MAX_GROUPS = 65535
-"""Work groups along one axis that every OpenGL 4.3 implementation allows."""
 
 
 def group_count(count: int, size: int) -> int:
@@ -59,7 +56,7 @@ class Strip:
         self.bin_grid = tuple(group_count(side, BIN_TILES) for side in self.grid)
         self.bin_count = self.bin_grid[0] * self.bin_grid[1]
         self.buffers: dict[str, Buffer] = {}
-        self.kernel_buffers: dict[str, BufferPart] = {}
+        self.kernel_buffers: dict[str, Buffer | BufferPart] = {}
 
     def reserve(self, **n_bytes: int) -> None:
         """Allocate named buffers of at least these sizes."""

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import MAX_LEVEL, MERGE_MIN_SPREAD_PX
+from filter_service.constants import MAX_LEVEL, MERGE_MIN_SPREAD_PX, MIN_SPREAD_PX
 from filter_service.native.records import KERNEL_SHAPE
 from filter_service.psfs.boxes import box_sizes
 from filter_service.psfs.frame_layers import FrameLayers
@@ -18,8 +18,6 @@ from filter_service.rendering.frame_kernels import (
 )
 from filter_service.rendering.image_cells import ImageCells, check_texels
 from filter_service.rendering.native.native_store import NativeStore
-
-MIN_SPREAD_PX = 1e-9
 
 
 @dataclass(frozen=True)
