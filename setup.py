@@ -13,6 +13,7 @@ setup(
         # part of filter_service in a wheel, but a top-level folder in a checkout
         "filter_service.shaders",
         "filter_service.shaders.common",
+        "filter_service.shaders.draws",
         "filter_service.shaders.passes",
     ],
     package_dir={"filter_service.shaders": "shaders"},

@@ -170,7 +170,10 @@ IMAGE_NODES = 1
 TEXTURE_ATLAS = 0
 TEXTURE_NODES = 1
 TEXTURE_STORE = 2
-"""Image and texture units: the frame's kernels, those of field nodes, the cache."""
+TEXTURE_COLOR = 3
+TEXTURE_DEPTH = 4
+"""Image and texture units: the frame's kernels, those of field nodes, the cache, and
+color and depth of a frame in textures."""
 
 STORE_SIDE_BITS = 12
 STORE_SIDE = 1 << STORE_SIDE_BITS
@@ -327,6 +330,7 @@ BINDINGS = {
     "BINDING_STORE_SHIFTS": 4,
     "BINDING_STORE_STARTS": 5,
     "BINDING_STORE_PSFS": 6,
+    "BINDING_SAMPLES": 0,
 }
 """Storage buffer bindings; the reference software renderer allows 16 per stage.  The
 passes that plan and blend kernels reuse numbers of the frame's bindings."""

@@ -45,10 +45,12 @@ class Compilers:
         return cls(glslang, spirv_val) if glslang and spirv_val else None
 
 
-def complaints(text: str, files: list[str], compilers: Compilers) -> list[str]:
+def complaints(
+    text: str, files: list[str], compilers: Compilers, stage: str = "comp"
+) -> list[str]:
     """What the compilers have to say about a shader, by the names of its files."""
     with tempfile.TemporaryDirectory() as folder:
-        source, binary = Path(folder) / "pass.comp", Path(folder) / "pass.spv"
+        source, binary = Path(folder) / f"pass.{stage}", Path(folder) / "pass.spv"
         source.write_text(text, encoding="utf-8")
         runs = (
             (compilers.glslang, source),
@@ -70,8 +72,9 @@ def _named(at: re.Match, files: list[str]) -> str:
 def check(variant: Variant, compilers: Compilers) -> list[str]:
     """What is wrong with a variant."""
     defines = dict(variant.defines)
-    text, files = load_shader(f"passes/{variant.name}.comp.glsl", **defines)
-    return [f"{variant}\n{said}" for said in complaints(text, files, compilers)]
+    text, files = load_shader(variant.path, **defines)
+    said = complaints(text, files, compilers, variant.stage)
+    return [f"{variant}\n{line}" for line in said]
 
 
 def main() -> int:

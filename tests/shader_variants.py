@@ -22,6 +22,13 @@ class Variant:
 
     name: str
     defines: tuple[tuple[str, int | float | str], ...]
+    stage: str = "comp"
+
+    @property
+    def path(self) -> str:
+        """File below ``shaders``."""
+        folder = "passes" if self.stage == "comp" else "draws"
+        return f"{folder}/{self.name}.{self.stage}.glsl"
 
     def __str__(self):
         told = [f"{name}={value}" for name, value in self.defines]
@@ -44,12 +51,26 @@ KINDS = {
 """The last has few or small storage blocks: its atlases are textures."""
 
 
+ARRAYS = ("COLOR_IS_ARRAY", "DEPTH_IS_ARRAY")
+
+
 def all_variants() -> list[Variant]:
     """Variants of all passes on drivers of every kind, in order."""
     found: set[Variant] = set()
     for kind in KINDS.values():
         found |= renderer_variants(kind)
-    return sorted(found, key=str)
+    return sorted(found | texture_variants(), key=str)
+
+
+def texture_variants() -> set[Variant]:
+    """Variants of frames in textures, plain ones and layers of arrays."""
+    found = {Variant("whole", (), "vert")}
+    for arrays in (), ("COLOR_IS_ARRAY",), ("DEPTH_IS_ARRAY",), ARRAYS:
+        defines = tuple((name, 1) for name in arrays)
+        found.add(Variant("build_fragments", (*defines, ("FROM_TEXTURES", 1))))
+        found.add(Variant("sample_input", defines))
+        found.add(Variant("show_frame", defines, "frag"))
+    return found
 
 
 def renderer_variants(kind: Kind) -> set[Variant]:
@@ -76,6 +97,7 @@ class _NoGpu(Gpu):
 
     def __init__(self, kind: Kind):
         self.context = _Anything()
+        self._current = None
         self.info = {"renderer": "none"}
         self.is_software = kind.is_software
         self.atlas_is_buffer = kind.atlas_is_buffer
@@ -83,6 +105,9 @@ class _NoGpu(Gpu):
         self.asked: set[Variant] = set()
         self._owners, self._queries = {}, []
         self.passes = _NoPasses(self.asked)
+
+    def entered(self):
+        return nullcontext()
 
     def storage(self, name, n_bytes):
         return _Memory(name, n_bytes)

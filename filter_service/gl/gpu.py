@@ -1,6 +1,7 @@
 """The OpenGL context and its memory: buffers, textures, uploads and readbacks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,15 +13,16 @@ from filter_service import constants
 from filter_service.errors import OutOfGpuMemory, RenderFailed
 from filter_service.gl.choose_device import open_on_device
 from filter_service.gl.copying import copy_bytes
-from filter_service.gl.hardware import is_software_renderer
-from filter_service.gl.passes import Atlas, Buffer, BufferPart, Pages, Passes
-from filter_service.gl.staging import (
-    ALIGNMENT,
-    Group,
-    Staging,
-    gl_calls,
-    has_buffer_storage,
+from filter_service.gl.current_context import (
+    CurrentContext,
+    EglCurrent,
+    current_moderngl_context,
 )
+from filter_service.gl.functions import gl_functions
+from filter_service.gl.hardware import is_software_renderer
+from filter_service.gl.kept_state import KeptState
+from filter_service.gl.passes import Atlas, Buffer, BufferPart, Pages, Passes
+from filter_service.gl.staging import ALIGNMENT, Group, Staging, has_buffer_storage
 from filter_service.gl_device import checked_gl_device, wanted_gl_device
 
 Query = moderngl.Query
@@ -37,30 +39,45 @@ ATLAS_BYTES = 1 << 30
 PART_ALIGNMENT = 256
 """Alignment of the parts of a buffer, which every OpenGL device accepts."""
 
-PASS_BLOCKS = 14
+PASS_BLOCKS = 13
 """Largest number of storage blocks that a pass binds, including its atlases."""
 
 
 class Gpu:
-    """A standalone EGL context with named, grow-only storage buffers.
+    """An OpenGL context with named, grow-only storage buffers.
 
     Parameters
     ----------
     device : str, optional
         "auto", or the index of an EGL device; by default that of the environment.
+    current : CurrentContext, optional
+        Context of the caller to use instead of an own one.  It must be current
+        whenever this object is used.
 
     Attributes
     ----------
     info : dict
-        Renderer, version, index of the EGL device, and limits.
+        Renderer, version, index of the EGL device (None for a context of the caller),
+        and limits.
+    functions : SimpleNamespace or None
+        From `gl_functions`.
     is_software : bool
         Whether the renderer runs on the CPU.
     passes : Passes
     """
 
-    def __init__(self, device: str | None = None) -> None:
-        choice = wanted_gl_device() if device is None else checked_gl_device(device)
-        self.context, index = open_on_device(choice, _context_on)
+    def __init__(
+        self, device: str | None = None, *, current: CurrentContext | None = None
+    ) -> None:
+        index: int | None = None
+        if current is None:
+            choice = wanted_gl_device() if device is None else checked_gl_device(device)
+            self.context, index = open_on_device(choice, _context_on)
+            self.functions = gl_functions()
+        else:
+            self.context = current_moderngl_context(current)
+            self.functions = gl_functions(current.load_opengl_function)
+        self._current, self._egl = current, EglCurrent()
         info = self.context.info
         self.info = {
             "renderer": info["GL_RENDERER"],
@@ -69,6 +86,12 @@ class Gpu:
             "device": index,
             "max_storage_block_bytes": info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"],
         }
+        blocks = int(info["GL_MAX_COMPUTE_SHADER_STORAGE_BLOCKS"])
+        if blocks < PASS_BLOCKS:
+            raise RenderFailed(
+                f"{self.info['renderer']} allows {blocks} storage blocks in a compute "
+                f"shader; the passes need {PASS_BLOCKS}"
+            )
         self.is_software = is_software_renderer(self.info["renderer"])
         self.max_block_bytes = int(info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"])
         self._buffers: dict[str, Buffer] = {}
@@ -77,27 +100,59 @@ class Gpu:
         self._queries: list[moderngl.Query] = []
         self._owners: dict[str, object] = {}
         self._reads: list[_Read] = []
-        self.atlas_is_buffer = not self.is_software and self._holds_large_atlases()
+        self.atlas_is_buffer = (
+            not self.is_software and self.max_block_bytes >= ATLAS_BYTES
+        )
+        self._kept_state = None
+        if current is not None:
+            if self.functions is None:
+                raise RenderFailed("the current OpenGL context lacks functions of 4.4")
+            uses_images = not self.atlas_is_buffer
+            self._kept_state = KeptState(self.functions, uses_images=uses_images)
         # A software renderer uses host memory, where staging would only add a copy.
-        self.use_staging(not self.is_software)
+        # Frames of textures are never waited for, so their counters need it.
+        self.use_staging(not self.is_software or current is not None)
 
-    def _holds_large_atlases(self) -> bool:
-        """Return whether a pass can bind a full-size atlas as a storage buffer."""
-        blocks = int(self.context.info["GL_MAX_COMPUTE_SHADER_STORAGE_BLOCKS"])
-        return blocks >= PASS_BLOCKS and self.max_block_bytes >= ATLAS_BYTES
+    @property
+    def is_lost(self) -> bool:
+        """Return whether the context is the caller's and not current.
+
+        It may have been destroyed, and everything in it.
+        """
+        return self._current is not None and not self._current.is_current
+
+    @contextmanager
+    def entered(self) -> Iterator[None]:
+        """Make the context current, and then the one that was.
+
+        In the caller's context, this keeps its state.
+
+        Raises
+        ------
+        RenderFailed
+            The caller's context is not current.
+        """
+        if self._current is None:
+            with self._egl.kept(), self.context:
+                yield
+            return
+        assert self._kept_state is not None
+        with self.context, self._kept_state.kept():
+            self.passes.forget_bindings()
+            yield
 
     def use_staging(self, wanted: bool) -> None:
         """Enable or disable transfers through mapped memory, if the driver has it."""
-        calls = gl_calls() if wanted and has_buffer_storage(self.context) else None
-        self._staging = (
-            None
-            if calls is None
-            else {way: Staging(self.context, calls) for way in ("to", "from")}
-        )
+        self._staging = None
+        if wanted and self.functions is not None and has_buffer_storage(self.context):
+            rings = (Staging(self.context, self.functions) for _ in range(2))
+            self._staging = dict(zip(("to", "from"), rings, strict=True))
 
     def close(self) -> None:
         """Free all resources; the object cannot be used afterward."""
-        with self.context:  # without a context, the driver frees nothing
+        if self.is_lost:
+            return
+        with self.entered():  # without a context, the driver frees nothing
             for buffer in self._buffers.values():
                 buffer.release()
             for atlas in self._atlases.values():
@@ -302,6 +357,29 @@ class Gpu:
         self._reads.append(waiting)
         self._staging["to"].fence(is_free=True)
         return partial(self._end_read, waiting)
+
+    def begin_late_read(
+        self, *parts: tuple[Buffer, int, NDArray[Any]]
+    ) -> Callable[[], bool]:
+        """Start a readback; return a function that fills the arrays without waiting.
+
+        It returns False until the GPU has copied the data.
+        """
+        if self._staging is None:
+            self.read_into(*parts)
+            return lambda: True
+        self.begin_read(*parts)
+        waiting = self._reads[-1]
+
+        def is_done() -> bool:
+            if not any(one is waiting for one in self._reads):
+                return True
+            if not self._staging or not self._staging["from"].is_passed(waiting.group):
+                return False
+            self._end_read(waiting)
+            return True
+
+        return is_done
 
     def _end_read(self, waiting: "_Read") -> None:
         if not any(one is waiting for one in self._reads):

@@ -1,6 +1,6 @@
 """Compute passes: compilation of variants, and dispatch with named buffers."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import moderngl
 
@@ -44,6 +44,13 @@ class BufferPart(NamedTuple):
     n_bytes: int
 
 
+class TextureUnit(Protocol):
+    """A texture that can be bound to a unit."""
+
+    def use(self, location: int) -> None:
+        """Bind the texture to a unit."""
+
+
 class Passes:
     """Compiled programs of a context, and its current bindings.
 
@@ -53,22 +60,28 @@ class Passes:
 
     Attributes
     ----------
-    programs : dict
+    programs, drawings : dict
         Compiled programs by name and sorted defines.
     """
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
         self.programs: dict[tuple[Any, ...], moderngl.ComputeShader] = {}
+        self.drawings: dict[tuple[Any, ...], moderngl.Program] = {}
         self._variants: dict[tuple[Any, ...], moderngl.ComputeShader] = {}
-        self._uniforms: dict[moderngl.ComputeShader, dict[str, Any]] = {}
+        self._uniforms: dict[Any, dict[str, Any]] = {}
         self._bound: dict[int, Buffer | BufferPart] = {}
 
     def release(self) -> None:
         """Free all programs."""
         for program in self.programs.values():
             program.release()
-        for known in (self.programs, self._variants, self._uniforms, self._bound):
+        for drawing in self.drawings.values():
+            drawing.release()
+        for known in (
+            *(self.programs, self.drawings),
+            *(self._variants, self._uniforms, self._bound),
+        ):
             known.clear()
 
     def program(self, name: str, **defines: int) -> moderngl.ComputeShader:
@@ -86,6 +99,38 @@ class Passes:
         self._variants[name, *defines.items()] = self.programs[key]
         return self.programs[key]
 
+    def drawing(self, vertex: str, fragment: str, **defines: int) -> moderngl.Program:
+        """Return the compiled program of two shaders in ``shaders/draws``, cached.
+
+        Parameters
+        ----------
+        vertex, fragment : str
+            Names without ``.vert.glsl`` and ``.frag.glsl``.
+        """
+        key = (fragment, *sorted(defines.items()))
+        if key not in self.drawings:
+            texts, files = [], []
+            for name in (f"draws/{vertex}.vert.glsl", f"draws/{fragment}.frag.glsl"):
+                text, own = load_shader(name, **defines)
+                texts.append(text)
+                files += own
+            try:
+                self.drawings[key] = self._context.program(
+                    vertex_shader=texts[0], fragment_shader=texts[1]
+                )
+            except moderngl.Error as error:
+                raise ShaderError(legend(str(error), files)) from error
+        return self.drawings[key]
+
+    def forget_bindings(self) -> None:
+        """Forget what is bound, as other code may have changed it."""
+        self._bound.clear()
+
+    def bind(self, buffers: dict[str, Buffer | BufferPart]) -> None:
+        """Bind buffers by binding name without ``BINDING_``."""
+        for binding, buffer in buffers.items():
+            self._bind(BINDING_POINTS[binding], buffer)
+
     def dispatch(
         self,
         name: str,
@@ -95,7 +140,7 @@ class Passes:
         uniforms: dict[str, Any] | None = None,
         defines: dict[str, Any] | None = None,
         images: dict[str, Atlas] | None = None,
-        textures: dict[str, Atlas | Pages] | None = None,
+        textures: "dict[str, Atlas | Pages | TextureUnit] | None" = None,
         indirect: tuple[Buffer, int] | None = None,
     ) -> None:
         """Dispatch a pass, followed by a memory barrier.
@@ -130,10 +175,9 @@ class Passes:
                 defines = {**defines, "ATLAS_IS_BUFFER": 1}
             else:
                 texture.use(getattr(constants, f"TEXTURE_{key}"))
-        for binding, buffer in buffers.items():
-            self._bind(BINDING_POINTS[binding], buffer)
+        self.bind(buffers)
         program = self.program(name, **defines)
-        self._set_uniforms(program, uniforms or {})
+        self.set_uniforms(program, uniforms or {})
         if indirect is not None:
             program.run_indirect(*indirect)
         else:
@@ -154,8 +198,10 @@ class Passes:
             buffer.bind_to_storage_buffer(point)
         self._bound[point] = buffer
 
-    def _set_uniforms(
-        self, program: moderngl.ComputeShader, uniforms: dict[str, Any]
+    def set_uniforms(
+        self,
+        program: moderngl.ComputeShader | moderngl.Program,
+        uniforms: dict[str, Any],
     ) -> None:
         """Set the uniforms that have changed, as each takes a driver call."""
         known = self._uniforms.setdefault(program, {})

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from filter_service.gl.gpu import Gpu, Query
 
@@ -45,6 +45,20 @@ class StageTimer:
         return dict(self._ms)
 
 
+class Untimed:
+    """A stage timer that measures nothing, for frames that are never waited for."""
+
+    def stage(self, name: str) -> AbstractContextManager[None]:
+        """Return a context manager that does nothing."""
+        return nullcontext()
+
+    wall = stage
+
+    def result_ms(self) -> dict[str, float]:
+        """Return no times."""
+        return {}
+
+
 class _Wall:
     """Context manager for wall time; a generator takes four times as long."""
 
@@ -57,3 +71,6 @@ class _Wall:
     def __exit__(self, *raised: object) -> None:
         elapsed_ms = 1e3 * (time.perf_counter() - self._started_s)
         self._times_ms[self._name] = self._times_ms.get(self._name, 0.0) + elapsed_ms
+
+
+Timer = StageTimer | Untimed

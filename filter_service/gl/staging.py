@@ -3,15 +3,14 @@
 Drivers move buffers that are mapped for reading to host memory, and passes then access
 them over the bus.  The buffers of the passes are therefore never mapped; data is copied
 through a separate ring.  This requires `glBufferStorage` (OpenGL 4.4 or
-ARB_buffer_storage), which moderngl does not offer; this module calls it by ctypes.
+ARB_buffer_storage).
 """
 
 import ctypes
-import ctypes.util
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,37 +39,7 @@ GL_SYNC_FLUSH_COMMANDS_BIT = 0x1
 GL_TIMEOUT_EXPIRED, GL_WAIT_FAILED = 0x911B, 0x911D
 WAIT_NS = 1_000_000_000
 
-_uint, _size, _pointer = ctypes.c_uint, ctypes.c_ssize_t, ctypes.c_void_p
-_function = ctypes.CFUNCTYPE
-_PROTOTYPES = {
-    "glGenBuffers": _function(None, ctypes.c_int, _pointer),
-    "glDeleteBuffers": _function(None, ctypes.c_int, _pointer),
-    "glBindBuffer": _function(None, _uint, _uint),
-    "glBufferStorage": _function(None, _uint, _size, _pointer, _uint),
-    "glMapBufferRange": _function(_pointer, _uint, _size, _size, _uint),
-    "glCopyBufferSubData": _function(None, _uint, _uint, _size, _size, _size),
-    "glFenceSync": _function(_pointer, _uint, _uint),
-    "glClientWaitSync": _function(_uint, _pointer, _uint, ctypes.c_uint64),
-    "glDeleteSync": _function(None, _pointer),
-    "glFlush": _function(None),
-}
-
-
-def gl_calls() -> dict[str, Callable[..., Any]] | None:
-    """Return the OpenGL functions of `Staging`, or None if EGL lacks one of them."""
-    library = ctypes.util.find_library("EGL") or "libEGL.so.1"
-    try:
-        address_of = ctypes.CDLL(library).eglGetProcAddress
-    except (OSError, AttributeError):
-        return None
-    address_of.restype, address_of.argtypes = _pointer, [ctypes.c_char_p]
-    calls: dict[str, Callable[..., Any]] = {}
-    for name, prototype in _PROTOTYPES.items():
-        address = address_of(name.encode())
-        if not address:
-            return None
-        calls[name] = prototype(address)
-    return calls
+_uint = ctypes.c_uint
 
 
 def has_buffer_storage(context: "moderngl.Context") -> bool:
@@ -103,15 +72,13 @@ class Staging:
     Parameters
     ----------
     context : moderngl.Context
-    calls : dict
-        From `gl_calls`.
+    functions : SimpleNamespace
+        From `gl_functions`.
     """
 
-    def __init__(
-        self, context: "moderngl.Context", calls: dict[str, Callable[..., Any]]
-    ):
+    def __init__(self, context: "moderngl.Context", functions: SimpleNamespace) -> None:
         self._context = context
-        self._calls = calls
+        self._gl = functions
         self._name = _uint(0)
         self._bytes: NDArray[np.uint8] = np.zeros(0, np.uint8)
         self._groups: deque[Group] = deque()
@@ -126,10 +93,10 @@ class Staging:
         """Free the ring; its allocations must not be accessed afterward."""
         for group in self._groups:
             if group.mark is not None:
-                self._calls["glDeleteSync"](group.mark)
+                self._gl.glDeleteSync(group.mark)
         self._groups.clear()
         if self._name.value:
-            self._calls["glDeleteBuffers"](1, ctypes.byref(self._name))
+            self._gl.glDeleteBuffers(1, ctypes.byref(self._name))
         self._name, self._bytes = _uint(0), np.zeros(0, np.uint8)
         self._first = self._end = 0
 
@@ -165,8 +132,8 @@ class Staging:
         is_free : bool
             Whether their memory may be used again after the fence, without `free`.
         """
-        mark = self._calls["glFenceSync"](GL_SYNC_GPU_COMMANDS_COMPLETE, 0)
-        self._calls["glFlush"]()
+        mark = self._gl.glFenceSync(GL_SYNC_GPU_COMMANDS_COMPLETE, 0)
+        self._gl.glFlush()
         group = Group(self._end, int(mark), is_free)
         self._groups.append(group)
         return group
@@ -193,12 +160,12 @@ class Staging:
     def _waits(self, group: Group, limit_ns: int) -> bool:
         if group.mark is None:
             return True
-        found = self._calls["glClientWaitSync"](
+        found = self._gl.glClientWaitSync(
             group.mark, GL_SYNC_FLUSH_COMMANDS_BIT, limit_ns
         )
         if found == GL_TIMEOUT_EXPIRED:
             return False
-        self._calls["glDeleteSync"](group.mark)
+        self._gl.glDeleteSync(group.mark)
         group.mark = None
         if found == GL_WAIT_FAILED:
             raise RenderFailed("the OpenGL driver has lost the GPU")
@@ -240,24 +207,24 @@ class Staging:
     def _copy(
         self, source: int, target: int, read_at: int, write_at: int, n_bytes: int
     ) -> None:
-        calls = self._calls
-        calls["glBindBuffer"](GL_COPY_READ_BUFFER, source)
-        calls["glBindBuffer"](GL_COPY_WRITE_BUFFER, target)
-        calls["glCopyBufferSubData"](
+        gl = self._gl
+        gl.glBindBuffer(GL_COPY_READ_BUFFER, source)
+        gl.glBindBuffer(GL_COPY_WRITE_BUFFER, target)
+        gl.glCopyBufferSubData(
             GL_COPY_READ_BUFFER, GL_COPY_WRITE_BUFFER, read_at, write_at, n_bytes
         )
 
     def _map_ring(self, n_bytes: int) -> None:
         self.release()
-        calls = self._calls
+        gl = self._gl
         access = GL_MAP_READ_BIT | GL_MAP_WRITE_BIT
         access |= GL_MAP_PERSISTENT_BIT | GL_MAP_COHERENT_BIT
-        calls["glGenBuffers"](1, ctypes.byref(self._name))
-        calls["glBindBuffer"](GL_COPY_READ_BUFFER, self._name)
-        calls["glBufferStorage"](
+        gl.glGenBuffers(1, ctypes.byref(self._name))
+        gl.glBindBuffer(GL_COPY_READ_BUFFER, self._name)
+        gl.glBufferStorage(
             GL_COPY_READ_BUFFER, n_bytes, None, access | GL_CLIENT_STORAGE_BIT
         )
-        address = calls["glMapBufferRange"](GL_COPY_READ_BUFFER, 0, n_bytes, access)
+        address = gl.glMapBufferRange(GL_COPY_READ_BUFFER, 0, n_bytes, access)
         if not address:
             self.release()
             raise OutOfGpuMemory(f"cannot map {n_bytes / 1e6:.0f} MB of memory")

@@ -13,6 +13,7 @@ from filter_service.rendering.filtered_view import FilteredView
 from filter_service.rendering.sampled_frame import SampledFrame
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
+from filter_service.texture_view import EarlierFrame, GlTexture, TextureView
 
 
 class LoadedStore(Protocol):
@@ -68,6 +69,52 @@ class ViewRequest:
     options: RenderOptions = DEFAULT_OPTIONS
     out: NDArray[Any] | None = None
     until_s: float | None = None
+
+
+@dataclass(frozen=True)
+class TextureRequest:
+    """One view in textures to filter, with the eye, its state and the options.
+
+    Attributes
+    ----------
+    view : TextureView
+    target : GlTexture
+        Texture for the filtered image: "rgba8" or "srgb8_a8" for sRGB values, "rgba16f"
+        for linear light.
+    handle : LoadedStore
+        PSFs of the eye, loaded by the engine.
+    target_is_top_first : bool
+        Whether the first row of the target is the top of the image.
+    """
+
+    view: TextureView
+    target: GlTexture
+    handle: Any
+    pupil_diameter_mm: float
+    focus_dpt: float
+    gaze_deg: tuple[float, float] | None = None
+    target_is_top_first: bool = False
+    options: RenderOptions = DEFAULT_OPTIONS
+
+
+@dataclass(frozen=True)
+class ShownTexture:
+    """State of the eye in a frame of textures, which the GPU may not have finished.
+
+    Attributes
+    ----------
+    pupil_diameter_mm, focus_dpt, gaze_deg
+        After clamping to the prepared ranges.
+    notes : tuple of str
+    earlier : EarlierFrame or None
+        The newest frame through this eye that the GPU has finished.
+    """
+
+    pupil_diameter_mm: float
+    focus_dpt: float
+    gaze_deg: tuple[float, float]
+    notes: tuple[str, ...]
+    earlier: EarlierFrame | None
 
 
 Pending = Callable[[], FilteredView]

@@ -4,6 +4,7 @@
 // In:  COLOR_IN (bytes RGB, sRGB; or linear RGB: f32 when COLOR_IS_LINEAR, halves when
 //      COLOR_IS_HALF),
 //      DEPTH_IN (f32 meters; hidden pixels are empty unless it is above 0),
+//      or both in textures when FROM_TEXTURES, where missing depth is infinite,
 //      LAYER_DPT, FIELD_DEFOCUS (change of defocus at the corners of the cells).
 // Out: PIXELS (linear RGB, vergence dpt; negative where nothing is hidden),
 //      PIXEL_LAYER (position), USED (a bit per cell and interval), STATS
@@ -17,8 +18,12 @@
 
 layout(local_size_x = TILE_SIZE_PX, local_size_y = TILE_SIZE_PX) in;
 
+#ifdef FROM_TEXTURES
+#include "common/input_textures.glsl"
+#else
 layout(std430, binding = BINDING_COLOR_IN) readonly buffer ColorIn { uint color_in[]; };
 layout(std430, binding = BINDING_DEPTH_IN) readonly buffer DepthIn { float depth_in[]; };
+#endif
 layout(std430, binding = BINDING_LAYER_DPT) readonly buffer LayerDpt { float layer_dpt[]; };
 layout(std430, binding = BINDING_PIXELS) writeonly buffer Pixels { vec4 pixels[]; };
 layout(std430, binding = BINDING_PIXEL_LAYER) writeonly buffer Position { float position[]; };
@@ -47,6 +52,17 @@ uniform float blur_px_per_dpt;    // slope of defocus blur at this pupil
 shared uint group_used[MAX_LAYERS / BITS_PER_WORD];
 shared uint group_stats[STAT_FRAGMENTS];  // counters of this pass
 
+#ifdef FROM_TEXTURES
+ivec2 image_pixel(uint pixel) {
+    return ivec2(int(pixel) % frame_size_px.x, int(pixel) / frame_size_px.x);
+}
+
+vec3 read_linear_rgb(uint pixel) {
+    return input_color(image_pixel(pixel), frame_size_px).rgb;
+}
+
+float read_depth_m(uint pixel) { return input_depth_m(image_pixel(pixel), frame_size_px); }
+#else
 uint byte_at(uint index) {
     uint word = color_in[index / uint(BYTES_PER_WORD)];
     return (word >> (uint(BYTE_BITS) * (index % uint(BYTES_PER_WORD)))) & BYTE_MASK;
@@ -69,6 +85,9 @@ vec3 read_linear_rgb(uint pixel) {
     return linear_from_srgb(vec3(bytes) / BYTE_MAX);
 #endif
 }
+
+float read_depth_m(uint pixel) { return depth_in[pixel]; }
+#endif
 
 // Whether depth is present: above 0, or infinite.  Tested by its bits, because a compiler
 // may assume that no value is NaN.
@@ -129,10 +148,14 @@ float layer_position(float dpt) {
 // Object distance, or NOTHING_DPT if a hidden pixel is empty, or so close to the surface
 // in front of it that the two would blur alike.
 float distance_of(uint pixel, uint seen, vec2 at) {
-    if (pixel == seen) return vergence_dpt(depth_in[pixel], at);
-    if (!is_depth(depth_in[pixel])) return NOTHING_DPT;
-    float dpt = vergence_dpt(depth_in[pixel], at);
-    float behind = vergence_dpt(depth_in[seen], at) - dpt;
+    float depth_m = read_depth_m(pixel);
+#ifdef FROM_TEXTURES
+    if (!is_depth(depth_m)) return 0.0;
+#endif
+    if (pixel == seen) return vergence_dpt(depth_m, at);
+    if (!is_depth(depth_m)) return NOTHING_DPT;
+    float dpt = vergence_dpt(depth_m, at);
+    float behind = vergence_dpt(read_depth_m(seen), at) - dpt;
     return behind * blur_px_per_dpt > DISCONTINUITY_PX ? dpt : NOTHING_DPT;
 }
 
@@ -151,10 +174,11 @@ void note_use(ivec2 at, float place) {
 // Counts the defects of a pixel, once: repeated pixels of a frame are not counted.
 void note_faults(ivec2 at, uint pixel, uint seen, bool is_finite) {
     if (any(lessThan(at, counted_px.xy)) || any(greaterThanEqual(at, counted_px.zw))) return;
-    bool holds = is_depth(depth_in[pixel]);
+    float depth_m = read_depth_m(pixel);
+    bool holds = is_depth(depth_m);
     if (!holds && pixel == seen) atomicAdd(group_stats[STAT_MISSING], 1u);
     if (!is_finite && (holds || pixel == seen)) atomicAdd(group_stats[STAT_BAD_COLOR], 1u);
-    if (holds && !is_prepared(depth_in[pixel], vec2(at)))
+    if (holds && !is_prepared(depth_m, vec2(at)))
         atomicAdd(group_stats[STAT_CLAMPED], 1u);
 }
 

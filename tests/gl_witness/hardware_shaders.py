@@ -7,4 +7,4 @@ def use_hardware_shaders() -> None:
     """Take every renderer of this process for a GPU."""
     gpu.is_software_renderer = lambda name: False
     # Storage blocks of these drivers end at 128 MB: enough for what the tests draw.
-    gpu.Gpu._holds_large_atlases = lambda self: True
+    gpu.ATLAS_BYTES = 0

@@ -5,23 +5,14 @@ import numpy as np
 from filter_service.constants import SORT_CAPACITIES
 from filter_service.gl.gpu import Gpu
 from filter_service.psfs import layer_loops, read_loops
-from filter_service.rendering import kernel_loops, map_loops
 from filter_service.rendering.gl.compile_passes import compile_passes
 from filter_service.rendering.gl.renderer import FilterRenderer
 from tests.conftest import Engine
 from tests.numerical.synthetic import Bench, texture
 from tests.shader_variants import Kind, renderer_variants
 
-MODULES = (kernel_loops, map_loops, layer_loops, read_loops)
-INNER = {
-    "clipped",
-    "bracket",
-    "channel_taps",
-    "number_marked",
-    "mapped_reach",
-    "needs_map",
-}
-INNER |= {"layer_blur_px", "_steps", "_between"}
+MODULES = (layer_loops, read_loops)
+INNER = {"clipped", "bracket", "channel_taps", "layer_blur_px", "_steps", "_between"}
 """Called by other loops alone: where those are read from disk, they are not."""
 
 

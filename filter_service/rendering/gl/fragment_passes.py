@@ -19,6 +19,7 @@ from filter_service.constants import (
 from filter_service.rendering.gl.kernel_passes import KernelRun, words_per_cell
 from filter_service.rendering.gl.strip import Strip, group_count
 from filter_service.rendering.image_cells import ImageCells
+from filter_service.rgbd_view import RgbdView
 
 COLOR_VARIANTS = {
     "uint8": None,
@@ -81,7 +82,7 @@ class FragmentPasses:
         self.image = image
         self.tolerance = tolerance
         self.first_row = first_row
-        self.scan = (first_row * strip.view.width_px, frame_pixel_count)
+        self.scan = (first_row * strip.size[0], frame_pixel_count)
         self.image_size_px = image_size_px
         self.border_px = border_px
         self.counted_px = counted_px
@@ -90,31 +91,24 @@ class FragmentPasses:
         self.white_level = white_level
         self.is_encoded = is_encoded and white_level > 0.0
 
-    def upload(self) -> None:
-        """Upload the strip, padded to whole words."""
-        colors, depths_m = (
-            self.strip.view.surface_colors,
-            self.strip.view.surface_depths_m,
-        )
-        with self.strip.timer.stage("upload_ms"):
-            n_bytes = sum(color.nbytes for color in colors)
-            n_bytes = group_count(n_bytes, BYTES_PER_WORD) * BYTES_PER_WORD
-            self.strip.reserve(COLOR_IN=n_bytes)
-            self.strip.buffers["COLOR_IN"] = self.strip.gpu.upload("COLOR_IN", *colors)
-            self.strip.buffers["DEPTH_IN"] = self.strip.gpu.upload(
-                "DEPTH_IN", *depths_m
-            )
+    def source(self) -> dict[str, Any]:
+        """Return how ``build_fragments`` reads the input, as options of `Strip.run`.
+
+        ``bindings`` are the buffers that it reads.
+        """
+        raise NotImplementedError
 
     def build_fragments(self, kernels: KernelRun) -> None:
         """Compute linear light, vergence and layer of pixels, and the used pairs."""
         n_pixels = self.strip.surface_count * self.strip.pixel_count
         self.strip.reserve(PIXELS=16 * n_pixels, PIXEL_LAYER=4 * n_pixels)
         self.strip.kernel_buffers = kernels.buffers
+        source = self.source()
         with self.strip.timer.stage("fragments_ms"):
             self.strip.run(
                 "build_fragments",
                 (*self.strip.grid, self.strip.surface_count),
-                *("COLOR_IN", "DEPTH_IN", "LAYER_DPT", "FIELD_DEFOCUS"),
+                *(*source.pop("bindings"), "LAYER_DPT", "FIELD_DEFOCUS"),
                 *("PIXELS", "PIXEL_LAYER", "USED", "STATS"),
                 **self._common,
                 words_per_cell=words_per_cell(self.strip.layers),
@@ -126,7 +120,7 @@ class FragmentPasses:
                 blur_px_per_dpt=self.strip.layers.blur_px_per_dpt,
                 object_range_dpt=self.object_range_dpt,
                 counted_px=self.counted_px,
-                defines=COLOR_VARIANTS[self.strip.view.color.dtype.name],
+                **source,
             )
 
     @property
@@ -185,4 +179,37 @@ class FragmentPasses:
             "bad_color_count": stats[STAT_BAD_COLOR],
             "fragment_count": stats[STAT_FRAGMENTS],
             "merged_count": stats[STAT_MERGED],
+        }
+
+
+class ArrayFragments(FragmentPasses):
+    """Fragments of an image in host memory.
+
+    Parameters
+    ----------
+    view : RgbdView
+        The image of the strip.
+    """
+
+    def __init__(self, strip: Strip, view: RgbdView, **values: Any) -> None:
+        super().__init__(strip, **values)
+        self._view = view
+
+    def upload(self) -> None:
+        """Upload the image, padded to whole words."""
+        colors, depths_m = self._view.surface_colors, self._view.surface_depths_m
+        with self.strip.timer.stage("upload_ms"):
+            n_bytes = sum(color.nbytes for color in colors)
+            n_bytes = group_count(n_bytes, BYTES_PER_WORD) * BYTES_PER_WORD
+            self.strip.reserve(COLOR_IN=n_bytes)
+            self.strip.buffers["COLOR_IN"] = self.strip.gpu.upload("COLOR_IN", *colors)
+            self.strip.buffers["DEPTH_IN"] = self.strip.gpu.upload(
+                "DEPTH_IN", *depths_m
+            )
+
+    def source(self) -> dict[str, Any]:
+        """Return the variant for the type of the color image, and its buffers."""
+        return {
+            "defines": COLOR_VARIANTS[self._view.color.dtype.name],
+            "bindings": ("COLOR_IN", "DEPTH_IN"),
         }

@@ -13,7 +13,7 @@ from filter_service.constants import (
     THREADS,
     TOTAL_WORDS,
 )
-from filter_service.rendering.gl.fragment_passes import FragmentPasses
+from filter_service.rendering.gl.fragment_passes import ArrayFragments
 from filter_service.rendering.gl.kernel_passes import KernelRun
 from filter_service.rendering.gl.list_passes import ListPasses
 from filter_service.rendering.gl.strip import Strip, dispatch_grid, group_count
@@ -35,7 +35,7 @@ class FramePasses:
     Parameters
     ----------
     strip : Strip
-    fragments : FragmentPasses
+    fragments : ArrayFragments
         Fragments of the same strip.
     begin_kernels : callable
         Function that begins to plan the kernels of the strip.
@@ -50,7 +50,7 @@ class FramePasses:
     def __init__(
         self,
         strip: Strip,
-        fragments: FragmentPasses,
+        fragments: ArrayFragments,
         begin_kernels: Callable[[], KernelRun],
     ):
         self.strip = strip

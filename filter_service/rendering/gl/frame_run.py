@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.frame_layers import FrameLayers
-from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.frame import (
     border_px_of,
@@ -24,7 +23,7 @@ from filter_service.rendering.frame import (
     reach_px_of,
 )
 from filter_service.rendering.gl.eye_states import EyeState
-from filter_service.rendering.gl.fragment_passes import FragmentPasses
+from filter_service.rendering.gl.fragment_passes import ArrayFragments
 from filter_service.rendering.gl.frame_passes import FramePasses
 from filter_service.rendering.gl.kernel_passes import FrameState
 from filter_service.rendering.gl.strip import Strip
@@ -195,8 +194,9 @@ class FrameRun:
             layers=self.layers,
             paper_rule=options.accumulation == "paper",
         )
-        fragments = FragmentPasses(
+        fragments = ArrayFragments(
             strip,
+            rows.view,
             image=image,
             tolerance=options.render_tolerance if options.merge else 0.0,
             first_row=rows.first_row,
@@ -204,7 +204,7 @@ class FrameRun:
             image_size_px=(self._view.width_px, self._view.height_px),
             border_px=plan.border_px,
             counted_px=counted_px(rows, self._view, plan.border_px),
-            object_range_dpt=_prepared_range_dpt(self._eye.handle.store),
+            object_range_dpt=self._eye.handle.prepared_range_dpt,
             white_level=plan.white_level,
             is_encoded=self.output == "srgb8",
         )
@@ -252,10 +252,3 @@ class _StripRun:
             self.passes = self._frame.passes_of(self.plan, self.rows)
             self.begin()
         return picture
-
-
-def _prepared_range_dpt(store: PsfStore) -> tuple[float, float]:
-    """Return the range of prepared object distances, with a margin for rounding."""
-    low_dpt, high_dpt = store.spec.object_range_dpt
-    margin = 1e-6 * max(high_dpt, 1.0)
-    return low_dpt - margin, high_dpt + margin

@@ -36,9 +36,16 @@ class GlStore(FrameStore):
         self._parts: dict[str, BufferPart] = {}
         self._tables: StoreTables | None = None  # of which the parts are a copy
         self._n_batches = 0
-        with gpu.context:
+        with gpu.entered():
             self.sync()
         _ = store.defocus  # computed here and not by the first frame
+
+    @property
+    def prepared_range_dpt(self) -> tuple[float, float]:
+        """Return the range of prepared object distances, with a margin for rounding."""
+        low_dpt, high_dpt = self.store.spec.object_range_dpt
+        margin = 1e-6 * max(high_dpt, 1.0)
+        return low_dpt - margin, high_dpt + margin
 
     def sync(self) -> tuple[Pages, dict[str, BufferPart]]:
         """Upload what has changed since the last call.
@@ -93,7 +100,9 @@ class GlStore(FrameStore):
     def release(self) -> None:
         """Free the GPU copy."""
         self.is_released = True
-        with self._gpu.context:  # without a context, the driver frees nothing
+        if self._gpu.is_lost:
+            return
+        with self._gpu.entered():  # without a context, the driver frees nothing
             self._free_pages()
             self._free_tables()
 

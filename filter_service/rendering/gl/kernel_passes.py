@@ -42,7 +42,7 @@ from filter_service.constants import (
 from filter_service.errors import GridTooLarge
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.passes import Atlas, Buffer, BufferPart, Pages
-from filter_service.gl.stage_timer import StageTimer
+from filter_service.gl.stage_timer import Timer
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.frame_kernels import interval_count
 from filter_service.rendering.gl.gl_store import GlStore
@@ -135,16 +135,14 @@ class KernelPasses:
         """Discard the kernels."""
         self._made_for: tuple[Any, ...] | None = None
 
-    def begin(
-        self, handle: GlStore, state: FrameState, timer: StageTimer
-    ) -> "KernelRun":
+    def begin(self, handle: GlStore, state: FrameState, timer: Timer) -> "KernelRun":
         """Upload the state if it has changed, and clear the counters of a frame.
 
         Parameters
         ----------
         handle : GlStore
         state : FrameState
-        timer : StageTimer
+        timer : Timer
         """
         gpu, layers, image = self.gpu, state.layers, state.image
         with timer.stage("upload_ms"):
@@ -236,14 +234,12 @@ class KernelPasses:
         for name, size in shared.items():
             self._buffers[name] = self.gpu.storage(name, size)
 
-    def grow(self, counts: NDArray[np.uint32]) -> None:
-        """Enlarge the buffers for a plan that did not fit, by its counters."""
+    def grow(self, counts: NDArray[np.uint32], headroom: float = HEADROOM) -> None:
+        """Enlarge the buffers to a multiple of a plan's counters, if need be."""
 
         def enlarged(capacity: int, index: int) -> int:
             count = int(counts[index])
-            if count <= capacity:
-                return capacity
-            return int(HEADROOM * count) + 1
+            return max(capacity, int(headroom * count) + 1)
 
         old = self._capacity
         self._capacity = Capacity(
@@ -281,7 +277,7 @@ class KernelRun:
     owner: KernelPasses
     handle: GlStore
     state: FrameState
-    timer: StageTimer
+    timer: Timer
     capacity: Capacity
     is_kept: bool
     buffers: dict[str, Buffer | BufferPart]
@@ -483,6 +479,28 @@ class KernelRun:
                 self.owner.grow(counts)
             return False
         return True
+
+    def keep_headroom(self, ratio: float) -> None:
+        """Keep the buffers larger than what the frame used, for frames that need more.
+
+        Parameters
+        ----------
+        ratio : float
+            Least capacity, relative to the use.
+        """
+        counts, capacity = self.counts, self.capacity
+        needs = {
+            PLAN_KERNELS: capacity.kernels,
+            PLAN_NODES: capacity.nodes,
+            PLAN_TEXELS: capacity.texels,
+            PLAN_NODE_TEXELS: capacity.node_texels,
+        }
+        if all(ratio * int(counts[index]) <= size for index, size in needs.items()):
+            return
+        if self.is_kept:
+            self.owner.reset()  # without the kernels of frames before
+        else:
+            self.owner.grow(counts, headroom=2.0 * ratio)
 
     def frame_counts(self) -> dict[str, int]:
         """Return the counts of `FilteredView` by name, after the readback."""

@@ -59,11 +59,17 @@ class ListPasses:
     strip : Strip
     atlas : Atlas, optional
         Texels of the fragments' kernels.
+    is_late : bool
+        Whether the totals are read after later frames have started, so that lists are
+        made once, in one band, and frames without some PSFs are shown.
     """
 
-    def __init__(self, strip: Strip, atlas: Atlas | None = None):
+    def __init__(
+        self, strip: Strip, atlas: Atlas | None = None, *, is_late: bool = False
+    ):
         self.strip = strip
         self.atlas = atlas
+        self._is_late = is_late
         self.lists = list_bands.ListTotals()
         self.bands: list[tuple[int, int, int]] = []
 
@@ -136,7 +142,7 @@ class ListPasses:
                 bin_count=self.strip.bin_count,
                 entry_capacity=entry_capacity,
                 spare_capacity=spare_capacity,
-                needs_all_psfs=1,
+                needs_all_psfs=int(not self._is_late),
             )
 
     @property
@@ -152,7 +158,7 @@ class ListPasses:
     def _list_limit(self) -> int:
         """Capacity of a band, and of one list, in entries."""
         fit = self.strip.gpu.max_block_bytes // ENTRY_BYTES
-        return min(list_bands.MAX_BAND_ENTRIES, fit)
+        return fit if self._is_late else min(list_bands.MAX_BAND_ENTRIES, fit)
 
     def _plan_bands(self) -> list[tuple[int, int, int]]:
         """Return the bands as (first bin, bin count, entries)."""
@@ -179,6 +185,13 @@ class ListPasses:
         self.strip.reserve(ENTRIES=n_bytes)
         needs_spare = self.lists.longest > SORT_CAPACITIES[-1]
         self.strip.reserve(ENTRIES_SPARE=n_bytes if needs_spare else 0)
+
+    def reserve_more(self, ratio: float) -> None:
+        """Enlarge the buffers to a multiple of the recorded totals, if need be."""
+        entries = min(int(ratio * self.lists.entry_count), self._list_limit)
+        self.strip.reserve(ENTRIES=ENTRY_BYTES * entries)
+        if self.lists.longest > SORT_CAPACITIES[-1]:
+            self.strip.reserve(ENTRIES_SPARE=ENTRY_BYTES * entries)
 
     def splat_bands(self) -> None:
         """Build, sort and splat the lists, band by band."""

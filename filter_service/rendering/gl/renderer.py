@@ -5,12 +5,23 @@ from functools import partial
 
 from filter_service.gl.gpu import Gpu
 from filter_service.psfs.store import PsfStore
-from filter_service.rendering.engine import OneView, Pending, ViewRequest
+from filter_service.rendering.engine import (
+    OneView,
+    Pending,
+    ShownTexture,
+    TextureRequest,
+    ViewRequest,
+)
 from filter_service.rendering.filtered_view import FilteredView, input_notes
 from filter_service.rendering.gl.eye_states import EyeStates
 from filter_service.rendering.gl.frame_run import FrameRun
 from filter_service.rendering.gl.gl_store import GlStore
-from filter_service.rendering.request_checks import check_request, output_array
+from filter_service.rendering.gl.texture_frames import TextureFrames
+from filter_service.rendering.request_checks import (
+    check_options,
+    check_request,
+    output_array,
+)
 
 
 class FilterRenderer(OneView):
@@ -20,6 +31,7 @@ class FilterRenderer(OneView):
         self._gpu = gpu
         self._eyes = EyeStates(gpu)
         self._had_missing_depth = False
+        self._textures: TextureFrames | None = None
 
     @property
     def name(self) -> str:
@@ -51,7 +63,7 @@ class FilterRenderer(OneView):
         """
         gaze = check_request(request, request.handle.store)
         # The application's own context may be current.
-        with self._gpu.context:
+        with self._gpu.entered():
             run = FrameRun(
                 self._gpu,
                 self._eyes.of(request.handle),
@@ -62,10 +74,41 @@ class FilterRenderer(OneView):
             )
         return partial(self._finish, run, *gaze)
 
+    def filter_textures(self, request: TextureRequest) -> ShownTexture:
+        """Filter a view from textures to a texture, without waiting for the GPU.
+
+        Raises
+        ------
+        BadMessage
+            Textures or options are invalid.
+        CameraMismatch
+            The store is for another camera, see `camera.is_same_camera`.
+        RenderFailed
+            The context is not current, or OpenGL cannot draw to the target.
+        OutOfGpuMemory
+        """
+        gaze_deg, notes = check_options(
+            request.options, request.view.camera, request.handle.store, request.gaze_deg
+        )
+        with self._gpu.entered():
+            if self._textures is None:
+                self._textures = TextureFrames(self._gpu)
+            self._textures.check(request)
+            layers, earlier = self._textures.filter(
+                request, self._eyes.of(request.handle), gaze_deg
+            )
+        return ShownTexture(
+            pupil_diameter_mm=layers.pupil_diameter_mm,
+            focus_dpt=layers.focus_dpt,
+            gaze_deg=gaze_deg,
+            notes=(*layers.notes, *notes),
+            earlier=earlier,
+        )
+
     def _finish(
         self, run: FrameRun, gaze_deg: tuple[float, float], gaze_notes: tuple[str, ...]
     ) -> FilteredView:
-        with self._gpu.context:
+        with self._gpu.entered():
             color, counts = run.finish()
             self._gpu.check("render")
             stages_ms = run.timer.result_ms()

@@ -1,13 +1,13 @@
 """Size and buffers of a frame, or a strip of it, in the passes."""
 
-from typing import Any
+from typing import Any, Protocol
 
+from filter_service.camera import Tangents
 from filter_service.constants import BIN_TILES, MAX_GROUPS, TILE_SIZE_PX
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.passes import Buffer, BufferPart
-from filter_service.gl.stage_timer import StageTimer
+from filter_service.gl.stage_timer import Timer
 from filter_service.psfs.frame_layers import FrameLayers
-from filter_service.rgbd_view import RgbdView
 
 
 def group_count(count: int, size: int) -> int:
@@ -21,12 +21,27 @@ def dispatch_grid(groups: int) -> tuple[int, int]:
     return columns, group_count(groups, columns)
 
 
+class StripView(Protocol):
+    """What the passes of a strip need to know of its image."""
+
+    @property
+    def width_px(self) -> int: ...  # noqa: D102
+    @property
+    def height_px(self) -> int: ...  # noqa: D102
+    @property
+    def tangents(self) -> Tangents: ...  # noqa: D102
+    @property
+    def depth_kind(self) -> str: ...  # noqa: D102
+    @property
+    def surface_count(self) -> int: ...  # noqa: D102
+
+
 class Strip:
     """State that all passes of a strip share; its buffers belong to the context.
 
     Parameters
     ----------
-    view : RgbdView
+    view : RgbdView or TextureView
         The strip; hidden depth is 0 where the hidden layer is empty.
     layers : FrameLayers
     paper_rule : bool
@@ -36,8 +51,8 @@ class Strip:
     def __init__(
         self,
         gpu: Gpu,
-        view: RgbdView,
-        timer: StageTimer,
+        view: StripView,
+        timer: Timer,
         *,
         layers: FrameLayers,
         paper_rule: bool,

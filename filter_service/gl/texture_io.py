@@ -1,0 +1,195 @@
+"""Textures of the caller as input and output of passes, in its own context."""
+
+import ctypes
+from types import SimpleNamespace
+from typing import Any
+
+import moderngl
+
+from filter_service.errors import BadMessage, RenderFailed
+from filter_service.texture_view import GlTexture
+
+GL_TEXTURE_2D, GL_TEXTURE_2D_ARRAY, GL_TEXTURE0 = 0x0DE1, 0x8C1A, 0x84C0
+GL_TEXTURE_WIDTH, GL_TEXTURE_HEIGHT, GL_TEXTURE_DEPTH = 0x1000, 0x1001, 0x8071
+GL_TEXTURE_INTERNAL_FORMAT = 0x1003
+GL_DRAW_FRAMEBUFFER, GL_COLOR_ATTACHMENT0 = 0x8CA9, 0x8CE0
+GL_FRAMEBUFFER_COMPLETE = 0x8CD5
+GL_TEXTURE_SRGB_DECODE_EXT, GL_SKIP_DECODE_EXT = 0x8A48, 0x8A4A
+SRGB_DECODE = "GL_EXT_texture_sRGB_decode"
+
+NEAREST_PARAMETERS = {
+    0x2800: 0x2600,  # magnification: nearest
+    0x2801: 0x2600,  # minification: nearest, without mipmaps
+    0x884C: 0,  # no comparison of depth
+}
+
+INTERNAL_FORMATS = {
+    "rgba8": (0x8058, 0x1908),
+    "srgb8_a8": (0x8C43,),
+    "rgba16f": (0x881A,),
+    "d32f": (0x8CAC, 0x8CAD),  # without or with stencil
+    "d24": (0x81A6, 0x88F0),
+    "r32f": (0x822E,),
+}
+"""OpenGL's internal formats of each format."""
+
+
+class BoundTexture:
+    """A texture of the caller that passes sample.
+
+    Parameters
+    ----------
+    sampler : int
+        Name of a sampler to use instead of the texture's parameters.
+    """
+
+    def __init__(
+        self, functions: SimpleNamespace, texture: GlTexture, sampler: int
+    ) -> None:
+        self._gl, self._texture, self._sampler = functions, texture, sampler
+
+    def use(self, location: int) -> None:
+        """Bind the texture and the sampler to a unit."""
+        gl = self._gl
+        gl.glActiveTexture(GL_TEXTURE0 + location)
+        gl.glBindTexture(target_of(self._texture), self._texture.name)
+        gl.glBindSampler(location, self._sampler)
+
+
+class TextureIo:
+    """Sampler and framebuffer for the caller's textures.
+
+    Parameters
+    ----------
+    context : moderngl.Context
+    functions : SimpleNamespace
+        From `gl_functions`.
+
+    Attributes
+    ----------
+    skips_decoding : bool
+        Whether sRGB textures are sampled without decoding, so that shaders decode them
+        as exactly as arrays.
+    """
+
+    def __init__(self, context: moderngl.Context, functions: SimpleNamespace) -> None:
+        self._gl = functions
+        self._sampler = ctypes.c_uint(0)
+        functions.glGenSamplers(1, ctypes.byref(self._sampler))
+        parameters = dict(NEAREST_PARAMETERS)
+        self.skips_decoding = SRGB_DECODE in context.extensions
+        if self.skips_decoding:
+            parameters[GL_TEXTURE_SRGB_DECODE_EXT] = GL_SKIP_DECODE_EXT
+        for name, value in parameters.items():
+            functions.glSamplerParameteri(self._sampler.value, name, value)
+        self._framebuffer = ctypes.c_uint(0)
+        functions.glGenFramebuffers(1, ctypes.byref(self._framebuffer))
+        self._checked: set[tuple[Any, ...]] = set()
+
+    def release(self) -> None:
+        """Free the OpenGL objects."""
+        self._gl.glDeleteSamplers(1, ctypes.byref(self._sampler))
+        self._gl.glDeleteFramebuffers(1, ctypes.byref(self._framebuffer))
+
+    def input(self, texture: GlTexture) -> BoundTexture:
+        """Return a texture that passes can sample."""
+        return BoundTexture(self._gl, texture, self._sampler.value)
+
+    def check(self, texture: GlTexture, size_px: tuple[int, int], field: str) -> None:
+        """Check size and format of a texture, once for each.
+
+        Raises
+        ------
+        BadMessage
+        """
+        key = texture, size_px
+        if key in self._checked:
+            return
+        gl, target = self._gl, target_of(texture)
+        if not gl.glIsTexture(texture.name):
+            raise BadMessage(
+                f"{texture.name}", field=f"{field}.name", allowed="an existing texture"
+            )
+        gl.glGetError()
+        gl.glActiveTexture(GL_TEXTURE0)
+        gl.glBindTexture(target, texture.name)
+        if gl.glGetError():
+            kind = "GL_TEXTURE_2D" if texture.layer is None else "GL_TEXTURE_2D_ARRAY"
+            raise BadMessage(
+                f"texture {texture.name} is of another target",
+                field=f"{field}.name",
+                allowed=f"a {kind}",
+            )
+        found_px = tuple(
+            self._parameter(target, name)
+            for name in (GL_TEXTURE_WIDTH, GL_TEXTURE_HEIGHT)
+        )
+        internal = self._parameter(target, GL_TEXTURE_INTERNAL_FORMAT)
+        layers = self._parameter(target, GL_TEXTURE_DEPTH)
+        if found_px != size_px:
+            raise BadMessage(
+                f"texture {texture.name} has {found_px[0]}x{found_px[1]} px",
+                field=field,
+                allowed=f"{size_px[0]}x{size_px[1]} px, the size of the view",
+            )
+        if internal not in INTERNAL_FORMATS[texture.format]:
+            known = [
+                name for name, all_ in INTERNAL_FORMATS.items() if internal in all_
+            ]
+            raise BadMessage(
+                f"texture {texture.name} is of internal format "
+                f"{known[0] if known else hex(internal)}",
+                field=f"{field}.format",
+                allowed=f"{texture.format}, as declared",
+            )
+        if texture.layer is not None and texture.layer >= layers:
+            raise BadMessage(
+                f"{texture.layer}", field=f"{field}.layer", allowed=f"0 to {layers - 1}"
+            )
+        self._checked.add(key)
+
+    def forget(self) -> None:
+        """Check all textures again: names of deleted textures are used for others."""
+        self._checked.clear()
+
+    def _parameter(self, target: int, name: int) -> int:
+        found = ctypes.c_int(0)
+        self._gl.glGetTexLevelParameteriv(target, 0, name, ctypes.byref(found))
+        return found.value
+
+    def draw_to(self, texture: GlTexture, size_px: tuple[int, int]) -> None:
+        """Make a texture the target of draws.
+
+        Raises
+        ------
+        RenderFailed
+            OpenGL cannot draw to it.
+        """
+        gl = self._gl
+        gl.glBindFramebuffer(GL_DRAW_FRAMEBUFFER, self._framebuffer.value)
+        # Attached anew each time: a deleted texture's name may now be of another one,
+        # and as long as it is attached, draws to a deleted texture succeed.
+        gl.glFramebufferTexture2D(
+            *(GL_DRAW_FRAMEBUFFER, GL_COLOR_ATTACHMENT0, GL_TEXTURE_2D, 0, 0)
+        )
+        if texture.layer is None:
+            gl.glFramebufferTexture2D(
+                *(GL_DRAW_FRAMEBUFFER, GL_COLOR_ATTACHMENT0, GL_TEXTURE_2D),
+                *(texture.name, 0),
+            )
+        else:
+            gl.glFramebufferTextureLayer(
+                *(GL_DRAW_FRAMEBUFFER, GL_COLOR_ATTACHMENT0),
+                *(texture.name, 0, texture.layer),
+            )
+        status = gl.glCheckFramebufferStatus(GL_DRAW_FRAMEBUFFER)
+        if status != GL_FRAMEBUFFER_COMPLETE:
+            raise RenderFailed(
+                f"cannot draw to texture {texture.name}: framebuffer status {status:#x}"
+            )
+        gl.glViewportIndexedf(0, 0.0, 0.0, *map(float, size_px))
+
+
+def target_of(texture: GlTexture) -> int:
+    """Return the OpenGL target of a texture."""
+    return GL_TEXTURE_2D if texture.layer is None else GL_TEXTURE_2D_ARRAY

@@ -1,0 +1,326 @@
+"""Frames from textures to a texture of the caller's context, without waiting.
+
+The CPU reads a frame's counters when a later frame finds that the GPU has finished it.
+If a frame lacked PSFs, others took their weight; if its kernels or lists did not fit
+their buffers, it shows its input.  The frames after it are complete: the CPU has then
+computed the PSFs or enlarged the buffers, which have headroom.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from filter_service.constants import (
+    PLAN_MISSING,
+    PLAN_OVERFLOWS,
+    TEXTURE_COLOR,
+    TEXTURE_DEPTH,
+    THREADS,
+    TOTAL_WORDS,
+)
+from filter_service.errors import NotPrepared, RenderFailed
+from filter_service.gl.gpu import Gpu
+from filter_service.gl.stage_timer import Untimed
+from filter_service.gl.texture_io import TextureIo
+from filter_service.psfs.frame_layers import FrameLayers
+from filter_service.rendering.engine import TextureRequest
+from filter_service.rendering.gl.eye_states import EyeState
+from filter_service.rendering.gl.fragment_passes import FragmentPasses
+from filter_service.rendering.gl.kernel_passes import FrameState, KernelRun
+from filter_service.rendering.gl.list_passes import ListPasses
+from filter_service.rendering.gl.strip import Strip, dispatch_grid, group_count
+from filter_service.rendering.image_cells import KernelsTooLarge
+from filter_service.texture_view import EarlierFrame, SampledInput, TextureView
+
+SAMPLE_STEP_PX = 16
+"""Stride at which the input is sampled for the CPU: 1/256 of the image."""
+
+FILL_S = 0.004
+"""Longest time in which a frame computes PSFs that an earlier frame lacked."""
+
+FILL_BATCH = 64
+"""PSFs between two looks at the time."""
+
+HEADROOM = 1.5
+"""Capacity of lists and kernels relative to the use of earlier frames: a frame that
+does not fit shows its input."""
+
+INPUT_UNITS = (TEXTURE_COLOR, TEXTURE_DEPTH)
+
+MAX_IN_FLIGHT = 4
+"""Frames whose counters have not been read.  Further ones are not counted."""
+
+
+class TextureFragments(FragmentPasses):
+    """Fragments of a frame in textures."""
+
+    def __init__(
+        self, strip: Strip, view: TextureView, io: TextureIo, **values: Any
+    ) -> None:
+        super().__init__(strip, **values)
+        self._view, self._io = view, io
+
+    def source(self) -> dict[str, Any]:
+        """Return the variant of the pass, its textures and their uniforms."""
+        return {
+            "defines": {"FROM_TEXTURES": 1, **layer_defines(self._view)},
+            "textures": input_textures(self._view, self._io),
+            "bindings": (),
+            **input_uniforms(self._view, self._io),
+        }
+
+
+def layer_defines(view: TextureView) -> dict[str, int]:
+    """Return the defines for inputs that are layers of arrays."""
+    defines = {}
+    if view.color.layer is not None:
+        defines["COLOR_IS_ARRAY"] = 1
+    if view.depth.layer is not None:
+        defines["DEPTH_IS_ARRAY"] = 1
+    return defines
+
+
+def input_textures(view: TextureView, io: TextureIo) -> dict[str, Any]:
+    """Return the input textures by name."""
+    return {"COLOR": io.input(view.color), "DEPTH": io.input(view.depth)}
+
+
+def input_uniforms(view: TextureView, io: TextureIo) -> dict[str, Any]:
+    """Return the uniforms of ``common/input_textures.glsl``."""
+    encoded = ("rgba8", "srgb8_a8") if io.skips_decoding else ("rgba8",)
+    projection = view.projection
+    return {
+        "color_layer": view.color.layer or 0,
+        "depth_layer": view.depth.layer or 0,
+        "color_is_encoded": int(view.color.format in encoded),
+        "inverse_depth": (0.0, 0.0) if projection is None else projection.inverse_depth,
+        "depth_is_projected": int(projection is not None),
+        "is_top_first": int(view.is_top_first),
+    }
+
+
+@dataclass
+class _Submitted:
+    """A frame whose counters the CPU has not read yet."""
+
+    number: int
+    eye: EyeState
+    kernels: KernelRun
+    lists: ListPasses
+    fragments: FragmentPasses
+    totals: NDArray[np.uint32]
+    samples: NDArray[np.uint32]
+    is_read: Callable[[], bool] = lambda: True
+
+
+class TextureFrames:
+    """Filters frames in textures of the context of a `Gpu`.
+
+    Parameters
+    ----------
+    gpu : Gpu
+        Of a context of the caller.
+    """
+
+    def __init__(self, gpu: Gpu) -> None:
+        if gpu.functions is None:
+            raise RenderFailed("this OpenGL lacks functions for frames in textures")
+        self._gpu, self._gl = gpu, gpu.functions
+        self._io = TextureIo(gpu.context, gpu.functions)
+        self._triangle: dict[Any, moderngl.VertexArray] = {}
+        self._submitted: deque[_Submitted] = deque()
+        self._number = 0
+
+    def release(self) -> None:
+        """Free the OpenGL objects."""
+        for triangle in self._triangle.values():
+            triangle.release()
+        self._io.release()
+
+    def check(self, request: TextureRequest) -> None:
+        """Check the textures of a request.
+
+        Raises
+        ------
+        BadMessage
+        """
+        view = request.view
+        size_px = view.width_px, view.height_px
+        for field, texture in (
+            ("color", view.color),
+            ("depth", view.depth),
+            ("target", request.target),
+        ):
+            self._io.check(texture, size_px, field)
+
+    def filter(
+        self, request: TextureRequest, eye: EyeState, gaze_deg: tuple[float, float]
+    ) -> tuple[FrameLayers, EarlierFrame | None]:
+        """Filter a frame; return its layers, and the counters of an earlier one."""
+        self._read_finished()
+        timer = Untimed()
+        layers = eye.states.layers(
+            timer,
+            eye.handle,
+            request.pupil_diameter_mm,
+            request.focus_dpt,
+            request.options.render_tolerance,
+        )
+        while True:
+            image = eye.states.cells(timer, eye.handle, gaze_deg, eye.cell_px)
+            change_dpt = eye.states.corner_change_dpt(timer, layers, image)
+            state = FrameState(layers, image, change_dpt)
+            is_counted = len(self._submitted) < MAX_IN_FLIGHT or not eye.is_settled
+            frame = self._run(request, eye, state, is_counted=is_counted)
+            if frame is None:
+                break
+            if eye.is_settled:
+                self._submitted.append(frame)
+                break
+            # The first frame of an eye waits, so that it is complete.
+            while not frame.is_read():
+                self._gpu.context.finish()
+            eye.is_settled = self._read(frame, until_s=None)
+            if eye.is_settled:
+                break
+        return layers, eye.earlier
+
+    def _run(
+        self,
+        request: TextureRequest,
+        eye: EyeState,
+        state: FrameState,
+        *,
+        is_counted: bool,
+    ) -> _Submitted | None:
+        view, options, gpu = request.view, request.options, self._gpu
+        strip = Strip(
+            gpu,
+            view,
+            Untimed(),
+            layers=state.layers,
+            paper_rule=options.accumulation == "paper",
+        )
+        size_px = view.width_px, view.height_px
+        fragments = TextureFragments(
+            strip,
+            view,
+            self._io,
+            image=state.image,
+            tolerance=options.render_tolerance if options.merge else 0.0,
+            first_row=0,
+            frame_pixel_count=strip.pixel_count,
+            image_size_px=size_px,
+            border_px=0,
+            counted_px=(0, 0, *size_px),
+            object_range_dpt=eye.handle.prepared_range_dpt,
+            white_level=view.white_level,
+            is_encoded=request.target.format != "rgba16f",
+        )
+        kernels = eye.kernels.begin(eye.handle, state, Untimed())
+        lists = ListPasses(strip, kernels.atlas, is_late=True)
+        fragments.build_fragments(kernels)
+        kernels.make()
+        fragments.merge_fragments()
+        lists.run()
+        self._show(request, strip)
+        self._number += 1
+        if not is_counted:
+            return None
+        samples = self._sample(strip, view)
+        frame = _Submitted(
+            *(self._number, eye, kernels, lists, fragments),
+            totals=np.empty(TOTAL_WORDS, np.uint32),
+            samples=samples,
+        )
+        frame.is_read = gpu.begin_late_read(
+            (*lists.totals, frame.totals),
+            *kernels.to_read(fragments.stats),
+            (strip.buffers["SAMPLES"], 0, samples),
+        )
+        return frame
+
+    def _sample(self, strip: Strip, view: TextureView) -> NDArray[np.uint32]:
+        columns, rows = (group_count(side, SAMPLE_STEP_PX) for side in strip.size)
+        strip.reserve(SAMPLES=8 * columns * rows)
+        strip.run(
+            "sample_input",
+            dispatch_grid(group_count(columns * rows, THREADS)),
+            "SAMPLES",
+            frame_size_px=strip.size,
+            sample_grid=(columns, rows),
+            sample_step_px=SAMPLE_STEP_PX,
+            defines=layer_defines(view),
+            textures=input_textures(view, self._io),
+            **input_uniforms(view, self._io),
+        )
+        return np.empty((rows, columns, 2), np.uint32)
+
+    def _show(self, request: TextureRequest, strip: Strip) -> None:
+        """Write the frame to the target."""
+        gpu, view = self._gpu, request.view
+        program = gpu.passes.drawing("whole", "show_frame", **layer_defines(view))
+        gpu.passes.set_uniforms(
+            program,
+            {
+                "frame_size_px": strip.size,
+                "output_is_encoded": int(request.target.format != "rgba16f"),
+                "target_is_top_first": int(request.target_is_top_first),
+                **input_uniforms(view, self._io),
+            },
+        )
+        gpu.passes.bind(
+            {name: strip.buffers[name] for name in ("COLOR_OUT", "DISPATCHES")}
+        )
+        for texture, unit in zip(
+            input_textures(view, self._io).values(), INPUT_UNITS, strict=True
+        ):
+            texture.use(unit)
+        triangle = self._triangle.get(program)
+        if triangle is None:
+            triangle = self._triangle[program] = gpu.context.vertex_array(program, [])
+        self._io.draw_to(request.target, strip.size)
+        triangle.render(moderngl.TRIANGLES, vertices=3)
+
+    # ----- counters
+
+    def _read_finished(self) -> None:
+        """Read the counters of the frames that the GPU has finished."""
+        while self._submitted and self._submitted[0].is_read():
+            frame = self._submitted.popleft()
+            self._read(frame, until_s=time.monotonic() + FILL_S)
+
+    def _read(self, frame: _Submitted, *, until_s: float | None) -> bool:
+        """Read a frame's counters and act on them; return whether it was complete."""
+        eye, kernels, lists = frame.eye, frame.kernels, frame.lists
+
+        def fill(psfs: NDArray[np.int64]) -> None:
+            eye.handle.store.fill(psfs, until_s=until_s, batch_count=FILL_BATCH)
+
+        is_complete = False
+        with suppress(NotPrepared):  # the next frames compute the others
+            try:
+                is_complete = kernels.is_complete(fill)
+            except KernelsTooLarge:
+                eye.cell_px = 2 * kernels.state.image.cell_px
+        fits = lists.record_totals(frame.totals)
+        lists.reserve_more(HEADROOM)
+        if is_complete:
+            kernels.keep_headroom(HEADROOM)
+        eye.earlier = EarlierFrame(
+            number=frame.number,
+            is_filtered=fits and not kernels.counts[PLAN_OVERFLOWS],
+            is_complete=not kernels.counts[PLAN_MISSING],
+            counts=frame.fragments.counts() | kernels.frame_counts() | lists.counts(),
+            sampled=SampledInput.of_words(frame.samples, SAMPLE_STEP_PX),
+        )
+        return is_complete and fits
