@@ -7,6 +7,7 @@ from .filtering.filtered import BuildingEye as BuildingEye
 from .filtering.filtered import EyeFailed as EyeFailed
 from .filtering.filtered import EyeReady as EyeReady
 from .filtering.filtered import Filtered as Filtered
+from .filtering.filtered import FilteredTexture as FilteredTexture
 from .filtering.several_eyes import plan_views as plan_views
 from .rgbd_view import ColorImage as ColorImage
 from .rgbd_view import RgbdView as RgbdView
@@ -14,4 +15,7 @@ from .rgbd_view import as_views as as_views
 from .settings import Accumulation as Accumulation
 from .settings import FilterSettings as FilterSettings
 from .settings import Output as Output
+from .texture_view import DepthProjection as DepthProjection
+from .texture_view import GlTexture as GlTexture
+from .texture_view import TextureView as TextureView
 from .view_state import ViewState as ViewState

@@ -97,7 +97,7 @@ class _NoGpu(Gpu):
 
     def __init__(self, kind: Kind):
         self.context = _Anything()
-        self._current = None
+        self._current, self.functions = None, None
         self.info = {"renderer": "none"}
         self.is_software = kind.is_software
         self.atlas_is_buffer = kind.atlas_is_buffer

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from filter_service.constants import ENGINES
 from filter_service.errors import RenderFailed
 from filter_service.gl.hardware import may_have_gpu
 from filter_service.gl_device import is_device_selected
+
+if TYPE_CHECKING:
+    from filter_service.gl.current_context import CurrentContext
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,11 @@ class ChosenEngine:
 
 
 def open_engine(
-    choice: str, closing: ExitStack, *, warm_up: bool = False
+    choice: str,
+    closing: ExitStack,
+    *,
+    warm_up: bool = False,
+    current: CurrentContext | None = None,
 ) -> ChosenEngine:
     """Open a frame engine.
 
@@ -42,6 +49,8 @@ def open_engine(
         Closes the engine.
     warm_up : bool
         Whether to compile shaders now instead of in the first frames.
+    current : CurrentContext, optional
+        Context of the caller for the engine gl, which is then chosen.
 
     Raises
     ------
@@ -52,6 +61,8 @@ def open_engine(
     """
     if choice not in ENGINES:
         raise ValueError(f"unknown engine {choice!r}; allowed: {', '.join(ENGINES)}")
+    if current is not None:
+        return _gl(closing, "in the caller's context", warm_up=warm_up, current=current)
     if choice == "native":
         return _native(closing, "as requested")
     if choice == "gl":
@@ -89,13 +100,18 @@ def _native(closing: ExitStack, reason: str) -> ChosenEngine:
 
 
 def _gl(
-    closing: ExitStack, reason: str, *, warm_up: bool, hardware_only: bool = False
+    closing: ExitStack,
+    reason: str,
+    *,
+    warm_up: bool,
+    hardware_only: bool = False,
+    current: CurrentContext | None = None,
 ) -> ChosenEngine:
     from filter_service.gl.gpu import Gpu
     from filter_service.rendering.gl.compile_passes import compile_passes
     from filter_service.rendering.gl.renderer import FilterRenderer
 
-    gpu = Gpu()
+    gpu = Gpu(current=current)
     closing.callback(gpu.close)
     if hardware_only and gpu.is_software:
         raise RenderFailed(f"{gpu.info['renderer']} is a software renderer")

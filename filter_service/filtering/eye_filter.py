@@ -14,20 +14,34 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any, Self, Unpack
+from typing import Any, Literal, Self, Unpack
 
 from numpy.typing import NDArray
 
 from estimator.profiles.files import load_profile
 from estimator.profiles.parse import EyeProfile, parse_profile
 from filter_service.camera import Camera
-from filter_service.errors import BadMessage, NotPrepared, ServiceTimeout
+from filter_service.errors import (
+    BadMessage,
+    NotPrepared,
+    RenderFailed,
+    ServiceTimeout,
+)
 from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
 from filter_service.filtering.builder import Builder
-from filter_service.filtering.filtered import EyeEvent, EyeFailed, EyeReady, Filtered
+from filter_service.filtering.filtered import (
+    EyeEvent,
+    EyeFailed,
+    EyeReady,
+    Filtered,
+    FilteredTexture,
+)
 from filter_service.filtering.planned_frame import PlannedFrame
-from filter_service.filtering.shared_builder import shared
-from filter_service.filtering.stream_eyes import StreamEyes
+from filter_service.filtering.shared_builder import SharedBuilder, shared
+from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
+from filter_service.rendering.engine import TextureEngine, TextureRequest
+from filter_service.rendering.media_effects import UNCHANGED, MediaEffects
+from filter_service.rendering.sampled_frame import SampledView
 from filter_service.rgbd_view import ColorImage, RgbdView, as_views
 from filter_service.settings import (
     DEFAULTS,
@@ -41,9 +55,12 @@ from filter_service.settings import (
     VergenceDpt,
     as_settings,
 )
+from filter_service.texture_view import GlTexture, TextureView
 from filter_service.validation import checked
 
 WAIT_SLICE_S = 0.02
+
+GL_CONTEXTS = ("own", "current")
 
 Profile = EyeProfile | Mapping[str, Any] | str | Path
 
@@ -74,6 +91,26 @@ def _as_cameras(cameras: Camera | Sequence[Camera]) -> tuple[Camera, ...]:
     return found
 
 
+def _acquired(engine: Engine, gl_context: str) -> tuple[Builder, SharedBuilder]:
+    """Return the shared builder of an engine and a context, with a reference."""
+    if gl_context not in GL_CONTEXTS:
+        raise BadMessage(
+            f"{gl_context!r}", field="gl_context", allowed=" or ".join(GL_CONTEXTS)
+        )
+    if gl_context == "own":
+        found = shared(engine)
+        return found.acquire(), found
+    if engine == "native":
+        raise BadMessage(
+            "'native'", field="engine", allowed="gl or auto in the current context"
+        )
+    from filter_service.gl.current_context import CurrentContext
+
+    current = CurrentContext()
+    found = shared("gl", current.handle)
+    return found.acquire(current), found
+
+
 class EyeFilter:
     """Filters a stream of frames through one eye, which may change during the stream.
 
@@ -102,6 +139,9 @@ class EyeFilter:
     engine : "auto", "gl" or "native"
         Engine of the shared builder: compute shaders, or compiled loops on all cores;
         "auto" selects gl on a hardware GPU, otherwise native.
+    gl_context : "own" or "current"
+        OpenGL context of the engine gl: one of its own, or the one that is current now,
+        as `filter_textures` requires.  The latter must be current for every call.
 
     Raises
     ------
@@ -122,14 +162,18 @@ class EyeFilter:
         max_cameras: int = 4,
         first_generation: int = 1,
         engine: Engine = "auto",
+        gl_context: Literal["own", "current"] = "own",
     ) -> None:
         first = None if profile is None else as_profile(profile)
         self.cameras = _as_cameras(camera)
         self.settings = as_settings(settings)
         self._on_event = on_event
         self._pid = os.getpid()
-        self._shared = shared(engine) if builder is None else None
-        self._builder: Builder | None = builder or shared(engine).acquire()
+        self._shared: SharedBuilder | None = None
+        self._takes_textures = builder is not None or gl_context == "current"
+        if builder is None:
+            builder, self._shared = _acquired(engine, gl_context)
+        self._builder: Builder | None = builder
         self._eyes = StreamEyes(
             self._handle_event,
             max_cameras,
@@ -428,6 +472,113 @@ class EyeFilter:
             self.is_extending = True
             return None
 
+    def filter_textures(
+        self,
+        view: TextureView,
+        target: GlTexture,
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        gaze_deg: tuple[float, float] | None = None,
+        target_is_top_first: bool | None = None,
+        newest_only: bool = False,
+        **options: Unpack[RenderOptionValues],
+    ) -> FilteredTexture | None:
+        """Filter a frame from textures to a texture, all in the caller's context.
+
+        This submits the frame to the GPU and does not wait for it, except for the first
+        frame of an eye.  Later commands of the context see the filtered image.  Counts,
+        and samples of the input, are those of an earlier frame.  The caller's OpenGL
+        state is kept.  Returns None, and writes nothing, while the eye is prepared.
+
+        A frame that needs PSFs that are not computed yet uses others instead; the
+        next frames have them.  To compute PSFs before frames need them, call `advance`
+        between frames, which takes some milliseconds, or prepare all of them with the
+        setting ``prepare="ranges"``.
+
+        Parameters
+        ----------
+        view : TextureView
+        target : GlTexture
+            Texture of the size of the view: "rgba8" or "srgb8_a8" receives sRGB values,
+            "rgba16f" linear light.  Alpha is that of the input.
+        pupil_diameter_mm, focus_dpt, gaze_deg, options
+            As for `filter`.
+        target_is_top_first : bool, optional
+            Whether the first row of the target is the top of the image; by default as
+            in the view.
+        newest_only : bool
+            As for `try_filter`.
+
+        Raises
+        ------
+        BadMessage
+            If an argument is out of range, textures do not fit, or the profile has
+            straylight or spectacle magnification, which only frames of arrays have.
+        SessionError
+            If there is no profile, or its build failed.
+        RenderError
+            If the filter does not use the caller's context (``gl_context``), another
+            context is current, or OpenGL cannot draw to the target.
+        """
+        engine = self.builder.engine
+        if not self._takes_textures or not isinstance(engine, TextureEngine):
+            raise RenderFailed(
+                "frames in textures need EyeFilter(..., gl_context='current')"
+            )
+        pupil_diameter_mm = checked(pupil_diameter_mm, PupilMm, "pupil_diameter_mm")
+        focus_dpt = checked(focus_dpt, VergenceDpt, "focus_dpt")
+        if gaze_deg is not None:
+            gaze_deg = checked(gaze_deg, tuple[GazeDeg, GazeDeg], "gaze_deg")
+        self.advance_builds()
+        plan = self._planned([view.camera], newest_only=newest_only)
+        if plan is None:
+            return None
+        effects = MediaEffects.of(plan.eye.profile, plan.eye.settings.display)
+        if effects is not None and effects.need_arrays is not None:
+            raise BadMessage(
+                f"it has {effects.need_arrays}",
+                field="profile",
+                allowed="none for frames in textures; filter frames of arrays",
+            )
+        started_s = time.monotonic()
+        shown = engine.filter_textures(
+            TextureRequest(
+                view,
+                target,
+                plan.stores[0],
+                pupil_diameter_mm,
+                focus_dpt,
+                gaze_deg,
+                target_is_top_first=(
+                    view.is_top_first
+                    if target_is_top_first is None
+                    else target_is_top_first
+                ),
+                gain_ratio=UNCHANGED if effects is None else effects.gain_ratio,
+                options=RenderOptions(**options),
+            )
+        )
+        self.builder.frame_s = time.monotonic() - started_s
+        self.builder.mark_rendered(self._eyes, plan)
+        if shown.earlier is not None:
+            self._eyes.history.record_sampled(
+                (SampledView.of_samples(view.camera, shown.earlier.sampled),),
+                pupil_diameter_mm=pupil_diameter_mm,
+                focus_dpt=focus_dpt,
+                gaze_deg=gaze_deg,
+                at_s=started_s,
+            )
+        return FilteredTexture(
+            plan.eye.profile_id,
+            plan.eye.generation,
+            shown.pupil_diameter_mm,
+            shown.focus_dpt,
+            shown.gaze_deg,
+            shown.notes,
+            shown.earlier,
+        )
+
     def plan(
         self,
         views: Sequence[RgbdView],
@@ -452,14 +603,20 @@ class EyeFilter:
             gaze_deg=gaze_deg,
             at_s=time.monotonic(),
         )
-        builder = self.builder
-        plan = self._eyes.plan([view.camera for view in views])
-        builder.free_retired(self._eyes)
+        plan = self._planned([view.camera for view in views], newest_only=newest_only)
+        if plan is None:
+            return None
+        return PlannedFrame(
+            self.builder, self._eyes, plan, tuple(views), pupil_diameter_mm, focus_dpt
+        )
+
+    def _planned(
+        self, cameras: Sequence[Camera], *, newest_only: bool
+    ) -> RenderPlan | None:
+        """Return the eye and the stores of a frame, or None while they are prepared."""
+        plan = self._eyes.plan(cameras)
+        self.builder.free_retired(self._eyes)
         self.is_extending = (
             plan is not None and newest_only and not self._eyes.is_newest(plan)
         )
-        if plan is None or self.is_extending:
-            return None
-        return PlannedFrame(
-            builder, self._eyes, plan, tuple(views), pupil_diameter_mm, focus_dpt
-        )
+        return None if self.is_extending else plan

@@ -12,6 +12,7 @@ from filter_service.camera import Camera
 from filter_service.errors import FilterError
 from filter_service.filtering.accepted_profile import AcceptedProfile
 from filter_service.rendering.filtered_view import FrameCounts, summed_counts
+from filter_service.texture_view import EarlierFrame
 from filter_service.view_state import EyeName
 
 
@@ -144,6 +145,30 @@ class Filtered(FrameCounts):
     def is_complete(self) -> bool:
         """Return true; false in earlier versions, which had previews."""
         return all(view.is_complete for view in self.views)
+
+
+@dataclass(frozen=True)
+class FilteredTexture:
+    """A frame in textures that was submitted to the GPU, and the eye that it is for.
+
+    Attributes
+    ----------
+    profile_id, generation : int
+        As in `ViewResult`.
+    pupil_diameter_mm, focus_dpt, gaze_deg
+        Values used.
+    notes : tuple of str
+    earlier : EarlierFrame or None
+        What is known of the newest frame through this eye that the GPU has finished.
+    """
+
+    profile_id: int
+    generation: int
+    pupil_diameter_mm: float
+    focus_dpt: float
+    gaze_deg: tuple[float, float]
+    notes: tuple[str, ...]
+    earlier: EarlierFrame | None
 
 
 def summed_times(times_ms: Iterable[Mapping[str, float]]) -> dict[str, float]:

@@ -37,7 +37,24 @@ class FrameHistory:
         at_s: float,
     ) -> None:
         """Add a frame that arrived at ``at_s``."""
-        seen = tuple(SampledView.of(view) for view in views)
+        self.record_sampled(
+            tuple(SampledView.of(view) for view in views),
+            pupil_diameter_mm=pupil_diameter_mm,
+            focus_dpt=focus_dpt,
+            gaze_deg=gaze_deg,
+            at_s=at_s,
+        )
+
+    def record_sampled(
+        self,
+        seen: tuple[SampledView, ...],
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        gaze_deg: tuple[float, float] | None,
+        at_s: float,
+    ) -> None:
+        """Add a frame whose views are sampled already."""
         self.last = SampledFrame(at_s, pupil_diameter_mm, focus_dpt, gaze_deg, seen)
         self._states.append((at_s, pupil_diameter_mm, focus_dpt))
         while self._states[0][0] < at_s - SPEED_S and len(self._states) > 2:

@@ -8,12 +8,16 @@ import os
 import threading
 from contextlib import ExitStack
 from functools import cache
+from typing import TYPE_CHECKING
 
 from filter_service.building.inline_worker import InlineWorker
 from filter_service.building.limits import BuildLimits
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.filtering.builder import Builder
 from filter_service.psfs.cache_folder import default_cache_dir
+
+if TYPE_CHECKING:
+    from filter_service.gl.current_context import CurrentContext
 
 log = logging.getLogger("ocufilter")
 
@@ -24,6 +28,7 @@ def open_builder(
     closing: ExitStack,
     *,
     engine: str = "auto",
+    current: CurrentContext | None = None,
 ) -> Builder:
     """Start the build worker and the engine at the same time.
 
@@ -35,6 +40,8 @@ def open_builder(
         Closes both.
     engine : "auto", "gl" or "native"
         Engine that filters frames.
+    current : CurrentContext, optional
+        Context of the caller for the engine gl, instead of an own one.
 
     Raises
     ------
@@ -46,7 +53,7 @@ def open_builder(
     # Imports take long; this process and the worker run them at the same time.
     from filter_service.filtering.choose_engine import open_engine
 
-    chosen = open_engine(engine, closing, warm_up=True)
+    chosen = open_engine(engine, closing, warm_up=True, current=current)
     # mypy checks here that the engine implements `FrameEngine`.
     builder = Builder(worker, chosen.engine, limits, engine_name=chosen.name)
     closing.callback(builder.close)
@@ -66,23 +73,32 @@ def open_inline_builder(closing: ExitStack, *, engine: str = "auto") -> Builder:
     return open_builder(InlineWorker(), BuildLimits(), closing, engine=engine)
 
 
-class _Shared:
-    """A reference-counted builder."""
+class SharedBuilder:
+    """A reference-counted builder.
 
-    def __init__(self, engine: str) -> None:
-        self._engine = engine
+    Parameters
+    ----------
+    engine : str
+    context : int
+        Address of the caller's context that it belongs to; 0 for an own one.
+    """
+
+    def __init__(self, engine: str, context: int = 0) -> None:
+        self._engine, self.context = engine, context
         self._builder: Builder | None = None
         self._closing = ExitStack()
         self._n_users = 0
         atexit.register(self._closing.close)
 
-    def acquire(self) -> Builder:
+    def acquire(self, current: CurrentContext | None = None) -> Builder:
         """Return the builder and add a reference; the first reference opens it."""
         if self._builder is None:
             limits = BuildLimits(store_cache_dir=default_cache_dir())
             with ExitStack() as closing:
                 self._builder = open_builder(
-                    WorkerHandle(), limits, closing, engine=self._engine
+                    *(WorkerHandle(), limits, closing),
+                    engine=self._engine,
+                    current=current,
                 )
                 self._closing.push(closing.pop_all())
         self._n_users += 1
@@ -100,13 +116,13 @@ class _Shared:
         self._parents = self._closing.pop_all()  # a reference, so that nothing is freed
 
 
-_opened: list[_Shared] = []
+_opened: list[SharedBuilder] = []
 
 
 @cache
-def shared(engine: str) -> _Shared:
-    """Return the shared builder of an engine setting."""
-    _opened.append(_Shared(engine))
+def shared(engine: str, context: int = 0) -> SharedBuilder:
+    """Return the shared builder of an engine setting and a context of the caller."""
+    _opened.append(SharedBuilder(engine, context))
     return _opened[-1]
 
 

@@ -70,14 +70,17 @@ class Gpu:
         self, device: str | None = None, *, current: CurrentContext | None = None
     ) -> None:
         index: int | None = None
+        self._egl = EglCurrent()
         if current is None:
             choice = wanted_gl_device() if device is None else checked_gl_device(device)
-            self.context, index = open_on_device(choice, _context_on)
+            with self._egl.kept():
+                self.context, index = open_on_device(choice, _context_on)
+                _ = self.context.info, self.context.extensions  # moderngl keeps them
             self.functions = gl_functions()
         else:
             self.context = current_moderngl_context(current)
             self.functions = gl_functions(current.load_opengl_function)
-        self._current, self._egl = current, EglCurrent()
+        self._current = current
         info = self.context.info
         self.info = {
             "renderer": info["GL_RENDERER"],
@@ -162,7 +165,8 @@ class Gpu:
                 ring.release()
         self._buffers.clear()
         self._atlases.clear()
-        self.context.release()
+        with self._egl.kept():
+            self.context.release()
 
     # ----- buffers
 
@@ -408,6 +412,12 @@ class Gpu:
     def release_queries(self, queries: list[moderngl.Query]) -> None:
         """Return timer queries to the pool, which never frees them."""
         self._queries += queries
+
+    def drop_errors(self) -> None:
+        """Drop errors that the caller's own commands have left in its context."""
+        if self._current is not None and self.functions is not None:
+            while self.functions.glGetError():
+                pass
 
     def check(self, where: str) -> None:
         """Raise the error that OpenGL has recorded since the last check, if any."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +85,8 @@ class TextureRequest:
         PSFs of the eye, loaded by the engine.
     target_is_top_first : bool
         Whether the first row of the target is the top of the image.
+    gain_ratio : (red, green, blue)
+        Transmittance of the ocular media.
     """
 
     view: TextureView
@@ -94,6 +96,7 @@ class TextureRequest:
     focus_dpt: float
     gaze_deg: tuple[float, float] | None = None
     target_is_top_first: bool = False
+    gain_ratio: tuple[float, float, float] = (1.0, 1.0, 1.0)
     options: RenderOptions = DEFAULT_OPTIONS
 
 
@@ -157,6 +160,23 @@ class FrameEngine(Protocol):
         NotPrepared
             The deadline ``until_s`` passed before all required PSFs were computed.
             The returned function may also raise it.
+        RenderError
+        """
+
+
+@runtime_checkable
+class TextureEngine(Protocol):
+    """An engine that filters frames in textures of the caller's context."""
+
+    def filter_textures(self, request: TextureRequest) -> ShownTexture:
+        """Filter a view from textures to a texture, without waiting for the GPU.
+
+        Raises
+        ------
+        BadMessage
+            Textures or options are invalid.
+        CameraMismatch
+            The store is for another camera, see `camera.is_same_camera`.
         RenderError
         """
 

@@ -63,6 +63,13 @@ class MediaEffects:
         found = cls(profile.straylight, gain_ratio, spectacle_magnification(profile))
         return None if found == cls(None) else found
 
+    @property
+    def need_arrays(self) -> str | None:
+        """Return the effect that frames in textures lack, in words, or None."""
+        if self.magnification_ratio is not None:
+            return "spectacle magnification"
+        return "straylight" if self.straylight is not None else None
+
     def apply(self, color: NDArray[np.float32], view: RgbdView) -> None:
         """Apply the media to linear light (height, width, 3) of a view, in place."""
         if self.straylight is not None:

@@ -16,6 +16,7 @@ from filter_service.rendering.frame_kernels import interval_count, missing_psfs
 from filter_service.rendering.image_cells import ImageCells
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
+from filter_service.texture_view import SampledInput
 
 STEP_PX = 4
 """Stride at which depth is sampled.  PSFs that only other pixels need are computed
@@ -38,11 +39,22 @@ class SampledView:
     object_dpt : (rows, columns)
     hidden_dpt : (rows, columns) or None
         Distances in the hidden layer; NaN where it is empty.
+    step_px : int
+        Stride of the samples.
     """
 
     camera: Camera
     object_dpt: NDArray[np.float64]
     hidden_dpt: NDArray[np.float64] | None = None
+    step_px: int = STEP_PX
+
+    @classmethod
+    def of_samples(cls, camera: Camera, sampled: SampledInput) -> SampledView:
+        """Return the samples of a view in textures."""
+        depth_m = np.where(sampled.depth_m > 0.0, sampled.depth_m, np.inf)
+        depth_m = depth_m.astype(np.float32)
+        view = RgbdView(sampled.color, depth_m, camera.tangents)
+        return cls(camera, object_dpt(view, depth_m), step_px=sampled.step_px)
 
     @classmethod
     def of(cls, view: RgbdView) -> SampledView:
@@ -126,7 +138,7 @@ def missing_psfs_of(
             continue
         for distances_dpt in (view.object_dpt, view.hidden_dpt):
             if distances_dpt is not None:
-                _mark_used(used, distances_dpt, layers, image)
+                _mark_used(used, distances_dpt, layers, image, view.step_px)
     return missing_psfs(store, layers, image, used)
 
 
@@ -135,6 +147,7 @@ def _mark_used(
     distances_dpt: NDArray[np.float64],
     layers: FrameLayers,
     image: ImageCells,
+    step_px: int,
 ) -> None:
     """Mark the (cell, interval) pairs of the sampled distances."""
     rows, columns = distances_dpt.shape
@@ -143,13 +156,13 @@ def _mark_used(
     )
     cells = np.zeros((rows, columns), np.int64)
     if image.cell_px:
-        row = np.minimum(np.arange(rows) * STEP_PX // image.cell_px, image.grid[1] - 1)
-        column = np.arange(columns) * STEP_PX // image.cell_px
+        row = np.minimum(np.arange(rows) * step_px // image.cell_px, image.grid[1] - 1)
+        column = np.arange(columns) * step_px // image.cell_px
         column = np.minimum(column, image.grid[0] - 1)
         cells = row[:, None] * image.grid[0] + column
         change_dpt = layers.field.at(image.corner_h_deg, image.corner_v_deg)
-        y = np.arange(rows) * STEP_PX / image.cell_px - row
-        x = np.arange(columns) * STEP_PX / image.cell_px - column
+        y = np.arange(rows) * step_px / image.cell_px - row
+        x = np.arange(columns) * step_px / image.cell_px - column
         corner = [
             change_dpt[row[:, None] + down, column + right]
             for down in (0, 1)

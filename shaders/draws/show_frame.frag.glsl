@@ -14,6 +14,7 @@ layout(std430, binding = BINDING_DISPATCHES) readonly buffer Dispatches { uvec4 
 uniform ivec2 frame_size_px;
 uniform int output_is_encoded;
 uniform int target_is_top_first;
+uniform vec3 gain;                // transmittance of the ocular media
 
 layout(location = 0) out vec4 shown;
 
@@ -21,7 +22,8 @@ void main() {
     ivec2 at = texture_place(ivec2(gl_FragCoord.xy), frame_size_px.y, target_is_top_first);
     vec4 own = input_color(at, frame_size_px);
     bool is_filtered = groups[DISPATCH_SPLAT].y != 0u;
-    vec3 light = is_filtered ? color_out[at.y * frame_size_px.x + at.x].rgb : own.rgb;
+    vec3 light = own.rgb;
+    if (is_filtered) light = gain * color_out[at.y * frame_size_px.x + at.x].rgb;
     // Values of the target's type, so that the driver has nothing to round.
     vec3 stored = output_is_encoded != 0 ? whole_bytes(srgb_from_linear(light))
                                          : half_from_linear(light);

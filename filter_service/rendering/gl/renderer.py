@@ -64,6 +64,7 @@ class FilterRenderer(OneView):
         gaze = check_request(request, request.handle.store)
         # The application's own context may be current.
         with self._gpu.entered():
+            self._gpu.drop_errors()
             run = FrameRun(
                 self._gpu,
                 self._eyes.of(request.handle),

@@ -275,6 +275,7 @@ class TextureFrames:
                 "frame_size_px": strip.size,
                 "output_is_encoded": int(request.target.format != "rgba16f"),
                 "target_is_top_first": int(request.target_is_top_first),
+                "gain": request.gain_ratio,
                 **input_uniforms(view, self._io),
             },
         )

@@ -1,0 +1,158 @@
+"""`EyeFilter` in the OpenGL context of its caller."""
+
+import time
+from contextlib import contextmanager
+
+import moderngl
+import numpy as np
+import pytest
+
+from filter_service import (
+    BadMessage,
+    DepthProjection,
+    EyeFilter,
+    GlTexture,
+    TextureView,
+)
+from filter_service.errors import RenderFailed
+from tests.numerical.gl_textures import Textures
+from tests.numerical.scene_frames import scene_view
+
+SIZE_PX = WIDTH, HEIGHT = 160, 90
+STATE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
+SETTINGS = {"mode": "dynamic", "tolerance": "loose"}
+NEAR_M = 0.05
+
+
+@contextmanager
+def context():
+    own = moderngl.create_context(standalone=True, backend="egl", require=430)
+    with own:
+        yield own
+    own.release()
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return scene_view("courtyard", width_px=WIDTH, height_px=HEIGHT)
+
+
+def texture_view(textures, scene):
+    """The scene as a renderer leaves it: sRGB and a depth buffer, last row first."""
+    rgba = np.dstack([scene.color, np.full(scene.depth_m.shape, 255, np.uint8)])
+    value = NEAR_M / scene.depth_m  # reversed, to infinity
+    return TextureView(
+        textures.new("srgb8_a8", SIZE_PX, rgba[::-1]),
+        textures.new("d32f", SIZE_PX, value[::-1]),
+        *SIZE_PX,
+        scene.tangents,
+        DepthProjection(NEAR_M, is_reversed=True),
+    )
+
+
+def frame_of(eye, view, target, **state):
+    """Submit frames until one is filtered."""
+    until_s = time.monotonic() + 60.0
+    while time.monotonic() < until_s:
+        shown = eye.filter_textures(view, target, **(STATE | state))
+        if shown is not None:
+            return shown
+        time.sleep(0.01)
+    raise AssertionError("the eye is never ready")
+
+
+def shown_image(textures, target):
+    return textures.read(target, SIZE_PX)[::-1, :, :3].astype(int)
+
+
+def test_frames_are_those_of_arrays(scene):
+    with context():
+        textures = Textures()
+        view, target = texture_view(textures, scene), textures.new("rgba8", SIZE_PX)
+        camera = scene.camera
+        with EyeFilter("myopia", camera, SETTINGS, gl_context="current") as eye:
+            shown = frame_of(eye, view, target)
+            assert shown.generation == 1
+            assert shown.earlier.is_filtered
+            expected = eye.filter(scene, **STATE)
+            found = shown_image(textures, target)
+            assert np.abs(found - expected.color).max() <= 1
+            eye.set_profile("keratoconus")
+            later = eye.filter_textures(view, target, **STATE)
+            assert later.generation == 1  # until the new eye is ready
+            np.testing.assert_array_equal(shown_image(textures, target), found)
+            while later.generation == 1:
+                later = frame_of(eye, view, target)
+                time.sleep(0.01)
+            expected = eye.filter(scene, whole=True, **STATE)
+            for _ in range(100):
+                frame_of(eye, view, target)
+                if np.abs(shown_image(textures, target) - expected.color).max() <= 1:
+                    break
+            else:
+                raise AssertionError("PSFs stay missing")
+        with EyeFilter("myopia", camera, SETTINGS) as own:  # in a context of its own
+            first = own.filter(scene, **STATE)
+        assert np.abs(found - first.color).max() <= 2
+
+
+def test_two_eyes_share_a_context(scene):
+    with context():
+        textures = Textures()
+        view = texture_view(textures, scene)
+        targets = [textures.new("srgb8_a8", SIZE_PX) for _ in range(2)]
+        eyes = [
+            EyeFilter(name, scene.camera, SETTINGS, gl_context="current")
+            for name in ("emmetropia", "myopia")
+        ]
+        for _ in range(3):
+            for eye, target in zip(eyes, targets, strict=True):
+                frame_of(eye, view, target)
+        for eye, target in zip(eyes, targets, strict=True):
+            expected = eye.filter(scene, **STATE).color
+            assert np.abs(shown_image(textures, target) - expected).max() <= 1
+            eye.close()
+
+
+def test_what_textures_cannot_have_is_refused(scene):
+    with context():
+        textures = Textures()
+        view, target = texture_view(textures, scene), textures.new("rgba8", SIZE_PX)
+        cloudy = {"kind": "preset", "name": "emmetropia", "straylight": {}}
+        with EyeFilter(cloudy, scene.camera, SETTINGS, gl_context="current") as eye:
+            with pytest.raises(BadMessage, match="straylight"):
+                frame_of(eye, view, target)
+            assert eye.filter(scene, **STATE).color.shape == scene.color.shape
+        with (
+            EyeFilter("myopia", scene.camera, engine="gl") as own,
+            pytest.raises(RenderFailed, match="gl_context='current'"),
+        ):
+            own.filter_textures(view, target, **STATE)
+        with EyeFilter("myopia", scene.camera, gl_context="current") as eye:
+            for wrong in ({"pupil_diameter_mm": 0.0}, {"focus_dpt": np.nan}):
+                with pytest.raises(BadMessage):
+                    eye.filter_textures(view, target, **(STATE | wrong))
+            with pytest.raises(BadMessage, match="allowed: an existing texture"):
+                for _ in range(6000):
+                    eye.filter_textures(view, GlTexture(9999, "rgba8"), **STATE)
+                    time.sleep(0.01)
+    with pytest.raises(RenderFailed, match="no OpenGL context is current"):
+        EyeFilter("myopia", scene.camera, gl_context="current")
+    with pytest.raises(BadMessage, match="own or current"):
+        EyeFilter("myopia", scene.camera, gl_context="mine")
+
+
+def test_a_context_that_is_gone_is_an_error_and_no_crash(scene):
+    with context():
+        textures = Textures()
+        view, target = texture_view(textures, scene), textures.new("rgba8", SIZE_PX)
+        eye = EyeFilter("myopia", scene.camera, SETTINGS, gl_context="current")
+        frame_of(eye, view, target)
+    with pytest.raises(RenderFailed, match="not current"):
+        eye.filter_textures(view, target, **STATE)
+    eye.close()
+    with context():
+        textures = Textures()
+        view, target = texture_view(textures, scene), textures.new("rgba8", SIZE_PX)
+        with EyeFilter("myopia", scene.camera, SETTINGS, gl_context="current") as eye:
+            frame_of(eye, view, target)
