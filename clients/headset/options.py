@@ -90,6 +90,13 @@ def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Names
         "--key", type=Path, metavar="FILE", help="key file of the client, for --service"
     )
     where.add_argument(
+        "--textures",
+        choices=("auto", "yes", "no"),
+        default="auto",
+        help="filter in textures of the viewer's OpenGL context, without copies: auto "
+        "on a hardware GPU (default: auto)",
+    )
+    where.add_argument(
         "--simulated",
         action="store_true",
         help="simulate a headset and a person who looks around; see --out",

@@ -1,10 +1,11 @@
-"""Drawing of images from memory into the headset's images, with OpenGL."""
+"""Drawing of images into the headset's images, with OpenGL."""
 
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import moderngl
 import numpy as np
+from numpy.typing import NDArray
 
 from clients.headset.runtime import ShownView
 
@@ -50,19 +51,30 @@ class Presenter:
 
     def draw(self, shown: ShownView, target: moderngl.Framebuffer) -> None:
         """Draw color and depth of a view into a framebuffer."""
-        self._seen.write(np.ascontiguousarray(shown.color), alignment=1)
-        self._depth_m.write(np.ascontiguousarray(shown.depth_m))
+        seen = _in_texture(shown.color, self._seen)
+        depth_m = _in_texture(shown.depth_m, self._depth_m)
         ratio = 0.0 if shown.plain is None else shown.plain_ratio
+        plain = self._plain
         if shown.plain is not None and ratio > 0.0:
-            self._plain.write(np.ascontiguousarray(shown.plain), alignment=1)
+            plain = _in_texture(shown.plain, self._plain)
         cast("moderngl.Uniform", self._program["plain_ratio"]).value = ratio
         context = self._context
         with context.scope(target, moderngl.DEPTH_TEST):
             context.depth_func = (
                 "1"  # always pass: depth is written only if the test is on
             )
-            for unit, texture in enumerate((self._seen, self._plain, self._depth_m)):
+            for unit, texture in enumerate((seen, plain, depth_m)):
                 texture.use(unit)
             target.viewport = (0, 0, *self._size_px)
             self._triangle.render(moderngl.TRIANGLES, vertices=3)
             context.depth_func = "<"
+
+
+def _in_texture(
+    image: NDArray[Any] | moderngl.Texture, own: moderngl.Texture
+) -> moderngl.Texture:
+    """Return an image's texture; an array is copied to the presenter's own."""
+    if not isinstance(image, np.ndarray):
+        return image
+    own.write(np.ascontiguousarray(image), alignment=1)
+    return own

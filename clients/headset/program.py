@@ -20,10 +20,12 @@ import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from clients.arguments import read_size_px
 from clients.extra import HEADSET_INSTALL
@@ -43,6 +45,7 @@ from clients.headset.stereo_gaze import StereoGaze
 from clients.headset.viewer import Viewer, ViewerLog
 from filter_service import FilterSettings
 from filter_service.errors import FilterError
+from filter_service.gl.hardware import is_software_renderer
 
 if TYPE_CHECKING:
     import moderngl
@@ -155,7 +158,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         context = _context(options, stack)
         scenery = scenery_of(options, context)
         stack.callback(getattr(scenery, "close", lambda: None))
-        seeing = _seeing(options, settings)
+        seeing = _seeing(options, settings, context)
         stack.callback(seeing.close)
         is_range_given = options.gaze_range is not None
         eyes = _Eyes(settings, is_range_given, look, seeing, profiles)
@@ -172,7 +175,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         )
         took_s = _view(viewer, controls, options)
         if options.out is not None:
-            pictures.write(options.out)
+            pictures.write(options.out, context)
         return _report(options, viewer.log, took_s, seeing)
 
 
@@ -220,7 +223,13 @@ def _runtime(
         return _open_xr(context, options)
     from clients.headset.simulated_runtime import SimulatedRuntime
 
-    return SimulatedRuntime(size_px, rate_hz=options.rate_hz, on_shown=pictures.keep)
+    def finish() -> None:
+        with context:
+            context.finish()
+
+    return SimulatedRuntime(
+        size_px, rate_hz=options.rate_hz, on_shown=pictures.keep, finish=finish
+    )
 
 
 def _openxr(name: str) -> Any:
@@ -257,13 +266,21 @@ def _open_xr(context: moderngl.Context, options: argparse.Namespace) -> Runtime:
     return runtime
 
 
-def _seeing(options: argparse.Namespace, settings: FilterSettings) -> StereoFilter:
+def _seeing(
+    options: argparse.Namespace, settings: FilterSettings, context: moderngl.Context
+) -> StereoFilter:
     if options.service is not None:
         seeing = ServiceFilter(options.service, settings, say, key_file=options.key)
         if options.frames is not None or options.seconds is not None:
             seeing.wait_for_service()  # a run that counts frames requires one
         return seeing
-    return LocalFilter(settings, say)
+    with context:
+        renderer = str(context.info["GL_RENDERER"])
+    # On a software renderer, the compiled loops are faster, and copies cost less.
+    wanted = options.textures == "yes"
+    if options.textures == "auto":
+        wanted = not is_software_renderer(renderer)
+    return LocalFilter(settings, say, context if wanted else None)
 
 
 class _Pictures:
@@ -277,15 +294,21 @@ class _Pictures:
         if shown and all(view.plain is not None for view in shown):
             self._shown = shown
 
-    def write(self, folder: Path) -> None:
+    def write(self, folder: Path, context: moderngl.Context | None = None) -> None:
         """Write one PNG per eye into an existing folder."""
         from PIL import Image
+
+        from clients.scenes.scene_view import read_texture
 
         if not self._shown:
             say(f"no frame was filtered, so nothing is written to {folder}")
         for shown in self._shown:
             path = folder / f"{shown.view.eye}.png"
-            Image.fromarray(shown.color).save(path)
+            color = shown.color
+            if not isinstance(color, np.ndarray):
+                with context or nullcontext():
+                    color = read_texture(color)[..., :3]
+            Image.fromarray(color).save(path)
             say(f"wrote {path}")
 
 

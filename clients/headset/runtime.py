@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.messages import Pose
+
+if TYPE_CHECKING:
+    import moderngl
+
+Image: TypeAlias = "NDArray[np.uint8] | moderngl.Texture"
+"""An image (h, w, 3) in an array, or in a texture with the top row first."""
 
 Eye = Literal["left", "right"]
 EYES: tuple[Eye, Eye] = ("left", "right")
@@ -110,21 +116,30 @@ class ShownView:
     ----------
     view : EyeView
         View that the image was rendered for, possibly that of an earlier frame.
-    color : (h, w, 3) uint8
+    color : (h, w, 3) uint8, or moderngl.Texture
         sRGB, top row first.
-    depth_m : (h, w) float32
+    depth_m : (h, w) float32, or moderngl.Texture
         Planar depth.
-    plain : (h, w, 3) uint8, optional
+    plain : (h, w, 3) uint8, or moderngl.Texture, optional
         Unfiltered image for the left part of the display.
     plain_ratio : float
         Fraction of the width that the unfiltered image covers.
     """
 
     view: EyeView
-    color: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
-    plain: NDArray[np.uint8] | None = None
+    color: Image
+    depth_m: NDArray[np.float32] | moderngl.Texture
+    plain: Image | None = None
     plain_ratio: float = 0.0
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Return width and height of the image."""
+        if isinstance(self.color, np.ndarray):
+            height_px, width_px = self.color.shape[:2]
+            return width_px, height_px
+        width_px, height_px = self.color.size
+        return width_px, height_px
 
 
 class Runtime(Protocol):

@@ -9,10 +9,12 @@ import numpy as np
 
 from clients.headset.poses import matrix_of
 from clients.headset.runtime import EyeView
-from clients.headset.stereo_gaze import RgbdPicture
+from clients.headset.stereo_gaze import TexturePicture
 from clients.scenes.geometry import Array
 from clients.scenes.scene import Scene
 from clients.scenes.scene_view import SceneView
+
+N_EYES = 2
 
 
 class SceneScenery:
@@ -45,13 +47,13 @@ class SceneScenery:
 
     def pictures(
         self, views: Sequence[EyeView], size_px: tuple[int, int]
-    ) -> tuple[RgbdPicture, ...]:
-        """Render the image of each eye."""
+    ) -> tuple[TexturePicture, ...]:
+        """Render the image of each eye; the next call overwrites the images."""
         found = []
-        for view in views:
+        for number, view in enumerate(views):
             pose = self._stand @ matrix_of(view.pose)
-            color, depth_m = self._view_of(size_px).render(pose, view.tangents)
-            found.append(RgbdPicture(view, color, depth_m))
+            image = self._view_of(size_px).draw(pose, view.tangents, image=number)
+            found.append(TexturePicture(view, image))
         return tuple(found)
 
     def _view_of(self, size_px: tuple[int, int]) -> SceneView:
@@ -62,6 +64,7 @@ class SceneScenery:
                 self._scene,
                 size_px,
                 supersampling=self._supersampling,
+                image_count=N_EYES,
             )
         return self._view
 

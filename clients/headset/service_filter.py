@@ -16,6 +16,7 @@ from clients.headset.stereo_filter import (
     StereoFrame,
     settings_for_gaze,
 )
+from clients.headset.stereo_gaze import Picture
 from filter_service import FilterSettings
 from filter_service.errors import FilterError
 from filter_service.messages import (
@@ -220,6 +221,10 @@ class ServiceFilter:
         if asked is None or asked[0] != view.profile_id or not view.is_complete:
             return None
         return view.focus_dpt
+
+    def known(self, picture: Picture) -> Picture:
+        """Return the image: the service needs arrays of it anyway."""
+        return picture
 
     def restart(self) -> None:
         """Discard the results and the frames in flight."""

@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from clients.headset.poses import matrix_of, turned
 from clients.headset.runtime import (
     EYES,
@@ -91,6 +93,8 @@ class SimulatedRuntime:
         Simulated events and sensor values.
     on_shown : callable, optional
         Called with (due, shown) for each frame that ends.
+    finish : callable, optional
+        Function that waits for images in textures, as a display does.
     """
 
     name = "simulated headset"
@@ -105,6 +109,7 @@ class SimulatedRuntime:
         head_at: Callable[[float], Pose] = swaying,
         happening: Happening | None = None,
         on_shown: Callable[[DueFrame, Sequence[ShownView]], None] | None = None,
+        finish: Callable[[], None] = lambda: None,
     ) -> None:
         if not 0.0 < rate_hz <= 1000.0:
             raise ValueError(f"rate_hz is {rate_hz}; allowed: above 0, up to 1000")
@@ -115,7 +120,7 @@ class SimulatedRuntime:
         self.tracks_eyes = self.happening.gaze_deg is not None
         self._period_s = 1.0 / rate_hz
         self._head_at = head_at
-        self._on_shown = on_shown
+        self._on_shown, self._finish = on_shown, finish
         self._start_s = time.monotonic()
         self._next_s = 0.0
         self._begun: DueFrame | None = None
@@ -164,15 +169,14 @@ class SimulatedRuntime:
         if self.happening.is_lost:
             raise SessionLost("the simulated session is lost")
         for view in shown:
-            width, height = self.size_px
-            if view.color.shape != (height, width, 3):
+            if view.size_px != self.size_px:
+                raise ValueError(f"color of {view.size_px}; expected {self.size_px}")
+            depth_m, (width, height) = view.depth_m, self.size_px
+            if isinstance(depth_m, np.ndarray) and depth_m.shape != (height, width):
                 raise ValueError(
-                    f"color of shape {view.color.shape}; expected {(height, width, 3)}"
+                    f"depth of shape {depth_m.shape}; expected {(height, width)}"
                 )
-            if view.depth_m.shape != (height, width):
-                raise ValueError(
-                    f"depth of shape {view.depth_m.shape}; expected {(height, width)}"
-                )
+        self._finish()
         if self._on_shown is not None:
             self._on_shown(due, shown)
 

@@ -6,11 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
-from clients.headset.runtime import DueFrame, Eye, EyeView
-from clients.headset.stereo_gaze import EyeAndGaze, RgbdPicture
+from clients.headset.runtime import DueFrame, Eye, EyeView, Image
+from clients.headset.stereo_gaze import EyeAndGaze, Picture
 from filter_service import FilterSettings, RgbdView
 from filter_service.messages import ViewState
 
@@ -22,7 +19,7 @@ class StereoFrame:
     """Frame to filter, with the state of both eyes."""
 
     due: DueFrame
-    pictures: tuple[RgbdPicture, ...]
+    pictures: tuple[Picture, ...]
     eyes: tuple[EyeAndGaze, ...]
     begun_s: float
 
@@ -56,7 +53,7 @@ class FilteredStereoFrame:
         Input frame.
     views : tuple of EyeView
         View of each image, with the pose that was returned with it.
-    colors : tuple of (h, w, 3) uint8
+    colors : tuple of (h, w, 3) uint8, or of moderngl.Texture
         Filtered image of each eye, sRGB.
     used_focus_dpt : tuple of float or None
         Focus of each eye; None if the previous eye was used, whose focus does not apply
@@ -71,7 +68,7 @@ class FilteredStereoFrame:
 
     frame: StereoFrame
     views: tuple[EyeView, ...]
-    colors: tuple[NDArray[np.uint8], ...]
+    colors: tuple[Image, ...]
     used_focus_dpt: tuple[float | None, ...]
     is_complete: bool
     notes: tuple[str, ...]
@@ -94,6 +91,13 @@ class StereoFilter(Protocol):
 
     def see(self, frame: StereoFrame) -> FilteredStereoFrame | None:
         """Submit a frame; return the newest result, or None before the first one."""
+
+    def known(self, picture: Picture) -> Picture:
+        """Return an image whose light and depth the eyes can follow without a wait.
+
+        It is the image itself if that is in arrays, otherwise a smaller one of an
+        earlier frame.
+        """
 
     def restart(self) -> None:
         """Discard results, whose poses refer to the previous session."""

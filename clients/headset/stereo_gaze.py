@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clients.headset.poses import angles_of, direction_of, matrix_of
-from clients.headset.runtime import DueFrame, Eye, EyeView
+from clients.headset.runtime import DueFrame, Eye, EyeView, Image
 from clients.natural_eye import (
     USUAL_WHITE_CD_M2,
     EyeState,
@@ -21,6 +23,11 @@ from clients.natural_eye import (
 )
 from estimator.dynamics import GazeFollower
 from filter_service.messages import Camera
+
+if TYPE_CHECKING:
+    import moderngl
+
+    from clients.scenes.scene_view import SceneImage
 
 Array = NDArray[np.float64]
 
@@ -55,6 +62,54 @@ class RgbdPicture:
         """Return the camera of the image."""
         height_px, width_px = self.depth_m.shape
         return Camera(width_px, height_px, self.view.tangents)
+
+
+class TexturePicture:
+    """Unfiltered image of one eye in textures, which are read only if need be.
+
+    Parameters
+    ----------
+    view : EyeView
+        View that the image was rendered for.
+    image : SceneImage
+        Color, sRGB, and planar depth.
+    """
+
+    def __init__(self, view: EyeView, image: SceneImage) -> None:
+        self.view, self.image = view, image
+
+    @cached_property
+    def _arrays(self) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        return self.image.read()
+
+    @property
+    def color(self) -> NDArray[np.uint8]:
+        """Return the color (h, w, 3), sRGB; the first call waits for the GPU."""
+        return self._arrays[0]
+
+    @property
+    def depth_m(self) -> NDArray[np.float32]:
+        """Return the planar depth (h, w); the first call waits for the GPU."""
+        return self._arrays[1]
+
+    @property
+    def camera(self) -> Camera:
+        """Return the camera of the image."""
+        width_px, height_px = self.image.color.size
+        return Camera(width_px, height_px, self.view.tangents)
+
+
+Picture = RgbdPicture | TexturePicture
+"""Image of one eye, in arrays or in textures."""
+
+
+def images_of(
+    picture: Picture,
+) -> tuple[Image, NDArray[np.float32] | moderngl.Texture]:
+    """Return color and depth of a picture as it has them: arrays or textures."""
+    if isinstance(picture, TexturePicture):
+        return picture.image.color, picture.image.depth_m
+    return picture.color, picture.depth_m
 
 
 @dataclass(frozen=True)
@@ -111,9 +166,23 @@ class StereoGaze:
         self.is_tracked = False
 
     def follow(
-        self, due: DueFrame, pictures: Sequence[RgbdPicture]
+        self,
+        due: DueFrame,
+        pictures: Sequence[Picture],
+        known: Sequence[Picture] | None = None,
     ) -> tuple[EyeAndGaze, ...]:
-        """Return the state of both eyes at the time when the images are shown."""
+        """Return the state of both eyes at the time when the images are shown.
+
+        Parameters
+        ----------
+        due : DueFrame
+        pictures : sequence of RgbdPicture or TexturePicture
+            Images of the frame.
+        known : sequence of the same, optional
+            Images whose light and depth the eyes follow, such as smaller ones of the
+            previous frame; by default those of the frame.
+        """
+        known = pictures if known is None else known
         at_s = due.now_s
         if due.gaze is not None:
             seen = due.gaze
@@ -122,10 +191,10 @@ class StereoGaze:
         self.is_tracked = gaze.is_tracked
         head = _head(due, pictures)
         direction = head[:3, :3] @ direction_of(gaze.h_deg, gaze.v_deg)
-        distance_m = self._distance(head[:3, 3], direction, pictures)
+        distance_m = self._distance(head[:3, 3], direction, known)
         # Both pupils follow the light of both eyes, and both lenses the same command.
         light_cd_m2 = float(
-            np.mean([luminance_cd_m2(p.color, self._white_cd_m2) for p in pictures])
+            np.mean([luminance_cd_m2(p.color, self._white_cd_m2) for p in known])
         )
         found = []
         for picture in pictures:
@@ -158,7 +227,7 @@ class StereoGaze:
         if eye in self._eyes:
             self._eyes[eye].change()
 
-    def _eye(self, picture: RgbdPicture) -> NaturalEye:
+    def _eye(self, picture: Picture) -> NaturalEye:
         eye = picture.view.eye
         if eye not in self._eyes:
             self._eyes[eye] = NaturalEye(
@@ -169,7 +238,7 @@ class StereoGaze:
         return self._eyes[eye]
 
     def _distance(
-        self, origin: Array, direction: Array, pictures: Sequence[RgbdPicture]
+        self, origin: Array, direction: Array, pictures: Sequence[Picture]
     ) -> float:
         """Return the distance of the point of fixation from between the eyes.
 
@@ -197,7 +266,7 @@ class StereoGaze:
 
 
 def _along(
-    origin: Array, direction: Array, picture: RgbdPicture, distance_m: float
+    origin: Array, direction: Array, picture: Picture, distance_m: float
 ) -> float | None:
     """Return the distance at which a ray meets a visible surface; None without depth.
 
@@ -221,7 +290,7 @@ def _along(
     return distance_m
 
 
-def _head(due: DueFrame, pictures: Sequence[RgbdPicture]) -> Array:
+def _head(due: DueFrame, pictures: Sequence[Picture]) -> Array:
     """Return the matrix of the head; if unknown, that of the eyes' mean pose."""
     if due.head is not None:
         return matrix_of(due.head)

@@ -19,7 +19,7 @@ from clients.headset.runtime import (
     ShownView,
 )
 from clients.headset.stereo_filter import FilteredStereoFrame, StereoFilter, StereoFrame
-from clients.headset.stereo_gaze import RgbdPicture, StereoGaze
+from clients.headset.stereo_gaze import Picture, StereoGaze, images_of
 
 MS_PER_S = 1e3
 STALE_S = 1.0
@@ -34,8 +34,8 @@ class Scenery(Protocol):
 
     def pictures(
         self, views: Sequence[EyeView], size_px: tuple[int, int]
-    ) -> tuple[RgbdPicture, ...]:
-        """Render the image of each eye."""
+    ) -> tuple[Picture, ...]:
+        """Render the image of each eye; the next call may overwrite textures."""
 
 
 @dataclass
@@ -238,7 +238,8 @@ class Viewer:
         """Return the filtered frame, the views to show, and the times of the stages."""
         pictures = self._scenery.pictures(due.views, size_px)
         rendered_s = time.monotonic()
-        eyes = self._look.follow(due, pictures)
+        known = [self._seeing.known(picture) for picture in pictures]
+        eyes = self._look.follow(due, pictures, known)
         looked_s = time.monotonic()
         self._tell_tracking()
         frame = StereoFrame(due, pictures, eyes, begun_s)
@@ -260,16 +261,17 @@ class Viewer:
         """Return the views to show, each with the pose that it was rendered for."""
         if seen is None or not self._controls.is_on:
             return tuple(
-                ShownView(picture.view, picture.color, picture.depth_m)
+                ShownView(picture.view, *images_of(picture))
                 for picture in frame.pictures
             )
         ratio = SPLIT_RATIO if self._controls.is_split else 0.0
-        return tuple(
-            ShownView(view, color, picture.depth_m, picture.color, ratio)
-            for view, color, picture in zip(
-                seen.views, seen.colors, seen.frame.pictures, strict=True
-            )
-        )
+        found = []
+        for view, color, picture in zip(
+            seen.views, seen.colors, seen.frame.pictures, strict=True
+        ):
+            plain, depth_m = images_of(picture)
+            found.append(ShownView(view, color, depth_m, plain, ratio))
+        return tuple(found)
 
     def _note(
         self, seen: FilteredStereoFrame | None, times_ms: dict[str, float]

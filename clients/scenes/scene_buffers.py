@@ -66,11 +66,14 @@ class SceneBuffers:
         Width and height of an image.
     supersampling : int
         Samples per pixel along each axis.
+    image_count : int
+        Number of targets of the pixels.
 
     Attributes
     ----------
-    pixels : moderngl.Framebuffer
-        Target of the pixels resolved from samples: color, and planar depth in meters.
+    images : list of moderngl.Framebuffer
+        Targets of the pixels resolved from samples: color, and planar depth in meters,
+        with the top row first.
     visible, hidden : Layer
         Objects of each layer; those of the hidden layer are created at first use.
     """
@@ -81,12 +84,16 @@ class SceneBuffers:
         scene: Scene,
         size_px: tuple[int, int],
         supersampling: int,
+        image_count: int,
     ):
         self._context, self._scene = context, scene
         self._size_px, self._supersampling = size_px, supersampling
         self._owned: list[Any] = []
         try:
-            self.pixels = self._target(size_px, None, with_depth=False)
+            self.images = [
+                self._target(size_px, None, with_depth=False)
+                for _ in range(image_count)
+            ]
             self._content = self._uploaded(scene)
             self.visible = self._layer({})
         except BaseException:

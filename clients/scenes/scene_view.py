@@ -49,6 +49,41 @@ def open_context(version: int = 330) -> moderngl.Context:
         return context
 
 
+class SceneImage:
+    """A rendered image in textures, with the top row first.
+
+    Attributes
+    ----------
+    color : moderngl.Texture
+        RGBA8 with sRGB values.
+    depth_m : moderngl.Texture
+        Planar depth, R32F; +inf for the background.
+    """
+
+    def __init__(
+        self,
+        context: moderngl.Context,
+        color: moderngl.Texture,
+        depth_m: moderngl.Texture,
+    ) -> None:
+        self._context, self.color, self.depth_m = context, color, depth_m
+
+    def read(self) -> Picture:
+        """Wait for the image and return it as arrays, as `SceneView.render` does."""
+        with self._context:
+            return read_texture(self.color)[..., :3], read_texture(self.depth_m)
+
+
+def read_texture(texture: moderngl.Texture) -> NDArray[Any]:
+    """Return the pixels of a texture, first row first; its context is current."""
+    width, height = texture.size
+    dtype = np.float32 if texture.dtype == "f4" else np.uint8
+    shape = (height, width, texture.components)[: 2 + (texture.components > 1)]
+    found = np.empty(shape, dtype)
+    texture.read_into(found, alignment=1)
+    return found
+
+
 class SceneView:
     """Renderer of one scene, in an OpenGL context that may be shared.
 
@@ -62,6 +97,8 @@ class SceneView:
         Width and height of an image.
     supersampling : int
         Samples per pixel along each axis.
+    image_count : int
+        Number of images that `draw` can keep at a time.
 
     Raises
     ------
@@ -87,6 +124,7 @@ class SceneView:
         size_px: tuple[int, int],
         *,
         supersampling: int = 2,
+        image_count: int = 1,
     ):
         width, height = size_px
         if min(width, height, supersampling) < 1:
@@ -98,7 +136,9 @@ class SceneView:
         self._context = context
         with context:
             self._check_size(supersampling)
-            self._buffers = SceneBuffers(context, scene, size_px, supersampling)
+            self._buffers = SceneBuffers(
+                context, scene, size_px, supersampling, image_count
+            )
 
     def __enter__(self) -> "SceneView":
         return self
@@ -144,6 +184,28 @@ class SceneView:
             self._draw(self._buffers.visible, uniforms)
             self._resolve(self._buffers.visible, picture)
         return picture
+
+    def draw(self, pose: Array, tangents: Tangents, *, image: int = 0) -> SceneImage:
+        """Render the scene from a pose to textures, without waiting for the GPU.
+
+        Parameters
+        ----------
+        pose, tangents
+            As for `render`.
+        image : int
+            Number of the image, whose previous content is lost.
+        """
+        uniforms = _uniforms(pose, self._projection(tangents))
+        target = self._buffers.images[image]
+        with self._context:
+            self._draw(self._buffers.visible, uniforms)
+            self._resolve_to(target, self._buffers.visible)
+        color, depth_m = target.color_attachments
+        return SceneImage(
+            self._context,
+            cast("moderngl.Texture", color),
+            cast("moderngl.Texture", depth_m),
+        )
 
     def render_layers(self, pose: Array, tangents: Tangents) -> tuple[Picture, Picture]:
         """Render the visible surface and the hidden layer behind it.
@@ -235,15 +297,21 @@ class SceneView:
 
     def _resolve(self, layer: Layer, out: Picture, seen: Any = None) -> None:
         """Resolve samples to pixels and copy these; waits for the GPU."""
-        pixels = self._buffers.pixels
+        pixels = self._buffers.images[0]
+        self._resolve_to(pixels, layer, seen)
+        # The size of a row of three-byte pixels need not be a multiple of four.
+        pixels.read_into(out[0], components=3, attachment=0, alignment=1)
+        pixels.read_into(out[1], components=1, attachment=1, dtype="f4")
+
+    def _resolve_to(
+        self, pixels: moderngl.Framebuffer, layer: Layer, seen: Any = None
+    ) -> None:
+        """Resolve samples to pixels."""
         with self._context.scope(pixels, moderngl.NOTHING):
             for unit, texture in enumerate((*layer.samples.color_attachments, seen)):
                 if texture is not None:
                     cast("moderngl.Texture", texture).use(unit)
             layer.resolving.render(moderngl.TRIANGLES, vertices=3)
-        # The size of a row of three-byte pixels need not be a multiple of four.
-        pixels.read_into(out[0], components=3, attachment=0, alignment=1)
-        pixels.read_into(out[1], components=1, attachment=1, dtype="f4")
 
     def _output(self, out: Picture | None) -> Picture:
         """Return the caller's output arrays after a check, or new ones."""

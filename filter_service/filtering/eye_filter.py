@@ -575,6 +575,7 @@ class EyeFilter:
             shown.pupil_diameter_mm,
             shown.focus_dpt,
             shown.gaze_deg,
+            shown.number,
             shown.notes,
             shown.earlier,
         )

@@ -157,6 +157,8 @@ class FilteredTexture:
         As in `ViewResult`.
     pupil_diameter_mm, focus_dpt, gaze_deg
         Values used.
+    number : int
+        Number of the frame among those of the context; see `EarlierFrame`.
     notes : tuple of str
     earlier : EarlierFrame or None
         What is known of the newest frame through this eye that the GPU has finished.
@@ -167,6 +169,7 @@ class FilteredTexture:
     pupil_diameter_mm: float
     focus_dpt: float
     gaze_deg: tuple[float, float]
+    number: int
     notes: tuple[str, ...]
     earlier: EarlierFrame | None
 

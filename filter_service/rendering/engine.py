@@ -108,6 +108,8 @@ class ShownTexture:
     ----------
     pupil_diameter_mm, focus_dpt, gaze_deg
         After clamping to the prepared ranges.
+    number : int
+        Number of the frame among those of the context, from 1 on.
     notes : tuple of str
     earlier : EarlierFrame or None
         The newest frame through this eye that the GPU has finished.
@@ -116,6 +118,7 @@ class ShownTexture:
     pupil_diameter_mm: float
     focus_dpt: float
     gaze_deg: tuple[float, float]
+    number: int
     notes: tuple[str, ...]
     earlier: EarlierFrame | None
 

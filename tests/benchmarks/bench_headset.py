@@ -73,6 +73,9 @@ class Watched:
         self.last = self._seeing.see(frame) or self.last
         return self.last
 
+    def known(self, picture):
+        return self._seeing.known(picture)
+
     def restart(self) -> None:
         self._seeing.restart()
 

@@ -19,12 +19,7 @@ WATCHED = {
     "glGetNamedBufferSubData": (None, (_uint, _size, _size, _pointer), DOWN, 2),
     "glCopyBufferSubData": (None, (_uint, _uint, _size, _size, _size), "copy", 4),
     "glMapBufferRange": (_pointer, (_uint, _size, _size, _uint), "map", 2),
-    "glTexImage2D": (
-        None,
-        (_uint, *(_int,) * 5, _int, _uint, _uint, _pointer),
-        IMAGE,
-        0,
-    ),
+    "glTexImage2D": (None, (_uint, *(_int,) * 5, _uint, _uint, _pointer), IMAGE, 0),
     "glTexSubImage2D": (None, (_uint, *(_int,) * 5, _uint, _uint, _pointer), IMAGE, 0),
     "glTexSubImage3D": (None, (_uint, *(_int,) * 7, _uint, _uint, _pointer), IMAGE, 0),
     "glReadPixels": (None, (*(_int,) * 4, _uint, _uint, _pointer), IMAGE, 0),

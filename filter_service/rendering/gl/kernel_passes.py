@@ -164,6 +164,7 @@ class KernelPasses:
             is_kept=is_kept,
             buffers={
                 **self._buffers,
+                **self._shared_buffers(),
                 **tables,
                 "STATS": gpu.storage("STATS", _WORD_BYTES * STAT_LANES * STAT_WORDS),
                 "USED": gpu.storage("USED", _WORD_BYTES * used_word_count(state)),
@@ -222,17 +223,20 @@ class KernelPasses:
             "KERNELS": _UVEC4_BYTES * KERNEL_WORDS * new.kernels,
             "NODES": _UVEC4_BYTES * NODE_WORDS * new.nodes,
         }
-        shared = {
-            "KERNEL_PAIRS": 2 * _WORD_BYTES * new.kernels,
-            "NODE_PAIRS": 2 * _WORD_BYTES * new.nodes,
-            "PARTS": _UVEC4_BYTES * PART_WORDS * new.kernels,
-            "RECIPES": _WORD_BYTES * 2 * RGB * RECIPE_WORDS * new.nodes,
-            "WORK": 2 * _WORD_BYTES * WORK_LISTS * new.work_items,
-        }
         for name, size in own.items():
             self._buffers[name] = self.gpu.storage(f"{name} {self._slot}", size)
-        for name, size in shared.items():
-            self._buffers[name] = self.gpu.storage(name, size)
+
+    def _shared_buffers(self) -> dict[str, Buffer]:
+        """Return the buffers that are used within a frame, so all eyes share them."""
+        capacity = self._capacity
+        sizes = {
+            "KERNEL_PAIRS": 2 * _WORD_BYTES * capacity.kernels,
+            "NODE_PAIRS": 2 * _WORD_BYTES * capacity.nodes,
+            "PARTS": _UVEC4_BYTES * PART_WORDS * capacity.kernels,
+            "RECIPES": _WORD_BYTES * 2 * RGB * RECIPE_WORDS * capacity.nodes,
+            "WORK": 2 * _WORD_BYTES * WORK_LISTS * capacity.work_items,
+        }
+        return {name: self.gpu.storage(name, size) for name, size in sizes.items()}
 
     def grow(self, counts: NDArray[np.uint32], headroom: float = HEADROOM) -> None:
         """Enlarge the buffers to a multiple of a plan's counters, if need be."""

@@ -102,6 +102,7 @@ class FilterRenderer(OneView):
             pupil_diameter_mm=layers.pupil_diameter_mm,
             focus_dpt=layers.focus_dpt,
             gaze_deg=gaze_deg,
+            number=self._textures.number,
             notes=(*layers.notes, *notes),
             earlier=earlier,
         )

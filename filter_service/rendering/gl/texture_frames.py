@@ -129,6 +129,11 @@ class TextureFrames:
     ----------
     gpu : Gpu
         Of a context of the caller.
+
+    Attributes
+    ----------
+    number : int
+        Number of frames that were submitted.
     """
 
     def __init__(self, gpu: Gpu) -> None:
@@ -138,7 +143,7 @@ class TextureFrames:
         self._io = TextureIo(gpu.context, gpu.functions)
         self._triangle: dict[Any, moderngl.VertexArray] = {}
         self._submitted: deque[_Submitted] = deque()
-        self._number = 0
+        self.number = 0
 
     def release(self) -> None:
         """Free the OpenGL objects."""
@@ -233,12 +238,12 @@ class TextureFrames:
         fragments.merge_fragments()
         lists.run()
         self._show(request, strip)
-        self._number += 1
+        self.number += 1
         if not is_counted:
             return None
         samples = self._sample(strip, view)
         frame = _Submitted(
-            *(self._number, eye, kernels, lists, fragments),
+            *(self.number, eye, kernels, lists, fragments),
             totals=np.empty(TOTAL_WORDS, np.uint32),
             samples=samples,
         )
