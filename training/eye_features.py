@@ -24,7 +24,7 @@ from estimator.optics.zernike import (
     MAX_RADIAL_ORDER,
     N_TERMS,
     index_from_nm,
-    monomial_matrix,
+    inverse_monomial_matrix,
     nm_from_index,
 )
 from training.meridional import Conic, excess_vergence
@@ -103,7 +103,7 @@ class Shift(nn.Module):
         ]
         order = np.argsort(horner_order())
         to_monomials = torch.as_tensor(np.array(offsets)[1:, order])
-        to_zernike = torch.as_tensor(np.linalg.inv(monomial_matrix()))[:, 1:]
+        to_zernike = torch.tensor(inverse_monomial_matrix())[:, 1:]
         k, p = torch.meshgrid(torch.arange(n), torch.arange(n), indexing="ij")
         binomials = torch.tensor(
             [[float(math.comb(j, i)) for j in range(n)] for i in range(n)]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from estimator.estimate.measured_residual import MeasuredResidual
 from estimator.field.interpolation import POWER, FieldInterpolation, FieldValues
 from estimator.optics.prescription import C20
-from estimator.optics.zernike import N_TERMS, monomial_matrix
+from estimator.optics.zernike import N_TERMS, inverse_monomial_matrix
 from estimator.wavefront.field_wavefronts import DEGREE
 
 DEGREES = (2, 4, 6)
@@ -91,6 +91,6 @@ class _Grid:
 
 def sums_by_degree(polynomial_um: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the contributions (..., 3) by degree to C(2,0) on a radius of 1 mm."""
-    share = np.linalg.inv(monomial_matrix())[:, C20] * polynomial_um
+    share = inverse_monomial_matrix()[:, C20] * polynomial_um
     sums = [share[..., degree == DEGREE].sum(axis=-1) for degree in DEGREES]
     return np.stack(sums, axis=-1)

@@ -113,6 +113,14 @@ def monomial_matrix() -> NDArray[np.float64]:
     return matrix
 
 
+@cache
+def inverse_monomial_matrix() -> NDArray[np.float64]:
+    """Return the inverse (28, 28) of `monomial_matrix`."""
+    inverse = np.linalg.inv(monomial_matrix()).astype(np.float64)
+    inverse.flags.writeable = False
+    return inverse
+
+
 def wavefront_polynomial(zernike_um: ArrayLike) -> NDArray[np.float64]:
     """Return the monomial coefficients (..., 28), um, of W on the unit circle.
 

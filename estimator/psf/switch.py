@@ -12,7 +12,7 @@ core (coma, caustics), where ray optics fails.
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.optics.zernike import monomial_matrix
+from estimator.optics.zernike import inverse_monomial_matrix
 from estimator.psf.survey import PupilSurvey
 
 BASE_DB = 41.56
@@ -37,7 +37,7 @@ _N_PLANE = 3
 
 def rms_waves_ratio(survey: PupilSurvey) -> NDArray[np.float64]:
     """Return the RMS (P,) of wavefronts without tilt over their pupils, in waves."""
-    zernike_um = survey.frames.disc_polynomial_um @ np.linalg.inv(monomial_matrix())
+    zernike_um = survey.frames.disc_polynomial_um @ inverse_monomial_matrix()
     rms_um: NDArray[np.float64] = np.sqrt((zernike_um[:, _N_PLANE:] ** 2).sum(axis=1))
     return rms_um / (survey.frames.wavelength_nm / 1000.0)
 

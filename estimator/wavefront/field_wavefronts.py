@@ -13,7 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.optics import prescription as rx
 from estimator.optics.units import SPHERE_PER_C20
-from estimator.optics.zernike import EXPONENTS, monomial_matrix, wavefront_polynomial
+from estimator.optics.zernike import (
+    EXPONENTS,
+    inverse_monomial_matrix,
+    wavefront_polynomial,
+)
 
 DEGREE: NDArray[np.int64] = EXPONENTS.sum(axis=1)
 """Degree of each monomial, (28,)."""
@@ -123,7 +127,7 @@ def zernike_from_polynomial(
     Piston is zero.
     """
     radius_mm = np.asarray(radius_mm, dtype=np.float64)[..., None]
-    zernike_um = (polynomial_um * radius_mm**DEGREE) @ np.linalg.inv(monomial_matrix())
+    zernike_um = (polynomial_um * radius_mm**DEGREE) @ inverse_monomial_matrix()
     zernike_um[..., 0] = 0.0
     return zernike_um
 

@@ -2,6 +2,7 @@
 
 from bisect import bisect_left
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from filter_service.planning.grid import LAYER_BLUR_RATIO, GridSpec
 from filter_service.planning.nodes import PlanAxes
 from filter_service.planning.readable import usable_pupils_mm
 from filter_service.psfs.field_defocus import FieldDefocus
-from filter_service.psfs.read_kernels import StateReads
+from filter_service.psfs.read_kernels import StateReads, StoreTables
 from filter_service.psfs.store import PsfStore
 
 
@@ -37,8 +38,8 @@ class FrameLayers:
         Total defocus at layer 0 dpt, per field node and channel.
     reads : StateReads
         Neighboring nodes of the state.
-    layer_blur_px : (n_layers,)
-        Largest geometric blur radius over field and channels.
+    tables : StoreTables
+        Nodes of the cache.
     edge_reach_px : float
         Distance to which kernels extend beyond the rays: diffraction at the pupil's
         edge that ``spec.kept_energy_ratio`` keeps.
@@ -50,12 +51,23 @@ class FrameLayers:
     field: FieldDefocus
     layer_zero_dpt: NDArray[np.float64]
     reads: StateReads
-    layer_blur_px: NDArray[np.float64]
+    tables: StoreTables
     edge_reach_px: float
     pupil_diameter_mm: float
     focus_dpt: float
     blur_px_per_dpt: float
     notes: tuple[str, ...]
+
+    @cached_property
+    def layer_blur_px(self) -> NDArray[np.float64]:
+        """Largest geometric blur radius (n_layers,) over field and channels."""
+        from filter_service.psfs.read_loops import layer_blur_px
+
+        blur_px = layer_blur_px(
+            self.tables, self.reads, self.layer_zero_dpt, self.layer_dpt
+        )
+        largest_px: NDArray[np.float64] = blur_px.max(axis=1)
+        return largest_px
 
     def reach_px(self, low_dpt: float, high_dpt: float, *, max_px: int) -> int:
         """Return an upper limit of the blur, px, of objects in a range."""
@@ -94,7 +106,6 @@ def frame_layers(
     """
     # Imported here: the service must be ready before it loads numba.
     from filter_service.psfs.layer_loops import layer_distances_dpt
-    from filter_service.psfs.read_loops import layer_blur_px
 
     plan, eye = store.plan, store.eye
     pupil_mm, notes = _usable_pupil(store, pupil_diameter_mm)
@@ -131,9 +142,7 @@ def frame_layers(
         field=change,
         layer_zero_dpt=layer_zero_dpt,
         reads=reads,
-        layer_blur_px=layer_blur_px(store.tables, reads, layer_zero_dpt, layer_dpt).max(
-            axis=1
-        ),
+        tables=store.tables,
         edge_reach_px=_edge_reach_px(store.spec, pupil_mm),
         pupil_diameter_mm=pupil_mm,
         focus_dpt=reached_dpt,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.corrections.rings import Rings
-from estimator.optics.zernike import N_TERMS, monomial_matrix
+from estimator.optics.zernike import N_TERMS, inverse_monomial_matrix, monomial_matrix
 from estimator.psf import fourier, geometric, geometric_kernels, pupil, survey, switch
 from estimator.psf import fourier_kernels as waves
 from estimator.psf.compute import ACCURACY
@@ -272,7 +272,7 @@ def _tables() -> tuple[PsfTables, dict[str, NDArray[np.generic]]]:
     fresnel = geometric.fresnel_table()
     contents: dict[str, NDArray[np.generic]] = {
         "monomials": monomial_matrix(),
-        "zernike_terms": np.linalg.inv(monomial_matrix()),
+        "zernike_terms": inverse_monomial_matrix(),
         "node_xy": pupil.NODES.T,
         "from_nodes": pupil.FROM_NODES.T,
         "slope_x": slopes[0],
