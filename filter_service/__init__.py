@@ -7,6 +7,7 @@ Importing this package loads no submodules, which keeps clients light.
     displays         wavelengths of red, green and blue
     camera           pinhole camera, and which cameras share PSFs
     rgbd_view        color, depth and camera of one view
+    texture_view     the same in textures of the caller
     view_state       eye and state of a view
     messages         types of the wire protocol (PROTOCOL.md)
     protocol_schema  JSON Schema of the message headers

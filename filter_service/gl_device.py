@@ -1,4 +1,4 @@
-"""Selection of the EGL device for OpenGL.
+"""Selection of the EGL device for OpenGL, and recognition of software renderers.
 
 The service passes its setting ``gl_device`` to its processes in an environment
 variable, which commands read too.
@@ -49,3 +49,11 @@ def wanted_gl_device() -> str:
         if wanted:
             return checked_gl_device(wanted, variable)
     return AUTO
+
+
+SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swr", "software")
+
+
+def is_software_renderer(name: str) -> bool:
+    """Return whether an OpenGL renderer of this name runs on the CPU."""
+    return any(word in name.lower() for word in SOFTWARE_RENDERERS)

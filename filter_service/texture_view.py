@@ -122,8 +122,9 @@ class TextureView:
     is_top_first : bool
         Whether the first row of the textures is the top of the image; OpenGL's own
         images start with the bottom row.
-    white_level : float
-        Linear light of white: differences far below it may be merged.
+    white_ratio : float
+        Linear light of white, relative to that of an 8-bit image: differences far below
+        it may be merged.
 
     Raises
     ------
@@ -138,7 +139,7 @@ class TextureView:
     tangents: Tangents
     projection: DepthProjection | None = None
     is_top_first: bool = False
-    white_level: float = 1.0
+    white_ratio: float = 1.0
 
     def __post_init__(self) -> None:
         """Check that the values suit each other."""
@@ -161,9 +162,9 @@ class TextureView:
                 field="projection",
                 allowed="a DepthProjection for d32f and d24, none for r32f",
             )
-        if not (math.isfinite(self.white_level) and self.white_level > 0.0):
+        if not (math.isfinite(self.white_ratio) and self.white_ratio > 0.0):
             raise BadMessage(
-                f"{self.white_level}", field="white_level", allowed="above 0, finite"
+                f"{self.white_ratio}", field="white_ratio", allowed="above 0, finite"
             )
         object.__setattr__(self, "tangents", self.camera.tangents)
 

@@ -14,8 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from estimator.threads import thread_count
-from filter_service.gl.hardware import is_software_renderer
-from filter_service.gl_device import GL_DEVICE_VARIABLE, is_device_selected
+from filter_service.gl_device import (
+    GL_DEVICE_VARIABLE,
+    is_device_selected,
+    is_software_renderer,
+)
 from filter_service.threads import UNSAFE_THREADING_LAYER
 
 SERVICE_PACKAGES = (

@@ -43,9 +43,8 @@ from clients.headset.service_filter import ServiceFilter
 from clients.headset.stereo_filter import StereoFilter
 from clients.headset.stereo_gaze import StereoGaze
 from clients.headset.viewer import Viewer, ViewerLog
-from filter_service import FilterSettings
+from filter_service import FilterSettings, is_software_renderer
 from filter_service.errors import FilterError
-from filter_service.gl.hardware import is_software_renderer
 
 if TYPE_CHECKING:
     import moderngl

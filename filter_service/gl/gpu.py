@@ -19,11 +19,14 @@ from filter_service.gl.current_context import (
     current_moderngl_context,
 )
 from filter_service.gl.functions import gl_functions
-from filter_service.gl.hardware import is_software_renderer
 from filter_service.gl.kept_state import KeptState
 from filter_service.gl.passes import Atlas, Buffer, BufferPart, Pages, Passes
 from filter_service.gl.staging import ALIGNMENT, Group, Staging, has_buffer_storage
-from filter_service.gl_device import checked_gl_device, wanted_gl_device
+from filter_service.gl_device import (
+    checked_gl_device,
+    is_software_renderer,
+    wanted_gl_device,
+)
 
 Query = moderngl.Query
 

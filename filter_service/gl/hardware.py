@@ -1,4 +1,4 @@
-"""Detection of GPUs and of software renderers, without starting a driver."""
+"""Detection of GPUs, without starting a driver."""
 
 import sys
 from pathlib import Path
@@ -15,11 +15,3 @@ def may_have_gpu(root: Path = Path("/")) -> bool:
     if not sys.platform.startswith("linux"):
         return True
     return any(any(root.glob(pattern[1:])) for pattern in RENDER_NODES)
-
-
-SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swr", "software")
-
-
-def is_software_renderer(name: str) -> bool:
-    """Return whether an OpenGL renderer of this name runs on the CPU."""
-    return any(word in name.lower() for word in SOFTWARE_RENDERERS)

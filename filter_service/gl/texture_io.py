@@ -73,7 +73,8 @@ class TextureIo:
     """
 
     def __init__(self, context: moderngl.Context, functions: SimpleNamespace) -> None:
-        self._gl = functions
+        self._context, self._gl = context, functions
+        self._triangles: dict[moderngl.Program, moderngl.VertexArray] = {}
         self._sampler = ctypes.c_uint(0)
         functions.glGenSamplers(1, ctypes.byref(self._sampler))
         parameters = dict(NEAREST_PARAMETERS)
@@ -88,6 +89,8 @@ class TextureIo:
 
     def release(self) -> None:
         """Free the OpenGL objects."""
+        for triangle in self._triangles.values():
+            triangle.release()
         self._gl.glDeleteSamplers(1, ctypes.byref(self._sampler))
         self._gl.glDeleteFramebuffers(1, ctypes.byref(self._framebuffer))
 
@@ -157,8 +160,10 @@ class TextureIo:
         self._gl.glGetTexLevelParameteriv(target, 0, name, ctypes.byref(found))
         return found.value
 
-    def draw_to(self, texture: GlTexture, size_px: tuple[int, int]) -> None:
-        """Make a texture the target of draws.
+    def draw(
+        self, program: moderngl.Program, texture: GlTexture, size_px: tuple[int, int]
+    ) -> None:
+        """Draw a triangle that covers a texture.
 
         Raises
         ------
@@ -188,6 +193,11 @@ class TextureIo:
                 f"cannot draw to texture {texture.name}: framebuffer status {status:#x}"
             )
         gl.glViewportIndexedf(0, 0.0, 0.0, *map(float, size_px))
+        triangle = self._triangles.get(program)
+        if triangle is None:
+            triangle = self._context.vertex_array(program, [])
+            self._triangles[program] = triangle
+        triangle.render(moderngl.TRIANGLES, vertices=3)
 
 
 def target_of(texture: GlTexture) -> int:

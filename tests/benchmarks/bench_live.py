@@ -29,7 +29,7 @@ import numpy as np
 
 from clients.arguments import size_px_argument
 from clients.pyrender_stream import path_settings
-from filter_service.gl.hardware import is_software_renderer
+from filter_service.gl_device import is_software_renderer
 from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.native import NativeRenderer
 from tests.benchmarks.engines import open_renderer

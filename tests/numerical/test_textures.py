@@ -114,7 +114,7 @@ def test_color_formats(caller, bench, color, rng, kind, is_top_first):
         *SIZE_PX,
         bench.tangents,
         is_top_first=is_top_first,
-        white_level=bench_white(array),
+        white_ratio=bench_white(array),
     )
     target = caller.textures.new(kind, SIZE_PX)
     caller.filter(view, target, target_is_top_first=is_top_first)
@@ -313,7 +313,7 @@ def test_wrong_textures_are_refused(caller, color, change, message):
         ({"depth": GlTexture(1, "d24")}, "projection"),
         ({"depth": GlTexture(1, "rgba8")}, "depth.format"),
         ({"color": GlTexture(1, "d32f")}, "color.format"),
-        ({"white_level": 0.0}, "white_level"),
+        ({"white_ratio": 0.0}, "white_ratio"),
         ({"width_px": 0}, "width_px"),
     ],
 )

@@ -108,6 +108,8 @@ HOME = {
         "filter_service/gl/gpu.py",  # one owner of the context
         "filter_service/gl/passes.py",  # and of what runs in it
         "filter_service/gl/staging.py",  # names its types
+        "filter_service/gl/current_context.py",  # a context of the caller
+        "filter_service/gl/texture_io.py",  # and its textures
         "clients/window.py",  # shows frames in a window of its own
         "clients/scenes/scene_*.py",  # renders scenes
         "clients/headset/*",  # draws into a headset's images

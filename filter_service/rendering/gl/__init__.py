@@ -3,6 +3,7 @@
 renderer         the engine
 gl_store         a PSF store with a copy of its kernels on the GPU
 frame_run        one view, from upload to result
+texture_frames   frames from textures to a texture of the caller
 strips           division of a frame into strips that fit the buffers
 strip            size and buffers of a frame or strip
 fragment_passes  passes from pixels to fragments

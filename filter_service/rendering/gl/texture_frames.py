@@ -15,7 +15,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
@@ -141,14 +140,11 @@ class TextureFrames:
             raise RenderFailed("this OpenGL lacks functions for frames in textures")
         self._gpu, self._gl = gpu, gpu.functions
         self._io = TextureIo(gpu.context, gpu.functions)
-        self._triangle: dict[Any, moderngl.VertexArray] = {}
         self._submitted: deque[_Submitted] = deque()
         self.number = 0
 
     def release(self) -> None:
         """Free the OpenGL objects."""
-        for triangle in self._triangle.values():
-            triangle.release()
         self._io.release()
 
     def check(self, request: TextureRequest) -> None:
@@ -228,7 +224,7 @@ class TextureFrames:
             border_px=0,
             counted_px=(0, 0, *size_px),
             object_range_dpt=eye.handle.prepared_range_dpt,
-            white_level=view.white_level,
+            white_level=view.white_ratio,
             is_encoded=request.target.format != "rgba16f",
         )
         kernels = eye.kernels.begin(eye.handle, state, Untimed())
@@ -291,11 +287,7 @@ class TextureFrames:
             input_textures(view, self._io).values(), INPUT_UNITS, strict=True
         ):
             texture.use(unit)
-        triangle = self._triangle.get(program)
-        if triangle is None:
-            triangle = self._triangle[program] = gpu.context.vertex_array(program, [])
-        self._io.draw_to(request.target, strip.size)
-        triangle.render(moderngl.TRIANGLES, vertices=3)
+        self._io.draw(program, request.target, strip.size)
 
     # ----- counters
 
