@@ -13,8 +13,9 @@ view = TextureView(
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, get_args
 
 import numpy as np
@@ -228,14 +229,22 @@ class EarlierFrame:
     is_complete : bool
         Whether all its PSFs had been computed; others took the weight of the missing
         ones.
-    counts : mapping
-        Counts of `FilteredView` by name.
-    sampled : SampledInput
-        Its input.
+    count, sample : callable
+        Functions that compute `counts` and `sampled` when they are first asked for.
     """
 
     number: int
     is_filtered: bool
     is_complete: bool
-    counts: Mapping[str, int]
-    sampled: SampledInput
+    count: Callable[[], Mapping[str, int]]
+    sample: Callable[[], SampledInput]
+
+    @cached_property
+    def counts(self) -> Mapping[str, int]:
+        """Counts of `FilteredView` by name."""
+        return self.count()
+
+    @cached_property
+    def sampled(self) -> SampledInput:
+        """Its input, at every n-th row and column."""
+        return self.sample()

@@ -562,8 +562,9 @@ class EyeFilter:
         self.builder.frame_s = time.monotonic() - started_s
         self.builder.mark_rendered(self._eyes, plan)
         if shown.earlier is not None:
+            earlier = shown.earlier
             self._eyes.history.record_sampled(
-                (SampledView.of_samples(view.camera, shown.earlier.sampled),),
+                lambda: (SampledView.of_samples(view.camera, earlier.sampled),),
                 pupil_diameter_mm=pupil_diameter_mm,
                 focus_dpt=focus_dpt,
                 gaze_deg=gaze_deg,

@@ -7,7 +7,7 @@ A wrong prediction cannot change an image, because a frame computes missing PSFs
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from filter_service.rendering.sampled_frame import SampledFrame, SampledView
 from filter_service.rgbd_view import RgbdView
@@ -37,8 +37,9 @@ class FrameHistory:
         at_s: float,
     ) -> None:
         """Add a frame that arrived at ``at_s``."""
+        seen = tuple(SampledView.of(view) for view in views)
         self.record_sampled(
-            tuple(SampledView.of(view) for view in views),
+            lambda: seen,
             pupil_diameter_mm=pupil_diameter_mm,
             focus_dpt=focus_dpt,
             gaze_deg=gaze_deg,
@@ -47,15 +48,15 @@ class FrameHistory:
 
     def record_sampled(
         self,
-        seen: tuple[SampledView, ...],
+        sample: Callable[[], tuple[SampledView, ...]],
         *,
         pupil_diameter_mm: float,
         focus_dpt: float,
         gaze_deg: tuple[float, float] | None,
         at_s: float,
     ) -> None:
-        """Add a frame whose views are sampled already."""
-        self.last = SampledFrame(at_s, pupil_diameter_mm, focus_dpt, gaze_deg, seen)
+        """Add a frame, whose views are sampled only if PSFs are computed for them."""
+        self.last = SampledFrame(at_s, pupil_diameter_mm, focus_dpt, gaze_deg, sample)
         self._states.append((at_s, pupil_diameter_mm, focus_dpt))
         while self._states[0][0] < at_s - SPEED_S and len(self._states) > 2:
             self._states.popleft()

@@ -362,7 +362,8 @@ class Gpu:
             at += -(-out.nbytes // ALIGNMENT) * ALIGNMENT
         waiting = _Read(ring.fence(), targets)
         self._reads.append(waiting)
-        self._staging["to"].fence(is_free=True)
+        if self._staging["to"].has_new:
+            self._staging["to"].fence(is_free=True)
         return partial(self._end_read, waiting)
 
     def begin_late_read(

@@ -88,12 +88,15 @@ class KeptState:
     functions : SimpleNamespace
         From `gl_functions`.
     uses_images : bool
-        Whether passes bind image units, as on a software renderer.
+        Whether atlases are textures, which passes bind to texture and image units, as
+        on a software renderer.
     """
 
     def __init__(self, functions: SimpleNamespace, *, uses_images: bool) -> None:
         self._gl = functions
         self._image_units = IMAGE_UNITS if uses_images else 0
+        first = 0 if uses_images else constants.TEXTURE_STORE
+        self._texture_units = range(first, TEXTURE_UNITS)
         self._ints = _Ints()
         self._long = ctypes.c_int64()
 
@@ -155,7 +158,7 @@ class KeptState:
                 else:
                     gl.glBindBufferBase(GL_SHADER_STORAGE_BUFFER, index, buffer)
             gl.glBindBuffer(GL_SHADER_STORAGE_BUFFER, storage)
-            for index, (plain, array, sampler) in enumerate(textures):
+            for index, plain, array, sampler in textures:
                 gl.glActiveTexture(GL_TEXTURE0 + index)
                 gl.glBindTexture(GL_TEXTURE_2D, plain)
                 gl.glBindTexture(GL_TEXTURE_2D_ARRAY, array)
@@ -177,21 +180,22 @@ class KeptState:
                 gl.glPixelStorei(name, value)
 
     def _blocks(self) -> list[tuple[int, int, int]]:
-        return [
-            (
-                self._get_at(GL_SHADER_STORAGE_BUFFER_BINDING, index),
-                self._get_long_at(GL_SHADER_STORAGE_BUFFER_START, index),
-                self._get_long_at(GL_SHADER_STORAGE_BUFFER_SIZE, index),
-            )
-            for index in range(STORAGE_BLOCKS)
-        ]
-
-    def _textures(self) -> list[tuple[int, int, int]]:
         found = []
-        for index in range(TEXTURE_UNITS):
+        for index in range(STORAGE_BLOCKS):
+            buffer = self._get_at(GL_SHADER_STORAGE_BUFFER_BINDING, index)
+            start = size = 0
+            if buffer:  # each query takes a microsecond, and few callers have any
+                start = self._get_long_at(GL_SHADER_STORAGE_BUFFER_START, index)
+                size = self._get_long_at(GL_SHADER_STORAGE_BUFFER_SIZE, index)
+            found.append((buffer, start, size))
+        return found
+
+    def _textures(self) -> list[tuple[int, int, int, int]]:
+        found = []
+        for index in self._texture_units:
             self._gl.glActiveTexture(GL_TEXTURE0 + index)
             plain, array = self._get(0x8069), self._get(0x8C1D)
-            found.append((plain, array, self._get(GL_SAMPLER_BINDING)))
+            found.append((index, plain, array, self._get(GL_SAMPLER_BINDING)))
         return found
 
     def _image(self, index: int) -> tuple[int, ...]:

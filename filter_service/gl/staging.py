@@ -138,6 +138,11 @@ class Staging:
         self._groups.append(group)
         return group
 
+    @property
+    def has_new(self) -> bool:
+        """Return whether there are allocations since the last fence."""
+        return self._end != (self._groups[-1].end if self._groups else self._first)
+
     def free(self, group: Group) -> None:
         """Allow the memory of allocations to be used again."""
         group.is_free = True

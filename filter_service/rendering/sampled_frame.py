@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,13 +77,24 @@ class SampledView:
 
 @dataclass(frozen=True)
 class SampledFrame:
-    """State of the eye in one frame, and its sampled views."""
+    """State of the eye in one frame, and its sampled views.
+
+    Attributes
+    ----------
+    sample : callable
+        Function that samples the views when they are first asked for.
+    """
 
     at_s: float
     pupil_diameter_mm: float
     focus_dpt: float
     gaze_deg: tuple[float, float] | None
-    views: tuple[SampledView, ...]
+    sample: Callable[[], tuple[SampledView, ...]]
+
+    @cached_property
+    def views(self) -> tuple[SampledView, ...]:
+        """The sampled views."""
+        return self.sample()
 
 
 def first_frame(camera: Camera, settings: FilterSettings) -> SampledFrame:
@@ -102,9 +114,8 @@ def first_frame(camera: Camera, settings: FilterSettings) -> SampledFrame:
     # Each cell of the image must contain each distance.
     column = np.linspace(low_dpt, high_dpt, FIRST_DISTANCE_COUNT)
     distances_dpt = np.resize(column, (rows, columns))
-    return SampledFrame(
-        0.0, pupil_mm, focus_dpt, None, (SampledView(camera, distances_dpt),)
-    )
+    views = (SampledView(camera, distances_dpt),)
+    return SampledFrame(0.0, pupil_mm, focus_dpt, None, lambda: views)
 
 
 def missing_psfs_of(

@@ -14,6 +14,9 @@ whatever the driver.
   it is told to copy four bytes of each image;
 - ``rest``: Python, numpy, compiled loops and calls: what an issue is made of.
 
+Frames of arrays, and, with "textures" in their setting, frames from textures to
+textures of the caller's context, which copy no image and wait for nothing.
+
 "frozen": pupil and focus stay; "moving": they change with every frame.  The error is
 that of the real frames against the native engine, PSNR in linear light.  The number of
 dispatches, bindings, uniforms, copies and waits of a frame stands with its case.
@@ -33,8 +36,12 @@ import moderngl
 import numpy as np
 
 from filter_service.gl import gpu as gpu_module
+from filter_service.gl.current_context import CurrentContext
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.staging import Staging
+from filter_service.rendering.engine import TextureRequest
+from filter_service.rendering.gl.renderer import FilterRenderer
+from filter_service.texture_view import GlTexture, TextureView
 from tests.benchmarks.bench_gpu import FOCUS_DPT, PUPIL_MM, REFERENCE, Case, open_case
 from tests.benchmarks.frame_runs import states_towards
 from tests.benchmarks.harness import Row, publish
@@ -121,6 +128,7 @@ def empty_passes(clock: Clock) -> Iterator[None]:
         (Staging, "_copy", clock.timed("driver's copies", few_bytes)),
         (Staging, "fence", clock.timed("fences", Staging.fence)),
         (Staging, "wait", clock.timed("waits", Staging.wait)),
+        (moderngl.VertexArray, "render", lambda *_, **__: None),
         (
             moderngl.Context,
             "memory_barrier",
@@ -145,12 +153,52 @@ def empty_passes(clock: Clock) -> Iterator[None]:
         yield
 
 
-def case_rows(case: Case, is_moving: bool, count: int) -> Iterator[Row]:
+class TextureCase:
+    """A case whose color, depth and result are textures of a caller's context."""
+
+    def __init__(self, case: Case):
+        view, self.eye, self.setting = case.view, case.eye, f"{case.setting} textures"
+        self.memory_mb, self.error_db = case.memory_mb, case.error_db
+        self.handles = case.handles
+        gpu = Gpu(current=CurrentContext())
+        gpu.is_software = False
+        self._renderer = FilterRenderer(gpu)
+        stores = [handle.store for handle in case.handles]
+        self._handles = [self._renderer.load(store) for store in stores]
+        size_px = view.width_px, view.height_px
+        new = gpu.context.texture
+        rgba = np.dstack([view.color, np.full(view.depth_m.shape, 255, np.uint8)])
+        color = new(size_px, 4, rgba.tobytes())
+        depth = new(size_px, 1, view.depth_m.tobytes(), dtype="f4")
+        targets = [new(size_px, 4) for _ in stores]
+        self._kept = color, depth, targets
+        self._view = TextureView(
+            GlTexture(color.glo, "rgba8"),
+            GlTexture(depth.glo, "r32f"),
+            *size_px,
+            view.tangents,
+            is_top_first=True,
+        )
+        self._targets = [GlTexture(target.glo, "rgba8") for target in targets]
+
+    def frame(self, state: dict) -> tuple[float, dict[str, float]]:
+        """Submit the views of one frame; wall time, ms, and no stages."""
+        start_s = time.perf_counter()
+        for handle, target in zip(self._handles, self._targets, strict=True):
+            self._renderer.filter_textures(
+                TextureRequest(
+                    self._view, target, handle, **state, target_is_top_first=True
+                )
+            )
+        return 1e3 * (time.perf_counter() - start_s), {}
+
+
+def case_rows(case: Case | TextureCase, is_moving: bool, count: int) -> Iterator[Row]:
     """Times of an eye's frames on nothing."""
     spec = case.handles[0].store.spec
     states = states_towards(spec, PUPIL_MM, FOCUS_DPT, STATES if is_moving else 1)
     clock, frames = Clock(), []
-    for state in states:
+    for state in (*states, states[0], states[0]):
         case.frame(state)
     with empty_passes(clock):
         for k in range(WARM_FRAMES + count):
@@ -161,7 +209,9 @@ def case_rows(case: Case, is_moving: bool, count: int) -> Iterator[Row]:
     yield from _rows(case, is_moving, frames, clock)
 
 
-def _rows(case: Case, is_moving: bool, frames: list, clock: Clock) -> Iterator[Row]:
+def _rows(
+    case: Case | TextureCase, is_moving: bool, frames: list, clock: Clock
+) -> Iterator[Row]:
     told = ", ".join(
         f"{clock.counts[name]} {said}"
         for name, said in (
@@ -182,7 +232,8 @@ def _rows(case: Case, is_moving: bool, frames: list, clock: Clock) -> Iterator[R
         values = (total_ms, copies_ms, driver_ms, total_ms - copies_ms - driver_ms)
         for name, value in zip(PARTS, values, strict=True):
             times_ms[name].append(value)
-    gigabytes_s = clock.copied_bytes / 1e6 / np.median(times_ms["image copies"])
+    copies_ms = max(float(np.median(times_ms["image copies"])), 1e-6)
+    gigabytes_s = clock.copied_bytes / 1e6 / copies_ms
     said = {"all": told, "image copies": f"{gigabytes_s:.1f} GB/s"}
     said["rest"] = f"least {np.min(times_ms['rest']):.2f} ms"
     plans_ms = [stages_ms.get("psf_plan_ms", 0.0) for *_, stages_ms in frames]
@@ -215,8 +266,17 @@ def main() -> None:
     for setting, (size_px, view_count) in views.items():
         for eye in QUICK_EYES if options.quick else EYES:
             case = open_case(gpu, eye, setting, size_px, view_count)
+            count = 20 if options.quick else FRAMES
+            context = moderngl.create_context(
+                standalone=True, backend="egl", require=430
+            )
+            with context:
+                textures = TextureCase(case)
+                for is_moving in (False, True):
+                    rows += case_rows(textures, is_moving, count)
+            context.release()
             for is_moving in (False, True):
-                rows += case_rows(case, is_moving, 20 if options.quick else FRAMES)
+                rows += case_rows(case, is_moving, count)
             for handle in case.handles:
                 handle.release()
     publish("host", rows, as_json=options.json, is_whole=not options.quick)

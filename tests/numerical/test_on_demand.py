@@ -348,7 +348,8 @@ def test_what_is_computed_ahead_is_what_the_frame_needs(streamed, views):
         state = {k: state[k] for k in ("pupil_diameter_mm", "focus_dpt")}
         store, renderer = PsfStore(*streamed), NativeRenderer()
         handle = renderer.load(store)
-        use = SampledFrame(0.0, *state.values(), None, (SampledView.of(view),))
+        seen = (SampledView.of(view),)
+        use = SampledFrame(0.0, *state.values(), None, lambda seen=seen: seen)
         ahead = handle.missing_psfs(use)
         handle.fill(ahead, until_s=time.monotonic() + 60.0, batch_count=512)
         assert store.computed_count == ahead.size

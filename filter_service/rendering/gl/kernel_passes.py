@@ -504,7 +504,7 @@ class KernelRun:
         if self.is_kept:
             self.owner.reset()  # without the kernels of frames before
         else:
-            self.owner.grow(counts, headroom=2.0 * ratio)
+            self.owner.grow(counts, headroom=HEADROOM * ratio)
 
     def frame_counts(self) -> dict[str, int]:
         """Return the counts of `FilteredView` by name, after the readback."""

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -318,7 +319,9 @@ class TextureFrames:
             number=frame.number,
             is_filtered=fits and not kernels.counts[PLAN_OVERFLOWS],
             is_complete=not kernels.counts[PLAN_MISSING],
-            counts=frame.fragments.counts() | kernels.frame_counts() | lists.counts(),
-            sampled=SampledInput.of_words(frame.samples, SAMPLE_STEP_PX),
+            count=lambda: (
+                frame.fragments.counts() | kernels.frame_counts() | lists.counts()
+            ),
+            sample=partial(SampledInput.of_words, frame.samples, SAMPLE_STEP_PX),
         )
         return is_complete and fits
