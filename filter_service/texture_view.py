@@ -30,6 +30,15 @@ DepthFormat = Literal["d32f", "d24", "r32f"]
 COLOR_FORMATS: tuple[ColorFormat, ...] = get_args(ColorFormat)
 DEPTH_FORMATS: tuple[DepthFormat, ...] = get_args(DepthFormat)
 
+BYTES_PER_PIXEL: dict[ColorFormat | DepthFormat, int] = {
+    "rgba8": 4,
+    "srgb8_a8": 4,
+    "rgba16f": 8,
+    "d32f": 4,
+    "d24": 4,
+    "r32f": 4,
+}
+
 
 @dataclass(frozen=True)
 class GlTexture:
@@ -67,6 +76,43 @@ class GlTexture:
             )
         if self.layer is not None and self.layer < 0:
             raise BadMessage(f"{self.layer}", field="layer", allowed="0 or more")
+
+
+@dataclass(frozen=True)
+class TextureMemory:
+    """Contents of memory that another process has exported for one texture.
+
+    Attributes
+    ----------
+    width_px, height_px : int
+    format : str
+        As in `GlTexture`; depth has no stencil.
+    size_bytes : int
+        Size of the allocation, in which the texture starts at 0.
+    is_dedicated : bool
+        Whether it is a dedicated allocation (``VkMemoryDedicatedAllocateInfo``).
+    """
+
+    width_px: int
+    height_px: int
+    format: ColorFormat | DepthFormat
+    size_bytes: int
+    is_dedicated: bool = False
+
+
+@dataclass(frozen=True)
+class TextureSupport:
+    """Devices whose memory an engine can import.
+
+    Attributes
+    ----------
+    device_uuids : tuple of str
+        Hexadecimal; as ``VkPhysicalDeviceIDProperties::deviceUUID``.
+    driver_uuid : str
+    """
+
+    device_uuids: tuple[str, ...]
+    driver_uuid: str
 
 
 @dataclass(frozen=True)

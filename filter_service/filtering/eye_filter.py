@@ -37,11 +37,13 @@ from filter_service.filtering.filtered import (
     FilteredTexture,
 )
 from filter_service.filtering.planned_frame import PlannedFrame
+from filter_service.filtering.planned_textures import (
+    PlannedTextures,
+    TargetedView,
+    texture_engine,
+)
 from filter_service.filtering.shared_builder import SharedBuilder, shared
 from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
-from filter_service.rendering.engine import TextureEngine, TextureRequest
-from filter_service.rendering.media_effects import UNCHANGED, MediaEffects
-from filter_service.rendering.sampled_frame import SampledView
 from filter_service.rgbd_view import ColorImage, RgbdView, as_views
 from filter_service.settings import (
     DEFAULTS,
@@ -521,64 +523,61 @@ class EyeFilter:
             If the filter does not use the caller's context (``gl_context``), another
             context is current, or OpenGL cannot draw to the target.
         """
-        engine = self.builder.engine
-        if not self._takes_textures or not isinstance(engine, TextureEngine):
+        if not self._takes_textures:
             raise RenderFailed(
                 "frames in textures need EyeFilter(..., gl_context='current')"
             )
-        pupil_diameter_mm = checked(pupil_diameter_mm, PupilMm, "pupil_diameter_mm")
-        focus_dpt = checked(focus_dpt, VergenceDpt, "focus_dpt")
         if gaze_deg is not None:
             gaze_deg = checked(gaze_deg, tuple[GazeDeg, GazeDeg], "gaze_deg")
         self.advance_builds()
-        plan = self._planned([view.camera], newest_only=newest_only)
-        if plan is None:
-            return None
-        effects = MediaEffects.of(plan.eye.profile, plan.eye.settings.display)
-        if effects is not None and effects.need_arrays is not None:
-            raise BadMessage(
-                f"it has {effects.need_arrays}",
-                field="profile",
-                allowed="none for frames in textures; filter frames of arrays",
-            )
-        started_s = time.monotonic()
-        shown = engine.filter_textures(
-            TextureRequest(
-                view,
-                target,
-                plan.stores[0],
-                pupil_diameter_mm,
-                focus_dpt,
-                gaze_deg,
-                target_is_top_first=(
-                    view.is_top_first
-                    if target_is_top_first is None
-                    else target_is_top_first
-                ),
-                gain_ratio=UNCHANGED if effects is None else effects.gain_ratio,
-                options=RenderOptions(**options),
-            )
+        planned = self.plan_textures(
+            [(view, target)],
+            pupil_diameter_mm=pupil_diameter_mm,
+            focus_dpt=focus_dpt,
+            newest_only=newest_only,
         )
-        self.builder.frame_s = time.monotonic() - started_s
-        self.builder.mark_rendered(self._eyes, plan)
-        if shown.earlier is not None:
-            earlier = shown.earlier
-            self._eyes.history.record_sampled(
-                lambda: (SampledView.of_samples(view.camera, earlier.sampled),),
-                pupil_diameter_mm=pupil_diameter_mm,
-                focus_dpt=focus_dpt,
-                gaze_deg=gaze_deg,
-                at_s=started_s,
-            )
+        if planned is None:
+            return None
+        shown = planned.show(
+            0,
+            gaze_deg=gaze_deg,
+            options=RenderOptions(**options),
+            target_is_top_first=target_is_top_first,
+        )
         return FilteredTexture(
-            plan.eye.profile_id,
-            plan.eye.generation,
+            planned.plan.eye.profile_id,
+            planned.plan.eye.generation,
             shown.pupil_diameter_mm,
             shown.focus_dpt,
             shown.gaze_deg,
             shown.number,
             shown.notes,
             shown.earlier,
+        )
+
+    def plan_textures(
+        self,
+        views: Sequence[TargetedView],
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        newest_only: bool = False,
+        **_: Any,
+    ) -> PlannedTextures | None:
+        """Return views in textures that are ready to be rendered, or None.
+
+        Parameters, errors and lifetime are those of `plan`.
+        """
+        texture_engine(self.builder)
+        pupil_diameter_mm = checked(pupil_diameter_mm, PupilMm, "pupil_diameter_mm")
+        focus_dpt = checked(focus_dpt, VergenceDpt, "focus_dpt")
+        plan = self._planned(
+            [view.camera for view, _ in views], newest_only=newest_only
+        )
+        if plan is None:
+            return None
+        return PlannedTextures(
+            self.builder, self._eyes, plan, tuple(views), pupil_diameter_mm, focus_dpt
         )
 
     def plan(

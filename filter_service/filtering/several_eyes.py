@@ -20,6 +20,7 @@ from filter_service.errors import BadMessage, NoProfile, SessionError
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.filtered import Filtered
 from filter_service.filtering.planned_frame import GazeDegrees, PlannedFrame
+from filter_service.filtering.planned_textures import PlannedTextures, TargetedView
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import (
     GazeDeg,
@@ -35,7 +36,7 @@ from filter_service.view_state import EyeName, ViewState, check_states
 class PlannedViews:
     """A frame whose eyes are all ready."""
 
-    by_eye: Mapping[EyeName, PlannedFrame]
+    by_eye: Mapping[EyeName, PlannedFrame | PlannedTextures]
     indices: Mapping[EyeName, tuple[int, ...]]  # indices of their views
     gazes_deg: tuple[GazeDegrees, ...]
 
@@ -72,12 +73,13 @@ class PlannedViews:
 
 def plan_views(
     filter_of: Callable[[EyeName], EyeFilter | None],
-    views: Sequence[RgbdView],
+    views: Sequence[RgbdView] | Sequence[TargetedView],
     states: Sequence[ViewState],
     *,
     pupil_diameter_mm: float,
     focus_dpt: float,
     gaze_deg: tuple[float, float] | None = None,
+    plan: Callable[..., PlannedFrame | PlannedTextures | None] = EyeFilter.plan,
 ) -> PlannedViews | None:
     """Plan a frame for the eyes of its views; return None while one is being prepared.
 
@@ -87,11 +89,13 @@ def plan_views(
     ----------
     filter_of : callable
         Returns the filter of an eye.
-    views : sequence of RgbdView
+    views : sequence of RgbdView, or of views in textures
     states : sequence of ViewState, one for each view
         Values that are None default to those of the frame.
     pupil_diameter_mm, focus_dpt, gaze_deg
         Values of the frame, as for `EyeFilter.try_filter`.
+    plan : callable
+        `EyeFilter.plan`, or `EyeFilter.plan_textures` for views in textures.
 
     Raises
     ------
@@ -115,7 +119,7 @@ def plan_views(
         if found is None:
             raise _with_eye_name(NoProfile("there is no filter"), eye, own[0])
         found.advance_builds()
-    planned: dict[EyeName, PlannedFrame] = {}
+    planned: dict[EyeName, PlannedFrame | PlannedTextures] = {}
     gazes_deg = tuple(_gaze(state.gaze_deg or gaze_deg) for state in states)
     failure: SessionError | None = None
     for eye, own in indices.items():
@@ -123,7 +127,8 @@ def plan_views(
         eye_filter = filter_of(eye)
         assert eye_filter is not None
         try:
-            frame = eye_filter.plan(
+            frame = plan(
+                eye_filter,
                 [views[i] for i in own],
                 pupil_diameter_mm=_or_default(
                     state.pupil_diameter_mm, pupil_diameter_mm

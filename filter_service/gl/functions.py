@@ -78,10 +78,42 @@ def egl_address_of(name: str) -> int | None:
     return found
 
 
+_MEMORY_PROTOTYPES: dict[str, tuple[Any, ...]] = {
+    # GL_EXT_memory_object and GL_EXT_memory_object_fd
+    "glBindTexture": (None, _uint, _uint),
+    "glCreateMemoryObjectsEXT": (None, _int, _pointer),
+    "glDeleteMemoryObjectsEXT": (None, _int, _pointer),
+    "glDeleteTextures": (None, _int, _pointer),
+    "glGenTextures": (None, _int, _pointer),
+    "glGetError": (_uint,),
+    "glGetIntegerv": (None, _uint, _pointer),
+    "glGetTexLevelParameteriv": (None, _uint, _int, _uint, _pointer),
+    "glGetUnsignedBytei_vEXT": (None, _uint, _uint, _pointer),
+    "glGetUnsignedBytevEXT": (None, _uint, _pointer),
+    "glImportMemoryFdEXT": (None, _uint, ctypes.c_uint64, _uint, _int),
+    "glMemoryObjectParameterivEXT": (None, _uint, _uint, _pointer),
+    "glTexStorageMem2DEXT": (
+        *(None, _uint, _int, _uint, _int, _int, _uint),
+        ctypes.c_uint64,
+    ),
+}
+
+
 def gl_functions(address_of: AddressOf = egl_address_of) -> SimpleNamespace | None:
     """Return the functions by name, or None if one of them is missing."""
+    return _loaded(_PROTOTYPES, address_of)
+
+
+def memory_functions(address_of: AddressOf = egl_address_of) -> SimpleNamespace | None:
+    """Return the functions that import memory, or None if one of them is missing."""
+    return _loaded(_MEMORY_PROTOTYPES, address_of)
+
+
+def _loaded(
+    prototypes: dict[str, tuple[Any, ...]], address_of: AddressOf
+) -> SimpleNamespace | None:
     found = {}
-    for name, (result, *arguments) in _PROTOTYPES.items():
+    for name, (result, *arguments) in prototypes.items():
         address = address_of(name)
         if not address:
             return None

@@ -21,7 +21,13 @@ from filter_service.gl.current_context import (
 from filter_service.gl.functions import gl_functions
 from filter_service.gl.kept_state import KeptState
 from filter_service.gl.passes import Atlas, Buffer, BufferPart, Pages, Passes
-from filter_service.gl.staging import ALIGNMENT, Group, Staging, has_buffer_storage
+from filter_service.gl.staging import (
+    ALIGNMENT,
+    Group,
+    Staging,
+    has_buffer_storage,
+    wait_for_fence,
+)
 from filter_service.gl_device import (
     checked_gl_device,
     is_software_renderer,
@@ -399,6 +405,19 @@ class Gpu:
         for target, source in waiting.targets:
             copy_bytes(target, source)
         ring.free(waiting.group)
+
+    def wait(self) -> None:
+        """Wait until the GPU has finished all commands, by a fence.
+
+        Raises
+        ------
+        RenderFailed
+            The driver has lost the GPU.
+        """
+        if self.functions is None:
+            self.context.finish()
+        else:
+            wait_for_fence(self.functions)
 
     @property
     def memory_mb(self) -> float:

@@ -165,15 +165,9 @@ class Staging:
     def _waits(self, group: Group, limit_ns: int) -> bool:
         if group.mark is None:
             return True
-        found = self._gl.glClientWaitSync(
-            group.mark, GL_SYNC_FLUSH_COMMANDS_BIT, limit_ns
-        )
-        if found == GL_TIMEOUT_EXPIRED:
+        if not _is_passed(self._gl, group.mark, limit_ns):
             return False
-        self._gl.glDeleteSync(group.mark)
         group.mark = None
-        if found == GL_WAIT_FAILED:
-            raise RenderFailed("the OpenGL driver has lost the GPU")
         return True
 
     def allocate(self, n_bytes: int) -> tuple[int, NDArray[np.uint8]]:
@@ -235,3 +229,27 @@ class Staging:
             raise OutOfGpuMemory(f"cannot map {n_bytes / 1e6:.0f} MB of memory")
         memory = (ctypes.c_uint8 * n_bytes).from_address(address)
         self._bytes = np.ctypeslib.as_array(memory)
+
+
+def wait_for_fence(functions: SimpleNamespace) -> None:
+    """Wait until the GPU has finished all commands of the current context.
+
+    Raises
+    ------
+    RenderFailed
+        The driver has lost the GPU.
+    """
+    mark = int(functions.glFenceSync(GL_SYNC_GPU_COMMANDS_COMPLETE, 0))
+    while not _is_passed(functions, mark, WAIT_NS):
+        pass
+
+
+def _is_passed(functions: SimpleNamespace, mark: int, limit_ns: int) -> bool:
+    """Return whether the GPU has passed a fence, which is then deleted."""
+    found = functions.glClientWaitSync(mark, GL_SYNC_FLUSH_COMMANDS_BIT, limit_ns)
+    if found == GL_TIMEOUT_EXPIRED:
+        return False
+    functions.glDeleteSync(mark)
+    if found == GL_WAIT_FAILED:
+        raise RenderFailed("the OpenGL driver has lost the GPU")
+    return True

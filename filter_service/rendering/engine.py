@@ -13,7 +13,13 @@ from filter_service.rendering.filtered_view import FilteredView
 from filter_service.rendering.sampled_frame import SampledFrame
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
-from filter_service.texture_view import EarlierFrame, GlTexture, TextureView
+from filter_service.texture_view import (
+    EarlierFrame,
+    GlTexture,
+    TextureMemory,
+    TextureSupport,
+    TextureView,
+)
 
 
 class LoadedStore(Protocol):
@@ -87,6 +93,11 @@ class TextureRequest:
         Whether the first row of the target is the top of the image.
     gain_ratio : (red, green, blue)
         Transmittance of the ocular media.
+    waits : bool
+        Whether to wait until the frame is finished, and to repeat it until it is
+        complete, so that `ShownTexture.earlier` describes this frame.
+    until_s : float, optional
+        Deadline of a frame that waits, as in `ViewRequest`.
     """
 
     view: TextureView
@@ -98,6 +109,8 @@ class TextureRequest:
     target_is_top_first: bool = False
     gain_ratio: tuple[float, float, float] = (1.0, 1.0, 1.0)
     options: RenderOptions = DEFAULT_OPTIONS
+    waits: bool = False
+    until_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -112,7 +125,8 @@ class ShownTexture:
         Number of the frame among those of the context, from 1 on.
     notes : tuple of str
     earlier : EarlierFrame or None
-        The newest frame through this eye that the GPU has finished.
+        The newest frame through this eye that the GPU has finished; this frame, if the
+        request waits.
     """
 
     pupil_diameter_mm: float
@@ -180,8 +194,34 @@ class TextureEngine(Protocol):
             Textures or options are invalid.
         CameraMismatch
             The store is for another camera, see `camera.is_same_camera`.
+        NotPrepared
+            As for `FrameEngine.begin`, if the request waits.
         RenderError
         """
+
+
+@runtime_checkable
+class TextureImporter(TextureEngine, Protocol):
+    """An engine that may import textures from memory of other processes."""
+
+    @property
+    def texture_support(self) -> TextureSupport | None:
+        """Devices whose memory it can import, or None."""
+
+    def import_texture(self, memory: TextureMemory, descriptor: int) -> Any:
+        """Return a texture, with the attribute ``texture``, in memory of a descriptor.
+
+        The descriptor is closed.
+
+        Raises
+        ------
+        BadMessage
+            The memory cannot be used for such a texture.
+        RenderError
+        """
+
+    def release_texture(self, imported: Any) -> None:
+        """Free an imported texture."""
 
 
 class OneView:

@@ -90,10 +90,20 @@ def input_notes(
     depth_m: NDArray[np.float32], missing_depth_count: int, bad_color_count: int
 ) -> list[str]:
     """Return notes on missing depth, an implausible depth unit and invalid color."""
+    return sampled_input_notes(
+        depth_m[::SAMPLE_STRIDE_PX, ::SAMPLE_STRIDE_PX],
+        bad_color_count,
+        has_depth=missing_depth_count < depth_m.size,
+    )
+
+
+def sampled_input_notes(
+    sampled_m: NDArray[np.float32], bad_color_count: int, *, has_depth: bool
+) -> list[str]:
+    """Return the same notes, from depth at some pixels."""
     notes = []
-    if missing_depth_count == depth_m.size:
+    if not has_depth:
         notes.append("no pixel has depth; infinity is assumed")
-    sampled_m = depth_m[::SAMPLE_STRIDE_PX, ::SAMPLE_STRIDE_PX]
     known_m = sampled_m[(sampled_m > 0.0) & (sampled_m < np.inf)]
     if known_m.size and known_m.min() >= FAR_SCENE_M:
         notes.append(f"all depth is beyond {FAR_SCENE_M:g} m: is it in meters?")

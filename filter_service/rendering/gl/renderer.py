@@ -1,9 +1,13 @@
 """The OpenGL frame engine."""
 
+import os
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 
+from filter_service.errors import RenderFailed
 from filter_service.gl.gpu import Gpu
+from filter_service.gl.imported_textures import ImportedTexture, TextureImporter
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import (
     OneView,
@@ -12,7 +16,11 @@ from filter_service.rendering.engine import (
     TextureRequest,
     ViewRequest,
 )
-from filter_service.rendering.filtered_view import FilteredView, input_notes
+from filter_service.rendering.filtered_view import (
+    FilteredView,
+    input_notes,
+    sampled_input_notes,
+)
 from filter_service.rendering.gl.eye_states import EyeStates
 from filter_service.rendering.gl.frame_run import FrameRun
 from filter_service.rendering.gl.gl_store import GlStore
@@ -21,6 +29,12 @@ from filter_service.rendering.request_checks import (
     check_options,
     check_request,
     output_array,
+)
+from filter_service.texture_view import (
+    EarlierFrame,
+    TextureMemory,
+    TextureSupport,
+    TextureView,
 )
 
 
@@ -32,6 +46,7 @@ class FilterRenderer(OneView):
         self._eyes = EyeStates(gpu)
         self._had_missing_depth = False
         self._textures: TextureFrames | None = None
+        self._importer: TextureImporter | None = None
 
     @property
     def name(self) -> str:
@@ -76,7 +91,7 @@ class FilterRenderer(OneView):
         return partial(self._finish, run, *gaze)
 
     def filter_textures(self, request: TextureRequest) -> ShownTexture:
-        """Filter a view from textures to a texture, without waiting for the GPU.
+        """Filter a view from textures to a texture; wait only if the request does.
 
         Raises
         ------
@@ -87,6 +102,8 @@ class FilterRenderer(OneView):
         RenderFailed
             The context is not current, or OpenGL cannot draw to the target.
         OutOfGpuMemory
+        NotPrepared
+            As for `begin`, if the request waits.
         """
         gaze_deg, notes = check_options(
             request.options, request.view.camera, request.handle.store, request.gaze_deg
@@ -98,6 +115,9 @@ class FilterRenderer(OneView):
             layers, earlier = self._textures.filter(
                 request, self._eyes.of(request.handle), gaze_deg
             )
+            if request.waits:
+                self._gpu.check("render")
+                notes = (*notes, *_input_notes(request.view, earlier))
         return ShownTexture(
             pupil_diameter_mm=layers.pupil_diameter_mm,
             focus_dpt=layers.focus_dpt,
@@ -106,6 +126,43 @@ class FilterRenderer(OneView):
             notes=(*layers.notes, *notes),
             earlier=earlier,
         )
+
+    @property
+    def texture_support(self) -> TextureSupport | None:
+        """Devices whose memory this can import, or None."""
+        if self._importer is None:
+            with suppress(RenderFailed), self._gpu.entered():
+                self._importer = TextureImporter(
+                    self._gpu.context.extensions, is_software=self._gpu.is_software
+                )
+        return None if self._importer is None else self._importer.support
+
+    def import_texture(self, memory: TextureMemory, descriptor: int) -> ImportedTexture:
+        """Return a texture in memory of another process; close the descriptor.
+
+        Raises
+        ------
+        BadMessage
+            OpenGL cannot use the memory for such a texture.
+        RenderFailed
+            This OpenGL imports no memory.
+        """
+        if self.texture_support is None or self._importer is None:
+            os.close(descriptor)
+            raise RenderFailed("this OpenGL imports no memory")
+        with self._gpu.entered():
+            return self._importer.import_texture(memory, descriptor)
+
+    def release_texture(self, imported: ImportedTexture) -> None:
+        """Free an imported texture and its memory."""
+        if self._importer is None:
+            return
+        with self._gpu.entered():
+            self._importer.release(imported)
+            # Drivers free memory when they flush, and an idle service would not.
+            self._gpu.wait()
+            if self._textures is not None:
+                self._textures.forget()
 
     def _finish(
         self, run: FrameRun, gaze_deg: tuple[float, float], gaze_notes: tuple[str, ...]
@@ -131,3 +188,14 @@ class FilterRenderer(OneView):
                 *input_notes(run.depth_m, *noted),
             ],
         )
+
+
+def _input_notes(view: TextureView, frame: EarlierFrame | None) -> tuple[str, ...]:
+    """Return the notes on the input of a finished frame."""
+    if frame is None:
+        return ()
+    has_depth = frame.counts["missing_depth_count"] < view.camera.pixel_count
+    found = sampled_input_notes(
+        frame.sampled.depth_m, frame.counts["bad_color_count"], has_depth=has_depth
+    )
+    return tuple(found)

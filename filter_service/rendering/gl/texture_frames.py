@@ -27,7 +27,7 @@ from filter_service.constants import (
     THREADS,
     TOTAL_WORDS,
 )
-from filter_service.errors import NotPrepared, RenderFailed
+from filter_service.errors import NotPrepared, OutOfGpuMemory, RenderFailed
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.stage_timer import Untimed
 from filter_service.gl.texture_io import TextureIo
@@ -55,6 +55,10 @@ HEADROOM = 1.5
 does not fit shows its input."""
 
 INPUT_UNITS = (TEXTURE_COLOR, TEXTURE_DEPTH)
+
+MAX_REPEATS = 8
+"""Largest number of runs of a frame that waits: for PSFs, kernels and lists, each of
+which may need larger buffers twice."""
 
 MAX_IN_FLIGHT = 4
 """Frames whose counters have not been read.  Further ones are not counted."""
@@ -144,6 +148,10 @@ class TextureFrames:
         self._submitted: deque[_Submitted] = deque()
         self.number = 0
 
+    def forget(self) -> None:
+        """Check textures again, whose names may now be of others."""
+        self._io.forget()
+
     def release(self) -> None:
         """Free the OpenGL objects."""
         self._io.release()
@@ -177,23 +185,30 @@ class TextureFrames:
             request.focus_dpt,
             request.options.render_tolerance,
         )
+        repeats = 0
         while True:
             image = eye.states.cells(timer, eye.handle, gaze_deg, eye.cell_px)
             change_dpt = eye.states.corner_change_dpt(timer, layers, image)
             state = FrameState(layers, image, change_dpt)
-            is_counted = len(self._submitted) < MAX_IN_FLIGHT or not eye.is_settled
+            waits = request.waits or not eye.is_settled
+            is_counted = len(self._submitted) < MAX_IN_FLIGHT or waits
             frame = self._run(request, eye, state, is_counted=is_counted)
             if frame is None:
                 break
-            if eye.is_settled:
+            if not waits:
                 self._submitted.append(frame)
                 break
             # The first frame of an eye waits, so that it is complete.
             while not frame.is_read():
                 self._gpu.context.finish()
-            eye.is_settled = self._read(frame, until_s=None)
+            eye.is_settled = self._read(frame, until_s=request.until_s)
             if eye.is_settled:
                 break
+            repeats += 1
+            if request.waits:
+                _check_repeats(repeats, request.until_s)
+        if request.waits:
+            self._gpu.wait()
         return layers, eye.earlier
 
     def _run(
@@ -325,3 +340,11 @@ class TextureFrames:
             sample=partial(SampledInput.of_words, frame.samples, SAMPLE_STEP_PX),
         )
         return is_complete and fits
+
+
+def _check_repeats(repeats: int, until_s: float | None) -> None:
+    """Raise if a frame that waits must not be repeated."""
+    if until_s is not None and time.monotonic() > until_s:
+        raise NotPrepared("PSFs of the frame are missing")
+    if repeats >= MAX_REPEATS:
+        raise OutOfGpuMemory("the lists of the frame exceed the buffers of this device")
