@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Unpack, cast
 
@@ -24,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.frame_packer import FramePacker, check_limits
-from clients.link import Event, FilteredFrame, ServiceLink
+from clients.link import Event, FilteredFrame, Outgoing, ServiceLink
+from clients.shared_textures import REPLY_LIMIT_S
 from filter_service import ColorImage, Output, RgbdView, as_views
 from filter_service.errors import BadMessage, FilterError, ServiceTimeout
 from filter_service.keys import load_client_key
@@ -49,8 +51,11 @@ from filter_service.messages import (
     ProfileRequest,
     Progress,
     Ready,
+    ShareTexture,
+    UnshareTexture,
     ViewHeader,
     ViewState,
+    ViewTextures,
     Welcome,
     check_states,
     encode,
@@ -358,10 +363,9 @@ class FilterClient:
         ------
         ProtocolError, SessionError, RenderError, ServiceTimeout
         """
-        limit_s = self.timeout_s if timeout_s is None else timeout_s
-        deadline_s = time.monotonic() + limit_s
-        while True:
-            frame_id = self.submit(
+        return self._until_filtered(
+            partial(
+                self.submit,
                 color,
                 depth_m,
                 pupil_diameter_mm=pupil_diameter_mm,
@@ -373,8 +377,18 @@ class FilterClient:
                 states=states,
                 display_time_ns=display_time_ns,
                 **options,
-            )
-            answer = self._await_frame(frame_id, deadline_s)
+            ),
+            timeout_s,
+        )
+
+    def _until_filtered(
+        self, submit: Callable[[], int], timeout_s: float | None
+    ) -> FilteredFrame:
+        """Submit a frame until it is filtered, and return it."""
+        limit_s = self.timeout_s if timeout_s is None else timeout_s
+        deadline_s = time.monotonic() + limit_s
+        while True:
+            answer = self._await_frame(submit(), deadline_s)
             if isinstance(answer, FilteredFrame):
                 return answer
             if isinstance(answer, ErrorReply):
@@ -517,6 +531,162 @@ class FilterClient:
         """
         _ = self._link  # raises if closed
         return self._packer.lend_view(camera, dtype=dtype, depth_kind=depth_kind)
+
+    # Textures
+
+    def share_texture(
+        self,
+        descriptor: int,
+        *,
+        width_px: int,
+        height_px: int,
+        format: str,
+        size_bytes: int,
+        is_dedicated: bool = False,
+        device_uuid: str | None = None,
+    ) -> int | None:
+        """Share memory of a texture with a service on the same GPU.
+
+        Parameters
+        ----------
+        descriptor : int
+            Opaque descriptor from ``vkGetMemoryFdKHR``, which the caller may close
+            afterward.  The image starts at 0, has optimal tiling, one level and one
+            layer.
+        width_px, height_px : int
+        format : str
+            Color: "rgba8" (sRGB values), "srgb8_a8" or "rgba16f" (linear light).
+            Depth: "d32f", "d24" or "r32f".
+        size_bytes : int
+            Size of the allocation.
+        is_dedicated : bool
+            Whether it is a dedicated allocation of Vulkan.
+        device_uuid : str, optional
+            ``VkPhysicalDeviceIDProperties::deviceUUID`` in hexadecimal digits.
+
+        Returns
+        -------
+        int or None
+            Number of the texture.  None, with one line in the log, if the service
+            cannot use it: send arrays to `filter` then.
+
+        Raises
+        ------
+        BadMessage
+            If the size or the format is not allowed.
+        ServiceTimeout
+            If there is no connection.
+        """
+        welcome = self.hello()
+        textures = self._link.textures
+        fields = {
+            "session_key": welcome.session_key,
+            "texture": textures.new_number(),
+            "width_px": width_px,
+            "height_px": height_px,
+            "format": format,
+            "size_bytes": size_bytes,
+            "is_dedicated": is_dedicated,
+        }
+        request = ShareTexture.parse(fields, (), welcome.limits)
+        number = request.texture
+        reason = textures.refusal(device_uuid) or textures.send(request, descriptor)
+        if not reason:
+            try:
+                reason = self._link.wait_until(
+                    lambda: textures.reply_about(number), REPLY_LIMIT_S, "a texture"
+                ).reason
+            except ServiceTimeout:
+                reason = "the service did not reply to a descriptor"
+        if reason:
+            textures.report(reason)
+        return None if reason else number
+
+    def unshare_texture(self, texture: int) -> None:
+        """Take a texture back; the service frees it."""
+        self._link.queue_message(encode(UnshareTexture(texture)))
+        self._link.pump(0.0)
+
+    def filter_textures(
+        self,
+        views: Sequence[tuple[Camera, ViewTextures]],
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        gaze_deg: tuple[float, float] | None = None,
+        states: Sequence[ViewState] = (),
+        display_time_ns: int | None = None,
+        timeout_s: float | None = None,
+        **options: Unpack[RenderOptionValues],
+    ) -> FilteredFrame:
+        """Filter a frame in shared textures; see `submit_textures` and `filter`.
+
+        Raises
+        ------
+        BadMessage
+            Among others, if the service has lost a texture with a render worker.
+        ProtocolError, SessionError, RenderError, ServiceTimeout
+        """
+        return self._until_filtered(
+            partial(
+                self.submit_textures,
+                views,
+                pupil_diameter_mm=pupil_diameter_mm,
+                focus_dpt=focus_dpt,
+                gaze_deg=gaze_deg,
+                states=states,
+                display_time_ns=display_time_ns,
+                **options,
+            ),
+            timeout_s,
+        )
+
+    def submit_textures(
+        self,
+        views: Sequence[tuple[Camera, ViewTextures]],
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        gaze_deg: tuple[float, float] | None = None,
+        states: Sequence[ViewState] = (),
+        display_time_ns: int | None = None,
+        **options: Unpack[RenderOptionValues],
+    ) -> int:
+        """Submit a frame in shared textures without waiting; return its frame_id.
+
+        The GPU must have finished rendering the textures.  The service uses them until
+        its reply, when the results are finished.
+
+        Parameters
+        ----------
+        views : sequence of (Camera, ViewTextures)
+            Numbers from `share_texture`, and the meaning of the depth.
+        pupil_diameter_mm, focus_dpt, gaze_deg, states, display_time_ns, options
+            As for `submit`.
+        """
+        states = tuple(states) or (ViewState(),) * len(views)
+        if len(states) != len(views):
+            raise ValueError(
+                f"{len(states)} states; allowed: {len(views)}, one per view"
+            )
+        check_states(states, pupil_diameter_mm, focus_dpt)
+        frame = Frame(
+            frame_id=self._next_frame_id,
+            views=tuple(
+                ViewHeader.of(camera, state=state)
+                for (camera, _), state in zip(views, states, strict=True)
+            ),
+            pupil_diameter_mm=float(pupil_diameter_mm),
+            focus_dpt=float(focus_dpt),
+            gaze_deg=None if gaze_deg is None else _floats(gaze_deg),
+            options=FrameOptions(**options),
+            textures=tuple(textures for _, textures in views),
+            display_time_ns=display_time_ns,
+        )
+        self._next_frame_id += 1
+        now_s = time.monotonic()
+        self._link.submit(Outgoing(frame.frame_id, encode(frame), [], now_s, frame, []))
+        return frame.frame_id
 
     def poll(self, timeout_s: float = 0.0) -> list[Event]:
         """Return the new events; wait up to ``timeout_s`` if there are none.

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from clients.connection import Connection, SendBuffer
 from clients.shared_memory import ClientSlot, SharedMemory
+from clients.shared_textures import SharedTextures
 from filter_service.errors import (
     AuthenticationFailed,
     FilterError,
@@ -39,6 +40,7 @@ from filter_service.messages import (
     Ready,
     Result,
     Shared,
+    SharedTexture,
     Welcome,
     decode_reply,
     encode,
@@ -59,7 +61,7 @@ class FilteredFrame:
     frame_id : int
         Id that `FilterClient.submit` returned.
     colors : tuple of (h, w, 3) arrays
-        One image per view.
+        One image per view; none for frames in textures.
     header : Result
         Reply of the service.
     age_ms : float
@@ -148,6 +150,7 @@ class ServiceLink:
         self._session_key = ""
         self._wants_memory = shared_memory
         self.memory = SharedMemory(lambda message: self.queue_message(encode(message)))
+        self.textures = SharedTextures()
         self._outbox: list[list[Any]] = []
         self._events: list[Event] = []
         self._refusal: FilterError | None = None
@@ -255,10 +258,12 @@ class ServiceLink:
         for outgoing in self.in_flight.values():
             self._drop(outgoing, "connection_lost")
         self.in_flight.clear()
-        if self.pending is not None and self.pending.frame.memory is not None:
-            self._drop(self.pending, "connection_lost")  # its memory is lost, too
+        pending = self.pending
+        if pending is not None and (pending.frame.memory or pending.frame.textures):
+            self._drop(pending, "connection_lost")  # its memory is lost, too
             self.pending = None
         self.memory.begin(is_offered=False)
+        self.textures.begin(None)
 
     def _drop(self, outgoing: Outgoing, reason: str) -> None:
         outgoing.end()
@@ -293,6 +298,8 @@ class ServiceLink:
             self.pongs.append(reply)
         elif isinstance(reply, Shared):
             self.memory.take_in(reply)
+        elif isinstance(reply, SharedTexture):
+            self.textures.take_in(reply)
         elif not isinstance(reply, Alive | Closing):
             self._events.append(reply)
             self._bound_progress()
@@ -301,6 +308,7 @@ class ServiceLink:
         """Start or resume a session, and send the profiles that it lacks."""
         self.welcome = welcome
         self._session_key = welcome.session_key
+        self.textures.begin(welcome.textures)
         if not self.in_flight:
             is_offered = self._wants_memory and "shm" in welcome.transports
             self.memory.begin(is_offered=is_offered)
@@ -340,7 +348,9 @@ class ServiceLink:
         )
 
     def _colors_in_memory(self, outgoing: Outgoing) -> tuple[NDArray[Any], ...]:
-        """Return the images that the service wrote to a slot."""
+        """Return the images that the service wrote to a slot; none for textures."""
+        if outgoing.frame.textures:
+            return ()
         frame, (_, slot) = outgoing.frame, outgoing.slots
         assert frame.memory is not None
         return tuple(

@@ -73,6 +73,14 @@ from filter_service.wire.requests import (
     SharedPlaces,
     Unshare,
 )
+from filter_service.wire.textures import (
+    SharedTexture,
+    ShareTexture,
+    TextureOffer,
+    UnshareTexture,
+    ViewTextures,
+    used_textures,
+)
 from filter_service.wire.unpacking import MAX_HEADER_BYTES, unpack_header
 
 __all__ = [
@@ -118,12 +126,17 @@ __all__ = [
     "Result",
     "ResultView",
     "Share",
+    "ShareTexture",
     "Shared",
     "SharedPlaces",
+    "SharedTexture",
+    "TextureOffer",
     "Unshare",
+    "UnshareTexture",
     "ViewHeader",
     "ViewImages",
     "ViewState",
+    "ViewTextures",
     "Welcome",
     "body_of_eye",
     "check_states",
@@ -133,12 +146,24 @@ __all__ = [
     "encoded_depth",
     "is_bye",
     "peek_ids",
+    "peek_session_key",
     "tangents_from_fov",
+    "used_textures",
 ]
 
 PROTOCOL_VERSION = 1
 
-Request = Hello | ProfileRequest | Frame | Share | Unshare | Ping | Bye
+Request = (
+    Hello
+    | ProfileRequest
+    | Frame
+    | Share
+    | Unshare
+    | ShareTexture
+    | UnshareTexture
+    | Ping
+    | Bye
+)
 Reply = (
     Welcome
     | Accepted
@@ -151,17 +176,21 @@ Reply = (
     | Alive
     | Closing
     | Shared
+    | SharedTexture
 )
 
 REQUESTS: dict[str, type[Message]] = {
     kind.type_name: kind
-    for kind in (Hello, ProfileRequest, Frame, Share, Unshare, Ping, Bye)
+    for kind in (
+        *(Hello, ProfileRequest, Frame, Share, Unshare),
+        *(ShareTexture, UnshareTexture, Ping, Bye),
+    )
 }
 REPLIES: dict[str, type[Message]] = {
     kind.type_name: kind
     for kind in (
         *(Welcome, Accepted, Progress, Ready, Result, Dropped),
-        *(ErrorReply, Pong, Alive, Closing, Shared),
+        *(ErrorReply, Pong, Alive, Closing, Shared, SharedTexture),
     )
 }
 
@@ -253,3 +282,12 @@ def peek_ids(parts: Sequence[Part]) -> tuple[int | None, int | None]:
         for value in (header.get("frame_id"), header.get("profile_id"))
     )
     return frame_id, profile_id
+
+
+def peek_session_key(parts: Sequence[Part]) -> str:
+    """Return the session key of a message that may be invalid, or an empty string."""
+    try:
+        key = unpack_header(parts[0]).get("session_key")
+    except (BadMessage, IndexError):
+        return ""
+    return key if isinstance(key, str) else ""

@@ -33,6 +33,8 @@ session_manager        start, resumption and end of sessions; their profiles
 session_table          all sessions, with or without a client
 session                state of one client: queued frame, credit, profiles
 client_memory          shared memory of clients
+client_textures        textures of clients
+texture_socket         datagram socket for their descriptors
 frame_queue            queue of frames and their replies
 image_positions        validation of a frame's positions in shared memory
 render_client          the front end's link to a render worker
@@ -42,6 +44,7 @@ render_worker          event loop of a render worker
 session_eyes           one filter for each eye of a session
 frame_reply            the reply to a frame
 shared_memory_frame    the same, with images in shared memory
+texture_frame          the same, with images in textures
 process_channel        messages between the processes
 config                 settings file
 process_info           version and memory of the process

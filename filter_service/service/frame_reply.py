@@ -51,7 +51,8 @@ def frame_reply(
         Output arrays, (height, width, 3) each, that the engine may write to.
     """
     started_s = time.monotonic()
-    try:
+
+    def filtered() -> Filtered | None:
         planned = plan_views(
             filter_of,
             [
@@ -64,13 +65,33 @@ def frame_reply(
             gaze_deg=frame.gaze_deg,
         )
         if planned is None:
-            return Dropped(frame.frame_id, "preparing")
-        filtered = planned.render(
+            return None
+        return planned.render(
             output=OUTPUT_OF_FORMAT[frame.output],
             out=out,
             until_s=started_s + PSF_BUDGET_S,
             **frame.options.render_values,
         )
+
+    return reply_to_frame(frame, filtered)
+
+
+def reply_to_frame(
+    frame: Frame, filter_frame: Callable[[], Filtered | None]
+) -> Result | Dropped | ErrorReply:
+    """Call a function that filters a frame, and return the reply; see `frame_reply`.
+
+    Parameters
+    ----------
+    frame : Frame
+    filter_frame : callable
+        Returns the filtered frame, or None while an eye is being prepared.
+    """
+    started_s = time.monotonic()
+    try:
+        filtered = filter_frame()
+        if filtered is None:
+            return Dropped(frame.frame_id, "preparing")
     except NotPrepared:
         return Dropped(frame.frame_id, "extending")
     except FilterError as error:

@@ -34,13 +34,16 @@ from filter_service.messages import (
     ProfileRequest,
     Reply,
     Share,
+    ShareTexture,
     Unshare,
+    UnshareTexture,
     decode_request,
     encode,
     is_bye,
     peek_ids,
 )
 from filter_service.service.client_memory import MAX_PARTS_PER_VIEW, ClientMemory
+from filter_service.service.client_textures import ClientTextures
 from filter_service.service.config import ServiceConfig
 from filter_service.service.connections import Connections, Peer
 from filter_service.service.descriptors import DescriptorLimit
@@ -62,6 +65,8 @@ from filter_service.service.served_devices import ServedDevice, ServedDevices
 from filter_service.service.session import Session, SessionRecord
 from filter_service.service.session_manager import SessionManager
 from filter_service.service.session_table import SessionTable
+from filter_service.service.texture_socket import TextureSocket
+from filter_service.texture_view import TextureSupport
 from filter_service.wire.message import Message
 
 MAX_MESSAGES_PER_TURN = 64  # a flooding client must not delay the others
@@ -113,12 +118,20 @@ class FrontEnd:
         self._client_memory = ClientMemory(
             config, self.endpoint, self._render_client_of
         )
+        is_local = self._client_memory.is_offered
+        self._texture_socket = (
+            TextureSocket(self._descriptors.reserve) if is_local else None
+        )
+        self._client_textures = ClientTextures(
+            self._texture_socket, self._sessions, self._devices, self._send
+        )
         self._session_manager = SessionManager(
             config,
             self.endpoint,
             self._sessions,
             self._devices,
             self._client_memory,
+            self._client_textures,
             self._send,
             self._record,
         )
@@ -178,7 +191,7 @@ class FrontEnd:
         """Handle a message of the supervisor; return whether to continue."""
         if message[0] == "link":
             device = self._devices[message[1]]
-            device.frames.fail_in_flight()
+            self._fail_work(device)
             device.render.connect(Link.from_descriptor(descriptors[0]))
         elif message[0] == "sessions":
             self._session_manager.restore(message[1])
@@ -197,6 +210,8 @@ class FrontEnd:
         """Run one iteration of the event loop; return whether to continue."""
         readable, writable = self._devices.descriptors()
         readable = readable | {self._supervisor.fileno()}
+        if self._texture_socket is not None:
+            readable = readable | {self._texture_socket.fileno()}
         if self._supervisor.has_unsent:
             writable = writable | {self._supervisor.fileno()}
         self._router.watch(readable, writable)
@@ -210,6 +225,7 @@ class FrontEnd:
         for number in self._router.pop_ended():
             self._session_manager.disconnect(number)
         self._handle_messages()
+        self._client_textures.receive(self._limits)
         for device in self._devices:
             device.frames.submit_next()
         self._run_periodic_tasks()
@@ -231,6 +247,7 @@ class FrontEnd:
                 if session.peer is not None:
                     self._router.send(session.peer, encode(Closing()))
         self._router.close(linger_ms=CLOSING_LINGER_MS)
+        self._client_textures.close()
 
     def _run_periodic_tasks(self) -> None:
         """Run periodic tasks."""
@@ -266,10 +283,17 @@ class FrontEnd:
                     self._forward_reply(*rest)
                 elif kind == "state":
                     device.memory_mb, device.stores_mb, device.is_building = rest
+                elif kind == "texture_reply":
+                    self._client_textures.accept_import(*rest)
                 elif kind == "started":
                     self._attach_worker(device, *rest)
         except LinkClosed:
-            device.frames.fail_in_flight()
+            self._fail_work(device)
+
+    def _fail_work(self, device: ServedDevice) -> None:
+        """Report to clients what is lost with a render worker."""
+        device.frames.fail_in_flight()
+        self._client_textures.report_lost(device)
 
     def _forward_reply(self, key: str, eye: EyeName, reply: Reply) -> None:
         """Forward a worker's reply about a profile; count it if it is a refusal."""
@@ -285,8 +309,10 @@ class FrontEnd:
         server: dict[str, str],
         eyes: list[tuple[Any, ...]],
         can_interrupt: bool,
+        texture_support: TextureSupport | None,
     ) -> None:
         """Synchronize the sessions with those of a new render worker."""
+        device.texture_support = texture_support
         device.server, device.render.can_interrupt = server, can_interrupt
         self._session_manager.attach_device(device, eyes)
         device.render.is_ready = True
@@ -409,6 +435,16 @@ class FrontEnd:
             self._send(peer, shared)
         elif isinstance(request, Unshare):
             self._client_memory.unshare(self._session_manager.session_of(peer), request)
+        elif isinstance(request, UnshareTexture):
+            self._client_textures.unshare(
+                self._session_manager.session_of(peer), request
+            )
+        elif isinstance(request, ShareTexture):
+            raise BadMessage(
+                "it came without a descriptor",
+                field="type",
+                allowed="share_texture over the socket of welcome.textures",
+            )
 
     def _reject_removed_key(self, removed: KeyRemoved) -> None:
         """End the session of a client whose key was removed."""

@@ -50,7 +50,7 @@ class InFlightFrame:
     session: Session
     peer: Peer | None
     waiting: WaitingFrame
-    places: SharedPlaces
+    places: SharedPlaces | None  # None for a frame in textures
     pool_slots: tuple[Slot, ...]  # from the pool, for images sent as parts
     submitted_s: float
 
@@ -154,11 +154,11 @@ class RenderClient:
             self.release(*frame.pool_slots)
         return lost
 
-    def send(self, *message: Any) -> None:
+    def send(self, *message: Any, descriptors: Sequence[int] = ()) -> None:
         """Send a message; ignore a closed link, which `receive` reports."""
         if self._link is not None:
             with contextlib.suppress(LinkClosed):
-                self._link.send(message)
+                self._link.send(message, descriptors)
 
     # Memory
 
@@ -166,6 +166,11 @@ class RenderClient:
     def session_quota_bytes(self) -> int:
         """Return the size limit of one session's slots, or of its unread results."""
         return int(SESSION_QUOTA * self._slots.max_bytes)
+
+    @property
+    def shared_quota_bytes(self) -> int:
+        """Return the size limit of what all sessions share together."""
+        return int(SHARED_QUOTA * self._slots.max_bytes)
 
     def share(self, size_bytes: int) -> Slot:
         """Return a new slot for a client; memory is never passed between clients.
@@ -176,7 +181,7 @@ class RenderClient:
             If the limit of shared memory is reached, or the system has none left.
         """
         shared = [slot for slot in self._slots if slot.number in self._shared]
-        most_bytes = int(SHARED_QUOTA * self._slots.max_bytes)
+        most_bytes = self.shared_quota_bytes
         shared_bytes = sum(slot.size_bytes for slot in shared)
         if shared_bytes + size_bytes > most_bytes:
             raise OutOfMemory(
@@ -224,12 +229,8 @@ class RenderClient:
         return slot
 
     def _send_slot(self, slot: Slot) -> None:
-        if self._link is not None:
-            try:
-                message = ("slot", slot.number, slot.size_bytes)
-                self._link.send(message, [slot.descriptor])
-            except LinkClosed:
-                pass
+        descriptors = [slot.descriptor]
+        self.send("slot", slot.number, slot.size_bytes, descriptors=descriptors)
 
     # Frames
 
@@ -254,7 +255,7 @@ class RenderClient:
         frame = waiting.frame
         places = frame.memory
         pool_slots: tuple[Slot, ...] = ()
-        if places is None:
+        if places is None and not frame.textures:
             places, pool_slots = self._copy_images(frame)
         number, self._next_number = self._next_number, self._next_number + 1
         self._last_heard_s = now_s = time.monotonic()
@@ -293,7 +294,7 @@ def completed(
     result: Result, frame: InFlightFrame, started_s: float, blocks_bytes: Sequence[int]
 ) -> Result:
     """Return a result with its images and the times known to the front end."""
-    if frame.pool_slots:
+    if frame.pool_slots and frame.places is not None:
         _, slot = frame.pool_slots
         result = replace(
             result, colors=_output_images(result, slot, frame.places, blocks_bytes)

@@ -7,6 +7,8 @@ its eyes to a new front end.
 Messages from the front end:
 
 - ``("slot", number, size)`` with a descriptor; ``("drop_slot", number)``
+- ``("texture", key, request)`` with a descriptor; ``("drop_texture", key, number)``;
+  ``("drop_textures", key)``
 - ``("open", key, session_id, generations)``, where ``generations`` are those of the
   session's eyes; ``("close", key)``
 - ``("profile", key, request)``
@@ -15,7 +17,8 @@ Messages from the front end:
 
 Messages to the front end:
 
-- ``("started", server, eyes, can_interrupt)``, the first one
+- ``("started", server, eyes, can_interrupt, texture_support)``, the first one
+- ``("texture_reply", key, number, reason)``, with a reason if it is not imported
 - ``("profile_reply", key, eye, reply)``
 - ``("frame_reply", number, reply, started_s, ended_s, used_s, blocks_bytes)``
 - ``("state", memory_mb, stores_mb, is_building)``
@@ -35,6 +38,7 @@ from typing import Any
 from estimator.profiles.parse import EyeProfile
 from filter_service.errors import FilterError, NoSession, RenderFailed
 from filter_service.filtering.builder import Builder
+from filter_service.filtering.planned_textures import texture_importer
 from filter_service.messages import (
     ErrorReply,
     EyeName,
@@ -42,6 +46,7 @@ from filter_service.messages import (
     ProfileRequest,
     Reply,
     SharedPlaces,
+    ShareTexture,
 )
 from filter_service.service.process_channel import Link, LinkClosed
 from filter_service.service.process_info import (
@@ -51,6 +56,7 @@ from filter_service.service.process_info import (
 )
 from filter_service.service.session_eyes import SessionEyes
 from filter_service.service.shared_memory_frame import filter_in_slots
+from filter_service.service.texture_frame import filter_in_textures
 from filter_service.shared_memory import Slot
 
 IDLE_WAIT_S = 0.5
@@ -93,6 +99,7 @@ class RenderWorker:
         self._max_cameras = max_cameras
         self._sessions: dict[str, SessionEyes] = {}
         self._slots: dict[int, Slot] = {}
+        self._textures: dict[str, dict[int, Any]] = {}  # imported, by session key
         self._front_end: Link | None = None
         self._inbox: deque[tuple[Any, list[int]]] = deque()
         self._next_state_s = 0.0
@@ -145,6 +152,7 @@ class RenderWorker:
             self._front_end.close()
         self._front_end = front_end
         self._drop_slots()
+        self._drop_all_textures()
         while self._inbox:  # of the previous front end
             for descriptor in self._inbox.popleft()[1]:
                 os.close(descriptor)
@@ -156,7 +164,9 @@ class RenderWorker:
             "gl_renderer": self._builder.engine.name,  # for older clients
         }
         eyes = [(key, session.profiles) for key, session in self._sessions.items()]
-        self._send(("started", server, eyes, self._can_interrupt))
+        importer = texture_importer(self._builder)
+        support = None if importer is None else importer.texture_support
+        self._send(("started", server, eyes, self._can_interrupt, support))
 
     # Event loop
 
@@ -253,6 +263,7 @@ class RenderWorker:
     def _close(self) -> None:
         for key in list(self._sessions):
             self._close_session(key)
+        self._drop_all_textures()
         self._builder.close()
         self._drop_slots()
         if self._front_end is not None:
@@ -275,11 +286,46 @@ class RenderWorker:
             self._slots[number] = Slot.received(number, size_bytes, *descriptors)
         elif kind == "drop_slot":
             self._slots.pop(rest[0]).close()
+        elif kind == "texture":
+            self._import_texture(*rest, *descriptors)
+        elif kind == "drop_texture":
+            key, number = rest
+            self._release_texture(self._textures.get(key, {}).pop(number, None))
+        elif kind == "drop_textures":
+            self._drop_textures(*rest)
 
     def _drop_slots(self) -> None:
         for slot in self._slots.values():
             slot.close()
         self._slots = {}
+
+    # Textures
+
+    def _import_texture(self, key: str, request: ShareTexture, descriptor: int) -> None:
+        """Import a texture of a session, or reply with the reason."""
+        importer, reason = texture_importer(self._builder), ""
+        assert importer is not None  # otherwise the front end offers no textures
+        try:
+            imported = importer.import_texture(request.memory, descriptor)
+            self._textures.setdefault(key, {})[request.texture] = imported
+        except Exception as error:
+            if not isinstance(error, FilterError):
+                log.exception("a texture could not be imported")
+            reason = str(error)
+        self._send(("texture_reply", key, request.texture, reason))
+
+    def _release_texture(self, imported: Any) -> None:
+        importer = texture_importer(self._builder)
+        if imported is not None and importer is not None:
+            importer.release_texture(imported)
+
+    def _drop_textures(self, key: str) -> None:
+        for imported in self._textures.pop(key, {}).values():
+            self._release_texture(imported)
+
+    def _drop_all_textures(self) -> None:
+        for key in list(self._textures):
+            self._drop_textures(key)
 
     # Sessions
 
@@ -296,6 +342,7 @@ class RenderWorker:
         )
 
     def _close_session(self, key: str) -> None:
+        self._drop_textures(key)
         session = self._sessions.pop(key, None)
         if session is not None:
             session.close()
@@ -319,7 +366,7 @@ class RenderWorker:
         number: int,
         key: str,
         frame: Frame,
-        places: SharedPlaces,
+        places: SharedPlaces | None,
         sizes_bytes: Sequence[int],
     ) -> None:
         """Filter a frame; a frame that interrupts another is not interrupted itself."""
@@ -340,13 +387,22 @@ class RenderWorker:
         self._send(("frame_reply", number, reply, *times_s, blocks_bytes))
 
     def _reply_to(
-        self, key: str, frame: Frame, places: SharedPlaces, sizes_bytes: Sequence[int]
+        self,
+        key: str,
+        frame: Frame,
+        places: SharedPlaces | None,
+        sizes_bytes: Sequence[int],
     ) -> tuple[Reply, list[int]]:
         """Return the reply to a frame; any failure becomes an error reply."""
         try:
             session = self._sessions.get(key)
             if session is None:
                 raise NoSession("the session has ended")
+            if frame.textures:
+                found = self._textures.get(key, {})
+                textures = {n: imported.texture for n, imported in found.items()}
+                return filter_in_textures(session.filter_of, frame, textures), []
+            assert places is not None
             # References, because the front end may drop the slots during the frame.
             slots = self._slots[places.slot], self._slots[places.result_slot]
             return filter_in_slots(session.filter_of, frame, slots, places, sizes_bytes)

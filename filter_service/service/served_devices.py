@@ -18,6 +18,7 @@ from filter_service.service.render_client import RenderClient
 from filter_service.service.router import Tracker
 from filter_service.service.session import Session
 from filter_service.service.session_table import SessionTable
+from filter_service.texture_view import TextureSupport
 
 
 class ServedDevice:
@@ -45,6 +46,8 @@ class ServedDevice:
         Frames of its sessions.
     server : dict, optional
         Description reported by its render worker; None until then.
+    texture_support : TextureSupport, optional
+        Textures that its render worker imports; None if it imports none.
     memory_mb, stores_mb : float
     is_building : bool
         State last reported by its render worker.
@@ -68,6 +71,7 @@ class ServedDevice:
             partial(sessions.connected_on, index), self.render, send
         )
         self.server: dict[str, str] | None = None
+        self.texture_support: TextureSupport | None = None
         self.memory_mb = self.stores_mb = 0.0
         self.is_building = self.is_lost = False
 

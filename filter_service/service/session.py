@@ -10,7 +10,13 @@ from dataclasses import dataclass, field
 from typing import Self
 
 from filter_service.errors import CreditExceeded
-from filter_service.messages import EyeName, Frame, ProfileRequest
+from filter_service.messages import (
+    EyeName,
+    Frame,
+    ProfileRequest,
+    ShareTexture,
+    used_textures,
+)
 from filter_service.service.connections import Peer
 from filter_service.service.router import Tracker
 from filter_service.shared_memory import Slot
@@ -29,6 +35,21 @@ class WaitingFrame:
     frame: Frame
     received_s: float
     decoded_s: float
+
+
+@dataclass
+class ClientTexture:
+    """A texture that a client has shared.
+
+    Attributes
+    ----------
+    request : ShareTexture
+    is_imported : bool
+        Whether the render worker has imported it.
+    """
+
+    request: ShareTexture
+    is_imported: bool = False
 
 
 def new_key() -> str:
@@ -119,6 +140,8 @@ class Session:
     slow_since_s: float | None = None  # since when too many are unsent
     shared: dict[int, Slot] = field(default_factory=dict)  # by number
     slots_in_use: set[int] = field(default_factory=set)  # numbers; used by frames
+    textures: dict[int, ClientTexture] = field(default_factory=dict)  # by number
+    textures_in_use: set[int] = field(default_factory=set)
     disconnected_since_s: float | None = None
     last_connection: int = 0
     eyes: dict[EyeName, EyeProfiles] = field(default_factory=dict)
@@ -180,12 +203,14 @@ class Session:
         return superseded
 
     def mark_in_use(self, frame: Frame) -> None:
-        """Mark the slots of a frame as in use."""
+        """Mark the slots and textures of a frame as in use."""
+        self.textures_in_use |= used_textures(frame.textures)
         if frame.memory is not None:
             self.slots_in_use |= {frame.memory.slot, frame.memory.result_slot}
 
     def mark_free(self, frame: Frame) -> None:
-        """Mark the slots of a frame as free."""
+        """Mark the slots and textures of a frame as free."""
+        self.textures_in_use -= used_textures(frame.textures)
         if frame.memory is not None:
             self.slots_in_use -= {frame.memory.slot, frame.memory.result_slot}
 

@@ -25,6 +25,7 @@ from filter_service.messages import (
     Welcome,
 )
 from filter_service.service.client_memory import ClientMemory
+from filter_service.service.client_textures import ClientTextures
 from filter_service.service.config import ServiceConfig
 from filter_service.service.connections import Peer
 from filter_service.service.router import Outcome, Tracker
@@ -54,6 +55,7 @@ class SessionManager:
     sessions : SessionTable
     devices : ServedDevices
     client_memory : ClientMemory
+    client_textures : ClientTextures
     send : callable
         Sends a reply to a peer.
     record : callable
@@ -72,6 +74,7 @@ class SessionManager:
         sessions: SessionTable,
         devices: ServedDevices,
         client_memory: ClientMemory,
+        client_textures: ClientTextures,
         send: Callable[[Peer, Reply], Tracker | None],
         record: Callable[[str, SessionRecord | None], None],
     ) -> None:
@@ -79,6 +82,7 @@ class SessionManager:
         self._endpoint = endpoint
         self._sessions, self._devices = sessions, devices
         self._client_memory = client_memory
+        self._client_textures = client_textures
         self._send, self._record = send, record
         self._pending_hellos: list[tuple[Peer, Hello]] = []  # until devices are known
         self._next_alive_s = time.monotonic() + config.alive_interval_s
@@ -147,6 +151,7 @@ class SessionManager:
             is_resumed=is_resumed,
             profile_id=session.profile_ids.get("both") if is_resumed else None,
             profile_ids=session.profile_ids if is_resumed else {},
+            textures=self._client_textures.offer_to(session),
         )
         self._send(peer, welcome)
 
@@ -335,6 +340,7 @@ class SessionManager:
         )
 
     def _free_client_memory(self, session: Session) -> None:
-        """Release the shared memory of a client that has disconnected."""
+        """Release the shared memory and textures of a client that has disconnected."""
         self._client_memory.free(session)
+        self._client_textures.free(session)
         self._devices.device_of(session).frames.disconnect(session)

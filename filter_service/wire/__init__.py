@@ -9,5 +9,6 @@ depths       depth encodings
 compression  lossless compression of parts
 requests     messages from the client
 replies      messages from the service
+textures     messages about shared textures
 unpacking    bounded unpacking of untrusted bytes
 """

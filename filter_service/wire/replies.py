@@ -42,6 +42,7 @@ from filter_service.wire.message import (
     clip_notes,
     expect_parts,
 )
+from filter_service.wire.textures import TextureOffer
 
 DROP_REASONS = (
     "superseded",
@@ -84,6 +85,7 @@ class Welcome(Message):
     is_resumed: bool = False
     profile_id: Id | None = None
     profile_ids: dict[EyeName, Id] = field(default_factory=dict)
+    textures: TextureOffer | None = None
 
     type_name: ClassVar[str] = "welcome"
 
@@ -212,7 +214,7 @@ class Result(Message):
         object.__setattr__(self, "notes", clip_notes(self.notes, max(1, most)))
 
     def parts(self) -> list[Any]:
-        """Return the images of all views; none if they are in shared memory."""
+        """Return the images of all views; none if their memory is shared."""
         if self.in_memory:
             return []
         if self.compression != "none":

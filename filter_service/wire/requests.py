@@ -45,6 +45,7 @@ from filter_service.wire.message import (
     Timestamp,
     expect_parts,
 )
+from filter_service.wire.textures import ViewTextures
 from filter_service.wire.unpacking import unpack_profile
 
 MAX_VIEWS = 8
@@ -126,6 +127,7 @@ class Frame(Message):
     output: ImageFormat = SRGB8
     options: FrameOptions = FrameOptions()
     memory: SharedPlaces | None = None
+    textures: Annotated[tuple[ViewTextures, ...], Meta(max_length=MAX_VIEWS)] = ()
     compression: Compression = "none"
     display_time_ns: Nanoseconds | None = None
     images: Images = field(default=(), compare=False, repr=False)
@@ -139,8 +141,8 @@ class Frame(Message):
         return sum(view.camera.pixel_count for view in self.views)
 
     def parts(self) -> list[Any]:
-        """Return the images of each view in turn; none if they are in shared memory."""
-        if self.memory is not None:
+        """Return the images of each view in turn; none if the memory is shared."""
+        if self.memory is not None or self.textures:
             return []
         if self.compression != "none":
             return [block for images in self.images for block in images.arrays]
@@ -174,6 +176,10 @@ class Frame(Message):
             check_part_size(view.camera, self.output, f"views[{i}]", limits)
         states = [view.state for view in self.views]
         check_states(states, self.pupil_diameter_mm, self.focus_dpt)
+        if self.textures:
+            expect_parts(parts, 0)
+            self._check_textures()
+            return self
         if self.memory is None:
             images = images_from_parts(self.views, parts, limits, self.compression)
             return self._with_payload(images)
@@ -195,6 +201,34 @@ class Frame(Message):
                     allowed=f"{count} multiples of {ALIGNMENT_BYTES}",
                 )
         return self
+
+    def _check_textures(self) -> None:
+        """Check that the fields of a frame in textures suit each other."""
+        if len(self.textures) != len(self.views):
+            raise BadMessage(
+                f"there are {len(self.textures)}",
+                field="textures",
+                allowed=f"{len(self.views)}, as views",
+            )
+        results = [view.result for view in self.textures]
+        inputs = {number for view in self.textures for number in view.numbers[:2]}
+        if len({*results}) < len(results) or inputs & {*results}:
+            raise BadMessage(
+                f"the results are {show(results)}",
+                field="textures",
+                allowed="results that no other view uses and that are no input",
+            )
+        for name, is_wrong in (
+            ("memory", self.memory is not None),
+            ("compression", self.compression != "none"),
+            ("views", any(view.has_hidden for view in self.views)),
+        ):
+            if is_wrong:
+                raise BadMessage(
+                    "it does not apply to textures",
+                    field=name,
+                    allowed="no memory, compression or hidden layer",
+                )
 
 
 def _check_count(views: Sequence[object], limits: Limits) -> None:
