@@ -379,8 +379,10 @@ class EyeFilter:
         **options
             Fields of `RenderOptions`: ``accumulation="coverage"`` or ``"paper"``
             (nearer surfaces occlude farther ones, or the published sum), ``merge=True``
-            (similar pixels share a splat; off is slower), and ``render_tolerance=1.0``
-            (0 is exact, 1 leaves no visible difference, up to 8 is faster).
+            (similar pixels share a splat; off is slower), ``render_tolerance=1.0``
+            (0 is exact, 1 leaves no visible difference, up to 8 is faster), and
+            ``peripheral_merging=False`` (on is faster for a viewer who looks along
+            ``gaze_deg``; without a gaze it has no effect).
 
         Returns
         -------

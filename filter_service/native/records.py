@@ -90,6 +90,7 @@ class Frame(c.Structure):
         ("paper_rule", c.c_int32),
         ("white_level", c.c_float),
         ("tolerance", c.c_float),
+        ("gaze_direction", c.c_float * 3),
         ("largest_reach_px", c.c_float),
         ("fragments", POINTER),
         ("lights", POINTER),

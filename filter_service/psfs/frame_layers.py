@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from estimator.eye.focusing import OUT_OF_REACH_DPT
 from estimator.optics.vergence import ObjectVergence
+from filter_service.constants import MERGE_MIN_SPREAD_PX
 from filter_service.planning.grid import LAYER_BLUR_RATIO, GridSpec
 from filter_service.planning.nodes import PlanAxes
 from filter_service.planning.readable import usable_pupils_mm
@@ -43,6 +44,8 @@ class FrameLayers:
     edge_reach_px : float
         Distance to which kernels extend beyond the rays: diffraction at the pupil's
         edge that ``spec.kept_energy_ratio`` keeps.
+    merge_spread_px : float
+        Smallest spread of kernels that merged squares may use.
     """
 
     layer_dpt: NDArray[np.float64]
@@ -57,6 +60,7 @@ class FrameLayers:
     focus_dpt: float
     blur_px_per_dpt: float
     notes: tuple[str, ...]
+    merge_spread_px: float = MERGE_MIN_SPREAD_PX
 
     @cached_property
     def layer_blur_px(self) -> NDArray[np.float64]:
@@ -88,6 +92,7 @@ def frame_layers(
     focus_dpt: float,
     object_range_dpt: tuple[float, float] | None = None,
     step_ratio: float = 1.0,
+    merge_spread_px: float = MERGE_MIN_SPREAD_PX,
 ) -> FrameLayers:
     """Plan the layers of a frame for a pupil and focus.
 
@@ -99,6 +104,8 @@ def frame_layers(
         Object distances in the frame; by default those of the cache.
     step_ratio : float
         Steps between layers relative to the default.
+    merge_spread_px : float
+        As in `FrameLayers`.
 
     References
     ----------
@@ -148,6 +155,7 @@ def frame_layers(
         focus_dpt=reached_dpt,
         blur_px_per_dpt=blur_px_per_dpt,
         notes=notes,
+        merge_spread_px=merge_spread_px,
     )
 
 

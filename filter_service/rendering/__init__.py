@@ -29,6 +29,7 @@ white_level      reference light for contrast
 perfect_eye      store that changes nothing, for testing engines
 frame            preparation of a view: missing depth, repeated edges
 gaze             gaze of a frame, clamped to the prepared range
+detection        limits of merging by the angle from the gaze
 image_cells      cells of the image that share kernels
 cell_maps        linear maps from their pixels to those of stored kernels
 map_loops        compiled loops of cell_maps

@@ -13,8 +13,10 @@ from filter_service.errors import OutOfMemory
 from filter_service.psfs.field_defocus import FieldAxes
 from filter_service.psfs.frame_layers import FrameLayers, frame_layers
 from filter_service.psfs.store import PsfStore
+from filter_service.rendering.detection import merge_spread_px
 from filter_service.rendering.image_cells import ImageCells, image_cells, stored_scale
 from filter_service.rendering.sampled_frame import SampledFrame, missing_psfs_of
+from filter_service.settings import DEFAULT_OPTIONS, RenderOptions
 
 LAYER_STEP_RATIOS = (0.2, 2.0)
 """Smallest and largest layer step relative to the default.  With the smallest, layers
@@ -122,7 +124,7 @@ class FrameStates:
 
     def _reset(self, handle: FrameStore | None) -> None:
         self._handle = handle
-        self._layers: tuple[tuple[float, float, float], FrameLayers] | None = None
+        self._layers: tuple[tuple[float, ...], FrameLayers] | None = None
         self._image: tuple[tuple[Any, ...], ImageCells] | None = None
         self._change: tuple[FrameLayers, ImageCells, NDArray[Any]] | None = None
         self._corner_weights: tuple[FieldAxes, ImageCells, CornerWeights] | None = None
@@ -137,11 +139,12 @@ class FrameStates:
         handle: FrameStore,
         pupil_diameter_mm: float,
         focus_dpt: float,
-        tolerance: float = 1.0,
+        options: RenderOptions = DEFAULT_OPTIONS,
     ) -> FrameLayers:
-        """Return the layers for a pupil, a focus and a rendering tolerance."""
+        """Return the layers for a pupil, a focus and the options of a frame."""
         self._reset_if_other(handle)
-        state = (pupil_diameter_mm, focus_dpt, tolerance)
+        tolerance, spread_px = options.render_tolerance, merge_spread_px(options)
+        state = (pupil_diameter_mm, focus_dpt, tolerance, spread_px)
         if self._layers is None or self._layers[0] != state:
             with timer.wall("psf_plan_ms"):
                 self._layers = (
@@ -151,6 +154,7 @@ class FrameStates:
                         pupil_diameter_mm=pupil_diameter_mm,
                         focus_dpt=focus_dpt,
                         step_ratio=layer_step_ratio(tolerance),
+                        merge_spread_px=spread_px,
                     ),
                 )
         return self._layers[1]

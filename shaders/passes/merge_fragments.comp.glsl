@@ -7,7 +7,7 @@
 // Out: FRAGMENT_COLOR, FRAGMENT_PLACE (THREADS slots per block), BLOCKS (count, largest
 //      reach bits, order matters, pixels merged), STATS (fragments, pixels merged).
 // Dispatch: one group per block, one thread per quad of pixels.
-// Twin: tests/numerical/test_renderer_passes.py.  Source: section 6.3 (merging of tiled
+// Twin: tests/numerical/test_peripheral_merging.py.  Source: section 6.3 (merging of tiled
 // splatting), which merges one level.
 
 layout(local_size_x = QUADS) in;
@@ -27,6 +27,7 @@ layout(std430, binding = BINDING_PLAN) readonly buffer Plan { uint plan[]; };
 #include "common/kernels.glsl"
 #include "common/reach.glsl"
 #include "common/fragments.glsl"
+#include "common/detection.glsl"
 
 uniform ivec2 frame_size_px;
 uniform int layer_count;
@@ -38,6 +39,8 @@ uniform int max_level;            // 0: no merging
 uniform ivec2 scan_px;            // index of the first pixel, pixels of the whole frame
 uniform int paper_order;          // sort as in the paper: meters plus scan position
 uniform int surface;              // 0: visible, 1: hidden
+
+float gain = 1.0;                 // of the block's limits, away from the gaze
 
 shared uint alive[2];             // bit per pixel of the block: it has a fragment
 shared uint largest_reach_bits;   // reach is positive, so its bits are ordered like it
@@ -126,12 +129,12 @@ bool is_similar(ivec2 at, int level, vec4 least, vec4 most, vec4 place) {
     float fraction;
     uint kernel = kernel_at(at, place.x, fraction);
     // At most neighboring intervals, so that the kernel of the mean is one of theirs.
-    return spread >= MERGE_MIN_SPREAD_PX
+    return spread >= smallest_spread_px(gain)
         && floor(place.z) - floor(place.y) <= 1.0
-        && largest <= tolerance * white_level * MERGE_CONTRAST
+        && largest <= gain * tolerance * white_level * MERGE_CONTRAST
                       * pow(spread, MERGE_CONTRAST_POWER)
         && (most.a - least.a) * blur_px_per_dpt
-           <= tolerance * max(MERGE_MAX_BLUR_STEP_PX, MERGE_MAX_BLUR_RATIO * place.w)
+           <= gain * tolerance * max(MERGE_MAX_BLUR_STEP_PX, MERGE_MAX_BLUR_RATIO * place.w)
         && kernel_has_level(kernel, level);
 }
 
@@ -237,6 +240,7 @@ void main() {
     ivec2 grid = ivec2(gl_NumWorkGroups.xy);
     ivec2 block_at = ivec2(gl_WorkGroupID.xy);
     uint block = uint((surface * grid.y + block_at.y) * grid.x + block_at.x);
+    gain = block_gain(block_at, vec2(frame_size_px));
     if (quad == 0u) {
         alive[0] = 0u;
         alive[1] = 0u;

@@ -22,6 +22,7 @@ layout(std430, binding = BINDING_PLAN) buffer Plan { uint plan[]; };
 #include "common/work_lists.glsl"
 
 uniform int layer_count;
+uniform float merge_spread_px;    // smallest spread of kernels that merged squares use
 uniform uint kernel_capacity;
 uniform uint texel_capacity;      // of the kernel atlas
 
@@ -95,7 +96,7 @@ void add_part(uint kernel, uint corner, uint cell, uint interval, inout uvec4 pa
 // as its own may use.
 void write_kernel(uint kernel, Sizes sum) {
     float widest_px = max(max(sum.spread.x, sum.spread.y), MIN_SPREAD_PX);
-    int highest = clamp(int(floor(log2(widest_px / MERGE_MIN_SPREAD_PX))) + 1, 0, MAX_LEVEL);
+    int highest = clamp(int(floor(log2(widest_px / merge_spread_px))) + 1, 0, MAX_LEVEL);
     ivec2 box = sum.reach.xz + sum.reach.yw + 1;
     uvec4 sizes = uvec4(0u);
     uvec4 scales;

@@ -15,6 +15,7 @@ from filter_service.rendering.engine import TextureRequest
 from filter_service.rendering.gl import kernel_passes, texture_frames
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.srgb import linear_from_srgb
+from filter_service.settings import RenderOptions
 from filter_service.texture_view import DepthProjection, GlTexture, TextureView
 from tests.conftest import Engine
 from tests.numerical.gl_calls import CountedContext
@@ -204,6 +205,25 @@ def test_every_state_of_a_stream(caller, bench, color):
         expected = bench.render(bench.view(color, depth_m), output="srgb8", **state)
         found = caller.textures.read(target, SIZE_PX)
         np.testing.assert_array_equal(found[..., :3], expected.color)
+
+
+def test_merging_follows_the_gaze(caller, bench, color):
+    """The gaze is far beside the image, where merging is at its limit."""
+    depth_m, gaze_deg = depth_scene(), (50.0, 0.0)
+    options = RenderOptions(peripheral_merging=True)
+    view, target = caller.view(color, depth_m), caller.textures.new("rgba8", SIZE_PX)
+    plain = bench.render(bench.view(color, depth_m), output="srgb8", **STATE)
+    caller.filter(view, target, gaze_deg=gaze_deg, options=options)
+    expected = bench.render(
+        bench.view(color, depth_m),
+        output="srgb8",
+        gaze_deg=gaze_deg,
+        **options.fields(),
+        **STATE,
+    )
+    assert expected.fragment_count < plain.fragment_count
+    found = caller.textures.read(target, SIZE_PX)
+    np.testing.assert_array_equal(found[..., :3], expected.color)
 
 
 def test_input_is_sampled(caller, color):

@@ -207,6 +207,7 @@ def refusal(parts, error=errors.BadMessage):
         ({"output": {"dtype": "uint16", "space": "srgb"}}, "output.dtype"),
         ({"options": {"accumulation": "sum"}}, "options.accumulation"),
         ({"options": {"merge": 1}}, "options.merge"),
+        ({"options": {"peripheral_merging": 1}}, "options.peripheral_merging"),
         ({"options": {"render_tolerance": -1.0}}, "options.render_tolerance"),
     ],
 )

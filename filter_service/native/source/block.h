@@ -20,6 +20,8 @@ typedef struct {
     uint64_t held;            /* pixels that are not empty */
     uint64_t edges;           /* pixels next to another surface */
     int highest_level;        /* of merging, over the pixels' kernels */
+    float tolerance;          /* of merging, at this angle from the gaze */
+    float smallest_spread_px; /* of kernels that merge */
 } block;
 
 INLINE f32x4 pixel_color(const frame *f, int surface, size_t pixel) {
@@ -119,6 +121,30 @@ INLINE void read_row(block *b, int i, size_t first, int width) {
     }
 }
 
+/* Sets the limits of merging, which grow with the angle from the gaze.  Twin:
+ * shaders/common/detection.glsl. */
+INLINE void set_limits(block *b) {
+    const frame *f = b->f;
+    const float *gaze = f->gaze_direction, *tangents = f->tangents;
+    b->tolerance = f->tolerance;
+    b->smallest_spread_px = MERGE_MIN_SPREAD_PX;
+    if (gaze[0] == 0.0f && gaze[1] == 0.0f && gaze[2] == 0.0f) return;
+    float half = 0.5f * TILE_SIZE_PX;
+    float across = ((float)b->x0 + half) / (float)f->width;
+    float along = ((float)b->y0 + half) / (float)f->height;
+    float right = tangents[0] + across * (tangents[1] - tangents[0]);
+    float up = tangents[2] + along * (tangents[3] - tangents[2]);
+    float length = sqrtf(right * right + up * up + 1.0f);
+    float cosine = (right * gaze[0] + up * gaze[1] + gaze[2]) / length;
+    float eccentricity_deg = acosf(smaller_float(cosine, 1.0f)) * (float)(180.0 / M_PI);
+    float beyond_deg = eccentricity_deg - DETECTION_MARGIN_DEG;
+    if (beyond_deg <= 0.0f) return;
+    float gain = exp2f(smaller_float(DETECTION_OCTAVES_PER_DEG * beyond_deg,
+                                     DETECTION_MAX_OCTAVES));
+    b->tolerance *= gain;
+    b->smallest_spread_px *= powf(gain, -1.0f / MERGE_CONTRAST_POWER);
+}
+
 /* Reads a block; empty pixels stay dark and sharp. */
 INLINE void read_block(block *b, const frame *f, int surface, int column, int row) {
     b->f = f;
@@ -127,6 +153,7 @@ INLINE void read_block(block *b, const frame *f, int surface, int column, int ro
     b->y0 = row * TILE_SIZE_PX;
     b->held = 0;
     b->highest_level = 0;
+    set_limits(b);
     b->edges = surface == 0 ? find_edges(b) : ~(uint64_t)0;
     int width = smaller_int(f->width - b->x0, TILE_SIZE_PX);
     int height = smaller_int(f->height - b->y0, TILE_SIZE_PX);

@@ -130,6 +130,7 @@ typedef struct {
     int32_t paper_rule;
     float white_level;
     float tolerance;          /* of merging, relative to the default */
+    float gaze_direction[3];  /* right, up, forward; zero: merging is the same everywhere */
     float largest_reach_px;
     fragment *fragments;      /* room for 64 per block; no gaps in a row of blocks */
     fragment_light *lights;

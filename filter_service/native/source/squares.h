@@ -72,16 +72,17 @@ INLINE f32x8 seen_contrast(const frame *f, const square_row *s, int c) {
 
 /* Bit mask of the squares that blur allows to merge into one fragment.  Relative to twice
  * the blur, a square of the next level looks the same, and so does its error. */
-INLINE uint32_t similar_lanes(const frame *f, const square_row *s, int level) {
+INLINE uint32_t similar_lanes(const block *b, const square_row *s, int level) {
+    const frame *f = b->f;
     f32x8 spread = s->spread_px * all8(1.0f / (float)(1 << (level - 1)));
     f32x8 contrast = seen_contrast(f, s, 0);
     for (int c = 1; c < RGB; ++c) contrast = larger8(contrast, seen_contrast(f, s, c));
-    f32x8 most = all8(f->tolerance * f->white_level * MERGE_CONTRAST) * spread * root8(spread);
+    f32x8 most = all8(b->tolerance * f->white_level * MERGE_CONTRAST) * spread * root8(spread);
     f32x8 step = larger8(all8(MERGE_MAX_BLUR_STEP_PX), all8(MERGE_MAX_BLUR_RATIO) * s->spread_px);
     f32x8 blur_px = (s->most_dpt - s->least_dpt) * all8(f->blur_px_per_dpt);
     i32x8 intervals = whole8(s->farthest) - whole8(s->nearest);
-    return bits_of8((spread >= all8(MERGE_MIN_SPREAD_PX)) & (contrast <= most)
-                    & (blur_px <= all8(f->tolerance) * step) & (intervals <= 1));
+    return bits_of8((spread >= all8(b->smallest_spread_px)) & (contrast <= most)
+                    & (blur_px <= all8(b->tolerance) * step) & (intervals <= 1));
 }
 
 INLINE float lane_of(const f32x8 *lanes, int lane) { return ((const float *)lanes)[lane]; }
@@ -123,7 +124,7 @@ INLINE uint64_t merge_level(const block *b, block_squares *all, uint64_t below, 
             const square_row *from = &all->rows[level - 2][2 * row];
             join_rows(from, from + 1, level, to);
         }
-        similar |= (uint64_t)similar_lanes(b->f, to, level) << (row * TILE_SIZE_PX << level);
+        similar |= (uint64_t)similar_lanes(b, to, level) << (row * TILE_SIZE_PX << level);
     }
     uint64_t merged = 0;
     for (uint64_t left = starts & similar; left; left &= left - 1) {

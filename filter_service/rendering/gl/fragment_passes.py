@@ -16,6 +16,7 @@ from filter_service.constants import (
     STAT_WORDS,
     THREADS,
 )
+from filter_service.rendering.detection import GazeDirection
 from filter_service.rendering.gl.kernel_passes import KernelRun, words_per_cell
 from filter_service.rendering.gl.strip import Strip, group_count
 from filter_service.rendering.image_cells import ImageCells
@@ -39,6 +40,8 @@ class FragmentPasses:
         Cells of the whole frame.
     tolerance : float
         Merging error relative to the default; 0 disables merging.
+    gaze : GazeDirection
+        Gaze that merging follows.
     first_row : int
         First row of the strip within the frame.
     frame_pixel_count : int
@@ -69,6 +72,7 @@ class FragmentPasses:
         *,
         image: ImageCells,
         tolerance: float,
+        gaze: GazeDirection,
         first_row: int,
         frame_pixel_count: int,
         image_size_px: tuple[int, int],
@@ -81,6 +85,7 @@ class FragmentPasses:
         self.strip = strip
         self.image = image
         self.tolerance = tolerance
+        self.gaze = gaze
         self.first_row = first_row
         self.scan = (first_row * strip.size[0], frame_pixel_count)
         self.image_size_px = image_size_px
@@ -156,6 +161,8 @@ class FragmentPasses:
                     white_level=self.white_level,
                     is_encoded=int(self.is_encoded),
                     tolerance=self.tolerance,
+                    tangents=self.strip.view.tangents,
+                    gaze_direction=self.gaze,
                     paper_order=int(self.strip.paper_rule),
                     scan_px=self.scan,
                     surface=surface,

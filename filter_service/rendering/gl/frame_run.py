@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.frame_layers import FrameLayers
+from filter_service.rendering.detection import merge_gaze
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.frame import (
     border_px_of,
@@ -88,7 +89,7 @@ class FrameRun:
             eye.handle,
             request.pupil_diameter_mm,
             request.focus_dpt,
-            request.options.render_tolerance,
+            request.options,
         )
         with self.timer.wall("prepare_ms"):
             self._view = drop_empty_layer(request.view)
@@ -199,6 +200,7 @@ class FrameRun:
             rows.view,
             image=image,
             tolerance=options.render_tolerance if options.merge else 0.0,
+            gaze=merge_gaze(options, self._request.gaze_deg),
             first_row=rows.first_row,
             frame_pixel_count=plan.whole.width_px * plan.whole.height_px,
             image_size_px=(self._view.width_px, self._view.height_px),

@@ -359,6 +359,7 @@ class KernelRun:
                 dispatch=PLAN_FOR_KERNELS,
                 defines=group,
                 layer_count=layer_count,
+                merge_spread_px=layers.merge_spread_px,
                 kernel_capacity=capacity.kernels,
                 texel_capacity=capacity.texels,
                 work_capacity=capacity.work_items,

@@ -32,6 +32,7 @@ from filter_service.gl.gpu import Gpu
 from filter_service.gl.stage_timer import Untimed
 from filter_service.gl.texture_io import TextureIo
 from filter_service.psfs.frame_layers import FrameLayers
+from filter_service.rendering.detection import merge_gaze
 from filter_service.rendering.engine import TextureRequest
 from filter_service.rendering.gl.eye_states import EyeState
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
@@ -183,7 +184,7 @@ class TextureFrames:
             eye.handle,
             request.pupil_diameter_mm,
             request.focus_dpt,
-            request.options.render_tolerance,
+            request.options,
         )
         repeats = 0
         while True:
@@ -234,6 +235,7 @@ class TextureFrames:
             self._io,
             image=state.image,
             tolerance=options.render_tolerance if options.merge else 0.0,
+            gaze=merge_gaze(options, request.gaze_deg),
             first_row=0,
             frame_pixel_count=strip.pixel_count,
             image_size_px=size_px,

@@ -18,6 +18,7 @@ from filter_service.native.records import (
     Frame,
 )
 from filter_service.psfs.frame_layers import FrameLayers
+from filter_service.rendering.detection import GazeDirection
 from filter_service.rendering.frame_kernels import interval_count
 from filter_service.rendering.image_cells import ImageCells
 from filter_service.rendering.native.arrays import Arrays
@@ -171,6 +172,7 @@ class FrameRecord:
         self,
         *,
         tolerance: float,
+        gaze: GazeDirection,
         paper_rule: bool,
         white_level: float,
         is_encoded: bool,
@@ -184,6 +186,7 @@ class FrameRecord:
             most = min(most, c.cell_px.bit_length() - 1)
         c.max_level = most if tolerance > 0.0 else 0
         c.tolerance = tolerance
+        c.gaze_direction[:] = gaze
         for r in range(1, RESOLUTIONS):
             spread_px = COARSE_SPREAD_PX[r] / tolerance if tolerance > 0.0 else math.inf
             c.coarse_spread_px[r] = max(spread_px, COARSE_SPREAD_PX[r])

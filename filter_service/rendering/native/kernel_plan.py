@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import MAX_LEVEL, MERGE_MIN_SPREAD_PX, MIN_SPREAD_PX
+from filter_service.constants import MAX_LEVEL, MIN_SPREAD_PX
 from filter_service.native.records import KERNEL_SHAPE
 from filter_service.psfs.boxes import box_sizes
 from filter_service.psfs.frame_layers import FrameLayers
@@ -81,7 +81,7 @@ def plan_kernels(
         used=used,
         kernels=kernels,
         kernel_of=pair_index(kernels, used.shape),
-        shapes=_shapes(kernels),
+        shapes=_shapes(kernels, layers.merge_spread_px),
         sources=(
             *(np.ascontiguousarray(numbers, np.int64) for numbers in sources),
             np.ascontiguousarray(kernels.weight_ratio, np.float64),
@@ -91,12 +91,12 @@ def plan_kernels(
     )
 
 
-def _shapes(kernels: FrameKernels) -> NDArray[np.void]:
+def _shapes(kernels: FrameKernels, merge_spread_px: float) -> NDArray[np.void]:
     shapes = np.zeros(kernels.count, KERNEL_SHAPE)
     shapes["spread_px"] = kernels.spread_px
     shapes["radius_px"] = kernels.radius_px
     shapes["reach_px"] = kernels.reach_px
     widest_px = np.maximum(kernels.spread_px.max(axis=1), MIN_SPREAD_PX)
-    steps = np.floor(np.log2(widest_px / MERGE_MIN_SPREAD_PX)) + 1
+    steps = np.floor(np.log2(widest_px / merge_spread_px)) + 1
     shapes["highest_level"] = np.clip(steps, 0, MAX_LEVEL)
     return shapes

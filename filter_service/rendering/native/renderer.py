@@ -15,6 +15,7 @@ from filter_service.errors import RenderFailed
 from filter_service.native.library import Library, compiled_library
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.store import PsfStore
+from filter_service.rendering.detection import merge_gaze
 from filter_service.rendering.engine import OneView, Pending, ViewRequest
 from filter_service.rendering.filtered_view import FilteredView, input_notes
 from filter_service.rendering.frame import (
@@ -123,7 +124,7 @@ class NativeRenderer(OneView):
             handle,
             request.pupil_diameter_mm,
             request.focus_dpt,
-            request.options.render_tolerance,
+            request.options,
         )
         fill = partial(self._fill, timer, handle, request.until_s)
         cell_px = None
@@ -162,6 +163,7 @@ class NativeRenderer(OneView):
         with timer.wall("merge_ms"):
             frame.set_merging(
                 tolerance=options.render_tolerance if options.merge else 0.0,
+                gaze=merge_gaze(options, request.gaze_deg),
                 paper_rule=options.accumulation == "paper",
                 white_level=white_level(view.color),
                 is_encoded=request.output == "srgb8",
