@@ -17,12 +17,15 @@ from filter_service.rgbd_view import RgbdView
 _SCRIPT = """
 import json
 import sys
+from dataclasses import replace
 import numpy as np
 from clients.scene_renderer import SceneRenderer
 from clients.scenes import courtyard, primitives
 from clients.scenes.paths import PATHS, Key, path_moments
-name, width, height, count, first, end, keys, hidden, out = sys.argv[1:]
+name, width, height, count, first, end, keys, hidden, fov, out = sys.argv[1:]
 scene = {"courtyard": courtyard, "primitives": primitives}[name].build()
+if float(fov):
+    scene = replace(scene, fov_deg=float(fov))
 path = [Key(*key) for key in json.loads(keys)] or PATHS[name]
 moments = path_moments(path, int(count))[int(first) : int(end)]
 with SceneRenderer(scene, (int(width), int(height))) as renderer:
@@ -44,10 +47,17 @@ SCENES = ("courtyard", "primitives")
 
 @cache
 def scene_view(
-    name: str, *, width_px: int, height_px: int, with_hidden: bool = False
+    name: str,
+    *,
+    width_px: int,
+    height_px: int,
+    with_hidden: bool = False,
+    fov_deg: float | None = None,
 ) -> RgbdView:
-    """Middle frame of a scene's own camera path."""
-    return _rendered(name, width_px, height_px, 5, 2, 3, with_hidden=with_hidden)[0]
+    """Middle frame of a scene's own camera path; ``fov_deg``: vertical, if another."""
+    size_px = width_px, height_px
+    options = {"with_hidden": with_hidden, "fov_deg": fov_deg}
+    return _rendered(name, *size_px, 5, 2, 3, **options)[0]
 
 
 @cache
@@ -75,14 +85,23 @@ def scene_views(
 
 
 def _rendered(
-    name, width_px, height_px, count, first, end, path=(), with_hidden=False
+    name,
+    width_px,
+    height_px,
+    count,
+    first,
+    end,
+    path=(),
+    with_hidden=False,
+    fov_deg=None,
 ) -> tuple:
     root = Path(__file__).parents[2]
     numbers = [str(n) for n in (width_px, height_px, count, first, end)]
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "frames.npz"
         layers = "hidden" if with_hidden else "seen"
-        arguments = [name, *numbers, json.dumps(path), layers, str(out)]
+        fov = str(fov_deg or 0.0)
+        arguments = [name, *numbers, json.dumps(path), layers, fov, str(out)]
         subprocess.run(
             [sys.executable, "-c", _SCRIPT, *arguments], check=True, cwd=root
         )
