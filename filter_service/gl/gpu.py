@@ -28,6 +28,7 @@ from filter_service.gl.staging import (
     has_buffer_storage,
     wait_for_fence,
 )
+from filter_service.gl.texture_io import TextureIo
 from filter_service.gl_device import (
     checked_gl_device,
     is_software_renderer,
@@ -110,6 +111,7 @@ class Gpu:
         self.passes = Passes(self.context)
         self._atlases: dict[str, moderngl.Texture] = {}
         self._queries: list[moderngl.Query] = []
+        self._texture_io: TextureIo | None = None
         self._owners: dict[str, object] = {}
         self._reads: list[_Read] = []
         self.atlas_is_buffer = (
@@ -172,10 +174,27 @@ class Gpu:
             self.passes.release()
             for ring in (self._staging or {}).values():
                 ring.release()
+            if self._texture_io is not None:
+                self._texture_io.release()
         self._buffers.clear()
         self._atlases.clear()
         with self._egl.kept():
             self.context.release()
+
+    @property
+    def texture_io(self) -> TextureIo:
+        """Return the sampler and the framebuffer for textures; `close` frees them.
+
+        Raises
+        ------
+        RenderFailed
+            OpenGL lacks functions for frames in textures.
+        """
+        if self.functions is None:
+            raise RenderFailed("this OpenGL lacks functions for frames in textures")
+        if self._texture_io is None:
+            self._texture_io = TextureIo(self.context, self.functions)
+        return self._texture_io
 
     # ----- buffers
 

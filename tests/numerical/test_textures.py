@@ -515,10 +515,40 @@ def test_formats_are_opengls(caller):
     for kind in FORMATS:
         texture_ = caller.textures.new(kind, SIZE_PX)
         with caller.gpu.entered():
-            caller.renderer._textures = caller.renderer._textures or (
-                texture_frames.TextureFrames(caller.gpu)
-            )
-            caller.renderer._textures._io.check(texture_, SIZE_PX, "color")
+            caller.gpu.texture_io.check(texture_, SIZE_PX, "color")
+
+
+def test_the_first_frame_is_not_repeated_forever(caller, color, monkeypatch):
+    """An eye whose frames are never complete does not stop the caller."""
+    view, target = (
+        caller.view(color, depth_scene()),
+        caller.textures.new("rgba8", SIZE_PX),
+    )
+    runs = []
+    monkeypatch.setattr(
+        texture_frames.TextureFrames, "_read", lambda *_, **__: runs.append(0)
+    )
+    caller.filter(view, target)
+    assert len(runs) == texture_frames.MAX_REPEATS
+
+
+def test_closing_leaves_no_objects(bench, color):
+    """The sampler and the framebuffer are freed; the caller's textures stay."""
+
+    def exists(kind, name):
+        address = CurrentContext().load_opengl_function(f"glIs{kind}")
+        return bool(ctypes.CFUNCTYPE(ctypes.c_ubyte, ctypes.c_uint)(address)(name))
+
+    with callers_context():
+        caller = Caller(bench)
+        target = caller.textures.new("rgba8", SIZE_PX)
+        caller.filter(caller.view(color, depth_scene()), target)
+        io = caller.gpu.texture_io
+        own = ("Sampler", io._sampler.value), ("Framebuffer", io._framebuffer.value)
+        assert [exists(*one) for one in own] == [True, True]
+        caller.close()
+        assert [exists(*one) for one in own] == [False, False]
+        assert exists("Texture", target.name)
 
 
 def test_an_engine_of_its_own_context_is_separate(gl_engine, bench, color):

@@ -91,19 +91,13 @@ class FilterRenderer(OneView):
         return partial(self._finish, run, *gaze)
 
     def filter_textures(self, request: TextureRequest) -> ShownTexture:
-        """Filter a view from textures to a texture; wait only if the request does.
+        """Filter a view from textures; see `TextureEngine.filter_textures`.
 
         Raises
         ------
-        BadMessage
-            Textures or options are invalid.
-        CameraMismatch
-            The store is for another camera, see `camera.is_same_camera`.
-        RenderFailed
-            The context is not current, or OpenGL cannot draw to the target.
-        OutOfGpuMemory
-        NotPrepared
-            As for `begin`, if the request waits.
+        OutOfGpuMemory, RenderFailed
+            In addition to its errors: the context is not current, or OpenGL cannot
+            draw to the target.
         """
         gaze_deg, notes = check_options(
             request.options, request.view.camera, request.handle.store, request.gaze_deg

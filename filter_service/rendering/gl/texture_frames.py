@@ -1,4 +1,4 @@
-"""Frames from textures to a texture of the caller's context, without waiting.
+"""Frames from textures to a texture of the same context, without waiting.
 
 The CPU reads a frame's counters when a later frame finds that the GPU has finished it.
 If a frame lacked PSFs, others took their weight; if its kernels or lists did not fit
@@ -27,7 +27,7 @@ from filter_service.constants import (
     THREADS,
     TOTAL_WORDS,
 )
-from filter_service.errors import NotPrepared, OutOfGpuMemory, RenderFailed
+from filter_service.errors import NotPrepared, OutOfGpuMemory
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.stage_timer import Untimed
 from filter_service.gl.texture_io import TextureIo
@@ -58,8 +58,8 @@ does not fit shows its input."""
 INPUT_UNITS = (TEXTURE_COLOR, TEXTURE_DEPTH)
 
 MAX_REPEATS = 8
-"""Largest number of runs of a frame that waits: for PSFs, kernels and lists, each of
-which may need larger buffers twice."""
+"""Largest number of runs of a frame that waits, and of the first frame of an eye: for
+PSFs, kernels and lists, each of which may need larger buffers twice."""
 
 MAX_IN_FLIGHT = 4
 """Frames whose counters have not been read.  Further ones are not counted."""
@@ -133,29 +133,26 @@ class TextureFrames:
     Parameters
     ----------
     gpu : Gpu
-        Of a context of the caller.
 
     Attributes
     ----------
     number : int
         Number of frames that were submitted.
+
+    Raises
+    ------
+    RenderFailed
+        OpenGL lacks functions for frames in textures.
     """
 
     def __init__(self, gpu: Gpu) -> None:
-        if gpu.functions is None:
-            raise RenderFailed("this OpenGL lacks functions for frames in textures")
-        self._gpu, self._gl = gpu, gpu.functions
-        self._io = TextureIo(gpu.context, gpu.functions)
+        self._gpu, self._io = gpu, gpu.texture_io
         self._submitted: deque[_Submitted] = deque()
         self.number = 0
 
     def forget(self) -> None:
         """Check textures again, whose names may now be of others."""
         self._io.forget()
-
-    def release(self) -> None:
-        """Free the OpenGL objects."""
-        self._io.release()
 
     def check(self, request: TextureRequest) -> None:
         """Check the textures of a request.
@@ -208,6 +205,8 @@ class TextureFrames:
             repeats += 1
             if request.waits:
                 _check_repeats(repeats, request.until_s)
+            elif repeats == MAX_REPEATS:  # later frames go on where this one ended
+                break
         if request.waits:
             self._gpu.wait()
         return layers, eye.earlier
