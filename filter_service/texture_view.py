@@ -271,7 +271,7 @@ class EarlierFrame:
         Number of the frame among those of the context, from 1 on.
     is_filtered : bool
         Whether it was filtered.  It shows its input if its kernels or lists did not fit
-        the buffers, which are larger since.
+        the buffers, which are then enlarged.
     is_complete : bool
         Whether all its PSFs had been computed; others took the weight of the missing
         ones.

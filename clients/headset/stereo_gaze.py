@@ -65,7 +65,7 @@ class RgbdPicture:
 
 
 class TexturePicture:
-    """Unfiltered image of one eye in textures, which are read only if need be.
+    """Unfiltered image of one eye in textures, which are read only if necessary.
 
     Parameters
     ----------

@@ -101,7 +101,7 @@ class Staging:
         self._first = self._end = 0
 
     def has_space(self, n_bytes: int) -> bool:
-        """Return whether bytes can be allocated, if need be after their fences."""
+        """Return whether bytes can be allocated, after their fences if necessary."""
         while not self._fits(n_bytes):
             if not self._groups or not self._groups[0].is_free:
                 return False

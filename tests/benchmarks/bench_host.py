@@ -12,15 +12,15 @@ whatever the driver.
 - ``driver's copies``: between its buffers, barriers and waits, which a GPU does by
   itself.  A software driver copies on this processor, which would empty its caches, so
   it is told to copy four bytes of each image;
-- ``rest``: Python, numpy, compiled loops and calls: what an issue is made of.
+- ``rest``: Python, numpy, compiled loops and calls of OpenGL.
 
 Frames of arrays, and, with "textures" in their setting, frames from textures to
 textures of the caller's context, which copy no image and wait for nothing.
 
 "frozen": pupil and focus stay; "moving": they change with every frame.  The error is
-that of the real frames against the native engine, PSNR in linear light.  The number of
-dispatches, bindings, uniforms, copies and waits of a frame stands with its case.
-Least times stand beside medians: another process on a core shows in the latter.
+that of the real frames against the native engine, PSNR in linear light.  Every case has
+its numbers of dispatches, bindings, uniforms, copies and waits of a frame.  Minima are
+listed beside medians, which other processes on a core increase.
 
 Writes results/host.json.
 """

@@ -1,6 +1,6 @@
 """A client with an OpenGL context, and memory as Mesa's Vulkan driver exports it.
 
-OpenGL only imports memory.  The descriptors of this module have the very bytes of those
+OpenGL only imports memory.  The descriptors of this module have the same bytes as those
 that lavapipe, Vulkan of the same Mesa, returns by `vkGetMemoryFdKHR`: a sealed file in
 memory with a header of its size, the offset of the data, and the driver's identifier.
 """

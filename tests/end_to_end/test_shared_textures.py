@@ -220,7 +220,7 @@ def test_two_clients_have_only_their_own_textures(service, client, gl):
             np.testing.assert_array_equal(found, of_arrays(one, seed).color)
 
 
-# ----- what ends
+# ----- textures and sessions that end
 
 
 def test_a_killed_client_leaves_nothing(service, client, gl):

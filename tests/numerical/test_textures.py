@@ -101,7 +101,7 @@ def with_alpha(color, alpha):
 @pytest.mark.parametrize("is_top_first", [True, False])
 @pytest.mark.parametrize("kind", ["rgba8", "srgb8_a8", "rgba16f"])
 def test_color_formats(caller, bench, color, rng, kind, is_top_first):
-    """8-bit images have the very bytes of arrays; alpha passes through."""
+    """8-bit images equal those of arrays in every byte; alpha is kept."""
     flip = slice(None) if is_top_first else slice(None, None, -1)
     depth_m, alpha = depth_scene(), rng.integers(0, 256, color.shape[:2])
     shown, output, array = color, "srgb8", color
@@ -399,7 +399,7 @@ CAPABILITIES = (
 
 
 def gl_state(gpu):
-    """What OpenGL says of its state, as far as drawing depends on it."""
+    """The state that drawing depends on, as OpenGL reports it."""
     gl, found = gpu.functions, {}
     ints, large = (ctypes.c_int * 16)(), ctypes.c_int64()
     for name in QUERIES["glGetIntegerv"]:

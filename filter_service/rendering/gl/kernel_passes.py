@@ -239,7 +239,7 @@ class KernelPasses:
         return {name: self.gpu.storage(name, size) for name, size in sizes.items()}
 
     def grow(self, counts: NDArray[np.uint32], headroom: float = HEADROOM) -> None:
-        """Enlarge the buffers to a multiple of a plan's counters, if need be."""
+        """Enlarge the buffers to a multiple of a plan's counters, if necessary."""
 
         def enlarged(capacity: int, index: int) -> int:
             count = int(counts[index])

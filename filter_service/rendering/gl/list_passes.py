@@ -187,7 +187,7 @@ class ListPasses:
         self.strip.reserve(ENTRIES_SPARE=n_bytes if needs_spare else 0)
 
     def reserve_more(self, ratio: float) -> None:
-        """Enlarge the buffers to a multiple of the recorded totals, if need be."""
+        """Enlarge the buffers to a multiple of the recorded totals, if necessary."""
         entries = min(int(ratio * self.lists.entry_count), self._list_limit)
         self.strip.reserve(ENTRIES=ENTRY_BYTES * entries)
         if self.lists.longest > SORT_CAPACITIES[-1]:
