@@ -155,8 +155,7 @@ class FilterRenderer(OneView):
             self._importer.release(imported)
             # Drivers free memory when they flush, and an idle service would not.
             self._gpu.wait()
-            if self._textures is not None:
-                self._textures.forget()
+            self._gpu.texture_io.forget()
 
     def _finish(
         self, run: FrameRun, gaze_deg: tuple[float, float], gaze_notes: tuple[str, ...]

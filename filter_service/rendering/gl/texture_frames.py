@@ -150,10 +150,6 @@ class TextureFrames:
         self._submitted: deque[_Submitted] = deque()
         self.number = 0
 
-    def forget(self) -> None:
-        """Check textures again, whose names may now be of others."""
-        self._io.forget()
-
     def check(self, request: TextureRequest) -> None:
         """Check the textures of a request.
 
