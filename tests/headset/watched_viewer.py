@@ -11,7 +11,10 @@ runtime requested and the views that the viewer showed, and at the end the repor
 import json
 import sys
 
+import moderngl
+
 from clients.headset import openxr_runtime, program
+from clients.scenes.scene_view import read_texture
 
 
 def tell(**what) -> None:
@@ -33,11 +36,16 @@ class WatchedRuntime(openxr_runtime.OpenXrRuntime):
                 "asked": [as_json(view) for view in due.views],
                 "shown": [as_json(view.view) for view in shown],
                 # of the middle row, which tells how sharp it is
-                "rows": [
-                    view.color[len(view.color) // 2, :, 1].tolist() for view in shown
-                ],
+                "rows": [self.middle_row(view.color) for view in shown],
             }
         )
+
+    def middle_row(self, color):
+        """Return the green channel of an array or a texture."""
+        if isinstance(color, moderngl.Texture):
+            with self._context:
+                color = read_texture(color)
+        return color[len(color) // 2, :, 1].tolist()
 
 
 def as_json(view):
