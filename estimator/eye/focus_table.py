@@ -14,6 +14,9 @@ STANDARD_PUPILS_MM = (2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0)
 NEAREST_PUPIL_MM = 0.6
 """Standard pupils closer than this to the eye's own pupil are omitted."""
 
+SAME_NODE = 1e-12
+"""Distance from a node at which a polynomial has its value."""
+
 LEAST_STATES = 3
 """Number of accommodations at which light must fill a pupil; others are omitted."""
 
@@ -50,43 +53,62 @@ class FocusTable:
         self._refractions_dpt = refractions_dpt
         self._squares_mm2 = np.square(pupils_mm[usable])
         self._pupil_shares = _barycentric_shares(self._squares_mm2)
-        self._used_shares = _barycentric_shares(accommodations_dpt)
-        self._last: tuple[float, NDArray[Any]] = (0.0, np.zeros(0))
+        self._over_accommodation = _Polynomial(accommodations_dpt)
+        self._last: tuple[float, list[float], _Polynomial | None] = (0.0, [], None)
 
-    def _at_pupil(self, pupil_mm: float) -> NDArray[np.float64]:
-        """Return refractions (m,) at a pupil; cache those of the last pupil."""
-        last = self._last
-        if last[0] != pupil_mm:
+    def _at_pupil(self, pupil_mm: float) -> tuple[list[float], "_Polynomial"]:
+        """Return refractions (m,) at a pupil, and the polynomial over them.
+
+        Those of the last pupil are cached: a frame asks for one pupil several times.
+        """
+        last_mm, found_dpt, inverse = self._last
+        if inverse is None or last_mm != pupil_mm:
             nodes, values = self._squares_mm2, self._refractions_dpt
-            last = pupil_mm, _through(nodes, values, self._pupil_shares, pupil_mm**2)
-            self._last = last
-        return last[1]
+            found = _through(nodes, values, self._pupil_shares, pupil_mm**2)
+            rises = np.flatnonzero(np.diff(found) >= 0.0)
+            falling = found[: int(rises[0]) + 1 if rises.size else found.size]
+            found_dpt, inverse = found.tolist(), _Polynomial(falling)
+            self._last = pupil_mm, found_dpt, inverse
+        return found_dpt, inverse
 
     def refraction_dpt(self, *, pupil_mm: float, accommodation_dpt: float) -> float:
         """Return the refraction through a pupil at an accommodation."""
-        return float(
-            _through(
-                self._accommodations_dpt,
-                self._at_pupil(pupil_mm),
-                self._used_shares,
-                accommodation_dpt,
-            )
-        )
+        found_dpt, _ = self._at_pupil(pupil_mm)
+        return self._over_accommodation.through(found_dpt, accommodation_dpt)
 
     def accommodation_dpt(self, *, pupil_mm: float, refraction_dpt: float) -> float:
-        """Return the accommodation in the table with the nearest refraction."""
-        found_dpt, used_dpt = self._falling(pupil_mm)
-        wanted_dpt = min(max(refraction_dpt, found_dpt[-1]), found_dpt[0])
-        shares = _barycentric_shares(found_dpt)
-        inverse = _through(found_dpt, used_dpt, shares, wanted_dpt)
-        return float(np.clip(inverse, used_dpt[0], used_dpt[-1]))
+        """Return the accommodation in the table with the nearest refraction.
 
-    def _falling(self, pupil_mm: float) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return refractions at a pupil while they fall, and their accommodations."""
-        found_dpt = self._at_pupil(pupil_mm)
-        rises = np.flatnonzero(np.diff(found_dpt) >= 0.0)
-        count = int(rises[0]) + 1 if rises.size else found_dpt.size
-        return found_dpt[:count], self._accommodations_dpt[:count]
+        Only those up to which the refraction falls are in reach.
+        """
+        found_dpt, inverse = self._at_pupil(pupil_mm)
+        used_dpt = self._over_accommodation.nodes[: len(inverse.nodes)]
+        wanted_dpt = min(max(refraction_dpt, inverse.nodes[-1]), found_dpt[0])
+        found = inverse.through(used_dpt, wanted_dpt)
+        return min(max(found, used_dpt[0]), used_dpt[-1])
+
+
+class _Polynomial:
+    """Polynomial through values at fixed nodes, with scalars.
+
+    It has few nodes, so that NumPy would take five times as long.
+    """
+
+    def __init__(self, nodes: NDArray[Any]):
+        self.nodes: list[float] = nodes.tolist()
+        self._shares: list[float] = _barycentric_shares(nodes).tolist()
+
+    def through(self, values: list[float], at: float) -> float:
+        """Return the value at a position of the polynomial through values (n,)."""
+        above = below = 0.0
+        for node, share, value in zip(self.nodes, self._shares, values, strict=True):
+            away = at - node
+            if -SAME_NODE < away < SAME_NODE:
+                return value
+            term = share / away
+            above += term * value
+            below += term
+        return above / below
 
 
 def _filled(nodes: NDArray[Any], rows: NDArray[Any]) -> NDArray[Any]:
@@ -120,7 +142,7 @@ def _through(
 ) -> NDArray[np.float64]:
     """Evaluate the polynomial through values (n, ...) at nodes (n,)."""
     away = at - nodes
-    is_hit = np.abs(away) < 1e-12
+    is_hit = np.abs(away) < SAME_NODE
     if is_hit.any():
         hit: NDArray[np.float64] = values[is_hit.argmax()]
         return hit

@@ -70,7 +70,7 @@ class FrameLayers:
         blur_px = layer_blur_px(
             self.tables, self.reads, self.layer_zero_dpt, self.layer_dpt
         )
-        largest_px: NDArray[np.float64] = blur_px.max(axis=1)
+        largest_px: NDArray[np.float64] = blur_px.max(axis=0)
         return largest_px
 
     def reach_px(self, low_dpt: float, high_dpt: float, *, max_px: int) -> int:

@@ -10,7 +10,7 @@ from filter_service.planning.grid import (
     LAYER_GAP_STEPS,
     MIN_BLUR_STEP_PX,
 )
-from filter_service.psfs.read_loops import layer_blur_px
+from filter_service.psfs.read_loops import add_blur_row
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -45,28 +45,51 @@ def layer_distances_dpt(
     at_dpt = np.unique(np.concatenate((regular, inside)))
     if at_dpt.size == 1:
         return at_dpt
-    blur_px = layer_blur_px(tables, reads, zero_dpt, at_dpt)
+    most_steps, least_px = _blur_steps(tables, reads, zero_dpt, at_dpt, blur_ratio)
     steps_before = np.zeros(at_dpt.size)
     for k in range(at_dpt.size - 1):
-        steps = _steps(blur_px[k], blur_px[k + 1], blur_ratio)
-        smallest_px = min(blur_px[k].min(), blur_px[k + 1].min())
+        smallest_px = min(least_px[k], least_px[k + 1])
         gap_dpt = LAYER_GAP_STEPS * blur_ratio * smallest_px
         gap_dpt = max(gap_dpt / max(blur_px_per_dpt, 1e-12), BASE_OBJECT_STEP_DPT)
-        steps = max(steps, (at_dpt[k + 1] - at_dpt[k]) / gap_dpt) / pace
+        steps = max(most_steps[k], (at_dpt[k + 1] - at_dpt[k]) / gap_dpt) / pace
         steps_before[k + 1] = steps_before[k] + steps
     ends = np.searchsorted(at_dpt, np.append(inside, high_dpt))
     return _between(at_dpt, steps_before, np.unique(ends))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _steps(first_px, second_px, blur_ratio):
-    """Return the largest number of blur steps of any node and channel."""
-    most = 0.0
-    for k in range(first_px.size):
-        smaller_px = min(first_px[k], second_px[k])
-        step_px = max(blur_ratio * smaller_px, MIN_BLUR_STEP_PX)
-        most = max(most, abs(second_px[k] - first_px[k]) / step_px)
-    return most
+@njit(
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+    # without NaN and signed zeros, minima and maxima are vector instructions
+    fastmath={"nnan", "nsz"},
+)
+def _blur_steps(tables, reads, zero_dpt, at_dpt, blur_ratio):
+    """Return the extremes over all nodes and channels.
+
+    Returns
+    -------
+    most_steps : (n - 1,)
+        Largest number of blur steps between neighboring vergences.
+    least_px : (n,)
+        Smallest blur at each.
+    """
+    n = at_dpt.size
+    most_steps, least_px = np.zeros(n - 1), np.full(n, np.inf)
+    row_px = np.empty(n)
+    for field in range(zero_dpt.shape[0]):
+        for channel in range(zero_dpt.shape[1]):
+            row_px[:] = 0.0
+            zero = zero_dpt[field, channel]
+            add_blur_row(tables, reads, field, channel, zero, at_dpt, row_px)
+            for k in range(n - 1):
+                first_px, second_px = row_px[k], row_px[k + 1]
+                step_px = max(blur_ratio * min(first_px, second_px), MIN_BLUR_STEP_PX)
+                steps = abs(second_px - first_px) / step_px
+                most_steps[k] = max(most_steps[k], steps)
+            for k in range(n):
+                least_px[k] = min(least_px[k], row_px[k])
+    return most_steps, least_px
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -12,7 +12,10 @@ from tests.numerical.synthetic import Bench, texture
 from tests.shader_variants import Kind, renderer_variants
 
 MODULES = (layer_loops, read_loops)
-INNER = {"clipped", "bracket", "channel_taps", "layer_blur_px", "_steps", "_between"}
+INNER = {
+    *("clipped", "bracket", "channel_taps", "add_blur_row"),
+    *("layer_blur_px", "_blur_steps", "_between"),
+}
 """Called by other loops alone: where those are read from disk, they are not."""
 
 

@@ -113,7 +113,7 @@ def test_layers_equal_the_plain_statement(case):
     reads, zero_dpt = layers.reads, layers.layer_zero_dpt
     at_dpt = layers.layer_dpt
     np.testing.assert_allclose(
-        layer_blur_px(store.tables, reads, zero_dpt, at_dpt),
+        layer_blur_px(store.tables, reads, zero_dpt, at_dpt).T,
         plan_twin.layer_blur_px(store, reads, zero_dpt, at_dpt),
         rtol=RTOL,
     )
