@@ -8,6 +8,7 @@ beyond.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,12 +20,14 @@ from estimator.eye.tracing import OPEN_RATIO
 from estimator.optics.chromatic import chromatic_refraction_dpt
 from estimator.optics.paraxial import entrance_pupil_mm
 from estimator.optics.surfaces import media_indices, pack_eye
-from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
 from estimator.optics.zernike import EXPONENTS, N_TERMS, remove_central_tilt
 from estimator.profiles.parse import EyeProfile
 from estimator.wavefront.aberrations import on_axis_zernike, wavefront_grid
 from estimator.wavefront.field_wavefronts import (
+    C20_DEGREES,
     DEGREE,
+    c20_by_degree,
     polynomial_in_mm,
     total_defocus_dpt,
     zernike_from_polynomial,
@@ -133,6 +136,26 @@ class MeasuredResidual:
         color_um = self.color_um(np.full(radius_mm.size, REFERENCE_WAVELENGTH_NM))
         return self.residues_um(radius_mm, np.ones(radius_mm.size)) + color_um
 
+    def on_axis_dpt(self, pupil_diameter_mm: float) -> float:
+        """Return M at 555 nm of `on_axis_um` in a pupil."""
+        radius_mm = pupil_diameter_mm / 2.0
+        stretch = float(stretch_ratio(np.array(radius_mm / self.radius_mm)))
+        measured_um, color_um = self._on_axis_c20
+        degrees = zip(C20_DEGREES, measured_um, color_um, strict=True)
+        return -SPHERE_PER_C20 * sum(
+            (measured * stretch**degree + color) * radius_mm ** (degree - 2)
+            for degree, measured, color in degrees
+        )
+
+    @cached_property
+    def _on_axis_c20(self) -> tuple[list[float], list[float]]:
+        """Contributions (3,) of the residual and its color to C(2,0)."""
+        color_um = self.color_um(np.array([REFERENCE_WAVELENGTH_NM]))[0]
+        measured, color = (
+            c20_by_degree(part_um).tolist() for part_um in (self.residue_um, color_um)
+        )
+        return measured, color
+
 
 def stretch_ratio(pupil_ratio: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the factors (n,) that scale pupil coordinates before the residual.
@@ -145,7 +168,7 @@ def stretch_ratio(pupil_ratio: NDArray[np.float64]) -> NDArray[np.float64]:
         times the measured radius; in between, that multiple is a parabola with
         continuous slope.
     """
-    beyond = np.clip(pupil_ratio - 1.0, 0.0, 2.0 * OVERSHOOT)
+    beyond = np.minimum(np.maximum(pupil_ratio - 1.0, 0.0), 2.0 * OVERSHOOT)
     rim = np.minimum(pupil_ratio, 1.0) + beyond - beyond**2 / (4.0 * OVERSHOOT)
     ratio: NDArray[np.float64] = rim / pupil_ratio
     return ratio

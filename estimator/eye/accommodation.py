@@ -64,6 +64,9 @@ class ResidualPhase(Protocol):
     def on_axis_um(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
         """Return monomials (n, 28) at 555 nm in the plane of pupils (n,)."""
 
+    def on_axis_dpt(self, pupil_diameter_mm: float) -> float:
+        """Return their least-squares M in a pupil."""
+
 
 def falling_count(refractions_dpt: NDArray[np.float64]) -> int:
     """Return how many leading refractions are finite and decreasing."""

@@ -8,12 +8,8 @@ from numpy.typing import NDArray
 
 from estimator.estimate.measured_residual import MeasuredResidual
 from estimator.field.interpolation import POWER, FieldInterpolation, FieldValues
-from estimator.optics.prescription import C20
-from estimator.optics.zernike import N_TERMS, inverse_monomial_matrix
-from estimator.wavefront.field_wavefronts import DEGREE
-
-DEGREES = (2, 4, 6)
-"""Degrees of the monomials that contribute to C(2,0)."""
+from estimator.optics.zernike import N_TERMS
+from estimator.wavefront.field_wavefronts import C20_DEGREES, DEGREE, c20_by_degree
 
 
 class FixedDefocus:
@@ -48,9 +44,9 @@ class FixedDefocus:
         count = values.field.size
         open_mm = np.full(count, np.inf) if open_mm is None else open_mm
         self._state = values.field, values.channel, np.ascontiguousarray(open_mm)
-        fading = residual_weight[:, None] * sums_by_degree(residual.residue_um)
+        fading = residual_weight[:, None] * c20_by_degree(residual.residue_um)
         self._added = (
-            sums_by_degree(added_um),
+            c20_by_degree(added_um),
             np.ascontiguousarray(fading),
             float(residual.radius_mm),
         )
@@ -76,9 +72,11 @@ class _Grid:
         self._nodes_mm = np.array(interpolation.grid.pupil_diameters_mm, np.float64)
         self._accommodations_dpt = interpolation.grid.accommodations_dpt
         whole = values.values
-        sums, rims = sums_by_degree(whole[..., :N_TERMS]), whole[..., N_TERMS:]
+        sums, rims = c20_by_degree(whole[..., :N_TERMS]), whole[..., N_TERMS:]
         self._values = np.ascontiguousarray(np.concatenate([sums, rims], axis=-1))
-        of_degree = [float(POWER[:N_TERMS][degree == DEGREE][0]) for degree in DEGREES]
+        of_degree = [
+            float(POWER[:N_TERMS][degree == DEGREE][0]) for degree in C20_DEGREES
+        ]
         self._powers = np.array([*of_degree, *POWER[N_TERMS:]])
 
     def inputs_at(self, accommodation_dpt: float) -> tuple[NDArray[np.float64], ...]:
@@ -87,10 +85,3 @@ class _Grid:
 
         weights = weights_at(self._accommodations_dpt, float(accommodation_dpt))
         return self._nodes_mm, self._powers, weights, self._values
-
-
-def sums_by_degree(polynomial_um: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the contributions (..., 3) by degree to C(2,0) on a radius of 1 mm."""
-    share = inverse_monomial_matrix()[:, C20] * polynomial_um
-    sums = [share[..., degree == DEGREE].sum(axis=-1) for degree in DEGREES]
-    return np.stack(sums, axis=-1)

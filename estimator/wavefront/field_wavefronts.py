@@ -28,6 +28,9 @@ TILT_Y, TILT_X = 1, 2
 N_RIM = 5
 """Columns of a rim: x, y of the center and xx, xy, yy of the matrix, mm."""
 
+C20_DEGREES = (2, 4, 6)
+"""Degrees of the monomials that contribute to C(2,0)."""
+
 N_SAMPLED, N_NEWTON_STEPS, NEWTON_STEP_RAD = 16, 4, 0.2
 """Search for the farthest point of a rim: number of samples, and number and largest
 length of Newton steps."""
@@ -130,6 +133,20 @@ def zernike_from_polynomial(
     zernike_um = (polynomial_um * radius_mm**DEGREE) @ inverse_monomial_matrix()
     zernike_um[..., 0] = 0.0
     return zernike_um
+
+
+def c20_by_degree(polynomial_um: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return contributions (..., 3), um, of `C20_DEGREES` to C(2,0) on 1 mm radius.
+
+    On a radius of r mm, the contribution of a degree is r**degree times as large.
+
+    Parameters
+    ----------
+    polynomial_um : (..., 28), um/mm^degree
+    """
+    share = inverse_monomial_matrix()[:, rx.C20] * polynomial_um
+    sums = [share[..., degree == DEGREE].sum(axis=-1) for degree in C20_DEGREES]
+    return np.stack(sums, axis=-1)
 
 
 def correction_polynomial(

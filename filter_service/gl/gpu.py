@@ -1,6 +1,6 @@
 """The OpenGL context and its memory: buffers, textures, uploads and readbacks."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
@@ -197,6 +197,11 @@ class Gpu:
         return self._texture_io
 
     # ----- buffers
+
+    @property
+    def buffers(self) -> Mapping[str, Buffer]:
+        """Named buffers."""
+        return self._buffers
 
     def storage(self, name: str, n_bytes: int) -> Buffer:
         """Return a named buffer of at least this size; growing loses its contents.

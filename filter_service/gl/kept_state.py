@@ -150,7 +150,11 @@ class KeptState:
             gl.glBindVertexArray(vertices)
             for target, buffer in buffers:
                 gl.glBindBuffer(target, buffer)
+            # one call for those that are mostly free
+            gl.glBindBuffersBase(GL_SHADER_STORAGE_BUFFER, 0, STORAGE_BLOCKS, None)
             for index, (buffer, start, size) in enumerate(blocks):
+                if not buffer:
+                    continue
                 if size:
                     gl.glBindBufferRange(
                         GL_SHADER_STORAGE_BUFFER, index, buffer, start, size

@@ -1,5 +1,7 @@
 """Compute passes: compilation of variants, and dispatch with named buffers."""
 
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple, Protocol
 
 import moderngl
@@ -51,6 +53,45 @@ class TextureUnit(Protocol):
         """Bind the texture to a unit."""
 
 
+class PassVariant(NamedTuple):
+    """A compiled pass, and what to bind for it.
+
+    Attributes
+    ----------
+    buffers, textures, images : tuple of (int, str)
+        Binding point or unit of each name.
+    barriers : int
+        Barriers that follow it.
+    """
+
+    program: moderngl.ComputeShader
+    buffers: tuple[tuple[int, str], ...]
+    textures: tuple[tuple[int, str], ...]
+    images: tuple[tuple[int, str], ...]
+    barriers: int
+
+
+class RecordedPass(NamedTuple):
+    """A dispatch that later frames repeat.
+
+    Attributes
+    ----------
+    uniforms : dict
+        Values that are the same whenever the pass is repeated.
+    changing : tuple of str
+        Uniforms that are not.
+    groups : (x, y, z)
+    indirect : (name, byte) or None
+        As in `Passes.dispatch`.
+    """
+
+    variant: PassVariant
+    uniforms: dict[str, Any]
+    changing: tuple[str, ...]
+    groups: tuple[int, ...]
+    indirect: tuple[str, int] | None
+
+
 class Passes:
     """Compiled programs of a context, and its current bindings.
 
@@ -68,9 +109,12 @@ class Passes:
         self._context = context
         self.programs: dict[tuple[Any, ...], moderngl.ComputeShader] = {}
         self.drawings: dict[tuple[Any, ...], moderngl.Program] = {}
-        self._variants: dict[tuple[Any, ...], moderngl.ComputeShader] = {}
+        self._variants: dict[tuple[Any, ...], PassVariant] = {}
         self._uniforms: dict[Any, dict[str, Any]] = {}
         self._bound: dict[int, Buffer | BufferPart] = {}
+        self._recorded: list[RecordedPass] | None = None
+        self._changing: frozenset[str] = frozenset()
+        self._set_by: dict[Any, RecordedPass] = {}
 
     def release(self) -> None:
         """Free all programs."""
@@ -80,15 +124,12 @@ class Passes:
             drawing.release()
         for known in (
             *(self.programs, self.drawings),
-            *(self._variants, self._uniforms, self._bound),
+            *(self._variants, self._uniforms, self._bound, self._set_by),
         ):
             known.clear()
 
     def program(self, name: str, **defines: int) -> moderngl.ComputeShader:
         """Return the compiled pass ``shaders/passes/<name>.comp.glsl``, cached."""
-        program = self._variants.get((name, *defines.items()))
-        if program is not None:
-            return program
         key = (name, *sorted(defines.items()))
         if key not in self.programs:
             text, files = load_shader(f"passes/{name}.comp.glsl", **defines)
@@ -96,7 +137,6 @@ class Passes:
                 self.programs[key] = self._context.compute_shader(text)
             except moderngl.Error as error:
                 raise ShaderError(legend(str(error), files)) from error
-        self._variants[name, *defines.items()] = self.programs[key]
         return self.programs[key]
 
     def drawing(self, vertex: str, fragment: str, **defines: int) -> moderngl.Program:
@@ -127,9 +167,10 @@ class Passes:
         self._bound.clear()
 
     def bind(self, buffers: dict[str, Buffer | BufferPart]) -> None:
-        """Bind buffers by binding name without ``BINDING_``."""
+        """Bind buffers by binding name without ``BINDING_``, unless they are bound."""
         for binding, buffer in buffers.items():
-            self._bind(BINDING_POINTS[binding], buffer)
+            if self._bound.get(BINDING_POINTS[binding]) is not buffer:
+                self._bind(BINDING_POINTS[binding], buffer)
 
     def dispatch(
         self,
@@ -141,7 +182,8 @@ class Passes:
         defines: dict[str, Any] | None = None,
         images: dict[str, Atlas] | None = None,
         textures: "dict[str, Atlas | Pages | TextureUnit] | None" = None,
-        indirect: tuple[Buffer, int] | None = None,
+        indirect: tuple[str, int] | None = None,
+        counts: Buffer | None = None,
     ) -> None:
         """Dispatch a pass, followed by a memory barrier.
 
@@ -156,41 +198,126 @@ class Passes:
             Variant of the pass.
         images, textures : dict, optional
             Textures or atlases by name without ``IMAGE_`` or ``TEXTURE_``.
-        indirect : (buffer, byte), optional
+        indirect : (name, byte), optional
             Location of the group counts on the GPU, which replace ``groups``.
+        counts : Buffer, optional
+            Buffer of this name, unless it is one of ``buffers``.
         """
-        images, textures, defines = images or {}, textures or {}, defines or {}
-        barriers = _BARRIERS
-        for key, image in images.items():
-            if isinstance(image, Buffer):
-                self._bind(BINDING_POINTS[ATLAS_BINDINGS[key]], image)
-                defines = {**defines, "ATLAS_IS_BUFFER": 1}
+        uniforms, groups = uniforms or {}, (*groups, 1)[:3]
+        values: dict[str, Any] = dict(buffers)
+        if indirect is not None and counts is not None:
+            values[indirect[0]] = counts
+        for kind in (images, textures):
+            for key, value in (kind or {}).items():
+                values[ATLAS_BINDINGS.get(key, key)] = value
+        recorded = RecordedPass(
+            self._variant(name, buffers, defines or {}, images or {}, textures or {}),
+            uniforms,
+            (),
+            (max(groups[0], 1), max(groups[1], 1), max(groups[2], 1)),
+            indirect,
+        )
+        if self._recorded is not None:
+            fixed = {k: v for k, v in uniforms.items() if k not in self._changing}
+            changing = tuple(key for key in uniforms if key in self._changing)
+            recorded = recorded._replace(uniforms=fixed, changing=changing)
+            self._recorded.append(recorded)
+        self.repeat([recorded], values, uniforms)
+
+    def _variant(
+        self,
+        name: str,
+        buffers: Mapping[str, Any],
+        defines: dict[str, int],
+        images: Mapping[str, Any],
+        textures: Mapping[str, Any],
+    ) -> PassVariant:
+        """Return a compiled pass and its bindings, cached."""
+        values = {**images, **textures}
+        atlases = [key for key, value in values.items() if isinstance(value, Buffer)]
+        key = name, *buffers, *defines.items(), *images, "", *textures, "", *atlases
+        found = self._variants.get(key)
+        if found is not None:
+            return found
+        blocks = [*buffers, *(ATLAS_BINDINGS[key] for key in atlases)]
+        units = {
+            kind: tuple(
+                (getattr(constants, f"{kind}_{key}"), ATLAS_BINDINGS.get(key, key))
+                for key in keys
+                if key not in atlases
+            )
+            for kind, keys in (("TEXTURE", textures), ("IMAGE", images))
+        }
+        if atlases:
+            defines = {**defines, "ATLAS_IS_BUFFER": 1}
+        found = self._variants[key] = PassVariant(
+            self.program(name, **defines),
+            tuple((BINDING_POINTS[block], block) for block in blocks),
+            units["TEXTURE"],
+            units["IMAGE"],
+            _IMAGE_BARRIERS if units["IMAGE"] else _BARRIERS,
+        )
+        return found
+
+    @contextmanager
+    def recorded(self, changing: frozenset[str]) -> Iterator[list[RecordedPass]]:
+        """Record the passes that are dispatched within, for `repeat`.
+
+        Parameters
+        ----------
+        changing : frozenset of str
+            Uniforms that have other values when the passes are repeated.
+        """
+        found: list[RecordedPass] = []
+        self._recorded, self._changing = found, changing
+        try:
+            yield found
+        finally:
+            self._recorded, self._changing = None, frozenset()
+
+    def repeat(
+        self,
+        passes: Sequence[RecordedPass],
+        values: Mapping[str, Any],
+        uniforms: Mapping[str, Any],
+    ) -> None:
+        """Dispatch passes, each followed by a memory barrier.
+
+        Parameters
+        ----------
+        values : mapping
+            Buffers, textures and images by the names of their bindings; atlases by
+            `ATLAS_BINDINGS`.
+        uniforms : mapping
+            Values of the changing uniforms.
+        """
+        bound, context = self._bound, self._context
+        for one in passes:
+            program, buffers, textures, images, barriers = one.variant
+            for point, name in buffers:
+                # Most bindings never change.
+                if bound.get(point) is not values[name]:
+                    self._bind(point, values[name])
+            for unit, name in textures:
+                values[name].use(unit)
+            for unit, name in images:
+                values[name].bind_to_image(unit, read=True, write=True)
+            if self._set_by.get(program) is not one:
+                self._set_by[program] = one
+                self.set_uniforms(program, one.uniforms)
+            if one.changing:
+                self.set_uniforms(program, {key: uniforms[key] for key in one.changing})
+            if one.indirect is not None:
+                program.run_indirect(values[one.indirect[0]], one.indirect[1])
             else:
-                unit = getattr(constants, f"IMAGE_{key}")
-                image.bind_to_image(unit, read=True, write=True)
-                barriers = _IMAGE_BARRIERS
-        for key, texture in textures.items():
-            if isinstance(texture, Buffer):
-                self._bind(BINDING_POINTS[ATLAS_BINDINGS[key]], texture)
-                defines = {**defines, "ATLAS_IS_BUFFER": 1}
-            else:
-                texture.use(getattr(constants, f"TEXTURE_{key}"))
-        self.bind(buffers)
-        program = self.program(name, **defines)
-        self.set_uniforms(program, uniforms or {})
-        if indirect is not None:
-            program.run_indirect(*indirect)
-        else:
-            program.run(*(max(count, 1) for count in (*groups, 1)[:3]))
-        self._context.memory_barrier(barriers)
+                program.run(*one.groups)
+            context.memory_barrier(barriers)
 
     def _bind(self, point: int, buffer: Buffer | BufferPart) -> None:
-        """Bind a buffer unless it is already bound; most bindings never change.
+        """Bind a buffer.
 
-        ``_bound`` holds references, so that a new buffer cannot equal a deleted one.
+        ``_bound`` holds references, so that a new buffer cannot be a deleted one.
         """
-        if self._bound.get(point) == buffer:
-            return
         if isinstance(buffer, BufferPart):
             whole, first, size = buffer
             whole.bind_to_storage_buffer(point, offset=first, size=size)

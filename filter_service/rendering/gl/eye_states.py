@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from filter_service.gl.gpu import Gpu
 from filter_service.rendering.frame_states import FrameStates
@@ -24,6 +25,7 @@ class EyeState:
     cell_px: int | None = None  # larger cells, if kernels of frames were too large
     is_settled: bool = False  # whether a frame of textures had all its kernels
     earlier: EarlierFrame | None = None  # the newest frame of textures that was read
+    recorded: dict[Any, Any] = field(default_factory=dict)  # frames of textures
 
 
 class EyeStates:

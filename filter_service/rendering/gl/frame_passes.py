@@ -68,6 +68,7 @@ class FramePasses:
         self.fragments.upload()
         kernels = self.kernels = self._begin_kernels()
         self.lists = ListPasses(self.strip, kernels.atlas)
+        kernels.clear()
         self.fragments.build_fragments(kernels)
         kernels.make()
         self.fragments.merge_fragments()

@@ -136,7 +136,7 @@ class KernelPasses:
         self._made_for: tuple[Any, ...] | None = None
 
     def begin(self, handle: GlStore, state: FrameState, timer: Timer) -> "KernelRun":
-        """Upload the state if it has changed, and clear the counters of a frame.
+        """Upload the state if it has changed.
 
         Parameters
         ----------
@@ -155,7 +155,7 @@ class KernelPasses:
                 self._upload_state(handle, state)
             self._reserve(image.count, handle.store.fields_count, layers)
             self._made_for = (handle, layers, image)
-        run = KernelRun(
+        return KernelRun(
             self,
             handle,
             state,
@@ -173,8 +173,6 @@ class KernelPasses:
             node_atlas=gpu.atlas(f"nodes {self._slot}", self._capacity.node_texels),
             pages=pages,
         )
-        run.clear()
-        return run
 
     def _keeps(self, handle: GlStore, state: FrameState) -> bool:
         """Return whether the kernels in memory are those of a state.
@@ -298,33 +296,58 @@ class KernelRun:
             "READ_PSFS", self.read_words.nbytes
         )
 
-    def clear(self) -> None:
-        """Clear the marks and counters of a frame."""
-        layers, image = self.state.layers, self.state.image
-        pairs, node_pairs = (
-            count * interval_count(layers)
-            for count in (image.count, self.handle.store.fields_count)
-        )
-        used_words = used_word_count(self.state)
+    @property
+    def uniforms(self) -> dict[str, Any]:
+        """Uniforms that depend on the state of the eye, of all passes of a frame."""
+        layers = self.state.layers
+        intervals = interval_count(layers)
+        return {
+            "used_words": used_word_count(self.state),
+            "words_per_cell": words_per_cell(layers),
+            "read_words": self.read_words.size,
+            "pair_count": self.state.image.count * intervals,
+            "node_pair_count": self.handle.store.fields_count * intervals,
+            "is_new": int(not self.is_kept),
+            "layer_count": len(layers.layer_dpt),
+            "neighbor_count": layers.reads.groups.size,
+            "merge_spread_px": layers.merge_spread_px,
+            "blur_px_per_dpt": layers.blur_px_per_dpt,
+        }
+
+    @property
+    def group_counts(self) -> tuple[int, int]:
+        """Work groups of the passes that clear a plan and list its kernels.
+
+        They are rounded, so that few states have a number of their own.
+        """
+        uniforms = self.uniforms
+        used_words = uniforms["used_words"]
         sizes = [used_words, self.read_words.size, STAT_LANES * STAT_WORDS, PLAN_WORDS]
         if not self.is_kept:
-            sizes += [pairs, node_pairs]
+            sizes += [uniforms["pair_count"], uniforms["node_pair_count"]]
+        return (
+            rounded_up(group_count(max(sizes), THREADS)),
+            rounded_up(group_count(used_words, THREADS)),
+        )
+
+    def clear(self) -> None:
+        """Clear the marks and counters of a frame."""
         with self.timer.stage("kernel_plan_ms"):
             self._run(
                 "begin_plan",
                 *("PLAN", "USED", "STATS", "READ_PSFS", "KERNEL_OF", "NODE_OF"),
-                groups=dispatch_grid(group_count(max(sizes), THREADS)),
-                used_words=used_words,
-                read_words=self.read_words.size,
-                pair_count=pairs,
-                node_pair_count=node_pairs,
-                is_new=int(not self.is_kept),
+                groups=dispatch_grid(self.group_counts[0]),
+                **self._some("used_words", "read_words", "pair_count"),
+                **self._some("node_pair_count", "is_new"),
             )
+
+    def _some(self, *names: str) -> dict[str, Any]:
+        uniforms = self.uniforms
+        return {name: uniforms[name] for name in names}
 
     def make(self) -> None:
         """Plan and blend the kernels that the marked pairs lack."""
-        layers, capacity = self.state.layers, self.capacity
-        layer_count, used_words = len(layers.layer_dpt), used_word_count(self.state)
+        capacity = self.capacity
         software = self.owner.gpu.is_software
         group = {"GROUP_THREADS": SOFTWARE_THREADS if software else THREADS}
         with self.timer.stage("kernel_plan_ms"):
@@ -332,10 +355,8 @@ class KernelRun:
                 "list_kernels",
                 *("USED", "CELLS", "KERNEL_OF", "KERNEL_PAIRS"),
                 *("NODE_OF", "NODE_PAIRS", "PLAN"),
-                groups=dispatch_grid(group_count(used_words, THREADS)),
-                used_words=used_words,
-                words_per_cell=words_per_cell(layers),
-                layer_count=layer_count,
+                groups=dispatch_grid(self.group_counts[1]),
+                **self._some("used_words", "words_per_cell", "layer_count"),
                 kernel_capacity=capacity.kernels,
                 node_capacity=capacity.nodes,
             )
@@ -346,8 +367,7 @@ class KernelRun:
                 *("RECIPES", "NODES", "WORK", "READ_PSFS", "PLAN"),
                 dispatch=PLAN_FOR_NODES,
                 defines=group,
-                layer_count=layer_count,
-                neighbor_count=layers.reads.groups.size,
+                **self._some("layer_count", "neighbor_count"),
                 node_capacity=capacity.nodes,
                 texel_capacity=capacity.node_texels,
                 work_capacity=capacity.work_items,
@@ -358,8 +378,7 @@ class KernelRun:
                 *("KERNELS", "PARTS", "WORK", "PLAN"),
                 dispatch=PLAN_FOR_KERNELS,
                 defines=group,
-                layer_count=layer_count,
-                merge_spread_px=layers.merge_spread_px,
+                **self._some("layer_count", "merge_spread_px"),
                 kernel_capacity=capacity.kernels,
                 texel_capacity=capacity.texels,
                 work_capacity=capacity.work_items,
@@ -406,7 +425,6 @@ class KernelRun:
         textures: dict[str, Any] | None = None,
         **uniforms: Any,
     ) -> None:
-        plan = self._plan
         self.owner.gpu.passes.dispatch(
             name,
             groups,
@@ -415,14 +433,8 @@ class KernelRun:
             defines=defines,
             images=images,
             textures=textures,
-            indirect=None if dispatch is None else (plan, DISPATCH_BYTES * dispatch),
+            indirect=None if dispatch is None else ("PLAN", DISPATCH_BYTES * dispatch),
         )
-
-    @property
-    def _plan(self) -> Buffer:
-        plan = self.buffers["PLAN"]
-        assert isinstance(plan, Buffer)
-        return plan
 
     def to_read(
         self, stats: NDArray[np.uint32]
@@ -513,6 +525,12 @@ class KernelRun:
             "kernel_count": int(self.counts[PLAN_KERNELS]),
             "kernel_texel_count": int(self.counts[PLAN_TEXELS]),
         }
+
+
+def rounded_up(count: int) -> int:
+    """Return a number from count to 5/4 of it, one of four between powers of two."""
+    step = 1 << max(count.bit_length() - 3, 0)
+    return -(-count // step) * step
 
 
 def marked(words: NDArray[np.uint32]) -> NDArray[np.int64]:

@@ -95,7 +95,7 @@ class ListPasses:
         Otherwise `splat_bands` must run.
         """
         self.lists = list_bands.read_totals(words)
-        entries, spare = self._capacities
+        entries, spare = self.capacities
         needs_spare = self.lists.longest > SORT_CAPACITIES[-1]
         return (
             self.strip.bin_count <= list_bands.MAX_BAND_BINS
@@ -104,7 +104,7 @@ class ListPasses:
         )
 
     @property
-    def _capacities(self) -> tuple[int, int]:
+    def capacities(self) -> tuple[int, int]:
         """Capacities of the two list buffers, in entries, for a single band."""
         entries, spare = (
             min(
@@ -125,7 +125,7 @@ class ListPasses:
             ENTRIES=16,
             ENTRIES_SPARE=16,
         )
-        entry_capacity, spare_capacity = self._capacities
+        entry_capacity, spare_capacity = self.capacities
         with self.strip.timer.stage("bin_ms"):
             self.strip.run(
                 "count_bins",
@@ -205,10 +205,9 @@ class ListPasses:
         self.make_lists(first_bin, bin_count, indirect=indirect)
         self._splat(first_bin, bin_count, indirect=indirect)
 
-    def _groups_on_gpu(self, index: int, indirect: bool) -> tuple[Buffer, int] | None:
+    def _groups_on_gpu(self, index: int, indirect: bool) -> tuple[str, int] | None:
         """Return the location of a dispatch size that ``scan_bins`` has written."""
-        location = self.strip.buffers["DISPATCHES"], DISPATCH_BYTES * index
-        return location if indirect else None
+        return ("DISPATCHES", DISPATCH_BYTES * index) if indirect else None
 
     def make_lists(
         self, first_bin: int, bin_count: int, *, indirect: bool = False

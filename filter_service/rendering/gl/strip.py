@@ -85,6 +85,7 @@ class Strip:
         defines = uniforms.pop("defines", None)
         textures = uniforms.pop("textures", None)
         indirect = uniforms.pop("indirect", None)
+        counts = None if indirect is None else self.buffers[indirect[0]]
         self.gpu.passes.dispatch(
             name,
             groups,
@@ -96,4 +97,9 @@ class Strip:
             defines=defines,
             textures=textures,
             indirect=indirect,
+            counts=counts,
         )
+
+    def refresh(self) -> None:
+        """Take the buffers that now have the names of this strip's buffers."""
+        self.buffers = {name: self.gpu.buffers[name] for name in self.buffers}

@@ -12,9 +12,10 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,7 @@ from filter_service.constants import (
 )
 from filter_service.errors import NotPrepared, OutOfGpuMemory
 from filter_service.gl.gpu import Gpu
+from filter_service.gl.passes import RecordedPass
 from filter_service.gl.stage_timer import Untimed
 from filter_service.gl.texture_io import TextureIo
 from filter_service.psfs.frame_layers import FrameLayers
@@ -39,7 +41,7 @@ from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.kernel_passes import FrameState, KernelRun
 from filter_service.rendering.gl.list_passes import ListPasses
 from filter_service.rendering.gl.strip import Strip, dispatch_grid, group_count
-from filter_service.rendering.image_cells import KernelsTooLarge
+from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
 from filter_service.texture_view import EarlierFrame, SampledInput, TextureView
 
 SAMPLE_STEP_PX = 16
@@ -60,6 +62,12 @@ INPUT_UNITS = (TEXTURE_COLOR, TEXTURE_DEPTH)
 MAX_REPEATS = 8
 """Largest number of runs of a frame that waits, and of the first frame of an eye: for
 PSFs, kernels and lists, each of which may need larger buffers twice."""
+
+LISTS = ("ENTRIES", "ENTRIES_SPARE")
+"""Buffers whose sizes are uniforms."""
+
+MAX_RECORDED = 16
+"""Recorded frames of an eye: few, as new ones are rare."""
 
 MAX_IN_FLIGHT = 4
 """Frames whose counters have not been read.  Further ones are not counted."""
@@ -111,6 +119,22 @@ def input_uniforms(view: TextureView, io: TextureIo) -> dict[str, Any]:
         "depth_is_projected": int(projection is not None),
         "is_top_first": int(view.is_top_first),
     }
+
+
+def sample_grid(strip: Strip) -> tuple[int, int]:
+    """Return the numbers of rows and columns of input samples."""
+    width_px, height_px = strip.size
+    return group_count(height_px, SAMPLE_STEP_PX), group_count(width_px, SAMPLE_STEP_PX)
+
+
+class _Passes(NamedTuple):
+    """Passes of a frame that later frames repeat."""
+
+    recorded: list[RecordedPass]
+    image: ImageCells  # so that no other has its id
+    strip: Strip
+    fragments: FragmentPasses
+    lists: ListPasses
 
 
 @dataclass
@@ -215,7 +239,79 @@ class TextureFrames:
         *,
         is_counted: bool,
     ) -> _Submitted | None:
+        gpu, view = self._gpu, request.view
+        kernels = eye.kernels.begin(eye.handle, state, Untimed())
+        key = self._key(request, state, kernels, is_counted=is_counted)
+        if key in eye.recorded:
+            passes = eye.recorded[key]
+            passes.strip.refresh()
+            inputs = input_textures(view, self._io)
+            atlases = {
+                "ATLAS": kernels.atlas,
+                "NODE_ATLAS": kernels.node_atlas,
+                "STORE": kernels.pages,
+            }
+            gpu.passes.repeat(
+                passes.recorded,
+                {**gpu.buffers, **kernels.buffers, **atlases, **inputs},
+                kernels.uniforms,
+            )
+        else:
+            if len(eye.recorded) == MAX_RECORDED:
+                eye.recorded.clear()
+            passes = self._dispatched(request, eye, kernels, is_counted=is_counted)
+            eye.recorded[key] = passes
+        self._show(request, passes.strip)
+        self.number += 1
+        if not is_counted:
+            return None
+        strip, lists = passes.strip, copy(passes.lists)
+        fragments = copy(passes.fragments)
+        fragments.stats = np.empty_like(fragments.stats)
+        rows, columns = sample_grid(strip)
+        frame = _Submitted(
+            *(self.number, eye, kernels, lists, fragments),
+            totals=np.empty(TOTAL_WORDS, np.uint32),
+            samples=np.empty((rows, columns, 2), np.uint32),
+        )
+        frame.is_read = gpu.begin_late_read(
+            (*lists.totals, frame.totals),
+            *kernels.to_read(fragments.stats),
+            (strip.buffers["SAMPLES"], 0, frame.samples),
+        )
+        return frame
+
+    def _key(
+        self,
+        request: TextureRequest,
+        state: FrameState,
+        kernels: KernelRun,
+        *,
+        is_counted: bool,
+    ) -> tuple[Any, ...]:
+        """Return what the passes of a frame depend on, besides buffers and state."""
+        view, gpu = request.view, self._gpu
+        return (
+            *(view.color.format, view.color.layer, view.depth.format, view.depth.layer),
+            *(view.width_px, view.height_px, view.tangents, view.projection),
+            *(view.is_top_first, view.white_ratio),
+            *(request.target.format == "rgba16f", request.options, request.gaze_deg),
+            *(id(state.image), kernels.capacity, kernels.group_counts),
+            *(gpu.buffers[name].size for name in LISTS if name in gpu.buffers),
+            is_counted,
+        )
+
+    def _dispatched(
+        self,
+        request: TextureRequest,
+        eye: EyeState,
+        kernels: KernelRun,
+        *,
+        is_counted: bool,
+    ) -> _Passes:
+        """Dispatch the passes of a frame, and record them."""
         view, options, gpu = request.view, request.options, self._gpu
+        state = kernels.state
         strip = Strip(
             gpu,
             view,
@@ -240,31 +336,19 @@ class TextureFrames:
             white_level=view.white_ratio,
             is_encoded=request.target.format != "rgba16f",
         )
-        kernels = eye.kernels.begin(eye.handle, state, Untimed())
         lists = ListPasses(strip, kernels.atlas, is_late=True)
-        fragments.build_fragments(kernels)
-        kernels.make()
-        fragments.merge_fragments()
-        lists.run()
-        self._show(request, strip)
-        self.number += 1
-        if not is_counted:
-            return None
-        samples = self._sample(strip, view)
-        frame = _Submitted(
-            *(self.number, eye, kernels, lists, fragments),
-            totals=np.empty(TOTAL_WORDS, np.uint32),
-            samples=samples,
-        )
-        frame.is_read = gpu.begin_late_read(
-            (*lists.totals, frame.totals),
-            *kernels.to_read(fragments.stats),
-            (strip.buffers["SAMPLES"], 0, samples),
-        )
-        return frame
+        with gpu.passes.recorded(frozenset(kernels.uniforms)) as recorded:
+            kernels.clear()
+            fragments.build_fragments(kernels)
+            kernels.make()
+            fragments.merge_fragments()
+            lists.run()
+            if is_counted:
+                self._sample(strip, view)
+        return _Passes(recorded, state.image, strip, fragments, lists)
 
-    def _sample(self, strip: Strip, view: TextureView) -> NDArray[np.uint32]:
-        columns, rows = (group_count(side, SAMPLE_STEP_PX) for side in strip.size)
+    def _sample(self, strip: Strip, view: TextureView) -> None:
+        rows, columns = sample_grid(strip)
         strip.reserve(SAMPLES=8 * columns * rows)
         strip.run(
             "sample_input",
@@ -277,7 +361,6 @@ class TextureFrames:
             textures=input_textures(view, self._io),
             **input_uniforms(view, self._io),
         )
-        return np.empty((rows, columns, 2), np.uint32)
 
     def _show(self, request: TextureRequest, strip: Strip) -> None:
         """Write the frame to the target."""
