@@ -5,6 +5,8 @@ the lens; over the pupil by a polynomial in its square, in which a wavefront's s
 terms are a short series.
 """
 
+import math
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -53,7 +55,7 @@ class FocusTable:
         self._refractions_dpt = refractions_dpt
         self._squares_mm2 = np.square(pupils_mm[usable])
         self._pupil_shares = _barycentric_shares(self._squares_mm2)
-        self._over_accommodation = _Polynomial(accommodations_dpt)
+        self._over_accommodation = _Polynomial(accommodations_dpt.tolist())
         self._last: tuple[float, list[float], _Polynomial | None] = (0.0, [], None)
 
     def _at_pupil(self, pupil_mm: float) -> tuple[list[float], "_Polynomial"]:
@@ -64,10 +66,10 @@ class FocusTable:
         last_mm, found_dpt, inverse = self._last
         if inverse is None or last_mm != pupil_mm:
             nodes, values = self._squares_mm2, self._refractions_dpt
-            found = _through(nodes, values, self._pupil_shares, pupil_mm**2)
-            rises = np.flatnonzero(np.diff(found) >= 0.0)
-            falling = found[: int(rises[0]) + 1 if rises.size else found.size]
-            found_dpt, inverse = found.tolist(), _Polynomial(falling)
+            found_dpt = _through(
+                nodes, values, self._pupil_shares, pupil_mm**2
+            ).tolist()
+            inverse = _Polynomial(_falling(found_dpt))
             self._last = pupil_mm, found_dpt, inverse
         return found_dpt, inverse
 
@@ -94,9 +96,13 @@ class _Polynomial:
     It has few nodes, so that NumPy would take five times as long.
     """
 
-    def __init__(self, nodes: NDArray[Any]):
-        self.nodes: list[float] = nodes.tolist()
-        self._shares: list[float] = _barycentric_shares(nodes).tolist()
+    def __init__(self, nodes: list[float]):
+        self.nodes = nodes
+        unit = 4.0 / ((max(nodes) - min(nodes)) or 1.0)  # as in _barycentric_shares
+        self._shares = [
+            1.0 / math.prod((node - other) * unit for other in nodes if other != node)
+            for node in nodes
+        ]
 
     def through(self, values: list[float], at: float) -> float:
         """Return the value at a position of the polynomial through values (n,)."""
@@ -109,6 +115,14 @@ class _Polynomial:
             above += term * value
             below += term
         return above / below
+
+
+def _falling(values: list[float]) -> list[float]:
+    """Return the first of values, as long as they fall."""
+    for count, (value, following) in enumerate(pairwise(values), start=1):
+        if following >= value:
+            return values[:count]
+    return values
 
 
 def _filled(nodes: NDArray[Any], rows: NDArray[Any]) -> NDArray[Any]:
