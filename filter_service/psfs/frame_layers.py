@@ -3,6 +3,7 @@
 from bisect import bisect_left
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,20 @@ from numpy.typing import NDArray
 from estimator.eye.focusing import OUT_OF_REACH_DPT
 from estimator.optics.vergence import ObjectVergence
 from filter_service.constants import MERGE_MIN_SPREAD_PX
-from filter_service.planning.grid import LAYER_BLUR_RATIO, GridSpec
+from filter_service.planning.grid import (
+    BASE_OBJECT_STEP_DPT,
+    GREEN,
+    LAYER_BLUR_RATIO,
+    GridSpec,
+)
 from filter_service.planning.nodes import PlanAxes
 from filter_service.planning.readable import usable_pupils_mm
 from filter_service.psfs.field_defocus import FieldDefocus
 from filter_service.psfs.read_kernels import StateReads, StoreTables
 from filter_service.psfs.store import PsfStore
+
+CURVE_MARGIN_DPT = 1.0
+"""Range of a step curve beyond the layers of its node, for states between nodes."""
 
 
 @dataclass(frozen=True)
@@ -121,10 +130,7 @@ def frame_layers(
     is_met = abs(reached_dpt - focus_dpt) <= OUT_OF_REACH_DPT
     if not is_met or pupil_mm != pupil_diameter_mm:
         notes += eye.notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt)
-    at_infinity_dpt, change = store.defocus.state(
-        pupil_diameter_mm=pupil_mm, accommodation_dpt=accommodation_dpt
-    )
-    layer_zero_dpt = at_infinity_dpt - store.defocus.change_at_nodes_dpt(change)
+    layer_zero_dpt, change = _layer_zero_dpt(store, pupil_mm, accommodation_dpt)
     corners = _corners(plan, pupil_mm, accommodation_dpt)
     reads = _state_reads(store, pupil_mm, corners)
     notes += _limit_notes(store, reads.groups)
@@ -134,13 +140,15 @@ def frame_layers(
         float(eye.vergence.vergence_dpt(near_dpt)),
     )
     low_dpt, high_dpt = change.range_dpt
-    in_focus_dpt = _in_focus_dpt(store, layer_zero_dpt[plan.axis_node])
-    blur_px_per_dpt = store.spec.blur_px_per_dpt(pupil_mm)
+    axis_zero_dpt = layer_zero_dpt[plan.axis_node]
+    curves = [_step_curve(store, *corner[:2]) for corner in corners]
     layer_dpt = layer_distances_dpt(
-        *(store.tables, reads, layer_zero_dpt),
+        np.concatenate(curves, axis=1),
+        np.array([0, *accumulate(curve.shape[1] for curve in curves)]),
+        *(reads.scales, reads.weights, float(axis_zero_dpt[GREEN])),
         (far_near_dpt[0] + low_dpt, far_near_dpt[1] + high_dpt),
-        np.append(in_focus_dpt, _plane_ends_dpt(store, change)),
-        *(blur_px_per_dpt, LAYER_BLUR_RATIO[store.spec.settings.mode], step_ratio),
+        np.append(_in_focus_dpt(store, axis_zero_dpt), _plane_ends_dpt(store, change)),
+        step_ratio,
     )
     return FrameLayers(
         layer_dpt=layer_dpt,
@@ -153,10 +161,61 @@ def frame_layers(
         edge_reach_px=_edge_reach_px(store.spec, pupil_mm),
         pupil_diameter_mm=pupil_mm,
         focus_dpt=reached_dpt,
-        blur_px_per_dpt=blur_px_per_dpt,
+        blur_px_per_dpt=store.spec.blur_px_per_dpt(pupil_mm),
         notes=notes,
         merge_spread_px=merge_spread_px,
     )
+
+
+def _layer_zero_dpt(
+    store: PsfStore, pupil_mm: float, accommodation_dpt: float
+) -> tuple[NDArray[np.float64], FieldDefocus]:
+    """Return the total defocus at layer 0 dpt, and its change over the field."""
+    at_infinity_dpt, change = store.defocus.state(
+        pupil_diameter_mm=pupil_mm, accommodation_dpt=accommodation_dpt
+    )
+    return at_infinity_dpt - store.defocus.change_at_nodes_dpt(change), change
+
+
+def _step_curve(store: PsfStore, pupil: int, accommodation: int) -> NDArray[np.float64]:
+    """Return the step curve (2, n) of a node of pupil and accommodation, cached.
+
+    Its rows are total defocus on the axis and the number of layers up to there.  States
+    between the nodes interpolate it, so that no frame reads the blur of all nodes: that
+    would take 0.1 to 0.3 ms.
+    """
+    from filter_service.psfs.layer_loops import step_curve
+
+    found = store.step_curves.get((pupil, accommodation))
+    if found is not None:
+        return found
+    plan, spec = store.plan, store.spec
+    pupil_mm = float(plan.pupils_mm[pupil])
+    zero_dpt, change = _layer_zero_dpt(
+        store, pupil_mm, float(plan.accommodations_dpt[accommodation])
+    )
+    far_dpt, near_dpt = (
+        float(store.eye.vergence.vergence_dpt(end)) for end in spec.object_range_dpt
+    )
+    low_dpt, high_dpt = change.range_dpt
+    regular = np.arange(
+        far_dpt + low_dpt - CURVE_MARGIN_DPT,
+        near_dpt + high_dpt + CURVE_MARGIN_DPT + BASE_OBJECT_STEP_DPT,
+        BASE_OBJECT_STEP_DPT,
+    )
+    axis_zero_dpt = zero_dpt[plan.axis_node]
+    in_focus_dpt = _in_focus_dpt(store, axis_zero_dpt)
+    is_inside = (in_focus_dpt > regular[0]) & (in_focus_dpt < regular[-1])
+    at_dpt = np.unique(np.append(regular, in_focus_dpt[is_inside]))
+    steps = step_curve(
+        store.tables,
+        _state_reads(store, pupil_mm, ((pupil, accommodation, 1.0),)),
+        *(zero_dpt, at_dpt, spec.blur_px_per_dpt(pupil_mm)),
+        LAYER_BLUR_RATIO[spec.settings.mode],
+    )
+    found = np.stack([at_dpt + axis_zero_dpt[GREEN], steps])
+    store.step_curves[pupil, accommodation] = found
+    return found
 
 
 def _edge_reach_px(spec: GridSpec, pupil_mm: float) -> float:

@@ -1,4 +1,8 @@
-"""Compiled loop that places the layers of a frame, once for each new state."""
+"""Compiled loops that place the layers of a frame, once for each new state.
+
+How many layers a state needs between two vergences is found for the nodes of pupil and
+accommodation, which many frames share, and interpolated between them.
+"""
 
 import math
 
@@ -15,21 +19,24 @@ from filter_service.psfs.read_loops import add_blur_row
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def layer_distances_dpt(
-    tables, reads, zero_dpt, range_dpt, ends_dpt, blur_px_per_dpt, blur_ratio, pace
+    curves, starts, scales, weights, zero_dpt, range_dpt, ends_dpt, pace
 ):
     """Return the vergences (n_layers,) of a frame's layers over a range, ascending.
 
     Parameters
     ----------
-    zero_dpt : (n_fields, 3)
-        Total defocus of field nodes and channels at 0 dpt.
+    curves : (2, n)
+        Step curves of the nodes around the state, one after the other; see
+        `step_curve`.
+    starts : (n_corners + 1,)
+        First column of each curve, and the end.
+    scales, weights : (n_corners,)
+        Pupil relative to that of each node, and weight of the node.
+    zero_dpt : float
+        Total defocus of the eye at 0 dpt.
     ends_dpt : (n,)
         Vergences that always are layers: the ends of object ranges, and vergences at
         which some channel is in focus, so that the blur is monotonic between layers.
-    blur_px_per_dpt : float
-        Blur of a perfect eye.
-    blur_ratio : float
-        Blur step between layers, relative to the blur radius.
     pace : float
         Factor of all steps.
 
@@ -45,16 +52,45 @@ def layer_distances_dpt(
     at_dpt = np.unique(np.concatenate((regular, inside)))
     if at_dpt.size == 1:
         return at_dpt
+    steps_before = np.zeros(at_dpt.size)
+    for corner in range(scales.size):
+        total_dpt = curves[0, starts[corner] : starts[corner + 1]]
+        steps = curves[1, starts[corner] : starts[corner + 1]]
+        k, last = 0, total_dpt.size - 2
+        for i in range(at_dpt.size):
+            t = (at_dpt[i] + zero_dpt) * scales[corner]
+            while k < last and total_dpt[k + 1] < t:
+                k += 1
+            # A line through the first or last two points goes on beyond them.
+            share = (t - total_dpt[k]) / (total_dpt[k + 1] - total_dpt[k])
+            found = steps[k] + share * (steps[k + 1] - steps[k])
+            steps_before[i] += found * weights[corner] / pace
+    ends = np.searchsorted(at_dpt, np.append(inside, high_dpt))
+    return _between(at_dpt, steps_before, np.unique(ends))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def step_curve(tables, reads, zero_dpt, at_dpt, blur_px_per_dpt, blur_ratio):
+    """Return the number of layers (n,) that a state needs up to each vergence (n,).
+
+    Parameters
+    ----------
+    zero_dpt : (n_fields, 3)
+        Total defocus of field nodes and channels at 0 dpt.
+    blur_px_per_dpt : float
+        Blur of a perfect eye.
+    blur_ratio : float
+        Blur step between layers, relative to the blur radius.
+    """
     most_steps, least_px = _blur_steps(tables, reads, zero_dpt, at_dpt, blur_ratio)
     steps_before = np.zeros(at_dpt.size)
     for k in range(at_dpt.size - 1):
         smallest_px = min(least_px[k], least_px[k + 1])
         gap_dpt = LAYER_GAP_STEPS * blur_ratio * smallest_px
         gap_dpt = max(gap_dpt / max(blur_px_per_dpt, 1e-12), BASE_OBJECT_STEP_DPT)
-        steps = max(most_steps[k], (at_dpt[k + 1] - at_dpt[k]) / gap_dpt) / pace
+        steps = max(most_steps[k], (at_dpt[k + 1] - at_dpt[k]) / gap_dpt)
         steps_before[k + 1] = steps_before[k] + steps
-    ends = np.searchsorted(at_dpt, np.append(inside, high_dpt))
-    return _between(at_dpt, steps_before, np.unique(ends))
+    return steps_before
 
 
 @njit(

@@ -87,6 +87,8 @@ class PsfStore:
         Number of evictions, which move kernels.
     methods : Counter
         Number of computed PSFs by method.
+    step_curves : dict
+        Cache of `frame_layers`, by state.
     """
 
     nodes: PlanNodes
@@ -111,6 +113,7 @@ class PsfStore:
         self._words = np.empty(0, np.uint16)
         self._n_words = 0
         self._added: list[NDArray[np.int64]] = []
+        self.step_curves: dict[State, NDArray[np.float64]] = {}
         self._rings: NodeRings | None = None
         if isinstance(plan, CachePlan):
             self._add_nodes(self._states, plan.nodes)
