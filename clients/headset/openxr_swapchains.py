@@ -102,7 +102,6 @@ class StereoImages:
                 f"the runtime offers the color formats {offered}; expected one of "
                 f"{_COLOR_FORMATS}"
             )
-        self._context = context
         self._framebuffers = Framebuffers(context)
         self._presenter = Presenter(context, size_px)
 
@@ -128,8 +127,8 @@ class StereoImages:
             textures = [swapchain.acquire() for swapchain in used]
             depth = textures[1] if len(textures) > 1 else 0
             try:
+                # The runtime waits for what was submitted before the release.
                 self._presenter.draw(view, self._framebuffers.of(textures[0], depth))
-                self._context.finish()
             finally:
                 for swapchain in used:
                     swapchain.release()
