@@ -103,7 +103,7 @@ class _NoGpu(Gpu):
         self.atlas_is_buffer = kind.atlas_is_buffer
         self.max_block_bytes = 1 << 30
         self.asked: set[Variant] = set()
-        self._owners, self._queries = {}, []
+        self._owners, self._free_queries = {}, []
         self.passes = _NoPasses(self.asked)
 
     def entered(self):
@@ -137,9 +137,6 @@ class _NoGpu(Gpu):
             out.reshape(-1).view(np.uint8)[:] = 0
         return lambda: None
 
-    def acquire_query(self):
-        return _Anything()
-
     def check(self, where):
         pass
 
@@ -163,8 +160,6 @@ class _Memory(Buffer):
 
 class _Anything(nullcontext):
     """Stands for OpenGL's own objects: takes every call."""
-
-    elapsed = 0
 
     def __getattr__(self, name):
         return lambda *arguments, **options: None

@@ -14,6 +14,7 @@ shader_source      shader preprocessor: includes, defines, line numbers
 stage_timer        times of a frame's stages
 staging            persistently mapped memory for uploads and readbacks
 texture_io         textures of the caller as input and output
+timer_query        timer queries that can be deleted
 """
 
 import lazy_loader

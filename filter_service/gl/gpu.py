@@ -29,13 +29,12 @@ from filter_service.gl.staging import (
     wait_for_fence,
 )
 from filter_service.gl.texture_io import TextureIo
+from filter_service.gl.timer_query import TimerQuery
 from filter_service.gl_device import (
     checked_gl_device,
     is_software_renderer,
     wanted_gl_device,
 )
-
-Query = moderngl.Query
 
 GROWTH = 1.25
 """Over-allocation of buffers that grow, so that slowly rising sizes do not reallocate
@@ -110,7 +109,8 @@ class Gpu:
         self._buffers: dict[str, Buffer] = {}
         self.passes = Passes(self.context)
         self._atlases: dict[str, moderngl.Texture] = {}
-        self._queries: list[moderngl.Query] = []
+        self._queries: list[TimerQuery] = []
+        self._free_queries: list[TimerQuery] = []
         self._texture_io: TextureIo | None = None
         self._owners: dict[str, object] = {}
         self._reads: list[_Read] = []
@@ -172,6 +172,8 @@ class Gpu:
             for atlas in self._atlases.values():
                 atlas.release()
             self.passes.release()
+            for query in self._queries:
+                query.release()
             for ring in (self._staging or {}).values():
                 ring.release()
             if self._texture_io is not None:
@@ -452,13 +454,22 @@ class Gpu:
 
     # ----- timers and errors
 
-    def acquire_query(self) -> moderngl.Query:
-        """Return a timer query from the pool; see `release_queries`."""
-        return self._queries.pop() if self._queries else self.context.query(time=True)
+    @property
+    def has_timers(self) -> bool:
+        """Return whether stages are timed by queries instead of the wall clock."""
+        return not self.is_software and self.functions is not None
 
-    def release_queries(self, queries: list[moderngl.Query]) -> None:
-        """Return timer queries to the pool, which never frees them."""
-        self._queries += queries
+    def acquire_query(self) -> TimerQuery:
+        """Return a timer query from the pool; see `release_queries`."""
+        if self._free_queries:
+            return self._free_queries.pop()
+        assert self.functions is not None  # see `has_timers`
+        self._queries.append(TimerQuery(self.functions))
+        return self._queries[-1]
+
+    def release_queries(self, queries: list[TimerQuery]) -> None:
+        """Return timer queries to the pool; `close` deletes them."""
+        self._free_queries += queries
 
     def drop_errors(self) -> None:
         """Drop errors that the caller's own commands have left in its context."""

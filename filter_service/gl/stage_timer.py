@@ -4,7 +4,8 @@ import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 
-from filter_service.gl.gpu import Gpu, Query
+from filter_service.gl.gpu import Gpu
+from filter_service.gl.timer_query import TimerQuery
 
 
 class StageTimer:
@@ -16,11 +17,11 @@ class StageTimer:
     def __init__(self, gpu: Gpu):
         self._gpu = gpu
         self._ms: dict[str, float] = {}
-        self._queries: list[tuple[str, Query]] = []
+        self._queries: list[tuple[str, TimerQuery]] = []
 
-    def stage(self, name: str) -> AbstractContextManager[None] | Query:
+    def stage(self, name: str) -> AbstractContextManager[None]:
         """Time a GPU stage; the times of equal names are added."""
-        if self._gpu.is_software:
+        if not self._gpu.has_timers:
             return self._finished(name)
         query = self._gpu.acquire_query()
         self._queries.append((name, query))
@@ -39,7 +40,7 @@ class StageTimer:
     def result_ms(self) -> dict[str, float]:
         """Wait for the GPU, and return the times by stage."""
         for name, query in self._queries:
-            self._ms[name] = self._ms.get(name, 0.0) + query.elapsed / 1e6
+            self._ms[name] = self._ms.get(name, 0.0) + query.elapsed_ns / 1e6
         self._gpu.release_queries([query for _, query in self._queries])
         self._queries.clear()
         return dict(self._ms)
