@@ -197,7 +197,10 @@ class TextureIo:
         if triangle is None:
             triangle = self._context.vertex_array(program, [])
             self._triangles[program] = triangle
+        # Mesa keeps a program, even a deleted one, if the next one has other stages.
+        gl.glUseProgram(0)
         triangle.render(moderngl.TRIANGLES, vertices=3)
+        gl.glUseProgram(0)
 
 
 def target_of(texture: GlTexture) -> int:
