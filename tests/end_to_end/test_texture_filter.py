@@ -1,9 +1,7 @@
 """`EyeFilter` in the OpenGL context of its caller."""
 
 import time
-from contextlib import contextmanager
 
-import moderngl
 import numpy as np
 import pytest
 
@@ -15,21 +13,14 @@ from filter_service import (
     TextureView,
 )
 from filter_service.errors import RenderFailed
-from tests.numerical.gl_textures import Textures
+from tests.numerical.gl_textures import Textures, callers_context
 from tests.numerical.scene_frames import scene_view
+from tests.numerical.test_gl_objects import counted_objects
 
 SIZE_PX = WIDTH, HEIGHT = 160, 90
 STATE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
 SETTINGS = {"mode": "dynamic", "tolerance": "loose"}
 NEAR_M = 0.05
-
-
-@contextmanager
-def context():
-    own = moderngl.create_context(standalone=True, backend="egl", require=430)
-    with own:
-        yield own
-    own.release()
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +57,7 @@ def shown_image(textures, target):
 
 
 def test_frames_are_those_of_arrays(scene):
-    with context():
+    with callers_context():
         textures = Textures()
         view, target = texture_view(textures, scene), textures.new("rgba8", SIZE_PX)
         camera = scene.camera
@@ -97,10 +88,11 @@ def test_frames_are_those_of_arrays(scene):
 
 
 def test_two_eyes_share_a_context(scene):
-    with context():
+    with callers_context():
         textures = Textures()
         view = texture_view(textures, scene)
         targets = [textures.new("srgb8_a8", SIZE_PX) for _ in range(2)]
+        before = counted_objects()
         eyes = [
             EyeFilter(name, scene.camera, SETTINGS, gl_context="current")
             for name in ("emmetropia", "myopia")
@@ -112,10 +104,11 @@ def test_two_eyes_share_a_context(scene):
             expected = eye.filter(scene, **STATE).color
             assert np.abs(shown_image(textures, target) - expected).max() <= 1
             eye.close()
+        assert counted_objects() == before
 
 
 def test_what_textures_cannot_have_is_refused(scene):
-    with context():
+    with callers_context():
         textures = Textures()
         view, target = texture_view(textures, scene), textures.new("rgba8", SIZE_PX)
         cloudy = {"kind": "preset", "name": "emmetropia", "straylight": {}}
@@ -143,7 +136,7 @@ def test_what_textures_cannot_have_is_refused(scene):
 
 
 def test_a_context_that_is_gone_is_an_error_and_no_crash(scene):
-    with context():
+    with callers_context():
         textures = Textures()
         view, target = texture_view(textures, scene), textures.new("rgba8", SIZE_PX)
         eye = EyeFilter("myopia", scene.camera, SETTINGS, gl_context="current")
@@ -151,7 +144,7 @@ def test_a_context_that_is_gone_is_an_error_and_no_crash(scene):
     with pytest.raises(RenderFailed, match="not current"):
         eye.filter_textures(view, target, **STATE)
     eye.close()
-    with context():
+    with callers_context():
         textures = Textures()
         view, target = texture_view(textures, scene), textures.new("rgba8", SIZE_PX)
         with EyeFilter("myopia", scene.camera, SETTINGS, gl_context="current") as eye:

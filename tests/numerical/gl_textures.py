@@ -1,12 +1,17 @@
 """Textures of a caller, made and read by OpenGL's own functions."""
 
 import ctypes
+from contextlib import contextmanager
 from dataclasses import dataclass
 
+import moderngl
 import numpy as np
 
 from filter_service.gl.current_context import CurrentContext
-from filter_service.texture_view import GlTexture
+from filter_service.rendering.srgb import linear_from_srgb
+from filter_service.rendering.white_level import white_level
+from filter_service.rgbd_view import RgbdView
+from filter_service.texture_view import DepthProjection, GlTexture, TextureView
 
 TEXTURE_2D, TEXTURE_2D_ARRAY = 0x0DE1, 0x8C1A
 FORMATS = {
@@ -31,6 +36,27 @@ _PROTOTYPES = {
     "glTexSubImage3D": (_uint, *(_int,) * 7, _uint, _uint, _pointer),
     "glGetTexImage": (_uint, _int, _uint, _uint, _pointer),
 }
+
+SETS = (
+    # format and layer of color, depth and target
+    (("rgba8", None), ("r32f", None), ("srgb8_a8", None)),
+    (("srgb8_a8", 0), ("d32f", None), ("rgba16f", 2)),
+    (("rgba16f", None), ("d24", 2), ("rgba8", None)),
+    (("rgba8", 1), ("d32f", 1), ("rgba8", 0)),
+)
+"""Textures of views: all formats, and layers of arrays or not in all combinations."""
+
+NEAR_M = 0.05
+MOST_D24 = 2**24 - 1
+
+
+@contextmanager
+def callers_context():
+    """A context of a caller, current within."""
+    context = moderngl.create_context(standalone=True, backend="egl", require=430)
+    with context:
+        yield context
+    context.release()
 
 
 @dataclass
@@ -79,3 +105,65 @@ class Textures:
     def delete(self, texture):
         """Delete a texture."""
         self.glDeleteTextures(1, ctypes.byref(_uint(texture.name)))
+
+
+def arrays_of(view, formats):
+    """The view with 8-bit color, as textures of one of `SETS` hold it."""
+    (color, _), (depth, _), _ = formats
+    rgb, depth_m = view.color, view.depth_m
+    if color == "rgba16f":
+        rgb = linear_from_srgb(rgb).astype(np.float16)
+    if depth == "d24":
+        with np.errstate(divide="ignore"):
+            depth_m = (NEAR_M * MOST_D24 / d24_of(depth_m)).astype(np.float32)
+    return RgbdView(rgb, depth_m, view.tangents)
+
+
+def d24_of(depth_m):
+    """Integers of a reversed depth buffer."""
+    return np.round(NEAR_M / depth_m.astype(float) * MOST_D24)
+
+
+class ViewTextures:
+    """A view in new textures, and a texture for its filtered image.
+
+    Parameters
+    ----------
+    view : RgbdView
+        With 8-bit color.
+    formats : tuple
+        One of `SETS`.
+    """
+
+    def __init__(self, view, formats):
+        self._textures = textures = Textures()
+        color, depth, target = formats
+        self._size_px = size_px = view.width_px, view.height_px
+        rgb = arrays_of(view, formats).color
+        stored, projection = view.depth_m, None
+        if depth[0] != "r32f":
+            projection = DepthProjection(NEAR_M, is_reversed=True)
+            stored = NEAR_M / stored
+        if depth[0] == "d24":
+            share = d24_of(view.depth_m) / MOST_D24
+            stored = np.round(share * (2**32 - 1)).astype(np.uint32)
+        rgba = np.dstack([rgb, np.ones(stored.shape, rgb.dtype)])
+        self.view = TextureView(
+            textures.new(color[0], size_px, rgba, layer=color[1]),
+            textures.new(depth[0], size_px, stored, layer=depth[1]),
+            *size_px,
+            view.tangents,
+            projection,
+            is_top_first=True,
+            white_ratio=white_level(rgb),
+        )
+        self.target = textures.new(target[0], size_px, layer=target[1])
+
+    def image(self):
+        """Return the filtered image (height, width, 3)."""
+        return self._textures.read(self.target, self._size_px)[..., :3]
+
+    def delete(self):
+        """Delete the textures."""
+        for texture in (self.view.color, self.view.depth, self.target):
+            self._textures.delete(texture)

@@ -1,9 +1,7 @@
 """Frames from textures to textures, against frames of arrays."""
 
 import ctypes
-from contextlib import contextmanager
 
-import moderngl
 import numpy as np
 import pytest
 
@@ -19,7 +17,7 @@ from filter_service.settings import RenderOptions
 from filter_service.texture_view import DepthProjection, GlTexture, TextureView
 from tests.conftest import Engine
 from tests.numerical.gl_calls import CountedContext
-from tests.numerical.gl_textures import FORMATS, Textures
+from tests.numerical.gl_textures import FORMATS, Textures, callers_context
 from tests.numerical.synthetic import Bench, depth_scene, texture
 
 WIDTH, HEIGHT = SIZE_PX = 150, 101
@@ -34,15 +32,6 @@ STATE = {"pupil_diameter_mm": 4.0, "focus_dpt": 7.0}
 STATES = [
     {"pupil_diameter_mm": 3.2 + 0.1 * k, "focus_dpt": 6.2 + 0.1 * k} for k in range(12)
 ]
-
-
-@contextmanager
-def callers_context():
-    """A context of a caller, current within."""
-    context = moderngl.create_context(standalone=True, backend="egl", require=430)
-    with context:
-        yield context
-    context.release()
 
 
 class Caller:
