@@ -6,6 +6,7 @@ from typing import Any
 
 import moderngl
 
+from filter_service.constants import TEXTURE_COLOR
 from filter_service.errors import BadMessage, RenderFailed
 from filter_service.texture_view import GlTexture
 
@@ -114,7 +115,7 @@ class TextureIo:
                 f"{texture.name}", field=f"{field}.name", allowed="an existing texture"
             )
         gl.glGetError()
-        gl.glActiveTexture(GL_TEXTURE0)
+        gl.glActiveTexture(GL_TEXTURE0 + TEXTURE_COLOR)  # a unit that is kept
         gl.glBindTexture(target, texture.name)
         if gl.glGetError():
             kind = "GL_TEXTURE_2D" if texture.layer is None else "GL_TEXTURE_2D_ARRAY"
