@@ -122,7 +122,7 @@ def test_a_descriptor_is_closed_whatever_it_is(waiting, tmp_path):
     file = (tmp_path / "plain").open("w+b")
     before = set(os.listdir("/proc/self/fd"))
     for _ in range(3):
-        with pytest.raises(BadMessage, match="cannot be read"):
+        with pytest.raises(BadMessage, match=r"cannot (be read|use it)"):
             waiting.renderer.import_texture(
                 TextureMemory(*SIZE_PX, "rgba8", 65536), os.dup(file.fileno())
             )
