@@ -3,6 +3,7 @@
  *
  * - Chains of access chains become one each, by spirv-opt: the validation layers of 2023
  *   do not follow zink's chains to the buffer, and then watch no access to it.
+ * - Draws are in render passes: in dynamic rendering, the layers of 2023 crash.
  * - With GL_WITNESS_DROP_BARRIERS every pipeline barrier is dropped: a deliberate fault.
  *
  * GL_WITNESS_SPIRV_OPT is the path of spirv-opt, GL_WITNESS_FOLDER one for its files.
@@ -57,6 +58,19 @@ static VKAPI_ATTR VkResult VKAPI_CALL create_device(
         next_barrier2 =
             (PFN_vkCmdPipelineBarrier2)next_device(*made, "vkCmdPipelineBarrier2KHR");
     next_module = (PFN_vkCreateShaderModule)next_device(*made, "vkCreateShaderModule");
+    return result;
+}
+
+static VKAPI_ATTR VkResult VKAPI_CALL extensions(
+    VkPhysicalDevice physical, const char *layer, uint32_t *n_found,
+    VkExtensionProperties *found) {
+    PFN_vkEnumerateDeviceExtensionProperties find =
+        (PFN_vkEnumerateDeviceExtensionProperties)next_instance(
+            instance, "vkEnumerateDeviceExtensionProperties");
+    VkResult result = find(physical, layer, n_found, found);
+    for (uint32_t i = 0; found && i < *n_found; ++i)
+        if (strcmp(found[i].extensionName, "VK_KHR_dynamic_rendering") == 0)
+            strcpy(found[i].extensionName, "VK_none");
     return result;
 }
 
@@ -116,6 +130,7 @@ static PFN_vkVoidFunction ours(const char *name) {
     static const struct { const char *name; PFN_vkVoidFunction function; } all[] = {
         {"vkCreateInstance", (PFN_vkVoidFunction)create_instance},
         {"vkCreateDevice", (PFN_vkVoidFunction)create_device},
+        {"vkEnumerateDeviceExtensionProperties", (PFN_vkVoidFunction)extensions},
         {"vkCreateShaderModule", (PFN_vkVoidFunction)create_module},
         {"vkCmdPipelineBarrier", (PFN_vkVoidFunction)barrier},
         {"vkCmdPipelineBarrier2", (PFN_vkVoidFunction)barrier2},

@@ -28,6 +28,7 @@ from tests.gl_witness.frames import (
     load_views,
     store_of,
 )
+from tests.gl_witness.texture_frames import filter_arrays, filter_textures
 from tests.shader_variants import Variant
 
 COUNTS = ("fragment_count", "merged_count", "entry_count", "kernel_count")
@@ -44,6 +45,9 @@ class Filtered:
         Fragments, pixels merged and so on, by frame.
     repeats_differ : list of str
         Frames that, filtered once more, have other bytes or counts.
+    texture_steps : dict
+        Largest difference of frames in textures from those of arrays, in steps of
+        8 bits.
     stores : dict
         Fingerprints of the eyes' PSFs: engines are compared on the same ones.
     programs : list of str
@@ -54,6 +58,7 @@ class Filtered:
 
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     repeats_differ: list[str] = field(default_factory=list)
+    texture_steps: dict[str, int] = field(default_factory=dict)
     stores: dict[str, str] = field(default_factory=dict)
     programs: list[str] = field(default_factory=list)
     arrays: dict[str, NDArray] = field(default_factory=dict)
@@ -107,8 +112,13 @@ def filter_with_gl(views: dict[str, RgbdView]) -> Filtered:
         use_hardware_shaders()
     filtered, gpu = Filtered(), Gpu()
     filter_cases(FilterRenderer(gpu), views, filtered)
-    programs = [Variant(name, tuple(defines)) for name, *defines in gpu.passes.programs]
-    filtered.programs = sorted(map(str, programs))
+    with gpu.entered():  # one context: `between.c` knows one device a process
+        pictures, filtered.texture_steps, programs = filter_textures(views)
+    filtered.arrays |= pictures
+    programs |= set(gpu.passes.programs)
+    filtered.programs = sorted(
+        str(Variant(name, tuple(defines))) for name, *defines in programs
+    )
     return filtered
 
 
@@ -116,6 +126,7 @@ def filter_with_native(views: dict[str, RgbdView]) -> Filtered:
     """All frames by the native engine."""
     filtered = Filtered()
     filter_cases(NativeRenderer(), views, filtered)
+    filtered.arrays |= filter_arrays(views, "native")
     return filtered
 
 

@@ -131,6 +131,7 @@ def watched(
             "VK_LAYER_SETTINGS_PATH": folder,
             "GL_WITNESS_SPIRV_OPT": str(FETCHED / "usr" / "bin" / "spirv-opt"),
             "GL_WITNESS_FOLDER": folder,
+            "MESA_VK_VERSION_OVERRIDE": "1.2",  # dynamic rendering is part of 1.3
             # nothing that was compiled without the layers
             "MESA_SHADER_CACHE_DISABLE": "1",
             **more,

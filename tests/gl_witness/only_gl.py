@@ -18,6 +18,10 @@ from tests.gl_witness.hardware_shaders import use_hardware_shaders
 
 OUTCOMES = pytest.StashKey()
 
+OWN_CONTEXTS = {"own_gpu", "caller", "fences"}
+"""Fixtures with which tests make contexts of their own.  Slow ones are left out: tens
+of thousands of frames on every driver."""
+
 
 def pytest_configure(config):
     config.stash[OUTCOMES] = {}
@@ -27,7 +31,10 @@ def pytest_configure(config):
 
 def draws(item) -> bool:
     """Whether a test needs the OpenGL context, or makes one of its own."""
-    return uses_gl(item) or "Gpu" in item.function.__code__.co_names
+    if uses_gl(item) or "Gpu" in item.function.__code__.co_names:
+        return True
+    is_long = item.get_closest_marker("slow") is not None
+    return not is_long and bool(OWN_CONTEXTS & set(item.fixturenames))
 
 
 @pytest.hookimpl(trylast=True)

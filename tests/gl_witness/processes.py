@@ -8,7 +8,7 @@ from pathlib import Path
 from tests.gl_witness.drivers import DRIVERS, environment
 from tests.gl_witness.filter_frames import Filtered
 from tests.gl_witness.frames import save_views
-from tests.shader_variants import KINDS, renderer_variants
+from tests.shader_variants import KINDS, renderer_variants, texture_variants
 from tests.source_tree import ROOT
 
 SIZE = {"width_px": 320, "height_px": 180}
@@ -44,7 +44,8 @@ def check_variants(shaders: str, filtered: Filtered) -> None:
     RuntimeError
         One did not.
     """
-    wanted = {str(variant) for variant in renderer_variants(KINDS[shaders])}
+    variants = renderer_variants(KINDS[shaders]) | texture_variants()
+    wanted = {str(variant) for variant in variants if variant.stage == "comp"}
     passes = {path.name.split(".")[0] for path in (ROOT / "shaders/passes").iterdir()}
     ran = {name.split("(")[0] for name in filtered.programs}
     missing = (wanted - set(filtered.programs)) | (passes - ran)

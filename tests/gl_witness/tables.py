@@ -7,7 +7,7 @@ from itertools import combinations
 from pathlib import Path
 
 from tests.gl_witness.compare import differences, summary
-from tests.gl_witness.drivers import SHADERS
+from tests.gl_witness.drivers import DRIVERS, SHADERS
 from tests.gl_witness.filter_frames import Filtered
 from tests.gl_witness.frames import save_views
 from tests.gl_witness.layers import WATCHES, prove, watched
@@ -27,6 +27,8 @@ def compare_frames() -> list[dict]:
         each = differences(found[there], found[here])
         row = {"here": here, "there": there, "frames": summary(each)}
         row["repeats_differ"] = found[there].repeats_differ
+        row["texture_steps"] = found[there].texture_steps
+        row["failed"] = any(steps > 1 for steps in row["texture_steps"].values())
         row["each"] = [asdict(one) for one in each if not one.is_none]
         rows.append(row)
         told = row["frames"]
@@ -34,6 +36,12 @@ def compare_frames() -> list[dict]:
             f"{here + ' : ' + there:<58} {told['byte for byte']:>2} of "
             f"{told['compared']:>2} equal, least {told['least_psnr_db']:.1f} dB, "
             f"largest difference {told['largest']:.1e}"
+        )
+    for driver in map(str, DRIVERS):
+        steps = found[driver].texture_steps.values()
+        say(
+            f"{driver}: {len(steps)} frames in textures, at most {max(steps)} of 255 "
+            "steps from those of arrays"
         )
     return rows
 
