@@ -1,38 +1,61 @@
-"""Frame time on a hardware GPU: passes, transfers and planning, with image error.
+"""Frame time on a hardware GPU, of arrays and of textures, with image error.
 
     python -m tests.benchmarks.bench_gpu [--quick] [--json] [--views NAME ...]
 
-The courtyard over the whole visual field ("dynamic"), colour and depth in host memory,
-8-bit sRGB in and out, one eye or two of a headset.  "moving": pupil and focus change
-with every frame, so that its kernels are blended anew; "frozen": they stay.  Frames
-come one after the other for two seconds before any is timed, for a GPU that rests
-lowers its clock; the clocks stand with the machine, where nvidia-smi tells them.
-"passes" is the sum of the GPU's own timers, "around" the rest of the wall time: copies
-to and from the GPU, planning, calls of the driver.
+The courtyard over the whole visual field ("dynamic"), 8-bit sRGB in and out, one eye or
+two of a headset.  "moving": pupil and focus change with every frame, so that its
+kernels are blended anew; "frozen": they stay.  Frames come one after the other for a
+while before any is timed, for a GPU that rests lowers its clock; the clocks stand with
+the machine, where nvidia-smi tells them.
+
+Color and depth in host memory:
+
+- ``frame``: wall time from the call to the image in host memory;
+- ``passes``: the sum of the GPU's timers of the passes, which follow; ``around`` the
+  rest of the wall time: copies to and from the GPU, calls of the driver.
+
+Color, depth and image in textures of the caller's context:
+
+- ``frame``: wall time from the call until the GPU has finished the frame;
+- ``call``: of it, until the call returns;
+- ``gpu``: by a timer of the GPU, from the first command of a frame to the last;
+- ``passes``, and each pass: other frames, with a timer around every pass.
+
+Beside each pass stand its counted work and its bound (pass_work).
 
 Error: PSNR in linear light against the native engine, whose loops have no code in
 common with the passes; its own error against the dense reference is in live.json.
+Images in textures have half floats for it.
+
+Rows go to out/gpu_rows.jsonl as they come, for runs that are ended early.  Writes
+results/gpu.json on hardware.
 """
 
 import argparse
 import json
+import sys
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
-from estimator.profiles.parse import parse_profile
 from filter_service.gl.gpu import Gpu
-from filter_service.planning.grid import GridSpec
-from filter_service.psfs.eye_for_spec import eye_for_spec
-from filter_service.psfs.store import build_psf_store
-from filter_service.rendering.engine import ViewRequest
-from filter_service.rendering.gl.renderer import FilterRenderer
-from filter_service.rendering.native import NativeRenderer
-from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.frame_runs import states_towards
+from tests.benchmarks.gpu_cases import (
+    EYES,
+    FOCUS_DPT,
+    PUPIL_MM,
+    QUICK_VIEWS,
+    REFERENCE,
+    VIEWS,
+    Case,
+    TextureCase,
+    open_case,
+)
 from tests.benchmarks.harness import (
+    KeptRows,
     Row,
     machine_info,
     nvidia_smi,
@@ -40,134 +63,159 @@ from tests.benchmarks.harness import (
     report,
     write_report,
 )
-from tests.grid_specs import grid_spec
-from tests.numerical.scene_frames import scene_view
-from tests.numerical.synthetic import psnr_db
+from tests.benchmarks.pass_work import STATE_STAGES, Rates, rates_of
 
-EYES = {
-    "-6 dpt": {"kind": "prescription", "sphere_dpt": -6.0},
-    "emmetropia": {"kind": "preset", "name": "emmetropia"},
-    "keratoconus": {"kind": "preset", "name": "keratoconus"},
-}
-VIEWS = {
-    "1280x720": ((1280, 720), 1),
-    "2560x1440": ((2560, 1440), 1),
-    "2 x 1832x1920": ((1832, 1920), 2),
-}
-QUICK_VIEWS = {"192x108": ((192, 108), 1), "2 x 96x100": ((96, 100), 2)}
 QUICK_NAMES = dict(zip(VIEWS, ("192x108", "192x108", "2 x 96x100"), strict=True))
 """The small view that stands for a large one."""
-PUPIL_MM, FOCUS_DPT = 4.5, 0.5
-REFERENCE = "native engine, same eye and state"
 HOST_STAGES = ("prepare_ms", "psf_plan_ms", "plan_ms", "upload_ms", "readback_ms")
 """Stages that are not passes: by the wall clock, but for the upload, whose timer on the
 GPU waits for the processor to copy."""
 
 
 @dataclass(frozen=True)
-class Case:
-    """An eye and its view, on both engines; pictures go where the last ones went."""
+class PassRow(Row):
+    """A row of a pass: its counted work, and the least time that it takes.
 
-    eye: str
-    setting: str
-    view: RgbdView
-    renderer: FilterRenderer
-    handles: list
-    memory_mb: float
-    error_db: float
-    rooms: list[np.ndarray]
+    Attributes
+    ----------
+    bytes, fetched_bytes, flops, atomics : float
+    bound_ms : float or None
+        None where the GPU's rates are not known.
+    """
 
-    def frame(self, state: dict) -> tuple[float, dict[str, float]]:
-        """Filter the views of one frame; wall time and stages, ms."""
-        stages_ms: dict[str, float] = {}
-        start_s = time.perf_counter()
-        begun = [
-            self.renderer.begin(
-                ViewRequest(self.view, handle, output="srgb8", out=room, **state)
+    bytes: float
+    fetched_bytes: float
+    flops: float
+    atomics: float
+    bound_ms: float | None
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How many frames are timed, after how many seconds of others."""
+
+    count: int
+    warm_s: float
+
+
+QUICK_PACE = Pace(3, 0.0)
+PACE = Pace(60, 1.5)
+
+
+class Rows:
+    """Rows of a case whose state changes or stays."""
+
+    def __init__(
+        self, case: Case | TextureCase, rates: Rates | None, *, is_moving: bool
+    ):
+        self._case, self._rates, self._is_moving = case, rates, is_moving
+        self._work = case.work.passes()
+
+    def of(self, times_ms: dict[str, Any]) -> Iterator[Row]:
+        """Yield a row for each name; those of passes have their work."""
+        how = "moving" if self._is_moving else "frozen"
+        for name, values in times_ms.items():
+            row = Row(
+                bench="gpu",
+                method=name,
+                case=self._case.eye,
+                setting=f"{self._case.setting} {how}",
+                n=len(values),
+                median_ms=float(np.median(values)),
+                p95_ms=float(np.percentile(values, 95)),
+                memory_mb=self._case.memory_mb,
+                error_name="psnr_db",
+                error=self._case.error_db,
+                reference=REFERENCE,
             )
-            for handle, room in zip(self.handles, self.rooms, strict=True)
-        ]
-        for finish in begun:
-            for name, ms in finish().stage_times_ms.items():
-                stages_ms[name] = stages_ms.get(name, 0.0) + ms
-        return 1e3 * (time.perf_counter() - start_s), stages_ms
-
-    def rows(self, is_moving: bool, count: int, warm_s: float) -> Iterator[Row]:
-        """Wall time, its parts, and the stages."""
-        states = states_towards(
-            self.handles[0].store.spec, PUPIL_MM, FOCUS_DPT, count if is_moving else 1
-        )
-        end_s, n = time.perf_counter() + warm_s, 0
-        while time.perf_counter() < end_s or n < 3:
-            self.frame(states[n % len(states)])
-            n += 1
-        frames = [self.frame(states[k % len(states)]) for k in range(count)]
-        names = {name: None for _, stages_ms in frames for name in stages_ms}
-        passes_ms = [
-            sum(ms for name, ms in stages_ms.items() if name not in HOST_STAGES)
-            for _, stages_ms in frames
-        ]
-        wall_ms = [wall_ms for wall_ms, _ in frames]
-        yield self._row("frame", is_moving, wall_ms)
-        yield self._row("  passes", is_moving, passes_ms)
-        yield self._row("  around", is_moving, np.subtract(wall_ms, passes_ms))
-        for name in names:
-            times_ms = [stages_ms.get(name, 0.0) for _, stages_ms in frames]
-            yield self._row(f"    {name.removesuffix('_ms')}", is_moving, times_ms)
-
-    def _row(self, method: str, is_moving: bool, times_ms) -> Row:
-        return Row(
-            bench="gpu",
-            method=method,
-            case=self.eye,
-            setting=f"{self.setting} {'moving' if is_moving else 'frozen'}",
-            n=len(times_ms),
-            median_ms=float(np.median(times_ms)),
-            p95_ms=float(np.percentile(times_ms, 95)),
-            memory_mb=self.memory_mb,
-            error_name="psnr_db",
-            error=self.error_db,
-            reference=REFERENCE,
-        )
+            work = self._work.get(name.strip()) if name.startswith("    ") else None
+            # Of a state that stays, nothing is planned and blended.
+            if work is None or (name.strip() in STATE_STAGES and not self._is_moving):
+                yield row
+                continue
+            bound_ms = None if self._rates is None else work.bound_ms(self._rates)
+            yield PassRow(**asdict(row), **asdict(work), bound_ms=bound_ms)
 
 
-def view_and_spec(size_px: tuple[int, int]) -> tuple[RgbdView, GridSpec]:
-    """Return the courtyard at a size, and what its PSFs are made for."""
-    width_px, height_px = size_px
-    view = scene_view("courtyard", width_px=width_px, height_px=height_px)
-    spec = grid_spec(
-        width_px=width_px,
-        height_px=height_px,
-        tangents=view.tangents,
-        pupil_range_mm=(4.0, 5.0),
-        focus_range_dpt=(0.0, 1.0),
-        mode="dynamic",
-    )
-    return view, spec
+def frames_of(
+    case: Case | TextureCase, pace: Pace, *, is_moving: bool
+) -> Callable[[Callable[[dict], Any]], list]:
+    """Return a function that calls another with the state of each frame."""
+    spec = case.handles[0].store.spec
+    states = states_towards(spec, PUPIL_MM, FOCUS_DPT, pace.count if is_moving else 1)
+
+    def frames(function: Callable[[dict], Any]) -> list:
+        return [function(states[k % len(states)]) for k in range(pace.count)]
+
+    end_s, n = time.perf_counter() + pace.warm_s, 0
+    while time.perf_counter() < end_s or n < 3:
+        case.frame(states[n % len(states)])
+        n += 1
+    return frames
 
 
-def open_case(gpu: Gpu, eye: str, setting: str, size_px, view_count: int) -> Case:
-    """Build an eye's store, load it, and judge a frame."""
-    view, spec = view_and_spec(size_px)
-    traced, _ = eye_for_spec(parse_profile(EYES[eye]), spec)
-    store = build_psf_store(traced, spec)
-    state = {"pupil_diameter_mm": PUPIL_MM, "focus_dpt": FOCUS_DPT}
-    native = NativeRenderer()
-    expected = native.render(view, native.load(store), **state).color
-    native.close()
-    renderer = FilterRenderer(gpu)
-    handles = [renderer.load(store) for _ in range(view_count)]  # an eye for each view
-    seen = renderer.render(view, handles[0], **state).color
-    return Case(
-        eye,
-        setting,
-        view,
-        renderer,
-        handles,
-        gpu.memory_mb,
-        psnr_db(seen, expected),
-        [np.empty(view.color.shape, np.uint8) for _ in handles],
-    )
+def stage_times(found: list[dict[str, float]]) -> dict[str, list[float]]:
+    """Return the times of each stage by name, indented."""
+    names = dict.fromkeys(name for stages_ms in found for name in stages_ms)
+    return {
+        f"    {name.removesuffix('_ms')}": [ms.get(name, 0.0) for ms in found]
+        for name in names
+    }
+
+
+def passes_ms(found: list[dict[str, float]]) -> list[float]:
+    """Return the sum of each frame's passes."""
+    return [
+        sum(ms for name, ms in stages_ms.items() if name not in HOST_STAGES)
+        for stages_ms in found
+    ]
+
+
+def array_times(case: Case, pace: Pace, *, is_moving: bool) -> dict[str, Any]:
+    """Return the times of frames of arrays by name."""
+    found = frames_of(case, pace, is_moving=is_moving)(case.frame)
+    wall_ms = [wall_ms for wall_ms, _ in found]
+    stages = [stages_ms for _, stages_ms in found]
+    return {
+        "frame": wall_ms,
+        "  passes": passes_ms(stages),
+        "  around": np.subtract(wall_ms, passes_ms(stages)),
+        **stage_times(stages),
+    }
+
+
+def texture_times(case: TextureCase, pace: Pace, *, is_moving: bool) -> dict[str, Any]:
+    """Return the times of frames of textures by name."""
+    frames = frames_of(case, pace, is_moving=is_moving)
+    case.incomplete_count = 0
+    found = frames(case.frame)
+    query = case.new_query()
+    gpu_ms = frames(lambda state: case.gpu_ms(state, query))
+    stages = frames(case.passes_ms)
+    if case.incomplete_count:
+        told = f"{case.eye}, {case.setting}: {case.incomplete_count} incomplete frames"
+        print(told, file=sys.stderr)
+    return {
+        "frame": [wall_ms for wall_ms, _ in found],
+        "  call": [stages_ms["call"] for _, stages_ms in found],
+        "  gpu": gpu_ms,
+        "  passes": passes_ms(stages),
+        **stage_times(stages),
+    }
+
+
+def case_rows(gpu: Gpu, case: Case, pace: Pace) -> Iterator[Row]:
+    """Yield the rows of an eye and a view: of textures, then of arrays."""
+    rates = rates_of(gpu.info["renderer"])
+    with gpu.entered():  # a caller's context that is current
+        textures = TextureCase(case)
+        for is_moving in (False, True):
+            times_ms = texture_times(textures, pace, is_moving=is_moving)
+            yield from Rows(textures, rates, is_moving=is_moving).of(times_ms)
+        textures.release()
+    for is_moving in (True, False):
+        times_ms = array_times(case, pace, is_moving=is_moving)
+        yield from Rows(case, rates, is_moving=is_moving).of(times_ms)
 
 
 def chosen_views(names: list[str], *, is_quick: bool) -> dict:
@@ -185,18 +233,20 @@ def main() -> None:
     parser.add_argument("--views", nargs="+", choices=VIEWS, default=list(VIEWS))
     options = parser.parse_args()
     gpu = Gpu()
-    count, warm_s = (3, 0.0) if options.quick else (60, 2.0)
-    rows, clocks = [], {}
+    pace = QUICK_PACE if options.quick else PACE
+    rows: list[Row] = []
+    clocks = {}
+    kept = KeptRows("gpu")
     for setting, (size_px, view_count) in chosen_views(
         options.views, is_quick=options.quick
     ).items():
         for eye in EYES:
             case = open_case(gpu, eye, setting, size_px, view_count)
-            for is_moving in (True, False):
-                rows += case.rows(is_moving, count, warm_s)
+            for row in case_rows(gpu, case, pace):
+                rows.append(row)
+                kept.add(row)
             clocks[f"{setting} {eye}"] = nvidia_smi("clocks.sm,clocks.mem")
-            for handle in case.handles:
-                handle.release()
+            case.release()
     machine = {**machine_info(), "gl_renderer": gpu.info["renderer"], "clocks": clocks}
     content = report(rows, machine=machine)
     if options.json:

@@ -36,18 +36,22 @@ import moderngl
 import numpy as np
 
 from filter_service.gl import gpu as gpu_module
-from filter_service.gl.current_context import CurrentContext
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.staging import Staging
-from filter_service.rendering.engine import TextureRequest
-from filter_service.rendering.gl.renderer import FilterRenderer
-from filter_service.texture_view import GlTexture, TextureView
-from tests.benchmarks.bench_gpu import FOCUS_DPT, PUPIL_MM, REFERENCE, Case, open_case
 from tests.benchmarks.frame_runs import states_towards
+from tests.benchmarks.gpu_cases import (
+    FOCUS_DPT,
+    PUPIL_MM,
+    QUICK_VIEWS,
+    REFERENCE,
+    VIEWS,
+    Case,
+    TextureCase,
+    open_case,
+)
 from tests.benchmarks.harness import Row, publish
 
-VIEWS = {"1280x720": ((1280, 720), 1), "2 x 1832x1920": ((1832, 1920), 2)}
-QUICK_VIEWS = {"192x108": ((192, 108), 1), "2 x 96x100": ((96, 100), 2)}
+SETTINGS = ("1280x720", "2 x 1832x1920")
 EYES, QUICK_EYES = ("-6 dpt", "emmetropia"), ("emmetropia",)
 STATES = 4
 FRAMES, WARM_FRAMES = 200, 30
@@ -153,46 +157,6 @@ def empty_passes(clock: Clock) -> Iterator[None]:
         yield
 
 
-class TextureCase:
-    """A case whose color, depth and result are textures of a caller's context."""
-
-    def __init__(self, case: Case):
-        view, self.eye, self.setting = case.view, case.eye, f"{case.setting} textures"
-        self.memory_mb, self.error_db = case.memory_mb, case.error_db
-        self.handles = case.handles
-        gpu = Gpu(current=CurrentContext())
-        gpu.is_software = False
-        self._renderer = FilterRenderer(gpu)
-        stores = [handle.store for handle in case.handles]
-        self._handles = [self._renderer.load(store) for store in stores]
-        size_px = view.width_px, view.height_px
-        new = gpu.context.texture
-        rgba = np.dstack([view.color, np.full(view.depth_m.shape, 255, np.uint8)])
-        color = new(size_px, 4, rgba.tobytes())
-        depth = new(size_px, 1, view.depth_m.tobytes(), dtype="f4")
-        targets = [new(size_px, 4) for _ in stores]
-        self._kept = color, depth, targets
-        self._view = TextureView(
-            GlTexture(color.glo, "rgba8"),
-            GlTexture(depth.glo, "r32f"),
-            *size_px,
-            view.tangents,
-            is_top_first=True,
-        )
-        self._targets = [GlTexture(target.glo, "rgba8") for target in targets]
-
-    def frame(self, state: dict) -> tuple[float, dict[str, float]]:
-        """Submit the views of one frame; wall time, ms, and no stages."""
-        start_s = time.perf_counter()
-        for handle, target in zip(self._handles, self._targets, strict=True):
-            self._renderer.filter_textures(
-                TextureRequest(
-                    self._view, target, handle, **state, target_is_top_first=True
-                )
-            )
-        return 1e3 * (time.perf_counter() - start_s), {}
-
-
 def case_rows(case: Case | TextureCase, is_moving: bool, count: int) -> Iterator[Row]:
     """Times of an eye's frames on nothing."""
     spec = case.handles[0].store.spec
@@ -262,7 +226,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args()
     gpu, rows = hardware_like(), []
-    views = QUICK_VIEWS if options.quick else VIEWS
+    views = QUICK_VIEWS if options.quick else {name: VIEWS[name] for name in SETTINGS}
     for setting, (size_px, view_count) in views.items():
         for eye in QUICK_EYES if options.quick else EYES:
             case = open_case(gpu, eye, setting, size_px, view_count)
@@ -271,14 +235,14 @@ def main() -> None:
                 standalone=True, backend="egl", require=430
             )
             with context:
-                textures = TextureCase(case)
+                textures = TextureCase(case, is_software=False)
                 for is_moving in (False, True):
                     rows += case_rows(textures, is_moving, count)
+                textures.release()
             context.release()
             for is_moving in (False, True):
                 rows += case_rows(case, is_moving, count)
-            for handle in case.handles:
-                handle.release()
+            case.release()
     publish("host", rows, as_json=options.json, is_whole=not options.quick)
 
 

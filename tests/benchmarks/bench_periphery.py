@@ -43,8 +43,8 @@ from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.native import NativeRenderer
 from filter_service.rendering.native.frame_record import FrameRecord
 from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.bench_gpu import EYES, FOCUS_DPT, PUPIL_MM
 from tests.benchmarks.frame_runs import states_towards
+from tests.benchmarks.gpu_cases import EYES, FOCUS_DPT, PUPIL_MM
 from tests.benchmarks.harness import (
     Row,
     memory_mb,

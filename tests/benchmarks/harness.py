@@ -135,6 +135,20 @@ def write_report(name: str, content: dict) -> Path:
     return path
 
 
+class KeptRows:
+    """File out/NAME_rows.jsonl of the rows of a run that may be ended early."""
+
+    def __init__(self, name: str):
+        OUT.mkdir(exist_ok=True)
+        self._path = OUT / f"{name}_rows.jsonl"
+        self._path.write_text("", encoding="utf-8")
+
+    def add(self, row: Row) -> None:
+        """Add a row."""
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"row": asdict(row)}) + "\n")
+
+
 def publish(name: str, rows: list[Row], *, as_json: bool, is_whole: bool) -> None:
     """Print rows as a table or as JSON, and write those of a whole run."""
     content = report(rows)

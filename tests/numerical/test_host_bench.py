@@ -2,8 +2,8 @@
 
 import pytest
 
-from tests.benchmarks.bench_gpu import open_case
 from tests.benchmarks.bench_host import case_rows, hardware_like
+from tests.benchmarks.gpu_cases import open_case
 
 
 @pytest.fixture(scope="module")
