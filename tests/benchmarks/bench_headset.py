@@ -1,6 +1,6 @@
 r"""Stages of a headset frame, filtered in process and by a service.
 
-    python -m tests.benchmarks.bench_headset [--quick] [--json]
+    python -m tests.benchmarks.bench_headset [--quick] [--json] [--sizes WxH ...]
     sh tests/headset/run_in_root.sh env OCUFILTER_COMMIT=$(git rev-parse --short HEAD) \
         python -m tests.benchmarks.bench_headset --openxr
 
@@ -10,7 +10,9 @@ Stages: ``scene`` renders both views (Mesa, on the processor); ``look`` finds ga
 focus and pupil; ``filter`` is the filter's own time for both eyes; ``around`` what this
 process adds to it; ``service``, ``wire`` and ``wait`` what a service adds: its own
 stages, the way there and back by shared memory, waiting for its turn; ``show`` hands
-the pictures to the runtime; ``age`` is from a frame's begin to where it was shown.
+the pictures to the runtime, which waits for those in textures; ``age`` is from a
+frame's begin to where it was shown.  "here, textures": as `ocufilter headset
+--textures`, where ``filter`` is the time of the calls.
 
 With --openxr, in the root of tests/headset: the same in Monado, with its compositor on
 the processor too, before a striped wall; prints JSON.
@@ -41,17 +43,18 @@ from clients.headset.stereo_gaze import StereoGaze
 from clients.headset.viewer import Viewer
 from clients.headset.viewpoint import viewpoint
 from clients.scenes.catalog import build_scene
+from clients.scenes.scene_view import read_texture
 from clients.service_process import ServiceProcess
 from filter_service import FilterSettings
 from filter_service.errors import FilterError
-from tests.benchmarks.harness import Row, memory_mb, publish, report
+from tests.benchmarks.harness import KeptRows, Row, memory_mb, publish, report
 
 SIZES_PX = ((448, 504), (896, 1007))
 QUICK_SIZES_PX = ((112, 126),)
 N_FRAMES, QUICK_FRAMES = 80, 5
 WARM_S = 60.0
 RATE_HZ = 72.0
-WAYS = ("here", "service, shm")
+WAYS = ("here, textures", "here", "service, shm")
 PROFILES = {
     "left": {"kind": "preset", "name": "myopia"},
     "right": {"kind": "preset", "name": "keratoconus"},
@@ -94,8 +97,13 @@ def viewer_of(open_runtime, scenery, seeing):
     )
 
 
-def error_db(seen) -> float:
+def error_db(seen, context) -> float:
     """Return the PSNR of what was seen to the same frame without tolerance."""
+    with context:
+        colors = [
+            color if isinstance(color, np.ndarray) else read_texture(color)[..., :3]
+            for color in seen.colors
+        ]
     exact = LocalFilter(SETTINGS, lambda line: None)
     try:
         for eye, profile in PROFILES.items():
@@ -113,7 +121,7 @@ def error_db(seen) -> float:
                 gaze_deg=eye.gaze_deg,
                 render_tolerance=0.0,
             )
-            squares.append((wanted.color - seen.colors[n].astype(float)) ** 2)
+            squares.append((wanted.color - colors[n].astype(float)) ** 2)
         return float(10.0 * np.log10(255.0**2 / np.mean(squares)))
     finally:
         exact.close()
@@ -147,9 +155,9 @@ def rows_of(log, took_s: float, method: str, case: str, error: float):
         )
 
 
-def ways(names):
-    """Yield (name, seeing) of each way to filter."""
-    for name in names:
+def ways(context):
+    """Yield (name, seeing) of each way to filter pictures of a context."""
+    for name in WAYS:
         with contextlib.ExitStack() as stack:
             if name == "service, shm":
                 folder = stack.enter_context(tempfile.TemporaryDirectory())
@@ -158,7 +166,8 @@ def ways(names):
                 )
                 seeing = ServiceFilter(service.endpoint, SETTINGS, lambda line: None)
             else:
-                seeing = LocalFilter(SETTINGS, lambda line: None)
+                own = context if name == "here, textures" else None
+                seeing = LocalFilter(SETTINGS, lambda line: None, own)
             stack.callback(seeing.close)
             yield name, seeing
 
@@ -167,19 +176,29 @@ def measure(sizes_px, n_frames: int) -> list[Row]:
     """Return the rows of a simulated headset."""
     scene = build_scene("courtyard")
     stand = upright(viewpoint(scene))
-    rows = []
+    rows: list[Row] = []
+    kept = KeptRows("headset")
     context = moderngl.create_context(standalone=True, backend="egl", require=430)
+
+    def finish() -> None:
+        with context:
+            context.finish()
+
     with contextlib.closing(SceneScenery(context, scene, stand)) as scenery:
         for size_px in sizes_px:
-            for name, seeing in ways(WAYS):
+            for name, seeing in ways(context):
                 log, seen, took_s = run(
-                    lambda size_px=size_px: SimulatedRuntime(size_px, rate_hz=RATE_HZ),
+                    lambda size_px=size_px: SimulatedRuntime(
+                        size_px, rate_hz=RATE_HZ, finish=finish
+                    ),
                     scenery,
                     seeing,
                     n_frames,
                 )
                 case = f"2 x {size_px[0]}x{size_px[1]}"
-                rows += rows_of(log, took_s, name, case, error_db(seen))
+                for row in rows_of(log, took_s, name, case, error_db(seen, context)):
+                    rows.append(row)
+                    kept.add(row)
     context.release()
     return rows
 
@@ -205,7 +224,7 @@ def measure_openxr(n_frames: int) -> list[Row]:
                 scenery = SceneScenery(context, scene, upright(viewpoint(scene)))
                 stack.callback(context.release)
                 stack.callback(scenery.close)
-                for name, seeing in ways(WAYS):
+                for name, seeing in ways(context):
                     log, seen, took_s = run(
                         lambda context=context: OpenXrRuntime(context),
                         scenery,
@@ -215,8 +234,14 @@ def measure_openxr(n_frames: int) -> list[Row]:
                     height_px, width_px = seen.colors[0].shape[:2]
                     kind = "XCB compositor" if screen else "null compositor"
                     case = f"2 x {width_px}x{height_px}, Monado's {kind}"
-                    rows += rows_of(log, took_s, name, case, error_db(seen))
+                    rows += rows_of(log, took_s, name, case, error_db(seen, context))
     return rows
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """Return width and height of WxH."""
+    width_px, height_px = text.split("x")
+    return int(width_px), int(height_px)
 
 
 def main() -> None:
@@ -225,8 +250,9 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small, five frames")
     parser.add_argument("--openxr", action="store_true", help="in Monado; see above")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--sizes", nargs="+", type=size_of, metavar="WxH")
     arguments = parser.parse_args()
-    sizes_px = QUICK_SIZES_PX if arguments.quick else SIZES_PX
+    sizes_px = QUICK_SIZES_PX if arguments.quick else arguments.sizes or SIZES_PX
     n_frames = QUICK_FRAMES if arguments.quick else N_FRAMES
     try:
         if arguments.openxr:
@@ -235,7 +261,8 @@ def main() -> None:
         rows = measure(sizes_px, n_frames)
     except FilterError as error:
         raise SystemExit(f"headset: {error}") from None
-    publish("headset", rows, as_json=arguments.json, is_whole=not arguments.quick)
+    is_whole = sizes_px == SIZES_PX
+    publish("headset", rows, as_json=arguments.json, is_whole=is_whole)
 
 
 if __name__ == "__main__":
