@@ -8,7 +8,6 @@ that what ends the run early takes no more than the step that it meets.
 
 import argparse
 import json
-import shutil
 import subprocess
 import sys
 import tarfile
@@ -60,8 +59,7 @@ class Run:
         self.budget = budget
         self.outcomes: list[Outcome] = []
         self.hardware: dict = {}
-        for folder in (out, out / "logs", out / "pictures"):
-            folder.mkdir(parents=True, exist_ok=True)
+        (out / "logs").mkdir(parents=True, exist_ok=True)
 
     def set_up(self, kit: Path, *, loaders: str) -> tuple[Path, dict[str, str]]:
         """Make the environment; its Python, and the variables of the steps.
@@ -118,7 +116,7 @@ class Run:
 
     def _done(self, step: Step, limit_s, python: Path, variables) -> Outcome:
         """Run a step's program, and take what it left."""
-        words = step.command(self.out / "pictures", is_quick=self.is_quick)
+        words = step.command(is_quick=self.is_quick)
         since_s, logs = time.time(), self.out / "logs"
         state, seconds = run_program(
             [str(python), "-m", *words],
@@ -132,9 +130,6 @@ class Run:
         content = printed_json(out) if step.is_json else {}
         if not content and step.rows_file:
             content = kept_rows(TREE / step.rows_file, since_s)
-        for picture in step.pictures:
-            if (TREE / picture).is_file() and state == DONE:
-                shutil.copy(TREE / picture, self.out / "pictures")
         return Outcome(
             step.name,
             step.what,

@@ -5,9 +5,12 @@ from pathlib import Path
 
 BENCHES = "tests.benchmarks."
 KIT = "tests.gpu_kit."
-GL = ("--json", "--engine", "gl")
-FIELD = ("--eyes", "myopia", "--sizes", "1280x720", "--scenes", "courtyard")
-RADIUS = ("--json", "--plot", "--sweeps", "radius")
+TEXTURE_TESTS = (
+    "tests/numerical/test_textures.py",
+    "tests/numerical/test_waiting_textures.py",
+    "tests/end_to_end/test_texture_filter.py",
+)
+SHARING_TESTS = ("tests/end_to_end/test_shared_textures.py",)
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,7 @@ class Step:
         What it measures, in a few words.
     module : str
     words : tuple of str
-        Arguments; ``{pictures}`` stands for the folder of pictures.
+        Arguments.
     full, quick : tuple of str
         More of them at full size, or with small frames.
     limit_s : float
@@ -31,8 +34,6 @@ class Step:
         Whether it prints one JSON object.
     rows_file : str
         Where it keeps rows as they come, for a run that is ended early.
-    pictures : tuple of str
-        Pictures that it writes into the tree.
     needs_torch : bool
     """
 
@@ -45,103 +46,99 @@ class Step:
     quick: tuple[str, ...] = ()
     is_json: bool = True
     rows_file: str = ""
-    pictures: tuple[str, ...] = ()
     needs_torch: bool = False
 
-    def command(self, pictures: Path, *, is_quick: bool) -> tuple[str, ...]:
+    def command(self, *, is_quick: bool) -> tuple[str, ...]:
         """Return module and arguments."""
-        words = (*self.words, *(self.quick if is_quick else self.full))
-        return (self.module, *(word.format(pictures=pictures) for word in words))
+        return (self.module, *self.words, *(self.quick if is_quick else self.full))
 
 
 def all_steps(tree: Path) -> tuple[Step, ...]:
     """Return every step of a run, in order."""
     return (
-        Step("machine", "what is here", KIT + "machine", limit_s=60.0),
+        Step("machine", "what is here", KIT + "machine", limit_s=15.0),
         Step(
             "compile",
             "numba's loops, once on a machine",
             "filter_service.filtering.compile_loops",
-            limit_s=120.0,
+            limit_s=45.0,
             is_json=False,
         ),
         Step(
             "gpu",
-            "frames at 720p",
+            "frames at 720p, in textures and arrays",
             BENCHES + "bench_gpu",
-            limit_s=80.0,
+            limit_s=75.0,
             words=("--json", "--views", "1280x720"),
             quick=("--quick",),
+            rows_file="out/gpu_rows.jsonl",
         ),
         Step(
             "stereo",
-            "frames of two eyes at 1832x1920",
+            "the same of two eyes at 1832x1920",
             BENCHES + "bench_gpu",
-            limit_s=80.0,
+            limit_s=95.0,
             words=("--json", "--views", "2 x 1832x1920"),
             quick=("--quick",),
+            rows_file="out/gpu_rows.jsonl",
         ),
         Step(
             "tests",
             "tests marked gpu",
             "pytest",
-            limit_s=60.0,
+            limit_s=30.0,
             words=("-q", "-m", "gpu", *gpu_test_files(tree)),
             is_json=False,
         ),
         Step(
-            "render",
-            "passes, beside the sorted gather",
-            BENCHES + "bench_render",
-            limit_s=90.0,
-            words=GL,
-            quick=("--quick",),
+            "textures",
+            "tests of frames in textures",
+            "pytest",
+            limit_s=35.0,
+            words=("-q", *TEXTURE_TESTS),
+            is_json=False,
         ),
         Step(
-            "pictures",
-            "pictures through three eyes",
-            KIT + "pictures",
+            "sharing",
+            "tests of textures between processes",
+            "pytest",
+            limit_s=25.0,
+            words=("-q", *SHARING_TESTS),
+            is_json=False,
+        ),
+        Step(
+            "headset",
+            "a headset's frames, in textures and arrays, and by a service",
+            BENCHES + "bench_headset",
+            limit_s=55.0,
+            words=("--json",),
+            full=("--sizes", "1832x1920"),
+            quick=("--quick",),
+            rows_file="out/headset_rows.jsonl",
+        ),
+        Step(
+            "host",
+            "the processor's time of a frame",
+            BENCHES + "bench_host",
             limit_s=40.0,
-            words=("{pictures}", "--size"),
-            full=("1280x720",),
-            quick=("192x108",),
+            words=("--json",),
+            quick=("--quick",),
         ),
         Step(
-            "switch",
-            "from a profile to the first frame",
-            BENCHES + "bench_switch",
-            limit_s=70.0,
-            words=("--json", "--mode", "dynamic", "--eyes", "keratoconus"),
-            quick=("--quick",),
+            "periphery",
+            "merging that follows the gaze",
+            BENCHES + "bench_periphery",
+            limit_s=20.0,
+            words=("--json", "--quick"),
         ),
         Step(
             "training",
             "a data set, a short training",
             KIT + "short_training",
-            limit_s=70.0,
+            limit_s=40.0,
             full=("tests/gpu_kit/short.toml",),
             quick=("tests/gpu_kit/quick.toml",),
             needs_torch=True,
-        ),
-        Step(
-            "field",
-            "rows at 720p against the dense reference",
-            BENCHES + "bench_field",
-            limit_s=90.0,
-            words=(*GL, "--plot"),
-            full=(*FIELD, "--methods", "ours"),
-            quick=("--quick", "--methods", "ours on-axis", "ours dynamic"),
-            rows_file="out/field_rows.jsonl",
-            pictures=("out/field.png",),
-        ),
-        Step(
-            "cost",
-            "time against blur radius",
-            BENCHES + "bench_cost",
-            limit_s=70.0,
-            words=RADIUS,
-            quick=("--quick",),
-            pictures=("out/cost.png",),
         ),
     )
 

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.gpu_kit.run import Run
+from tests.gpu_kit.goals import read_goals
+from tests.gpu_kit.run import BUDGET_S, Run
 from tests.gpu_kit.runner import DONE, FAILED, LEFT_OUT, NOT_BEGUN, Budget
-from tests.gpu_kit.steps import Step
+from tests.gpu_kit.steps import Step, all_steps
+from tests.source_tree import ROOT
 
 ROWS = {"gl_renderer": "Card 9", "torch": "", "rows": [{"method": "a", "n": 1}]}
 
@@ -82,3 +84,9 @@ def test_rows_that_a_step_kept_count_where_it_fails(tmp_path, monkeypatch):
     content = start(new_run(tmp_path), step)
     assert content["step"]["state"] == FAILED
     assert content["rows"] == [{"method": "a", "error": 46.0}]
+
+
+def test_every_step_has_time_and_every_goal_a_step():
+    steps = all_steps(ROOT)
+    assert sum(step.limit_s for step in steps) <= BUDGET_S
+    assert {goal.step for goal in read_goals()} <= {step.name for step in steps}
