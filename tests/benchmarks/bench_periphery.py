@@ -64,6 +64,9 @@ GL_CASES = (("courtyard", "emmetropia"), ("courtyard", "-6 dpt"))
 """A frame takes seconds on llvmpipe, whose memory does not suffice for keratoconus."""
 
 QUICK_SIZES = {"96x100": ((96, 100), 96.0)}
+QUICK_SCENES = SCENES[:2]
+"""Those without a photograph, which comes with scikit-image."""
+
 GAZE_DEG = (0.0, 0.0)
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 FOVEAL_SENSITIVITY = {8.0: 246.0, 4.0: 334.0, 2.0: 334.0, 1.0: 260.0}
@@ -147,10 +150,10 @@ def view_of(name: str, size_px: tuple[int, int], fov_deg: float) -> RgbdView:
     )
 
 
-def scenes_of(sizes: dict, eyes: dict) -> Iterator[Scene]:
+def scenes_of(names: tuple[str, ...], sizes: dict, eyes: dict) -> Iterator[Scene]:
     """Yield each scene through each eye."""
     for size, (size_px, fov_deg) in sizes.items():
-        views = {name: view_of(name, size_px, fov_deg) for name in SCENES}
+        views = {name: view_of(name, size_px, fov_deg) for name in names}
         for eye, profile in eyes.items():
             spec = grid_spec(
                 width_px=size_px[0],
@@ -337,7 +340,8 @@ def main() -> None:
     engines = {"native": (NativeRenderer(), None), "gl": (FilterRenderer(gpu), gpu)}
     rows: list[Row] = []
     flicker: list[FlickerRow] = []
-    for scene in scenes_of(QUICK_SIZES if is_quick else SIZES, eyes):
+    names, sizes = (QUICK_SCENES, QUICK_SIZES) if is_quick else (SCENES, SIZES)
+    for scene in scenes_of(names, sizes, eyes):
         rows += rows_of(scene, engines, is_quick=is_quick)
         if scene.eye == "emmetropia":
             flicker += flicker_of(scene, engines["native"][0])
