@@ -61,7 +61,7 @@ def all_steps(tree: Path) -> tuple[Step, ...]:
             "compile",
             "numba's loops, once on a machine",
             "filter_service.filtering.compile_loops",
-            limit_s=45.0,
+            limit_s=55.0,
             is_json=False,
         ),
         Step(
@@ -120,7 +120,7 @@ def all_steps(tree: Path) -> tuple[Step, ...]:
             "host",
             "the processor's time of a frame",
             BENCHES + "bench_host",
-            limit_s=40.0,
+            limit_s=30.0,
             words=("--json",),
             quick=("--quick",),
         ),
