@@ -14,10 +14,9 @@ of a similar one, or their bound and the time of empty dispatches.
   times the kernels that they used (FORESEEN_RATIO).
 - Around the passes of arrays: the time of gpu.json for a state that stays, so much per
   view and pixel; a change adds what it adds to the processor's time in host.json.
-- Frames of textures: the passes plus the processor's time to submit them, for which
-  that of frames of arrays without copies stands (``rest`` of host.json, on its
-  processor and at its commit).  Where the GPU works meanwhile, a frame takes less, at
-  least the longer of the two (``low_ms``).
+- Frames of textures: the passes plus the processor's time to submit them (host.json,
+  on its processor).  Where the GPU works meanwhile, a frame takes less, at least the
+  longer of the two (``low_ms``).
 
 ``off``: each eye's times by the prices of the other two eyes, the largest deviation.
 
@@ -114,10 +113,10 @@ class Measured:
         return ratio * self._row_ms(case, stage, "moving")
 
     def host_ms(self, view_count: int, how: str, *, part: str) -> float:
-        """Processor's time of a part of a frame: that of the slowest eye there."""
+        """Processor's time of a part of a frame: of the eye with less load beside."""
         name = next(n for n, (_, count) in VIEWS.items() if count == view_count)
         start = f"{name} {how}"
-        return max(
+        return min(
             float(row["median_ms"])
             for row in self._host
             if row["method"] == part and row["setting"].split(";")[0] == start
@@ -184,7 +183,7 @@ class Forecast:
         views = round(work.views)
         if is_textures:
             how = "moving" if is_moving else "frozen"
-            return self._measured.host_ms(views, how, part="rest")
+            return self._measured.host_ms(views, f"textures {how}", part="all")
         stays_ms, changes_ms = (
             self._measured.host_ms(views, how, part="rest")
             for how in ("frozen", "moving")
