@@ -39,6 +39,7 @@ class Planned:
         bits[:, : used.shape[1]] = used
         with self.gpu.context:
             self.run = self.passes.begin(self.handle, self.state, StageTimer(self.gpu))
+            self.run.clear()
             self.gpu.write(
                 self.run.buffers["USED"], np.packbits(bits, bitorder="little")
             )

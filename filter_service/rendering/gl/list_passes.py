@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import (
+    BATCH,
     DISPATCH_BYTES,
     DISPATCH_COUNT,
     DISPATCH_SCATTER,
@@ -46,6 +47,10 @@ threads that load 128 fragments to shared memory and fetch one texel at a time."
 HARDWARE_STRETCH_SLOTS = 16
 """Slots of a block per thread.  A bin has more threads than blocks in its window, so
 that blocks are divided; a software renderer processes whole blocks."""
+
+SPARE_ENTRIES = BATCH
+"""Entries of a list buffer that lists never fill.  ``splat_tiles`` reads a batch of
+entries up to the end of its list, but zink loads all of the batch."""
 
 SOFTWARE_LIST_THREADS = 8
 """Threads per bin on a software renderer: one vector."""
@@ -108,7 +113,7 @@ class ListPasses:
         """Capacities of the two list buffers, in entries, for a single band."""
         entries, spare = (
             min(
-                self.strip.buffers[name].size // ENTRY_BYTES,
+                self.strip.buffers[name].size // ENTRY_BYTES - SPARE_ENTRIES,
                 self._list_limit,
             )
             for name in ("ENTRIES", "ENTRIES_SPARE")
@@ -122,8 +127,8 @@ class ListPasses:
             WINDOWS=16 * self.strip.bin_count,
             BIN_OFFSETS=4 * (self.strip.bin_count + TOTAL_WORDS),
             DISPATCHES=DISPATCH_BYTES * DISPATCH_COUNT,
-            ENTRIES=16,
-            ENTRIES_SPARE=16,
+            ENTRIES=_list_bytes(0),
+            ENTRIES_SPARE=_list_bytes(0),
         )
         entry_capacity, spare_capacity = self.capacities
         with self.strip.timer.stage("bin_ms"):
@@ -157,7 +162,7 @@ class ListPasses:
     @property
     def _list_limit(self) -> int:
         """Capacity of a band, and of one list, in entries."""
-        fit = self.strip.gpu.max_block_bytes // ENTRY_BYTES
+        fit = self.strip.gpu.max_block_bytes // ENTRY_BYTES - SPARE_ENTRIES
         return fit if self._is_late else min(list_bands.MAX_BAND_ENTRIES, fit)
 
     def _plan_bands(self) -> list[tuple[int, int, int]]:
@@ -181,17 +186,18 @@ class ListPasses:
         """Divide the lists into bands, and allocate buffers for the longest."""
         with self.strip.timer.wall("plan_ms"):
             self.bands = self._plan_bands()
-        n_bytes = ENTRY_BYTES * max(entries for _, _, entries in self.bands)
+        n_bytes = _list_bytes(max(entries for _, _, entries in self.bands))
         self.strip.reserve(ENTRIES=n_bytes)
         needs_spare = self.lists.longest > SORT_CAPACITIES[-1]
-        self.strip.reserve(ENTRIES_SPARE=n_bytes if needs_spare else 0)
+        if needs_spare:
+            self.strip.reserve(ENTRIES_SPARE=n_bytes)
 
     def reserve_more(self, ratio: float) -> None:
         """Enlarge the buffers to a multiple of the recorded totals, if necessary."""
         entries = min(int(ratio * self.lists.entry_count), self._list_limit)
-        self.strip.reserve(ENTRIES=ENTRY_BYTES * entries)
+        self.strip.reserve(ENTRIES=_list_bytes(entries))
         if self.lists.longest > SORT_CAPACITIES[-1]:
-            self.strip.reserve(ENTRIES_SPARE=ENTRY_BYTES * entries)
+            self.strip.reserve(ENTRIES_SPARE=_list_bytes(entries))
 
     def splat_bands(self) -> None:
         """Build, sort and splat the lists, band by band."""
@@ -288,3 +294,8 @@ class ListPasses:
             "entry_count": self.lists.entry_count,
             "overflow_count": self.lists.overflow_count,
         }
+
+
+def _list_bytes(n_entries: int) -> int:
+    """Return the size of a buffer for lists of a number of entries."""
+    return ENTRY_BYTES * (n_entries + SPARE_ENTRIES)
