@@ -10,9 +10,10 @@ import numpy as np
 
 from estimator.profiles.parse import parse_profile
 from filter_service.gl.current_context import CurrentContext
-from filter_service.gl.gpu import Gpu, Query
+from filter_service.gl.gpu import Gpu
 from filter_service.gl.stage_timer import StageTimer
 from filter_service.gl.texture_io import TextureIo
+from filter_service.gl.timer_query import TimerQuery
 from filter_service.planning.grid import GridSpec
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import PsfStore, build_psf_store
@@ -169,11 +170,11 @@ class TextureCase:
         self._gpu.context.finish()
         return 1e3 * (time.perf_counter() - start_s), {"call": call_ms}
 
-    def gpu_ms(self, state: dict, query: Query) -> float:
+    def gpu_ms(self, state: dict, query: TimerQuery) -> float:
         """Return the time of a frame from its first to its last command, ms."""
         with query:
             self.submit(state)
-        return query.elapsed / 1e6
+        return query.elapsed_ns / 1e6
 
     def passes_ms(self, state: dict) -> dict[str, float]:
         """Return the times of a frame's passes, ms."""
@@ -201,9 +202,9 @@ class TextureCase:
             self.submit(state)
         return timer.result_ms()
 
-    def new_query(self) -> Query:
-        """Return a timer query of the context."""
-        return self._gpu.context.query(time=True)
+    def new_query(self) -> TimerQuery:
+        """Return a timer query of the context, which closes with it."""
+        return self._gpu.acquire_query()
 
     def release(self) -> None:
         """Release all objects of the context."""
