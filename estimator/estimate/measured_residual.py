@@ -139,7 +139,9 @@ class MeasuredResidual:
     def on_axis_dpt(self, pupil_diameter_mm: float) -> float:
         """Return M at 555 nm of `on_axis_um` in a pupil."""
         radius_mm = pupil_diameter_mm / 2.0
-        stretch = float(stretch_ratio(np.array(radius_mm / self.radius_mm)))
+        pupil_ratio, stretch = radius_mm / self.radius_mm, 1.0
+        if pupil_ratio > 1.0:
+            stretch = float(stretch_ratio(np.array(pupil_ratio)))
         measured_um, color_um = self._on_axis_c20
         degrees = zip(C20_DEGREES, measured_um, color_um, strict=True)
         return -SPHERE_PER_C20 * sum(
