@@ -53,6 +53,9 @@ class GlTexture:
         "d32f" or "d24" (with or without stencil), or "r32f".
     layer : int, optional
         Layer of an array.
+    is_renderbuffer : bool
+        Whether the name is of a renderbuffer.  Each frame copies it to a texture, which
+        resolves several samples per pixel; a target is drawn to.
 
     Raises
     ------
@@ -63,6 +66,7 @@ class GlTexture:
     name: int
     format: ColorFormat | DepthFormat
     layer: int | None = None
+    is_renderbuffer: bool = False
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -74,8 +78,9 @@ class GlTexture:
                 field="format",
                 allowed=", ".join((*COLOR_FORMATS, *DEPTH_FORMATS)),
             )
-        if self.layer is not None and self.layer < 0:
-            raise BadMessage(f"{self.layer}", field="layer", allowed="0 or more")
+        if self.layer is not None and (self.layer < 0 or self.is_renderbuffer):
+            allowed = "None for a renderbuffer" if self.is_renderbuffer else "0 or more"
+            raise BadMessage(f"{self.layer}", field="layer", allowed=allowed)
 
 
 @dataclass(frozen=True)

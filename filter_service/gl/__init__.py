@@ -10,6 +10,7 @@ hardware           detection of GPUs
 imported_textures  textures in memory of another process
 kept_state         state of the caller that passes leave as it is
 passes             compilation and dispatch of compute passes
+renderbuffers      renderbuffers of the caller, and copies to sample
 shader_source      shader preprocessor: includes, defines, line numbers
 stage_timer        times of a frame's stages
 staging            persistently mapped memory for uploads and readbacks

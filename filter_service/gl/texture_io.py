@@ -1,6 +1,7 @@
 """Textures of the caller as input and output of passes, in its own context."""
 
 import ctypes
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,7 +9,8 @@ import moderngl
 
 from filter_service.constants import TEXTURE_COLOR
 from filter_service.errors import BadMessage, RenderFailed
-from filter_service.texture_view import GlTexture
+from filter_service.gl.renderbuffers import GL_RENDERBUFFER, Renderbuffers
+from filter_service.texture_view import GlTexture, TextureView
 
 GL_TEXTURE_2D, GL_TEXTURE_2D_ARRAY, GL_TEXTURE0 = 0x0DE1, 0x8C1A, 0x84C0
 GL_TEXTURE_WIDTH, GL_TEXTURE_HEIGHT, GL_TEXTURE_DEPTH = 0x1000, 0x1001, 0x8071
@@ -87,6 +89,7 @@ class TextureIo:
         self._framebuffer = ctypes.c_uint(0)
         functions.glGenFramebuffers(1, ctypes.byref(self._framebuffer))
         self._checked: set[tuple[Any, ...]] = set()
+        self._renderbuffers = Renderbuffers(functions)
 
     def release(self) -> None:
         """Free the OpenGL objects."""
@@ -94,13 +97,33 @@ class TextureIo:
             triangle.release()
         self._gl.glDeleteSamplers(1, ctypes.byref(self._sampler))
         self._gl.glDeleteFramebuffers(1, ctypes.byref(self._framebuffer))
+        self._renderbuffers.release()
+
+    def in_textures(self, view: TextureView) -> TextureView:
+        """Return a view with renderbuffers copied to textures, for one frame.
+
+        Raises
+        ------
+        RenderFailed
+            OpenGL cannot copy them.
+        """
+        size_px = view.width_px, view.height_px
+        if not (view.color.is_renderbuffer or view.depth.is_renderbuffer):
+            return view
+        color, depth = (
+            self._renderbuffers.copied(image, size_px)
+            if image.is_renderbuffer
+            else image
+            for image in (view.color, view.depth)
+        )
+        return replace(view, color=color, depth=depth)
 
     def input(self, texture: GlTexture) -> BoundTexture:
         """Return a texture that passes can sample."""
         return BoundTexture(self._gl, texture, self._sampler.value)
 
     def check(self, texture: GlTexture, size_px: tuple[int, int], field: str) -> None:
-        """Check size and format of a texture, once for each.
+        """Check size and format of a texture or renderbuffer, once for each.
 
         Raises
         ------
@@ -109,11 +132,44 @@ class TextureIo:
         key = texture, size_px
         if key in self._checked:
             return
-        gl, target = self._gl, target_of(texture)
-        if not gl.glIsTexture(texture.name):
+        kind = "renderbuffer" if texture.is_renderbuffer else "texture"
+        exists = (
+            self._gl.glIsRenderbuffer
+            if texture.is_renderbuffer
+            else self._gl.glIsTexture
+        )
+        if not exists(texture.name):
             raise BadMessage(
-                f"{texture.name}", field=f"{field}.name", allowed="an existing texture"
+                f"{texture.name}", field=f"{field}.name", allowed=f"an existing {kind}"
             )
+        found_px, internal = (
+            self._renderbuffers.properties(texture.name)
+            if texture.is_renderbuffer
+            else self._properties(texture, field)
+        )
+        if found_px != size_px:
+            raise BadMessage(
+                f"{kind} {texture.name} has {found_px[0]}x{found_px[1]} px",
+                field=field,
+                allowed=f"{size_px[0]}x{size_px[1]} px, the size of the view",
+            )
+        if internal not in INTERNAL_FORMATS[texture.format]:
+            known = [
+                name for name, all_ in INTERNAL_FORMATS.items() if internal in all_
+            ]
+            raise BadMessage(
+                f"{kind} {texture.name} is of internal format "
+                f"{known[0] if known else hex(internal)}",
+                field=f"{field}.format",
+                allowed=f"{texture.format}, as declared",
+            )
+        self._checked.add(key)
+
+    def _properties(
+        self, texture: GlTexture, field: str
+    ) -> tuple[tuple[int, int], int]:
+        """Return size and internal format of a texture; check its target and layer."""
+        gl, target = self._gl, target_of(texture)
         gl.glGetError()
         gl.glActiveTexture(GL_TEXTURE0 + TEXTURE_COLOR)  # a unit that is kept
         gl.glBindTexture(target, texture.name)
@@ -124,33 +180,18 @@ class TextureIo:
                 field=f"{field}.name",
                 allowed=f"a {kind}",
             )
-        found_px = tuple(
+        width_px, height_px, layers, internal = (
             self._parameter(target, name)
-            for name in (GL_TEXTURE_WIDTH, GL_TEXTURE_HEIGHT)
+            for name in (
+                *(GL_TEXTURE_WIDTH, GL_TEXTURE_HEIGHT, GL_TEXTURE_DEPTH),
+                GL_TEXTURE_INTERNAL_FORMAT,
+            )
         )
-        internal = self._parameter(target, GL_TEXTURE_INTERNAL_FORMAT)
-        layers = self._parameter(target, GL_TEXTURE_DEPTH)
-        if found_px != size_px:
-            raise BadMessage(
-                f"texture {texture.name} has {found_px[0]}x{found_px[1]} px",
-                field=field,
-                allowed=f"{size_px[0]}x{size_px[1]} px, the size of the view",
-            )
-        if internal not in INTERNAL_FORMATS[texture.format]:
-            known = [
-                name for name, all_ in INTERNAL_FORMATS.items() if internal in all_
-            ]
-            raise BadMessage(
-                f"texture {texture.name} is of internal format "
-                f"{known[0] if known else hex(internal)}",
-                field=f"{field}.format",
-                allowed=f"{texture.format}, as declared",
-            )
         if texture.layer is not None and texture.layer >= layers:
             raise BadMessage(
                 f"{texture.layer}", field=f"{field}.layer", allowed=f"0 to {layers - 1}"
             )
-        self._checked.add(key)
+        return (width_px, height_px), internal
 
     def forget(self) -> None:
         """Check all textures again: names of deleted textures are used for others."""
@@ -178,7 +219,12 @@ class TextureIo:
         gl.glFramebufferTexture2D(
             *(GL_DRAW_FRAMEBUFFER, GL_COLOR_ATTACHMENT0, GL_TEXTURE_2D, 0, 0)
         )
-        if texture.layer is None:
+        if texture.is_renderbuffer:
+            gl.glFramebufferRenderbuffer(
+                *(GL_DRAW_FRAMEBUFFER, GL_COLOR_ATTACHMENT0),
+                *(GL_RENDERBUFFER, texture.name),
+            )
+        elif texture.layer is None:
             gl.glFramebufferTexture2D(
                 *(GL_DRAW_FRAMEBUFFER, GL_COLOR_ATTACHMENT0, GL_TEXTURE_2D),
                 *(texture.name, 0),
@@ -191,7 +237,8 @@ class TextureIo:
         status = gl.glCheckFramebufferStatus(GL_DRAW_FRAMEBUFFER)
         if status != GL_FRAMEBUFFER_COMPLETE:
             raise RenderFailed(
-                f"cannot draw to texture {texture.name}: framebuffer status {status:#x}"
+                f"cannot draw to {_kind(texture)} {texture.name}: framebuffer status "
+                f"{status:#x}"
             )
         gl.glViewportIndexedf(0, 0.0, 0.0, *map(float, size_px))
         triangle = self._triangles.get(program)
@@ -207,3 +254,7 @@ class TextureIo:
 def target_of(texture: GlTexture) -> int:
     """Return the OpenGL target of a texture."""
     return GL_TEXTURE_2D if texture.layer is None else GL_TEXTURE_2D_ARRAY
+
+
+def _kind(texture: GlTexture) -> str:
+    return "renderbuffer" if texture.is_renderbuffer else "texture"

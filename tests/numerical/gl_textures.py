@@ -13,7 +13,7 @@ from filter_service.rendering.white_level import white_level
 from filter_service.rgbd_view import RgbdView
 from filter_service.texture_view import DepthProjection, GlTexture, TextureView
 
-TEXTURE_2D, TEXTURE_2D_ARRAY = 0x0DE1, 0x8C1A
+TEXTURE_2D, TEXTURE_2D_ARRAY, RENDERBUFFER = 0x0DE1, 0x8C1A, 0x8D41
 FORMATS = {
     # internal format, format and type of the pixels, their dtype and channels
     "rgba8": (0x8058, 0x1908, 0x1401, np.uint8, 4),
@@ -35,6 +35,16 @@ _PROTOTYPES = {
     "glTexSubImage2D": (_uint, *(_int,) * 5, _uint, _uint, _pointer),
     "glTexSubImage3D": (_uint, *(_int,) * 7, _uint, _uint, _pointer),
     "glGetTexImage": (_uint, _int, _uint, _uint, _pointer),
+    "glGenRenderbuffers": (_int, _pointer),
+    "glDeleteRenderbuffers": (_int, _pointer),
+    "glBindRenderbuffer": (_uint, _uint),
+    "glRenderbufferStorageMultisample": (_uint, _int, _uint, _int, _int),
+    "glGenFramebuffers": (_int, _pointer),
+    "glDeleteFramebuffers": (_int, _pointer),
+    "glBindFramebuffer": (_uint, _uint),
+    "glFramebufferTexture2D": (_uint, _uint, _uint, _uint, _int),
+    "glFramebufferRenderbuffer": (_uint, _uint, _uint, _uint),
+    "glBlitFramebuffer": (*(_int,) * 8, _uint, _uint),
 }
 
 SETS = (
@@ -102,9 +112,52 @@ class Textures:
         self.glGetTexImage(target, 0, form, kind_of, found.ctypes.data)
         return found[texture.layer or 0]
 
+    def renderbuffer(self, texture, size_px, *, sample_count=0):
+        """Return a renderbuffer with the contents of a texture."""
+        name = _uint()
+        self.glGenRenderbuffers(1, ctypes.byref(name))
+        self.glBindRenderbuffer(RENDERBUFFER, name.value)
+        self.glRenderbufferStorageMultisample(
+            RENDERBUFFER, sample_count, FORMATS[texture.format][0], *size_px
+        )
+        found = GlTexture(name.value, texture.format, is_renderbuffer=True)
+        self._blit(texture, found, size_px)
+        return found
+
+    def texture_of(self, renderbuffer, size_px):
+        """Return a texture with the contents of a renderbuffer."""
+        found = self.new(renderbuffer.format, size_px)
+        self._blit(renderbuffer, found, size_px)
+        return found
+
+    def _blit(self, source, target, size_px):
+        is_depth = source.format in ("d32f", "d24")
+        attachment, mask = (0x8D00, 0x100) if is_depth else (0x8CE0, 0x4000)
+        names = (_uint * 2)()
+        self.glGenFramebuffers(2, names)
+        for where, name, image in zip(
+            (0x8CA8, 0x8CA9), names, (source, target), strict=True
+        ):
+            self.glBindFramebuffer(where, name)
+            if image.is_renderbuffer:
+                self.glFramebufferRenderbuffer(
+                    where, attachment, RENDERBUFFER, image.name
+                )
+            else:
+                self.glFramebufferTexture2D(
+                    where, attachment, TEXTURE_2D, image.name, 0
+                )
+        self.glBlitFramebuffer(0, 0, *size_px, 0, 0, *size_px, mask, 0x2600)
+        self.glDeleteFramebuffers(2, names)
+
     def delete(self, texture):
-        """Delete a texture."""
-        self.glDeleteTextures(1, ctypes.byref(_uint(texture.name)))
+        """Delete a texture or a renderbuffer."""
+        delete = (
+            self.glDeleteRenderbuffers
+            if texture.is_renderbuffer
+            else self.glDeleteTextures
+        )
+        delete(1, ctypes.byref(_uint(texture.name)))
 
 
 def arrays_of(view, formats):

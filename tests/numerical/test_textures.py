@@ -1,6 +1,7 @@
 """Frames from textures to textures, against frames of arrays."""
 
 import ctypes
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -117,6 +118,66 @@ def bench_white(color):
     from filter_service.rendering.white_level import white_level
 
     return white_level(color)
+
+
+@pytest.mark.parametrize("sample_count", [0, 4])
+@pytest.mark.parametrize(
+    ("color_kind", "depth_kind"),
+    [("rgba8", "d32f"), ("srgb8_a8", "d24"), ("rgba16f", "r32f")],
+)
+def test_renderbuffers(caller, color, color_kind, depth_kind, sample_count):
+    """Every byte is that of a frame in textures with the same contents."""
+    textures, values = caller.textures, {}
+    depth_m, shown = depth_scene(), color
+    if color_kind == "rgba16f":
+        shown = linear_from_srgb(color).astype(np.float16)
+    stored = depth_m
+    if depth_kind != "r32f":
+        values["projection"] = DepthProjection(0.2)
+        stored = (1.0 / 0.2 - 1.0 / depth_m) * 0.2
+    if depth_kind == "d24":
+        stored = np.round(stored.astype(float) * (2**32 - 1)).astype(np.uint32)
+    in_textures = TextureView(
+        textures.new(color_kind, SIZE_PX, with_alpha(shown, shown[..., 0])),
+        textures.new(depth_kind, SIZE_PX, stored),
+        *SIZE_PX,
+        caller.bench.tangents,
+        **values,
+    )
+    target = textures.new(color_kind, SIZE_PX)
+    for _ in range(2):
+        caller.filter(in_textures, target)
+    expected = textures.read(target, SIZE_PX)
+    color_buffer, depth_buffer = (
+        textures.renderbuffer(image, SIZE_PX, sample_count=sample_count)
+        for image in (in_textures.color, in_textures.depth)
+    )
+    drawn = textures.renderbuffer(target, SIZE_PX, sample_count=sample_count)
+    caller.gpu.functions.glBindRenderbuffer(0x8D41, depth_buffer.name)
+    view = replace(in_textures, color=color_buffer, depth=depth_buffer)
+    bad = replace(in_textures, color=replace(color_buffer, name=999))
+    with pytest.raises(BadMessage, match="an existing renderbuffer"):
+        caller.filter(bad, target)
+    for into in (target, drawn):
+        caller.filter(in_textures, target)  # other contents of what is shared
+        caller.filter(view, into)
+        found = textures.texture_of(into, SIZE_PX) if into is drawn else into
+        np.testing.assert_array_equal(textures.read(found, SIZE_PX), expected)
+    bound = ctypes.c_int(0)
+    caller.gpu.functions.glGetIntegerv(0x8CA7, ctypes.byref(bound))
+    assert bound.value == depth_buffer.name
+    assert caller.gpu.functions.glGetError() == 0
+
+
+def test_a_renderbuffer_of_another_kind_is_refused(caller, color):
+    depth_m = depth_scene()
+    view = caller.view(color, depth_m)
+    buffer = caller.textures.renderbuffer(view.color, SIZE_PX)
+    declared = replace(buffer, format="rgba16f")
+    with pytest.raises(BadMessage, match="is of internal format rgba8"):
+        caller.filter(replace(view, color=declared), view.color)
+    with pytest.raises(BadMessage, match="None for a renderbuffer"):
+        replace(buffer, layer=1)
 
 
 @pytest.mark.parametrize("far_m", [50.0, np.inf])

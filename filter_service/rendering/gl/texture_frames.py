@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -195,6 +195,7 @@ class TextureFrames:
     ) -> tuple[FrameLayers, EarlierFrame | None]:
         """Filter a frame; return its layers, and the counters of an earlier one."""
         self._read_finished()
+        request = replace(request, view=self._io.in_textures(request.view))
         timer = Untimed()
         layers = eye.states.layers(
             timer,
