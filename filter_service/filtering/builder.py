@@ -158,6 +158,7 @@ class Builder:
             self.streams.remove(stream)
         self.cancel(stream)
         stream.end()
+        stream.begun_count = 0
         self.free_retired(stream)
 
     def close(self) -> None:
@@ -173,7 +174,9 @@ class Builder:
         stream.ticket = stream.building = None
 
     def free_retired(self, stream: StreamEyes) -> None:
-        """Free the stores that a stream has retired."""
+        """Free the stores that a stream has retired, unless frames are unfinished."""
+        if stream.begun_count:
+            return
         for store in stream.retired:
             store.release()
         self._released += stream.retired

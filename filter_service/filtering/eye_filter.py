@@ -452,6 +452,55 @@ class EyeFilter:
         RenderError
             If the engine failed.
         """
+        try:
+            finish = self.begin(
+                views,
+                pupil_diameter_mm=pupil_diameter_mm,
+                focus_dpt=focus_dpt,
+                gaze_deg=gaze_deg,
+                output=output,
+                newest_only=newest_only,
+                until_s=until_s,
+                out=out,
+                **options,
+            )
+            return None if finish is None else finish()
+        except NotPrepared:
+            self.is_extending = True
+            return None
+
+    def begin(
+        self,
+        views: Sequence[RgbdView],
+        *,
+        pupil_diameter_mm: float,
+        focus_dpt: float,
+        gaze_deg: tuple[float, float] | None = None,
+        output: Output = "srgb8",
+        newest_only: bool = False,
+        until_s: float | None = None,
+        out: Sequence[NDArray[Any] | None] | None = None,
+        **options: Unpack[RenderOptionValues],
+    ) -> Callable[[], Filtered] | None:
+        """Start one frame; return a function that waits for it and returns the result.
+
+        On a hardware GPU, the CPU is free until then: to render, to begin the frame of
+        the other eye, or to begin the next frame, whose images are copied while the GPU
+        filters this one.  Other engines filter the frame at once.
+
+        The parameters and errors are those of `try_filter`, which waits.
+
+        Returns
+        -------
+        callable or None
+            None while the eye is being prepared.
+
+        Raises
+        ------
+        NotPrepared
+            If PSFs were not computed by ``until_s``.  The returned function may also
+            raise it.
+        """
         self.advance_builds()
         if gaze_deg is not None:
             gaze_deg = checked(gaze_deg, tuple[GazeDeg, GazeDeg], "gaze_deg")
@@ -464,17 +513,13 @@ class EyeFilter:
         )
         if planned is None:
             return None
-        try:
-            return planned.render(
-                gazes_deg=[gaze_deg] * len(views),
-                output=output,
-                options=RenderOptions(**options),
-                out=out,
-                until_s=until_s,
-            )
-        except NotPrepared:
-            self.is_extending = True
-            return None
+        return planned.begin(
+            gazes_deg=[gaze_deg] * len(views),
+            output=output,
+            options=RenderOptions(**options),
+            out=out,
+            until_s=until_s,
+        )
 
     def filter_textures(
         self,

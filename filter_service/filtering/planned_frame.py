@@ -101,9 +101,11 @@ class PlannedFrame:
                 self.views, plan.stores, gazes_deg, arrays, strict=True
             )
         ]
+        self.stream.begun_count += 1  # so that no store of it is freed
         return partial(self._finish, begun, started_s)
 
     def _finish(self, begun: Sequence[Pending], started_s: float) -> Filtered:
+        self.stream.begun_count = max(self.stream.begun_count - 1, 0)
         rendered = [finish() for finish in begun]
         self.builder.frame_s = time.monotonic() - started_s
         self.builder.mark_rendered(self.stream, self.plan)

@@ -58,6 +58,8 @@ class StreamEyes:
         The newest one and, while that is not ready, the previous one.
     retired : list of LoadedStore
         Stores to be released.
+    begun_count : int
+        Number of frames that are begun and not finished.
     history : FrameHistory
         Last frames.
     """
@@ -70,6 +72,7 @@ class StreamEyes:
     building: BuildTarget | None = None
     eyes: list[AcceptedProfile] = field(default_factory=list)
     retired: list[LoadedStore] = field(default_factory=list)
+    begun_count: int = 0
     history: FrameHistory = field(default_factory=FrameHistory)
     _n_accepted: int = 0
     _last_cameras: tuple[Camera, ...] = ()

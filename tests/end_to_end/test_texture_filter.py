@@ -10,6 +10,7 @@ from filter_service import (
     DepthProjection,
     EyeFilter,
     GlTexture,
+    RgbdView,
     TextureView,
 )
 from filter_service.errors import RenderFailed
@@ -149,3 +150,42 @@ def test_a_context_that_is_gone_is_an_error_and_no_crash(scene):
         view, target = texture_view(textures, scene), textures.new("rgba8", SIZE_PX)
         with EyeFilter("myopia", scene.camera, SETTINGS, gl_context="current") as eye:
             frame_of(eye, view, target)
+
+
+@pytest.mark.parametrize("where", ["native", "context of the caller"])
+def test_frames_begun_early_are_those_of_filter(scene, where):
+    """Also if a new eye is prepared meanwhile, which retires the stores of the old."""
+    views = [
+        RgbdView(
+            np.ascontiguousarray(np.roll(scene.color, 9 * k, axis=1)),
+            np.ascontiguousarray(np.roll(scene.depth_m, 9 * k, axis=1)),
+            scene.tangents,
+        )
+        for k in range(4)
+    ]
+    states = [
+        {"pupil_diameter_mm": pupil_mm, "focus_dpt": focus_dpt}
+        for pupil_mm, focus_dpt in ((4.0, 0.5), (4.2, 0.7), (4.2, 0.7), (3.8, 0.2))
+    ]
+    engine = {"engine": "native"} if where == "native" else {"gl_context": "current"}
+    with (
+        callers_context(),
+        EyeFilter("myopia", scene.camera, SETTINGS, **engine) as eye,
+    ):
+        expected = [
+            eye.filter([view], **state).color
+            for view, state in zip(views, states, strict=True)
+        ]
+        begun = [
+            eye.begin([view], **state)
+            for view, state in zip(views, states, strict=True)
+        ]
+        eye.set_profile("emmetropia")
+        eye.wait()
+        other = eye.filter([views[0]], whole=True, **states[0]).color
+        for finish, color in zip(begun, expected, strict=True):
+            np.testing.assert_array_equal(finish().color, color)
+        assert (other != expected[0]).any()
+        stored = len(eye.prepared_stores)
+        eye.filter([views[0]], **states[0])  # frees what is no longer used
+        assert len(eye.prepared_stores) == stored == 1
