@@ -171,7 +171,8 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
         last = self._last_taken_off
         if last[0] != pupil_diameter_mm:
             taken_off_dpt = super()._taken_off_dpt(pupil_diameter_mm)
-            taken_off_dpt -= float(self._rest_dpt(pupil_diameter_mm)[0])
+            if self._rest is not None:
+                taken_off_dpt -= self._rest.on_axis_dpt(pupil_diameter_mm)
             self._last_taken_off = last = pupil_diameter_mm, taken_off_dpt
         return last[1]
 

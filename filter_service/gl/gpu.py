@@ -1,7 +1,7 @@
 """The OpenGL context and its memory: buffers, textures, uploads and readbacks."""
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -117,7 +117,7 @@ class Gpu:
         self.atlas_is_buffer = (
             not self.is_software and self.max_block_bytes >= ATLAS_BYTES
         )
-        self._kept_state = None
+        self._kept_state: KeptState | None = None
         if current is not None:
             if self.functions is None:
                 raise RenderFailed("the current OpenGL context lacks functions of 4.4")
@@ -295,7 +295,8 @@ class Gpu:
         size = (side, min(lines, side), count)
         if count <= limit:
             try:
-                pages = self.context.texture_array(size, 1, dtype="u2")
+                with self._transfers():
+                    pages = self.context.texture_array(size, 1, dtype="u2")
             except moderngl.Error as error:
                 raise OutOfGpuMemory(
                     f"{2e-6 * n_words:.0f} MB of PSFs: {error}"
@@ -314,11 +315,18 @@ class Gpu:
         while len(lines):
             page, row = divmod(first_line, side)
             count = min(len(lines), side - row)
-            pages.write(
-                np.ascontiguousarray(lines[:count]),
-                viewport=(0, row, page, side, count, 1),
-            )
+            with self._transfers():
+                pages.write(
+                    np.ascontiguousarray(lines[:count]),
+                    viewport=(0, row, page, side, count, 1),
+                )
             first_line, lines = first_line + count, lines[count:]
+
+    def _transfers(self) -> AbstractContextManager[None]:
+        """Return a context in which moderngl transfers pixels."""
+        if self._kept_state is None:
+            return nullcontext()
+        return self._kept_state.for_transfers()
 
     def atlas(self, name: str, n_texels: int) -> Atlas:
         """Return a named, grow-only atlas of texels of four uints.
@@ -343,7 +351,8 @@ class Gpu:
             atlas.release()
             del self._atlases[name]
             wanted = min(int(rows * GROWTH) + 1, limit)
-        atlas = self.context.texture((constants.ATLAS_WIDTH, wanted), 4, dtype="u4")
+        with self._transfers():
+            atlas = self.context.texture((constants.ATLAS_WIDTH, wanted), 4, dtype="u4")
         atlas.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._atlases[name] = atlas
         return atlas

@@ -33,10 +33,14 @@ BUFFERS = {
     0x8F36: 0x8F36,  # copy read
     0x8F37: 0x8F37,  # copy write
     0x90EE: 0x90EF,  # dispatch indirect
+}
+"""Generic bindings that moderngl and `Staging` change."""
+
+PIXEL_BUFFERS = {
     0x88EB: 0x88ED,  # pixel pack
     0x88EC: 0x88EF,  # pixel unpack
 }
-"""Generic bindings that moderngl and `Staging` change."""
+"""Generic bindings that change what transfers of pixels mean."""
 
 SWITCHES = {
     0x0BF2: "logic operation",
@@ -129,14 +133,10 @@ class KeptState:
         gl.glGetBooleani_v(GL_COLOR_WRITEMASK, 0, mask)
         switches = [name for name in SWITCHES if gl.glIsEnabled(name)]
         first = [name for name in FIRST_SWITCHES if gl.glIsEnabledi(name, 0)]
-        store = [(name, get(name)) for name in PIXEL_STORE]
         for name in switches:
             gl.glDisable(name)
         for name in first:
             gl.glDisablei(name, 0)
-        for name, value in store:
-            if value != PIXEL_STORE[name]:
-                gl.glPixelStorei(name, PIXEL_STORE[name])
         for target, buffer in buffers:
             if buffer:
                 gl.glBindBuffer(target, 0)
@@ -180,8 +180,26 @@ class KeptState:
                 gl.glEnable(name)
             for name in first:
                 gl.glEnablei(name, 0)
+
+    @contextmanager
+    def for_transfers(self) -> Iterator[None]:
+        """Within, transfers of pixels are as moderngl expects; restore it on exit."""
+        gl = self._gl
+        store = [(name, self._get(name)) for name in PIXEL_STORE]
+        buffers = [
+            (target, self._get(query)) for target, query in PIXEL_BUFFERS.items()
+        ]
+        for name, _ in store:
+            gl.glPixelStorei(name, PIXEL_STORE[name])
+        for target, _ in buffers:
+            gl.glBindBuffer(target, 0)
+        try:
+            yield
+        finally:
             for name, value in store:
                 gl.glPixelStorei(name, value)
+            for target, buffer in buffers:
+                gl.glBindBuffer(target, buffer)
 
     def _blocks(self) -> list[tuple[int, int, int]]:
         found = []

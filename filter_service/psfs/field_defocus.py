@@ -96,7 +96,12 @@ class FieldDefocus:
     ) -> NDArray[np.float64]:
         """Return the change (...) for weights of `FieldAxes.weights`."""
         row_weights, column_weights = weights
-        return ((row_weights @ self.change_dpt) * column_weights).sum(axis=-1)
+        # One product of matrices: NumPy multiplies stacks of them one by one.
+        by_column = row_weights.reshape(-1, row_weights.shape[-1]) @ self.change_dpt
+        found_dpt: NDArray[np.float64] = np.einsum(
+            "ij,ij->i", by_column, column_weights.reshape(by_column.shape)
+        )
+        return found_dpt.reshape(row_weights.shape[:-1])
 
 
 class EyeDefocus:

@@ -20,6 +20,10 @@ from estimator.optics.prescription import C20, Prescription
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile, preset_names
 from estimator.wavefront.aberrations import wavefront_aberrations
+from estimator.wavefront.field_wavefronts import (
+    total_defocus_dpt,
+    zernike_from_polynomial,
+)
 from tests.numerical.spot_focus import (
     SPOT_DIAMETER_RATIO,
     focus_by_spot,
@@ -94,6 +98,15 @@ def test_reach_through_a_pupil_is_what_is_traced_there(name):
         assert near_dpt == pytest.approx(-traced, abs=0.01)
         assert near_dpt - far_dpt <= 10.0 + 1e-3  # the amplitude without an age
         assert "near point" in nearest.notes[0]
+
+
+@pytest.mark.parametrize("name", ["emmetropia", "keratoconus", "post_lasik"])
+def test_refraction_of_the_residual_is_that_of_its_wavefront(name):
+    rest = estimate_eye(parse_profile({"kind": "preset", "name": name})).rest(555.0)
+    for pupil_mm in (1.0, 2.9, 4.0, 5.9, 6.1, 7.5, 9.0):  # measured through 6 mm
+        zernike_um = zernike_from_polynomial(rest.on_axis_um(pupil_mm), pupil_mm / 2)
+        expected_dpt = total_defocus_dpt(zernike_um, pupil_mm / 2)[0]
+        assert rest.on_axis_dpt(pupil_mm) == pytest.approx(expected_dpt, abs=1e-12)
 
 
 def _far_sighted():
