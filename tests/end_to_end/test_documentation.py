@@ -28,9 +28,12 @@ def test_the_examples_of_a_page_run(path, tmp_path):
     if path.stem == "python":
         lines = printed.splitlines()
         assert lines[0].startswith("(90, 160, 3) 1 True")
-        assert lines[1] == "float32 True"
-        assert lines[2] in ("1", "2")
-        assert f"print(error)  # {lines[4]}\n" in path.read_text(encoding="utf-8")
+        contrasts = [float(line.split()[1]) for line in lines[1:4]]
+        assert contrasts == sorted(contrasts, reverse=True)
+        assert contrasts[2] < 0.6 * contrasts[0]
+        assert lines[4] == "float32 True"
+        assert lines[5] in ("1", "2")
+        assert f"print(error)  # {lines[7]}\n" in path.read_text(encoding="utf-8")
     if path.stem == "opengl":
         assert printed == "1 0\nTrue\n"
     if path.stem == "stereo":
