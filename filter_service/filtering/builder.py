@@ -158,7 +158,7 @@ class Builder:
             self.streams.remove(stream)
         self.cancel(stream)
         stream.end()
-        stream.begun_count = 0
+        stream.begun.clear()
         self.free_retired(stream)
 
     def close(self) -> None:
@@ -175,7 +175,7 @@ class Builder:
 
     def free_retired(self, stream: StreamEyes) -> None:
         """Free the stores that a stream has retired, unless frames are unfinished."""
-        if stream.begun_count:
+        if stream.begun:
             return
         for store in stream.retired:
             store.release()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 from numpy.typing import NDArray
@@ -101,11 +100,10 @@ class PlannedFrame:
                 self.views, plan.stores, gazes_deg, arrays, strict=True
             )
         ]
-        self.stream.begun_count += 1  # so that no store of it is freed
-        return partial(self._finish, begun, started_s)
+        return _BegunFrame(self, begun, started_s)
 
-    def _finish(self, begun: Sequence[Pending], started_s: float) -> Filtered:
-        self.stream.begun_count = max(self.stream.begun_count - 1, 0)
+    def finish(self, begun: Sequence[Pending], started_s: float) -> Filtered:
+        """Wait for the views and return the result."""
         rendered = [finish() for finish in begun]
         self.builder.frame_s = time.monotonic() - started_s
         self.builder.mark_rendered(self.stream, self.plan)
@@ -129,3 +127,23 @@ class PlannedFrame:
             stage_times_ms=summed_times(view.stage_times_ms for view in rendered),
             **summed_counts(rendered),
         )
+
+
+class _BegunFrame:
+    """A frame in progress: while it exists, the stores of its stream are kept.
+
+    A caller may drop it instead of calling it, as when another eye's frame has failed.
+    """
+
+    def __init__(
+        self, planned: PlannedFrame, begun: Sequence[Pending], started_s: float
+    ) -> None:
+        self._planned, self._begun, self._started_s = planned, begun, started_s
+        planned.stream.begun.add(self)
+
+    def __call__(self) -> Filtered:
+        """Wait for the frame."""
+        try:
+            return self._planned.finish(self._begun, self._started_s)
+        finally:
+            self._planned.stream.begun.discard(self)

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
+from weakref import WeakSet
 
 from estimator.profiles.parse import EyeProfile
 from filter_service.camera import Camera
@@ -58,8 +59,8 @@ class StreamEyes:
         The newest one and, while that is not ready, the previous one.
     retired : list of LoadedStore
         Stores to be released.
-    begun_count : int
-        Number of frames that are begun and not finished.
+    begun : WeakSet
+        Frames that are begun and neither finished nor dropped.
     history : FrameHistory
         Last frames.
     """
@@ -72,7 +73,7 @@ class StreamEyes:
     building: BuildTarget | None = None
     eyes: list[AcceptedProfile] = field(default_factory=list)
     retired: list[LoadedStore] = field(default_factory=list)
-    begun_count: int = 0
+    begun: WeakSet[Any] = field(default_factory=WeakSet)
     history: FrameHistory = field(default_factory=FrameHistory)
     _n_accepted: int = 0
     _last_cameras: tuple[Camera, ...] = ()

@@ -92,6 +92,26 @@ def test_frames_go_through_the_old_eye_while_the_new_one_is_built(eye_filter, ev
     assert any(isinstance(event, BuildingEye) for event in events)
 
 
+@pytest.mark.parametrize("is_finished", [True, False])
+def test_a_frame_keeps_its_store_until_it_is_finished_or_dropped(
+    eye_filter, is_finished
+):
+    view = RgbdView(COLOR, DEPTH_M, CAMERA.tangents)
+    eye_filter.set_profile(eye(7))
+    eye_filter.filter(view, **SEE)
+    (prepared,) = eye_filter.prepared_stores
+    finish = eye_filter.begin([view], **SEE)
+    eye_filter.set_profile(eye(8))
+    assert mark_of(eye_filter.filter(view, whole=True, **SEE)) == 8
+    assert prepared.store.n_released == 0
+    if is_finished:
+        assert mark_of(finish()) == 7
+    else:
+        del finish
+    eye_filter.filter(view, **SEE)
+    assert prepared.store.n_released == 1
+
+
 def test_a_profile_that_fails_leaves_the_old_eye_in_use(eye_filter, events):
     eye_filter.set_profile(eye(1))
     eye_filter.wait(10.0)
