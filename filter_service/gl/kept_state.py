@@ -150,7 +150,7 @@ class KeptState:
             gl.glBindVertexArray(vertices)
             for target, buffer in buffers:
                 gl.glBindBuffer(target, buffer)
-            # one call for those that are mostly free
+            # Most are free, and one call unbinds all.
             gl.glBindBuffersBase(GL_SHADER_STORAGE_BUFFER, 0, STORAGE_BLOCKS, None)
             for index, (buffer, start, size) in enumerate(blocks):
                 if not buffer:
@@ -183,7 +183,7 @@ class KeptState:
 
     @contextmanager
     def for_transfers(self) -> Iterator[None]:
-        """Within, transfers of pixels are as moderngl expects; restore it on exit."""
+        """Set what moderngl expects for transfers of pixels; on exit, restore it."""
         gl = self._gl
         store = [(name, self._get(name)) for name in PIXEL_STORE]
         buffers = [

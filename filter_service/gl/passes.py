@@ -81,15 +81,15 @@ class RecordedPass(NamedTuple):
     changing : tuple of str
         Uniforms that are not.
     groups : (x, y, z)
-    indirect : (name, byte) or None
-        As in `Passes.dispatch`.
+    counts_at : (name, byte) or None
+        Location of the group counts on the GPU, which replace ``groups``.
     """
 
     variant: PassVariant
     uniforms: dict[str, Any]
     changing: tuple[str, ...]
     groups: tuple[int, ...]
-    indirect: tuple[str, int] | None
+    counts_at: tuple[str, int] | None
 
 
 class Passes:
@@ -182,8 +182,7 @@ class Passes:
         defines: dict[str, Any] | None = None,
         images: dict[str, Atlas] | None = None,
         textures: "dict[str, Atlas | Pages | TextureUnit] | None" = None,
-        indirect: tuple[str, int] | None = None,
-        counts: Buffer | None = None,
+        indirect: tuple[str, Buffer, int] | None = None,
     ) -> None:
         """Dispatch a pass, followed by a memory barrier.
 
@@ -198,15 +197,14 @@ class Passes:
             Variant of the pass.
         images, textures : dict, optional
             Textures or atlases by name without ``IMAGE_`` or ``TEXTURE_``.
-        indirect : (name, byte), optional
+        indirect : (name, buffer, byte), optional
             Location of the group counts on the GPU, which replace ``groups``.
-        counts : Buffer, optional
-            Buffer of this name, unless it is one of ``buffers``.
         """
         uniforms, groups = uniforms or {}, (*groups, 1)[:3]
         values: dict[str, Any] = dict(buffers)
-        if indirect is not None and counts is not None:
-            values[indirect[0]] = counts
+        counts_at = None
+        if indirect is not None:
+            values[indirect[0]], counts_at = indirect[1], (indirect[0], indirect[2])
         for kind in (images, textures):
             for key, value in (kind or {}).items():
                 values[ATLAS_BINDINGS.get(key, key)] = value
@@ -215,7 +213,7 @@ class Passes:
             uniforms,
             (),
             (max(groups[0], 1), max(groups[1], 1), max(groups[2], 1)),
-            indirect,
+            counts_at,
         )
         if self._recorded is not None:
             fixed = {k: v for k, v in uniforms.items() if k not in self._changing}
@@ -307,8 +305,8 @@ class Passes:
                 self.set_uniforms(program, one.uniforms)
             if one.changing:
                 self.set_uniforms(program, {key: uniforms[key] for key in one.changing})
-            if one.indirect is not None:
-                program.run_indirect(values[one.indirect[0]], one.indirect[1])
+            if one.counts_at is not None:
+                program.run_indirect(values[one.counts_at[0]], one.counts_at[1])
             else:
                 program.run(*one.groups)
             context.memory_barrier(barriers)

@@ -89,20 +89,24 @@ class Renderbuffers:
         gl.glFramebufferTexture2D(
             GL_DRAW_FRAMEBUFFER, attachment, GL_TEXTURE_2D, texture, 0
         )
-        for target in (GL_READ_FRAMEBUFFER, GL_DRAW_FRAMEBUFFER):
-            status = gl.glCheckFramebufferStatus(target)
-            if status != GL_FRAMEBUFFER_COMPLETE:
-                raise RenderFailed(
-                    f"cannot copy renderbuffer {renderbuffer.name}: framebuffer status "
-                    f"{status:#x}"
-                )
-        mask = GL_COLOR_BUFFER_BIT if is_color else GL_DEPTH_BUFFER_BIT
-        gl.glBlitFramebuffer(0, 0, *size_px, 0, 0, *size_px, mask, GL_NEAREST)
+        statuses = {
+            gl.glCheckFramebufferStatus(target)
+            for target in (GL_READ_FRAMEBUFFER, GL_DRAW_FRAMEBUFFER)
+        }
+        if statuses == {GL_FRAMEBUFFER_COMPLETE}:
+            mask = GL_COLOR_BUFFER_BIT if is_color else GL_DEPTH_BUFFER_BIT
+            gl.glBlitFramebuffer(0, 0, *size_px, 0, 0, *size_px, mask, GL_NEAREST)
         # Nothing stays attached, so that color and depth do not meet.
         gl.glFramebufferRenderbuffer(
             GL_READ_FRAMEBUFFER, attachment, GL_RENDERBUFFER, 0
         )
         gl.glFramebufferTexture2D(GL_DRAW_FRAMEBUFFER, attachment, GL_TEXTURE_2D, 0, 0)
+        if statuses != {GL_FRAMEBUFFER_COMPLETE}:
+            found = ", ".join(f"{status:#x}" for status in sorted(statuses))
+            raise RenderFailed(
+                f"cannot copy renderbuffer {renderbuffer.name}: framebuffer status "
+                f"{found}"
+            )
         return GlTexture(texture, renderbuffer.format)
 
     def _copy_of(self, renderbuffer: GlTexture, size_px: tuple[int, int]) -> int:

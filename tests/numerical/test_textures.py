@@ -277,6 +277,36 @@ def test_merging_follows_the_gaze(caller, bench, color):
     np.testing.assert_array_equal(found[..., :3], expected.color)
 
 
+def test_passes_are_recorded_once_while_gaze_and_state_change(gl_engine, rng, color):
+    """Cells turn with the gaze; each frame equals that of arrays."""
+    turned = {**FIELD, "gaze_range_deg": (12.0, 8.0)}
+    bench = Bench(gl_engine, MYOPIA, width_px=WIDTH, height_px=HEIGHT, **turned)
+    depth_m = depth_scene()
+    with callers_context():
+        caller = Caller(bench)
+        view, target = (
+            caller.view(color, depth_m),
+            caller.textures.new("rgba8", SIZE_PX),
+        )
+        counts = []
+        for shift_deg in (0.0, 0.3):  # the second time, only gazes are new
+            for k, state in enumerate(STATES[:4]):
+                gaze_deg = (2.0 * k - 3.0 + shift_deg, 3.0 - k)
+                for _ in range(2):  # one with new kernels, one with those
+                    caller.filter(view, target, gaze_deg=gaze_deg, **state)
+                expected = bench.render(
+                    bench.view(color, depth_m),
+                    output="srgb8",
+                    gaze_deg=gaze_deg,
+                    **state,
+                )
+                found = caller.textures.read(target, SIZE_PX)[..., :3]
+                np.testing.assert_array_equal(found, expected.color)
+            counts.append(len(caller.renderer._eyes.of(caller.handle).recorded))
+        caller.close()
+    assert counts[1] <= counts[0] + 1, "each of eight frames would add one"
+
+
 def test_input_is_sampled(caller, color):
     depth_m = depth_scene()
     view, target = caller.view(color, depth_m), caller.textures.new("rgba8", SIZE_PX)
@@ -584,7 +614,7 @@ def test_the_first_frame_is_not_repeated_forever(caller, color, monkeypatch):
 
 
 def test_closing_leaves_no_objects(bench, color):
-    """The sampler and the framebuffer are freed; the caller's textures stay."""
+    """Sampler, framebuffers and copies are freed; the caller's textures stay."""
 
     def exists(kind, name):
         address = CurrentContext().load_opengl_function(f"glIs{kind}")
@@ -593,12 +623,22 @@ def test_closing_leaves_no_objects(bench, color):
     with callers_context():
         caller = Caller(bench)
         target = caller.textures.new("rgba8", SIZE_PX)
-        caller.filter(caller.view(color, depth_scene()), target)
+        view = caller.view(color, depth_scene())
+        buffer = caller.textures.renderbuffer(view.color, SIZE_PX)
+        caller.filter(replace(view, color=buffer), target)
         io = caller.gpu.texture_io
-        own = ("Sampler", io._sampler.value), ("Framebuffer", io._framebuffer.value)
-        assert [exists(*one) for one in own] == [True, True]
+        copies = io._renderbuffers
+        own = [
+            ("Sampler", io._sampler.value),
+            *(
+                ("Framebuffer", n)
+                for n in (io._framebuffer.value, *copies._framebuffers)
+            ),
+            *(("Texture", name) for _, name in copies._copies.values()),
+        ]
+        assert [exists(*one) for one in own] == [True] * 5
         caller.close()
-        assert [exists(*one) for one in own] == [False, False]
+        assert [exists(*one) for one in own] == [False] * 5
         assert exists("Texture", target.name)
 
 

@@ -337,11 +337,11 @@ class KernelRun:
                 "begin_plan",
                 *("PLAN", "USED", "STATS", "READ_PSFS", "KERNEL_OF", "NODE_OF"),
                 groups=dispatch_grid(self.group_counts[0]),
-                **self._some("used_words", "read_words", "pair_count"),
-                **self._some("node_pair_count", "is_new"),
+                **self._uniforms_of("used_words", "read_words", "pair_count"),
+                **self._uniforms_of("node_pair_count", "is_new"),
             )
 
-    def _some(self, *names: str) -> dict[str, Any]:
+    def _uniforms_of(self, *names: str) -> dict[str, Any]:
         uniforms = self.uniforms
         return {name: uniforms[name] for name in names}
 
@@ -356,7 +356,7 @@ class KernelRun:
                 *("USED", "CELLS", "KERNEL_OF", "KERNEL_PAIRS"),
                 *("NODE_OF", "NODE_PAIRS", "PLAN"),
                 groups=dispatch_grid(self.group_counts[1]),
-                **self._some("used_words", "words_per_cell", "layer_count"),
+                **self._uniforms_of("used_words", "words_per_cell", "layer_count"),
                 kernel_capacity=capacity.kernels,
                 node_capacity=capacity.nodes,
             )
@@ -367,7 +367,7 @@ class KernelRun:
                 *("RECIPES", "NODES", "WORK", "READ_PSFS", "PLAN"),
                 dispatch=PLAN_FOR_NODES,
                 defines=group,
-                **self._some("layer_count", "neighbor_count"),
+                **self._uniforms_of("layer_count", "neighbor_count"),
                 node_capacity=capacity.nodes,
                 texel_capacity=capacity.node_texels,
                 work_capacity=capacity.work_items,
@@ -378,7 +378,7 @@ class KernelRun:
                 *("KERNELS", "PARTS", "WORK", "PLAN"),
                 dispatch=PLAN_FOR_KERNELS,
                 defines=group,
-                **self._some("layer_count", "merge_spread_px"),
+                **self._uniforms_of("layer_count", "merge_spread_px"),
                 kernel_capacity=capacity.kernels,
                 texel_capacity=capacity.texels,
                 work_capacity=capacity.work_items,
@@ -425,6 +425,11 @@ class KernelRun:
         textures: dict[str, Any] | None = None,
         **uniforms: Any,
     ) -> None:
+        plan = self.buffers["PLAN"]
+        assert isinstance(plan, Buffer)
+        indirect = (
+            None if dispatch is None else ("PLAN", plan, DISPATCH_BYTES * dispatch)
+        )
         self.owner.gpu.passes.dispatch(
             name,
             groups,
@@ -433,7 +438,7 @@ class KernelRun:
             defines=defines,
             images=images,
             textures=textures,
-            indirect=None if dispatch is None else ("PLAN", DISPATCH_BYTES * dispatch),
+            indirect=indirect,
         )
 
     def to_read(

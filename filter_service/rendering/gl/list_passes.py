@@ -211,9 +211,13 @@ class ListPasses:
         self.make_lists(first_bin, bin_count, indirect=indirect)
         self._splat(first_bin, bin_count, indirect=indirect)
 
-    def _groups_on_gpu(self, index: int, indirect: bool) -> tuple[str, int] | None:
+    def _groups_on_gpu(
+        self, index: int, indirect: bool
+    ) -> tuple[str, Buffer, int] | None:
         """Return the location of a dispatch size that ``scan_bins`` has written."""
-        return ("DISPATCHES", DISPATCH_BYTES * index) if indirect else None
+        name = "DISPATCHES"
+        location = name, self.strip.buffers[name], DISPATCH_BYTES * index
+        return location if indirect else None
 
     def make_lists(
         self, first_bin: int, bin_count: int, *, indirect: bool = False

@@ -85,7 +85,6 @@ class Strip:
         defines = uniforms.pop("defines", None)
         textures = uniforms.pop("textures", None)
         indirect = uniforms.pop("indirect", None)
-        counts = None if indirect is None else self.buffers[indirect[0]]
         self.gpu.passes.dispatch(
             name,
             groups,
@@ -97,7 +96,6 @@ class Strip:
             defines=defines,
             textures=textures,
             indirect=indirect,
-            counts=counts,
         )
 
     def refresh(self) -> None:

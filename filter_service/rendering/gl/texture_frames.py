@@ -41,7 +41,7 @@ from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.kernel_passes import FrameState, KernelRun
 from filter_service.rendering.gl.list_passes import ListPasses
 from filter_service.rendering.gl.strip import Strip, dispatch_grid, group_count
-from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
+from filter_service.rendering.image_cells import KernelsTooLarge
 from filter_service.texture_view import EarlierFrame, SampledInput, TextureView
 
 SAMPLE_STEP_PX = 16
@@ -67,7 +67,7 @@ LISTS = ("ENTRIES", "ENTRIES_SPARE")
 """Buffers whose sizes are uniforms."""
 
 MAX_RECORDED = 16
-"""Recorded frames of an eye: few, as new ones are rare."""
+"""Recorded frames of an eye.  New ones are rare, unless merging follows the gaze."""
 
 MAX_IN_FLIGHT = 4
 """Frames whose counters have not been read.  Further ones are not counted."""
@@ -131,7 +131,6 @@ class _Passes(NamedTuple):
     """Passes of a frame that later frames repeat."""
 
     recorded: list[RecordedPass]
-    image: ImageCells  # so that no other has its id
     strip: Strip
     fragments: FragmentPasses
     lists: ListPasses
@@ -195,7 +194,9 @@ class TextureFrames:
     ) -> tuple[FrameLayers, EarlierFrame | None]:
         """Filter a frame; return its layers, and the counters of an earlier one."""
         self._read_finished()
-        request = replace(request, view=self._io.in_textures(request.view))
+        view = self._io.in_textures(request.view)
+        if view is not request.view:
+            request = replace(request, view=view)
         timer = Untimed()
         layers = eye.states.layers(
             timer,
@@ -291,13 +292,14 @@ class TextureFrames:
         is_counted: bool,
     ) -> tuple[Any, ...]:
         """Return what the passes of a frame depend on, besides buffers and state."""
-        view, gpu = request.view, self._gpu
+        view, gpu, image = request.view, self._gpu, state.image
         return (
             *(view.color.format, view.color.layer, view.depth.format, view.depth.layer),
             *(view.width_px, view.height_px, view.tangents, view.projection),
             *(view.is_top_first, view.white_ratio),
-            *(request.target.format == "rgba16f", request.options, request.gaze_deg),
-            *(id(state.image), kernels.capacity, kernels.group_counts),
+            *(request.target.format == "rgba16f", request.options),
+            merge_gaze(request.options, request.gaze_deg),
+            *(image.cell_px, image.grid, kernels.capacity, kernels.group_counts),
             *(gpu.buffers[name].size for name in LISTS if name in gpu.buffers),
             is_counted,
         )
@@ -346,7 +348,7 @@ class TextureFrames:
             lists.run()
             if is_counted:
                 self._sample(strip, view)
-        return _Passes(recorded, state.image, strip, fragments, lists)
+        return _Passes(recorded, strip, fragments, lists)
 
     def _sample(self, strip: Strip, view: TextureView) -> None:
         rows, columns = sample_grid(strip)
