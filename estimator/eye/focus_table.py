@@ -53,8 +53,7 @@ class FocusTable:
         refractions_dpt = _filled(accommodations_dpt, refractions_dpt[usable])
         self._accommodations_dpt = accommodations_dpt
         self._refractions_dpt = refractions_dpt
-        self._squares_mm2 = np.square(pupils_mm[usable])
-        self._pupil_shares = _barycentric_shares(self._squares_mm2)
+        self._over_square_mm2 = _Polynomial(np.square(pupils_mm[usable]).tolist())
         self._over_accommodation = _Polynomial(accommodations_dpt.tolist())
         self._last: tuple[float, list[float], _Polynomial | None] = (0.0, [], None)
 
@@ -65,10 +64,8 @@ class FocusTable:
         """
         last_mm, found_dpt, inverse = self._last
         if inverse is None or last_mm != pupil_mm:
-            nodes, values = self._squares_mm2, self._refractions_dpt
-            found_dpt = _through(
-                nodes, values, self._pupil_shares, pupil_mm**2
-            ).tolist()
+            weights = self._over_square_mm2.weights(pupil_mm**2)
+            found_dpt = (np.array(weights) @ self._refractions_dpt).tolist()
             inverse = _Polynomial(_falling(found_dpt))
             self._last = pupil_mm, found_dpt, inverse
         return found_dpt, inverse
@@ -91,30 +88,33 @@ class FocusTable:
 
 
 class _Polynomial:
-    """Polynomial through values at fixed nodes, with scalars.
+    """Polynomial through values at fixed nodes, by the barycentric formula.
 
     It has few nodes, so that NumPy would take five times as long.
     """
 
     def __init__(self, nodes: list[float]):
         self.nodes = nodes
-        unit = 4.0 / ((max(nodes) - min(nodes)) or 1.0)  # as in _barycentric_shares
+        # so that many nodes do not overflow
+        unit = 4.0 / ((max(nodes) - min(nodes)) or 1.0)
         self._shares = [
             1.0 / math.prod((node - other) * unit for other in nodes if other != node)
             for node in nodes
         ]
 
+    def weights(self, at: float) -> list[float]:
+        """Return the weights (n,) of the values at a position."""
+        away = [at - node for node in self.nodes]
+        if any(-SAME_NODE < distance < SAME_NODE for distance in away):
+            return [float(-SAME_NODE < distance < SAME_NODE) for distance in away]
+        terms = [share / d for share, d in zip(self._shares, away, strict=True)]
+        total = sum(terms)
+        return [term / total for term in terms]
+
     def through(self, values: list[float], at: float) -> float:
         """Return the value at a position of the polynomial through values (n,)."""
-        above = below = 0.0
-        for node, share, value in zip(self.nodes, self._shares, values, strict=True):
-            away = at - node
-            if -SAME_NODE < away < SAME_NODE:
-                return value
-            term = share / away
-            above += term * value
-            below += term
-        return above / below
+        weights = self.weights(at)
+        return sum(w * value for w, value in zip(weights, values, strict=True))
 
 
 def _falling(values: list[float]) -> list[float]:
@@ -135,31 +135,6 @@ def _filled(nodes: NDArray[Any], rows: NDArray[Any]) -> NDArray[Any]:
     rows = rows.copy()
     for row in rows:
         known = np.isfinite(row)
-        shares = _barycentric_shares(nodes[known])
-        row[~known] = [
-            _through(nodes[known], row[known], shares, at) for at in nodes[~known]
-        ]
+        through = _Polynomial(nodes[known].tolist()).through
+        row[~known] = [through(row[known].tolist(), at) for at in nodes[~known]]
     return rows
-
-
-def _barycentric_shares(nodes: NDArray[Any]) -> NDArray[np.float64]:
-    """Return weights (n,) of the barycentric formula for nodes (n,)."""
-    span = np.ptp(nodes) or 1.0  # so that many nodes do not overflow
-    away = (nodes[:, None] - nodes[None]) * (4.0 / span)
-    np.fill_diagonal(away, 1.0)
-    shares: NDArray[np.float64] = 1.0 / away.prod(axis=1)
-    return shares
-
-
-def _through(
-    nodes: NDArray[Any], values: NDArray[Any], shares: NDArray[Any], at: float
-) -> NDArray[np.float64]:
-    """Evaluate the polynomial through values (n, ...) at nodes (n,)."""
-    away = at - nodes
-    is_hit = np.abs(away) < SAME_NODE
-    if is_hit.any():
-        hit: NDArray[np.float64] = values[is_hit.argmax()]
-        return hit
-    terms = shares / away
-    found: NDArray[np.float64] = terms @ values / terms.sum()
-    return found

@@ -37,6 +37,7 @@ _X, _Y, _XX, _XY, _YY, _MOST, _COS, _SIN = (LANES * k for k in range(N_RIM + 3))
 sine of the farthest point so far."""
 
 _OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+_VECTOR_OPTIONS = {**_OPTIONS, "fastmath": {"arcp", "contract"}}
 
 
 @njit(**_OPTIONS)
@@ -188,7 +189,7 @@ def _scale_rim(values, pupil_mm, scale):
             values[k] *= pupil_mm
 
 
-@njit(fastmath={"nnan", "nsz", "arcp", "contract"}, **_OPTIONS)
+@njit(**_VECTOR_OPTIONS)
 def _circumscribed_mm(rims):
     """Return radii (n,) of circumscribed circles; see `circumscribed_radius_mm`.
 
@@ -209,14 +210,17 @@ def _circumscribed_mm(rims):
             c, s = lanes[_COS + i], lanes[_SIN + i]
             px = lanes[_X + i] + lanes[_XX + i] * c + lanes[_XY + i] * s
             py = lanes[_Y + i] + lanes[_XY + i] * c + lanes[_YY + i] * s
-            lanes[_MOST + i] = max(px * px + py * py, lanes[_MOST + i])
+            square = px * px + py * py
+            is_less = square < lanes[_MOST + i]
+            lanes[_MOST + i] = lanes[_MOST + i] if is_less else square
         for i in range(min(LANES, n - first)):
             radius_mm[first + i] = math.sqrt(lanes[_MOST + i])
     return radius_mm
 
 
-@njit(fastmath={"nnan", "nsz", "arcp", "contract"}, **_OPTIONS)
+@njit(**_VECTOR_OPTIONS)
 def _take_farthest_sample(lanes):
+    """Start with the farthest of points at equal angles."""
     for i in range(LANES):
         lanes[_MOST + i] = -1.0
     for k in range(N_SAMPLED):
@@ -231,7 +235,7 @@ def _take_farthest_sample(lanes):
             lanes[_SIN + i] = s if is_more else lanes[_SIN + i]
 
 
-@njit(fastmath={"nnan", "nsz", "arcp", "contract"}, **_OPTIONS)
+@njit(**_VECTOR_OPTIONS)
 def _step_to_farthest(lanes):
     """Turn the directions by one Newton step each."""
     for i in range(LANES):
@@ -243,7 +247,9 @@ def _step_to_farthest(lanes):
         second = tx * tx + ty * ty - px * from_center_x - py * from_center_y
         is_concave = second < 0.0
         step = -(px * tx + py * ty) / (second if is_concave else 1.0)
-        step = min(max(step, -NEWTON_STEP_RAD), NEWTON_STEP_RAD)
+        # Conditional expressions are vector instructions; min and max are not.
+        step = step if step < NEWTON_STEP_RAD else NEWTON_STEP_RAD
+        step = step if step > -NEWTON_STEP_RAD else -NEWTON_STEP_RAD
         step = step if is_concave else 0.0
         # Series of cosine and sine, exact to 1e-14 for such steps.
         q = step * step

@@ -93,13 +93,7 @@ def step_curve(tables, reads, zero_dpt, at_dpt, blur_px_per_dpt, blur_ratio):
     return steps_before
 
 
-@njit(
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-    # without NaN and signed zeros, minima and maxima are vector instructions
-    fastmath={"nnan", "nsz"},
-)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _blur_steps(tables, reads, zero_dpt, at_dpt, blur_ratio):
     """Return the extremes over all nodes and channels.
 
