@@ -1,0 +1,83 @@
+"""Compiles the OpenXR runtime and the application that the tests of the layer use.
+
+build_runtime   mock_runtime.c, with its manifest for XR_RUNTIME_JSON
+build_driver    driver.c
+missing         what this machine lacks for that
+
+    python -m tests.openxr_layer.build FOLDER [FLAG ...]     builds both
+"""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+COMPILER = shutil.which("cc")
+HEADERS = ("openxr/openxr.h", "openxr/openxr_platform.h", "GL/glx.h", "EGL/egl.h")
+INCLUDE = Path("/usr/include")
+
+FLAGS = ("-std=gnu11", "-O1", "-g", "-Wall", "-Wextra", "-Werror")
+LIBRARIES = ("-lGL", "-lEGL", "-lX11", "-lm", "-lpthread")
+
+
+def missing() -> str | None:
+    """Return why nothing can be built here, or None."""
+    if COMPILER is None:
+        return "no C compiler"
+    absent = [name for name in HEADERS if not (INCLUDE / name).exists()]
+    return f"no header {absent[0]} in {INCLUDE}" if absent else None
+
+
+def build_runtime(folder: Path, *flags: str) -> Path:
+    """Compile the runtime; return its manifest.
+
+    Parameters
+    ----------
+    folder : Path
+        Where libmock_runtime.so and mock_runtime.json are written.
+    *flags : str
+        More flags of the compiler, such as ``-fsanitize=address``.
+
+    Raises
+    ------
+    subprocess.CalledProcessError
+        The compiler failed; what it said is on standard error.
+    """
+    library = folder / "libmock_runtime.so"
+    shared = ("-shared", "-fPIC", "-fvisibility=hidden")
+    _compile("mock_runtime.c", library, (*shared, *flags), LIBRARIES)
+    manifest = folder / "mock_runtime.json"
+    runtime = {"name": "mock runtime", "library_path": str(library)}
+    manifest.write_text(
+        json.dumps({"file_format_version": "1.0.0", "runtime": runtime}),
+        encoding="utf-8",
+    )
+    return manifest
+
+
+def build_driver(folder: Path, *flags: str) -> Path:
+    """Compile the application; return its path.  As `build_runtime`."""
+    program = folder / "driver"
+    _compile("driver.c", program, flags, (*LIBRARIES, "-lopenxr_loader"))
+    return program
+
+
+def _compile(source, output, flags, libraries) -> None:
+    subprocess.run(
+        [COMPILER, *FLAGS, *flags, str(HERE / source), "-o", str(output), *libraries],
+        check=True,
+    )
+
+
+def main() -> None:
+    """Build both into a folder."""
+    folder, *flags = sys.argv[1:]
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    print(build_runtime(Path(folder), *flags))
+    print(build_driver(Path(folder), *flags))
+
+
+if __name__ == "__main__":
+    main()
