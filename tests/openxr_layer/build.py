@@ -46,7 +46,9 @@ def build_runtime(folder: Path, *flags: str) -> Path:
         The compiler failed; what it said is on standard error.
     """
     library = folder / "libmock_runtime.so"
-    shared = ("-shared", "-fPIC", "-fvisibility=hidden")
+    # nodelete: the loader unloads a runtime with its instance, and the runtime counts
+    # frames and handles through the life of the process
+    shared = ("-shared", "-fPIC", "-fvisibility=hidden", "-Wl,-z,nodelete")
     _compile("mock_runtime.c", library, (*shared, *flags), LIBRARIES)
     manifest = folder / "mock_runtime.json"
     runtime = {"name": "mock runtime", "library_path": str(library)}
