@@ -129,7 +129,7 @@ class Monado:
 
     def stop(self) -> None:
         """Ask the service to end, and wait until it has."""
-        _end(self._service)
+        end(self._service)
 
     def kill(self) -> None:
         """End the service as a crash would: its socket stays behind."""
@@ -214,7 +214,7 @@ class Xvfb:
 
     def stop(self) -> None:
         """End it."""
-        _end(self._server)
+        end(self._server)
         shutil.rmtree(self._frame_dir, ignore_errors=True)
 
     def picture(self) -> np.ndarray:
@@ -398,7 +398,7 @@ def _connected(port: int) -> socket.socket:
         time.sleep(POLL_S)
 
 
-def _end(process: subprocess.Popen | None) -> None:
+def end(process: subprocess.Popen | None) -> None:
     """Ask a process to end, and see to it."""
     if process is None:
         return

@@ -1,0 +1,40 @@
+"""The runtime and the application, built once; tests are skipped where they cannot be."""
+
+import shutil
+
+import pytest
+
+from tests.headset.xorg import Xorg
+from tests.openxr_layer import build
+
+
+def pytest_collection_modifyitems(items):
+    """Skip where nothing can be built."""
+    reason = build.missing()
+    for item in items:
+        if reason and "tests/openxr_layer" in item.nodeid:
+            item.add_marker(pytest.mark.skip(reason=reason))
+
+
+@pytest.fixture(scope="session")
+def runtime(tmp_path_factory):
+    """Return the manifest of the mock runtime."""
+    return build.build_runtime(tmp_path_factory.mktemp("runtime"))
+
+
+@pytest.fixture(scope="session")
+def driver(tmp_path_factory):
+    """Return the path of the application."""
+    return build.build_driver(tmp_path_factory.mktemp("driver"))
+
+
+@pytest.fixture(scope="session")
+def display(tmp_path_factory):
+    """Return the name of a display with a dummy screen."""
+    if shutil.which("Xorg") is None:
+        pytest.skip("no Xorg with its dummy driver here")
+    server = Xorg(tmp_path_factory.mktemp("xorg"))
+    try:
+        yield server.start()
+    finally:
+        server.stop()
