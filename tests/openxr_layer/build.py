@@ -1,6 +1,6 @@
 """Compiles the OpenXR runtime and the application that the tests of the layer use.
 
-build_runtime   mock_runtime.c, with its manifest for XR_RUNTIME_JSON
+build_runtime   mock_runtime/, with its manifest for XR_RUNTIME_JSON
 build_driver    driver.c
 missing         what this machine lacks for that
 thread_sanitizer_options   for programs built with -fsanitize=thread
@@ -14,7 +14,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-HERE = Path(__file__).parent
+RUNTIME = Path(__file__).with_name("mock_runtime")
+DRIVER = Path(__file__).with_name("driver.c")
 COMPILER = shutil.which("cc")
 HEADERS = ("openxr/openxr.h", "openxr/openxr_platform.h", "GL/glx.h", "EGL/egl.h")
 INCLUDE = Path("/usr/include")
@@ -51,7 +52,7 @@ def build_runtime(folder: Path, *flags: str) -> Path:
     # nodelete: the loader unloads a runtime with its instance, and the runtime counts
     # frames and handles through the life of the process
     shared = ("-shared", "-fPIC", "-fvisibility=hidden", "-Wl,-z,nodelete")
-    _compile("mock_runtime.c", library, (*shared, *flags), LIBRARIES)
+    _compile(sorted(RUNTIME.glob("*.c")), library, (*shared, *flags), LIBRARIES)
     manifest = folder / "mock_runtime.json"
     runtime = {"name": "mock runtime", "library_path": str(library)}
     manifest.write_text(
@@ -64,7 +65,7 @@ def build_runtime(folder: Path, *flags: str) -> Path:
 def build_driver(folder: Path, *flags: str) -> Path:
     """Compile the application; return its path.  As `build_runtime`."""
     program = folder / "driver"
-    _compile("driver.c", program, flags, (*LIBRARIES, "-lopenxr_loader"))
+    _compile([DRIVER], program, flags, (*LIBRARIES, "-lopenxr_loader"))
     return program
 
 
@@ -85,9 +86,9 @@ def thread_sanitizer_options(folder: Path) -> dict[str, str]:
     return {"TSAN_OPTIONS": f"detect_deadlocks=0 suppressions={suppressions}"}
 
 
-def _compile(source, output, flags, libraries) -> None:
+def _compile(sources, output, flags, libraries) -> None:
     subprocess.run(
-        [COMPILER, *FLAGS, *flags, str(HERE / source), "-o", str(output), *libraries],
+        [COMPILER, *FLAGS, *flags, *map(str, sources), "-o", str(output), *libraries],
         check=True,
     )
 

@@ -1,4 +1,4 @@
-"""The runtime and the application, built once; tests are skipped where they cannot be."""
+"""The runtime and the application, built once; where that fails, tests are skipped."""
 
 import shutil
 

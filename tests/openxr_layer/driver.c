@@ -353,30 +353,32 @@ static void read_state(struct snapshot *to) {
     glGetQueryiv(GL_SAMPLES_PASSED, GL_CURRENT_QUERY, &to->query);
 }
 
+/* Fail with the first difference; where the context is another one, all else is too. */
 static void compare_states(const char *call, const struct snapshot *a,
                            const struct snapshot *b) {
+    static const char *const CURRENT[] = {"display", "context", "draw surface",
+                                          "read surface"};
     char why[128] = "";
+#define DIFFER(differs, ...) \
+    if (!*why && (differs)) snprintf(why, sizeof why, __VA_ARGS__)
+    for (int i = 0; i < 8; i++)
+        DIFFER(a->current[i] != b->current[i], "the current %s changed", CURRENT[i % 4]);
+    DIFFER(a->api != b->api, "EGL's API changed");
+    DIFFER(a->error, "OpenGL's error 0x%x before it", a->error);
+    DIFFER(b->error, "OpenGL's error 0x%x", b->error);
     for (int i = 0; i < N_STATES; i++)
-        if (memcmp(a->values[i], b->values[i], sizeof a->values[i]))
-            snprintf(why, sizeof why, "%s was %g, is %g", STATES[i].name,
-                     (double)a->values[i][0], (double)b->values[i][0]);
+        DIFFER(memcmp(a->values[i], b->values[i], sizeof a->values[i]),
+               "%s was %g, is %g", STATES[i].name, (double)a->values[i][0],
+               (double)b->values[i][0]);
     for (int unit = 0; unit < N_UNITS; unit++)
         for (int i = 0; i < N_UNIT_STATES; i++)
-            if (a->units[unit][i] != b->units[unit][i])
-                snprintf(why, sizeof why, "%s of unit %d was %d, is %d",
-                         UNIT_STATES[i].name, unit, a->units[unit][i], b->units[unit][i]);
+            DIFFER(a->units[unit][i] != b->units[unit][i], "%s of unit %d was %d, is %d",
+                   UNIT_STATES[i].name, unit, a->units[unit][i], b->units[unit][i]);
     for (int i = 0; i < 4; i++)
-        if (a->uniform_buffers[i] != b->uniform_buffers[i])
-            snprintf(why, sizeof why, "uniform buffer %d changed", i);
-    if (a->query != b->query) snprintf(why, sizeof why, "the query changed");
-    if (a->api != b->api) snprintf(why, sizeof why, "EGL's API changed");
-    if (a->error || b->error)
-        snprintf(why, sizeof why, "OpenGL's error 0x%x", a->error ? a->error : b->error);
-    for (int i = 0; i < 8; i++)
-        if (a->current[i] != b->current[i])
-            snprintf(why, sizeof why, "the current %s changed",
-                     (const char *[]){"display", "context", "draw surface",
-                                      "read surface"}[i % 4]);
+        DIFFER(a->uniform_buffers[i] != b->uniform_buffers[i],
+               "uniform buffer %d was %d, is %d", i, a->uniform_buffers[i],
+               b->uniform_buffers[i]);
+    DIFFER(a->query != b->query, "the query was %d, is %d", a->query, b->query);
     if (*why) fail(call, why);
 }
 

@@ -1,4 +1,4 @@
-"""The mock runtime serves programs, sees what they do wrong, and captures what is shown.
+"""The mock runtime serves programs, sees what is wrong, and captures what is shown.
 
 Run in the root of `tests/headset/setup_root.sh`, with the packages libopenxr-dev,
 libgl-dev, libegl-dev, libx11-dev and, for hello_xr, libopenxr-utils,
@@ -140,10 +140,65 @@ def test_frames_are_waited_for_in_a_thread(shown):
     assert check_pictures(run) == 2 * N_FRAMES
 
 
-def test_a_window_is_taken_too(shown, display):
-    run = shown("plain", "--check-state", "--glx", DISPLAY=display)
-    check_clean(run)
-    assert check_pictures(run) == 2 * N_FRAMES
+@pytest.mark.parametrize("case", ["plain", "other-thread", "restart"])
+def test_a_window_is_taken_too(shown, display, tmp_path, case):
+    report = tmp_path / "validation.txt"
+    variables = {
+        "DISPLAY": display,
+        "XR_ENABLE_API_LAYERS": "XR_APILAYER_LUNARG_core_validation",
+        "XR_CORE_VALIDATION_EXPORT_TYPE": "text",
+        "XR_CORE_VALIDATION_FILE_NAME": str(report),
+    }
+    run = shown(case, "--check-state", "--glx", **variables)
+    n_frames = CASES[case]
+    check_clean(run, n_frames)
+    assert check_pictures(run) == 2 * n_frames
+    complaints = [line for line in report.read_text().splitlines() if "VUID" in line]
+    assert all("VALID_DEBUG" in line for line in complaints)
+
+
+SPOILER = """
+#define _GNU_SOURCE
+#define GL_GLEXT_PROTOTYPES
+#include <dlfcn.h>
+#include <EGL/egl.h>
+#include <GL/gl.h>
+#include <GL/glext.h>
+#include <openxr/openxr.h>
+
+XrResult xrReleaseSwapchainImage(XrSwapchain chain,
+                                 const XrSwapchainImageReleaseInfo *info) {
+    PFN_xrReleaseSwapchainImage next = dlsym(RTLD_NEXT, "xrReleaseSwapchainImage");
+    XrResult result = next(chain, info);
+    STATEMENT;
+    return result;
+}
+"""
+"""In front of the loader, as a layer would be behind it."""
+SPOILERS = {
+    "glViewport(0, 0, 1, 1)": "GL_VIEWPORT",
+    "glActiveTexture(GL_TEXTURE5)": "GL_ACTIVE_TEXTURE",
+    "glBindTexture(GL_TEXTURE_2D, 0)": "GL_TEXTURE_BINDING_2D of unit 3",
+    "glBindFramebuffer(GL_READ_FRAMEBUFFER, 0)": "GL_READ_FRAMEBUFFER_BINDING",
+    "glUseProgram(0)": "GL_CURRENT_PROGRAM",
+    "glDisable(GL_SCISSOR_TEST)": "GL_SCISSOR_TEST",
+    "glPixelStorei(GL_PACK_ALIGNMENT, 4)": "GL_PACK_ALIGNMENT",
+    "glEnable(0)": "OpenGL's error 0x500",
+    "eglBindAPI(EGL_OPENGL_ES_API)": "EGL's API",
+    "eglMakeCurrent(eglGetCurrentDisplay(), 0, 0, 0)": "the current display changed",
+}
+
+
+@pytest.mark.parametrize(("statement", "name"), SPOILERS.items())
+def test_the_driver_sees_a_state_that_changed(shown, tmp_path, statement, name):
+    source, library = tmp_path / "spoiler.c", tmp_path / "spoiler.so"
+    source.write_text(SPOILER.replace("STATEMENT", statement))
+    command = [build.COMPILER, "-shared", "-fPIC", str(source), "-o", str(library)]
+    subprocess.run([*command, "-lGL", "-lEGL"], check=True)
+    run = shown("plain", "--check-state", LD_PRELOAD=str(library))
+    assert run.exit_code == 1
+    assert name in run.told[-1]["error"]
+    assert run.told[-1]["call"].startswith("xrReleaseSwapchainImage")
 
 
 @pytest.mark.parametrize(
@@ -315,7 +370,9 @@ WRONG = {
 
 def test_what_is_wrong_is_reported(shown):
     run = shown("violation")
-    tried = {line["violation"]: line["code"] for line in run.told if "violation" in line}
+    tried = {
+        line["violation"]: line["code"] for line in run.told if "violation" in line
+    }
     assert tried == WRONG
     assert len(run.violations) == len(WRONG)
     assert all(line.startswith("mock: violation: xr") for line in run.violations)
@@ -331,7 +388,9 @@ def test_depth_that_is_not_valid_is_reported(shown, case):
     assert {line["end_frame"] for line in run.told if "frame" in line} == {"XR_SUCCESS"}
 
 
-@pytest.mark.parametrize("case", ["plain", "other-thread", "end-from-thread", "restart"])
+@pytest.mark.parametrize(
+    "case", ["plain", "other-thread", "end-from-thread", "restart"]
+)
 def test_threads_do_not_race(tmp_path, case):
     if runtime_of("thread") is None:
         pytest.skip("no ThreadSanitizer here")
