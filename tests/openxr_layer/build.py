@@ -1,7 +1,7 @@
 """Compiles the OpenXR runtime and the application that the tests of the layer use.
 
 build_runtime   mock_runtime/, with its manifest for XR_RUNTIME_JSON
-build_driver    driver.c
+build_driver    driver/
 missing         what this machine lacks for that
 thread_sanitizer_options   for programs built with -fsanitize=thread
 
@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 
 RUNTIME = Path(__file__).with_name("mock_runtime")
-DRIVER = Path(__file__).with_name("driver.c")
+DRIVER = Path(__file__).with_name("driver")
 COMPILER = shutil.which("cc")
 HEADERS = ("openxr/openxr.h", "openxr/openxr_platform.h", "GL/glx.h", "EGL/egl.h")
 INCLUDE = Path("/usr/include")
@@ -65,7 +65,9 @@ def build_runtime(folder: Path, *flags: str) -> Path:
 def build_driver(folder: Path, *flags: str) -> Path:
     """Compile the application; return its path.  As `build_runtime`."""
     program = folder / "driver"
-    _compile([DRIVER], program, flags, (*LIBRARIES, "-lopenxr_loader"))
+    _compile(
+        sorted(DRIVER.glob("*.c")), program, flags, (*LIBRARIES, "-lopenxr_loader")
+    )
     return program
 
 

@@ -2,7 +2,7 @@
 
 read_frames   frames.jsonl of a folder that MOCK_XR_CAPTURE named
 pixels_of     the picture of a view, a quad or a depth image
-drawn         the picture that driver.c draws
+drawn         the picture that the driver draws
 
 All pictures have their first row at the bottom, as in OpenGL.
 """
@@ -49,7 +49,7 @@ def pixels_of(folder: Path, image: dict) -> np.ndarray:
 
 
 def drawn(frame: int, view: int, size_px: tuple[int, int]) -> np.ndarray:
-    """Return what driver.c draws, (height, width, 3) uint8.
+    """Return what the driver draws, (height, width, 3) uint8.
 
     Parameters
     ----------

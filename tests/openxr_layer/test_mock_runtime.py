@@ -233,6 +233,43 @@ def test_depth_is_no_number_in_half_of_the_columns(shown):
     assert (depth[:, ::2] > 0).all()
 
 
+def plane_depth(z_m):
+    return FAR_M * (z_m - NEAR_M) / (z_m * (FAR_M - NEAR_M))
+
+
+def is_plane(depth, z_m):
+    return np.allclose(depth, plane_depth(z_m), atol=1e-5)
+
+
+FAULTS = {
+    "depth-constant": lambda depth, info: (depth == 1).all(),
+    "depth-swapped": lambda depth, info: (
+        is_plane(depth, DISTANCE_M) and info["range_and_planes"][2] == FAR_M
+    ),
+    "depth-zero-near": lambda depth, info: info["range_and_planes"][2] == 0,
+    "depth-size": lambda depth, info: (
+        is_plane(depth, DISTANCE_M)
+        and depth.shape == (SIZE_PX[1] // 2, SIZE_PX[0] // 2)
+    ),
+    "depth-stale": lambda depth, info: (
+        is_plane(depth, DISTANCE_M) and info["releases"] == 1
+    ),
+    "depth-garbage": lambda depth, info: 0.2 < depth.std() < 0.4,
+    "depth-other-array": lambda depth, info: is_plane(
+        depth, DISTANCE_M * (2 - info["view"])
+    ),
+}
+
+
+@pytest.mark.parametrize(("case", "has_fault"), FAULTS.items())
+def test_depth_has_its_fault(shown, case, has_fault):
+    run = shown(case)
+    check_clean(run)
+    for i, view in enumerate(run.frames[-1]["layers"][0]["views"]):
+        info = view["depth"] | {"view": i}
+        assert has_fault(pixels_of(run.folder, info), info)
+
+
 def test_without_the_extension_there_is_no_depth(shown):
     offered = "XR_KHR_opengl_enable,XR_MNDX_egl_enable"
     run = shown("plain", MOCK_XR_EXTENSIONS=offered)
@@ -329,6 +366,13 @@ def test_local_space_is_recentered(shown):
     check_clean(run)
     turned = [f["layers"][0]["views"][0]["pose"][4] != 0 for f in run.frames]
     assert turned == [frame["frame"] > 4 for frame in run.frames]
+
+
+def test_waits_for_images_are_in_vain_at_first(shown):
+    run = shown("poll", MOCK_XR_WAIT_TIMEOUTS="5")
+    check_clean(run)
+    assert run.told[-1]["timeouts"] == 5
+    assert check_pictures(run) == 2 * N_FRAMES
 
 
 def test_the_session_is_lost(shown):

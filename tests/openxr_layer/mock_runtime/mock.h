@@ -56,6 +56,7 @@ struct format {
     unsigned pixel_bytes;
     bool is_depth;
 };
+
 /* What a thread has current: a context of EGL, one of GLX or none. */
 struct current {
     EGLDisplay egl_display;
@@ -92,7 +93,6 @@ struct object {
             XrSessionState state;
             bool is_running, is_lost, in_frame, has_actions, is_synced;
             uint32_t view_count;
-            XrViewConfigurationType views;
             uint64_t waited, begun; /* frames */
             int64_t waited_number, number; /* of the frame that waits, that has begun */
             XrTime waited_time, time;

@@ -160,7 +160,6 @@ XrResult XRAPI_CALL xrBeginSession(XrSession session,
     REQUIRE(found->session.state == XR_SESSION_STATE_READY, XR_ERROR_SESSION_NOT_READY,
             "its state is %d", (int)found->session.state);
     found->session.is_running = true;
-    found->session.views = info->primaryViewConfigurationType;
     found->session.view_count = views_of(info->primaryViewConfigurationType);
     return XR_SUCCESS;
 }

@@ -1,68 +1,5 @@
-/* An OpenXR application that draws known pictures, for tests of an API layer below it.
- *
- *   driver CASE [--frames N] [--size WxH] [--format F] [--depth D] [--distance-m X]
- *          [--near-z X] [--far-z X] [--glx] [--threads] [--check-state]
- *
- * CASE is one of `CASES` below, which says what each does.  Formats: SRGB8_ALPHA8, RGBA8,
- * RGB10_A2, RGBA16F; D16, D24, D32F, D24S8, D32FS8, none.  The depth is that of a plane
- * across the view; planes of --near-z 100 --far-z 0.1 are reversed, "inf" is infinite.
- *
- * Row y (from the bottom) and column x of view v of frame n are white where
- * (x + n) / 4 is even, elsewhere red (v = 0) or blue (v = 1); in the lowest 8 rows the
- * first 64 columns are 16 cells, bit by bit of n: green for 1 and black for 0.  A quad is
- * a view of its own, 2, in green.  Alpha is 1, or x / width where the case is about alpha.
- *
- * On standard output: a line of JSON for each frame shown, with the time it is for, the
- * views as submitted ("%a": x, y, z, quaternion; left, right, up, down) and milliseconds
- * in calls; and a summary.  Exit status: 0; 1 if a call failed, or if one left a state
- * changed (--check-state); 77 if the runtime lacks what the case needs.
- */
-#include <EGL/egl.h>
-#include <EGL/eglext.h>
-#define GL_GLEXT_PROTOTYPES
-#include <GL/gl.h>
-#include <GL/glext.h>
-#include <GL/glx.h>
-#include <math.h>
-#include <pthread.h>
-#include <stdbool.h>
-#include <stdint.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-#include <time.h>
-#define XR_USE_GRAPHICS_API_OPENGL
-#define XR_USE_PLATFORM_XLIB
-#define XR_USE_PLATFORM_EGL
-#include <openxr/openxr.h>
-#include <openxr/openxr_platform.h>
-#include <openxr/openxr_reflection.h>
-
-enum fault {
-    SOUND,
-    CONSTANT,
-    NOT_A_NUMBER,
-    SWAPPED,
-    ZERO_NEAR,
-    EQUAL,
-    RANGE,
-    SIZE,
-    STALE,
-    RECT,
-    GARBAGE,
-    OTHER_ARRAY
-};
-
-struct plan {
-    const char *name, *words;
-    bool is_array, is_wide, has_offset, is_dynamic, is_flipped, has_alpha, is_mono;
-    bool is_view_locked, in_action_space, renews_space, other_thread, no_context;
-    bool ends_from_thread, second, violates;
-    uint32_t samples;
-    int release_every; /* frames; -1: only the first one */
-    int sessions, projections, quad; /* quad: -1 below, 1 above the projection */
-    enum fault depth;
-};
+/* The cases, and how a session goes; the options are described in driver.h. */
+#include "driver.h"
 
 static const struct plan CASES[] = {
     {"plain", "two swapchains, both drawn each frame", .release_every = 1},
@@ -84,6 +21,7 @@ static const struct plan CASES[] = {
     {"restart", "three sessions, one after the other", .sessions = 3},
     {"end-from-thread", "the frames run in a thread", .ends_from_thread = true},
     {"second-session", "another session beside and after", .second = true},
+    {"poll", "waits of no time for the images", .never_waits = true},
     {"dynamic-size", "another size every 5 frames", .is_dynamic = true},
     {"fov-flipped", "angleUp below angleDown", .is_flipped = true},
     {"alpha", "a projection blended by its alpha", .has_alpha = true},
@@ -113,442 +51,15 @@ static const struct {
     {"D32FS8", GL_DEPTH32F_STENCIL8},    {"none", GL_NONE},
 };
 
-enum { QUAD_PX = 64, OFFSET_X_PX = 40, OFFSET_Y_PX = 24, SKIPPED = 77 };
+enum { QUAD_PX = 64, OFFSET_X_PX = 40, OFFSET_Y_PX = 24 };
 
-static struct {
-    struct plan plan;
-    int frames;
-    uint32_t width, height;
-    GLenum color_format, depth_format;
-    float distance_m, near_z, far_z;
-    bool glx, threads, check_state;
-} options = {.frames = 30,
+struct options options = {.frames = 30,
              .color_format = GL_SRGB8_ALPHA8,
              .depth_format = GL_DEPTH_COMPONENT32F,
              .distance_m = 2,
              .near_z = 0.1f,
              .far_z = 100};
 
-/* --- failures -------------------------------------------------------------------- */
-
-static const char *code_name(XrResult code) {
-    switch (code) {
-#define NAME(name, value) \
-    case name: \
-        return #name;
-        XR_LIST_ENUM_XrResult(NAME) default : return "XrResult";
-    }
-}
-
-static void fail(const char *call, const char *why) {
-    printf("{\"error\": \"%s\", \"call\": \"%s\"}\n", why, call);
-    fflush(stdout);
-    fprintf(stderr, "driver: %s: %s\n", call, why);
-    _Exit(1); /* other threads may be in the middle of a frame */
-}
-
-static XrResult must(XrResult result, const char *call) {
-    if (XR_FAILED(result)) fail(call, code_name(result));
-    return result;
-}
-
-#define MUST(call) must(call, #call)
-
-static void skip(const char *why) {
-    printf("{\"skipped\": \"%s\"}\n", why);
-    exit(SKIPPED);
-}
-
-/* --- contexts -------------------------------------------------------------------- */
-
-struct context_handles { /* one of them */
-    EGLContext egl;
-    GLXContext glx;
-};
-
-static struct {
-    EGLDisplay egl_display;
-    EGLConfig egl_config;
-    Display *x_display;
-    GLXFBConfig glx_config;
-    Window window;
-    VisualID visual;
-    struct context_handles context;
-} graphics;
-
-static struct context_handles new_context(void) {
-    static const EGLint EGL_VERSION_3_3[] = {EGL_CONTEXT_MAJOR_VERSION, 3,
-                                             EGL_CONTEXT_MINOR_VERSION, 3, EGL_NONE};
-    static const int GLX_VERSION_3_3[] = {GLX_CONTEXT_MAJOR_VERSION_ARB, 3,
-                                          GLX_CONTEXT_MINOR_VERSION_ARB, 3,
-                                          GLX_CONTEXT_PROFILE_MASK_ARB,
-                                          GLX_CONTEXT_CORE_PROFILE_BIT_ARB, None};
-    PFNGLXCREATECONTEXTATTRIBSARBPROC make =
-        (PFNGLXCREATECONTEXTATTRIBSARBPROC)glXGetProcAddressARB(
-            (const GLubyte *)"glXCreateContextAttribsARB");
-    struct context_handles made = {0};
-    if (options.glx)
-        made.glx = make(graphics.x_display, graphics.glx_config, NULL, True,
-                        GLX_VERSION_3_3);
-    else
-        made.egl = eglCreateContext(graphics.egl_display, graphics.egl_config,
-                                    EGL_NO_CONTEXT, EGL_VERSION_3_3);
-    if (!made.glx && !made.egl) fail("new_context", "no OpenGL 3.3");
-    return made;
-}
-
-static void open_egl(void) {
-    static const EGLint CONFIG[] = {EGL_SURFACE_TYPE, EGL_PBUFFER_BIT, EGL_RENDERABLE_TYPE,
-                                    EGL_OPENGL_BIT, EGL_NONE};
-    EGLint count = 0;
-    graphics.egl_display = eglGetPlatformDisplay(EGL_PLATFORM_SURFACELESS_MESA,
-                                                 EGL_DEFAULT_DISPLAY, NULL);
-    if (!eglInitialize(graphics.egl_display, NULL, NULL))
-        fail("eglInitialize", "no display without a surface");
-    eglBindAPI(EGL_OPENGL_API);
-    eglChooseConfig(graphics.egl_display, CONFIG, &graphics.egl_config, 1, &count);
-    graphics.context = new_context();
-}
-
-static void open_glx(void) {
-    static const int CONFIG[] = {GLX_DRAWABLE_TYPE, GLX_WINDOW_BIT, GLX_RENDER_TYPE,
-                                 GLX_RGBA_BIT, GLX_DOUBLEBUFFER, True, GLX_RED_SIZE, 8, None};
-    int count = 0;
-    graphics.x_display = XOpenDisplay(NULL);
-    if (!graphics.x_display) fail("XOpenDisplay", "no display");
-    GLXFBConfig *found = glXChooseFBConfig(
-        graphics.x_display, DefaultScreen(graphics.x_display), CONFIG, &count);
-    if (!count) fail("glXChooseFBConfig", "no configuration");
-    graphics.glx_config = found[0];
-    XFree(found);
-    XVisualInfo *visual =
-        glXGetVisualFromFBConfig(graphics.x_display, graphics.glx_config);
-    graphics.visual = visual->visualid;
-    Window root = DefaultRootWindow(graphics.x_display);
-    XSetWindowAttributes with = {
-        .colormap = XCreateColormap(graphics.x_display, root, visual->visual, AllocNone)};
-    graphics.window =
-        XCreateWindow(graphics.x_display, root, 0, 0, 64, 64, 0, visual->depth,
-                      InputOutput, visual->visual, CWColormap, &with);
-    XFree(visual);
-    graphics.context = new_context();
-}
-
-static void make_current(bool is_current) {
-    bool done =
-        options.glx
-            ? glXMakeCurrent(graphics.x_display, is_current ? graphics.window : None,
-                             is_current ? graphics.context.glx : NULL)
-            : eglBindAPI(EGL_OPENGL_API) &&
-                  eglMakeCurrent(graphics.egl_display, EGL_NO_SURFACE, EGL_NO_SURFACE,
-                                 is_current ? graphics.context.egl : EGL_NO_CONTEXT);
-    if (!done) fail("make_current", "the context could not be made current");
-}
-
-static void close_graphics(void) {
-    make_current(false);
-    if (options.glx) {
-        glXDestroyContext(graphics.x_display, graphics.context.glx);
-        XDestroyWindow(graphics.x_display, graphics.window);
-        XCloseDisplay(graphics.x_display);
-    } else {
-        eglDestroyContext(graphics.egl_display, graphics.context.egl);
-        eglTerminate(graphics.egl_display);
-        eglReleaseThread();
-    }
-}
-
-/* --- state of OpenGL that calls must leave alone --------------------------------- */
-
-#define LIST(name) {#name, name}
-static const struct {
-    const char *name;
-    GLenum value;
-} STATES[] = {
-    LIST(GL_CURRENT_PROGRAM), LIST(GL_VERTEX_ARRAY_BINDING), LIST(GL_ARRAY_BUFFER_BINDING),
-    LIST(GL_ELEMENT_ARRAY_BUFFER_BINDING), LIST(GL_PIXEL_PACK_BUFFER_BINDING),
-    LIST(GL_PIXEL_UNPACK_BUFFER_BINDING), LIST(GL_UNIFORM_BUFFER_BINDING),
-    LIST(GL_TRANSFORM_FEEDBACK_BUFFER_BINDING), LIST(GL_COPY_READ_BUFFER_BINDING),
-    LIST(GL_COPY_WRITE_BUFFER_BINDING), LIST(GL_SHADER_STORAGE_BUFFER_BINDING),
-    LIST(GL_DRAW_INDIRECT_BUFFER_BINDING), LIST(GL_DISPATCH_INDIRECT_BUFFER_BINDING),
-    LIST(GL_ATOMIC_COUNTER_BUFFER_BINDING), LIST(GL_PROGRAM_PIPELINE_BINDING),
-    LIST(GL_DRAW_FRAMEBUFFER_BINDING), LIST(GL_READ_FRAMEBUFFER_BINDING),
-    LIST(GL_RENDERBUFFER_BINDING), LIST(GL_DRAW_BUFFER), LIST(GL_READ_BUFFER),
-    LIST(GL_ACTIVE_TEXTURE), LIST(GL_VIEWPORT), LIST(GL_SCISSOR_BOX), LIST(GL_DEPTH_RANGE),
-    LIST(GL_COLOR_WRITEMASK), LIST(GL_DEPTH_WRITEMASK), LIST(GL_DEPTH_FUNC),
-    LIST(GL_STENCIL_WRITEMASK), LIST(GL_STENCIL_BACK_WRITEMASK), LIST(GL_STENCIL_FUNC),
-    LIST(GL_STENCIL_REF), LIST(GL_STENCIL_VALUE_MASK), LIST(GL_STENCIL_FAIL),
-    LIST(GL_STENCIL_PASS_DEPTH_FAIL), LIST(GL_STENCIL_PASS_DEPTH_PASS),
-    LIST(GL_BLEND_SRC_RGB), LIST(GL_BLEND_DST_RGB), LIST(GL_BLEND_SRC_ALPHA),
-    LIST(GL_BLEND_DST_ALPHA), LIST(GL_BLEND_EQUATION_RGB), LIST(GL_BLEND_EQUATION_ALPHA),
-    LIST(GL_BLEND_COLOR), LIST(GL_CULL_FACE_MODE), LIST(GL_FRONT_FACE),
-    LIST(GL_POLYGON_MODE), LIST(GL_POLYGON_OFFSET_FACTOR), LIST(GL_POLYGON_OFFSET_UNITS),
-    LIST(GL_COLOR_CLEAR_VALUE), LIST(GL_DEPTH_CLEAR_VALUE), LIST(GL_STENCIL_CLEAR_VALUE),
-    LIST(GL_LOGIC_OP_MODE), LIST(GL_SAMPLE_COVERAGE_VALUE), LIST(GL_POINT_SIZE),
-    LIST(GL_PACK_ALIGNMENT), LIST(GL_PACK_ROW_LENGTH), LIST(GL_PACK_SKIP_ROWS),
-    LIST(GL_PACK_SKIP_PIXELS), LIST(GL_PACK_IMAGE_HEIGHT), LIST(GL_PACK_SKIP_IMAGES),
-    LIST(GL_PACK_SWAP_BYTES), LIST(GL_UNPACK_ALIGNMENT), LIST(GL_UNPACK_ROW_LENGTH),
-    LIST(GL_UNPACK_SKIP_ROWS), LIST(GL_UNPACK_SKIP_PIXELS), LIST(GL_UNPACK_IMAGE_HEIGHT),
-    LIST(GL_UNPACK_SKIP_IMAGES), LIST(GL_UNPACK_SWAP_BYTES), LIST(GL_BLEND),
-    LIST(GL_DEPTH_TEST), LIST(GL_STENCIL_TEST), LIST(GL_SCISSOR_TEST), LIST(GL_CULL_FACE),
-    LIST(GL_FRAMEBUFFER_SRGB), LIST(GL_MULTISAMPLE), LIST(GL_SAMPLE_COVERAGE),
-    LIST(GL_SAMPLE_ALPHA_TO_COVERAGE), LIST(GL_SAMPLE_MASK), LIST(GL_DITHER),
-    LIST(GL_COLOR_LOGIC_OP), LIST(GL_POLYGON_OFFSET_FILL), LIST(GL_DEPTH_CLAMP),
-    LIST(GL_RASTERIZER_DISCARD), LIST(GL_PRIMITIVE_RESTART), LIST(GL_PROGRAM_POINT_SIZE),
-    LIST(GL_TEXTURE_CUBE_MAP_SEAMLESS), LIST(GL_CLIP_DISTANCE0), LIST(GL_CLIP_ORIGIN),
-    LIST(GL_CLIP_DEPTH_MODE),
-};
-static const struct {
-    const char *name;
-    GLenum value;
-} UNIT_STATES[] = {
-    LIST(GL_TEXTURE_BINDING_2D), LIST(GL_TEXTURE_BINDING_2D_ARRAY),
-    LIST(GL_TEXTURE_BINDING_3D), LIST(GL_TEXTURE_BINDING_CUBE_MAP),
-    LIST(GL_TEXTURE_BINDING_RECTANGLE), LIST(GL_TEXTURE_BINDING_BUFFER),
-    LIST(GL_TEXTURE_BINDING_2D_MULTISAMPLE), LIST(GL_TEXTURE_BINDING_2D_MULTISAMPLE_ARRAY),
-    LIST(GL_SAMPLER_BINDING),
-};
-#define LENGTH(array) (sizeof(array) / sizeof *(array))
-enum { N_STATES = LENGTH(STATES), N_UNIT_STATES = LENGTH(UNIT_STATES), N_UNITS = 8 };
-
-static bool is_known[N_STATES], is_unit_known[N_UNIT_STATES];
-
-struct snapshot {
-    void *current[8];
-    EGLenum api;
-    GLenum error;
-    GLfloat values[N_STATES][4];
-    GLint units[N_UNITS][N_UNIT_STATES];
-    GLint uniform_buffers[4], query;
-};
-
-static bool has_context(void) { return eglGetCurrentContext() || glXGetCurrentContext(); }
-
-static void read_state(struct snapshot *to) {
-    memset(to, 0, sizeof *to);
-    void *current[] = {eglGetCurrentDisplay(),
-                       eglGetCurrentContext(),
-                       eglGetCurrentSurface(EGL_DRAW),
-                       eglGetCurrentSurface(EGL_READ),
-                       glXGetCurrentDisplay(),
-                       glXGetCurrentContext(),
-                       (void *)(uintptr_t)glXGetCurrentDrawable(),
-                       (void *)(uintptr_t)glXGetCurrentReadDrawable()};
-    memcpy(to->current, current, sizeof current);
-    to->api = eglQueryAPI();
-    if (!has_context()) return;
-    to->error = glGetError();
-    for (int i = 0; i < N_STATES; i++)
-        if (is_known[i]) glGetFloatv(STATES[i].value, to->values[i]);
-    GLint active;
-    glGetIntegerv(GL_ACTIVE_TEXTURE, &active);
-    for (int unit = 0; unit < N_UNITS; unit++) {
-        glActiveTexture(GL_TEXTURE0 + (GLenum)unit);
-        for (int i = 0; i < N_UNIT_STATES; i++)
-            if (is_unit_known[i]) glGetIntegerv(UNIT_STATES[i].value, &to->units[unit][i]);
-    }
-    glActiveTexture((GLenum)active);
-    for (GLuint i = 0; i < 4; i++)
-        glGetIntegeri_v(GL_UNIFORM_BUFFER_BINDING, i, &to->uniform_buffers[i]);
-    glGetQueryiv(GL_SAMPLES_PASSED, GL_CURRENT_QUERY, &to->query);
-}
-
-/* Fail with the first difference; where the context is another one, all else is too. */
-static void compare_states(const char *call, const struct snapshot *a,
-                           const struct snapshot *b) {
-    static const char *const CURRENT[] = {"display", "context", "draw surface",
-                                          "read surface"};
-    char why[128] = "";
-#define DIFFER(differs, ...) \
-    if (!*why && (differs)) snprintf(why, sizeof why, __VA_ARGS__)
-    for (int i = 0; i < 8; i++)
-        DIFFER(a->current[i] != b->current[i], "the current %s changed", CURRENT[i % 4]);
-    DIFFER(a->api != b->api, "EGL's API changed");
-    DIFFER(a->error, "OpenGL's error 0x%x before it", a->error);
-    DIFFER(b->error, "OpenGL's error 0x%x", b->error);
-    for (int i = 0; i < N_STATES; i++)
-        DIFFER(memcmp(a->values[i], b->values[i], sizeof a->values[i]),
-               "%s was %g, is %g", STATES[i].name, (double)a->values[i][0],
-               (double)b->values[i][0]);
-    for (int unit = 0; unit < N_UNITS; unit++)
-        for (int i = 0; i < N_UNIT_STATES; i++)
-            DIFFER(a->units[unit][i] != b->units[unit][i], "%s of unit %d was %d, is %d",
-                   UNIT_STATES[i].name, unit, a->units[unit][i], b->units[unit][i]);
-    for (int i = 0; i < 4; i++)
-        DIFFER(a->uniform_buffers[i] != b->uniform_buffers[i],
-               "uniform buffer %d was %d, is %d", i, a->uniform_buffers[i],
-               b->uniform_buffers[i]);
-    DIFFER(a->query != b->query, "the query was %d, is %d", a->query, b->query);
-    if (*why) fail(call, why);
-}
-
-static GLuint made[8]; /* objects that are bound while calls are made */
-
-static void make_unusual_objects(void) {
-    for (int i = 0; i < N_STATES; i++) { /* some came with later versions of OpenGL */
-        GLfloat values[16];
-        glGetFloatv(STATES[i].value, values);
-        is_known[i] = glGetError() == GL_NO_ERROR;
-    }
-    for (int i = 0; i < N_UNIT_STATES; i++) {
-        GLint value;
-        glGetIntegerv(UNIT_STATES[i].value, &value);
-        is_unit_known[i] = glGetError() == GL_NO_ERROR;
-    }
-    glGenTextures(3, made);
-    glGenBuffers(1, &made[3]);
-    glGenSamplers(1, &made[4]);
-    glGenRenderbuffers(1, &made[5]);
-    glGenQueries(1, &made[6]);
-}
-
-/* Set what a layer might rely on, or change, to values that are not the defaults. */
-static void set_unusual_state(void) {
-    static const GLenum BUFFERS[] = {GL_ARRAY_BUFFER,     GL_PIXEL_PACK_BUFFER,
-                                     GL_PIXEL_UNPACK_BUFFER, GL_UNIFORM_BUFFER,
-                                     GL_COPY_READ_BUFFER, GL_COPY_WRITE_BUFFER};
-    static const GLenum TOGGLES[] = {GL_BLEND,        GL_DEPTH_TEST, GL_STENCIL_TEST,
-                                     GL_SCISSOR_TEST, GL_CULL_FACE,  GL_FRAMEBUFFER_SRGB,
-                                     GL_RASTERIZER_DISCARD, GL_SAMPLE_COVERAGE};
-    for (size_t i = 0; i < LENGTH(BUFFERS); i++) glBindBuffer(BUFFERS[i], made[3]);
-    for (size_t i = 0; i < LENGTH(TOGGLES); i++) glEnable(TOGGLES[i]);
-    for (GLuint unit = 0; unit < N_UNITS; unit++) {
-        glActiveTexture(GL_TEXTURE0 + unit);
-        glBindTexture(GL_TEXTURE_2D, made[0]);
-        glBindTexture(GL_TEXTURE_2D_ARRAY, made[1]);
-        glBindTexture(GL_TEXTURE_2D_MULTISAMPLE, made[2]);
-        glBindSampler(unit, made[4]);
-    }
-    glActiveTexture(GL_TEXTURE3);
-    glBindBufferBase(GL_UNIFORM_BUFFER, 1, made[3]);
-    glBindRenderbuffer(GL_RENDERBUFFER, made[5]);
-    glViewport(3, 5, 7, 11);
-    glScissor(1, 2, 3, 4);
-    glDepthRange(0.25, 0.75);
-    glColorMask(GL_TRUE, GL_FALSE, GL_TRUE, GL_FALSE);
-    glDepthMask(GL_FALSE);
-    glDepthFunc(GL_GEQUAL);
-    glStencilFunc(GL_NOTEQUAL, 3, 0x55);
-    glStencilMask(0x0f);
-    glBlendFuncSeparate(GL_ONE, GL_SRC_ALPHA, GL_ZERO, GL_DST_COLOR);
-    glBlendEquation(GL_FUNC_REVERSE_SUBTRACT);
-    glBlendColor(0.1f, 0.2f, 0.3f, 0.4f);
-    glCullFace(GL_FRONT);
-    glFrontFace(GL_CW);
-    glPolygonMode(GL_FRONT_AND_BACK, GL_LINE);
-    glClearColor(0.5f, 0.25f, 0.125f, 1);
-    glClearDepth(0.5);
-    glClearStencil(7);
-    glSampleCoverage(0.5f, GL_TRUE);
-    glPixelStorei(GL_PACK_ALIGNMENT, 8);
-    glPixelStorei(GL_PACK_ROW_LENGTH, 77);
-    glPixelStorei(GL_UNPACK_ALIGNMENT, 2);
-    glPixelStorei(GL_UNPACK_ROW_LENGTH, 55);
-    glPixelStorei(GL_UNPACK_SKIP_PIXELS, 1);
-    glBeginQuery(GL_SAMPLES_PASSED, made[6]);
-}
-
-static void set_usual_state(void) {
-    static const GLenum OFF[] = {GL_BLEND,        GL_STENCIL_TEST,     GL_CULL_FACE,
-                                 GL_SCISSOR_TEST, GL_FRAMEBUFFER_SRGB, GL_RASTERIZER_DISCARD,
-                                 GL_SAMPLE_COVERAGE};
-    for (size_t i = 0; i < LENGTH(OFF); i++) glDisable(OFF[i]);
-    for (GLuint unit = 0; unit < N_UNITS; unit++) glBindSampler(unit, 0);
-    glEnable(GL_DEPTH_TEST); /* without it no depth is written */
-    glDepthFunc(GL_ALWAYS);
-    glDepthMask(GL_TRUE);
-    glDepthRange(0, 1);
-    glColorMask(GL_TRUE, GL_TRUE, GL_TRUE, GL_TRUE);
-    glPolygonMode(GL_FRONT_AND_BACK, GL_FILL);
-    glBindBuffer(GL_PIXEL_UNPACK_BUFFER, 0);
-    glPixelStorei(GL_UNPACK_ALIGNMENT, 4);
-    glPixelStorei(GL_UNPACK_ROW_LENGTH, 0);
-    glPixelStorei(GL_UNPACK_SKIP_PIXELS, 0);
-    glActiveTexture(GL_TEXTURE0);
-    glEndQuery(GL_SAMPLES_PASSED);
-}
-
-static double now_ms(void) {
-    struct timespec now;
-    clock_gettime(CLOCK_MONOTONIC, &now);
-    return 1e3 * (double)now.tv_sec + 1e-6 * (double)now.tv_nsec;
-}
-
-/* Make a call of OpenXR, note how long it takes, and see that it leaves OpenGL alone. */
-#define CHECKED(result, spent_ms, call) \
-    do { \
-        struct snapshot before, after; \
-        if (options.check_state) read_state(&before); \
-        double start_ms = now_ms(); \
-        result = call; \
-        spent_ms += now_ms() - start_ms; \
-        if (options.check_state) { \
-            read_state(&after); \
-            compare_states(#call, &before, &after); \
-        } \
-    } while (0)
-
-#define MUST_CHECKED(spent_ms, call) \
-    do { \
-        XrResult result; \
-        CHECKED(result, spent_ms, call); \
-        must(result, #call); \
-    } while (0)
-
-/* --- pictures -------------------------------------------------------------------- */
-
-static const char VERTEX[] =
-    "#version 330 core\n"
-    "void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0,"
-    " 0, 1); }";
-static const char FRAGMENT[] =
-    "#version 330 core\n"
-    "uniform ivec4 part; uniform int frame, view; uniform bool flipped, alpha, noise;\n"
-    "uniform float depth; out vec4 color;\n"
-    "void main() {\n"
-    "  ivec2 at = ivec2(gl_FragCoord.xy) - part.xy;\n"
-    "  if (flipped) at.y = part.w - 1 - at.y;\n"
-    "  vec3 own = vec3(view == 0, view == 2, view == 1);\n"
-    "  bool bit = ((frame >> (at.x / 4)) & 1) == 1;\n"
-    "  bool is_number = at.y < 8 && at.x < 64;\n"
-    "  color.rgb = is_number ? vec3(0, bit, 0)\n"
-    "                        : ((at.x + frame) / 4) % 2 == 0 ? vec3(1) : own;\n"
-    "  color.a = alpha ? float(at.x) / float(part.z) : 1.0;\n"
-    "  float random = fract(sin(dot(vec2(at), vec2(12.9898, 78.233)) + float(frame))"
-    " * 43758.5453);\n"
-    "  gl_FragDepth = noise ? random : depth;\n"
-    "}";
-
-static GLuint program, vertex_array, framebuffer;
-
-static GLuint compiled(GLenum kind, const char *text) {
-    GLint ok;
-    GLuint shader = glCreateShader(kind);
-    glShaderSource(shader, 1, &text, NULL);
-    glCompileShader(shader);
-    glGetShaderiv(shader, GL_COMPILE_STATUS, &ok);
-    if (!ok) fail("glCompileShader", "a shader does not compile");
-    return shader;
-}
-
-static void make_objects(void) {
-    program = glCreateProgram();
-    glAttachShader(program, compiled(GL_VERTEX_SHADER, VERTEX));
-    glAttachShader(program, compiled(GL_FRAGMENT_SHADER, FRAGMENT));
-    glLinkProgram(program);
-    glGenVertexArrays(1, &vertex_array);
-    glGenFramebuffers(1, &framebuffer);
-    if (options.check_state) make_unusual_objects();
-}
-
-/* Return what a depth buffer holds at a distance: 0 at nearZ, 1 at farZ. */
-static float window_depth(float z_m) {
-    double near_z = (double)options.near_z, far_z = (double)options.far_z;
-    double z = (double)z_m;
-    if (isinf(far_z)) return (float)(1 - near_z / z);
-    if (isinf(near_z)) return (float)(far_z / z);
-    return (float)(far_z * (z - near_z) / (z * (far_z - near_z)));
-}
 
 /* --- swapchains ------------------------------------------------------------------ */
 
@@ -576,6 +87,7 @@ struct session {
     uint32_t view_count;
     XrView views[2]; /* of the pictures in the swapchains */
     int frame; /* shown so far */
+    int timeouts; /* of waits for an image */
     XrTime time;
     XrSpace layer_space;
     double acquire_ms, wait_ms, release_ms, end_ms;
@@ -646,17 +158,20 @@ static void make_images(const struct session *session, struct images *images,
 }
 
 static void acquire(struct session *session, struct chain *chain) {
-    XrSwapchainImageWaitInfo info = {.type = XR_TYPE_SWAPCHAIN_IMAGE_WAIT_INFO,
-                                     .timeout = XR_INFINITE_DURATION};
-    MUST_CHECKED(session->acquire_ms,
+    XrSwapchainImageWaitInfo info = {
+        .type = XR_TYPE_SWAPCHAIN_IMAGE_WAIT_INFO,
+        .timeout = options.plan.never_waits ? 0 : XR_INFINITE_DURATION};
+    MUST_TIMED(session->acquire_ms,
                  xrAcquireSwapchainImage(chain->handle, NULL, &chain->index));
-    MUST_CHECKED(session->acquire_ms, xrWaitSwapchainImage(chain->handle, &info));
+    while (MUST_TIMED(session->acquire_ms, xrWaitSwapchainImage(chain->handle, &info)) ==
+           XR_TIMEOUT_EXPIRED)
+        session->timeouts++;
     chain->is_acquired = true;
 }
 
 static void release(struct session *session, struct chain *chain) {
     if (!chain->is_acquired) return;
-    MUST_CHECKED(session->release_ms, xrReleaseSwapchainImage(chain->handle, NULL));
+    MUST_TIMED(session->release_ms, xrReleaseSwapchainImage(chain->handle, NULL));
     chain->is_acquired = false;
 }
 
@@ -676,18 +191,6 @@ static XrSwapchainSubImage part_of(const struct plan *plan, const struct chain *
     return part;
 }
 
-static void attach(GLenum point, const struct chain *chain, uint32_t layer) {
-    GLuint texture = chain ? chain->textures[chain->index] : 0;
-    if (chain && chain->layers > 1)
-        glFramebufferTextureLayer(GL_FRAMEBUFFER, point, texture, 0, (GLint)layer);
-    else
-        glFramebufferTexture(GL_FRAMEBUFFER, point, texture, 0);
-}
-
-static void set_uniform(const char *name, int value) {
-    glUniform1i(glGetUniformLocation(program, name), value);
-}
-
 /* A shader cannot write what is no number: it is clamped after it.  Mesa also clamps what
  * is uploaded, and stores 0; other drivers store it. */
 static void spoil_depth(const struct chain *chain) {
@@ -701,32 +204,34 @@ static void spoil_depth(const struct chain *chain) {
     free(values);
 }
 
+static void attach_image(GLenum point, const struct chain *chain, uint32_t layer) {
+    attach(point, chain ? chain->textures[chain->index] : 0, chain && chain->layers > 1,
+           layer);
+}
+
 static void draw_view(const struct plan *plan, const struct images *images, uint32_t view,
                       int frame) {
     const struct chain *color = &images->color[view % images->chain_count];
     const struct chain *depth = &images->depth[view % images->chain_count];
-    XrSwapchainSubImage part = part_of(plan, color, view, frame);
-    int x = part.imageRect.offset.x, y = part.imageRect.offset.y;
-    int width = part.imageRect.extent.width, height = part.imageRect.extent.height;
     float distance_m = options.distance_m * (plan->depth == OTHER_ARRAY && view ? 2 : 1);
-    bool has_own_size = images->has_depth && depth->width != color->width;
+    struct picture picture = {
+        .frame = frame,
+        .view = images->first_view + (int)view,
+        .part = part_of(plan, color, view, frame).imageRect,
+        .is_flipped = plan->is_flipped,
+        .has_alpha = images->has_alpha,
+        .has_noise = plan->depth == GARBAGE,
+        .depth = plan->depth == CONSTANT ? 1 : window_depth(distance_m),
+    };
     bool has_depth = images->has_depth && depth->is_acquired;
-    glBindFramebuffer(GL_FRAMEBUFFER, framebuffer);
-    glUseProgram(program);
-    glBindVertexArray(vertex_array);
-    glUniform4i(glGetUniformLocation(program, "part"), x, y, width, height);
-    set_uniform("frame", frame);
-    set_uniform("view", images->first_view + (int)view);
-    set_uniform("flipped", plan->is_flipped);
-    set_uniform("alpha", images->has_alpha);
-    set_uniform("noise", plan->depth == GARBAGE);
-    glUniform1f(glGetUniformLocation(program, "depth"),
-                plan->depth == CONSTANT ? 1 : window_depth(distance_m));
-    for (int pass = 0; pass < (has_own_size ? 2 : 1); pass++) {
-        attach(GL_COLOR_ATTACHMENT0, pass ? NULL : color, view);
-        attach(GL_DEPTH_ATTACHMENT, has_depth && pass == has_own_size ? depth : NULL, view);
-        glViewport(x, y, width, height);
-        glDrawArrays(GL_TRIANGLES, 0, 3);
+    bool is_apart = has_depth && depth->width != color->width; /* of another size */
+    attach_image(GL_COLOR_ATTACHMENT0, color, view);
+    attach_image(GL_DEPTH_ATTACHMENT, has_depth && !is_apart ? depth : NULL, view);
+    draw_picture(&picture);
+    if (is_apart) {
+        attach_image(GL_COLOR_ATTACHMENT0, NULL, 0);
+        attach_image(GL_DEPTH_ATTACHMENT, depth, view);
+        draw_picture(&picture);
     }
     if (plan->depth == NOT_A_NUMBER && has_depth) spoil_depth(depth);
 }
@@ -875,8 +380,7 @@ static XrResult end_frame(struct session *session, const struct layers *layers) 
         .layerCount = layers ? layers->count : 0,
         .layers = layers ? layers->list : NULL,
     };
-    XrResult result;
-    CHECKED(result, session->end_ms, xrEndFrame(session->handle, &info));
+    XrResult result = TIMED(session->end_ms, xrEndFrame(session->handle, &info));
     /* A runtime may refuse depth that is not valid. */
     if (!options.plan.depth) must(result, "xrEndFrame");
     return result;
@@ -921,7 +425,7 @@ static void *wait_in_thread(void *given) {
 static XrFrameState wait_frame(struct session *session) {
     XrFrameState state = {.type = XR_TYPE_FRAME_STATE};
     if (!options.threads) {
-        MUST_CHECKED(session->wait_ms, xrWaitFrame(session->handle, NULL, &state));
+        MUST_TIMED(session->wait_ms, xrWaitFrame(session->handle, NULL, &state));
         return state;
     }
     if (!session->has_waiter) {
@@ -974,7 +478,7 @@ static void locate_views(struct session *session) {
     XrViewState state = {.type = XR_TYPE_VIEW_STATE};
     uint32_t count;
     for (int i = 0; i < 2; i++) session->views[i] = (XrView){.type = XR_TYPE_VIEW};
-    MUST_CHECKED(session->wait_ms, xrLocateViews(session->handle, &info, &state, 2, &count,
+    MUST_TIMED(session->wait_ms, xrLocateViews(session->handle, &info, &state, 2, &count,
                                                  session->views));
     for (int i = 0; i < 2; i++) /* without a location: at the origin */
         if (!(state.viewStateFlags & XR_VIEW_STATE_ORIENTATION_VALID_BIT))
@@ -988,7 +492,7 @@ static void show_frame(struct session *session) {
     session->acquire_ms = session->release_ms = session->end_ms = 0;
     XrFrameState state = wait_frame(session);
     session->time = state.predictedDisplayTime;
-    MUST_CHECKED(session->wait_ms, xrBeginFrame(session->handle, NULL));
+    MUST_TIMED(session->wait_ms, xrBeginFrame(session->handle, NULL));
     if (action_set) {
         XrActiveActionSet active = {.actionSet = action_set};
         XrActionsSyncInfo info = {.type = XR_TYPE_ACTIONS_SYNC_INFO,
@@ -1265,7 +769,7 @@ static void run_frames_in_thread(struct session *session) {
     while (!session->is_over) take_events(session, 1), rest();
 }
 
-static int shown; /* frames, of all sessions */
+static int shown, timeouts; /* of all sessions */
 
 static void run(struct session *sessions, int count) {
     for (int i = 0; i < count; i++) furnish(&sessions[i]);
@@ -1275,6 +779,7 @@ static void run(struct session *sessions, int count) {
         run_sessions(sessions, count);
     for (int i = 0; i < count; i++) {
         shown += sessions[i].frame;
+        timeouts += sessions[i].timeouts;
         destroy_session(&sessions[i]);
     }
 }
@@ -1402,7 +907,8 @@ int main(int count, char **arguments) {
     if (options.glx) open_glx();
     else open_egl();
     make_current(true);
-    make_objects();
+    make_drawing();
+    if (options.check_state) make_unusual_objects();
     open_instance();
     if (options.check_state) set_unusual_state();
     if (options.plan.second) {
@@ -1416,7 +922,8 @@ int main(int count, char **arguments) {
     }
     MUST(xrDestroyInstance(instance));
     close_graphics();
-    printf("{\"case\": \"%s\", \"frames\": %d, \"checked_state\": %s}\n", options.plan.name,
-           shown, options.check_state ? "true" : "false");
+    printf("{\"case\": \"%s\", \"frames\": %d, \"timeouts\": %d, "
+           "\"checked_state\": %s}\n",
+           options.plan.name, shown, timeouts, options.check_state ? "true" : "false");
     return 0;
 }
