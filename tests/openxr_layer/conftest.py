@@ -5,6 +5,7 @@ import shutil
 import pytest
 
 from tests.headset.xorg import Xorg
+from tests.native_build import runtime_of
 from tests.openxr_layer import build
 
 
@@ -26,6 +27,16 @@ def runtime(tmp_path_factory):
 def driver(tmp_path_factory):
     """Return the path of the application."""
     return build.build_driver(tmp_path_factory.mktemp("driver"))
+
+
+@pytest.fixture(scope="session")
+def watched(tmp_path_factory):
+    """Return both, built for ThreadSanitizer."""
+    if runtime_of("thread") is None:
+        pytest.skip("no ThreadSanitizer here")
+    folder = tmp_path_factory.mktemp("watched")
+    flag = "-fsanitize=thread"
+    return build.build_runtime(folder, flag), build.build_driver(folder, flag)
 
 
 @pytest.fixture(scope="session")

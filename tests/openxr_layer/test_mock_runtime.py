@@ -1,12 +1,10 @@
 """The mock runtime serves programs, sees what is wrong, and captures what is shown.
 
 Run in the root of `tests/headset/setup_root.sh`, with the packages libopenxr-dev,
-libgl-dev, libegl-dev, libx11-dev and, for hello_xr, libopenxr-utils,
+libgl-dev, libegl-dev, libx11-dev, openxr-layer-corevalidation, libopenxr-utils,
 xserver-xorg-core and xserver-xorg-video-dummy.
 """
 
-import json
-import os
 import shutil
 import subprocess
 
@@ -15,61 +13,11 @@ import pytest
 
 from tests.native_build import runtime_of
 from tests.openxr_layer import build
-from tests.openxr_layer.captured import drawn, pixels_of, read_frames
+from tests.openxr_layer.captured import drawn, pixels_of
+from tests.openxr_layer.programs import SIZE_PX, Run, run_hello_xr
 
 N_FRAMES = 8
-SIZE_PX = (128, 96)
-TIMEOUT_S = 60
 NEAR_M, FAR_M, DISTANCE_M = 0.1, 100.0, 2.0
-
-
-class Shown:
-    """A program that has run on the mock runtime.
-
-    Attributes
-    ----------
-    exit_code : int
-    said : str
-        What the runtime and others wrote to standard error.
-    told : list of dict
-        What the program told in JSON.
-    frames : list of dict
-        Captured frames that have layers.
-    """
-
-    def __init__(self, runtime, folder, *command, **variables):
-        self.folder = folder / "captured"
-        environment = {
-            "XR_RUNTIME_JSON": str(runtime),
-            "MOCK_XR_CAPTURE": str(self.folder),
-            "MOCK_XR_RATE_HZ": "0",
-            "MOCK_XR_SIZE": "{}x{}".format(*SIZE_PX),
-            "LP_NUM_THREADS": "1",
-        }
-        run = subprocess.run(
-            list(map(str, command)),
-            env=os.environ | environment | variables,
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT_S,
-        )
-        self.exit_code, self.said = run.returncode, run.stderr
-        lines = run.stdout.splitlines()
-        self.told = [json.loads(line) for line in lines if line.startswith("{")]
-        has_frames = (self.folder / "frames.jsonl").exists()
-        frames = read_frames(self.folder) if has_frames else []
-        self.frames = [frame for frame in frames if frame["layers"]]
-
-    @property
-    def violations(self):
-        return [line for line in self.said.splitlines() if "violation" in line]
-
-    def pairs(self):
-        """Yield what the driver tells of each frame, and what was captured of it."""
-        captured = {frame["display_time"]: frame for frame in self.frames}
-        for line in self.told:
-            if "frame" in line:
-                yield line, captured[line["display_time"]]
 
 
 @pytest.fixture
@@ -78,7 +26,7 @@ def shown(runtime, driver, tmp_path):
 
     def run(case, *options, **variables):
         frames = ("--frames", N_FRAMES)
-        return Shown(runtime, tmp_path, driver, case, *frames, *options, **variables)
+        return Run(runtime, tmp_path, driver, case, *frames, *options, **variables)
 
     return run
 
@@ -435,13 +383,9 @@ def test_depth_that_is_not_valid_is_reported(shown, case):
 @pytest.mark.parametrize(
     "case", ["plain", "other-thread", "end-from-thread", "restart"]
 )
-def test_threads_do_not_race(tmp_path, case):
-    if runtime_of("thread") is None:
-        pytest.skip("no ThreadSanitizer here")
-    flag = "-fsanitize=thread"
-    manifest = build.build_runtime(tmp_path, flag)
-    program = build.build_driver(tmp_path, flag)
-    run = Shown(
+def test_threads_do_not_race(watched, tmp_path, case):
+    manifest, program = watched
+    run = Run(
         *(manifest, tmp_path, program, case, "--frames", N_FRAMES, "--threads"),
         **build.thread_sanitizer_options(tmp_path),
     )
@@ -457,40 +401,17 @@ def test_addresses_are_valid(tmp_path, driver):
     variables = {"LD_PRELOAD": str(library), "ASAN_OPTIONS": "detect_leaks=0"}
     for case, n_frames in {"msaa4": N_FRAMES, "second-session": 3 * N_FRAMES}.items():
         options = ("--frames", N_FRAMES)
-        run = Shown(manifest, tmp_path, driver, case, *options, **variables)
+        run = Run(manifest, tmp_path, driver, case, *options, **variables)
         assert "ERROR: AddressSanitizer" not in run.said
         check_clean(run, n_frames)
 
 
 @pytest.mark.skipif(shutil.which("hello_xr") is None, reason="no hello_xr here")
 def test_hello_xr_is_shown(runtime, tmp_path, display):
-    folder, n_frames = tmp_path / "captured", 60
-    variables = {
-        "XR_RUNTIME_JSON": str(runtime),
-        "DISPLAY": display,
-        "MOCK_XR_CAPTURE": str(folder),
-        "MOCK_XR_EXIT_AT": str(n_frames),
-    }
-    with (
-        (tmp_path / "said.txt").open("w+b") as said,
-        subprocess.Popen(
-            ["timeout", str(TIMEOUT_S), "hello_xr", "-g", "OpenGL"],
-            env=os.environ | variables,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=said,
-            text=True,
-        ) as program,
-    ):
-        for line in program.stdout:
-            if "SESSION_STATE_EXITING" in line:
-                break
-        program.communicate()  # it waits for a key, or the end of its input
-        said.seek(0)
-        assert b"violation" not in said.read()
-    assert program.returncode == 0
-    frames = [frame for frame in read_frames(folder) if frame["layers"]]
+    n_frames = 60
+    frames, violations = run_hello_xr(runtime, tmp_path, display, n_frames)
+    assert violations == []
     assert len(frames) == n_frames
     for frame in frames:
         for view in frame["layers"][0]["views"]:
-            assert pixels_of(folder, view)[..., :3].max() > 0
+            assert pixels_of(tmp_path / "captured", view)[..., :3].max() > 0
