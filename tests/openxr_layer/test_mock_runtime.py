@@ -268,6 +268,17 @@ def test_alpha_is_a_gradient(shown):
     assert run.frames[-1]["layers"][0]["flags"] == 6
 
 
+def test_a_picture_is_upside_down(shown):
+    run = shown("fov-flipped")
+    check_clean(run)
+    for told, frame in run.pairs():
+        for i, view in enumerate(frame["layers"][0]["views"]):
+            *_, up, down = view["fov"]
+            assert up < 0 < down
+            pixels = pixels_of(run.folder, view)[::-1, :, :3]
+            assert (pixels == drawn(told["frame"], i, SIZE_PX)).all()
+
+
 def test_an_image_is_shown_again(shown):
     for case, releases in {"reuse": 1, "half-rate": N_FRAMES // 2}.items():
         run = shown(case)
@@ -351,8 +362,13 @@ WRONG = {
     "view count": "XR_ERROR_VALIDATION_FAILURE",
     "chain": "XR_ERROR_VALIDATION_FAILURE",
     "flags": "XR_ERROR_VALIDATION_FAILURE",
+    "depth for color": "XR_ERROR_VALIDATION_FAILURE",
+    "depth rect": "XR_ERROR_SWAPCHAIN_RECT_INVALID",
+    "blend mode": "XR_ERROR_ENVIRONMENT_BLEND_MODE_UNSUPPORTED",
+    "layer type": "XR_ERROR_LAYER_INVALID",
     "time": "XR_ERROR_TIME_INVALID",
     "swapchain": "XR_ERROR_HANDLE_INVALID",
+    "wait": "XR_ERROR_CALL_ORDER_INVALID",
     "release": "XR_ERROR_CALL_ORDER_INVALID",
     "begin": "XR_ERROR_CALL_ORDER_INVALID",
     "end session": "XR_ERROR_SESSION_NOT_STOPPING",

@@ -13,7 +13,8 @@ static const struct plan CASES[] = {
     {"quad-below", "a quad under the projection", .quad = -1},
     {"quad-above", "a quad over the projection", .quad = 1},
     {"view-locked", "the projection is in a VIEW space", .is_view_locked = true},
-    {"action-space", "the projection is in a space of an action", .in_action_space = true},
+    {"action-space", "the projection is in a space of an action",
+     .in_action_space = true},
     {"space-destroyed", "another space every 10 frames", .renews_space = true},
     {"mono", "one view, of PRIMARY_MONO", .is_mono = true},
     {"other-thread", "another thread releases and ends", .other_thread = true},
@@ -27,7 +28,8 @@ static const struct plan CASES[] = {
     {"alpha", "a projection blended by its alpha", .has_alpha = true},
     {"violation", "errors that the runtime must report", .violates = true},
     {"depth-constant", "nothing but 1", .depth = CONSTANT},
-    {"depth-nan", "not a number (with Mesa: 0) in every second column", .depth = NOT_A_NUMBER},
+    {"depth-nan", "not a number (with Mesa: 0) in every second column",
+     .depth = NOT_A_NUMBER},
     {"depth-swapped", "nearZ and farZ exchanged", .depth = SWAPPED},
     {"depth-zero-near", "nearZ is 0", .depth = ZERO_NEAR},
     {"depth-equal", "nearZ is farZ", .depth = EQUAL},
@@ -36,30 +38,31 @@ static const struct plan CASES[] = {
     {"depth-stale", "released in the first frame only", .depth = STALE},
     {"depth-rect", "part outside of the image", .depth = RECT},
     {"depth-garbage", "noise", .depth = GARBAGE},
-    {"depth-other-array", "each view has the depth of the other, at twice or half the "
-                          "distance", .is_array = true, .depth = OTHER_ARRAY},
+    {"depth-other-array",
+     "each view has the depth of the other, at twice or half the "
+     "distance",
+     .is_array = true, .depth = OTHER_ARRAY},
 };
 
 static const struct {
     const char *name;
     GLenum format;
 } FORMATS[] = {
-    {"SRGB8_ALPHA8", GL_SRGB8_ALPHA8},   {"RGBA8", GL_RGBA8},
-    {"RGB10_A2", GL_RGB10_A2},           {"RGBA16F", GL_RGBA16F},
-    {"D16", GL_DEPTH_COMPONENT16},       {"D24", GL_DEPTH_COMPONENT24},
-    {"D32F", GL_DEPTH_COMPONENT32F},     {"D24S8", GL_DEPTH24_STENCIL8},
-    {"D32FS8", GL_DEPTH32F_STENCIL8},    {"none", GL_NONE},
+    {"SRGB8_ALPHA8", GL_SRGB8_ALPHA8}, {"RGBA8", GL_RGBA8},
+    {"RGB10_A2", GL_RGB10_A2},         {"RGBA16F", GL_RGBA16F},
+    {"D16", GL_DEPTH_COMPONENT16},     {"D24", GL_DEPTH_COMPONENT24},
+    {"D32F", GL_DEPTH_COMPONENT32F},   {"D24S8", GL_DEPTH24_STENCIL8},
+    {"D32FS8", GL_DEPTH32F_STENCIL8},  {"none", GL_NONE},
 };
 
 enum { QUAD_PX = 64, OFFSET_X_PX = 40, OFFSET_Y_PX = 24 };
 
 struct options options = {.frames = 30,
-             .color_format = GL_SRGB8_ALPHA8,
-             .depth_format = GL_DEPTH_COMPONENT32F,
-             .distance_m = 2,
-             .near_z = 0.1f,
-             .far_z = 100};
-
+                          .color_format = GL_SRGB8_ALPHA8,
+                          .depth_format = GL_DEPTH_COMPONENT32F,
+                          .distance_m = 2,
+                          .near_z = 0.1f,
+                          .far_z = 100};
 
 /* --- swapchains ------------------------------------------------------------------ */
 
@@ -86,8 +89,8 @@ struct session {
     struct images images[2], quad;
     uint32_t view_count;
     XrView views[2]; /* of the pictures in the swapchains */
-    int frame; /* shown so far */
-    int timeouts; /* of waits for an image */
+    int frame;       /* shown so far */
+    int timeouts;    /* of waits for an image */
     XrTime time;
     XrSpace layer_space;
     double acquire_ms, wait_ms, release_ms, end_ms;
@@ -106,8 +109,8 @@ static XrActionSet action_set;
 static XrAction pose_action;
 static pthread_mutex_t tell_lock = PTHREAD_MUTEX_INITIALIZER;
 
-static void make_chain(const struct session *session, struct chain *chain, GLenum format,
-                       uint32_t width, uint32_t height, uint32_t layers,
+static void make_chain(const struct session *session, struct chain *chain,
+                       GLenum format, uint32_t width, uint32_t height, uint32_t layers,
                        uint32_t samples) {
     bool is_color = format == options.color_format;
     XrSwapchainCreateInfo info = {
@@ -149,11 +152,11 @@ static void make_images(const struct session *session, struct images *images,
     uint32_t layers = plan->is_array ? session->view_count : 1;
     uint32_t samples = plan->samples ? plan->samples : 1;
     for (uint32_t i = 0; i < images->chain_count; i++) {
-        make_chain(session, &images->color[i], options.color_format, width, height, layers,
-                   samples);
+        make_chain(session, &images->color[i], options.color_format, width, height,
+                   layers, samples);
         if (images->has_depth)
-            make_chain(session, &images->depth[i], options.depth_format, width / divisor,
-                       height / divisor, layers, samples);
+            make_chain(session, &images->depth[i], options.depth_format,
+                       width / divisor, height / divisor, layers, samples);
     }
 }
 
@@ -162,9 +165,9 @@ static void acquire(struct session *session, struct chain *chain) {
         .type = XR_TYPE_SWAPCHAIN_IMAGE_WAIT_INFO,
         .timeout = options.plan.never_waits ? 0 : XR_INFINITE_DURATION};
     MUST_TIMED(session->acquire_ms,
-                 xrAcquireSwapchainImage(chain->handle, NULL, &chain->index));
-    while (MUST_TIMED(session->acquire_ms, xrWaitSwapchainImage(chain->handle, &info)) ==
-           XR_TIMEOUT_EXPIRED)
+               xrAcquireSwapchainImage(chain->handle, NULL, &chain->index));
+    while (MUST_TIMED(session->acquire_ms,
+                      xrWaitSwapchainImage(chain->handle, &info)) == XR_TIMEOUT_EXPIRED)
         session->timeouts++;
     chain->is_acquired = true;
 }
@@ -191,16 +194,16 @@ static XrSwapchainSubImage part_of(const struct plan *plan, const struct chain *
     return part;
 }
 
-/* A shader cannot write what is no number: it is clamped after it.  Mesa also clamps what
- * is uploaded, and stores 0; other drivers store it. */
+/* A shader cannot write what is no number: it is clamped after it.  Mesa also clamps
+ * what is uploaded, and stores 0; other drivers store it. */
 static void spoil_depth(const struct chain *chain) {
     size_t count = (size_t)chain->width * chain->height;
     float *values = malloc(count * sizeof *values);
     for (size_t i = 0; i < count; i++)
         values[i] = i % 2 ? NAN : window_depth(options.distance_m);
     glBindTexture(GL_TEXTURE_2D, chain->textures[chain->index]);
-    glTexSubImage2D(GL_TEXTURE_2D, 0, 0, 0, (GLsizei)chain->width, (GLsizei)chain->height,
-                    GL_DEPTH_COMPONENT, GL_FLOAT, values);
+    glTexSubImage2D(GL_TEXTURE_2D, 0, 0, 0, (GLsizei)chain->width,
+                    (GLsizei)chain->height, GL_DEPTH_COMPONENT, GL_FLOAT, values);
     free(values);
 }
 
@@ -209,11 +212,12 @@ static void attach_image(GLenum point, const struct chain *chain, uint32_t layer
            layer);
 }
 
-static void draw_view(const struct plan *plan, const struct images *images, uint32_t view,
-                      int frame) {
+static void draw_view(const struct plan *plan, const struct images *images,
+                      uint32_t view, int frame) {
     const struct chain *color = &images->color[view % images->chain_count];
     const struct chain *depth = &images->depth[view % images->chain_count];
-    float distance_m = options.distance_m * (plan->depth == OTHER_ARRAY && view ? 2 : 1);
+    float distance_m =
+        options.distance_m * (plan->depth == OTHER_ARRAY && view ? 2 : 1);
     struct picture picture = {
         .frame = frame,
         .view = images->first_view + (int)view,
@@ -236,7 +240,8 @@ static void draw_view(const struct plan *plan, const struct images *images, uint
     if (plan->depth == NOT_A_NUMBER && has_depth) spoil_depth(depth);
 }
 
-static void draw(struct session *session, const struct plan *plan, struct images *images) {
+static void draw(struct session *session, const struct plan *plan,
+                 struct images *images) {
     for (uint32_t i = 0; i < images->chain_count; i++) {
         acquire(session, &images->color[i]);
         if (images->has_depth && !(plan->depth == STALE && session->frame))
@@ -275,8 +280,9 @@ struct layers {
     uint32_t count;
 };
 
-static void describe_depth(XrCompositionLayerDepthInfoKHR *depth, const struct plan *plan,
-                           const struct images *images, uint32_t view, int frame) {
+static void describe_depth(XrCompositionLayerDepthInfoKHR *depth,
+                           const struct plan *plan, const struct images *images,
+                           uint32_t view, int frame) {
     const struct chain *chain = &images->depth[view % images->chain_count];
     *depth = (XrCompositionLayerDepthInfoKHR){
         .type = XR_TYPE_COMPOSITION_LAYER_DEPTH_INFO_KHR,
@@ -362,12 +368,14 @@ static void tell_frame(const struct session *session, XrResult result) {
                                  p->orientation.w, f->angleLeft,     f->angleRight,
                                  f->angleUp,       f->angleDown};
         printf("%s[", i ? ", " : "");
-        for (int k = 0; k < 11; k++) printf("%s\"%a\"", k ? ", " : "", (double)numbers[k]);
+        for (int k = 0; k < 11; k++)
+            printf("%s\"%a\"", k ? ", " : "", (double)numbers[k]);
         printf("]");
     }
-    printf("], \"acquire_ms\": %.3f, \"release_ms\": %.3f, \"end_frame_ms\": %.3f, "
-           "\"end_frame\": \"%s\"}\n",
-           session->acquire_ms, session->release_ms, session->end_ms, code_name(result));
+    printf(
+        "], \"acquire_ms\": %.3f, \"release_ms\": %.3f, \"end_frame_ms\": %.3f, "
+        "\"end_frame\": \"%s\"}\n",
+        session->acquire_ms, session->release_ms, session->end_ms, code_name(result));
     fflush(stdout);
     pthread_mutex_unlock(&tell_lock);
 }
@@ -457,10 +465,12 @@ static void end_waiter(struct session *session) {
     end_frame(session, NULL);
 }
 
-static XrSpace reference_space(const struct session *session, XrReferenceSpaceType type) {
-    XrReferenceSpaceCreateInfo info = {.type = XR_TYPE_REFERENCE_SPACE_CREATE_INFO,
-                                       .referenceSpaceType = type,
-                                       .poseInReferenceSpace = {{0, 0, 0, 1}, {0, 0, 0}}};
+static XrSpace reference_space(const struct session *session,
+                               XrReferenceSpaceType type) {
+    XrReferenceSpaceCreateInfo info = {
+        .type = XR_TYPE_REFERENCE_SPACE_CREATE_INFO,
+        .referenceSpaceType = type,
+        .poseInReferenceSpace = {{0, 0, 0, 1}, {0, 0, 0}}};
     XrSpace space;
     MUST(xrCreateReferenceSpace(session->handle, &info, &space));
     return space;
@@ -478,8 +488,8 @@ static void locate_views(struct session *session) {
     XrViewState state = {.type = XR_TYPE_VIEW_STATE};
     uint32_t count;
     for (int i = 0; i < 2; i++) session->views[i] = (XrView){.type = XR_TYPE_VIEW};
-    MUST_TIMED(session->wait_ms, xrLocateViews(session->handle, &info, &state, 2, &count,
-                                                 session->views));
+    MUST_TIMED(session->wait_ms, xrLocateViews(session->handle, &info, &state, 2,
+                                               &count, session->views));
     for (int i = 0; i < 2; i++) /* without a location: at the origin */
         if (!(state.viewStateFlags & XR_VIEW_STATE_ORIENTATION_VALID_BIT))
             session->views[i].pose = (XrPosef){{0, 0, 0, 1}, {0, 0, 0}};
@@ -552,7 +562,8 @@ static void violate(struct session *session) {
                            .layers = wrong.list};
     XrSpace gone = reference_space(session, XR_REFERENCE_SPACE_TYPE_LOCAL);
     MUST(xrDestroySpace(gone));
-    make_chain(session, &never, options.color_format, options.width, options.height, 1, 1);
+    make_chain(session, &never, options.color_format, options.width, options.height, 1,
+               1);
     describe_layers(session, &right);
     right.list[0] = (const void *)&wrong.projections[0];
     right.projections[0].views = wrong.views[0];
@@ -570,9 +581,18 @@ static void violate(struct session *session) {
     TRY("view count", wrong.projections[0].viewCount = 1);
     TRY("chain", wrong.views[0][0].next = &unknown);
     TRY("flags", wrong.projections[0].layerFlags = 1 << 30);
+    TRY("depth for color",
+        wrong.views[0][0].subImage.swapchain = images->depth[0].handle);
+    TRY("depth rect", wrong.depths[0][1].subImage.imageRect.offset.y = -1;
+        wrong.views[0][1].next = &wrong.depths[0][1]);
+    TRY("blend mode", info.environmentBlendMode = XR_ENVIRONMENT_BLEND_MODE_ADDITIVE);
+    info.environmentBlendMode = XR_ENVIRONMENT_BLEND_MODE_OPAQUE;
+    TRY("layer type", wrong.projections[0].type = XR_TYPE_VIEW);
     TRY("time", info.displayTime = 0);
     MUST(xrDestroySwapchain(never.handle));
     tell_violation("swapchain", xrDestroySwapchain(never.handle));
+    XrSwapchainImageWaitInfo wait = {.type = XR_TYPE_SWAPCHAIN_IMAGE_WAIT_INFO};
+    tell_violation("wait", xrWaitSwapchainImage(images->color[0].handle, &wait));
     tell_violation("release", xrReleaseSwapchainImage(images->color[0].handle, NULL));
     if (!options.threads) /* where the next frame has been waited for, it may begin */
         tell_violation("begin", xrBeginFrame(session->handle, NULL));
@@ -773,10 +793,8 @@ static int shown, timeouts; /* of all sessions */
 
 static void run(struct session *sessions, int count) {
     for (int i = 0; i < count; i++) furnish(&sessions[i]);
-    if (options.plan.ends_from_thread)
-        run_frames_in_thread(sessions);
-    else
-        run_sessions(sessions, count);
+    if (options.plan.ends_from_thread) run_frames_in_thread(sessions);
+    else run_sessions(sessions, count);
     for (int i = 0; i < count; i++) {
         shown += sessions[i].frame;
         timeouts += sessions[i].timeouts;
@@ -787,10 +805,10 @@ static void run(struct session *sessions, int count) {
 /* --- instance -------------------------------------------------------------------- */
 
 static XrResult create_instance(XrInstance *made_instance) {
-    static const char *const WANTED[] = {
-        XR_KHR_OPENGL_ENABLE_EXTENSION_NAME, XR_MNDX_EGL_ENABLE_EXTENSION_NAME,
-        XR_KHR_COMPOSITION_LAYER_DEPTH_EXTENSION_NAME,
-        XR_EXT_EYE_GAZE_INTERACTION_EXTENSION_NAME};
+    static const char *const WANTED[] = {XR_KHR_OPENGL_ENABLE_EXTENSION_NAME,
+                                         XR_MNDX_EGL_ENABLE_EXTENSION_NAME,
+                                         XR_KHR_COMPOSITION_LAYER_DEPTH_EXTENSION_NAME,
+                                         XR_EXT_EYE_GAZE_INTERACTION_EXTENSION_NAME};
     XrExtensionProperties offered[128];
     for (int i = 0; i < 128; i++)
         offered[i] = (XrExtensionProperties){.type = XR_TYPE_EXTENSION_PROPERTIES};
@@ -809,11 +827,12 @@ static XrResult create_instance(XrInstance *made_instance) {
         skip("the runtime does not take this kind of context");
     has_depth_extension = has[2];
     has_gaze = has[3];
-    XrInstanceCreateInfo info = {.type = XR_TYPE_INSTANCE_CREATE_INFO,
-                                 .applicationInfo = {.applicationName = "driver",
-                                                     .apiVersion = XR_MAKE_VERSION(1, 0, 0)},
-                                 .enabledExtensionCount = enabled_count,
-                                 .enabledExtensionNames = enabled};
+    XrInstanceCreateInfo info = {
+        .type = XR_TYPE_INSTANCE_CREATE_INFO,
+        .applicationInfo = {.applicationName = "driver",
+                            .apiVersion = XR_MAKE_VERSION(1, 0, 0)},
+        .enabledExtensionCount = enabled_count,
+        .enabledExtensionNames = enabled};
     return xrCreateInstance(&info, made_instance);
 }
 
@@ -833,8 +852,8 @@ static void open_instance(void) {
     XrViewConfigurationView views[2] = {{.type = XR_TYPE_VIEW_CONFIGURATION_VIEW},
                                         {.type = XR_TYPE_VIEW_CONFIGURATION_VIEW}};
     uint32_t count;
-    XrResult result = xrEnumerateViewConfigurationViews(instance, the_system, view_type, 2,
-                                                        &count, views);
+    XrResult result = xrEnumerateViewConfigurationViews(instance, the_system, view_type,
+                                                        2, &count, views);
     if (result == XR_ERROR_VIEW_CONFIGURATION_TYPE_UNSUPPORTED)
         skip("the runtime has no such views");
     must(result, "xrEnumerateViewConfigurationViews");
@@ -890,7 +909,8 @@ static void read_arguments(int count, char **arguments) {
                 sscanf(value, "%ux%u", &options.width, &options.height);
             else if (!strcmp(name, "--format")) options.color_format = format_of(value);
             else if (!strcmp(name, "--depth")) options.depth_format = format_of(value);
-            else if (!strcmp(name, "--distance-m")) options.distance_m = strtof(value, NULL);
+            else if (!strcmp(name, "--distance-m"))
+                options.distance_m = strtof(value, NULL);
             else if (!strcmp(name, "--near-z")) options.near_z = strtof(value, NULL);
             else if (!strcmp(name, "--far-z")) options.far_z = strtof(value, NULL);
             else {
@@ -922,8 +942,9 @@ int main(int count, char **arguments) {
     }
     MUST(xrDestroyInstance(instance));
     close_graphics();
-    printf("{\"case\": \"%s\", \"frames\": %d, \"timeouts\": %d, "
-           "\"checked_state\": %s}\n",
-           options.plan.name, shown, timeouts, options.check_state ? "true" : "false");
+    printf(
+        "{\"case\": \"%s\", \"frames\": %d, \"timeouts\": %d, "
+        "\"checked_state\": %s}\n",
+        options.plan.name, shown, timeouts, options.check_state ? "true" : "false");
     return 0;
 }

@@ -3,19 +3,21 @@
  *   driver CASE [--frames N] [--size WxH] [--format F] [--depth D] [--distance-m X]
  *          [--near-z X] [--far-z X] [--glx] [--threads] [--check-state]
  *
- * CASE is one of `CASES` in driver.c, which says what each does.  Formats: SRGB8_ALPHA8, RGBA8,
- * RGB10_A2, RGBA16F; D16, D24, D32F, D24S8, D32FS8, none.  The depth is that of a plane
- * across the view; planes of --near-z 100 --far-z 0.1 are reversed, "inf" is infinite.
+ * CASE is one of `CASES` in driver.c, where it says what each does.  Formats of color:
+ * SRGB8_ALPHA8, RGBA8, RGB10_A2, RGBA16F; of depth: D16, D24, D32F, D24S8, D32FS8,
+ * none. The depth is that of a plane across the view.  --near-z 100 --far-z 0.1 is
+ * reversed, and "inf" is infinite.  With --threads a thread waits for the frames.
  *
  * Row y (from the bottom) and column x of view v of frame n are white where
  * (x + n) / 4 is even, elsewhere red (v = 0) or blue (v = 1); in the lowest 8 rows the
- * first 64 columns are 16 cells, bit by bit of n: green for 1 and black for 0.  A quad is
- * a view of its own, 2, in green.  Alpha is 1, or x / width where the case is about alpha.
+ * first 64 columns are 16 cells, bit by bit of n: green for 1 and black for 0.  A quad
+ * is a view of its own, 2, in green.  Alpha is 1, or x / width where the case is about
+ * alpha.
  *
  * On standard output: a line of JSON for each frame shown, with the time it is for, the
- * views as submitted ("%a": x, y, z, quaternion; left, right, up, down) and milliseconds
- * in calls; and a summary.  Exit status: 0; 1 if a call failed, or if one left a state
- * changed (--check-state); 77 if the runtime lacks what the case needs.
+ * views as submitted ("%a": x, y, z, quaternion; left, right, up, down) and
+ * milliseconds in calls; and a summary.  Exit status: 0; 1 if a call failed, or if one
+ * left a state changed (--check-state); 77 if the runtime lacks what the case needs.
  */
 #include <EGL/egl.h>
 #include <EGL/eglext.h>
@@ -59,7 +61,7 @@ struct plan {
     bool is_view_locked, in_action_space, renews_space, other_thread, no_context;
     bool ends_from_thread, second, violates;
     uint32_t samples;
-    int release_every; /* frames; -1: only the first one */
+    int release_every;               /* frames; -1: only the first one */
     int sessions, projections, quad; /* quad: -1 below, 1 above the projection */
     enum fault depth;
 };
@@ -122,10 +124,12 @@ void make_unusual_objects(void);
 void set_unusual_state(void);
 void set_usual_state(void);
 void read_state(struct snapshot *to);
-void compare_states(const char *call, const struct snapshot *a, const struct snapshot *b);
+void compare_states(const char *call, const struct snapshot *a,
+                    const struct snapshot *b);
 double now_ms(void);
 
-/* Make a call of OpenXR, note how long it takes, and see that it leaves OpenGL alone. */
+/* Make a call of OpenXR, note how long it takes, and see that it leaves OpenGL alone.
+ */
 #define TIMED(spent_ms, call) \
     ({ \
         struct snapshot before, after; \

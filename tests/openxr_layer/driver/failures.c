@@ -6,9 +6,9 @@
 const char *code_name(XrResult code) {
     switch (code) {
 #define NAME(name, value) \
-    case name: \
-        return #name;
-        XR_LIST_ENUM_XrResult(NAME) default : return "XrResult";
+    case name: return #name;
+        XR_LIST_ENUM_XrResult(NAME)
+    default: return "XrResult";
     }
 }
 

@@ -6,17 +6,20 @@ struct graphics graphics;
 struct context_handles new_context(void) {
     static const EGLint EGL_VERSION_3_3[] = {EGL_CONTEXT_MAJOR_VERSION, 3,
                                              EGL_CONTEXT_MINOR_VERSION, 3, EGL_NONE};
-    static const int GLX_VERSION_3_3[] = {GLX_CONTEXT_MAJOR_VERSION_ARB, 3,
-                                          GLX_CONTEXT_MINOR_VERSION_ARB, 3,
+    static const int GLX_VERSION_3_3[] = {GLX_CONTEXT_MAJOR_VERSION_ARB,
+                                          3,
+                                          GLX_CONTEXT_MINOR_VERSION_ARB,
+                                          3,
                                           GLX_CONTEXT_PROFILE_MASK_ARB,
-                                          GLX_CONTEXT_CORE_PROFILE_BIT_ARB, None};
+                                          GLX_CONTEXT_CORE_PROFILE_BIT_ARB,
+                                          None};
     PFNGLXCREATECONTEXTATTRIBSARBPROC make =
         (PFNGLXCREATECONTEXTATTRIBSARBPROC)glXGetProcAddressARB(
             (const GLubyte *)"glXCreateContextAttribsARB");
     struct context_handles made = {0};
     if (options.glx)
-        made.glx = make(graphics.x_display, graphics.glx_config, NULL, True,
-                        GLX_VERSION_3_3);
+        made.glx =
+            make(graphics.x_display, graphics.glx_config, NULL, True, GLX_VERSION_3_3);
     else
         made.egl = eglCreateContext(graphics.egl_display, graphics.egl_config,
                                     EGL_NO_CONTEXT, EGL_VERSION_3_3);
@@ -25,11 +28,11 @@ struct context_handles new_context(void) {
 }
 
 void open_egl(void) {
-    static const EGLint CONFIG[] = {EGL_SURFACE_TYPE, EGL_PBUFFER_BIT, EGL_RENDERABLE_TYPE,
-                                    EGL_OPENGL_BIT, EGL_NONE};
+    static const EGLint CONFIG[] = {EGL_SURFACE_TYPE, EGL_PBUFFER_BIT,
+                                    EGL_RENDERABLE_TYPE, EGL_OPENGL_BIT, EGL_NONE};
     EGLint count = 0;
-    graphics.egl_display = eglGetPlatformDisplay(EGL_PLATFORM_SURFACELESS_MESA,
-                                                 EGL_DEFAULT_DISPLAY, NULL);
+    graphics.egl_display =
+        eglGetPlatformDisplay(EGL_PLATFORM_SURFACELESS_MESA, EGL_DEFAULT_DISPLAY, NULL);
     if (!eglInitialize(graphics.egl_display, NULL, NULL))
         fail("eglInitialize", "no display without a surface");
     eglBindAPI(EGL_OPENGL_API);
@@ -38,8 +41,15 @@ void open_egl(void) {
 }
 
 void open_glx(void) {
-    static const int CONFIG[] = {GLX_DRAWABLE_TYPE, GLX_WINDOW_BIT, GLX_RENDER_TYPE,
-                                 GLX_RGBA_BIT, GLX_DOUBLEBUFFER, True, GLX_RED_SIZE, 8, None};
+    static const int CONFIG[] = {GLX_DRAWABLE_TYPE,
+                                 GLX_WINDOW_BIT,
+                                 GLX_RENDER_TYPE,
+                                 GLX_RGBA_BIT,
+                                 GLX_DOUBLEBUFFER,
+                                 True,
+                                 GLX_RED_SIZE,
+                                 8,
+                                 None};
     int count = 0;
     graphics.x_display = XOpenDisplay(NULL);
     if (!graphics.x_display) fail("XOpenDisplay", "no display");
@@ -53,7 +63,8 @@ void open_glx(void) {
     graphics.visual = visual->visualid;
     Window root = DefaultRootWindow(graphics.x_display);
     XSetWindowAttributes with = {
-        .colormap = XCreateColormap(graphics.x_display, root, visual->visual, AllocNone)};
+        .colormap =
+            XCreateColormap(graphics.x_display, root, visual->visual, AllocNone)};
     graphics.window =
         XCreateWindow(graphics.x_display, root, 0, 0, 64, 64, 0, visual->depth,
                       InputOutput, visual->visual, CWColormap, &with);

@@ -3,7 +3,8 @@
 
 static const char VERTEX[] =
     "#version 330 core\n"
-    "void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0,"
+    "void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - "
+    "1.0,"
     " 0, 1); }";
 static const char FRAGMENT[] =
     "#version 330 core\n"
@@ -57,8 +58,7 @@ void attach(GLenum point, GLuint texture, bool is_array, uint32_t layer) {
     glBindFramebuffer(GL_FRAMEBUFFER, framebuffer);
     if (is_array)
         glFramebufferTextureLayer(GL_FRAMEBUFFER, point, texture, 0, (GLint)layer);
-    else
-        glFramebufferTexture(GL_FRAMEBUFFER, point, texture, 0);
+    else glFramebufferTexture(GL_FRAMEBUFFER, point, texture, 0);
 }
 
 static GLint uniform(const char *name) { return glGetUniformLocation(program, name); }

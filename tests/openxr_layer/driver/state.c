@@ -6,47 +6,107 @@ static const struct {
     const char *name;
     GLenum value;
 } STATES[] = {
-    LIST(GL_CURRENT_PROGRAM), LIST(GL_VERTEX_ARRAY_BINDING), LIST(GL_ARRAY_BUFFER_BINDING),
-    LIST(GL_ELEMENT_ARRAY_BUFFER_BINDING), LIST(GL_PIXEL_PACK_BUFFER_BINDING),
-    LIST(GL_PIXEL_UNPACK_BUFFER_BINDING), LIST(GL_UNIFORM_BUFFER_BINDING),
-    LIST(GL_TRANSFORM_FEEDBACK_BUFFER_BINDING), LIST(GL_COPY_READ_BUFFER_BINDING),
-    LIST(GL_COPY_WRITE_BUFFER_BINDING), LIST(GL_SHADER_STORAGE_BUFFER_BINDING),
-    LIST(GL_DRAW_INDIRECT_BUFFER_BINDING), LIST(GL_DISPATCH_INDIRECT_BUFFER_BINDING),
-    LIST(GL_ATOMIC_COUNTER_BUFFER_BINDING), LIST(GL_PROGRAM_PIPELINE_BINDING),
-    LIST(GL_DRAW_FRAMEBUFFER_BINDING), LIST(GL_READ_FRAMEBUFFER_BINDING),
-    LIST(GL_RENDERBUFFER_BINDING), LIST(GL_DRAW_BUFFER), LIST(GL_READ_BUFFER),
-    LIST(GL_ACTIVE_TEXTURE), LIST(GL_VIEWPORT), LIST(GL_SCISSOR_BOX), LIST(GL_DEPTH_RANGE),
-    LIST(GL_COLOR_WRITEMASK), LIST(GL_DEPTH_WRITEMASK), LIST(GL_DEPTH_FUNC),
-    LIST(GL_STENCIL_WRITEMASK), LIST(GL_STENCIL_BACK_WRITEMASK), LIST(GL_STENCIL_FUNC),
-    LIST(GL_STENCIL_REF), LIST(GL_STENCIL_VALUE_MASK), LIST(GL_STENCIL_FAIL),
-    LIST(GL_STENCIL_PASS_DEPTH_FAIL), LIST(GL_STENCIL_PASS_DEPTH_PASS),
-    LIST(GL_BLEND_SRC_RGB), LIST(GL_BLEND_DST_RGB), LIST(GL_BLEND_SRC_ALPHA),
-    LIST(GL_BLEND_DST_ALPHA), LIST(GL_BLEND_EQUATION_RGB), LIST(GL_BLEND_EQUATION_ALPHA),
-    LIST(GL_BLEND_COLOR), LIST(GL_CULL_FACE_MODE), LIST(GL_FRONT_FACE),
-    LIST(GL_POLYGON_MODE), LIST(GL_POLYGON_OFFSET_FACTOR), LIST(GL_POLYGON_OFFSET_UNITS),
-    LIST(GL_COLOR_CLEAR_VALUE), LIST(GL_DEPTH_CLEAR_VALUE), LIST(GL_STENCIL_CLEAR_VALUE),
-    LIST(GL_LOGIC_OP_MODE), LIST(GL_SAMPLE_COVERAGE_VALUE), LIST(GL_POINT_SIZE),
-    LIST(GL_PACK_ALIGNMENT), LIST(GL_PACK_ROW_LENGTH), LIST(GL_PACK_SKIP_ROWS),
-    LIST(GL_PACK_SKIP_PIXELS), LIST(GL_PACK_IMAGE_HEIGHT), LIST(GL_PACK_SKIP_IMAGES),
-    LIST(GL_PACK_SWAP_BYTES), LIST(GL_UNPACK_ALIGNMENT), LIST(GL_UNPACK_ROW_LENGTH),
-    LIST(GL_UNPACK_SKIP_ROWS), LIST(GL_UNPACK_SKIP_PIXELS), LIST(GL_UNPACK_IMAGE_HEIGHT),
-    LIST(GL_UNPACK_SKIP_IMAGES), LIST(GL_UNPACK_SWAP_BYTES), LIST(GL_BLEND),
-    LIST(GL_DEPTH_TEST), LIST(GL_STENCIL_TEST), LIST(GL_SCISSOR_TEST), LIST(GL_CULL_FACE),
-    LIST(GL_FRAMEBUFFER_SRGB), LIST(GL_MULTISAMPLE), LIST(GL_SAMPLE_COVERAGE),
-    LIST(GL_SAMPLE_ALPHA_TO_COVERAGE), LIST(GL_SAMPLE_MASK), LIST(GL_DITHER),
-    LIST(GL_COLOR_LOGIC_OP), LIST(GL_POLYGON_OFFSET_FILL), LIST(GL_DEPTH_CLAMP),
-    LIST(GL_RASTERIZER_DISCARD), LIST(GL_PRIMITIVE_RESTART), LIST(GL_PROGRAM_POINT_SIZE),
-    LIST(GL_TEXTURE_CUBE_MAP_SEAMLESS), LIST(GL_CLIP_DISTANCE0), LIST(GL_CLIP_ORIGIN),
+    LIST(GL_CURRENT_PROGRAM),
+    LIST(GL_VERTEX_ARRAY_BINDING),
+    LIST(GL_ARRAY_BUFFER_BINDING),
+    LIST(GL_ELEMENT_ARRAY_BUFFER_BINDING),
+    LIST(GL_PIXEL_PACK_BUFFER_BINDING),
+    LIST(GL_PIXEL_UNPACK_BUFFER_BINDING),
+    LIST(GL_UNIFORM_BUFFER_BINDING),
+    LIST(GL_TRANSFORM_FEEDBACK_BUFFER_BINDING),
+    LIST(GL_COPY_READ_BUFFER_BINDING),
+    LIST(GL_COPY_WRITE_BUFFER_BINDING),
+    LIST(GL_SHADER_STORAGE_BUFFER_BINDING),
+    LIST(GL_DRAW_INDIRECT_BUFFER_BINDING),
+    LIST(GL_DISPATCH_INDIRECT_BUFFER_BINDING),
+    LIST(GL_ATOMIC_COUNTER_BUFFER_BINDING),
+    LIST(GL_PROGRAM_PIPELINE_BINDING),
+    LIST(GL_DRAW_FRAMEBUFFER_BINDING),
+    LIST(GL_READ_FRAMEBUFFER_BINDING),
+    LIST(GL_RENDERBUFFER_BINDING),
+    LIST(GL_DRAW_BUFFER),
+    LIST(GL_READ_BUFFER),
+    LIST(GL_ACTIVE_TEXTURE),
+    LIST(GL_VIEWPORT),
+    LIST(GL_SCISSOR_BOX),
+    LIST(GL_DEPTH_RANGE),
+    LIST(GL_COLOR_WRITEMASK),
+    LIST(GL_DEPTH_WRITEMASK),
+    LIST(GL_DEPTH_FUNC),
+    LIST(GL_STENCIL_WRITEMASK),
+    LIST(GL_STENCIL_BACK_WRITEMASK),
+    LIST(GL_STENCIL_FUNC),
+    LIST(GL_STENCIL_REF),
+    LIST(GL_STENCIL_VALUE_MASK),
+    LIST(GL_STENCIL_FAIL),
+    LIST(GL_STENCIL_PASS_DEPTH_FAIL),
+    LIST(GL_STENCIL_PASS_DEPTH_PASS),
+    LIST(GL_BLEND_SRC_RGB),
+    LIST(GL_BLEND_DST_RGB),
+    LIST(GL_BLEND_SRC_ALPHA),
+    LIST(GL_BLEND_DST_ALPHA),
+    LIST(GL_BLEND_EQUATION_RGB),
+    LIST(GL_BLEND_EQUATION_ALPHA),
+    LIST(GL_BLEND_COLOR),
+    LIST(GL_CULL_FACE_MODE),
+    LIST(GL_FRONT_FACE),
+    LIST(GL_POLYGON_MODE),
+    LIST(GL_POLYGON_OFFSET_FACTOR),
+    LIST(GL_POLYGON_OFFSET_UNITS),
+    LIST(GL_COLOR_CLEAR_VALUE),
+    LIST(GL_DEPTH_CLEAR_VALUE),
+    LIST(GL_STENCIL_CLEAR_VALUE),
+    LIST(GL_LOGIC_OP_MODE),
+    LIST(GL_SAMPLE_COVERAGE_VALUE),
+    LIST(GL_POINT_SIZE),
+    LIST(GL_PACK_ALIGNMENT),
+    LIST(GL_PACK_ROW_LENGTH),
+    LIST(GL_PACK_SKIP_ROWS),
+    LIST(GL_PACK_SKIP_PIXELS),
+    LIST(GL_PACK_IMAGE_HEIGHT),
+    LIST(GL_PACK_SKIP_IMAGES),
+    LIST(GL_PACK_SWAP_BYTES),
+    LIST(GL_UNPACK_ALIGNMENT),
+    LIST(GL_UNPACK_ROW_LENGTH),
+    LIST(GL_UNPACK_SKIP_ROWS),
+    LIST(GL_UNPACK_SKIP_PIXELS),
+    LIST(GL_UNPACK_IMAGE_HEIGHT),
+    LIST(GL_UNPACK_SKIP_IMAGES),
+    LIST(GL_UNPACK_SWAP_BYTES),
+    LIST(GL_BLEND),
+    LIST(GL_DEPTH_TEST),
+    LIST(GL_STENCIL_TEST),
+    LIST(GL_SCISSOR_TEST),
+    LIST(GL_CULL_FACE),
+    LIST(GL_FRAMEBUFFER_SRGB),
+    LIST(GL_MULTISAMPLE),
+    LIST(GL_SAMPLE_COVERAGE),
+    LIST(GL_SAMPLE_ALPHA_TO_COVERAGE),
+    LIST(GL_SAMPLE_MASK),
+    LIST(GL_DITHER),
+    LIST(GL_COLOR_LOGIC_OP),
+    LIST(GL_POLYGON_OFFSET_FILL),
+    LIST(GL_DEPTH_CLAMP),
+    LIST(GL_RASTERIZER_DISCARD),
+    LIST(GL_PRIMITIVE_RESTART),
+    LIST(GL_PROGRAM_POINT_SIZE),
+    LIST(GL_TEXTURE_CUBE_MAP_SEAMLESS),
+    LIST(GL_CLIP_DISTANCE0),
+    LIST(GL_CLIP_ORIGIN),
     LIST(GL_CLIP_DEPTH_MODE),
 };
 static const struct {
     const char *name;
     GLenum value;
 } UNIT_STATES[] = {
-    LIST(GL_TEXTURE_BINDING_2D), LIST(GL_TEXTURE_BINDING_2D_ARRAY),
-    LIST(GL_TEXTURE_BINDING_3D), LIST(GL_TEXTURE_BINDING_CUBE_MAP),
-    LIST(GL_TEXTURE_BINDING_RECTANGLE), LIST(GL_TEXTURE_BINDING_BUFFER),
-    LIST(GL_TEXTURE_BINDING_2D_MULTISAMPLE), LIST(GL_TEXTURE_BINDING_2D_MULTISAMPLE_ARRAY),
+    LIST(GL_TEXTURE_BINDING_2D),
+    LIST(GL_TEXTURE_BINDING_2D_ARRAY),
+    LIST(GL_TEXTURE_BINDING_3D),
+    LIST(GL_TEXTURE_BINDING_CUBE_MAP),
+    LIST(GL_TEXTURE_BINDING_RECTANGLE),
+    LIST(GL_TEXTURE_BINDING_BUFFER),
+    LIST(GL_TEXTURE_BINDING_2D_MULTISAMPLE),
+    LIST(GL_TEXTURE_BINDING_2D_MULTISAMPLE_ARRAY),
     LIST(GL_SAMPLER_BINDING),
 };
 enum { N_STATES = LENGTH(STATES), N_UNIT_STATES = LENGTH(UNIT_STATES) };
@@ -78,7 +138,8 @@ void read_state(struct snapshot *to) {
     for (int unit = 0; unit < N_UNITS; unit++) {
         glActiveTexture(GL_TEXTURE0 + (GLenum)unit);
         for (int i = 0; i < N_UNIT_STATES; i++)
-            if (is_unit_known[i]) glGetIntegerv(UNIT_STATES[i].value, &to->units[unit][i]);
+            if (is_unit_known[i])
+                glGetIntegerv(UNIT_STATES[i].value, &to->units[unit][i]);
     }
     glActiveTexture((GLenum)active);
     for (GLuint i = 0; i < 4; i++)
@@ -88,14 +149,15 @@ void read_state(struct snapshot *to) {
 
 /* Fail with the first difference; where the context is another one, all else is too. */
 void compare_states(const char *call, const struct snapshot *a,
-                           const struct snapshot *b) {
+                    const struct snapshot *b) {
     static const char *const CURRENT[] = {"display", "context", "draw surface",
                                           "read surface"};
     char why[128] = "";
 #define DIFFER(differs, ...) \
     if (!*why && (differs)) snprintf(why, sizeof why, __VA_ARGS__)
     for (int i = 0; i < 8; i++)
-        DIFFER(a->current[i] != b->current[i], "the current %s changed", CURRENT[i % 4]);
+        DIFFER(a->current[i] != b->current[i], "the current %s changed",
+               CURRENT[i % 4]);
     DIFFER(a->api != b->api, "EGL's API changed");
     DIFFER(a->error, "OpenGL's error 0x%x before it", a->error);
     DIFFER(b->error, "OpenGL's error 0x%x", b->error);
@@ -105,8 +167,9 @@ void compare_states(const char *call, const struct snapshot *a,
                (double)b->values[i][0]);
     for (int unit = 0; unit < N_UNITS; unit++)
         for (int i = 0; i < N_UNIT_STATES; i++)
-            DIFFER(a->units[unit][i] != b->units[unit][i], "%s of unit %d was %d, is %d",
-                   UNIT_STATES[i].name, unit, a->units[unit][i], b->units[unit][i]);
+            DIFFER(a->units[unit][i] != b->units[unit][i],
+                   "%s of unit %d was %d, is %d", UNIT_STATES[i].name, unit,
+                   a->units[unit][i], b->units[unit][i]);
     for (int i = 0; i < 4; i++)
         DIFFER(a->uniform_buffers[i] != b->uniform_buffers[i],
                "uniform buffer %d was %d, is %d", i, a->uniform_buffers[i],
@@ -137,12 +200,12 @@ void make_unusual_objects(void) {
 
 /* Set what a layer might rely on, or change, to values that are not the defaults. */
 void set_unusual_state(void) {
-    static const GLenum BUFFERS[] = {GL_ARRAY_BUFFER,     GL_PIXEL_PACK_BUFFER,
+    static const GLenum BUFFERS[] = {GL_ARRAY_BUFFER,        GL_PIXEL_PACK_BUFFER,
                                      GL_PIXEL_UNPACK_BUFFER, GL_UNIFORM_BUFFER,
-                                     GL_COPY_READ_BUFFER, GL_COPY_WRITE_BUFFER};
-    static const GLenum TOGGLES[] = {GL_BLEND,        GL_DEPTH_TEST, GL_STENCIL_TEST,
-                                     GL_SCISSOR_TEST, GL_CULL_FACE,  GL_FRAMEBUFFER_SRGB,
-                                     GL_RASTERIZER_DISCARD, GL_SAMPLE_COVERAGE};
+                                     GL_COPY_READ_BUFFER,    GL_COPY_WRITE_BUFFER};
+    static const GLenum TOGGLES[] = {
+        GL_BLEND,     GL_DEPTH_TEST,       GL_STENCIL_TEST,       GL_SCISSOR_TEST,
+        GL_CULL_FACE, GL_FRAMEBUFFER_SRGB, GL_RASTERIZER_DISCARD, GL_SAMPLE_COVERAGE};
     for (size_t i = 0; i < LENGTH(BUFFERS); i++) glBindBuffer(BUFFERS[i], made[3]);
     for (size_t i = 0; i < LENGTH(TOGGLES); i++) glEnable(TOGGLES[i]);
     for (GLuint unit = 0; unit < N_UNITS; unit++) {
@@ -182,9 +245,10 @@ void set_unusual_state(void) {
 }
 
 void set_usual_state(void) {
-    static const GLenum OFF[] = {GL_BLEND,        GL_STENCIL_TEST,     GL_CULL_FACE,
-                                 GL_SCISSOR_TEST, GL_FRAMEBUFFER_SRGB, GL_RASTERIZER_DISCARD,
-                                 GL_SAMPLE_COVERAGE};
+    static const GLenum OFF[] = {
+        GL_BLEND,          GL_STENCIL_TEST,     GL_CULL_FACE,
+        GL_SCISSOR_TEST,   GL_FRAMEBUFFER_SRGB, GL_RASTERIZER_DISCARD,
+        GL_SAMPLE_COVERAGE};
     for (size_t i = 0; i < LENGTH(OFF); i++) glDisable(OFF[i]);
     for (GLuint unit = 0; unit < N_UNITS; unit++) glBindSampler(unit, 0);
     glEnable(GL_DEPTH_TEST); /* without it no depth is written */

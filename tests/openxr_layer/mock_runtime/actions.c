@@ -17,7 +17,7 @@ static XrPath path_of(const char *text) {
 }
 
 XrResult XRAPI_CALL xrStringToPath(XrInstance instance, const char *text,
-                                          XrPath *path) {
+                                   XrPath *path) {
     ENTER;
     FIND(found, INSTANCE, instance);
     REQUIRE(*text == '/' && text[1] &&
@@ -27,9 +27,8 @@ XrResult XRAPI_CALL xrStringToPath(XrInstance instance, const char *text,
     return XR_SUCCESS;
 }
 
-XrResult XRAPI_CALL xrPathToString(XrInstance instance, XrPath path,
-                                          uint32_t capacity, uint32_t *count,
-                                          char *text) {
+XrResult XRAPI_CALL xrPathToString(XrInstance instance, XrPath path, uint32_t capacity,
+                                   uint32_t *count, char *text) {
     ENTER;
     FIND(found, INSTANCE, instance);
     REQUIRE(path && path <= path_count, XR_ERROR_PATH_INVALID, "there is no such path");
@@ -60,8 +59,8 @@ static XrResult name_action(struct object *made, const char *name,
 }
 
 XrResult XRAPI_CALL xrCreateActionSet(XrInstance instance,
-                                             const XrActionSetCreateInfo *info,
-                                             XrActionSet *set) {
+                                      const XrActionSetCreateInfo *info,
+                                      XrActionSet *set) {
     ENTER;
     FIND(found, INSTANCE, instance);
     STRUCTURE(info, XR_TYPE_ACTION_SET_CREATE_INFO);
@@ -71,7 +70,7 @@ XrResult XRAPI_CALL xrCreateActionSet(XrInstance instance,
 }
 
 XrResult XRAPI_CALL xrCreateAction(XrActionSet set, const XrActionCreateInfo *info,
-                                          XrAction *action) {
+                                   XrAction *action) {
     ENTER;
     FIND(found, ACTION_SET, set);
     STRUCTURE(info, XR_TYPE_ACTION_CREATE_INFO);
@@ -119,7 +118,8 @@ XrResult XRAPI_CALL xrSuggestInteractionProfileBindings(
                 action->action.name);
     }
     if (!is_gaze) return XR_SUCCESS; /* there are no controllers */
-    for (uint64_t i = 0; i < mock.object_count; i++) /* it replaces the last suggestion */
+    for (uint64_t i = 0; i < mock.object_count;
+         i++) /* it replaces the last suggestion */
         if (mock.objects[i]->kind == ACTION) mock.objects[i]->action.is_gaze = false;
     for (uint32_t i = 0; i < suggested->countSuggestedBindings; i++) {
         const XrActionSuggestedBinding *one = &suggested->suggestedBindings[i];
@@ -129,8 +129,8 @@ XrResult XRAPI_CALL xrSuggestInteractionProfileBindings(
     return XR_SUCCESS;
 }
 
-XrResult XRAPI_CALL
-xrAttachSessionActionSets(XrSession session, const XrSessionActionSetsAttachInfo *info) {
+XrResult XRAPI_CALL xrAttachSessionActionSets(
+    XrSession session, const XrSessionActionSetsAttachInfo *info) {
     ENTER;
     FIND(found, SESSION, session);
     STRUCTURE(info, XR_TYPE_SESSION_ACTION_SETS_ATTACH_INFO);
@@ -181,8 +181,8 @@ XrResult XRAPI_CALL xrSyncActions(XrSession session, const XrActionsSyncInfo *in
     state->isActive = XR_FALSE
 
 XrResult XRAPI_CALL xrGetActionStateBoolean(XrSession session,
-                                                   const XrActionStateGetInfo *info,
-                                                   XrActionStateBoolean *state) {
+                                            const XrActionStateGetInfo *info,
+                                            XrActionStateBoolean *state) {
     ACTION_STATE(XR_ACTION_TYPE_BOOLEAN_INPUT, XR_TYPE_ACTION_STATE_BOOLEAN);
     state->currentState = state->changedSinceLastSync = XR_FALSE;
     state->lastChangeTime = 0;
@@ -190,8 +190,8 @@ XrResult XRAPI_CALL xrGetActionStateBoolean(XrSession session,
 }
 
 XrResult XRAPI_CALL xrGetActionStateFloat(XrSession session,
-                                                 const XrActionStateGetInfo *info,
-                                                 XrActionStateFloat *state) {
+                                          const XrActionStateGetInfo *info,
+                                          XrActionStateFloat *state) {
     ACTION_STATE(XR_ACTION_TYPE_FLOAT_INPUT, XR_TYPE_ACTION_STATE_FLOAT);
     state->currentState = 0;
     state->changedSinceLastSync = XR_FALSE;
@@ -200,8 +200,8 @@ XrResult XRAPI_CALL xrGetActionStateFloat(XrSession session,
 }
 
 XrResult XRAPI_CALL xrGetActionStateVector2f(XrSession session,
-                                                    const XrActionStateGetInfo *info,
-                                                    XrActionStateVector2f *state) {
+                                             const XrActionStateGetInfo *info,
+                                             XrActionStateVector2f *state) {
     ACTION_STATE(XR_ACTION_TYPE_VECTOR2F_INPUT, XR_TYPE_ACTION_STATE_VECTOR2F);
     state->currentState = (XrVector2f){0, 0};
     state->changedSinceLastSync = XR_FALSE;
@@ -210,15 +210,15 @@ XrResult XRAPI_CALL xrGetActionStateVector2f(XrSession session,
 }
 
 XrResult XRAPI_CALL xrGetActionStatePose(XrSession session,
-                                                const XrActionStateGetInfo *info,
-                                                XrActionStatePose *state) {
+                                         const XrActionStateGetInfo *info,
+                                         XrActionStatePose *state) {
     ACTION_STATE(XR_ACTION_TYPE_POSE_INPUT, XR_TYPE_ACTION_STATE_POSE);
     state->isActive = found->session.is_synced && is_gaze_active(action);
     return XR_SUCCESS;
 }
 
 XrResult XRAPI_CALL xrGetCurrentInteractionProfile(XrSession session, XrPath user,
-                                                          XrInteractionProfileState *state) {
+                                                   XrInteractionProfileState *state) {
     ENTER;
     FIND(found, SESSION, session);
     STRUCTURE(state, XR_TYPE_INTERACTION_PROFILE_STATE);
@@ -254,8 +254,8 @@ XrResult XRAPI_CALL xrGetInputSourceLocalizedName(
 }
 
 XrResult XRAPI_CALL xrApplyHapticFeedback(XrSession session,
-                                                 const XrHapticActionInfo *info,
-                                                 const XrHapticBaseHeader *feedback) {
+                                          const XrHapticActionInfo *info,
+                                          const XrHapticBaseHeader *feedback) {
     ENTER;
     FIND(found, SESSION, session);
     STRUCTURE(info, XR_TYPE_HAPTIC_ACTION_INFO);
@@ -264,7 +264,7 @@ XrResult XRAPI_CALL xrApplyHapticFeedback(XrSession session,
 }
 
 XrResult XRAPI_CALL xrStopHapticFeedback(XrSession session,
-                                                const XrHapticActionInfo *info) {
+                                         const XrHapticActionInfo *info) {
     ENTER;
     FIND(found, SESSION, session);
     STRUCTURE(info, XR_TYPE_HAPTIC_ACTION_INFO);

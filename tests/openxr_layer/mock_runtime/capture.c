@@ -20,8 +20,7 @@ static void read_pixels(const struct object *swapchain, int image, XrRect2Di par
         glCreateFramebuffers(2, framebuffers);
         if (swapchain->swapchain.info.arraySize > 1)
             glNamedFramebufferTextureLayer(framebuffers[0], point, texture, 0, z);
-        else
-            glNamedFramebufferTexture(framebuffers[0], point, texture, 0);
+        else glNamedFramebufferTexture(framebuffers[0], point, texture, 0);
         glNamedFramebufferTexture(framebuffers[1], point, resolved, 0);
         glEnable(GL_FRAMEBUFFER_SRGB); /* samples are averaged as light */
         glBlitNamedFramebuffer(
@@ -87,8 +86,8 @@ static void capture_image(const struct capture *to, const XrSwapchainSubImage *p
             swapchain->swapchain.info.sampleCount, rect.offset.x, rect.offset.y,
             rect.extent.width, rect.extent.height, part->imageArrayIndex);
     if (!to->has_pixels) return;
-    size_t size = (size_t)rect.extent.width * (size_t)rect.extent.height *
-                  format->pixel_bytes;
+    size_t size =
+        (size_t)rect.extent.width * (size_t)rect.extent.height * format->pixel_bytes;
     void *pixels = calloc(1, size);
     read_pixels(swapchain, swapchain->swapchain.released, rect, part->imageArrayIndex,
                 pixels, (GLsizei)size);
@@ -131,7 +130,8 @@ static void capture_view(const struct capture *to, uint32_t index,
     fprintf(file, "}");
 }
 
-static void capture_layer(struct capture *to, const XrCompositionLayerBaseHeader *layer) {
+static void capture_layer(struct capture *to,
+                          const XrCompositionLayerBaseHeader *layer) {
     FILE *file = to->file;
     bool is_quad = layer->type == XR_TYPE_COMPOSITION_LAYER_QUAD;
     fprintf(file, "%s{\"type\": \"%s\", \"flags\": %llu, ", to->layer ? ", " : "",

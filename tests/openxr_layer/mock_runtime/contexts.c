@@ -5,10 +5,10 @@ enum { MAX_KNOWN = 64 };
 
 static struct current get_current(void) {
     return (struct current){
-        eglGetCurrentDisplay(),          eglGetCurrentContext(),
-        eglGetCurrentSurface(EGL_DRAW),  eglGetCurrentSurface(EGL_READ),
-        glXGetCurrentDisplay(),          glXGetCurrentContext(),
-        glXGetCurrentDrawable(),         glXGetCurrentReadDrawable()};
+        eglGetCurrentDisplay(),         eglGetCurrentContext(),
+        eglGetCurrentSurface(EGL_DRAW), eglGetCurrentSurface(EGL_READ),
+        glXGetCurrentDisplay(),         glXGetCurrentContext(),
+        glXGetCurrentDrawable(),        glXGetCurrentReadDrawable()};
 }
 
 /* A thread cannot have a context of EGL and one of GLX: the other one goes first. */
@@ -57,8 +57,8 @@ void know_context(void *context) {
     if (known_count < MAX_KNOWN) known_contexts[known_count++] = context;
 }
 
-/* A layer that leaves its context current is seen at the next call: the thread then has a
- * context that is no session's, and that nobody had before there was a session. */
+/* A layer that leaves its context current is seen at the next call: the thread then has
+ * a context that is no session's, and that nobody had before there was a session. */
 static void check_current_context(void) {
     void *context = eglGetCurrentContext();
     if (!context) context = glXGetCurrentContext();
@@ -68,9 +68,10 @@ static void check_current_context(void) {
     know_context(context); /* reported once */
     for (uint64_t i = 0; i < mock.object_count; i++)
         if (mock.objects[i]->kind == SESSION && mock.objects[i]->is_alive) {
-            fprintf(stderr,
-                    "mock: violation: %s: the current context is not the application's\n",
-                    mock.call);
+            fprintf(
+                stderr,
+                "mock: violation: %s: the current context is not the application's\n",
+                mock.call);
             return;
         }
 }

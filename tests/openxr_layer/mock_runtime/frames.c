@@ -20,7 +20,7 @@ static void sleep_until(XrTime time_ns) {
 }
 
 XrResult XRAPI_CALL xrWaitFrame(XrSession session, const XrFrameWaitInfo *info,
-                                       XrFrameState *state) {
+                                XrFrameState *state) {
     ENTER;
     FIND(found, SESSION, session);
     if (info) STRUCTURE(info, XR_TYPE_FRAME_WAIT_INFO);
@@ -30,18 +30,20 @@ XrResult XRAPI_CALL xrWaitFrame(XrSession session, const XrFrameWaitInfo *info,
     clock_gettime(CLOCK_REALTIME, &limit);
     limit.tv_sec += WAIT_S;
     while (found->session.waited > found->session.begun && found->is_alive)
-        if (pthread_cond_timedwait(&mock.frame_has_begun, &mock.lock, &limit) == ETIMEDOUT) {
+        if (pthread_cond_timedwait(&mock.frame_has_begun, &mock.lock, &limit) ==
+            ETIMEDOUT) {
             mock.call = __func__;
             return violation(XR_ERROR_CALL_ORDER_INVALID,
-                             "the frame of the last call did not begin in %d s", WAIT_S);
+                             "the frame of the last call did not begin in %d s",
+                             WAIT_S);
         }
     REQUIRE_RUNNING(found); /* it may have ended in the meantime */
     long rate_hz = number_setting("MOCK_XR_RATE_HZ", 90);
     XrDuration period = 1000000000 / (rate_hz ? rate_hz : 90);
-    XrTime last = found->session.waited_time, now = now_ns();
     /* The frame is shown two periods after the application is woken for it. */
-    XrTime time = last + period;
-    if (time < now + 2 * period) time = rate_hz || last <= now ? now + 2 * period : last + 1;
+    XrTime time = now_ns() + 2 * period;
+    XrTime earliest = found->session.waited_time + (rate_hz ? period : 1);
+    if (time < earliest) time = earliest;
     found->session.waited++;
     found->session.waited_time = time;
     found->session.waited_number = remember_frame(time);

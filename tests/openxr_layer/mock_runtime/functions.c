@@ -138,15 +138,16 @@ static const struct {
 };
 
 XrResult XRAPI_CALL xrGetInstanceProcAddr(XrInstance instance, const char *name,
-                                                 PFN_xrVoidFunction *function) {
+                                          PFN_xrVoidFunction *function) {
     ENTER;
     *function = NULL;
     if (instance && !find(INSTANCE, ID(instance))) return XR_ERROR_HANDLE_INVALID;
     for (size_t i = 0; i < sizeof FUNCTIONS / sizeof *FUNCTIONS; i++) {
         int extension = FUNCTIONS[i].extension;
         if (strcmp(FUNCTIONS[i].name, name)) continue;
-        bool has_it = extension == CORE_1_1 ? XR_VERSION_MINOR(mock.api_version) >= 1
-                                            : extension < 0 || mock.is_enabled[extension];
+        bool has_it = extension == CORE_1_1
+                          ? XR_VERSION_MINOR(mock.api_version) >= 1
+                          : extension < 0 || mock.is_enabled[extension];
         if (!has_it || (!instance && extension != ALWAYS)) break;
         *function = FUNCTIONS[i].function;
         return XR_SUCCESS;

@@ -2,7 +2,7 @@
 #include "mock.h"
 
 XrResult check_sub_image(struct object *session, const XrSwapchainSubImage *part,
-                                bool is_depth) {
+                         bool is_depth) {
     const char *what = is_depth ? "depth" : "color";
     FIND(swapchain, SWAPCHAIN, part->swapchain);
     unsigned long long id = swapchain->id;
@@ -12,8 +12,8 @@ XrResult check_sub_image(struct object *session, const XrSwapchainSubImage *part
     REQUIRE(swapchain->swapchain.release_count, XR_ERROR_LAYER_INVALID,
             "%s: no image of swapchain %llu was ever released", what, id);
     REQUIRE(swapchain->swapchain.format->is_depth == is_depth,
-            XR_ERROR_VALIDATION_FAILURE, "%s: swapchain %llu has the format %s", what, id,
-            swapchain->swapchain.format->name);
+            XR_ERROR_VALIDATION_FAILURE, "%s: swapchain %llu has the format %s", what,
+            id, swapchain->swapchain.format->name);
     const XrRect2Di *rect = &part->imageRect;
     REQUIRE(rect->offset.x >= 0 && rect->offset.y >= 0 && rect->extent.width > 0 &&
                 rect->extent.height > 0 &&
@@ -46,9 +46,10 @@ static XrResult check_view(struct object *session,
     XrStructureType depth = XR_TYPE_COMPOSITION_LAYER_DEPTH_INFO_KHR;
     STRUCTURE(view, XR_TYPE_COMPOSITION_LAYER_PROJECTION_VIEW,
               mock.is_enabled[DEPTH] ? depth : 0);
-    REQUIRE(is_unit(&view->pose), XR_ERROR_POSE_INVALID, "the pose of a view is not one");
-    const float angles[] = {view->fov.angleLeft, view->fov.angleRight, view->fov.angleUp,
-                            view->fov.angleDown};
+    REQUIRE(is_unit(&view->pose), XR_ERROR_POSE_INVALID,
+            "the pose of a view is not one");
+    const float angles[] = {view->fov.angleLeft, view->fov.angleRight,
+                            view->fov.angleUp, view->fov.angleDown};
     for (int i = 0; i < 4; i++)
         REQUIRE(fabs((double)angles[i]) < acos(0), XR_ERROR_VALIDATION_FAILURE,
                 "an angle of the field of view is %g", (double)angles[i]);
@@ -60,7 +61,7 @@ static XrResult check_view(struct object *session,
 }
 
 XrResult check_layer(struct object *session,
-                            const XrCompositionLayerBaseHeader *layer) {
+                     const XrCompositionLayerBaseHeader *layer) {
     const XrCompositionLayerFlags KNOWN_FLAGS =
         XR_COMPOSITION_LAYER_CORRECT_CHROMATIC_ABERRATION_BIT |
         XR_COMPOSITION_LAYER_BLEND_TEXTURE_SOURCE_ALPHA_BIT |
@@ -78,7 +79,8 @@ XrResult check_layer(struct object *session,
     REQUIRE(space->parent == session, XR_ERROR_VALIDATION_FAILURE,
             "a layer's space is of another session");
     if (layer->type == XR_TYPE_COMPOSITION_LAYER_QUAD) {
-        REQUIRE(is_unit(&quad->pose), XR_ERROR_POSE_INVALID, "a quad's pose is not one");
+        REQUIRE(is_unit(&quad->pose), XR_ERROR_POSE_INVALID,
+                "a quad's pose is not one");
         REQUIRE(quad->eyeVisibility <= XR_EYE_VISIBILITY_RIGHT,
                 XR_ERROR_VALIDATION_FAILURE, "a quad's visibility is %d",
                 (int)quad->eyeVisibility);

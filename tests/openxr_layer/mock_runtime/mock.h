@@ -1,13 +1,13 @@
 /* An OpenXR runtime without a headset, for tests of an API layer above it.
  *
- * It validates strictly: what an application or a layer does wrong gets the error code of
- * the specification and a line "mock: violation: FUNCTION: ..." on standard error.  Its
- * swapchain images are textures of OpenGL, made in a context of its own that shares with
- * the application's; like Monado, it makes the application's context current where it has
- * to wait for its commands, and restores what was current.
+ * It validates strictly: what an application or a layer does wrong gets the error code
+ * of the specification and a line "mock: violation: FUNCTION: ..." on standard error.
+ * Its swapchain images are textures of OpenGL, made in a context of its own that shares
+ * with the application's; like Monado, it makes the application's context current where
+ * it has to wait for its commands, and restores what was current.
  *
  * Environment (numbers of frames count xrWaitFrame in this process, from 0):
- *   MOCK_XR_EXTENSIONS     offered, separated by commas or spaces (default: all it knows)
+ *   MOCK_XR_EXTENSIONS     offered, separated by commas or spaces (all it knows)
  *   MOCK_XR_FORMATS        swapchain formats, best first: GL_SRGB8_ALPHA8,...
  *   MOCK_XR_SIZE           recommended size of a view (448x504)
  *   MOCK_XR_MONO           1: also offers PRIMARY_MONO
@@ -93,7 +93,7 @@ struct object {
             XrSessionState state;
             bool is_running, is_lost, in_frame, has_actions, is_synced;
             uint32_t view_count;
-            uint64_t waited, begun; /* frames */
+            uint64_t waited, begun;        /* frames */
             int64_t waited_number, number; /* of the frame that waits, that has begun */
             XrTime waited_time, time;
             struct object *attached[MAX_ACTION_SETS];
@@ -138,8 +138,8 @@ extern struct mock {
 /* --- objects.c ------------------------------------------------------------------- */
 
 const char *code_name(XrResult code);
-__attribute__((format(printf, 2, 3))) XrResult violation(XrResult code, const char *words,
-                                                         ...);
+__attribute__((format(printf, 2, 3))) XrResult violation(XrResult code,
+                                                         const char *words, ...);
 const char *setting(const char *name, const char *otherwise);
 long number_setting(const char *name, long otherwise);
 const char *next_word(const char **list, size_t *length);
@@ -157,8 +157,8 @@ const void *chained_structure(const void *next, XrStructureType type);
     struct object *name = find(kind, ID(handle)); \
     if (mock.is_instance_lost) return XR_ERROR_INSTANCE_LOST; \
     if (!name) \
-        return violation(XR_ERROR_HANDLE_INVALID, "%s %llu does not exist", KINDS[kind], \
-                         (unsigned long long)ID(handle)); \
+        return violation(XR_ERROR_HANDLE_INVALID, "%s %llu does not exist", \
+                         KINDS[kind], (unsigned long long)ID(handle)); \
     if (session_of(name) && session_of(name)->session.is_lost) \
     return XR_ERROR_SESSION_LOST
 

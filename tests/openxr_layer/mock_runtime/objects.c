@@ -13,10 +13,9 @@ const char *const KINDS[] = {"instance",   "session", "space",    "swapchain",
 const char *code_name(XrResult code) {
     switch (code) {
 #define NAME(name, value) \
-    case name: \
-        return #name;
+    case name: return #name;
         XR_LIST_ENUM_XrResult(NAME)
-        default : return "XrResult";
+    default: return "XrResult";
     }
 }
 
@@ -51,7 +50,8 @@ const char *next_word(const char **list, size_t *length) {
 
 struct object *create(enum kind kind, struct object *parent) {
     struct object *made = calloc(1, sizeof *made);
-    mock.objects = realloc(mock.objects, (mock.object_count + 1) * sizeof *mock.objects);
+    mock.objects =
+        realloc(mock.objects, (mock.object_count + 1) * sizeof *mock.objects);
     mock.objects[mock.object_count++] = made;
     made->kind = kind;
     made->is_alive = true;
@@ -71,15 +71,14 @@ struct object *session_of(struct object *object) {
     return object;
 }
 
-
-
 XrResult check_chain(const void *next, const XrStructureType *allowed) {
     for (const XrBaseInStructure *at = next; at; at = at->next) {
         bool is_known = false;
         for (int i = 1; allowed[i]; i++) is_known |= at->type == allowed[i];
-        REQUIRE(is_known, XR_ERROR_VALIDATION_FAILURE,
-                "a structure of type %d is chained, which is unknown there or not enabled",
-                (int)at->type);
+        REQUIRE(
+            is_known, XR_ERROR_VALIDATION_FAILURE,
+            "a structure of type %d is chained, which is unknown there or not enabled",
+            (int)at->type);
     }
     return XR_SUCCESS;
 }

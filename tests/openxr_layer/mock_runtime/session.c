@@ -34,7 +34,8 @@ void enter_state(struct object *session, XrSessionState state) {
 void begin_stopping(struct object *session) {
     XrSessionState state = session->session.state;
     if (state == XR_SESSION_STATE_STOPPING) return;
-    if (state == XR_SESSION_STATE_FOCUSED) enter_state(session, XR_SESSION_STATE_VISIBLE);
+    if (state == XR_SESSION_STATE_FOCUSED)
+        enter_state(session, XR_SESSION_STATE_VISIBLE);
     if (state >= XR_SESSION_STATE_VISIBLE)
         enter_state(session, XR_SESSION_STATE_SYNCHRONIZED);
     enter_state(session, XR_SESSION_STATE_STOPPING);
@@ -51,7 +52,8 @@ XrResult XRAPI_CALL xrPollEvent(XrInstance instance, XrEventDataBuffer *event) {
     return XR_SUCCESS;
 }
 
-static XrResult bind_egl(struct object *session, const XrGraphicsBindingEGLMNDX *given) {
+static XrResult bind_egl(struct object *session,
+                         const XrGraphicsBindingEGLMNDX *given) {
     static const EGLint VERSION[] = {EGL_CONTEXT_MAJOR_VERSION, 4,
                                      EGL_CONTEXT_MINOR_VERSION, 5, EGL_NONE};
     REQUIRE(mock.is_enabled[EGL], XR_ERROR_VALIDATION_FAILURE, "EGL is not enabled");
@@ -89,22 +91,26 @@ static XrResult bind_glx(struct object *session,
     session->session.pbuffer =
         glXCreatePbuffer(given->xDisplay, given->glxFBConfig, SMALL);
     own->glx_draw = own->glx_read = session->session.pbuffer;
-    own->glx = make(given->xDisplay, given->glxFBConfig, given->glxContext, True, VERSION);
+    own->glx =
+        make(given->xDisplay, given->glxFBConfig, given->glxContext, True, VERSION);
     REQUIRE(own->glx, XR_ERROR_GRAPHICS_DEVICE_INVALID,
             "no context can share with the application's");
     return XR_SUCCESS;
 }
 
 XrResult XRAPI_CALL xrCreateSession(XrInstance instance,
-                                           const XrSessionCreateInfo *info,
-                                           XrSession *session) {
+                                    const XrSessionCreateInfo *info,
+                                    XrSession *session) {
     ENTER;
     FIND(parent, INSTANCE, instance);
     STRUCTURE(info, XR_TYPE_SESSION_CREATE_INFO,
-              XR_TYPE_GRAPHICS_BINDING_OPENGL_XLIB_KHR, XR_TYPE_GRAPHICS_BINDING_EGL_MNDX);
+              XR_TYPE_GRAPHICS_BINDING_OPENGL_XLIB_KHR,
+              XR_TYPE_GRAPHICS_BINDING_EGL_MNDX);
     REQUIRE_SYSTEM(info->systemId);
-    REQUIRE(mock.is_enabled[OPENGL], XR_ERROR_GRAPHICS_DEVICE_INVALID, "OpenGL is not enabled");
-    REQUIRE(parent->instance.has_asked_for_requirements, XR_ERROR_GRAPHICS_REQUIREMENTS_CALL_MISSING,
+    REQUIRE(mock.is_enabled[OPENGL], XR_ERROR_GRAPHICS_DEVICE_INVALID,
+            "OpenGL is not enabled");
+    REQUIRE(parent->instance.has_asked_for_requirements,
+            XR_ERROR_GRAPHICS_REQUIREMENTS_CALL_MISSING,
             "xrGetOpenGLGraphicsRequirementsKHR was not called");
     const void *egl = chained_structure(info->next, XR_TYPE_GRAPHICS_BINDING_EGL_MNDX);
     const void *glx =
@@ -138,7 +144,7 @@ void destroy_session(struct object *session) {
     }
     for (uint32_t i = 0; i < session->session.attached_count; i++)
         session->session.attached[i]->action.is_attached = false;
-    session->is_alive = false;
+    session->is_alive = session->session.is_running = false;
     pthread_cond_broadcast(&mock.frame_has_begun);
 }
 
@@ -150,13 +156,13 @@ XrResult XRAPI_CALL xrDestroySession(XrSession session) {
     return XR_SUCCESS;
 }
 
-XrResult XRAPI_CALL xrBeginSession(XrSession session,
-                                          const XrSessionBeginInfo *info) {
+XrResult XRAPI_CALL xrBeginSession(XrSession session, const XrSessionBeginInfo *info) {
     ENTER;
     FIND(found, SESSION, session);
     STRUCTURE(info, XR_TYPE_SESSION_BEGIN_INFO);
     REQUIRE_VIEWS(info->primaryViewConfigurationType);
-    REQUIRE(!found->session.is_running, XR_ERROR_SESSION_RUNNING, "it has begun before");
+    REQUIRE(!found->session.is_running, XR_ERROR_SESSION_RUNNING,
+            "it has begun before");
     REQUIRE(found->session.state == XR_SESSION_STATE_READY, XR_ERROR_SESSION_NOT_READY,
             "its state is %d", (int)found->session.state);
     found->session.is_running = true;
@@ -169,7 +175,8 @@ XrResult XRAPI_CALL xrEndSession(XrSession session) {
     FIND(found, SESSION, session);
     REQUIRE_RUNNING(found);
     REQUIRE(found->session.state == XR_SESSION_STATE_STOPPING,
-            XR_ERROR_SESSION_NOT_STOPPING, "its state is %d", (int)found->session.state);
+            XR_ERROR_SESSION_NOT_STOPPING, "its state is %d",
+            (int)found->session.state);
     found->session.is_running = found->session.in_frame = false;
     found->session.begun = found->session.waited;
     pthread_cond_broadcast(&mock.frame_has_begun);

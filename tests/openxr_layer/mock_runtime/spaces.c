@@ -7,7 +7,8 @@ static const XrFovf EYE_FOV[] = {{-0.80f, 0.75f, 0.78f, -0.82f},
                                  {-0.75f, 0.80f, 0.78f, -0.82f}};
 static const float FLOOR_M = -1.6f;
 /* of the second LOCAL in the first: aside and turned left by 30 degrees */
-static const XrPosef RECENTERED = {{0, 0.258819045f, 0, 0.965925826f}, {0.25f, 0, -0.5f}};
+static const XrPosef RECENTERED = {{0, 0.258819045f, 0, 0.965925826f},
+                                   {0.25f, 0, -0.5f}};
 
 static struct {
     XrTime time;
@@ -142,9 +143,9 @@ static const XrReferenceSpaceType REFERENCE_SPACES[] = {
     XR_REFERENCE_SPACE_TYPE_VIEW, XR_REFERENCE_SPACE_TYPE_LOCAL,
     XR_REFERENCE_SPACE_TYPE_STAGE, XR_REFERENCE_SPACE_TYPE_LOCAL_FLOOR};
 
-XrResult XRAPI_CALL xrEnumerateReferenceSpaces(XrSession session,
-                                                      uint32_t capacity, uint32_t *count,
-                                                      XrReferenceSpaceType *types) {
+XrResult XRAPI_CALL xrEnumerateReferenceSpaces(XrSession session, uint32_t capacity,
+                                               uint32_t *count,
+                                               XrReferenceSpaceType *types) {
     ENTER;
     FIND(found, SESSION, session);
     TWO_CALLS(capacity, count, reference_space_count());
@@ -153,8 +154,8 @@ XrResult XRAPI_CALL xrEnumerateReferenceSpaces(XrSession session,
 }
 
 XrResult XRAPI_CALL xrCreateReferenceSpace(XrSession session,
-                                                  const XrReferenceSpaceCreateInfo *info,
-                                                  XrSpace *space) {
+                                           const XrReferenceSpaceCreateInfo *info,
+                                           XrSpace *space) {
     ENTER;
     FIND(found, SESSION, session);
     STRUCTURE(info, XR_TYPE_REFERENCE_SPACE_CREATE_INFO);
@@ -173,8 +174,8 @@ XrResult XRAPI_CALL xrCreateReferenceSpace(XrSession session,
 }
 
 XrResult XRAPI_CALL xrGetReferenceSpaceBoundsRect(XrSession session,
-                                                         XrReferenceSpaceType type,
-                                                         XrExtent2Df *bounds) {
+                                                  XrReferenceSpaceType type,
+                                                  XrExtent2Df *bounds) {
     ENTER;
     FIND(found, SESSION, session);
     (void)type;
@@ -183,8 +184,8 @@ XrResult XRAPI_CALL xrGetReferenceSpaceBoundsRect(XrSession session,
 }
 
 XrResult XRAPI_CALL xrCreateActionSpace(XrSession session,
-                                               const XrActionSpaceCreateInfo *info,
-                                               XrSpace *space) {
+                                        const XrActionSpaceCreateInfo *info,
+                                        XrSpace *space) {
     ENTER;
     FIND(found, SESSION, session);
     STRUCTURE(info, XR_TYPE_ACTION_SPACE_CREATE_INFO);
@@ -222,7 +223,7 @@ static void locate(struct object *space, struct object *base, XrTime time,
 }
 
 XrResult XRAPI_CALL xrLocateSpace(XrSpace space, XrSpace base, XrTime time,
-                                         XrSpaceLocation *location) {
+                                  XrSpaceLocation *location) {
     ENTER;
     FIND(found, SPACE, space);
     FIND(found_base, SPACE, base);
@@ -242,9 +243,8 @@ XrResult XRAPI_CALL xrLocateSpace(XrSpace space, XrSpace base, XrTime time,
     return XR_SUCCESS;
 }
 
-XrResult XRAPI_CALL xrLocateSpaces(XrSession session,
-                                          const XrSpacesLocateInfo *info,
-                                          XrSpaceLocations *locations) {
+XrResult XRAPI_CALL xrLocateSpaces(XrSession session, const XrSpacesLocateInfo *info,
+                                   XrSpaceLocations *locations) {
     ENTER;
     FIND(found, SESSION, session);
     STRUCTURE(info, XR_TYPE_SPACES_LOCATE_INFO);
@@ -262,8 +262,8 @@ XrResult XRAPI_CALL xrLocateSpaces(XrSession session,
 }
 
 XrResult XRAPI_CALL xrLocateViews(XrSession session, const XrViewLocateInfo *info,
-                                         XrViewState *state, uint32_t capacity,
-                                         uint32_t *count, XrView *views) {
+                                  XrViewState *state, uint32_t capacity,
+                                  uint32_t *count, XrView *views) {
     ENTER;
     FIND(found, SESSION, session);
     STRUCTURE(info, XR_TYPE_VIEW_LOCATE_INFO);
@@ -280,8 +280,7 @@ XrResult XRAPI_CALL xrLocateViews(XrSession session, const XrViewLocateInfo *inf
         state->viewStateFlags =
             XR_VIEW_STATE_ORIENTATION_VALID_BIT | XR_VIEW_STATE_POSITION_VALID_BIT |
             XR_VIEW_STATE_ORIENTATION_TRACKED_BIT | XR_VIEW_STATE_POSITION_TRACKED_BIT;
-    else
-        base = IDENTITY;
+    else base = IDENTITY;
     TWO_CALLS(capacity, count, n);
     for (uint32_t i = 0; i < n; i++) {
         STRUCTURE(&views[i], XR_TYPE_VIEW);

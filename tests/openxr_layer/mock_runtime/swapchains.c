@@ -15,9 +15,8 @@ static const struct format FORMATS[] = {
 };
 enum { N_FORMATS = sizeof FORMATS / sizeof *FORMATS };
 
-XrResult XRAPI_CALL xrEnumerateSwapchainFormats(XrSession session,
-                                                       uint32_t capacity, uint32_t *count,
-                                                       int64_t *formats) {
+XrResult XRAPI_CALL xrEnumerateSwapchainFormats(XrSession session, uint32_t capacity,
+                                                uint32_t *count, int64_t *formats) {
     ENTER;
     FIND(found, SESSION, session);
     int64_t offered[N_FORMATS];
@@ -55,10 +54,8 @@ static bool make_textures(struct object *swapchain) {
                                       GL_TRUE);
         else if (samples > 1)
             glTexStorage2DMultisample(target, samples, format, width, height, GL_TRUE);
-        else if (is_array)
-            glTexStorage3D(target, mips, format, width, height, layers);
-        else
-            glTexStorage2D(target, mips, format, width, height);
+        else if (is_array) glTexStorage3D(target, mips, format, width, height, layers);
+        else glTexStorage2D(target, mips, format, width, height);
     }
     glBindTexture(target, 0);
     glFinish(); /* before another context uses them */
@@ -66,8 +63,8 @@ static bool make_textures(struct object *swapchain) {
 }
 
 XrResult XRAPI_CALL xrCreateSwapchain(XrSession session,
-                                             const XrSwapchainCreateInfo *info,
-                                             XrSwapchain *swapchain) {
+                                      const XrSwapchainCreateInfo *info,
+                                      XrSwapchain *swapchain) {
     ENTER;
     FIND(found, SESSION, session);
     STRUCTURE(info, XR_TYPE_SWAPCHAIN_CREATE_INFO);
@@ -120,9 +117,9 @@ XrResult XRAPI_CALL xrDestroySwapchain(XrSwapchain swapchain) {
     return XR_SUCCESS;
 }
 
-XrResult XRAPI_CALL xrEnumerateSwapchainImages(XrSwapchain swapchain,
-                                                      uint32_t capacity, uint32_t *count,
-                                                      XrSwapchainImageBaseHeader *images) {
+XrResult XRAPI_CALL xrEnumerateSwapchainImages(XrSwapchain swapchain, uint32_t capacity,
+                                               uint32_t *count,
+                                               XrSwapchainImageBaseHeader *images) {
     ENTER;
     FIND(found, SWAPCHAIN, swapchain);
     TWO_CALLS(capacity, count, found->swapchain.image_count);
@@ -135,8 +132,8 @@ XrResult XRAPI_CALL xrEnumerateSwapchainImages(XrSwapchain swapchain,
 }
 
 XrResult XRAPI_CALL xrAcquireSwapchainImage(XrSwapchain swapchain,
-                                                   const XrSwapchainImageAcquireInfo *info,
-                                                   uint32_t *index) {
+                                            const XrSwapchainImageAcquireInfo *info,
+                                            uint32_t *index) {
     ENTER;
     FIND(found, SWAPCHAIN, swapchain);
     if (info) STRUCTURE(info, XR_TYPE_SWAPCHAIN_IMAGE_ACQUIRE_INFO);
@@ -152,7 +149,7 @@ XrResult XRAPI_CALL xrAcquireSwapchainImage(XrSwapchain swapchain,
 }
 
 XrResult XRAPI_CALL xrWaitSwapchainImage(XrSwapchain swapchain,
-                                                const XrSwapchainImageWaitInfo *info) {
+                                         const XrSwapchainImageWaitInfo *info) {
     ENTER;
     FIND(found, SWAPCHAIN, swapchain);
     STRUCTURE(info, XR_TYPE_SWAPCHAIN_IMAGE_WAIT_INFO);
@@ -171,8 +168,8 @@ XrResult XRAPI_CALL xrWaitSwapchainImage(XrSwapchain swapchain,
     return XR_SUCCESS;
 }
 
-XrResult XRAPI_CALL xrReleaseSwapchainImage(
-    XrSwapchain swapchain, const XrSwapchainImageReleaseInfo *info) {
+XrResult XRAPI_CALL xrReleaseSwapchainImage(XrSwapchain swapchain,
+                                            const XrSwapchainImageReleaseInfo *info) {
     ENTER;
     FIND(found, SWAPCHAIN, swapchain);
     if (info) STRUCTURE(info, XR_TYPE_SWAPCHAIN_IMAGE_RELEASE_INFO);

@@ -38,7 +38,7 @@ XrResult XRAPI_CALL xrEnumerateInstanceExtensionProperties(
 }
 
 XrResult XRAPI_CALL xrCreateInstance(const XrInstanceCreateInfo *info,
-                                            XrInstance *instance) {
+                                     XrInstance *instance) {
     ENTER;
     STRUCTURE(info, XR_TYPE_INSTANCE_CREATE_INFO,
               XR_TYPE_DEBUG_UTILS_MESSENGER_CREATE_INFO_EXT);
@@ -79,7 +79,7 @@ XrResult XRAPI_CALL xrDestroyInstance(XrInstance instance) {
 }
 
 XrResult XRAPI_CALL xrGetInstanceProperties(XrInstance instance,
-                                                   XrInstanceProperties *properties) {
+                                            XrInstanceProperties *properties) {
     ENTER;
     FIND(found, INSTANCE, instance);
     STRUCTURE(properties, XR_TYPE_INSTANCE_PROPERTIES);
@@ -89,33 +89,30 @@ XrResult XRAPI_CALL xrGetInstanceProperties(XrInstance instance,
 }
 
 XrResult XRAPI_CALL xrResultToString(XrInstance instance, XrResult value,
-                                            char text[XR_MAX_RESULT_STRING_SIZE]) {
+                                     char text[XR_MAX_RESULT_STRING_SIZE]) {
     ENTER;
     FIND(found, INSTANCE, instance);
     snprintf(text, XR_MAX_RESULT_STRING_SIZE, "%s", code_name(value));
     return XR_SUCCESS;
 }
 
-XrResult XRAPI_CALL xrStructureTypeToString(
-    XrInstance instance, XrStructureType value,
-    char text[XR_MAX_STRUCTURE_NAME_SIZE]) {
+XrResult XRAPI_CALL xrStructureTypeToString(XrInstance instance, XrStructureType value,
+                                            char text[XR_MAX_STRUCTURE_NAME_SIZE]) {
     ENTER;
     FIND(found, INSTANCE, instance);
     switch (value) {
 #define STRUCTURE_NAME(name, number) \
-    case name: \
-        strcpy(text, #name); \
-        break;
+    case name: strcpy(text, #name); break;
         XR_LIST_ENUM_XrStructureType(STRUCTURE_NAME)
-        default
-            : snprintf(text, XR_MAX_STRUCTURE_NAME_SIZE, "XR_UNKNOWN_STRUCTURE_TYPE_%d",
-                       (int)value);
+    default:
+        snprintf(text, XR_MAX_STRUCTURE_NAME_SIZE, "XR_UNKNOWN_STRUCTURE_TYPE_%d",
+                 (int)value);
     }
     return XR_SUCCESS;
 }
 
 XrResult XRAPI_CALL xrGetSystem(XrInstance instance, const XrSystemGetInfo *info,
-                                       XrSystemId *system) {
+                                XrSystemId *system) {
     ENTER;
     FIND(found, INSTANCE, instance);
     STRUCTURE(info, XR_TYPE_SYSTEM_GET_INFO);
@@ -126,7 +123,7 @@ XrResult XRAPI_CALL xrGetSystem(XrInstance instance, const XrSystemGetInfo *info
 }
 
 XrResult XRAPI_CALL xrGetSystemProperties(XrInstance instance, XrSystemId system,
-                                                 XrSystemProperties *properties) {
+                                          XrSystemProperties *properties) {
     ENTER;
     FIND(found, INSTANCE, instance);
     REQUIRE_SYSTEM(system);
@@ -154,9 +151,10 @@ uint32_t views_of(XrViewConfigurationType type) {
            view_configuration_count() == 2;
 }
 
-XrResult XRAPI_CALL xrEnumerateViewConfigurations(
-    XrInstance instance, XrSystemId system, uint32_t capacity, uint32_t *count,
-    XrViewConfigurationType *types) {
+XrResult XRAPI_CALL xrEnumerateViewConfigurations(XrInstance instance,
+                                                  XrSystemId system, uint32_t capacity,
+                                                  uint32_t *count,
+                                                  XrViewConfigurationType *types) {
     ENTER;
     FIND(found, INSTANCE, instance);
     REQUIRE_SYSTEM(system);
@@ -201,9 +199,11 @@ XrResult XRAPI_CALL xrEnumerateViewConfigurationViews(
     return XR_SUCCESS;
 }
 
-XrResult XRAPI_CALL xrEnumerateEnvironmentBlendModes(
-    XrInstance instance, XrSystemId system, XrViewConfigurationType type,
-    uint32_t capacity, uint32_t *count, XrEnvironmentBlendMode *modes) {
+XrResult XRAPI_CALL xrEnumerateEnvironmentBlendModes(XrInstance instance,
+                                                     XrSystemId system,
+                                                     XrViewConfigurationType type,
+                                                     uint32_t capacity, uint32_t *count,
+                                                     XrEnvironmentBlendMode *modes) {
     ENTER;
     FIND(found, INSTANCE, instance);
     REQUIRE_SYSTEM(system);
