@@ -5,6 +5,7 @@ from glob import glob
 from setuptools import Extension, find_packages, setup
 
 NATIVE = "filter_service/native/source"
+LAYER = "clients/openxr_layer/source"
 FLAGS = ["-std=gnu11", "-g0", "-fvisibility=hidden"]
 
 setup(
@@ -17,9 +18,9 @@ setup(
         "filter_service.shaders.passes",
     ],
     package_dir={"filter_service.shaders": "shaders"},
-    # Both libraries are optional and loaded with ctypes.  Without a C compiler, the
-    # engine is gl, and dropping messages with millions of parts takes ten times as
-    # long.
+    # All libraries are optional and loaded by path.  Without a C compiler, the engine is
+    # gl, and dropping messages with millions of parts takes ten times as long.  Without
+    # the headers of OpenXR, OpenGL and X11, `ocufilter layer` says what it requires.
     ext_modules=[
         Extension(
             "filter_service.native._loops",
@@ -41,6 +42,15 @@ setup(
             "filter_service.service._drop_parts",
             sources=["filter_service/service/drop_parts.c"],
             extra_compile_args=[*FLAGS, "-O2"],
+            optional=True,
+        ),
+        Extension(
+            "clients.openxr_layer._layer",
+            sources=sorted(glob(f"{LAYER}/*.c")),
+            depends=sorted(glob(f"{LAYER}/*.h")),
+            libraries=["dl"],
+            extra_compile_args=[*FLAGS, "-O2", "-pthread"],
+            extra_link_args=["-pthread"],
             optional=True,
         ),
     ],

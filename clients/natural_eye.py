@@ -149,17 +149,23 @@ class NaturalEye:
         self._far_dpt, self._near_dpt = 0.0, MAX_VERGENCE_DPT
 
 
-def luminance_cd_m2(color: NDArray[np.uint8], white_cd_m2: float) -> float:
+def luminance_cd_m2(
+    color: NDArray[np.uint8] | NDArray[np.float16], white_cd_m2: float
+) -> float:
     """Return the mean luminance of an image on a display.
 
     Parameters
     ----------
-    color : (h, w, 3) uint8
-        sRGB.
+    color : (h, w, 3) uint8 or float16
+        sRGB, or linear light, in which the display's white is 1.
     white_cd_m2 : float
         Luminance of the display's white.
     """
-    light = _LINEAR_OF_SRGB8[color[::_STRIDE, ::_STRIDE]]
+    sample = color[::_STRIDE, ::_STRIDE]
+    if color.dtype == np.uint8:
+        light = _LINEAR_OF_SRGB8[sample]
+    else:
+        light = np.clip(np.nan_to_num(sample.astype(np.float32)), 0.0, 1.0)
     return white_cd_m2 * float((light @ _LUMINANCE).mean())
 
 

@@ -4,7 +4,7 @@ console          output, errors, progress
 setting_options  command-line options generated from `FilterSettings`
 display_file     measured spectra of a display
 program          the `ocufilter` program: dispatch and errors
-programs         demo, headset, report, batch, web, doctor
+programs         demo, headset, layer, report, batch, web, doctor
 checkout         bench and paper
 serve            the service, and ahead-of-time compilation of its loops
 status           state of a running service

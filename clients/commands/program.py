@@ -12,7 +12,15 @@ from clients.commands.eyes import eyes
 from clients.commands.field import field
 from clients.commands.filter_image import filter_image
 from clients.commands.keys import keys
-from clients.commands.programs import batch, demo, doctor, headset, report, web
+from clients.commands.programs import (
+    batch,
+    demo,
+    doctor,
+    headset,
+    layer,
+    report,
+    web,
+)
 from clients.commands.psf import psf
 from clients.commands.serve import prepare, serve
 from clients.commands.status import status
@@ -47,7 +55,7 @@ app.command()(psf)
 app.command(
     context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
 )(bench)
-for program in (headset, web, batch, report):
+for program in (headset, layer, web, batch, report):
     app.command(
         context_settings={
             "allow_extra_args": True,

@@ -1,4 +1,4 @@
-"""`ocufilter demo`, `headset`, `report`, `batch`, `web` and `doctor`.
+"""`ocufilter demo`, `headset`, `layer`, `report`, `batch`, `web` and `doctor`.
 
 Modules that do the work are imported only when a command runs.
 """
@@ -55,6 +55,16 @@ def headset(context: typer.Context) -> None:
     ocufilter headset --left myopia --right keratoconus
     """
     _run("clients.headset.program", context.args)
+
+
+def layer(context: typer.Context) -> None:
+    """Run another OpenXR program, unchanged, seen through given eyes.
+
+    For its actions and options, see `ocufilter layer --help`.
+
+    ocufilter layer run --left myopia -- hello_xr -g OpenGL
+    """
+    _run("clients.openxr_layer.program", context.args)
 
 
 def report(context: typer.Context) -> None:

@@ -159,7 +159,7 @@ class LocalFilter:
         )
         if planned is None:
             return None
-        seen = planned.render()
+        seen = planned.render(output=frame.output)
         stages_ms = seen.stage_times_ms
         whole_ms = MS_PER_S * (time.monotonic() - begin_s)
         return FilteredStereoFrame(

@@ -36,59 +36,9 @@ def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Names
     scene.add_argument(
         "--supersampling", type=int, default=2, help="samples per pixel along each axis"
     )
-    eyes = parser.add_argument_group("the eyes")
-    what = "preset name, JSON, or a .json, .abp, .csv or .zmx file"
-    eyes.add_argument(
-        "--profile",
-        default="myopia",
-        help=f"profile of both eyes: {what} (default: myopia)",
-    )
-    eyes.add_argument("--left", metavar="PROFILE", help="profile of the left eye")
-    eyes.add_argument("--right", metavar="PROFILE", help="profile of the right eye")
-    eyes.add_argument(
-        "--age",
-        type=float,
-        default=USUAL_AGE_YEARS,
-        metavar="YEARS",
-        help=f"age of the person (default: {USUAL_AGE_YEARS:g})",
-    )
-    eyes.add_argument(
-        "--pupil-mm",
-        type=float,
-        metavar="MM",
-        help="fixed pupil diameter (default: the pupil follows the light)",
-    )
-    eyes.add_argument(
-        "--white-cd-m2",
-        type=float,
-        default=USUAL_WHITE_CD_M2,
-        metavar="L",
-        help="luminance of the display's white, which drives the pupil "
-        f"(default: {USUAL_WHITE_CD_M2:g})",
-    )
-    eyes.add_argument(
-        "--gaze-range",
-        default=None,
-        metavar="H,V",
-        help="range of gaze, deg (default: 15,10 with a tracker, otherwise 0,0); a "
-        "larger range takes longer to prepare",
-    )
-    eyes.add_argument(
-        "--settings",
-        default="{}",
-        metavar="JSON",
-        help='settings of the filter, such as {"tolerance": "loose"}',
-    )
+    add_eye_arguments(parser)
     where = parser.add_argument_group("where frames are filtered")
-    where.add_argument(
-        "--service",
-        metavar="ENDPOINT",
-        help="filter in a running service, such as tcp://127.0.0.1:5577 (default: in "
-        "this process)",
-    )
-    where.add_argument(
-        "--key", type=Path, metavar="FILE", help="key file of the client, for --service"
-    )
+    add_service_arguments(where)
     where.add_argument(
         "--textures",
         choices=("auto", "yes", "no"),
@@ -133,6 +83,72 @@ def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Names
     options = parser.parse_args(argv)
     _settle_where(parser, options)
     return options
+
+
+def add_eye_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of both eyes, which `settings_of` and `profiles_of` read."""
+    eyes = parser.add_argument_group("the eyes")
+    what = "preset name, JSON, or a .json, .abp, .csv or .zmx file"
+    eyes.add_argument(
+        "--profile",
+        default="myopia",
+        help=f"profile of both eyes: {what} (default: myopia)",
+    )
+    eyes.add_argument("--left", metavar="PROFILE", help="profile of the left eye")
+    eyes.add_argument("--right", metavar="PROFILE", help="profile of the right eye")
+    eyes.add_argument(
+        "--age",
+        type=float,
+        default=USUAL_AGE_YEARS,
+        metavar="YEARS",
+        help=f"age of the person (default: {USUAL_AGE_YEARS:g})",
+    )
+    eyes.add_argument(
+        "--pupil-mm",
+        type=float,
+        metavar="MM",
+        help="fixed pupil diameter (default: the pupil follows the light)",
+    )
+    eyes.add_argument(
+        "--focus-dpt",
+        type=float,
+        metavar="D",
+        help="fixed focus (default: focus follows the viewed distance)",
+    )
+    eyes.add_argument(
+        "--white-cd-m2",
+        type=float,
+        default=USUAL_WHITE_CD_M2,
+        metavar="L",
+        help="luminance of the display's white, which drives the pupil "
+        f"(default: {USUAL_WHITE_CD_M2:g})",
+    )
+    eyes.add_argument(
+        "--gaze-range",
+        default=None,
+        metavar="H,V",
+        help="range of gaze, deg (default: 15,10 with a tracker, otherwise 0,0); a "
+        "larger range takes longer to prepare",
+    )
+    eyes.add_argument(
+        "--settings",
+        default="{}",
+        metavar="JSON",
+        help='settings of the filter, such as {"tolerance": "loose"}',
+    )
+
+
+def add_service_arguments(where: argparse._ArgumentGroup) -> None:
+    """Add the options of a service that filters the frames."""
+    where.add_argument(
+        "--service",
+        metavar="ENDPOINT",
+        help="filter in a running service, such as tcp://127.0.0.1:5577 (default: in "
+        "this process)",
+    )
+    where.add_argument(
+        "--key", type=Path, metavar="FILE", help="key file of the client, for --service"
+    )
 
 
 def _settle_where(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:

@@ -150,6 +150,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         pupil_diameter_mm=options.pupil_mm,
         white_cd_m2=options.white_cd_m2,
         gaze_range_deg=settings.gaze_range_deg,
+        focus_dpt=options.focus_dpt,
     )
     check_limits(options)
     pictures = _Pictures()

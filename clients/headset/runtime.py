@@ -14,7 +14,7 @@ from filter_service.messages import Pose
 if TYPE_CHECKING:
     import moderngl
 
-Image: TypeAlias = "NDArray[np.uint8] | moderngl.Texture"
+Image: TypeAlias = "NDArray[np.uint8] | NDArray[np.float16] | moderngl.Texture"
 """An image (h, w, 3) in an array, or in a texture with the top row first."""
 
 Eye = Literal["left", "right"]

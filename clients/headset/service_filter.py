@@ -126,6 +126,7 @@ class ServiceFilter:
                 pupil_diameter_mm=frame.eyes[0].state.pupil_diameter_mm,
                 focus_dpt=frame.eyes[0].state.focus_dpt,
                 states=frame.states,
+                output=frame.output,
                 display_time_ns=frame.due.display_time_ns,
             )
             self._on_way[frame_id] = frame

@@ -6,10 +6,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+import numpy as np
+
 from clients.headset.runtime import DueFrame, Eye, EyeView, Image
 from clients.headset.stereo_gaze import EyeAndGaze, Picture
 from filter_service import FilterSettings, RgbdView
 from filter_service.messages import ViewState
+from filter_service.settings import Output
 
 Say = Callable[[str], None]
 
@@ -27,6 +30,12 @@ class StereoFrame:
     def views(self) -> list[RgbdView]:
         """Return the views to filter."""
         return [RgbdView(p.color, p.depth_m, p.view.tangents) for p in self.pictures]
+
+    @property
+    def output(self) -> Output:
+        """Return the format of the results, which is that of the images."""
+        is_srgb = all(picture.color.dtype == np.uint8 for picture in self.pictures)
+        return "srgb8" if is_srgb else "linear16"
 
     @property
     def states(self) -> tuple[ViewState, ...]:
@@ -53,8 +62,8 @@ class FilteredStereoFrame:
         Input frame.
     views : tuple of EyeView
         View of each image, with the pose that was returned with it.
-    colors : tuple of (h, w, 3) uint8, or of moderngl.Texture
-        Filtered image of each eye, sRGB.
+    colors : tuple of (h, w, 3) uint8 or float16, or of moderngl.Texture
+        Filtered image of each eye, sRGB or linear light as the input.
     used_focus_dpt : tuple of float or None
         Focus of each eye; None if the previous eye was used, whose focus does not apply
         to the requested eye.

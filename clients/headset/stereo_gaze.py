@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from clients.headset.poses import angles_of, direction_of, matrix_of
 from clients.headset.runtime import DueFrame, Eye, EyeView, Image
 from clients.natural_eye import (
+    MAX_VERGENCE_DPT,
     USUAL_WHITE_CD_M2,
     EyeState,
     NaturalEye,
@@ -47,14 +48,14 @@ class RgbdPicture:
     ----------
     view : EyeView
         View that the image was rendered for.
-    color : (h, w, 3) uint8
-        sRGB.
+    color : (h, w, 3) uint8 or float16
+        sRGB, or linear light.
     depth_m : (h, w) float32
         Planar depth.
     """
 
     view: EyeView
-    color: NDArray[np.uint8]
+    color: NDArray[np.uint8] | NDArray[np.float16]
     depth_m: NDArray[np.float32]
 
     @property
@@ -143,6 +144,8 @@ class StereoGaze:
         Luminance of the display's white.
     gaze_range_deg : (h, v)
         Largest gaze angles in the images; the gaze is clamped to them.
+    focus_dpt : float, optional
+        Fixed focus; by default, focus follows the distance of the point of fixation.
     """
 
     def __init__(
@@ -152,7 +155,12 @@ class StereoGaze:
         pupil_diameter_mm: float | None = None,
         white_cd_m2: float = USUAL_WHITE_CD_M2,
         gaze_range_deg: tuple[float, float] = STRAIGHT_AHEAD,
+        focus_dpt: float | None = None,
     ) -> None:
+        if focus_dpt is not None and not 0.0 <= focus_dpt <= MAX_VERGENCE_DPT:
+            raise ValueError(
+                f"focus_dpt is {focus_dpt}; allowed: 0 to {MAX_VERGENCE_DPT:g}"
+            )
         if not 0.0 < white_cd_m2 <= 1e5:
             raise ValueError(
                 f"white_cd_m2 is {white_cd_m2}; allowed: above 0, up to 100000"
@@ -160,6 +168,7 @@ class StereoGaze:
         self._age_years, self._pupil_mm = age_years, pupil_diameter_mm
         self._white_cd_m2 = white_cd_m2
         self.gaze_range_deg = gaze_range_deg
+        self._focus_dpt = focus_dpt
         self._follower = GazeFollower()
         self._eyes: dict[Eye, NaturalEye] = {}
         self._distance_m: float | None = None
@@ -200,6 +209,8 @@ class StereoGaze:
         for picture in pictures:
             eye = self._eye(picture)
             state = eye.look(light_cd_m2, 1.0 / distance_m, at_s)
+            if self._focus_dpt is not None:
+                state = EyeState(state.pupil_diameter_mm, self._focus_dpt)
             if due.pupil_diameter_mm is not None:
                 state = state.with_pupil(due.pupil_diameter_mm)
             point = head[:3, 3] + min(distance_m, FAR_M) * direction

@@ -1,0 +1,487 @@
+"""The helper of the OpenXR layer: filters the frames of one program at a time."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import os
+import selectors
+import socket
+import struct
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from clients.frame_log import percentiles
+from clients.headset.poses import angles_of, rotation_of
+from clients.headset.runtime import EYES, DueFrame, Eye, GazeSample
+from clients.headset.stereo_filter import Say, StereoFilter, StereoFrame
+from clients.headset.stereo_gaze import RgbdPicture, StereoGaze
+from clients.headset.viewer import SPLIT_RATIO
+from clients.openxr_layer import wire
+from clients.openxr_layer.frame_images import FrameImages, check_frame
+from filter_service.errors import FilterError
+from filter_service.shared_memory import Slot
+
+SOCKET_VARIABLE = "OCUFILTER_LAYER_SOCKET"
+SOCKET_NAME = "ocufilter-layer.sock"
+USUAL_AGE_MS = 150
+WAIT_S = 1.0
+"""Period that is told to a service's filter, which waits for a result accordingly."""
+
+MS_PER_S, US_PER_MS, NS_PER_S = 1e3, 1e3, 1e9
+N_LATE = 10
+"""Successive late results after which the user is told."""
+
+N_TIMES = 4096
+"""Newest frames whose times are reported."""
+
+MAX_WAITING = 8
+"""Connections that are neither closed nor the program's."""
+
+
+def socket_path() -> Path:
+    """Return where the layer looks for its helper, as source/link.c does."""
+    given = os.environ.get(SOCKET_VARIABLE)
+    if given:
+        return Path(given)
+    folder = os.environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.getuid()}"
+    return Path(folder) / SOCKET_NAME
+
+
+@dataclass(frozen=True)
+class HelperOptions:
+    """How frames are filtered.
+
+    Attributes
+    ----------
+    wait_ms : int
+        Longest wait of the program for the result of its frame.
+    max_age_ms : int
+        Age up to which a filtered frame is shown.
+    flat_dpt : float
+        Distance of everything in programs without depth, 1/m; 0 is infinity.
+    is_split : bool
+        Whether the left half stays unfiltered.
+    """
+
+    wait_ms: int = 0
+    max_age_ms: int = USUAL_AGE_MS
+    flat_dpt: float = 1.0
+    is_split: bool = False
+
+    @property
+    def flat_m(self) -> float:
+        """Return the planar depth of programs without depth."""
+        return 1.0 / self.flat_dpt if self.flat_dpt else float("inf")
+
+
+@dataclass(eq=False)
+class _Program:
+    """The program whose frames are filtered."""
+
+    connection: socket.socket
+    name: str
+    memory: Slot | None = None
+    slot_count: int = 0
+    slot_bytes: int = 0
+    notes: set[str] = field(default_factory=set)
+
+
+class LayerHelper:
+    """Filters the frames of programs with the layer, one program at a time.
+
+    Parameters
+    ----------
+    seeing : StereoFilter
+        Filter of both eyes.
+    look : StereoGaze
+        Gaze, focus and pupils.
+    say : callable
+        Called with each message for the user, one line.
+    options : HelperOptions
+    change : callable
+        Called with (eye, profile text) by `ocufilter layer set`; raises `ValueError`.
+    path : Path
+        Where to listen.
+
+    Raises
+    ------
+    OSError
+        If the socket cannot be created, or another helper listens there.
+    """
+
+    def __init__(
+        self,
+        seeing: StereoFilter,
+        look: StereoGaze,
+        say: Say,
+        options: HelperOptions,
+        change: Callable[[Eye, str], None],
+        path: Path,
+    ) -> None:
+        self._seeing, self._look, self._say = seeing, look, say
+        self._options, self._change = options, change
+        self._path = path
+        self._listener = _listening(path)
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._listener, selectors.EVENT_READ)
+        self._program: _Program | None = None
+        self._waiting: set[socket.socket] = set()
+        self.on_frame: Callable[[StereoFrame, Any], None] | None = None
+        self._stages_ms: dict[str, deque[float]] = {}
+        self._n_late = 0
+        self.n_frames = self.n_shown = self.n_filtered = self.n_unready = 0
+
+    def close(self) -> None:
+        """Close all connections and remove the socket."""
+        self._drop("")
+        for connection in list(self._waiting):
+            self._forget(connection)
+        self._selector.close()
+        self._listener.close()
+        self._path.unlink(missing_ok=True)
+
+    def run_once(self, timeout_s: float) -> None:
+        """Handle what has arrived; wait up to ``timeout_s`` if nothing has."""
+        for key, _ in self._selector.select(timeout_s):
+            found = key.fileobj
+            assert isinstance(found, socket.socket)
+            if found is self._listener:
+                self._accept()
+            elif self._program is not None and found is self._program.connection:
+                self._take(self._program)
+            elif found in self._waiting:
+                self._take_first(found)
+
+    # Connections
+
+    def _accept(self) -> None:
+        try:
+            connection, _ = self._listener.accept()
+        except OSError:  # it has hung up
+            return
+        connection.setblocking(False)
+        if not _is_trusted(connection) or len(self._waiting) >= MAX_WAITING:
+            connection.close()
+            return
+        self._waiting.add(connection)
+        self._selector.register(connection, selectors.EVENT_READ)
+
+    def _forget(self, connection: socket.socket) -> None:
+        self._waiting.discard(connection)
+        with contextlib.suppress(KeyError):
+            self._selector.unregister(connection)
+        connection.close()
+
+    def _drop(self, why: str) -> None:
+        program, self._program = self._program, None
+        if program is None:
+            return
+        if why:
+            self._say(f"{program.name}: {why}")
+        if program.memory is not None:
+            program.memory.close()
+        self._forget(program.connection)
+
+    def _take_first(self, connection: socket.socket) -> None:
+        """Answer the first message of a connection."""
+        try:
+            data = connection.recv(wire.MAX_CONTROL_BYTES + 4)
+        except OSError:
+            data = b""
+        if wire.kind_of(data) == wire.CONTROL:
+            reply = json.dumps(self._control(data[4:])).encode()
+            with contextlib.suppress(OSError):
+                connection.send(reply)
+            self._forget(connection)
+            return
+        try:
+            hello = wire.parsed(data)
+        except ValueError:
+            hello = None
+        if not isinstance(hello, wire.Hello) or hello.magic != wire.MAGIC:
+            self._forget(connection)
+            return
+        name = hello.application.decode(errors="replace") or f"pid {hello.process_id}"
+        if hello.version != wire.VERSION:
+            self._say(f"{name}: its layer is of another version of ocufilter")
+            self._forget(connection)
+        elif self._program is not None:
+            # It tries again every second.
+            self._program.notes.add("second")
+            self._forget(connection)
+        else:
+            self._begin(connection, name)
+
+    def _begin(self, connection: socket.socket, name: str) -> None:
+        self._waiting.discard(connection)
+        self._program = _Program(connection, name)
+        welcome = wire.Welcome(
+            *(wire.WELCOME, wire.MAGIC, wire.VERSION, 1),
+            *(self._options.wait_ms, self._options.max_age_ms),
+        )
+        self._say(f"{name}: connected")
+        self._seeing.restart()
+        self._look.restart()
+        self._send(self._program, welcome)
+
+    def _send(self, program: _Program, message: ctypes.Structure) -> None:
+        try:
+            program.connection.send(bytes(message))
+        except OSError:  # also if it does not read: then it is not worth waiting for
+            self._drop("disconnected")
+
+    def _control(self, data: bytes) -> dict[str, Any]:
+        """Answer a request of `ocufilter layer set` or `status`."""
+        try:
+            wanted = json.loads(data)
+            for eye in EYES:
+                if eye in wanted:
+                    self._change(eye, str(wanted[eye]))
+        except (ValueError, TypeError) as error:
+            return {"error": str(error)}
+        return {
+            "program": self._program.name if self._program else None,
+            **self.report(),
+        }
+
+    # Frames
+
+    def _take(self, program: _Program) -> None:
+        """Take the next message of the program."""
+        try:
+            data, descriptors, _, _ = socket.recv_fds(
+                program.connection, ctypes.sizeof(wire.Frame) + 1, 1
+            )
+        except BlockingIOError:
+            return
+        except OSError:
+            data, descriptors = b"", []
+        try:
+            if not data:
+                self._drop("disconnected")
+                return
+            message = wire.parsed(data)
+            if isinstance(message, wire.Ring) and len(descriptors) == 1:
+                self._share(program, message, descriptors.pop())
+            elif isinstance(message, wire.Frame):
+                self._filter(program, message)
+            else:
+                raise ValueError("a message out of order")
+        except ValueError as error:
+            self._drop(f"disconnected, because it sent {error}")
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)
+
+    def _share(self, program: _Program, ring: wire.Ring, descriptor: int) -> None:
+        size_bytes = ring.slot_count * ring.slot_bytes
+        if (
+            not 1 <= ring.slot_count <= wire.MAX_SLOTS
+            or not 1 <= size_bytes <= wire.MAX_SHARED_BYTES
+        ):
+            os.close(descriptor)
+            raise ValueError(f"shared memory of {size_bytes} bytes")
+        try:
+            memory = Slot.received(0, size_bytes, descriptor)
+        except (OSError, ValueError):
+            os.close(descriptor)
+            raise ValueError("shared memory that is not sealed") from None
+        if program.memory is not None:
+            program.memory.close()
+        program.memory = memory
+        program.slot_count, program.slot_bytes = ring.slot_count, ring.slot_bytes
+
+    def _filter(self, program: _Program, frame: wire.Frame) -> None:
+        begun_s = time.monotonic()
+        if program.memory is None or frame.slot >= program.slot_count:
+            raise ValueError(f"a frame in slot {frame.slot}")
+        check_frame(frame)
+        images = FrameImages(program.memory, frame.slot * program.slot_bytes, frame)
+        pictures = []
+        for index, eye in enumerate(EYES):
+            picture, note = images.picture(index, eye, self._options.flat_m)
+            pictures.append(picture)
+            self._tell_depth(program, note)
+        is_filtered = self._see(frame, tuple(pictures), images, begun_s)
+        self._count(frame, is_filtered)
+        self._send(
+            program,
+            wire.Result(
+                wire.RESULT,
+                frame.slot,
+                frame.frame_id,
+                wire.FILTERED if is_filtered else wire.OWN_FRAME,
+            ),
+        )
+
+    def _tell_depth(self, program: _Program, note: str) -> None:
+        if note and note not in program.notes:
+            program.notes.add(note)
+            flat = (
+                "infinity"
+                if not self._options.flat_dpt
+                else f"{self._options.flat_m:g} m"
+            )
+            is_used = "exchanged" in note
+            rest = "it is corrected" if is_used else f"all is {flat} away"
+            self._say(f"{program.name}: depth: {note}; {rest}")
+
+    def _see(
+        self,
+        given: wire.Frame,
+        pictures: tuple[RgbdPicture, ...],
+        images: FrameImages,
+        begun_s: float,
+    ) -> bool:
+        """Filter a frame; return whether it was."""
+        due = DueFrame(
+            given.display_time_ns,
+            True,
+            tuple(picture.view for picture in pictures),
+            tuple(given.head) if given.flags & wire.HAS_HEAD else None,
+            _gaze_of(given),
+            period_s=WAIT_S,
+        )
+        try:
+            frame = StereoFrame(
+                due, pictures, self._look.follow(due, pictures), begun_s
+            )
+            looked_s = time.monotonic()
+            seen = self._seeing.see(frame)
+        except (FilterError, ValueError) as error:
+            self._say(f"a frame is not filtered: {error}")
+            return False
+        if self.on_frame is not None:
+            self.on_frame(frame, seen)
+        if seen is None or seen.frame is not frame:
+            return False
+        for index, (picture, eye, used_dpt) in enumerate(
+            zip(pictures, frame.eyes, seen.used_focus_dpt, strict=True)
+        ):
+            images.put(
+                index,
+                seen.colors[index],
+                SPLIT_RATIO if self._options.is_split else 0.0,
+            )
+            if used_dpt is not None:
+                self._look.learn(picture.view.eye, eye.state.focus_dpt, used_dpt)
+        took_ms = MS_PER_S * (time.monotonic() - begun_s)
+        self._note(
+            look_ms=MS_PER_S * (looked_s - begun_s), **seen.stages_ms, helper_ms=took_ms
+        )
+        self._tell_time(took_ms)
+        return True
+
+    def _tell_time(self, took_ms: float) -> None:
+        """Report that results are too old, unless a few are."""
+        limit_ms = max(self._options.max_age_ms, self._options.wait_ms)
+        self._n_late = self._n_late + 1 if took_ms > limit_ms else 0
+        if self._n_late == N_LATE:
+            self._say(
+                f"filtering a frame takes {took_ms:.0f} ms, and results are not shown "
+                f"after {limit_ms} ms; reduce the program's resolution, or raise "
+                "--max-age-ms"
+            )
+
+    def _note(self, **stages_ms: float) -> None:
+        for name, time_ms in stages_ms.items():
+            self._stages_ms.setdefault(name, deque(maxlen=N_TIMES)).append(time_ms)
+
+    def _count(self, frame: wire.Frame, is_filtered: bool) -> None:
+        self.n_frames += 1
+        self.n_unready += not is_filtered
+        self.n_shown += frame.frames
+        self.n_filtered += frame.frames_filtered
+        if frame.frames:
+            self._note(
+                **{
+                    f"{name}_ms": getattr(frame, f"{name}_us")
+                    / US_PER_MS
+                    / frame.frames
+                    for name in ("copy", "read", "upload", "other")
+                }
+            )
+
+    def report(self) -> dict[str, Any]:
+        """Return counts of frames, and times in ms."""
+        return {
+            "filtered": self.n_frames - self.n_unready,
+            "not_filtered": self.n_unready,
+            "submitted": self.n_shown,
+            "shown_filtered": self.n_filtered,
+            "stages_ms": {
+                name: percentiles(list(times))
+                for name, times in self._stages_ms.items()
+            },
+        }
+
+
+def ask(
+    path: Path, request: Mapping[str, Any], timeout_s: float = 10.0
+) -> dict[str, Any]:
+    """Send a request to a running helper; return its answer.
+
+    Raises
+    ------
+    OSError
+        If no helper listens there, or it does not answer.
+    ValueError
+        If it refuses the request.
+    """
+    data = struct.pack("<I", wire.CONTROL) + json.dumps(request).encode()
+    if len(data) > wire.MAX_CONTROL_BYTES:
+        raise ValueError(
+            f"the profiles have {len(data)} bytes; allowed: {wire.MAX_CONTROL_BYTES}"
+        )
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+        connection.settimeout(timeout_s)
+        connection.connect(str(path))
+        connection.send(data)
+        answer: dict[str, Any] = json.loads(connection.recv(1 << 20))
+    if "error" in answer:
+        raise ValueError(answer["error"])
+    return answer
+
+
+def _listening(path: Path) -> socket.socket:
+    """Return a socket that listens; replace one that a helper left behind."""
+    found = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+    try:
+        if path.is_socket():
+            with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
+                try:
+                    probe.connect(str(path))
+                except ConnectionRefusedError:
+                    path.unlink()
+                else:
+                    raise OSError(f"another helper listens at {path}")
+        found.bind(str(path))
+        path.chmod(0o600)
+        found.listen()
+    except BaseException:
+        found.close()
+        raise
+    return found
+
+
+def _is_trusted(connection: socket.socket) -> bool:
+    """Whether the peer is a process of this user, or of root."""
+    size = struct.calcsize("3i")
+    peer = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size)
+    _, user, _ = struct.unpack("3i", peer)
+    return user in (0, os.getuid())
+
+
+def _gaze_of(frame: wire.Frame) -> GazeSample | None:
+    """Return the gaze that the eye tracker reports."""
+    if not frame.flags & wire.HAS_GAZE:
+        return None
+    ahead = -rotation_of(frame.gaze)[:, 2]
+    time_ns = frame.gaze_time_ns or frame.display_time_ns
+    return GazeSample(*angles_of(ahead), at_s=time_ns / NS_PER_S)

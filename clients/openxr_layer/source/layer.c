@@ -1,0 +1,444 @@
+/* An OpenXR API layer through which another program is seen as an eye would see it.
+ *
+ * It copies color and depth of each view when the application releases its images, sends
+ * them to a helper process, and shows the newest filtered frame in place of the
+ * application's.  Whatever it does not understand passes unchanged.  See
+ * docs/how-to/openxr-layer.md. */
+#include "layer.h"
+
+#include <openxr/openxr_loader_negotiation.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "log.h"
+
+#define EXPORT __attribute__((visibility("default")))
+#define DEPTH XR_KHR_COMPOSITION_LAYER_DEPTH_EXTENSION_NAME
+#define GAZE XR_EXT_EYE_GAZE_INTERACTION_EXTENSION_NAME
+#define MAX_COPIED_RELEASES 4u
+
+/* Handles -------------------------------------------------------------------------------
+ *
+ * The specification demands that the application does not destroy a handle while another
+ * thread uses it, so that the lock is only of the lists. */
+
+static pthread_mutex_t registry = PTHREAD_MUTEX_INITIALIZER;
+static instance *instances;
+static session *sessions;
+static swapchain *swapchains;
+static space *spaces;
+
+#define ADD(list, item)                                                                  \
+    do {                                                                                 \
+        pthread_mutex_lock(&registry);                                                   \
+        (item)->next = list;                                                             \
+        list = item;                                                                     \
+        pthread_mutex_unlock(&registry);                                                 \
+    } while (0)
+
+#define REMOVE(type, list, item)                                                         \
+    do {                                                                                 \
+        pthread_mutex_lock(&registry);                                                   \
+        type **at_item = &list;                                                          \
+        while (*at_item != (item)) at_item = &(*at_item)->next;                          \
+        *at_item = (item)->next;                                                         \
+        pthread_mutex_unlock(&registry);                                                 \
+        free(item);                                                                      \
+    } while (0)
+
+#define FIND(type, list, value)                                                          \
+    pthread_mutex_lock(&registry);                                                       \
+    type *found = list;                                                                  \
+    while (found && found->handle != (value)) found = found->next;                       \
+    pthread_mutex_unlock(&registry)
+
+static instance *find_instance(XrInstance handle) {
+    FIND(instance, instances, handle);
+    return found;
+}
+
+static session *find_session(XrSession handle) {
+    FIND(session, sessions, handle);
+    return found;
+}
+
+swapchain *find_swapchain(XrSwapchain handle) {
+    FIND(swapchain, swapchains, handle);
+    return found;
+}
+
+static space *find_space(XrSpace handle) {
+    FIND(space, spaces, handle);
+    return found;
+}
+
+bool find_space_kind(XrSpace handle, space_kind *kind) {
+    const space *found = find_space(handle);
+    if (!found) return false;
+    *kind = found->kind;
+    return true;
+}
+
+/* Sessions ------------------------------------------------------------------------------- */
+
+/* Forget a session and what belongs to it; its handles are destroyed by the runtime. */
+static void destroy_session(session *at) {
+    pthread_mutex_lock(&at->lock);
+    frames_close(at);
+    pthread_mutex_unlock(&at->lock);
+    for (swapchain *chain = swapchains; chain;) {
+        swapchain *next = chain->next;
+        if (chain->session == at) REMOVE(swapchain, swapchains, chain);
+        chain = next;
+    }
+    for (space *known = spaces; known;) {
+        space *next = known->next;
+        if (known->session == at->handle) REMOVE(space, spaces, known);
+        known = next;
+    }
+    pthread_mutex_destroy(&at->lock);
+    REMOVE(session, sessions, at);
+}
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSession(XrInstance handle,
+                                                          const XrSessionCreateInfo *info,
+                                                          XrSession *made) {
+    instance *own = find_instance(handle);
+    if (!own) return XR_ERROR_HANDLE_INVALID;
+    XrResult result = own->CreateSession(handle, info, made);
+    if (XR_FAILED(result)) return result;
+    session *at = calloc(1, sizeof *at);
+    if (!at) return result; /* the session works without the layer */
+    at->handle = *made;
+    at->own = own;
+    pthread_mutex_init(&at->lock, NULL);
+    link_init(&at->link, own->application);
+    const char *reason = gl_open(&at->gl, info);
+    at->has_gl = !reason;
+    if (reason) LOG("the application's own frames are shown: %s", reason);
+    ADD(sessions, at);
+    return result;
+}
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_DestroySession(XrSession handle) {
+    session *at = find_session(handle);
+    if (!at) return XR_ERROR_HANDLE_INVALID;
+    PFN_xrDestroySession destroy = at->own->DestroySession;
+    destroy_session(at);
+    return destroy(handle);
+}
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_BeginFrame(XrSession handle,
+                                                       const XrFrameBeginInfo *info) {
+    session *at = find_session(handle);
+    if (!at) return XR_ERROR_HANDLE_INVALID;
+    frames_begin(at);
+    return at->own->BeginFrame(handle, info);
+}
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_EndFrame(XrSession handle,
+                                                     const XrFrameEndInfo *info) {
+    session *at = find_session(handle);
+    return at ? frames_end(at, info) : XR_ERROR_HANDLE_INVALID;
+}
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_PollEvent(XrInstance handle,
+                                                      XrEventDataBuffer *event) {
+    instance *own = find_instance(handle);
+    if (!own) return XR_ERROR_HANDLE_INVALID;
+    XrResult result = own->PollEvent(handle, event);
+    if (result != XR_SUCCESS ||
+        event->type != XR_TYPE_EVENT_DATA_REFERENCE_SPACE_CHANGE_PENDING)
+        return result;
+    const XrEventDataReferenceSpaceChangePending *change = (const void *)event;
+    session *at = find_session(change->session);
+    if (at) {
+        pthread_mutex_lock(&at->lock);
+        at->recentered = change->changeTime;
+        pthread_mutex_unlock(&at->lock);
+    }
+    return result;
+}
+
+/* Spaces --------------------------------------------------------------------------------- */
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateReferenceSpace(
+    XrSession handle, const XrReferenceSpaceCreateInfo *info, XrSpace *made) {
+    session *at = find_session(handle);
+    if (!at) return XR_ERROR_HANDLE_INVALID;
+    XrResult result = at->own->CreateReferenceSpace(handle, info, made);
+    space *known = XR_SUCCEEDED(result) ? calloc(1, sizeof *known) : NULL;
+    if (!known) return result;
+    known->handle = *made;
+    known->session = handle;
+    known->own = at->own;
+    known->kind = (space_kind){info->referenceSpaceType, info->poseInReferenceSpace};
+    ADD(spaces, known);
+    return result;
+}
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_DestroySpace(XrSpace handle) {
+    space *known = find_space(handle);
+    if (known) {
+        PFN_xrDestroySpace destroy = known->own->DestroySpace;
+        REMOVE(space, spaces, known);
+        return destroy(handle);
+    }
+    /* Spaces of actions and extensions are not recorded; nearly all programs have one
+     * instance. */
+    XrResult result = XR_ERROR_HANDLE_INVALID;
+    for (instance *own = instances; own && result == XR_ERROR_HANDLE_INVALID;
+         own = own->next)
+        result = own->DestroySpace(handle);
+    return result;
+}
+
+/* Swapchains ----------------------------------------------------------------------------- */
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSwapchain(
+    XrSession handle, const XrSwapchainCreateInfo *info, XrSwapchain *made) {
+    session *at = find_session(handle);
+    if (!at) return XR_ERROR_HANDLE_INVALID;
+    XrResult result = at->own->CreateSwapchain(handle, info, made);
+    if (XR_FAILED(result)) return result;
+    swapchain *chain = calloc(1, sizeof *chain);
+    if (!chain) return result;
+    chain->handle = *made;
+    chain->session = at;
+    chain->info = *info;
+    chain->info.next = NULL;
+    XrSwapchainImageOpenGLKHR images[MAX_IMAGES];
+    for (int i = 0; i < MAX_IMAGES; ++i)
+        images[i] = (XrSwapchainImageOpenGLKHR){.type = XR_TYPE_SWAPCHAIN_IMAGE_OPENGL_KHR};
+    if (at->has_gl && XR_SUCCEEDED(at->own->EnumerateSwapchainImages(
+                          *made, MAX_IMAGES, &chain->image_count,
+                          (XrSwapchainImageBaseHeader *)images)))
+        for (uint32_t i = 0; i < chain->image_count; ++i) chain->images[i] = images[i].image;
+    else
+        chain->image_count = 0;
+    ADD(swapchains, chain);
+    return result;
+}
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_DestroySwapchain(XrSwapchain handle) {
+    swapchain *chain = find_swapchain(handle);
+    if (!chain) return XR_ERROR_HANDLE_INVALID;
+    session *at = chain->session;
+    gl_current before;
+    pthread_mutex_lock(&at->lock);
+    if (chain->copy && at->has_gl && gl_enter(&at->gl, &before)) {
+        at->gl.DeleteTextures(1, &chain->copy);
+        gl_leave(&at->gl, &before, false);
+    }
+    pthread_mutex_unlock(&at->lock);
+    REMOVE(swapchain, swapchains, chain);
+    return at->own->DestroySwapchain(handle);
+}
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_AcquireSwapchainImage(
+    XrSwapchain handle, const XrSwapchainImageAcquireInfo *info, uint32_t *index) {
+    swapchain *chain = find_swapchain(handle);
+    if (!chain) return XR_ERROR_HANDLE_INVALID;
+    XrResult result = chain->session->own->AcquireSwapchainImage(handle, info, index);
+    if (XR_SUCCEEDED(result) && chain->acquired_count < MAX_IMAGES)
+        chain->acquired[chain->acquired_count++] = *index;
+    return result;
+}
+
+static void copy_released(swapchain *chain) {
+    session *at = chain->session;
+    uint32_t index = chain->acquired_count ? chain->acquired[0] : MAX_IMAGES;
+    /* Images of quads and other layers need no copy. */
+    if (!at->has_gl || index >= chain->image_count || !swapchain_can_copy(chain) ||
+        chain->unused_releases >= MAX_COPIED_RELEASES)
+        return;
+    pthread_mutex_lock(&at->lock);
+    gl_current before;
+    uint64_t begun_ns = now_ns();
+    if (!at->link.is_welcome) {
+        chain->has_copy = false; /* not of this image */
+    } else if (gl_enter(&at->gl, &before)) {
+        ++chain->unused_releases;
+        swapchain_copy(chain, chain->images[index]);
+        gl_leave(&at->gl, &before, true);
+        at->copy_ns += now_ns() - begun_ns;
+    } else {
+        LOG_ONCE(&at->told, SAID_OTHER_API,
+                 "images are released with a context of another window system; not "
+                 "filtered");
+    }
+    pthread_mutex_unlock(&at->lock);
+}
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_ReleaseSwapchainImage(
+    XrSwapchain handle, const XrSwapchainImageReleaseInfo *info) {
+    swapchain *chain = find_swapchain(handle);
+    if (!chain) return XR_ERROR_HANDLE_INVALID;
+    copy_released(chain);
+    XrResult result = chain->session->own->ReleaseSwapchainImage(handle, info);
+    if (XR_SUCCEEDED(result) && chain->acquired_count) {
+        --chain->acquired_count;
+        memmove(chain->acquired, chain->acquired + 1,
+                chain->acquired_count * sizeof *chain->acquired);
+    }
+    return result;
+}
+
+/* Actions -------------------------------------------------------------------------------- */
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_SuggestInteractionProfileBindings(
+    XrInstance handle, const XrInteractionProfileSuggestedBinding *given) {
+    instance *own = find_instance(handle);
+    return own ? gaze_suggest(own, given) : XR_ERROR_HANDLE_INVALID;
+}
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_AttachSessionActionSets(
+    XrSession handle, const XrSessionActionSetsAttachInfo *given) {
+    session *at = find_session(handle);
+    return at ? gaze_attach(at, given) : XR_ERROR_HANDLE_INVALID;
+}
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_SyncActions(XrSession handle,
+                                                        const XrActionsSyncInfo *given) {
+    session *at = find_session(handle);
+    return at ? gaze_sync(at, given) : XR_ERROR_HANDLE_INVALID;
+}
+
+/* Instances ------------------------------------------------------------------------------ */
+
+static bool names(const XrInstanceCreateInfo *info, const char *extension) {
+    for (uint32_t i = 0; i < info->enabledExtensionCount; ++i)
+        if (!strcmp(info->enabledExtensionNames[i], extension)) return true;
+    return false;
+}
+
+/* Create the instance below with other extensions than the application asks for. */
+static XrResult create_below(const XrInstanceCreateInfo *given, bool adds_gaze,
+                             bool drops_depth, const XrApiLayerCreateInfo *layers,
+                             XrInstance *made) {
+    const char **all = calloc(given->enabledExtensionCount + 1, sizeof *all);
+    if (!all) return XR_ERROR_OUT_OF_MEMORY;
+    uint32_t count = 0;
+    for (uint32_t i = 0; i < given->enabledExtensionCount; ++i) {
+        const char *name = given->enabledExtensionNames[i];
+        if (!drops_depth || strcmp(name, DEPTH)) all[count++] = name;
+    }
+    if (adds_gaze) all[count++] = GAZE;
+    XrInstanceCreateInfo mine = *given;
+    mine.enabledExtensionCount = count;
+    mine.enabledExtensionNames = all;
+    XrApiLayerCreateInfo rest = *layers;
+    rest.nextInfo = layers->nextInfo->next;
+    XrResult result = layers->nextInfo->nextCreateApiLayerInstance(&mine, &rest, made);
+    free(all);
+    return result;
+}
+
+static bool has_functions(instance *own) {
+    bool all = true;
+#define F(name)                                                                          \
+    all &= XR_SUCCEEDED(own->get_proc_addr(own->handle, "xr" #name,                      \
+                                           (PFN_xrVoidFunction *)&own->name));
+    NEXT_FUNCTIONS(F)
+#undef F
+    return all;
+}
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateApiLayerInstance(
+    const XrInstanceCreateInfo *info, const XrApiLayerCreateInfo *layers,
+    XrInstance *made) {
+    if (!layers || !layers->nextInfo || strcmp(layers->nextInfo->layerName, LAYER_NAME))
+        return XR_ERROR_INITIALIZATION_FAILED;
+    /* A runtime that lacks an extension refuses the instance.  The gaze is the layer's
+     * wish; depth is offered to the application by the layer's manifest. */
+    bool has_gaze = names(info, GAZE), has_depth = names(info, DEPTH);
+    XrResult result = XR_ERROR_EXTENSION_NOT_PRESENT;
+    bool adds_gaze = false, drops_depth = false;
+    for (int i = 0; i < 4 && result == XR_ERROR_EXTENSION_NOT_PRESENT; ++i) {
+        adds_gaze = !(i & 1);
+        drops_depth = i & 2;
+        if ((adds_gaze && has_gaze) || (drops_depth && !has_depth)) continue;
+        result = create_below(info, adds_gaze, drops_depth, layers, made);
+    }
+    if (XR_FAILED(result)) return result;
+    instance *own = calloc(1, sizeof *own);
+    if (!own) return XR_ERROR_OUT_OF_MEMORY;
+    own->handle = *made;
+    own->get_proc_addr = layers->nextInfo->nextGetInstanceProcAddr;
+    own->has_gaze = adds_gaze || has_gaze;
+    own->is_depth_stripped = drops_depth;
+    memcpy(own->application, info->applicationInfo.applicationName,
+           sizeof own->application - 1);
+    if (!has_functions(own)) {
+        free(own);
+        return XR_ERROR_INITIALIZATION_FAILED;
+    }
+    if (own->has_gaze) gaze_create(own);
+    ADD(instances, own);
+    return result;
+}
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_DestroyInstance(XrInstance handle) {
+    instance *own = find_instance(handle);
+    if (!own) return XR_ERROR_HANDLE_INVALID;
+    PFN_xrDestroyInstance destroy = own->DestroyInstance;
+    for (session *at = sessions; at;) {
+        session *next = at->next;
+        if (at->own == own) destroy_session(at);
+        at = next;
+    }
+    REMOVE(instance, instances, own);
+    return destroy(handle);
+}
+
+/* The loader ----------------------------------------------------------------------------- */
+
+static XRAPI_ATTR XrResult XRAPI_CALL layer_GetInstanceProcAddr(
+    XrInstance handle, const char *name, PFN_xrVoidFunction *function) {
+    static const struct {
+        const char *name;
+        PFN_xrVoidFunction function;
+    } OWN[] = {
+#define F(name) {"xr" #name, (PFN_xrVoidFunction)layer_##name}
+        F(AcquireSwapchainImage),
+        F(AttachSessionActionSets),
+        F(BeginFrame),
+        F(CreateReferenceSpace),
+        F(CreateSession),
+        F(CreateSwapchain),
+        F(DestroyInstance),
+        F(DestroySession),
+        F(DestroySpace),
+        F(DestroySwapchain),
+        F(EndFrame),
+        F(GetInstanceProcAddr),
+        F(PollEvent),
+        F(ReleaseSwapchainImage),
+        F(SuggestInteractionProfileBindings),
+        F(SyncActions),
+#undef F
+    };
+    for (size_t i = 0; i < sizeof OWN / sizeof *OWN; ++i) {
+        if (strcmp(name, OWN[i].name)) continue;
+        *function = OWN[i].function;
+        return XR_SUCCESS;
+    }
+    instance *own = find_instance(handle);
+    return own ? own->get_proc_addr(handle, name, function) : XR_ERROR_HANDLE_INVALID;
+}
+
+EXPORT XRAPI_ATTR XrResult XRAPI_CALL xrNegotiateLoaderApiLayerInterface(
+    const XrNegotiateLoaderInfo *loader, const char *name,
+    XrNegotiateApiLayerRequest *request) {
+    if (!loader || !request || (name && strcmp(name, LAYER_NAME)) ||
+        loader->structType != XR_LOADER_INTERFACE_STRUCT_LOADER_INFO ||
+        request->structType != XR_LOADER_INTERFACE_STRUCT_API_LAYER_REQUEST ||
+        loader->minInterfaceVersion > XR_CURRENT_LOADER_API_LAYER_VERSION ||
+        loader->maxInterfaceVersion < XR_CURRENT_LOADER_API_LAYER_VERSION)
+        return XR_ERROR_INITIALIZATION_FAILED;
+    request->layerInterfaceVersion = XR_CURRENT_LOADER_API_LAYER_VERSION;
+    request->layerApiVersion = XR_CURRENT_API_VERSION;
+    request->getInstanceProcAddr = layer_GetInstanceProcAddr;
+    request->createApiLayerInstance = layer_CreateApiLayerInstance;
+    return XR_SUCCESS;
+}

@@ -1,0 +1,191 @@
+#define _GNU_SOURCE
+#include "link.h"
+
+#include <errno.h>
+#include <fcntl.h>
+#include <poll.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/socket.h>
+#include <sys/un.h>
+#include <unistd.h>
+
+#include "log.h"
+
+#define RETRY_NS 1000000000u
+#define MAX_SHARED_BYTES (1ull << 30)
+
+void link_init(link_state *link, const char *application) {
+    *link = (link_state){.descriptor = -1};
+    strncpy(link->application, application, sizeof link->application - 1);
+}
+
+static void release_memory(link_state *link) {
+    if (link->memory) munmap(link->memory, link->slot_count * link->slot_bytes);
+    link->memory = NULL;
+    link->slot_bytes = 0;
+}
+
+void link_close(link_state *link) {
+    release_memory(link);
+    if (link->descriptor >= 0) close(link->descriptor);
+    link->descriptor = -1;
+    link->is_welcome = false;
+    link->retry_ns = now_ns() + RETRY_NS;
+}
+
+static void lose(link_state *link, const char *why) {
+    /* A helper that refuses a second program closes without a welcome, every second. */
+    if (link->is_welcome) LOG("%s; showing the application's own frames", why);
+    link->is_lost |= link->is_welcome;
+    link_close(link);
+}
+
+/* The address, as in clients/openxr_layer/helper.py; false if it is too long. */
+static bool address_of(struct sockaddr_un *address) {
+    *address = (struct sockaddr_un){.sun_family = AF_UNIX};
+    const char *path = secure_getenv("OCUFILTER_LAYER_SOCKET");
+    const char *folder = secure_getenv("XDG_RUNTIME_DIR");
+    size_t size = sizeof address->sun_path;
+    int length;
+    if (path && *path) length = snprintf(address->sun_path, size, "%s", path);
+    else if (folder && *folder)
+        length = snprintf(address->sun_path, size, "%s/ocufilter-layer.sock", folder);
+    else
+        length = snprintf(address->sun_path, size, "/run/user/%u/ocufilter-layer.sock",
+                          (unsigned)getuid());
+    return length > 0 && (size_t)length < size;
+}
+
+/* Images of the screen go only to the user of this process, or to root. */
+static bool is_trusted(int descriptor) {
+    struct ucred peer;
+    socklen_t size = sizeof peer;
+    return !getsockopt(descriptor, SOL_SOCKET, SO_PEERCRED, &peer, &size) &&
+           (peer.uid == getuid() || peer.uid == 0);
+}
+
+static bool send_message(int descriptor, const void *message, size_t size, int passed) {
+    struct iovec part = {(void *)(uintptr_t)message, size};
+    union {
+        struct cmsghdr header;
+        char space[CMSG_SPACE(sizeof(int))];
+    } control = {0};
+    struct msghdr packet = {.msg_iov = &part, .msg_iovlen = 1};
+    if (passed >= 0) {
+        packet.msg_control = control.space;
+        packet.msg_controllen = sizeof control.space;
+        struct cmsghdr *header = CMSG_FIRSTHDR(&packet);
+        header->cmsg_level = SOL_SOCKET;
+        header->cmsg_type = SCM_RIGHTS;
+        header->cmsg_len = CMSG_LEN(sizeof(int));
+        memcpy(CMSG_DATA(header), &passed, sizeof passed);
+    }
+    return sendmsg(descriptor, &packet, MSG_NOSIGNAL | MSG_DONTWAIT) == (ssize_t)size;
+}
+
+void link_connect(link_state *link) {
+    if (link->descriptor >= 0 || now_ns() < link->retry_ns) return;
+    link->retry_ns = now_ns() + RETRY_NS;
+    struct sockaddr_un address;
+    if (!address_of(&address)) return;
+    int made = socket(AF_UNIX, SOCK_SEQPACKET | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
+    if (made < 0) return;
+    wire_hello hello = {.kind = WIRE_HELLO,
+                        .magic = WIRE_MAGIC,
+                        .version = WIRE_VERSION,
+                        .process_id = (uint32_t)getpid()};
+    memcpy(hello.application, link->application, sizeof hello.application);
+    if (connect(made, (struct sockaddr *)&address, sizeof address) || !is_trusted(made) ||
+        !send_message(made, &hello, sizeof hello, -1)) {
+        close(made);
+        return;
+    }
+    link->descriptor = made;
+}
+
+static void welcome(link_state *link, const wire_welcome *message) {
+    if (message->magic != WIRE_MAGIC || message->version != WIRE_VERSION ||
+        message->slot_count < 1 || message->slot_count > MAX_SLOTS) {
+        LOG("the helper is of another version of ocufilter");
+        link_close(link);
+        return;
+    }
+    link->is_welcome = true;
+    link->slot_count = message->slot_count;
+    link->wait_ms = message->wait_ms;
+    link->max_age_ms = message->max_age_ms;
+    LOG("connected to the helper");
+}
+
+bool link_receive(link_state *link, wire_result *result) {
+    while (link->descriptor >= 0) {
+        union {
+            uint32_t kind;
+            wire_welcome welcome;
+            wire_result result;
+        } message;
+        ssize_t size = recv(link->descriptor, &message, sizeof message, MSG_DONTWAIT);
+        if (size < 0 && (errno == EAGAIN || errno == EINTR)) return false;
+        if (size <= 0) {
+            lose(link, "the helper has ended");
+        } else if (size == sizeof message.welcome && message.kind == WIRE_WELCOME &&
+                   !link->is_welcome) {
+            welcome(link, &message.welcome);
+        } else if (size == sizeof message.result && message.kind == WIRE_RESULT &&
+                   message.result.slot < link->slot_count) {
+            *result = message.result;
+            return true;
+        } else {
+            lose(link, "the helper has sent an unknown message");
+        }
+    }
+    return false;
+}
+
+void link_wait(link_state *link, uint64_t limit_ns) {
+    struct pollfd wanted = {.fd = link->descriptor, .events = POLLIN};
+    struct timespec limit = {(time_t)(limit_ns / 1000000000u), (long)(limit_ns % 1000000000u)};
+    if (link->descriptor >= 0) ppoll(&wanted, 1, &limit, NULL);
+}
+
+/* Its pages are allocated and its size is sealed, so that no process gets a bus error. */
+static int make_memory(size_t size) {
+    int made = memfd_create("ocufilter-layer", MFD_CLOEXEC | MFD_ALLOW_SEALING);
+    if (made < 0) return -1;
+    if (posix_fallocate(made, 0, (off_t)size) ||
+        fcntl(made, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL)) {
+        close(made);
+        return -1;
+    }
+    return made;
+}
+
+bool link_share(link_state *link, size_t slot_bytes) {
+    if (link->memory && slot_bytes <= link->slot_bytes) return true;
+    if (slot_bytes > MAX_SHARED_BYTES / link->slot_count) return false;
+    /* Slots begin at pages, for the copies of both processes. */
+    size_t whole = (slot_bytes + 4095) & ~(size_t)4095;
+    release_memory(link);
+    int made = make_memory(link->slot_count * whole);
+    if (made < 0) return false;
+    void *mapped = mmap(NULL, link->slot_count * whole, PROT_READ | PROT_WRITE, MAP_SHARED,
+                        made, 0);
+    wire_ring ring = {WIRE_RING, link->slot_count, whole};
+    bool is_sent = mapped != MAP_FAILED &&
+                   send_message(link->descriptor, &ring, sizeof ring, made);
+    close(made);
+    if (mapped != MAP_FAILED) {
+        link->memory = mapped;
+        link->slot_bytes = whole;
+    }
+    if (!is_sent) release_memory(link);
+    return is_sent;
+}
+
+bool link_send(link_state *link, const wire_frame *frame) {
+    if (send_message(link->descriptor, frame, sizeof *frame, -1)) return true;
+    if (errno != EAGAIN) lose(link, "the helper has ended");
+    return false;
+}

@@ -1,0 +1,84 @@
+/* Messages between the layer and its helper, and the layout of their shared memory.
+ *
+ * A message is one packet of a Unix socket (SOCK_SEQPACKET).  The layer sends HELLO; the
+ * helper answers WELCOME; the layer sends RING with the descriptor of a sealed memfd, and
+ * then FRAMEs whose images are in a slot of it.  The helper writes the filtered color
+ * over the color and sends RESULT, after which the slot is the layer's again.
+ *
+ * clients/openxr_layer/wire.py has the same structures; the tests compare both. */
+#ifndef OCU_LAYER_WIRE_H
+#define OCU_LAYER_WIRE_H
+
+#include <stdint.h>
+
+#define WIRE_MAGIC 0x4f435558u /* "OCUX" */
+#define WIRE_VERSION 1u
+#define WIRE_EYES 2
+
+enum { WIRE_HELLO = 1, WIRE_WELCOME, WIRE_RING, WIRE_FRAME, WIRE_RESULT };
+
+/* Format of color images.  Rows begin at the bottom, as in OpenGL. */
+enum {
+    WIRE_SRGB8 = 1,   /* RGBA, sRGB */
+    WIRE_LINEAR8,     /* RGBA, linear light */
+    WIRE_LINEAR16F    /* RGBA, linear light, half floats */
+};
+
+enum {
+    WIRE_HAS_HEAD = 1,
+    WIRE_HAS_GAZE = 2,
+    WIRE_IS_BLENDED = 4 /* the layer below shows through the alpha channel */
+};
+
+typedef struct {
+    uint32_t kind, magic, version, process_id;
+    char application[128];
+} wire_hello;
+
+typedef struct {
+    uint32_t kind, magic, version;
+    uint32_t slot_count;  /* frames that the helper holds at a time, 1 or 2 */
+    uint32_t wait_ms;     /* longest wait for the result of a frame */
+    uint32_t max_age_ms;  /* of a filtered frame that is shown again */
+} wire_welcome;
+
+typedef struct {
+    uint32_t kind, slot_count;
+    uint64_t slot_bytes;
+} wire_ring;
+
+typedef struct {
+    uint64_t start;       /* in the slot, bytes */
+    uint32_t width_px, height_px;
+} wire_image;
+
+typedef struct {
+    float position_m[3], orientation[4]; /* x, y, z, w */
+    float fov_rad[4];                    /* left, right, up, down */
+    float min_depth, max_depth, near_m, far_m;
+    wire_image color, depth;             /* depth: float32, 0 to 1; width 0 without */
+} wire_view;
+
+typedef struct {
+    uint32_t kind, slot;
+    uint64_t frame_id;
+    int64_t display_time_ns;
+    uint32_t flags, color_format;
+    float head[7];        /* position, orientation */
+    float gaze[4];        /* orientation within the head; -z points ahead */
+    int64_t gaze_time_ns; /* 0: unknown */
+    wire_view views[WIRE_EYES];
+    /* since the previous FRAME: frames that the application submitted, and what the
+     * layer took on its threads */
+    uint32_t frames, frames_filtered;
+    uint32_t copy_us, read_us, upload_us, other_us;
+} wire_frame;
+
+typedef struct {
+    uint32_t kind, slot;
+    uint64_t frame_id;
+    uint32_t is_filtered; /* 0: show the application's own frame */
+    uint32_t padding;
+} wire_result;
+
+#endif

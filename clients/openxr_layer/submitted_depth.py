@@ -1,0 +1,122 @@
+"""Depth that an OpenXR application submits, which is often wrong, as planar depth."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Depth = NDArray[np.float32]
+
+CHECK_STRIDE = 8
+MAX_INVALID_RATIO = 0.2
+"""Largest fraction of values that are not in the range of the depth buffer."""
+
+NEAR_RATIO = 2.0
+"""Depth is exchanged if at least half the pixels are closer than this many near planes:
+objects as close as that are drawn only with a near plane that is too far away."""
+
+FAR_RATIO = 4.0
+
+
+class DepthRange(NamedTuple):
+    """Values of `XrCompositionLayerDepthInfoKHR`.
+
+    Attributes
+    ----------
+    min_depth, max_depth : float
+        Values in the buffer at `near_m` and `far_m`.
+    near_m, far_m : float
+        Planar depths; near is farther than far in reversed buffers, and one of them may
+        be infinite.
+    """
+
+    min_depth: float
+    max_depth: float
+    near_m: float
+    far_m: float
+
+    def problem(self) -> str:
+        """Return what is wrong with the values; empty if nothing is."""
+        low, high, near_m, far_m = self
+        if not 0.0 <= low < high <= 1.0:
+            return f"the range of the buffer is {low:g} to {high:g}"
+        if not (near_m > 0.0 and far_m > 0.0):  # also NaN
+            return f"its planes are at {near_m:g} and {far_m:g} m"
+        if near_m == far_m:
+            return f"both its planes are at {near_m:g} m"
+        return ""
+
+
+def planar_depth(
+    values: Depth, given: DepthRange, size_px: tuple[int, int]
+) -> tuple[Depth | None, str]:
+    """Return planar depth in m for the pixels of an image, and a note.
+
+    Parameters
+    ----------
+    values : (h, w) float32
+        Depth buffer, 0 to 1.
+    given : DepthRange
+    size_px : (int, int)
+        Width and height of the image, which may differ from those of the buffer.
+
+    Returns
+    -------
+    depth_m : (height, width) float32, or None if the buffer contains no depth
+    note : str
+        What was found to be wrong; empty if nothing was.
+    """
+    problem = given.problem()
+    if problem:
+        return None, problem
+    sample = values[::CHECK_STRIDE, ::CHECK_STRIDE]
+    is_valid = (sample >= given.min_depth) & (sample <= given.max_depth)
+    if np.mean(is_valid) < 1.0 - MAX_INVALID_RATIO:
+        return None, "most of its values are out of range"
+    if np.ptp(sample[is_valid]) == 0.0:
+        return None, f"all its values are {sample[is_valid][0]:g}"
+    note = ""
+    if _is_exchanged(sample[is_valid], given):
+        given = given._replace(near_m=given.far_m, far_m=given.near_m)
+        note = "its near and far planes are exchanged; corrected"
+    height_px, width_px = values.shape
+    if (width_px, height_px) != size_px:
+        values = values[_nearest(height_px, size_px[1])][
+            :, _nearest(width_px, size_px[0])
+        ]
+    return _planar(values, given), note
+
+
+def _planar(values: Depth, given: DepthRange) -> Depth:
+    """Return planar depth, m; 0 where there is none."""
+    # The inverse of planar depth is linear in the values; a plane may be infinite.
+    low, high, near_m, far_m = given
+    slope = (1.0 / far_m - 1.0 / near_m) / (high - low)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth_m = np.float32(1.0) / (
+            values * np.float32(slope) + np.float32(1.0 / near_m - slope * low)
+        )
+    # Rounding at an infinite plane may give a small negative inverse.
+    is_valid = (values >= low) & (values <= high)
+    far = np.float32(max(near_m, far_m))
+    np.copyto(depth_m, far, where=~(depth_m > 0.0))
+    return np.where(is_valid, depth_m, np.float32(0.0))
+
+
+def _is_exchanged(values: Depth, given: DepthRange) -> bool:
+    """Whether the image is only plausible with exchanged planes."""
+    own = float(np.median(_planar(values, given)))
+    other = given._replace(near_m=given.far_m, far_m=given.near_m)
+    exchanged = float(np.median(_planar(values, other)))
+    near_m = min(given.near_m, given.far_m)
+    return own < NEAR_RATIO * near_m and (
+        exchanged > FAR_RATIO * near_m or math.isinf(exchanged)
+    )
+
+
+def _nearest(given_px: int, wanted_px: int) -> NDArray[np.intp]:
+    """Return the index of the nearest pixel for each wanted one."""
+    return ((np.arange(wanted_px) + 0.5) * (given_px / wanted_px)).astype(np.intp)

@@ -1,0 +1,133 @@
+"""Messages between the OpenXR layer and its helper; see source/wire.h."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from ctypes import c_char, c_float, c_int64, c_uint32, c_uint64
+
+MAGIC, VERSION = 0x4F435558, 1
+HELLO, WELCOME, RING, FRAME, RESULT = 1, 2, 3, 4, 5
+CONTROL = 100
+"""A request of `ocufilter layer set` or `status`: JSON after the kind."""
+
+SRGB8, LINEAR8, LINEAR16F = 1, 2, 3
+HAS_HEAD, HAS_GAZE, IS_BLENDED = 1, 2, 4
+
+OWN_FRAME, FILTERED = 0, 1
+MAX_SIDE_PX = 16384
+MAX_SHARED_BYTES = 1 << 30
+MAX_SLOTS = 2
+MAX_CONTROL_BYTES = 100_000
+
+
+class Hello(ctypes.Structure):
+    """First message of the layer."""
+
+    _fields_ = (
+        *((name, c_uint32) for name in ("kind", "magic", "version", "process_id")),
+        ("application", c_char * 128),
+    )
+
+
+class Welcome(ctypes.Structure):
+    """Answer of the helper."""
+
+    _fields_ = tuple(
+        (name, c_uint32)
+        for name in ("kind", "magic", "version", "slot_count", "wait_ms", "max_age_ms")
+    )
+
+
+class Ring(ctypes.Structure):
+    """Shared memory, whose descriptor goes with the message."""
+
+    _fields_ = (("kind", c_uint32), ("slot_count", c_uint32), ("slot_bytes", c_uint64))
+
+
+class Image(ctypes.Structure):
+    """An image in a slot."""
+
+    _fields_ = (("start", c_uint64), ("width_px", c_uint32), ("height_px", c_uint32))
+
+
+class View(ctypes.Structure):
+    """One eye's view."""
+
+    _fields_ = (
+        ("position_m", c_float * 3),
+        ("orientation", c_float * 4),
+        ("fov_rad", c_float * 4),
+        *((name, c_float) for name in ("min_depth", "max_depth", "near_m", "far_m")),
+        ("color", Image),
+        ("depth", Image),
+    )
+
+    @property
+    def pose(self) -> tuple[float, ...]:
+        """Return position and orientation."""
+        return (*self.position_m, *self.orientation)
+
+    @property
+    def tangents(self) -> tuple[float, float, float, float]:
+        """Return the tangents of the angles to the edges: left, right, up, down."""
+        left, right, up, down = (math.tan(angle) for angle in self.fov_rad)
+        return left, right, up, down
+
+
+class Frame(ctypes.Structure):
+    """A frame to filter, and what the layer did since the previous one."""
+
+    _fields_ = (
+        ("kind", c_uint32),
+        ("slot", c_uint32),
+        ("frame_id", c_uint64),
+        ("display_time_ns", c_int64),
+        ("flags", c_uint32),
+        ("color_format", c_uint32),
+        ("head", c_float * 7),
+        ("gaze", c_float * 4),
+        ("gaze_time_ns", c_int64),
+        ("views", View * 2),
+        *(
+            (name, c_uint32)
+            for name in (
+                *("frames", "frames_filtered"),
+                *("copy_us", "read_us", "upload_us", "other_us"),
+            )
+        ),
+    )
+
+
+class Result(ctypes.Structure):
+    """A filtered frame, in place of the colors of its slot."""
+
+    _fields_ = (
+        ("kind", c_uint32),
+        ("slot", c_uint32),
+        ("frame_id", c_uint64),
+        ("is_filtered", c_uint32),
+        ("padding", c_uint32),
+    )
+
+
+_KINDS: dict[int, type[ctypes.Structure]] = {HELLO: Hello, RING: Ring, FRAME: Frame}
+
+
+def kind_of(data: bytes) -> int:
+    """Return the kind of a message; 0 without one."""
+    return int.from_bytes(data[:4], "little") if len(data) >= 4 else 0
+
+
+def parsed(data: bytes) -> Hello | Ring | Frame:
+    """Return a message of the layer.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    structure = _KINDS.get(kind_of(data))
+    if structure is None or len(data) != ctypes.sizeof(structure):
+        raise ValueError(f"an unknown message of {len(data)} bytes")
+    return structure.from_buffer_copy(data)  # type: ignore[return-value]
