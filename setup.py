@@ -18,9 +18,9 @@ setup(
         "filter_service.shaders.passes",
     ],
     package_dir={"filter_service.shaders": "shaders"},
-    # All libraries are optional and loaded by path.  Without a C compiler, the engine is
-    # gl, and dropping messages with millions of parts takes ten times as long.  Without
-    # the headers of OpenXR, OpenGL and X11, `ocufilter layer` says what it requires.
+    # All libraries are optional and loaded by path.  Without a C compiler, the engine
+    # is gl, and dropping messages with millions of parts takes ten times as long.
+    # Without the headers of OpenXR, OpenGL and X11, `ocufilter layer` says what to do.
     ext_modules=[
         Extension(
             "filter_service.native._loops",

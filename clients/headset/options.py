@@ -14,6 +14,9 @@ from clients.headset.runtime import EYES, Eye
 from clients.natural_eye import USUAL_AGE_YEARS, USUAL_WHITE_CD_M2
 from filter_service import FilterSettings
 
+TRACKED_RANGE_DEG = (15.0, 10.0)
+"""Range of gaze with an eye tracker, unless the user gives one."""
+
 
 def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Namespace:
     """Return the parsed command line."""

@@ -32,6 +32,7 @@ from clients.extra import HEADSET_INSTALL
 from clients.headset.controls import HELP, Controls, TerminalKeys
 from clients.headset.local_filter import LocalFilter
 from clients.headset.options import (
+    TRACKED_RANGE_DEG,
     arguments_of,
     check_limits,
     profiles_of,
@@ -52,7 +53,6 @@ if TYPE_CHECKING:
     from clients.scenes.geometry import Array
     from clients.scenes.scene import Scene
 
-TRACKED_RANGE_DEG = (15.0, 10.0)
 WARM_UP_S = 60.0
 """Longest wait for the first filtered frame; `--seconds` counts from that frame."""
 

@@ -18,6 +18,10 @@ from clients.openxr_layer.submitted_depth import DepthRange, planar_depth
 from filter_service.shared_memory import Slot
 
 _HALF_OF_BYTE = (np.arange(256) / 255.0).astype(np.float16)
+_HALVES = np.nan_to_num(
+    np.arange(65536, dtype=np.uint16).view(np.float16).astype(np.float32)
+)
+_BYTE_OF_HALF = np.rint(255.0 * _HALVES.clip(0.0, 1.0)).astype(np.uint8)
 _DTYPES: dict[int, np.dtype[Any]] = {
     wire.SRGB8: np.dtype(np.uint8),
     wire.LINEAR8: np.dtype(np.uint8),
@@ -101,11 +105,11 @@ class FrameImages:
             Planar depth without usable depth.
         """
         given = self._frame.views[index]
-        raw = self._colors[index][self._rows(index), :, :3]
+        raw = self._colors[index][self._rows(index)]
+        color = np.empty((*raw.shape[:2], 3), raw.dtype)
+        _copy_channels(color, raw)
         if self._frame.color_format == wire.LINEAR8:
-            color = _HALF_OF_BYTE[raw]
-        else:
-            color = np.ascontiguousarray(raw)
+            color = _HALF_OF_BYTE[color]
         depth_m, note = self._depth_m(index)
         if depth_m is None:
             depth_m = np.full(color.shape[:2], flat_m, np.float32)
@@ -148,9 +152,17 @@ class FrameImages:
         rows = self._rows(index)
         begin = round(plain_ratio * to.shape[1])
         if self._frame.color_format == wire.LINEAR8:
-            light = np.clip(color, 0.0, 1.0).astype(np.float32)
-            color = np.rint(255.0 * light).astype(np.uint8)
-        to[rows, begin:, :3] = color[:, begin:]
+            color = _BYTE_OF_HALF[color.view(np.uint16)]
+        _copy_channels(to[rows, begin:], color[:, begin:])
         # Runtimes ignore the alpha of a layer that is not blended; screenshots do not.
         if not self._frame.flags & wire.IS_BLENDED:
             to[..., 3] = 255 if to.dtype == np.uint8 else 1.0
+
+
+def _copy_channels(to: NDArray[Any], color: NDArray[Any]) -> None:
+    """Copy red, green and blue between images, one after the other.
+
+    NumPy's copy of all three, three values at a time, takes four to six times as long.
+    """
+    for channel in range(3):
+        to[..., channel] = color[..., channel]

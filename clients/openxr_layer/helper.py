@@ -14,7 +14,9 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+
+from numpy.typing import NDArray
 
 from clients.frame_log import percentiles
 from clients.headset.poses import angles_of, rotation_of
@@ -133,6 +135,7 @@ class LayerHelper:
         self._program: _Program | None = None
         self._waiting: set[socket.socket] = set()
         self.on_frame: Callable[[StereoFrame, Any], None] | None = None
+        self.on_gaze: Callable[[], None] = lambda: None  # an eye tracker was found
         self._stages_ms: dict[str, deque[float]] = {}
         self._n_late = 0
         self.n_frames = self.n_shown = self.n_filtered = self.n_unready = 0
@@ -308,7 +311,7 @@ class LayerHelper:
             picture, note = images.picture(index, eye, self._options.flat_m)
             pictures.append(picture)
             self._tell_depth(program, note)
-        is_filtered = self._see(frame, tuple(pictures), images, begun_s)
+        is_filtered = self._see(program, frame, tuple(pictures), images, begun_s)
         self._count(frame, is_filtered)
         self._send(
             program,
@@ -323,23 +326,21 @@ class LayerHelper:
     def _tell_depth(self, program: _Program, note: str) -> None:
         if note and note not in program.notes:
             program.notes.add(note)
-            flat = (
-                "infinity"
-                if not self._options.flat_dpt
-                else f"{self._options.flat_m:g} m"
-            )
-            is_used = "exchanged" in note
-            rest = "it is corrected" if is_used else f"all is {flat} away"
-            self._say(f"{program.name}: depth: {note}; {rest}")
+            self._say(f"{program.name}: depth: {note}")
 
     def _see(
         self,
+        program: _Program,
         given: wire.Frame,
         pictures: tuple[RgbdPicture, ...],
         images: FrameImages,
         begun_s: float,
     ) -> bool:
         """Filter a frame; return whether it was."""
+        if given.flags & wire.HAS_GAZE and "gaze" not in program.notes:
+            program.notes.add("gaze")
+            self._say(f"{program.name}: eyes are tracked")
+            self.on_gaze()
         due = DueFrame(
             given.display_time_ns,
             True,
@@ -349,9 +350,8 @@ class LayerHelper:
             period_s=WAIT_S,
         )
         try:
-            frame = StereoFrame(
-                due, pictures, self._look.follow(due, pictures), begun_s
-            )
+            eyes = self._look.follow(due, pictures)
+            frame = StereoFrame(due, pictures, eyes, begun_s)
             looked_s = time.monotonic()
             seen = self._seeing.see(frame)
         except (FilterError, ValueError) as error:
@@ -364,11 +364,8 @@ class LayerHelper:
         for index, (picture, eye, used_dpt) in enumerate(
             zip(pictures, frame.eyes, seen.used_focus_dpt, strict=True)
         ):
-            images.put(
-                index,
-                seen.colors[index],
-                SPLIT_RATIO if self._options.is_split else 0.0,
-            )
+            color = cast("NDArray[Any]", seen.colors[index])  # as the input
+            images.put(index, color, SPLIT_RATIO if self._options.is_split else 0.0)
             if used_dpt is not None:
                 self._look.learn(picture.view.eye, eye.state.focus_dpt, used_dpt)
         took_ms = MS_PER_S * (time.monotonic() - begun_s)

@@ -29,6 +29,7 @@ from typing import Any
 
 from clients.arguments import read_profile
 from clients.headset.options import (
+    TRACKED_RANGE_DEG,
     add_eye_arguments,
     add_service_arguments,
     profiles_of,
@@ -44,6 +45,7 @@ from clients.openxr_layer.helper import (
     ask,
     socket_path,
 )
+from filter_service import FilterSettings
 from filter_service.errors import FilterError
 
 CHECK_S = 0.25
@@ -143,7 +145,8 @@ def _add_socket(parser: Any) -> None:
     )
 
 
-def _helper_options(options: argparse.Namespace) -> HelperOptions:
+def _checked(options: argparse.Namespace) -> tuple[HelperOptions, FilterSettings]:
+    """Check the options before the engine is loaded."""
     if not 0.0 <= options.flat_dpt <= 20.0:
         raise ValueError(f"--flat-dpt is {options.flat_dpt}; allowed: 0 to 20")
     if not 0 <= options.wait_ms <= MAX_WAIT_MS:
@@ -152,8 +155,12 @@ def _helper_options(options: argparse.Namespace) -> HelperOptions:
         raise ValueError(
             f"--max-age-ms is {options.max_age_ms}; allowed: 1 to {MAX_WAIT_MS}"
         )
-    return HelperOptions(
-        options.wait_ms, options.max_age_ms, options.flat_dpt, options.split
+    profiles_of(options)
+    return (
+        HelperOptions(
+            options.wait_ms, options.max_age_ms, options.flat_dpt, options.split
+        ),
+        settings_of(options),
     )
 
 
@@ -201,8 +208,22 @@ class _Eyes:
     def __init__(self, options: argparse.Namespace, seeing: Any, look: Any) -> None:
         self._seeing, self._look = seeing, look
         self._files = _ProfileFiles(options)
-        for eye, profile in profiles_of(options).items():
-            seeing.change(eye, profile)
+        self._profiles = profiles_of(options)
+        self._is_range_given = options.gaze_range is not None
+        self._request()
+
+    def _request(self) -> None:
+        for eye, profile in self._profiles.items():
+            self._seeing.change(eye, profile)
+
+    def prepare_for_gaze(self) -> None:
+        """Prepare a range of gaze for an eye tracker, unless the user gave one."""
+        if self._is_range_given or any(self._look.gaze_range_deg):
+            return
+        self._look.gaze_range_deg = TRACKED_RANGE_DEG
+        settings = self._seeing.settings
+        self._seeing.settings = settings.changed(gaze_range_deg=TRACKED_RANGE_DEG)
+        self._request()
 
     def change(self, eye: Eye, text: str) -> None:
         """Change an eye's profile.
@@ -214,6 +235,7 @@ class _Eyes:
         """
         profile = read_profile(text, f"--{eye}")
         self._files.watch(eye, text)
+        self._profiles[eye] = profile
         self._look.change(eye)
         self._seeing.change(eye, profile)
         say(f"{eye} eye: {profile.get('name', profile.get('kind'))}")
@@ -230,8 +252,7 @@ class _Eyes:
 @contextlib.contextmanager
 def _helper(options: argparse.Namespace) -> Iterator[tuple[LayerHelper, _Eyes]]:
     """Return the helper, which listens, and its eyes."""
-    helper_options, settings = _helper_options(options), settings_of(options)
-    profiles_of(options)  # before the engine is loaded
+    helper_options, settings = _checked(options)
     from clients.headset.local_filter import LocalFilter
     from clients.headset.service_filter import ServiceFilter
     from clients.headset.stereo_filter import StereoFilter
@@ -254,6 +275,7 @@ def _helper(options: argparse.Namespace) -> Iterator[tuple[LayerHelper, _Eyes]]:
         helper = LayerHelper(
             seeing, look, say, helper_options, eyes.change, options.socket
         )
+        helper.on_gaze = eyes.prepare_for_gaze
         with contextlib.closing(helper):
             yield helper, eyes
 
@@ -285,6 +307,7 @@ def _run(options: argparse.Namespace) -> int:
     command = options.program[1:] if options.program[:1] == ["--"] else options.program
     if not command:
         raise ValueError("there is no program; put it after --")
+    _checked(options)
     library = manifest.library()
     ending = _Ending()
     with _helper(options) as (helper, eyes), tempfile.TemporaryDirectory() as folder:

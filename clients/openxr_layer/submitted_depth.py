@@ -19,6 +19,8 @@ NEAR_RATIO = 2.0
 objects as close as that are drawn only with a near plane that is too far away."""
 
 FAR_RATIO = 4.0
+NOISE_RATIO = 0.5
+"""Median difference of neighbors to median deviation: 1 in noise, 0.001 in a room."""
 
 
 class DepthRange(NamedTuple):
@@ -78,6 +80,8 @@ def planar_depth(
         return None, "most of its values are out of range"
     if np.ptp(sample[is_valid]) == 0.0:
         return None, f"all its values are {sample[is_valid][0]:g}"
+    if _is_noise(values[::CHECK_STRIDE]):
+        return None, "the values of neighboring pixels are unrelated"
     note = ""
     if _is_exchanged(sample[is_valid], given):
         given = given._replace(near_m=given.far_m, far_m=given.near_m)
@@ -115,6 +119,15 @@ def _is_exchanged(values: Depth, given: DepthRange) -> bool:
     return own < NEAR_RATIO * near_m and (
         exchanged > FAR_RATIO * near_m or math.isinf(exchanged)
     )
+
+
+def _is_noise(rows: Depth) -> bool:
+    """Whether neighbors in a row differ as much as pixels do on the whole."""
+    own = rows[np.isfinite(rows)]
+    spread = np.median(np.abs(own - np.median(own)))
+    steps = np.abs(np.diff(rows, axis=1))
+    step = np.median(steps[np.isfinite(steps)]) if np.isfinite(steps).any() else 0.0
+    return bool(step > NOISE_RATIO * spread > 0.0)
 
 
 def _nearest(given_px: int, wanted_px: int) -> NDArray[np.intp]:

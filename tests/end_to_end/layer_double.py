@@ -1,0 +1,87 @@
+"""The layer's side of the connection to its helper, in Python."""
+
+import fcntl
+import os
+import socket
+
+import numpy as np
+
+from clients.headset.simulated_runtime import eye_views, still
+from clients.openxr_layer import wire
+from filter_service.shared_memory import Slot, aligned_starts
+
+TIMEOUT_S = 60.0
+
+
+class LayerDouble:
+    """Sends frames to a helper as source/link.c and source/frames.c do."""
+
+    def __init__(self, path, name="program"):
+        self.connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.connection.settimeout(TIMEOUT_S)
+        self.connection.connect(str(path))
+        hello = wire.Hello(wire.HELLO, wire.MAGIC, wire.VERSION, os.getpid())
+        hello.application = name.encode()
+        self.connection.send(bytes(hello))
+        self.slot = None
+        self.frame_id = 0
+
+    def close(self):
+        self.connection.close()
+
+    def welcome(self):
+        data = self.connection.recv(1000)
+        return wire.Welcome.from_buffer_copy(data) if data else None
+
+    def share(self, size_bytes, *, seals=fcntl.F_SEAL_SHRINK, says_bytes=None):
+        """Share memory of one slot."""
+        descriptor = os.memfd_create("layer", os.MFD_ALLOW_SEALING)
+        os.ftruncate(descriptor, size_bytes)
+        if seals:
+            fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, seals)
+        ring = wire.Ring(wire.RING, 1, says_bytes or size_bytes)
+        socket.send_fds(self.connection, [bytes(ring)], [descriptor])
+        self.slot = Slot(0, size_bytes, descriptor)
+
+    def frame(self, colors, depths=(None, None), *, color_format=wire.SRGB8, **values):
+        """Return a frame with images of these kinds, rows as in OpenGL, in the slot."""
+        self.frame_id += 1
+        frame = wire.Frame(wire.FRAME, 0, self.frame_id)
+        frame.color_format = color_format
+        frame.display_time_ns = 1_000_000_000 + 11_000_000 * self.frame_id
+        given = [*colors, *depths]
+        images = [image for image in given if image is not None]
+        found, size_bytes = aligned_starts([image.nbytes for image in images])
+        if self.slot is None or self.slot.size_bytes < size_bytes:
+            self.share(-(-size_bytes // 4096) * 4096)
+        self.slot.put(images, found)
+        starts = iter(found)
+        for view, color, eye_view in zip(
+            frame.views, colors, eye_views(still(0.0)), strict=True
+        ):
+            view.color = wire.Image(next(starts), color.shape[1], color.shape[0])
+            view.position_m[:] = eye_view.pose[:3]
+            view.orientation[:] = eye_view.pose[3:]
+            view.fov_rad[:] = np.arctan(eye_view.tangents)
+            view.min_depth, view.max_depth, view.near_m, view.far_m = 0, 1, 0.1, 100.0
+        for view, depth in zip(frame.views, depths, strict=True):
+            if depth is not None:
+                height_px, width_px = depth.shape
+                view.depth = wire.Image(next(starts), width_px, height_px)
+        for name, value in values.items():
+            setattr(frame, name, value)
+        return frame
+
+    def send(self, frame):
+        self.connection.send(bytes(frame))
+
+    def result(self):
+        data = self.connection.recv(1000)
+        return wire.Result.from_buffer_copy(data) if data else None
+
+    def color(self, frame, index):
+        """Return the color that is in the slot, rows as in OpenGL."""
+        image = frame.views[index].color
+        dtype = np.uint8 if frame.color_format != wire.LINEAR16F else np.float16
+        shape = image.height_px, image.width_px, 4
+        return self.slot.array(image.start, shape, np.dtype(dtype)).copy()

@@ -1,0 +1,418 @@
+"""The helper of the OpenXR layer: results, bad input, and programs that come and go."""
+
+import contextlib
+import os
+import socket
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clients.headset.local_filter import LocalFilter
+from clients.headset.stereo_gaze import StereoGaze
+from clients.openxr_layer import program, wire
+from clients.openxr_layer.helper import HelperOptions, LayerHelper, ask
+from filter_service import Camera, EyeFilter, FilterSettings, RgbdView
+from filter_service.messages import body_of_eye
+from tests.end_to_end.layer_double import LayerDouble
+
+SIZE_PX = (96, 72)
+PUPIL_MM, FOCUS_DPT = 4.0, 1.0
+SETTINGS = FilterSettings(
+    pupil_range_mm=(PUPIL_MM, PUPIL_MM),
+    focus_range_dpt=(FOCUS_DPT, FOCUS_DPT),
+    object_range_dpt=(0.0, 4.0),
+)
+PROFILES = {
+    "left": {"kind": "prescription", "sphere_dpt": -3.0},
+    "right": {"kind": "prescription", "sphere_dpt": 0.0},
+}
+
+
+class RunningHelper:
+    """A helper in a thread."""
+
+    def __init__(self, path, **options):
+        self.lines, self.changed, self.errors = [], [], []
+        self.path = path
+        self._options = options
+        self._is_over = threading.Event()
+        self._is_listening = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self):
+        self._thread.start()
+        assert self._is_listening.wait(30.0), self.errors
+        return self
+
+    def __exit__(self, *_):
+        self._is_over.set()
+        self._thread.join()
+        assert not self.errors
+
+    def _change(self, eye, text):
+        if text == "nobody":
+            raise ValueError("there is no eye 'nobody'")
+        self.changed.append((eye, text))
+
+    def _run(self):
+        try:
+            seeing = LocalFilter(SETTINGS, self.lines.append)
+            for eye, profile in PROFILES.items():
+                seeing.change(eye, profile)
+            look = StereoGaze(
+                age_years=30.0, pupil_diameter_mm=PUPIL_MM, focus_dpt=FOCUS_DPT
+            )
+            self.helper = helper = LayerHelper(
+                *(seeing, look, self.lines.append),
+                *(HelperOptions(**self._options), self._change, self.path),
+            )
+            self._is_listening.set()
+            while not self._is_over.is_set():
+                helper.run_once(0.02)
+            helper.close()
+            seeing.close()
+        except BaseException as error:
+            self.errors.append(error)
+            raise
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "layer.sock"
+
+
+@pytest.fixture
+def connect(path):
+    """Return how to connect as a layer; connections are closed at the end."""
+    with contextlib.ExitStack() as stack:
+
+        def connected(name="program"):
+            return stack.enter_context(contextlib.closing(LayerDouble(path, name)))
+
+        yield connected
+
+
+@pytest.fixture
+def helper(path):
+    with RunningHelper(path) as running:
+        yield running
+
+
+def stripes(seed, dtype=np.uint8):
+    """Colors and alpha, and depth as OpenGL's buffer has it; the top row first."""
+    random = np.random.default_rng(seed)
+    width_px, height_px = SIZE_PX
+    color = random.integers(0, 256, (height_px // 4, width_px // 4, 4))
+    color = np.kron(color, np.ones((4, 4, 1))).astype(np.uint8)
+    depth_m = np.full((height_px, width_px), 4.0, np.float32)
+    depth_m[20:50, 20:60] = 0.5
+    values = (1.0 / 0.1 - 1.0 / depth_m) / (1.0 / 0.1 - 1.0 / 100.0)
+    if dtype == np.float16:
+        color = (color / 128.0).astype(np.float16)
+    return color, depth_m, values.astype(np.float32)
+
+
+def truth(eye, color, depth_m, tangents, output):
+    """Return what EyeFilter gives."""
+    width_px, height_px = SIZE_PX
+    camera = Camera(width_px, height_px, tangents)
+    body = body_of_eye(PROFILES[eye], eye)  # a left eye is mirrored
+    with EyeFilter(body, camera, SETTINGS) as eye_filter:
+        view = RgbdView(np.ascontiguousarray(color[..., :3]), depth_m, tangents)
+        seen = eye_filter.filter(
+            view,
+            pupil_diameter_mm=PUPIL_MM,
+            focus_dpt=FOCUS_DPT,
+            whole=True,
+            output=output,
+        )
+        return seen.views[0].color
+
+
+def upward(image):
+    """Return an image with the bottom row first."""
+    return np.ascontiguousarray(image[::-1])
+
+
+def filtered(layer, make_frame):
+    """Send frames until one is filtered; return it."""
+    for _ in range(10_000):
+        frame = make_frame()
+        layer.send(frame)
+        result = layer.result()
+        assert result is not None
+        assert (result.slot, result.frame_id) == (0, frame.frame_id)
+        if result.is_filtered:
+            return frame
+    raise AssertionError("no frame was filtered")
+
+
+def tangents_of(frame, index):
+    return frame.views[index].tangents
+
+
+@pytest.mark.parametrize(
+    ("color_format", "dtype", "output"),
+    [(wire.SRGB8, np.uint8, "srgb8"), (wire.LINEAR16F, np.float16, "linear16")],
+)
+def test_frames_are_those_of_the_eye_filter(
+    helper, path, connect, color_format, dtype, output
+):
+    layer = connect()
+    assert layer.welcome().slot_count == 1
+    images = [stripes(seed, dtype) for seed in (1, 2)]
+    colors = [upward(color) for color, _, _ in images]
+    depths = [upward(values) for _, _, values in images]
+    frame = filtered(
+        layer, lambda: layer.frame(colors, depths, color_format=color_format)
+    )
+    for index, eye in enumerate(("left", "right")):
+        color, depth_m, _ = images[index]
+        expected = truth(eye, color, depth_m, tangents_of(frame, index), output)
+        found = upward(layer.color(frame, index))
+        # Depth goes through the buffer's float32.
+        tolerance = 1.0 if dtype == np.uint8 else 2e-3
+        error = np.abs(found[..., :3].astype(float) - expected.astype(float))
+        assert error.max() <= tolerance
+        assert (found[..., 3] == (255 if dtype == np.uint8 else 1.0)).all()
+    difference = layer.color(frame, 0)[..., :3] - colors[0][..., :3].astype(float)
+    assert np.abs(difference).mean() > 0.005 * (255 if dtype == np.uint8 else 1.0)
+    layer.close()
+
+
+def test_linear_bytes(helper, path, connect):
+    layer = connect()
+    layer.welcome()
+    color, depth_m, values = stripes(3)
+    frame = filtered(
+        layer,
+        lambda: layer.frame(
+            [upward(color)] * 2, [upward(values)] * 2, color_format=wire.LINEAR8
+        ),
+    )
+    light = (color / 255.0).astype(np.float32)
+    expected = truth("left", light, depth_m, tangents_of(frame, 0), "linear")
+    found = upward(layer.color(frame, 0))[..., :3] / 255.0
+    assert np.abs(found - expected).max() <= 1.0 / 255.0
+    layer.close()
+
+
+def test_blended_layers_keep_their_alpha(helper, path, connect):
+    layer = connect()
+    layer.welcome()
+    color, _, values = stripes(4)
+    frame = filtered(
+        layer,
+        lambda: layer.frame(
+            [upward(color)] * 2, [upward(values)] * 2, flags=wire.IS_BLENDED
+        ),
+    )
+    np.testing.assert_array_equal(upward(layer.color(frame, 1))[..., 3], color[..., 3])
+    layer.close()
+
+
+def test_views_that_are_upside_down(helper, path, connect):
+    layer = connect()
+    layer.welcome()
+    color, depth_m, values = stripes(5)
+
+    def upside_down():
+        frame = layer.frame([color.copy()] * 2, [values.copy()] * 2)
+        for view in frame.views:
+            left, right, up, down = view.fov_rad
+            view.fov_rad[:] = left, right, down, up
+        return frame
+
+    frame = filtered(layer, upside_down)
+    left, right, down, up = tangents_of(frame, 0)
+    expected = truth("left", color, depth_m, (left, right, up, down), "srgb8")
+    found = layer.color(frame, 0)[..., :3]
+    assert np.abs(found.astype(float) - expected).max() <= 1.0
+    layer.close()
+
+
+def test_without_depth_everything_is_at_the_flat_distance(path, connect):
+    with RunningHelper(path, flat_dpt=2.0, is_split=True) as helper:
+        layer = connect()
+        layer.welcome()
+        color, depth_m, _ = stripes(6)
+        frame = filtered(layer, lambda: layer.frame([upward(color)] * 2))
+        flat_m = np.full_like(depth_m, 0.5)
+        expected = truth("left", color, flat_m, tangents_of(frame, 0), "srgb8")
+        found = upward(layer.color(frame, 0))[..., :3].astype(float)
+        middle = SIZE_PX[0] // 2
+        assert np.abs(found[:, middle:] - expected[:, middle:]).max() <= 1.0
+        np.testing.assert_array_equal(found[:, :middle], color[:, :middle, :3])
+        assert sum("everything is 0.5 m away" in line for line in helper.lines) == 1
+        layer.close()
+
+
+def test_a_second_program_waits_for_the_first_one_to_end(helper, path, connect):
+    first, second = LayerDouble(path, "first"), None
+    assert first.welcome() is not None
+    second = LayerDouble(path, "second")
+    assert second.welcome() is None
+    second.close()
+    first.close()
+    third = LayerDouble(path, "third")
+    assert third.welcome() is not None
+    third.close()
+
+
+def spoiled(change):
+    def make(layer):
+        color, _, values = stripes(7)
+        frame = layer.frame([upward(color)] * 2, [upward(values)] * 2)
+        change(frame)
+        return bytes(frame)
+
+    return make
+
+
+def set_pose(frame):
+    frame.views[0].position_m[0] = np.nan
+
+
+def set_start(frame):
+    frame.views[1].depth.start = 2**63
+
+
+def set_size(frame):
+    frame.views[0].color.width_px = 16384
+
+
+def set_fov(frame):
+    frame.views[0].fov_rad[1] = 1.6
+
+
+BAD = {
+    "nothing known": lambda layer: b"\x09\0\0\0",
+    "too short": lambda layer: bytes(wire.Frame(wire.FRAME))[:-1],
+    "too long": lambda layer: bytes(wire.Frame(wire.FRAME)) + b"\0",
+    "no memory": lambda layer: bytes(wire.Frame(wire.FRAME, 0, 1)),
+    "hello again": lambda layer: bytes(wire.Hello(wire.HELLO, wire.MAGIC)),
+    "ring without memory": lambda layer: bytes(wire.Ring(wire.RING, 1, 4096)),
+    "slot": spoiled(lambda frame: setattr(frame, "slot", 1)),
+    "format": spoiled(lambda frame: setattr(frame, "color_format", 9)),
+    "pose": spoiled(set_pose),
+    "start": spoiled(set_start),
+    "size": spoiled(set_size),
+    "field of view": spoiled(set_fov),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_messages_end_the_connection_and_nothing_else(helper, path, connect, name):
+    layer = connect()
+    layer.welcome()
+    layer.connection.send(BAD[name](layer))
+    assert layer.result() is None
+    layer.close()
+    assert any("disconnected, because it sent" in line for line in helper.lines)
+    other = LayerDouble(path)
+    assert other.welcome() is not None
+    other.close()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"seals": 0}, {"says_bytes": 8192}, {"says_bytes": 2**40}],
+    ids=["not sealed", "smaller", "huge"],
+)
+def test_bad_memory_ends_the_connection(helper, path, connect, options):
+    layer = connect()
+    layer.welcome()
+    layer.share(4096, **options)
+    assert layer.result() is None
+    layer.slot.close()
+    layer.slot = None  # with its mapping, which has a descriptor of its own
+    assert shared_descriptors() == []
+
+
+def shared_descriptors():
+    """Return the open descriptors of a layer's memory."""
+    found = []
+    for descriptor in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):
+            found += [
+                name for name in [os.readlink(descriptor)] if "memfd:layer" in name
+            ]
+    return found
+
+
+def test_profiles_are_changed_and_errors_told(helper, path, connect):
+    found = ask(path, {"left": "myopia"})
+    assert found["program"] is None
+    assert helper.changed == [("left", "myopia")]
+    with pytest.raises(ValueError, match="no eye 'nobody'"):
+        ask(path, {"right": "nobody"})
+    with pytest.raises(ValueError, match="allowed: 100000"):
+        ask(path, {"right": "x" * 200_000})
+
+
+def test_one_helper_per_socket(helper, path, connect):
+    with pytest.raises(OSError, match="another helper listens"):
+        LayerHelper(None, None, print, HelperOptions(), print, path)
+    assert ask(path, {})["filtered"] == 0
+
+
+def test_a_socket_that_was_left_behind_is_replaced(path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left:
+        left.bind(str(path))
+    with RunningHelper(path):
+        assert ask(path, {})["program"] is None
+    assert not path.exists()
+
+
+def test_silent_connections_are_bounded(helper, path):
+    silent = []
+    for _ in range(12):
+        made = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        made.settimeout(20.0)
+        made.connect(str(path))
+        silent.append(made)
+    assert silent[-1].recv(10) == b""
+    for made in silent:
+        made.close()
+    for _ in range(1000):  # until it has noticed
+        with contextlib.suppress(OSError):
+            assert ask(path, {})["program"] is None
+            return
+    raise AssertionError("it does not answer")
+
+
+# The command
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["run", "--flat-dpt", "-1", "--", "x"],
+            "--flat-dpt is -1.0; allowed: 0 to 20",
+        ),
+        (["serve", "--wait-ms", "-5"], "--wait-ms is -5; allowed: 0 to 600000"),
+        (["serve", "--max-age-ms", "0"], "--max-age-ms is 0; allowed: 1 to 600000"),
+        (["serve", "--focus-dpt", "99"], "focus_dpt is 99.0; allowed: 0 to 20"),
+        (["serve", "--left", "{}x"], "--left is not JSON"),
+        (["run"], "there is no program; put it after --"),
+        (["set"], "there is no profile; use --profile, --left or --right"),
+    ],
+)
+def test_options_are_checked(arguments, message, capsys, tmp_path):
+    socket_option = ["--socket", str(tmp_path / "s")]
+    at = arguments.index("--") if "--" in arguments else len(arguments)
+    assert program.main([*arguments[:at], *socket_option, *arguments[at:]]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_status_and_install_without_the_library(capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("OCUFILTER_LAYER_LIBRARY", str(tmp_path / "none.so"))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    assert program.main(["status", "--socket", str(tmp_path / "s")]) == 1
+    assert "the layer was not built" in capsys.readouterr().out
+    assert program.main(["install"]) == 1
+    assert "libopenxr-dev" in capsys.readouterr().err
+    assert program.main(["remove"]) == 0
