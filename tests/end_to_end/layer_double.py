@@ -28,6 +28,9 @@ class LayerDouble:
 
     def close(self):
         self.connection.close()
+        if self.slot is not None:
+            self.slot.close()
+        self.slot = None  # with its mapping, which has a descriptor of its own
 
     def welcome(self):
         data = self.connection.recv(1000)
