@@ -14,7 +14,11 @@ from numpy.typing import NDArray
 from clients.headset.runtime import Eye, EyeView
 from clients.headset.stereo_gaze import RgbdPicture
 from clients.openxr_layer import wire
-from clients.openxr_layer.submitted_depth import DepthRange, planar_depth
+from clients.openxr_layer.submitted_depth import (
+    DepthRange,
+    corrected_range,
+    planar_depth,
+)
 from filter_service.shared_memory import Slot
 
 _HALF_OF_BYTE = (np.arange(256) / 255.0).astype(np.float16)
@@ -65,6 +69,8 @@ class FrameImages:
         Where the frame's slot begins, bytes.
     frame : Frame
         A frame that was checked.
+    engine : str
+        Name of the program's engine.
 
     Raises
     ------
@@ -72,8 +78,10 @@ class FrameImages:
         If an image extends beyond the memory.
     """
 
-    def __init__(self, memory: Slot, start: int, frame: wire.Frame) -> None:
-        self._frame = frame
+    def __init__(
+        self, memory: Slot, start: int, frame: wire.Frame, engine: str = ""
+    ) -> None:
+        self._frame, self._engine = frame, engine
         dtype = _DTYPES[frame.color_format]
         self._colors = [
             memory.array(
@@ -127,11 +135,14 @@ class FrameImages:
         values, given = self._depths[index], self._frame.views[index]
         if values is None:
             return None, "the program submits none"
-        return planar_depth(
+        stated = DepthRange(given.min_depth, given.max_depth, given.near_m, given.far_m)
+        meant, note = corrected_range(stated, self._engine)
+        depth_m, other_note = planar_depth(
             np.ascontiguousarray(values[self._rows(index)]),
-            DepthRange(given.min_depth, given.max_depth, given.near_m, given.far_m),
+            meant,
             (given.color.width_px, given.color.height_px),
         )
+        return depth_m, other_note or note
 
     def put(
         self,

@@ -88,6 +88,7 @@ class _Program:
 
     connection: socket.socket
     name: str
+    engine: str
     memory: Slot | None = None
     slot_count: int = 0
     slot_bytes: int = 0
@@ -219,11 +220,11 @@ class LayerHelper:
             self._program.notes.add("second")
             self._forget(connection)
         else:
-            self._begin(connection, name)
+            self._begin(connection, name, hello.engine.decode(errors="replace"))
 
-    def _begin(self, connection: socket.socket, name: str) -> None:
+    def _begin(self, connection: socket.socket, name: str, engine: str) -> None:
         self._waiting.discard(connection)
-        self._program = _Program(connection, name)
+        self._program = _Program(connection, name, engine)
         welcome = wire.Welcome(
             *(wire.WELCOME, wire.MAGIC, wire.VERSION, 1),
             *(self._options.wait_ms, self._options.max_age_ms),
@@ -305,7 +306,8 @@ class LayerHelper:
         if program.memory is None or frame.slot >= program.slot_count:
             raise ValueError(f"a frame in slot {frame.slot}")
         check_frame(frame)
-        images = FrameImages(program.memory, frame.slot * program.slot_bytes, frame)
+        start = frame.slot * program.slot_bytes
+        images = FrameImages(program.memory, start, frame, program.engine)
         pictures = []
         for index, eye in enumerate(EYES):
             picture, note = images.picture(index, eye, self._options.flat_m)

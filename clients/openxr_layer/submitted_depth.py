@@ -52,6 +52,23 @@ class DepthRange(NamedTuple):
         return ""
 
 
+QT_NEAR_M = 1.0
+
+
+def corrected_range(given: DepthRange, engine: str) -> tuple[DepthRange, str]:
+    """Return the range that an engine means, and a note if that differs.
+
+    Qt Quick 3D (6.8 to 6.12) states its planes in centimeters, and renders with a
+    projection for depths from 0 to 1 in OpenGL's range from -1 to 1, so that its values
+    are between 0.5 and 1.
+    """
+    planes_m = given.near_m, given.far_m
+    if engine != "Qt" or not min(planes_m) >= QT_NEAR_M:
+        return given, ""
+    found = DepthRange(0.5, 1.0, 0.01 * given.near_m, 0.01 * given.far_m)
+    return found, "its planes are in centimeters, as always in Qt Quick 3D; corrected"
+
+
 def planar_depth(
     values: Depth, given: DepthRange, size_px: tuple[int, int]
 ) -> tuple[Depth | None, str]:

@@ -27,6 +27,7 @@ class Hello(ctypes.Structure):
     _fields_ = (
         *((name, c_uint32) for name in ("kind", "magic", "version", "process_id")),
         ("application", c_char * 128),
+        ("engine", c_char * 128),
     )
 
 

@@ -5,7 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from clients.openxr_layer.submitted_depth import DepthRange, planar_depth
+from clients.openxr_layer.submitted_depth import (
+    DepthRange,
+    corrected_range,
+    planar_depth,
+)
 
 WIDTH_PX, HEIGHT_PX = 64, 48
 
@@ -176,3 +180,16 @@ def test_a_photograph_is_depth():
     assert note == ""
     is_known = np.isfinite(depth_m)
     np.testing.assert_allclose(found_m[is_known], depth_m[is_known], rtol=2e-4)
+
+
+def test_depth_of_qt():
+    # Read from Qt 6.12 on Monado: surfaces at these depths, planes at "5 and 2000 m".
+    depth_m = np.repeat([[0.45, 2.30, 5.995]], 20, axis=1)
+    values = np.repeat([[0.945558, 0.990356, 0.997073]], 20, axis=1).astype(np.float32)
+    meant, note = corrected_range(DepthRange(0.0, 1.0, 5.0, 2000.0), "Qt")
+    assert "centimeters" in note
+    found_m, _ = planar_depth(values, meant, (60, 1))
+    np.testing.assert_allclose(1.0 / found_m, 1.0 / depth_m, atol=2e-5)
+    as_stated = DepthRange(0.0, 1.0, 0.05, 20.0)
+    assert corrected_range(as_stated, "Qt") == (as_stated, "")
+    assert corrected_range(DepthRange(0.0, 1.0, 5.0, 2000.0), "other")[1] == ""

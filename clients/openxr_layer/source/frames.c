@@ -46,7 +46,7 @@ static bool plan_views(session *at, plan *p) {
             color->info.format != p->color[0]->info.format) {
             LOG_ONCE(&at->told, SAID_FORMAT,
                      "images of format 0x%llx are not filtered; supported: SRGB8_ALPHA8, "
-                     "RGBA8, RGB10_A2, RGBA16F, the same for both eyes",
+                     "RGBA8, RGB10_A2, RGBA16, RGBA16F, the same for both eyes",
                      (long long)color->info.format);
             return false;
         }

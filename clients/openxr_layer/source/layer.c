@@ -112,7 +112,7 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSession(XrInstance handle,
     at->handle = *made;
     at->own = own;
     pthread_mutex_init(&at->lock, NULL);
-    link_init(&at->link, own->application);
+    link_init(&at->link, own->application, own->engine);
     const char *reason = gl_open(&at->gl, info);
     at->has_gl = !reason;
     if (reason) LOG("the application's own frames are shown: %s", reason);
@@ -369,6 +369,7 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateApiLayerInstance(
     own->is_depth_stripped = drops_depth;
     memcpy(own->application, info->applicationInfo.applicationName,
            sizeof own->application - 1);
+    memcpy(own->engine, info->applicationInfo.engineName, sizeof own->engine - 1);
     if (!has_functions(own)) {
         free(own);
         return XR_ERROR_INITIALIZATION_FAILED;

@@ -44,7 +44,7 @@ typedef struct instance {
 #define F(name) PFN_xr##name name;
     NEXT_FUNCTIONS(F)
 #undef F
-    char application[XR_MAX_APPLICATION_NAME_SIZE];
+    char application[XR_MAX_APPLICATION_NAME_SIZE], engine[XR_MAX_ENGINE_NAME_SIZE];
     bool is_depth_stripped; /* the runtime does not take depth, the application submits it */
     bool has_gaze;        /* XR_EXT_eye_gaze_interaction is enabled */
     bool is_gaze_suggested;

@@ -16,9 +16,10 @@
 #define RETRY_NS 1000000000u
 #define MAX_SHARED_BYTES (1ull << 30)
 
-void link_init(link_state *link, const char *application) {
+void link_init(link_state *link, const char *application, const char *engine) {
     *link = (link_state){.descriptor = -1};
     strncpy(link->application, application, sizeof link->application - 1);
+    strncpy(link->engine, engine, sizeof link->engine - 1);
 }
 
 static void release_memory(link_state *link) {
@@ -97,6 +98,7 @@ void link_connect(link_state *link) {
                         .version = WIRE_VERSION,
                         .process_id = (uint32_t)getpid()};
     memcpy(hello.application, link->application, sizeof hello.application);
+    memcpy(hello.engine, link->engine, sizeof hello.engine);
     if (connect(made, (struct sockaddr *)&address, sizeof address) || !is_trusted(made) ||
         !send_message(made, &hello, sizeof hello, -1)) {
         close(made);

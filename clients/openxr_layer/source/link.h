@@ -15,13 +15,13 @@ typedef struct {
     bool is_welcome;        /* the helper has answered */
     bool is_lost;           /* since the last link_poll */
     uint64_t retry_ns;      /* when to try again */
-    char application[128];
+    char application[128], engine[128];
     uint32_t slot_count, wait_ms, max_age_ms;
     uint8_t *memory;        /* slot_count slots; NULL without */
     size_t slot_bytes;
 } link_state;
 
-void link_init(link_state *link, const char *application);
+void link_init(link_state *link, const char *application, const char *engine);
 
 /* Connect if it is time to; never blocks. */
 void link_connect(link_state *link);

@@ -32,7 +32,7 @@ enum {
 
 typedef struct {
     uint32_t kind, magic, version, process_id;
-    char application[128];
+    char application[128], engine[128];
 } wire_hello;
 
 typedef struct {
