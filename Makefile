@@ -13,7 +13,7 @@ NO_TESTS := test $$? -eq 5 # pytest's exit status if ARGS selects none of these 
 BENCHES := $(filter-out gpu soak witness,$(patsubst tests/benchmarks/bench_%.py,%,$(sort $(wildcard tests/benchmarks/bench_*.py))))
 
 .DEFAULT_GOAL := help
-.PHONY: demo docs web test test-training test-examples test-batch-ray test-headset test-web validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-witness setup-peers peers
+.PHONY: demo docs web test test-training test-examples test-batch-ray test-headset test-layer test-web validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-witness setup-peers peers
 
 demo: setup  ## filter two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
@@ -37,6 +37,10 @@ test-batch-ray: setup-batch-ray  ## test `ocufilter batch` on two workers of a R
 
 test-examples: setup-examples  ## test the notebook in an environment like a user's
 	.examples/bin/python -m pytest -c /dev/null --rootdir . -p no:cacheprovider tests/examples $(ARGS)
+
+test-layer:  ## test `ocufilter layer` in the chroot of test-headset
+	@sh tests/headset/setup_root.sh
+	sh tests/headset/run_in_root.sh python -m pytest tests/openxr_layer $(ARGS)
 
 test-headset:  ## test `ocufilter headset` with an OpenXR runtime in a chroot
 	@sh tests/headset/setup_root.sh

@@ -14,8 +14,8 @@ from tests.source_tree import ROOT
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 
 
-def extension():
-    """The extension module of the loops as setup.py has it."""
+def extension(ending="_loops"):
+    """The extension module of the loops, or another one, as setup.py has it."""
     given = {}
     stand_in = ModuleType("setuptools")  # a bare machine may not have it
     stand_in.Extension = lambda name, **options: SimpleNamespace(name=name, **options)
@@ -24,7 +24,7 @@ def extension():
     with mock.patch.dict(sys.modules, setuptools=stand_in), contextlib.chdir(ROOT):
         runpy.run_path("setup.py")
     modules = given["ext_modules"]
-    return next(module for module in modules if module.name.endswith("_loops"))
+    return next(module for module in modules if module.name.endswith(ending))
 
 
 def build_library(folder: Path, *flags: str) -> Path:

@@ -134,7 +134,7 @@ class FrameImages:
     def _depth_m(self, index: int) -> tuple[NDArray[np.float32] | None, str]:
         values, given = self._depths[index], self._frame.views[index]
         if values is None:
-            return None, "the program submits none"
+            return None, "there is none"
         stated = DepthRange(given.min_depth, given.max_depth, given.near_m, given.far_m)
         meant, note = corrected_range(stated, self._engine)
         depth_m, other_note = planar_depth(

@@ -19,6 +19,7 @@ NEAR_RATIO = 2.0
 objects as close as that are drawn only with a near plane that is too far away."""
 
 FAR_RATIO = 4.0
+FAR_PLANE_RATIO = 0.99
 NOISE_RATIO = 0.5
 """Median difference of neighbors to median deviation: 1 in noise, 0.001 in a room."""
 
@@ -95,14 +96,14 @@ def planar_depth(
     is_valid = (sample >= given.min_depth) & (sample <= given.max_depth)
     if np.mean(is_valid) < 1.0 - MAX_INVALID_RATIO:
         return None, "most of its values are out of range"
-    if np.ptp(sample[is_valid]) == 0.0:
-        return None, f"all its values are {sample[is_valid][0]:g}"
-    if _is_noise(values[::CHECK_STRIDE]):
-        return None, "the values of neighboring pixels are unrelated"
     note = ""
     if _is_exchanged(sample[is_valid], given):
         given = given._replace(near_m=given.far_m, far_m=given.near_m)
         note = "its near and far planes are exchanged; corrected"
+    if _is_cleared(sample[is_valid], given):
+        return None, f"all its values are {sample[is_valid][0]:g}"
+    if _is_noise(values[::CHECK_STRIDE], given):
+        return None, "the values of neighboring pixels are unrelated"
     height_px, width_px = values.shape
     if (width_px, height_px) != size_px:
         values = values[_nearest(height_px, size_px[1])][
@@ -121,25 +122,47 @@ def _planar(values: Depth, given: DepthRange) -> Depth:
             values * np.float32(slope) + np.float32(1.0 / near_m - slope * low)
         )
     # Rounding at an infinite plane may give a small negative inverse.
-    is_valid = (values >= low) & (values <= high)
     far = np.float32(max(near_m, far_m))
     np.copyto(depth_m, far, where=~(depth_m > 0.0))
-    return np.where(is_valid, depth_m, np.float32(0.0))
+    return np.where(_has_depth(values, given), depth_m, np.float32(0.0))
+
+
+def _has_depth(values: Depth, given: DepthRange) -> NDArray[np.bool_]:
+    """Return which pixels have depth.
+
+    Nothing is drawn exactly at the near plane: such values are of pixels without depth,
+    as those that were not a number and were clamped.
+    """
+    low, high, near_m, far_m = given
+    if near_m < far_m:
+        return (values > low) & (values <= high)
+    return (values >= low) & (values < high)
 
 
 def _is_exchanged(values: Depth, given: DepthRange) -> bool:
     """Whether the image is only plausible with exchanged planes."""
-    own = float(np.median(_planar(values, given)))
-    other = given._replace(near_m=given.far_m, far_m=given.near_m)
-    exchanged = float(np.median(_planar(values, other)))
     near_m = min(given.near_m, given.far_m)
+    other = given._replace(near_m=given.far_m, far_m=given.near_m)
+    # Where nothing was drawn, exchanged planes have their near plane.
+    own = float(np.median(np.maximum(_planar(values, given), near_m)))
+    exchanged = float(np.median(np.maximum(_planar(values, other), near_m)))
     return own < NEAR_RATIO * near_m and (
         exchanged > FAR_RATIO * near_m or math.isinf(exchanged)
     )
 
 
-def _is_noise(rows: Depth) -> bool:
+def _is_cleared(values: Depth, given: DepthRange) -> bool:
+    """Whether nothing was drawn; a wall across the view has one value as well."""
+    if np.ptp(values) > 0.0:
+        return False
+    near_m, far_m = sorted((given.near_m, given.far_m))
+    depth_m = float(_planar(values[:1], given)[0])
+    return not NEAR_RATIO * near_m < depth_m < FAR_PLANE_RATIO * far_m
+
+
+def _is_noise(values: Depth, given: DepthRange) -> bool:
     """Whether neighbors in a row differ as much as pixels do on the whole."""
+    rows = np.where(_has_depth(values, given), values, np.float32(np.nan))
     own = rows[np.isfinite(rows)]
     spread = np.median(np.abs(own - np.median(own)))
     steps = np.abs(np.diff(rows, axis=1))

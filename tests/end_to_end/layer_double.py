@@ -1,13 +1,16 @@
-"""The layer's side of the connection to its helper, in Python."""
+"""The layer's side of the connection to its helper, in Python; a helper in a thread."""
 
+import contextlib
 import fcntl
 import os
 import socket
+import threading
 
 import numpy as np
 
 from clients.headset.simulated_runtime import eye_views, still
 from clients.openxr_layer import wire
+from clients.openxr_layer.helper import HelperOptions, LayerHelper
 from filter_service.shared_memory import Slot, aligned_starts
 
 TIMEOUT_S = 60.0
@@ -88,3 +91,63 @@ class LayerDouble:
         dtype = np.uint8 if frame.color_format != wire.LINEAR16F else np.float16
         shape = image.height_px, image.width_px, 4
         return self.slot.array(image.start, shape, np.dtype(dtype)).copy()
+
+
+class RunningHelper:
+    """A helper in a thread.
+
+    Parameters
+    ----------
+    path : Path
+        Its socket.
+    make_eyes : callable
+        Returns its filter and its `StereoGaze`; its argument prints a line.
+    **options
+        Those of `HelperOptions`.
+
+    Attributes
+    ----------
+    lines : list of str
+        What it has said.
+    changed : list of (eye, profile)
+        What it was told to change.
+    """
+
+    def __init__(self, path, make_eyes, **options):
+        self.lines, self.changed, self.errors = [], [], []
+        self.helper = None
+        self._path, self._make_eyes, self._options = path, make_eyes, options
+        self._is_over = threading.Event()
+        self._is_listening = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self):
+        self._thread.start()
+        assert self._is_listening.wait(TIMEOUT_S), self.errors
+        return self
+
+    def __exit__(self, *_):
+        self._is_over.set()
+        self._thread.join()
+        assert not self.errors
+
+    def _change(self, eye, text):
+        if text == "nobody":
+            raise ValueError("there is no eye 'nobody'")
+        self.changed.append((eye, text))
+
+    def _run(self):
+        try:
+            seeing, look = self._make_eyes(self.lines.append)
+            with contextlib.closing(seeing):
+                self.helper = LayerHelper(
+                    *(seeing, look, self.lines.append),
+                    *(HelperOptions(**self._options), self._change, self._path),
+                )
+                self._is_listening.set()
+                with contextlib.closing(self.helper):
+                    while not self._is_over.is_set():
+                        self.helper.run_once(0.02)
+        except BaseException as error:
+            self.errors.append(error)
+            raise

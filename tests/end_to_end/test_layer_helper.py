@@ -3,7 +3,6 @@
 import contextlib
 import os
 import socket
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from clients.openxr_layer import program, wire
 from clients.openxr_layer.helper import HelperOptions, LayerHelper, ask
 from filter_service import Camera, EyeFilter, FilterSettings, RgbdView
 from filter_service.messages import body_of_eye
-from tests.end_to_end.layer_double import LayerDouble
+from tests.end_to_end.layer_double import LayerDouble, RunningHelper
 
 SIZE_PX = (96, 72)
 PUPIL_MM, FOCUS_DPT = 4.0, 1.0
@@ -30,52 +29,17 @@ PROFILES = {
 }
 
 
-class RunningHelper:
-    """A helper in a thread."""
+def running_helper(path, **options):
+    return RunningHelper(path, real_eyes, **options)
 
-    def __init__(self, path, **options):
-        self.lines, self.changed, self.errors = [], [], []
-        self.path = path
-        self._options = options
-        self._is_over = threading.Event()
-        self._is_listening = threading.Event()
-        self._thread = threading.Thread(target=self._run)
 
-    def __enter__(self):
-        self._thread.start()
-        assert self._is_listening.wait(30.0), self.errors
-        return self
-
-    def __exit__(self, *_):
-        self._is_over.set()
-        self._thread.join()
-        assert not self.errors
-
-    def _change(self, eye, text):
-        if text == "nobody":
-            raise ValueError("there is no eye 'nobody'")
-        self.changed.append((eye, text))
-
-    def _run(self):
-        try:
-            seeing = LocalFilter(SETTINGS, self.lines.append)
-            for eye, profile in PROFILES.items():
-                seeing.change(eye, profile)
-            look = StereoGaze(
-                age_years=30.0, pupil_diameter_mm=PUPIL_MM, focus_dpt=FOCUS_DPT
-            )
-            self.helper = helper = LayerHelper(
-                *(seeing, look, self.lines.append),
-                *(HelperOptions(**self._options), self._change, self.path),
-            )
-            self._is_listening.set()
-            while not self._is_over.is_set():
-                helper.run_once(0.02)
-            helper.close()
-            seeing.close()
-        except BaseException as error:
-            self.errors.append(error)
-            raise
+def real_eyes(say):
+    """Return both eyes' filter, and their gaze and focus, which are fixed."""
+    seeing = LocalFilter(SETTINGS, say)
+    for eye, profile in PROFILES.items():
+        seeing.change(eye, profile)
+    look = StereoGaze(age_years=30.0, pupil_diameter_mm=PUPIL_MM, focus_dpt=FOCUS_DPT)
+    return seeing, look
 
 
 @pytest.fixture
@@ -96,7 +60,7 @@ def connect(path):
 
 @pytest.fixture
 def helper(path):
-    with RunningHelper(path) as running:
+    with running_helper(path) as running:
         yield running
 
 
@@ -234,7 +198,7 @@ def test_views_that_are_upside_down(helper, path, connect):
 
 
 def test_without_depth_everything_is_at_the_flat_distance(path, connect):
-    with RunningHelper(path, flat_dpt=2.0, is_split=True) as helper:
+    with running_helper(path, flat_dpt=2.0, is_split=True) as helper:
         layer = connect()
         layer.welcome()
         color, depth_m, _ = stripes(6)
@@ -360,7 +324,7 @@ def test_one_helper_per_socket(helper, path, connect):
 def test_a_socket_that_was_left_behind_is_replaced(path):
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left:
         left.bind(str(path))
-    with RunningHelper(path):
+    with running_helper(path):
         assert ask(path, {})["program"] is None
     assert not path.exists()
 

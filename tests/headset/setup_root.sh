@@ -1,5 +1,5 @@
 #!/bin/sh
-# Create a chroot with the OpenXR runtime Monado, Xvfb and this project, for tests.
+# Create a chroot with the OpenXR runtime Monado, X servers and this project, for tests.
 #
 #   sh tests/headset/setup_root.sh [ROOT]     default: $HEADSET_ROOT, or .headset in the
 #                                             checkout; 2.5 GB, a few minutes
@@ -21,7 +21,10 @@ case $root in /*) ;; *) root=$(pwd)/$root ;; esac
 RELEASE=trixie
 SYSTEM_PACKAGES="monado-service monado-cli libopenxr1-monado libopenxr-loader1
     mesa-vulkan-drivers libegl1 libgl1 libglx-mesa0 libgl1-mesa-dri libgles2
-    libopengl0 xvfb xauth python3 python3-venv gcc libc6-dev libgomp1 iproute2"
+    libopengl0 xvfb xauth python3 python3-venv gcc libc6-dev libgomp1 iproute2
+    libopenxr-dev libopenxr-utils libgl-dev libegl-dev libx11-dev
+    openxr-layer-apidump openxr-layer-corevalidation
+    xserver-xorg-core xserver-xorg-video-dummy"
 PYTHON_PACKAGES="pytest pyopenxr>=1.1,<1.2 trimesh networkx"
 MARK=$root/.ocufilter-root
 SYSTEM_STAMP=$root/.ocufilter-system
@@ -132,7 +135,7 @@ install_system() {
     find_mirror
     make_base
     copy_host_settings
-    step "installing Monado, Mesa and Xvfb (half a minute)" \
+    step "installing Monado, Mesa and X servers (half a minute)" \
         in_root sh -c 'apt-get update && DEBIAN_FRONTEND=noninteractive \
             apt-get install -y --no-install-recommends "$@" && apt-get clean' \
         sh $SYSTEM_PACKAGES

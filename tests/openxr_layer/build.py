@@ -2,6 +2,7 @@
 
 build_runtime   mock_runtime/, with its manifest for XR_RUNTIME_JSON
 build_driver    driver/
+build_layer     the layer itself
 missing         what this machine lacks for that
 thread_sanitizer_options   for programs built with -fsanitize=thread
 
@@ -14,13 +15,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.native_build import extension
+from tests.source_tree import ROOT
+
 RUNTIME = Path(__file__).with_name("mock_runtime")
 DRIVER = Path(__file__).with_name("driver")
 COMPILER = shutil.which("cc")
 HEADERS = ("openxr/openxr.h", "openxr/openxr_platform.h", "GL/glx.h", "EGL/egl.h")
 INCLUDE = Path("/usr/include")
 
-FLAGS = ("-std=gnu11", "-O1", "-g", "-Wall", "-Wextra", "-Werror")
+WARNINGS = ("-Wall", "-Wextra", "-Werror")
+FLAGS = ("-std=gnu11", "-O1", "-g", *WARNINGS)
 UNSEEN_LIBRARIES = ("libgallium", "libEGL_mesa", "libGLX_mesa")
 LIBRARIES = ("-lGL", "-lEGL", "-lX11", "-lm", "-lpthread")
 
@@ -69,6 +74,20 @@ def build_driver(folder: Path, *flags: str) -> Path:
         sorted(DRIVER.glob("*.c")), program, flags, (*LIBRARIES, "-lopenxr_loader")
     )
     return program
+
+
+def build_layer(folder: Path, *flags: str) -> Path:
+    """Compile the layer as the package does; return its path.  As `build_runtime`."""
+    library = folder / "layer.so"
+    own = extension("_layer")
+    command = (COMPILER, "-shared", "-fPIC", *own.extra_compile_args, *WARNINGS, "-g")
+    libraries = [f"-l{name}" for name in own.libraries]
+    subprocess.run(
+        [*command, *flags, *own.sources, "-o", str(library), "-pthread", *libraries],
+        cwd=ROOT,
+        check=True,
+    )
+    return library
 
 
 def thread_sanitizer_options(folder: Path) -> dict[str, str]:

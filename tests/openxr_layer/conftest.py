@@ -40,6 +40,12 @@ def watched(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def layer(tmp_path_factory):
+    """Return the path of the layer's library."""
+    return build.build_layer(tmp_path_factory.mktemp("layer"))
+
+
+@pytest.fixture(scope="session")
 def display(tmp_path_factory):
     """Return the name of a display with a dummy screen."""
     if shutil.which("Xorg") is None:

@@ -193,3 +193,20 @@ def test_depth_of_qt():
     as_stated = DepthRange(0.0, 1.0, 0.05, 20.0)
     assert corrected_range(as_stated, "Qt") == (as_stated, "")
     assert corrected_range(DepthRange(0.0, 1.0, 5.0, 2000.0), "other")[1] == ""
+
+
+def test_a_wall_across_the_view_is_depth():
+    values = projected(np.full((HEIGHT_PX, WIDTH_PX), 2.0), 0.1, 100.0)
+    found_m, note = planar_depth(values.astype(np.float32), GOOD, (WIDTH_PX, HEIGHT_PX))
+    assert note == ""
+    np.testing.assert_allclose(found_m, 2.0, rtol=1e-5)
+
+
+def test_values_at_the_near_plane_are_missing_depth():
+    depth_m = scene_m()
+    values = projected(depth_m, 0.1, 100.0).astype(np.float32)
+    values[:, 1::2] = 0.0
+    found_m, note = planar_depth(values, GOOD, (WIDTH_PX, HEIGHT_PX))
+    assert note == ""
+    assert (found_m[:, 1::2] == 0.0).all()
+    np.testing.assert_allclose(found_m[:, ::2], depth_m[:, ::2], rtol=1e-3)

@@ -1,0 +1,335 @@
+"""What the runtime is shown of a program with the layer, on the mock runtime.
+
+The filter inverts pictures, so that each shown picture tells its frame and whether it
+was filtered.
+"""
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+
+from tests.end_to_end.layer_double import RunningHelper
+from tests.native_build import runtime_of
+from tests.openxr_layer import build
+from tests.openxr_layer.captured import drawn, pixels_of
+from tests.openxr_layer.layered import (
+    LONG_MS,
+    inverting_eyes,
+    layer_environment,
+    run,
+)
+
+N_FRAMES = 12
+SIZE_PX = (128, 96)
+MOCK = {
+    "MOCK_XR_RATE_HZ": "0",
+    "MOCK_XR_SIZE": "{}x{}".format(*SIZE_PX),
+    "LP_NUM_THREADS": "1",
+}
+
+
+class Stage:
+    """The layer, the mock runtime and the driver; and a helper, if one is started."""
+
+    def __init__(self, library, runtime, driver, folder, monkeypatch):
+        self.folder, self.driver = folder, driver
+        self.path = folder / "layer.sock"
+        self._library, self._monkeypatch = library, monkeypatch
+        self._runtime = runtime
+
+    def environment(self, **variables):
+        own = layer_environment(
+            self._library, self.folder, self.path, self._monkeypatch
+        )
+        return own | MOCK | {"XR_RUNTIME_JSON": str(self._runtime)} | variables
+
+    def run(self, case, *options, n_frames=N_FRAMES, **variables):
+        shutil.rmtree(self.folder / "captured", ignore_errors=True)
+        command = (self.driver, case, "--frames", n_frames, *options)
+        return run(command, self.folder, self.environment(**variables))
+
+    def helper(self, *, wait_ms=LONG_MS, **options):
+        return RunningHelper(self.path, inverting_eyes, wait_ms=wait_ms, **options)
+
+
+@pytest.fixture
+def stage(layer, runtime, driver, tmp_path, monkeypatch):
+    return Stage(layer, runtime, driver, tmp_path, monkeypatch)
+
+
+def floats(numbers):
+    return [float.fromhex(number) for number in numbers]
+
+
+FULL = {"GL_RGBA16F": 1.0, "GL_RGB10_A2": 1023.0}
+
+
+def levels(view, pixels):
+    """Return colors as bytes, exactly or as they are stored."""
+    return 255.0 * pixels[..., :3] / FULL.get(view["format"], 255.0)
+
+
+def kind_of(view, pixels, number, eye):
+    """Return "own", "filtered", or "neither" for the picture of a frame."""
+    found = levels(view, pixels)
+    expected = drawn(number, eye, view["rect"][2:]).astype(float)
+    for name, picture in {"own": expected, "filtered": 255.0 - expected}.items():
+        if np.abs(found - picture).max() <= 0.51:
+            return name
+    return "neither"
+
+
+def shown_kinds(ran, *, index=0):
+    """Return for each frame how its views are shown, with their own poses."""
+    kinds = []
+    for told, frame in ran.pairs():
+        layer = frame["layers"][index]
+        found = set()
+        for eye, view in enumerate(layer["views"]):
+            assert view["pose"] + view["fov"] == floats(told["views"][eye])
+            pixels = pixels_of(ran.captured, view)
+            found.add(kind_of(view, pixels, told["frame"], eye))
+        assert len(found) == 1
+        kinds.append(found.pop())
+    return kinds
+
+
+def check_clean(ran, n_frames=N_FRAMES):
+    assert ran.violations == []
+    assert ran.exit_code == 0, ran.told[-1]
+    assert ran.told[-1]["frames"] == n_frames
+
+
+def is_filtered_after_start(kinds):
+    """Whether all but the first frames, before there is a connection, are filtered."""
+    first = kinds.index("filtered")
+    return first <= len(kinds) // 2 and set(kinds[first:]) == {"filtered"}
+
+
+# What is filtered
+
+FILTERED = ["plain", "array", "wide", "offset", "msaa4", "dynamic-size"]
+FILTERED += ["other-thread", "no-context", "space-destroyed", "end-from-thread"]
+
+
+@pytest.mark.parametrize("case", FILTERED)
+def test_frames_are_filtered(stage, case):
+    with stage.helper():
+        ran = stage.run(case, "--check-state")
+    check_clean(ran)
+    kinds = shown_kinds(ran)
+    assert is_filtered_after_start(kinds)
+    # The depth is that of another frame in general, and is dropped.
+    has_depth = ["depth" in f["layers"][0]["views"][0] for f in ran.frames]
+    assert has_depth == [kind == "own" for kind in kinds]
+
+
+@pytest.mark.parametrize("kind", ["RGBA8", "SRGB8_ALPHA8", "RGB10_A2", "RGBA16F"])
+def test_formats(stage, kind):
+    with stage.helper():
+        ran = stage.run("plain", "--format", kind)
+    check_clean(ran)
+    assert is_filtered_after_start(shown_kinds(ran))
+    assert {f["layers"][0]["views"][0]["format"] for f in ran.frames} == {f"GL_{kind}"}
+
+
+def test_on_glx(stage, display):
+    with stage.helper():
+        ran = stage.run("plain", "--check-state", "--glx", DISPLAY=display)
+    check_clean(ran)
+    assert is_filtered_after_start(shown_kinds(ran))
+
+
+# What is not
+
+
+def test_without_a_helper_frames_are_the_own(stage):
+    ran = stage.run("plain", "--check-state")
+    check_clean(ran)
+    assert set(shown_kinds(ran)) == {"own"}
+    assert ran.layer_lines == ["no helper is connected; trying again every second"]
+
+
+@pytest.mark.parametrize(
+    ("case", "line"),
+    [
+        ("view-locked", "fixed to the head"),
+        ("action-space", "fixed to the head"),
+        ("mono", "layers of 1 views are not filtered"),
+    ],
+)
+def test_other_layers_pass(stage, case, line):
+    with stage.helper():
+        ran = stage.run(case, MOCK_XR_MONO="1")
+    check_clean(ran)
+    assert set(shown_kinds(ran)) == {"own"}
+    assert sum(line in said for said in ran.layer_lines) == 1
+
+
+@pytest.mark.parametrize(
+    ("case", "index"), [("two-layers", 0), ("quad-below", 1), ("quad-above", 0)]
+)
+def test_one_of_several_layers_is_filtered(stage, case, index):
+    with stage.helper():
+        ran = stage.run(case)
+    check_clean(ran)
+    assert is_filtered_after_start(shown_kinds(ran, index=index))
+    for told, frame in ran.pairs():
+        other = frame["layers"][1 - index]
+        assert other["type"] == ("projection" if case == "two-layers" else "quad")
+        if other["type"] == "quad":
+            pixels = pixels_of(ran.captured, other)
+            assert kind_of(other, pixels, told["frame"], 2) == "own"
+        else:
+            assert other["flags"] == frame["layers"][1]["flags"]
+
+
+def test_alpha_is_kept(stage):
+    with stage.helper():
+        ran = stage.run("alpha")
+    check_clean(ran)
+    assert is_filtered_after_start(shown_kinds(ran))
+    layer = ran.frames[-1]["layers"][0]
+    alpha = pixels_of(ran.captured, layer["views"][0])[..., 3]
+    width_px = SIZE_PX[0]
+    expected = np.round(255 * np.arange(width_px) / width_px)
+    np.testing.assert_array_equal(alpha, np.broadcast_to(expected, alpha.shape))
+
+
+def test_a_flipped_view_is_filtered(stage):
+    with stage.helper():
+        ran = stage.run("fov-flipped")
+    check_clean(ran)
+    kinds = set()
+    for told, frame in ran.pairs():
+        view = frame["layers"][0]["views"][0]
+        assert view["fov"][2] < view["fov"][3]
+        pixels = pixels_of(ran.captured, view)
+        kinds |= {kind_of(view, pixels, told["frame"], 0)}
+        kinds |= {kind_of(view, pixels[::-1], told["frame"], 0)}
+    assert "filtered" in kinds
+
+
+@pytest.mark.parametrize("case", ["reuse", "half-rate"])
+def test_images_without_a_new_release_are_filtered(stage, case):
+    with stage.helper():
+        ran = stage.run(case, n_frames=40)
+    check_clean(ran, 40)
+    last = ran.frames[-1]["layers"][0]["views"][0]
+    pixels = pixels_of(ran.captured, last)
+    numbers = [line["frame"] for line in ran.told if "frame" in line]
+    kinds = {kind_of(last, pixels, number, 0) for number in numbers}
+    # An image that was released before there was a helper has no copy.
+    assert kinds & {"own", "filtered"} == {"own" if case == "reuse" else "filtered"}
+
+
+@pytest.mark.parametrize("case", ["restart", "second-session"])
+def test_sessions_one_after_the_other(stage, case):
+    with stage.helper():
+        ran = stage.run(case, n_frames=40, MOCK_XR_RATE_HZ="30")
+    check_clean(ran, 120)
+    kinds = shown_kinds(ran)
+    assert set(kinds) == {"own", "filtered"}
+    if case == "restart":  # else two of them are open at the same time
+        assert kinds[39::40] == ["filtered"] * 3
+    assert kinds[-1] == "filtered"
+
+
+def test_runtime_without_depth(stage):
+    with stage.helper():
+        ran = stage.run(
+            "plain", MOCK_XR_EXTENSIONS="XR_KHR_opengl_enable,XR_MNDX_egl_enable"
+        )
+    check_clean(ran)
+    assert is_filtered_after_start(shown_kinds(ran))
+
+
+def test_runtime_without_depth_nor_helper(stage):
+    ran = stage.run(
+        "plain", MOCK_XR_EXTENSIONS="XR_KHR_opengl_enable,XR_MNDX_egl_enable"
+    )
+    check_clean(ran)
+    assert set(shown_kinds(ran)) == {"own"}
+
+
+def test_images_that_the_runtime_still_reads(stage):
+    with stage.helper():
+        ran = stage.run("plain", MOCK_XR_WAIT_TIMEOUTS="9", n_frames=40)
+    check_clean(ran, 40)
+    kinds = shown_kinds(ran)
+    assert kinds[-1] == "filtered"
+
+
+def test_a_session_that_is_lost(stage):
+    for when in ("6", "6,instance"):
+        with stage.helper():
+            ran = stage.run("plain", MOCK_XR_LOSE_AT=when)
+        assert ran.exit_code == 1
+        assert ran.told[-1]["error"].endswith("_LOST")
+        assert ran.violations == []
+
+
+# Depth
+
+DEPTH_NOTES = {
+    "depth-constant": "all its values are",
+    "depth-nan": "",
+    "depth-swapped": "exchanged; corrected",
+    "depth-zero-near": "planes are at 0",
+    "depth-equal": "both its planes are at 1 m",
+    "depth-range": "the range of the buffer",
+    "depth-size": "",
+    "depth-stale": "there is none",  # it was released before there was a helper
+    "depth-rect": "there is none",
+    "depth-garbage": "unrelated",
+    "depth-other-array": "",
+}
+
+
+@pytest.mark.parametrize("case", DEPTH_NOTES)
+def test_wrong_depth(stage, case):
+    with stage.helper() as helper:
+        ran = stage.run(case, MOCK_XR_LENIENT_DEPTH="1")
+    assert ran.exit_code == 0
+    assert is_filtered_after_start(shown_kinds(ran))
+    notes = [line for line in helper.lines if "depth" in line]
+    assert bool(notes) == bool(DEPTH_NOTES[case])
+    assert DEPTH_NOTES[case] in "".join(notes)
+
+
+# Threads and memory
+
+
+@pytest.mark.parametrize(
+    "case", ["plain", "other-thread", "end-from-thread", "restart", "no-context"]
+)
+def test_threads_do_not_race(runtime, tmp_path, monkeypatch, case):
+    if runtime_of("thread") is None:
+        pytest.skip("no ThreadSanitizer here")
+    flag = "-fsanitize=thread"
+    library = build.build_layer(tmp_path, flag)
+    program = build.build_driver(tmp_path, flag)
+    stage = Stage(library, runtime, program, tmp_path, monkeypatch)
+    with stage.helper():
+        ran = stage.run(case, "--threads", **build.thread_sanitizer_options(tmp_path))
+    assert "WARNING: ThreadSanitizer" not in ran.said
+    check_clean(ran, 3 * N_FRAMES if case == "restart" else N_FRAMES)
+    assert "filtered" in shown_kinds(ran) or case == "restart"
+
+
+def test_addresses_are_valid(runtime, driver, tmp_path, monkeypatch):
+    preloaded = runtime_of("address")
+    if preloaded is None:
+        pytest.skip("no AddressSanitizer here")
+    library = build.build_layer(tmp_path, "-fsanitize=address,undefined")
+    stage = Stage(library, runtime, driver, tmp_path, monkeypatch)
+    variables = {"LD_PRELOAD": str(preloaded), "ASAN_OPTIONS": "detect_leaks=0"}
+    for case, n_frames in {"msaa4": 12, "second-session": 36, "two-layers": 12}.items():
+        with stage.helper():
+            ran = stage.run(case, **variables)
+        assert not re.search("ERROR: AddressSanitizer|runtime error", ran.said), (
+            ran.said
+        )
+        check_clean(ran, n_frames)
