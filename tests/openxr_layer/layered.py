@@ -3,9 +3,11 @@
 import json
 import os
 import subprocess
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from clients.headset.local_filter import LocalFilter
 from clients.headset.stereo_filter import FilteredStereoFrame
 from clients.headset.stereo_gaze import StereoGaze
 from clients.openxr_layer import manifest
@@ -98,18 +100,18 @@ def run(command, folder, environment):
 
 
 class Inverting:
-    """Filter that returns each picture inverted."""
+    """Filter that returns each picture inverted, after a time in s."""
 
     settings = None
 
-    def __init__(self):
-        self.frames = []
+    def __init__(self, takes_s=0.0):
+        self.takes_s = takes_s
 
     def change(self, eye, profile):
         """There are no eyes."""
 
     def see(self, frame):
-        self.frames.append(frame)
+        time.sleep(self.takes_s)
         return FilteredStereoFrame(
             frame,
             tuple(picture.view for picture in frame.pictures),
@@ -131,7 +133,41 @@ def inverted(color):
     return (255 if color.dtype.kind == "u" else 1) - color
 
 
-def inverting_eyes(_say):
-    """Return the inverting filter, and eyes that look ahead with fixed focus."""
-    look = StereoGaze(age_years=30.0, pupil_diameter_mm=4.0, focus_dpt=1.0)
-    return Inverting(), look
+class Patient:
+    """Filter that waits until its eyes are prepared."""
+
+    def __init__(self, seeing):
+        self._seeing = seeing
+        self.restart, self.close = seeing.restart, seeing.close
+
+    def see(self, frame):
+        while True:
+            seen = self._seeing.see(frame)
+            if seen is not None and seen.is_complete:
+                return seen
+            time.sleep(0.01)
+
+
+PUPIL_MM, FOCUS_DPT = 4.0, 1.0
+
+
+def frozen_look():
+    """Return eyes that look straight ahead, with fixed pupils and focus."""
+    return StereoGaze(age_years=30.0, pupil_diameter_mm=PUPIL_MM, focus_dpt=FOCUS_DPT)
+
+
+def inverting_eyes(_say, takes_s=0.0):
+    """Return the inverting filter, and frozen eyes."""
+    return Inverting(takes_s), frozen_look()
+
+
+def frozen_eyes(profiles, settings):
+    """Return how to make the filter of two real eyes, and frozen eyes."""
+
+    def made(say):
+        seeing = LocalFilter(settings, say)
+        for eye, profile in profiles.items():
+            seeing.change(eye, profile)
+        return Patient(seeing), frozen_look()
+
+    return made
