@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from clients.frame_log import percentiles
 from clients.headset.poses import angles_of, rotation_of
 from clients.headset.runtime import EYES, DueFrame, Eye, GazeSample
+from clients.headset.service_filter import LogOnce
 from clients.headset.stereo_filter import Say, StereoFilter, StereoFrame
 from clients.headset.stereo_gaze import RgbdPicture, StereoGaze
 from clients.headset.viewer import SPLIT_RATIO
@@ -77,6 +78,11 @@ class HelperOptions:
     is_split: bool = False
 
     @property
+    def longest_age_ms(self) -> int:
+        """Return the age up to which a frame is shown, also one that was waited for."""
+        return max(self.max_age_ms, self.wait_ms)
+
+    @property
     def flat_m(self) -> float:
         """Return the planar depth of programs without depth."""
         return 1.0 / self.flat_dpt if self.flat_dpt else float("inf")
@@ -128,6 +134,7 @@ class LayerHelper:
         path: Path,
     ) -> None:
         self._seeing, self._look, self._say = seeing, look, say
+        self._say_once = LogOnce(say)
         self._options, self._change = options, change
         self._path = path
         self._listener = _listening(path)
@@ -227,7 +234,7 @@ class LayerHelper:
         self._program = _Program(connection, name, engine)
         welcome = wire.Welcome(
             *(wire.WELCOME, wire.MAGIC, wire.VERSION, 1),
-            *(self._options.wait_ms, self._options.max_age_ms),
+            *(self._options.wait_ms, self._options.longest_age_ms),
         )
         self._say(f"{name}: connected")
         self._seeing.restart()
@@ -357,7 +364,7 @@ class LayerHelper:
             looked_s = time.monotonic()
             seen = self._seeing.see(frame)
         except (FilterError, ValueError) as error:
-            self._say(f"a frame is not filtered: {error}")
+            self._say_once(f"a frame is not filtered: {error}")
             return False
         if self.on_frame is not None:
             self.on_frame(frame, seen)
@@ -379,7 +386,7 @@ class LayerHelper:
 
     def _tell_time(self, took_ms: float) -> None:
         """Report that results are too old, unless a few are."""
-        limit_ms = max(self._options.max_age_ms, self._options.wait_ms)
+        limit_ms = self._options.longest_age_ms
         self._n_late = self._n_late + 1 if took_ms > limit_ms else 0
         if self._n_late == N_LATE:
             self._say(
