@@ -146,7 +146,8 @@ class LayerHelper:
         self.on_gaze: Callable[[], None] = lambda: None  # an eye tracker was found
         self._stages_ms: dict[str, deque[float]] = {}
         self._n_late = 0
-        self.n_frames = self.n_shown = self.n_filtered = self.n_unready = 0
+        self.n_frames = self.n_unready = 0
+        self.n_submitted = self.n_shown = self.n_lapsed = 0
 
     def close(self) -> None:
         """Close all connections and remove the socket."""
@@ -402,8 +403,9 @@ class LayerHelper:
     def _count(self, frame: wire.Frame, is_filtered: bool) -> None:
         self.n_frames += 1
         self.n_unready += not is_filtered
-        self.n_shown += frame.frames
-        self.n_filtered += frame.frames_filtered
+        self.n_submitted += frame.frames
+        self.n_shown += frame.frames_filtered
+        self.n_lapsed += frame.frames_lapsed
         if frame.frames:
             self._note(
                 **{
@@ -419,8 +421,9 @@ class LayerHelper:
         return {
             "filtered": self.n_frames - self.n_unready,
             "not_filtered": self.n_unready,
-            "submitted": self.n_shown,
-            "shown_filtered": self.n_filtered,
+            "submitted": self.n_submitted,
+            "shown_filtered": self.n_shown,
+            "lapsed": self.n_lapsed,
             "stages_ms": {
                 name: percentiles(list(times))
                 for name, times in self._stages_ms.items()

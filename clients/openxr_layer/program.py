@@ -343,8 +343,9 @@ def _print_report(helper: LayerHelper, options: argparse.Namespace) -> None:
         sys.stdout.write(json.dumps(report) + "\n")
         return
     say(
-        f"{report['filtered']} frames filtered, {report['shown_filtered']} of "
-        f"{report['submitted']} shown filtered"
+        f"{report['filtered']} frames filtered; {report['shown_filtered']} of "
+        f"{report['submitted']} frames shown filtered, {report['lapsed']} shown "
+        "unfiltered after the first of them"
     )
     for name, values in report["stages_ms"].items():
         words = ", ".join(f"{p} {value:g}" for p, value in values.items())

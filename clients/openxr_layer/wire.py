@@ -93,7 +93,7 @@ class Frame(ctypes.Structure):
         *(
             (name, c_uint32)
             for name in (
-                *("frames", "frames_filtered"),
+                *("frames", "frames_filtered", "frames_lapsed", "padding"),
                 *("copy_us", "read_us", "upload_us", "other_us"),
             )
         ),

@@ -288,13 +288,14 @@ static void send_read(session *at, slot *of, uint64_t limit_ns) {
     wire_frame *frame = &of->frame;
     frame->frames = at->frames;
     frame->frames_filtered = at->frames_filtered;
+    frame->frames_lapsed = at->frames_lapsed;
     frame->copy_us = (uint32_t)(at->copy_ns / 1000);
     frame->read_us = (uint32_t)(at->read_ns / 1000);
     frame->upload_us = (uint32_t)(at->upload_ns / 1000);
     frame->other_us = (uint32_t)(at->other_ns / 1000);
     of->state = link_send(&at->link, frame) ? SLOT_SENT : SLOT_FREE;
     if (of->state == SLOT_FREE) return;
-    at->frames = at->frames_filtered = 0;
+    at->frames = at->frames_filtered = at->frames_lapsed = 0;
     at->copy_ns = at->read_ns = at->upload_ns = at->other_ns = 0;
 }
 
@@ -556,6 +557,8 @@ XrResult frames_end(session *at, const XrFrameEndInfo *info) {
         XrSpace base = is_shown_valid(at, info->displayTime)
                            ? own_space(at, &at->shown.kind)
                            : XR_NULL_HANDLE;
+        at->has_filtered |= base != XR_NULL_HANDLE;
+        at->frames_lapsed += at->has_filtered && !base;
         if (base) {
             ++at->frames_filtered;
             set_substitute(at, &p, base, &made);

@@ -126,7 +126,8 @@ typedef struct session {
     XrSpace view_space, gaze_space;
     bool is_gaze_attached;
     XrTime recentered;     /* poses of frames before that time are invalid */
-    uint32_t frames, frames_filtered;
+    bool has_filtered;     /* a frame was shown filtered */
+    uint32_t frames, frames_filtered, frames_lapsed;
     uint64_t copy_ns, read_ns, upload_ns, other_ns;
 } session;
 

@@ -68,9 +68,10 @@ typedef struct {
     float gaze[4];        /* orientation within the head; -z points ahead */
     int64_t gaze_time_ns; /* 0: unknown */
     wire_view views[WIRE_EYES];
-    /* since the previous FRAME: frames that the application submitted, and what the
-     * layer took on its threads */
-    uint32_t frames, frames_filtered;
+    /* since the previous FRAME: frames that the application submitted, those shown
+     * filtered, those shown as they were although others had been filtered before, and
+     * the time that the layer took on the application's threads */
+    uint32_t frames, frames_filtered, frames_lapsed, padding;
     uint32_t copy_us, read_us, upload_us, other_us;
 } wire_frame;
 
