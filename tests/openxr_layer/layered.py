@@ -1,20 +1,13 @@
-"""Programs that run with the layer, on the mock runtime or another one."""
+"""Environments of programs with the layer, and filters for its helper."""
 
-import json
-import os
-import subprocess
 import time
-from dataclasses import dataclass, field
-from pathlib import Path
 
 from clients.headset.local_filter import LocalFilter
 from clients.headset.stereo_filter import FilteredStereoFrame
 from clients.headset.stereo_gaze import StereoGaze
 from clients.openxr_layer import manifest
 from clients.openxr_layer.helper import SOCKET_VARIABLE
-from tests.openxr_layer.captured import read_frames
 
-TIMEOUT_S = 90
 LAYER_LINE = "ocufilter layer: "
 LONG_MS = 60_000
 
@@ -36,67 +29,12 @@ def layer_environment(library, folder, socket_path, monkeypatch):
     return manifest.layered_environment(folder) | {SOCKET_VARIABLE: str(socket_path)}
 
 
-@dataclass
-class Ran:
-    """A program that has ended.
-
-    Attributes
-    ----------
-    exit_code : int
-    said : str
-        Standard error.
-    told : list of dict
-        JSON on standard output.
-    captured : Path
-        Folder of the mock runtime's captures.
-    """
-
-    exit_code: int
-    said: str
-    told: list = field(repr=False)
-    captured: Path
-
-    @property
-    def frames(self):
-        """Frames that had layers."""
-        found = (self.captured / "frames.jsonl").exists()
-        return [f for f in read_frames(self.captured) if f["layers"]] if found else []
-
-    @property
-    def violations(self):
-        return [line for line in self.said.splitlines() if "violation" in line]
-
-    @property
-    def layer_lines(self):
-        """What the layer has said."""
-        lines = self.said.splitlines()
-        return [
-            line.removeprefix(LAYER_LINE)
-            for line in lines
-            if line.startswith(LAYER_LINE)
-        ]
-
-    def pairs(self):
-        """Yield what the driver tells of each frame, and what was captured of it."""
-        shown = {frame["display_time"]: frame for frame in self.frames}
-        for line in self.told:
-            if "frame" in line:
-                yield line, shown[line["display_time"]]
-
-
-def run(command, folder, environment):
-    """Run a program to its end, with captures in a folder."""
-    captured = folder / "captured"
-    done = subprocess.run(
-        list(map(str, command)),
-        env=os.environ | environment | {"MOCK_XR_CAPTURE": str(captured)},
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT_S,
-    )
-    lines = done.stdout.splitlines()
-    told = [json.loads(line) for line in lines if line.startswith("{")]
-    return Ran(done.returncode, done.stderr, told, captured)
+def layer_lines(run):
+    """Return what the layer has said in a `Run`."""
+    lines = run.said.splitlines()
+    return [
+        line.removeprefix(LAYER_LINE) for line in lines if line.startswith(LAYER_LINE)
+    ]
 
 
 class Inverting:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tests.openxr_layer.captured import read_frames
 
-TIMEOUT_S = 60
+TIMEOUT_S = 150
 SIZE_PX = (128, 96)
 """Of a view, unless MOCK_XR_SIZE says otherwise."""
 

@@ -18,16 +18,11 @@ from tests.openxr_layer.layered import (
     LONG_MS,
     inverting_eyes,
     layer_environment,
-    run,
+    layer_lines,
 )
+from tests.openxr_layer.programs import SIZE_PX, Run
 
 N_FRAMES = 12
-SIZE_PX = (128, 96)
-MOCK = {
-    "MOCK_XR_RATE_HZ": "0",
-    "MOCK_XR_SIZE": "{}x{}".format(*SIZE_PX),
-    "LP_NUM_THREADS": "1",
-}
 
 
 class Stage:
@@ -39,16 +34,13 @@ class Stage:
         self._library, self._monkeypatch = library, monkeypatch
         self._runtime = runtime
 
-    def environment(self, **variables):
+    def run(self, case, *options, n_frames=N_FRAMES, **variables):
         own = layer_environment(
             self._library, self.folder, self.path, self._monkeypatch
         )
-        return own | MOCK | {"XR_RUNTIME_JSON": str(self._runtime)} | variables
-
-    def run(self, case, *options, n_frames=N_FRAMES, **variables):
         shutil.rmtree(self.folder / "captured", ignore_errors=True)
         command = (self.driver, case, "--frames", n_frames, *options)
-        return run(command, self.folder, self.environment(**variables))
+        return Run(self._runtime, self.folder, *command, **(own | variables))
 
     def helper(self, *, wait_ms=LONG_MS, **options):
         return RunningHelper(self.path, inverting_eyes, wait_ms=wait_ms, **options)
@@ -72,7 +64,7 @@ def levels(view, pixels):
 
 
 def kind_of(view, pixels, number, eye):
-    """Return "own", "filtered", or "neither" for the picture of a frame."""
+    """Return whether the picture of a frame is its "own", "filtered", or neither."""
     found = levels(view, pixels)
     expected = drawn(number, eye, view["rect"][2:]).astype(float)
     for name, picture in {"own": expected, "filtered": 255.0 - expected}.items():
@@ -89,7 +81,7 @@ def shown_kinds(ran, *, index=0):
         found = set()
         for eye, view in enumerate(layer["views"]):
             assert view["pose"] + view["fov"] == floats(told["views"][eye])
-            pixels = pixels_of(ran.captured, view)
+            pixels = pixels_of(ran.folder, view)
             found.add(kind_of(view, pixels, told["frame"], eye))
         assert len(found) == 1
         kinds.append(found.pop())
@@ -149,7 +141,7 @@ def test_without_a_helper_frames_are_the_own(stage):
     ran = stage.run("plain", "--check-state")
     check_clean(ran)
     assert set(shown_kinds(ran)) == {"own"}
-    assert ran.layer_lines == ["no helper is connected; trying again every second"]
+    assert layer_lines(ran) == ["no helper is connected; trying again every second"]
 
 
 @pytest.mark.parametrize(
@@ -165,7 +157,7 @@ def test_other_layers_pass(stage, case, line):
         ran = stage.run(case, MOCK_XR_MONO="1")
     check_clean(ran)
     assert set(shown_kinds(ran)) == {"own"}
-    assert sum(line in said for said in ran.layer_lines) == 1
+    assert sum(line in said for said in layer_lines(ran)) == 1
 
 
 @pytest.mark.parametrize(
@@ -180,7 +172,7 @@ def test_one_of_several_layers_is_filtered(stage, case, index):
         other = frame["layers"][1 - index]
         assert other["type"] == ("projection" if case == "two-layers" else "quad")
         if other["type"] == "quad":
-            pixels = pixels_of(ran.captured, other)
+            pixels = pixels_of(ran.folder, other)
             assert kind_of(other, pixels, told["frame"], 2) == "own"
         else:
             assert other["flags"] == frame["layers"][1]["flags"]
@@ -192,7 +184,7 @@ def test_alpha_is_kept(stage):
     check_clean(ran)
     assert is_filtered_after_start(shown_kinds(ran))
     layer = ran.frames[-1]["layers"][0]
-    alpha = pixels_of(ran.captured, layer["views"][0])[..., 3]
+    alpha = pixels_of(ran.folder, layer["views"][0])[..., 3]
     width_px = SIZE_PX[0]
     expected = np.round(255 * np.arange(width_px) / width_px)
     np.testing.assert_array_equal(alpha, np.broadcast_to(expected, alpha.shape))
@@ -206,7 +198,7 @@ def test_a_flipped_view_is_filtered(stage):
     for told, frame in ran.pairs():
         view = frame["layers"][0]["views"][0]
         assert view["fov"][2] < view["fov"][3]
-        pixels = pixels_of(ran.captured, view)
+        pixels = pixels_of(ran.folder, view)
         kinds |= {kind_of(view, pixels, told["frame"], 0)}
         kinds |= {kind_of(view, pixels[::-1], told["frame"], 0)}
     assert "filtered" in kinds
@@ -218,7 +210,7 @@ def test_images_without_a_new_release_are_filtered(stage, case):
         ran = stage.run(case, n_frames=40)
     check_clean(ran, 40)
     last = ran.frames[-1]["layers"][0]["views"][0]
-    pixels = pixels_of(ran.captured, last)
+    pixels = pixels_of(ran.folder, last)
     numbers = [line["frame"] for line in ran.told if "frame" in line]
     kinds = {kind_of(last, pixels, number, 0) for number in numbers}
     # An image that was released before there was a helper has no copy.
@@ -305,13 +297,9 @@ def test_wrong_depth(stage, case):
 @pytest.mark.parametrize(
     "case", ["plain", "other-thread", "end-from-thread", "restart", "no-context"]
 )
-def test_threads_do_not_race(runtime, tmp_path, monkeypatch, case):
-    if runtime_of("thread") is None:
-        pytest.skip("no ThreadSanitizer here")
-    flag = "-fsanitize=thread"
-    library = build.build_layer(tmp_path, flag)
-    program = build.build_driver(tmp_path, flag)
-    stage = Stage(library, runtime, program, tmp_path, monkeypatch)
+def test_threads_do_not_race(watched, tmp_path, monkeypatch, case):
+    library = build.build_layer(tmp_path, "-fsanitize=thread")
+    stage = Stage(library, *watched, tmp_path, monkeypatch)
     with stage.helper():
         ran = stage.run(case, "--threads", **build.thread_sanitizer_options(tmp_path))
     assert "WARNING: ThreadSanitizer" not in ran.said

@@ -13,7 +13,7 @@ import pytest
 
 from tests.end_to_end.layer_double import RunningHelper
 from tests.openxr_layer.captured import NUMBER_PX, STRIPE_PX, pixels_of
-from tests.openxr_layer.layered import inverting_eyes
+from tests.openxr_layer.layered import inverting_eyes, layer_lines
 from tests.openxr_layer.test_layer import Stage, check_clean, floats, kind_of
 
 RATE_HZ = 60
@@ -65,7 +65,7 @@ def shown_frames(ran):
     for line, frame in ran.pairs():
         own = set()
         for eye, view in enumerate(frame["layers"][0]["views"]):
-            pixels = pixels_of(ran.captured, view)
+            pixels = pixels_of(ran.folder, view)
             number, is_filtered = number_in(pixels)
             kind = "filtered" if is_filtered else "own"
             assert kind_of(view, pixels, number, eye) == kind
@@ -137,7 +137,7 @@ HELPER = """
 import sys
 from pathlib import Path
 from clients.openxr_layer.helper import HelperOptions, LayerHelper
-from tests.openxr_layer.layered import inverting_eyes
+from tests.openxr_layer.layered import inverting_eyes, layer_lines
 seeing, look = inverting_eyes(print)
 helper = LayerHelper(seeing, look, print, HelperOptions(), print, Path(sys.argv[1]))
 print("listening", flush=True)
@@ -210,9 +210,9 @@ def test_a_helper_that_starts_late_is_killed_and_comes_back(stage):
     between = frames[killed_after + 2 : 4 * RATE_HZ]
     assert not any(is_filtered for _, _, is_filtered in between)
     assert any(is_filtered for _, _, is_filtered in frames[-30:])
-    assert ran.layer_lines.count("connected to the helper") == 2
+    assert layer_lines(ran).count("connected to the helper") == 2
     ended = "the helper has ended; showing the application's own frames"
-    assert ran.layer_lines.count(ended) == 1
+    assert layer_lines(ran).count(ended) == 1
 
 
 def stage_frames(stage):

@@ -127,7 +127,7 @@ def test_hello_xr_under_validation(run, display, tmp_path):
                 program.wait_until(lambda said, goal=goal: n_ended(said) >= goal)
                 pictures.append(monado.screenshot())
             code, report = program.report()
-    assert code == 128 + signal.SIGINT
+    assert code in (0, 128 + signal.SIGINT)  # the signal, or the end of its input
     assert report["submitted"] >= N_FRAMES
     assert report["lapsed"] == 0
     assert report["shown_filtered"] >= N_FRAMES / 2

@@ -2,9 +2,7 @@
 
 import json
 import shutil
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from filter_service import EyeFilter, FilterSettings, RgbdView
 from filter_service.messages import body_of_eye
 from tests.end_to_end.layer_double import RunningHelper
 from tests.headset.rooms import stripes
-from tests.openxr_layer.captured import pixels_of, read_frames
+from tests.openxr_layer.captured import pixels_of
 from tests.openxr_layer.layered import (
     FOCUS_DPT,
     LONG_MS,
@@ -21,9 +19,8 @@ from tests.openxr_layer.layered import (
     frozen_eyes,
     layer_environment,
 )
-from tests.openxr_layer.test_layer import MOCK
+from tests.openxr_layer.programs import Run, run_hello_xr
 
-TIMEOUT_S = 150
 SIZE_PX = (160, 180)
 N_FRAMES = 30
 SETTINGS = {
@@ -47,19 +44,9 @@ needs_hello_xr = pytest.mark.skipif(
 
 
 @pytest.fixture
-def environment(layer, runtime, tmp_path, monkeypatch):
+def environment(layer, tmp_path, monkeypatch):
     own = layer_environment(layer, tmp_path, tmp_path / "layer.sock", monkeypatch)
-    size = "{}x{}".format(*SIZE_PX)
-    captured = str(tmp_path / "captured")
-    return (
-        own
-        | MOCK
-        | {
-            "XR_RUNTIME_JSON": str(runtime),
-            "MOCK_XR_SIZE": size,
-            "MOCK_XR_CAPTURE": captured,
-        }
-    )
+    return own | {"MOCK_XR_SIZE": "{}x{}".format(*SIZE_PX)}
 
 
 @pytest.fixture
@@ -72,26 +59,6 @@ def moving_head(tmp_path):
     path = tmp_path / "head.txt"
     path.write_text("\n".join(lines))
     return str(path)
-
-
-def run_hello_xr(environment):
-    """Run hello_xr until its session ends; return what it and others have said."""
-    with subprocess.Popen(
-        ["timeout", str(TIMEOUT_S), "hello_xr", "-g", "OpenGL"],
-        env=environment,
-        stdin=subprocess.PIPE,  # it ends with its input
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    ) as program:
-        lines = []
-        for line in program.stdout:
-            lines.append(line)
-            if "SESSION_STATE_EXITING" in line:
-                break
-        rest, _ = program.communicate()
-    assert program.returncode == 0
-    return "".join(lines) + (rest or "")
 
 
 def filtered_by_hand(eye, picture):
@@ -111,7 +78,7 @@ def filtered_by_hand(eye, picture):
 
 @needs_hello_xr
 def test_hello_xr_is_shown_as_the_eye_filter_sees_it(
-    environment, display, tmp_path, moving_head
+    environment, runtime, display, tmp_path, moving_head
 ):
     inputs = {}
     make_eyes = frozen_eyes(PROFILES, FilterSettings(**SETTINGS))
@@ -120,16 +87,9 @@ def test_hello_xr_is_shown_as_the_eye_filter_sees_it(
         helper.helper.on_frame = lambda frame, _: inputs.setdefault(
             frame.due.display_time_ns, frame
         )
-        said = run_hello_xr(
-            environment
-            | {
-                "DISPLAY": display,
-                "MOCK_XR_EXIT_AT": str(N_FRAMES),
-                "MOCK_XR_HEAD": moving_head,
-            }
-        )
-    assert "violation" not in said
-    frames = [f for f in read_frames(tmp_path / "captured") if f["layers"]]
+        own = environment | {"MOCK_XR_HEAD": moving_head}
+        frames, violations = run_hello_xr(runtime, tmp_path, display, N_FRAMES, **own)
+    assert violations == []
     assert len(frames) >= N_FRAMES - 5
     seen = [frame for frame in frames if frame["display_time"] in inputs]
     assert len(seen) >= N_FRAMES - 8  # all but those before the connection
@@ -156,48 +116,34 @@ HEADSET += ("--settings", json.dumps(SETTINGS), "--textures", "no")
 HEADSET += ("--supersampling", "1", "--frames", str(N_FRAMES))
 
 
-def run_headset(module, room, environment):
-    """Run the headset client; return its captured frames by the poses of both eyes."""
-    eyes = [
-        part
-        for eye, body in PROFILES.items()
-        for part in (f"--{eye}", json.dumps(body))
-    ]
-    done = subprocess.run(
-        [sys.executable, "-m", module, "--scene", room, *HEADSET, *eyes],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT_S,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "violation" not in done.stderr
-    frames = read_frames(Path(environment["MOCK_XR_CAPTURE"]))
-    return [frame for frame in frames if frame["layers"]][-N_FRAMES:]
+def run_headset(module, room, runtime, folder, environment):
+    """Run the headset client; return it when it has ended."""
+    folder.mkdir()
+    eyes = []
+    for eye, body in PROFILES.items():
+        eyes += [f"--{eye}", json.dumps(body)]
+    command = (sys.executable, "-m", module, "--scene", room, *HEADSET, *eyes)
+    ran = Run(runtime, folder, *command, **environment)
+    assert ran.exit_code == 0, ran.said
+    assert ran.violations == []
+    return ran
 
 
 def test_the_headset_client_is_filtered_as_it_filters_itself(
-    environment, tmp_path, moving_head
+    environment, runtime, tmp_path, moving_head
 ):
     room = str(stripes(tmp_path / "room.glb"))
     own = environment | {"MOCK_XR_HEAD": moving_head}
-    folders = {name: tmp_path / name for name in ("through", "itself")}
     make_eyes = frozen_eyes(PROFILES, FilterSettings(**SETTINGS))
+    plain_viewer = "tests.openxr_layer.plain_viewer"
     with RunningHelper(tmp_path / "layer.sock", make_eyes, wait_ms=LONG_MS):
-        through = run_headset(
-            "tests.openxr_layer.plain_viewer",
-            room,
-            own | {"MOCK_XR_CAPTURE": str(folders["through"])},
-        )
+        through = run_headset(plain_viewer, room, runtime, tmp_path / "through", own)
     del own["XR_ENABLE_API_LAYERS"]
-    itself = run_headset(
-        "clients.headset.program",
-        room,
-        own | {"MOCK_XR_CAPTURE": str(folders["itself"])},
-    )
-    expected = {poses_of(frame): frame for frame in itself}
+    viewer = "clients.headset.program"
+    itself = run_headset(viewer, room, runtime, tmp_path / "itself", own)
+    expected = {poses_of(frame): frame for frame in itself.frames[-N_FRAMES:]}
     n_compared = 0
-    for frame in through[N_FRAMES // 3 :]:  # connected
+    for frame in through.frames[-N_FRAMES // 2 :]:  # connected
         other = expected.get(poses_of(frame))
         if other is None:
             continue
@@ -205,8 +151,8 @@ def test_the_headset_client_is_filtered_as_it_filters_itself(
             frame["layers"][0]["views"], other["layers"][0]["views"], strict=True
         ):
             assert found["fov"] == wanted["fov"]
-            pixels = pixels_of(folders["through"], found)[..., :3].astype(int)
-            wanted_pixels = pixels_of(folders["itself"], wanted)[..., :3]
+            pixels = pixels_of(through.folder, found)[..., :3].astype(int)
+            wanted_pixels = pixels_of(itself.folder, wanted)[..., :3]
             assert np.abs(pixels - wanted_pixels).max() <= 1
             n_compared += 1
     assert n_compared >= 10
