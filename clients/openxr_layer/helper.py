@@ -8,10 +8,9 @@ import json
 import os
 import selectors
 import socket
-import struct
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -27,11 +26,10 @@ from clients.headset.stereo_gaze import RgbdPicture, StereoGaze
 from clients.headset.viewer import SPLIT_RATIO
 from clients.openxr_layer import wire
 from clients.openxr_layer.frame_images import FrameImages, check_frame
+from clients.openxr_layer.helper_socket import is_trusted, listening
 from filter_service.errors import FilterError
 from filter_service.shared_memory import Slot
 
-SOCKET_VARIABLE = "OCUFILTER_LAYER_SOCKET"
-SOCKET_NAME = "ocufilter-layer.sock"
 USUAL_AGE_MS = 150
 WAIT_S = 1.0
 """Period that is told to a service's filter, which waits for a result accordingly."""
@@ -45,15 +43,6 @@ N_TIMES = 4096
 
 MAX_WAITING = 8
 """Connections that are neither closed nor the program's."""
-
-
-def socket_path() -> Path:
-    """Return where the layer looks for its helper, as source/link.c does."""
-    given = os.environ.get(SOCKET_VARIABLE)
-    if given:
-        return Path(given)
-    folder = os.environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.getuid()}"
-    return Path(folder) / SOCKET_NAME
 
 
 @dataclass(frozen=True)
@@ -137,7 +126,7 @@ class LayerHelper:
         self._say_once = LogOnce(say)
         self._options, self._change = options, change
         self._path = path
-        self._listener = _listening(path)
+        self._listener = listening(path)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
         self._program: _Program | None = None
@@ -178,7 +167,7 @@ class LayerHelper:
         except OSError:  # it has hung up
             return
         connection.setblocking(False)
-        if not _is_trusted(connection) or len(self._waiting) >= MAX_WAITING:
+        if not is_trusted(connection) or len(self._waiting) >= MAX_WAITING:
             connection.close()
             return
         self._waiting.add(connection)
@@ -429,62 +418,6 @@ class LayerHelper:
                 for name, times in self._stages_ms.items()
             },
         }
-
-
-def ask(
-    path: Path, request: Mapping[str, Any], timeout_s: float = 10.0
-) -> dict[str, Any]:
-    """Send a request to a running helper; return its answer.
-
-    Raises
-    ------
-    OSError
-        If no helper listens there, or it does not answer.
-    ValueError
-        If it refuses the request.
-    """
-    data = struct.pack("<I", wire.CONTROL) + json.dumps(request).encode()
-    if len(data) > wire.MAX_CONTROL_BYTES:
-        raise ValueError(
-            f"the profiles have {len(data)} bytes; allowed: {wire.MAX_CONTROL_BYTES}"
-        )
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
-        connection.settimeout(timeout_s)
-        connection.connect(str(path))
-        connection.send(data)
-        answer: dict[str, Any] = json.loads(connection.recv(1 << 20))
-    if "error" in answer:
-        raise ValueError(answer["error"])
-    return answer
-
-
-def _listening(path: Path) -> socket.socket:
-    """Return a socket that listens; replace one that a helper left behind."""
-    found = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
-    try:
-        if path.is_socket():
-            with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
-                try:
-                    probe.connect(str(path))
-                except ConnectionRefusedError:
-                    path.unlink()
-                else:
-                    raise OSError(f"another helper listens at {path}")
-        found.bind(str(path))
-        path.chmod(0o600)
-        found.listen()
-    except BaseException:
-        found.close()
-        raise
-    return found
-
-
-def _is_trusted(connection: socket.socket) -> bool:
-    """Whether the peer is a process of this user, or of root."""
-    size = struct.calcsize("3i")
-    peer = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size)
-    _, user, _ = struct.unpack("3i", peer)
-    return user in (0, os.getuid())
 
 
 def _gaze_of(frame: wire.Frame) -> GazeSample | None:

@@ -37,14 +37,8 @@ from clients.headset.options import (
 )
 from clients.headset.runtime import EYES, Eye
 from clients.openxr_layer import manifest
-from clients.openxr_layer.helper import (
-    SOCKET_VARIABLE,
-    USUAL_AGE_MS,
-    HelperOptions,
-    LayerHelper,
-    ask,
-    socket_path,
-)
+from clients.openxr_layer.helper import USUAL_AGE_MS, HelperOptions, LayerHelper
+from clients.openxr_layer.helper_socket import SOCKET_VARIABLE, ask, socket_path
 from filter_service import FilterSettings
 from filter_service.errors import FilterError
 

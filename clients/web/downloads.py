@@ -1,18 +1,23 @@
-"""Downloads of a page: picture, profile and report."""
+"""Downloads of a page: picture, profile and report; and a program's headset."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from nicegui import ui
 
+from clients.headset.runtime import Eye
+from clients.openxr_layer.helper_socket import ask, socket_path
 from clients.report import report_html
 from clients.web.eye_form import SIDES, EyeSide
 from clients.web.figure_worker import FigureFailed, FigureWorker
 from clients.web.page_state import PageState
 from clients.web.picture_sender import PictureSender
+
+EYE_OF_SIDE: Mapping[EyeSide, Eye] = {"OD": "right", "OS": "left"}
 
 READY_S = 120.0
 """Maximum time that a download waits for the full picture."""
@@ -20,6 +25,8 @@ READY_S = 120.0
 
 class Downloads:
     """Buttons that download the picture, the profile and the report.
+
+    Another button shows the eyes in the program of a running `ocufilter layer`.
 
     Parameters
     ----------
@@ -67,9 +74,10 @@ class Downloads:
                     on_copy,
                 ),
             ):
-                ui.button(label, icon=icon, on_click=act).props(
-                    "outline dense no-caps size=sm"
-                ).classes("oc-download").tooltip(tip)
+                _button(label, icon, tip, act)
+            if socket_path().is_socket():
+                tip = "Show this eye in the program that runs with `ocufilter layer`"
+                _button("Headset", "view_in_ar", tip, self._headset)
 
     async def _picture(self) -> None:
         if self._empty_reason():
@@ -121,3 +129,22 @@ class Downloads:
                 ui.notify(str(error), type="negative", position="top")
                 return
             ui.download(text.encode(), f"ocufilter_{side}.json")
+
+    async def _headset(self) -> None:
+        try:
+            eyes: dict[str, str] = {
+                EYE_OF_SIDE[side]: json.dumps(self._state.body(side))
+                for side in self._state.sides
+            }
+            answer = await asyncio.to_thread(ask, socket_path(), eyes)
+        except (OSError, ValueError) as error:
+            ui.notify(str(error), type="negative", position="top")
+            return
+        shown = answer["program"] or "the next program"
+        ui.notify(f"Sent to {shown}", type="positive", position="top")
+
+
+def _button(label: str, icon: str, tip: str, act: Callable[[], Any]) -> None:
+    ui.button(label, icon=icon, on_click=act).props(
+        "outline dense no-caps size=sm"
+    ).classes("oc-download").tooltip(tip)

@@ -1,18 +1,19 @@
 """Environments of programs with the layer, and filters for its helper."""
 
 import time
+from unittest import mock
 
 from clients.headset.local_filter import LocalFilter
 from clients.headset.stereo_filter import FilteredStereoFrame
 from clients.headset.stereo_gaze import StereoGaze
 from clients.openxr_layer import manifest
-from clients.openxr_layer.helper import SOCKET_VARIABLE
+from clients.openxr_layer.helper_socket import SOCKET_VARIABLE
 
 LAYER_LINE = "ocufilter layer: "
 LONG_MS = 60_000
 
 
-def layer_environment(library, folder, socket_path, monkeypatch):
+def layer_environment(library, folder, socket_path):
     """Return the environment of a program with a layer.
 
     Parameters
@@ -24,8 +25,9 @@ def layer_environment(library, folder, socket_path, monkeypatch):
         The helper's socket.
     """
     # A library with a sanitizer loads only into programs with the sanitizer.
-    monkeypatch.setattr(manifest, "library", lambda: library)
-    (folder / f"{manifest.NAME}.json").write_text(manifest.manifest("explicit"))
+    with mock.patch.object(manifest, "library", return_value=library):
+        text = manifest.manifest("explicit")
+    (folder / f"{manifest.NAME}.json").write_text(text)
     return manifest.layered_environment(folder) | {SOCKET_VARIABLE: str(socket_path)}
 
 

@@ -28,18 +28,14 @@ N_FRAMES = 12
 class Stage:
     """The layer, the mock runtime and the driver; and a helper, if one is started."""
 
-    def __init__(self, library, runtime, driver, folder, monkeypatch):
-        self.folder, self.driver = folder, driver
-        self.path = folder / "layer.sock"
-        self._library, self._monkeypatch = library, monkeypatch
-        self._runtime = runtime
+    def __init__(self, library, runtime, driver, folder):
+        self.folder, self.path = folder, folder / "layer.sock"
+        self._library, self._runtime, self._driver = library, runtime, driver
 
     def run(self, case, *options, n_frames=N_FRAMES, **variables):
-        own = layer_environment(
-            self._library, self.folder, self.path, self._monkeypatch
-        )
+        own = layer_environment(self._library, self.folder, self.path)
         shutil.rmtree(self.folder / "captured", ignore_errors=True)
-        command = (self.driver, case, "--frames", n_frames, *options)
+        command = (self._driver, case, "--frames", n_frames, *options)
         return Run(self._runtime, self.folder, *command, **(own | variables))
 
     def helper(self, *, wait_ms=LONG_MS, **options):
@@ -47,8 +43,8 @@ class Stage:
 
 
 @pytest.fixture
-def stage(layer, runtime, driver, tmp_path, monkeypatch):
-    return Stage(layer, runtime, driver, tmp_path, monkeypatch)
+def stage(layer, runtime, driver, tmp_path):
+    return Stage(layer, runtime, driver, tmp_path)
 
 
 def floats(numbers):
@@ -297,9 +293,9 @@ def test_wrong_depth(stage, case):
 @pytest.mark.parametrize(
     "case", ["plain", "other-thread", "end-from-thread", "restart", "no-context"]
 )
-def test_threads_do_not_race(watched, tmp_path, monkeypatch, case):
+def test_threads_do_not_race(watched, tmp_path, case):
     library = build.build_layer(tmp_path, "-fsanitize=thread")
-    stage = Stage(library, *watched, tmp_path, monkeypatch)
+    stage = Stage(library, *watched, tmp_path)
     with stage.helper():
         ran = stage.run(case, "--threads", **build.thread_sanitizer_options(tmp_path))
     assert "WARNING: ThreadSanitizer" not in ran.said
@@ -307,12 +303,12 @@ def test_threads_do_not_race(watched, tmp_path, monkeypatch, case):
     assert "filtered" in shown_kinds(ran) or case == "restart"
 
 
-def test_addresses_are_valid(runtime, driver, tmp_path, monkeypatch):
+def test_addresses_are_valid(runtime, driver, tmp_path):
     preloaded = runtime_of("address")
     if preloaded is None:
         pytest.skip("no AddressSanitizer here")
     library = build.build_layer(tmp_path, "-fsanitize=address,undefined")
-    stage = Stage(library, runtime, driver, tmp_path, monkeypatch)
+    stage = Stage(library, runtime, driver, tmp_path)
     variables = {"LD_PRELOAD": str(preloaded), "ASAN_OPTIONS": "detect_leaks=0"}
     for case, n_frames in {"msaa4": 12, "second-session": 36, "two-layers": 12}.items():
         with stage.helper():

@@ -24,8 +24,8 @@ NS_PER_S = 1e9
 
 
 @pytest.fixture
-def stage(layer, runtime, driver, tmp_path, monkeypatch):
-    return Stage(layer, runtime, driver, tmp_path, monkeypatch)
+def stage(layer, runtime, driver, tmp_path):
+    return Stage(layer, runtime, driver, tmp_path)
 
 
 @pytest.fixture
@@ -239,7 +239,7 @@ def test_a_helper_that_hangs(stage):
     assert any(is_filtered for _, _, is_filtered in frames[-30:])
 
 
-def test_a_helper_of_another_user_gets_no_frames(stage, monkeypatch):
+def test_a_helper_of_another_user_gets_no_frames(stage):
     if os.getuid() != 0:
         pytest.skip("it requires root to be another user")
     path = stage.folder / "layer.sock"

@@ -44,8 +44,8 @@ needs_hello_xr = pytest.mark.skipif(
 
 
 @pytest.fixture
-def environment(layer, tmp_path, monkeypatch):
-    own = layer_environment(layer, tmp_path, tmp_path / "layer.sock", monkeypatch)
+def environment(layer, tmp_path):
+    own = layer_environment(layer, tmp_path, tmp_path / "layer.sock")
     return own | {"MOCK_XR_SIZE": "{}x{}".format(*SIZE_PX)}
 
 

@@ -26,7 +26,7 @@ GENERATED = {
 }
 """Pages that only the built documentation has."""
 
-OWN_OPTIONS = ("batch", "bench", "headset", "report", "web")
+OWN_OPTIONS = ("batch", "bench", "headset", "layer", "report", "web")
 """Commands whose programs parse their options themselves."""
 
 

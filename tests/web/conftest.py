@@ -1,6 +1,7 @@
 """A real browser and a real page: Debian's Chromium, and the program."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -8,17 +9,29 @@ import sys
 import pytest
 from playwright.sync_api import sync_playwright
 
+from clients.openxr_layer.helper_socket import SOCKET_VARIABLE
 from tests.source_tree import ROOT
 from tests.web.browser import BROWSERS, PageUnderTest, open_browser
 
 
 @pytest.fixture(scope="session")
-def address():
+def layer_socket(tmp_path_factory):
+    """Return the path at which the page looks for the helper of a layer."""
+    return tmp_path_factory.mktemp("layer") / "layer.sock"
+
+
+@pytest.fixture(scope="session")
+def address(layer_socket):
     """Start `ocufilter web`; return the address that it prints."""
     command = [sys.executable, "-m", "clients.web.program"]
     command += ["--no-browser", "--port", "0", "--json"]
     with subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command,
+        cwd=ROOT,
+        env=os.environ | {SOCKET_VARIABLE: str(layer_socket)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     ) as program:
         yield json.loads(program.stdout.readline())["address"]
         program.terminate()

@@ -10,7 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from clients.headset.stereo_gaze import StereoGaze
 from estimator import parse_profile
+from tests.end_to_end.headset_doubles import Inverting
+from tests.end_to_end.layer_double import RunningHelper
+from tests.web.browser import PageUnderTest
 
 
 def _change(first, second):
@@ -207,6 +211,25 @@ def test_a_report_is_downloaded(page):
     assert "<html" in text
     assert "Right eye" in text
     assert "data:image/" in text
+
+
+def test_the_eye_is_shown_in_the_program_of_a_layer(browser, address, layer_socket):
+    def no_eyes(_say):
+        return Inverting(), StereoGaze(age_years=30.0)
+
+    with RunningHelper(layer_socket, no_eyes) as helper:
+        context = browser.new_context(viewport={"width": 1280, "height": 800})
+        page = PageUnderTest(context.new_page())
+        page.open(address)
+        page.entry("cylinder_dpt").fill("-1.25")
+        page.settle(after=page.number())
+        page.choose("Headset")
+        page.page.get_by_text("Sent to the next program").wait_for()
+        assert page.errors == []
+        context.close()
+    ((eye, text),) = helper.changed
+    assert eye == "right"
+    assert json.loads(text)["cylinder_dpt"] == -1.25
 
 
 def test_a_profile_file_is_taken_and_a_wrong_one_explained(page):

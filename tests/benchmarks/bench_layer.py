@@ -1,0 +1,195 @@
+r"""What the OpenXR layer adds to a program's frames, and how old filtered frames are.
+
+    sh tests/headset/run_in_root.sh env OCUFILTER_COMMIT=$(git rev-parse --short HEAD) \
+        python -m tests.benchmarks.bench_layer [--quick] \
+        > tests/benchmarks/results/layer.json
+
+The application of tests/openxr_layer on its mock runtime, at 72 frames a second, with
+depth, in OpenGL by Mesa on the processor: without the layer; with the layer but no
+helper; and with a helper that filters through a myope's left and a keratoconic right
+eye.
+
+``release + end`` is the time of all calls that release an image or end a frame, of both
+views, whatever they wait for; the runtime waits in them for the application's drawing.
+``added`` is the difference of its medians to those without the layer.  Stages are what
+the layer tells: ``copy`` of color and depth at release, which also waits for the
+drawing; ``read`` into shared memory, ``upload`` of a result, and ``other`` per frame;
+``helper`` is from a frame's arrival to its result.  ``age`` is from a frame's display
+time to that of the frame in whose place it is shown.
+
+The error is the peak signal-to-noise ratio, of 8 bits, of the last pictures to the same
+frame filtered with no tolerance for errors of rendering; infinite for unfiltered ones.
+Prints JSON.
+"""
+
+import argparse
+import contextlib
+import json
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from clients.headset.local_filter import LocalFilter
+from clients.headset.stereo_filter import FilteredStereoFrame
+from clients.headset.stereo_gaze import StereoGaze
+from tests.benchmarks.bench_headset import PROFILES, SETTINGS, error_db
+from tests.benchmarks.harness import Row, memory_mb, report
+from tests.end_to_end.layer_double import RunningHelper
+from tests.openxr_layer import build
+from tests.openxr_layer.layered import layer_environment
+from tests.openxr_layer.programs import Run
+
+SIZES_PX = ((448, 504), (896, 1007))
+QUICK_SIZES_PX = ((112, 126),)
+RATE_HZ = 72
+N_FRAMES, QUICK_FRAMES = 1500, 200
+SETTLED = 0.5  # of the frames, by which eyes are ready
+STAGES = ("copy_ms", "read_ms", "upload_ms", "other_ms", "helper_ms")
+
+
+class Bench:
+    """The application with and without the layer, at one size."""
+
+    def __init__(self, folder: Path, size_px: tuple[int, int], n_frames: int) -> None:
+        self._folder, self._n_frames = folder, n_frames
+        self._socket = folder / "layer.sock"
+        self._runtime = build.build_runtime(folder)
+        self._driver = build.build_driver(folder)
+        self._layered = layer_environment(
+            build.build_layer(folder), folder, self._socket
+        )
+        self._size = "{}x{}".format(*size_px)
+        self.case = f"2 x {self._size}"
+        head = folder / "head.txt"
+        places = (f"{1e-4 * i} 0 0 0 0 0 1" for i in range(n_frames + 100))
+        head.write_text("\n".join(places))
+        self._variables = {
+            "MOCK_XR_SIZE": self._size,
+            "MOCK_XR_RATE_HZ": str(RATE_HZ),
+            "MOCK_XR_HEAD": str(head),
+            "MOCK_XR_CAPTURE_EVERY": "100000",
+        }
+
+    def run(self, *, is_layered: bool) -> Run:
+        """Run the application; return it when it has ended."""
+        own = self._layered if is_layered else {}
+        options = ("plain", "--frames", self._n_frames, "--size", self._size)
+        ran = Run(
+            self._runtime,
+            self._folder,
+            self._driver,
+            *options,
+            **own,
+            **self._variables,
+        )
+        if ran.exit_code != 0 or ran.violations:
+            raise SystemExit(ran.said[-2000:])
+        return ran
+
+    def row(self, method, setting, times_ms, error=float("inf")) -> Row:
+        """Return a row of times."""
+        median_ms, p95_ms = np.percentile(times_ms, (50, 95))
+        return self.told_row(method, setting, len(times_ms), median_ms, p95_ms, error)
+
+    def told_row(self, method, setting, n, median_ms, p95_ms, error) -> Row:
+        """Return a row of a median and a percentile."""
+        return Row(
+            bench="layer",
+            method=method,
+            case=self.case,
+            setting=setting,
+            n=n,
+            median_ms=float(median_ms),
+            p95_ms=float(p95_ms),
+            memory_mb=memory_mb(),
+            error_name="PSNR dB",
+            error=error,
+            reference="no tolerance for errors of rendering",
+        )
+
+    def filtered(self) -> tuple[Run, dict, FilteredStereoFrame]:
+        """Run it with a helper; return it, the helper's report and the last result."""
+        seen = {}
+
+        def made(say):
+            seeing = LocalFilter(SETTINGS, say)
+            for eye, profile in PROFILES.items():
+                seeing.change(eye, profile)
+            return seeing, StereoGaze(age_years=30.0)
+
+        with RunningHelper(self._socket, made, max_age_ms=5000) as helper:
+            helper.helper.on_frame = lambda _, result: seen.update(last=result)
+            ran = self.run(is_layered=True)
+            report = helper.helper.report()
+        return ran, report, seen["last"]
+
+
+def call_times_ms(ran: Run) -> np.ndarray:
+    """Return the time of the calls that release images and end frames, per frame."""
+    lines = [line for line in ran.told if "frame" in line]
+    return np.array([line["release_ms"] + line["end_frame_ms"] for line in lines])
+
+
+def ages_ms(ran: Run) -> np.ndarray:
+    """Return by how much older the frame is that is shown; by poses, 0 without."""
+    told = [line for line in ran.told if "frame" in line]
+    number = {}
+    for i, line in enumerate(told):
+        number[tuple(map(float.fromhex, line["views"][0][:7]))] = i
+    shown = {frame["display_time"]: frame for frame in ran.frames}
+    ages = []
+    for i, line in enumerate(told):
+        view = shown[line["display_time"]]["layers"][0]["views"][0]
+        ages.append((i - number[tuple(view["pose"])]) / RATE_HZ)
+    return 1e3 * np.array(ages)
+
+
+def measure(size_px: tuple[int, int], n_frames: int) -> list[Row]:
+    """Return the rows of one size."""
+    with tempfile.TemporaryDirectory() as folder:
+        bench = Bench(Path(folder), size_px, n_frames)
+        settled = slice(int(SETTLED * n_frames), None)
+        plain = call_times_ms(bench.run(is_layered=False))[settled]
+        idle = call_times_ms(bench.run(is_layered=True))[settled]
+        ran, told, last = bench.filtered()
+    busy, ages = call_times_ms(ran)[settled], ages_ms(ran)[settled]
+    error = error_db(last, contextlib.nullcontext())  # of arrays
+    rows = [
+        bench.row("no layer", "release + end", plain),
+        bench.row("layer, no helper", "release + end", idle),
+        bench.row("layer, no helper", "added", idle - np.median(plain)),
+        bench.row("layer, helper", "release + end", busy, error),
+        bench.row("layer, helper", "added", busy - np.median(plain), error),
+    ]
+    for name in STAGES:
+        found = told["stages_ms"][name]
+        n_told = told["filtered"]
+        rows.append(
+            bench.told_row(
+                "layer, helper", name, n_told, found["p50"], found["p95"], error
+            )
+        )
+    is_old = ages > 0
+    rows.append(bench.row("layer, helper", "age", ages[is_old], error))
+    share = (
+        f"{told['submitted']} submitted, {told['filtered']} filtered, "
+        f"{told['shown_filtered']} shown filtered, {told['lapsed']} lapsed"
+    )
+    rows.append(bench.row("layer, helper", share, ages[is_old], error))
+    return rows
+
+
+def main() -> None:
+    """Measure, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="small, 200 frames")
+    arguments = parser.parse_args()
+    sizes_px = QUICK_SIZES_PX if arguments.quick else SIZES_PX
+    n_frames = QUICK_FRAMES if arguments.quick else N_FRAMES
+    rows = [row for size_px in sizes_px for row in measure(size_px, n_frames)]
+    print(json.dumps(report(rows), indent=1))
+
+
+if __name__ == "__main__":
+    main()
