@@ -130,6 +130,20 @@ def test_on_glx(stage, display):
     assert is_filtered_after_start(shown_kinds(ran))
 
 
+BUFFERED = {"OCUFILTER_LAYER_READS": "buffered"}
+"""As with a hardware GPU: reads do not wait."""
+
+
+@pytest.mark.parametrize("case", ["plain", "array", "msaa4", "other-thread", "restart"])
+def test_reads_that_do_not_wait(stage, case):
+    with stage.helper():
+        ran = stage.run(case, "--check-state", n_frames=30, **BUFFERED)
+    check_clean(ran, 90 if case == "restart" else 30)
+    kinds = shown_kinds(ran)
+    assert kinds[-1] == "filtered"
+    assert case == "restart" or is_filtered_after_start(kinds)
+
+
 # What is not
 
 
@@ -296,8 +310,11 @@ def test_wrong_depth(stage, case):
 def test_threads_do_not_race(watched, tmp_path, case):
     library = build.build_layer(tmp_path, "-fsanitize=thread")
     stage = Stage(library, *watched, tmp_path)
+    variables = build.thread_sanitizer_options(tmp_path)
+    if case != "plain":
+        variables |= BUFFERED
     with stage.helper():
-        ran = stage.run(case, "--threads", **build.thread_sanitizer_options(tmp_path))
+        ran = stage.run(case, "--threads", **variables)
     assert "WARNING: ThreadSanitizer" not in ran.said
     check_clean(ran, 3 * N_FRAMES if case == "restart" else N_FRAMES)
     assert "filtered" in shown_kinds(ran) or case == "restart"
@@ -310,9 +327,11 @@ def test_addresses_are_valid(runtime, driver, tmp_path):
     library = build.build_layer(tmp_path, "-fsanitize=address,undefined")
     stage = Stage(library, runtime, driver, tmp_path)
     variables = {"LD_PRELOAD": str(preloaded), "ASAN_OPTIONS": "detect_leaks=0"}
-    for case, n_frames in {"msaa4": 12, "second-session": 36, "two-layers": 12}.items():
+    cases = {"msaa4": 12, "second-session": 36, "two-layers": 12, "half-rate": 12}
+    for case, n_frames in cases.items():
+        reads = BUFFERED if case == "half-rate" else {}
         with stage.helper():
-            ran = stage.run(case, **variables)
+            ran = stage.run(case, **(variables | reads))
         assert not re.search("ERROR: AddressSanitizer|runtime error", ran.said), (
             ran.said
         )

@@ -77,9 +77,11 @@ def shown_frames(ran):
     return found
 
 
-def test_pictures_go_with_their_poses(stage, moving_head):
+@pytest.mark.parametrize("reads", ["direct", "buffered"])
+def test_pictures_go_with_their_poses(stage, moving_head, reads):
+    variables = LIVE | {"MOCK_XR_HEAD": moving_head, "OCUFILTER_LAYER_READS": reads}
     with live_helper(stage, 0.03):
-        ran = stage.run("plain", n_frames=N_FRAMES, MOCK_XR_HEAD=moving_head, **LIVE)
+        ran = stage.run("plain", n_frames=N_FRAMES, **variables)
     check_clean(ran, N_FRAMES)
     frames = shown_frames(ran)
     first = next(i for i, (_, _, is_filtered) in enumerate(frames) if is_filtered)

@@ -5,7 +5,7 @@
 #include "layer.h"
 #include "log.h"
 
-#define NS_PER_MS 1000000u
+#define NS_PER_MS UINT64_C(1000000)
 #define ALIGN(bytes) (((bytes) + 63) & ~(size_t)63)
 
 /* The projection layer of a frame that is to be filtered. */
@@ -470,7 +470,7 @@ static void await(session *at, const slot *of) {
 
 static bool is_shown_valid(const session *at, XrTime time) {
     if (!at->is_shown) return false;
-    if (now_ns() - at->shown.begun_ns > (uint64_t)at->link.max_age_ms * NS_PER_MS)
+    if (now_ns() - at->shown.begun_ns > at->link.max_age_ms * NS_PER_MS)
         return false;
     return !(at->shown.frame.display_time_ns < at->recentered && at->recentered <= time);
 }

@@ -66,7 +66,7 @@ XrResult gaze_attach(session *at, const XrSessionActionSetsAttachInfo *given) {
     if (own->is_gaze_suggested)
         all = calloc(given->countActionSets + 1, sizeof *all);
     if (all) {
-        memcpy(all, given->actionSets, given->countActionSets * sizeof *all);
+        for (uint32_t i = 0; i < given->countActionSets; ++i) all[i] = given->actionSets[i];
         all[given->countActionSets] = own->gaze_set;
         XrSessionActionSetsAttachInfo mine = *given;
         mine.countActionSets = given->countActionSets + 1;
@@ -86,7 +86,8 @@ XrResult gaze_sync(session *at, const XrActionsSyncInfo *given) {
     if (at->is_gaze_attached)
         all = calloc(given->countActiveActionSets + 1, sizeof *all);
     if (!all) return at->own->SyncActions(at->handle, given);
-    memcpy(all, given->activeActionSets, given->countActiveActionSets * sizeof *all);
+    for (uint32_t i = 0; i < given->countActiveActionSets; ++i)
+        all[i] = given->activeActionSets[i];
     all[given->countActiveActionSets] =
         (XrActiveActionSet){at->own->gaze_set, XR_NULL_PATH};
     XrActionsSyncInfo mine = *given;

@@ -81,9 +81,19 @@ bool find_space_kind(XrSpace handle, space_kind *kind) {
 
 /* Sessions ------------------------------------------------------------------------------- */
 
+/* The context's textures live on in the application's context, which shares them. */
+static void delete_copies(session *at) {
+    gl_current before;
+    if (!at->has_gl || !gl_enter(&at->gl, &before)) return;
+    for (swapchain *chain = swapchains; chain; chain = chain->next)
+        if (chain->session == at && chain->copy) at->gl.DeleteTextures(1, &chain->copy);
+    gl_leave(&at->gl, &before, false);
+}
+
 /* Forget a session and what belongs to it; its handles are destroyed by the runtime. */
 static void destroy_session(session *at) {
     pthread_mutex_lock(&at->lock);
+    delete_copies(at);
     frames_close(at);
     pthread_mutex_unlock(&at->lock);
     for (swapchain *chain = swapchains; chain;) {
@@ -108,7 +118,10 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSession(XrInstance handle,
     XrResult result = own->CreateSession(handle, info, made);
     if (XR_FAILED(result)) return result;
     session *at = calloc(1, sizeof *at);
-    if (!at) return result; /* the session works without the layer */
+    if (!at) {
+        own->DestroySession(*made);
+        return XR_ERROR_OUT_OF_MEMORY;
+    }
     at->handle = *made;
     at->own = own;
     pthread_mutex_init(&at->lock, NULL);
@@ -202,7 +215,10 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSwapchain(
     XrResult result = at->own->CreateSwapchain(handle, info, made);
     if (XR_FAILED(result)) return result;
     swapchain *chain = calloc(1, sizeof *chain);
-    if (!chain) return result;
+    if (!chain) {
+        at->own->DestroySwapchain(*made);
+        return XR_ERROR_OUT_OF_MEMORY;
+    }
     chain->handle = *made;
     chain->session = at;
     chain->info = *info;

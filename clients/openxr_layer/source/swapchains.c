@@ -118,15 +118,18 @@ void swapchain_copy(swapchain *chain, GLuint image) {
     const XrSwapchainCreateInfo *info = &chain->info;
     chain->has_copy = false;
     if (!chain->copy && !make_copy(chain)) return;
+    GLenum error = GL_INVALID_OPERATION;
     if (gl->CopyImageSubData && info->sampleCount <= 1) {
         GLenum target = target_of(chain);
         gl->CopyImageSubData(image, target, 0, 0, 0, 0, chain->copy, target, 0, 0, 0, 0,
                              (GLsizei)info->width, (GLsizei)info->height,
                              (GLsizei)info->arraySize);
-    } else {
-        blit(chain, image);
+        error = gl->GetError();
     }
-    GLenum error = gl->GetError();
+    if (error) { /* also for images of another format than the one they are named by */
+        blit(chain, image);
+        error = gl->GetError();
+    }
     chain->has_copy = error == GL_NO_ERROR;
     if (error)
         LOG_ONCE(&at->told, SAID_GL_ERROR,
