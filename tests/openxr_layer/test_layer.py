@@ -10,6 +10,8 @@ import shutil
 import numpy as np
 import pytest
 
+from clients.openxr_layer import manifest, program
+from clients.openxr_layer.helper_socket import SOCKET_VARIABLE
 from tests.end_to_end.layer_double import RunningHelper
 from tests.native_build import runtime_of
 from tests.openxr_layer import build
@@ -336,3 +338,33 @@ def test_addresses_are_valid(runtime, driver, tmp_path):
             ran.said
         )
         check_clean(ran, n_frames)
+
+
+# Installation
+
+
+@pytest.mark.parametrize("kind", ["explicit", "implicit"])
+def test_the_loader_finds_the_installed_layer(
+    layer, runtime, driver, tmp_path, monkeypatch, kind
+):
+    monkeypatch.setenv(manifest.LIBRARY_VARIABLE, str(layer))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    options = ["--implicit"] if kind == "implicit" else []
+    assert program.main(["install", *options]) == 0
+    enabled = {"XR_ENABLE_API_LAYERS": manifest.NAME}
+    variables = enabled if kind == "explicit" else {}
+    socket = {SOCKET_VARIABLE: str(tmp_path / "layer.sock")}
+
+    def lines(**more):
+        shutil.rmtree(tmp_path / "captured", ignore_errors=True)
+        command = (driver, "plain", "--frames", N_FRAMES)
+        ran = Run(runtime, tmp_path, *command, **(socket | variables | more))
+        check_clean(ran)
+        return layer_lines(ran)
+
+    assert lines() == ["no helper is connected; trying again every second"]
+    if kind == "implicit":
+        assert lines(**{manifest.OFF_VARIABLE: "1"}) == []
+    assert program.main(["remove"]) == 0
+    variables = {}
+    assert lines() == []
