@@ -6,8 +6,8 @@ r"""What the OpenXR layer adds to a program's frames, and how old filtered frame
 
 The application of tests/openxr_layer on its mock runtime, at 72 frames a second, with
 depth, in OpenGL by Mesa on the processor: without the layer; with the layer but no
-helper; and with a helper that filters through a myope's left and a keratoconic right
-eye.
+helper; with a helper that takes every frame and filters none, at once; and with one
+that filters through a myope's left and a keratoconic right eye, on the same cores.
 
 ``release + end`` is the time of all calls that release an image or end a frame, of both
 views, whatever they wait for; the runtime waits in them for the application's drawing.
@@ -43,9 +43,24 @@ from tests.openxr_layer.programs import Run
 SIZES_PX = ((448, 504), (896, 1007))
 QUICK_SIZES_PX = ((112, 126),)
 RATE_HZ = 72
-N_FRAMES, QUICK_FRAMES = 1500, 200
+N_FRAMES, QUICK_FRAMES = 1500, 600
 SETTLED = 0.5  # of the frames, by which eyes are ready
-STAGES = ("copy_ms", "read_ms", "upload_ms", "other_ms", "helper_ms")
+STAGES = ("copy", "read", "upload", "other", "helper")
+
+
+class Unprepared:
+    """Filter that has no eyes yet."""
+
+    settings = None
+
+    def see(self, _frame) -> None:
+        """Return no result."""
+
+    def restart(self) -> None:
+        """There is nothing to discard."""
+
+    def close(self) -> None:
+        """There is nothing to release."""
 
 
 class Bench:
@@ -108,6 +123,16 @@ class Bench:
             reference="no tolerance for errors of rendering",
         )
 
+    def copied(self) -> tuple[Run, dict]:
+        """Run it with a helper that filters nothing; return it, and what that told."""
+
+        def made(_say):
+            return Unprepared(), StereoGaze(age_years=30.0)
+
+        with RunningHelper(self._socket, made) as helper:
+            ran = self.run(is_layered=True)
+            return ran, helper.helper.report()
+
     def filtered(self) -> tuple[Run, dict, FilteredStereoFrame]:
         """Run it with a helper; return it, the helper's report and the last result."""
         seen = {}
@@ -145,6 +170,17 @@ def ages_ms(ran: Run) -> np.ndarray:
     return 1e3 * np.array(ages)
 
 
+def stage_rows(bench, method, told, names, error=float("inf")) -> list[Row]:
+    """Return rows of the stages that a helper reports."""
+    rows = []
+    for name in names:
+        found, n = told["stages_ms"][f"{name}_ms"], told["filtered"]
+        n = n or told["not_filtered"]
+        row = bench.told_row(method, name, n, found["p50"], found["p95"], error)
+        rows.append(row)
+    return rows
+
+
 def measure(size_px: tuple[int, int], n_frames: int) -> list[Row]:
     """Return the rows of one size."""
     with tempfile.TemporaryDirectory() as folder:
@@ -152,24 +188,21 @@ def measure(size_px: tuple[int, int], n_frames: int) -> list[Row]:
         settled = slice(int(SETTLED * n_frames), None)
         plain = call_times_ms(bench.run(is_layered=False))[settled]
         idle = call_times_ms(bench.run(is_layered=True))[settled]
+        taken, taken_told = bench.copied()
         ran, told, last = bench.filtered()
     busy, ages = call_times_ms(ran)[settled], ages_ms(ran)[settled]
+    base = np.median(plain)
     error = error_db(last, contextlib.nullcontext())  # of arrays
     rows = [
         bench.row("no layer", "release + end", plain),
         bench.row("layer, no helper", "release + end", idle),
-        bench.row("layer, no helper", "added", idle - np.median(plain)),
+        bench.row("layer, no helper", "added", idle - base),
+        bench.row("layer, copies", "added", call_times_ms(taken)[settled] - base),
+        *stage_rows(bench, "layer, copies", taken_told, ("copy", "read", "other")),
         bench.row("layer, helper", "release + end", busy, error),
-        bench.row("layer, helper", "added", busy - np.median(plain), error),
+        bench.row("layer, helper", "added", busy - base, error),
     ]
-    for name in STAGES:
-        found = told["stages_ms"][name]
-        n_told = told["filtered"]
-        rows.append(
-            bench.told_row(
-                "layer, helper", name, n_told, found["p50"], found["p95"], error
-            )
-        )
+    rows += stage_rows(bench, "layer, helper", told, STAGES, error)
     is_old = ages > 0
     rows.append(bench.row("layer, helper", "age", ages[is_old], error))
     share = (
@@ -183,7 +216,7 @@ def measure(size_px: tuple[int, int], n_frames: int) -> list[Row]:
 def main() -> None:
     """Measure, print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="small, 200 frames")
+    parser.add_argument("--quick", action="store_true", help="small, 600 frames")
     arguments = parser.parse_args()
     sizes_px = QUICK_SIZES_PX if arguments.quick else SIZES_PX
     n_frames = QUICK_FRAMES if arguments.quick else N_FRAMES
