@@ -13,7 +13,12 @@ import pytest
 
 from tests.end_to_end.layer_double import RunningHelper
 from tests.openxr_layer.captured import NUMBER_PX, STRIPE_PX, pixels_of
-from tests.openxr_layer.layered import inverting_eyes, layer_lines
+from tests.openxr_layer.layered import (
+    Inverting,
+    frozen_look,
+    inverting_eyes,
+    layer_lines,
+)
 from tests.openxr_layer.test_layer import Stage, check_clean, floats, kind_of
 
 RATE_HZ = 60
@@ -139,7 +144,12 @@ HELPER = """
 import sys
 from pathlib import Path
 from clients.openxr_layer.helper import HelperOptions, LayerHelper
-from tests.openxr_layer.layered import inverting_eyes, layer_lines
+from tests.openxr_layer.layered import (
+    Inverting,
+    frozen_look,
+    inverting_eyes,
+    layer_lines,
+)
 seeing, look = inverting_eyes(print)
 helper = LayerHelper(seeing, look, print, HelperOptions(), print, Path(sys.argv[1]))
 print("listening", flush=True)
@@ -215,6 +225,33 @@ def test_a_helper_that_starts_late_is_killed_and_comes_back(stage):
     assert layer_lines(ran).count("connected to the helper") == 2
     ended = "the helper has ended; showing the application's own frames"
     assert layer_lines(ran).count(ended) == 1
+
+
+class Unready(Inverting):
+    """Filter whose eyes are not ready for the first frames."""
+
+    n_unready = 10
+
+    def see(self, frame):
+        self.n_unready -= 1
+        return super().see(frame) if self.n_unready < 0 else None
+
+
+def test_counts_are_of_one_helper(stage):
+    """Frames before its eyes are ready have not lapsed, whoever filtered before."""
+    results, options = [], {"max_age_ms": 2000}
+    program = in_background(stage, results)
+    with live_helper(stage, 0.0, **options):
+        wait_for_frames(stage, 2 * RATE_HZ)
+    again = RunningHelper(stage.path, lambda _: (Unready(), frozen_look()), **options)
+    with again:
+        program.join()
+    (ran,) = results
+    check_clean(ran, 6 * RATE_HZ)
+    report = again.helper.report()
+    assert report["not_filtered"] == Unready.n_unready
+    assert report["shown_filtered"] > 0
+    assert report["lapsed"] == 0
 
 
 def stage_frames(stage):

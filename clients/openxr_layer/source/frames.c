@@ -265,6 +265,11 @@ static size_t used_bytes(const wire_frame *frame) {
     return end;
 }
 
+static void clear_counts(session *at) {
+    at->frames = at->frames_filtered = at->frames_lapsed = 0;
+    at->copy_ns = at->read_ns = at->upload_ns = at->other_ns = 0;
+}
+
 /* Send a frame whose images have been read, in the layer's context. */
 static void send_read(session *at, slot *of, uint64_t limit_ns) {
     gl_context *gl = &at->gl;
@@ -294,9 +299,7 @@ static void send_read(session *at, slot *of, uint64_t limit_ns) {
     frame->upload_us = (uint32_t)(at->upload_ns / 1000);
     frame->other_us = (uint32_t)(at->other_ns / 1000);
     of->state = link_send(&at->link, frame) ? SLOT_SENT : SLOT_FREE;
-    if (of->state == SLOT_FREE) return;
-    at->frames = at->frames_filtered = at->frames_lapsed = 0;
-    at->copy_ns = at->read_ns = at->upload_ns = at->other_ns = 0;
+    if (of->state != SLOT_FREE) clear_counts(at);
 }
 
 /* From the helper ---------------------------------------------------------------------------- */
@@ -312,6 +315,9 @@ static void receive(session *at) {
     }
     if (!at->link.is_lost) return;
     at->link.is_lost = at->is_shown = false;
+    /* Counts are for each helper. */
+    at->has_filtered = false;
+    clear_counts(at);
     for (int i = 0; i < MAX_SLOTS; ++i) at->slots[i].state = SLOT_FREE;
 }
 
@@ -439,6 +445,7 @@ static void exchange(session *at, const plan *p, slot *to, uint64_t limit_ns) {
     uint64_t read_ns = now_ns();
     at->upload_ns += uploaded_ns - begun_ns;
     at->read_ns += read_ns - uploaded_ns;
+    at->inside_ns += read_ns - begun_ns;
     for (slot *of; (of = find_slot(at, SLOT_READING));) {
         send_read(at, of, limit_ns);
         if (of->state == SLOT_READING) break;
@@ -543,7 +550,8 @@ XrResult frames_end(session *at, const XrFrameEndInfo *info) {
     for (uint32_t i = 0; i < info->layerCount; ++i) layers[i] = info->layers[i];
     substitute made;
     pthread_mutex_lock(&at->lock);
-    uint64_t begun_ns = now_ns(), inside_ns = at->read_ns + at->upload_ns;
+    uint64_t begun_ns = now_ns();
+    at->inside_ns = 0;
     receive(at);
     plan p;
     if (!at->link.is_welcome) {
@@ -565,8 +573,7 @@ XrResult frames_end(session *at, const XrFrameEndInfo *info) {
             layers[p.index] = (const XrCompositionLayerBaseHeader *)&made.layer;
         }
         uint64_t added_ns = now_ns() - begun_ns;
-        inside_ns = at->read_ns + at->upload_ns - inside_ns;
-        at->other_ns += added_ns > inside_ns ? added_ns - inside_ns : 0;
+        at->other_ns += added_ns > at->inside_ns ? added_ns - at->inside_ns : 0;
     }
     pthread_mutex_unlock(&at->lock);
     return pass_on(at, info, layers);

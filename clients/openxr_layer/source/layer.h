@@ -126,9 +126,10 @@ typedef struct session {
     XrSpace view_space, gaze_space;
     bool is_gaze_attached;
     XrTime recentered;     /* poses of frames before that time are invalid */
-    bool has_filtered;     /* a frame was shown filtered */
+    bool has_filtered;     /* a frame of this helper was shown */
     uint32_t frames, frames_filtered, frames_lapsed;
     uint64_t copy_ns, read_ns, upload_ns, other_ns;
+    uint64_t inside_ns;    /* of the current frame, in read_ns and upload_ns */
 } session;
 
 /* swapchains.c */
