@@ -19,10 +19,15 @@ Notes = dict[str, dict[str, Any]]
 _NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?")
 
 
+def without_numbers(note: str) -> str:
+    """Return a note with "#" for each number."""
+    return _NUMBER.sub("#", note)
+
+
 def add_notes(notes: Notes, new: Sequence[str]) -> None:
     """Count a frame's notes; notes that differ only in numbers are of one kind."""
     for note in new:
-        kind = _NUMBER.sub("#", note)
+        kind = without_numbers(note)
         notes.setdefault(kind, {"frames": 0, "example": note})["frames"] += 1
 
 

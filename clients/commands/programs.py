@@ -58,7 +58,7 @@ def headset(context: typer.Context) -> None:
 
 
 def layer(context: typer.Context) -> None:
-    """Run another OpenXR program, unchanged, seen through given eyes.
+    """Run another OpenXR program, unmodified, seen through simulated eyes.
 
     For its actions and options, see `ocufilter layer --help`.
 

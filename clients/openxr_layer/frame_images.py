@@ -65,8 +65,6 @@ class FrameImages:
     ----------
     memory : Slot
         Shared memory.
-    start : int
-        Where the frame's slot begins, bytes.
     frame : Frame
         A frame that was checked.
     engine : str
@@ -78,14 +76,12 @@ class FrameImages:
         If an image extends beyond the memory.
     """
 
-    def __init__(
-        self, memory: Slot, start: int, frame: wire.Frame, engine: str = ""
-    ) -> None:
+    def __init__(self, memory: Slot, frame: wire.Frame, engine: str = "") -> None:
         self._frame, self._engine = frame, engine
         dtype = _DTYPES[frame.color_format]
         self._colors = [
             memory.array(
-                start + view.color.start,
+                view.color.start,
                 (view.color.height_px, view.color.width_px, 4),
                 dtype,
             )
@@ -93,7 +89,7 @@ class FrameImages:
         ]
         self._depths = [
             memory.array(
-                start + view.depth.start,
+                view.depth.start,
                 (view.depth.height_px, view.depth.width_px),
                 np.dtype(np.float32),
             )

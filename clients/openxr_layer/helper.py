@@ -17,7 +17,7 @@ from typing import Any, cast
 
 from numpy.typing import NDArray
 
-from clients.frame_log import percentiles
+from clients.frame_log import percentiles, without_numbers
 from clients.headset.poses import angles_of, rotation_of
 from clients.headset.runtime import EYES, DueFrame, Eye, GazeSample
 from clients.headset.service_filter import LogOnce
@@ -68,7 +68,10 @@ class HelperOptions:
 
     @property
     def longest_age_ms(self) -> int:
-        """Return the age up to which a frame is shown, also one that was waited for."""
+        """Return the age up to which a frame is shown.
+
+        A frame that the program waited for is shown at any age.
+        """
         return max(self.max_age_ms, self.wait_ms)
 
     @property
@@ -85,8 +88,6 @@ class _Program:
     name: str
     engine: str
     memory: Slot | None = None
-    slot_count: int = 0
-    slot_bytes: int = 0
     notes: set[str] = field(default_factory=set)
 
 
@@ -136,7 +137,7 @@ class LayerHelper:
         self._stages_ms: dict[str, deque[float]] = {}
         self._n_late = 0
         self.n_frames = self.n_unready = 0
-        self.n_submitted = self.n_shown = self.n_lapsed = 0
+        self.n_submitted = self.n_shown = self.n_fallback = 0
 
     def close(self) -> None:
         """Close all connections and remove the socket."""
@@ -208,22 +209,20 @@ class LayerHelper:
         if not isinstance(hello, wire.Hello) or hello.magic != wire.MAGIC:
             self._forget(connection)
             return
-        name = hello.application.decode(errors="replace") or f"pid {hello.process_id}"
+        name = _printable(hello.application) or f"process {hello.process_id}"
         if hello.version != wire.VERSION:
             self._say(f"{name}: its layer is of another version of ocufilter")
             self._forget(connection)
         elif self._program is not None:
-            # It tries again every second.
-            self._program.notes.add("second")
-            self._forget(connection)
+            self._forget(connection)  # it tries again every second
         else:
-            self._begin(connection, name, hello.engine.decode(errors="replace"))
+            self._begin(connection, name, _printable(hello.engine))
 
     def _begin(self, connection: socket.socket, name: str, engine: str) -> None:
         self._waiting.discard(connection)
         self._program = _Program(connection, name, engine)
         welcome = wire.Welcome(
-            *(wire.WELCOME, wire.MAGIC, wire.VERSION, 1),
+            *(wire.WELCOME, wire.MAGIC, wire.VERSION),
             *(self._options.wait_ms, self._options.longest_age_ms),
         )
         self._say(f"{name}: connected")
@@ -244,7 +243,7 @@ class LayerHelper:
             for eye in EYES:
                 if eye in wanted:
                     self._change(eye, str(wanted[eye]))
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, RecursionError) as error:
             return {"error": str(error)}
         return {
             "program": self._program.name if self._program else None,
@@ -268,7 +267,7 @@ class LayerHelper:
                 self._drop("disconnected")
                 return
             message = wire.parsed(data)
-            if isinstance(message, wire.Ring) and len(descriptors) == 1:
+            if isinstance(message, wire.Memory) and len(descriptors) == 1:
                 self._share(program, message, descriptors.pop())
             elif isinstance(message, wire.Frame):
                 self._filter(program, message)
@@ -280,31 +279,25 @@ class LayerHelper:
             for descriptor in descriptors:
                 os.close(descriptor)
 
-    def _share(self, program: _Program, ring: wire.Ring, descriptor: int) -> None:
-        size_bytes = ring.slot_count * ring.slot_bytes
-        if (
-            not 1 <= ring.slot_count <= wire.MAX_SLOTS
-            or not 1 <= size_bytes <= wire.MAX_SHARED_BYTES
-        ):
+    def _share(self, program: _Program, message: wire.Memory, descriptor: int) -> None:
+        if not 1 <= message.size_bytes <= wire.MAX_SHARED_BYTES:
             os.close(descriptor)
-            raise ValueError(f"shared memory of {size_bytes} bytes")
+            raise ValueError(f"shared memory of {message.size_bytes} bytes")
         try:
-            memory = Slot.received(0, size_bytes, descriptor)
+            memory = Slot.received(0, message.size_bytes, descriptor)
         except (OSError, ValueError):
             os.close(descriptor)
             raise ValueError("shared memory that is not sealed") from None
         if program.memory is not None:
             program.memory.close()
         program.memory = memory
-        program.slot_count, program.slot_bytes = ring.slot_count, ring.slot_bytes
 
     def _filter(self, program: _Program, frame: wire.Frame) -> None:
         begun_s = time.monotonic()
-        if program.memory is None or frame.slot >= program.slot_count:
-            raise ValueError(f"a frame in slot {frame.slot}")
+        if program.memory is None:
+            raise ValueError("a frame without memory")
         check_frame(frame)
-        start = frame.slot * program.slot_bytes
-        images = FrameImages(program.memory, start, frame, program.engine)
+        images = FrameImages(program.memory, frame, program.engine)
         pictures = []
         for index, eye in enumerate(EYES):
             picture, note = images.picture(index, eye, self._options.flat_m)
@@ -312,19 +305,13 @@ class LayerHelper:
             self._tell_depth(program, note)
         is_filtered = self._see(program, frame, tuple(pictures), images, begun_s)
         self._count(frame, is_filtered)
-        self._send(
-            program,
-            wire.Result(
-                wire.RESULT,
-                frame.slot,
-                frame.frame_id,
-                wire.FILTERED if is_filtered else wire.OWN_FRAME,
-            ),
-        )
+        result = wire.Result(wire.RESULT, is_filtered, frame.frame_id)
+        self._send(program, result)
 
     def _tell_depth(self, program: _Program, note: str) -> None:
-        if note and note not in program.notes:
-            program.notes.add(note)
+        kind = without_numbers(note)  # a program may send other numbers in each frame
+        if note and kind not in program.notes:
+            program.notes.add(kind)
             self._say(f"{program.name}: depth: {note}")
 
     def _see(
@@ -394,7 +381,7 @@ class LayerHelper:
         self.n_unready += not is_filtered
         self.n_submitted += frame.frames
         self.n_shown += frame.frames_filtered
-        self.n_lapsed += frame.frames_lapsed
+        self.n_fallback += frame.frames_fallback
         if frame.frames:
             self._note(
                 **{
@@ -412,12 +399,18 @@ class LayerHelper:
             "not_filtered": self.n_unready,
             "submitted": self.n_submitted,
             "shown_filtered": self.n_shown,
-            "lapsed": self.n_lapsed,
+            "fallback": self.n_fallback,
             "stages_ms": {
                 name: percentiles(list(times))
                 for name, times in self._stages_ms.items()
             },
         }
+
+
+def _printable(name: bytes) -> str:
+    """Return a name that may be written to a terminal."""
+    text = name.decode(errors="replace")
+    return "".join(c if c.isprintable() else "?" for c in text)
 
 
 def _gaze_of(frame: wire.Frame) -> GazeSample | None:

@@ -59,7 +59,7 @@ def manifest(kind: Kind) -> str:
             "library_path": str(library()),
             "api_version": "1.1",
             "implementation_version": "1",
-            "description": "Shows each frame as a given eye would see it",
+            "description": "Shows each frame as a simulated eye would see it",
             # For runtimes without depth, where the layer removes it.
             "instance_extensions": [
                 {
@@ -93,8 +93,9 @@ def search_path(own: Path) -> str:
     given = os.environ.get("XR_API_LAYER_PATH")
     if given:
         return os.pathsep.join((str(own), given))
+    settings = os.environ.get("XDG_CONFIG_DIRS") or "/etc/xdg"
     data = os.environ.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share"
-    system = ["/etc/xdg", "/etc", *data.split(":")]
+    system = [*settings.split(":"), "/etc", *data.split(":")]
     folders = [Path(base) / "openxr/1/api_layers/explicit.d" for base in system]
     return os.pathsep.join(map(str, (own, folder("explicit"), *folders)))
 

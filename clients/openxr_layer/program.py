@@ -1,4 +1,4 @@
-"""See another OpenXR program, unchanged, through given eyes.
+"""See another OpenXR program, unmodified, through simulated eyes.
 
     ocufilter layer run --left myopia --right keratoconus -- hello_xr -g OpenGL
     ocufilter layer set --left emmetropia
@@ -338,7 +338,7 @@ def _print_report(helper: LayerHelper, options: argparse.Namespace) -> None:
         return
     say(
         f"{report['filtered']} frames filtered; {report['shown_filtered']} of "
-        f"{report['submitted']} frames shown filtered, {report['lapsed']} shown "
+        f"{report['submitted']} frames shown filtered, {report['fallback']} shown "
         "unfiltered after the first of them"
     )
     for name, values in report["stages_ms"].items():

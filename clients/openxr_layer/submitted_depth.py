@@ -15,7 +15,7 @@ MAX_INVALID_RATIO = 0.2
 """Largest fraction of values that are not in the range of the depth buffer."""
 
 NEAR_RATIO = 2.0
-"""Depth is exchanged if at least half the pixels are closer than this many near planes:
+"""The planes are swapped if at least half the pixels are closer than this many near planes:
 objects as close as that are drawn only with a near plane that is too far away."""
 
 FAR_RATIO = 4.0
@@ -97,9 +97,9 @@ def planar_depth(
     if np.mean(is_valid) < 1.0 - MAX_INVALID_RATIO:
         return None, "most of its values are out of range"
     note = ""
-    if _is_exchanged(sample[is_valid], given):
+    if _is_swapped(sample[is_valid], given):
         given = given._replace(near_m=given.far_m, far_m=given.near_m)
-        note = "its near and far planes are exchanged; corrected"
+        note = "its near and far planes are swapped; corrected"
     if _is_cleared(sample[is_valid], given):
         return None, f"all its values are {sample[is_valid][0]:g}"
     if _is_noise(values[::CHECK_STRIDE], given):
@@ -139,15 +139,15 @@ def _has_depth(values: Depth, given: DepthRange) -> NDArray[np.bool_]:
     return (values >= low) & (values < high)
 
 
-def _is_exchanged(values: Depth, given: DepthRange) -> bool:
-    """Whether the image is only plausible with exchanged planes."""
+def _is_swapped(values: Depth, given: DepthRange) -> bool:
+    """Whether the image is only plausible with swapped planes."""
     near_m = min(given.near_m, given.far_m)
     other = given._replace(near_m=given.far_m, far_m=given.near_m)
-    # Where nothing was drawn, exchanged planes have their near plane.
+    # Where nothing was drawn, swapped planes have their near plane.
     own = float(np.median(np.maximum(_planar(values, given), near_m)))
-    exchanged = float(np.median(np.maximum(_planar(values, other), near_m)))
+    swapped = float(np.median(np.maximum(_planar(values, other), near_m)))
     return own < NEAR_RATIO * near_m and (
-        exchanged > FAR_RATIO * near_m or math.isinf(exchanged)
+        swapped > FAR_RATIO * near_m or math.isinf(swapped)
     )
 
 

@@ -7,17 +7,15 @@ import math
 from ctypes import c_char, c_float, c_int64, c_uint32, c_uint64
 
 MAGIC, VERSION = 0x4F435558, 1
-HELLO, WELCOME, RING, FRAME, RESULT = 1, 2, 3, 4, 5
+HELLO, WELCOME, MEMORY, FRAME, RESULT = 1, 2, 3, 4, 5
 CONTROL = 100
 """A request of `ocufilter layer set` or `status`: JSON after the kind."""
 
 SRGB8, LINEAR8, LINEAR16F = 1, 2, 3
 HAS_HEAD, HAS_GAZE, IS_BLENDED = 1, 2, 4
 
-OWN_FRAME, FILTERED = 0, 1
 MAX_SIDE_PX = 16384
 MAX_SHARED_BYTES = 1 << 30
-MAX_SLOTS = 2
 MAX_CONTROL_BYTES = 100_000
 
 
@@ -36,18 +34,18 @@ class Welcome(ctypes.Structure):
 
     _fields_ = tuple(
         (name, c_uint32)
-        for name in ("kind", "magic", "version", "slot_count", "wait_ms", "max_age_ms")
+        for name in ("kind", "magic", "version", "wait_ms", "max_age_ms")
     )
 
 
-class Ring(ctypes.Structure):
+class Memory(ctypes.Structure):
     """Shared memory, whose descriptor goes with the message."""
 
-    _fields_ = (("kind", c_uint32), ("slot_count", c_uint32), ("slot_bytes", c_uint64))
+    _fields_ = (("kind", c_uint32), ("padding", c_uint32), ("size_bytes", c_uint64))
 
 
 class Image(ctypes.Structure):
-    """An image in a slot."""
+    """An image in the memory."""
 
     _fields_ = (("start", c_uint64), ("width_px", c_uint32), ("height_px", c_uint32))
 
@@ -81,10 +79,9 @@ class Frame(ctypes.Structure):
 
     _fields_ = (
         ("kind", c_uint32),
-        ("slot", c_uint32),
+        ("flags", c_uint32),
         ("frame_id", c_uint64),
         ("display_time_ns", c_int64),
-        ("flags", c_uint32),
         ("color_format", c_uint32),
         ("head", c_float * 7),
         ("gaze", c_float * 4),
@@ -93,7 +90,7 @@ class Frame(ctypes.Structure):
         *(
             (name, c_uint32)
             for name in (
-                *("frames", "frames_filtered", "frames_lapsed", "padding"),
+                *("frames", "frames_filtered", "frames_fallback"),
                 *("copy_us", "read_us", "upload_us", "other_us"),
             )
         ),
@@ -101,18 +98,16 @@ class Frame(ctypes.Structure):
 
 
 class Result(ctypes.Structure):
-    """A filtered frame, in place of the colors of its slot."""
+    """Result of a frame, whose colors are now filtered."""
 
     _fields_ = (
         ("kind", c_uint32),
-        ("slot", c_uint32),
-        ("frame_id", c_uint64),
         ("is_filtered", c_uint32),
-        ("padding", c_uint32),
+        ("frame_id", c_uint64),
     )
 
 
-_KINDS: dict[int, type[ctypes.Structure]] = {HELLO: Hello, RING: Ring, FRAME: Frame}
+_KINDS: dict[int, type[ctypes.Structure]] = {HELLO: Hello, MEMORY: Memory, FRAME: Frame}
 
 
 def kind_of(data: bytes) -> int:
@@ -120,7 +115,7 @@ def kind_of(data: bytes) -> int:
     return int.from_bytes(data[:4], "little") if len(data) >= 4 else 0
 
 
-def parsed(data: bytes) -> Hello | Ring | Frame:
+def parsed(data: bytes) -> Hello | Memory | Frame:
     """Return a message of the layer.
 
     Raises

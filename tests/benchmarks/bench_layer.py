@@ -207,7 +207,7 @@ def measure(size_px: tuple[int, int], n_frames: int) -> list[Row]:
     rows.append(bench.row("layer, helper", "age", ages[is_old], error))
     share = (
         f"{told['submitted']} submitted, {told['filtered']} filtered, "
-        f"{told['shown_filtered']} shown filtered, {told['lapsed']} lapsed"
+        f"{told['shown_filtered']} shown filtered, {told['fallback']} fallback"
     )
     rows.append(bench.row("layer, helper", share, ages[is_old], error))
     return rows

@@ -40,17 +40,17 @@ class LayerDouble:
         return wire.Welcome.from_buffer_copy(data) if data else None
 
     def share(self, size_bytes, *, seals=fcntl.F_SEAL_SHRINK, says_bytes=None):
-        """Share memory of one slot."""
+        """Share memory."""
         descriptor = os.memfd_create("layer", os.MFD_ALLOW_SEALING)
         os.ftruncate(descriptor, size_bytes)
         if seals:
             fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, seals)
-        ring = wire.Ring(wire.RING, 1, says_bytes or size_bytes)
-        socket.send_fds(self.connection, [bytes(ring)], [descriptor])
+        message = wire.Memory(wire.MEMORY, 0, says_bytes or size_bytes)
+        socket.send_fds(self.connection, [bytes(message)], [descriptor])
         self.slot = Slot(0, size_bytes, descriptor)
 
     def frame(self, colors, depths=(None, None), *, color_format=wire.SRGB8, **values):
-        """Return a frame with images of these kinds, rows as in OpenGL, in the slot."""
+        """Return a frame with images in the memory, their rows as in OpenGL."""
         self.frame_id += 1
         frame = wire.Frame(wire.FRAME, 0, self.frame_id)
         frame.color_format = color_format
@@ -86,7 +86,7 @@ class LayerDouble:
         return wire.Result.from_buffer_copy(data) if data else None
 
     def color(self, frame, index):
-        """Return the color that is in the slot, rows as in OpenGL."""
+        """Return the color that is in the memory, rows as in OpenGL."""
         image = frame.views[index].color
         dtype = np.uint8 if frame.color_format != wire.LINEAR16F else np.float16
         shape = image.height_px, image.width_px, 4

@@ -108,7 +108,7 @@ def filtered(layer, make_frame):
         layer.send(frame)
         result = layer.result()
         assert result is not None
-        assert (result.slot, result.frame_id) == (0, frame.frame_id)
+        assert result.frame_id == frame.frame_id
         if result.is_filtered:
             return frame
     raise AssertionError("no frame was filtered")
@@ -126,7 +126,7 @@ def test_frames_are_those_of_the_eye_filter(
     helper, path, connect, color_format, dtype, output
 ):
     layer = connect()
-    assert layer.welcome().slot_count == 1
+    assert layer.welcome().max_age_ms == 150
     images = [stripes(seed, dtype) for seed in (1, 2)]
     colors = [upward(color) for color, _, _ in images]
     depths = [upward(values) for _, _, values in images]
@@ -258,8 +258,9 @@ BAD = {
     "too long": lambda layer: bytes(wire.Frame(wire.FRAME)) + b"\0",
     "no memory": lambda layer: bytes(wire.Frame(wire.FRAME, 0, 1)),
     "hello again": lambda layer: bytes(wire.Hello(wire.HELLO, wire.MAGIC)),
-    "ring without memory": lambda layer: bytes(wire.Ring(wire.RING, 1, 4096)),
-    "slot": spoiled(lambda frame: setattr(frame, "slot", 1)),
+    "memory without a descriptor": lambda layer: bytes(
+        wire.Memory(wire.MEMORY, 0, 4096)
+    ),
     "format": spoiled(lambda frame: setattr(frame, "color_format", 9)),
     "pose": spoiled(set_pose),
     "start": spoiled(set_start),
@@ -314,6 +315,32 @@ def test_profiles_are_changed_and_errors_told(helper, path, connect):
         ask(path, {"right": "nobody"})
     with pytest.raises(ValueError, match="allowed: 100000"):
         ask(path, {"right": "x" * 200_000})
+
+
+def test_requests_that_are_nested_too_deeply_are_refused(helper, path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+        connection.settimeout(20.0)
+        connection.connect(str(path))
+        connection.send(wire.CONTROL.to_bytes(4, "little") + b"[" * 90_000)
+        assert b"error" in connection.recv(10_000)
+    assert ask(path, {})["program"] is None
+
+
+def test_names_are_printed_without_control_characters(helper, path, connect):
+    connect("\x1b[2J").welcome()
+    assert helper.lines == ["?[2J: connected"]
+
+
+def test_notes_on_depth_are_not_repeated_for_other_numbers(helper, path, connect):
+    layer = connect()
+    layer.welcome()
+    color, _, values = stripes(8)
+    for near_m in (-1.0, -2.0, -3.0):
+        frame = layer.frame([upward(color)] * 2, [upward(values)] * 2)
+        frame.views[0].near_m = near_m
+        layer.send(frame)
+        layer.result()
+    assert sum("planes are at" in line for line in helper.lines) == 1
 
 
 def test_one_helper_per_socket(helper, path, connect):

@@ -2,6 +2,7 @@
 
 build_runtime   mock_runtime/, with its manifest for XR_RUNTIME_JSON
 build_driver    driver/
+build_handles   handles.c, a program with two threads
 build_layer     the layer itself
 missing         what this machine lacks for that
 thread_sanitizer_options   for programs built with -fsanitize=thread
@@ -73,6 +74,14 @@ def build_driver(folder: Path, *flags: str) -> Path:
     _compile(
         sorted(DRIVER.glob("*.c")), program, flags, (*LIBRARIES, "-lopenxr_loader")
     )
+    return program
+
+
+def build_handles(folder: Path, *flags: str) -> Path:
+    """Compile handles.c; return its path.  As `build_runtime`."""
+    program = folder / "handles"
+    source = Path(__file__).with_name("handles.c")
+    _compile([source], program, flags, (*LIBRARIES, "-lopenxr_loader"))
     return program
 
 

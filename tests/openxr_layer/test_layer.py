@@ -6,6 +6,7 @@ was filtered.
 
 import re
 import shutil
+import time
 
 import numpy as np
 import pytest
@@ -32,12 +33,12 @@ class Stage:
 
     def __init__(self, library, runtime, driver, folder):
         self.folder, self.path = folder, folder / "layer.sock"
-        self._library, self._runtime, self._driver = library, runtime, driver
+        self._library, self._runtime, self.driver = library, runtime, driver
 
     def run(self, case, *options, n_frames=N_FRAMES, **variables):
         own = layer_environment(self._library, self.folder, self.path)
         shutil.rmtree(self.folder / "captured", ignore_errors=True)
-        command = (self._driver, case, "--frames", n_frames, *options)
+        command = (self.driver, case, "--frames", n_frames, *options)
         return Run(self._runtime, self.folder, *command, **(own | variables))
 
     def helper(self, *, wait_ms=LONG_MS, **options):
@@ -102,6 +103,7 @@ def is_filtered_after_start(kinds):
 
 FILTERED = ["plain", "array", "wide", "offset", "msaa4", "dynamic-size"]
 FILTERED += ["other-thread", "no-context", "space-destroyed", "end-from-thread"]
+FILTERED += ["ahead"]
 
 
 @pytest.mark.parametrize("case", FILTERED)
@@ -114,6 +116,19 @@ def test_frames_are_filtered(stage, case):
     # The depth is that of another frame in general, and is dropped.
     has_depth = ["depth" in f["layers"][0]["views"][0] for f in ran.frames]
     assert has_depth == [kind == "own" for kind in kinds]
+
+
+def without_other_contexts(violations):
+    """Return the other ones: the mock does not know that a program has two contexts."""
+    return [line for line in violations if "current context" not in line]
+
+
+def test_another_context_is_current(stage):
+    with stage.helper():
+        ran = stage.run("other-context", "--check-state")
+    assert ran.exit_code == 0, ran.told[-1]
+    assert without_other_contexts(ran.violations) == []
+    assert is_filtered_after_start(shown_kinds(ran))
 
 
 @pytest.mark.parametrize("kind", ["RGBA8", "SRGB8_ALPHA8", "RGB10_A2", "RGBA16F"])
@@ -159,8 +174,8 @@ def test_without_a_helper_frames_are_the_own(stage):
 @pytest.mark.parametrize(
     ("case", "line"),
     [
-        ("view-locked", "fixed to the head"),
-        ("action-space", "fixed to the head"),
+        ("view-locked", "head-locked"),
+        ("action-space", "head-locked"),
         ("mono", "layers of 1 views are not filtered"),
     ],
 )
@@ -170,6 +185,9 @@ def test_other_layers_pass(stage, case, line):
     check_clean(ran)
     assert set(shown_kinds(ran)) == {"own"}
     assert sum(line in said for said in layer_lines(ran)) == 1
+
+
+BLENDED = 6  # by the texture's alpha, which is not premultiplied
 
 
 @pytest.mark.parametrize(
@@ -186,8 +204,11 @@ def test_one_of_several_layers_is_filtered(stage, case, index):
         if other["type"] == "quad":
             pixels = pixels_of(ran.folder, other)
             assert kind_of(other, pixels, told["frame"], 2) == "own"
-        else:
-            assert other["flags"] == frame["layers"][1]["flags"]
+            continue
+        assert other["flags"] == BLENDED
+        for eye, view in enumerate(other["views"]):
+            pixels = pixels_of(ran.folder, view)
+            assert kind_of(view, pixels, told["frame"], eye) == "own"
 
 
 def test_alpha_is_kept(stage):
@@ -266,6 +287,81 @@ def test_images_that_the_runtime_still_reads(stage):
     assert kinds[-1] == "filtered"
 
 
+@pytest.mark.parametrize("n_swapchains", [6, 7])
+def test_a_swapchain_that_cannot_be_replaced(stage, n_swapchains):
+    # Four are the program's, and two the layer's until the image grows.
+    with stage.helper(wait_ms=0):
+        ran = stage.run(
+            "growing",
+            n_frames=90,
+            MOCK_XR_RATE_HZ="60",
+            MOCK_XR_MAX_SWAPCHAINS=str(n_swapchains),
+        )
+    check_clean(ran, 90)
+    assert any("provides no swapchain" in line for line in layer_lines(ran))
+
+
+def test_an_image_that_grows(stage):
+    with stage.helper():
+        ran = stage.run("growing", n_frames=90)
+    check_clean(ran, 90)
+    assert is_filtered_after_start(shown_kinds(ran))
+
+
+def test_images_that_were_not_shown_for_a_while(stage):
+    with stage.helper():
+        ran = stage.run("hidden", n_frames=40)
+    check_clean(ran, 40)
+    shown = {frame["display_time"]: frame for frame in ran.frames}
+    for line in ran.told:
+        frame = shown.get(line.get("display_time"))
+        if frame is None:
+            continue
+        view = frame["layers"][0]["views"][0]
+        pixels = pixels_of(ran.folder, view)
+        # It is of this frame, filtered or not.
+        assert kind_of(view, pixels, line["frame"], 0) in ("own", "filtered")
+    assert kind_of(view, pixels, line.get("frame", 39), 0) == "filtered"
+
+
+def test_waiting_ends_where_the_runtime_still_reads(stage):
+    with stage.helper(wait_ms=5000):
+        ran = stage.run("plain", MOCK_XR_WAIT_TIMEOUTS=str(10**9))
+    check_clean(ran)
+    assert set(shown_kinds(ran)) == {"own"}
+
+
+def test_a_session_without_opengl_and_a_runtime_without_depth(stage):
+    # The layer finds no context that shares, as with Vulkan, in a program with depth.
+    offered = "XR_KHR_opengl_enable,XR_MNDX_egl_enable"
+    ran = stage.run("plain", MOCK_XR_EXTENSIONS=offered, OCUFILTER_LAYER_READS="none")
+    check_clean(ran)
+    assert set(shown_kinds(ran)) == {"own"}
+    assert any("own frames are shown" in line for line in layer_lines(ran))
+
+
+def test_a_forked_child_does_not_keep_the_helper(stage):
+    with stage.helper() as helper:
+        ran = stage.run("fork", n_frames=40)
+        check_clean(ran, 40)
+        end_s = time.monotonic() + 10.0  # the child lives on for twice as long
+        while "driver: disconnected" not in helper.lines:
+            assert time.monotonic() < end_s
+            time.sleep(0.01)
+    assert is_filtered_after_start(shown_kinds(ran))
+
+
+def test_a_limit_of_file_sizes(stage):
+    limited = stage.folder / "limited.sh"
+    limited.write_text(f'#!/bin/sh\nulimit -f 8\nexec {stage.driver} "$@"\n')
+    limited.chmod(0o755)
+    stage.driver = limited
+    with stage.helper():
+        ran = stage.run("plain", MOCK_XR_CAPTURE="", MOCK_XR_SIZE="512x512")
+    check_clean(ran)
+    assert any("no shared memory" in line for line in layer_lines(ran))
+
+
 def test_a_session_that_is_lost(stage):
     for when in ("6", "6,instance"):
         with stage.helper():
@@ -280,7 +376,7 @@ def test_a_session_that_is_lost(stage):
 DEPTH_NOTES = {
     "depth-constant": "all its values are",
     "depth-nan": "",
-    "depth-swapped": "exchanged; corrected",
+    "depth-swapped": "swapped; corrected",
     "depth-zero-near": "planes are at 0",
     "depth-equal": "both its planes are at 1 m",
     "depth-range": "the range of the buffer",
@@ -307,7 +403,8 @@ def test_wrong_depth(stage, case):
 
 
 @pytest.mark.parametrize(
-    "case", ["plain", "other-thread", "end-from-thread", "restart", "no-context"]
+    "case",
+    ["plain", "other-thread", "end-from-thread", "restart", "no-context", "ahead"],
 )
 def test_threads_do_not_race(watched, tmp_path, case):
     library = build.build_layer(tmp_path, "-fsanitize=thread")
@@ -338,6 +435,17 @@ def test_addresses_are_valid(runtime, driver, tmp_path):
             ran.said
         )
         check_clean(ran, n_frames)
+
+
+def test_handles_of_several_sessions(watched, tmp_path):
+    library = build.build_layer(tmp_path, "-fsanitize=thread")
+    program_path = build.build_handles(tmp_path, "-fsanitize=thread")
+    own = layer_environment(library, tmp_path, tmp_path / "none.sock")
+    own |= build.thread_sanitizer_options(tmp_path)
+    ran = Run(watched[0], tmp_path, program_path, **own)
+    assert "WARNING: ThreadSanitizer" not in ran.said
+    assert ran.exit_code == 0, ran.said
+    assert without_other_contexts(ran.violations) == []
 
 
 # Installation

@@ -77,7 +77,7 @@ def test_background_is_at_the_far_plane():
 
 @pytest.mark.parametrize(("near_m", "far_m"), RANGES)
 @pytest.mark.parametrize("is_reversed", [False, True])
-def test_exchanged_planes_are_corrected(near_m, far_m, is_reversed):
+def test_swapped_planes_are_corrected(near_m, far_m, is_reversed):
     depth_m = scene_m()
     values = projected(depth_m, near_m, far_m)
     if is_reversed:
@@ -88,11 +88,11 @@ def test_exchanged_planes_are_corrected(near_m, far_m, is_reversed):
     found_m, note = planar_depth(
         values.astype(np.float32), given, (WIDTH_PX, HEIGHT_PX)
     )
-    assert "exchanged" in note
+    assert "swapped" in note
     assert np.abs(1.0 / found_m - 1.0 / depth_m).max() <= 4.0 * 2.0**-24 / near_m
 
 
-def test_a_hand_close_to_the_eyes_is_not_taken_for_exchanged_planes():
+def test_a_hand_close_to_the_eyes_is_not_taken_for_swapped_planes():
     depth_m = np.full((HEIGHT_PX, WIDTH_PX), 0.25)
     depth_m[:4] = 3.0
     values = projected(depth_m, 0.1, 100.0).astype(np.float32)

@@ -12,7 +12,7 @@ from tests.source_tree import ROOT
 STRUCTURES = {
     "wire_hello": wire.Hello,
     "wire_welcome": wire.Welcome,
-    "wire_ring": wire.Ring,
+    "wire_memory": wire.Memory,
     "wire_image": wire.Image,
     "wire_view": wire.View,
     "wire_frame": wire.Frame,
@@ -23,7 +23,7 @@ CONSTANTS = {
     "WIRE_VERSION": wire.VERSION,
     "WIRE_HELLO": wire.HELLO,
     "WIRE_WELCOME": wire.WELCOME,
-    "WIRE_RING": wire.RING,
+    "WIRE_MEMORY": wire.MEMORY,
     "WIRE_FRAME": wire.FRAME,
     "WIRE_RESULT": wire.RESULT,
     "WIRE_SRGB8": wire.SRGB8,

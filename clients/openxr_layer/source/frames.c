@@ -6,13 +6,14 @@
 #include "log.h"
 
 #define NS_PER_MS UINT64_C(1000000)
+#define MAX_RESULTS 4
 #define ALIGN(bytes) (((bytes) + 63) & ~(size_t)63)
 
 /* The projection layer of a frame that is to be filtered. */
 typedef struct {
     const XrCompositionLayerProjection *layer;
     uint32_t index;
-    space_kind kind;
+    reference_space space;
     swapchain *color[WIRE_EYES], *depth[WIRE_EYES]; /* depth: NULL without */
     const XrCompositionLayerDepthInfoKHR *depth_info[WIRE_EYES];
 } plan;
@@ -38,20 +39,24 @@ static const XrCompositionLayerDepthInfoKHR *depth_of(const void *next) {
 /* Find the images of a layer; false if it goes out as it is. */
 static bool plan_views(session *at, plan *p) {
     for (int eye = 0; eye < WIRE_EYES; ++eye) {
-        const XrCompositionLayerProjectionView *view = p->layer->views + eye;
-        swapchain *color = p->color[eye] = find_swapchain(view->subImage.swapchain);
+        swapchain *color = find_swapchain(p->layer->views[eye].subImage.swapchain);
         if (!color || color->session != at) return false;
+        p->color[eye] = color;
         color->unused_releases = 0;
+    }
+    for (int eye = 0; eye < WIRE_EYES; ++eye) {
+        const XrCompositionLayerProjectionView *view = p->layer->views + eye;
+        const swapchain *color = p->color[eye];
         if (!swapchain_can_copy(color) || is_depth_format(color->info.format) ||
             color->info.format != p->color[0]->info.format) {
-            LOG_ONCE(&at->told, SAID_FORMAT,
+            LOG_ONCE(&at->reported, REASON_FORMAT,
                      "images of format 0x%llx are not filtered; supported: SRGB8_ALPHA8, "
                      "RGBA8, RGB10_A2, RGBA16, RGBA16F, the same for both eyes",
                      (long long)color->info.format);
             return false;
         }
         if (!is_inside(color, &view->subImage)) {
-            LOG_ONCE(&at->told, SAID_RECTANGLE, "a view extends beyond its image");
+            LOG_ONCE(&at->reported, REASON_RECTANGLE, "a view extends beyond its image");
             return false;
         }
         if (!color->has_copy) return false;
@@ -75,14 +80,13 @@ static bool make_plan(session *at, const XrFrameEndInfo *info, plan *p) {
         if (!layer || layer->type != XR_TYPE_COMPOSITION_LAYER_PROJECTION) continue;
         *p = (plan){.layer = (const XrCompositionLayerProjection *)layer, .index = i};
         if (p->layer->viewCount != WIRE_EYES || !p->layer->views) {
-            LOG_ONCE(&at->told, SAID_VIEWS,
+            LOG_ONCE(&at->reported, REASON_VIEWS,
                      "layers of %u views are not filtered; supported: two",
                      p->layer->viewCount);
-        } else if (!find_space_kind(layer->space, &p->kind) ||
-                   p->kind.type == XR_REFERENCE_SPACE_TYPE_VIEW) {
-            LOG_ONCE(&at->told, SAID_SPACE,
-                     "layers that are fixed to the head or to a controller are not "
-                     "filtered");
+        } else if (!find_reference_space(layer->space, &p->space) ||
+                   p->space.type == XR_REFERENCE_SPACE_TYPE_VIEW) {
+            LOG_ONCE(&at->reported, REASON_SPACE,
+                     "head-locked and controller-locked layers are not filtered");
         } else if (plan_views(at, p)) {
             return true;
         }
@@ -92,38 +96,38 @@ static bool make_plan(session *at, const XrFrameEndInfo *info, plan *p) {
 
 /* Spaces of the layer's own -------------------------------------------------------------- */
 
-static bool is_same_kind(const space_kind *a, const space_kind *b) {
+static bool is_same_space(const reference_space *a, const reference_space *b) {
     return a->type == b->type && !memcmp(&a->pose, &b->pose, sizeof a->pose);
 }
 
-static XrSpace create_space(session *at, const space_kind *kind) {
+static XrSpace create_space(session *at, const reference_space *kind) {
     XrReferenceSpaceCreateInfo info = {.type = XR_TYPE_REFERENCE_SPACE_CREATE_INFO,
                                        .referenceSpaceType = kind->type,
                                        .poseInReferenceSpace = kind->pose};
     XrSpace made = XR_NULL_HANDLE;
-    if (XR_FAILED(at->own->CreateReferenceSpace(at->handle, &info, &made)))
+    if (XR_FAILED(at->instance->CreateReferenceSpace(at->handle, &info, &made)))
         return XR_NULL_HANDLE;
     return made;
 }
 
 /* The application may destroy its space while a frame in it is filtered. */
-static XrSpace own_space(session *at, const space_kind *kind) {
-    const unsigned limit = sizeof at->own_spaces / sizeof *at->own_spaces;
-    for (unsigned i = 0; i < at->own_space_count && i < limit; ++i)
-        if (is_same_kind(at->own_kinds + i, kind)) return at->own_spaces[i];
+static XrSpace own_space(session *at, const reference_space *kind) {
+    for (unsigned i = 0; i < at->space_count && i < MAX_SPACES; ++i)
+        if (is_same_space(at->space_kinds + i, kind)) return at->spaces[i];
     XrSpace made = create_space(at, kind);
     if (!made) return XR_NULL_HANDLE;
-    unsigned i = at->own_space_count++ % limit;
-    if (at->own_spaces[i]) at->own->DestroySpace(at->own_spaces[i]);
-    at->own_spaces[i] = made;
-    at->own_kinds[i] = *kind;
+    unsigned i = at->space_count++ % MAX_SPACES;
+    if (at->spaces[i]) at->instance->DestroySpace(at->spaces[i]);
+    at->spaces[i] = made;
+    at->space_kinds[i] = *kind;
     return made;
 }
 
-static void locate_head(session *at, const space_kind *kind, XrTime time,
-                        wire_frame *frame) {
+static void locate_head(session *at, const reference_space *kind, XrTime time,
+                        wire_frame *wire) {
     if (!at->view_space) {
-        const space_kind view = {XR_REFERENCE_SPACE_TYPE_VIEW, {.orientation.w = 1.0f}};
+        const reference_space view = {XR_REFERENCE_SPACE_TYPE_VIEW,
+                                      {.orientation.w = 1.0f}};
         at->view_space = create_space(at, &view);
     }
     XrSpace base = own_space(at, kind);
@@ -131,12 +135,12 @@ static void locate_head(session *at, const space_kind *kind, XrTime time,
     const XrSpaceLocationFlags needed = XR_SPACE_LOCATION_ORIENTATION_VALID_BIT |
                                         XR_SPACE_LOCATION_POSITION_VALID_BIT;
     if (!at->view_space || !base ||
-        XR_FAILED(at->own->LocateSpace(at->view_space, base, time, &found)) ||
+        XR_FAILED(at->instance->LocateSpace(at->view_space, base, time, &found)) ||
         (found.locationFlags & needed) != needed)
         return;
-    memcpy(frame->head, &found.pose.position, sizeof found.pose.position);
-    memcpy(frame->head + 3, &found.pose.orientation, sizeof found.pose.orientation);
-    frame->flags |= WIRE_HAS_HEAD;
+    memcpy(wire->head, &found.pose.position, sizeof found.pose.position);
+    memcpy(wire->head + 3, &found.pose.orientation, sizeof found.pose.orientation);
+    wire->flags |= WIRE_HAS_HEAD;
 }
 
 /* To the helper --------------------------------------------------------------------------- */
@@ -150,22 +154,23 @@ static size_t place(wire_image *image, size_t start, const XrSwapchainSubImage *
 }
 
 /* Describe a frame; return the bytes of its images. */
-static size_t describe(session *at, const plan *p, const XrFrameEndInfo *info, slot *to) {
-    wire_frame *frame = &to->frame;
-    *frame = (wire_frame){.kind = WIRE_FRAME,
-                          .slot = (uint32_t)(to - at->slots),
-                          .frame_id = at->next_frame++,
-                          .display_time_ns = info->displayTime,
-                          .color_format = wire_format_of(p->color[0]->info.format)};
-    to->kind = p->kind;
-    to->flags = p->layer->layerFlags;
-    to->format = p->color[0]->info.format;
-    if (to->flags & XR_COMPOSITION_LAYER_BLEND_TEXTURE_SOURCE_ALPHA_BIT)
-        frame->flags |= WIRE_IS_BLENDED;
-    size_t bytes = 0, pixel = frame->color_format == WIRE_LINEAR16F ? 8 : 4;
+static size_t describe(session *at, const plan *p, const XrFrameEndInfo *info) {
+    app_frame *frame = &at->frame;
+    wire_frame *wire = &frame->wire;
+    *frame = (app_frame){.begun_ns = now_ns(),
+                         .space = p->space,
+                         .flags = p->layer->layerFlags,
+                         .format = p->color[0]->info.format};
+    *wire = (wire_frame){.kind = WIRE_FRAME,
+                         .frame_id = at->next_frame++,
+                         .display_time_ns = info->displayTime,
+                         .color_format = wire_format_of(frame->format)};
+    if (frame->flags & XR_COMPOSITION_LAYER_BLEND_TEXTURE_SOURCE_ALPHA_BIT)
+        wire->flags |= WIRE_IS_BLENDED;
+    size_t bytes = 0, pixel = wire->color_format == WIRE_LINEAR16F ? 8 : 4;
     for (int eye = 0; eye < WIRE_EYES; ++eye) {
         const XrCompositionLayerProjectionView *given = p->layer->views + eye;
-        wire_view *view = frame->views + eye;
+        wire_view *view = wire->views + eye;
         memcpy(view->position_m, &given->pose.position, sizeof view->position_m);
         memcpy(view->orientation, &given->pose.orientation, sizeof view->orientation);
         memcpy(view->fov_rad, &given->fov, sizeof view->fov_rad);
@@ -173,7 +178,7 @@ static size_t describe(session *at, const plan *p, const XrFrameEndInfo *info, s
     }
     for (int eye = 0; eye < WIRE_EYES; ++eye) {
         const XrCompositionLayerDepthInfoKHR *depth = p->depth_info[eye];
-        wire_view *view = frame->views + eye;
+        wire_view *view = wire->views + eye;
         if (!depth) continue;
         bytes = place(&view->depth, bytes, &depth->subImage, sizeof(float));
         view->min_depth = depth->minDepth;
@@ -184,122 +189,89 @@ static size_t describe(session *at, const plan *p, const XrFrameEndInfo *info, s
     return bytes;
 }
 
-static slot *find_slot(session *at, slot_state state) {
-    for (uint32_t i = 0; i < at->link.slot_count; ++i)
-        if (at->slots[i].state == state) return at->slots + i;
-    return NULL;
-}
-
-static bool is_idle(const session *at) {
-    for (uint32_t i = 0; i < at->link.slot_count; ++i)
-        if (at->slots[i].state != SLOT_FREE) return false;
+/* Begin a frame for the helper; false if it is busy or there is no memory. */
+static bool begin_frame(session *at, const plan *p, const XrFrameEndInfo *info) {
+    if (at->frame.state != FRAME_NONE) return false;
+    size_t bytes = describe(at, p, info);
+    if (!link_share(&at->link, bytes)) {
+        if (at->link.is_accepted)
+            LOG_ONCE(&at->reported, REASON_MEMORY, "no shared memory for %zu bytes", bytes);
+        return false;
+    }
+    locate_head(at, &p->space, info->displayTime, &at->frame.wire);
+    gaze_locate(at, info->displayTime, &at->frame.wire);
     return true;
 }
 
-/* Find a slot for a frame, with memory for its images. */
-static slot *take_slot(session *at, const plan *p, const XrFrameEndInfo *info) {
-    slot *to = find_slot(at, SLOT_FREE);
-    if (!to) return NULL;
-    size_t bytes = describe(at, p, info, to);
-    /* New memory replaces all slots. */
-    if (bytes > at->link.slot_bytes && !is_idle(at)) return NULL;
-    if (!link_share(&at->link, bytes)) {
-        if (at->link.is_welcome)
-            LOG_ONCE(&at->told, SAID_MEMORY, "no shared memory for %zu bytes", bytes);
-        return NULL;
-    }
-    to->begun_ns = now_ns();
-    locate_head(at, &p->kind, info->displayTime, &to->frame);
-    gaze_locate(at, info->displayTime, &to->frame);
-    return to;
-}
-
-static uint8_t *memory_of(const session *at, const slot *of) {
-    return at->link.memory + (size_t)(of - at->slots) * at->link.slot_bytes;
-}
-
 /* Begin to read the copies of a frame, in the layer's context. */
-static void read_images(session *at, const plan *p, slot *to) {
+static void read_images(session *at, const plan *p) {
     gl_context *gl = &at->gl;
-    uint8_t *base = memory_of(at, to);
+    uint8_t *base = at->link.memory;
     if (!gl->is_software) {
         /* A buffer is read without waiting for the GPU. */
-        if (to->is_read) gl->DeleteSync(to->is_read); /* of a helper that has ended */
-        if (!to->pixels) gl->GenBuffers(1, &to->pixels);
-        gl->BindBuffer(GL_PIXEL_PACK_BUFFER, to->pixels);
-        if (to->pixels_bytes != at->link.slot_bytes) {
-            to->pixels_bytes = at->link.slot_bytes;
-            gl->BufferData(GL_PIXEL_PACK_BUFFER, (GLsizeiptr)to->pixels_bytes, NULL,
+        if (at->is_read) gl->DeleteSync(at->is_read); /* of a helper that has ended */
+        if (!at->pixels) gl->GenBuffers(1, &at->pixels);
+        gl->BindBuffer(GL_PIXEL_PACK_BUFFER, at->pixels);
+        if (at->pixels_bytes != at->link.memory_bytes) {
+            at->pixels_bytes = at->link.memory_bytes;
+            gl->BufferData(GL_PIXEL_PACK_BUFFER, (GLsizeiptr)at->pixels_bytes, NULL,
                            GL_STREAM_READ);
         }
         base = NULL;
     }
     for (int eye = 0; eye < WIRE_EYES; ++eye) {
-        const wire_view *view = to->frame.views + eye;
+        const wire_view *view = at->frame.wire.views + eye;
         swapchain_read(p->color[eye], &p->layer->views[eye].subImage,
-                       to->frame.color_format, base + view->color.start);
+                       at->frame.wire.color_format, base + view->color.start);
         if (p->depth[eye])
             swapchain_read(p->depth[eye], &p->depth_info[eye]->subImage, 0,
                            base + view->depth.start);
     }
     if (!gl->is_software) {
         gl->BindBuffer(GL_PIXEL_PACK_BUFFER, 0);
-        to->is_read = gl->FenceSync(GL_SYNC_GPU_COMMANDS_COMPLETE, 0);
+        at->is_read = gl->FenceSync(GL_SYNC_GPU_COMMANDS_COMPLETE, 0);
         gl->Flush();
     }
-    to->state = SLOT_READING;
-}
-
-static size_t used_bytes(const wire_frame *frame) {
-    size_t end = 0;
-    for (int eye = 0; eye < WIRE_EYES; ++eye) {
-        const wire_view *view = frame->views + eye;
-        size_t pixel = frame->color_format == WIRE_LINEAR16F ? 8 : 4;
-        size_t color = view->color.start +
-                       pixel * view->color.width_px * view->color.height_px;
-        size_t depth = view->depth.start +
-                       sizeof(float) * view->depth.width_px * view->depth.height_px;
-        if (color > end) end = color;
-        if (depth > end) end = depth;
-    }
-    return end;
+    at->frame.state = FRAME_READING;
 }
 
 static void clear_counts(session *at) {
-    at->frames = at->frames_filtered = at->frames_lapsed = 0;
+    at->frames = at->frames_filtered = at->frames_fallback = 0;
     at->copy_ns = at->read_ns = at->upload_ns = at->other_ns = 0;
+    at->inside_ns = 0;
 }
 
-/* Send a frame whose images have been read, in the layer's context. */
-static void send_read(session *at, slot *of, uint64_t limit_ns) {
+/* Copy the buffer that has been read; false if the GPU has not finished. */
+static bool take_buffer(session *at, uint64_t limit_ns) {
     gl_context *gl = &at->gl;
-    if (!gl->is_software) {
-        GLenum state = gl->ClientWaitSync(of->is_read, GL_SYNC_FLUSH_COMMANDS_BIT, limit_ns);
-        if (state == GL_TIMEOUT_EXPIRED) return;
-        gl->DeleteSync(of->is_read);
-        of->is_read = NULL;
-        size_t bytes = used_bytes(&of->frame);
-        gl->BindBuffer(GL_PIXEL_PACK_BUFFER, of->pixels);
-        const void *found =
-            gl->MapBufferRange(GL_PIXEL_PACK_BUFFER, 0, (GLsizeiptr)bytes, GL_MAP_READ_BIT);
-        if (found) memcpy(memory_of(at, of), found, bytes);
-        gl->UnmapBuffer(GL_PIXEL_PACK_BUFFER);
-        gl->BindBuffer(GL_PIXEL_PACK_BUFFER, 0);
-        if (!found) {
-            of->state = SLOT_FREE;
-            return;
-        }
-    }
-    wire_frame *frame = &of->frame;
-    frame->frames = at->frames;
-    frame->frames_filtered = at->frames_filtered;
-    frame->frames_lapsed = at->frames_lapsed;
-    frame->copy_us = (uint32_t)(at->copy_ns / 1000);
-    frame->read_us = (uint32_t)(at->read_ns / 1000);
-    frame->upload_us = (uint32_t)(at->upload_ns / 1000);
-    frame->other_us = (uint32_t)(at->other_ns / 1000);
-    of->state = link_send(&at->link, frame) ? SLOT_SENT : SLOT_FREE;
-    if (of->state != SLOT_FREE) clear_counts(at);
+    if (gl->ClientWaitSync(at->is_read, GL_SYNC_FLUSH_COMMANDS_BIT, limit_ns) ==
+        GL_TIMEOUT_EXPIRED)
+        return false;
+    gl->DeleteSync(at->is_read);
+    at->is_read = NULL;
+    gl->BindBuffer(GL_PIXEL_PACK_BUFFER, at->pixels);
+    const void *found = gl->MapBufferRange(GL_PIXEL_PACK_BUFFER, 0,
+                                           (GLsizeiptr)at->pixels_bytes, GL_MAP_READ_BIT);
+    if (found) memcpy(at->link.memory, found, at->pixels_bytes);
+    else at->frame.state = FRAME_NONE;
+    gl->UnmapBuffer(GL_PIXEL_PACK_BUFFER);
+    gl->BindBuffer(GL_PIXEL_PACK_BUFFER, 0);
+    return found != NULL;
+}
+
+/* Send the frame if its images have been read, in the layer's context. */
+static void send_frame(session *at, uint64_t limit_ns) {
+    if (!at->gl.is_software && !take_buffer(at, limit_ns)) return;
+    wire_frame *wire = &at->frame.wire;
+    wire->frames = at->frames;
+    wire->frames_filtered = at->frames_filtered;
+    wire->frames_fallback = at->frames_fallback;
+    wire->copy_us = (uint32_t)(at->copy_ns / 1000);
+    wire->read_us = (uint32_t)(at->read_ns / 1000);
+    wire->upload_us = (uint32_t)(at->upload_ns / 1000);
+    wire->other_us = (uint32_t)(at->other_ns / 1000);
+    at->frame.state = link_send(&at->link, wire) ? FRAME_SENT : FRAME_NONE;
+    if (at->frame.state == FRAME_SENT) clear_counts(at);
 }
 
 /* From the helper ---------------------------------------------------------------------------- */
@@ -307,179 +279,199 @@ static void send_read(session *at, slot *of, uint64_t limit_ns) {
 static void receive(session *at) {
     wire_result result;
     link_connect(&at->link);
-    while (link_receive(&at->link, &result)) {
-        slot *of = at->slots + result.slot;
-        if (of->state != SLOT_SENT || of->frame.frame_id != result.frame_id) continue;
-        of->state = result.is_filtered ? SLOT_FILTERED : SLOT_FREE;
+    /* One result is due; a helper that floods the socket does not stop the application. */
+    for (int i = 0; i < MAX_RESULTS && link_receive(&at->link, &result); ++i) {
+        if (at->frame.state != FRAME_SENT || at->frame.wire.frame_id != result.frame_id)
+            continue;
+        at->frame.state = result.is_filtered ? FRAME_FILTERED : FRAME_NONE;
         if (!result.is_filtered) at->is_shown = false;
     }
     if (!at->link.is_lost) return;
     at->link.is_lost = at->is_shown = false;
+    at->frame.state = FRAME_NONE;
     /* Counts are for each helper. */
     at->has_filtered = false;
     clear_counts(at);
-    for (int i = 0; i < MAX_SLOTS; ++i) at->slots[i].state = SLOT_FREE;
 }
 
-/* Return the newest filtered frame; older ones are not shown. */
-static slot *newest_filtered(session *at) {
-    slot *newest = NULL;
-    for (uint32_t i = 0; i < at->link.slot_count; ++i) {
-        slot *of = at->slots + i;
-        if (of->state != SLOT_FILTERED) continue;
-        slot *older = !newest || newest->frame.frame_id < of->frame.frame_id ? newest : of;
-        if (older) older->state = SLOT_FREE;
-        if (older != of) newest = of;
-    }
-    return newest;
+/* The specification demands that commands that refer to a swapchain have completed. */
+static void finish_uploads(session *at) {
+    gl_current before;
+    if (!gl_enter(&at->gl, &before)) return;
+    at->gl.Finish();
+    gl_leave(&at->gl, &before, false);
 }
 
-static bool create_image(session *at, own_image *image, const slot *of, int eye) {
-    const wire_image *color = &of->frame.views[eye].color;
-    if (image->handle && image->format == of->format &&
-        image->width_px >= color->width_px && image->height_px >= color->height_px)
-        return true;
-    /* Sizes that change with the frame rate must not create a swapchain per frame. */
-    uint32_t width_px = color->width_px, height_px = color->height_px;
-    if (image->handle && image->format == of->format) {
-        if (width_px < image->width_px) width_px = image->width_px;
-        if (height_px < image->height_px) height_px = image->height_px;
-    }
-    if (image->handle) at->own->DestroySwapchain(image->handle);
-    *image = (own_image){.format = of->format, .width_px = width_px, .height_px = height_px};
+static void destroy_image(session *at, own_image *image) {
+    if (image->handle) at->instance->DestroySwapchain(image->handle);
+    *image = (own_image){0};
+}
+
+static bool fill_image(session *at, own_image *image) {
     XrSwapchainCreateInfo info = {.type = XR_TYPE_SWAPCHAIN_CREATE_INFO,
                                   .usageFlags = XR_SWAPCHAIN_USAGE_COLOR_ATTACHMENT_BIT |
                                                 XR_SWAPCHAIN_USAGE_SAMPLED_BIT |
                                                 XR_SWAPCHAIN_USAGE_TRANSFER_DST_BIT,
-                                  .format = of->format,
+                                  .format = image->format,
                                   .sampleCount = 1,
-                                  .width = width_px,
-                                  .height = height_px,
+                                  .width = image->width_px,
+                                  .height = image->height_px,
                                   .faceCount = 1,
                                   .arraySize = 1,
                                   .mipCount = 1};
-    if (XR_FAILED(at->own->CreateSwapchain(at->handle, &info, &image->handle))) {
+    if (XR_FAILED(at->instance->CreateSwapchain(at->handle, &info, &image->handle))) {
         image->handle = XR_NULL_HANDLE;
         return false;
     }
     XrSwapchainImageOpenGLKHR found[MAX_IMAGES];
     for (int i = 0; i < MAX_IMAGES; ++i)
         found[i] = (XrSwapchainImageOpenGLKHR){.type = XR_TYPE_SWAPCHAIN_IMAGE_OPENGL_KHR};
-    if (XR_FAILED(at->own->EnumerateSwapchainImages(
+    if (XR_FAILED(at->instance->EnumerateSwapchainImages(
             image->handle, MAX_IMAGES, &image->image_count,
-            (XrSwapchainImageBaseHeader *)found))) {
-        at->own->DestroySwapchain(image->handle);
-        image->handle = XR_NULL_HANDLE;
+            (XrSwapchainImageBaseHeader *)found)))
         return false;
-    }
     for (uint32_t i = 0; i < image->image_count; ++i) image->images[i] = found[i].image;
     return true;
 }
 
+static bool create_image(session *at, own_image *image, const wire_image *color) {
+    bool is_same_format = image->handle && image->format == at->frame.format;
+    if (is_same_format && image->width_px >= color->width_px &&
+        image->height_px >= color->height_px)
+        return true;
+    /* Sizes that change with the frame rate must not create a swapchain per frame. */
+    uint32_t width_px = color->width_px, height_px = color->height_px;
+    if (is_same_format && width_px < image->width_px) width_px = image->width_px;
+    if (is_same_format && height_px < image->height_px) height_px = image->height_px;
+    at->is_shown = false; /* a new swapchain has no image yet */
+    if (image->handle) finish_uploads(at);
+    destroy_image(at, image);
+    image->format = at->frame.format;
+    image->width_px = width_px;
+    image->height_px = height_px;
+    if (fill_image(at, image)) return true;
+    destroy_image(at, image);
+    return false;
+}
+
 /* Acquire an image of the layer's own for each eye; false if the runtime still reads it. */
-static bool acquire_images(session *at, const slot *of) {
+static bool acquire_images(session *at) {
     for (int eye = 0; eye < WIRE_EYES; ++eye) {
         own_image *image = at->images + eye;
-        if (!create_image(at, image, of, eye)) {
-            LOG_ONCE(&at->told, SAID_SWAPCHAIN,
-                     "the runtime has no swapchain for filtered images");
+        if (!create_image(at, image, &at->frame.wire.views[eye].color)) {
+            LOG_ONCE(&at->reported, REASON_SWAPCHAIN,
+                     "the runtime provides no swapchain for filtered images");
+            at->frame.state = FRAME_NONE; /* try again with the next result */
             return false;
         }
         if (!image->is_acquired)
             image->is_acquired = XR_SUCCEEDED(
-                at->own->AcquireSwapchainImage(image->handle, NULL, &image->index));
+                at->instance->AcquireSwapchainImage(image->handle, NULL, &image->index));
         const XrSwapchainImageWaitInfo at_once = {.type = XR_TYPE_SWAPCHAIN_IMAGE_WAIT_INFO,
                                                   .timeout = 0};
         if (image->is_acquired && !image->is_waited)
             image->is_waited =
-                at->own->WaitSwapchainImage(image->handle, &at_once) == XR_SUCCESS;
+                at->instance->WaitSwapchainImage(image->handle, &at_once) == XR_SUCCESS;
         if (!image->is_waited) return false;
     }
     return true;
 }
 
-static void upload_images(session *at, const slot *of) {
+static bool upload_images(session *at) {
     gl_context *gl = &at->gl;
-    GLenum type = of->frame.color_format == WIRE_LINEAR16F ? GL_HALF_FLOAT : GL_UNSIGNED_BYTE;
+    const wire_frame *wire = &at->frame.wire;
+    GLenum type = wire->color_format == WIRE_LINEAR16F ? GL_HALF_FLOAT : GL_UNSIGNED_BYTE;
     for (int eye = 0; eye < WIRE_EYES; ++eye) {
         const own_image *image = at->images + eye;
-        const wire_image *color = &of->frame.views[eye].color;
+        const wire_image *color = &wire->views[eye].color;
         gl->BindTexture(GL_TEXTURE_2D, image->images[image->index]);
         gl->TexSubImage2D(GL_TEXTURE_2D, 0, 0, 0, (GLsizei)color->width_px,
                           (GLsizei)color->height_px, GL_RGBA, type,
-                          memory_of(at, of) + color->start);
+                          at->link.memory + color->start);
     }
     gl->BindTexture(GL_TEXTURE_2D, 0);
+    GLenum error = gl->GetError();
+    if (error)
+        LOG_ONCE(&at->reported, REASON_UPLOAD,
+                 "filtered images cannot be uploaded (OpenGL error 0x%x)", error);
+    return !error;
 }
 
-static void release_images(session *at, slot *of) {
-    bool is_released = true;
+static void release_images(session *at, bool is_uploaded) {
     for (int eye = 0; eye < WIRE_EYES; ++eye) {
         own_image *image = at->images + eye;
-        is_released &=
-            XR_SUCCEEDED(at->own->ReleaseSwapchainImage(image->handle, NULL));
+        is_uploaded &=
+            XR_SUCCEEDED(at->instance->ReleaseSwapchainImage(image->handle, NULL));
         image->is_acquired = image->is_waited = false;
     }
-    of->state = SLOT_FREE;
-    at->is_shown = is_released;
-    at->shown = *of;
+    at->frame.state = FRAME_NONE;
+    at->is_shown = is_uploaded;
+    at->shown = at->frame;
 }
 
-/* Both ways in one stay in the layer's context: upload a filtered frame, and read the
- * frame of a plan. */
-static void exchange(session *at, const plan *p, slot *to, uint64_t limit_ns) {
-    if (!at->link.is_welcome) return; /* its memory is gone */
-    slot *filtered = newest_filtered(at);
-    bool can_upload = filtered && acquire_images(at, filtered);
-    if (!can_upload && !to && !find_slot(at, SLOT_READING)) return;
+/* Upload the filtered frame, if there is one. */
+static void take_result(session *at) {
     gl_current before;
+    if (!at->link.is_accepted || at->frame.state != FRAME_FILTERED || !acquire_images(at) ||
+        !gl_enter(&at->gl, &before))
+        return;
+    uint64_t begun_ns = now_ns();
+    bool is_uploaded = upload_images(at);
+    uint64_t spent_ns = now_ns() - begun_ns;
+    at->upload_ns += spent_ns;
+    at->inside_ns += spent_ns;
+    gl_leave(&at->gl, &before, true);
+    release_images(at, is_uploaded);
+}
+
+/* Read the images of a plan, and send those that have been read. */
+static void give_frame(session *at, const plan *p, uint64_t limit_ns) {
+    gl_current before;
+    if (!at->link.is_accepted || (!p && at->frame.state != FRAME_READING)) return;
     if (!gl_enter(&at->gl, &before)) {
-        LOG_ONCE(&at->told, SAID_OTHER_API,
+        LOG_ONCE(&at->reported, REASON_OTHER_API,
                  "frames end with a context of another window system; not filtered");
         return;
     }
     uint64_t begun_ns = now_ns();
-    if (can_upload) upload_images(at, filtered);
-    uint64_t uploaded_ns = now_ns();
-    if (to) read_images(at, p, to);
-    uint64_t read_ns = now_ns();
-    at->upload_ns += uploaded_ns - begun_ns;
-    at->read_ns += read_ns - uploaded_ns;
-    at->inside_ns += read_ns - begun_ns;
-    for (slot *of; (of = find_slot(at, SLOT_READING));) {
-        send_read(at, of, limit_ns);
-        if (of->state == SLOT_READING) break;
-    }
-    gl_leave(&at->gl, &before, can_upload);
-    if (can_upload) release_images(at, filtered);
+    if (p) read_images(at, p);
+    uint64_t spent_ns = now_ns() - begun_ns;
+    at->read_ns += spent_ns;
+    at->inside_ns += spent_ns;
+    if (at->frame.state == FRAME_READING) send_frame(at, limit_ns);
+    gl_leave(&at->gl, &before, false);
 }
 
 void frames_begin(session *at) {
     if (!at->has_gl || at->gl.is_software) return;
     pthread_mutex_lock(&at->lock);
-    if (find_slot(at, SLOT_READING)) exchange(at, NULL, NULL, 0);
+    give_frame(at, NULL, 0);
     pthread_mutex_unlock(&at->lock);
 }
 
 /* Wait for the result of a frame, and upload it. */
-static void await(session *at, const slot *of) {
-    uint64_t id = of->frame.frame_id, end_ns = now_ns() + at->link.wait_ms * NS_PER_MS;
-    while (of->state != SLOT_FREE && of->frame.frame_id == id && at->link.is_welcome) {
+static void await_result(session *at) {
+    uint64_t id = at->frame.wire.frame_id;
+    uint64_t end_ns = now_ns() + at->link.wait_ms * NS_PER_MS;
+    while (at->frame.state != FRAME_NONE && at->frame.wire.frame_id == id &&
+           at->link.is_accepted) {
         uint64_t begun_ns = now_ns();
         if (begun_ns >= end_ns) return;
-        if (of->state == SLOT_SENT) link_wait(&at->link, end_ns - begun_ns);
+        if (at->frame.state == FRAME_SENT) link_wait(&at->link, end_ns - begun_ns);
         receive(at);
-        exchange(at, NULL, NULL, end_ns - begun_ns);
+        give_frame(at, NULL, end_ns - begun_ns);
+        take_result(at);
+        /* The runtime still reads the images, until this frame has ended. */
+        if (at->frame.state == FRAME_FILTERED) return;
     }
 }
 
 /* What is shown -------------------------------------------------------------------------------- */
 
-static bool is_shown_valid(const session *at, XrTime time) {
-    if (!at->is_shown) return false;
-    if (now_ns() - at->shown.begun_ns > at->link.max_age_ms * NS_PER_MS)
-        return false;
-    return !(at->shown.frame.display_time_ns < at->recentered && at->recentered <= time);
+static bool is_shown_valid(session *at, XrTime time) {
+    return at->is_shown &&
+           now_ns() - at->shown.begun_ns <= at->link.max_age_ms * NS_PER_MS &&
+           !is_recentered_between(at, at->shown.wire.display_time_ns, time);
 }
 
 typedef struct {
@@ -493,7 +485,7 @@ static void set_substitute(session *at, const plan *p, XrSpace base, substitute 
     made->layer.space = base;
     made->layer.views = made->views;
     for (int eye = 0; eye < WIRE_EYES; ++eye) {
-        const wire_view *view = at->shown.frame.views + eye;
+        const wire_view *view = at->shown.wire.views + eye;
         XrCompositionLayerProjectionView *to = made->views + eye;
         *to = (XrCompositionLayerProjectionView){.type = p->layer->views[eye].type};
         memcpy(&to->pose.position, view->position_m, sizeof view->position_m);
@@ -519,7 +511,7 @@ static const XrCompositionLayerBaseHeader *without_depth(session *at, const void
         const XrCompositionLayerDepthInfoKHR *depth = depth_of(views[i].next);
         if (!depth) continue;
         if ((const void *)depth != views[i].next)
-            LOG_ONCE(&at->told, SAID_CHAIN,
+            LOG_ONCE(&at->reported, REASON_NEXT_CHAIN,
                      "structures before the depth of a view are not passed on");
         views[i].next = depth->next;
     }
@@ -531,49 +523,58 @@ static XrResult pass_on(session *at, const XrFrameEndInfo *info,
     XrFrameEndInfo mine = *info;
     mine.layers = layers;
     bool is_owned[MAX_LAYERS] = {false};
-    for (uint32_t i = 0; at->own->is_depth_stripped && i < info->layerCount; ++i) {
+    for (uint32_t i = 0; at->instance->is_depth_stripped && i < info->layerCount; ++i) {
         const XrCompositionLayerProjection *layer = (const void *)layers[i];
-        if (!layer || layer->type != XR_TYPE_COMPOSITION_LAYER_PROJECTION) continue;
+        if (!layer || layer->type != XR_TYPE_COMPOSITION_LAYER_PROJECTION || !layer->views)
+            continue;
         layers[i] = without_depth(at, layer);
         is_owned[i] = (const void *)layers[i] != layer;
     }
-    XrResult result = at->own->EndFrame(at->handle, &mine);
+    XrResult result = at->instance->EndFrame(at->handle, &mine);
     for (uint32_t i = 0; i < info->layerCount; ++i)
         if (is_owned[i]) free((void *)(uintptr_t)layers[i]);
     return result;
 }
 
+/* Exchange frames with the helper; return the space of a frame to show, or none. */
+static XrSpace exchange(session *at, const plan *p, const XrFrameEndInfo *info) {
+    ++at->frames;
+    take_result(at); /* first, so that the helper gets this frame */
+    if (begin_frame(at, p, info)) {
+        give_frame(at, p, at->link.wait_ms * NS_PER_MS);
+        if (at->link.wait_ms) await_result(at);
+    } else {
+        give_frame(at, NULL, 0);
+    }
+    if (!is_shown_valid(at, info->displayTime)) return XR_NULL_HANDLE;
+    return own_space(at, &at->shown.space);
+}
+
 XrResult frames_end(session *at, const XrFrameEndInfo *info) {
-    if (!at->has_gl || !info->layers || info->layerCount > MAX_LAYERS)
-        return at->own->EndFrame(at->handle, info);
+    if (!info->layers || info->layerCount > MAX_LAYERS)
+        return at->instance->EndFrame(at->handle, info);
     const XrCompositionLayerBaseHeader *layers[MAX_LAYERS];
     for (uint32_t i = 0; i < info->layerCount; ++i) layers[i] = info->layers[i];
+    if (!at->has_gl) return pass_on(at, info, layers);
     substitute made;
+    plan p;
     pthread_mutex_lock(&at->lock);
     uint64_t begun_ns = now_ns();
     at->inside_ns = 0;
     receive(at);
-    plan p;
-    if (!at->link.is_welcome) {
-        LOG_ONCE(&at->told, SAID_NO_HELPER,
+    if (!at->link.is_accepted) {
+        LOG_ONCE(&at->reported, REASON_NO_HELPER,
                  "no helper is connected; trying again every second");
     } else if (make_plan(at, info, &p)) {
-        ++at->frames;
-        slot *to = take_slot(at, &p, info);
-        exchange(at, &p, to, at->link.wait_ms * NS_PER_MS);
-        if (to && at->link.wait_ms) await(at, to);
-        XrSpace base = is_shown_valid(at, info->displayTime)
-                           ? own_space(at, &at->shown.kind)
-                           : XR_NULL_HANDLE;
+        XrSpace base = exchange(at, &p, info);
         at->has_filtered |= base != XR_NULL_HANDLE;
-        at->frames_lapsed += at->has_filtered && !base;
+        at->frames_fallback += at->has_filtered && !base;
         if (base) {
             ++at->frames_filtered;
             set_substitute(at, &p, base, &made);
             layers[p.index] = (const XrCompositionLayerBaseHeader *)&made.layer;
         }
-        uint64_t added_ns = now_ns() - begun_ns;
-        at->other_ns += added_ns > at->inside_ns ? added_ns - at->inside_ns : 0;
+        at->other_ns += now_ns() - begun_ns - at->inside_ns;
     }
     pthread_mutex_unlock(&at->lock);
     return pass_on(at, info, layers);
@@ -582,22 +583,19 @@ XrResult frames_end(session *at, const XrFrameEndInfo *info) {
 void frames_close(session *at) {
     if (!at->has_gl) return;
     gl_current before;
-    bool is_current = gl_enter(&at->gl, &before);
-    if (is_current) {
-        for (int i = 0; i < MAX_SLOTS; ++i) {
-            if (at->slots[i].pixels) at->gl.DeleteBuffers(1, &at->slots[i].pixels);
-            if (at->slots[i].is_read) at->gl.DeleteSync(at->slots[i].is_read);
-        }
+    if (gl_enter(&at->gl, &before)) {
+        if (at->pixels) at->gl.DeleteBuffers(1, &at->pixels);
+        if (at->is_read) at->gl.DeleteSync(at->is_read);
         at->gl.DeleteFramebuffers(1, &at->gl.read_framebuffer);
         at->gl.DeleteFramebuffers(1, &at->gl.draw_framebuffer);
+        at->gl.Finish();
         gl_leave(&at->gl, &before, false);
     }
-    for (int eye = 0; eye < WIRE_EYES; ++eye)
-        if (at->images[eye].handle) at->own->DestroySwapchain(at->images[eye].handle);
-    for (unsigned i = 0; i < sizeof at->own_spaces / sizeof *at->own_spaces; ++i)
-        if (at->own_spaces[i]) at->own->DestroySpace(at->own_spaces[i]);
-    if (at->view_space) at->own->DestroySpace(at->view_space);
-    if (at->gaze_space) at->own->DestroySpace(at->gaze_space);
+    for (int eye = 0; eye < WIRE_EYES; ++eye) destroy_image(at, at->images + eye);
+    for (unsigned i = 0; i < MAX_SPACES; ++i)
+        if (at->spaces[i]) at->instance->DestroySpace(at->spaces[i]);
+    if (at->view_space) at->instance->DestroySpace(at->view_space);
+    if (at->gaze_space) at->instance->DestroySpace(at->gaze_space);
     gl_close(&at->gl);
     link_close(&at->link);
     at->has_gl = false;

@@ -51,16 +51,18 @@ XrResult gaze_suggest(instance *own, const XrInteractionProfileSuggestedBinding 
 }
 
 static void create_spaces(session *at) {
-    instance *own = at->own;
+    instance *own = at->instance;
     XrActionSpaceCreateInfo info = {.type = XR_TYPE_ACTION_SPACE_CREATE_INFO,
                                     .action = own->gaze_action,
                                     .poseInActionSpace.orientation.w = 1.0f};
+    pthread_mutex_lock(&at->lock);
     at->is_gaze_attached =
         XR_SUCCEEDED(own->CreateActionSpace(at->handle, &info, &at->gaze_space));
+    pthread_mutex_unlock(&at->lock);
 }
 
 XrResult gaze_attach(session *at, const XrSessionActionSetsAttachInfo *given) {
-    instance *own = at->own;
+    instance *own = at->instance;
     if (own->has_gaze && !own->is_gaze_suggested) gaze_suggest(own, NULL);
     XrActionSet *all = NULL;
     if (own->is_gaze_suggested)
@@ -85,15 +87,15 @@ XrResult gaze_sync(session *at, const XrActionsSyncInfo *given) {
     XrActiveActionSet *all = NULL;
     if (at->is_gaze_attached)
         all = calloc(given->countActiveActionSets + 1, sizeof *all);
-    if (!all) return at->own->SyncActions(at->handle, given);
+    if (!all) return at->instance->SyncActions(at->handle, given);
     for (uint32_t i = 0; i < given->countActiveActionSets; ++i)
         all[i] = given->activeActionSets[i];
     all[given->countActiveActionSets] =
-        (XrActiveActionSet){at->own->gaze_set, XR_NULL_PATH};
+        (XrActiveActionSet){at->instance->gaze_set, XR_NULL_PATH};
     XrActionsSyncInfo mine = *given;
     mine.countActiveActionSets = given->countActiveActionSets + 1;
     mine.activeActionSets = all;
-    XrResult result = at->own->SyncActions(at->handle, &mine);
+    XrResult result = at->instance->SyncActions(at->handle, &mine);
     free(all);
     return result;
 }
@@ -104,7 +106,7 @@ void gaze_locate(session *at, XrTime time, wire_frame *frame) {
     XrSpaceLocation found = {.type = XR_TYPE_SPACE_LOCATION, .next = &sample};
     const XrSpaceLocationFlags needed = XR_SPACE_LOCATION_ORIENTATION_VALID_BIT |
                                         XR_SPACE_LOCATION_ORIENTATION_TRACKED_BIT;
-    if (XR_FAILED(at->own->LocateSpace(at->gaze_space, at->view_space, time, &found)) ||
+    if (XR_FAILED(at->instance->LocateSpace(at->gaze_space, at->view_space, time, &found)) ||
         (found.locationFlags & needed) != needed)
         return;
     memcpy(frame->gaze, &found.pose.orientation, sizeof frame->gaze);

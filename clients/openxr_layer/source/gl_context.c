@@ -2,10 +2,13 @@
 #include "gl_context.h"
 
 #include <dlfcn.h>
+#include <pthread.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "log.h"
+
+#define READS "OCUFILTER_LAYER_READS"
 
 /* Window-system functions, from the libraries that the application has loaded. */
 #define GLX_FUNCTIONS(F)                                                                 \
@@ -56,7 +59,12 @@ static bool set_pointer(void *target, void *found) {
     return found != NULL;
 }
 
-static const char *load_glx(void) {
+/* Functions are loaded once in a process. */
+static pthread_mutex_t loading = PTHREAD_MUTEX_INITIALIZER;
+
+static const char *load_glx_once(void) {
+    static bool is_loaded;
+    if (is_loaded) return NULL;
     void *gl = library("libGL.so.1"), *x11 = library("libX11.so.6");
     if (!gl || !x11) return "libGL or libX11 is missing";
     if (!set_pointer(&glx_get_proc, dlsym(gl, "glXGetProcAddressARB")))
@@ -68,10 +76,13 @@ static const char *load_glx(void) {
     all &= set_pointer(&p_##name, glx_get_proc((const GLubyte *)#name));
     GLX_FUNCTIONS(F)
 #undef F
+    is_loaded = all;
     return all ? NULL : "a function of GLX is missing";
 }
 
-static const char *load_egl(PFN_xrEglGetProcAddressMNDX get_proc) {
+static const char *load_egl_once(PFN_xrEglGetProcAddressMNDX get_proc) {
+    static bool is_loaded;
+    if (is_loaded) return NULL;
     void *egl = library("libEGL.so.1");
     if (get_proc) memcpy(&egl_get_proc, &get_proc, sizeof egl_get_proc);
     else if (!egl || !set_pointer(&egl_get_proc, dlsym(egl, "eglGetProcAddress")))
@@ -83,7 +94,22 @@ static const char *load_egl(PFN_xrEglGetProcAddressMNDX get_proc) {
            set_pointer(&p_##name, egl_get_proc(#name));
     EGL_FUNCTIONS(F)
 #undef F
+    is_loaded = all;
     return all ? NULL : "a function of EGL is missing";
+}
+
+static const char *load_glx(void) {
+    pthread_mutex_lock(&loading);
+    const char *reason = load_glx_once();
+    pthread_mutex_unlock(&loading);
+    return reason;
+}
+
+static const char *load_egl(PFN_xrEglGetProcAddressMNDX get_proc) {
+    pthread_mutex_lock(&loading);
+    const char *reason = load_egl_once(get_proc);
+    pthread_mutex_unlock(&loading);
+    return reason;
 }
 
 static const char *load_gl(gl_context *gl) {
@@ -92,7 +118,7 @@ static const char *load_gl(gl_context *gl) {
 #define F(NAME, name) all &= set_pointer(&gl->name, GET("gl" #name));
     GL_FUNCTIONS(F)
 #undef F
-    set_pointer(&gl->CopyImageSubData, GET("glCopyImageSubData"));
+    set_pointer(&gl->CopyImageSubData, GET("glCopyImageSubData")); /* also without support */
 #undef GET
     return all ? NULL : "a function of OpenGL 3.2 is missing";
 }
@@ -107,8 +133,8 @@ static int note_x_error(Display *display, XErrorEvent *event) {
     return 0;
 }
 
-/* The configuration of the application's context.  The one of the graphics binding is
- * wrong in programs that runtimes accept, because runtimes ignore it. */
+/* The configuration of the application's context.  Some programs pass a wrong one in the
+ * graphics binding, which runtimes ignore. */
 static GLXFBConfig config_of(Display *display, GLXContext context) {
     int id = 0, screen = 0, count = 0;
     p_glXQueryContext(display, context, GLX_FBCONFIG_ID, &id);
@@ -138,7 +164,9 @@ static const char *open_glx(gl_context *gl, const XrGraphicsBindingOpenGLXlibKHR
     load_egl(NULL); /* for gl_enter; it may be missing */
     Display *display = gl->x_display = binding->xDisplay;
     if (!display || !binding->glxContext) return "the graphics binding has no context";
-    /* By default, the first error ends the program. */
+    /* By default, the first error ends the program.  The handler is of the process. */
+    static pthread_mutex_t handler = PTHREAD_MUTEX_INITIALIZER;
+    pthread_mutex_lock(&handler);
     p_XSync(display, False);
     XErrorHandler previous = p_XSetErrorHandler(note_x_error);
     GLXFBConfig config = config_of(display, binding->glxContext);
@@ -160,6 +188,7 @@ static const char *open_glx(gl_context *gl, const XrGraphicsBindingOpenGLXlibKHR
     }
     p_XSync(display, False);
     p_XSetErrorHandler(previous);
+    pthread_mutex_unlock(&handler);
     if (!config) return "the configuration of the application's context is unknown";
     return gl->glx_context ? NULL : "no context shares with the application's";
 }
@@ -201,6 +230,8 @@ static const char *open_egl(gl_context *gl, const XrGraphicsBindingEGLMNDX *bind
 const char *gl_open(gl_context *gl, const XrSessionCreateInfo *info) {
     *gl = (gl_context){.egl_context = EGL_NO_CONTEXT, .egl_surface = EGL_NO_SURFACE};
     const char *reason = "the application does not use OpenGL on X11 or EGL";
+    const char *reads = getenv(READS);
+    if (reads && !strcmp(reads, "none")) return reason; /* as with Vulkan, in tests */
     for (const XrBaseInStructure *at = info->next; at; at = at->next) {
         if (at->type == XR_TYPE_GRAPHICS_BINDING_OPENGL_XLIB_KHR) {
             reason = open_glx(gl, (const XrGraphicsBindingOpenGLXlibKHR *)at);
@@ -219,11 +250,16 @@ const char *gl_open(gl_context *gl, const XrSessionCreateInfo *info) {
         gl_close(gl);
         return reason;
     }
+    int major = 0, minor = 0;
+    const char *version = (const char *)gl->GetString(GL_VERSION);
+    if (!version || sscanf(version, "%d.%d", &major, &minor) != 2 ||
+        10 * major + minor < 43)
+        gl->CopyImageSubData = NULL;
     const char *renderer = (const char *)gl->GetString(GL_RENDERER);
     gl->is_software = renderer && (strstr(renderer, "llvmpipe") ||
                                    strstr(renderer, "softpipe") ||
                                    strstr(renderer, "Software Rasterizer"));
-    const char *reads = getenv("OCUFILTER_LAYER_READS"); /* for tests without a GPU */
+    /* As with a GPU, in tests without one. */
     if (reads && !strcmp(reads, "buffered")) gl->is_software = false;
     gl->GenFramebuffers(1, &gl->read_framebuffer);
     gl->GenFramebuffers(1, &gl->draw_framebuffer);
@@ -304,17 +340,24 @@ bool gl_enter(gl_context *gl, gl_current *before) {
     bool is_current = make_own_current(gl);
     if (!is_current) restore(gl, before);
     if (drawn) {
-        if (is_current) gl->WaitSync(drawn, 0, GL_TIMEOUT_IGNORED);
-        gl->DeleteSync(drawn);
+        before->is_shared = is_current && gl->IsSync(drawn);
+        if (before->is_shared) gl->WaitSync(drawn, 0, GL_TIMEOUT_IGNORED);
+        else if (is_current) { /* an unrelated context, which alone has the fence */
+            restore(gl, before);
+            gl->DeleteSync(drawn);
+            is_current = make_own_current(gl);
+            drawn = NULL;
+        }
+        if (drawn) gl->DeleteSync(drawn);
     }
     return is_current;
 }
 
 void gl_leave(gl_context *gl, const gl_current *before, bool has_written) {
     GLsync written = NULL;
-    if (has_written && before->has_context)
+    if (has_written && before->is_shared)
         written = gl->FenceSync(GL_SYNC_GPU_COMMANDS_COMPLETE, 0);
-    if (has_written && !before->has_context) gl->Finish();
+    if (has_written && !before->is_shared) gl->Finish();
     gl->Flush();
     restore(gl, before);
     if (written) {

@@ -40,6 +40,7 @@
     F(GENTEXTURES, GenTextures)                                                          \
     F(GETERROR, GetError)                                                                \
     F(GETSTRING, GetString)                                                              \
+    F(ISSYNC, IsSync)                                                                    \
     F(MAPBUFFERRANGE, MapBufferRange)                                                    \
     F(READBUFFER, ReadBuffer)                                                            \
     F(READPIXELS, ReadPixels)                                                            \
@@ -69,6 +70,7 @@ typedef struct {
 /* What was current on the thread. */
 typedef struct {
     bool has_context;
+    bool is_shared; /* it shares objects with the layer's context */
     Display *x_display;
     GLXContext glx_context;
     GLXDrawable glx_draw, glx_read;

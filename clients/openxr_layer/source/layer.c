@@ -19,8 +19,8 @@
 
 /* Handles -------------------------------------------------------------------------------
  *
- * The specification demands that the application does not destroy a handle while another
- * thread uses it, so that the lock is only of the lists. */
+ * The lock protects the lists and not their items: the specification requires that the
+ * application does not destroy a handle while another thread uses it. */
 
 static pthread_mutex_t registry = PTHREAD_MUTEX_INITIALIZER;
 static instance *instances;
@@ -43,7 +43,23 @@ static space *spaces;
         while (*at_item != (item)) at_item = &(*at_item)->next;                          \
         *at_item = (item)->next;                                                         \
         pthread_mutex_unlock(&registry);                                                 \
-        free(item);                                                                      \
+    } while (0)
+
+/* Move the items of a session from a list to a list of their own. */
+#define DETACH(type, list, is_own, detached)                                             \
+    do {                                                                                 \
+        pthread_mutex_lock(&registry);                                                   \
+        for (type **at_item = &list; *at_item;) {                                        \
+            type *item = *at_item;                                                       \
+            if (!(is_own)) {                                                             \
+                at_item = &item->next;                                                   \
+                continue;                                                                \
+            }                                                                            \
+            *at_item = item->next;                                                       \
+            item->next = detached;                                                       \
+            detached = item;                                                             \
+        }                                                                                \
+        pthread_mutex_unlock(&registry);                                                 \
     } while (0)
 
 #define FIND(type, list, value)                                                          \
@@ -54,6 +70,13 @@ static space *spaces;
 
 static instance *find_instance(XrInstance handle) {
     FIND(instance, instances, handle);
+    return found;
+}
+
+static instance *next_instance(const instance *after) {
+    pthread_mutex_lock(&registry);
+    instance *found = after ? after->next : instances;
+    pthread_mutex_unlock(&registry);
     return found;
 }
 
@@ -72,42 +95,51 @@ static space *find_space(XrSpace handle) {
     return found;
 }
 
-bool find_space_kind(XrSpace handle, space_kind *kind) {
-    const space *found = find_space(handle);
-    if (!found) return false;
-    *kind = found->kind;
-    return true;
+bool find_reference_space(XrSpace handle, reference_space *found) {
+    const space *known = find_space(handle);
+    if (known) *found = known->kind;
+    return known;
+}
+
+/* A forked child has a copy of the connections, which would keep the helper occupied. */
+static void abandon_links(void) {
+    for (session *at = sessions; at; at = at->next) link_abandon(&at->link);
 }
 
 /* Sessions ------------------------------------------------------------------------------- */
 
-/* The context's textures live on in the application's context, which shares them. */
-static void delete_copies(session *at) {
-    gl_current before;
-    if (!at->has_gl || !gl_enter(&at->gl, &before)) return;
-    for (swapchain *chain = swapchains; chain; chain = chain->next)
-        if (chain->session == at && chain->copy) at->gl.DeleteTextures(1, &chain->copy);
-    gl_leave(&at->gl, &before, false);
+static void destroy_swapchain(swapchain *chain) {
+    pthread_mutex_destroy(&chain->lock);
+    free(chain);
 }
 
 /* Forget a session and what belongs to it; its handles are destroyed by the runtime. */
 static void destroy_session(session *at) {
+    swapchain *chains = NULL;
+    space *known = NULL;
+    DETACH(swapchain, swapchains, item->session == at, chains);
+    DETACH(space, spaces, item->session == at->handle, known);
     pthread_mutex_lock(&at->lock);
-    delete_copies(at);
+    gl_current before;
+    /* Textures would live on in the application's context, which shares them. */
+    if (at->has_gl && gl_enter(&at->gl, &before)) {
+        for (swapchain *chain = chains; chain; chain = chain->next)
+            if (chain->copy) at->gl.DeleteTextures(1, &chain->copy);
+        gl_leave(&at->gl, &before, false);
+    }
     frames_close(at);
     pthread_mutex_unlock(&at->lock);
-    for (swapchain *chain = swapchains; chain;) {
-        swapchain *next = chain->next;
-        if (chain->session == at) REMOVE(swapchain, swapchains, chain);
-        chain = next;
+    for (swapchain *next; chains; chains = next) {
+        next = chains->next;
+        destroy_swapchain(chains);
     }
-    for (space *known = spaces; known;) {
-        space *next = known->next;
-        if (known->session == at->handle) REMOVE(space, spaces, known);
-        known = next;
+    for (space *next; known; known = next) {
+        next = known->next;
+        free(known);
     }
-    pthread_mutex_destroy(&at->lock);
     REMOVE(session, sessions, at);
+    pthread_mutex_destroy(&at->lock);
+    free(at);
 }
 
 static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSession(XrInstance handle,
@@ -123,7 +155,7 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSession(XrInstance handle,
         return XR_ERROR_OUT_OF_MEMORY;
     }
     at->handle = *made;
-    at->own = own;
+    at->instance = own;
     pthread_mutex_init(&at->lock, NULL);
     link_init(&at->link, own->application, own->engine);
     const char *reason = gl_open(&at->gl, info);
@@ -136,7 +168,7 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSession(XrInstance handle,
 static XRAPI_ATTR XrResult XRAPI_CALL layer_DestroySession(XrSession handle) {
     session *at = find_session(handle);
     if (!at) return XR_ERROR_HANDLE_INVALID;
-    PFN_xrDestroySession destroy = at->own->DestroySession;
+    PFN_xrDestroySession destroy = at->instance->DestroySession;
     destroy_session(at);
     return destroy(handle);
 }
@@ -146,7 +178,7 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_BeginFrame(XrSession handle,
     session *at = find_session(handle);
     if (!at) return XR_ERROR_HANDLE_INVALID;
     frames_begin(at);
-    return at->own->BeginFrame(handle, info);
+    return at->instance->BeginFrame(handle, info);
 }
 
 static XRAPI_ATTR XrResult XRAPI_CALL layer_EndFrame(XrSession handle,
@@ -164,13 +196,22 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_PollEvent(XrInstance handle,
         event->type != XR_TYPE_EVENT_DATA_REFERENCE_SPACE_CHANGE_PENDING)
         return result;
     const XrEventDataReferenceSpaceChangePending *change = (const void *)event;
-    session *at = find_session(change->session);
-    if (at) {
-        pthread_mutex_lock(&at->lock);
-        at->recentered = change->changeTime;
-        pthread_mutex_unlock(&at->lock);
-    }
+    pthread_mutex_lock(&registry);
+    session *at = sessions;
+    while (at && at->handle != change->session) at = at->next;
+    if (at) at->recentered[at->recentered_count++ % MAX_RECENTERED] = change->changeTime;
+    pthread_mutex_unlock(&registry);
     return result;
+}
+
+/* Whether a space got another origin after the first time, up to the last one. */
+bool is_recentered_between(session *at, XrTime first, XrTime last) {
+    bool is_between = false;
+    pthread_mutex_lock(&registry);
+    for (int i = 0; i < MAX_RECENTERED; ++i)
+        is_between |= first < at->recentered[i] && at->recentered[i] <= last;
+    pthread_mutex_unlock(&registry);
+    return is_between;
 }
 
 /* Spaces --------------------------------------------------------------------------------- */
@@ -179,13 +220,13 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateReferenceSpace(
     XrSession handle, const XrReferenceSpaceCreateInfo *info, XrSpace *made) {
     session *at = find_session(handle);
     if (!at) return XR_ERROR_HANDLE_INVALID;
-    XrResult result = at->own->CreateReferenceSpace(handle, info, made);
+    XrResult result = at->instance->CreateReferenceSpace(handle, info, made);
     space *known = XR_SUCCEEDED(result) ? calloc(1, sizeof *known) : NULL;
     if (!known) return result;
     known->handle = *made;
     known->session = handle;
-    known->own = at->own;
-    known->kind = (space_kind){info->referenceSpaceType, info->poseInReferenceSpace};
+    known->instance = at->instance;
+    known->kind = (reference_space){info->referenceSpaceType, info->poseInReferenceSpace};
     ADD(spaces, known);
     return result;
 }
@@ -193,16 +234,17 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateReferenceSpace(
 static XRAPI_ATTR XrResult XRAPI_CALL layer_DestroySpace(XrSpace handle) {
     space *known = find_space(handle);
     if (known) {
-        PFN_xrDestroySpace destroy = known->own->DestroySpace;
+        PFN_xrDestroySpace destroy = known->instance->DestroySpace;
         REMOVE(space, spaces, known);
+        free(known);
         return destroy(handle);
     }
     /* Spaces of actions and extensions are not recorded; nearly all programs have one
      * instance. */
     XrResult result = XR_ERROR_HANDLE_INVALID;
-    for (instance *own = instances; own && result == XR_ERROR_HANDLE_INVALID;
-         own = own->next)
-        result = own->DestroySpace(handle);
+    for (instance *of = next_instance(NULL); of && result == XR_ERROR_HANDLE_INVALID;
+         of = next_instance(of))
+        result = of->DestroySpace(handle);
     return result;
 }
 
@@ -212,21 +254,22 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateSwapchain(
     XrSession handle, const XrSwapchainCreateInfo *info, XrSwapchain *made) {
     session *at = find_session(handle);
     if (!at) return XR_ERROR_HANDLE_INVALID;
-    XrResult result = at->own->CreateSwapchain(handle, info, made);
+    XrResult result = at->instance->CreateSwapchain(handle, info, made);
     if (XR_FAILED(result)) return result;
     swapchain *chain = calloc(1, sizeof *chain);
     if (!chain) {
-        at->own->DestroySwapchain(*made);
+        at->instance->DestroySwapchain(*made);
         return XR_ERROR_OUT_OF_MEMORY;
     }
     chain->handle = *made;
     chain->session = at;
+    pthread_mutex_init(&chain->lock, NULL);
     chain->info = *info;
     chain->info.next = NULL;
     XrSwapchainImageOpenGLKHR images[MAX_IMAGES];
     for (int i = 0; i < MAX_IMAGES; ++i)
         images[i] = (XrSwapchainImageOpenGLKHR){.type = XR_TYPE_SWAPCHAIN_IMAGE_OPENGL_KHR};
-    if (at->has_gl && XR_SUCCEEDED(at->own->EnumerateSwapchainImages(
+    if (at->has_gl && XR_SUCCEEDED(at->instance->EnumerateSwapchainImages(
                           *made, MAX_IMAGES, &chain->image_count,
                           (XrSwapchainImageBaseHeader *)images)))
         for (uint32_t i = 0; i < chain->image_count; ++i) chain->images[i] = images[i].image;
@@ -248,30 +291,40 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_DestroySwapchain(XrSwapchain handle)
     }
     pthread_mutex_unlock(&at->lock);
     REMOVE(swapchain, swapchains, chain);
-    return at->own->DestroySwapchain(handle);
+    destroy_swapchain(chain);
+    return at->instance->DestroySwapchain(handle);
 }
 
 static XRAPI_ATTR XrResult XRAPI_CALL layer_AcquireSwapchainImage(
     XrSwapchain handle, const XrSwapchainImageAcquireInfo *info, uint32_t *index) {
     swapchain *chain = find_swapchain(handle);
     if (!chain) return XR_ERROR_HANDLE_INVALID;
-    XrResult result = chain->session->own->AcquireSwapchainImage(handle, info, index);
+    XrResult result = chain->session->instance->AcquireSwapchainImage(handle, info, index);
+    pthread_mutex_lock(&chain->lock);
     if (XR_SUCCEEDED(result) && chain->acquired_count < MAX_IMAGES)
         chain->acquired[chain->acquired_count++] = *index;
+    pthread_mutex_unlock(&chain->lock);
     return result;
+}
+
+/* Return the index of the image that is released next, or one that no image has. */
+static uint32_t next_released(swapchain *chain) {
+    pthread_mutex_lock(&chain->lock);
+    uint32_t index = chain->acquired_count ? chain->acquired[0] : MAX_IMAGES;
+    pthread_mutex_unlock(&chain->lock);
+    return index;
 }
 
 static void copy_released(swapchain *chain) {
     session *at = chain->session;
-    uint32_t index = chain->acquired_count ? chain->acquired[0] : MAX_IMAGES;
+    uint32_t index = next_released(chain);
     /* Images of quads and other layers need no copy. */
-    if (!at->has_gl || index >= chain->image_count || !swapchain_can_copy(chain) ||
-        chain->unused_releases >= MAX_COPIED_RELEASES)
-        return;
+    if (!at->has_gl || !swapchain_can_copy(chain)) return;
     pthread_mutex_lock(&at->lock);
     gl_current before;
     uint64_t begun_ns = now_ns();
-    if (!at->link.is_welcome) {
+    if (!at->link.is_accepted || index >= chain->image_count ||
+        chain->unused_releases >= MAX_COPIED_RELEASES) {
         chain->has_copy = false; /* not of this image */
     } else if (gl_enter(&at->gl, &before)) {
         ++chain->unused_releases;
@@ -279,7 +332,7 @@ static void copy_released(swapchain *chain) {
         gl_leave(&at->gl, &before, true);
         at->copy_ns += now_ns() - begun_ns;
     } else {
-        LOG_ONCE(&at->told, SAID_OTHER_API,
+        LOG_ONCE(&at->reported, REASON_OTHER_API,
                  "images are released with a context of another window system; not "
                  "filtered");
     }
@@ -291,12 +344,14 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_ReleaseSwapchainImage(
     swapchain *chain = find_swapchain(handle);
     if (!chain) return XR_ERROR_HANDLE_INVALID;
     copy_released(chain);
-    XrResult result = chain->session->own->ReleaseSwapchainImage(handle, info);
+    XrResult result = chain->session->instance->ReleaseSwapchainImage(handle, info);
+    pthread_mutex_lock(&chain->lock);
     if (XR_SUCCEEDED(result) && chain->acquired_count) {
         --chain->acquired_count;
         memmove(chain->acquired, chain->acquired + 1,
                 chain->acquired_count * sizeof *chain->acquired);
     }
+    pthread_mutex_unlock(&chain->lock);
     return result;
 }
 
@@ -360,6 +415,16 @@ static bool has_functions(instance *own) {
     return all;
 }
 
+/* Runtimes may allow a single instance, so that one that is not used must go. */
+static void destroy_below(PFN_xrGetInstanceProcAddr get_proc_addr, XrInstance handle) {
+    PFN_xrDestroyInstance destroy = NULL;
+    if (XR_SUCCEEDED(get_proc_addr(handle, "xrDestroyInstance",
+                                   (PFN_xrVoidFunction *)&destroy)))
+        destroy(handle);
+}
+
+static void watch_forks(void) { pthread_atfork(NULL, NULL, abandon_links); }
+
 static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateApiLayerInstance(
     const XrInstanceCreateInfo *info, const XrApiLayerCreateInfo *layers,
     XrInstance *made) {
@@ -377,34 +442,44 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateApiLayerInstance(
         result = create_below(info, adds_gaze, drops_depth, layers, made);
     }
     if (XR_FAILED(result)) return result;
+    PFN_xrGetInstanceProcAddr get_proc_addr = layers->nextInfo->nextGetInstanceProcAddr;
     instance *own = calloc(1, sizeof *own);
-    if (!own) return XR_ERROR_OUT_OF_MEMORY;
-    own->handle = *made;
-    own->get_proc_addr = layers->nextInfo->nextGetInstanceProcAddr;
+    if (own) {
+        own->handle = *made;
+        own->get_proc_addr = get_proc_addr;
+    }
+    if (!own || !has_functions(own)) {
+        destroy_below(get_proc_addr, *made);
+        free(own);
+        return XR_ERROR_INITIALIZATION_FAILED;
+    }
     own->has_gaze = adds_gaze || has_gaze;
     own->is_depth_stripped = drops_depth;
     memcpy(own->application, info->applicationInfo.applicationName,
            sizeof own->application - 1);
     memcpy(own->engine, info->applicationInfo.engineName, sizeof own->engine - 1);
-    if (!has_functions(own)) {
-        free(own);
-        return XR_ERROR_INITIALIZATION_FAILED;
-    }
     if (own->has_gaze) gaze_create(own);
     ADD(instances, own);
+    static pthread_once_t once = PTHREAD_ONCE_INIT;
+    pthread_once(&once, watch_forks);
     return result;
+}
+
+static session *session_of(const instance *own) {
+    pthread_mutex_lock(&registry);
+    session *found = sessions;
+    while (found && found->instance != own) found = found->next;
+    pthread_mutex_unlock(&registry);
+    return found;
 }
 
 static XRAPI_ATTR XrResult XRAPI_CALL layer_DestroyInstance(XrInstance handle) {
     instance *own = find_instance(handle);
     if (!own) return XR_ERROR_HANDLE_INVALID;
     PFN_xrDestroyInstance destroy = own->DestroyInstance;
-    for (session *at = sessions; at;) {
-        session *next = at->next;
-        if (at->own == own) destroy_session(at);
-        at = next;
-    }
+    for (session *at; (at = session_of(own));) destroy_session(at);
     REMOVE(instance, instances, own);
+    free(own);
     return destroy(handle);
 }
 

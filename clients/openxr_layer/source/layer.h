@@ -8,8 +8,10 @@
 #include "link.h"
 
 #define LAYER_NAME "XR_APILAYER_ocufilter_eye"
-#define MAX_IMAGES 16
+#define MAX_IMAGES 32
 #define MAX_LAYERS 64
+#define MAX_RECENTERED 4
+#define MAX_SPACES 4
 
 /* Functions of the next layer or of the runtime. */
 #define NEXT_FUNCTIONS(F)                                                                \
@@ -28,7 +30,6 @@
     F(DestroySwapchain)                                                                  \
     F(EndFrame)                                                                          \
     F(EnumerateSwapchainImages)                                                          \
-    F(GetSystemProperties)                                                               \
     F(LocateSpace)                                                                       \
     F(PollEvent)                                                                         \
     F(ReleaseSwapchainImage)                                                             \
@@ -52,18 +53,18 @@ typedef struct instance {
     XrAction gaze_action;
 } instance;
 
-/* A reference space, by which poses of two frames compare. */
+/* Spaces of the same type and pose have the same coordinates. */
 typedef struct {
     XrReferenceSpaceType type;
     XrPosef pose;
-} space_kind;
+} reference_space;
 
 typedef struct space {
     struct space *next;
     XrSpace handle;
     XrSession session;
-    instance *own;
-    space_kind kind;
+    instance *instance;
+    reference_space kind;
 } space;
 
 typedef struct swapchain {
@@ -73,6 +74,7 @@ typedef struct swapchain {
     XrSwapchainCreateInfo info;
     uint32_t image_count;
     GLuint images[MAX_IMAGES];
+    pthread_mutex_t lock;          /* of these: several threads may acquire and release */
     uint32_t acquired[MAX_IMAGES]; /* indices, the oldest first */
     uint32_t acquired_count;
     GLuint copy;                   /* of the image that was released last */
@@ -80,20 +82,17 @@ typedef struct swapchain {
     unsigned unused_releases;      /* since a frame with this swapchain was filtered */
 } swapchain;
 
-typedef enum { SLOT_FREE, SLOT_READING, SLOT_SENT, SLOT_FILTERED } slot_state;
+typedef enum { FRAME_NONE, FRAME_READING, FRAME_SENT, FRAME_FILTERED } frame_state;
 
-/* A frame on its way through the helper. */
+/* A frame of the application, on its way through the helper or shown. */
 typedef struct {
-    slot_state state;
+    frame_state state;
     uint64_t begun_ns;
-    space_kind kind;
+    reference_space space;
     XrCompositionLayerFlags flags;
-    int64_t format;        /* of the application's color images */
-    wire_frame frame;
-    GLuint pixels;         /* buffer that is read into, without software rendering */
-    size_t pixels_bytes;
-    GLsync is_read;
-} slot;
+    int64_t format;        /* of the color images */
+    wire_frame wire;
+} app_frame;
 
 /* A swapchain of the layer's own, with the filtered image of one eye. */
 typedef struct {
@@ -109,25 +108,30 @@ typedef struct {
 typedef struct session {
     struct session *next;
     XrSession handle;
-    instance *own;
+    instance *instance;
+    /* times of the latest changes of the origins of spaces, under the registry's lock */
+    XrTime recentered[MAX_RECENTERED];
+    unsigned recentered_count;
     pthread_mutex_t lock;  /* of everything below; held while the context is current */
     bool has_gl;
     gl_context gl;
     link_state link;
-    unsigned told;
-    slot slots[MAX_SLOTS];
+    unsigned reported;
+    app_frame frame;       /* the one that the helper has */
+    GLuint pixels;         /* buffer that it is read into, without software rendering */
+    size_t pixels_bytes;
+    GLsync is_read;
     uint64_t next_frame;
     own_image images[WIRE_EYES];
-    bool is_shown;         /* the images have the result of `shown` */
-    slot shown;
-    space_kind own_kinds[4];
-    XrSpace own_spaces[4]; /* of these kinds */
-    unsigned own_space_count;
+    bool is_shown;         /* `images` contain the result of `shown` */
+    app_frame shown;
+    reference_space space_kinds[MAX_SPACES];
+    XrSpace spaces[MAX_SPACES]; /* the layer's own, of these kinds */
+    unsigned space_count;
     XrSpace view_space, gaze_space;
     bool is_gaze_attached;
-    XrTime recentered;     /* poses of frames before that time are invalid */
     bool has_filtered;     /* a frame of this helper was shown */
-    uint32_t frames, frames_filtered, frames_lapsed;
+    uint32_t frames, frames_filtered, frames_fallback;
     uint64_t copy_ns, read_ns, upload_ns, other_ns;
     uint64_t inside_ns;    /* of the current frame, in read_ns and upload_ns */
 } session;
@@ -154,6 +158,7 @@ void frames_close(session *at);
 
 /* layer.c */
 swapchain *find_swapchain(XrSwapchain handle);
-bool find_space_kind(XrSpace handle, space_kind *kind);
+bool find_reference_space(XrSpace handle, reference_space *found);
+bool is_recentered_between(session *at, XrTime first, XrTime last);
 
 #endif

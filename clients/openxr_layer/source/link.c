@@ -7,6 +7,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/mman.h>
+#include <sys/resource.h>
 #include <sys/socket.h>
 #include <sys/un.h>
 #include <unistd.h>
@@ -14,7 +15,8 @@
 #include "log.h"
 
 #define RETRY_NS 1000000000u
-#define MAX_SHARED_BYTES (1ull << 30)
+#define MAX_SHARED_BYTES (UINT64_C(1) << 30)
+#define MAX_WAIT_MS 600000u
 
 void link_init(link_state *link, const char *application, const char *engine) {
     *link = (link_state){.descriptor = -1};
@@ -23,23 +25,30 @@ void link_init(link_state *link, const char *application, const char *engine) {
 }
 
 static void release_memory(link_state *link) {
-    if (link->memory) munmap(link->memory, link->slot_count * link->slot_bytes);
+    if (link->memory) munmap(link->memory, link->memory_bytes);
     link->memory = NULL;
-    link->slot_bytes = 0;
+    link->memory_bytes = 0;
 }
 
 void link_close(link_state *link) {
     release_memory(link);
     if (link->descriptor >= 0) close(link->descriptor);
     link->descriptor = -1;
-    link->is_welcome = false;
+    link->is_accepted = false;
     link->retry_ns = now_ns() + RETRY_NS;
+}
+
+void link_abandon(link_state *link) {
+    if (link->descriptor >= 0) close(link->descriptor);
+    link->descriptor = -1;
+    link->is_accepted = false;
+    link->memory = NULL; /* it is not mapped in the child */
 }
 
 static void lose(link_state *link, const char *why) {
     /* A helper that refuses a second program closes without a welcome, every second. */
-    if (link->is_welcome) LOG("%s; showing the application's own frames", why);
-    link->is_lost |= link->is_welcome;
+    if (link->is_accepted) LOG("%s; showing the application's own frames", why);
+    link->is_lost |= link->is_accepted;
     link_close(link);
 }
 
@@ -108,15 +117,13 @@ void link_connect(link_state *link) {
 }
 
 static void welcome(link_state *link, const wire_welcome *message) {
-    if (message->magic != WIRE_MAGIC || message->version != WIRE_VERSION ||
-        message->slot_count < 1 || message->slot_count > MAX_SLOTS) {
+    if (message->magic != WIRE_MAGIC || message->version != WIRE_VERSION) {
         LOG("the helper is of another version of ocufilter");
         link_close(link);
         return;
     }
-    link->is_welcome = true;
-    link->slot_count = message->slot_count;
-    link->wait_ms = message->wait_ms;
+    link->is_accepted = true;
+    link->wait_ms = message->wait_ms < MAX_WAIT_MS ? message->wait_ms : MAX_WAIT_MS;
     link->max_age_ms = message->max_age_ms;
     LOG("connected to the helper");
 }
@@ -133,10 +140,9 @@ bool link_receive(link_state *link, wire_result *result) {
         if (size <= 0) {
             lose(link, "the helper has ended");
         } else if (size == sizeof message.welcome && message.kind == WIRE_WELCOME &&
-                   !link->is_welcome) {
+                   !link->is_accepted) {
             welcome(link, &message.welcome);
-        } else if (size == sizeof message.result && message.kind == WIRE_RESULT &&
-                   message.result.slot < link->slot_count) {
+        } else if (size == sizeof message.result && message.kind == WIRE_RESULT) {
             *result = message.result;
             return true;
         } else {
@@ -152,11 +158,22 @@ void link_wait(link_state *link, uint64_t limit_ns) {
     if (link->descriptor >= 0) ppoll(&wanted, 1, &limit, NULL);
 }
 
-/* Its pages are allocated and its size is sealed, so that no process gets a bus error. */
+/* Allocate all pages now: later, a lack of memory would be a bus error.  Beyond the limit
+ * of file sizes, allocation would end the process with SIGXFSZ. */
+static bool allocate(int descriptor, size_t size) {
+    struct rlimit limit;
+    if (!getrlimit(RLIMIT_FSIZE, &limit) && limit.rlim_cur < size) return false;
+    int error;
+    do error = posix_fallocate(descriptor, 0, (off_t)size);
+    while (error == EINTR);
+    return !error;
+}
+
+/* Its size is sealed, so that no process can cause a bus error in the other one. */
 static int make_memory(size_t size) {
     int made = memfd_create("ocufilter-layer", MFD_CLOEXEC | MFD_ALLOW_SEALING);
     if (made < 0) return -1;
-    if (posix_fallocate(made, 0, (off_t)size) ||
+    if (!allocate(made, size) ||
         fcntl(made, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL)) {
         close(made);
         return -1;
@@ -164,26 +181,29 @@ static int make_memory(size_t size) {
     return made;
 }
 
-bool link_share(link_state *link, size_t slot_bytes) {
-    if (link->memory && slot_bytes <= link->slot_bytes) return true;
-    if (slot_bytes > MAX_SHARED_BYTES / link->slot_count) return false;
-    /* Slots begin at pages, for the copies of both processes. */
-    size_t whole = (slot_bytes + 4095) & ~(size_t)4095;
-    release_memory(link);
-    int made = make_memory(link->slot_count * whole);
+static bool share(link_state *link, size_t size_bytes) {
+    int made = make_memory(size_bytes);
     if (made < 0) return false;
-    void *mapped = mmap(NULL, link->slot_count * whole, PROT_READ | PROT_WRITE, MAP_SHARED,
-                        made, 0);
-    wire_ring ring = {WIRE_RING, link->slot_count, whole};
+    void *mapped = mmap(NULL, size_bytes, PROT_READ | PROT_WRITE, MAP_SHARED, made, 0);
+    wire_memory message = {.kind = WIRE_MEMORY, .size_bytes = size_bytes};
     bool is_sent = mapped != MAP_FAILED &&
-                   send_message(link->descriptor, &ring, sizeof ring, made);
+                   send_message(link->descriptor, &message, sizeof message, made);
     close(made);
-    if (mapped != MAP_FAILED) {
-        link->memory = mapped;
-        link->slot_bytes = whole;
-    }
+    if (mapped == MAP_FAILED) return false;
+    madvise(mapped, size_bytes, MADV_DONTFORK);
+    link->memory = mapped;
+    link->memory_bytes = size_bytes;
     if (!is_sent) release_memory(link);
     return is_sent;
+}
+
+bool link_share(link_state *link, size_t size_bytes) {
+    if (link->memory && size_bytes <= link->memory_bytes) return true;
+    if (size_bytes > MAX_SHARED_BYTES || now_ns() < link->retry_memory_ns) return false;
+    release_memory(link);
+    bool is_shared = share(link, (size_bytes + 4095) & ~(size_t)4095);
+    if (!is_shared) link->retry_memory_ns = now_ns() + RETRY_NS;
+    return is_shared;
 }
 
 bool link_send(link_state *link, const wire_frame *frame) {

@@ -8,17 +8,16 @@
 
 #include "wire.h"
 
-#define MAX_SLOTS 2
-
 typedef struct {
     int descriptor;         /* -1 without a connection */
-    bool is_welcome;        /* the helper has answered */
+    bool is_accepted;        /* the helper has answered */
     bool is_lost;           /* since the last link_poll */
     uint64_t retry_ns;      /* when to try again */
     char application[128], engine[128];
-    uint32_t slot_count, wait_ms, max_age_ms;
-    uint8_t *memory;        /* slot_count slots; NULL without */
-    size_t slot_bytes;
+    uint32_t wait_ms, max_age_ms;
+    uint8_t *memory;        /* NULL without */
+    size_t memory_bytes;
+    uint64_t retry_memory_ns;
 } link_state;
 
 void link_init(link_state *link, const char *application, const char *engine);
@@ -32,12 +31,15 @@ bool link_receive(link_state *link, wire_result *result);
 /* Wait for a message, at most that long. */
 void link_wait(link_state *link, uint64_t limit_ns);
 
-/* Share memory with slots of at least that size; false if that is impossible. */
-bool link_share(link_state *link, size_t slot_bytes);
+/* Share memory of at least that size; false if that is impossible. */
+bool link_share(link_state *link, size_t size_bytes);
 
 /* Send a frame; false if the helper does not take it. */
 bool link_send(link_state *link, const wire_frame *frame);
 
 void link_close(link_state *link);
+
+/* Give up the connection in a child process, which has a copy of it. */
+void link_abandon(link_state *link);
 
 #endif

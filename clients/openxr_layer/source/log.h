@@ -15,22 +15,23 @@
 
 /* Reasons that are reported once per session. */
 typedef enum {
-    SAID_CHAIN,
-    SAID_FORMAT,
-    SAID_GL_ERROR,
-    SAID_MEMORY,
-    SAID_NO_HELPER,
-    SAID_OTHER_API,
-    SAID_RECTANGLE,
-    SAID_SPACE,
-    SAID_SWAPCHAIN,
-    SAID_VIEWS
-} said;
+    REASON_NEXT_CHAIN,
+    REASON_FORMAT,
+    REASON_GL_ERROR,
+    REASON_MEMORY,
+    REASON_NO_HELPER,
+    REASON_OTHER_API,
+    REASON_RECTANGLE,
+    REASON_SPACE,
+    REASON_SWAPCHAIN,
+    REASON_UPLOAD,
+    REASON_VIEWS
+} reason;
 
-#define LOG_ONCE(told, reason, ...)                                                      \
+#define LOG_ONCE(reported, why, ...)                                                      \
     do {                                                                                 \
-        if (!(*(told) >> (reason) & 1u)) {                                               \
-            *(told) |= 1u << (reason);                                                   \
+        if (!(*(reported) >> (why) & 1u)) {                                               \
+            *(reported) |= 1u << (why);                                                   \
             LOG(__VA_ARGS__);                                                            \
         }                                                                                \
     } while (0)

@@ -121,9 +121,12 @@ void swapchain_copy(swapchain *chain, GLuint image) {
     GLenum error = GL_INVALID_OPERATION;
     if (gl->CopyImageSubData && info->sampleCount <= 1) {
         GLenum target = target_of(chain);
+        /* Changes by another context are visible from the next binding on. */
+        gl->BindTexture(target, image);
         gl->CopyImageSubData(image, target, 0, 0, 0, 0, chain->copy, target, 0, 0, 0, 0,
                              (GLsizei)info->width, (GLsizei)info->height,
                              (GLsizei)info->arraySize);
+        gl->BindTexture(target, 0);
         error = gl->GetError();
     }
     if (error) { /* also for images of another format than the one they are named by */
@@ -132,7 +135,7 @@ void swapchain_copy(swapchain *chain, GLuint image) {
     }
     chain->has_copy = error == GL_NO_ERROR;
     if (error)
-        LOG_ONCE(&at->told, SAID_GL_ERROR,
+        LOG_ONCE(&at->reported, REASON_GL_ERROR,
                  "a released image cannot be copied (OpenGL error 0x%x)", error);
 }
 

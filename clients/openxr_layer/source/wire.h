@@ -1,9 +1,9 @@
 /* Messages between the layer and its helper, and the layout of their shared memory.
  *
  * A message is one packet of a Unix socket (SOCK_SEQPACKET).  The layer sends HELLO; the
- * helper answers WELCOME; the layer sends RING with the descriptor of a sealed memfd, and
- * then FRAMEs whose images are in a slot of it.  The helper writes the filtered color
- * over the color and sends RESULT, after which the slot is the layer's again.
+ * helper answers WELCOME; the layer sends MEMORY with the descriptor of a sealed memfd,
+ * and then a FRAME whose images are in that memory.  The helper writes the filtered color
+ * over the color and sends RESULT; only then may the layer send the next FRAME.
  *
  * clients/openxr_layer/wire.py has the same structures; the tests compare both. */
 #ifndef OCU_LAYER_WIRE_H
@@ -15,7 +15,7 @@
 #define WIRE_VERSION 1u
 #define WIRE_EYES 2
 
-enum { WIRE_HELLO = 1, WIRE_WELCOME, WIRE_RING, WIRE_FRAME, WIRE_RESULT };
+enum { WIRE_HELLO = 1, WIRE_WELCOME, WIRE_MEMORY, WIRE_FRAME, WIRE_RESULT };
 
 /* Format of color images.  Rows begin at the bottom, as in OpenGL. */
 enum {
@@ -37,18 +37,17 @@ typedef struct {
 
 typedef struct {
     uint32_t kind, magic, version;
-    uint32_t slot_count;  /* frames that the helper holds at a time, 1 or 2 */
     uint32_t wait_ms;     /* longest wait for the result of a frame */
     uint32_t max_age_ms;  /* of a filtered frame that is shown again */
 } wire_welcome;
 
 typedef struct {
-    uint32_t kind, slot_count;
-    uint64_t slot_bytes;
-} wire_ring;
+    uint32_t kind, padding;
+    uint64_t size_bytes;
+} wire_memory;
 
 typedef struct {
-    uint64_t start;       /* in the slot, bytes */
+    uint64_t start;       /* in the memory, bytes */
     uint32_t width_px, height_px;
 } wire_image;
 
@@ -60,26 +59,24 @@ typedef struct {
 } wire_view;
 
 typedef struct {
-    uint32_t kind, slot;
+    uint32_t kind, flags;
     uint64_t frame_id;
     int64_t display_time_ns;
-    uint32_t flags, color_format;
+    uint32_t color_format;
     float head[7];        /* position, orientation */
     float gaze[4];        /* orientation within the head; -z points ahead */
     int64_t gaze_time_ns; /* 0: unknown */
     wire_view views[WIRE_EYES];
     /* since the previous FRAME: frames that the application submitted, those shown
-     * filtered, those shown as they were although others had been filtered before, and
-     * the time that the layer took on the application's threads */
-    uint32_t frames, frames_filtered, frames_lapsed, padding;
+     * filtered, those shown unfiltered after the first filtered one, and the time that
+     * the layer took on the application's threads */
+    uint32_t frames, frames_filtered, frames_fallback;
     uint32_t copy_us, read_us, upload_us, other_us;
 } wire_frame;
 
 typedef struct {
-    uint32_t kind, slot;
+    uint32_t kind, is_filtered; /* 0: show the application's own frame */
     uint64_t frame_id;
-    uint32_t is_filtered; /* 0: show the application's own frame */
-    uint32_t padding;
 } wire_result;
 
 #endif

@@ -1,6 +1,8 @@
 /* The cases, and how a session goes; the options are described in driver.h. */
 #include "driver.h"
 
+#include <unistd.h>
+
 static const struct plan CASES[] = {
     {"plain", "two swapchains, both drawn each frame", .release_every = 1},
     {"array", "one swapchain of two layers", .is_array = true},
@@ -24,6 +26,12 @@ static const struct plan CASES[] = {
     {"second-session", "another session beside and after", .second = true},
     {"poll", "waits of no time for the images", .never_waits = true},
     {"dynamic-size", "another size every 5 frames", .is_dynamic = true},
+    {"growing", "a larger part of the image from frame 60 on", .is_growing = true},
+    {"hidden", "frames 10 to 24 have no layer", .is_hidden = true},
+    {"other-context", "an unrelated context is current in releases and ends",
+     .other_context = true},
+    {"ahead", "another thread acquires while this one releases", .acquires_ahead = true},
+    {"fork", "a child process that does nothing, from frame 20 on", .forks = true},
     {"fov-flipped", "angleUp below angleDown", .is_flipped = true},
     {"alpha", "a projection blended by its alpha", .has_alpha = true},
     {"violation", "errors that the runtime must report", .violates = true},
@@ -55,7 +63,16 @@ static const struct {
     {"D32FS8", GL_DEPTH32F_STENCIL8},  {"none", GL_NONE},
 };
 
-enum { QUAD_PX = 64, OFFSET_X_PX = 40, OFFSET_Y_PX = 24 };
+enum {
+    QUAD_PX = 64,
+    OFFSET_X_PX = 40,
+    OFFSET_Y_PX = 24,
+    GROWN_FRAME = 60,
+    HIDDEN_FRAME = 10,
+    SHOWN_FRAME = 25,
+    FORK_FRAME = 20,
+    CHILD_S = 20,
+};
 
 struct options options = {.frames = 30,
                           .color_format = GL_SRGB8_ALPHA8,
@@ -70,7 +87,8 @@ struct chain {
     XrSwapchain handle;
     GLuint textures[8];
     uint32_t width, height, layers, samples, index;
-    bool is_acquired;
+    bool is_acquired, is_ahead; /* ahead: the next image is acquired */
+    uint32_t next_index;
 };
 
 /* The images of one layer: a swapchain for each view, or one for all. */
@@ -164,17 +182,32 @@ static void acquire(struct session *session, struct chain *chain) {
     XrSwapchainImageWaitInfo info = {
         .type = XR_TYPE_SWAPCHAIN_IMAGE_WAIT_INFO,
         .timeout = options.plan.never_waits ? 0 : XR_INFINITE_DURATION};
-    MUST_TIMED(session->acquire_ms,
-               xrAcquireSwapchainImage(chain->handle, NULL, &chain->index));
+    if (chain->is_ahead)
+        chain->index = chain->next_index;
+    else
+        MUST_TIMED(session->acquire_ms,
+                   xrAcquireSwapchainImage(chain->handle, NULL, &chain->index));
+    chain->is_ahead = false;
     while (MUST_TIMED(session->acquire_ms,
                       xrWaitSwapchainImage(chain->handle, &info)) == XR_TIMEOUT_EXPIRED)
         session->timeouts++;
     chain->is_acquired = true;
 }
 
+static void *acquire_ahead(void *given) {
+    struct chain *chain = given;
+    must(xrAcquireSwapchainImage(chain->handle, NULL, &chain->next_index),
+         "xrAcquireSwapchainImage");
+    chain->is_ahead = true;
+    return NULL;
+}
+
 static void release(struct session *session, struct chain *chain) {
     if (!chain->is_acquired) return;
+    pthread_t thread;
+    if (options.plan.acquires_ahead) pthread_create(&thread, NULL, acquire_ahead, chain);
     MUST_TIMED(session->release_ms, xrReleaseSwapchainImage(chain->handle, NULL));
+    if (options.plan.acquires_ahead) pthread_join(thread, NULL);
     chain->is_acquired = false;
 }
 
@@ -187,6 +220,7 @@ static XrSwapchainSubImage part_of(const struct plan *plan, const struct chain *
     if (plan->has_offset)
         part.imageRect.offset = (XrOffset2Di){OFFSET_X_PX, OFFSET_Y_PX};
     if (plan->is_dynamic) width -= 16 * (frame / 5 % 4), height -= 8 * (frame / 5 % 4);
+    if (plan->is_growing && frame < GROWN_FRAME) width -= 48, height -= 24;
     if (chain->width < (uint32_t)width) width = (int)chain->width;
     if (chain->height < (uint32_t)height) height = (int)chain->height;
     part.imageRect.extent = (XrExtent2Di){width, height};
@@ -394,13 +428,47 @@ static XrResult end_frame(struct session *session, const struct layers *layers) 
     return result;
 }
 
-/* Release what was drawn, and submit it. */
-static void finish_frame(struct session *session) {
+static void release_and_end(struct session *session) {
     struct layers layers;
     for (int i = 0; i < 2; i++) release_images(session, &session->images[i]);
     release_images(session, &session->quad);
     describe_layers(session, &layers);
+    if (options.plan.is_hidden && session->frame >= HIDDEN_FRAME &&
+        session->frame < SHOWN_FRAME)
+        layers.count = 0;
     tell_frame(session, end_frame(session, &layers));
+}
+
+/* The same with a context current that shares nothing with the session's. */
+static void finish_in_other_context(struct session *session) {
+    static struct context_handles other;
+    struct context_handles ours = graphics.context;
+    glFinish();
+    if (!other.egl && !other.glx) other = new_context();
+    graphics.context = other;
+    make_current(true);
+    release_and_end(session);
+    GLenum error = glGetError();
+    graphics.context = ours;
+    make_current(true);
+    if (error) fail("xrEndFrame", "it left an OpenGL error in the current context");
+}
+
+/* A child inherits all descriptors. */
+static void fork_child(void) {
+    fflush(stdout);
+    if (fork()) return;
+    close(STDOUT_FILENO); /* whoever reads them waits for their end */
+    close(STDERR_FILENO);
+    sleep(CHILD_S);
+    _exit(0);
+}
+
+/* Release what was drawn, and submit it. */
+static void finish_frame(struct session *session) {
+    if (options.plan.forks && session->frame == FORK_FRAME) fork_child();
+    if (options.plan.other_context) finish_in_other_context(session);
+    else release_and_end(session);
 }
 
 static void *finish_in_thread(void *session) {

@@ -15,6 +15,7 @@
  *   MOCK_XR_HEAD           file with a line "x y z qx qy qz qw" per frame, in the first
  *                          LOCAL space; the last one repeats (default: at its origin)
  *   MOCK_XR_GAZE_DEG       "h,v" to the right and up (0,0), or "none": not active
+ *   MOCK_XR_MAX_SWAPCHAINS  so many swapchains are made in this process
  *   MOCK_XR_WAIT_TIMEOUTS  so many waits of no time for an image are in vain
  *   MOCK_XR_RECENTER_AT    frame at whose end LOCAL and LOCAL_FLOOR get another origin
  *   MOCK_XR_LOSE_AT        frame whose xrEndFrame loses the session; "N,instance"

@@ -1,6 +1,8 @@
 /* Swapchains: textures, and who has them. */
 #include "mock.h"
 
+#include <limits.h>
+
 #define DEPTH_PIXELS GL_DEPTH_COMPONENT, GL_FLOAT, 4, true
 static const struct format FORMATS[] = {
     {"GL_SRGB8_ALPHA8", GL_SRGB8_ALPHA8, GL_RGBA, GL_UNSIGNED_BYTE, 4, false},
@@ -84,6 +86,9 @@ XrResult XRAPI_CALL xrCreateSwapchain(XrSession session,
         return XR_ERROR_FEATURE_UNSUPPORTED;
     XrResult result = finish_application(found);
     if (result != XR_SUCCESS) return result;
+    static long made_count;
+    if (made_count++ >= number_setting("MOCK_XR_MAX_SWAPCHAINS", LONG_MAX))
+        return XR_ERROR_OUT_OF_MEMORY;
     struct object *made = create(SWAPCHAIN, found);
     made->swapchain.info = *info;
     made->swapchain.info.next = NULL;
