@@ -13,7 +13,7 @@ NO_TESTS := test $$? -eq 5 # pytest's exit status if ARGS selects none of these 
 BENCHES := $(filter-out gpu soak witness,$(patsubst tests/benchmarks/bench_%.py,%,$(sort $(wildcard tests/benchmarks/bench_*.py))))
 
 .DEFAULT_GOAL := help
-.PHONY: demo docs web test test-training test-examples test-batch-ray test-headset test-layer test-web validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-witness setup-peers peers
+.PHONY: demo docs web test test-training test-examples test-batch-ray test-headset test-layer test-layer-applications test-web validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-witness setup-peers peers
 
 demo: setup  ## filter two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
@@ -42,6 +42,11 @@ test-layer:  ## test `ocufilter layer` in the chroot of test-headset
 	@sh tests/headset/setup_root.sh
 	sh tests/headset/run_in_root.sh python -m pytest tests/openxr_layer $(ARGS)
 
+test-layer-applications:  ## test `ocufilter layer` with Qt, Psychtoolbox and Blender (4 GB)
+	@sh tests/headset/setup_root.sh --applications
+	HEADSET_ROOT="$${HEADSET_APPLICATIONS_ROOT:-$(CURDIR)/.headset-applications}" \
+	    sh tests/headset/run_in_root.sh python -m pytest tests/openxr_layer/applications $(ARGS)
+
 test-headset:  ## test `ocufilter headset` with an OpenXR runtime in a chroot
 	@sh tests/headset/setup_root.sh
 	sh tests/headset/run_in_root.sh python -m pytest tests/headset $(ARGS)
@@ -64,6 +69,8 @@ validate: setup-test setup-web  ## run the slow tests and every benchmark; write
 	        out/roundtrip.json $(RESULTS)/roundtrip_$${how}_$$eyes.json || exit 1; \
 	done; done
 	$(PYTHON) -m tests.benchmarks.bench_wavefront
+	sh tests/headset/setup_root.sh --applications && $(MAKE) test-layer-applications \
+	    || test $$? -eq 77 # where there can be no chroot
 
 witness: setup-witness  ## compare frames with a path tracer that renders through the same eyes
 	$(PYTHON) -m tests.benchmarks.bench_witness $(ARGS)
@@ -87,12 +94,12 @@ check: setup  ## check style, formatting and types; compile every shader with gl
 	$(PYTHON) -m tests.shader_check
 
 clean:  ## remove generated files, including .venv but not out/
-	rm -rf .venv .witness .batch_ray .docs .peers .examples .gl_witness .headset build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules tests/web/node_modules
+	rm -rf .venv .witness .batch_ray .docs .peers .examples .gl_witness .headset .headset-applications build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules tests/web/node_modules
 	find filter_service -name '_*.so' -delete
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## list the targets
-	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 24
+	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 32
 
 setup:
 	@sh setup.sh

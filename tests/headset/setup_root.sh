@@ -3,6 +3,11 @@
 #
 #   sh tests/headset/setup_root.sh [ROOT]     default: $HEADSET_ROOT, or .headset in the
 #                                             checkout; 2.5 GB, a few minutes
+#   sh tests/headset/setup_root.sh --applications [ROOT]
+#                                             with the OpenXR applications Qt Quick 3D,
+#                                             Psychtoolbox and Blender; default:
+#                                             $HEADSET_APPLICATIONS_ROOT, or
+#                                             .headset-applications; 4 GB
 #
 # Monado is available in Debian since trixie, so the chroot is trixie on any host.  Its
 # packages come from the mirror that the host's apt uses, or from DEBIAN_MIRROR.  Use
@@ -15,7 +20,14 @@
 set -eu
 here=$(cd "$(dirname "$0")" && pwd)
 checkout=$(cd "$here/../.." && pwd)
-root=${1:-${HEADSET_ROOT:-$checkout/.headset}}
+kind=
+if [ "${1:-}" = --applications ]; then
+    kind=$1
+    shift
+    root=${1:-${HEADSET_APPLICATIONS_ROOT:-$checkout/.headset-applications}}
+else
+    root=${1:-${HEADSET_ROOT:-$checkout/.headset}}
+fi
 case $root in /*) ;; *) root=$(pwd)/$root ;; esac
 
 RELEASE=trixie
@@ -26,9 +38,16 @@ SYSTEM_PACKAGES="monado-service monado-cli libopenxr1-monado libopenxr-loader1
     openxr-layer-apidump openxr-layer-corevalidation
     xserver-xorg-core xserver-xorg-video-dummy"
 PYTHON_PACKAGES="pytest pyopenxr>=1.1,<1.2 trimesh networkx"
+APPLICATION_PACKAGES="octave-psychtoolbox-3 blender libdbus-1-3 libfontconfig1
+    libglib2.0-0t64 libxcb-cursor0 libxcb-icccm4 libxcb-image0 libxcb-keysyms1
+    libxcb-randr0 libxcb-render-util0 libxcb-render0 libxcb-shape0 libxcb-util1
+    libxcb-xkb1 libxkbcommon-x11-0"
+QT_PACKAGES="PySide6_Addons==6.12.0" # Debian's 6.8 cannot create a session in Monado
+if [ -n "$kind" ]; then SYSTEM_PACKAGES="$SYSTEM_PACKAGES $APPLICATION_PACKAGES"; fi
 MARK=$root/.ocufilter-root
 SYSTEM_STAMP=$root/.ocufilter-system
 PYTHON_STAMP=$root/.ocufilter-python
+QT_STAMP=$root/.ocufilter-qt
 
 say() { printf 'headset: %s\n' "$*" >&2; }
 
@@ -59,7 +78,7 @@ check_rights() {
         if ! sudo -n true 2>/dev/null; then
             cannot "creating a chroot requires root, or sudo without a password"
         fi
-        sudo -n --preserve-env sh "$here/setup_root.sh" "$root" || exit $?
+        sudo -n --preserve-env sh "$here/setup_root.sh" $kind "$root" || exit $?
         exit 0
     fi
     if ! unshare --mount --net sh -c 'mount -t tmpfs tmpfs /mnt && chroot / true' \
@@ -182,7 +201,21 @@ install_project() {
     say "the chroot is ready"
 }
 
+# --- Qt ---------------------------------------------------------------------------
+
+install_qt() { # in an environment of its own, at /opt/pyside
+    if [ "$(cat "$QT_STAMP" 2>/dev/null || true)" = "$QT_PACKAGES" ]; then return; fi
+    rm -f "$QT_STAMP"
+    copy_host_settings
+    step "creating a Python environment for Qt" \
+        in_root /usr/bin/python3 -m venv --clear /opt/pyside
+    step "installing Qt (half a minute)" in_root /opt/pyside/bin/pip install -q \
+        --no-cache-dir --disable-pip-version-check $QT_PACKAGES
+    echo "$QT_PACKAGES" >"$QT_STAMP"
+}
+
 export HEADSET_ROOT="$root"
 check_rights
 install_system
 install_project
+if [ -n "$kind" ]; then install_qt; fi

@@ -8,6 +8,8 @@ from tests.headset.xorg import Xorg
 from tests.native_build import runtime_of
 from tests.openxr_layer import build
 
+collect_ignore = ["applications"]  # only if named: another root and more time
+
 
 def pytest_collection_modifyitems(items):
     """Skip where nothing can be built."""
