@@ -15,8 +15,8 @@ MAX_INVALID_RATIO = 0.2
 """Largest fraction of values that are not in the range of the depth buffer."""
 
 NEAR_RATIO = 2.0
-"""The planes are swapped if at least half the pixels are closer than this many times the
-near plane, which no program draws."""
+"""The planes are swapped if at least half the pixels are closer than this many times
+the near plane, which no program draws."""
 
 FAR_RATIO = 4.0
 FAR_PLANE_RATIO = 0.99

@@ -88,7 +88,7 @@ def test_each_eye_sees_as_it_does(application, layer, run_command, tmp_path):
     print(application.name, ratios, f"{away:.4f}", report)
     assert code == ENDINGS[application.ends_itself]
     assert report["shown_filtered"] >= N_FRAMES
-    assert report["lapsed"] == 0
+    assert report["fallback"] == 0
     # Without depth, everything is as far away as the wall.
     left, right = ratios["far"]
     assert left < BLURRED_RATIO
@@ -195,7 +195,7 @@ def test_helper_is_killed_and_comes_back(application, layer, tmp_path, monkeypat
     np.testing.assert_array_equal(alone, plain)
     np.testing.assert_array_equal(again, seen)
     assert report["shown_filtered"] >= N_FRAMES
-    assert report["lapsed"] == 0
+    assert report["fallback"] == 0
 
 
 @pytest.fixture(scope="module")
