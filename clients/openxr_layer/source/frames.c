@@ -238,7 +238,6 @@ static void read_images(session *at, const plan *p) {
 static void clear_counts(session *at) {
     at->frames = at->frames_filtered = at->frames_fallback = 0;
     at->copy_ns = at->read_ns = at->upload_ns = at->other_ns = 0;
-    at->inside_ns = 0;
 }
 
 /* Copy the buffer that has been read; false if the GPU has not finished. */
