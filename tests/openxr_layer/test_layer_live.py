@@ -284,7 +284,7 @@ class Unready(Inverting):
 
 
 def test_counts_are_of_one_helper(stage):
-    """Frames before its eyes are ready do not count as unfiltered, whoever filtered before."""
+    """Frames before its eyes are ready do not count as unfiltered."""
     results, options = [], {"max_age_ms": 2000}
     program = in_background(stage, results)
     with live_helper(stage, 0.0, **options):

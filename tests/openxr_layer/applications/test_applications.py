@@ -161,18 +161,16 @@ class Serving:
         return report_of(output)
 
 
-def layer_variables(library, folder, monkeypatch, **others):
+def layer_variables(library, folder, **others):
     """Return variables of a program with the layer."""
-    path = folder / "layer.sock"
-    with monkeypatch.context() as patch:
-        found = layer_environment(library, folder, path, patch)
+    found = layer_environment(library, folder, folder / "layer.sock")
     wanted = ("XR_API_LAYER_PATH", "XR_ENABLE_API_LAYERS", "OCUFILTER_LAYER_SOCKET")
     return {name: found[name] for name in wanted} | others
 
 
 @each("qt-glx", "qt-egl", "psychtoolbox-untimed", "psychtoolbox-presenter-thread")
-def test_helper_is_killed_and_comes_back(application, layer, tmp_path, monkeypatch):
-    variables = layer_variables(layer, tmp_path, monkeypatch)
+def test_helper_is_killed_and_comes_back(application, layer, tmp_path):
+    variables = layer_variables(layer, tmp_path)
     with (
         Running(application, tmp_path / "seen", **variables) as running,
         Serving(tmp_path, "first") as first,
@@ -211,10 +209,10 @@ def sanitized(tmp_path_factory):
 
 
 @each()
-def test_sanitizers(application, sanitized, tmp_path, monkeypatch):
+def test_sanitizers(application, sanitized, tmp_path):
     library, preloaded = sanitized
     own = {"LD_PRELOAD": preloaded, "ASAN_OPTIONS": "detect_leaks=0"}
-    variables = layer_variables(library, tmp_path, monkeypatch, **own)
+    variables = layer_variables(library, tmp_path, **own)
     with (
         Serving(tmp_path, "helper") as helper,
         Running(application, tmp_path / "seen", **variables) as running,
