@@ -29,14 +29,14 @@ from typing import Any
 
 from clients.arguments import read_profile
 from clients.headset.options import (
-    TRACKED_RANGE_DEG,
     add_eye_arguments,
     add_service_arguments,
     profiles_of,
     settings_of,
 )
-from clients.headset.runtime import EYES, Eye
+from clients.headset.runtime import EYES
 from clients.openxr_layer import manifest
+from clients.openxr_layer.eyes import Eyes
 from clients.openxr_layer.helper import USUAL_AGE_MS, HelperOptions, LayerHelper
 from clients.openxr_layer.helper_socket import SOCKET_VARIABLE, ask, socket_path
 from filter_service import FilterSettings
@@ -161,90 +161,8 @@ def _checked(options: argparse.Namespace) -> tuple[HelperOptions, FilterSettings
 # The helper
 
 
-class _ProfileFiles:
-    """Profiles that come from files, which are read again when they change."""
-
-    def __init__(self, options: argparse.Namespace) -> None:
-        self._paths: dict[Eye, Path] = {}
-        self._seen: dict[Eye, tuple[int, int] | None] = {}
-        for eye in EYES:
-            text = getattr(options, eye)
-            self.watch(eye, options.profile if text is None else text)
-
-    def watch(self, eye: Eye, text: str) -> None:
-        """Watch the file of an eye's profile if it is one."""
-        path = Path(text)
-        self._paths.pop(eye, None)
-        if not text.lstrip().startswith("{") and path.is_file():
-            self._paths[eye] = path
-            self._seen[eye] = _stamp(path)
-
-    def changed(self) -> Iterator[tuple[Eye, str]]:
-        """Yield the eyes whose file has changed, and its path."""
-        for eye, path in self._paths.items():
-            stamp = _stamp(path)
-            if stamp is not None and stamp != self._seen[eye]:
-                self._seen[eye] = stamp
-                yield eye, str(path)
-
-
-def _stamp(path: Path) -> tuple[int, int] | None:
-    try:
-        found = path.stat()
-    except OSError:  # while it is replaced
-        return None
-    return found.st_mtime_ns, found.st_size
-
-
-class _Eyes:
-    """Profiles of both eyes, which change while frames are filtered."""
-
-    def __init__(self, options: argparse.Namespace, seeing: Any, look: Any) -> None:
-        self._seeing, self._look = seeing, look
-        self._files = _ProfileFiles(options)
-        self._profiles = profiles_of(options)
-        self._is_range_given = options.gaze_range is not None
-        self._request()
-
-    def _request(self) -> None:
-        for eye, profile in self._profiles.items():
-            self._seeing.change(eye, profile)
-
-    def prepare_for_gaze(self) -> None:
-        """Prepare a range of gaze for an eye tracker, unless the user gave one."""
-        if self._is_range_given or any(self._look.gaze_range_deg):
-            return
-        self._look.gaze_range_deg = TRACKED_RANGE_DEG
-        settings = self._seeing.settings
-        self._seeing.settings = settings.changed(gaze_range_deg=TRACKED_RANGE_DEG)
-        self._request()
-
-    def change(self, eye: Eye, text: str) -> None:
-        """Change an eye's profile.
-
-        Raises
-        ------
-        ValueError
-            If the profile cannot be read.
-        """
-        profile = read_profile(text, f"--{eye}")
-        self._files.watch(eye, text)
-        self._profiles[eye] = profile
-        self._look.change(eye)
-        self._seeing.change(eye, profile)
-        say(f"{eye} eye: {profile.get('name', profile.get('kind'))}")
-
-    def reread(self) -> None:
-        """Read the files that have changed."""
-        for eye, text in list(self._files.changed()):
-            try:
-                self.change(eye, text)
-            except ValueError as error:
-                say(f"{eye} eye is unchanged: {error}")
-
-
 @contextlib.contextmanager
-def _helper(options: argparse.Namespace) -> Iterator[tuple[LayerHelper, _Eyes]]:
+def _helper(options: argparse.Namespace) -> Iterator[tuple[LayerHelper, Eyes]]:
     """Return the helper, which listens, and its eyes."""
     helper_options, settings = _checked(options)
     from clients.headset.local_filter import LocalFilter
@@ -265,7 +183,7 @@ def _helper(options: argparse.Namespace) -> Iterator[tuple[LayerHelper, _Eyes]]:
     else:
         seeing = LocalFilter(settings, say)
     with contextlib.closing(seeing):
-        eyes = _Eyes(options, seeing, look)
+        eyes = Eyes(options, seeing, look, say)
         helper = LayerHelper(
             seeing, look, say, helper_options, eyes.change, options.socket
         )

@@ -170,6 +170,43 @@ class Monado:
         return self._run_dir / SOCKET_NAME
 
 
+def start_x_server(log_path: Path, *command: str) -> tuple[subprocess.Popen, str]:
+    """Start an X server; return it and the name of its display.
+
+    Parameters
+    ----------
+    log_path : Path
+        Where its output is written.
+    *command : str
+        Program and options.
+
+    Raises
+    ------
+    RuntimeError
+        It did not start.
+    """
+    read_end, write_end = map(os.fdopen, os.pipe(), "rw")
+    with read_end, write_end, log_path.open("wb") as log:
+        server = subprocess.Popen(
+            [
+                *(*DIES_WITH_US, *command, "-nolisten", "tcp"),
+                *("-displayfd", str(write_end.fileno())),
+            ],
+            pass_fds=[write_end.fileno()],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+        )
+        write_end.close()
+        number = read_end.readline().strip()  # empty where it has ended
+    if not number:
+        server.wait()
+        raise RuntimeError(
+            f"{command[0]}: {log_path.read_text(errors='replace')[-2000:]}"
+        )
+    return server, f":{number}"
+
+
 class Xvfb:
     """A screen in memory.
 
@@ -193,24 +230,11 @@ class Xvfb:
             It did not start.
         """
         width_px, height_px = SCREEN_SIZE_PX
-        read_end, write_end = map(os.fdopen, os.pipe(), "rw")
-        with read_end, write_end, self._log_path.open("wb") as log:
-            self._server = subprocess.Popen(
-                [
-                    *(*DIES_WITH_US, "Xvfb", "-displayfd", str(write_end.fileno())),
-                    *("-screen", "0", f"{width_px}x{height_px}x24"),
-                    *("-fbdir", str(self._frame_dir), "-nolisten", "tcp"),
-                ],
-                pass_fds=[write_end.fileno()],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-            )
-            write_end.close()
-            number = read_end.readline().strip()  # empty where it has ended
-        if not number:
-            raise RuntimeError(f"Xvfb: {self._log_path.read_text()[-2000:]}")
-        return f":{number}"
+        options = ("-screen", "0", f"{width_px}x{height_px}x24")
+        self._server, display = start_x_server(
+            self._log_path, "Xvfb", *options, "-fbdir", str(self._frame_dir)
+        )
+        return display
 
     def stop(self) -> None:
         """End it."""

@@ -5,11 +5,10 @@ Xorg   the server with its dummy driver, from `start` to `stop`
 For use in a chroot with the packages xserver-xorg-core and xserver-xorg-video-dummy.
 """
 
-import os
 import subprocess
 from pathlib import Path
 
-from tests.headset.monado import DIES_WITH_US, end
+from tests.headset.monado import end, start_x_server
 
 SIZE_PX = (1280, 800)
 VIDEO_KB = 64000
@@ -72,26 +71,13 @@ class Xorg:
                 video_kb=VIDEO_KB, width_px=width_px, height_px=height_px
             )
         )
-        said = self._log_dir / "xorg.out"
-        read_end, write_end = map(os.fdopen, os.pipe(), "rw")
-        with read_end, write_end, said.open("wb") as out:
-            self._server = subprocess.Popen(
-                [
-                    *(*DIES_WITH_US, "Xorg", "-displayfd", str(write_end.fileno())),
-                    *("-config", str(configuration), "-noreset", "+extension", "GLX"),
-                    *("-logfile", str(self._log_dir / "xorg.log")),
-                    *("-novtswitch", "-sharevts", "-nolisten", "tcp"),
-                ],
-                pass_fds=[write_end.fileno()],
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=subprocess.STDOUT,
-            )
-            write_end.close()
-            number = read_end.readline().strip()  # empty where it has ended
-        if not number:
-            raise RuntimeError(f"Xorg: {said.read_text(errors='replace')[-2000:]}")
-        return f":{number}"
+        self._server, display = start_x_server(
+            self._log_dir / "xorg.out",
+            *("Xorg", "-config", str(configuration), "-noreset"),
+            *("+extension", "GLX", "-logfile", str(self._log_dir / "xorg.log")),
+            *("-novtswitch", "-sharevts"),
+        )
+        return display
 
     def stop(self) -> None:
         """End it."""

@@ -6,6 +6,7 @@ was filtered.
 
 import re
 import shutil
+import subprocess
 import time
 
 import numpy as np
@@ -331,13 +332,32 @@ def test_waiting_ends_where_the_runtime_still_reads(stage):
     assert set(shown_kinds(ran)) == {"own"}
 
 
-def test_a_session_without_opengl_and_a_runtime_without_depth(stage):
-    # The layer finds no context that shares, as with Vulkan, in a program with depth.
-    offered = "XR_KHR_opengl_enable,XR_MNDX_egl_enable"
-    ran = stage.run("plain", MOCK_XR_EXTENSIONS=offered, OCUFILTER_LAYER_READS="none")
-    check_clean(ran)
+NO_X11 = """
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <string.h>
+void *dlopen(const char *name, int flags) {
+    static void *(*next)(const char *, int);
+    if (!next) next = dlsym(RTLD_NEXT, "dlopen");
+    return name && !strcmp(name, "libX11.so.6") ? NULL : next(name, flags);
+}
+"""
+
+
+def test_a_session_that_cannot_be_filtered_and_a_runtime_without_depth(stage, display):
+    source, library = stage.folder / "no_x11.c", stage.folder / "no_x11.so"
+    source.write_text(NO_X11)
+    command = (build.COMPILER, "-shared", "-fPIC", str(source), "-o", str(library))
+    subprocess.run(command, check=True)
+    ran = stage.run(
+        *("plain", "--glx"),
+        DISPLAY=display,
+        LD_PRELOAD=str(library),
+        MOCK_XR_EXTENSIONS="XR_KHR_opengl_enable,XR_MNDX_egl_enable",
+    )
+    check_clean(ran)  # the depth that it submits has been removed
     assert set(shown_kinds(ran)) == {"own"}
-    assert any("own frames are shown" in line for line in layer_lines(ran))
+    assert any("libX11 is missing" in line for line in layer_lines(ran))
 
 
 def test_a_forked_child_does_not_keep_the_helper(stage):

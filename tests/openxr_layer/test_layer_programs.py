@@ -23,6 +23,7 @@ from tests.openxr_layer.programs import Run, run_hello_xr
 
 SIZE_PX = (160, 180)
 N_FRAMES = 30
+GAZE_DEG = (4.0, -2.0)  # which frozen eyes do not follow
 SETTINGS = {
     "pupil_range_mm": (PUPIL_MM, PUPIL_MM),
     "focus_range_dpt": (FOCUS_DPT, FOCUS_DPT),
@@ -87,13 +88,21 @@ def test_hello_xr_is_shown_as_the_eye_filter_sees_it(
         helper.helper.on_frame = lambda frame, _: inputs.setdefault(
             frame.due.display_time_ns, frame
         )
-        own = environment | {"MOCK_XR_HEAD": moving_head}
+        own = environment | {
+            "MOCK_XR_HEAD": moving_head,
+            "MOCK_XR_GAZE_DEG": "{:g},{:g}".format(*GAZE_DEG),
+        }
         frames, violations = run_hello_xr(runtime, tmp_path, display, N_FRAMES, **own)
     assert violations == []
     assert len(frames) >= N_FRAMES - 5
     seen = [frame for frame in frames if frame["display_time"] in inputs]
     assert len(seen) >= N_FRAMES - 8  # all but those before the connection
     assert seen == frames[-len(seen) :]
+    # Its first frames come before it has synchronized its actions.
+    gazes = [inputs[frame["display_time"]].due.gaze for frame in seen[10:]]
+    assert [(gaze.h_deg, gaze.v_deg) for gaze in gazes] == [
+        pytest.approx(GAZE_DEG, abs=1e-4)
+    ] * len(gazes)
     n_blurred = 0
     for frame in (seen[0], seen[len(seen) // 2], seen[-1]):
         given = inputs[frame["display_time"]]

@@ -36,7 +36,7 @@ static const XrCompositionLayerDepthInfoKHR *depth_of(const void *next) {
     return NULL;
 }
 
-/* Find the images of a layer; false if it goes out as it is. */
+/* Find the images of a layer; false if it cannot be filtered. */
 static bool plan_views(session *at, plan *p) {
     for (int eye = 0; eye < WIRE_EYES; ++eye) {
         swapchain *color = find_swapchain(p->layer->views[eye].subImage.swapchain);
@@ -293,7 +293,7 @@ static void receive(session *at) {
     clear_counts(at);
 }
 
-/* The specification demands that commands that refer to a swapchain have completed. */
+/* Before xrDestroySwapchain, all commands that refer to its images must have completed. */
 static void finish_uploads(session *at) {
     gl_current before;
     if (!gl_enter(&at->gl, &before)) return;

@@ -1,7 +1,7 @@
 /* Gaze of an eye tracker, by an action of the layer's own beside the application's.
  *
- * The application attaches its action sets once per session, so that the layer's set goes
- * with them; without an application that attaches any, there is no gaze. */
+ * Action sets can be attached only once per session, so the layer attaches its own set with
+ * the application's.  If the application attaches none, there is no gaze. */
 #include <stdlib.h>
 #include <string.h>
 

@@ -8,8 +8,6 @@
 
 #include "log.h"
 
-#define READS "OCUFILTER_LAYER_READS"
-
 /* Window-system functions, from the libraries that the application has loaded. */
 #define GLX_FUNCTIONS(F)                                                                 \
     F(GLXContext, glXCreateContextAttribsARB,                                            \
@@ -164,7 +162,7 @@ static const char *open_glx(gl_context *gl, const XrGraphicsBindingOpenGLXlibKHR
     load_egl(NULL); /* for gl_enter; it may be missing */
     Display *display = gl->x_display = binding->xDisplay;
     if (!display || !binding->glxContext) return "the graphics binding has no context";
-    /* By default, the first error ends the program.  The handler is of the process. */
+    /* The default handler ends the program at the first error.  A process has one. */
     static pthread_mutex_t handler = PTHREAD_MUTEX_INITIALIZER;
     pthread_mutex_lock(&handler);
     p_XSync(display, False);
@@ -230,8 +228,6 @@ static const char *open_egl(gl_context *gl, const XrGraphicsBindingEGLMNDX *bind
 const char *gl_open(gl_context *gl, const XrSessionCreateInfo *info) {
     *gl = (gl_context){.egl_context = EGL_NO_CONTEXT, .egl_surface = EGL_NO_SURFACE};
     const char *reason = "the application does not use OpenGL on X11 or EGL";
-    const char *reads = getenv(READS);
-    if (reads && !strcmp(reads, "none")) return reason; /* as with Vulkan, in tests */
     for (const XrBaseInStructure *at = info->next; at; at = at->next) {
         if (at->type == XR_TYPE_GRAPHICS_BINDING_OPENGL_XLIB_KHR) {
             reason = open_glx(gl, (const XrGraphicsBindingOpenGLXlibKHR *)at);
@@ -259,7 +255,7 @@ const char *gl_open(gl_context *gl, const XrSessionCreateInfo *info) {
     gl->is_software = renderer && (strstr(renderer, "llvmpipe") ||
                                    strstr(renderer, "softpipe") ||
                                    strstr(renderer, "Software Rasterizer"));
-    /* As with a GPU, in tests without one. */
+    const char *reads = getenv("OCUFILTER_LAYER_READS"); /* as with a GPU, without one */
     if (reads && !strcmp(reads, "buffered")) gl->is_software = false;
     gl->GenFramebuffers(1, &gl->read_framebuffer);
     gl->GenFramebuffers(1, &gl->draw_framebuffer);

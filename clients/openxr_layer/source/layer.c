@@ -2,7 +2,7 @@
  *
  * It copies color and depth of each view when the application releases its images, sends
  * them to a helper process, and shows the newest filtered frame in place of the
- * application's.  Whatever it does not understand passes unchanged.  See
+ * application's.  It passes on all other calls and layers unchanged.  See
  * docs/how-to/openxr-layer.md. */
 #include "layer.h"
 
@@ -430,8 +430,8 @@ static XRAPI_ATTR XrResult XRAPI_CALL layer_CreateApiLayerInstance(
     XrInstance *made) {
     if (!layers || !layers->nextInfo || strcmp(layers->nextInfo->layerName, LAYER_NAME))
         return XR_ERROR_INITIALIZATION_FAILED;
-    /* A runtime that lacks an extension refuses the instance.  The gaze is the layer's
-     * wish; depth is offered to the application by the layer's manifest. */
+    /* Runtimes refuse an instance with extensions that they lack.  The layer adds the gaze
+     * extension if it can; depth is offered to the application by the layer's manifest. */
     bool has_gaze = names(info, GAZE), has_depth = names(info, DEPTH);
     XrResult result = XR_ERROR_EXTENSION_NOT_PRESENT;
     bool adds_gaze = false, drops_depth = false;
