@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.rendering.filtered_view import FilteredView
+from filter_service.rendering.frame_states import FrameStates
 from filter_service.rendering.sampled_frame import SampledFrame
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
@@ -64,6 +65,8 @@ class ViewRequest:
         Array of the shape and type of the output, which the engine may fill.
     until_s : float, optional
         Deadline by `time.monotonic`; the engine computes no PSFs after it.
+    white_level : float, optional
+        White level of the view, if it is known; see `white_level`.
     """
 
     view: RgbdView
@@ -75,6 +78,7 @@ class ViewRequest:
     options: RenderOptions = DEFAULT_OPTIONS
     out: NDArray[Any] | None = None
     until_s: float | None = None
+    white_level: float | None = None
 
 
 @dataclass(frozen=True)
@@ -161,6 +165,9 @@ class FrameEngine(Protocol):
 
     def load(self, store: Any) -> LoadedStore:
         """Load a store; its kernels may be computed later."""
+
+    def frame_states(self, handle: Any) -> FrameStates:
+        """Return the cached layers and cells of the frames of a loaded store."""
 
     def begin(self, request: ViewRequest) -> Pending:
         """Start filtering a view; return a function that waits for the result.

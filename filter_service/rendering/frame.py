@@ -110,10 +110,20 @@ def extended(view: RgbdView, border_px: int) -> RgbdView:
 
 def radial_stretch(view: RgbdView) -> NDArray[np.float64]:
     """Return radial over planar depth of each pixel, (height, width)."""
+    return stretch_at(
+        view, np.arange(view.width_px), np.arange(view.height_px)[:, None]
+    )
+
+
+def stretch_at(
+    view: RgbdView, x_px: NDArray[np.int64], y_px: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return radial over planar depth (...) at pixels."""
     left, right, up, down = view.tangents
-    x = left + (right - left) * (np.arange(view.width_px) + 0.5) / view.width_px
-    y = up + (down - up) * (np.arange(view.height_px) + 0.5) / view.height_px
-    return np.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2)
+    x = left + (right - left) * (x_px + 0.5) / view.width_px
+    y = up + (down - up) * (y_px + 0.5) / view.height_px
+    found: NDArray[np.float64] = np.sqrt(1.0 + x**2 + y**2)
+    return found
 
 
 def object_dpt(view: RgbdView, depth_m: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -1,10 +1,12 @@
 """Cached parts of a frame's plan that depend only on pupil, focus and gaze."""
 
+from __future__ import annotations
+
 import math
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,9 @@ from filter_service.rendering.detection import merge_spread_px
 from filter_service.rendering.image_cells import ImageCells, image_cells, stored_scale
 from filter_service.rendering.sampled_frame import SampledFrame, missing_psfs_of
 from filter_service.settings import DEFAULT_OPTIONS, RenderOptions
+
+if TYPE_CHECKING:  # it loads numba
+    from filter_service.rendering.pupil_edges import PupilEdges
 
 LAYER_STEP_RATIOS = (0.2, 2.0)
 """Smallest and largest layer step relative to the default.  With the smallest, layers
@@ -50,6 +55,13 @@ class FrameStore:
     def node_scale(self) -> NDArray[np.float64]:
         """Scale of the stored pixels, see `stored_scale`; cached, as it takes 3 ms."""
         return stored_scale(self.store.spec, self.store.plan)
+
+    @cached_property
+    def edges(self) -> PupilEdges:
+        """Edges of the pupils of its nodes."""
+        from filter_service.rendering.pupil_edges import PupilEdges
+
+        return PupilEdges(self.store)
 
     @property
     def computed_count(self) -> int:

@@ -72,15 +72,3 @@ def add_scattered(
                 )
                 light = unscattered_ratio * image[y, x, c] + over + v * (under - over)
                 image[y, x, c] = np.float32(gains[c] * light)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def encode_srgb(start, end, image, table, encoded):
-    """Encode linear light (n,) as bytes (n,) by a lookup table (size,) over 0 to 1."""
-    last = table.size - 1
-    for k in range(start, end):
-        light = image[k]
-        if light > 0.0:
-            encoded[k] = table[int(min(light, 1.0) * last + 0.5)]
-        else:
-            encoded[k] = 0

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from estimator.media.absorption import channel_gains
 from estimator.media.straylight import Straylight
 from estimator.profiles.parse import EyeProfile
+from filter_service.constants import RGB
 from filter_service.displays import display_wavelengths_nm
+from filter_service.rendering.edge_light import EdgeLight
 from filter_service.rendering.engine import FrameEngine, Pending, ViewRequest
 from filter_service.rendering.filtered_view import FilteredView
 from filter_service.rendering.haze import add_haze, run_in_threads
@@ -26,10 +28,12 @@ from filter_service.rendering.spectacles import (
     spectacle_magnification,
 )
 from filter_service.rendering.srgb import half_from_linear, srgb_from_linear
+from filter_service.rendering.white_level import white_level
 from filter_service.rgbd_view import RgbdView
 
 UNCHANGED = (1.0, 1.0, 1.0)
 ENCODE_STEPS = 1 << 16
+NOTHING = np.empty((0, 0, RGB), np.float32)
 
 
 @dataclass(frozen=True)
@@ -78,50 +82,89 @@ class MediaEffects:
             color *= np.array(self.gain_ratio, np.float32)
 
 
+class _Stages:
+    """Wall times of stages, ms."""
+
+    def __init__(self) -> None:
+        self.times_ms: dict[str, float] = {}
+        self.start()
+
+    def start(self) -> None:
+        """Start the next stage."""
+        self._started_s = time.perf_counter()
+
+    def end(self, name: str) -> None:
+        """Add the time since the last end or start to a stage, and start the next."""
+        elapsed_ms = 1e3 * (time.perf_counter() - self._started_s)
+        self.times_ms[name] = self.times_ms.get(name, 0.0) + elapsed_ms
+        self.start()
+
+
 def begin_through_media(
     engine: FrameEngine, request: ViewRequest, effects: MediaEffects | None
 ) -> Pending:
-    """Start filtering a view with media effects; see `FrameEngine.begin`."""
-    if effects is None:
-        return engine.begin(request)
-    started_s = time.perf_counter()
-    output, view = request.output, request.view
-    if effects.magnification_ratio is not None:
+    """Start filtering a view, with the media and with light beyond the kernels.
+
+    See `FrameEngine.begin`.
+    """
+    stages = _Stages()
+    view = request.view
+    if effects is not None and effects.magnification_ratio is not None:
         view = seen_through(view, effects.magnification_ratio)
-    before_s = time.perf_counter() - started_s
-    begun = engine.begin(replace(request, view=view, output="linear", out=None))
-    return partial(_finish, begun, effects, view, output, before_s)
+        request = replace(request, view=view)
+        stages.end("media_ms")
+    if view.color.dtype != np.uint8:
+        request = replace(request, white_level=white_level(view.color))
+    edge_light = EdgeLight.of(engine, request)
+    if edge_light is not None:
+        request = replace(request, view=edge_light.view)
+        stages.end("edge_light_ms")
+    elif effects is None:
+        return engine.begin(request)
+    from filter_service.rendering.edge_light_loops import add_coarse
+
+    begun = engine.begin(replace(request, output="linear", out=None))
+
+    def finish() -> FilteredView:
+        rendered = begun()
+        stages.start()
+        color = np.ascontiguousarray(rendered.color, dtype=np.float32)
+        coarse = NOTHING
+        if edge_light is not None:
+            coarse = edge_light.add(color)
+        if coarse.size and (effects is not None or request.output != "srgb8"):
+            run_in_threads(add_coarse, len(color), coarse, color)
+            coarse = NOTHING
+        if edge_light is not None:
+            stages.end("edge_light_ms")
+        if effects is not None:
+            effects.apply(color, view)
+        color = encoded(color, request.output, coarse)
+        stages.end("edge_light_ms" if effects is None else "media_ms")
+        times_ms = {**rendered.stage_times_ms, **stages.times_ms}
+        return replace(rendered, color=color, stage_times_ms=times_ms)
+
+    return finish
 
 
-def _finish(
-    begun: Pending,
-    effects: MediaEffects,
-    view: RgbdView,
-    output: str,
-    before_s: float,
-) -> FilteredView:
-    rendered = begun()
-    started_s = time.perf_counter()
-    color = np.ascontiguousarray(rendered.color, dtype=np.float32)
-    effects.apply(color, view)
-    color = encoded(color, output)
-    media_ms = 1e3 * (time.perf_counter() - started_s + before_s)
-    stages_ms = {**rendered.stage_times_ms, "media_ms": media_ms}
-    return replace(rendered, color=color, stage_times_ms=stages_ms)
+def encoded(
+    color: NDArray[np.float32], output: str, coarse: NDArray[np.float32] = NOTHING
+) -> NDArray[Any]:
+    """Return linear light in the encoding of an output.
 
-
-def encoded(color: NDArray[np.float32], output: str) -> NDArray[Any]:
-    """Return linear light in the encoding of an output."""
+    Parameters
+    ----------
+    coarse : (rows, columns, 3), optional
+        Light on pixels of twice the size, added before the encoding as sRGB.
+    """
     if output == "linear":
         return color
     if output == "linear16":
         return half_from_linear(color)
-    from filter_service.rendering.haze_loops import encode_srgb
+    from filter_service.rendering.edge_light_loops import add_and_encode
 
     found = np.empty(color.shape, np.uint8)
-    run_in_threads(
-        encode_srgb, color.size, color.reshape(-1), _encoding(), found.reshape(-1)
-    )
+    run_in_threads(add_and_encode, len(color), coarse, color, _encoding(), found)
     return found
 
 

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 WHITE_STEP_PX = 8
 """Stride in pixels at which the white level is sampled."""
 
-WHITE_PERCENTILE, WHITE_RATIO = 90.0, 2.0
+LIT_PERCENTILE, PERCENTILE, WHITE_RATIO = 90.0, 99.6, 2.0
 """The white level of a linear image is its maximum, but at most this ratio times the
-90th percentile of its lit pixels, so that a small light source does not set it."""
+90th percentile of its lit pixels and the 99.6th percentile of all, so that a small
+light source does not set it, even alone in the dark."""
 
 
 def white_level(color: NDArray[Any]) -> float:
@@ -21,7 +22,9 @@ def white_level(color: NDArray[Any]) -> float:
     if color.dtype == np.uint8:
         return 1.0
     light = np.abs(color[::WHITE_STEP_PX, ::WHITE_STEP_PX].astype(np.float64))
-    lit = light[(light > 0.0) & np.isfinite(light)]
+    light = light[np.isfinite(light)]
+    lit = light[light > 0.0]
     if lit.size == 0:
         return 0.0
-    return float(min(lit.max(), WHITE_RATIO * np.percentile(lit, WHITE_PERCENTILE)))
+    limits = np.percentile(lit, LIT_PERCENTILE), np.percentile(light, PERCENTILE)
+    return float(min(lit.max(), WHITE_RATIO * min(limits)))

@@ -152,11 +152,14 @@ class FrameRun:
         with self.timer.wall("prepare_ms"):
             whole = extended(view, border_px)
         change_dpt = eye.states.corner_change_dpt(self.timer, self.layers, image)
+        white = self._request.white_level
+        if white is None:
+            white = white_level(view.color)
         return _Plan(
             whole,
             border_px,
             FrameState(self.layers, image, change_dpt),
-            white_level(view.color),
+            white,
             split_into_strips(
                 whole,
                 partial(reach_px_of, view, self.layers, image),

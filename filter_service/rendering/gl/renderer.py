@@ -21,6 +21,7 @@ from filter_service.rendering.filtered_view import (
     input_notes,
     sampled_input_notes,
 )
+from filter_service.rendering.frame_states import FrameStates
 from filter_service.rendering.gl.eye_states import EyeStates
 from filter_service.rendering.gl.frame_run import FrameRun
 from filter_service.rendering.gl.gl_store import GlStore
@@ -67,6 +68,10 @@ class FilterRenderer(OneView):
     def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
         """Return False: frames on a GPU are too short for pauses."""
         return False
+
+    def frame_states(self, handle: GlStore) -> FrameStates:
+        """Return the cached layers and cells of the frames of a loaded store."""
+        return self._eyes.of(handle).states
 
     def begin(self, request: ViewRequest) -> Pending:
         """Start filtering a view; see `FrameEngine.begin`.

@@ -25,6 +25,7 @@ from filter_service.rendering.frame import (
     fill_missing_depth,
 )
 from filter_service.rendering.frame_kernels import Fill
+from filter_service.rendering.frame_states import FrameStates
 from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
 from filter_service.rendering.native.arrays import Arrays
 from filter_service.rendering.native.eye_states import EyeState, EyeStates
@@ -107,6 +108,10 @@ class NativeRenderer(OneView):
         """Load a store; its kernels may be computed later."""
         return NativeStore(store)
 
+    def frame_states(self, handle: NativeStore) -> FrameStates:
+        """Return the cached layers and cells of the frames of a loaded store."""
+        return self._eyes.of(handle).states
+
     def begin(self, request: ViewRequest) -> Pending:
         """Filter one view; see `FrameEngine.begin`.
 
@@ -161,11 +166,14 @@ class NativeRenderer(OneView):
             frame.set_kernels(plan)
             frame.set_store(eye.handle)
         with timer.wall("merge_ms"):
+            white = request.white_level
+            if white is None:
+                white = white_level(view.color)
             frame.set_merging(
                 tolerance=options.render_tolerance if options.merge else 0.0,
                 gaze=merge_gaze(options, request.gaze_deg),
                 paper_rule=options.accumulation == "paper",
-                white_level=white_level(view.color),
+                white_level=white,
                 is_encoded=request.output == "srgb8",
             )
             self._loops.run("merge", frame.c)

@@ -1,0 +1,254 @@
+"""Kinds of bright sources, and the edges of the pupil that send their light."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.psf.survey import N_EDGE
+from filter_service.constants import RGB
+from filter_service.planning.grid import GREEN
+from filter_service.psfs.frame_layers import FrameLayers
+from filter_service.rendering.bright_pixels import BrightPixels
+from filter_service.rendering.engine import FrameEngine, ViewRequest
+from filter_service.rendering.frame_kernels import interval_count
+from filter_service.rendering.frame_states import FrameStore
+from filter_service.rendering.gaze import clamped_gaze
+from filter_service.rendering.image_cells import ImageCells
+
+BLUR_STEP, BLUR_UNIT_PX = 0.05, 10.0
+"""Sources share a kernel of light if their blur differs by less than 5 % or 0.5 px."""
+
+MAX_KINDS, MAX_KINDS_PX = 24, 40_000
+"""Largest number of kinds, and of the pixels of their kernels.  Those with the most
+light per pixel are kept; other sources have distant light only."""
+
+END_PX = 6.0
+"""Estimated distance from the rays of the spot to the end of a kernel."""
+
+
+class _Untimed:
+    """Stage timer of `FrameStates` that does not measure."""
+
+    def wall(self, name: str) -> AbstractContextManager[None]:
+        return nullcontext()
+
+
+@dataclass(frozen=True)
+class EyeAtFrame:
+    """A store in one state of the eye.
+
+    Attributes
+    ----------
+    corner_change_dpt : (rows + 1, columns + 1)
+        See `FrameStates.corner_change_dpt`.
+    """
+
+    handle: FrameStore
+    layers: FrameLayers
+    image: ImageCells
+    corner_change_dpt: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, engine: FrameEngine, request: ViewRequest) -> EyeAtFrame:
+        """Return the state of a request, from the engine's cache."""
+        handle, timer = request.handle, _Untimed()
+        states = engine.frame_states(handle)
+        layers = states.layers(
+            timer,
+            handle,
+            request.pupil_diameter_mm,
+            request.focus_dpt,
+            request.options,
+        )
+        gaze_deg, _ = clamped_gaze(handle.store.spec, request.gaze_deg)
+        image = states.cells(timer, handle, gaze_deg)
+        return cls(
+            handle, layers, image, states.corner_change_dpt(timer, layers, image)
+        )
+
+    def cells_at(
+        self, x_px: NDArray[Any], y_px: NDArray[Any]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Return row, column and change of defocus (n,) of the cells of pixels (n,)."""
+        edge_px, change_dpt = self.image.cell_px, self.corner_change_dpt
+        if not edge_px:
+            none = np.zeros(x_px.size, np.int64)
+            return none, none, np.zeros(x_px.size)
+        columns, rows = self.image.grid
+        row = np.minimum(y_px // edge_px, rows - 1)
+        column = np.minimum(x_px // edge_px, columns - 1)
+        v, u = (y_px + 0.5) / edge_px - row, (x_px + 0.5) / edge_px - column
+        upper, lower = (
+            change_dpt[row + down, column] * (1.0 - u)
+            + change_dpt[row + down, column + 1] * u
+            for down in (0, 1)
+        )
+        return row, column, upper * (1.0 - v) + lower * v
+
+
+@dataclass(frozen=True)
+class SourceKinds:
+    """Kinds of sources, each represented by its brightest.
+
+    Attributes
+    ----------
+    of_source : (m,)
+        Kind of each source.
+    is_own : (m,)
+        Whether a source is of this kind, and not only similar.
+    place : (n, 3)
+        Row and column of the cell, and blur in steps.
+    cell, interval, layer_dpt : (n,)
+    part_ratio : (n,)
+        Position within the interval of layers, 0 to 1.
+    """
+
+    of_source: NDArray[np.int64]
+    is_own: NDArray[np.bool_]
+    place: NDArray[np.int64]
+    cell: NDArray[np.int64]
+    interval: NDArray[np.int64]
+    layer_dpt: NDArray[np.float64]
+    part_ratio: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, state: EyeAtFrame, pixels: BrightPixels) -> SourceKinds:
+        """Sort sources by their cell and blur."""
+        layers, image = state.layers, state.image
+        row, column, change_dpt = state.cells_at(*pixels.source_at_px.T)
+        cell = row * image.grid[0] + column
+        vergence_dpt = np.asarray(layers.vergence.vergence_dpt(pixels.object_dpt))
+        steps_dpt = layers.layer_dpt
+        layer_dpt = np.clip(
+            np.clip(vergence_dpt, *layers.vergence_range_dpt) + change_dpt,
+            steps_dpt[0],
+            steps_dpt[-1],
+        )
+        node = image.nodes[cell, image.weight_ratio[cell].argmax(axis=1)]
+        total_dpt = layer_dpt + layers.layer_zero_dpt[node, GREEN]
+        blur_px = layers.blur_px_per_dpt * np.abs(total_dpt)
+        blur = np.arcsinh(blur_px * np.sign(total_dpt) / BLUR_UNIT_PX) / BLUR_STEP
+        key = np.stack([row, column, np.rint(blur).astype(np.int64)], axis=-1)
+        place, of_source = np.unique(key, axis=0, return_inverse=True)
+        of_source = of_source.reshape(-1)
+        brightness = pixels.light.sum(axis=1)
+        order = np.lexsort((brightness, of_source))
+        first = order[np.flatnonzero(np.diff(of_source[order], append=-1))]
+        light = np.bincount(of_source, brightness).astype(np.float64)
+        kept = _kept(light, blur_px[first])
+        similar = _nearest(place, place[kept])
+        is_own = np.isin(np.arange(len(place)), kept)[of_source]
+        of_source, place, first = similar[of_source], place[kept], first[kept]
+        interval = np.searchsorted(steps_dpt, layer_dpt[first], side="right") - 1
+        interval = np.clip(interval, 0, interval_count(layers) - 1)
+        upper = np.minimum(interval + 1, steps_dpt.size - 1)
+        step_dpt = steps_dpt[upper] - steps_dpt[interval]
+        part = (layer_dpt[first] - steps_dpt[interval]) / np.where(
+            step_dpt > 0.0, step_dpt, 1.0
+        )
+        return cls(
+            of_source,
+            is_own,
+            place,
+            cell[first],
+            interval,
+            layer_dpt[first],
+            np.clip(part, 0.0, 1.0),
+        )
+
+    def grouped(self, group: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+        """Return a similar kind (n,) for each, at most ``count`` per group (n,)."""
+        found = np.arange(group.size)
+        for own in np.unique(group):
+            kinds = np.flatnonzero(group == own)
+            for power in range(32):
+                _, first, number = np.unique(
+                    self.place[kinds] >> power,
+                    axis=0,
+                    return_index=True,
+                    return_inverse=True,
+                )
+                if first.size <= count:
+                    break
+            found[kinds] = kinds[first[number.reshape(-1)]]
+        return found
+
+
+def _kept(
+    light: NDArray[np.float64], blur_px: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Return the kinds (n,) with the most light per pixel of their kernels."""
+    kernel_px = (3.0 * np.sqrt(2.0) * (blur_px + END_PX)) ** 2
+    order = np.argsort(-light / kernel_px, kind="stable")[:MAX_KINDS]
+    count = max(int(np.searchsorted(np.cumsum(kernel_px[order]), MAX_KINDS_PX)), 1)
+    return np.sort(order[:count])
+
+
+def _nearest(place: NDArray[np.int64], kept: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the index of the nearest kept place (k, 3) to each place (n, 3)."""
+    found = np.empty(len(place), np.int64)
+    for first in range(0, len(place), 256):
+        part = place[first : first + 256]
+        square = np.square(part[:, None] - kept).sum(axis=2)
+        found[first : first + 256] = square.argmin(axis=1)
+    return found
+
+
+@dataclass(frozen=True)
+class EdgeElements:
+    """Edges of the pupils of kinds, in pixels of the image (x right, y down).
+
+    Attributes
+    ----------
+    elements : (n, 3, 7, N_EDGE + 1), float32
+        x and y of slopes, tangents and normals, and lengths times the strength of the
+        light; see `edge_light_loops`.
+    shift_px : (n, N_EDGE, 2)
+        Displacement of rays to the elements, per diopter.
+    """
+
+    elements: NDArray[np.float32]
+    shift_px: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, state: EyeAtFrame, kinds: SourceKinds) -> EdgeElements:
+        """Blend the edges of the store's nodes, as its kernels are blended."""
+        from filter_service.rendering.edge_light_loops import blend_edges
+
+        layers, image, store = state.layers, state.image, state.handle.store
+        nodes, n = image.nodes[kinds.cell], kinds.cell.size
+        groups = (layers.reads.groups + nodes[..., None]).ravel()
+        slope_px = np.zeros((n, RGB, N_EDGE, 2))
+        half, edge_um = np.zeros((n, RGB, 2, 2)), np.zeros((n, RGB))
+        shift, center = np.zeros((n, 2, 2)), np.zeros((n, 2))
+        maps = image.maps.tables
+        blend_edges(
+            store.tables,
+            layers.reads,
+            state.handle.edges.of(groups),
+            (maps.node_from_cell, maps.cell_from_node),
+            (kinds.cell, nodes, image.weight_ratio[kinds.cell], kinds.layer_dpt),
+            layers.layer_zero_dpt,
+            (slope_px, half, edge_um, shift, center),
+        )
+        angle = 2.0 * np.pi * np.arange(N_EDGE) / N_EDGE
+        disc = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        along = np.einsum("kcij,mj->kcmi", half, disc[:, ::-1] * [-1.0, 1.0])
+        length = np.hypot(along[..., 0], along[..., 1])
+        tangent = along / length[..., None]
+        normal = tangent[..., ::-1] * [1.0, -1.0]
+        area = np.pi * np.abs(np.linalg.det(half))
+        strength = edge_um / (4.0 * np.pi**2 * area) * (2.0 * np.pi / N_EDGE)
+        length *= strength[..., None]
+        rows = np.concatenate([slope_px, tangent, normal, length[..., None]], axis=-1)
+        elements = np.concatenate([rows, rows[:, :, :1]], axis=2)
+        in_pupil = np.einsum("kij,mj->kmi", half[:, GREEN], disc)
+        return cls(
+            np.ascontiguousarray(np.swapaxes(elements, 2, 3), np.float32),
+            np.einsum("kij,kmj->kmi", shift, in_pupil) + center[:, None],
+        )

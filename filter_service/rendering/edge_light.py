@@ -1,0 +1,485 @@
+"""Light of bright pixels beyond their kernels.
+
+Kernels end where about 1 % of the light of a point is farther out: light that was
+diffracted at the edge of the pupil.  A lamp may be a thousand times as bright as white,
+so that this share is visible, as a halo and as streaks.  It is added to the filtered
+image: near a source pixel by pixel, farther away on grids of increasing pitch.
+
+References
+----------
+M. Born & E. Wolf, Principles of Optics, 7th ed., section 8.9: far from the geometric
+image, diffracted light comes from the edge of the aperture.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimator.psf.survey import N_EDGE
+from filter_service.constants import RGB
+from filter_service.rendering.bright_pixels import BrightPixels
+from filter_service.rendering.edge_kinds import EdgeElements, EyeAtFrame, SourceKinds
+from filter_service.rendering.engine import FrameEngine, ViewRequest
+from filter_service.rendering.frame_kernels import (
+    Fill,
+    frame_kernels,
+    interval_count,
+)
+from filter_service.rendering.haze import run_in_threads
+from filter_service.rgbd_view import RgbdView
+
+N_PHI = 32
+"""Directions from a source, of the tables of distant light."""
+
+RHO_PX = 8.0 * 1.45 ** np.arange(10)
+"""Distances from a source, of the tables of distant light.  Beyond the last, 227 px,
+the light falls as the third power."""
+
+FINE = 8
+"""Steps between two distances in the tables."""
+
+RADII_PX = (16, 24, 36, 54, 81, 122, 182, 273, 410)
+"""Distances up to which light may be added pixel by pixel."""
+
+FADE_RATIO = 1.5
+"""Ratio of the distances between which one grid replaces another."""
+
+COARSE_RATIO = 8.0
+"""Least distance from the source, in coarse pixels, at which they are used.  The error
+of distribution and interpolation is about 1.5 % there."""
+
+LEAST_REACH_PX, MAX_REACH_PX = 100.0, 1000.0
+
+INVISIBLE_RATIO = 1e-4
+"""Ratio to white of light that need not be added: a third of the first step of 8 bits.
+"""
+
+LEFT_OUT_RATIO = 2e-5
+"""Ratio to white of a single source's light that need not be added."""
+
+MAX_FAR_KINDS = 4
+"""Largest number of kernels of distant light for each of the radii, of sources that the
+entire pupil sees.  If there are more, similar sources share one."""
+
+MAX_PARTLY_HIDDEN = 6
+"""Largest number of kernels of sources that only a part of the pupil sees.  Others are
+treated as seen by the entire pupil, with less light."""
+
+MAX_NEAR_PRODUCTS = 6_000_000
+"""Products per channel that pixel-by-pixel light may take; if there are more, sources
+are merged in squares of 3, 9 or 27 pixels."""
+
+
+@lru_cache(maxsize=1)
+def _directions() -> NDArray[np.float32]:
+    """Return the directions (N_PHI, 2) of the tables of distant light."""
+    angle = 2.0 * np.pi * np.arange(N_PHI) / N_PHI
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1).astype(np.float32)
+
+
+@lru_cache(maxsize=64)
+def _places(
+    inner_px: float, outer_px: float, pitch_px: int
+) -> tuple[NDArray[np.float32], ...]:
+    """Return factor, and position in the tables, of offsets (side, side).
+
+    The factors fade in and out from two distances on.
+    """
+    half = math.ceil(FADE_RATIO * outer_px / pitch_px)
+    y, x = np.mgrid[-half : half + 1, -half : half + 1] * float(pitch_px)
+    rho_px = np.hypot(x, y)
+    share = 1.0 - _faded(rho_px, outer_px)
+    if inner_px:
+        share -= 1.0 - _faded(rho_px, inner_px)
+    rho_px = np.maximum(rho_px, RHO_PX[0])
+    factor = share / rho_px**3
+    if pitch_px > 1:
+        # Distribution to coarse pixels and interpolation between them add this much to
+        # the third power.
+        factor /= 1.0 + 1.5 * (pitch_px / rho_px) ** 2
+    # Between two distances, the tables are linear in the reciprocal.
+    whole = np.minimum(np.searchsorted(RHO_PX, rho_px, side="right"), RHO_PX.size - 1)
+    low, high = 1.0 / RHO_PX[whole - 1], 1.0 / RHO_PX[whole]
+    part = np.clip((1.0 / rho_px - low) / (high - low), 0.0, 0.9999)
+    phi_index = np.arctan2(y, x) / (2.0 * np.pi) * N_PHI % N_PHI
+    return tuple(
+        a.astype(np.float32) for a in (factor, FINE * (whole - 1 + part), phi_index)
+    )
+
+
+def _faded(rho_px: NDArray[np.float64], edge_px: float) -> NDArray[np.float64]:
+    """Return a smooth step from 0 to 1 at a distance."""
+    part = np.clip((rho_px / edge_px - 1.0) / (FADE_RATIO - 1.0), 0.0, 1.0)
+    return part * part * (3.0 - 2.0 * part)
+
+
+def _copy_rows(start: int, end: int, source: Any, target: Any) -> None:
+    target[start:end] = source[start:end]
+
+
+class EdgeLight:
+    """Light of a view's bright pixels beyond their kernels.
+
+    Attributes
+    ----------
+    view : RgbdView
+        The view without the light that is added: its kernels contain all of the light
+        of a pixel.
+    """
+
+    def __init__(
+        self,
+        state: EyeAtFrame,
+        view: RgbdView,
+        pixels: BrightPixels,
+        white: float,
+        fill: Fill,
+    ):
+        self._state, self._pixels, self._white = state, pixels, white
+        self._kinds = SourceKinds.of(state, pixels)
+        self._edges = EdgeElements.of(state, self._kinds)
+        self._find_ends(fill)
+        self._sources, self._kernel, self._light = self._visible(view)
+        self._polar = self._tables()
+        at_end = self._polar[:, :, -1].max(axis=(1, 2))
+        self._per_light = at_end[self._kernel].astype(np.float64)  # times rho³
+        self._reach_px = self._needed_reach_px(view)
+        similar = self._kinds.grouped(self._radius_px, MAX_FAR_KINDS)
+        hidden = np.arange(similar.size, self._kernel_kind.size)
+        self._far_kernel = np.concatenate([similar, hidden])
+        self._near = {r: self._near_kernels(r) for r in sorted(set(self._radius_px))}
+        self.view = self._dimmed(view)
+
+    @classmethod
+    def of(cls, engine: FrameEngine, request: ViewRequest) -> EdgeLight | None:
+        """Return the light of a request, or None if nothing is bright.
+
+        Raises
+        ------
+        NotPrepared
+            As `FrameEngine.begin`.
+        """
+        store, white = request.handle.store, request.white_level
+        # Light of ring lenses does not come from the edge alone.
+        if not store.spec.settings.diffraction or store.eye.rings is not None:
+            return None
+        if request.view.color.dtype == np.uint8 or white is None:
+            return None
+        pixels = BrightPixels.of(request.view, white)
+        if pixels is None:
+            return None
+        fill = partial(store.fill, until_s=request.until_s)
+        return cls(EyeAtFrame.of(engine, request), request.view, pixels, white, fill)
+
+    def _find_ends(self, fill: Fill) -> None:
+        """Compute the kernels of the kinds, and find where they end."""
+        state, kinds = self._state, self._kinds
+        layers, image = state.layers, state.image
+        used = np.zeros((image.count, interval_count(layers)), bool)
+        used[kinds.cell, kinds.interval] = True
+        kernels = frame_kernels(state.handle.store, layers, image, used, fill=fill)
+        pair = np.searchsorted(
+            kernels.cells * used.shape[1] + kernels.intervals,
+            kinds.cell * used.shape[1] + kinds.interval,
+        )
+        self._maps = kernels.maps[pair]
+        self._end_px = kernels.reach_px[pair].max(axis=1)
+        radii_px = np.array(RADII_PX)
+        corner_px = math.sqrt(2.0) * self._end_px + 1.0
+        self._exact_px = np.maximum(corner_px, RHO_PX[0] + 1.0).astype(np.float32)
+        self._radius_px = radii_px[
+            np.minimum(np.searchsorted(radii_px, self._exact_px), radii_px.size - 1)
+        ]
+
+    def _visible(
+        self, view: RgbdView
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """Return the sources (n,) that are seen, their kernels and light (n, 3).
+
+        The first kernels are those of kinds that the entire pupil sees.
+        """
+        seen, of_source = self._seen_by_edges(view), self._kinds.of_source
+        light, kernel = self._pixels.light.copy(), of_source.copy()
+        n = self._kinds.cell.size
+        self._kernel_kind = np.arange(n)
+        self._seen = np.ones((n, N_EDGE), np.float32)
+        share = seen.mean(axis=1)
+        partly = np.flatnonzero((share > 0.0) & (share < 1.0))
+        if partly.size:
+            key = np.column_stack([of_source[partly], seen[partly]])
+            found, own = np.unique(key, axis=0, return_inverse=True)
+            own = own.reshape(-1)
+            total = np.bincount(own, light[partly].sum(axis=1) * share[partly])
+            brightest = np.argsort(-total)[:MAX_PARTLY_HIDDEN]
+            number = np.full(len(found), -1)
+            number[brightest] = n + np.arange(brightest.size)
+            has_own = number[own] >= 0
+            kernel[partly[has_own]] = number[own[has_own]]
+            light[partly[~has_own]] *= share[partly[~has_own], None]
+            kinds = found[brightest, 0].astype(np.int64)
+            self._kernel_kind = np.concatenate([self._kernel_kind, kinds])
+            edges = found[brightest, 1:].astype(np.float32)
+            self._seen = np.concatenate([self._seen, edges])
+        sources = np.flatnonzero(share > 0.0)
+        order = sources[np.argsort(kernel[sources], kind="stable")]
+        return order, kernel[order], light[order]
+
+    def _seen_by_edges(self, view: RgbdView) -> NDArray[np.float32]:
+        """Return which elements (n, N_EDGE) of the edge see sources."""
+        from filter_service.rendering.visibility_loops import (
+            SQUARE_PX,
+            least_in_squares,
+            visible_edges,
+        )
+
+        depth_m = np.ascontiguousarray(view.depth_m)
+        shape = tuple(-(-n // SQUARE_PX) for n in depth_m.shape)
+        least_bits = np.empty(shape, np.int32)
+        run_in_threads(least_in_squares, shape[0], depth_m.view(np.int32), least_bits)
+        nearest_dpt = 1.0 / least_bits.view(np.float32).astype(np.float64)
+        x_px, y_px = self._pixels.source_at_px.T
+        tangents = view.tangents if view.depth_kind == "planar" else (math.nan,) * 4
+        seen = np.empty((x_px.size, N_EDGE), np.float32)
+        run_in_threads(
+            visible_edges,
+            x_px.size,
+            (
+                x_px.copy(),
+                y_px.copy(),
+                self._pixels.object_dpt,
+                self._kinds.of_source,
+                self._pixels.source_surface > 0,
+            ),
+            self._edges.shift_px,
+            (depth_m, np.array(tangents)),
+            nearest_dpt,
+            seen,
+        )
+        return seen
+
+    def _tables(self) -> NDArray[np.float32]:
+        """Return the distant light (n, N_PHI, n_fine, 3) of all kernels."""
+        from filter_service.rendering.edge_light_loops import fill_polar
+
+        n = self._kernel_kind.size
+        fine = FINE * (RHO_PX.size - 1) + 1
+        found = np.empty((n, N_PHI, fine, RGB), np.float32)
+        run_in_threads(
+            fill_polar,
+            n * N_PHI,
+            self._edges.elements,
+            self._kernel_kind,
+            self._seen,
+            RHO_PX.astype(np.float32),
+            _directions(),
+            found,
+        )
+        return found
+
+    def _needed_reach_px(self, view: RgbdView) -> float:
+        """Return the distance at which the light has become invisible."""
+        diagonal_px = math.hypot(view.width_px, view.height_px)
+        largest_px = max(min(MAX_REACH_PX, diagonal_px), LEAST_REACH_PX)
+        if not self._white > 0.0:
+            return largest_px
+        total = float(
+            (self._per_light[:, None] * self._light).sum(axis=0).max(initial=0.0)
+        )
+        reach_px = math.cbrt(total / (INVISIBLE_RATIO * self._white))
+        return min(max(reach_px, LEAST_REACH_PX), largest_px)
+
+    def _kernels_with(self, radius_px: int) -> NDArray[np.int64]:
+        """Return the kernels (n,) with light pixel by pixel up to a radius."""
+        return np.flatnonzero(self._radius_px[self._kernel_kind] == radius_px)
+
+    def _near_kernels(self, radius_px: int) -> NDArray[np.float32]:
+        """Return the kernels (n, side, side, 3) of light near a source."""
+        from filter_service.rendering.edge_light_loops import omitted_ratio
+
+        state, kinds = self._state, self._kinds
+        layers, image = state.layers, state.image
+        places = _places(0.0, radius_px, 1)
+        own = np.flatnonzero(self._radius_px == radius_px)
+        omitted = np.empty((own.size, RGB, *places[0].shape), np.float32)
+        steps_dpt = layers.layer_dpt
+        for i, kind in enumerate(own.tolist()):
+            cell, interval = kinds.cell[kind], int(kinds.interval[kind])
+            upper = min(interval + 1, steps_dpt.size - 1)
+            part = kinds.part_ratio[kind]
+            omitted_ratio(
+                state.handle.store.tables,
+                layers.reads,
+                (
+                    image.nodes[cell],
+                    image.weight_ratio[cell],
+                    steps_dpt[[interval, upper]],
+                    np.array([1.0 - part, part]),
+                ),
+                layers.layer_zero_dpt,
+                self._maps[kind],
+                int(self._end_px[kind]),
+                omitted[i],
+            )
+        kernels = self._kernels_with(radius_px)
+        index = np.searchsorted(own, self._kernel_kind[kernels]).astype(np.int64)
+        return self._filled(kernels, places, omitted, index)
+
+    def _filled(
+        self,
+        own: NDArray[np.int64],
+        places: tuple[NDArray[np.float32], ...],
+        omitted: NDArray[np.float32],
+        index: NDArray[np.int64],
+    ) -> NDArray[np.float32]:
+        from filter_service.rendering.edge_light_loops import fill_kernels
+
+        """Return kernels (n, side, side, 3) of light for some of the kernels (n,)."""
+        side, kind = len(places[0]), self._kernel_kind[own]
+        near = (
+            *(self._edges.elements, kind, self._seen[own], self._exact_px[kind]),
+            *(omitted, index),
+        )
+        found = np.empty((own.size, side, side, RGB), np.float32)
+        run_in_threads(
+            fill_kernels, own.size * side, places, self._polar[own], near, found
+        )
+        return found
+
+    def _dimmed(self, view: RgbdView) -> RgbdView:
+        """Return the view without the share of light that is beyond the kernels."""
+        from filter_service.rendering.bright_pixel_loops import dim_pixels
+
+        n = self._kinds.cell.size
+        ratio = np.empty((2 * n, RGB))  # of own kinds, and of similar ones
+        for radius_px, near in self._near.items():
+            kinds = np.flatnonzero(self._radius_px == radius_px)  # the first kernels
+            ratio[kinds] = near[: kinds.size].sum(axis=(1, 2), dtype=np.float64)
+            # That beyond, which falls as the third power of the distance.
+            middle_px = 0.5 * (1.0 + FADE_RATIO) * radius_px
+            at = FINE * min(np.searchsorted(RHO_PX, middle_px), RHO_PX.size - 1)
+            beyond = self._polar[kinds, :, at].mean(axis=1)
+            ratio[n + kinds] = 2.0 * np.pi * beyond / middle_px
+            ratio[kinds] += ratio[n + kinds]
+        kind = np.where(self._kinds.is_own, 0, n) + self._kinds.of_source
+        pixels, colors = self._pixels, []
+        for surface, color in enumerate(view.surface_colors):
+            here = slice(None)
+            if view.surface_count > 1:
+                here = pixels.surface == surface
+            dimmed = np.empty(color.shape, color.dtype)
+            run_in_threads(_copy_rows, len(color), color, dimmed)
+            y_px, x_px = pixels.y_px[here], pixels.x_px[here]
+            source, share = pixels.source[here], pixels.share_ratio[here]
+            if color.dtype == np.float32:
+                dim_pixels(y_px, x_px, source, share, kind, ratio, dimmed)
+            else:
+                part = share[:, None] * ratio[kind[source]]
+                dimmed[y_px, x_px] = dimmed[y_px, x_px] * (1.0 - part)
+            colors.append(dimmed)
+        hidden = colors[1] if len(colors) > 1 else None
+        return replace(view, color=colors[0], hidden_color=hidden)
+
+    def add(self, color: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Add the light to a filtered image (height, width, 3), in place.
+
+        Returns
+        -------
+        coarse : (rows, columns, 3)
+            Light on pixels of twice the size, which the caller adds, or an empty array.
+        """
+        planes: dict[int, NDArray[np.float32]] = {}
+        for radius_px, near in self._near.items():
+            self._add_near(color, radius_px, near)
+            own = np.unique(self._far_kernel[self._kernels_with(radius_px)])
+            inner_px = float(radius_px)
+            pitch_px = 2 ** int(math.log2(radius_px / COARSE_RATIO))
+            while inner_px < self._reach_px:
+                # The sum of all sources that are left out is invisible.
+                least = LEFT_OUT_RATIO * self._white * inner_px**3
+                here = (self._per_light[:, None] * self._light).max(axis=1) > least
+                here &= np.isin(self._far_kernel[self._kernel], own)
+                if here.any():
+                    if pitch_px not in planes:
+                        shape = tuple(-(-n // pitch_px) for n in color.shape[:2])
+                        planes[pitch_px] = np.zeros((*shape, RGB), np.float32)
+                    places = _places(inner_px, 2.0 * inner_px, pitch_px)
+                    none = np.empty((1, RGB, 0, 0), np.float32)
+                    kernels = self._filled(
+                        own, places, none, np.zeros(own.size, np.int64)
+                    )
+                    number = np.searchsorted(own, self._far_kernel[self._kernel])
+                    self._add_grid(planes[pitch_px], here, number, kernels, pitch_px)
+                inner_px, pitch_px = 2.0 * inner_px, 2 * pitch_px
+        return self._add_planes(color, planes)
+
+    def _add_near(
+        self, color: NDArray[np.float32], radius_px: int, near: NDArray[np.float32]
+    ) -> None:
+        """Add the light near sources, of those with a kernel of their own kind."""
+        own = self._kernels_with(radius_px)
+        here = np.isin(self._kernel, own) & self._kinds.is_own[self._sources]
+        products, pitch_px = np.count_nonzero(here) * near.shape[1] ** 2, 1
+        while products > MAX_NEAR_PRODUCTS and pitch_px < 27:
+            products, pitch_px = products // 9, 3 * pitch_px
+        number = np.searchsorted(own, self._kernel)
+        self._add_grid(color, here, number, near, pitch_px, is_image=True)
+
+    def _add_grid(
+        self,
+        plane: NDArray[np.float32],
+        here: NDArray[np.bool_],
+        number: NDArray[np.int64],
+        kernels: NDArray[np.float32],
+        pitch_px: int,
+        *,
+        is_image: bool = False,
+    ) -> None:
+        """Add some sources to a plane, from points of a grid.
+
+        Parameters
+        ----------
+        plane : (rows, columns, 3)
+            Of the pitch of the grid, or the image.
+        here : (n,)
+            Which sources to add.
+        number : (n,)
+            Their kernels.
+        """
+        from filter_service.rendering.edge_light_loops import add_kernels, gather_points
+
+        order = np.flatnonzero(here)
+        order = order[np.argsort(number[order], kind="stable")]
+        height, width = self._pixels.size_px
+        shape = tuple(-(-n // pitch_px) + 2 for n in (height, width))
+        at, kernel, light = gather_points(
+            self._pixels.source_px[self._sources[order]],
+            number[order],
+            self._light[order],
+            pitch_px,
+            pitch_px > self._pixels.edge_px,
+            np.full(shape, -1, np.int64),
+        )
+        if is_image:  # centers of squares of an odd number of pixels
+            at = pitch_px * at + pitch_px // 2
+        run_in_threads(add_kernels, len(plane), at, kernel, light, kernels, plane)
+
+    def _add_planes(
+        self, color: NDArray[np.float32], planes: dict[int, NDArray[np.float32]]
+    ) -> NDArray[np.float32]:
+        """Add planes to each other, from coarse to fine; return that of 2 pixels."""
+        from filter_service.rendering.edge_light_loops import add_coarse
+
+        pitch_px = max(planes, default=1)
+        while pitch_px > 2:
+            coarse, pitch_px = planes[pitch_px], pitch_px // 2
+            if pitch_px not in planes:
+                shape = tuple(-(-n // pitch_px) for n in color.shape[:2])
+                planes[pitch_px] = np.zeros((*shape, RGB), np.float32)
+            run_in_threads(add_coarse, len(planes[pitch_px]), coarse, planes[pitch_px])
+        return planes.get(2, np.empty((0, 0, RGB), np.float32))
