@@ -1,5 +1,7 @@
 """Straylight and absorption: published functions, brute force, and what stays."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -247,7 +249,9 @@ def test_the_filter_adds_what_the_profile_asks_for_and_tells_its_time():
     view = RgbdView(
         lamp(WIDE, 100, 100, 10.0), np.ones((360, 640), np.float32), WIDE.tangents
     )
-    request = ViewRequest(view, None, 4.0, 0.0)
+    settings = SimpleNamespace(diffraction=False)
+    store = SimpleNamespace(spec=SimpleNamespace(settings=settings), eye=None)
+    request = ViewRequest(view, SimpleNamespace(store=store), 4.0, 0.0)
     effects = MediaEffects.of(profile, "common")
     found = begin_through_media(Glass(), request, effects)()
     red, _, blue = found.color[100, 110]

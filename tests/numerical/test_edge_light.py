@@ -1,0 +1,365 @@
+"""Light beyond the kernels of bright pixels, against brute force."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from estimator.profiles.parse import parse_profile
+from estimator.psf.survey import N_EDGE
+from filter_service.planning.plan import plan_cache
+from filter_service.psfs.eye_for_spec import eye_for_spec
+from filter_service.psfs.store import PsfStore
+from filter_service.rendering import bright_pixels, edge_kinds, edge_light
+from filter_service.rendering.bright_pixels import FADE_WHITE, BrightPixels
+from filter_service.rendering.edge_light import EdgeLight
+from filter_service.rendering.edge_light_loops import fill_polar
+from filter_service.rendering.engine import ViewRequest
+from filter_service.rendering.media_effects import begin_through_media
+from filter_service.rgbd_view import RgbdView
+from tests.grid_specs import grid_spec
+from tests.numerical.synthetic import Bench, tangents
+from tests.reference.edge_light import lamp_light, ring_ratios
+
+WIDTH, HEIGHT = 180, 160
+X, Y, RADIUS = 90, 80, 56
+FIELD_DEG = np.degrees(HEIGHT * 0.7e-3)  # pixels of 0.7 mrad
+EMMETROPE = {
+    "kind": "prescription",
+    "sphere_dpt": 0.0,
+    "higher_order": "none",
+    "age_years": 30,
+}
+ASTIGMAT = {**EMMETROPE, "sphere_dpt": -1.0, "cylinder_dpt": -4.0, "axis_deg": 30}
+LAMP = 1000.0
+PUPIL_MM = 4.0
+
+
+class EyeBench(Bench):
+    """A bench of a traced eye, whose pupil and wavefront change over the field."""
+
+    def __init__(self, engine, profile, eccentricity_deg, **more):
+        self.width_px, self.height_px = WIDTH, HEIGHT
+        self.tangents = tangents(WIDTH, HEIGHT, FIELD_DEG)
+        self.spec = grid_spec(
+            width_px=WIDTH,
+            height_px=HEIGHT,
+            tangents=self.tangents,
+            mode="quality",
+            gaze_deg=(-eccentricity_deg, 0.0),
+            pupil_range_mm=(PUPIL_MM, PUPIL_MM + 0.5),
+            focus_range_dpt=(0.0, 3.0),
+            object_range_dpt=(0.0, 2.5),
+            **more,
+        )
+        eye, _ = eye_for_spec(parse_profile(profile), self.spec)
+        self.store = PsfStore(eye, self.spec, plan_cache(eye, self.spec))
+        self.gpu = engine.gpu
+        self.renderer = engine.new_renderer()
+        self.handle = self.renderer.load(self.store)
+
+
+def bench_of(engine, profile=EMMETROPE, eccentricity_deg=0.0):
+    return EyeBench(engine, profile, eccentricity_deg)
+
+
+def dark():
+    return np.zeros((HEIGHT, WIDTH, 3), np.float32)
+
+
+def request_of(bench, color, depth_m=1e6, focus_dpt=0.0, hidden=None, **more):
+    view = bench.view(color, depth_m, "radial")
+    if hidden is not None:
+        hidden_color, hidden_m = hidden
+        view = replace(view, hidden_color=hidden_color, hidden_depth_m=hidden_m)
+    state = {"pupil_diameter_mm": PUPIL_MM, "focus_dpt": focus_dpt}
+    return ViewRequest(view, bench.handle, **state, **more)
+
+
+def seen(bench, *given, **more):
+    return begin_through_media(
+        bench.renderer, request_of(bench, *given, **more), None
+    )().color
+
+
+def without(bench, *given, **more):
+    return bench.renderer.begin(request_of(bench, *given, **more))().color
+
+
+def around(color, channel=1):
+    """The channel within RADIUS of the lamp, as shares of its light."""
+    return (
+        color[Y - RADIUS : Y + RADIUS + 1, X - RADIUS : X + RADIUS + 1, channel] / LAMP
+    )
+
+
+def lamp_at(x=X, y=Y):
+    color = dark()
+    color[y, x] = LAMP
+    return color
+
+
+@pytest.mark.parametrize("eccentricity_deg", [0.0, 30.0])
+@pytest.mark.parametrize(
+    ("profile", "focus_dpt"),
+    [(EMMETROPE, 0.0), (EMMETROPE, 1.0), (EMMETROPE, 3.0), (ASTIGMAT, 0.0)],
+    ids=["sharp", "1 dpt", "3 dpt", "astigmatic"],
+)
+def test_a_lamp_has_the_exact_halo(engine, profile, focus_dpt, eccentricity_deg):
+    """Rings within 6 %, and sixteenths of rings, which are the streaks, within 10 %.
+
+    At the tips of an astigmatic spot, a caustic meets the end of the kernel.
+    """
+    ring_error, sector_error = (0.10, 0.15) if profile is ASTIGMAT else (0.06, 0.10)
+    bench = bench_of(engine, profile, eccentricity_deg)
+    color = lamp_at()
+    plain = without(bench, color, focus_dpt=focus_dpt)
+    found = around(seen(bench, color, focus_dpt=focus_dpt))
+    exact = lamp_light(
+        bench.store,
+        *(X, Y),
+        pupil_mm=PUPIL_MM,
+        focus_dpt=focus_dpt,
+        object_dpt=1e-6,
+        radius_px=RADIUS,
+        channel=1,
+    )
+    ratios = ring_ratios(found, exact, around(plain) <= 0.0, 6, 16)
+    assert np.abs(ratios[:, -1] - 1.0).max() <= ring_error
+    assert np.nanmax(np.abs(ratios - 1.0)) <= sector_error
+    inside, total = around(plain) > 0.0, plain[..., 1].sum() / LAMP
+    assert found[inside].sum() == pytest.approx(exact[inside].sum() * total, rel=1e-3)
+
+
+@pytest.mark.both_engines
+@pytest.mark.parametrize("apart_px", [2, 0])
+def test_a_half_hidden_lamp_has_the_halo_of_the_rest_of_the_pupil(engine, apart_px):
+    """An edge at 0.5 m beside the lamp, or in front of it: its right half is hidden."""
+    bench = bench_of(engine)
+    depth_m = np.full((HEIGHT, WIDTH), 1e6, np.float32)
+    depth_m[:, X + apart_px :] = 0.5
+    hidden = dark(), np.where(depth_m < 1.0, np.float32(1e6), np.float32(0.0))
+    (hidden[0] if apart_px <= 0 else (color := dark()))[Y, X] = LAMP
+    if apart_px <= 0:
+        color = dark()
+    found = around(seen(bench, color, depth_m, hidden=hidden))
+    exact = lamp_light(
+        bench.store,
+        *(X, Y),
+        pupil_mm=PUPIL_MM,
+        focus_dpt=0.0,
+        object_dpt=1e-6,
+        radius_px=RADIUS,
+        channel=1,
+        cut_mm=(apart_px - 0.5) * 0.7 / 2.0,
+    )
+    spot = around(without(bench, lamp_at())) > 0.0
+    ratios = ring_ratios(found, exact, ~spot, 3, 8)
+    assert np.abs(ratios[:, -1] - 1.0).max() <= 0.05
+    assert np.nanmax(np.abs(ratios - 1.0)) <= 0.10
+
+
+def test_a_hidden_lamp_does_not_leak(engine):
+    bench = bench_of(engine)
+    depth_m = np.full((HEIGHT, WIDTH), 0.5, np.float32)
+    depth_m[:, : X - 40] = 1e6
+    hidden = lamp_at(), np.where(depth_m < 1.0, np.float32(1e6), np.float32(0.0))
+    arguments = {"depth_m": depth_m, "hidden": hidden}
+    found, plain = (f(bench, dark(), **arguments) for f in (seen, without))
+    ratio = 1.0 - 0.02  # the lamp is dimmed by the light beyond its kernel
+    assert np.all(found <= plain + 1e-7)
+    assert np.all(found >= ratio * plain - 1e-7)
+
+
+def test_a_lamp_in_front_is_not_hidden_by_what_is_behind(engine):
+    bench = bench_of(engine)
+    depth_m = np.full((HEIGHT, WIDTH), 0.5, np.float32)
+    depth_m[:, X + 3 :] = 1e6
+    beside, alone = (
+        seen(bench, lamp_at(), depth, focus_dpt=2.0) for depth in (depth_m, 0.5)
+    )
+    far = np.abs(np.arange(WIDTH) - X) > 20
+    np.testing.assert_allclose(beside[Y, far], alone[Y, far], rtol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float16, np.float32])
+def test_pictures_of_displayed_range_do_not_change(engine, rng, dtype):
+    bench = bench_of(engine)
+    color = rng.random((HEIGHT, WIDTH, 3))
+    color = (
+        (255.0 * color).astype(np.uint8) if dtype == np.uint8 else color.astype(dtype)
+    )
+    found, plain = (f(bench, color, output="srgb8") for f in (seen, without))
+    np.testing.assert_array_equal(found, plain)
+
+
+def lit(level):
+    """A lamp of a level in a gray room, which is white."""
+    color = np.full((HEIGHT, WIDTH, 3), 1.0, np.float32)
+    color[Y - 1 : Y + 2, X - 1 : X + 2] = level
+    return color
+
+
+@pytest.mark.both_engines
+def test_the_light_fades_in(engine):
+    bench = bench_of(engine)
+    low, high = FADE_WHITE
+    added = []
+    for level in np.linspace(low, high, 5):
+        color = lit(level)
+        added.append(
+            seen(bench, color)[Y, X + 12, 1] - without(bench, color)[Y, X + 12, 1]
+        )
+    added = np.array(added) / np.linspace(low, high, 5)
+    assert added[0] == 0.0
+    assert np.all(np.diff(added) > 0.0)
+    full = (
+        seen(bench, lit(100.0))[Y, X + 12, 1] - without(bench, lit(100.0))[Y, X + 12, 1]
+    )
+    assert added[-1] == pytest.approx(full / 100.0, rel=0.02)
+
+
+@pytest.mark.both_engines
+def test_the_light_is_conserved(engine):
+    """What is beyond the image is missing: 1e-3 of the light of a sharp lamp."""
+    bench = bench_of(engine)
+    found, plain = (f(bench, lamp_at()).sum(axis=(0, 1)) for f in (seen, without))
+    np.testing.assert_allclose(found, plain, rtol=1.5e-3)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 2.0**-20])
+def test_the_light_scales_with_the_scene(engine, unit):
+    bench = bench_of(engine)
+    color = lit(900.0)
+    scaled = seen(bench, (unit * color).astype(np.float32)) / unit
+    np.testing.assert_allclose(scaled, seen(bench, color), rtol=2e-5)
+
+
+def test_half_floats_are_like_their_floats(engine):
+    bench = bench_of(engine)
+    color = lit(900.0)
+    half = seen(bench, color.astype(np.float16))
+    np.testing.assert_allclose(half, seen(bench, color), rtol=2e-3)
+
+
+@pytest.mark.both_engines
+@pytest.mark.parametrize("output", ["srgb8", "linear16"])
+def test_outputs_are_encodings_of_the_same_light(engine, output):
+    bench = bench_of(engine)
+    from filter_service.rendering.srgb import half_from_linear, srgb_from_linear
+
+    linear = seen(bench, lit(900.0))
+    found = seen(bench, lit(900.0), output=output).astype(
+        int if output == "srgb8" else float
+    )
+    wanted = {"srgb8": srgb_from_linear, "linear16": half_from_linear}[output](linear)
+    tolerance = 1 if output == "srgb8" else 1e-6
+    assert np.abs(found - wanted.astype(found.dtype)).max() <= tolerance
+
+
+def test_values_that_are_not_finite_are_no_sources(engine):
+    bench = bench_of(engine)
+    color = lit(900.0)
+    color[3, 4] = [np.inf, np.nan, 1e6]
+    found = seen(bench, color)
+    assert np.isfinite(found).all()
+    assert found[3, 4, 0] < 1.0 < found[3, 4, 2]
+
+
+def scattered(rng):
+    """Sixty lamps of several levels, and a window, before two distances."""
+    color = np.full((HEIGHT, WIDTH, 3), 0.4, np.float32)
+    at = rng.integers(0, HEIGHT * WIDTH, 60)
+    color.reshape(-1, 3)[at] = rng.uniform(20.0, 600.0, (60, 1))
+    color[20:40, 100:140] = 30.0
+    depth_m = np.where(np.arange(WIDTH) < 70, 0.6, 4.0).astype(np.float32)
+    return color, np.broadcast_to(depth_m, (HEIGHT, WIDTH)).copy()
+
+
+def test_shared_kernels_and_merged_pixels_are_near_the_exact_sum(
+    engine, rng, monkeypatch
+):
+    """Of the light added, as rms: 15 %; without limits, every pixel is by itself."""
+    bench = bench_of(engine)
+    color, depth_m = scattered(rng)
+    limited, plain = (f(bench, color, depth_m) for f in (seen, without))
+    for module, name in (
+        (bright_pixels, "MAX_SOURCES"),
+        (edge_kinds, "MAX_KINDS"),
+        (edge_kinds, "MAX_KINDS_PX"),
+        (edge_light, "MAX_FAR_KINDS"),
+        (edge_light, "MAX_PARTLY_HIDDEN"),
+        (edge_light, "MAX_NEAR_PRODUCTS"),
+    ):
+        monkeypatch.setattr(module, name, 10**12)
+    monkeypatch.setattr(edge_light, "LEFT_OUT_RATIO", 0.0)
+    exact = seen(bench, color, depth_m)
+    room = exact.max(axis=2) < 1.0
+    error = np.sqrt(np.mean((limited - exact)[room] ** 2))
+    assert error <= 0.15 * np.sqrt(np.mean((exact - plain)[room] ** 2))
+
+
+def test_many_bright_pixels_are_merged_with_all_their_light(rng):
+    color = np.zeros((200, 300, 3), np.float32)
+    color[20:120, 30:230] = rng.uniform(10.0, 90.0, (100, 200, 3))
+    view = RgbdView(color, np.ones((200, 300), np.float32), (-0.3, 0.3, 0.2, -0.2))
+    pixels = BrightPixels.of(view, 1.0)
+    assert pixels.light.shape[0] <= bright_pixels.MAX_SOURCES < pixels.x_px.size
+    np.testing.assert_allclose(
+        pixels.light.sum(axis=0), color.sum(axis=(0, 1), dtype=np.float64), rtol=1e-6
+    )
+    weight = color.sum(axis=2, dtype=np.float64)
+    middle = (weight * np.arange(300)).sum() / weight.sum()
+    own = pixels.light.sum(axis=1)
+    assert (pixels.source_px[:, 0] * own).sum() / own.sum() == pytest.approx(middle)
+
+
+@pytest.mark.parametrize(("diffraction", "rings"), [(False, None), (True, "rings")])
+def test_eyes_without_light_from_the_edge_alone_keep_their_kernels(diffraction, rings):
+    """PSFs by rays, and ring lenses, whose steps diffract as well."""
+    store = SimpleNamespace(
+        spec=SimpleNamespace(settings=SimpleNamespace(diffraction=diffraction)),
+        eye=SimpleNamespace(rings=rings),
+    )
+    view = RgbdView(
+        lamp_at(), np.ones((HEIGHT, WIDTH), np.float32), (-0.1, 0.1, 0.1, -0.1)
+    )
+    request = ViewRequest(view, SimpleNamespace(store=store), 4.0, 0.0, white_level=1.0)
+    assert EdgeLight.of(None, request) is None
+
+
+@pytest.mark.parametrize("blur_px", [0.0, 3.0, -5.0])
+def test_the_light_of_a_round_edge_has_its_closed_form(blur_px):
+    """lambda / (2 pi^3 D rho) [1 / (rho - g)^2 + 1 / (rho + g)^2], in um and um/px."""
+    wavelength_um, radius_um_per_px = 0.55, 1.4
+    angle = 2.0 * np.pi * np.arange(N_EDGE + 1) / N_EDGE
+    normal = np.stack([np.cos(angle), np.sin(angle)])
+    tangent = np.stack([-np.sin(angle), np.cos(angle)])
+    area = np.pi * radius_um_per_px**2
+    length = radius_um_per_px * 2.0 * np.pi / N_EDGE
+    length *= wavelength_um / (4.0 * np.pi**2 * area)
+    edge = np.concatenate(
+        [blur_px * normal, tangent, normal, np.full((1, N_EDGE + 1), length)]
+    )
+    edges = np.broadcast_to(edge.astype(np.float32), (1, 3, 7, N_EDGE + 1)).copy()
+    rho_px = np.array([20.0, 28.0, 40.0, 160.0])
+    directions = np.stack([np.cos([0.0, 0.3, 2.0]), np.sin([0.0, 0.3, 2.0])], axis=-1)
+    polar = np.empty((1, 3, 8 * 3 + 1, 3), np.float32)
+    fill_polar(
+        *(0, 3, edges, np.zeros(1, np.int64), np.ones((1, N_EDGE), np.float32)),
+        *(rho_px.astype(np.float32), directions.astype(np.float32), polar),
+    )
+    low_px, high_px = rho_px - blur_px, rho_px + blur_px
+    exact = wavelength_um / (4.0 * np.pi**3 * radius_um_per_px * rho_px)
+    exact = exact * (1.0 / low_px**2 + 1.0 / high_px**2)
+    found = polar[0, :, ::8, 1] / rho_px**3
+    np.testing.assert_allclose(found, np.broadcast_to(exact, found.shape), rtol=0.012)
+
+
+def test_missing_depth_of_a_lamp_is_that_of_its_surroundings(engine):
+    bench = bench_of(engine)
+    depth_m = np.full((HEIGHT, WIDTH), 0.5, np.float32)
+    known = seen(bench, lamp_at(), depth_m)
+    depth_m[Y - 2 : Y + 3, X - 2 : X + 3] = np.nan
+    np.testing.assert_allclose(seen(bench, lamp_at(), depth_m), known, rtol=1e-5)
