@@ -36,7 +36,7 @@ from tests.numerical.synthetic import tangents
 from tests.reference.edge_light import lamp_light, ring_ratios
 
 SIZE, QUICK_SIZE = (1280, 720), (320, 180)
-COUNT, QUICK_COUNT = 24, 3
+COUNT, QUICK_COUNT = 12, 3
 LAMP, RADIUS_PX, PITCH_MRAD = 1000.0, 100, 0.7
 EMMETROPE = {
     "kind": "prescription",

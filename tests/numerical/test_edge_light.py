@@ -8,6 +8,8 @@ import pytest
 
 from estimator.profiles.parse import parse_profile
 from estimator.psf.survey import N_EDGE
+from filter_service import EyeFilter
+from filter_service.camera import Camera
 from filter_service.planning.plan import plan_cache
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import PsfStore
@@ -363,3 +365,19 @@ def test_missing_depth_of_a_lamp_is_that_of_its_surroundings(engine):
     known = seen(bench, lamp_at(), depth_m)
     depth_m[Y - 2 : Y + 3, X - 2 : X + 3] = np.nan
     np.testing.assert_allclose(seen(bench, lamp_at(), depth_m), known, rtol=1e-5)
+
+
+@pytest.mark.both_engines
+def test_frames_of_an_eye_filter_have_the_light(engine):
+    """Through the public call, with a hidden layer and both eyes' engine of streams."""
+    camera = Camera(WIDTH, HEIGHT, tangents(WIDTH, HEIGHT, FIELD_DEG))
+    depth_m = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+    with EyeFilter(EMMETROPE, camera, engine=engine.name) as eye_filter:
+        state = {"pupil_diameter_mm": PUPIL_MM, "focus_dpt": 0.5, "output": "linear"}
+        lamp = eye_filter.filter(lamp_at(), depth_m, **state)
+        dim = eye_filter.filter(lamp_at() / LAMP + 0.5, depth_m, **state)
+    assert lamp.stage_times_ms["edge_light_ms"] > 0.0
+    assert "edge_light_ms" not in dim.stage_times_ms
+    beyond = lamp.color[Y, X + 12 : X + 40, 1]
+    assert np.all(beyond > 0.0)
+    assert np.all(np.diff(beyond) < 0.0)
