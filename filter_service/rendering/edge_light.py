@@ -165,14 +165,15 @@ class EdgeLight:
         NotPrepared
             As `FrameEngine.begin`.
         """
-        store, white = request.handle.store, request.white_level
-        # Light of ring lenses does not come from the edge alone.
-        if not store.spec.settings.diffraction or store.eye.rings is not None:
-            return None
+        white = request.white_level
         if request.view.color.dtype == np.uint8 or white is None:
             return None
         pixels = BrightPixels.of(request.view, white)
         if pixels is None:
+            return None
+        store = request.handle.store
+        # Light of ring lenses does not come from the edge alone.
+        if not store.spec.settings.diffraction or store.eye.rings is not None:
             return None
         fill = partial(store.fill, until_s=request.until_s)
         return cls(EyeAtFrame.of(engine, request), request.view, pixels, white, fill)
