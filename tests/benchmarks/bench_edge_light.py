@@ -177,7 +177,8 @@ def frame_rows(size: tuple[int, int], count: int):
 
         for name, color in colors.items():
             times_ms: dict[bool, list[float]] = {True: [], False: []}
-            others = [*states[1:], states[0]]  # each frame changes the state
+            half = len(states) // 2  # each frame changes the state
+            others = [*states[half:], *states[:half]]
             for k, pair in enumerate([*zip(states, others, strict=True)] * 2):
                 for is_added, state in zip((False, True), pair, strict=True):
                     started_s = time.perf_counter()
