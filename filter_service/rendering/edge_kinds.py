@@ -205,9 +205,9 @@ class EdgeElements:
 
     Attributes
     ----------
-    elements : (n, 3, 7, N_EDGE + 1), float32
-        x and y of slopes, tangents and normals, and lengths times the strength of the
-        light; see `edge_light_loops`.
+    elements : (n, 3, 8, N_EDGE + 1), float32
+        x and y of slopes, tangents and normals, lengths times the strength of the
+        light, and sines of the angle to the next tangent; the first comes again.
     shift_px : (n, N_EDGE, 2)
         Displacement of rays to the elements, per diopter.
     """
@@ -245,7 +245,10 @@ class EdgeElements:
         area = np.pi * np.abs(np.linalg.det(half))
         strength = edge_um / (4.0 * np.pi**2 * area) * (2.0 * np.pi / N_EDGE)
         length *= strength[..., None]
-        rows = np.concatenate([slope_px, tangent, normal, length[..., None]], axis=-1)
+        after = np.roll(tangent, -1, axis=2)
+        turn = tangent[..., 0] * after[..., 1] - tangent[..., 1] * after[..., 0]
+        scalars = np.stack([length, turn], axis=-1)
+        rows = np.concatenate([slope_px, tangent, normal, scalars], axis=-1)
         elements = np.concatenate([rows, rows[:, :, :1]], axis=2)
         in_pupil = np.einsum("kij,mj->kmi", half[:, GREEN], disc)
         return cls(

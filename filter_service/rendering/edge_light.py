@@ -226,7 +226,8 @@ class EdgeLight:
             kinds = found[brightest, 0].astype(np.int64)
             self._kernel_kind = np.concatenate([self._kernel_kind, kinds])
             edges = found[brightest, 1:].astype(np.float32)
-            self._seen = np.concatenate([self._seen, edges])
+            between = 0.5 * (edges + np.roll(edges, -1, axis=1))
+            self._seen = np.concatenate([self._seen, between])
         sources = np.flatnonzero(share > 0.0)
         order = sources[np.argsort(kernel[sources], kind="stable")]
         return order, kernel[order], light[order]

@@ -152,34 +152,36 @@ def _edge_light(x, y, edge, seen, scratch):
 
     Parameters
     ----------
-    edge : (7, n_edge + 1), float32
-        x and y of slopes, tangents and normals, and lengths; the first comes again.
+    edge : (8, n_edge + 1), float32
+        x and y of slopes, tangents and normals, lengths, and sines of the angle to the
+        next tangent; the first element comes again.
     seen : (n_edge,), float32
-        Visible share of each element.
+        Visible share of the edge from each element to the next.
     scratch : (2, n_edge + 1), float32
     """
-    across, along = scratch
-    half, least = np.float32(0.5), np.float32(1e-3)
-    sixth = np.float32(1.0 / 6.0)
+    half, quarter, sixth = np.float32(0.5), np.float32(0.25), np.float32(1.0 / 6.0)
+    none, one, least = np.float32(0.0), np.float32(1.0), np.float32(1e-3)
+    across, along = scratch[0], scratch[1]
     for k in range(edge.shape[1]):
         from_x, from_y = x - edge[0, k], y - edge[1, k]
         across[k] = from_x * edge[2, k] + from_y * edge[3, k]
         along[k] = from_x * edge[4, k] + from_y * edge[5, k]
-    total = np.float32(0.0)
+    # Slices, because LLVM does not vectorize a loop over k and k + 1.
+    across_here, across_next = scratch[0, :-1], scratch[0, 1:]
+    along_here, along_next = scratch[1, :-1], scratch[1, 1:]
+    total = none
     for k in range(seen.shape[0]):
-        low, high = min(across[k], across[k + 1]), max(across[k], across[k + 1])
+        rise = across_next[k] - across_here[k]
+        middle = half * (across_next[k] + across_here[k])
         # At least `least`, so that an interval of zero length counts once.
-        change = max(high - low, least)
-        middle = half * (high + low)
+        change = max(abs(rise), least)
         low, high = middle - half * change, middle + half * change
-        overlap = max(min(high, half) - max(low, -half), np.float32(0.0))
+        overlap = max(min(high, half) - max(low, -half), none)
         # At the zero of f: the normal turns between the elements.
-        turn = edge[2, k] * edge[3, k + 1] - edge[3, k] * edge[2, k + 1]
-        distance = half * (along[k] + along[k + 1])
-        distance -= sixth * turn * (across[k + 1] - across[k])
-        square = max(distance * distance, np.float32(1.0)) - np.float32(0.25)
-        part = half * (seen[k] + seen[(k + 1) % seen.shape[0]])
-        total += part * edge[6, k] * overlap / (change * square)
+        distance = half * (along_here[k] + along_next[k])
+        distance -= sixth * edge[7, k] * rise
+        square = max(distance * distance, one) - quarter
+        total += seen[k] * edge[6, k] * overlap / (change * square)
     return total
 
 

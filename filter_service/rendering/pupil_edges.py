@@ -15,8 +15,6 @@ from filter_service.constants import RGB
 from filter_service.planning.slopes import apodization
 from filter_service.psfs.store import PsfStore
 
-N_DEFOCUS = 2
-
 
 class EdgeTables(NamedTuple):
     """Edges of the pupils of groups, in pixels of the stored kernels (x right, y down).

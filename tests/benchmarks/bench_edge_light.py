@@ -191,20 +191,21 @@ def frame_rows(size: tuple[int, int], count: int):
                         elapsed_ms = 1e3 * (time.perf_counter() - started_s)
                         times_ms[is_added].append(elapsed_ms)
             added_ms = np.array(times_ms[True]) - times_ms[False]
-            error = 0.0
-            if color.dtype != np.uint8 and engine_name == "native":
-                error = limited_error(frame, without, color, states[0])
+            error = limited_error(frame, without, color, states[0])
             yield Row(
                 *("edge_light", f"{engine_name}, added to a frame", name),
                 *(f"{size[0]}x{size[1]}", len(added_ms)),
                 *(float(np.median(added_ms)), float(np.percentile(added_ms, 95))),
                 *(memory_mb(), "rms of the added light", error),
-                "every pixel by itself" if error else "none",
+                "every pixel by itself",
             )
 
 
 def limited_error(frame, without, color, state) -> float:
-    """Rms error of the added light relative to its rms, where the image is below 2."""
+    """Rms error of the added light where the image is below 2.
+
+    It is relative to the rms of that light, or absolute if there is none.
+    """
     limited = frame(color, state, "linear").color
     with without:
         plain = frame(color, state, "linear").color
@@ -215,12 +216,11 @@ def limited_error(frame, without, color, state) -> float:
     for patch in patches:
         patch.stop()
     is_dim = exact.max(axis=2) < 2.0
-    added = float(np.sqrt(np.mean((exact - plain)[is_dim] ** 2)))
-    return (
-        float(np.sqrt(np.mean((limited - exact)[is_dim] ** 2))) / added
-        if added
-        else 0.0
+    added, error = (
+        float(np.sqrt(np.mean((image - exact)[is_dim] ** 2)))
+        for image in (plain, limited)
     )
+    return error / added if added else error
 
 
 def main() -> None:

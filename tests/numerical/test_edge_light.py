@@ -339,12 +339,19 @@ def test_the_light_of_a_round_edge_has_its_closed_form(blur_px):
     normal = np.stack([np.cos(angle), np.sin(angle)])
     tangent = np.stack([-np.sin(angle), np.cos(angle)])
     area = np.pi * radius_um_per_px**2
+    turn = np.sin(2.0 * np.pi / N_EDGE)
     length = radius_um_per_px * 2.0 * np.pi / N_EDGE
     length *= wavelength_um / (4.0 * np.pi**2 * area)
     edge = np.concatenate(
-        [blur_px * normal, tangent, normal, np.full((1, N_EDGE + 1), length)]
+        [
+            blur_px * normal,
+            tangent,
+            normal,
+            np.full((1, N_EDGE + 1), length),
+            np.full((1, N_EDGE + 1), turn),
+        ]
     )
-    edges = np.broadcast_to(edge.astype(np.float32), (1, 3, 7, N_EDGE + 1)).copy()
+    edges = np.broadcast_to(edge.astype(np.float32), (1, 3, 8, N_EDGE + 1)).copy()
     rho_px = np.array([20.0, 28.0, 40.0, 160.0])
     directions = np.stack([np.cos([0.0, 0.3, 2.0]), np.sin([0.0, 0.3, 2.0])], axis=-1)
     polar = np.empty((1, 3, 8 * 3 + 1, 3), np.float32)
