@@ -126,6 +126,18 @@ def _copy_rows(start: int, end: int, source: Any, target: Any) -> None:
 class EdgeLight:
     """Light of a view's bright pixels beyond their kernels.
 
+    Parameters
+    ----------
+    state : EyeAtFrame
+    view : RgbdView
+        In linear light.
+    pixels : BrightPixels
+        Its bright pixels.
+    white : float
+        Its white level; 0 if nearly all of it is dark.
+    fill : callable
+        Function that computes missing PSFs (n,).
+
     Attributes
     ----------
     view : RgbdView

@@ -47,13 +47,20 @@ class EdgeTables(NamedTuple):
 
 @dataclass(eq=False)
 class PupilEdges:
-    """Edges of the pupils of a store, computed when they are first needed."""
+    """Edges of the pupils of a store, computed when they are first needed.
+
+    Attributes
+    ----------
+    store : PsfStore
+    tables : EdgeTables or None
+        None before the first use.
+    """
 
     store: PsfStore
     tables: EdgeTables | None = None
 
     def of(self, groups: NDArray[np.int64]) -> EdgeTables:
-        """Return the tables, with the edges of some groups (n,)."""
+        """Return the tables, with the edges of the groups (n,) of field nodes."""
         count = self.store.nodes.channel_shift_dpt.shape[0]
         if self.tables is None or self.tables.is_known.size < count:
             self.tables = _grown(self.tables, count)
