@@ -7,6 +7,9 @@ from numba import njit
 
 from filter_service.constants import RGB
 
+MAX_LIGHT = 1e30
+"""Brightest light of a source, so that sums of sources remain finite in float32."""
+
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_bright(start, end, bits, limit, counts):
@@ -54,7 +57,7 @@ def fade_light(color, white, fade, share, light):
         for c in range(RGB):
             light[k, c] = 0.0
             if math.isfinite(color[k, c]):
-                light[k, c] = max(color[k, c], 0.0)
+                light[k, c] = min(max(color[k, c], 0.0), MAX_LIGHT)
                 brightest = max(brightest, light[k, c])
         part = 1.0
         if brightest < high * white:

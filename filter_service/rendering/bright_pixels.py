@@ -145,7 +145,7 @@ def _bright(
 
     color = np.ascontiguousarray(color)
     bits = color.reshape(len(color), -1).view(f"i{color.itemsize}")
-    limit = np.array(min(FADE_WHITE[0] * white, np.finfo(color.dtype).max))
+    limit = np.array(min(FADE_WHITE[0] * white, float(np.finfo(color.dtype).max)))
     limit_bits = limit.astype(color.dtype).view(bits.dtype)[()]
     offsets = np.zeros(len(color) + 1, np.int64)
     run_in_threads(count_bright, len(color), bits, limit_bits, offsets[1:])

@@ -357,11 +357,12 @@ def add_coarse(start, end, coarse, image):
         _add_row(above, image[y].reshape(-1))
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_and_encode(start, end, coarse, image, table, encoded):
     """Do the same, and encode the rows as bytes by a table (size,) over 0 to 1.
 
-    The coarse image is empty if there is nothing to add.
+    The coarse image is empty if there is nothing to add.  Light that is not a number
+    becomes 0: with ``fastmath``, it would become an index beyond the table.
     """
     above = np.empty((coarse.shape[1] + 2) * RGB, np.float32)
     row = np.empty(image.shape[1] * RGB, np.float32)
@@ -374,7 +375,8 @@ def add_and_encode(start, end, coarse, image, table, encoded):
             _row_between(coarse, y, above)
             _add_row(above, row)
         for i in range(row.size):
-            index[i] = np.int32(min(max(row[i], zero), one) * last + half)
+            light = row[i] if row[i] > zero else zero
+            index[i] = np.int32((light if light < one else one) * last + half)
         target = encoded[y].reshape(-1)
         for i in range(row.size):
             target[i] = table[index[i]]

@@ -18,7 +18,7 @@ from filter_service.rendering.bright_pixels import FADE_WHITE, BrightPixels
 from filter_service.rendering.edge_light import EdgeLight
 from filter_service.rendering.edge_light_loops import fill_polar
 from filter_service.rendering.engine import ViewRequest
-from filter_service.rendering.media_effects import begin_through_media
+from filter_service.rendering.media_effects import begin_through_media, encoded
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec
 from tests.numerical.synthetic import Bench, tangents
@@ -267,6 +267,28 @@ def test_values_that_are_not_finite_are_no_sources(engine):
     found = seen(bench, color)
     assert np.isfinite(found).all()
     assert found[3, 4, 0] < 1.0 < found[3, 4, 2]
+
+
+def test_any_light_can_be_encoded():
+    """A value that is not a number must not become an index beyond the table."""
+    values = [np.nan, np.inf, -np.inf, 3.4e38, -3.4e38, 0.0, 0.5, 1.0]
+    color = np.array(values * 3, np.float32).reshape(2, 4, 3)
+    found = encoded(color, "srgb8").reshape(-1)[:8]
+    np.testing.assert_array_equal(found, [0, 255, 0, 255, 0, 0, 188, 255])
+
+
+@pytest.mark.parametrize(
+    ("dtype", "level"), [(np.float32, 3e37), (np.float32, 1e30), (np.float16, 6e4)]
+)
+@pytest.mark.parametrize("output", ["linear", "srgb8"])
+def test_the_brightest_light_remains_finite(engine, rng, dtype, level, output):
+    """A third of the pixels at any distance, some of which are missing."""
+    bench = bench_of(engine)
+    color = rng.random((HEIGHT, WIDTH, 3))
+    color[rng.random((HEIGHT, WIDTH)) < 0.3] = level
+    depth_m = rng.choice([0.05, 1.0, np.inf, np.nan, 0.0], size=(HEIGHT, WIDTH))
+    found = seen(bench, color.astype(dtype), depth_m.astype(np.float32), output=output)
+    assert np.isfinite(found).all()
 
 
 def scattered(rng):
