@@ -18,7 +18,6 @@ from estimator.media.straylight import Straylight
 from estimator.profiles.parse import EyeProfile
 from filter_service.constants import RGB
 from filter_service.displays import display_wavelengths_nm
-from filter_service.rendering.edge_light import EdgeLight
 from filter_service.rendering.engine import FrameEngine, Pending, ViewRequest
 from filter_service.rendering.filtered_view import FilteredView
 from filter_service.rendering.haze import add_haze, run_in_threads
@@ -107,6 +106,8 @@ def begin_through_media(
 
     See `FrameEngine.begin`.
     """
+    from filter_service.rendering.edge_light import EdgeLight
+
     stages = _Stages()
     view = request.view
     if effects is not None and effects.magnification_ratio is not None:
