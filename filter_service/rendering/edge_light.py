@@ -170,7 +170,7 @@ class EdgeLight:
 
     @classmethod
     def of(cls, engine: FrameEngine, request: ViewRequest) -> EdgeLight | None:
-        """Return the light of a request, or None if nothing is bright.
+        """Return the light of a request in linear light, or None if nothing is bright.
 
         Raises
         ------
@@ -178,7 +178,7 @@ class EdgeLight:
             As `FrameEngine.begin`.
         """
         white = request.white_level
-        if request.view.color.dtype == np.uint8 or white is None:
+        if white is None:
             return None
         pixels = BrightPixels.of(request.view, white)
         if pixels is None:

@@ -106,17 +106,18 @@ def begin_through_media(
 
     See `FrameEngine.begin`.
     """
-    from filter_service.rendering.edge_light import EdgeLight
-
     stages = _Stages()
     view = request.view
     if effects is not None and effects.magnification_ratio is not None:
         view = seen_through(view, effects.magnification_ratio)
         request = replace(request, view=view)
         stages.end("media_ms")
+    edge_light = None
     if view.color.dtype != np.uint8:
+        from filter_service.rendering.edge_light import EdgeLight
+
         request = replace(request, white_level=white_level(view.color))
-    edge_light = EdgeLight.of(engine, request)
+        edge_light = EdgeLight.of(engine, request)
     if edge_light is not None:
         request = replace(request, view=edge_light.view)
         stages.end("edge_light_ms")
