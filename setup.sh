@@ -9,6 +9,7 @@
 #   sh setup.sh web        also those packages and a browser for the web tests
 #   sh setup.sh docs       also a separate environment with MkDocs
 #   sh setup.sh witness    also a separate environment with a path tracer
+#   sh setup.sh release    also a separate environment that builds and checks releases
 #   sh setup.sh peers      also the alternatives that `ocufilter bench peers` compares
 #   sh setup.sh examples   only a separate environment with the package and Jupyter
 #
@@ -37,6 +38,11 @@ PEERS_VENV=.peers
 PEERS_PACKAGES="optiland"
 PEERS_312_PACKAGES="deeplens-core torch torchvision"
 EXAMPLES_VENV=.examples
+# for `make release`
+RELEASE_VENV=.release
+RELEASE_PACKAGES="setuptools build ziglang auditwheel twine uv"
+RELEASE_SYSTEM_PACKAGES="gcc libc6-dev gcc-aarch64-linux-gnu libc6-dev-arm64-cross
+    qemu-user-static"
 # for `make docs`
 DOCS_PACKAGES="mkdocs-material mkdocstrings[python]"
 # for `make test-web`
@@ -269,6 +275,20 @@ install_peers() { # optiland and, with Python 3.12, DeepLens in a separate envir
     cp constraints.txt $PEERS_VENV/constraints.txt
 }
 
+install_release() { # tools that build and check releases
+    missing=$(missing_packages $RELEASE_SYSTEM_PACKAGES)
+    if [ -n "$missing" ] && ! apt_install $missing; then
+        say "a release requires:  $(install_command "$missing")"
+        exit 1
+    fi
+    if cmp -s constraints.txt $RELEASE_VENV/constraints.txt; then return; fi
+    say "installing the tools for releases into $RELEASE_VENV (0.5 GB)"
+    $(find_python) -m venv --clear $RELEASE_VENV
+    $RELEASE_VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install -c constraints.txt $RELEASE_PACKAGES
+    cp constraints.txt $RELEASE_VENV/constraints.txt
+}
+
 install_examples() { # the package as users install it, without the checkout
     wanted=$(pwd; cksum setup.sh setup.py pyproject.toml constraints.txt
         find estimator filter_service clients shaders -type f ! -name '*.so' \
@@ -304,4 +324,5 @@ if [ "${1:-}" = web ]; then
     install_node_packages tests/web "the accessibility checks of the web tests"
 fi
 if [ "${1:-}" = witness ]; then install_witness; fi
+if [ "${1:-}" = release ]; then install_release; fi
 if [ "${1:-}" = peers ]; then install_peers; fi
