@@ -8,6 +8,7 @@ headers.sh    the headers that the OpenXR layer is compiled with
 contents      what must be in a wheel and in the sdist
 smoke         the installed commands, in an environment of their own
 pythons       environments of each Python, with the oldest and newest dependencies
-bounds.txt    versions that are tested as the oldest
+environment   an empty environment, of this system or of another one in a folder
+commands      child processes
 aarch64       the native engine for aarch64 under emulation, with recorded calls
 """
