@@ -17,8 +17,9 @@ NATIVE = "filter_service/native/source"
 LAYER = "clients/openxr_layer/source"
 FLAGS = ["-std=gnu11", "-g0", "-fvisibility=hidden"]
 WITHOUT = {
-    "_loops": "the native engine is missing: frames will be filtered with OpenGL, which "
-    "is slow without a GPU.  Install a C compiler (Debian: apt install gcc libc6-dev)",
+    "_loops": "the native engine is missing: frames will be filtered with OpenGL, "
+    "which is slow without a GPU.  Install a C compiler (Debian: apt install gcc "
+    "libc6-dev)",
     "_drop_parts": "the service will take ten times as long to drop messages with "
     "millions of parts.  Install a C compiler (Debian: apt install gcc libc6-dev)",
     "_layer": "`ocufilter layer` will not work.  Install a C compiler and headers "

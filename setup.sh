@@ -10,6 +10,7 @@
 #   sh setup.sh docs       also a separate environment with MkDocs
 #   sh setup.sh witness    also a separate environment with a path tracer
 #   sh setup.sh release    also a separate environment that builds and checks releases
+#   sh setup.sh release-check   the same without compilers for another processor
 #   sh setup.sh peers      also the alternatives that `ocufilter bench peers` compares
 #   sh setup.sh examples   only a separate environment with the package and Jupyter
 #
@@ -275,12 +276,15 @@ install_peers() { # optiland and, with Python 3.12, DeepLens in a separate envir
     cp constraints.txt $PEERS_VENV/constraints.txt
 }
 
-install_release() { # tools that build and check releases
+install_release_compilers() { # and an emulator
     missing=$(missing_packages $RELEASE_SYSTEM_PACKAGES)
     if [ -n "$missing" ] && ! apt_install $missing; then
         say "a release requires:  $(install_command "$missing")"
         exit 1
     fi
+}
+
+install_release() { # tools that build and check releases
     if cmp -s constraints.txt $RELEASE_VENV/constraints.txt; then return; fi
     say "installing the tools for releases into $RELEASE_VENV (0.5 GB)"
     $(find_python) -m venv --clear $RELEASE_VENV
@@ -324,5 +328,6 @@ if [ "${1:-}" = web ]; then
     install_node_packages tests/web "the accessibility checks of the web tests"
 fi
 if [ "${1:-}" = witness ]; then install_witness; fi
-if [ "${1:-}" = release ]; then install_release; fi
+if [ "${1:-}" = release ]; then install_release_compilers; fi
+case ${1:-} in release | release-check) install_release ;; esac
 if [ "${1:-}" = peers ]; then install_peers; fi

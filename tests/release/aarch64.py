@@ -4,7 +4,7 @@
 
 Frames and PSFs are computed by the library of each wheel, x86-64 with its portable
 variant, which is the only one on aarch64.  Prints the largest differences.  With test
-files, pytest also runs these files with the emulated library in place of the native one.
+files, pytest also runs these with the emulated library in place of the native one.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def emulated(wheel: Path) -> Iterator[EmulatedLibrary]:
     flags = ("-std=gnu11", "-O2", "-Wall", "-Wextra", "-Werror")
     run(COMPILERS["aarch64"], *flags, source, "-o", driver, "-ldl")
     process = EmulatedLibrary(EMULATOR, "-L", SYSTEM, driver, path)
-    with mock.patch.object(native.ctypes, "CDLL", lambda _: process):
+    with mock.patch.object(native.ctypes, "CDLL", return_value=process):
         yield process
     process.close()
 

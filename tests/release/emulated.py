@@ -1,7 +1,7 @@
 """The native library for another processor, called from this process.
 
-Only the compiled C code is emulated (`qemu-user`): a child process runs the functions of
-the library and fetches the data that they use from this process, see `emulated.c`.
+Only the compiled C code is emulated (`qemu-user`): a child process runs the functions
+of the library and fetches the data that they use from this process, see `emulated.c`.
 """
 
 from __future__ import annotations

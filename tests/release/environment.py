@@ -59,7 +59,9 @@ class Environment:
     def inside(self, name: str) -> str:
         """Return a path in the folder of this environment as its commands see it."""
         path = self.folder / name
-        return f"/{path.relative_to(self.python.root)}" if self.python.root else str(path)
+        return (
+            f"/{path.relative_to(self.python.root)}" if self.python.root else str(path)
+        )
 
     def install(self, wheel: Path, *oldest: str, extra: str = "") -> None:
         """Install a wheel, with the oldest versions of ``oldest`` and newest others."""
@@ -101,10 +103,12 @@ class Environment:
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()
-            raise Failed(f"{command} {arguments[:1]}: no end in {timeout_s} s") from None
+            raise Failed(
+                f"{command} {arguments[:1]}: no end in {timeout_s} s"
+            ) from None
         if process.returncode != 0:
             said = "\n  ".join((out + errors).strip().splitlines()[-20:])
-            words = " ".join((command, *arguments[:2]))
+            words = " ".join((command, *arguments[:2])).partition("\n")[0]
             raise Failed(f"{words}: exit status {process.returncode}:\n  {said}")
         return out
 
@@ -129,7 +133,10 @@ class Environment:
 
     def _environment(self) -> dict[str, str]:
         given = {k: v for k, v in os.environ.items() if k not in LEADS}
-        return given | {"HOME": self.inside("home"), "XDG_CACHE_HOME": self.inside("home")}
+        return given | {
+            "HOME": self.inside("home"),
+            "XDG_CACHE_HOME": self.inside("home"),
+        }
 
     def _start(self, command, environment) -> subprocess.Popen[str]:
         if self.python.root:

@@ -16,6 +16,7 @@ import subprocess
 import time
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from tests.release import smoke
@@ -39,7 +40,9 @@ def find_pythons(paths: list[str], roots: list[Path]) -> list[Python]:
     found: dict[str, Python] = {}
     for root, command in asked:
         try:
-            answer = subprocess.run([*command, "-c", ASK], capture_output=True, text=True)
+            answer = subprocess.run(
+                [*command, "-c", ASK], capture_output=True, text=True
+            )
         except OSError:
             continue
         if answer.returncode == 0:
@@ -50,7 +53,7 @@ def find_pythons(paths: list[str], roots: list[Path]) -> list[Python]:
 
 
 def oldest_dependencies(wheel: Path) -> list[str]:
-    """Return the requirements of a wheel, of which the oldest versions are installed."""
+    """Return the requirements of a wheel without its extras."""
     with zipfile.ZipFile(wheel) as archive:
         (name,) = [n for n in archive.namelist() if n.endswith(".dist-info/METADATA")]
         metadata = archive.read(name).decode()
@@ -98,7 +101,7 @@ def test_wheel(wheel: Path, python: Python, which: str) -> dict:
         environment.install(wheel, extra="web")
         row["installed_with_page_mb"] = round(environment.size_mb())
         for name, command in smoke.COMMANDS.items():
-            _timed(row, f"{name}_s", lambda: command(environment))
+            _timed(row, f"{name}_s", partial(command, environment))
     environment.remove()
     return row
 

@@ -28,7 +28,8 @@ CONTRAST = """
 import numpy as np
 from PIL import Image
 
-before, after = (np.asarray(Image.open(f"{name}.png"), float) for name in ("squares", "seen"))
+names = "squares.png", "seen.png"
+before, after = (np.asarray(Image.open(name), float) for name in names)
 assert before.shape == after.shape, after.shape
 print(after.std() / before.std())
 """
@@ -43,9 +44,10 @@ color = np.full((36, 64, 3), 128, np.uint8)
 color[:, 32:] = 255
 depth_m = np.full((36, 64), 2.0, np.float32)
 camera = Camera.from_fov(10.0, width_px=64, height_px=36)
+settings = {"mode": "on-axis", "eye_model": "wavefront"}
 with ServiceProcess(command=[sys.argv[1], "serve"]) as service:
     with FilterClient(service.endpoint) as client:
-        client.set_profile("myopia", views=[camera])
+        client.set_profile("myopia", settings=settings, views=[camera], timeout_s=600)
         seen = client.filter(color, depth_m, pupil_diameter_mm=4.0, focus_dpt=0.0)
     code = service.stop()
 assert seen.color.shape == color.shape
@@ -109,7 +111,9 @@ def report(environment: Environment) -> None:
 
 def web(environment: Environment) -> None:
     """Start the page, read it, and stop it."""
-    page = environment.start("ocufilter", "web", "--no-browser", "--json", "--port", "0")
+    page = environment.start(
+        "ocufilter", "web", "--no-browser", "--json", "--port", "0"
+    )
     try:
         line = page.stdout.readline() if page.stdout else ""
         if not line.startswith("{"):
