@@ -120,7 +120,9 @@ def web(environment: Environment) -> None:
             page.kill()
             raise Failed(f"web: no address: {line}{page.communicate()[1][-2000:]}")
         (address,) = [v for v in json.loads(line).values() if "://" in str(v)]
-        with urllib.request.urlopen(address, timeout=120) as response:
+        # the first request exchanges the token for a cookie
+        opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+        with opener.open(address, timeout=120) as response:
             text = response.read().decode()
         if "ocufilter" not in text.lower():
             raise Failed("web: the page is another one")
@@ -128,6 +130,8 @@ def web(environment: Environment) -> None:
         page.communicate(timeout=60)
     except subprocess.TimeoutExpired:
         raise Failed("web: does not stop") from None
+    except OSError as error:
+        raise Failed(f"web: {error}") from None
     finally:
         page.kill()
     if page.returncode not in (0, 130, -signal.SIGINT):
