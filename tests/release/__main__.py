@@ -64,13 +64,13 @@ def quick() -> None:
     """Build with this machine's compiler, twice, and check the contents."""
     warn_of_changes()
     os.umask(0o022)
-    time_s = build.commit_time_s()
+    commit, time_s = build.last_commit()
     built = []
     for name in ("first", "second"):
         out = BUILD / name / name
         shutil.rmtree(out.parent, ignore_errors=True)
         out.mkdir(parents=True)
-        source = build.export(BUILD / name / "source")
+        source = build.export(commit, BUILD / name / "source")
         sdist = build.build_sdist(source, out, time_s)
         built.append([sdist, build.build_local_wheel(sdist, out, time_s)])
     build.compare(*built)
@@ -93,9 +93,10 @@ def table(rows: list[dict]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def checklist(built: list[Path], checks: list[str], rows: list[dict]) -> str:
+def checklist(
+    commit: str, built: list[Path], checks: list[str], rows: list[dict]
+) -> str:
     """Return the checklist of a release, Markdown."""
-    commit = run("git", "log", "-1", "--format=%H").strip()
     untested = set(pythons.VERSIONS) - {row["python"] for row in rows}
     steps = [
         "choose a license" if license_line() == "no license chosen" else None,
@@ -123,7 +124,7 @@ def release(options: argparse.Namespace) -> None:
     """Build, check and test everything."""
     warn_of_changes()
     os.umask(0o022)
-    built = build.build_twice(BUILD / "dist")
+    commit, built = build.build_twice(BUILD / "dist")
     sdist, x86_64, for_aarch64 = built
     checks = ["two builds in different folders have the same bytes"]
     for wheel in (x86_64, for_aarch64):
@@ -151,11 +152,12 @@ def release(options: argparse.Namespace) -> None:
         shutil.copy2(path, DIST)
     sums = "".join(f"{build.sha256(path)}  {path.name}\n" for path in built)
     (DIST / SUMS).write_text(sums, encoding="utf-8")
-    (DIST / CHECKLIST).write_text(checklist(built, checks, rows), encoding="utf-8")
+    text = checklist(commit, built, checks, rows)
+    (DIST / CHECKLIST).write_text(text, encoding="utf-8")
     (BUILD / "environments.json").write_text(
         json.dumps(rows, indent=1), encoding="utf-8"
     )
-    print((DIST / CHECKLIST).read_text(encoding="utf-8"))
+    print(text)
     if any(row["errors"] for row in rows):
         raise Failed("the wheel failed in an environment; see the checklist")
 

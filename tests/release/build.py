@@ -31,16 +31,17 @@ def platform_tag(processor: str) -> str:
     return f"manylinux_{GLIBC.replace('.', '_')}_{processor}"
 
 
-def commit_time_s() -> int:
-    """Return the time of the last commit, which all files in the archives get."""
-    return int(run("git", "log", "-1", "--format=%ct").strip())
+def last_commit() -> tuple[str, int]:
+    """Return the last commit, and its time, which all files in the archives get."""
+    name, time_s = run("git", "log", "-1", "--format=%H %ct").split()
+    return name, int(time_s)
 
 
-def export(folder: Path) -> Path:
-    """Write the files of the last commit to a folder."""
+def export(commit: str, folder: Path) -> Path:
+    """Write the files of a commit to a folder."""
     folder.mkdir(parents=True)
     archive = folder.with_suffix(".tar")
-    run("git", "archive", "--format=tar", "-o", archive, "HEAD")
+    run("git", "archive", "--format=tar", "-o", archive, commit)
     _unpack(archive, folder)
     archive.unlink()
     return folder
@@ -91,12 +92,11 @@ def build_local_wheel(sdist: Path, out: Path, time_s: int) -> Path:
     return path
 
 
-def build_all(out: Path) -> list[Path]:
+def build_all(commit: str, time_s: int, out: Path) -> list[Path]:
     """Build the sdist and a wheel for each processor; return their paths."""
-    time_s = commit_time_s()
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    source = export(out.parent / f"{out.name}-source")
+    source = export(commit, out.parent / f"{out.name}-source")
     sdist = build_sdist(source, out, time_s)
     shutil.rmtree(source)
     return [sdist, *(build_wheel(sdist, out, name, time_s) for name in COMPILERS)]
@@ -121,14 +121,15 @@ def compare(first: list[Path], second: list[Path]) -> None:
         raise Failed(f"two builds differ: {', '.join(names)}")
 
 
-def build_twice(out: Path) -> list[Path]:
-    """Build into a folder, and again elsewhere; return the equal files."""
+def build_twice(out: Path) -> tuple[str, list[Path]]:
+    """Build into a folder, and again elsewhere; return the commit and equal files."""
     shutil.rmtree(BUILD / "again", ignore_errors=True)
     say("building the sdist and the wheels")
-    built = build_all(out)
+    last = last_commit()  # once, because a commit may be added meanwhile
+    built = build_all(*last, out)
     say("building them again, in a folder with another name")
-    compare(built, build_all(BUILD / "again" / "elsewhere"))
-    return built
+    compare(built, build_all(*last, BUILD / "again" / "elsewhere"))
+    return last[0], built
 
 
 def _build(source: Path, out: Path, *options: str, **environment) -> None:
@@ -161,7 +162,8 @@ def _normalize(path: Path, time_s: int) -> None:
 def main() -> None:
     """Build into the folder of the command line."""
     os.umask(0o022)
-    for path in build_twice(Path(sys.argv[1]).resolve()):
+    _, built = build_twice(Path(sys.argv[1]).resolve())
+    for path in built:
         print(f"{sha256(path)}  {path.name}")
 
 
