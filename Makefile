@@ -94,7 +94,7 @@ check: setup  ## check style, formatting and types; compile every shader with gl
 	$(PYTHON) -m tests.shader_check
 
 clean:  ## remove generated files, including .venv but not out/
-	rm -rf .venv .witness .batch_ray .docs .peers .examples .gl_witness .headset .headset-applications build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules tests/web/node_modules
+	rm -rf .venv .witness .batch_ray .docs .release .peers .examples .gl_witness .headset .headset-applications build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules tests/web/node_modules
 	find filter_service -name '_*.so' -delete
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 

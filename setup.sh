@@ -8,6 +8,7 @@
 #   sh setup.sh page       also the packages for `ocufilter web`
 #   sh setup.sh web        also those packages and a browser for the web tests
 #   sh setup.sh docs       also a separate environment with MkDocs
+#   sh setup.sh release    also a separate environment with the tools of a release
 #   sh setup.sh witness    also a separate environment with a path tracer
 #   sh setup.sh peers      also the alternatives that `ocufilter bench peers` compares
 #   sh setup.sh examples   only a separate environment with the package and Jupyter
@@ -54,6 +55,9 @@ PEERS_312_PACKAGES="deeplens-core torch torchvision"
 EXAMPLES_VENV=.examples
 # for `make docs`
 DOCS_PACKAGES="mkdocs-material mkdocstrings[python]"
+# for `python -m tests.release...`: NOTICE, metadata and the bill of materials
+RELEASE_VENV=.release
+RELEASE_PACKAGES="check-jsonschema cyclonedx-bom trove-classifiers"
 # for `make test-web`
 BROWSER_PACKAGES="chromium fonts-dejavu-core"
 VENV=.venv
@@ -226,6 +230,15 @@ install_docs() { # MkDocs
     cp constraints.txt $DOCS_VENV/constraints.txt
 }
 
+install_release() { # tools of a release
+    if cmp -s constraints.txt $RELEASE_VENV/constraints.txt; then return; fi
+    say "installing the tools of a release into $RELEASE_VENV"
+    derive_venv $RELEASE_VENV
+    $RELEASE_VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install -c constraints.txt $RELEASE_PACKAGES
+    cp constraints.txt $RELEASE_VENV/constraints.txt
+}
+
 install_browser() { # and the package that controls it
     missing=$(missing_packages $BROWSER_PACKAGES)
     if [ -n "$missing" ] && ! apt_install $missing; then
@@ -303,6 +316,7 @@ fi
 if [ "$kind" = batch-ray ]; then install_ray; fi
 if [ "$kind" = page ]; then install_page; fi
 if [ "$kind" = docs ]; then install_docs; fi
+if [ "$kind" = release ]; then install_release; fi
 if [ "$kind" = web ]; then
     install_page
     install_browser
