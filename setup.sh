@@ -57,7 +57,7 @@ EXAMPLES_VENV=.examples
 DOCS_PACKAGES="mkdocs-material mkdocstrings[python]"
 # for `python -m tests.release...`: NOTICE, metadata and the bill of materials
 RELEASE_VENV=.release
-RELEASE_PACKAGES="check-jsonschema cyclonedx-bom trove-classifiers"
+RELEASE_PACKAGES="check-jsonschema cyclonedx-bom setuptools trove-classifiers"
 # for `make test-web`
 BROWSER_PACKAGES="chromium fonts-dejavu-core"
 VENV=.venv

@@ -3,8 +3,10 @@
     python -m tests.release.sbom out/ocufilter.cdx.json
     python -m tests.release.sbom out/ocufilter.cdx.json --python /path/to/python
 
-The versions are those of an environment, by default the one that runs this program.  It
-should contain the extras for users.  Requires the packages of `sh setup.sh release`.
+The versions are those of an environment, by default the one that runs this program, and
+the licenses those of NOTICE.  Packages that NOTICE does not list, such as tools for
+developers, are left out; extras that are not installed are reported.  Requires the
+packages of `sh setup.sh release`.
 """
 
 from __future__ import annotations
@@ -19,8 +21,7 @@ from typing import Any
 
 from packaging.utils import canonicalize_name
 
-from tests.release.notices import STATED_ELSEWHERE
-from tests.release.requirements import USER_EXTRAS, declared
+from tests.release.notices import NOTICE, PACKAGES, section
 from tests.source_tree import ROOT
 
 
@@ -41,34 +42,27 @@ def whole_environment(python: str) -> dict[str, Any]:
         return found
 
 
-def restricted(bom: dict[str, Any], names: set[str]) -> dict[str, Any]:
-    """Return an SBOM without packages that only other requirements of the root need.
+def restricted(bom: dict[str, Any], licenses: dict[str, str]) -> dict[str, Any]:
+    """Return an SBOM with those packages only that have a license in NOTICE.
+
+    The environment may also contain tools for developers.
 
     Parameters
     ----------
-    names : set of str
-        Direct requirements that stay.
+    licenses : dict of str
+        SPDX expressions, by normalized name.
     """
-    names_by_ref = {
-        c["bom-ref"]: canonicalize_name(c["name"]) for c in bom["components"]
-    }
-    required = {d["ref"]: d.get("dependsOn", []) for d in bom["dependencies"]}
+    components = [
+        {**c, "licenses": [{"expression": licenses[canonicalize_name(c["name"])]}]}
+        for c in bom["components"]
+        if canonicalize_name(c["name"]) in licenses
+    ]
+    kept = {component["bom-ref"] for component in components}
     root = bom["metadata"]["component"]["bom-ref"]
-    required[root] = [ref for ref in required[root] if names_by_ref[ref] in names]
-    kept, pending = set(), [root]
-    while pending:
-        ref = pending.pop()
-        if ref not in kept:
-            kept.add(ref)
-            pending += required.get(ref, ())
-    components = [c for c in bom["components"] if c["bom-ref"] in kept]
-    for component in components:
-        license_ = STATED_ELSEWHERE.get(canonicalize_name(component["name"]))
-        if license_ is not None:
-            component["licenses"] = [{"expression": license_}]
     dependencies = [
-        {"ref": ref, "dependsOn": required[ref]} if required.get(ref) else {"ref": ref}
-        for ref in sorted(kept)
+        {"ref": d["ref"], "dependsOn": [r for r in d.get("dependsOn", ()) if r in kept]}
+        for d in bom["dependencies"]
+        if d["ref"] in kept | {root}
     ]
     return {**bom, "components": components, "dependencies": dependencies}
 
@@ -97,15 +91,17 @@ def main() -> None:
     parser.add_argument("output", type=Path)
     parser.add_argument("--python", default=sys.executable, help="of the environment")
     arguments = parser.parse_args()
-    names = set(declared(USER_EXTRAS))
-    bom = restricted(whole_environment(arguments.python), names)
+    entries = section(NOTICE.read_text(encoding="utf-8"), PACKAGES)
+    licenses = dict(line.split(" | ")[:2] for line in entries)
+    bom = restricted(whole_environment(arguments.python), licenses)
     text = validated(json.dumps(bom, indent=1, ensure_ascii=False) + "\n")
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_text(text, encoding="utf-8")
     found = {canonicalize_name(component["name"]) for component in bom["components"]}
     print(f"sbom: {len(found)} packages in {arguments.output}")
-    if names - found:
-        print(f"sbom: not installed: {', '.join(sorted(names - found))}")
+    if licenses.keys() - found:
+        missing = sorted(licenses.keys() - found)
+        print(f"sbom: not installed: {', '.join(missing)}")
 
 
 if __name__ == "__main__":

@@ -158,24 +158,33 @@ def test_a_node_package_without_an_entry_is_a_problem():
 
 
 def test_the_bill_of_materials_contains_what_users_install_only():
-    names = ("Tool.X", "lib", "core", "old")
+    names = ("Tool.X", "my.lib", "core")
     bom = {
         "metadata": {"component": {"bom-ref": "root"}},
         "components": [{"bom-ref": f"{name}==1", "name": name} for name in names],
         "dependencies": [
-            {"ref": "root", "dependsOn": ["lib==1", "Tool.X==1"]},
-            {"ref": "lib==1", "dependsOn": ["core==1"]},
-            {"ref": "Tool.X==1", "dependsOn": ["core==1", "old==1"]},
+            {"ref": "root", "dependsOn": ["my.lib==1", "Tool.X==1"]},
+            {"ref": "my.lib==1", "dependsOn": ["core==1", "Tool.X==1"]},
+            {"ref": "Tool.X==1", "dependsOn": ["core==1"]},
             {"ref": "core==1"},
-            {"ref": "old==1"},
         ],
     }
-    found = sbom.restricted(bom, {"lib"})
-    assert [c["name"] for c in found["components"]] == ["lib", "core"]
-    assert found["dependencies"] == [
-        {"ref": "core==1"},
-        {"ref": "lib==1", "dependsOn": ["core==1"]},
-        {"ref": "root", "dependsOn": ["lib==1"]},
+    found = sbom.restricted(bom, {"my-lib": "MIT", "core": "ISC", "other": "ISC"})
+    assert [(c["name"], c["licenses"]) for c in found["components"]] == [
+        ("my.lib", [{"expression": "MIT"}]),
+        ("core", [{"expression": "ISC"}]),
     ]
-    both = sbom.restricted(bom, {"lib", "tool-x"})
-    assert len(both["components"]) == 4
+    assert found["dependencies"] == [
+        {"ref": "root", "dependsOn": ["my.lib==1"]},
+        {"ref": "my.lib==1", "dependsOn": ["core==1"]},
+        {"ref": "core==1", "dependsOn": []},
+    ]
+
+
+def test_an_invalid_bill_of_materials_is_refused():
+    pytest.importorskip("cyclonedx", reason="sh setup.sh release installs it")
+    bom = {"bomFormat": "CycloneDX", "specVersion": "1.6", "version": 1}
+    text = json.dumps({**bom, "components": [{"type": "library", "name": "a"}]})
+    assert sbom.validated(text) == text
+    with pytest.raises(ValueError, match=r"not valid CycloneDX 1\.6"):
+        sbom.validated(json.dumps({**bom, "components": [{"name": "a"}]}))
