@@ -13,7 +13,7 @@ NO_TESTS := test $$? -eq 5 # pytest's exit status if ARGS selects none of these 
 BENCHES := $(filter-out gpu soak witness,$(patsubst tests/benchmarks/bench_%.py,%,$(sort $(wildcard tests/benchmarks/bench_*.py))))
 
 .DEFAULT_GOAL := help
-.PHONY: demo docs web test test-training test-examples test-batch-ray test-headset test-layer test-layer-applications test-web validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-witness setup-peers peers
+.PHONY: demo docs web test test-training test-examples test-batch-ray test-headset test-layer test-layer-applications test-web validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-witness setup-peers peers release release-check setup-release setup-release-check
 
 demo: setup  ## filter two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
@@ -93,8 +93,14 @@ check: setup  ## check style, formatting and types; compile every shader with gl
 	@sh tests/gl_witness/setup.sh glslang || test $$? -eq 77
 	$(PYTHON) -m tests.shader_check
 
+release: setup-release  ## build, check and test the sdist and the wheels; writes dist/
+	$(PYTHON) -m tests.release $(ARGS)
+
+release-check: setup-release-check  ## build the sdist and a wheel twice; check them
+	$(PYTHON) -m tests.release --quick
+
 clean:  ## remove generated files, including .venv but not out/
-	rm -rf .venv .witness .batch_ray .docs .release .peers .examples .gl_witness .headset .headset-applications build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules tests/web/node_modules
+	rm -rf .venv .release .witness .batch_ray .docs .peers .examples .gl_witness .headset .headset-applications build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules tests/web/node_modules
 	find filter_service -name '_*.so' -delete
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -130,3 +136,9 @@ setup-witness:
 
 setup-peers:
 	@sh setup.sh peers
+
+setup-release:
+	@sh setup.sh release
+
+setup-release-check:
+	@sh setup.sh release-check

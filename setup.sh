@@ -8,8 +8,9 @@
 #   sh setup.sh page       also the packages for `ocufilter web`
 #   sh setup.sh web        also those packages and a browser for the web tests
 #   sh setup.sh docs       also a separate environment with MkDocs
-#   sh setup.sh release    also a separate environment with the tools of a release
 #   sh setup.sh witness    also a separate environment with a path tracer
+#   sh setup.sh release    also a separate environment that builds and checks releases
+#   sh setup.sh release-check   the same without compilers for another processor
 #   sh setup.sh peers      also the alternatives that `ocufilter bench peers` compares
 #   sh setup.sh examples   only a separate environment with the package and Jupyter
 #
@@ -53,11 +54,14 @@ PEERS_VENV=.peers
 PEERS_PACKAGES="optiland"
 PEERS_312_PACKAGES="deeplens-core torch torchvision"
 EXAMPLES_VENV=.examples
+# for `make release`
+RELEASE_VENV=.release
+RELEASE_PACKAGES="setuptools build ziglang auditwheel twine uv
+    check-jsonschema cyclonedx-bom trove-classifiers"
+RELEASE_SYSTEM_PACKAGES="gcc libc6-dev gcc-aarch64-linux-gnu libc6-dev-arm64-cross
+    qemu-user-static"
 # for `make docs`
 DOCS_PACKAGES="mkdocs-material mkdocstrings[python]"
-# for `python -m tests.release...`: NOTICE, metadata and the bill of materials
-RELEASE_VENV=.release
-RELEASE_PACKAGES="check-jsonschema cyclonedx-bom setuptools trove-classifiers"
 # for `make test-web`
 BROWSER_PACKAGES="chromium fonts-dejavu-core"
 VENV=.venv
@@ -230,15 +234,6 @@ install_docs() { # MkDocs
     cp constraints.txt $DOCS_VENV/constraints.txt
 }
 
-install_release() { # tools of a release
-    if cmp -s constraints.txt $RELEASE_VENV/constraints.txt; then return; fi
-    say "installing the tools of a release into $RELEASE_VENV"
-    derive_venv $RELEASE_VENV
-    $RELEASE_VENV/bin/python -m pip -qq --disable-pip-version-check \
-        install -c constraints.txt $RELEASE_PACKAGES
-    cp constraints.txt $RELEASE_VENV/constraints.txt
-}
-
 install_browser() { # and the package that controls it
     missing=$(missing_packages $BROWSER_PACKAGES)
     if [ -n "$missing" ] && ! apt_install $missing; then
@@ -287,6 +282,23 @@ install_peers() { # optiland and, with Python 3.12, DeepLens in a separate envir
     cp constraints.txt $PEERS_VENV/constraints.txt
 }
 
+install_release_compilers() { # and an emulator
+    missing=$(missing_packages $RELEASE_SYSTEM_PACKAGES)
+    if [ -n "$missing" ] && ! apt_install $missing; then
+        say "a release requires:  $(install_command "$missing")"
+        exit 1
+    fi
+}
+
+install_release() { # tools that build and check releases
+    if cmp -s constraints.txt $RELEASE_VENV/constraints.txt; then return; fi
+    say "installing the tools for releases into $RELEASE_VENV (0.5 GB)"
+    $(find_python) -m venv --clear $RELEASE_VENV
+    $RELEASE_VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install -c constraints.txt $RELEASE_PACKAGES
+    cp constraints.txt $RELEASE_VENV/constraints.txt
+}
+
 install_examples() { # the package as users install it, without the checkout
     wanted=$(pwd; cksum setup.sh setup.py pyproject.toml constraints.txt
         find estimator filter_service clients shaders -type f ! -name '*.so' \
@@ -316,11 +328,12 @@ fi
 if [ "$kind" = batch-ray ]; then install_ray; fi
 if [ "$kind" = page ]; then install_page; fi
 if [ "$kind" = docs ]; then install_docs; fi
-if [ "$kind" = release ]; then install_release; fi
 if [ "$kind" = web ]; then
     install_page
     install_browser
     install_node_packages tests/web "the accessibility checks of the web tests"
 fi
 if [ "$kind" = witness ]; then install_witness; fi
+if [ "$kind" = release ]; then install_release_compilers; fi
+case $kind in release | release-check) install_release ;; esac
 if [ "$kind" = peers ]; then install_peers; fi
