@@ -2,9 +2,11 @@
 
     python -m tests.release.sbom out/ocufilter.cdx.json
     python -m tests.release.sbom out/ocufilter.cdx.json --python /path/to/python
+    python -m tests.release.sbom out/ocufilter.cdx.json --install
 
 The versions are those of an environment, by default the one that runs this program, and
-the licenses those of NOTICE.  Packages that NOTICE does not list, such as tools for
+the licenses those of NOTICE.  --install creates a temporary environment with the versions
+in constraints.txt and all extras for users (1.3 GB).  Packages that NOTICE does not list, such as tools for
 developers, are left out; extras that are not installed are reported.  Requires the
 packages of `sh setup.sh release`.
 """
@@ -16,12 +18,14 @@ import json
 import subprocess
 import sys
 import tempfile
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from packaging.utils import canonicalize_name
 
 from tests.release.notices import NOTICE, PACKAGES, section
+from tests.release.requirements import USER_EXTRAS, project
 from tests.source_tree import ROOT
 
 
@@ -40,6 +44,19 @@ def whole_environment(python: str) -> dict[str, Any]:
         )
         found: dict[str, Any] = json.loads(output.read_text(encoding="utf-8"))
         return found
+
+
+def new_environment(folder: Path) -> str:
+    """Create an environment with what users install; return its interpreter."""
+    subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
+    python = str(folder / "bin/python")
+    table = project()
+    extras = (table["optional-dependencies"][extra] for extra in USER_EXTRAS)
+    required = sorted({*table["dependencies"], *chain.from_iterable(extras)})
+    pip = (python, "-m", "pip", "-qq", "--disable-pip-version-check", "install")
+    constraints = str(ROOT / "constraints.txt")
+    subprocess.run([*pip, "-c", constraints, *required], check=True)
+    return python
 
 
 def restricted(bom: dict[str, Any], licenses: dict[str, str]) -> dict[str, Any]:
@@ -90,10 +107,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Write an SBOM.")
     parser.add_argument("output", type=Path)
     parser.add_argument("--python", default=sys.executable, help="of the environment")
+    parser.add_argument("--install", action="store_true", help="create an environment")
     arguments = parser.parse_args()
     entries = section(NOTICE.read_text(encoding="utf-8"), PACKAGES)
     licenses = dict(line.split(" | ")[:2] for line in entries)
-    bom = restricted(whole_environment(arguments.python), licenses)
+    with tempfile.TemporaryDirectory() as folder:
+        python = arguments.python
+        if arguments.install:
+            python = new_environment(Path(folder))
+        bom = restricted(whole_environment(python), licenses)
     text = validated(json.dumps(bom, indent=1, ensure_ascii=False) + "\n")
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_text(text, encoding="utf-8")
