@@ -5,10 +5,10 @@
     python -m tests.release.sbom out/ocufilter.cdx.json --install
 
 The versions are those of an environment, by default the one that runs this program, and
-the licenses those of NOTICE.  --install creates a temporary environment with the versions
-in constraints.txt and all extras for users (1.3 GB).  Packages that NOTICE does not list, such as tools for
-developers, are left out; extras that are not installed are reported.  Requires the
-packages of `sh setup.sh release`.
+the licenses those of NOTICE.  --install creates a temporary environment with the
+versions in constraints.txt and all extras for users (1.3 GB).  Packages that NOTICE
+does not list, such as tools for developers, are left out; missing extras are
+reported.  Requires the packages of `sh setup.sh release`.
 """
 
 from __future__ import annotations
