@@ -10,7 +10,7 @@
 #   sh setup.sh docs       also a separate environment with MkDocs
 #   sh setup.sh witness    also a separate environment with a path tracer
 #   sh setup.sh release    also a separate environment that builds and checks releases
-#   sh setup.sh release-check   the same without compilers for another processor
+#   sh setup.sh release-check  also an environment for `make release-check`
 #   sh setup.sh peers      also the alternatives that `ocufilter bench peers` compares
 #   sh setup.sh examples   only a separate environment with the package and Jupyter
 #
@@ -54,10 +54,10 @@ PEERS_VENV=.peers
 PEERS_PACKAGES="optiland"
 PEERS_312_PACKAGES="deeplens-core torch torchvision"
 EXAMPLES_VENV=.examples
-# for `make release`
+# for `make release-check` and `make release`
 RELEASE_VENV=.release
-RELEASE_PACKAGES="setuptools build ziglang auditwheel twine uv
-    check-jsonschema cyclonedx-bom trove-classifiers"
+RELEASE_CHECK_PACKAGES="setuptools build twine check-jsonschema trove-classifiers"
+RELEASE_PACKAGES="$RELEASE_CHECK_PACKAGES ziglang auditwheel uv cyclonedx-bom"
 RELEASE_SYSTEM_PACKAGES="gcc libc6-dev gcc-aarch64-linux-gnu libc6-dev-arm64-cross
     qemu-user-static"
 # for `make docs`
@@ -291,11 +291,13 @@ install_release_compilers() { # and an emulator
 }
 
 install_release() { # tools that build and check releases
-    if cmp -s constraints.txt $RELEASE_VENV/constraints.txt; then return; fi
-    say "installing the tools for releases into $RELEASE_VENV (0.5 GB)"
+    have='import sys; from importlib.metadata import version; list(map(version, sys.argv[1:]))'
+    if cmp -s constraints.txt $RELEASE_VENV/constraints.txt &&
+        $RELEASE_VENV/bin/python -c "$have" "$@" 2>/dev/null; then return; fi
+    say "installing $* into $RELEASE_VENV"
     $(find_python) -m venv --clear $RELEASE_VENV
     $RELEASE_VENV/bin/python -m pip -qq --disable-pip-version-check \
-        install -c constraints.txt $RELEASE_PACKAGES
+        install -c constraints.txt "$@"
     cp constraints.txt $RELEASE_VENV/constraints.txt
 }
 
@@ -334,6 +336,9 @@ if [ "$kind" = web ]; then
     install_node_packages tests/web "the accessibility checks of the web tests"
 fi
 if [ "$kind" = witness ]; then install_witness; fi
-if [ "$kind" = release ]; then install_release_compilers; fi
-case $kind in release | release-check) install_release ;; esac
+if [ "$kind" = release-check ]; then install_release $RELEASE_CHECK_PACKAGES; fi
+if [ "$kind" = release ]; then
+    install_release_compilers
+    install_release $RELEASE_PACKAGES
+fi
 if [ "$kind" = peers ]; then install_peers; fi

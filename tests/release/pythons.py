@@ -84,7 +84,7 @@ def test_wheel(wheel: Path, python: Python, which: str) -> dict:
     oldest = oldest_dependencies(wheel) if which == "oldest" else []
     row: dict = {"python": python.version, "dependencies": which, "errors": []}
     folder = BUILD / "environments" / f"{python.version}-{which}"
-    # Installed twice: first, packages come from the network into the cache of uv.
+    # Installed twice: the first time fills uv's cache from the network.
     for name in ("download_s", "install_s"):
         environment = Environment(python, folder)
         _timed(row, name, partial(environment.install, wheel, *oldest))

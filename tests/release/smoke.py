@@ -105,7 +105,7 @@ def report(environment: Environment) -> None:
     """Write a report as HTML."""
     environment.run("ocufilter", "report", "keratoconus", "-o", "eye.html")
     text = (environment.work / "eye.html").read_text(encoding="utf-8")
-    if "<svg" not in text or "</html>" not in text:
+    if "data:image/svg+xml" not in text or "</html>" not in text:
         raise Failed("report: eye.html is not complete")
 
 
