@@ -14,11 +14,26 @@
 #   sh setup.sh peers      also the alternatives that `ocufilter bench peers` compares
 #   sh setup.sh examples   only a separate environment with the package and Jupyter
 #
+# Missing system packages are installed with apt-get.  If that requires sudo, the script
+# asks on a terminal.  Otherwise, or if the answer is no, it prints the command.  With
+# --yes, or OCUFILTER_SETUP_YES=1 in the environment, it does not ask:
+#
+#   sh setup.sh --yes test
+#
 # Running the script again takes a fraction of a second: it reinstalls the environment
 # only if this file, setup.py, pyproject.toml, constraints.txt, the C sources or the
 # path of the clone has changed.
 set -eu
 cd "$(dirname "$0")"
+. ./ask_sudo.sh
+
+kind=
+for argument in "$@"; do
+    case $argument in
+    --yes) OCUFILTER_SETUP_YES=1 ;;
+    *) kind=$argument ;;
+    esac
+done
 
 SYSTEM_PACKAGES="libegl1 libgl1 libgl1-mesa-dri libgomp1"
 # for reports as PDF; the service does not need them
@@ -41,8 +56,8 @@ PEERS_312_PACKAGES="deeplens-core torch torchvision"
 EXAMPLES_VENV=.examples
 # for `make release-check` and `make release`
 RELEASE_VENV=.release
-RELEASE_CHECK_PACKAGES="setuptools build twine"
-RELEASE_PACKAGES="$RELEASE_CHECK_PACKAGES ziglang auditwheel uv"
+RELEASE_CHECK_PACKAGES="setuptools build twine check-jsonschema trove-classifiers"
+RELEASE_PACKAGES="$RELEASE_CHECK_PACKAGES ziglang auditwheel uv cyclonedx-bom"
 RELEASE_SYSTEM_PACKAGES="gcc libc6-dev gcc-aarch64-linux-gnu libc6-dev-arm64-cross
     qemu-user-static"
 # for `make docs`
@@ -66,22 +81,14 @@ missing_packages() {
     done | xargs # join the lines
 }
 
-apt_prefix() { # print the prefix for apt-get; fail if this user may not run it
-    if [ "$(id -u)" = 0 ]; then
-        echo env
-    elif command -v sudo >/dev/null && sudo -n true 2>/dev/null; then
-        echo sudo -n env
-    else
-        return 1
-    fi
-}
+install_command() { echo "sudo apt-get update && sudo apt-get install -y $*"; }
 
 apt_install() {
-    prefix=$(apt_prefix) || return 1
+    may_run_as_root "$(install_command "$@")" || return 1
     say "installing $* with apt-get"
     log=$(mktemp)
-    if { $prefix apt-get update &&
-        $prefix DEBIAN_FRONTEND=noninteractive \
+    if { $as_root apt-get update &&
+        $as_root env DEBIAN_FRONTEND=noninteractive \
             apt-get install -y --no-install-recommends "$@"; } >"$log" 2>&1; then
         rm -f "$log"
     else
@@ -90,8 +97,6 @@ apt_install() {
         return 1
     fi
 }
-
-install_command() { echo "sudo apt-get update && sudo apt-get install -y $*"; }
 
 install_system_libraries() {
     if ! command -v dpkg-query >/dev/null; then
@@ -312,28 +317,28 @@ install_examples() { # the package as users install it, without the checkout
 
 install_system_libraries
 install_c_compiler
-if [ "${1:-}" = examples ]; then
+if [ "$kind" = examples ]; then
     install_examples
     exit
 fi
 install_packages
-if [ "${1:-}" = training ]; then install_training_packages; fi
-if [ "${1:-}" = test ]; then
+if [ "$kind" = training ]; then install_training_packages; fi
+if [ "$kind" = test ]; then
     install_test_packages
     install_node_packages clients/js "the tests of the JavaScript client"
 fi
-if [ "${1:-}" = batch-ray ]; then install_ray; fi
-if [ "${1:-}" = page ]; then install_page; fi
-if [ "${1:-}" = docs ]; then install_docs; fi
-if [ "${1:-}" = web ]; then
+if [ "$kind" = batch-ray ]; then install_ray; fi
+if [ "$kind" = page ]; then install_page; fi
+if [ "$kind" = docs ]; then install_docs; fi
+if [ "$kind" = web ]; then
     install_page
     install_browser
     install_node_packages tests/web "the accessibility checks of the web tests"
 fi
-if [ "${1:-}" = witness ]; then install_witness; fi
-if [ "${1:-}" = release-check ]; then install_release $RELEASE_CHECK_PACKAGES; fi
-if [ "${1:-}" = release ]; then
+if [ "$kind" = witness ]; then install_witness; fi
+if [ "$kind" = release-check ]; then install_release $RELEASE_CHECK_PACKAGES; fi
+if [ "$kind" = release ]; then
     install_release_compilers
     install_release $RELEASE_PACKAGES
 fi
-if [ "${1:-}" = peers ]; then install_peers; fi
+if [ "$kind" = peers ]; then install_peers; fi

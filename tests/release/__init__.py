@@ -11,4 +11,9 @@ pythons       environments of each Python, with the oldest and newest dependenci
 environment   an empty environment, of this system or of another one in a folder
 commands      child processes
 aarch64       the native engine for aarch64 under emulation, with recorded calls
+metadata      metadata of the repository and of distributions, citation, license
+notices       NOTICE: an entry for every dependency and data file
+sbom          bill of materials of what users install
+sizes         installed sizes of dependencies
+requirements  what the package requires, as declared and as installed
 """

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -38,6 +39,12 @@ def license_line() -> str:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     chosen = project["project"].get("license")
     return f"license: {chosen}" if chosen else "no license chosen"
+
+
+def check_metadata(built: list[Path]) -> str:
+    """Check NOTICE and the metadata of distributions; return what they report."""
+    found = run(sys.executable, "-m", "tests.release.notices")
+    return found + run(TOOLS / "python", "-m", "tests.release.metadata", *built)
 
 
 def warn_of_changes() -> None:
@@ -83,7 +90,7 @@ def quick() -> None:
     check_without_compiler(sdist, BUILD / "first")
     for path in built[0]:
         print(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB; two builds are equal")
-    print(license_line())
+    print(check_metadata(built[0]), end="")
 
 
 def table(rows: list[dict]) -> str:
@@ -133,6 +140,7 @@ def release(options: argparse.Namespace) -> None:
     contents.check_sdist(sdist)
     contents.check_description(*built)
     checks.append("the contents are complete; twine check --strict")
+    checks += check_metadata(built).splitlines()
     check_without_compiler(sdist, BUILD / "without-compiler")
     checks.append("the sdist builds without a compiler and says what is missing")
     say("comparing the library for aarch64, under emulation, with that for x86-64")
@@ -150,7 +158,12 @@ def release(options: argparse.Namespace) -> None:
     DIST.mkdir()
     for path in built:
         shutil.copy2(path, DIST)
-    sums = "".join(f"{build.sha256(path)}  {path.name}\n" for path in built)
+    say("writing the bill of materials")
+    bom = DIST / f"{sdist.name.removesuffix('.tar.gz')}.cdx.json"
+    checks += run(
+        *(TOOLS / "python", "-m", "tests.release.sbom", bom, "--install")
+    ).splitlines()
+    sums = "".join(f"{build.sha256(path)}  {path.name}\n" for path in [*built, bom])
     (DIST / SUMS).write_text(sums, encoding="utf-8")
     text = checklist(commit, built, checks, rows)
     (DIST / CHECKLIST).write_text(text, encoding="utf-8")

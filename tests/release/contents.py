@@ -58,7 +58,9 @@ def check_sdist(path: Path) -> None:
     with tarfile.open(path) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     patterns = ("filter_service/**/*.[ch]", "clients/**/*.[ch]")
-    sources = {p.relative_to(ROOT).as_posix() for n in patterns for p in ROOT.glob(n)}
+    found = (path for pattern in patterns for path in ROOT.glob(pattern))
+    sources = {p.relative_to(ROOT).as_posix() for p in found}
+    sources = {name for name in sources if "/node_modules/" not in name}
     files = {p.relative_to(ROOT).as_posix() for n in HELD for p in ROOT.glob(n)}
     missing = (sources | files | set(SOURCES)) - names
     surplus = {name for name in names if name.startswith(("tests/", "training/"))}
