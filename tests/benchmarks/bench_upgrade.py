@@ -159,7 +159,7 @@ def upgrade(way: str, old: tuple[str, ...], settings: dict) -> tuple[Run, float]
         with FilterClient(service.endpoint, timeout_s=LIMIT_S) as client:
             client.set_profile(PROFILE, views=[view])
             before = client.filter(view, **SEE).color.astype(np.float32)
-            thread = threading.Thread(target=send)
+            thread = threading.Thread(target=send, daemon=True)
             thread.start()
             time.sleep(STREAM_S)
             times_s = [time.monotonic()]
@@ -193,7 +193,7 @@ def main(argv=None) -> None:
                 on_disk = {"store_cache_dir": str(Path(folder) / "eyes")}
                 settings = on_disk if case == "eyes on disk" else {}
                 runs = []
-                for _ in range(1 if options.quick else 5):
+                for _ in range(1 if options.quick else 3):
                     run, memory_mb = upgrade(way, old, settings)
                     runs.append(run)
                     counts.append({"method": way, "case": case, **run.counts()})
