@@ -98,9 +98,10 @@ check: setup  ## check style, formatting and types; compile every shader with gl
 	$(PYTHON) -m tests.shader_check
 
 clean:  ## remove generated files, including .venv but not out/
-	rm -rf .venv .witness .batch_ray .docs .workflows .peers .examples .gl_witness .headset .headset-applications build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules tests/web/node_modules tests/workflows/node_modules
+	rm -rf .venv .witness .batch_ray .docs .peers .examples .gl_witness .headset .headset-applications build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules tests/web/node_modules
 	find filter_service -name '_*.so' -delete
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf .workflows tests/workflows/node_modules
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 32

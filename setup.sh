@@ -8,9 +8,9 @@
 #   sh setup.sh page       also the packages for `ocufilter web`
 #   sh setup.sh web        also those packages and a browser for the web tests
 #   sh setup.sh docs       also a separate environment with MkDocs
-#   sh setup.sh workflows  only a separate environment with linters of workflows
 #   sh setup.sh witness    also a separate environment with a path tracer
 #   sh setup.sh peers      also the alternatives that `ocufilter bench peers` compares
+#   sh setup.sh workflows  only a separate environment with linters of workflows
 #   sh setup.sh examples   only a separate environment with the package and Jupyter
 #
 # Running the script again takes a fraction of a second: it reinstalls the environment
@@ -40,11 +40,11 @@ PEERS_312_PACKAGES="deeplens-core torch torchvision"
 EXAMPLES_VENV=.examples
 # for `make docs`
 DOCS_PACKAGES="mkdocs-material mkdocstrings[python]"
+# for `make test-web`
+BROWSER_PACKAGES="chromium fonts-dejavu-core"
 # for `make test-workflows`
 WORKFLOWS_VENV=.workflows
 WORKFLOWS_PACKAGES="zizmor"
-# for `make test-web`
-BROWSER_PACKAGES="chromium fonts-dejavu-core"
 VENV=.venv
 STAMP=$VENV/.ocufilter-installed
 EXAMPLES_STAMP=$EXAMPLES_VENV/.ocufilter-installed
