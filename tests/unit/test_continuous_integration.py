@@ -31,8 +31,9 @@ def test_every_suite_that_is_named_runs():
 def test_the_hosted_workflow_runs_the_same_suites():
     text = (ROOT / ".github/workflows/test.yml").read_text(encoding="utf-8")
     listed = re.search(r"^ +suite:\n((?: +- [a-z-]+\n)+)", text, re.MULTILINE)[1]
-    suites = re.findall(r"- ([a-z-]+)$", listed, re.MULTILINE)
-    assert sorted(suites) == sorted(_suites())
+    matrix = set(re.findall(r"- ([a-z-]+)$", listed, re.MULTILINE))
+    jobs = set(re.findall(r"run: make ([a-z-]+)$", text, re.MULTILINE))
+    assert matrix <= set(_suites()) <= matrix | jobs
 
 
 @pytest.fixture
