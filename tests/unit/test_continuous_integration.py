@@ -28,6 +28,14 @@ def test_every_suite_that_is_named_runs():
     assert sorted(_suites()) == sorted(named)
 
 
+def test_the_hosted_workflow_runs_the_same_suites():
+    text = (ROOT / ".github/workflows/test.yml").read_text(encoding="utf-8")
+    listed = re.search(r"^ +suite:\n((?: +- [a-z-]+\n)+)", text, re.MULTILINE)[1]
+    matrix = set(re.findall(r"- ([a-z-]+)$", listed, re.MULTILINE))
+    jobs = set(re.findall(r"run: make ([a-z-]+)$", text, re.MULTILINE))
+    assert matrix <= set(_suites()) <= matrix | jobs
+
+
 @pytest.fixture
 def run(tmp_path):
     """Return how to run a copy of the script with stand-ins for make and the set-up."""
