@@ -8,7 +8,6 @@ import os
 import shutil
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 from tests.release import aarch64, build, contents, pythons
@@ -32,13 +31,6 @@ COLUMNS = {
     "installed_mb": "MB",
     "installed_with_page_mb": "MB with page",
 }
-
-
-def license_line() -> str:
-    """Return the state of the license."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    chosen = project["project"].get("license")
-    return f"license: {chosen}" if chosen else "no license chosen"
 
 
 def check_metadata(built: list[Path]) -> str:
@@ -105,10 +97,17 @@ def checklist(
 ) -> str:
     """Return the checklist of a release, Markdown."""
     untested = set(pythons.VERSIONS) - {row["python"] for row in rows}
+    open_choices = [check for check in checks if " chosen (" in check]
+    failures = [
+        f"failed: Python {row['python']}, {row['dependencies']}: "
+        f"{error.splitlines()[0]}"
+        for row in rows
+        for error in row["errors"]
+    ]
     steps = [
-        "choose a license" if license_line() == "no license chosen" else None,
+        *open_choices,
         *(f"test with Python {version}: none here" for version in sorted(untested)),
-        *(f"failed: {error}" for row in rows for error in row["errors"]),
+        *failures,
         "compare the version with the changelog and tag the commit",
         f"upload the files of {SUMS}",
     ]
@@ -117,12 +116,12 @@ def checklist(
         f"Commit {commit}\n",
         *(f"- {p.name}: {p.stat().st_size / 1e6:.1f} MB" for p in built),
         "\n## Passed\n",
-        *(f"- [x] {check}" for check in checks),
+        *(f"- [x] {check}" for check in checks if check not in open_choices),
         "\n## Environments\n",
         "Times without network.  The first picture includes compiling loops, once.\n",
         table(rows),
         "\n## To do\n",
-        *(f"- [ ] {step}" for step in steps if step),
+        *(f"- [ ] {step}" for step in steps),
     ]
     return "\n".join(parts) + "\n"
 

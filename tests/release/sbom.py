@@ -120,7 +120,7 @@ def main() -> None:
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_text(text, encoding="utf-8")
     found = {canonicalize_name(component["name"]) for component in bom["components"]}
-    print(f"sbom: {len(found)} packages in {arguments.output}")
+    print(f"sbom: {len(found)} packages in {arguments.output.name}")
     if licenses.keys() - found:
         missing = sorted(licenses.keys() - found)
         print(f"sbom: not installed: {', '.join(missing)}")

@@ -6,6 +6,7 @@ import zipfile
 
 import pytest
 
+from tests.release import __main__ as release
 from tests.release import build, contents, pythons
 from tests.release.commands import Failed
 
@@ -71,3 +72,18 @@ def test_oldest_dependencies_are_those_of_no_extra(tmp_path):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("ocufilter-0.dist-info/METADATA", "\n".join(lines))
     assert pythons.oldest_dependencies(path) == ["numpy>=1.26"]
+
+
+def test_the_checklist_separates_what_passed_from_what_remains(tmp_path):
+    sdist = tmp_path / "ocufilter-1.tar.gz"
+    sdist.touch()
+    row = {"python": "3.12", "dependencies": "oldest", "errors": ["web_s: no\nmore"]}
+    checks = ["the contents are complete", "metadata: no license chosen (add LICENSE)"]
+    text = release.checklist("1234", [sdist], checks, [row])
+    passed, to_do = text.split("## To do")
+    assert "- [x] the contents are complete" in passed
+    assert "license" not in passed
+    assert "- [ ] metadata: no license chosen (add LICENSE)" in to_do
+    assert "- [ ] failed: Python 3.12, oldest: web_s: no\n" in to_do
+    assert "- [ ] test with Python 3.11: none here" in to_do
+    assert "3.12: none here" not in to_do
