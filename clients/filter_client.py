@@ -16,6 +16,7 @@ Every wait has a timeout, whose error says what the client waited for.
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -333,7 +334,7 @@ class FilterClient:
                 if not (wait and event.is_building):
                     return event
             if isinstance(event, Ready):
-                n_ready += event.is_complete
+                n_ready += 1
                 if n_ready >= n_awaited or wait == "first":
                     return event
 
@@ -372,7 +373,6 @@ class FilterClient:
                 focus_dpt=focus_dpt,
                 gaze_deg=gaze_deg,
                 output=output,
-                prepared_only=True,
                 depth_encoding=depth_encoding,
                 states=states,
                 display_time_ns=display_time_ns,
@@ -462,7 +462,7 @@ class FilterClient:
         output : {"srgb8", "linear", "linear16"}
             8-bit sRGB, or linear light in float32 or float16.
         prepared_only : bool
-            Deprecated, without effect: every frame shows the state that it requests.
+            Deprecated and without effect; it will be removed in version 0.3.
         depth_encoding : {"float32", "float16", "dpt16", "mm16"}
             Encoding of depth on the wire: meters as float32; or, in half the bytes for
             slow networks, meters or diopters as float16, or integer millimeters.
@@ -474,6 +474,12 @@ class FilterClient:
         **options
             Fields of `RenderOptions`; see `EyeFilter.filter`.
         """
+        if prepared_only:
+            warnings.warn(
+                "prepared_only has no effect; it will be removed in version 0.3",
+                DeprecationWarning,
+                stacklevel=2,
+            )
         if depth_encoding not in DEPTH_ENCODINGS:
             raise ValueError(
                 f"depth_encoding is {depth_encoding!r}; allowed: "
@@ -500,7 +506,7 @@ class FilterClient:
             focus_dpt=float(focus_dpt),
             gaze_deg=None if gaze_deg is None else _floats(gaze_deg),
             output=FORMATS[output],
-            options=FrameOptions(prepared_only=prepared_only, **options),
+            options=FrameOptions(**options),
             display_time_ns=display_time_ns,
         )
         self._next_frame_id += 1

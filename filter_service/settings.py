@@ -6,6 +6,7 @@ the same object.  CONTRIBUTING.md describes how to add one.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache
@@ -198,8 +199,8 @@ class FilterSettings(Record):
     accuracy: Annotated[
         Accuracy,
         _doc(
-            "Deprecated, without effect: eyes are traced exactly; goes with version "
-            "0.3."
+            "Deprecated, without effect: eyes are traced exactly; will be removed in "
+            "version 0.3."
         ),
     ] = "exact"
     age_years: Annotated[
@@ -264,6 +265,7 @@ def as_settings(settings: FilterSettings | Mapping[str, Any]) -> FilterSettings:
         If the type is wrong, a name is unknown, or a value is out of range.
     """
     if isinstance(settings, FilterSettings):
+        _warn_of_deprecated(settings)
         return settings
     if not isinstance(settings, Mapping):
         raise BadMessage(
@@ -278,7 +280,18 @@ def as_settings(settings: FilterSettings | Mapping[str, Any]) -> FilterSettings:
                 field="settings",
                 allowed=", ".join(setting_types()),
             )
-    return FilterSettings(**settings)
+    found = FilterSettings(**settings)
+    _warn_of_deprecated(found)
+    return found
+
+
+def _warn_of_deprecated(settings: FilterSettings) -> None:
+    if settings.accuracy != "exact":
+        warnings.warn(
+            "the setting accuracy has no effect; it will be removed in version 0.3",
+            DeprecationWarning,
+            stacklevel=4,  # the caller of a method that takes settings
+        )
 
 
 def setting_help(name: str) -> str:

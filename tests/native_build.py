@@ -21,7 +21,11 @@ def extension(ending="_loops"):
     stand_in.Extension = lambda name, **options: SimpleNamespace(name=name, **options)
     stand_in.find_packages = lambda **_: []
     stand_in.setup = given.update
-    with mock.patch.dict(sys.modules, setuptools=stand_in), contextlib.chdir(ROOT):
+    modules = {"setuptools": stand_in}
+    for name in ("bdist_wheel", "build_ext"):
+        modules[f"setuptools.command.{name}"] = ModuleType(name)
+        setattr(modules[f"setuptools.command.{name}"], name, object)
+    with mock.patch.dict(sys.modules, modules), contextlib.chdir(ROOT):
         runpy.run_path("setup.py")
     modules = given["ext_modules"]
     return next(module for module in modules if module.name.endswith(ending))

@@ -40,7 +40,7 @@ SERVICE_PACKAGES = (
 CLIENT_PACKAGES = ("av",)
 WINDOW_PACKAGES = ("glfw",)
 FORMER_PACKAGES = ("pyrender", "trimesh", "PyOpenGL", "imageio", "imageio-ffmpeg")
-"""Packages that the clients no longer require; ``packages`` keeps their keys."""
+"""Packages that are no longer required; version 0.3 removes them from ``packages``."""
 
 SYSTEM_LIBRARIES = {"EGL": "libegl1", "GL": "libgl1", "gomp": "libgomp1"}
 """Libraries that are loaded by name, and Debian packages that contain them."""

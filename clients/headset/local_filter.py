@@ -87,7 +87,7 @@ class LocalFilter:
         return nullcontext() if self._context is None else self._context
 
     def _tell(self, eye: Eye, event: EyeEvent) -> None:
-        if isinstance(event, EyeReady) and event.is_complete:
+        if isinstance(event, EyeReady):
             self._needs_arrays = False  # perhaps not of this eye
             self._say(f"{eye} eye: ready after {event.build_ms:.0f} ms")
         elif isinstance(event, EyeFailed) and not isinstance(
@@ -170,7 +170,7 @@ class LocalFilter:
                 self._used_dpt(picture, view.generation, view.focus_dpt)
                 for view, picture in zip(seen.views, frame.pictures, strict=True)
             ),
-            seen.is_complete,
+            True,
             seen.notes,
             {
                 "filter_ms": sum(stages_ms.values()),

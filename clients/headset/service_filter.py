@@ -170,7 +170,7 @@ class ServiceFilter:
             elif isinstance(event, ErrorReply):
                 self._on_way.pop(event.frame_id, None)
                 self._take_error(event)
-            elif isinstance(event, Ready) and event.is_complete:
+            elif isinstance(event, Ready):
                 self._say(f"{event.eye} eye: ready after {event.build_ms:.0f} ms")
 
     def _take_error(self, reply: ErrorReply) -> None:
@@ -204,7 +204,7 @@ class ServiceFilter:
             views,
             answer.colors,
             tuple(self._used_focus_dpt(header, view) for view in header.views),
-            header.is_complete,
+            True,
             header.notes,
             {
                 "filter_ms": filter_ms - _added_ms(header.stage_times_ms),
@@ -217,9 +217,9 @@ class ServiceFilter:
     def _used_focus_dpt(self, header: Result, view: ResultView) -> float | None:
         """Return the focus of a view; None if the requested eye was not used."""
         if view.profile_id is None:  # a service that supports one eye only
-            return header.focus_dpt if header.is_complete else None
+            return header.focus_dpt
         asked = self._asked.get(view.eye)
-        if asked is None or asked[0] != view.profile_id or not view.is_complete:
+        if asked is None or asked[0] != view.profile_id:
             return None
         return view.focus_dpt
 

@@ -98,7 +98,7 @@ export class FilterClient {
           await this.await_(isReady, "the eye to be ready", ours, 12 * this.timeoutMs);
         }
         ready = arrived.shift();
-        missing -= ready.is_complete ? 1 : 0;
+        missing -= 1;
       }
       return ready;
     } finally {

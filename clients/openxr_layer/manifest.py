@@ -9,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import json
 import os
-import sysconfig
 from pathlib import Path
 from typing import Literal
 
@@ -35,8 +34,7 @@ def library() -> Path:
         If it was not built, or cannot be loaded.
     """
     given = os.environ.get(LIBRARY_VARIABLE)
-    suffix = sysconfig.get_config_var("EXT_SUFFIX") or ".so"
-    path = Path(given) if given else Path(__file__).with_name(f"_layer{suffix}")
+    path = Path(given) if given else Path(__file__).with_name("_layer.so")
     if not path.is_file():
         raise NoLayer(
             "the layer was not built; it requires Linux, a C compiler and the headers "

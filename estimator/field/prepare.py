@@ -1,5 +1,6 @@
 """Preparation of the eye of a profile for PSFs: measured wavefront or traced model."""
 
+import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -73,6 +74,12 @@ def prepare_eye(
         )
     if accuracy not in ACCURACIES:
         raise ValueError(f"accuracy '{accuracy}': allowed are {', '.join(ACCURACIES)}")
+    if accuracy != "exact":
+        warnings.warn(
+            "the argument accuracy has no effect; it will be removed in version 0.3",
+            DeprecationWarning,
+            stacklevel=2,
+        )
     if eye_model == "wavefront" and not profile.is_given:
         return MeasuredWavefront.from_profile(profile), profile.notes
 
@@ -95,8 +102,6 @@ def prepare_eye(
         ),
     )
     notes = eye_notes(estimated)
-    if accuracy != "exact":
-        notes = (*notes, f"accuracy {accuracy!r} has no effect: the eye is traced")
     if np.any(field_range_deg):
         notes = (*notes, periphery_note(eye))
     return eye, (*notes, *profile.notes)

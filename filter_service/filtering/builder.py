@@ -351,7 +351,6 @@ class Builder:
                 psf_count=prepared.store.computed_count,
                 memory_mb=prepared.store.memory_mb,
                 notes=prepared.notes,
-                is_complete=True,
             )
         )
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import wait
 from pathlib import Path
@@ -281,7 +282,12 @@ class EyeFilter:
             self.builder.advance(ahead=False)
 
     def keep_going(self) -> None:
-        """Call `advance_builds`; deprecated, goes with version 0.3."""
+        """Call `advance_builds`; deprecated, will be removed in version 0.3."""
+        warnings.warn(
+            "keep_going is now advance_builds; it will be removed in version 0.3",
+            DeprecationWarning,
+            stacklevel=2,
+        )
         self.advance_builds()
 
     def advance(self) -> None:
@@ -313,7 +319,7 @@ class EyeFilter:
 
     def _outcome(self, eye: AcceptedProfile) -> EyeReady:
         """Return or raise the outcome of an eye whose builds have finished."""
-        if self.ready is not None and self.ready.eye is eye and self.ready.is_complete:
+        if self.ready is not None and self.ready.eye is eye:
             return self.ready
         if eye.failures:  # reported before
             raise eye.failures[-1][1].with_traceback(None)

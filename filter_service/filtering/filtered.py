@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,6 +15,15 @@ from filter_service.filtering.accepted_profile import AcceptedProfile
 from filter_service.rendering.filtered_view import FrameCounts, summed_counts
 from filter_service.texture_view import EarlierFrame
 from filter_service.view_state import EyeName
+
+
+def _is_complete() -> bool:
+    warnings.warn(
+        "is_complete is always true; it will be removed in version 0.3",
+        DeprecationWarning,
+        stacklevel=3,  # the reader of the property
+    )
+    return True
 
 
 @dataclass(frozen=True)
@@ -33,8 +43,6 @@ class ViewResult:
         Values used.  A profile may limit the pupil, and an eye can only add power.
     gaze_deg : (h, v)
         Gaze used.
-    is_complete : bool
-        Always true; false in earlier versions, which had previews.
     """
 
     color: NDArray[Any]
@@ -44,7 +52,11 @@ class ViewResult:
     pupil_diameter_mm: float
     focus_dpt: float
     gaze_deg: tuple[float, float]
-    is_complete: bool = True
+
+    @property
+    def is_complete(self) -> bool:
+        """Return true; deprecated, will be removed in version 0.3."""
+        return _is_complete()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,8 +155,8 @@ class Filtered(FrameCounts):
 
     @property
     def is_complete(self) -> bool:
-        """Return true; false in earlier versions, which had previews."""
-        return all(view.is_complete for view in self.views)
+        """Return true; deprecated, will be removed in version 0.3."""
+        return _is_complete()
 
 
 @dataclass(frozen=True)
@@ -206,8 +218,6 @@ class EyeReady:
         Memory of the PSFs, 10^6 bytes.
     notes : tuple of str
         Notes for the user.
-    is_complete : bool
-        Always true; false in earlier versions, which had previews.
     """
 
     eye: AcceptedProfile
@@ -216,7 +226,11 @@ class EyeReady:
     psf_count: int
     memory_mb: float
     notes: tuple[str, ...]
-    is_complete: bool
+
+    @property
+    def is_complete(self) -> bool:
+        """Return true; deprecated, will be removed in version 0.3."""
+        return _is_complete()
 
 
 @dataclass(frozen=True)

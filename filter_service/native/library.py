@@ -6,7 +6,6 @@ import ctypes
 import os
 from collections.abc import Callable
 from functools import cache
-from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +15,15 @@ from filter_service.errors import RenderFailed
 from filter_service.native import records
 
 FOLDER = Path(__file__).parent
-STEM = "_loops"
+FILE = "_loops.so"
 LIBRARY_VARIABLE = "OCUFILTER_NATIVE_LIBRARY"
 Between = ctypes.CFUNCTYPE(None)
 
 STAGES = ("pixels", "merge", "place", "blend", "splat")
 
 REMEDY = (
-    "install a C compiler (apt-get install gcc libc6-dev) and the package again, "
-    "or choose the engine gl"
+    "install a C compiler (apt-get install gcc libc6-dev) and the package again "
+    "(with pip's --no-cache-dir --force-reinstall), or choose the engine gl"
 )
 
 
@@ -154,11 +153,8 @@ def library_path() -> Path | None:
     """
     if other := os.environ.get(LIBRARY_VARIABLE):
         return Path(other)
-    for suffix in EXTENSION_SUFFIXES:
-        path = FOLDER / (STEM + suffix)
-        if path.exists():
-            return path
-    return None
+    path = FOLDER / FILE
+    return path if path.exists() else None
 
 
 @cache

@@ -69,11 +69,14 @@ def eye_for_spec(
         wavelengths_nm=spec.traced_wavelengths_nm,
         field_range_deg=_with_axis(spec.field_range_deg),
         eye_model=settings.eye_model,
-        accuracy=settings.accuracy,
         progress=report,
     )
-    if settings.lateral_color and isinstance(eye, MeasuredWavefront):
-        notes = (*notes, NO_LATERAL_COLOR)
+    if isinstance(eye, MeasuredWavefront):
+        if settings.lateral_color:
+            notes = (*notes, NO_LATERAL_COLOR)
+    elif settings.accuracy != "exact":
+        accuracy = f"accuracy {settings.accuracy!r}"
+        notes = (*notes, f"{accuracy} has no effect: the eye is traced")
     if depends_on_gaze(profile.correction) and any(settings.gaze_range_deg):
         notes = (*notes, ONE_GAZE)
     return eye, notes

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import ctypes
 from functools import cache
-from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from typing import Any
 
 import zmq
 
-STEM = "_drop_parts"
+FILE = "_drop_parts.so"
 CALLS = ("init", "recv", "more", "close")
 
 
@@ -66,9 +65,7 @@ def drop_parts_in_python(socket: zmq.Socket[Any], max_count: int) -> tuple[int, 
 @cache
 def _compiled() -> tuple[ctypes.CDLL, _ZmqCalls] | None:
     """Return the compiled loop and libzmq's functions; None if either is missing."""
-    folder = Path(__file__).parent
-    found = (folder / f"{STEM}{suffix}" for suffix in EXTENSION_SUFFIXES)
-    path = next((path for path in found if path.is_file()), None)
+    path = Path(__file__).with_name(FILE)
     try:
         from zmq.backend.cython import _zmq
 
@@ -80,7 +77,7 @@ def _compiled() -> tuple[ctypes.CDLL, _ZmqCalls] | None:
                 for name in CALLS
             )
         )
-        library = None if path is None else ctypes.CDLL(str(path))
+        library = ctypes.CDLL(str(path)) if path.is_file() else None
     except (ImportError, OSError, AttributeError):
         return None
     if library is None:

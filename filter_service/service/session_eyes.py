@@ -157,7 +157,6 @@ class SessionEyes:
                 memory_mb=event.memory_mb,
                 pixel_pitch_mrad=event.camera.pixel_pitch_mrad,
                 notes=event.notes,
-                is_complete=event.is_complete,
                 eye=name,
             )
         else:

@@ -134,7 +134,7 @@ class Progress(Message):
 class Ready(Message):
     """The PSFs of a profile are computed; from now on, frames are filtered with them.
 
-    ``is_complete`` is always true; it was false in releases that had previews.
+    ``is_complete`` is deprecated and always true.
     """
 
     profile_id: Id
@@ -182,8 +182,8 @@ class ResultView(Record):
 class Result(Message):
     """A filtered frame, with everything that determines how it looks.
 
-    Fields that a view also has are those of the first view; ``is_complete`` is true if
-    it is true for all views.
+    Fields that a view also has are those of the first view.  ``is_complete`` is
+    deprecated and always true.
     """
 
     frame_id: Id

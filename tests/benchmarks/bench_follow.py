@@ -80,7 +80,7 @@ class Following:
         self.filter.wait(WAIT_S)
 
     def _note(self, event: object) -> None:
-        if isinstance(event, EyeReady) and event.is_complete:
+        if isinstance(event, EyeReady):
             self.ready_s.append(time.monotonic())
 
     def __enter__(self) -> "Following":
@@ -129,7 +129,7 @@ class Following:
             )
             seen.times_ms.append(1e3 * (time.perf_counter() - begin_s))
             end_s = time.monotonic()
-            is_whole = shown is not None and shown.is_complete
+            is_whole = shown is not None
             seen.n_whole += is_whole and end_s - due_s <= 2.0 / rate_hz
             if is_whole and shown.generation > 1:
                 seen.new_eye_s = min(seen.new_eye_s, end_s - changed_s)

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from clients.filter_client import FilterClient
+from clients.filter_client import FilterClient, FilteredFrame
 from clients.service_process import CHECKOUT, ServiceProcess
 from filter_service.errors import ServiceTimeout
-from filter_service.messages import Ping
+from filter_service.messages import Dropped, Ping
 from tests.end_to_end.conftest import TIMEOUT_S, make_view, small_frame
 
 pytestmark = pytest.mark.clock
@@ -105,6 +105,49 @@ def test_frames_on_their_way_to_a_killed_service_are_reported_as_lost(start_serv
         ]
         with pytest.raises(ServiceTimeout, match="connection lost"):
             client.ping(timeout_s=0.3)
+
+
+@pytest.mark.parametrize(
+    ("transport", "in_flight"), [("messages", 1), ("shared memory", 2)]
+)
+def test_every_frame_of_a_stream_is_reported_while_the_service_is_upgraded(
+    start_service, transport, in_flight
+):
+    service = start_service(filter_ms=20)
+    view = make_view()
+    with FilterClient(
+        service.endpoint,
+        timeout_s=TIMEOUT_S,
+        max_in_flight=in_flight,
+        shared_memory=transport == "shared memory",
+    ) as client:
+        client.set_profile(EYE, views=[view])
+        submitted, events = [], []
+
+        def stream(is_over):
+            end_s = time.monotonic() + TIMEOUT_S
+            while not is_over():
+                assert time.monotonic() < end_s
+                submitted.append(client.submit(view, **SEE))
+                events.extend(client.poll(0.005))
+
+        stream(lambda: sum(isinstance(e, FilteredFrame) for e in events) > 5)
+        service.process.send_signal(signal.SIGTERM)
+        stream(lambda: service.process.poll() is not None)
+        n_before = len(submitted)
+        stream(lambda: len(submitted) > n_before + 20)
+        start_service(filter_ms=20, bind=service.endpoint)
+        first = len(events)
+        stream(lambda: sum(isinstance(e, FilteredFrame) for e in events[first:]) > 5)
+        while client.n_unanswered:
+            events.extend(client.poll(TIMEOUT_S))
+        answers = [e for e in events if getattr(e, "frame_id", None) is not None]
+        assert sorted(e.frame_id for e in answers) == submitted
+        reasons = {e.reason for e in answers if isinstance(e, Dropped)}
+        assert reasons <= {"superseded", "connection_lost", "preparing"}
+        lost = [e for e in answers if getattr(e, "reason", "") == "connection_lost"]
+        assert 1 <= len(lost) <= in_flight + 1  # with memory, also the queued frame
+        assert answers[-1].color[0, 0, 0] == 5  # the profile was sent again
 
 
 @pytest.mark.parametrize("name", ["supervisor", "front-end", "render"])

@@ -14,6 +14,8 @@
 # HEADSET_ROOT selects the chroot (default: .headset in the checkout).  Mounts are
 # private to the command.  Signals are passed on, and the exit status is the command's.
 # It is 77 if the command may not run on this machine or if the chroot does not exist.
+#
+# The command runs as root.  As in setup_root.sh, sudo never runs unasked.
 set -eu
 here=$(cd "$(dirname "$0")" && pwd)
 checkout=$(cd "$here/../.." && pwd)
@@ -29,15 +31,13 @@ if [ "${1:-}" != --mounting ]; then
         echo "headset: no chroot in $root; to create it:  sh $here/setup_root.sh" >&2
         exit 77
     fi
-    prefix=
-    if [ "$(id -u)" != 0 ]; then
-        prefix="sudo -n"
-        if ! $prefix true 2>/dev/null; then
-            echo "headset: running commands in $root requires root permissions" >&2
-            exit 77
-        fi
+    . "$checkout/ask_sudo.sh"
+    if ! may_run_as_root "sudo sh $here/run_in_root.sh $*"; then
+        echo "headset: running commands in $root requires root; run:" \
+            "sudo HEADSET_ROOT=$root sh $here/run_in_root.sh $*" >&2
+        exit 77
     fi
-    exec $prefix unshare --mount $network \
+    exec $as_root unshare --mount $network \
         sh "$here/run_in_root.sh" --mounting "${network:-online}" "$root" "$@"
 fi
 

@@ -9,6 +9,10 @@
 #                                             $HEADSET_APPLICATIONS_ROOT, or
 #                                             .headset-applications; 4 GB
 #
+# Creating a chroot requires root.  For other users, the script asks on a terminal before it
+# runs sudo.  Otherwise it prints the command.  With --yes as the first argument, or
+# OCUFILTER_SETUP_YES=1 in the environment, it does not ask.
+#
 # Monado is available in Debian since trixie, so the chroot is trixie on any host.  Its
 # packages come from the mirror that the host's apt uses, or from DEBIAN_MIRROR.  Use
 # run_in_root.sh to run commands in it.  Running this script again takes a fraction of a
@@ -20,7 +24,12 @@
 set -eu
 here=$(cd "$(dirname "$0")" && pwd)
 checkout=$(cd "$here/../.." && pwd)
+. "$checkout/ask_sudo.sh"
 kind=
+if [ "${1:-}" = --yes ]; then
+    OCUFILTER_SETUP_YES=1
+    shift
+fi
 if [ "${1:-}" = --applications ]; then
     kind=$1
     shift
@@ -74,11 +83,12 @@ in_root() { HEADSET_ROOT=$root sh "$here/run_in_root.sh" --online "$@"; }
 # --- requirements -------------------------------------------------------------
 
 check_rights() {
-    if [ "$(id -u)" != 0 ]; then
-        if ! sudo -n true 2>/dev/null; then
-            cannot "creating a chroot requires root, or sudo without a password"
-        fi
-        sudo -n --preserve-env sh "$here/setup_root.sh" $kind "$root" || exit $?
+    command="sudo --preserve-env sh $here/setup_root.sh${kind:+ $kind} $root"
+    if ! may_run_as_root "$command"; then
+        cannot "creating a chroot requires root; run:  $command"
+    fi
+    if [ -n "$as_root" ]; then
+        $as_root --preserve-env sh "$here/setup_root.sh" $kind "$root" || exit $?
         exit 0
     fi
     if ! unshare --mount --net sh -c 'mount -t tmpfs tmpfs /mnt && chroot / true' \

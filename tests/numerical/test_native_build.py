@@ -4,11 +4,13 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from filter_service import constants
 from filter_service.native import records
+from filter_service.native.library import compiled_library, library_path
 from tests.native_build import COMPILER, build_library, runtime_of
 from tests.source_tree import ROOT
 
@@ -35,6 +37,16 @@ def test_numbers_of_the_sources_are_those_of_python():
     assert len(defined) > 10
     for name, value in defined.items():
         assert float(value) == getattr(constants, name), name
+
+
+def test_processors_with_avx2_use_it():
+    """However the library was linked: one that says no is correct but slow."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if not cpuinfo.exists() or library_path() is None:
+        pytest.skip("needs Linux and the native engine")
+    flags = re.search(r"^flags\s*:(.*)$", cpuinfo.read_text(), re.MULTILINE)
+    has_avx2 = flags is not None and {"avx2", "fma"} <= set(flags[1].split())
+    assert compiled_library().variant == ("avx2" if has_avx2 else "portable")
 
 
 def test_packed_words_are_those_of_python():

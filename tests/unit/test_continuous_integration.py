@@ -23,9 +23,17 @@ def _suites() -> list[str]:
 def test_every_suite_that_is_named_runs():
     page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     named = re.findall(
-        r"^\| `make (check|docs|test|test-[a-z-]+)` ", page, re.MULTILINE
+        r"^\| `make (check|docs|release-check|test|test-[a-z-]+)` ", page, re.MULTILINE
     )
     assert sorted(_suites()) == sorted(named)
+
+
+def test_the_hosted_workflow_runs_the_same_suites():
+    text = (ROOT / ".github/workflows/test.yml").read_text(encoding="utf-8")
+    listed = re.search(r"^ +suite:\n((?: +- [a-z-]+\n)+)", text, re.MULTILINE)[1]
+    matrix = set(re.findall(r"- ([a-z-]+)$", listed, re.MULTILINE))
+    jobs = set(re.findall(r"run: make ([a-z-]+)$", text, re.MULTILINE))
+    assert matrix <= set(_suites()) <= matrix | jobs
 
 
 @pytest.fixture

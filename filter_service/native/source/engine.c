@@ -1,6 +1,9 @@
 /* Functions that Python calls. */
 #include <pthread.h>
 #include <stdlib.h>
+#if defined(__x86_64__)
+#include <cpuid.h>
+#endif
 
 #include "color.h"
 #include "loops.h"
@@ -10,6 +13,18 @@
 extern const loops loops_any;
 #if defined(__x86_64__)
 extern const loops loops_avx2;
+
+/* Returns whether the processor and the system support AVX2 and FMA.  Not
+ * __builtin_cpu_supports, which reads a variable of the compiler's runtime library: that of
+ * zig never sets it. */
+static int has_avx2(void) {
+    unsigned a, b, c, d, enabled;
+    const unsigned needed = bit_FMA | bit_OSXSAVE | bit_AVX;
+    if (!__get_cpuid(1, &a, &b, &c, &d) || (c & needed) != needed) return 0;
+    if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || !(b & bit_AVX2)) return 0;
+    __asm__("xgetbv" : "=a"(enabled), "=d"(d) : "c"(0));
+    return (enabled & 6u) == 6u; /* the system saves the registers */
+}
 #endif
 
 /* Makes tables and returns the loops for this processor; `portable` selects those for every
@@ -18,9 +33,7 @@ EXPORT const loops *ocu_loops(int portable) {
     static pthread_once_t once = PTHREAD_ONCE_INIT;
     pthread_once(&once, make_color_tables);
 #if defined(__x86_64__)
-    __builtin_cpu_init();
-    if (!portable && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
-        return &loops_avx2;
+    if (!portable && has_avx2()) return &loops_avx2;
 #else
     (void)portable;
 #endif

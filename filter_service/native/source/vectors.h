@@ -125,7 +125,7 @@ INLINE f32x8 size8(f32x8 value) {
 }
 
 INLINE f32x8 root8(f32x8 value) {
-#ifdef OCU_AVX2
+#if defined(OCU_AVX2) && !defined(__clang__) /* clang makes one instruction of the loop */
     return __builtin_ia32_sqrtps256(value);
 #else
     for (int i = 0; i < 8; ++i) value[i] = __builtin_sqrtf(value[i]);

@@ -1,0 +1,121 @@
+"""Deprecated names warn, and are gone with the version that was announced."""
+
+import re
+import tomllib
+import warnings
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from clients import FilterClient
+from estimator import parse_profile, prepare_eye
+from filter_service import (
+    Camera,
+    EyeFilter,
+    EyeReady,
+    Filtered,
+    FilterSettings,
+    RgbdView,
+)
+from filter_service.filtering.filtered import ViewResult
+from filter_service.messages import PROTOCOL_VERSION
+from tests.source_tree import PACKAGES, ROOT, python_files
+
+CAMERA = Camera(32, 16, (-0.1, 0.1, 0.05, -0.05))
+COUNTS = ("missing_depth", "clamped_depth", "bad_color")
+PROFILE = {"kind": "prescription", "sphere_dpt": -1.0}
+
+
+def _version(text: str) -> tuple[int, ...]:
+    return tuple(map(int, text.split(".")[:2]))
+
+
+def _current() -> tuple[int, ...]:
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    return _version(tomllib.loads(text)["project"]["version"])
+
+
+def _rows() -> list[list[str]]:
+    page = (ROOT / "docs/reference/versions.md").read_text(encoding="utf-8")
+    table = page.partition("## Deprecations")[2]
+    rows = [line.strip("| ").split(" | ") for line in re.findall(r"^\|.*", table, re.M)]
+    return rows[2:]
+
+
+def test_no_announced_removal_is_overdue():
+    removals = [row[3] for row in _rows()]
+    assert len(removals) > 5
+    for removal in removals:
+        if removal.startswith("protocol "):
+            assert int(removal.split()[1]) > PROTOCOL_VERSION
+        else:
+            assert _version(removal) > _current()
+
+
+def test_every_warning_names_a_version_to_come():
+    files = [path for package in PACKAGES for path in python_files(package)]
+    texts = [path.read_text(encoding="utf-8") for path in files]
+    n_warnings = sum(text.count("DeprecationWarning,") for text in texts)
+    versions = [
+        version
+        for text in texts
+        for version in re.findall(r"will be removed in version (\d\.\d+)\"", text)
+    ]
+    assert len(versions) == n_warnings > 3
+    assert all(_version(version) > _current() for version in versions)
+
+
+def test_the_setting_accuracy():
+    for settings in ({"accuracy": "fast"}, FilterSettings(accuracy="fast")):
+        with pytest.warns(DeprecationWarning, match="version 0.3") as caught:
+            EyeFilter(None, CAMERA, settings).close()
+        assert [warning.filename for warning in caught] == [__file__]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        EyeFilter(None, CAMERA, FilterSettings(accuracy="exact")).close()
+
+
+def test_the_argument_accuracy():
+    with pytest.warns(DeprecationWarning, match="version 0.3") as caught:
+        prepare_eye(
+            parse_profile(PROFILE),
+            pupil_diameters_mm=np.array([4.0]),
+            focus_range_dpt=(0.0, 0.0),
+            wavelengths_nm=np.array([555.0]),
+            eye_model="wavefront",
+            accuracy="fast",
+        )
+    assert [warning.filename for warning in caught] == [__file__]
+
+
+def test_keep_going():
+    with EyeFilter(None, CAMERA) as eye_filter:
+        with pytest.warns(DeprecationWarning, match="advance_builds") as caught:
+            eye_filter.keep_going()
+    assert [warning.filename for warning in caught] == [__file__]
+
+
+def test_prepared_only(tmp_path):
+    color, depth_m = np.zeros((16, 32, 3), np.uint8), np.ones((16, 32), np.float32)
+    view = RgbdView(color, depth_m, CAMERA.tangents)
+    with closing(FilterClient(f"ipc://{tmp_path}/nobody")) as client:
+        with pytest.warns(DeprecationWarning, match="version 0.3") as caught:
+            client.submit(
+                view,
+                pupil_diameter_mm=4.0,
+                focus_dpt=0.0,
+                prepared_only=True,
+            )
+    assert [warning.filename for warning in caught] == [__file__]
+
+
+def test_is_complete():
+    view = ViewResult(np.zeros((1, 1, 3)), "both", 1, 1, 4.0, 0.0, (0.0, 0.0))
+    counts = dict.fromkeys((f"{name}_count" for name in COUNTS), 0)
+    whole = Filtered(views=(view,), notes=(), stage_times_ms={}, **counts)
+    ready = EyeReady(None, CAMERA, 1.0, 1, 1.0, ())
+    for result in (view, whole, ready):
+        with pytest.warns(DeprecationWarning, match="version 0.3") as caught:
+            assert result.is_complete is True
+        assert [warning.filename for warning in caught] == [__file__]
