@@ -24,8 +24,15 @@ BLUR_STEP, BLUR_UNIT_PX = 0.05, 10.0
 """Sources share a kernel of light if their blur differs by less than 5 % or 0.5 px."""
 
 MAX_KINDS, MAX_KINDS_PX = 24, 40_000
-"""Largest number of kinds, and of the pixels of their kernels.  Those with the most
-light per pixel are kept; other sources have distant light only."""
+"""Largest number of kinds, and of the pixels of their kernels.  Those are kept to which
+the most light per pixel is similar."""
+
+MAX_CANDIDATES = 64
+"""Kinds, with the most light per pixel, among which those to keep are searched."""
+
+SIMILAR_STEPS = 5
+"""Largest difference in rows, columns or steps of blur up to which a source has the
+near light of another kind; others have distant light only."""
 
 END_PX = 6.0
 """Estimated distance from the rays of the spot to the end of a kernel."""
@@ -99,8 +106,8 @@ class SourceKinds:
     ----------
     of_source : (m,)
         Kind of each source.
-    is_own : (m,)
-        Whether a source is of this kind, and not only similar.
+    is_similar : (m,)
+        Whether a source is near enough to this kind to have its near light.
     place : (n, 3)
         Row and column of the cell, and blur in steps.
     cell, interval, layer_dpt : (n,)
@@ -109,7 +116,7 @@ class SourceKinds:
     """
 
     of_source: NDArray[np.int64]
-    is_own: NDArray[np.bool_]
+    is_similar: NDArray[np.bool_]
     place: NDArray[np.int64]
     cell: NDArray[np.int64]
     interval: NDArray[np.int64]
@@ -140,10 +147,11 @@ class SourceKinds:
         order = np.lexsort((brightness, of_source))
         first = order[np.flatnonzero(np.diff(of_source[order], append=-1))]
         light = np.bincount(of_source, brightness).astype(np.float64)
-        kept = _kept(light, blur_px[first])
-        similar = _nearest(place, place[kept])
-        is_own = np.isin(np.arange(len(place)), kept)[of_source]
-        of_source, place, first = similar[of_source], place[kept], first[kept]
+        kept = _kept(place, light, blur_px[first])
+        nearest = _nearest(place, place[kept])
+        difference = np.abs(place - place[kept][nearest]).max(axis=1)
+        is_similar = (difference <= SIMILAR_STEPS)[of_source]
+        of_source, place, first = nearest[of_source], place[kept], first[kept]
         interval = np.searchsorted(steps_dpt, layer_dpt[first], side="right") - 1
         interval = np.clip(interval, 0, interval_count(layers) - 1)
         upper = np.minimum(interval + 1, steps_dpt.size - 1)
@@ -153,7 +161,7 @@ class SourceKinds:
         )
         return cls(
             of_source,
-            is_own,
+            is_similar,
             place,
             cell[first],
             interval,
@@ -180,13 +188,29 @@ class SourceKinds:
 
 
 def _kept(
-    light: NDArray[np.float64], blur_px: NDArray[np.float64]
+    place: NDArray[np.int64], light: NDArray[np.float64], blur_px: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Return the kinds (n,) with the most light per pixel of their kernels."""
+    """Return the kinds to keep, in order, of kinds at places (n, 3)."""
     kernel_px = (3.0 * np.sqrt(2.0) * (blur_px + END_PX)) ** 2
-    order = np.argsort(-light / kernel_px, kind="stable")[:MAX_KINDS]
-    count = max(int(np.searchsorted(np.cumsum(kernel_px[order]), MAX_KINDS_PX)), 1)
-    return np.sort(order[:count])
+    if len(place) <= MAX_KINDS and kernel_px.sum() <= MAX_KINDS_PX:
+        return np.arange(len(place))
+    brightness = (light / kernel_px).astype(np.float32)
+    candidates = np.argsort(-brightness, kind="stable")[:MAX_CANDIDATES]
+    difference = np.abs(place[candidates, None] - place).max(axis=2)
+    # Of a candidate's kernel for each kind: 1 for its own, 0 for those not similar.
+    quality = np.maximum(1.0 - difference / (SIMILAR_STEPS + 1.0), 0.0)
+    quality = quality.astype(np.float32)
+    reached, total_px = np.zeros(len(place), np.float32), 0.0
+    kept: list[int] = []
+    while len(kept) < MAX_KINDS:
+        gain = np.maximum(quality - reached, 0.0) @ brightness
+        best = int(gain.argmax())
+        total_px += kernel_px[candidates[best]]
+        if not gain[best] > 0.0 or (kept and total_px > MAX_KINDS_PX):
+            break
+        kept.append(int(candidates[best]))
+        reached = np.maximum(reached, quality[best])
+    return np.sort(kept)
 
 
 def _nearest(place: NDArray[np.int64], kept: NDArray[np.int64]) -> NDArray[np.int64]:

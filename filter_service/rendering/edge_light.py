@@ -370,7 +370,7 @@ class EdgeLight:
         from filter_service.rendering.bright_pixel_loops import dim_pixels
 
         n = self._kinds.cell.size
-        ratio = np.empty((2 * n, RGB))  # of own kinds, and of similar ones
+        ratio = np.empty((2 * n, RGB))  # with near light, and with distant light only
         for radius_px, near in self._near.items():
             kinds = np.flatnonzero(self._radius_px == radius_px)  # the first kernels
             ratio[kinds] = near[: kinds.size].sum(axis=(1, 2), dtype=np.float64)
@@ -380,7 +380,7 @@ class EdgeLight:
             beyond = self._polar[kinds, :, at].mean(axis=1)
             ratio[n + kinds] = 2.0 * np.pi * beyond / middle_px
             ratio[kinds] += ratio[n + kinds]
-        kind = np.where(self._kinds.is_own, 0, n) + self._kinds.of_source
+        kind = np.where(self._kinds.is_similar, 0, n) + self._kinds.of_source
         pixels, colors = self._pixels, []
         for surface, color in enumerate(view.surface_colors):
             here = slice(None)
@@ -435,9 +435,9 @@ class EdgeLight:
     def _add_near(
         self, color: NDArray[np.float32], radius_px: int, near: NDArray[np.float32]
     ) -> None:
-        """Add the light near sources, of those with a kernel of their own kind."""
+        """Add the light near sources, of those that are similar to their kind."""
         own = self._kernels_with(radius_px)
-        here = np.isin(self._kernel, own) & self._kinds.is_own[self._sources]
+        here = np.isin(self._kernel, own) & self._kinds.is_similar[self._sources]
         products, pitch_px = np.count_nonzero(here) * near.shape[1] ** 2, 1
         while products > MAX_NEAR_PRODUCTS and pitch_px < 27:
             products, pitch_px = products // 9, 3 * pitch_px

@@ -301,10 +301,12 @@ def scattered(rng):
     return color, np.broadcast_to(depth_m, (HEIGHT, WIDTH)).copy()
 
 
+@pytest.mark.parametrize("max_kinds", [edge_kinds.MAX_KINDS, 4])
 def test_shared_kernels_and_merged_pixels_are_near_the_exact_sum(
-    engine, rng, monkeypatch
+    engine, rng, monkeypatch, max_kinds
 ):
     """Of the light added, as rms: 15 %; without limits, every pixel is by itself."""
+    monkeypatch.setattr(edge_kinds, "MAX_KINDS", max_kinds)
     bench = bench_of(engine)
     color, depth_m = scattered(rng)
     limited, plain = (f(bench, color, depth_m) for f in (seen, without))
