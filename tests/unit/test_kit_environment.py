@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from packaging.requirements import Requirement
 
 from tests.gpu_kit import environment
 from tests.source_tree import ROOT
@@ -25,7 +26,8 @@ def packages(name: str) -> set[str]:
 
 def test_all_that_the_service_needs_is_carried_or_expected():
     text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-    needed = {n.lower() for n in tomllib.loads(text)["project"]["dependencies"]}
+    required = tomllib.loads(text)["project"]["dependencies"]
+    needed = {Requirement(requirement).name.lower() for requirement in required}
     assert needed <= packages("CARRIED") | packages("EXPECTED")
     assert not packages("CARRIED") & packages("EXPECTED")
     named = {names.split()[0] for names in environment.EXPECTED.values()}
