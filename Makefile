@@ -13,7 +13,7 @@ NO_TESTS := test $$? -eq 5 # pytest's exit status if ARGS selects none of these 
 BENCHES := $(filter-out gpu soak witness,$(patsubst tests/benchmarks/bench_%.py,%,$(sort $(wildcard tests/benchmarks/bench_*.py))))
 
 .DEFAULT_GOAL := help
-.PHONY: demo docs web test test-training test-examples test-batch-ray test-headset test-layer test-layer-applications test-web test-workflows validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-workflows setup-witness setup-peers peers release release-check setup-release setup-release-check
+.PHONY: demo docs web test test-timed test-training test-examples test-batch-ray test-headset test-layer test-layer-applications test-web test-workflows validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-workflows setup-witness setup-peers peers release release-check setup-release setup-release-check
 
 demo: setup  ## filter two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
@@ -24,10 +24,12 @@ web: setup-page  ## open a web page for your own prescription and photograph
 docs: setup-docs  ## build the documentation in strict mode; writes out/docs/
 	NO_MKDOCS_2_WARNING=1 .docs/bin/python -m mkdocs build --quiet --strict $(ARGS)
 
-test: setup-test  ## run all tests except slow ones and those for a hardware GPU
+test: setup-test  ## run the tests, except slow ones and those that measure time or need a GPU
 	$(PYTHON) -m pytest $(UNTIMED) $(PARALLEL) tests/unit tests/numerical $(ARGS) || $(NO_TESTS)
 	$(PYTHON) -m pytest $(UNTIMED) $(PARALLEL) tests/end_to_end $(ARGS) || $(NO_TESTS)
-	$(PYTHON) -m pytest $(TIMED) tests/end_to_end $(ARGS) || $(NO_TESTS)
+
+test-timed: setup-test  ## run the tests that measure time, one at a time
+	$(PYTHON) -m pytest $(TIMED) tests/end_to_end $(ARGS)
 
 test-training: setup-training  ## run the training tests, with torch, and a short training run
 	$(PYTHON) -m pytest tests/training $(ARGS)
