@@ -1,7 +1,7 @@
 // A native range input, so that the browser provides its role, keys and touch.
 //
-// It keeps its own value while it is dragged, so that the server's response to an older
-// value does not move it back.
+// It keeps its own value until the server has answered its last report, so that the
+// response to an older value does not move it back.
 const THROTTLE_MS = 30; // between two reported values
 const PAGE_STEPS = 10; // steps of a Page key
 
@@ -18,17 +18,23 @@ export default {
     </div>`,
   props: {
     name: String, label: String, text: String, min: Number, max: Number,
-    step: Number, value: Number, disabled: Boolean,
+    step: Number, value: Number, answered: Number, disabled: Boolean,
   },
   data() {
-    return { current: this.value, id: `oc-range-${Math.random().toString(36).slice(2)}` };
+    return {
+      current: this.value,
+      sent: this.answered, // number of the last report
+      id: `oc-range-${Math.random().toString(36).slice(2)}`,
+    };
   },
   watch: {
-    value(value) {
-      if (!this.waiting) this.current = value;
-    },
+    value() { this.follow(); },
+    answered() { this.follow(); },
   },
   methods: {
+    follow() {
+      if (!this.waiting && this.answered >= this.sent) this.current = this.value;
+    },
     onInput(event) {
       this.current = Number(event.target.value);
       this.report();
@@ -44,11 +50,13 @@ export default {
     },
     report() {
       if (this.waiting) return;
-      this.$emit("move", this.current);
+      this.sent += 1;
+      this.$emit("move", [this.current, this.sent]);
       const reported = this.current;
       this.waiting = setTimeout(() => {
         this.waiting = null;
         if (this.current !== reported) this.report();
+        else this.follow();
       }, THROTTLE_MS);
     },
   },

@@ -8,6 +8,9 @@ from nicegui.element import Element
 
 from clients.web.numbers import NumberField
 
+MAX_REPORTS = 2**53
+"""Largest report number that a browser represents exactly."""
+
 
 # nicegui, which takes the name of the component, has no types here
 class SliderRow(Element, component="range_slider.js"):  # type: ignore[call-arg]
@@ -47,6 +50,7 @@ class SliderRow(Element, component="range_slider.js"):  # type: ignore[call-arg]
                 "min": number.low,
                 "max": number.high,
                 "step": number.step,
+                "answered": 0,
                 "disabled": False,
             }
         )
@@ -54,8 +58,11 @@ class SliderRow(Element, component="range_slider.js"):  # type: ignore[call-arg]
         self.on("move", lambda event: self._moved(event.args))
 
     def _moved(self, sent: object) -> None:
-        value = self.number.within(sent)
-        if value is not None:
+        if not isinstance(sent, list) or len(sent) != 2:
+            return
+        value, report_number = self.number.within(sent[0]), sent[1]
+        if value is not None and type(report_number) is int:
+            self._props["answered"] = min(report_number, MAX_REPORTS)
             self.show(value)
             self._on_move(value)
 

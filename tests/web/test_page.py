@@ -144,9 +144,11 @@ def test_the_point_under_the_pointer_is_drawn(page):
 
 
 def test_a_trifocal_lens_is_chosen_and_sharper_near_than_a_monofocal_one(page):
+    number = page.number()
     page.choose("Letter chart")
     page.press("age_years", "PageUp", 4)
     page.press("distance_dpt", "PageUp", 4)
+    assert page.settle(after=number)["wanted_focus_dpt"] == 2.25  # of each key
     number = page.number()
     page.wear("Intraocular lens")
     page.settle(after=number)
