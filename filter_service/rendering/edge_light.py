@@ -351,9 +351,21 @@ class EdgeLight:
         omitted: NDArray[np.float32],
         index: NDArray[np.int64],
     ) -> NDArray[np.float32]:
+        """Return kernels (n, side, side, 3) of light for some of the kernels (n,).
+
+        Parameters
+        ----------
+        own : (n,)
+            Which kernels.
+        places : 3 of (side, side)
+            See `_places`.
+        omitted : (k, 3, side, side)
+            Share of kernels that ends before each pixel; empty for distant light.
+        index : (n,)
+            Row of ``omitted`` of each kernel.
+        """
         from filter_service.rendering.edge_light_loops import fill_kernels
 
-        """Return kernels (n, side, side, 3) of light for some of the kernels (n,)."""
         side, kind = len(places[0]), self._kernel_kind[own]
         near = (
             *(self._edges.elements, kind, self._seen[own], self._exact_px[kind]),

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.release.smoke import REQUEST
 from tests.source_tree import ROOT
 
 TIMEOUT_S = 300  # where no kernel of numba's has been compiled yet
@@ -46,26 +47,6 @@ COMPILED = {
     "filter_service/service/_drop_parts.so",
 }
 """Libraries that any C compiler makes; the OpenXR layer also needs headers."""
-
-CLIENT = """
-import json, sys
-import numpy as np
-from clients import FilterClient, ServiceProcess
-from filter_service import Camera
-
-color = np.full((36, 64, 3), 128, np.uint8)
-color[:, 32:] = 255
-depth_m = np.full((36, 64), 2.0, np.float32)
-camera = Camera.from_fov(10.0, width_px=64, height_px=36)
-settings = {"mode": "on-axis", "eye_model": "wavefront"}
-with ServiceProcess(command=sys.argv[1:]) as service:
-    with FilterClient(service.endpoint) as client:
-        client.set_profile("myopia", settings=settings, views=[camera])
-        seen = client.filter(color, depth_m, pupil_diameter_mm=4.0, focus_dpt=0.0)
-    code = service.stop()
-row = seen.color[18, :, 1].tolist()
-print(json.dumps({"shape": seen.color.shape, "row": row, "code": code}))
-"""
 
 
 def copy_checkout(folder):
@@ -269,13 +250,8 @@ def test_filter_refuses_a_bad_option_in_one_line(run, image):
 
 
 def test_serve_answers_a_client(installed):
-    serve = (installed.ocufilter, "serve")
-    finished = start(installed, installed.python, "-c", CLIENT, *serve)
+    finished = start(installed, installed.python, "-c", REQUEST, installed.ocufilter)
     assert finished.returncode == 0, finished.stderr
-    seen = json.loads(finished.stdout)
-    assert seen["shape"] == [36, 64, 3]
-    assert seen["code"] == 0
-    assert 128 < seen["row"][32] < 255  # the edge is blurred
 
 
 def test_estimate_finds_an_eye(run_json):
