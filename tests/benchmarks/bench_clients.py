@@ -15,7 +15,6 @@ processes including those that `status` does not count, and the memory without a
 """
 
 import argparse
-import json
 import math
 import os
 import threading
@@ -29,7 +28,7 @@ from clients.filter_client import FilterClient, FilteredFrame, ViewState
 from clients.service_process import ServiceProcess
 from filter_service.messages import Dropped, ErrorReply
 from tests.benchmarks.bench_roundtrip import EYES, Settings, make_frames
-from tests.benchmarks.harness import Row, print_rows, report, write_report
+from tests.benchmarks.harness import Row, publish
 
 SIZE_PX = (640, 360)
 WARM_UP_S, MEASURED_S = 1.0, 6.0
@@ -214,15 +213,8 @@ def main(argv=None) -> None:
                     reference="a result for every frame",
                 )
             )
-    content = report(rows) | {"best_runs": bests}
-    if not options.quick:
-        write_report("clients", content)
-    if options.json:
-        print(json.dumps(content))
-        return
-    print_rows(rows)
-    for best in bests:
-        print("  ".join(f"{name}={value}" for name, value in best.items()))
+    is_whole, details = not options.quick, {"best_runs": bests}
+    publish("clients", rows, as_json=options.json, is_whole=is_whole, details=details)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ beyond the first of a frame.  Writes results/upgrade.json, with the counts of ea
 """
 
 import argparse
-import json
 import tempfile
 import threading
 import time
@@ -30,7 +29,7 @@ from clients.filter_client import FilterClient, FilteredFrame, RgbdView
 from clients.service_process import SERVE_COMMAND, ServiceProcess
 from filter_service.messages import Dropped, ErrorReply
 from tests.benchmarks.bench_roundtrip import Settings, make_frames
-from tests.benchmarks.harness import Row, print_rows, report, write_report
+from tests.benchmarks.harness import Row, publish
 
 PROFILE = {"kind": "prescription", "eye_side": "OD", "sphere_dpt": -2}
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0}
@@ -213,15 +212,8 @@ def main(argv=None) -> None:
                     reference="one event for every submitted frame",
                 )
             )
-    content = report(rows) | {"runs": counts}
-    if not options.quick:
-        write_report("upgrade", content)
-    if options.json:
-        print(json.dumps(content))
-        return
-    print_rows(rows)
-    for line in counts:
-        print("  ".join(f"{name}={value}" for name, value in line.items()))
+    is_whole, details = not options.quick, {"runs": counts}
+    publish("upgrade", rows, as_json=options.json, is_whole=is_whole, details=details)
 
 
 if __name__ == "__main__":

@@ -149,15 +149,27 @@ class KeptRows:
             file.write(json.dumps({"row": asdict(row)}) + "\n")
 
 
-def publish(name: str, rows: list[Row], *, as_json: bool, is_whole: bool) -> None:
-    """Print rows as a table or as JSON, and write those of a whole run."""
-    content = report(rows)
+def publish(
+    name: str,
+    rows: list[Row],
+    *,
+    as_json: bool,
+    is_whole: bool,
+    details: dict[str, list[dict]] | None = None,
+) -> None:
+    """Print rows as a table or as JSON, and write those of a whole run.
+
+    ``details`` are lists of other figures, which are printed below the table.
+    """
+    content = report(rows) | (details or {})
     if is_whole:
         write_report(name, content)
     if as_json:
         print(json.dumps(content))
     else:
         print_rows(rows)
+        for line in (line for lines in (details or {}).values() for line in lines):
+            print("  ".join(f"{name}={value}" for name, value in line.items()))
 
 
 def print_rows(rows: list[Row]) -> None:
