@@ -24,15 +24,15 @@ BLUR_STEP, BLUR_UNIT_PX = 0.05, 10.0
 """Sources share a kernel of light if their blur differs by less than 5 % or 0.5 px."""
 
 MAX_KINDS, MAX_KINDS_PX = 24, 40_000
-"""Largest number of kinds, and of the pixels of their kernels.  Those are kept to which
-the most light per pixel is similar."""
+"""Maximum number of kinds, and of the pixels of their kernels.  If there are more, the
+kinds are selected so that the brightest sources are similar to one of them."""
 
 MAX_CANDIDATES = 64
-"""Kinds, with the most light per pixel, among which those to keep are searched."""
+"""Number of kinds to select from: those with the most light per pixel."""
 
 SIMILAR_STEPS = 5
-"""Largest difference in rows, columns or steps of blur up to which a source has the
-near light of another kind; others have distant light only."""
+"""Maximum difference in rows, columns or steps of blur at which a source uses the near
+light of another kind.  Sources that differ more have distant light only."""
 
 END_PX = 6.0
 """Estimated distance from the rays of the spot to the end of a kernel."""
@@ -107,7 +107,7 @@ class SourceKinds:
     of_source : (m,)
         Kind of each source.
     is_similar : (m,)
-        Whether a source is near enough to this kind to have its near light.
+        Whether a source is similar enough to its kind to use the kind's near light.
     place : (n, 3)
         Row and column of the cell, and blur in steps.
     cell, interval, layer_dpt : (n,)
@@ -190,14 +190,24 @@ class SourceKinds:
 def _kept(
     place: NDArray[np.int64], light: NDArray[np.float64], blur_px: NDArray[np.float64]
 ) -> NDArray[np.int64]:
-    """Return the kinds to keep, in order, of kinds at places (n, 3)."""
+    """Return the indices (k,) of the kinds to keep, ascending.
+
+    Parameters
+    ----------
+    place : (n, 3)
+        See `SourceKinds`.
+    light : (n,)
+        Light of all sources of a kind.
+    blur_px : (n,)
+    """
     kernel_px = (3.0 * np.sqrt(2.0) * (blur_px + END_PX)) ** 2
     if len(place) <= MAX_KINDS and kernel_px.sum() <= MAX_KINDS_PX:
         return np.arange(len(place))
     brightness = (light / kernel_px).astype(np.float32)
     candidates = np.argsort(-brightness, kind="stable")[:MAX_CANDIDATES]
     difference = np.abs(place[candidates, None] - place).max(axis=2)
-    # Of a candidate's kernel for each kind: 1 for its own, 0 for those not similar.
+    # How well the kernel of a candidate represents each kind: 1 for its own, 0 for
+    # kinds that are not similar.
     quality = np.maximum(1.0 - difference / (SIMILAR_STEPS + 1.0), 0.0)
     quality = quality.astype(np.float32)
     reached, total_px = np.zeros(len(place), np.float32), 0.0
@@ -231,7 +241,8 @@ class EdgeElements:
     ----------
     elements : (n, 3, 8, N_EDGE + 1), float32
         x and y of slopes, tangents and normals, lengths times the strength of the
-        light, and sines of the angle to the next tangent; the first comes again.
+        light, and sines of the angle to the next tangent.  The first element is
+        repeated at the end.
     shift_px : (n, N_EDGE, 2)
         Displacement of rays to the elements, per diopter.
     """

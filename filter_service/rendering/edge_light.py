@@ -447,7 +447,7 @@ class EdgeLight:
     def _add_near(
         self, color: NDArray[np.float32], radius_px: int, near: NDArray[np.float32]
     ) -> None:
-        """Add the light near sources, of those that are similar to their kind."""
+        """Add the near light of the sources that are similar to their kind."""
         own = self._kernels_with(radius_px)
         here = np.isin(self._kernel, own) & self._kinds.is_similar[self._sources]
         products, pitch_px = np.count_nonzero(here) * near.shape[1] ** 2, 1

@@ -154,7 +154,7 @@ def _edge_light(x, y, edge, seen, scratch):
     ----------
     edge : (8, n_edge + 1), float32
         x and y of slopes, tangents and normals, lengths, and sines of the angle to the
-        next tangent; the first element comes again.
+        next tangent.  The first element is repeated at the end.
     seen : (n_edge,), float32
         Visible share of the edge from each element to the next.
     scratch : (2, n_edge + 1), float32

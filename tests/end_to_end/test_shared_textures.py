@@ -131,7 +131,7 @@ def has_no_more(service, before):
 
 
 def has_few_maps(service, before=(0, 0, 0)):
-    """Whether no memory was mapped, except that Mesa 25 may still use."""
+    """Whether at most the memory of textures that Mesa may still bind was added."""
     return leaks(service)[2] <= max(before[2], MAX_BOUND)
 
 
