@@ -15,6 +15,7 @@ from clients.batch.video_writing import (
     join_segments,
     write_segment,
 )
+from filter_service.atomic_files import replace_atomically
 
 _GIF_WIDTH_PX = 1200
 
@@ -45,11 +46,17 @@ def write_video(
     kind, rate_hz = VIDEO_KINDS["h264"], frames_per_second
     try:
         write_segment(segment, enumerate(frames()), kind=kind, rate_hz=rate_hz)
-        join_segments(target, [(0, segment)], kind=kind, rate_hz=rate_hz)
+        replace_atomically(
+            target,
+            lambda part: join_segments(
+                part, [(0, segment)], kind=kind, rate_hz=rate_hz
+            ),
+        )
     except (OSError, ValueError, EncodingFailed):  # libx264 is missing or fails
-        target.unlink(missing_ok=True)
         target = stem.with_suffix(".gif")
-        _write_gif(target, frames(), frames_per_second)
+        replace_atomically(
+            target, lambda part: _write_gif(part, frames(), frames_per_second)
+        )
     segment.unlink(missing_ok=True)
     return target
 

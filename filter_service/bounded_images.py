@@ -402,18 +402,20 @@ def _count(file: BinaryIO, marker: bytes) -> int:
 # --- .npy ---------------------------------------------------------------------
 
 
-def read_npy(path: Path, *, option: str = "") -> NDArray[Any]:
+def read_npy(
+    path: Path, *, option: str = "", content: bytes | None = None
+) -> NDArray[Any]:
     """Return the array of a ``.npy`` file of bool, integers or floats.
 
     The shape in the header is compared with the file's size and the limits before any
-    memory is allocated.
+    memory is allocated.  ``content`` is that of the file, if it has been read.
 
     Raises
     ------
     InvalidFile
     """
     try:
-        with open(path, "rb") as file:
+        with open(path, "rb") if content is None else io.BytesIO(content) as file:
             return _npy_array(file, _size_of(file))
     except _InvalidImage as error:
         raise InvalidFile(path, error.found, error.allowed, option) from None
@@ -434,7 +436,10 @@ def _npy_array(file: BinaryIO, size_bytes: int) -> NDArray[Any]:
     if n_bytes > MAX_DECODED_BYTES:
         allowed = f"at most {MAX_DECODED_BYTES:,} bytes"
         raise _InvalidImage(f"{claimed}, {n_bytes:,} bytes", allowed)
-    array = np.fromfile(file, dtype, n_values)
+    if isinstance(file, io.BytesIO):
+        array = np.frombuffer(file.getbuffer(), dtype, n_values, file.tell()).copy()
+    else:
+        array = np.fromfile(file, dtype, n_values)
     return array.reshape(shape, order="F" if is_fortran else "C")
 
 
@@ -486,7 +491,11 @@ def _npy_header(file: BinaryIO) -> tuple[np.dtype, tuple[int, ...], bool]:
 
 
 def read_exr_channels(
-    path: Path, choose: Callable[[set[str]], tuple[str, ...]], *, option: str = ""
+    path: Path,
+    choose: Callable[[set[str]], tuple[str, ...]],
+    *,
+    option: str = "",
+    content: bytes | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Return channels of the first part of an OpenEXR file, as float32.
 
@@ -494,6 +503,8 @@ def read_exr_channels(
     ----------
     choose : callable
         Returns the channels to read, of those in the file, or raises.
+    content : bytes, optional
+        Content of the file, which is read if this is not given.
 
     Raises
     ------
@@ -502,21 +513,24 @@ def read_exr_channels(
     import OpenEXR
 
     try:
-        with open(path, "rb") as stream:
-            size_bytes = _size_of(stream)
-            if stream.read(4) != EXR_MAGIC:  # the library would write to stderr
-                _raise_invalid(path, "not an OpenEXR file", "OpenEXR", option)
-        if size_bytes > MAX_FILE_BYTES:
-            allowed = f"at most {MAX_FILE_BYTES:,} bytes"
-            _raise_invalid(path, f"{size_bytes:,} bytes", allowed, option)
-        with _GLOBALS_LOCK, _captured_output() as captured:
-            how = {"separate_channels": True}
-            with OpenEXR.File(str(path), header_only=True, **how) as file:
-                _check_exr(file.parts)
-            with OpenEXR.File(str(path), **how) as file:
-                channels = file.channels()
-                wanted = choose(set(channels))
-                found = {k: np.asarray(channels[k].pixels, np.float32) for k in wanted}
+        with _openable(path, content) as name:
+            with open(name, "rb") as stream:
+                size_bytes = _size_of(stream)
+                if stream.read(4) != EXR_MAGIC:  # the library would write to stderr
+                    _raise_invalid(path, "not an OpenEXR file", "OpenEXR", option)
+            if size_bytes > MAX_FILE_BYTES:
+                allowed = f"at most {MAX_FILE_BYTES:,} bytes"
+                _raise_invalid(path, f"{size_bytes:,} bytes", allowed, option)
+            with _GLOBALS_LOCK, _captured_output() as captured:
+                how = {"separate_channels": True}
+                with OpenEXR.File(name, header_only=True, **how) as file:
+                    _check_exr(file.parts)
+                with OpenEXR.File(name, **how) as file:
+                    channels = file.channels()
+                    wanted = choose(set(channels))
+                    found = {
+                        k: np.asarray(channels[k].pixels, np.float32) for k in wanted
+                    }
         text = "".join(captured)
         if EXR_INCOMPLETE in text:  # the library continues with the intact part
             reason = text[text.index(EXR_INCOMPLETE) :].split("\n")[0].split(" - ")[-1]
@@ -531,6 +545,18 @@ def read_exr_channels(
     except Exception as error:  # bindings raise nearly anything on damaged files
         problem = f"cannot be read ({_error_text(error)})"
         raise InvalidFile(path, problem, "an intact OpenEXR file", option) from None
+
+
+@contextmanager
+def _openable(path: Path, content: bytes | None) -> Iterator[str]:
+    """Yield a name under which a library can open a file, or content in memory."""
+    if content is None:
+        yield str(path)
+        return
+    with os.fdopen(os.memfd_create("content", os.MFD_CLOEXEC), "wb") as file:
+        file.write(content)
+        file.flush()
+        yield f"/proc/self/fd/{file.fileno()}"
 
 
 def _exr_chunk_rows(header: dict[str, Any]) -> int:

@@ -7,6 +7,7 @@ PFM.
 """
 
 import math
+import os
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -34,13 +35,17 @@ ROW_VALUES = 1 << 20
 """Values converted at a time, so that no float64 copy of a large image is held."""
 
 
-def read_color(path: Path, *, option: str = "color") -> NDArray[Any]:
+def read_color(
+    path: Path, *, option: str = "color", content: bytes | None = None
+) -> NDArray[Any]:
     """Read a color image.
 
     Parameters
     ----------
     option : str
         Option that requested it, for error messages; empty if there is none.
+    content : bytes, optional
+        Content of the file, which is read if this is not given.
 
     Returns
     -------
@@ -53,19 +58,24 @@ def read_color(path: Path, *, option: str = "color") -> NDArray[Any]:
         If the file is missing, of unknown format, damaged or too large, or its pixels
         have an unsupported type or shape.
     """
-    suffix = _known_suffix(option, path, COLOR_SUFFIXES)
+    suffix = _known_suffix(option, path, COLOR_SUFFIXES, content)
     pixels: NDArray[Any]
     if suffix == ".exr":
-        pixels = _exr_color(path, option)
+        pixels = _exr_color(path, option, content)
     elif suffix == ".npy":
-        pixels = read_npy(path, option=option)
+        pixels = read_npy(path, option=option, content=content)
     else:
-        pixels = read_picture_rgb(path, option=option)
+        source = path if content is None else content
+        pixels = read_picture_rgb(source, name=str(path), option=option)
     return _checked_color(pixels, path, option)
 
 
 def read_depth(
-    path: Path, *, depth_scale: float | None = None, option: str = "depth"
+    path: Path,
+    *,
+    depth_scale: float | None = None,
+    option: str = "depth",
+    content: bytes | None = None,
 ) -> NDArray[np.float32]:
     """Read a depth image in meters.
 
@@ -76,6 +86,8 @@ def read_depth(
         Required for 8-bit files, which are seldom in millimeters.
     option : str
         Option that requested it, for error messages; empty if there is none.
+    content : bytes, optional
+        Content of the file, which is read if this is not given.
 
     Returns
     -------
@@ -90,13 +102,14 @@ def read_depth(
     ValueError
         If the scale is not positive.
     """
-    suffix = _known_suffix(option, path, DEPTH_SUFFIXES)
+    suffix = _known_suffix(option, path, DEPTH_SUFFIXES, content)
     if suffix == ".exr":
-        stored = _exr_depth(path, option)
+        stored = _exr_depth(path, option, content)
     elif suffix == ".npy":
-        stored = read_npy(path, option=option)
+        stored = read_npy(path, option=option, content=content)
     else:
-        stored = read_picture_values(path, option=option)
+        source = path if content is None else content
+        stored = read_picture_values(source, name=str(path), option=option)
     if stored.ndim == 3 and stored.shape[2] == 1:
         stored = stored[:, :, 0]
     if stored.ndim != 2 or stored.size == 0 or stored.dtype.kind not in "uif":
@@ -132,13 +145,18 @@ def check_output(path: Path, suffixes: tuple[str, ...] = OUTPUT_SUFFIXES) -> Non
     Raises
     ------
     ValueError
-        If the format is unknown, or the folder does not exist.
+        If the format is unknown, the folder does not exist or is not writable, or the
+        path is a folder.
     """
     if path.suffix.lower() not in suffixes:
         found = f"'{path.suffix}' is not a kind of output"
         _raise_invalid("out", path, found, "a name that ends in " + ", ".join(suffixes))
     if not path.absolute().parent.is_dir():
         _raise_invalid("out", path, "its folder does not exist", "an existing folder")
+    if not os.access(path.absolute().parent, os.W_OK):
+        _raise_invalid("out", path, "its folder is read-only", "a writable folder")
+    if path.is_dir():
+        _raise_invalid("out", path, "it is a folder", "the name of a file")
 
 
 def write_image(path: Path, image: NDArray[Any], *, png_level: int = 6) -> None:
@@ -176,11 +194,15 @@ def _raise_invalid(field: str, path: Path, found: str, allowed: str) -> NoReturn
     raise InvalidFile(path, found, allowed, field)
 
 
-def _known_suffix(field: str, path: Path, suffixes: tuple[str, ...]) -> str:
+def _known_suffix(
+    field: str, path: Path, suffixes: tuple[str, ...], content: bytes | None
+) -> str:
     suffix = path.suffix.lower()
     if suffix not in suffixes:
         found = f"'{path.suffix}' is not a kind it reads"
         _raise_invalid(field, path, found, ", ".join(suffixes))
+    if content is not None:
+        return suffix
     try:
         is_file = path.is_file()
     except (OSError, ValueError):  # a null byte, or a name that is too long
@@ -190,14 +212,14 @@ def _known_suffix(field: str, path: Path, suffixes: tuple[str, ...]) -> str:
     return suffix
 
 
-def _exr_color(path: Path, option: str) -> NDArray[np.float32]:
+def _exr_color(path: Path, option: str, content: bytes | None) -> NDArray[np.float32]:
     def choose(names: set[str]) -> tuple[str, ...]:
         if not set("RGB") <= names:
             found = f"channels {', '.join(sorted(names))}"
             _raise_invalid(option, path, found[:200], "channels R, G and B")
         return tuple("RGB")
 
-    channels = read_exr_channels(path, choose, option=option)
+    channels = read_exr_channels(path, choose, option=option, content=content)
     shapes = {channel.shape for channel in channels.values()}
     if len(shapes) > 1:
         _raise_invalid(
@@ -209,7 +231,7 @@ def _exr_color(path: Path, option: str) -> NDArray[np.float32]:
     return rgb
 
 
-def _exr_depth(path: Path, option: str) -> NDArray[np.float32]:
+def _exr_depth(path: Path, option: str, content: bytes | None) -> NDArray[np.float32]:
     def choose(names: set[str]) -> tuple[str, ...]:
         for name in ("Z", "Y", "R"):
             if name in names:
@@ -217,7 +239,8 @@ def _exr_depth(path: Path, option: str) -> NDArray[np.float32]:
         found = f"channels {', '.join(sorted(names))}"
         _raise_invalid(option, path, found[:200], "a channel Z, Y or R")
 
-    return read_exr_channels(path, choose, option=option).popitem()[1]
+    channels = read_exr_channels(path, choose, option=option, content=content)
+    return channels.popitem()[1]
 
 
 def _write_exr(path: Path, linear_rgb: NDArray[Any]) -> None:

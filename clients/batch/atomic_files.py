@@ -1,27 +1,21 @@
-"""Atomic writes of files, and file hashes."""
+"""Atomic writes of files below a folder, and file hashes."""
 
 from __future__ import annotations
 
 import hashlib
-import os
-import secrets
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-PART = ".part"
-MAX_STEM = 180
-"""Length limit of a stem, so that the temporary name is valid in a file system."""
+from filter_service.atomic_files import PART_NAME, replace_atomically
 
-_NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _BLOCK_BYTES = 1 << 20
 
 
-def write_whole(path: Path, write: Callable[[Path], None]) -> dict[str, Any]:
-    """Write a file under a temporary name in the same folder, then rename it.
+def write_whole(path: Path, write: Callable[[Path], object]) -> dict[str, Any]:
+    """Write a file atomically, and its folder if that is missing.
 
-    A killed process leaves at most a file ``.NAME.RANDOM.part.SUFFIX``, which
-    `remove_parts` removes.
+    A killed process leaves at most one temporary file, which `remove_parts` removes.
 
     Parameters
     ----------
@@ -36,20 +30,13 @@ def write_whole(path: Path, write: Callable[[Path], None]) -> dict[str, Any]:
         Size in ``bytes`` and ``sha256`` of the file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    random = secrets.token_hex(8)
-    part = path.with_name(f".{path.stem[:MAX_STEM]}.{random}{PART}{path.suffix}")
-    os.close(os.open(part, _NEW_FILE, 0o666))  # does not follow a link
-    try:
+    content: dict[str, Any] = {}
+
+    def write_and_hash(part: Path) -> None:
         write(part)
-        with part.open("rb") as file:
-            os.fsync(
-                file.fileno()
-            )  # the content precedes the rename, even in a power failure
-        content = content_of(part)
-        os.replace(part, path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
+        content.update(content_of(part))
+
+    replace_atomically(path, write_and_hash)
     return content
 
 
@@ -65,30 +52,26 @@ def content_of(path: Path) -> dict[str, Any]:
 
 def remove_parts(folder: Path) -> int:
     """Remove temporary files of killed processes; return their number."""
-    parts = [path for path in folder.rglob(".*") if PART in path.suffixes]
+    parts = [
+        path
+        for path in folder.rglob(".ocufilter-*")
+        if PART_NAME.fullmatch(path.name) and path.is_file() and not path.is_symlink()
+    ]
     for path in parts:
         path.unlink(missing_ok=True)
     return len(parts)
 
 
-def input_of(path: Path) -> dict[str, Any]:
-    """Return the name, size, time and hash of an input file."""
-    status = path.stat()
-    return {
-        "name": path.name,
-        "mtime_ns": status.st_mtime_ns,
-        **content_of(path),
-    }
+def below(folder: Path, name: object) -> Path | None:
+    """Return the path of a file below a folder; None if the name leads outside.
 
-
-def is_unchanged(path: Path, recorded: dict[str, Any]) -> bool:
-    """Return whether a file matches its record; read it only if its time differs."""
-    try:
-        status = path.stat()
-    except OSError:
-        return False
-    if status.st_size != recorded["bytes"]:
-        return False
-    if status.st_mtime_ns == recorded["mtime_ns"]:
-        return True
-    return content_of(path)["sha256"] == recorded["sha256"]
+    Links in the folder are followed: a folder that is a link leads outside.
+    """
+    if not isinstance(name, str) or not name or "\0" in name:
+        return None
+    inner = Path(name)
+    if inner.is_absolute() or ".." in inner.parts:
+        return None
+    path = folder / inner
+    is_inside = path.parent.resolve().is_relative_to(folder.resolve())
+    return path if is_inside else None

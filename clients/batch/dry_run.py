@@ -33,7 +33,8 @@ def dry_run(
     n_all = len(batch.frames) * len(batch.job.profiles)
     n_missing = n_all
     if (batch.out / LINES).is_file():
-        with Manifest(batch.out, batch.described()) as manifest:
+        job = batch.described()
+        with Manifest(batch.out, job, read_only=True) as manifest:
             units = missing_units(batch, manifest)
         n_missing = sum(len(unit.frames) for unit in units)
     measured = [_measured(batch, profile) for profile in batch.job.profiles]

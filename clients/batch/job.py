@@ -8,12 +8,11 @@ import shutil
 import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
 from clients.batch.states import States
-from filter_service import FilterSettings, Output
+from filter_service import FilterSettings, Output, __version__
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 FORMATS = ("png", "npy", "exr", "ffv1", "h264")
@@ -110,11 +109,7 @@ def batch_settings(given: Mapping[str, Any], states: States) -> FilterSettings:
 
 def code_version() -> dict[str, str | None]:
     """Return the version of the package and, in a checkout, its commit."""
-    try:
-        package = version("ocufilter")
-    except PackageNotFoundError:
-        package = "unknown"
-    return {"version": package, "commit": _commit()}
+    return {"version": __version__, "commit": _commit()}
 
 
 def _commit() -> str | None:

@@ -67,9 +67,9 @@ _EXTRACTED = re.compile(r"^(\d+_colors|sync_depth_\d+)\.(?:png|jpg)$")
 class KinectCounts:
     """Depth format of the raw counts of the Kinect's depth camera."""
 
-    def read(self, path: Path) -> NDArray[np.float32]:
+    def read(self, path: Path, content: bytes | None = None) -> NDArray[np.float32]:
         """Return the depth in the view of the color camera, m; 0 if unknown."""
-        stored = read_depth(path, depth_scale=1.0, option="")
+        stored = read_depth(path, depth_scale=1.0, option="", content=content)
         width_px, height_px = COLOR_CAMERA.size_px or (0, 0)
         if stored.shape != (height_px, width_px):
             found = f"{stored.shape[1]}x{stored.shape[0]} px"

@@ -22,7 +22,8 @@ DEPTH_WORDS = ("sync_depth", "depth", "z")
 
 def _at_an_end(words: tuple[str, ...]) -> re.Pattern[str]:
     any_of = "|".join(words)
-    return re.compile(rf"^({any_of})[-_.]|[-_.]({any_of})$")
+    # Not on the text in lower case: that of some letters has another length.
+    return re.compile(rf"^({any_of})[-_.]|[-_.]({any_of})\Z", re.ASCII | re.IGNORECASE)
 
 
 _COLOR_WORD, _DEPTH_WORD = _at_an_end(COLOR_WORDS), _at_an_end(DEPTH_WORDS)
@@ -74,7 +75,7 @@ def _colors_and_depths(
             _named(images_in(depth_folder, DEPTH_SUFFIXES), _DEPTH_WORD),
         )
     files = images_in(source, (*COLOR_SUFFIXES, *DEPTH_SUFFIXES))
-    depths = [path for path in files if _DEPTH_WORD.search(path.stem.lower())]
+    depths = [path for path in files if _DEPTH_WORD.search(path.stem)]
     colors = [path for path in files if path not in set(depths)]
     if not depths:  # distinguished by file type
         depths = [path for path in files if path.suffix.lower() not in _PICTURES]
@@ -107,7 +108,7 @@ def _named(paths: list[Path], word: re.Pattern[str]) -> dict[str, Path]:
     """Return files by their names without the word for color or depth."""
     found: dict[str, Path] = {}
     for path in paths:
-        match = word.search(path.stem.lower())
+        match = word.search(path.stem)
         name = path.stem
         if match is not None:
             name = (name[: match.start()] + name[match.end() :]) or path.stem

@@ -1,30 +1,33 @@
 """Record of a batch: a line per frame during the run, and a summary at the end.
 
-    manifest.jsonl   the job, then a line for each frame; if a frame was processed
-    again,
-                     its last line counts
+    manifest.jsonl   the job, then a line for each frame and each video; if one was
+                     made again, its last line counts
     manifest.json    the job, counts, failures and notes
 
 One process appends complete lines; a partial line after a power failure is removed. A
-frame without a line is processed again even if its files exist.
+frame without a line is processed again even if its files exist.  File names that are
+not UTF-8 are written with escapes (`text_of`).
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
-from clients.batch.atomic_files import is_unchanged, write_whole
+from clients.batch.atomic_files import below
 from clients.batch.job import fingerprint
+from clients.batch.source import SourceFrame
 from clients.batch.work import Record
 from clients.frame_log import Notes, add_notes
 from estimator import InvalidFile
 from estimator.bounded_files import loads_bounded
+from filter_service.atomic_files import write_atomically
 
 LINES, SUMMARY = "manifest.jsonl", "manifest.json"
 RESTART = "the same value, another folder, or --overwrite"
@@ -33,6 +36,32 @@ MAX_LINE_BYTES, MAX_LINE_ITEMS = 16_000_000, 2_000_000
 
 SYNC_S = 2.0
 """Interval of writes to disk: a power failure loses at most this much work."""
+
+
+ContentOf = Callable[[Path], Mapping[str, Any]]
+"""Function that returns the size and the hash of a file, as `content_of`."""
+
+_ESCAPE = re.compile(r"\\(?:\\|x[89a-f][0-9a-f])")
+
+
+def text_of(name: str) -> str:
+    r"""Return a file name as text that JSON can hold, whatever its bytes.
+
+    Bytes that are not UTF-8 become ``\xNN``, and a backslash is doubled, so that no two
+    names have the same text.
+    """
+    doubled = os.fsencode(name.replace("\\", r"\\"))
+    return doubled.decode("utf-8", "backslashreplace")
+
+
+def name_of(text: str) -> str:
+    """Return the file name that `text_of` returned as text."""
+
+    def unescaped(match: re.Match[str]) -> str:
+        escape = match[0]
+        return "\\" if escape == r"\\" else chr(0xDC00 + int(escape[2:], 16))
+
+    return _ESCAPE.sub(unescaped, text)
 
 
 class ManifestDiffers(InvalidFile):
@@ -48,6 +77,8 @@ class Manifest:
         Existing folder.
     job : mapping
         Parameters that determine the images, as JSON-compatible values.
+    read_only : bool
+        Whether to leave the file as it is, because another process may write to it.
 
     Raises
     ------
@@ -57,14 +88,19 @@ class Manifest:
         If the file is not a manifest.
     """
 
-    def __init__(self, out: Path, job: Mapping[str, Any]) -> None:
+    def __init__(
+        self, out: Path, job: Mapping[str, Any], *, read_only: bool = False
+    ) -> None:
         self._out = out
         self._path = out / LINES
+        self._read_only = read_only
         self._places: dict[tuple[str, str], int] = {}  # byte offsets of lines
+        self._videos: dict[str, Record] = {}
         self._synced_s = time.monotonic()
-        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK
+        flags = os.O_RDONLY if read_only else os.O_RDWR | os.O_CREAT | os.O_APPEND
+        flags |= os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         try:
-            self._file = os.open(self._path, flags, 0o644)
+            self._file = os.open(self._path, flags, 0o600)
         except OSError as error:
             found = f"cannot be opened ({error.strerror})"
             raise InvalidFile(self._path, found, "a plain file or none") from None
@@ -80,8 +116,11 @@ class Manifest:
 
     def __exit__(self, *exc_info: object) -> None:
         """Close the file."""
-        os.fsync(self._file)
-        os.close(self._file)
+        try:
+            if not self._read_only:
+                os.fsync(self._file)
+        finally:
+            os.close(self._file)
 
     def _read(self, job: Mapping[str, Any]) -> None:
         end = 0
@@ -93,21 +132,46 @@ class Manifest:
                 elif record.get("kind") == "frame":
                     _check_frame(record, self._path)
                     self._places[record["profile"], record["frame"]] = end
+                elif record.get("kind") == "video":
+                    _check_video(record, self._path)
+                    self._videos[record["profile"]] = record
                 end += len(line)
         if len(line) > MAX_LINE_BYTES:
             found = f"a line has more than {MAX_LINE_BYTES:,} bytes"
             raise InvalidFile(self._path, found, "fewer")
+        if self._read_only:
+            return
         os.ftruncate(self._file, end)
         if end == 0:
-            self._write({"kind": "job", "fingerprint": fingerprint(job), **job})
+            self._write(_job_line(job))
 
     def append(self, record: Record) -> None:
-        """Append a line for a frame."""
-        self._places[record["profile"], record["frame"]] = self._write(record)
+        """Append a line for a frame, or for the video of a profile."""
+        written = _with_text(record)
+        place = self._write(_line(written))
+        if record["kind"] == "video":
+            self._videos[record["profile"]] = written
+        else:
+            self._places[record["profile"], written["frame"]] = place
 
-    def _write(self, record: Record) -> int:
+    def check_in_place(self) -> None:
+        """Check that the folder still contains the file.
+
+        Raises
+        ------
+        OSError
+            If it has been removed or replaced.
+        """
+        try:
+            found = os.stat(self._path, follow_symlinks=False)
+            in_place = os.path.samestat(found, os.fstat(self._file))
+        except FileNotFoundError:
+            in_place = False
+        if not in_place:
+            raise OSError(f"'{self._path}' was removed or replaced during the run")
+
+    def _write(self, line: bytes) -> int:
         place = os.lseek(self._file, 0, os.SEEK_END)
-        line = json.dumps(record, allow_nan=False).encode() + b"\n"
         written = os.write(self._file, line)
         if written != len(line):  # disk full: remove the partial line
             os.ftruncate(self._file, place)
@@ -122,7 +186,7 @@ class Manifest:
 
     def record(self, profile: str, frame: str) -> Record | None:
         """Return the last record of a frame, or None."""
-        place = self._places.get((profile, frame))
+        place = self._places.get((profile, text_of(frame)))
         return None if place is None else self._at(place)
 
     def _at(self, place: int) -> Record:
@@ -133,22 +197,85 @@ class Manifest:
         return json.loads(b"".join(parts).split(b"\n", 1)[0])
 
     def records(self) -> Iterator[Record]:
-        """Yield the last record of each frame, sorted by profile and name."""
+        """Yield the last record of each frame, sorted by profile and name.
+
+        Names are those of `text_of`.
+        """
         for key in sorted(self._places):
             yield self._at(self._places[key])
 
-    def is_done(self, profile: str, frame: str, files: tuple[Path, ...]) -> bool:
-        """Return whether a frame's output exists and its inputs are unchanged."""
-        record = self.record(profile, frame)
+    def is_done(self, profile: str, frame: SourceFrame, content_of: ContentOf) -> bool:
+        """Return whether a frame's output is intact and its inputs are unchanged.
+
+        Parameters
+        ----------
+        content_of : callable
+            Returns the size and hash of a file.
+        """
+        record = self.record(profile, frame.name)
         if record is None or not record["ok"]:
             return False
-        path = below(self._out, record["file"])
-        if path is None or not path.is_file() or path.stat().st_size != record["bytes"]:
-            return False
-        return len(files) == len(record["inputs"]) and all(
-            is_unchanged(path, recorded)
-            for path, recorded in zip(files, record["inputs"], strict=True)
+        # Records of earlier versions have no camera.
+        source = json.loads(json.dumps(frame.described()))
+        files, inputs = frame.files, record["inputs"]
+        return (
+            record.get("source", source) == source
+            and len(files) == len(inputs)
+            and self._is_intact(record, content_of)
+            and all(map(_has_content, files, inputs, [content_of] * len(files)))
         )
+
+    def has_video(self, profile: str, path: Path, content_of: ContentOf) -> bool:
+        """Return whether a file is the last video of a profile, unchanged."""
+        record = self._videos.get(profile)
+        return record is not None and _has_content(path, record, content_of)
+
+    def _is_intact(self, record: Record, content_of: ContentOf) -> bool:
+        path = below(self._out, name_of(record["file"]))
+        return path is not None and _has_content(path, record, content_of)
+
+
+def begin_manifest(out: Path, job: Mapping[str, Any]) -> None:
+    """Replace the manifest of a folder by that of a new job, atomically."""
+    write_atomically(out / LINES, _job_line(job))
+
+
+def _job_line(job: Mapping[str, Any]) -> bytes:
+    return _line({"kind": "job", "fingerprint": fingerprint(job), **job})
+
+
+def _line(record: Mapping[str, Any]) -> bytes:
+    return json.dumps(record, allow_nan=False).encode() + b"\n"
+
+
+def _with_text(record: Record) -> Record:
+    """Return a record whose file names JSON can hold."""
+    written = dict(record)
+    for key in ("frame", "file"):
+        if key in record:
+            written[key] = text_of(record[key])
+    if "files" in record:
+        written["files"] = [text_of(name) for name in record["files"]]
+    if "inputs" in record:
+        written["inputs"] = [
+            {**one, "name": text_of(one["name"])} for one in record["inputs"]
+        ]
+    if "error" in record:
+        error = record["error"].encode("utf-8", "backslashreplace")
+        written["error"] = error.decode()
+    return written
+
+
+def _has_content(
+    path: Path, recorded: Mapping[str, Any], content_of: ContentOf
+) -> bool:
+    """Return whether a file has the recorded size and hash."""
+    try:
+        if not path.is_file() or path.stat().st_size != recorded["bytes"]:
+            return False
+        return content_of(path)["sha256"] == recorded["sha256"]
+    except OSError:
+        return False
 
 
 def records_of(path: Path) -> Iterator[Record]:
@@ -159,18 +286,6 @@ def records_of(path: Path) -> Iterator[Record]:
                 yield _parsed(line, path)
             except InvalidFile:
                 continue
-
-
-def below(folder: Path, name: object) -> Path | None:
-    """Return the path of a file that a manifest names; None if outside the folder."""
-    if not isinstance(name, str) or not name or "\0" in name:
-        return None
-    inner = Path(name)
-    if inner.is_absolute() or ".." in inner.parts:
-        return None
-    path = folder / inner
-    is_inside = path.parent.resolve().is_relative_to(folder.resolve())
-    return path if is_inside else None
 
 
 def _parsed(line: bytes, path: Path) -> Record:
@@ -192,13 +307,15 @@ _FRAME_FIELDS: dict[str, type | tuple[type, ...]] = {
 _DONE_FIELDS: dict[str, type | tuple[type, ...]] = {
     "file": str,
     "bytes": int,
+    "sha256": str,
     "inputs": list,
     "notes": list,
     "missing_depth_count": int,
     "clamped_depth_count": int,
     "overflow_count": int,
 }
-_INPUT_FIELDS = {"bytes": int, "mtime_ns": int, "sha256": str}
+_INPUT_FIELDS = {"bytes": int, "sha256": str}
+_VIDEO_FIELDS = {"profile": str, "file": str, "bytes": int, "sha256": str}
 
 
 def _check_frame(record: Record, path: Path) -> None:
@@ -213,8 +330,20 @@ def _check_frame(record: Record, path: Path) -> None:
                 isinstance(recorded.get(k), kind) for k, kind in _INPUT_FIELDS.items()
             ):
                 wrong.append("inputs")
+    _refuse("frame", wrong, path)
+
+
+def _check_video(record: Record, path: Path) -> None:
+    """Check that a video's record has all required fields."""
+    wrong = [
+        k for k, kind in _VIDEO_FIELDS.items() if not isinstance(record.get(k), kind)
+    ]
+    _refuse("video", wrong, path)
+
+
+def _refuse(kind: str, wrong: list[str], path: Path) -> None:
     if wrong:
-        found = f"the record of a frame has an invalid '{wrong[0]}'"
+        found = f"the record of a {kind} has an invalid '{wrong[0]}'"
         raise InvalidFile(path, found, "the manifest of a batch, or --overwrite")
 
 
@@ -253,15 +382,14 @@ def _short(value: Any) -> str:
 def write_summary(out: Path, summary: Mapping[str, Any]) -> None:
     """Write the summary atomically."""
     text = json.dumps(summary, indent=1, allow_nan=False) + "\n"
-
-    def write(path: Path) -> None:
-        path.write_text(text, encoding="utf-8")
-
-    write_whole(out / SUMMARY, write)
+    write_atomically(out / SUMMARY, text)
 
 
 def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, Any]:
-    """Return the counts, failures and notes of the requested frames."""
+    """Return the counts, failures and notes of the requested frames.
+
+    ``wanted`` contains profiles and frames as in the manifest.
+    """
     n_done, failures = Counter[str](), []
     notes: Notes = {}
     pixels = Counter[str]()

@@ -3,18 +3,21 @@
     python -m clients.batch.process_pool DESCRIPTOR
 
 runs a worker, which receives units through a pipe and returns records.  It exits when
-the pipe closes, at the latest between two frames.
+the pipe closes: between two frames, or after `GRACE_S` in the midst of one.
 """
 
 from __future__ import annotations
 
 import os
+import select
 import signal
 import socket
 import subprocess
 import sys
+import threading
+import time
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -29,6 +32,9 @@ MAX_DEATHS = 2
 """Worker deaths at the same frame, after which the frame is considered the cause."""
 
 END_LIMIT_S = 5.0
+GRACE_S = 1.0
+"""Time to finish a frame after the pipe has closed.  A batch that resumes a killed one
+waits longer for the lock, which the workers hold."""
 
 
 @dataclass(eq=False)
@@ -42,15 +48,37 @@ class _Worker:
 
 
 class ProcessPool:
-    """Pool of processes that run units, each with a given number of engine threads."""
+    """Pool of processes that run units, each with a given number of engine threads.
 
-    def __init__(self, job: Job, out: Path, *, n_workers: int, n_threads: int) -> None:
+    Parameters
+    ----------
+    job : Job
+        Parameters of the batch.
+    out : Path
+        Output folder.
+    n_workers, n_threads : int
+        Number of processes, and of engine threads in each.
+    lock : int, optional
+        Descriptor that the workers inherit: the folder stays locked until they exit,
+        even if this process is killed.
+    """
+
+    def __init__(
+        self,
+        job: Job,
+        out: Path,
+        *,
+        n_workers: int,
+        n_threads: int,
+        lock: int | None = None,
+    ) -> None:
         self._setup = job, out
+        self._locks = () if lock is None else (lock,)
         self._n_workers, self._n_threads = n_workers, n_threads
         self._workers: list[_Worker] = []
         self._deaths: Counter[tuple[str, str]] = Counter()
 
-    def run(self, units: Sequence[Unit]) -> Iterator[Record]:
+    def run(self, units: Sequence[Unit]) -> Generator[Record, None, None]:
         """Yield the records of units as frames are finished, in any order.
 
         Raises
@@ -71,7 +99,7 @@ class ProcessPool:
             self.close()
 
     def close(self) -> None:
-        """Stop the workers after their current frame; kill them after `END_LIMIT_S`."""
+        """Stop the workers; kill them after `END_LIMIT_S`."""
         for worker in self._workers:
             worker.pipe.close()
         for worker in self._workers:
@@ -101,7 +129,7 @@ class ProcessPool:
         descriptor = str(theirs.fileno())
         process = subprocess.Popen(
             [sys.executable, "-P", "-m", "clients.batch.process_pool", descriptor],
-            pass_fds=[theirs.fileno()],
+            pass_fds=[theirs.fileno(), *self._locks],
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # Ctrl-C reaches only this process, which stops it
             env={
@@ -163,6 +191,7 @@ def _how_it_ended(code: int) -> str:
 def serve(descriptor: int) -> None:
     """Run the units that arrive through a pipe until it closes."""
     pipe = Connection(descriptor)
+    threading.Thread(target=_exit_after, args=(descriptor,), daemon=True).start()
     try:
         runner = UnitRunner(*pipe.recv())
         while True:
@@ -175,6 +204,15 @@ def serve(descriptor: int) -> None:
         pipe.send(("unusable", str(error)))
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return
+
+
+def _exit_after(descriptor: int) -> None:
+    """Exit soon after the other end of a pipe is closed, whatever this process does."""
+    closed = select.poll()
+    closed.register(descriptor, 0)  # reports only that the other end is closed
+    closed.poll()
+    time.sleep(GRACE_S)
+    os._exit(1)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,16 @@ from clients.batch.exact_filter import EngineUnusable
 from clients.batch.manifest import Manifest, note_line
 from clients.batch.options import arguments_of, batch_of, workers_and_threads
 from clients.batch.process_pool import THREADS_VARIABLE, ProcessPool
-from clients.batch.run import Batch, Pool, only_one, prepare_folder, run_batch
+from clients.batch.run import (
+    Batch,
+    Pool,
+    begin_anew,
+    check_folder,
+    check_links,
+    only_one,
+    run_batch,
+)
+from estimator.bounded_files import printable
 from filter_service.errors import FilterError
 from filter_service.progress import Progress
 
@@ -39,28 +48,35 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         os.environ[THREADS_VARIABLE] = "1"
         price = options.price_per_core_hour
         return dry_run(batch, n_cores=n_workers * n_threads, price_per_core_hour=price)
-    prepare_folder(batch, overwrite=options.overwrite)
-    pool = _pool(options, batch, n_workers, n_threads)
-    with (
-        only_one(batch.out),
-        Manifest(batch.out, batch.described()) as manifest,
-        Progress("batch", quiet=options.json) as progress,
-    ):
-        task = progress.task(
-            ", ".join(batch.job.profiles),
-            total=len(batch.frames) * len(batch.job.profiles),
-        )
-        return run_batch(
-            batch, manifest, pool, on_done=lambda n_done, n_all: task.update(n_done)
-        )
+    check_folder(batch.out)
+    with only_one(batch.out) as lock:
+        check_links(batch)
+        pool = _pool(options, batch, n_workers, n_threads, lock)
+        if options.overwrite:
+            begin_anew(batch)
+        with (
+            Manifest(batch.out, batch.described()) as manifest,
+            Progress("batch", quiet=options.json) as progress,
+        ):
+            task = progress.task(
+                ", ".join(batch.job.profiles),
+                total=len(batch.frames) * len(batch.job.profiles),
+            )
+            return run_batch(
+                batch, manifest, pool, on_done=lambda n_done, n_all: task.update(n_done)
+            )
 
 
 def _pool(
-    options: argparse.Namespace, batch: Batch, n_workers: int, n_threads: int
+    options: argparse.Namespace,
+    batch: Batch,
+    n_workers: int,
+    n_threads: int,
+    lock: int,
 ) -> Pool:
     if options.ray is None:
         return ProcessPool(
-            batch.job, batch.out, n_workers=n_workers, n_threads=n_threads
+            batch.job, batch.out, n_workers=n_workers, n_threads=n_threads, lock=lock
         )
     from clients.batch.ray_pool import RayPool
 
@@ -119,22 +135,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         return 1
     except ValueError as error:
-        print(f"batch: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"batch: {printable(' '.join(str(error).split()))}", file=sys.stderr)
         return 2
     except (EngineUnusable, FilterError, OSError) as error:
-        print(f"batch: {error}", file=sys.stderr)
+        print(f"batch: {printable(str(error))}", file=sys.stderr)
         return 1
     if options.json:
-        lines = [json.dumps(summary, allow_nan=False)]
+        lines = [json.dumps(summary, allow_nan=False)]  # ASCII of any length
     elif options.dry_run:
-        lines = lines_of(summary, options.price_per_core_hour)
+        lines = [*map(printable, lines_of(summary, options.price_per_core_hour))]
     else:
-        lines = report_lines(summary, options)
+        lines = [*map(printable, report_lines(summary, options))]
     sys.stdout.write("\n".join(lines) + "\n")
     if options.dry_run and all(p["errors"] for p in summary["profiles"]):
         return 1
     failures = failure_lines(summary)
-    sys.stderr.writelines(f"{line}\n" for line in failures)
+    sys.stderr.writelines(f"{printable(line)}\n" for line in failures)
     return 1 if failures else 0
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, cast
@@ -61,7 +61,7 @@ class RayPool:
         self._address, self._n_workers = address, n_workers
         self._n_threads = n_threads
 
-    def run(self, units: Sequence[Unit]) -> Iterator[Record]:
+    def run(self, units: Sequence[Unit]) -> Generator[Record, None, None]:
         """Yield the records of units as units are finished, in any order."""
         if not units:
             return

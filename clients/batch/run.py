@@ -4,28 +4,32 @@ from __future__ import annotations
 
 import fcntl
 import os
-import shutil
+import re
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Protocol, cast
 
-from clients.batch.atomic_files import content_of, remove_parts, write_whole
+from clients.batch.atomic_files import below, content_of, remove_parts, write_whole
 from clients.batch.job import Job, code_version
 from clients.batch.manifest import (
     LINES,
     SUMMARY,
     Manifest,
-    below,
+    begin_manifest,
+    name_of,
     records_of,
     summary_of,
+    text_of,
     write_summary,
 )
 from clients.batch.source import SourceFrame
 from clients.batch.work import Record, Unit
-from estimator import InvalidFile
+from estimator import InvalidFile, thread_count
 
 UNIT_FRAMES = 16
 """Frames per unit of work: few enough that all workers finish at about the same time,
@@ -38,12 +42,17 @@ determines the bytes of the video."""
 SEGMENTS = ".segments"
 VIDEO_SUFFIXES = (".mkv", ".mp4")
 LOCK = ".lock"
+LOCK_WAIT_S = 3.0
+"""Time that the workers of a killed batch, which hold the lock, have to exit."""
+
+_CHECKED_AT_ONCE = 1000
+_SEGMENT_NAME = re.compile(r"\d{8}\.mkv")
 
 
 class Pool(Protocol):
     """Interface of pools that run units."""
 
-    def run(self, units: Sequence[Unit]) -> Iterator[Record]:
+    def run(self, units: Sequence[Unit]) -> Generator[Record, None, None]:
         """Yield the records of units as frames are finished, in any order."""
 
 
@@ -73,52 +82,89 @@ class Batch:
 
     def described(self) -> dict[str, Any]:
         """Return the parameters that determine the images, for JSON."""
+        return self._described
+
+    @cached_property
+    def _described(self) -> dict[str, Any]:
+        # Once, because code and videos may change during the run.
         return {
             "made_by": code_version(),
             "source": {
-                "name": self.source.resolve().name,
+                "name": text_of(self.source.resolve().name),
                 "layout": self.layout,
-                "videos": self._videos(),
+                "videos": {
+                    text_of(path.name): digest
+                    for path, (_, digest) in self._videos.items()
+                },
             },
             **self.job.described(),
         }
 
-    def _videos(self) -> dict[str, str]:
-        """Return the hashes of the source videos."""
+    @cached_property
+    def _videos(self) -> dict[Path, tuple[tuple[int, ...], str]]:
+        """Return the identity and the hash of each source video."""
         paths = {
             path
             for frame in self.frames
             for path in {frame.color, frame.depth} - set(frame.files)
             if frame.fault is None
         }
-        return {path.name: content_of(path)["sha256"] for path in sorted(paths)}
+        return {
+            path: (_identity(path), content_of(path)["sha256"])
+            for path in sorted(paths)
+        }
+
+    def check_videos(self) -> None:
+        """Check that the source videos are those whose hashes the manifest contains.
+
+        Raises
+        ------
+        OSError
+            If one has changed since it was hashed.
+        """
+        for path, (identity, _) in self._videos.items():
+            if _identity(path) != identity:
+                raise OSError(
+                    f"'{path}' changed during the run; start again with --overwrite"
+                )
 
 
-def prepare_folder(batch: Batch, *, overwrite: bool) -> None:
-    """Create the output folder, or check that it belongs to a batch.
+def _identity(path: Path) -> tuple[int, ...]:
+    status = path.stat()
+    times_ns = status.st_mtime_ns, status.st_ctime_ns  # users cannot set the latter
+    return status.st_dev, status.st_ino, status.st_size, *times_ns
+
+
+def check_folder(out: Path) -> None:
+    """Create the output folder, or check that it is empty or belongs to a batch.
 
     Raises
     ------
     ValueError
         If it contains other files.
     """
-    out = batch.out
     out.mkdir(parents=True, exist_ok=True)
-    if not (out / LINES).exists():
-        others = [path.name for path in out.iterdir() if path.name != LOCK]
-        if others:
-            raise ValueError(
-                f"--out '{out}' contains '{min(others)}' and no {LINES}; allowed: an "
-                "empty folder, or the folder of an earlier batch"
-            )
-    elif overwrite:
-        _remove_results(batch)
+    others = [path.name for path in out.iterdir() if path.name != LOCK]
+    # In this order: another batch may be creating its manifest.
+    if others and not (out / LINES).exists():
+        raise ValueError(
+            f"--out '{out}' contains '{min(others)}' and no {LINES}; allowed: an "
+            "empty folder, or the folder of an earlier batch"
+        )
 
 
-def _remove_results(batch: Batch) -> None:
-    """Remove the results of an earlier batch that its manifest lists."""
+def begin_anew(batch: Batch) -> None:
+    """Remove the results that the manifest lists, and replace it by the batch's.
+
+    The caller must hold the lock of `only_one`.  If this is interrupted, the earlier
+    manifest stays.
+    """
+    if not (batch.out / LINES).exists():
+        return
+    job = batch.described()  # raises if a video cannot be read
     for record in records_of(batch.out / LINES):
-        names = [record.get("file")]
+        file = record.get("file")
+        names = [name_of(file)] if isinstance(file, str) else []
         profiles = record.get("profiles", ())
         if isinstance(profiles, dict | list):
             names += [f"{k}{suffix}" for k in profiles for suffix in VIDEO_SUFFIXES]
@@ -126,14 +172,44 @@ def _remove_results(batch: Batch) -> None:
             path = below(batch.out, name)
             if path is not None and not path.is_dir():
                 path.unlink(missing_ok=True)
-    shutil.rmtree(batch.out / SEGMENTS, ignore_errors=True)
-    for name in (SUMMARY, LINES):
-        (batch.out / name).unlink(missing_ok=True)
+    _remove_segments(batch.out)
+    (batch.out / SUMMARY).unlink(missing_ok=True)
+    begin_manifest(batch.out, job)
+
+
+def _remove_segments(out: Path) -> None:
+    """Remove the segments of videos, including those that no manifest lists."""
+    for path in (out / SEGMENTS).glob("*/*.mkv"):
+        name = path.relative_to(out).as_posix()
+        if _SEGMENT_NAME.fullmatch(path.name) and below(out, name) is not None:
+            path.unlink()
+    with suppress(OSError):  # contains other files, or does not exist
+        for folder in (out / SEGMENTS).iterdir():
+            folder.rmdir()
+        (out / SEGMENTS).rmdir()
+
+
+def check_links(batch: Batch) -> None:
+    """Check that no folder of results is a link to another place.
+
+    Raises
+    ------
+    ValueError
+        If one is.  The message names it.
+    """
+    for name in (SEGMENTS, *batch.job.profiles):
+        if below(batch.out, f"{name}/file") is None:
+            raise ValueError(
+                f"'{batch.out / name}' leads outside '{batch.out}'; allowed: a folder "
+                "that is not a link"
+            )
 
 
 @contextmanager
-def only_one(out: Path) -> Iterator[None]:
-    """Lock a folder against a second batch.
+def only_one(out: Path) -> Iterator[int]:
+    """Lock a folder against a second batch; yield the descriptor that holds the lock.
+
+    Processes that inherit the descriptor hold the lock, too.
 
     Raises
     ------
@@ -142,27 +218,40 @@ def only_one(out: Path) -> Iterator[None]:
     """
     flags = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
     try:
-        descriptor = os.open(out / LOCK, flags, 0o644)
+        descriptor = os.open(out / LOCK, flags, 0o600)
     except OSError as error:
         found = f"cannot be opened ({error.strerror})"
         raise InvalidFile(out / LOCK, found, "a plain file or none") from None
     with os.fdopen(descriptor, "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ValueError(f"--out '{out}': another batch is running there") from None
-        yield
+        deadline_s = time.monotonic() + LOCK_WAIT_S
+        while not _is_locked(file.fileno()):
+            if time.monotonic() > deadline_s:
+                raise ValueError(f"--out '{out}': another batch is running there")
+            time.sleep(0.02)
+        yield file.fileno()
+
+
+def _is_locked(descriptor: int) -> bool:
+    """Lock a file; return whether this succeeded."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def missing_units(batch: Batch, manifest: Manifest) -> list[Unit]:
-    """Return the missing work as units, profile by profile."""
+    """Return the missing work as units, profile by profile.
+
+    This reads the results and the inputs of all frames in the manifest, on all cores.
+    """
     units: list[Unit] = []
+    known = cache(content_of)  # frames share segments, and profiles share inputs
     for profile in batch.job.profiles:
         for segment, frames in _parts(batch, profile):
+            is_done = _are_done(profile, frames, manifest, known)
             missing = [
-                frame
-                for frame in frames
-                if not manifest.is_done(profile, frame.name, frame.files)
+                frame for frame, done in zip(frames, is_done, strict=True) if not done
             ]
             if missing and segment is not None:
                 missing = list(frames)  # a segment is always written completely
@@ -171,6 +260,22 @@ def missing_units(batch: Batch, manifest: Manifest) -> list[Unit]:
                 some = tuple(missing[start : start + step])
                 units.append(Unit(len(units), profile, some, segment))
     return units
+
+
+def _are_done(
+    profile: str,
+    frames: Sequence[SourceFrame],
+    manifest: Manifest,
+    known: Callable[[Path], dict[str, Any]],
+) -> list[bool]:
+    found: list[bool] = []
+    with ThreadPoolExecutor(thread_count()) as threads:
+        for start in range(0, len(frames), _CHECKED_AT_ONCE):
+            some = frames[start : start + _CHECKED_AT_ONCE]
+            found += threads.map(
+                lambda one: manifest.is_done(profile, one, known), some
+            )
+    return found
 
 
 def _parts(
@@ -211,22 +316,31 @@ def run_batch(
     remove_parts(batch.out)
     started_s = time.monotonic()
     units = missing_units(batch, manifest)
-    wanted = {(p, frame.name) for p in batch.job.profiles for frame in batch.frames}
+    wanted = {
+        (profile, text_of(frame.name))
+        for profile in batch.job.profiles
+        for frame in batch.frames
+    }
     n_missing = sum(len(unit.frames) for unit in units)
     n_done = len(wanted) - n_missing
     on_done(n_done, len(wanted))
     for profile in {unit.profile for unit in units}:
         video_of(batch, profile).unlink(missing_ok=True)  # it will be written again
     cpu_s, n_failed = 0.0, 0
-    for record in pool.run(units):
-        manifest.append(record)
-        n_failed += not record["ok"]
-        cpu_s += record.get("cpu_ms", 0.0) / 1e3
-        n_done += 1
-        on_done(n_done, len(wanted))
-    remove_parts(batch.out)  # of killed workers
+    try:
+        with closing(pool.run(units)) as records:
+            for record in records:
+                batch.check_videos()
+                manifest.append(record)
+                n_failed += not record["ok"]
+                cpu_s += record.get("cpu_ms", 0.0) / 1e3
+                n_done += 1
+                on_done(n_done, len(wanted))
+    finally:
+        remove_parts(batch.out)  # of killed workers
     if batch.job.is_video:
         _join_videos(batch, manifest)
+    manifest.check_in_place()
     took_s = time.monotonic() - started_s
     summary = {
         "frames": len(wanted),
@@ -259,7 +373,7 @@ def _join_videos(batch: Batch, manifest: Manifest) -> None:
     kind, rate_hz = VIDEO_KINDS[batch.job.format], batch.job.rate_hz
     for profile in batch.job.profiles:
         target = video_of(batch, profile)
-        if target.is_file():
+        if manifest.has_video(profile, target, content_of):
             continue
         segments = [
             (number * SEGMENT_FRAMES, batch.out / cast(Path, segment))
@@ -272,7 +386,10 @@ def _join_videos(batch: Batch, manifest: Manifest) -> None:
         def join(path: Path, segments: list[tuple[int, Path]] = segments) -> None:
             join_segments(path, segments, kind=kind, rate_hz=rate_hz)
 
-        write_whole(target, join)
+        content = write_whole(target, join)
+        manifest.append(
+            {"kind": "video", "profile": profile, "file": target.name, **content}
+        )
 
 
 def _is_ok(manifest: Manifest, profile: str, frame: SourceFrame) -> bool:

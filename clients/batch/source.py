@@ -6,9 +6,9 @@ Layouts list frames; workers read their files.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,8 +77,11 @@ class Pinhole:
 class DepthForm(Protocol):
     """Interface of depth formats."""
 
-    def read(self, path: Path) -> NDArray[np.float32]:
-        """Return the depth in a file, m; 0, negative and NaN are missing."""
+    def read(self, path: Path, content: bytes | None = None) -> NDArray[np.float32]:
+        """Return the depth in a file, m; 0, negative and NaN are missing.
+
+        If the content of the file is given, the file is not read.
+        """
 
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
         """Return the depth in a video frame, m."""
@@ -90,9 +93,10 @@ class Scaled:
 
     depth_scale_m: float | None = None
 
-    def read(self, path: Path) -> NDArray[np.float32]:
+    def read(self, path: Path, content: bytes | None = None) -> NDArray[np.float32]:
         """Return the depth in a file, m."""
-        return read_depth(path, depth_scale=self.depth_scale_m, option="")
+        scale_m = self.depth_scale_m
+        return read_depth(path, depth_scale=scale_m, option="", content=content)
 
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
         """Return the depth in a video frame, m."""
@@ -112,9 +116,10 @@ class Disparity:
     baseline_m: float
     offset_px: float
 
-    def read(self, path: Path) -> NDArray[np.float32]:
+    def read(self, path: Path, content: bytes | None = None) -> NDArray[np.float32]:
         """Return the depth in a file, m; 0 if the disparity is unknown."""
-        return self._depth_m(read_depth(path, depth_scale=1.0, option=""))
+        stored = read_depth(path, depth_scale=1.0, option="", content=content)
+        return self._depth_m(stored)
 
     def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
         """Return the depth in a video frame, m."""
@@ -163,6 +168,13 @@ class SourceFrame:
         """Return the image files of the frame, without videos."""
         parts = ((self.color, self.color_index), (self.depth, self.depth_index))
         return tuple(path for path, index in parts if index is None)
+
+    def described(self) -> dict[str, Any]:
+        """Return the camera and the depth format, for JSON."""
+        return {
+            part: {"kind": type(value).__name__, **asdict(cast(Any, value))}
+            for part, value in (("camera", self.optics), ("depth", self.depth_form))
+        }
 
 
 class BadFrame(ValueError):

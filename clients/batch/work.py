@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -11,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clients.batch.atomic_files import input_of, write_whole
+from clients.batch.atomic_files import below, write_whole
 from clients.batch.exact_filter import ExactFilter
 from clients.batch.job import Job
 from clients.batch.source import BadFrame, SourceFrame, check_sizes
+from estimator.bounded_files import read_bytes
 from filter_service import Filtered, FilterError, RgbdView
+from filter_service.bounded_images import MAX_FILE_BYTES
 from filter_service.image_files import read_color, write_image
 
 if TYPE_CHECKING:
@@ -115,7 +118,7 @@ class UnitRunner:
             write_image(path, color, png_level=PNG_LEVEL)
 
         try:
-            written = write_whole(self._out / file, write)
+            written = write_whole(self._place(file), write)
         except FAILURES as error:
             return _failed(profile, frame, error)
         seen.record["ms"]["write"] = _ms_since(start_s)
@@ -151,7 +154,8 @@ class UnitRunner:
             path.touch()  # exists even without frames
 
         try:
-            written = write_whole(self._out / unit.segment, write)
+            place = self._place(unit.segment)
+            written = write_whole(place, write)
         except Cancelled:
             return
         except FAILURES as error:
@@ -159,11 +163,21 @@ class UnitRunner:
                 yield _failed(unit.profile, frame, error)
             return
         if not any(record["ok"] for record in records):
-            (self._out / unit.segment).unlink()
+            place.unlink()
         for record in records:
             if record["ok"]:
                 record = {**record, "file": unit.segment.as_posix(), **written}
             yield record
+
+    def _place(self, file: Path) -> Path:
+        """Return the path of a result; reject a folder that is a link to elsewhere."""
+        path = below(self._out, file.as_posix())
+        if path is None:
+            raise BadFrame(
+                f"'{self._out / file}' leads outside '{self._out}'; allowed: folders "
+                "that are not links"
+            )
+        return path
 
     def _attempt(self, profile: str, frame: SourceFrame) -> FilteredPicture | Record:
         try:
@@ -175,7 +189,7 @@ class UnitRunner:
         if frame.fault is not None:
             raise BadFrame(frame.fault)
         start_s = time.perf_counter()
-        color, depth_m = self._read(frame)
+        color, depth_m, inputs = self._read(frame)
         check_sizes(frame, color, depth_m)
         height_px, width_px = depth_m.shape
         view = RgbdView(color, depth_m, frame.optics.tangents(width_px, height_px))
@@ -195,22 +209,40 @@ class UnitRunner:
             "clamped_depth_count": int(seen.clamped_depth_count),
             "overflow_count": int(seen.overflow_count),
             "notes": list(seen.notes),
-            "inputs": [input_of(path) for path in frame.files],
+            "inputs": inputs,
+            "source": frame.described(),
             "ms": {"read": read_ms, "filter": _ms_since(start_s)},
         }
         if built_now:
             record["ms"]["build"] = 1e3 * (self._filter.build_s - built_s)
         return FilteredPicture(seen, record)
 
-    def _read(self, frame: SourceFrame) -> tuple[NDArray[Any], NDArray[np.float32]]:
+    def _read(
+        self, frame: SourceFrame
+    ) -> tuple[NDArray[Any], NDArray[np.float32], list[Record]]:
+        """Return color, depth and the records of the image files.
+
+        Each file is read once: the bytes that are decoded are those that are hashed,
+        even if the file changes.
+        """
+        inputs: list[Record] = []
+
+        def content_of(path: Path) -> bytes:
+            content = read_bytes(path, max_bytes=MAX_FILE_BYTES)
+            digest = hashlib.sha256(content).hexdigest()
+            n_bytes = len(content)
+            inputs.append({"name": path.name, "bytes": n_bytes, "sha256": digest})
+            return content
+
         if frame.color_index is None:
-            color = read_color(frame.color, option="")
+            color = read_color(frame.color, option="", content=content_of(frame.color))
         else:
             color = self._reader(frame.color).color(frame.color_index)
         if frame.depth_index is None:
-            return color, frame.depth_form.read(frame.depth)
+            content = content_of(frame.depth)
+            return color, frame.depth_form.read(frame.depth, content), inputs
         stored = self._reader(frame.depth).integers(frame.depth_index)
-        return color, frame.depth_form.of_integers(stored)
+        return color, frame.depth_form.of_integers(stored), inputs
 
     def _reader(self, path: Path) -> VideoReader:
         if path not in self._readers:
