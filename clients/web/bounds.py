@@ -24,6 +24,8 @@ envelope."""
 MAX_PAGES = 32
 """Maximum number of open pages; each has its own eyes, with tens of MB of PSFs."""
 
+FULL = f"{MAX_PAGES} pages are open; close one and reload this page"
+
 PAGE_PATH = "/"
 KNOWN_PREFIXES = ("/_nicegui/", "/_nicegui_ws/", "/favicon.ico")
 UPLOAD_PREFIX, UPLOAD_PART = "/_nicegui/client/", "/upload/"
@@ -112,7 +114,7 @@ class Bounds:
         if is_upload and self._n_uploads >= self._limits.uploads:
             return 503, f"{self._limits.uploads} uploads at a time; try again later"
         if path == PAGE_PATH and method in READ_METHODS and self._is_full():
-            return 503, f"{MAX_PAGES} pages are open; close one and reload this page"
+            return 503, FULL
         return None
 
 

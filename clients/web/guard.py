@@ -83,7 +83,8 @@ class Guard:
         elif not self._is_addressed_to_us(scope):
             await _refuse(kind, receive, send, 421, page_of("Unknown host"))
         elif kind == "http" and self._has_token(scope):
-            await self._redirect_with_cookie(send)
+            is_tls = scope.get("scheme") == "https"
+            await self._redirect_with_cookie(send, is_tls=is_tls)
         elif self._has_cookie(scope) and is_from_here(scope):
             await self.app(scope, receive, _with_headers(send))
         else:
@@ -115,10 +116,12 @@ class Guard:
             for name, _, value in pairs
         )
 
-    async def _redirect_with_cookie(self, send: Send) -> None:
+    async def _redirect_with_cookie(self, send: Send, *, is_tls: bool) -> None:
         # not Strict: after a link on another site, a browser would not send it to the
         # address that it is redirected to
         cookie = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Lax"
+        if is_tls:  # a browser would not return a Secure cookie over plain HTTP
+            cookie += "; Secure"
         # keeps the token out of the address bar and the browser's history
         headers = [
             (b"set-cookie", cookie.encode("latin-1")),

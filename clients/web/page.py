@@ -8,8 +8,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from fastapi import Response
+from fastapi.responses import HTMLResponse
 from nicegui import Client, app, events, run, ui
 
+from clients.web.bounds import FULL, MAX_PAGES
 from clients.web.chart import caption, marks_of
 from clients.web.downloads import Downloads
 from clients.web.eye_form import SIDES, EyeSide
@@ -17,6 +20,7 @@ from clients.web.eye_panel import EyePanel
 from clients.web.figure_panel import FigurePanel
 from clients.web.figure_worker import FigureWorker
 from clients.web.filter_thread import FilterThread
+from clients.web.guard import page_of
 from clients.web.numbers import NumberField, distance_text
 from clients.web.page_link import PageLink
 from clients.web.page_state import AGE, CONDITIONS, DISTANCE, FOCUS, PUPIL, PageState
@@ -47,6 +51,9 @@ SCENE_WAIT_S = 1.5
 """Maximum time that a page waits for the default scene before it opens without one."""
 
 CONNECT_S = 30.0
+RESPONSE_S = 120.0
+"""Time limit for building a page.  It takes 0.35 s, and pages are built one at a time:
+as many as may be open wait for each other."""
 
 AMPLITUDE = (
     "The amplitude is that of objective accommodation; a push-up measurement also "
@@ -66,6 +73,11 @@ class SharedResources:
         self.filter_thread = FilterThread()
         self.figure_worker = FigureWorker()
         self.picture_senders: dict[str, PictureSender] = {}
+
+    @property
+    def are_full(self) -> bool:
+        """Return whether the maximum number of pages is open."""
+        return len(self.picture_senders) >= MAX_PAGES
 
     def close(self) -> None:
         """Stop the thread and the process; closing twice is allowed."""
@@ -478,11 +490,13 @@ def add_page(
 ) -> None:
     """Serve the page at `/`."""
 
-    @ui.page("/", title="ocufilter")
-    async def _page(client: Client) -> None:
+    @ui.page("/", title="ocufilter", response_timeout=RESPONSE_S)
+    async def _page(client: Client) -> Response | None:
         # usually available already, because it is rendered when the server starts
         first = asyncio.ensure_future(run.io_bound(scene_picture, DEFAULT_SCENE))
         await asyncio.wait({first}, timeout=SCENE_WAIT_S)
+        if resources.are_full:  # by requests that waited at the same time
+            return HTMLResponse(page_of(FULL), 503)
         page = Page(resources, profile, token)
         client.on_delete(page.close)
         if first.done():
@@ -490,11 +504,12 @@ def add_page(
         try:
             await client.connected(timeout=CONNECT_S)
         except TimeoutError:  # the browser has left
-            return
+            return None
         with client:
             if not first.done():
                 await asyncio.wait({first})
                 page.show_default_scene(first)
             await page.start()
+        return None
 
     app.on_shutdown(resources.close)

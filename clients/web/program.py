@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import ipaddress
 import json
+import logging
 import secrets
 import signal
 import socket
@@ -23,6 +24,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from clients.extra import WEB_INSTALL
+from filter_service.log_lines import configure_logging
 
 DEFAULT_PORT = 8765
 TOKEN_BYTES = 24
@@ -57,7 +59,8 @@ def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
         default=[],
         metavar="HOST",
         help="host name in requests from a proxy on this machine; may be repeated.  "
-        "Without --host, only requests for localhost and these names are accepted",
+        "Without --host, only requests for localhost and these names are accepted.  "
+        "The cookie is Secure if the proxy sends X-Forwarded-Proto: https",
     )
     parser.add_argument(
         "--no-browser",
@@ -151,6 +154,7 @@ def serve(options: argparse.Namespace) -> int:
     token, one_time_token = (secrets.token_urlsafe(TOKEN_BYTES) for _ in range(2))
     from clients.web.server import make_server
 
+    configure_logging("web", level=logging.WARNING)
     addresses = [address_of(options.host, port, t) for t in (token, one_time_token)]
     server = make_server(
         token,
@@ -158,6 +162,7 @@ def serve(options: argparse.Namespace) -> int:
         profile,
         one_time_token=None if options.no_browser else one_time_token,
         hosts=hosts,
+        is_behind_proxy=bool(options.proxy_host),
         on_ready=lambda: _announce(*cast(tuple[str, str], addresses), options),
     )
     # the server shuts down by itself and raises the signal again: exit cleanly

@@ -7,7 +7,6 @@ Building a scene takes seconds, during which the page must stay responsive.
 
 from __future__ import annotations
 
-import json
 import struct
 import subprocess
 import sys
@@ -20,10 +19,16 @@ from typing import Any
 import numpy as np
 
 from clients.arguments import read_size_px
-from clients.batch.atomic_files import write_whole
+from clients.headset.gltf_container import (
+    MAX_HEADER_BYTES,
+    MAX_HEADER_DEPTH,
+    MAX_HEADER_ITEMS,
+)
 from clients.web.picture import Picture, picture_of
 from estimator import InvalidFile
+from estimator.bounded_files import loads_bounded
 from filter_service import RgbdView
+from filter_service.atomic_files import replace_atomically
 
 TIMEOUT_S = 300.0
 SIZE_PX = (960, 540)
@@ -65,7 +70,7 @@ def gltf_picture(name: str, content: bytes) -> Picture:
     Raises
     ------
     InvalidFile
-        If the file is of another kind.
+        If the file is of another kind, or refers to other files.
     SceneNotRendered
         If the file is damaged or cannot be rendered here.
     """
@@ -95,15 +100,20 @@ def _check_is_self_contained(name: str, content: bytes) -> None:
         length = _GLB_HEADER.unpack_from(content)[3]
         text = content[_GLB_HEADER.size :][:length]
     try:
-        header = json.loads(text)
-        uris = _uris(header)
-    except (ValueError, RecursionError):
-        raise ValueError(f"“{name:.60}” is not a glTF 2 file") from None
-    for uri in uris:
+        header = loads_bounded(
+            text,
+            max_bytes=MAX_HEADER_BYTES,
+            max_depth=MAX_HEADER_DEPTH,
+            max_items=MAX_HEADER_ITEMS,
+        )
+    except ValueError as error:
+        found = f"is not a glTF 2 file ({error})"
+        raise InvalidFile(name[:60], found, "glTF 2") from None
+    for uri in _uris(header):
         if not uri.startswith("data:"):
-            raise ValueError(
-                f"“{name:.60}” refers to another file, “{uri:.60}”; expected a .glb, "
-                "or a .gltf with embedded textures and meshes"
+            allowed = ".glb, or .gltf with embedded textures and meshes"
+            raise InvalidFile(
+                name[:60], f"refers to another file, '{uri:.60}'", allowed
             )
 
 
@@ -180,7 +190,7 @@ def main(source: str, file: str, size: str) -> int:
             "tangents": renderer.tangents,
             "state": state,
         }
-    write_whole(Path(file), lambda part: np.savez(part, **arrays))
+    replace_atomically(Path(file), lambda part: np.savez(part, **arrays))
     return 0
 
 

@@ -16,7 +16,7 @@ from fastapi import FastAPI, WebSocket
 from fastapi.exception_handlers import http_exception_handler
 from nicegui import app, ui
 
-from clients.web.bounds import MAX_MESSAGE_BYTES, MAX_PAGES, Bounds
+from clients.web.bounds import MAX_MESSAGE_BYTES, Bounds
 from clients.web.connections import MAX_HEAD_BYTES, BoundedConnection
 from clients.web.guard import POLICY_VIOLATION, Guard
 from clients.web.page import PICTURES_PATH, SharedResources, add_page
@@ -41,6 +41,7 @@ def make_server(
     *,
     one_time_token: str | None = None,
     hosts: Collection[str] | None = None,
+    is_behind_proxy: bool = False,
     on_ready: Callable[[], None],
 ) -> uvicorn.Server:
     """Return the server.  Pass the listening sockets to its `run` method.
@@ -48,6 +49,9 @@ def make_server(
     Parameters
     ----------
     one_time_token, hosts : as in `Guard`
+    is_behind_proxy : bool
+        Whether a proxy on this machine tells the scheme of a request, in
+        ``X-Forwarded-Proto``.
     """
     resources: list[SharedResources] = []
 
@@ -84,9 +88,7 @@ def make_server(
     )
     # NiceGUI's own handler creates a page for each unknown address
     app.add_exception_handler(404, http_exception_handler)
-    bounded = Bounds(
-        application, is_full=lambda: len(resources[0].picture_senders) >= MAX_PAGES
-    )
+    bounded = Bounds(application, is_full=lambda: resources[0].are_full)
     guarded = Guard(
         bounded,
         token=token,
@@ -97,11 +99,14 @@ def make_server(
     return uvicorn.Server(
         uvicorn.Config(
             guarded,
+            log_config=None,  # as the program has configured it
             log_level="warning",
             timeout_graceful_shutdown=SHUTDOWN_TIMEOUT_S,
             http=BoundedConnection,
             h11_max_incomplete_event_size=MAX_HEAD_BYTES,
             ws_max_size=MAX_MESSAGE_BYTES,
             server_header=False,
+            proxy_headers=is_behind_proxy,
+            forwarded_allow_ips=["127.0.0.1", "::1"],
         )
     )

@@ -7,14 +7,15 @@ the entries that differ from a new page, and never the content of a file.
 from __future__ import annotations
 
 import base64
-import binascii
 import json
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
 from clients.web.correction_form import DESIGNS, KINDS, CorrectionForm
-from clients.web.eye_form import SIDES, EyeForm, preset_titles
+from clients.web.eye_form import SIDES, EyeForm, Source, preset_titles
 from clients.web.page_state import CONDITIONS, PageState, Shown
+from estimator.bounded_files import loads_bounded
 
 VERSION = 1
 MAX_CHARACTERS = 8000
@@ -99,17 +100,15 @@ def restore(state: PageState, fragment: str) -> Restored:
         return found
     state.reset()
     state.is_focus_set = entries.get("focus_set") is True
-    if entries.get("shown") in get_args(Shown):
-        state.shown = entries["shown"]
-    scene = entries.get("scene")
-    found.scene = scene if scene in SCENES else SCENES[0]
+    state.shown = _choice(entries, "shown", get_args(Shown)) or state.shown
+    found.scene = _choice(entries, "scene", SCENES) or SCENES[0]
     values = _mapping(entries.get("values"))
     for number in CONDITIONS:
         if number.name not in values:
             continue
         value = values[number.name]
         if isinstance(value, bool) or not isinstance(value, int | float):
-            found.problems.append(f"{number.label}: {value!r:.30} is not a number.")
+            found.problems.append(f"{number.label}: {_short(value)} is not a number.")
             continue
         problem = number.problem(f"{value:g}")
         if problem:
@@ -128,8 +127,9 @@ def _read(fragment: str) -> dict[str, Any] | None:
         return None
     try:
         padded = fragment + "=" * (-len(fragment) % 4)
-        entries = json.loads(base64.urlsafe_b64decode(padded))
-    except (ValueError, binascii.Error, RecursionError):
+        text = base64.urlsafe_b64decode(padded)
+        entries = loads_bounded(text, max_bytes=MAX_CHARACTERS, finite=True)
+    except ValueError:
         return None
     if not isinstance(entries, dict) or entries.get("v") != VERSION:
         return None
@@ -140,9 +140,20 @@ def _mapping(value: object) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
+def _choice(entries: Mapping[str, Any], name: str, options: Collection[str]) -> Any:
+    """Return an entry that is one of some texts; None if it is missing or another."""
+    value = entries.get(name)
+    return value if isinstance(value, str) and value in options else None
+
+
+def _short(value: object) -> str:
+    return f"{value!r:.30}"
+
+
 def _restore_eye(form: EyeForm, entries: dict[str, Any]) -> list[str]:
     problems = []
-    if entries.get("source") == "file":
+    source = _choice(entries, "source", get_args(Source))
+    if source == "file":
         name = str(entries.get("file", ""))[:MAX_ENTRY_CHARACTERS]
         if form.file_body is not None and form.file_name[:MAX_ENTRY_CHARACTERS] == name:
             form.source = "file"
@@ -150,30 +161,33 @@ def _restore_eye(form: EyeForm, entries: dict[str, Any]) -> list[str]:
             problems.append(
                 f"the profile file {name!r} is not part of a link; upload it"
             )
-    elif entries.get("source") == "preset":
-        form.source = "preset"
-    if entries.get("preset") in preset_titles():
-        form.preset = entries["preset"]
+    elif source is not None:
+        form.source = source
+    if preset := _choice(entries, "preset", preset_titles()):
+        form.preset = preset
     elif "preset" in entries:
-        problems.append(f"preset {entries['preset']!r:.30} is unknown")
+        problems.append(f"preset {_short(entries['preset'])} is unknown")
     form.has_higher_order = entries.get("higher_order") is not False
-    _restore_texts(form.texts, _mapping(entries.get("texts")))
+    problems += _restore_texts(form.texts, _mapping(entries.get("texts")))
     correction = _mapping(entries.get("correction"))
     if correction:
         form.wears_correction = True
         form.worn = CorrectionForm()
-        if correction.get("kind") in KINDS:
-            form.worn.kind = correction["kind"]
+        if kind := _choice(correction, "kind", KINDS):
+            form.worn.kind = kind
         else:
-            problems.append(f"correction {correction.get('kind')!r:.30} is unknown")
-        if correction.get("design") in DESIGNS:
-            form.worn.design = correction["design"]
-        _restore_texts(form.worn.texts, _mapping(correction.get("texts")))
+            problems.append(f"correction {_short(correction.get('kind'))} is unknown")
+        form.worn.design = _choice(correction, "design", DESIGNS) or form.worn.design
+        problems += _restore_texts(form.worn.texts, _mapping(correction.get("texts")))
     return problems
 
 
-def _restore_texts(texts: dict[str, str], entries: dict[str, Any]) -> None:
-    """Set known entries; the form reports invalid ones, as it does typed ones."""
-    for name in texts:
-        if name in entries:
-            texts[name] = str(entries[name])[:MAX_ENTRY_CHARACTERS]
+def _restore_texts(texts: dict[str, str], entries: dict[str, Any]) -> list[str]:
+    """Set known entries; the form reports invalid texts, as it does typed ones."""
+    problems = []
+    for name in texts.keys() & entries.keys():
+        if isinstance(entries[name], str):
+            texts[name] = entries[name][:MAX_ENTRY_CHARACTERS]
+        else:
+            problems.append(f"{name} {_short(entries[name])} is not text")
+    return problems
