@@ -18,6 +18,7 @@ from clients.figures.style import (
     SMALL_PT,
     SOFT,
     legend_above,
+    literal_legend,
     new_figure,
     style_axes,
     with_grid,
@@ -69,14 +70,14 @@ def draw_rms_by_order(
     radius_mm = min(study.found.zernike_radius_mm for study in studies)
     names = [*(str(n) for n in ORDERS[1:]), "3-6"]
     width, positions = 0.8 / len(studies), np.arange(len(names))
-    seconds = []
+    seconds, drawn = [], []
     for k, (study, color) in enumerate(zip(studies, (BLUE, GREEN), strict=False)):
         wavefront_um = on_circle_um(study, radius_mm)
         by_order = rms_by_order_um(wavefront_um)
         values = [*(by_order[n] for n in ORDERS[1:]), rms_um(wavefront_um)]
         at = positions + (k - 0.5 * (len(studies) - 1)) * width
-        label = labels[k] if labels else None
-        bars = axes.bar(at, values, width * 0.92, color=color, label=label)
+        bars = axes.bar(at, values, width * 0.92, color=color)
+        drawn.append(bars)
         axes.bar_label(
             bars,
             [f"{v:.2f}" for v in values],
@@ -94,10 +95,7 @@ def draw_rms_by_order(
     style_axes(axes, title=title, x=f"radial order\n{note}", y="RMS, µm")
     axes.xaxis.label.set_fontsize(SMALL_PT)
     if labels:
-        axes.figure.legend(
-            *axes.get_legend_handles_labels(), fontsize=SMALL_PT, labelcolor=INK,
-            frameon=False, loc="outside lower center",
-        )  # fmt: skip
+        literal_legend(axes.figure, drawn, labels, loc="outside lower center")
 
 
 def rms_by_order_figure(studies: Sequence[EyeStudy], **options: Any) -> Figure:

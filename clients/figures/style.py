@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import ScaledTranslation
@@ -29,6 +29,9 @@ LINE_PT = 1.5
 LEGEND_DOWN_PT = 27.0
 """Distance from an axis to the legend below it; tick and axis labels are between."""
 MM_PER_INCH = 25.4
+LITERAL: dict[str, Any] = {"parse_math": False}
+"""Property of a text that contains a name: ``$`` does not start a formula."""
+
 DIVERGING, SEQUENTIAL = "RdBu_r", "cividis"
 
 
@@ -41,7 +44,7 @@ def new_figure(width_mm: float, height_mm: float) -> Figure:
 def style_axes(axes: Axes, *, title: str = "", x: str = "", y: str = "") -> None:
     """Set title and labels of axes, and apply the common style."""
     if title:
-        axes.set_title(title, fontsize=TITLE_PT, color=INK, loc="left")
+        axes.set_title(title, fontsize=TITLE_PT, color=INK, loc="left", **LITERAL)
     axes.set_xlabel(x, fontsize=TEXT_PT, color=INK)
     axes.set_ylabel(y, fontsize=TEXT_PT, color=INK)
     axes.tick_params(labelsize=SMALL_PT, colors=SOFT, width=0.6, length=2.5)
@@ -85,13 +88,31 @@ def legend_below(axes: Axes, entries: Sequence[tuple[str, dict[str, Any]]]) -> N
     lines = [Line2D([], [], **({"linewidth": LINE_PT} | looks)) for _, looks in entries]
     down = ScaledTranslation(0.0, -LEGEND_DOWN_PT / 72.0, axes.figure.dpi_scale_trans)
     below = axes.transAxes + down
-    axes.legend(
-        lines, [label for label, _ in entries], fontsize=SMALL_PT, labelcolor=INK,
-        frameon=False,
+    literal_legend(
+        axes, lines, [label for label, _ in entries],
         loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=3, columnspacing=1.2,
         bbox_transform=below,
         handlelength=1.6, borderaxespad=0.0,
     )  # fmt: skip
+
+
+def literal_legend(
+    owner: Axes | FigureBase,
+    handles: Sequence[Any],
+    labels: Sequence[str],
+    **placing: Any,
+) -> None:
+    """Draw a legend of labels as they are written.
+
+    matplotlib itself takes labels with ``$`` for formulas, and omits those that start
+    with an underscore.
+    """
+    legend = owner.legend(
+        handles, [" "] * len(handles), fontsize=SMALL_PT, labelcolor=INK,
+        frameon=False, **placing,
+    )  # fmt: skip
+    for text, label in zip(legend.get_texts(), labels, strict=True):
+        text.set(text=label, **LITERAL)
 
 
 def mark_unknown(axes: Axes) -> None:

@@ -18,7 +18,7 @@ from clients.figures import (
 from clients.figures.orders import LOWEST_HIGHER_ORDER, on_circle_um
 from clients.figures.psfs import psf_sides_arcmin
 from clients.figures.study import PUPILS_MM
-from clients.figures.style import TITLE_PT
+from clients.figures.style import LITERAL, TITLE_PT
 from clients.report.blocks import (
     Document,
     Plot,
@@ -156,7 +156,7 @@ def _psfs(study: EyeStudy, label: str, sides_arcmin: tuple[float, float]) -> Plo
 
     def draw(panel: FigureBase) -> None:
         draw_psfs(panel, study, sides_arcmin=sides_arcmin)
-        panel.suptitle(label, fontsize=TITLE_PT)
+        panel.suptitle(label, fontsize=TITLE_PT, **LITERAL)
 
     return Plot(draw, PSF_MM, f"Point-spread functions: {label}")
 

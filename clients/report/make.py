@@ -12,9 +12,10 @@ from clients.report.comparison import comparison_document
 from clients.report.content import eye_document
 from clients.report.facts import EyeFacts, facts_of
 from clients.report.html_page import html_of
-from clients.report.labels import distinct_labels
+from clients.report.labels import check_text, distinct_labels
 from clients.report.origin import Record, origin_of, running_footer
 from estimator import drawn_profiles
+from filter_service.atomic_files import write_atomically
 
 SUFFIXES = (".html", ".pdf")
 PANGO_PACKAGES = ("libpango-1.0-0", "libpangoft2-1.0-0", "libharfbuzz-subset0")
@@ -51,7 +52,7 @@ def report_html(
     profile, after : EyeProfile, mapping, preset name or path
         With ``after``, the report starts with the differences.
     label, after_label : str
-        Names of the eyes, instead of their profiles' names.
+        Names of the eyes, instead of their profiles' names; at most 60 characters.
     reference, patient, examiner : str
         Record or order number, patient name and examiner name, shown in the header; at
         most 60 characters each.
@@ -66,8 +67,8 @@ def report_html(
     Raises
     ------
     ValueError
-        If a profile is invalid, no light passes through an eye, a text is too long, or
-        there is nothing to draw.
+        If a profile is invalid, no light passes through an eye, a text is too long or
+        cannot be printed, or there is nothing to draw.
     """
     record = Record(patient=patient, examiner=examiner, reference=reference)
     eyes = compute_eye_facts(
@@ -96,9 +97,11 @@ def compute_eye_facts(
     Raises
     ------
     ValueError
-        If a profile is invalid, no light passes through an eye, or persons cannot be
-        drawn: for two eyes, or because they would not differ.
+        If a profile or a label is invalid, no light passes through an eye, or persons
+        cannot be drawn: for two eyes, or because they would not differ.
     """
+    for field, label in zip(("label", "after_label"), labels, strict=False):
+        check_text(field, label)
     if people is not None:
         if len(profiles) > 1:
             raise ValueError(
@@ -149,6 +152,8 @@ def write_report(
 ) -> None:
     """Write a report as ``.html``, or as ``.pdf`` tagged for screen readers.
 
+    Only the owner can read the file, because it contains names and prescriptions.
+
     Raises
     ------
     ReportError
@@ -157,10 +162,8 @@ def write_report(
         If the file cannot be written.
     """
     text = html_of(document_of(eyes, record))
-    if path.suffix.lower() == ".pdf":
-        path.write_bytes(_render_pdf(text))
-    else:
-        path.write_text(text, encoding="utf-8")
+    is_pdf = path.suffix.lower() == ".pdf"
+    write_atomically(path, _render_pdf(text) if is_pdf else text)
 
 
 def check_pdf() -> None:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from datetime import datetime
-from importlib.metadata import version
 
 from clients.report.facts import EyeFacts
+from clients.report.labels import check_text
+from filter_service import __version__
 
 SHOWN_DIGITS = 16
 """Digits of a profile's digest that are shown: 64 bits."""
-
-MAX_TEXT_LENGTH = 60
-"""Maximum length of a text, so that all texts fit in the page margin."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +20,7 @@ class Record:
     Raises
     ------
     ValueError
-        If a text is too long.
+        If a text is too long or cannot be printed.
     """
 
     patient: str = ""
@@ -31,12 +29,7 @@ class Record:
 
     def __post_init__(self) -> None:
         for name in (field.name for field in fields(self)):
-            length = len(getattr(self, name))
-            if length > MAX_TEXT_LENGTH:
-                raise ValueError(
-                    f"{name} has {length} characters; allowed: at most "
-                    f"{MAX_TEXT_LENGTH}"
-                )
+            check_text(name, getattr(self, name))
 
 
 def origin_of(eyes: list[EyeFacts], record: Record) -> tuple[tuple[str, str], ...]:
@@ -47,7 +40,7 @@ def origin_of(eyes: list[EyeFacts], record: Record) -> tuple[tuple[str, str], ..
         ("Examiner", record.examiner),
         ("Reference", record.reference),
         ("Date", f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}"),
-        ("Version", f"ocufilter {version('ocufilter')}"),
+        ("Version", f"ocufilter {__version__}"),
         ("Profile", digests),
     )
     return tuple((name, value) for name, value in entries if value)

@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from clients.figures.study import profile_of
+from clients.report.labels import check_text, shortened
 from clients.report.make import (
     SUFFIXES,
     ReportError,
@@ -38,6 +39,7 @@ from clients.report.make import (
 )
 from clients.report.origin import Record
 from filter_service.errors import FilterError
+from filter_service.image_files import check_output
 from filter_service.progress import Progress
 
 
@@ -122,6 +124,8 @@ def run(options: argparse.Namespace) -> str:
     )
     if options.out is not None and options.out.suffix.lower() == ".pdf":
         check_pdf()
+    check_text("--name", options.name)
+    check_text("--after-name", options.after_name)
     sources = [options.profile] + ([options.after] if options.after else [])
     profiles = [profile_of(source) for source in sources]  # fail early
     labels = tuple(
@@ -158,17 +162,14 @@ def _check_out(options: argparse.Namespace) -> None:
         if not options.json:
             raise ValueError("--out is missing; expected a .html or .pdf file")
         return
-    if out.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"--out '{out}': expected a .html or .pdf file")
-    if not out.absolute().parent.is_dir():
-        raise ValueError(f"--out '{out}': folder {out.parent} does not exist")
+    check_output(out, SUFFIXES)
 
 
 def _default_name(source: str) -> str:
     """Return a file's name without its suffix, or a preset's name; empty for JSON."""
     if source.lstrip().startswith("{"):
         return ""
-    return Path(source).stem if Path(source).suffix else source
+    return shortened(Path(source).stem if Path(source).suffix else source)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

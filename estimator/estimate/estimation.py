@@ -35,6 +35,7 @@ from estimator.networks.card import (
     NetworkUnfit,
     WeightsMissing,
 )
+from estimator.note import Note
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import N_TERMS, remove_central_tilt
 from estimator.profiles.measured_wavefront import profile_amplitude_dpt
@@ -274,7 +275,8 @@ def estimate_eye(
         labels = ("given",) * len(start_vectors)
     found = _refined(problem, start_s, start_vectors, labels, reason)
     if method == "network":
-        found = replace(found, notes=(f"not by network: {reason}", *found.notes))
+        note = Note("not_by_network", f"not by network: {reason}")
+        found = replace(found, notes=(note, *found.notes))
     return found
 
 
@@ -322,15 +324,19 @@ def _notes(error_um: float, method: str) -> tuple[str, ...]:
     if error_um <= POOR_FIT_UM:
         return ()
     which = "network's eye" if method == "network" else "eye model"
-    return (
+    note = Note(
+        "poor_fit",
         f"the {which} reaches this wavefront only to {error_um:.2g} um on average: the "
         "rest is added to it near the axis",
+        mean_error_um=error_um,
     )
+    return (note,)
 
 
 def _unusual(parameters: EyeParameters, profile: EyeProfile) -> tuple[str, ...]:
     named = unusual(parameters, retina=profile.retina)
-    return (f"unusual for a person: {'; '.join(named)}",) if named else ()
+    text = f"unusual for a person: {'; '.join(named)}"
+    return (Note("unusual_eye", text),) if named else ()
 
 
 def _start_vectors(

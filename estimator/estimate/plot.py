@@ -86,7 +86,8 @@ def plot_eye(found: EstimatedEye, path: Path, *, focus_dpt: float = 0.0) -> None
     )
     section.set_title(
         f"{found.name}: {focused.parameters.eye_length_mm:.2f} mm long, "
-        f"M {found.refraction_dpt:+.2f} dpt, focus {focused.focus_dpt:.2f} dpt"
+        f"M {found.refraction_dpt:+.2f} dpt, focus {focused.focus_dpt:.2f} dpt",
+        parse_math=False,  # a name may contain $
     )
     _draw_coefficients(bars, found)
     figure.savefig(path, dpi=130)

@@ -50,7 +50,7 @@ def field_figure(
     figure = Figure(figsize=(10, 6.5), layout="constrained")
     if drawn is not None:
         title += f"; {len(drawn.coma_um)} drawn persons: {_band_text(table)}"
-    figure.suptitle(title)
+    figure.suptitle(title, parse_math=False)  # a name may contain $
     maps = _maps(table if drawn is None else drawn)
     for axes, (name, values) in zip(
         figure.subplots(2, 2).ravel(), maps.items(), strict=True
