@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clients.arguments import read_size_px
+from clients.arguments import profile_title, read_size_px
 from clients.extra import HEADSET_INSTALL
 from clients.headset.controls import HELP, Controls, TerminalKeys
 from clients.headset.local_filter import LocalFilter
@@ -44,7 +44,9 @@ from clients.headset.service_filter import ServiceFilter
 from clients.headset.stereo_filter import StereoFilter
 from clients.headset.stereo_gaze import StereoGaze
 from clients.headset.viewer import Viewer, ViewerLog
+from estimator.bounded_files import printable
 from filter_service import FilterSettings, is_software_renderer
+from filter_service.atomic_files import replace_atomically
 from filter_service.errors import FilterError
 
 if TYPE_CHECKING:
@@ -61,7 +63,7 @@ CORE_VALIDATION = "XR_APILAYER_LUNARG_core_validation"
 
 def say(line: str) -> None:
     """Print a message for the user to stderr; stdout is for results."""
-    print(f"headset: {line}", file=sys.stderr, flush=True)
+    print(f"headset: {printable(line)}", file=sys.stderr, flush=True)
 
 
 def gaze_range_of(
@@ -127,7 +129,7 @@ class _Eyes:
         """Request another eye."""
         self.look.change(eye)
         self.seeing.change(eye, profile)
-        say(f"{eye} eye: {profile.get('name', profile.get('kind'))}")
+        say(f"{eye} eye: {profile_title(profile)}")
 
     def begin(self, runtime: Runtime) -> None:
         """Request both eyes once the gaze range is known, and when it changes."""
@@ -158,8 +160,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         context = _context(options, stack)
         scenery = scenery_of(options, context)
         stack.callback(getattr(scenery, "close", lambda: None))
-        seeing = _seeing(options, settings, context)
-        stack.callback(seeing.close)
+        seeing = _seeing(options, settings, context, stack)
         is_range_given = options.gaze_range is not None
         eyes = _Eyes(settings, is_range_given, look, seeing, profiles)
         controls = Controls(profiles, eyes.change, say)
@@ -267,10 +268,15 @@ def _open_xr(context: moderngl.Context, options: argparse.Namespace) -> Runtime:
 
 
 def _seeing(
-    options: argparse.Namespace, settings: FilterSettings, context: moderngl.Context
+    options: argparse.Namespace,
+    settings: FilterSettings,
+    context: moderngl.Context,
+    stack: ExitStack,
 ) -> StereoFilter:
+    """Return the filter of both eyes, which the stack closes."""
     if options.service is not None:
         seeing = ServiceFilter(options.service, settings, say, key_file=options.key)
+        stack.callback(seeing.close)  # also if no service answers
         if options.frames is not None or options.seconds is not None:
             seeing.wait_for_service()  # a run that counts frames requires one
         return seeing
@@ -280,7 +286,9 @@ def _seeing(
     wanted = options.textures == "yes"
     if options.textures == "auto":
         wanted = not is_software_renderer(renderer)
-    return LocalFilter(settings, say, context if wanted else None)
+    local = LocalFilter(settings, say, context if wanted else None)
+    stack.callback(local.close)
+    return local
 
 
 class _Pictures:
@@ -308,7 +316,7 @@ class _Pictures:
             if not isinstance(color, np.ndarray):
                 with context or nullcontext():
                     color = read_texture(color)[..., :3]
-            Image.fromarray(color).save(path)
+            replace_atomically(path, Image.fromarray(color).save)
             say(f"wrote {path}")
 
 

@@ -146,6 +146,11 @@ class StereoGaze:
         Largest gaze angles in the images; the gaze is clamped to them.
     focus_dpt : float, optional
         Fixed focus; by default, focus follows the distance of the point of fixation.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of range.
     """
 
     def __init__(
@@ -165,6 +170,8 @@ class StereoGaze:
             raise ValueError(
                 f"white_cd_m2 is {white_cd_m2}; allowed: above 0, up to 100000"
             )
+        # which refuses wrong values before anything expensive starts
+        NaturalEye(age_years=age_years, pupil_diameter_mm=pupil_diameter_mm)
         self._age_years, self._pupil_mm = age_years, pupil_diameter_mm
         self._white_cd_m2 = white_cd_m2
         self.gaze_range_deg = gaze_range_deg

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
-from clients.arguments import read_profile
+from clients.arguments import profile_title, read_profile
 from clients.headset.options import TRACKED_RANGE_DEG, profiles_of
 from clients.headset.runtime import EYES, Eye
 from clients.headset.stereo_filter import Say, StereoFilter
@@ -107,7 +107,7 @@ class Eyes:
         self._profiles[eye] = profile
         self._look.change(eye)
         self._seeing.change(eye, profile)
-        self._say(f"{eye} eye: {profile.get('name', profile.get('kind'))}")
+        self._say(f"{eye} eye: {profile_title(profile)}")
 
     def reread(self) -> None:
         """Read the files that have changed."""

@@ -27,6 +27,7 @@ from clients.headset.viewer import SPLIT_RATIO
 from clients.openxr_layer import wire
 from clients.openxr_layer.frame_images import FrameImages, check_frame
 from clients.openxr_layer.helper_socket import is_trusted, listening
+from estimator.bounded_files import loads_bounded, printable
 from filter_service.errors import FilterError
 from filter_service.shared_memory import Slot
 
@@ -41,8 +42,9 @@ N_LATE = 10
 N_TIMES = 4096
 """Newest frames whose times are reported."""
 
-MAX_WAITING = 8
-"""Connections that are neither closed nor the program's."""
+MAX_WAITING = 64
+"""Connections that are neither closed nor the program's.  Of more, the oldest goes:
+a layer and a command send their first message at once."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ class LayerHelper:
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
         self._program: _Program | None = None
-        self._waiting: set[socket.socket] = set()
+        self._waiting: dict[socket.socket, None] = {}  # oldest first
         self.on_frame: Callable[[StereoFrame, Any], None] | None = None
         self.on_gaze: Callable[[], None] = lambda: None  # an eye tracker was found
         self._stages_ms: dict[str, deque[float]] = {}
@@ -168,14 +170,16 @@ class LayerHelper:
         except OSError:  # it has hung up
             return
         connection.setblocking(False)
-        if not is_trusted(connection) or len(self._waiting) >= MAX_WAITING:
+        if not is_trusted(connection):
             connection.close()
             return
-        self._waiting.add(connection)
+        if len(self._waiting) >= MAX_WAITING:
+            self._forget(next(iter(self._waiting)))
+        self._waiting[connection] = None
         self._selector.register(connection, selectors.EVENT_READ)
 
     def _forget(self, connection: socket.socket) -> None:
-        self._waiting.discard(connection)
+        self._waiting.pop(connection, None)
         with contextlib.suppress(KeyError):
             self._selector.unregister(connection)
         connection.close()
@@ -219,7 +223,7 @@ class LayerHelper:
             self._begin(connection, name, _printable(hello.engine))
 
     def _begin(self, connection: socket.socket, name: str, engine: str) -> None:
-        self._waiting.discard(connection)
+        self._waiting.pop(connection, None)
         self._program = _Program(connection, name, engine)
         welcome = wire.Welcome(
             *(wire.WELCOME, wire.MAGIC, wire.VERSION),
@@ -239,11 +243,16 @@ class LayerHelper:
     def _control(self, data: bytes) -> dict[str, Any]:
         """Answer a request of `ocufilter layer set` or `status`."""
         try:
-            wanted = json.loads(data)
+            wanted = loads_bounded(data, max_bytes=wire.MAX_CONTROL_BYTES)
+            if not isinstance(wanted, dict):
+                raise ValueError(f"{wanted!r:.60}; allowed: a JSON object")
             for eye in EYES:
-                if eye in wanted:
-                    self._change(eye, str(wanted[eye]))
-        except (ValueError, TypeError, RecursionError) as error:
+                text = wanted.get(eye)
+                if isinstance(text, str):
+                    self._change(eye, text)
+                elif eye in wanted:
+                    raise ValueError(f"{eye} is {text!r:.60}; allowed: text")
+        except ValueError as error:
             return {"error": str(error)}
         return {
             "program": self._program.name if self._program else None,
@@ -409,8 +418,7 @@ class LayerHelper:
 
 def _printable(name: bytes) -> str:
     """Return a name that may be written to a terminal."""
-    text = name.decode(errors="replace")
-    return "".join(c if c.isprintable() else "?" for c in text)
+    return printable(name.decode(errors="replace"))
 
 
 def _gaze_of(frame: wire.Frame) -> GazeSample | None:

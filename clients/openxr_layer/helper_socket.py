@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from clients.openxr_layer import wire
+from estimator.bounded_files import loads_bounded
 
 SOCKET_VARIABLE = "OCUFILTER_LAYER_SOCKET"
 SOCKET_NAME = "ocufilter-layer.sock"
@@ -34,7 +35,7 @@ def ask(
     Raises
     ------
     OSError
-        If no helper listens there, or it does not answer.
+        If no helper of this user listens there, or it does not answer.
     ValueError
         If it refuses the request.
     """
@@ -46,8 +47,13 @@ def ask(
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.settimeout(timeout_s)
         connection.connect(str(path))
+        if not is_trusted(connection):
+            raise PermissionError(f"another user's process listens at {path}")
         connection.send(data)
-        answer: dict[str, Any] = json.loads(connection.recv(MAX_ANSWER_BYTES))
+        received = connection.recv(MAX_ANSWER_BYTES)
+    if not received:
+        raise ConnectionResetError(f"the helper at {path} closed the connection")
+    answer: dict[str, Any] = loads_bounded(received, max_bytes=MAX_ANSWER_BYTES)
     if "error" in answer:
         raise ValueError(answer["error"])
     return answer

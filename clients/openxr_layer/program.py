@@ -39,7 +39,10 @@ from clients.openxr_layer import manifest
 from clients.openxr_layer.eyes import Eyes
 from clients.openxr_layer.helper import USUAL_AGE_MS, HelperOptions, LayerHelper
 from clients.openxr_layer.helper_socket import SOCKET_VARIABLE, ask, socket_path
+from estimator import ProfileError, parse_profile
+from estimator.bounded_files import printable
 from filter_service import FilterSettings
+from filter_service.atomic_files import replace_atomically
 from filter_service.errors import FilterError
 
 CHECK_S = 0.25
@@ -51,7 +54,7 @@ MAX_WAIT_MS = 600_000
 
 def say(line: str) -> None:
     """Print a message for the user to stderr."""
-    print(f"layer: {line}", file=sys.stderr, flush=True)
+    print(f"layer: {printable(line)}", file=sys.stderr, flush=True)
 
 
 # Command line
@@ -274,7 +277,10 @@ def _set(options: argparse.Namespace) -> int:
         text = options.profile if text is None else text
         if text is not None:
             is_path = Path(text).exists() and not text.lstrip().startswith("{")
-            read_profile(text, f"--{eye}")  # its errors are printed here
+            try:
+                parse_profile(read_profile(text, f"--{eye}"))
+            except ProfileError as error:
+                raise ValueError(f"--{eye}: {error}") from None
             wanted[eye] = str(Path(text).resolve()) if is_path else text
     if not wanted:
         raise ValueError("there is no profile; use --profile, --left or --right")
@@ -288,7 +294,7 @@ def _install(options: argparse.Namespace) -> int:
     _remove_all()
     path = manifest.manifest_path(kind)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
+    replace_atomically(path, lambda part: part.write_text(text))
     say(f"wrote {path}")
     if options.implicit:
         say(f"all OpenXR programs load it, except with {manifest.OFF_VARIABLE}=1")
