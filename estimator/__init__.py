@@ -15,9 +15,11 @@ From a profile to PSFs: `load_profile`, `estimate_eye` or `prepare_eye`, `comput
     periphery/     measured changes of wavefronts off the axis
     estimate/      estimation of an eye from a measurement
     field/         wavefronts of an eye over its visual field
+    note           notes for the user, with codes and numbers
     bounded_files  size-limited reading of untrusted text and JSON
     threads        number of threads to use
     machine_speed  relative speed of one core
+    version        version of the installed package
 """
 
 import lazy_loader

@@ -53,4 +53,5 @@ from .profiles.parse import published_names as published_names
 from .psf.compute import compute_psf_batch as compute_psf_batch
 from .psf.compute import compute_psfs as compute_psfs
 from .threads import thread_count as thread_count
+from .version import __version__ as __version__
 from .wavefront.aberrations import wavefront_aberrations as wavefront_aberrations

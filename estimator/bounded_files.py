@@ -64,7 +64,24 @@ class InvalidFile(ValueError):
         """Return one line with option, file, problem and accepted content."""
         where = f"--{self.option} '{self.path}'" if self.option else f"'{self.path}'"
         text = f"{where}: {self.found}"
-        return f"{text}; allowed: {self.allowed}" if self.allowed else text
+        return printable(f"{text}; allowed: {self.allowed}" if self.allowed else text)
+
+
+MAX_LINE_CHARACTERS = 4000
+"""Length limit of a message; a path may have 4095 bytes."""
+
+
+def printable(text: str, *, most: int = MAX_LINE_CHARACTERS) -> str:
+    """Return untrusted text as one line that no terminal or log misreads.
+
+    Line breaks, control characters, changes of direction and halves of surrogate pairs
+    become escapes as in Python; text beyond ``most`` characters becomes "...".
+    """
+    if len(text) > most:
+        text = text[: most - 3] + "..."
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def reason_of(error: BaseException) -> str:
@@ -94,9 +111,12 @@ def read_bytes(path: Path, *, max_bytes: int, option: str = "") -> bytes:
             parts, size = [], status.st_size
             if size <= max_bytes:  # count again: the file may grow while it is read
                 size = 0
-                while size <= max_bytes and (part := file.read(_READ_BYTES)):
+                # In one part if the file keeps its size, which then is not copied.
+                n_wanted = max(_READ_BYTES, status.st_size + 1)
+                while size <= max_bytes and (part := file.read(n_wanted)):
                     parts.append(part)
                     size += len(part)
+                    n_wanted = _READ_BYTES
     except IsADirectoryError:
         raise InvalidFile(path, "not a regular file", "a file", option) from None
     except FileNotFoundError:

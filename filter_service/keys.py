@@ -79,7 +79,10 @@ def load_client_key(path: Path | str) -> ClientKey:
     """
     values = _read(Path(path), ("public", "secret", "server"))
     pair = KeyPair(values["public"], values["secret"])
-    return ClientKey(values.get("name", "client"), pair, values["server"])
+    name = values.get("name", "client")
+    if not isinstance(name, str):
+        raise ValueError(f"{path}: 'name' is {name!r:.60}; expected text")
+    return ClientKey(name, pair, values["server"])
 
 
 class KeyRing:
@@ -279,7 +282,7 @@ def _stamp(status: os.stat_result) -> tuple[int, ...]:
     return status.st_ino, status.st_mtime_ns, status.st_size
 
 
-def _read(path: Path, wanted: tuple[str, ...]) -> dict[str, str]:
+def _read(path: Path, wanted: tuple[str, ...]) -> dict[str, Any]:
     """Read a key file; never block on a pipe, and limit the size."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
@@ -294,7 +297,7 @@ def _read(path: Path, wanted: tuple[str, ...]) -> dict[str, str]:
         )
     try:
         values = tomllib.loads(content.decode("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not a key file: {error}") from None
     for name in wanted:
         if not isinstance(values.get(name), str) or not KEY.fullmatch(values[name]):

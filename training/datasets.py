@@ -6,15 +6,19 @@ be generated in any order and by several processes, and regenerated.
 
 import json
 import warnings
+import zipfile
+import zlib
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
+from estimator.bounded_files import InvalidFile, read_json, reason_of
 from training.population import (
     partly_accommodated_eyes,
     population_eyes,
@@ -27,6 +31,14 @@ MANIFEST = "manifest.json"
 SAMPLINGS = ("random", "sobol")
 N_POPULATION_AXES = 3
 """Additional sampling axes: choice of the population, refraction, accommodation."""
+
+
+DAMAGED = (
+    *(ValueError, KeyError, TypeError, OSError, EOFError, OverflowError),
+    *(NotImplementedError, RuntimeError, MemoryError, SyntaxError),
+    *(TokenError, zipfile.BadZipFile, zlib.error),
+)
+"""What `numpy.load` raises for damaged files."""
 
 
 class DataError(ValueError):
@@ -61,10 +73,12 @@ class Recipe:
 
     def __post_init__(self) -> None:
         if self.domain not in DOMAINS:
-            raise DataError(f"domain '{self.domain}': allowed are {', '.join(DOMAINS)}")
+            raise DataError(
+                f"domain {self.domain!r:.60}: allowed are {', '.join(DOMAINS)}"
+            )
         if self.sampling not in SAMPLINGS:
             raise DataError(
-                f"sampling '{self.sampling}': allowed are {', '.join(SAMPLINGS)}"
+                f"sampling {self.sampling!r:.60}: allowed are {', '.join(SAMPLINGS)}"
             )
         if not 0.0 <= self.population_ratio <= 1.0:
             raise DataError(
@@ -241,21 +255,40 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     Raises
     ------
     DataError
-        There is no manifest, or it has another format.
+        There is no manifest, or it is damaged or has another format.
     """
     file = folder / MANIFEST
     if not file.exists():
         raise DataError(f"{folder}: no data set; run python -m training.generate")
-    manifest = json.loads(file.read_text(encoding="utf-8"))
+    try:
+        manifest = read_json(file)
+    except InvalidFile as error:
+        raise DataError(str(error)) from None
+    if not isinstance(manifest, dict):
+        raise DataError(f"{file}: {manifest!r:.60}, expected a JSON object")
     if manifest.get("format") != FORMAT:
-        raise DataError(f"{file}: format {manifest.get('format')}, expected {FORMAT}")
+        found = manifest.get("format")
+        raise DataError(f"{file}: format {found!r:.60}, expected {FORMAT}")
     return manifest
 
 
 def recipe_of(manifest: dict[str, Any]) -> Recipe:
-    """Return the recipe that a manifest was written for."""
-    known = Recipe.__dataclass_fields__
-    return Recipe(**{name: manifest[name] for name in known if name in manifest})
+    """Return the recipe that a manifest was written for.
+
+    Raises
+    ------
+    DataError
+        A field is missing, or of another type.
+    """
+    given = {}
+    for each in fields(Recipe):
+        if each.name not in manifest and each.default is MISSING:
+            raise DataError(f"{MANIFEST}: {each.name} is missing")
+        given[each.name] = value = manifest.get(each.name, each.default)
+        wanted: Any = (int, float) if each.type is float else each.type
+        if isinstance(value, bool) or not isinstance(value, wanted):
+            raise DataError(f"{MANIFEST}: {each.name} {value!r:.60}: of another type")
+    return Recipe(**given)
 
 
 def load_shards(folder: Path) -> Iterator[Shard]:
@@ -264,7 +297,7 @@ def load_shards(folder: Path) -> Iterator[Shard]:
     Raises
     ------
     DataError
-        A shard is missing.
+        A shard is missing or damaged.
     """
     recipe = recipe_of(read_manifest(folder))
     for number in range(recipe.n_shards):
@@ -274,8 +307,13 @@ def load_shards(folder: Path) -> Iterator[Shard]:
                 f"{file.name} of {recipe.n_shards} is missing in {folder}; resume with "
                 "python -m training.generate"
             )
-        with np.load(file) as data:
-            yield Shard(data["inputs"], data["targets"], int(data["n_rejected"]))
+        try:
+            # np.load does not close a damaged file that it opened itself
+            with file.open("rb") as opened, np.load(opened) as data:
+                shard = Shard(data["inputs"], data["targets"], int(data["n_rejected"]))
+        except DAMAGED as error:
+            raise DataError(f"{file}: damaged ({reason_of(error)})") from None
+        yield shard
 
 
 def load(folder: Path) -> Shard:

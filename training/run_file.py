@@ -1,10 +1,10 @@
 """Run files: one TOML per network, with all parameters of its training."""
 
-import tomllib
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
+from estimator.bounded_files import InvalidFile, read_text, read_toml
 from training.datasets import Recipe
 from training.models import ModelSettings
 from training.tasks import TASKS
@@ -13,6 +13,11 @@ LOSSES = ("standard", "physical")
 EYE_LOSSES = ("parameters", "discriminator", "tracer")
 DEFAULT_FOLDER = Path("out/training")
 
+MAX_RUN_BYTES = 100_000
+_KINDS = {
+    **{"task": str, "seed": int, "output_folder": str},
+    **{"data": dict, "model": dict, "training": dict},
+}
 _FROM_FILE: Any = None
 
 
@@ -91,16 +96,23 @@ def read_run(file: Path) -> Run:
         The file is invalid; the message has the table, the key and the allowed values.
     """
     try:
-        text = file.read_text(encoding="utf-8")
-        body = tomllib.loads(text)
-    except (OSError, tomllib.TOMLDecodeError) as error:
-        raise RunFileError(f"{file}: {error}") from error
+        text = read_text(file, max_bytes=MAX_RUN_BYTES)
+        body = read_toml(file, max_bytes=MAX_RUN_BYTES)
+    except InvalidFile as error:
+        raise RunFileError(str(error)) from None
+    for key, kind in _KINDS.items():
+        if not isinstance(body.get(key, kind()), kind):
+            raise RunFileError(
+                f"{key} {body[key]!r:.60}: must be of type {kind.__name__}"
+            )
     _only(body, ("task", "seed", "output_folder", "data", "model", "training"), "")
     task = body.get("task")
     if task not in TASKS:
         raise RunFileError(f"task '{task}': allowed are {', '.join(TASKS)}")
     data = dict(body.get("data", {}))
-    folder = data.pop("folder", None)
+    folder = data.pop("folder", "")
+    if not isinstance(folder, str):
+        raise RunFileError(f"data.folder {folder!r:.60}: must be of type str")
     domain = TASKS[task].domain.name
     if data.setdefault("domain", domain) != domain:
         raise RunFileError(
@@ -147,9 +159,9 @@ def _table(kind: type[_Settings], body: dict[str, Any], table: str) -> _Settings
     for key, value in body.items():
         wanted: Any = known[key].type
         good = (int, float) if wanted is float else wanted
-        if not isinstance(value, good) or (wanted is not bool and value is True):
+        if isinstance(value, bool) != (wanted is bool) or not isinstance(value, good):
             raise RunFileError(
-                f"{table}.{key} {value!r}: must be of type {wanted.__name__}"
+                f"{table}.{key} {value!r:.60}: must be of type {wanted.__name__}"
             )
     try:
         return kind(**body)

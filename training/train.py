@@ -217,7 +217,12 @@ def _cut_log(file: Path, step: int) -> None:
     if not file.exists():
         return
     lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
-    retained = [line for line in lines if json.loads(line)["step"] <= step]
+    try:
+        retained = [line for line in lines if json.loads(line)["step"] <= step]
+    except (ValueError, TypeError, LookupError, RecursionError):
+        raise RunFileError(
+            f"{file} has a line without a step; remove it to restart the training"
+        ) from None
     file.write_text("".join(retained), encoding="utf-8")
 
 

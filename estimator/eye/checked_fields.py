@@ -5,7 +5,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from estimator.bounded_files import printable
+
 MAX_COMPARED = 60
+MAX_FIELD, MAX_PROBLEM = 200, 400
+"""Length limits of the parts of a message that repeat a profile."""
 
 WHOLE = "profile"
 """Field name of an error that concerns the whole profile."""
@@ -25,10 +29,11 @@ class ProfileError(ValueError):
     """
 
     def __init__(self, field: str, problem: str, allowed: str):
-        named = field if field == WHOLE else f"{WHOLE} field '{field}'"
-        super().__init__(f"{named}: {problem}; allowed: {allowed}")
-        self.field, self.problem = field, problem
-        self.allowed = allowed
+        self.field = printable(field, most=MAX_FIELD)
+        self.problem = printable(problem, most=MAX_PROBLEM)
+        self.allowed = printable(allowed)
+        named = field if field == WHOLE else f"{WHOLE} field '{self.field}'"
+        super().__init__(f"{named}: {self.problem}; allowed: {self.allowed}")
 
 
 def number(

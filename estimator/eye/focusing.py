@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from estimator.corrections.rings import Rings
 from estimator.eye.focus_table import FocusTable
+from estimator.note import Note
 from estimator.optics.vergence import ObjectVergence
 
 if TYPE_CHECKING:
@@ -124,25 +125,41 @@ class Focusing(ABC):
         """Return notes on a focus distance that this eye cannot reach."""
         far_dpt, near_dpt = self.focus_limits_dpt(pupil_diameter_mm)
         if focus_dpt < far_dpt - OUT_OF_REACH_DPT:
-            return (
+            note = Note(
+                "focus_beyond_far_point",
                 f"focus {focus_dpt:g} dpt is beyond the far point "
                 f"({far_dpt:.3g} dpt): the eye stays relaxed",
+                focus_dpt=focus_dpt,
+                far_point_dpt=far_dpt,
             )
+            return (note,)
         if focus_dpt <= near_dpt + OUT_OF_REACH_DPT:
             return ()
-        reached = (
-            f"is nearer than the near point ({max(0.0, round(near_dpt, 3)):.3g} dpt)"
+        code, reached = (
+            (
+                "focus_nearer_than_near_point",
+                "is nearer than the near point "
+                f"({max(0.0, round(near_dpt, 3)):.3g} dpt)",
+            )
             if near_dpt > -OUT_OF_REACH_DPT
-            else f"is out of reach, as are all distances, by {-near_dpt:.3g} dpt or "
-            "more"
+            else (
+                "focus_out_of_reach",
+                f"is out of reach, as are all distances, by {-near_dpt:.3g} dpt or "
+                "more",
+            )
         )
         added_dpt = self.vergence.vergence_dpt(near_dpt) - self.vergence.vergence_dpt(
             far_dpt
         )
-        return (
+        note = Note(
+            code,
             f"focus {focus_dpt:g} dpt {reached}: "
             f"accommodation stops at {added_dpt:.3g} dpt",
+            focus_dpt=focus_dpt,
+            near_point_dpt=near_dpt,
+            accommodation_dpt=added_dpt,
         )
+        return (note,)
 
 
 @dataclass(frozen=True)
@@ -312,8 +329,11 @@ class FocusingEye(Focusing):
         notes = self.focus_notes(focus_dpt, pupil_diameter_mm=usable_mm)
         if pupil_diameter_mm <= self.max_pupil_diameter_mm + 1e-9:
             return notes
-        capped = (
+        capped = Note(
+            "pupil_capped",
             f"pupil {pupil_diameter_mm:g} mm capped at the {self.pupil_limit} "
-            f"{self.max_pupil_diameter_mm:g} mm"
+            f"{self.max_pupil_diameter_mm:g} mm",
+            pupil_diameter_mm=pupil_diameter_mm,
+            used_mm=self.max_pupil_diameter_mm,
         )
         return (capped, *notes)

@@ -70,10 +70,21 @@ class SurfaceModel:
         StatesDiffer
             A part of a state is missing in another one, or of another kind.
         """
+        return self.at_each([nominal_dpt])[0]
+
+    def at_each(self, nominal_dpt: Sequence[float]) -> list[EyeSurfaces]:
+        """Return the eyes at several nominal accommodations.
+
+        The parts of the states are compared once, which takes most of the time.
+
+        Raises
+        ------
+        StatesDiffer
+            A part of a state is missing in another one, or of another kind.
+        """
         if not self.accommodated:
-            return self.relaxed
-        blended: EyeSurfaces = _blended(self._states, self._weights(nominal_dpt), "")
-        return blended
+            return [self.relaxed] * len(nominal_dpt)
+        return _blended(self._states, self._weights(np.asarray(nominal_dpt)), "")
 
 
 def _plain(value: Any) -> Any:
@@ -90,59 +101,70 @@ def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
-def _blended(values: Sequence[Any], weights: NDArray[np.float64], name: str) -> Any:
-    """Return the weighted sum of values, part by part."""
-    first = values[0]
+def _blended(
+    values: Sequence[Any], weights: NDArray[np.float64], name: str
+) -> list[Any]:
+    """Return weighted sums of values, part by part: one for each row of weights."""
+    first, count = values[0], len(weights)
     if any(type(value) is not type(first) for value in values):
         kinds = ", ".join(type(value).__name__ for value in values)
         raise StatesDiffer(f"{name}: differs in kind between the states ({kinds})")
     if isinstance(first, float):
-        return _number(values, weights, name)
+        return _numbers(values, weights, name)
     if isinstance(first, np.ndarray):
-        return np.tensordot(weights, np.stack(values), axes=1)
+        return list(np.tensordot(weights, np.stack(values), axes=1))
     if dataclasses.is_dataclass(first) and not isinstance(first, type):
-        return dataclasses.replace(
-            first,
-            **{
-                part.name: _part(values, weights, part.name, name)
-                for part in dataclasses.fields(first)
-            },
-        )
+        parts = {
+            part.name: _part(values, weights, part.name, name)
+            for part in dataclasses.fields(first)
+        }
+        return [
+            dataclasses.replace(first, **{key: part[k] for key, part in parts.items()})
+            for k in range(count)
+        ]
     if isinstance(first, Mapping):
         _check_equal([sorted(value) for value in values], name)
-        return {
+        parts = {
             key: _blended([v[key] for v in values], weights, f"{name}.{key}")
             for key in first
         }
+        return [{key: part[k] for key, part in parts.items()} for k in range(count)]
     if isinstance(first, tuple):
         _check_equal([len(value) for value in values], name)
-        return tuple(
+        entries = [
             _blended(entries, weights, f"{name}[{i}]")
             for i, entries in enumerate(zip(*values, strict=True))
-        )
+        ]
+        return [tuple(entry[k] for entry in entries) for k in range(count)]
     _check_equal(values, name)
-    return first
+    return [first] * count
 
 
 def _part(
     values: Sequence[Any], weights: NDArray[np.float64], part: str, name: str
-) -> Any:
+) -> list[Any]:
     parts = [getattr(value, part) for value in values]
     path = f"{name}.{part}" if name else part
     if part == "radius_mm" and not np.isfinite(parts).all():
         # a surface that flattens to a plane is continuous in its curvature
         curvatures = [tuple(1.0 / r for r in radii) for radii in parts]
-        blended = _blended(curvatures, weights, path)
-        return tuple(1.0 / c if c else math.inf for c in blended)
+        return [
+            tuple(1.0 / c if c else math.inf for c in blended)
+            for blended in _blended(curvatures, weights, path)
+        ]
     return _blended(parts, weights, path)
 
 
-def _number(values: Sequence[float], weights: NDArray[np.float64], name: str) -> float:
-    if all(value == values[0] for value in values):  # exact, and inf stays inf
-        return values[0]
+def _numbers(
+    values: Sequence[float], weights: NDArray[np.float64], name: str
+) -> list[float]:
+    first = values[0]
+    if all(value == first for value in values):  # exact, and inf stays inf
+        return [first] * len(weights)
     if not np.isfinite(values).all():
         raise StatesDiffer(f"{name}: is given in some states only")
-    return float(weights @ np.array(values))
+    blended: list[float] = (weights @ np.array(values)).tolist()
+    return blended
 
 
 def _check_equal(values: Sequence[Any], name: str) -> None:

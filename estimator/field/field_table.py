@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.field.prepare import prepare_eye
 from estimator.field.traced_eye import TracedEye
+from estimator.note import Note
 from estimator.optics import prescription as rx
 from estimator.profiles.parse import EyeProfile
 from estimator.wavefront.field_wavefronts import (
@@ -146,8 +147,12 @@ def _edge_notes(
     inside = (h_deg >= h_low) & (h_deg <= h_high) & (v_deg >= v_low) & (v_deg <= v_high)
     if inside.all():
         return ()
-    return (
+    count = int(np.count_nonzero(~inside))
+    note = Note(
+        "directions_outside",
         f"light passes the pupil from h {h_low:.1f} to {h_high:.1f} deg and v "
-        f"{v_low:.1f} to {v_high:.1f} deg: {np.count_nonzero(~inside)} directions "
+        f"{v_low:.1f} to {v_high:.1f} deg: {count} directions "
         "outside have the wavefront at the edge",
+        direction_count=count,
     )
+    return (note,)

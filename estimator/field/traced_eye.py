@@ -38,6 +38,7 @@ from estimator.field.trace_range import (
     trace_field,
 )
 from estimator.field.traced_fields import TracedFields, check_limits
+from estimator.note import Note
 from estimator.wavefront.field_wavefronts import (
     FieldWavefronts,
     distinct_rows,
@@ -242,10 +243,14 @@ class TracedEye(FocusingEye):
         )
         if abs(reachable_dpt - focus_dpt) <= PREPARED_MARGIN_DPT:
             return ()
-        return (
+        note = Note(
+            "focus_not_prepared",
             f"focus {focus_dpt:g} dpt is outside the prepared range "
             f"(settings.focus_range_dpt): {reachable_dpt:.3g} dpt is used instead",
+            focus_dpt=focus_dpt,
+            used_dpt=reachable_dpt,
         )
+        return (note,)
 
     def accommodation_nodes_dpt(
         self,

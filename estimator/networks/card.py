@@ -4,7 +4,6 @@ The training writes ``weights/<name>.json`` with ``weights/<name>.onnx``.  The c
 below are the contract between training and inference: both import them from here.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.bounded_files import read_json
 from estimator.eye.parameters import PARAMETER_NAMES
 from estimator.optics.zernike import N_TERMS
 
@@ -203,8 +203,8 @@ def read_card(name: str) -> Card:
     if not path.is_file():
         raise WeightsMissing(missing_text(path))
     try:
-        return parse_card(name, json.loads(path.read_text(encoding="utf-8")))
-    except (KeyError, TypeError, ValueError) as error:
+        return parse_card(name, read_json(path))
+    except (LookupError, AttributeError, TypeError, ValueError, OverflowError) as error:
         raise DamagedWeights(
             f"{path.name}: expected the card of the network '{name}' ({error!r}); "
             f"{REMEDY}"
@@ -225,6 +225,8 @@ def parse_card(name: str, data: Mapping[str, Any]) -> Card:
     KeyError, TypeError, ValueError
         The card is incomplete, or belongs to another network or version.
     """
+    if not isinstance(data, dict):
+        raise ValueError("expected a JSON object")
     columns = tuple(column["name"] for column in data["inputs"])
     for key, value, expected in (
         ("format", data["format"], CARD_FORMAT),

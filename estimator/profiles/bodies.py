@@ -269,3 +269,6 @@ MeasuredBody = PresetBody | PrescriptionBody | ZernikeBody | ZernikeSetBody | Ey
 """Bodies without surfaces; those of `given_bodies` load compiled code, slowly."""
 
 MEASURED_KINDS = tuple(str(k.__struct_config__.tag) for k in get_args(MeasuredBody))
+
+TRACED_KINDS = ("pseudophakic", "published", "surfaces")
+"""Kinds of `given_bodies`, read by tracing rays, with code that loads slowly."""

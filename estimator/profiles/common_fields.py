@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.bounded_files import printable
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import RetinaShape
 from estimator.media.straylight import CATARACTS, DEFAULT_AGE_YEARS, Straylight
@@ -18,6 +19,8 @@ from estimator.optics.zernike import (
 )
 from estimator.profiles import bodies
 from estimator.profiles.correction import parse_correction, vertex_notes
+
+MAX_NAME_CHARACTERS = 200
 
 
 def common_fields(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
@@ -47,7 +50,9 @@ def common_fields(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
         )
     is_prescription = isinstance(body, bodies.PrescriptionBody)
     return {
-        "name": kind if body.name is msgspec.UNSET else str(body.name),
+        "name": kind
+        if body.name is msgspec.UNSET
+        else printable(str(body.name), most=MAX_NAME_CHARACTERS),
         "eye_side": body.eye_side,
         "age_years": age_years,
         "correction": parse_correction(body.correction, has_cornea=not is_prescription),

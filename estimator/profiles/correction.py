@@ -17,6 +17,7 @@ from estimator.corrections.progressive import ProgressiveLens
 from estimator.corrections.rings import DiffractiveRings, RefractiveZones, Rings
 from estimator.corrections.worn_lens import WornLens
 from estimator.eye.checked_fields import ProfileError
+from estimator.note import Note
 from estimator.optics import prescription as rx
 from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
 from estimator.profiles.correction_bodies import (
@@ -143,7 +144,13 @@ def _vertex_note(name: str, body: "VertexBody") -> str:
             "; vertex_mm is missing: the powers of spectacles need it, usually "
             "12 to 14 mm"
         )
-    return note
+    return Note(
+        "plane_of_powers",
+        note,
+        sphere_dpt=lens.sphere_dpt,
+        cylinder_dpt=lens.cylinder_dpt,
+        vertex_mm=lens.vertex_mm,
+    )
 
 
 def prescription(body: "VertexBody", *, path: str) -> rx.Prescription:

@@ -8,6 +8,7 @@ import msgspec
 from estimator.corrections.worn_lens import replaces_lens
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.surface_model import SurfaceModel
+from estimator.note import Note
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.profiles import bodies, given_bodies
 from estimator.profiles.common_fields import coefficients_um, common_fields
@@ -18,9 +19,10 @@ from estimator.profiles.published import published_eye
 from estimator.profiles.surfaces import surface_model
 from estimator.profiles.validation import convert
 
-IMPLANT_NOTE = (
+IMPLANT_NOTE = Note(
+    "traced_through_implant",
     "the eye is traced through its implant: wavefronts measured before surgery are not "
-    "part of it"
+    "part of it",
 )
 
 

@@ -8,12 +8,15 @@ sags.  Whatever else would change a ray is refused by its name.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NoReturn
 
 from estimator.eye.checked_fields import ProfileError
 from estimator.optics.zernike import N_TERMS, nm_from_index
 
 MAX_ELEMENTS = 60
+MAX_NUMBER = 1e9
+"""Largest number in a lens file: powers and sums of larger ones would overflow."""
+
 AIR = "air"
 
 Medium = dict[str, Any]
@@ -39,7 +42,7 @@ class Element:
 
     number: int
     z_mm: float = 0.0
-    radius_mm: float | list[float] | None = None
+    radius_mm: float | list[float | None] | None = None
     medium: Medium | None = None
     is_stop: bool = False
     shape: dict[str, Any] = field(default_factory=dict)
@@ -281,6 +284,11 @@ def _number(text: str, number: int, operand: str) -> float:
 
 # --- optiland -----------------------------------------------------------------------
 
+GEOMETRIES = (
+    *("Plane", "StandardGeometry", "EvenAsphere", "BiconicGeometry"),
+    *("ToroidalGeometry", "ZernikePolynomialGeometry"),
+)
+
 
 def is_optiland(data: Mapping[str, Any]) -> bool:
     """Return whether a JSON object is an optic that optiland saved."""
@@ -293,108 +301,165 @@ def optiland_body(data: Mapping[str, Any], name: str) -> dict[str, Any]:
     Raises
     ------
     ProfileError
-        An element is not understood, or a field is missing.
+        An element is not understood, or a field is missing or of another type.
     """
-    try:
-        listed = list(data["surface_group"]["surfaces"])[: MAX_ELEMENTS + 2]
-        elements = [
-            _optiland_element(number, surface)
-            for number, surface in enumerate(listed)
-            if number  # 0 is the object
-        ]
-        return surfaces_body(elements, str(data.get("name") or name))
-    except ProfileError:
-        raise
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise ProfileError(
-            "surface_group",
-            f"is incomplete ({type(error).__name__}: {error!s:.80})",
-            "an optic saved by optiland",
-        ) from None
+    listed = _Part(data, "the file").part("surface_group").items("surfaces")
+    elements = [
+        _optiland_element(number, _Part(surface, f"surface {number} of the file"))
+        for number, surface in enumerate(listed[: MAX_ELEMENTS + 2])
+        if number  # 0 is the object
+    ]
+    title = data.get("name")
+    return surfaces_body(elements, title if isinstance(title, str) and title else name)
 
 
-def _optiland_element(number: int, surface: Mapping[str, Any]) -> Element:
-    kind, geometry = surface["type"], surface["geometry"]
-    if kind != "Surface" or surface["interaction_model"]["is_reflective"]:
-        raise refused(number, f"{kind!r:.40} is not understood", "refracting surfaces")
-    axes = geometry["cs"]
-    if axes["reference_cs"] is not None:
-        raise refused(number, "reference_cs is not understood", "null")
+class _Part:
+    """An object of a file, whose fields are checked where they are read.
+
+    Every method raises `ProfileError`, which names the object, the field and its value.
+    """
+
+    def __init__(self, data: object, where: str) -> None:
+        if not isinstance(data, Mapping):
+            raise ProfileError(where, f"{_short(data)} is not an object", "an object")
+        self._data, self._where = data, where
+
+    def value(self, name: str) -> Any:
+        """Return a field that must exist."""
+        if name not in self._data:
+            allowed = "an optic saved by optiland"
+            raise ProfileError(self._where, f"'{name}' is missing", allowed)
+        return self._data[name]
+
+    def optional(self, name: str) -> Any:
+        """Return a field, or None."""
+        return self._data.get(name)
+
+    def part(self, name: str) -> "_Part":
+        """Return an object."""
+        return _Part(self.value(name), f"{self._where}, {name}")
+
+    def items(self, name: str) -> list[Any]:
+        """Return a list."""
+        value = self.value(name)
+        if not isinstance(value, list):
+            self.refuse(name, _short(value), "a list")
+        return value
+
+    def number(self, name: str) -> float:
+        """Return a finite number."""
+        return self._number(name, self.value(name))
+
+    def numbers(self, name: str) -> list[float]:
+        """Return a list of finite numbers."""
+        return [self._number(name, value) for value in self.items(name)]
+
+    def radius_mm(self, name: str) -> float | None:
+        """Return a radius; None if it is infinite."""
+        value = self.value(name)
+        is_plane = isinstance(value, float) and math.isinf(value)
+        return None if is_plane else self._number(name, value)
+
+    def flag(self, name: str) -> bool:
+        """Return a boolean."""
+        value = self.value(name)
+        if not isinstance(value, bool):
+            self.refuse(name, _short(value), "true or false")
+        return value
+
+    def only(self, name: str, *options: str) -> str:
+        """Return a field that must be one of some texts."""
+        value = self.value(name)
+        if not isinstance(value, str) or value not in options:
+            problem = f"{_short(value)} is not understood"
+            self.refuse(name, problem, " or ".join(options))
+        return value
+
+    def refuse(self, name: str, problem: str, allowed: str) -> NoReturn:
+        """Raise the error for a field."""
+        raise ProfileError(f"{self._where}, {name}", problem, allowed)
+
+    def _number(self, name: str, value: object) -> float:
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            if -MAX_NUMBER <= value <= MAX_NUMBER:  # NaN is not
+                return float(value)
+        allowed = f"a number from {-MAX_NUMBER:g} to {MAX_NUMBER:g}"
+        self.refuse(name, _short(value), allowed)
+
+
+def _short(value: object) -> str:
+    return f"{value!r:.60}"
+
+
+def _optiland_element(number: int, surface: _Part) -> Element:
+    surface.only("type", "Surface")
+    if surface.part("interaction_model").flag("is_reflective"):
+        surface.refuse("is_reflective", "true", "refracting surfaces")
+    geometry = surface.part("geometry")
+    axes = geometry.part("cs")
+    if axes.value("reference_cs") is not None:
+        axes.refuse("reference_cs", "is not understood", "null")
+    x_mm, y_mm, z_mm = (axes.number(name) for name in ("x", "y", "z"))
+    turns = [axes.number(name) for name in ("rx", "ry", "rz")]
     element = Element(
         number,
-        z_mm=float(axes["z"]),
-        is_stop=surface["is_stop"],
-        medium=_optiland_medium(number, surface["material_post"]),
+        z_mm=z_mm,
+        is_stop=surface.flag("is_stop"),
+        medium=_optiland_medium(surface.part("material_post")),
     )
     shape = element.shape
-    if axes["x"] or axes["y"]:
-        shape["decentration_mm"] = [axes["x"], axes["y"]]
-    if axes["rx"] or axes["ry"] or axes["rz"]:
-        shape["rotation_deg"], shape["tilt_deg"] = _turns_deg(
-            axes["rx"], axes["ry"], axes["rz"]
-        )
+    if x_mm or y_mm:
+        shape["decentration_mm"] = [x_mm, y_mm]
+    if any(turns):
+        shape["rotation_deg"], shape["tilt_deg"] = _turns_deg(*turns)
     _optiland_shape(element, geometry)
-    aperture = surface.get("aperture")
-    if aperture is not None:
-        if aperture["type"] != "RadialAperture" or aperture["r_min"]:
-            raise refused(
-                number,
-                f"aperture {aperture['type']!r:.40} is not understood",
-                "RadialAperture with r_min 0",
-            )
+    if surface.optional("aperture") is not None:
+        aperture = surface.part("aperture")
+        aperture.only("type", "RadialAperture")
+        if aperture.number("r_min"):
+            aperture.refuse("r_min", "an aperture with an inner radius", "0")
         if not element.is_stop:
-            shape["clear_radius_mm"] = aperture["r_max"]
+            shape["clear_radius_mm"] = aperture.number("r_max")
     return element
 
 
-def _optiland_shape(element: Element, geometry: Mapping[str, Any]) -> None:
-    kind, shape = geometry["type"], element.shape
+def _optiland_shape(element: Element, geometry: _Part) -> None:
+    kind, shape = geometry.only("type", *GEOMETRIES), element.shape
     if kind == "Plane":
         return
     if kind in ("BiconicGeometry", "ToroidalGeometry"):
-        element.radius_mm = [geometry["radius_x"], geometry["radius_y"]]
+        element.radius_mm = [geometry.radius_mm(f"radius_{axis}") for axis in "xy"]
         if kind == "BiconicGeometry":
-            conics = [geometry["conic_x"], geometry["conic_y"]]
+            conics = [geometry.number("conic_x"), geometry.number("conic_y")]
             shape["form"] = {"kind": "separate_profiles", "conic_constants": conics}
-        elif any(geometry["coeffs_poly_y"]):
-            raise refused(element.number, "coeffs_poly_y is not understood", "no terms")
+        elif any(geometry.numbers("coeffs_poly_y")):
+            geometry.refuse("coeffs_poly_y", "is not understood", "zeros")
         else:
-            shape["conic_constant"] = geometry["conic_yz"]
+            shape["conic_constant"] = geometry.number("conic_yz")
             shape["form"] = {"kind": "toroid"}
         return
-    radius_mm = geometry["radius"]
-    element.radius_mm = radius_mm if math.isfinite(radius_mm) else None
-    if geometry["conic"]:
-        shape["conic_constant"] = geometry["conic"]
+    element.radius_mm = geometry.radius_mm("radius")
+    if conic := geometry.number("conic"):
+        shape["conic_constant"] = conic
     if kind == "EvenAsphere":
-        terms = list(geometry["coefficients"])
+        terms = geometry.numbers("coefficients")
         if any(terms):
             shape["form"] = {"kind": "even_asphere", "coefficients": terms}
     elif kind == "ZernikePolynomialGeometry":
-        shape.update(_zernike_sag(element.number, geometry))
-    elif kind != "StandardGeometry":
-        raise refused(
-            element.number,
-            f"geometry {kind!r:.40} is not understood",
-            "Plane, StandardGeometry, EvenAsphere, BiconicGeometry, ToroidalGeometry "
-            "or ZernikePolynomialGeometry",
-        )
+        shape.update(_zernike_sag(geometry))
 
 
-def _zernike_sag(number: int, geometry: Mapping[str, Any]) -> dict[str, Any]:
+def _zernike_sag(geometry: _Part) -> dict[str, Any]:
     """Return offset terms; optiland's are normalized, in the OSA order."""
-    terms = list(geometry["coefficients"])
-    if geometry["zernike_type"] != "standard" or len(terms) > N_TERMS:
-        raise refused(
-            number,
-            f"{len(terms)} Zernike terms of type {geometry['zernike_type']!r:.20}",
-            f"up to {N_TERMS} of type 'standard'",
-        )
+    geometry.only("zernike_type", "standard")
+    terms = geometry.numbers("coefficients")
+    if len(terms) > N_TERMS:
+        geometry.refuse("coefficients", f"{len(terms)} terms", f"up to {N_TERMS}")
     offsets = []
     for j, term in enumerate(terms + [0.0] * (N_TERMS - len(terms))):
         n, m = nm_from_index(j)
         offsets.append(term * math.sqrt((2 - (m == 0)) * (n + 1)))
-    return {"offset_mm": offsets, "offset_radius_mm": geometry["norm_radius"]}
+    return {"offset_mm": offsets, "offset_radius_mm": geometry.number("norm_radius")}
 
 
 def _turns_deg(rx: float, ry: float, rz: float) -> tuple[float, list[float]]:
@@ -412,15 +477,8 @@ def _turns_deg(rx: float, ry: float, rz: float) -> tuple[float, list[float]]:
     return math.degrees(about_z), [math.degrees(about_x), math.degrees(about_y)]
 
 
-def _optiland_medium(number: int, material: Mapping[str, Any]) -> Medium | None:
-    kind = material["type"]
-    if kind == "IdealMaterial":
-        index = material["index"]
-        return None if index == 1.0 else _glass(index, 0.0)
-    if kind == "AbbeMaterial":
-        return _glass(material["index"], material["abbe"])
-    raise refused(
-        number,
-        f"material {kind!r:.40} is not understood",
-        "IdealMaterial or AbbeMaterial",
-    )
+def _optiland_medium(material: _Part) -> Medium | None:
+    if material.only("type", "IdealMaterial", "AbbeMaterial") == "AbbeMaterial":
+        return _glass(material.number("index"), material.number("abbe"))
+    index = material.number("index")
+    return None if index == 1.0 else _glass(index, 0.0)

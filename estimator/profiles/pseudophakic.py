@@ -198,10 +198,9 @@ def biconvex_radius_mm(power_dpt: float, *, index: float, thickness_mm: float) -
     """
     if power_dpt == 0.0:
         return math.inf
-    # P = 2 F - F² t / n of the surface power F
-    share = thickness_mm / MM_PER_M / index
-    surface_dpt = (1.0 - math.sqrt(1.0 - share * power_dpt)) / share
-    return MM_PER_M * (index - LABEL_INDEX) / surface_dpt
+    # P = 2 F - F² t / n of the surface power F = P / (1 + root), not 0 for any P
+    root = math.sqrt(1.0 - thickness_mm / MM_PER_M / index * power_dpt)
+    return MM_PER_M * (index - LABEL_INDEX) * (1.0 + root) / power_dpt
 
 
 def _material(body: ImplantBody) -> Constant | AbbeNumber:

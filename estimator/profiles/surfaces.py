@@ -64,13 +64,14 @@ def _check_between(model: SurfaceModel) -> None:
     """Raise where the eye between two states cannot be traced."""
     nodes = [0.0, *model.accommodations_dpt]
     steps = np.arange(len(nodes), step=1.0 / (N_CHECKED_BETWEEN + 1))
-    for dpt in np.interp(steps, np.arange(len(nodes)), nodes).tolist():
+    between_dpt = np.interp(steps, np.arange(len(nodes)), nodes).tolist()
+    try:
+        eyes = model.at_each(between_dpt)
+    except StatesDiffer as error:
+        raise ProfileError("states", str(error), "states with the same parts") from None
+    for dpt, eye in zip(between_dpt, eyes, strict=True):
         try:
-            _check_traceable(model.at(dpt))
-        except StatesDiffer as error:
-            raise ProfileError(
-                "states", str(error), "states with the same parts"
-            ) from None
+            _check_traceable(eye)
         except ValueError as error:
             raise ProfileError(
                 "states", f"at {dpt:.3g} dpt, {error}", "surfaces in order"

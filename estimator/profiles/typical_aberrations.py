@@ -24,6 +24,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.note import Note
 from estimator.optics.prescription import C2M2, C20, C22
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import (
@@ -249,8 +250,11 @@ def typical_note(profile: EyeProfile) -> str:
     if profile.sample is not None:
         source = f"of a person drawn with sample {profile.sample} for {whose}"
     rms_um = float(np.linalg.norm(_higher_um(profile)))
-    return (
+    return Note(
+        "typical_aberrations",
         f"higher-order aberrations {source} added to the prescription, RMS "
         f"{rms_um:.2f} um at {TYPICAL_PUPIL_MM:g} mm; "
-        f'"higher_order": "none" in the profile switches them off'
+        f'"higher_order": "none" in the profile switches them off',
+        rms_um=rms_um,
+        pupil_diameter_mm=TYPICAL_PUPIL_MM,
     )

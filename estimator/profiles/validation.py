@@ -7,6 +7,7 @@ where it rejects a profile, `_check` locates the first invalid field by the same
 import math
 import reprlib
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import msgspec
@@ -52,9 +53,13 @@ def convert(data: object, kind: Any) -> Any:
     try:
         return msgspec.convert(plain, kind)
     except msgspec.ValidationError as error:
-        _check(plain, inspect.type_info(kind), "")
+        _check(plain, _type_info(kind), "")
         # msgspec rejects what the walk accepts, for example an integer beyond 64 bits
         raise ProfileError("profile", str(error), "see the JSON Schema") from None
+
+
+_type_info = cache(inspect.type_info)
+"""Description of a type, which takes longer than to check a profile."""
 
 
 def _tagged(data: object, field: str) -> object:
@@ -242,10 +247,11 @@ def allowed_values(kind: inspect.Type) -> str:
     """Return the allowed values of a type in words."""
     if isinstance(kind, inspect.Metadata):
         return (kind.extra or {}).get(ALLOWED) or allowed_values(kind.type)
-    if isinstance(kind, inspect.FloatType):
-        return f"a number from {kind.ge:g} to {kind.le:g}"
-    if isinstance(kind, inspect.IntType):
-        return f"an integer from {kind.ge:g} to {kind.le:g}"
+    if isinstance(kind, inspect.FloatType | inspect.IntType):
+        noun = "a number" if isinstance(kind, inspect.FloatType) else "an integer"
+        if kind.ge is None or kind.le is None:  # an outer rule has the limits
+            return noun
+        return f"{noun} from {kind.ge:g} to {kind.le:g}"
     if isinstance(kind, inspect.UnionType):
         return " or ".join(
             "null" if isinstance(member, inspect.NoneType) else allowed_values(member)

@@ -9,6 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from estimator.note import Note
 from filter_service.camera import Camera
 from filter_service.errors import FilterError
 from filter_service.filtering.accepted_profile import AcceptedProfile
@@ -105,7 +106,7 @@ class Filtered(FrameCounts):
         return cls(
             views=tuple(views[i] for i in sorted(views)),
             notes=tuple(
-                note if eye == "both" else f"{eye} eye: {note}"
+                note if eye == "both" else _with_prefix(note, f"{eye} eye: ")
                 for eye, seen in by_eye.items()
                 for note in seen.notes
             ),
@@ -184,6 +185,10 @@ class FilteredTexture:
     number: int
     notes: tuple[str, ...]
     earlier: EarlierFrame | None
+
+
+def _with_prefix(note: str, prefix: str) -> str:
+    return note.with_prefix(prefix) if isinstance(note, Note) else prefix + note
 
 
 def summed_times(times_ms: Iterable[Mapping[str, float]]) -> dict[str, float]:

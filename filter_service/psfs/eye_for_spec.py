@@ -9,19 +9,22 @@ from estimator.field.eye_optics import EyeOptics
 from estimator.field.prepare import prepare_eye
 from estimator.field.trace_range import FieldRange
 from estimator.field.traced_eye import MAX_PUPIL_MM
+from estimator.note import Note
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import EyeProfile
 from filter_service.errors import BuildCancelled
 from filter_service.planning.grid import GridSpec, pupil_nodes_mm
 
-NO_LATERAL_COLOR = (
+NO_LATERAL_COLOR = Note(
+    "lateral_color_ignored",
     "settings.lateral_color has no effect on a measured wavefront; "
-    "it requires a traced eye"
+    "it requires a traced eye",
 )
 
-ONE_GAZE = (
+ONE_GAZE = Note(
+    "one_gaze",
     "the lens is evaluated for the middle of settings.gaze_range_deg; the "
-    "other gaze directions use the same part of the lens"
+    "other gaze directions use the same part of the lens",
 )
 
 
@@ -75,8 +78,8 @@ def eye_for_spec(
         if settings.lateral_color:
             notes = (*notes, NO_LATERAL_COLOR)
     elif settings.accuracy != "exact":
-        accuracy = f"accuracy {settings.accuracy!r}"
-        notes = (*notes, f"{accuracy} has no effect: the eye is traced")
+        text = f"accuracy {settings.accuracy!r} has no effect: the eye is traced"
+        notes = (*notes, Note("accuracy_ignored", text))
     if depends_on_gaze(profile.correction) and any(settings.gaze_range_deg):
         notes = (*notes, ONE_GAZE)
     return eye, notes

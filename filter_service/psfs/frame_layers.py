@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.eye.focusing import OUT_OF_REACH_DPT
+from estimator.note import Note
 from estimator.optics.vergence import ObjectVergence
 from filter_service.constants import MERGE_MIN_SPREAD_PX
 from filter_service.planning.grid import (
@@ -245,10 +246,14 @@ def _limit_notes(store: PsfStore, groups: NDArray[np.int64]) -> tuple[str, ...]:
     count = store.fields_count
     if not any(store.nodes.is_limited[g : g + count].any() for g in groups.tolist()):
         return ()
-    return (
+    radius_px = store.spec.max_blur_radius_px
+    note = Note(
+        "blur_limited",
         "in part of the field, blur exceeds the largest kernel and is limited to a "
-        f"radius of {store.spec.max_blur_radius_px} px",
+        f"radius of {radius_px} px",
+        radius_px=radius_px,
     )
+    return (note,)
 
 
 def _usable_pupil(
@@ -261,9 +266,14 @@ def _usable_pupil(
     clamped_mm = float(np.clip(usable_mm, low_mm, high_mm))
     if abs(clamped_mm - usable_mm) <= 1e-9:
         return clamped_mm, ()
-    note = (
+    note = Note(
+        "pupil_not_prepared",
         f"pupil_diameter_mm {pupil_diameter_mm:g} is outside the prepared range of "
-        f"{low_mm:.3g} to {high_mm:.3g} mm; using {clamped_mm:.3g} mm"
+        f"{low_mm:.3g} to {high_mm:.3g} mm; using {clamped_mm:.3g} mm",
+        pupil_diameter_mm=pupil_diameter_mm,
+        low_mm=low_mm,
+        high_mm=high_mm,
+        used_mm=clamped_mm,
     )
     return clamped_mm, (note,)
 

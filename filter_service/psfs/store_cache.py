@@ -113,10 +113,14 @@ _logged: set[tuple[Path, str]] = set()
 
 
 def _log_once(path: Path, text: str) -> None:
-    """Log a problem with a file the first time only."""
+    """Log a problem with a file the first time only.
+
+    The log never contains the name of a file: it is a hash of an eye, which anyone can
+    compare with those of likely prescriptions.
+    """
     if (path, text) not in _logged:
         _logged.add((path, text))
-        log.warning("%s: %s", path, text)
+        log.warning("a file in %s %s", path.parent, text)
 
 
 def _remove(path: Path, reason: Exception) -> None:
@@ -124,9 +128,9 @@ def _remove(path: Path, reason: Exception) -> None:
     try:
         path.unlink(missing_ok=True)
     except OSError:  # a folder, or no permission
-        _log_once(path, f"ignored: {reason}")
+        _log_once(path, f"is ignored: {reason}")
     else:
-        log.warning("removed %s: %s", path, reason)
+        log.warning("removed a damaged file from %s: %s", path.parent, reason)
 
 
 class StoreCache:
@@ -168,7 +172,7 @@ class StoreCache:
             _remove(path, error)
             return None
         except OSError as error:
-            _log_once(path, f"cannot be read: {error}")
+            _log_once(path, f"cannot be read: {error.strerror or type(error).__name__}")
             return None
         with suppress(OSError):  # another service has removed it meanwhile
             os.utime(path)
@@ -238,4 +242,4 @@ class StoreCache:
                 return
             path.unlink(missing_ok=True)
             n_bytes -= size
-            log.info("removed %s: the cache is full", path.name)
+            log.info("removed a file from %s: the cache is full", path.parent)

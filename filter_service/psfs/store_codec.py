@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.note import Note, note_of
+
 PACKAGES = ("estimator.", "filter_service.")
 """Packages whose classes may be written and instantiated."""
 
@@ -57,9 +59,13 @@ def unpack(tree: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
         return tuple(unpack(item, arrays) for item in content)
     if kind == "map":
         return {key: unpack(item, arrays) for key, item in content}
+    if kind == "note":
+        return note_of(*content)
     name, state = content
     if kind != "object":
-        raise ValueError(f"unknown kind {kind!r}; expected array, tuple, map or object")
+        raise ValueError(
+            f"unknown kind {kind!r}; expected array, tuple, map, note or object"
+        )
     made: Any = object.__new__(_class_of(name))
     for field, item in state.items():
         object.__setattr__(made, field, unpack(item, arrays))
@@ -73,6 +79,8 @@ def _packed(
         return {"array": _array_name(value, path, arrays, known)}
     if isinstance(value, np.generic):
         value = value.item()
+    if isinstance(value, Note):
+        return {"note": [value.code, str(value), value.values]}
     if isinstance(value, _PLAIN):
         return value
     if isinstance(value, list | tuple):

@@ -7,6 +7,7 @@ from a page boundary on.  No part of a file can execute code.
 from __future__ import annotations
 
 import json
+import math
 import os
 import stat
 import struct
@@ -172,7 +173,7 @@ def _blocks(arrays: dict[str, NDArray[Any]]) -> Iterator[bytes | memoryview]:
 def _array(data: NDArray[np.uint8], place: list[Any]) -> NDArray[Any]:
     name, shape, start = place
     dtype = np.dtype(name)
-    n_bytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
+    n_bytes = math.prod(shape) * dtype.itemsize
     return data[start : start + n_bytes].view(dtype).reshape(shape)
 
 

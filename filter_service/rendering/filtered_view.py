@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.note import Note
+
 
 @dataclass(frozen=True, kw_only=True)
 class FrameCounts:
@@ -101,14 +103,14 @@ def sampled_input_notes(
     sampled_m: NDArray[np.float32], bad_color_count: int, *, has_depth: bool
 ) -> list[str]:
     """Return the same notes, from depth at some pixels."""
-    notes = []
+    notes: list[str] = []
     if not has_depth:
-        notes.append("no pixel has depth; infinity is assumed")
+        notes.append(Note("no_depth", "no pixel has depth; infinity is assumed"))
     known_m = sampled_m[(sampled_m > 0.0) & (sampled_m < np.inf)]
     if known_m.size and known_m.min() >= FAR_SCENE_M:
-        notes.append(f"all depth is beyond {FAR_SCENE_M:g} m: is it in meters?")
+        text = f"all depth is beyond {FAR_SCENE_M:g} m: is it in meters?"
+        notes.append(Note("depth_implausible", text, beyond_m=FAR_SCENE_M))
     if bad_color_count:
-        notes.append(
-            f"{bad_color_count} pixels with non-finite color were set to black"
-        )
+        text = f"{bad_color_count} pixels with non-finite color were set to black"
+        notes.append(Note("color_not_finite", text, pixel_count=bad_color_count))
     return notes

@@ -2,6 +2,7 @@
 
 import math
 
+from estimator.note import Note
 from filter_service.errors import BadMessage
 from filter_service.planning.grid import GridSpec
 
@@ -46,14 +47,20 @@ def clamped_gaze(
         clamped_deg = spec.settings.gaze_deg
     if math.dist(requested_deg, clamped_deg) <= ROUNDING_DEG:
         return clamped_deg, ()
-    reason = (
-        "is outside what was prepared"
+    code, reason = (
+        ("gaze_not_prepared", "is outside what was prepared")
         if spec.follows_field
-        else "is not followed in mode on-axis"
+        else ("gaze_not_followed", "is not followed in mode on-axis")
     )
-    return clamped_deg, (
+    note = Note(
+        code,
         f"gaze {_text(requested_deg)} {reason}: {_text(clamped_deg)} used",
+        h_deg=requested_deg[0],
+        v_deg=requested_deg[1],
+        used_h_deg=clamped_deg[0],
+        used_v_deg=clamped_deg[1],
     )
+    return clamped_deg, (note,)
 
 
 def _text(gaze_deg: tuple[float, float]) -> str:

@@ -79,8 +79,11 @@ class IndexTable:
                 f"{len(self.wavelengths_nm)} wavelengths and {len(self.indices)} "
                 "indices: must be equal numbers, at least 2"
             )
-        if not all(a < b for a, b in pairwise(self.wavelengths_nm)):
-            raise ValueError(f"wavelengths {self.wavelengths_nm} nm: must increase")
+        for before, after in pairwise(self.wavelengths_nm):
+            if not before < after:
+                raise ValueError(
+                    f"wavelengths {before:g} nm and {after:g} nm: must increase"
+                )
 
     def refractive_index(self, wavelength_nm: ArrayLike) -> NDArray[np.float64]:
         """Return the index (...) at wavelengths (...)."""
