@@ -330,7 +330,8 @@ class FilterClient:
             if isinstance(event, Progress) and on_progress is not None:
                 on_progress(event)
             if isinstance(event, Accepted):
-                n_awaited = event.n_cameras
+                # Again after a lost connection: the profile was sent again.
+                n_awaited, n_ready = event.n_cameras, 0
                 if not (wait and event.is_building):
                     return event
             if isinstance(event, Ready):
@@ -412,9 +413,13 @@ class FilterClient:
             self._link.pump_before(deadline_s, f"a reply to frame {frame_id}")
 
     def _await_ready(self, deadline_s: float) -> None:
-        """Wait for an eye that is being prepared; raise if its preparation fails."""
+        """Wait for an eye that is being prepared; raise if its preparation fails.
+
+        Return also after a lost connection, with which `Ready` may be lost.
+        """
         profile_ids = {p.profile_id for p in self._link.profiles.values()}
-        while True:
+        welcome = self.welcome
+        while self.welcome is welcome:
             event = self._link.take_event(
                 lambda e: (
                     isinstance(e, Ready | ErrorReply) and e.profile_id in profile_ids
@@ -726,11 +731,15 @@ class FilterClient:
     def ping(self, timeout_s: float | None = None) -> tuple[float, Pong]:
         """Return the round trip in ms, and the state of the service's render worker."""
         limit_s = self.timeout_s if timeout_s is None else timeout_s
-        self.hello(limit_s)
+        deadline_s = time.monotonic() + limit_s
         self._link.pongs.clear()
-        start_s = time.monotonic()
-        self._link.queue_message(encode(Ping(start_s)))
-        self._link.wait_until(
-            lambda: bool(self._link.pongs), limit_s, "a reply to ping"
-        )
+        start_s, asked = time.monotonic(), None
+        while not self._link.pongs:
+            if self.welcome is not asked and self.welcome is not None:
+                # Also after a lost connection, with which the reply was lost.
+                asked, start_s = self.welcome, time.monotonic()
+                self._link.queue_message(encode(Ping(start_s)))
+                self._link.pump(0.0)
+            else:
+                self._link.pump_before(deadline_s, "a reply to ping")
         return 1000 * (time.monotonic() - start_s), self._link.pongs[-1]

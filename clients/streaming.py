@@ -10,7 +10,14 @@ from clients.filter_client import Event, FilterClient, FilteredFrame
 from clients.frame_log import FrameLog
 from clients.scene_renderer import SceneFrame
 from filter_service.errors import ConnectionLost, ServiceTimeout
-from filter_service.messages import Accepted, Dropped, ErrorReply, Progress, Ready
+from filter_service.messages import (
+    Accepted,
+    Dropped,
+    ErrorReply,
+    Progress,
+    Ready,
+    ViewState,
+)
 
 _BUILDING_HZ = 4.0
 """Frame rate while an eye is being prepared: enough to show that the stream continues,
@@ -22,11 +29,13 @@ _POLL_S = 0.05
 
 def submit(client: FilterClient, frame: SceneFrame) -> int:
     """Submit a frame with its state; return its frame_id."""
+    is_stereo = frame.right_view is not None
     return client.submit(
-        frame.view,
+        frame.views,
         pupil_diameter_mm=frame.pupil_diameter_mm,
         focus_dpt=frame.focus_dpt,
         gaze_deg=frame.gaze_deg,
+        states=(ViewState("left"), ViewState("right")) if is_stereo else (),
     )
 
 
@@ -54,7 +63,7 @@ def _filtered(client: FilterClient, frame: SceneFrame) -> FilteredFrame | Droppe
     submit(client, frame)
     deadline_s = time.monotonic() + client.timeout_s
     while time.monotonic() < deadline_s:
-        for event in _events(client):
+        for event in events_of(client):
             if isinstance(event, FilteredFrame | Dropped):
                 return event
     raise ServiceTimeout(f"no reply to a frame within {client.timeout_s:g} s")
@@ -115,7 +124,7 @@ def change_eye(
         if is_due and not client.n_unanswered:
             submit(client, frames[index % len(frames)])
             index, next_send_s = index + 1, now_s + 1 / _BUILDING_HZ
-        for event in _events(client):
+        for event in events_of(client):
             if isinstance(event, FilteredFrame):
                 if event.header.generation != accepted.generation:
                     n_through_previous += 1
@@ -137,9 +146,15 @@ def change_eye(
     }
 
 
-def _events(client: FilterClient) -> list[Event]:
-    """Poll; raise the errors of the service, and ConnectionLost if it disconnects."""
-    events = client.poll(_POLL_S)
+def events_of(client: FilterClient, timeout_s: float = _POLL_S) -> list[Event]:
+    """Poll for replies.
+
+    Raises
+    ------
+    FilterError
+        An error that the service replied, or ConnectionLost if it has disconnected.
+    """
+    events = client.poll(max(0.0, timeout_s))
     for event in events:
         if isinstance(event, ErrorReply):
             raise event.exception()

@@ -22,6 +22,7 @@ Importing this package loads no submodules, which keeps clients light.
     atomic_files     atomic file writes
     bounded_images   image decoders with memory limits
     gl_device        selection of the OpenGL device
+    version          version of the installed package
     threads          numba's threading layer
     one_blas_thread  NumPy's BLAS on one thread
     gl/              OpenGL context and shaders

@@ -19,4 +19,5 @@ from .settings import Output as Output
 from .texture_view import DepthProjection as DepthProjection
 from .texture_view import GlTexture as GlTexture
 from .texture_view import TextureView as TextureView
+from .version import __version__ as __version__
 from .view_state import ViewState as ViewState

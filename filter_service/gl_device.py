@@ -26,7 +26,7 @@ def checked_gl_device(wanted: str, name: str = "gl_device") -> str:
     if wanted == AUTO or (wanted.isascii() and wanted.isdecimal()):
         return wanted
     raise ValueError(
-        f"{name} is {wanted!r}; allowed: auto, or the index of an EGL device, "
+        f"{name} is {wanted!r:.100}; allowed: auto, or the index of an EGL device, "
         "0 or more, as `ocufilter doctor` lists them"
     )
 

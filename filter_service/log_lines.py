@@ -5,7 +5,11 @@ from __future__ import annotations
 import json
 import logging
 import os
+import sys
+import threading
 import time
+from collections import deque
+from types import TracebackType
 
 FORMAT_VARIABLE = "OCUFILTER_LOG_FORMAT"
 LOG_FORMATS = ("text", "json")
@@ -16,6 +20,19 @@ MAX_REPEATS = 10
 
 ONCE_A_SECOND = {"max_repeats": 1}
 """`extra` argument of log calls that are written at most once a second."""
+
+
+MAX_WAITING_LINES = 1000
+"""Maximum number of lines that wait to be written; further ones are dropped."""
+
+WRITE_LIMIT_S = 0.02
+"""Maximum time that a caller waits until its line is written.  It usually takes 0.1 ms,
+so that a line precedes what the process does next."""
+
+EXIT_LIMIT_S = 0.5
+"""Maximum time at exit for writing the lines that wait."""
+
+STDERR = 2
 
 
 class JsonLines(logging.Formatter):
@@ -67,12 +84,102 @@ class RepeatFilter(logging.Filter):
         return True
 
 
-def configure_logging(process_name: str) -> None:
-    """Log to stderr, in the format that the environment selects."""
-    handler = logging.StreamHandler()
+class LineWriter(logging.Handler):
+    """Writes lines from a thread, so that a full pipe or a slow disk stops no caller.
+
+    A caller waits for its line for a moment.  Once that was not enough, callers do not
+    wait until all lines are written.  Beyond a number of waiting lines, and after a
+    write that fails, lines are dropped; the next one written reports how many.
+
+    Parameters
+    ----------
+    descriptor : int
+        Descriptor to write to.
+    """
+
+    def __init__(self, descriptor: int = STDERR) -> None:
+        super().__init__()
+        self._descriptor = descriptor
+        self._lines: deque[bytes] = deque()
+        self._n_dropped = 0
+        self._is_writing = self._is_behind = False
+        self._changed = threading.Condition()
+        threading.Thread(target=self._run, name="log", daemon=True).start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Add a line to those that wait."""
+        line = self._line_of(record)
+        with self._changed:
+            if len(self._lines) >= MAX_WAITING_LINES:
+                self._n_dropped += 1
+                return
+            if self._n_dropped:
+                text = f"{self._n_dropped} log lines could not be written"
+                warning = logging.WARNING
+                note = logging.LogRecord(record.name, warning, "", 0, text, None, None)
+                self._lines.append(self._line_of(note))
+                self._n_dropped = 0
+            self._lines.append(line)
+            self._changed.notify_all()
+            if not self._is_behind:
+                self._is_behind = not self._wait(WRITE_LIMIT_S)
+
+    def flush(self) -> None:
+        """Wait for the lines to be written, for a limited time."""
+        with self._changed:
+            self._wait(EXIT_LIMIT_S)
+
+    def _wait(self, limit_s: float) -> bool:
+        """Wait for the lines to be written; return whether they are."""
+        return self._changed.wait_for(
+            lambda: not self._lines and not self._is_writing, limit_s
+        )
+
+    def _line_of(self, record: logging.LogRecord) -> bytes:
+        try:
+            text = self.format(record)
+        except Exception as error:  # the handler of such errors writes to stderr
+            text = f"{record.msg!r} could not be formatted: {error}"
+        return f"{text}\n".encode("utf-8", "backslashreplace")
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._is_writing = False
+                self._is_behind &= bool(self._lines)
+                self._changed.notify_all()
+                self._changed.wait_for(lambda: self._lines)
+                line = self._lines.popleft()
+                self._is_writing = True
+            try:
+                while line:
+                    line = line[os.write(self._descriptor, line) :]
+            except OSError:
+                with self._changed:
+                    self._n_dropped += 1
+
+
+def _log_exception(
+    kind: type[BaseException], error: BaseException, traceback: TracebackType | None
+) -> None:
+    """Log an exception that ends the process, in place of printing it."""
+    logging.getLogger("ocufilter").critical(
+        "the process ends", exc_info=(kind, error, traceback)
+    )
+
+
+def configure_logging(process_name: str, *, level: int = logging.INFO) -> None:
+    """Log to stderr, in the format that the environment selects.
+
+    Nothing that this process logs waits for a reader: neither lines nor warnings nor
+    the exception that ends it.
+    """
+    handler = LineWriter()
     if os.environ.get(FORMAT_VARIABLE) == "json":
         handler.setFormatter(JsonLines(process_name))
     else:
         handler.setFormatter(logging.Formatter(TEXT.format(name=process_name)))
     handler.addFilter(RepeatFilter())
-    logging.basicConfig(level=logging.INFO, handlers=[handler])
+    logging.basicConfig(level=level, handlers=[handler])
+    logging.captureWarnings(True)
+    sys.excepthook = _log_exception

@@ -224,8 +224,20 @@ def is_bye(parts: Sequence[Part]) -> bool:
         return False
 
 
-def decode_request(parts: Sequence[Part], limits: Limits | None = None) -> Message:
+def decode_request(
+    parts: Sequence[Part],
+    limits: Limits | None = None,
+    *,
+    unpacks_profiles: bool = True,
+) -> Message:
     """Decode and validate a message of a client.
+
+    Parameters
+    ----------
+    parts : sequence of bytes-like
+    limits : Limits, optional
+    unpacks_profiles : bool
+        Whether to unpack the bodies of profiles; otherwise they remain bytes.
 
     Raises
     ------
@@ -234,7 +246,10 @@ def decode_request(parts: Sequence[Part], limits: Limits | None = None) -> Messa
     """
     limits = limits or Limits()
     try:
-        return _decoded(parts, REQUESTS, limits)
+        message = _decoded(parts, REQUESTS, limits)
+        if unpacks_profiles and isinstance(message, ProfileRequest):
+            return message.unpacked()
+        return message
     except BadMessage as error:
         raise limits.with_limits(error) from None
 

@@ -4,14 +4,18 @@
         task = progress.task("Rendering", total=60)
         task.advance()
 
-Lines are written when a task starts or its stage changes, and every few seconds.
+Lines are written when a task starts or its stage changes, and every few seconds.  They
+contain the remaining time once the counted items take equally long: see `Task.count`.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
+from bisect import bisect_right
+from collections.abc import Callable
 from types import TracebackType
 from typing import Any, Self, TextIO
 
@@ -22,6 +26,16 @@ STAGE_NAMES = {"psfs": "PSFs"}
 MIN_ESTIMATE_S = 2.0
 """Minimum duration for an estimate of the remaining time."""
 
+MIN_ITEMS = 6
+"""Smallest number of items that gives a rate."""
+
+MAX_RATIO = 1.5
+"""Largest ratio of the estimates from the newest items and from all, so that their mean
+is right within a factor of two whichever of them holds."""
+
+MAX_SAMPLES = 512
+"""Updates that a task remembers; of more, every other one is dropped."""
+
 
 class Task:
     """A task with a count; created by `Progress.task`."""
@@ -30,7 +44,8 @@ class Task:
         self.title, self.total, self.unit = title, total, unit
         self.stage = ""
         self.done = 0.0
-        self._first: tuple[float, float] | None = None  # done, and when
+        self._samples: list[tuple[float, float]] = []  # done, and when
+        self._began_s = progress.clock()
         self._progress = progress
 
     def advance(self) -> None:
@@ -40,8 +55,12 @@ class Task:
     def update(self, done: float, stage: str | None = None) -> None:
         """Set the completed part of the total, and the current stage."""
         is_new_stage = stage is not None and stage != self.stage
-        if self._first is None or is_new_stage:
-            self._first = (done, time.monotonic())
+        if not self._samples:  # a resumed task begins with more than one
+            self._samples.append((done if done > 1.0 else 0.0, self._began_s))
+        if done > self._samples[-1][0]:
+            self._samples.append((done, self._progress.clock()))
+        if len(self._samples) > MAX_SAMPLES:
+            del self._samples[1:-1:2]
         self.done, self.stage = done, self.stage if stage is None else stage
         self._progress._changed(self, is_new_stage)
 
@@ -53,21 +72,45 @@ class Task:
 
     @property
     def count(self) -> str:
-        """Return the completed part and the estimated remaining time."""
+        """Return the completed part and, once it is known, the remaining time.
+
+        Percentages have no remaining time, because their stages advance at rates of
+        their own.
+        """
         if not self.total:
             return ""
         if self.unit == "%":
-            return f"{100.0 * self.done / self.total:.0f} %{self._time_left()}"
-        return f"{self.done:.0f}/{self.total:.0f} {self.unit}{self._time_left()}"
+            return f"{100.0 * self.done / self.total:.0f} %"
+        left_s = self._left_s()
+        left = "" if left_s is None else f", {left_s:.0f} s left"
+        return f"{self.done:.0f}/{self.total:.0f} {self.unit}{left}"
 
-    def _time_left(self) -> str:
-        """Estimate the remaining time from the rate since the first update."""
-        if self._first is None:
-            return ""
-        done, spent_s = self.done - self._first[0], time.monotonic() - self._first[1]
-        if done <= 0.0 or self.done >= self.total or spent_s < MIN_ESTIMATE_S:
-            return ""
-        return f", {spent_s * (self.total - self.done) / done:.0f} s left"
+    def _left_s(self) -> float | None:
+        """Estimate the remaining time; None unless old and new items agree.
+
+        The rates of all items, with what preceded the first, and of the newest half,
+        quarter and so on differ while something is prepared, and after it.  The fewer
+        items remain, the fewer of the newest count.
+        """
+        if not self._samples or self.done >= self.total:
+            return None
+        (first, began_s), (done, last_s) = self._samples[0], self._samples[-1]
+        now_s = self._progress.clock()
+        n_items = done - first
+        if n_items <= MIN_ITEMS or now_s - began_s < MIN_ESTIMATE_S:
+            return None
+        left_s, least = [], max(MIN_ITEMS, min(n_items, self.total - done) / 4.0)
+        while n_items >= least:
+            at = bisect_right(self._samples, (done - n_items, math.inf)) - 1
+            before, since_s = self._samples[at]
+            left_s.append((last_s - since_s) * (self.total - done) / (done - before))
+            is_last = n_items == least
+            n_items = 0.0 if is_last else max(n_items / 2.0, least)
+        low_s, high_s = min(left_s), max(left_s)
+        silent_s, item_s = now_s - last_s, high_s / (self.total - done)
+        if high_s > MAX_RATIO * low_s or silent_s > MIN_ITEMS * item_s:
+            return None
+        return max(math.sqrt(low_s * high_s) - silent_s, 0.0)
 
 
 class Progress:
@@ -85,6 +128,8 @@ class Progress:
         Stream in place of stderr.
     interval_s : float
         Longest time between lines.
+    clock : callable
+        Returns the time in seconds.
     """
 
     def __init__(
@@ -95,7 +140,9 @@ class Progress:
         as_lines: bool = False,
         stream: TextIO | None = None,
         interval_s: float = INTERVAL_S,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self.clock = clock
         self._name, self._interval_s = name, interval_s
         self._stream = sys.stderr if stream is None else stream
         self._is_quiet = quiet
@@ -103,7 +150,7 @@ class Progress:
         self._bars: _Bars | None = None
         self._task: Task | None = None
         self._last = ("", 0.0)  # line and when
-        self._started_s = time.monotonic()
+        self._started_s = clock()
         self._lock = threading.Lock()
         self._ended = threading.Event()
 
@@ -154,7 +201,7 @@ class Progress:
     def _repeat(self) -> None:
         """Write a line whenever none has been written for the interval."""
         while not self._ended.wait(self._interval_s / 10.0):
-            task, silent_s = self._task, time.monotonic() - self._last[1]
+            task, silent_s = self._task, self.clock() - self._last[1]
             if task is not None and silent_s >= self._interval_s:
                 self._write_line(task, force=True)
 
@@ -163,7 +210,7 @@ class Progress:
             return
         with self._lock:
             text = ", ".join(filter(None, (task.name, task.count)))
-            now_s = time.monotonic()
+            now_s = self.clock()
             if text == self._last[0] and not force:
                 return
             self._last = (text, now_s)

@@ -1,16 +1,22 @@
 // Sends a few frames to a service and prints the results as JSON.
 //
-//     node check.js ENDPOINT PROFILE_JSON [LEFT_JSON RIGHT_JSON]
+//     node check.js [--wait] ENDPOINT PROFILE_JSON [LEFT_JSON RIGHT_JSON]
 //
 // Covers mono and stereo frames, two eyes with separate profiles (PROFILE_JSON by
-// default), 8-bit and linear light, and errors with their fields. It then prints "lost"
-// on a line of its own and waits for a line on stdin, so that the caller may break the
-// connection. Finally it filters another frame.
+// default), 8-bit and linear light, and errors with their fields. With --wait, it then
+// prints "lost" on a line of its own and waits for a line on stdin, so that the caller may
+// break the connection. Finally it filters another frame.
 
 import { createInterface } from "node:readline";
 import { FilterClient } from "./filter_client.js";
 
-const [endpoint, profileText, leftText, rightText] = process.argv.slice(2);
+const words = process.argv.slice(2).filter((word) => word !== "--wait");
+const waits = process.argv.includes("--wait");
+const [endpoint, profileText, leftText, rightText] = words;
+if (profileText === undefined) {
+  console.error("usage: node check.js [--wait] ENDPOINT PROFILE_JSON [LEFT_JSON RIGHT_JSON]");
+  process.exit(2);
+}
 const widthPx = 32;
 const heightPx = 18;
 const tangents = [-0.5, 0.5, 0.28, -0.28];
@@ -63,8 +69,10 @@ for (const [name, wrong] of [
   });
 }
 found.pong = (await client.ping()).n_sessions;
-console.log("lost");
-await new Promise((resolve) => createInterface(process.stdin).once("line", resolve));
+if (waits) {
+  console.log("lost");
+  await new Promise((resolve) => createInterface(process.stdin).once("line", resolve));
+}
 const again = await client.filter([view(Uint8Array, 10)], look);
 found.again = [client.welcome.session_id, again.colors[0].at(-1)];
 const both = await client.filter(

@@ -77,31 +77,35 @@ export class FilterClient {
     };
     await this.hello();
     const request = [encode(header), Buffer.from(JSON.stringify(body))];
-    this.profiles.set(eye, { id: header.profile_id, request });
+    const profile = { id: header.profile_id, request, isReady: false };
+    this.profiles.set(eye, profile);
     const ours = (reply) => reply.profile_id === header.profile_id;
     const accepted = this.await_(
       (reply) => ours(reply) && reply.type === "accepted",
       "the profile to be accepted",
       ours,
     );
-    // An eye may be ready before the number of its cameras has been read.
+    // An eye may be ready before `accepted` resolves. After a lost connection, `begin` sends
+    // the profile again, and its replies are counted anew.
     const isReady = (reply) => ours(reply) && reply.type === "ready";
-    const arrived = [];
-    const note = (reply) => isReady(reply) && arrived.push(reply);
+    let missing = 0;
+    let ready = null;
+    const note = (reply) => {
+      if (ours(reply) && reply.type === "accepted") missing = reply.n_cameras;
+      if (!isReady(reply)) return;
+      missing -= 1;
+      ready = reply;
+    };
     this.notes.add(note);
     try {
       await this.send(request);
-      let missing = (await accepted).n_cameras;
-      let ready = null;
+      await accepted;
       while (missing > 0) {
-        if (!arrived.length) {
-          await this.await_(isReady, "the eye to be ready", ours, 12 * this.timeoutMs);
-        }
-        ready = arrived.shift();
-        missing -= 1;
+        await this.await_(isReady, "the eye to be ready", ours, 12 * this.timeoutMs);
       }
       return ready;
     } finally {
+      profile.isReady = true; // or has failed: `begin` need not send it for an answer
       this.notes.delete(note);
     }
   }
@@ -129,7 +133,8 @@ export class FilterClient {
       const answer = this.await_(ours, `frame ${frameId}`, ours);
       await this.send([encode(header), ...views.flatMap(images)]);
       const reply = await answer.catch((error) => {
-        if (error.code === "connection_lost") return { reason: error.code };
+        const isLost = ["connection_lost", "no_session"].includes(error.code);
+        if (isLost) return { reason: "connection_lost" };
         throw error;
       });
       if (reply.type === "result") return reply;
@@ -185,7 +190,10 @@ export class FilterClient {
         const reply = decode(head);
         if (reply.type === "result") reply.colors = parts.map((p, i) => picture(reply, p, i));
         if (reply.type === "welcome") await this.begin(reply);
-        if (reply.type === "error" && reply.code === "no_session") await this.greet();
+        if (reply.type === "error" && reply.code === "no_session" && this.welcome) {
+          this.welcome = null;
+          await this.greet();
+        }
         this.hand(reply);
       }
     } catch (error) {
@@ -198,8 +206,9 @@ export class FilterClient {
     this.welcome = welcome;
     this.key = welcome.session_key;
     const known = { both: welcome.profile_id, ...welcome.profile_ids };
-    for (const [eye, { id, request }] of this.profiles) {
-      if (known[eye] !== id) await this.send(request);
+    for (const [eye, { id, request, isReady }] of this.profiles) {
+      // Replies about a profile may have been lost with the connection.
+      if (known[eye] !== id || !isReady) await this.send(request);
     }
   }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from estimator.eye.checked_fields import ProfileError
+from estimator.note import Note
 from filter_service.building.jobs import BuildJob, BuiltStore
 from filter_service.building.read_profile import unknown_profile
 from filter_service.errors import (
@@ -73,7 +74,7 @@ def _built(
 
     stored = cache.load(key, check_cancelled=check_cancelled)
     if stored is not None:
-        notes = (*stored.notes, "eye from the disk cache")
+        notes = (*stored.notes, Note("eye_from_cache", "eye from the disk cache"))
         return BuiltStore(PsfStore(**stored.parts), notes)
     eye, notes = eye_for_spec(profile, spec, progress=progress, cancelled=cancelled)
     check_cancelled()

@@ -21,7 +21,7 @@ from filter_service.building.helper_process import (
     is_stopped,
     wait_or_kill,
 )
-from filter_service.building.jobs import BuildJob, BuiltStore
+from filter_service.building.jobs import BuiltStore
 from filter_service.errors import (
     BuildCancelled,
     FilterError,
@@ -112,6 +112,8 @@ class WorkerHandle:
         Niceness of the process.  While a new eye is estimated on two busy cores, 91 to
         96 % of a stream's frames are complete with 0, and 95 to 98 % with 5; with 10,
         eyes that take long to estimate hardly ever finish.
+    task : str
+        Task of the process, for error messages.
     """
 
     build: str = BUILD
@@ -119,8 +121,9 @@ class WorkerHandle:
     build_limit_s: float = 600.0
     warm_up: str = WARM_UP
     niceness: int = NICENESS
+    task: str = "computes PSFs"
     n_restarts: int = 0
-    _queue: deque[tuple[int, BuildJob]] = field(default_factory=deque)
+    _queue: deque[tuple[int, Any]] = field(default_factory=deque)
     _next_ticket: int = 1
     _running: int | None = None
     _kill_at_s: float | None = None
@@ -179,8 +182,8 @@ class WorkerHandle:
         """Return whether `poll` has work to do even if the pipe is silent."""
         return self._worker is None or self._kill_at_s is not None
 
-    def submit(self, job: BuildJob) -> int:
-        """Queue a job; return its ticket."""
+    def submit(self, job: Any) -> int:
+        """Queue a job, the argument of ``build``; return its ticket."""
         ticket = self._next_ticket
         self._next_ticket += 1
         self._queue.append((ticket, job))
@@ -279,7 +282,6 @@ class WorkerHandle:
         was_cancelled = self._kill_at_s is not None
         was_ready = self._is_ready
         tickets = [] if self._running is None else [self._running]
-        worker.pipe.close()
         self._worker = None
         self._is_ready = False
         self._end_running()
@@ -287,7 +289,7 @@ class WorkerHandle:
         if was_cancelled:
             error: FilterError = BuildCancelled("the build was terminated")
         else:
-            error = WorkerCrashed(f"the process that computes PSFs {how}")
+            error = WorkerCrashed(f"the process that {self.task} {how}")
             log.error("%s; starting a new one", error.message)
         if not was_ready:
             # The cause was not a job; queued ones would wait forever.
@@ -296,4 +298,6 @@ class WorkerHandle:
             self._start_at_s = time.monotonic() + RESTART_DELAY_S
         else:
             self.start()
+        # After the start: under the same number, selectors would miss the new pipe.
+        worker.pipe.close()
         return [BuildError(ticket, error) for ticket in tickets]

@@ -17,6 +17,8 @@ from filter_service.native import records
 FOLDER = Path(__file__).parent
 FILE = "_loops.so"
 LIBRARY_VARIABLE = "OCUFILTER_NATIVE_LIBRARY"
+VARIANT_VARIABLE = "OCUFILTER_NATIVE_VARIANT"
+VARIANTS = ("auto", "portable")
 Between = ctypes.CFUNCTYPE(None)
 
 STAGES = ("pixels", "merge", "place", "blend", "splat")
@@ -37,7 +39,7 @@ class Library:
     path : Path
         Path of the shared library.
     portable : bool
-        Do not use optional processor features; for tests.
+        Do not use optional processor features.
 
     Raises
     ------
@@ -161,12 +163,21 @@ def library_path() -> Path | None:
 def compiled_library() -> Library:
     """Return the compiled library, loaded once.
 
+    The environment variable ``OCUFILTER_NATIVE_VARIANT`` selects "portable", the code
+    for any processor, or "auto", which uses AVX2 where the processor has it.
+
     Raises
     ------
     RenderFailed
         If it was not built or cannot be loaded; the message has the remedy.
+        If there is no such variant.
     """
     path = library_path()
     if path is None:
         raise RenderFailed(f"the native engine was not built here; {REMEDY}")
-    return Library(path)
+    variant = os.environ.get(VARIANT_VARIABLE, "auto")
+    if variant not in VARIANTS:
+        raise RenderFailed(
+            f"{VARIANT_VARIABLE}={variant!r}; allowed: {', '.join(VARIANTS)}"
+        )
+    return Library(path, portable=variant == "portable")

@@ -41,13 +41,14 @@ render_client          the front end's link to a render worker
 fair_queue             fair queuing of frames
 render_worker_process  main program of a render worker
 render_worker          event loop of a render worker
+profile_reader         the process that reads large profiles
 session_eyes           one filter for each eye of a session
 frame_reply            the reply to a frame
 shared_memory_frame    the same, with images in shared memory
 texture_frame          the same, with images in textures
 process_channel        messages between the processes
 config                 settings file
-process_info           version and memory of the process
+process_info           memory of the process
 
 `ocufilter.service` is a systemd unit.
 """

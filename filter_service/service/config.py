@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from estimator.bounded_files import MAX_BITS, read_toml
 from estimator.threads import MAX_THREADS, thread_count
 from filter_service.building.limits import BuildLimits, default_cache_dir
 from filter_service.constants import ENGINES
@@ -18,6 +18,8 @@ from filter_service.wire.message import DEFAULT_ENDPOINT, Limits
 
 LOOPBACK_HOSTS = ("127.0.0.1", "[::1]", "localhost")
 MB = 10**6
+MAX_CONFIG_BYTES = 100_000
+"""Size limit of a configuration file; one with every setting has 1 kB."""
 
 
 @dataclass(frozen=True)
@@ -145,15 +147,14 @@ class ServiceConfig:
             ("log_format", LOG_FORMATS),
         ):
             if getattr(self, name) not in allowed:
-                raise ValueError(
-                    f"{name} is {getattr(self, name)!r}; allowed: {', '.join(allowed)}"
-                )
+                found = f"{name} is {getattr(self, name)!r:.100}"
+                raise ValueError(f"{found}; allowed: {', '.join(allowed)}")
         checked_gl_device(self.gl_device)
         check_devices(self.devices, engine=self.engine, gl_device=self.gl_device)
         for name, (low, high) in RANGES.items():
             value = getattr(self, name)
             if not low <= value <= high:
-                raise ValueError(f"{name} is {value!r}; allowed: {low} to {high}")
+                raise ValueError(f"{name} is {value!r:.100}; allowed: {low} to {high}")
 
     @property
     def device_names(self) -> tuple[str, ...]:
@@ -266,26 +267,28 @@ def changed_while_running(
 def _check_bind(bind: object, *, has_keys: bool) -> None:
     if not isinstance(bind, str) or "://" not in bind:
         raise ValueError(
-            f"bind is {bind!r}; allowed: tcp://127.0.0.1:PORT or ipc://PATH"
+            f"bind is {bind!r:.100}; allowed: tcp://127.0.0.1:PORT or ipc://PATH"
         )
     transport, address = bind.split("://", 1)
     if transport == "ipc" and address:
         return
     if transport != "tcp":
-        raise ValueError(f"bind is {bind!r}; allowed: tcp://HOST:PORT or ipc://PATH")
+        raise ValueError(
+            f"bind is {bind!r:.100}; allowed: tcp://HOST:PORT or ipc://PATH"
+        )
     host, _, port = address.rpartition(":")
     is_port = port == "*" or (port.isdigit() and int(port) < 65536)
     if not host or not is_port:
         raise ValueError(
-            f"bind is {bind!r}; allowed: tcp://HOST:PORT, PORT 0 to 65535 or *"
+            f"bind is {bind!r:.100}; allowed: tcp://HOST:PORT, PORT 0 to 65535 or *"
         )
     if host not in LOOPBACK_HOSTS and not has_keys:
         raise ValueError(
-            f"bind is {bind!r}, which other machines can reach: anyone who connects "
-            "could use sessions of other clients and exhaust this machine's memory. "
-            "Listen on tcp://127.0.0.1:PORT and let clients connect through an SSH "
-            "tunnel, or create keys (`ocufilter keys add NAME`) and set keys_dir in "
-            "the configuration file"
+            f"bind is {bind!r:.100}, which other machines can reach: anyone who "
+            "connects could use sessions of other clients and exhaust this machine's "
+            "memory. Listen on tcp://127.0.0.1:PORT and let clients connect through an "
+            "SSH tunnel, or create keys (`ocufilter keys add NAME`) and set keys_dir "
+            "in the configuration file"
         )
 
 
@@ -296,16 +299,12 @@ def load_config(path: Path | str | None = None, **overrides: Any) -> ServiceConf
     ------
     ValueError
         For an unknown setting, a wrong type or a value out of range; the message names
-        the setting.
-    OSError
-        If the file cannot be read.
+        the setting.  If the file cannot be read or is not TOML, the error is an
+        `InvalidFile`.
     """
     settings: dict[str, Any] = {}
     if path is not None:
-        try:
-            settings = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise ValueError(f"{path} is not a valid TOML file: {error}") from None
+        settings = read_toml(Path(path), max_bytes=MAX_CONFIG_BYTES, option="config")
     settings |= {name: value for name, value in overrides.items() if value is not None}
     return ServiceConfig(**_typed(settings))
 
@@ -315,7 +314,7 @@ def _string_items(name: str, value: object) -> tuple[str, ...]:
     words = [w.strip() for w in value.split(",")] if isinstance(value, str) else value
     if isinstance(words, list | tuple) and all(type(word) is str for word in words):
         return tuple(words)
-    raise ValueError(f"{name} is {value!r}; allowed: a list of strings")
+    raise ValueError(f"{name} is {value!r:.100}; allowed: a list of strings")
 
 
 def _typed(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -326,23 +325,23 @@ def _typed(settings: Mapping[str, Any]) -> dict[str, Any]:
     unknown = sorted(set(settings) - set(defaults))
     if unknown:
         raise ValueError(
-            f"unknown setting {unknown[0]!r}; allowed: {', '.join(defaults)}"
+            f"unknown setting {unknown[0]!r:.100}; allowed: {', '.join(defaults)}"
         )
     typed: dict[str, Any] = {}
     for name, value in settings.items():
         if name == "ready_file":
             if not isinstance(value, str | Path):
-                raise ValueError(f"{name} is {value!r}; allowed: str")
+                raise ValueError(f"{name} is {value!r:.100}; allowed: str")
             typed[name] = Path(value)
             continue
         wanted = type(defaults[name])
-        if wanted is float and type(value) is int:
+        if wanted is float and type(value) is int and value.bit_length() <= MAX_BITS:
             value = float(value)
         if name == "gl_device" and type(value) is int:
             value = str(value)
         if name == "devices":
             value = _string_items(name, value)
         if type(value) is not wanted:
-            raise ValueError(f"{name} is {value!r}; allowed: {wanted.__name__}")
+            raise ValueError(f"{name} is {value!r:.100}; allowed: {wanted.__name__}")
         typed[name] = value
     return typed

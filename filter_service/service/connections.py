@@ -9,6 +9,7 @@ id, which a client chooses itself.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import socket
 import struct
@@ -22,8 +23,12 @@ from filter_service.log_lines import ONCE_A_SECOND
 from filter_service.service.rate_limit import RateLimit
 
 MAX_UNREAD_BYTES = 262_144
-"""Bytes that a connection without a session may send without completing a message.  It
-sends no large ones, and libzmq buffers incomplete messages without exposing them."""
+"""Bytes of an incomplete message that a connection without a session may send in any
+time.  libzmq buffers incomplete messages without exposing them."""
+
+MAX_INCOMPLETE_S = 10.0
+"""Time for which such a connection may have sent more than that.  After a restart of
+the service, a client that has not noticed sends a frame, to be told `no_session`."""
 
 CHECK_INTERVAL_S = 0.01
 MAX_CHECKED = 64
@@ -83,6 +88,8 @@ class Connection:
     is_shut_down: bool = False
     has_had_session: bool = False
     counted_bytes: int | None = None  # received when its last message was complete
+    unread_bytes: int = 0  # received since then, if more than `MAX_UNREAD_BYTES`
+    unread_since_s: float = 0.0
     rates: RateLimit = field(default_factory=RateLimit)
 
 
@@ -101,6 +108,9 @@ class Connections:
     family : socket.AddressFamily
         Address family of all connections.  Querying it for each connection took a third
         of the connection's total cost.
+    max_unread_bytes : int
+        Maximum total size of the large incomplete messages of connections without a
+        session.
 
     Attributes
     ----------
@@ -112,8 +122,11 @@ class Connections:
         max_count: int,
         with_session: Collection[int],
         family: socket.AddressFamily = socket.AF_INET,
+        *,
+        max_unread_bytes: int = 250_000_000,
     ) -> None:
         self._family = family
+        self._max_unread_bytes = max_unread_bytes
         self.max_count = max_count
         self.n_evicted = 0
         self._with_session = with_session
@@ -125,6 +138,7 @@ class Connections:
         self._with_greeting: dict[str, dict[int, Connection]] = {}
         self._next_check_s = 0.0
         self._to_check: list[Connection] = []
+        self._unread: set[Connection] = set()  # with a large incomplete message
         self._n_ending = 0  # shut down, not yet reported as ended
 
     def __len__(self) -> int:
@@ -155,6 +169,7 @@ class Connections:
         if connection is None:
             return None
         self._n_ending -= connection.is_shut_down
+        self._unread.discard(connection)
         self._remove_candidate(connection)
         if connection.number is not None:
             self._numbered.pop(connection.number, None)
@@ -184,6 +199,7 @@ class Connections:
             found.number = number
             self._numbered[number] = found
         found.counted_bytes = None
+        self._unread.discard(found)
         return None if found.is_shut_down else found
 
     def is_open(self, number: int) -> bool:
@@ -245,8 +261,17 @@ class Connections:
                 return True
         return False
 
+    @property
+    def due_s(self) -> float:
+        """Return the `time.monotonic` at which `check_unread` is next due."""
+        return self._next_check_s if self._to_check or self._unread else math.inf
+
     def check_unread(self, now_s: float) -> None:
-        """Close connections without a session that send too much of a message."""
+        """Close connections without a session that hold too much of a message.
+
+        Call this after the complete messages have been received: they are answered
+        whatever their size.
+        """
         if now_s < self._next_check_s:
             return
         self._next_check_s = now_s + CHECK_INTERVAL_S
@@ -255,22 +280,38 @@ class Connections:
         checked = self._to_check[-MAX_CHECKED:]
         del self._to_check[-MAX_CHECKED:]
         for connection in checked:
-            connection.has_had_session |= connection.number in self._with_session
-            if connection.has_had_session or connection.is_shut_down:
-                continue
-            n_bytes = self._bytes_received(connection)
-            if connection.counted_bytes is None:
-                connection.counted_bytes = n_bytes
-            elif n_bytes - connection.counted_bytes > MAX_UNREAD_BYTES:
+            self._count_unread(connection, now_s)
+        excess_bytes = sum(c.unread_bytes for c in self._unread)
+        excess_bytes -= self._max_unread_bytes
+        for connection in sorted(self._unread, key=lambda c: -c.unread_bytes):
+            is_late = now_s - connection.unread_since_s > MAX_INCOMPLETE_S
+            if is_late or excess_bytes > 0:
+                excess_bytes -= connection.unread_bytes
                 self._shut_down(connection)
                 log.warning(
                     "closed a connection from %s: it sent %d bytes and no message",
-                    *(connection.address, n_bytes),
+                    *(connection.address, connection.unread_bytes),
                 )
+
+    def _count_unread(self, connection: Connection, now_s: float) -> None:
+        """Measure the incomplete message of a connection without a session."""
+        connection.has_had_session |= connection.number in self._with_session
+        if connection.has_had_session or connection.is_shut_down:
+            self._unread.discard(connection)
+            return
+        n_bytes = self._bytes_received(connection)
+        if connection.counted_bytes is None:
+            connection.counted_bytes = n_bytes
+        connection.unread_bytes = n_bytes - connection.counted_bytes
+        if connection.unread_bytes > MAX_UNREAD_BYTES:
+            if connection not in self._unread:
+                self._unread.add(connection)
+                connection.unread_since_s = now_s
 
     def _shut_down(self, connection: Connection) -> None:
         """Shut a connection down; libzmq then closes the descriptor itself."""
         connection.is_shut_down = True
+        self._unread.discard(connection)
         self._n_ending += 1
         self._remove_candidate(connection)
         end = self._borrow_socket(connection)

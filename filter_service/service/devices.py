@@ -52,7 +52,7 @@ def device_named(text: str) -> Device:
         return Device(engine, gl_device=number)
     if engine == "native" and is_number and 1 <= int(number) <= MAX_THREADS:
         return Device(engine, threads=int(number))
-    raise ValueError(f"unknown device {text!r} in devices; allowed: {ALLOWED}")
+    raise ValueError(f"unknown device {text!r:.100} in devices; allowed: {ALLOWED}")
 
 
 def check_devices(names: tuple[str, ...], *, engine: str, gl_device: str) -> None:
@@ -71,6 +71,6 @@ def check_devices(names: tuple[str, ...], *, engine: str, gl_device: str) -> Non
     for setting, value in (("engine", engine), ("gl_device", gl_device)):
         if names and value != "auto":
             raise ValueError(
-                f"{setting} is {value!r}, but devices select their own engines; "
+                f"{setting} is {value!r:.100}, but devices select their own engines; "
                 "allowed with devices: auto"
             )

@@ -80,9 +80,13 @@ class FairQueue(Generic[Client]):
         """
         idle_s = max(0.0, started_s - max(self._free_since_s, queued_since_s))
         self._free_since_s = max(self._free_since_s, ended_s)
-        share = self._shares.get(client)
-        if share is not None:
-            share.used_s += min(used_s + idle_s, MAX_CHARGE_S)
+        if client in self._shares:  # otherwise it has ended
+            self.charge(client, used_s + idle_s)
+
+    def charge(self, client: Client, used_s: float) -> None:
+        """Charge a session for time that was spent for it."""
+        share = self._shares.setdefault(client, _Share(self._level_s))
+        share.used_s += min(used_s, MAX_CHARGE_S)
 
     def forget(self, client: Client) -> None:
         """Forget a session that has ended."""

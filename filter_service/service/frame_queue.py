@@ -93,6 +93,10 @@ class FrameQueue:
         self._orphaned += session.unsent
         session.unsent = []
 
+    def charge(self, session: Session, used_s: float) -> None:
+        """Charge a session for work other than its frames."""
+        self._queue.charge(session.key, used_s)
+
     def forget(self, session: Session) -> None:
         """Forget the time that a session has used."""
         self._queue.forget(session.key)

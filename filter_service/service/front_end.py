@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any
 
@@ -74,6 +75,10 @@ MAX_ACCIDENTAL_PARTS = 1000  # a client that sends more surplus parts is hostile
 IDLE_WAIT_S = 1.0
 TRIM_INTERVAL_S = 10.0
 CLOSING_LINGER_MS = 200
+UNREAD_SHARE = 0.125
+"""Share of the front end's memory for large messages of clients without a session: by
+default 250 MB, two frames of 4096x4096."""
+
 MB = 10**6
 log = logging.getLogger("ocufilter")
 
@@ -98,6 +103,7 @@ class FrontEnd:
             self._descriptors.max_connections,
             self._sessions.connections,
             socket_family(config.bind),
+            max_unread_bytes=int(UNREAD_SHARE * config.max_socket_mb * MB),
         )
         self._n_ignored = 0
         self._is_degraded = False
@@ -170,11 +176,18 @@ class FrontEnd:
 
     # Event loop
 
-    def run(self) -> None:
-        """Serve until the supervisor sends stop or exits."""
+    def run(self, received: Iterable[tuple[Any, list[int]]] = ()) -> None:
+        """Serve until the supervisor sends stop or exits.
+
+        Parameters
+        ----------
+        received : iterable of (message, descriptors)
+            Messages of the supervisor that arrived during the start.
+        """
         try:
-            while self._run_once():
-                pass
+            is_running = self._handle_all(received)
+            while is_running:
+                is_running = self._run_once()
         except LinkClosed:
             log.error("the supervisor exited")
         finally:
@@ -184,6 +197,9 @@ class FrontEnd:
         """Handle the supervisor's messages; return whether to continue."""
         with self._descriptors.reserve():  # for links to new processes
             messages = self._supervisor.receive()
+        return self._handle_all(messages)
+
+    def _handle_all(self, messages: Iterable[tuple[Any, list[int]]]) -> bool:
         # A list: every message is handled, whatever the first ones return.
         return all([self.handle_control(*message) for message in messages])  # noqa: C419
 
@@ -238,7 +254,9 @@ class FrontEnd:
         wait_s = self._devices.wait_s(now_s)
         if wait_s is not None:
             return wait_s
-        due_s = min(self._session_manager.due_s, self._next_trim_s)
+        due_s = min(
+            *(self._session_manager.due_s, self._next_trim_s, self._connections.due_s)
+        )
         return min(IDLE_WAIT_S, max(0.0, due_s - now_s))
 
     def _close(self) -> None:
@@ -252,6 +270,7 @@ class FrontEnd:
     def _run_periodic_tasks(self) -> None:
         """Run periodic tasks."""
         now_s = time.monotonic()
+        self._connections.check_unread(now_s)
         for device in self._devices:
             device.frames.reclaim_sent()
         self._session_manager.run_periodic_tasks()
@@ -281,6 +300,8 @@ class FrontEnd:
                     device.frames.accept_result(*rest)
                 elif kind == "profile_reply":
                     self._forward_reply(*rest)
+                elif kind == "profile_used":
+                    self._session_manager.charge_profile(*rest)
                 elif kind == "state":
                     device.memory_mb, device.stores_mb, device.is_building = rest
                 elif kind == "texture_reply":
@@ -387,7 +408,8 @@ class FrontEnd:
                     field="parts",
                     allowed=f"at most {len(parts) - 1}",
                 )
-            request = decode_request(parts, self._limits)
+            # A render worker unpacks profiles, the newest one of each eye only.
+            request = decode_request(parts, self._limits, unpacks_profiles=False)
             if isinstance(request, Frame):
                 session = self._session_manager.session_of(peer)
                 frames = self._frames_of(session)

@@ -31,9 +31,7 @@ def main() -> None:
         supervisor.send(("failed", str(error)))
         raise SystemExit(1) from None
     supervisor.send(("ready", front_end.endpoint))
-    for message, descriptors in others:
-        front_end.handle_control(message, descriptors)
-    front_end.run()
+    front_end.run(others)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
+import select
 import signal
 from collections.abc import Callable
 from functools import partial
@@ -12,6 +14,8 @@ from filter_service.atomic_files import write_atomically
 from filter_service.log_lines import FORMAT_VARIABLE, configure_logging
 from filter_service.service.config import ServiceConfig
 from filter_service.service.supervisor import OPEN_BUILDER, ServiceFailed, Supervisor
+
+STDOUT = 1
 
 log = logging.getLogger("ocufilter")
 
@@ -69,12 +73,37 @@ class ReadyAnnouncement:
         self._is_printed = False
 
     def ready(self, endpoint: str) -> None:
-        """Write the ready file, and print one line the first time."""
-        if self._config.ready_file is not None:
-            write_atomically(self._config.ready_file, endpoint + "\n")
+        """Print one line the first time, and write the ready file.
+
+        A service that cannot print the line runs; one that cannot write the file does
+        not start.
+
+        Raises
+        ------
+        OSError
+            If the ready file cannot be written.
+        """
         if not self._is_printed:
             self._is_printed = True
-            print(f"ocufilter: serving on {endpoint}", flush=True)
+            try:
+                _print_line(f"ocufilter: serving on {endpoint}\n")
+            except OSError as error:
+                log.warning("stdout cannot be written: %s", error.strerror)
+        if self._config.ready_file is not None:
+            write_atomically(self._config.ready_file, endpoint + "\n")
+
+
+def _print_line(line: str) -> None:
+    """Write a line to stdout, unbuffered: otherwise Python fails again at exit.
+
+    Raises
+    ------
+    OSError
+        If the line cannot be written at once.
+    """
+    if not select.select([], [STDOUT], [], 0.0)[1]:
+        raise BlockingIOError(errno.EAGAIN, "its reader does not read")
+    os.write(STDOUT, line.encode())
 
 
 def _remove_ready_file(config: ServiceConfig) -> None:

@@ -1,18 +1,9 @@
-"""Version and memory of the process."""
+"""Memory of the process."""
 
 import ctypes
 import resource
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-
-
-def package_version() -> str:
-    """Return the installed version, or ``checkout`` if it is not installed."""
-    try:
-        return version("ocufilter")
-    except PackageNotFoundError:
-        return "checkout"
 
 
 def resident_memory_mb() -> float:

@@ -20,6 +20,8 @@ Messages to the front end:
 - ``("started", server, eyes, can_interrupt, texture_support)``, the first one
 - ``("texture_reply", key, number, reason)``, with a reason if it is not imported
 - ``("profile_reply", key, eye, reply)``
+- ``("profile_used", key, used_s)``, the processor time of reading a profile, before the
+  reply
 - ``("frame_reply", number, reply, started_s, ended_s, used_s, blocks_bytes)``
 - ``("state", memory_mb, stores_mb, is_building)``
 """
@@ -31,15 +33,16 @@ import os
 import selectors
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
 from estimator.profiles.parse import EyeProfile
-from filter_service.errors import FilterError, NoSession, RenderFailed
+from filter_service.errors import FilterError, NoProfile, NoSession, RenderFailed
 from filter_service.filtering.builder import Builder
 from filter_service.filtering.planned_textures import texture_importer
 from filter_service.messages import (
+    Dropped,
     ErrorReply,
     EyeName,
     Frame,
@@ -50,14 +53,15 @@ from filter_service.messages import (
 )
 from filter_service.service.process_channel import Link, LinkClosed
 from filter_service.service.process_info import (
-    package_version,
     resident_memory_mb,
     trim_heap,
 )
+from filter_service.service.profile_reader import ProfileReader, ReadProfile
 from filter_service.service.session_eyes import SessionEyes
 from filter_service.service.shared_memory_frame import filter_in_slots
 from filter_service.service.texture_frame import filter_in_textures
 from filter_service.shared_memory import Slot
+from filter_service.version import __version__
 
 IDLE_WAIT_S = 0.5
 WORKER_POLL_S = 0.1
@@ -95,7 +99,7 @@ class RenderWorker:
         max_cameras: int,
     ) -> None:
         self._builder = builder
-        self._read_profile = read_profile
+        self._reader = ProfileReader(read_profile)
         self._max_cameras = max_cameras
         self._sessions: dict[str, SessionEyes] = {}
         self._slots: dict[int, Slot] = {}
@@ -114,7 +118,10 @@ class RenderWorker:
         )
 
     def run(
-        self, control: Link, handle_control: Callable[[Any, list[int]], bool]
+        self,
+        control: Link,
+        handle_control: Callable[[Any, list[int]], bool],
+        received: Iterable[tuple[Any, list[int]]] = (),
     ) -> None:
         """Serve until the supervisor sends stop or exits.
 
@@ -124,18 +131,23 @@ class RenderWorker:
             Link to the supervisor.
         handle_control : callable
             Handles a message of the supervisor; returns whether to continue.
+        received : iterable of (message, descriptors), optional
+            Messages of the supervisor that arrived during the start.
         """
         selector = selectors.DefaultSelector()
-        selector.register(control, selectors.EVENT_READ)
 
-        def listen() -> None:
-            for message, descriptors in control.receive():
+        def handle(messages: Iterable[tuple[Any, list[int]]]) -> None:
+            for message, descriptors in messages:
                 if not handle_control(message, descriptors):
                     self._is_stopping = True
+
+        def listen() -> None:
+            handle(control.receive())
 
         self._listen = listen
         try:
             self._builder.worker.start()
+            handle(received)
             while not self._is_stopping:
                 self._watch(selector, control)
                 selector.select(self._wait_s())
@@ -158,7 +170,7 @@ class RenderWorker:
                 os.close(descriptor)
         server = {
             "name": "ocufilter",
-            "version": package_version(),
+            "version": __version__,
             "engine": self._builder.engine_name,
             "renderer": self._builder.engine.name,
             "gl_renderer": self._builder.engine.name,  # for older clients
@@ -171,28 +183,32 @@ class RenderWorker:
     # Event loop
 
     def _watch(self, selector: selectors.BaseSelector, control: Link) -> None:
-        wanted = {control.fileno(): selectors.EVENT_READ}
-        worker = self._builder.worker.file_descriptor
-        if worker is not None:
-            wanted[worker] = selectors.EVENT_READ
+        wanted: dict[int, tuple[int, Link | None]] = {
+            control.fileno(): (selectors.EVENT_READ, control)
+        }
+        for worker in (self._builder.worker, self._reader):
+            if worker.file_descriptor is not None:
+                wanted[worker.file_descriptor] = selectors.EVENT_READ, None
         if self._front_end is not None:
             events = selectors.EVENT_READ
             if self._front_end.has_unsent:
                 events |= selectors.EVENT_WRITE
-            wanted[self._front_end.fileno()] = events
-        known = {key.fd: key for key in selector.get_map().values()}
-        for descriptor in set(known) - set(wanted):
-            selector.unregister(known[descriptor].fileobj)
-        for descriptor, events in wanted.items():
+            wanted[self._front_end.fileno()] = events, self._front_end
+        for key in list(selector.get_map().values()):
+            # A link may have the descriptor of another that was closed meanwhile.
+            if key.fd not in wanted or key.data is not wanted[key.fd][1]:
+                selector.unregister(key.fileobj)
+        known = selector.get_map()
+        for descriptor, (events, link) in wanted.items():
             if descriptor not in known:
-                selector.register(descriptor, events)
+                selector.register(descriptor, events, link)
             elif known[descriptor].events != events:
-                selector.modify(known[descriptor].fileobj, events)
+                selector.modify(descriptor, events, link)
 
     def _wait_s(self) -> float:
         if self._builder.is_warming:
             return 0.0
-        if self._builder.worker.needs_poll:
+        if self._builder.worker.needs_poll or self._reader.needs_poll:
             return WORKER_POLL_S
         return IDLE_WAIT_S
 
@@ -209,6 +225,8 @@ class RenderWorker:
                 if self._front_end is not None:
                     self._front_end.close()
                 self._front_end = None
+        for key, request, found in self._reader.poll():
+            self._accept_profile(key, request, found)
         if is_short:
             return
         self._builder.advance()
@@ -264,6 +282,7 @@ class RenderWorker:
         for key in list(self._sessions):
             self._close_session(key)
         self._drop_all_textures()
+        self._reader.close()
         self._builder.close()
         self._drop_slots()
         if self._front_end is not None:
@@ -276,7 +295,7 @@ class RenderWorker:
         if kind == "frame":
             self._filter(*rest)
         elif kind == "profile":
-            self._accept_profile(*rest)
+            self._read_profile(*rest)
         elif kind == "open":
             self._open_session(*rest)
         elif kind == "close":
@@ -343,18 +362,26 @@ class RenderWorker:
 
     def _close_session(self, key: str) -> None:
         self._drop_textures(key)
+        self._reader.forget(key)
         session = self._sessions.pop(key, None)
         if session is not None:
             session.close()
 
-    def _accept_profile(self, key: str, request: ProfileRequest) -> None:
+    def _read_profile(self, key: str, request: ProfileRequest) -> None:
+        """Read a profile, or begin to."""
+        if key in self._sessions:
+            found = self._reader.submit(key, request)
+            if found is not None:
+                self._accept_profile(key, request, found)
+
+    def _accept_profile(
+        self, key: str, request: ProfileRequest, found: ReadProfile
+    ) -> None:
         """Accept or reject a profile; its progress follows as events."""
-        session = self._sessions.get(key)
-        if session is not None:
-            self._send_profile_reply(
-                key, request.eye, session.accept_profile(request, self._read_profile)
-            )
-            self._send_state(is_due=True)
+        reply = self._sessions[key].accept_profile(request, found.found)
+        self._send(("profile_used", key, found.used_s))
+        self._send_profile_reply(key, request.eye, reply)
+        self._send_state(is_due=True)
 
     def _send_profile_reply(self, key: str, eye: EyeName, reply: Reply) -> None:
         self._send(("profile_reply", key, eye, reply))
@@ -376,6 +403,9 @@ class RenderWorker:
             self._frame_since_s, self._interrupted_s = started_s, 0.0
         try:
             reply, blocks_bytes = self._reply_to(key, frame, places, sizes_bytes)
+            is_early = isinstance(reply, ErrorReply) and reply.code == NoProfile.code
+            if is_early and self._reader.is_reading(key):
+                reply = Dropped(frame.frame_id, "preparing")
         finally:
             interrupted_s = self._interrupted_s if is_first else 0.0
             if is_first:

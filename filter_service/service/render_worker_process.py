@@ -73,9 +73,7 @@ def main() -> None:
         loop = RenderWorker(builder, read_profile, max_cameras=config.max_cameras)
         supervisor.send(("ready", ""))
         on_ready()
-        for message, descriptors in others:
-            handle_control(loop, message, descriptors)
-        loop.run(supervisor, lambda *message: handle_control(loop, *message))
+        loop.run(supervisor, lambda *message: handle_control(loop, *message), others)
 
 
 def handle_control(

@@ -200,7 +200,6 @@ class Router:
             self._poller.modify(self._monitor, zmq.POLLIN)
         self._read_monitor()
         self._authenticator.handle_requests()
-        self._connections.check_unread(time.monotonic())
 
     def pop_ended(self) -> list[int]:
         """Return the numbers of the connections that have ended since the last call."""

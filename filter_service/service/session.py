@@ -145,6 +145,7 @@ class Session:
     disconnected_since_s: float | None = None
     last_connection: int = 0
     eyes: dict[EyeName, EyeProfiles] = field(default_factory=dict)
+    next_profile_s: float = 0.0  # earliest time of its next profile
 
     def eye(self, name: EyeName) -> EyeProfiles:
         """Return the profiles of an eye."""

@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 from estimator.profiles.parse import EyeProfile
 from filter_service.errors import FilterError, NoSession
@@ -22,7 +21,6 @@ from filter_service.messages import (
     Ready,
     Reply,
 )
-from filter_service.view_state import body_of_eye
 
 log = logging.getLogger("ocufilter")
 
@@ -106,22 +104,22 @@ class SessionEyes:
         return self._eyes[name]
 
     def accept_profile(
-        self,
-        request: ProfileRequest,
-        read_profile: Callable[[dict[str, Any]], EyeProfile],
+        self, request: ProfileRequest, profile: EyeProfile | FilterError
     ) -> Reply:
         """Set a profile; return the reply, accepted or an error.
 
         Parameters
         ----------
         request : ProfileRequest
-        read_profile : callable
-            ``read_profile(body)`` returns a parsed profile, or raises `FilterError`.
+        profile : EyeProfile or FilterError
+            The parsed body, or why it was refused.
         """
         try:
+            if isinstance(profile, FilterError):
+                raise profile
             eye = self._eye(request.eye)
             accepted = eye.eye_filter.set_profile(
-                read_profile(body_of_eye(request.body, request.eye)),
+                profile,
                 settings=request.settings,
                 cameras=request.views,
                 profile_id=request.profile_id,

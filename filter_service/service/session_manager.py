@@ -38,8 +38,8 @@ MAX_PENDING_HELLOS = 256
 
 PROFILE_PAUSE_S = 0.05
 """Minimum interval between two profiles of an eye: the render worker takes a few
-milliseconds to parse one and start its build.  Of the profiles that arrive meanwhile,
-only the newest is sent."""
+milliseconds to start a build.  Of the profiles that arrive meanwhile, only the newest
+is sent."""
 
 log = logging.getLogger("ocufilter")
 
@@ -125,7 +125,8 @@ class SessionManager:
                 (peer, hello),
             ]
             return
-        session, is_resumed = self._sessions.by_peer(peer), False
+        session = self._sessions.by_peer(peer)
+        is_resumed = session is not None and session.key == hello.session_key
         if session is None:
             session = self._sessions.by_key(hello.session_key)
             if session is not None and session.owner != peer.key:
@@ -151,6 +152,7 @@ class SessionManager:
             is_resumed=is_resumed,
             profile_id=session.profile_ids.get("both") if is_resumed else None,
             profile_ids=session.profile_ids if is_resumed else {},
+            n_unanswered=session.n_unanswered,
             textures=self._client_textures.offer_to(session),
         )
         self._send(peer, welcome)
@@ -248,8 +250,9 @@ class SessionManager:
         now_s = time.monotonic()
         if eye.queued_profile is None or eye.sent_profile is not None:
             return
-        if now_s < eye.next_send_s:
-            self._next_profile_s = min(self._next_profile_s, eye.next_send_s)
+        due_s = max(eye.next_send_s, session.next_profile_s)
+        if now_s < due_s:
+            self._next_profile_s = min(self._next_profile_s, due_s)
             return
         eye.next_send_s = now_s + PROFILE_PAUSE_S
         eye.sent_profile, eye.queued_profile = eye.queued_profile, None
@@ -263,6 +266,17 @@ class SessionManager:
         for session in self._sessions:
             for eye in session.eyes.values():
                 self._send_queued_profile(session, eye)
+
+    def charge_profile(self, key: str, used_s: float) -> None:
+        """Charge a session for reading a profile, which delays its frames and profiles.
+
+        A session then takes at most half of the time of the process that reads them.
+        """
+        session = self._sessions.by_key(key)
+        if session is not None:
+            begin_s = max(session.next_profile_s, time.monotonic())
+            session.next_profile_s = begin_s + used_s
+            self._devices.device_of(session).frames.charge(session, used_s)
 
     def forward_reply(self, key: str, name: EyeName, reply: Reply) -> None:
         """Forward a render worker's reply about an eye's profile to the client."""

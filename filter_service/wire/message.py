@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Self
 
 from msgspec import Meta
@@ -18,18 +18,44 @@ Part = bytes | bytearray | memoryview
 MAX_ID = 2**53 - 1  # exact as a double, as in JSON and JavaScript
 MAX_NOTES = 8
 MAX_NOTE_BYTES = 200
+MAX_NOTE_VALUE = 1e12
 MAX_DEVICES = 8
 
 Id = Annotated[int, Meta(ge=0, le=MAX_ID)]
 Count = Id
 ShortText = Annotated[str, Meta(max_length=100)]
 Text = Annotated[str, Meta(max_length=2048)]
+NoteValue = Annotated[float, Meta(ge=-MAX_NOTE_VALUE, le=MAX_NOTE_VALUE)]
 Notes = Annotated[tuple[Text, ...], Meta(max_length=MAX_NOTES)]
 Milliseconds = Annotated[float, Meta(ge=0.0, le=1e12)]
 Timestamp = Annotated[float, Meta(ge=-1e18, le=1e18)]
 Megabytes = Annotated[float, Meta(ge=0.0, le=1e9)]
 Nanoseconds = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Size = Annotated[int, Meta(ge=1, le=2**40)]
+
+
+@dataclass(frozen=True)
+class NoteDetail(Record):
+    """The cause of a note and its numbers, by names that end in their unit."""
+
+    code: ShortText
+    values: dict[ShortText, NoteValue] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, note: str) -> Self:
+        """Return the details of an `estimator.note.Note`, or "other" of other text.
+
+        Numbers that are not finite are left out.  Clients, which import this module, do
+        not import the estimator.
+        """
+        values = getattr(note, "values", {})
+        numbers = {n: v for n, v in values.items() if abs(v) <= MAX_NOTE_VALUE}
+        return cls(getattr(note, "code", "other"), numbers)
+
+    @property
+    def size_bytes(self) -> int:
+        """Return about the size of the details in a header."""
+        return 20 + len(self.code) + sum(12 + len(name) for name in self.values)
 
 
 @dataclass(frozen=True)
@@ -118,6 +144,25 @@ def clip(text: str, max_bytes: int) -> str:
     return encoded[: max_bytes - 3].decode("utf-8", "ignore") + "..."
 
 
-def clip_notes(notes: Sequence[str], most: int = MAX_NOTES) -> tuple[str, ...]:
-    """Return the first notes, truncated to fit into a header."""
-    return tuple(clip(note, MAX_NOTE_BYTES) for note in notes[:most])
+def fit_notes(
+    notes: Sequence[str], details: Sequence[NoteDetail], max_count: int, max_bytes: int
+) -> tuple[tuple[str, ...], tuple[NoteDetail, ...]]:
+    """Return the first notes with their details, truncated to fit into a header.
+
+    Parameters
+    ----------
+    notes : sequence of str
+    details : sequence of NoteDetail
+        Those of a received message; otherwise each note has its own.
+    """
+    fitting: list[str] = []
+    found: list[NoteDetail] = []
+    for i, note in enumerate(notes[:max_count]):
+        detail = details[i] if i < len(details) else NoteDetail.of(note)
+        text = clip(note, MAX_NOTE_BYTES)
+        max_bytes -= len(text.encode("utf-8")) + detail.size_bytes
+        if fitting and max_bytes < 0:
+            break
+        fitting.append(text)
+        found.append(detail)
+    return tuple(fitting), tuple(found)

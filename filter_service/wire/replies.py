@@ -32,6 +32,7 @@ from filter_service.wire.message import (
     Message,
     Milliseconds,
     Nanoseconds,
+    NoteDetail,
     Notes,
     Part,
     ShortText,
@@ -39,8 +40,8 @@ from filter_service.wire.message import (
     Text,
     Timestamp,
     clip,
-    clip_notes,
     expect_parts,
+    fit_notes,
 )
 from filter_service.wire.textures import TextureOffer
 
@@ -59,6 +60,19 @@ MAX_STAGE_BYTES = 100
 MAX_RENDERER_BYTES = 80
 
 
+MAX_READY_NOTES_BYTES = 3200
+MAX_RESULT_NOTE_BYTES = 200
+"""Size of all notes of `ready`, and of `result` for each note, with their details."""
+
+NoteDetails = Annotated[tuple[NoteDetail, ...], Meta(max_length=MAX_NOTES)]
+
+
+def _fit_notes(reply: Ready | Result, max_count: int, max_bytes: int) -> None:
+    notes, details = fit_notes(reply.notes, reply.note_details, max_count, max_bytes)
+    object.__setattr__(reply, "notes", notes)
+    object.__setattr__(reply, "note_details", details)
+
+
 def _clipped(reply: Message, /, **limits: int) -> None:
     """Truncate texts of a new message to fit into a header."""
     for name, max_bytes in limits.items():
@@ -71,8 +85,9 @@ def _clipped(reply: Message, /, **limits: int) -> None:
 class Welcome(Message):
     """The reply to hello: the service's description, limits and credit.
 
-    If ``is_resumed``, the session of the key was resumed: ``profile_id`` is the last
+    If ``is_resumed``, the session of the key continues: ``profile_id`` is the last
     accepted profile of the eye ``both``, and ``profile_ids`` those of all its eyes.
+    ``n_unanswered`` frames of this connection will still be answered.
     """
 
     session_id: Id
@@ -85,6 +100,7 @@ class Welcome(Message):
     is_resumed: bool = False
     profile_id: Id | None = None
     profile_ids: dict[EyeName, Id] = field(default_factory=dict)
+    n_unanswered: Annotated[int, Meta(ge=0, le=1000)] = 0
     textures: TextureOffer | None = None
 
     type_name: ClassVar[str] = "welcome"
@@ -146,6 +162,7 @@ class Ready(Message):
         Annotated[float, Meta(ge=0.0, le=1e6)], Annotated[float, Meta(ge=0.0, le=1e6)]
     ]
     notes: Notes = ()
+    note_details: NoteDetails = ()
     is_complete: bool = True
     eye: EyeName = "both"
 
@@ -153,7 +170,7 @@ class Ready(Message):
 
     def __post_init__(self) -> None:
         """Keep the notes that fit into a header."""
-        object.__setattr__(self, "notes", clip_notes(self.notes))
+        _fit_notes(self, MAX_NOTES, MAX_READY_NOTES_BYTES)
 
 
 AngleDeg = Annotated[float, Meta(ge=-360.0, le=360.0)]
@@ -199,6 +216,7 @@ class Result(Message):
     gaze_deg: tuple[AngleDeg, AngleDeg] = (0.0, 0.0)
     overflow_count: Count = 0
     notes: Notes = ()
+    note_details: NoteDetails = ()
     is_complete: bool = True
     in_memory: bool = False
     compression: Compression = "none"
@@ -210,8 +228,8 @@ class Result(Message):
 
     def __post_init__(self) -> None:
         """Keep the notes that fit into a header, fewer with more than two views."""
-        most = MAX_NOTES - max(0, len(self.views) - 2)
-        object.__setattr__(self, "notes", clip_notes(self.notes, max(1, most)))
+        most = max(1, MAX_NOTES - max(0, len(self.views) - 2))
+        _fit_notes(self, most, MAX_RESULT_NOTE_BYTES * most)
 
     def parts(self) -> list[Any]:
         """Return the images of all views; none if their memory is shared."""

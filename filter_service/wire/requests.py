@@ -46,7 +46,7 @@ from filter_service.wire.message import (
     expect_parts,
 )
 from filter_service.wire.textures import ViewTextures
-from filter_service.wire.unpacking import unpack_profile
+from filter_service.wire.unpacking import check_profile_size, unpack_profile
 
 MAX_VIEWS = 8
 
@@ -66,10 +66,14 @@ class ProfileRequest(Message):
     """Sets the profile of an eye; the body is a separate part.
 
     ``views`` are cameras to prepare for.  ``eye`` names one of the session's eyes.
+
+    Notes
+    -----
+    The body of a received request is bytes until `unpacked`.
     """
 
     profile_id: Id
-    body: dict[str, Any] = field(default_factory=dict)
+    body: dict[str, Any] | bytes = field(default_factory=dict)
     settings: FilterSettings = DEFAULTS
     views: Annotated[tuple[Camera, ...], Meta(max_length=MAX_VIEWS)] = ()
     eye: EyeName = "both"
@@ -78,16 +82,31 @@ class ProfileRequest(Message):
     payload: ClassVar[str] = "body"
 
     def parts(self) -> list[Any]:
-        """Return the body as JSON."""
+        """Return the body as JSON, or as it was received."""
+        if isinstance(self.body, bytes):
+            return [self.body]
         return [json.dumps(self.body, allow_nan=False).encode("utf-8")]
 
     def with_parts(self, parts: Sequence[Part], limits: Limits) -> Self:
-        """Return the request with its body, which is unpacked but not interpreted."""
+        """Return the request with the bytes of its body."""
         _check_count(self.views, limits)
         for i, camera in enumerate(self.views):
             check_camera(camera, f"views[{i}]", limits)
         expect_parts(parts, 1)
-        return self._with_payload(unpack_profile(parts[0], limits.max_profile_bytes))
+        check_profile_size(parts[0], limits.max_profile_bytes)
+        return self._with_payload(bytes(parts[0]))
+
+    def unpacked(self) -> Self:
+        """Return the request with its body as a map, which is not interpreted.
+
+        Raises
+        ------
+        BadMessage
+            If the body is neither JSON nor msgpack, or beyond a limit.
+        """
+        if isinstance(self.body, bytes):
+            return self._with_payload(unpack_profile(self.body))
+        return self
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -74,18 +74,13 @@ def unpack_header(data: bytes | bytearray | memoryview) -> dict[str, Any]:
     return header
 
 
-def unpack_profile(
-    data: bytes | bytearray | memoryview, max_bytes: int
-) -> dict[str, Any]:
-    """Return the profile map from its part, JSON or msgpack.
-
-    A JSON object starts with ``{`` or white space; a msgpack map starts with neither.
+def check_profile_size(data: bytes | bytearray | memoryview, max_bytes: int) -> None:
+    """Check the size of a profile before it is unpacked.
 
     Raises
     ------
     BadMessage
-        If it is too long or neither of the two, or has a repeated key or a non-finite
-        number.
+        If it is empty or too long.
     """
     size_bytes = memoryview(data).nbytes
     if not 1 <= size_bytes <= max_bytes:
@@ -94,7 +89,18 @@ def unpack_profile(
             field="profile",
             allowed=f"1 to {max_bytes} bytes",
         )
-    body = bytes(data)
+
+
+def unpack_profile(body: bytes) -> dict[str, Any]:
+    """Return the profile map from its part, JSON or msgpack.
+
+    A JSON object starts with ``{`` or white space; a msgpack map starts with neither.
+
+    Raises
+    ------
+    BadMessage
+        If it is neither of the two, or has a repeated key or a non-finite number.
+    """
     if body.lstrip()[:1] == b"{":
         profile = _load_json(body)
     else:

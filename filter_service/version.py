@@ -1,0 +1,5 @@
+"""Version of the installed package ocufilter."""
+
+from estimator import version
+
+__version__ = version.__version__
