@@ -2,6 +2,11 @@
 
     ocufilter serve &
     python -m clients.pyrender_stream --scene courtyard --profile keratoconus --window
+    python -m clients.pyrender_stream --file chair.glb --stereo
+
+pyrender renders files (glTF, OBJ, STL, PLY and others that trimesh loads); either
+renderer renders the built-in scenes.  `clients.pyrender_renderer` streams any
+`pyrender.Scene` of another program.
 
 The program renders and sends frames without waiting for replies.  The newest frame
 replaces one that waits to be sent.
@@ -13,7 +18,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from itertools import chain
@@ -23,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.arguments import read_profile, size_px_argument
-from clients.extra import what_to_install
+from clients.extra import PYRENDER_INSTALL, what_to_install
 from clients.filter_client import FilterClient, FilteredFrame
 from clients.frame_log import FrameLog
 from clients.natural_eye import (
@@ -33,32 +38,43 @@ from clients.natural_eye import (
     distance_at,
     luminance_cd_m2,
 )
-from clients.scene_renderer import SceneFrame, scene_frames
+from clients.scene_renderer import SceneFrame, back_and_forth, scene_frames
 from clients.scenes.catalog import SCENE_BUILDERS, build_scene
-from clients.scenes.paths import PATHS, path_moments
+from clients.scenes.paths import PATHS, Moment, path_moments
 from clients.streaming import submit
 from filter_service.errors import FilterError, ServiceTimeout
-from filter_service.messages import DEFAULT_ENDPOINT, Camera, Dropped, ErrorReply
-
-try:
-    from clients.window import LiveWindow, NoDisplay
-except ModuleNotFoundError as error:
-    if __name__ != "__main__":
-        raise
-    sys.exit(f"pyrender_stream: {what_to_install(error)}")
+from filter_service.messages import (
+    DEFAULT_ENDPOINT,
+    Camera,
+    Dropped,
+    ErrorReply,
+    EyeName,
+)
 
 FRAMES_PER_ROUND = 60
 MAX_LOOK_AROUND_DEG = 30.0
 STRAIGHT_AHEAD = (0.0, 0.0)
 NATURAL_RANGES = {"pupil_range_mm": (2.0, 8.0), "focus_range_dpt": (0.0, 8.5)}
+USUAL_SCENE = "courtyard"
+USUAL_IPD_MM = 63.0
 
 Show = Callable[[NDArray[np.uint8], NDArray[np.uint8], str], bool]
 Learn = Callable[[float, float], None]
 
 
+class CannotRun(Exception):
+    """A package or a display is missing."""
+
+
 def path_settings(*scene_names: str) -> dict[str, tuple[float, float]]:
     """Return settings that cover the pupils and foci on the paths of scenes."""
-    moments = [m for name in scene_names for m in path_moments(PATHS[name], 200)]
+    return moment_settings(
+        [m for name in scene_names for m in path_moments(PATHS[name], 200)]
+    )
+
+
+def moment_settings(moments: Sequence[Moment]) -> dict[str, tuple[float, float]]:
+    """Return settings that cover the pupils and foci of moments."""
     pupils_mm = [moment.pupil_diameter_mm for moment in moments]
     foci_dpt = [moment.focus_dpt for moment in moments]
     # The nearest object in a scene is at 0.12 m; the margins allow for rounding.
@@ -193,11 +209,46 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
         prog="python -m clients.pyrender_stream", description=__doc__.split("\n")[0]
     )
     parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT)
-    parser.add_argument("--scene", default="courtyard", choices=sorted(SCENE_BUILDERS))
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument(
+        "--scene",
+        choices=sorted(SCENE_BUILDERS),
+        help=f"built-in scene (default: {USUAL_SCENE})",
+    )
+    source.add_argument(
+        "--file", help="file that trimesh loads: .glb, .gltf, .obj, .stl, .ply ..."
+    )
+    parser.add_argument(
+        "--m-per-unit",
+        default=1.0,
+        type=float,
+        metavar="M",
+        help="meters per unit of the file, such as 0.001 (default: 1)",
+    )
+    parser.add_argument(
+        "--renderer",
+        choices=("own", "pyrender"),
+        help="renderer of a built-in scene (default: own); files require pyrender",
+    )
+    parser.add_argument(
+        "--stereo", action="store_true", help="render one view for each eye"
+    )
+    parser.add_argument(
+        "--ipd-mm",
+        default=USUAL_IPD_MM,
+        type=float,
+        metavar="MM",
+        help=f"interpupillary distance, for --stereo (default: {USUAL_IPD_MM:g})",
+    )
     parser.add_argument(
         "--profile",
         default="myopia",
         help="preset name, JSON, or a .json, .abp, .csv or .zmx file",
+    )
+    parser.add_argument(
+        "--right-profile",
+        metavar="PROFILE",
+        help="profile of the right eye, for --stereo (default: that of --profile)",
     )
     parser.add_argument(
         "--size", default="480x270", type=size_px_argument, metavar="WxH"
@@ -208,7 +259,8 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--hidden",
         action="store_true",
-        help="also send the hidden layer, the surface behind the visible one",
+        help="also send the hidden layer, the surface behind the visible one "
+        "(own renderer only)",
     )
     parser.add_argument(
         "--window",
@@ -246,44 +298,111 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         raise ValueError(
             f"--look-around is {reach_deg:g}; allowed: 0 to {MAX_LOOK_AROUND_DEG:g} deg"
         )
-    scene = build_scene(options.scene)
+    eye = NaturalEye(age_years=options.age) if options.natural else None
+    profiles = _profiles(options)
+    rendered, settings = _source(options)
     log = FrameLog()
     with ExitStack() as stack:
-        show = None
-        if options.window:
-            show = stack.enter_context(LiveWindow(options.size, "ocufilter")).show
-        frames = scene_frames(
-            scene,
-            None,
-            options.frames,
-            options.size,
-            with_hidden=options.hidden,
-            repeats=options.window,
-        )
+        show = _opened_window(options.size, stack) if options.window else None
         client = stack.enter_context(
             FilterClient(options.endpoint, client_name="pyrender_stream")
         )
-        frames = stack.enter_context(closing(frames))
-        settings = path_settings(options.scene)
+        frames: Iterator[SceneFrame] = stack.enter_context(closing(rendered))
         if reach_deg:
             frames = looking_around(frames, reach_deg)
             settings["gaze_range_deg"] = (reach_deg, 0.5 * reach_deg)
         learn: dict[str, Learn] = {}
-        if options.natural:
-            eye = NaturalEye(age_years=options.age)
+        if eye is not None:
             frames = looking_naturally(frames, eye)
             settings |= NATURAL_RANGES
             learn = {"learn": eye.learn}
         first = next(frames)
         if show is not None:
             show(first.color, np.zeros_like(first.color), "ocufilter   preparing")
-        client.set_profile(
-            read_profile(options.profile),
-            settings=settings,
-            views=[first.view],
-        )
+        for side, profile in profiles.items():
+            client.set_profile(profile, eye=side, settings=settings, views=[first.view])
         n_sent = stream(client, chain([first], frames), log, show, **learn)
     return {"sent": n_sent, **log.summary()}
+
+
+def _profiles(options: argparse.Namespace) -> dict[EyeName, dict[str, Any]]:
+    """Return the profile of each eye."""
+    profile = read_profile(options.profile)
+    if not options.stereo:
+        if options.right_profile is not None:
+            raise ValueError("--right-profile requires --stereo")
+        return {"both": profile}
+    if options.right_profile is None:
+        return {"left": profile, "right": profile}
+    right = read_profile(options.right_profile, "--right-profile")
+    return {"left": profile, "right": right}
+
+
+def _source(
+    options: argparse.Namespace,
+) -> tuple[Generator[SceneFrame, None, None], dict[str, tuple[float, float]]]:
+    """Return the frames to stream, and settings that cover their states."""
+    ipd_mm = options.ipd_mm if options.stereo else None
+    if not 0.0 < options.ipd_mm < np.inf:
+        raise ValueError(f"--ipd-mm is {options.ipd_mm:g}; allowed: above 0")
+    if options.file is not None and options.renderer == "own":
+        raise ValueError("--renderer is own; allowed with --file: pyrender")
+    if options.file is None and options.renderer != "pyrender":
+        name = options.scene or USUAL_SCENE
+        frames = scene_frames(
+            build_scene(name),
+            None,
+            options.frames,
+            options.size,
+            with_hidden=options.hidden,
+            repeats=options.window,
+            ipd_mm=ipd_mm,
+        )
+        return frames, path_settings(name)
+    if options.hidden:
+        raise ValueError(
+            "--hidden requires the renderer own; pyrender renders one layer"
+        )
+    try:
+        from clients import pyrender_renderer, pyrender_scenes
+    except ModuleNotFoundError as error:
+        raise CannotRun(what_to_install(error, PYRENDER_INSTALL)) from None
+    flags, infinite_from_m = 0, np.inf
+    if options.file is None:
+        built = build_scene(options.scene or USUAL_SCENE)
+        scene, camera = pyrender_scenes.built_in(built)
+        moments = path_moments(PATHS[built.name], options.frames)
+        flags, infinite_from_m = pyrender_scenes.BUILT_IN_FLAGS, built.infinite_from_m
+        settings = path_settings(built.name)
+    else:
+        loaded = pyrender_scenes.load_file(options.file, m_per_unit=options.m_per_unit)
+        scene = loaded.scene
+        camera, moments = pyrender_scenes.orbit(
+            loaded.bounds_m, options.frames, options.size
+        )
+        settings = moment_settings(moments)
+    frames = pyrender_renderer.pyrender_frames(
+        scene,
+        options.size,
+        camera=camera,
+        path=back_and_forth(moments) if options.window else moments,
+        ipd_mm=ipd_mm,
+        flags=flags,
+        infinite_from_m=infinite_from_m,
+    )
+    return frames, settings
+
+
+def _opened_window(size_px: tuple[int, int], stack: ExitStack) -> Show:
+    """Open a window until the end of the stack; return its method to show images."""
+    try:
+        from clients import window  # which requires glfw
+    except ModuleNotFoundError as error:
+        raise CannotRun(what_to_install(error)) from error
+    try:
+        return stack.enter_context(window.LiveWindow(size_px, "ocufilter")).show
+    except window.NoDisplay as error:
+        raise CannotRun(str(error)) from error
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -294,7 +413,7 @@ def main(argv: list[str] | None = None) -> int:
     except ValueError as error:
         sys.stderr.write(f"pyrender_stream: {error}\n")
         return 2
-    except (FilterError, NoDisplay) as error:
+    except (FilterError, CannotRun) as error:
         sys.stderr.write(f"pyrender_stream: {error}\n")
         return 1
     text = json.dumps(report) + "\n" if options.json else _report_line(report)

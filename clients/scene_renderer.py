@@ -1,14 +1,14 @@
 """Off-screen rendering of a scene's color and depth along a camera path."""
 
-from collections.abc import Generator
-from dataclasses import dataclass
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, replace
 from itertools import cycle
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clients.scenes.geometry import Array
-from clients.scenes.paths import PATHS, Key, path_moments
+from clients.scenes.paths import PATHS, Key, Moment, path_moments
 from clients.scenes.scene import Scene
 from clients.scenes.scene_view import Picture, SceneView, open_context
 from filter_service import RgbdView
@@ -34,6 +34,9 @@ class SceneFrame:
         Gaze direction in the image; None is straight ahead.
     hidden_color, hidden_depth_m : arrays, optional
         Color and depth of the hidden layer; depth is 0 where nothing is hidden.
+    right_view : RgbdView, optional
+        What the right eye sees in a stereo frame, whose other images are the left
+        eye's.
     """
 
     color: NDArray[np.uint8]
@@ -45,10 +48,11 @@ class SceneFrame:
     gaze_deg: tuple[float, float] | None = None
     hidden_color: NDArray[np.uint8] | None = None
     hidden_depth_m: NDArray[np.float32] | None = None
+    right_view: RgbdView | None = None
 
     @property
     def view(self) -> RgbdView:
-        """Return the images in the client library's type."""
+        """Return the images in the client library's type; in stereo, the left ones."""
         return RgbdView(
             self.color,
             self.depth_m,
@@ -56,6 +60,38 @@ class SceneFrame:
             hidden_color=self.hidden_color,
             hidden_depth_m=self.hidden_depth_m,
         )
+
+    @property
+    def views(self) -> list[RgbdView]:
+        """Return one view, or those of the left and the right eye."""
+        return [self.view] if self.right_view is None else [self.view, self.right_view]
+
+
+def eye_poses(pose: Array, ipd_mm: float | None) -> list[Array]:
+    """Return the poses (4, 4) of the left and the right eye, or of one eye.
+
+    Parameters
+    ----------
+    pose : (4, 4) array
+        Camera to world, of the point between the eyes.
+    ipd_mm : float, optional
+        Interpupillary distance; None is one eye, at that point.
+
+    Raises
+    ------
+    ValueError
+        If the distance is not a positive number.
+    """
+    if ipd_mm is None:
+        return [pose]
+    if not 0.0 < ipd_mm < np.inf:
+        raise ValueError(f"ipd_mm is {ipd_mm:g}; allowed: above 0")
+    poses = []
+    for side in (-1.0, 1.0):
+        eye = np.array(pose, float)
+        eye[:3, 3] += side * ipd_mm / 2000.0 * eye[:3, 0]
+        poses.append(eye)
+    return poses
 
 
 class SceneRenderer:
@@ -127,6 +163,7 @@ def scene_frames(
     *,
     with_hidden: bool = False,
     repeats: bool = False,
+    ipd_mm: float | None = None,
 ) -> Generator[SceneFrame, None, None]:
     """Render a scene along a camera path.
 
@@ -144,22 +181,39 @@ def scene_frames(
         Whether to render the hidden layer.
     repeats : bool
         Whether to follow the path back and forth, endlessly.
+    ipd_mm : float, optional
+        Interpupillary distance of stereo frames; None renders one view.
     """
     moments = path_moments(path or PATHS[scene.name], n_frames)
     with SceneRenderer(scene, size_px) as renderer:
-        for moment in cycle(moments + moments[-2:0:-1]) if repeats else moments:
-            hidden: Picture | tuple[None, None] = (None, None)
-            if with_hidden:
-                (color, depth_m), hidden = renderer.render_layers(moment.pose)
-            else:
-                color, depth_m = renderer.render(moment.pose)
-            yield SceneFrame(
-                color=color,
-                depth_m=depth_m,
-                tangents=renderer.tangents,
-                pose=moment.pose,
-                pupil_diameter_mm=moment.pupil_diameter_mm,
-                focus_dpt=moment.focus_dpt,
-                hidden_color=hidden[0],
-                hidden_depth_m=hidden[1],
-            )
+        for moment in back_and_forth(moments) if repeats else moments:
+            eyes = []
+            for pose in eye_poses(moment.pose, ipd_mm):
+                hidden: Picture | tuple[None, None] = (None, None)
+                if with_hidden:
+                    seen, hidden = renderer.render_layers(pose)
+                else:
+                    seen = renderer.render(pose)
+                eyes.append(
+                    SceneFrame(
+                        color=seen[0],
+                        depth_m=seen[1],
+                        tangents=renderer.tangents,
+                        pose=pose,
+                        pupil_diameter_mm=moment.pupil_diameter_mm,
+                        focus_dpt=moment.focus_dpt,
+                        hidden_color=hidden[0],
+                        hidden_depth_m=hidden[1],
+                    )
+                )
+            yield joined(eyes)
+
+
+def back_and_forth(moments: list[Moment]) -> Iterator[Moment]:
+    """Follow a path to its end, back to its beginning, and so on."""
+    return cycle(moments + moments[-2:0:-1])
+
+
+def joined(eyes: list[SceneFrame]) -> SceneFrame:
+    """Return the frame of one eye, or the stereo frame of the left and right eye."""
+    return replace(eyes[0], right_view=eyes[1].view) if len(eyes) > 1 else eyes[0]

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import moderngl
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clients.scenes.geometry import Array
 from clients.scenes.scene import Scene
@@ -126,16 +126,12 @@ class SceneView:
         supersampling: int = 2,
         image_count: int = 1,
     ):
-        width, height = size_px
-        if min(width, height, supersampling) < 1:
-            raise ValueError(
-                f"size_px is {width}x{height} and supersampling {supersampling}; "
-                "allowed: 1 or more each"
-            )
         self.scene, self.size_px = scene, size_px
         self._context = context
         with context:
-            self._check_size(supersampling)
+            info = context.info
+            largest = min(info["GL_MAX_TEXTURE_SIZE"], *info["GL_MAX_VIEWPORT_DIMS"])
+            check_size(size_px, supersampling, largest)
             self._buffers = SceneBuffers(
                 context, scene, size_px, supersampling, image_count
             )
@@ -331,19 +327,38 @@ class SceneView:
                 )
         return out
 
-    def _check_size(self, supersampling: int) -> None:
-        info = self._context.info
-        largest = min(info["GL_MAX_TEXTURE_SIZE"], *info["GL_MAX_VIEWPORT_DIMS"])
-        if supersampling * max(self.size_px) > largest:
-            width, height = self.size_px
-            raise ValueError(
-                f"{width}x{height} px with {supersampling} samples per axis; this "
-                f"OpenGL renders up to {largest} samples along a side"
-            )
+
+def check_size(size_px: tuple[int, int], supersampling: int, largest: int) -> None:
+    """Refuse images without pixels and those with more than OpenGL can render.
+
+    Parameters
+    ----------
+    size_px : (int, int)
+        Width and height of an image.
+    supersampling : int
+        Samples per pixel along each axis.
+    largest : int
+        Most samples along a side.
+
+    Raises
+    ------
+    ValueError
+    """
+    width, height = size_px
+    if min(width, height, supersampling) < 1:
+        raise ValueError(
+            f"size_px is {width}x{height} and supersampling {supersampling}; "
+            "allowed: 1 or more each"
+        )
+    if supersampling * max(size_px) > largest:
+        raise ValueError(
+            f"{width}x{height} px with {supersampling} samples per axis; this "
+            f"OpenGL renders up to {largest} samples along a side"
+        )
 
 
-def _uniforms(pose: Array, clip_from_view: Array) -> dict[str, tuple[float, ...]]:
-    """Return the camera's uniforms of the scene shader, by name.
+def check_pose(pose: ArrayLike) -> Array:
+    """Return a camera's pose (4, 4) as an array.
 
     Raises
     ------
@@ -356,6 +371,12 @@ def _uniforms(pose: Array, clip_from_view: Array) -> dict[str, tuple[float, ...]
     turned = pose[:3, :3].T @ pose[:3, :3]
     if not np.allclose(turned, np.eye(3), atol=1e-3):
         raise ValueError("pose is not rigid; its axes must be orthogonal unit vectors")
+    return pose
+
+
+def _uniforms(pose: Array, clip_from_view: Array) -> dict[str, tuple[float, ...]]:
+    """Return the camera's uniforms of the scene shader, by name."""
+    pose = check_pose(pose)
     view_from_world = np.linalg.inv(pose)
     # GLSL matrices are column-major.
     clip_from_world = (clip_from_view @ view_from_world).T
