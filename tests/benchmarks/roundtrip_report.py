@@ -4,96 +4,28 @@ from __future__ import annotations
 
 import platform
 import subprocess
-from collections import Counter
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
+from clients.latency.stream import SUMS, LatencyRun
+
 PERCENTILES = (50, 95, 99, 99.9)
-CLIENT_STAGES = ("client_wait_ms", "wire_and_queue_ms")
-SERVICE_STAGES = ("decode_ms", "queue_ms", "copy_out_ms", "other_ms")
-"""Stages of the service outside the renderer."""
-
-SUMS = ("added_ms", "service_total_ms", "round_trip_ms", "age_ms")
 
 
-@dataclass
-class LatencyRun:
-    """Samples of one run; one entry per filtered frame.
-
-    Attributes
-    ----------
-    case, setting : str
-        Descriptions of the content and of schedule and transport.
-    stages_ms : dict of lists
-        ``client_wait_ms`` from the schedule to the send; ``wire_and_queue_ms``, the
-        round trip minus the service's own total; the service's stages;
-        ``added_ms``, the round trip minus the renderer's stages;
-        ``service_total_ms``, ``round_trip_ms``, and ``age_ms`` from the schedule to the
-        reply (includes delays of a late client: the schedule never waits).
-    due_s : list
-        Scheduled time of each filtered frame, from the start of the run.
-    max_repeat_difference : float
-        Largest difference between two replies to the same frame, in units of the
-        output (levels of 255, or linear light); reveals mixed up or torn images.
-    n_bytes : (sent, received)
-        Total size of the run's messages.
-    floor_ms : float
-        Round trip of the same number of bytes over a bare socket between two processes.
-    """
-
-    case: str
-    setting: str
-    renderer: str
-    stages_ms: dict[str, list[float]] = field(default_factory=dict)
-    due_s: list[float] = field(default_factory=list)
-    drops: Counter = field(default_factory=Counter)
-    n_scheduled: int = 0
-    duration_s: float = 0.0
-    memory_start_mb: float = 0.0
-    memory_end_mb: float = 0.0
-    max_repeat_difference: float = 0.0
-    n_bytes: tuple[int, int] = (0, 0)
-    floor_ms: float = 0.0
-
-    def add(self, due_s: float, times_ms: dict[str, float]) -> None:
-        """Add one filtered frame."""
-        self.due_s.append(due_s)
-        for name, value_ms in times_ms.items():
-            self.stages_ms.setdefault(name, []).append(value_ms)
-
-    @property
-    def n_filtered(self) -> int:
-        """Return the number of filtered frames."""
-        return len(self.due_s)
-
-    def stage_names(self) -> list[str]:
-        """Return the stages in the order that a frame passes them, then the sums."""
-        inner = [n for n in self.stages_ms if n not in (*CLIENT_STAGES, *SUMS)]
-        ordered = [*CLIENT_STAGES, *inner, *SUMS]
-        return [name for name in ordered if name in self.stages_ms]
-
-    @property
-    def n_bytes_per_frame(self) -> tuple[int, int]:
-        """Return the bytes sent and received per frame."""
-        sent, received = self.n_bytes
-        n_frames = max(1, self.n_filtered)
-        return sent // n_frames, received // n_frames
-
-    def percentiles_ms(self, name: str) -> dict[float, float]:
-        """Return `PERCENTILES` of one stage."""
-        values = np.percentile(self.stages_ms[name], PERCENTILES)
-        return dict(zip(PERCENTILES, values.tolist(), strict=True))
+def percentiles_ms(run: LatencyRun, stage: str) -> dict[float, float]:
+    """Return `PERCENTILES` of one stage."""
+    values = np.percentile(run.stages_ms[stage], PERCENTILES)
+    return dict(zip(PERCENTILES, values.tolist(), strict=True))
 
 
 def as_json(run: LatencyRun) -> dict[str, Any]:
     """Return the run in the format of `ocufilter bench`: each time with an error."""
     rows = []
     for name in run.stage_names():
-        p = run.percentiles_ms(name)
+        p = percentiles_ms(run, name)
         rows.append(
             {
                 "bench": "roundtrip",
@@ -137,7 +69,7 @@ def as_table(run: LatencyRun) -> Table:
     for name in run.stage_names():
         if name == SUMS[0]:
             table.add_section()
-        values = run.percentiles_ms(name).values()
+        values = percentiles_ms(run, name).values()
         table.add_row(name.removesuffix("_ms"), *(f"{value:.2f}" for value in values))
     return table
 
@@ -174,7 +106,7 @@ def save_plot(run: LatencyRun, path: Path) -> None:
     names = [name for name in run.stage_names() if name not in SUMS][::-1]
     places = np.arange(len(names))
     for offset, percentile in zip((0.3, 0.1, -0.1, -0.3), PERCENTILES, strict=True):
-        values = [run.percentiles_ms(name)[percentile] for name in names]
+        values = [percentiles_ms(run, name)[percentile] for name in names]
         by_stage.barh(places + offset, values, height=0.2, label=f"p{percentile:g}")
     by_stage.set_yticks(places, [name.removesuffix("_ms") for name in names])
     by_stage.set(xlabel="[ms]", title=run.setting)
