@@ -57,8 +57,8 @@ PEERS_312_PACKAGES="deeplens-core torch torchvision"
 EXAMPLES_VENV=.examples
 # for `make release-check` and `make release`
 RELEASE_VENV=.release
-RELEASE_CHECK_PACKAGES="setuptools build twine check-jsonschema trove-classifiers"
-RELEASE_PACKAGES="$RELEASE_CHECK_PACKAGES ziglang auditwheel uv cyclonedx-bom"
+RELEASE_CHECK_PACKAGES="setuptools build twine check-jsonschema trove-classifiers uv"
+RELEASE_PACKAGES="$RELEASE_CHECK_PACKAGES ziglang auditwheel cyclonedx-bom"
 RELEASE_SYSTEM_PACKAGES="gcc libc6-dev gcc-aarch64-linux-gnu libc6-dev-arm64-cross
     qemu-user-static"
 # for `make docs`
@@ -184,7 +184,7 @@ install_packages() {
     start_compiling
     say "installing the other packages while the loops compile"
     $pip install -c constraints.txt setuptools
-    $pip install -c constraints.txt --no-build-isolation -e '.[clients,batch,report,dev]'
+    $pip install -c constraints.txt --no-build-isolation -e '.[clients,batch,pyrender,report,dev]'
     say "the packages are installed"
     trap - EXIT
     wait "$compiling" || say "compiling failed; the service will compile when it starts"

@@ -14,14 +14,18 @@ The package imports its modules only when their names are used.
     headset/         `ocufilter headset`: a scene in an OpenXR headset
     natural_eye      eye whose pupil and focus follow light and distance
     frame_log        statistics of streams
+    latency/         latency of frames through a running service
     arguments        parsers of profiles, settings and sizes on command lines
     pyrender_stream  streaming of a scene through a running service
+    pyrender_renderer  frames of pyrender scenes
+    pyrender_scenes  files that trimesh loads, and the built-in scenes, for pyrender
     demo             `ocufilter demo`: two scenes through six eyes
     scenes/          two scenes, a letter chart, and their rendering
     report/          `ocufilter report`
     commands/        command line `ocufilter`
     web/             `ocufilter web`: a page in a browser
     figures/         figures of an eye, for reports and web pages
+    version          version of the installed package
 """
 
 import lazy_loader

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from estimator import PROFILE_SUFFIXES, InvalidFile, profile_body, published_names
-from estimator.bounded_files import loads_bounded
+from estimator import InvalidFile, preset_names, profile_body, published_names
+from estimator.bounded_files import loads_bounded, printable
 
 MAX_ARGUMENT_BYTES = 1_000_000
+MAX_TITLE_CHARACTERS = 100
 
 
 def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
     """Return a profile from JSON text, a file, or the name of an eye.
 
-    A file has one of `PROFILE_SUFFIXES`.  The service resolves preset names.
+    A file has one of `PROFILE_SUFFIXES`.  The service resolves preset names; its fields
+    are not validated here.
 
     Raises
     ------
@@ -27,7 +30,7 @@ def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
     path = Path(text)
     if text in published_names():
         return {"kind": "published", "name": text}
-    if path.suffix.lower() not in PROFILE_SUFFIXES and not path.is_file():
+    if text in preset_names():
         return {"kind": "preset", "name": text}
     try:
         body = profile_body(path)
@@ -39,6 +42,12 @@ def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
     if not isinstance(body, dict):
         raise ValueError(f"{option} {path} is {body!r}; allowed: a JSON object")
     return body
+
+
+def profile_title(profile: Mapping[str, Any]) -> str:
+    """Return a profile's name, or its kind, as text for a message."""
+    name = str(profile.get("name", profile.get("kind")))
+    return printable(name, most=MAX_TITLE_CHARACTERS)
 
 
 def read_object(option: str, text: str) -> dict[str, Any]:

@@ -41,6 +41,7 @@ from clients.sheet import (
     video_frame,
 )
 from clients.streaming import change_eye, filter_in_order
+from filter_service.atomic_files import replace_atomically
 from filter_service.errors import FilterError, RenderFailed
 from filter_service.progress import Progress
 
@@ -175,7 +176,9 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         "total_s": round(time.monotonic() - start_s, 1),
     }
     text = json.dumps(report, indent=1, allow_nan=False)
-    (options.out / "latency.json").write_text(text + "\n", encoding="utf-8")
+    replace_atomically(
+        options.out / "latency.json", lambda part: part.write_text(text + "\n")
+    )
     return report
 
 
@@ -264,7 +267,8 @@ def _written(
     """Write the contact sheet and the video; return the video's path."""
     progress.task("Writing the contact sheet")
     cell_px = cell_size_px(options.size)
-    _contact_sheet(frames, films, cell_px).save(options.out / "contact_sheet.png")
+    sheet = _contact_sheet(frames, films, cell_px)
+    replace_atomically(options.out / "contact_sheet.png", sheet.save)
     task = progress.task("Writing the video", total=len(frames))
 
     def pages() -> Iterator[NDArray[np.uint8]]:

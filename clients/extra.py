@@ -5,9 +5,12 @@ import sys
 INSTALL = "pip install 'ocufilter[clients]'"
 
 
-def what_to_install(error: ModuleNotFoundError) -> str:
+PYRENDER_INSTALL = "pip install 'ocufilter[pyrender]'"
+
+
+def what_to_install(error: ModuleNotFoundError, command: str = INSTALL) -> str:
     """Return one line that names the missing package and the command to install it."""
-    return f"the package {error.name} is not installed: {INSTALL}"
+    return f"the package {error.name} is not installed: {command}"
 
 
 HEADSET_INSTALL = f"{sys.executable} -m pip install 'ocufilter[headset]'"

@@ -140,6 +140,7 @@ class ServiceLink:
     ) -> None:
         self.welcome: Welcome | None = None
         self.profiles: dict[EyeName, ProfileRequest] = {}
+        self._n_ready_missing: dict[int, int] = {}  # of profiles, by id
         self.pending: Outgoing | None = None
         self.in_flight: dict[int, Outgoing] = {}
         self.pongs: list[Pong] = []
@@ -301,6 +302,17 @@ class ServiceLink:
         elif isinstance(reply, SharedTexture):
             self.textures.take_in(reply)
         elif not isinstance(reply, Alive | Closing):
+            if isinstance(reply, Accepted):
+                current = {profile.profile_id for profile in self.profiles.values()}
+                self._n_ready_missing = {
+                    number: count
+                    for number, count in self._n_ready_missing.items()
+                    if number in current
+                } | {reply.profile_id: reply.n_cameras}
+            elif isinstance(reply, Ready):
+                missing = self._n_ready_missing.get(reply.profile_id, 0)
+                if missing:
+                    self._n_ready_missing[reply.profile_id] = missing - 1
             self._events.append(reply)
             self._bound_progress()
 
@@ -315,7 +327,9 @@ class ServiceLink:
         known: dict[EyeName, int | None] = {"both": welcome.profile_id}
         known |= welcome.profile_ids
         for eye, profile in self.profiles.items():
-            if known.get(eye) != profile.profile_id:
+            # A reply about a profile may have been lost with the connection.
+            is_ready = self._n_ready_missing.get(profile.profile_id) == 0
+            if known.get(eye) != profile.profile_id or not is_ready:
                 self.queue_message(encode(profile))
 
     def _bound_progress(self) -> None:
@@ -374,7 +388,9 @@ class ServiceLink:
             outgoing = self.in_flight.pop(reply.frame_id, None)
             if outgoing is not None:
                 outgoing.end()
-        elif self.welcome is None and reply.profile_id is None:
+        elif reply.profile_id is not None:
+            self._n_ready_missing[reply.profile_id] = 0  # an outcome as well
+        elif self.welcome is None:
             self._refusal = reply.exception()
         self._events.append(reply)
 

@@ -8,6 +8,7 @@ programs         demo, headset, layer, report, batch, web, doctor
 checkout         bench and paper
 serve            the service, and ahead-of-time compilation of its loops
 status           state of a running service
+latency          latency and error of frames through a running service
 keys             client keys of the service
 eyes             on-disk cache of eyes
 filter_image     filtering of one image

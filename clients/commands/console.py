@@ -20,8 +20,8 @@ class CommandFailed(Exception):
 
 
 def print_line(line: str = "") -> None:
-    """Print one line to stdout."""
-    sys.stdout.write(line + "\n")
+    """Print one line to stdout, with escapes for names that are not UTF-8."""
+    sys.stdout.write(line.encode("utf-8", "backslashreplace").decode() + "\n")
 
 
 def print_json(data: dict[str, Any]) -> None:

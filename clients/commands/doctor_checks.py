@@ -20,6 +20,7 @@ from filter_service.gl_device import (
     is_software_renderer,
 )
 from filter_service.threads import UNSAFE_THREADING_LAYER
+from filter_service.version import __version__
 
 SERVICE_PACKAGES = (
     "numpy",
@@ -39,7 +40,8 @@ SERVICE_PACKAGES = (
 )
 CLIENT_PACKAGES = ("av",)
 WINDOW_PACKAGES = ("glfw",)
-FORMER_PACKAGES = ("pyrender", "trimesh", "PyOpenGL", "imageio", "imageio-ffmpeg")
+PYRENDER_PACKAGES = ("pyrender", "trimesh", "PyOpenGL")
+FORMER_PACKAGES = ("imageio", "imageio-ffmpeg")
 """Packages that are no longer required; version 0.3 removes them from ``packages``."""
 
 SYSTEM_LIBRARIES = {"EGL": "libegl1", "GL": "libgl1", "gomp": "libgomp1"}
@@ -86,8 +88,8 @@ def examine() -> dict[str, Any]:
         JSON-compatible, with the keys ``ok`` (whether the service can run), ``works``
         (by purpose), ``checks``, ``install`` (commands), ``machine``, ``gl`` (with the
         EGL ``devices``), ``native`` (the compiled loops), ``threading_layer``,
-        ``networks`` (each with the size of its weights and its expected error) and
-        ``packages`` (versions).
+        ``networks`` (each with the size of its weights and its expected error),
+        ``packages`` (versions) and ``version`` (of ocufilter).
     """
     gl = run_probe("gl")
     shaders = {} if "error" in gl else run_probe("shaders", SHADERS_TIMEOUT_S)
@@ -108,6 +110,7 @@ def examine() -> dict[str, Any]:
         check_networks(networks),
         check_packages("client packages", CLIENT_PACKAGES, packages),
         check_packages("window packages", WINDOW_PACKAGES, packages),
+        check_packages("pyrender packages", PYRENDER_PACKAGES, packages),
         check_display(),
     ]
     works = what_works({check.name: check.ok for check in checks})
@@ -123,6 +126,7 @@ def examine() -> dict[str, Any]:
         "threading_layer": threads.get("layer"),
         "networks": networks.get("cards", {}),
         "packages": packages,
+        "version": __version__,
     }
 
 
@@ -188,8 +192,8 @@ def processor_name() -> str:
 def package_versions() -> dict[str, str | None]:
     """Return the version of each package that ocufilter may use; None if missing."""
     versions: dict[str, str | None] = {}
-    names = SERVICE_PACKAGES + CLIENT_PACKAGES + WINDOW_PACKAGES + FORMER_PACKAGES
-    for name in names:
+    names = SERVICE_PACKAGES + CLIENT_PACKAGES + WINDOW_PACKAGES + PYRENDER_PACKAGES
+    for name in names + FORMER_PACKAGES:
         try:
             versions[name] = version(name)
         except PackageNotFoundError:
@@ -348,6 +352,7 @@ def what_works(ok: dict[str, bool]) -> dict[str, bool]:
         "filter": filters,
         "serve": serve,
         "demo": demo,
+        "pyrender": serve and ok["pyrender packages"] and ok["gl"],
         "window": demo and ok["window packages"] and ok["display"],
     }
 

@@ -1,6 +1,7 @@
 """`ocufilter estimate`: estimate the parameters of an eye from its profile."""
 
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -62,6 +63,7 @@ def estimate(
     from estimator.estimate.estimation import estimate_eye
     from estimator.networks.card import DamagedWeights, WeightsMissing
     from estimator.profiles.files import load_profile
+    from filter_service.atomic_files import replace_atomically
     from filter_service.image_files import check_output
 
     if plot is not None:
@@ -74,7 +76,7 @@ def estimate(
     if plot is not None:
         from estimator.estimate.plot import plot_eye
 
-        plot_eye(found, plot)
+        replace_atomically(plot, partial(plot_eye, found), is_private=True)
     summary = _summary(found)
     if json_output:
         print_json(summary)

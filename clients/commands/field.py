@@ -2,6 +2,7 @@
 
 import math
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -103,6 +104,7 @@ def field(
     from estimator.corrections.worn_lens import rings_of
     from estimator.field.field_table import field_table
     from estimator.profiles.files import load_profile
+    from filter_service.atomic_files import replace_atomically
     from filter_service.image_files import check_output
 
     if plot is not None:
@@ -126,7 +128,9 @@ def field(
     if plot is not None:
         from estimator.field.plot import plot_field
 
-        plot_field(found, plot, title=f"{eye.name}, {pupil_mm:g} mm", drawn=drawn)
+        title = f"{eye.name}, {pupil_mm:g} mm"
+        write = partial(plot_field, found, title=title, drawn=drawn)
+        replace_atomically(plot, write, is_private=True)
     if eye.correction is not None:
         notes.append("seen through the correction")
     if rings_of(eye.correction) is not None:

@@ -178,6 +178,7 @@ def filter_image(
 
     from estimator.profiles.files import load_profile
     from filter_service import image_files
+    from filter_service.atomic_files import replace_atomically
     from filter_service.rendering.frame import object_range_dpt
     from filter_service.settings import FilterSettings
 
@@ -215,7 +216,9 @@ def filter_image(
             render_tolerance=render_tolerance,
             output=output,
         )
-    image_files.write_image(out, filtered.seen.color)
+    replace_atomically(
+        out, lambda part: image_files.write_image(part, filtered.seen.color)
+    )
     whole_ms = 1e3 * (time.perf_counter() - started_s)
     summary = _summary(
         filtered,

@@ -1,17 +1,19 @@
 """The `ocufilter` program: dispatch of commands, and one line for each error."""
 
+import io
 import sys
 
 import typer
 from typer.exceptions import Abort, TyperException
 
 from clients.commands.checkout import bench, paper
-from clients.commands.console import CommandFailed
+from clients.commands.console import CommandFailed, print_line
 from clients.commands.estimate import estimate
 from clients.commands.eyes import eyes
 from clients.commands.field import field
 from clients.commands.filter_image import filter_image
 from clients.commands.keys import keys
+from clients.commands.latency import latency
 from clients.commands.programs import (
     batch,
     demo,
@@ -41,10 +43,12 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command()(demo)
 app.command()(serve)
 app.command()(status)
+app.command()(latency)
 app.add_typer(keys, name="keys")
 app.add_typer(eyes, name="eyes")
 app.command(name="filter")(filter_image)
@@ -68,9 +72,24 @@ app.command()(prepare)
 app.command()(doctor)
 
 
+def _print_version(is_asked: bool) -> None:
+    if is_asked:
+        from filter_service.version import __version__
+
+        print_line(f"ocufilter {__version__}")
+        raise typer.Exit
+
+
 @app.callback(invoke_without_command=True)
 def _root(
     context: typer.Context,
+    version: bool = typer.Option(  # noqa: ARG001  (its callback prints it)
+        False,
+        "--version",
+        callback=_print_version,
+        is_eager=True,
+        help="Print the version and exit.",
+    ),
     traceback: bool = typer.Option(  # noqa: ARG001  (`_exit_code` reads it)
         False, help="Show the traceback of an error."
     ),
@@ -81,6 +100,9 @@ def _root(
 
 def main() -> None:
     """Run the program; errors become one line on stderr and an exit code."""
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        # otherwise a file whose name is not UTF-8 ends a finished command with an error
+        sys.stdout.reconfigure(errors="backslashreplace")
     sys.exit(_exit_code(sys.argv[1:]))
 
 

@@ -127,7 +127,8 @@ def doctor(json_output: Json = False) -> None:
 def _print_diagnosis(report: dict[str, Any]) -> None:
     machine = report["machine"]
     print_line(
-        f"{machine['system']}, {machine['processor']}, {machine['n_cores']} cores"
+        f"ocufilter {report['version']}, {machine['system']}, "
+        f"{machine['processor']}, {machine['n_cores']} cores"
     )
     for check in report["checks"]:
         print_line(

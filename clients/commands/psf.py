@@ -23,6 +23,7 @@ from clients.commands.wavefront import (
 
 if TYPE_CHECKING:
     import numpy as np
+    from numpy.typing import NDArray
 
     from estimator.corrections.rings import Rings
     from estimator.psf.kernel_types import Psf
@@ -276,13 +277,16 @@ def _facts(computed: "Psf", state: _State) -> dict[str, Any]:
 def _write(out: Path, computed: "Psf", *, pixel_arcmin: float) -> None:
     import numpy as np
 
+    from filter_service.atomic_files import replace_atomically
     from filter_service.image_files import write_image
     from filter_service.psfs.picture import draw_psf
 
+    image: NDArray[Any]
     if out.suffix.lower() == ".npy":
-        write_image(out, computed.kernel.astype(np.float32))
+        image = computed.kernel.astype(np.float32)
     else:
-        write_image(out, draw_psf(computed.kernel, pixel_arcmin=pixel_arcmin))
+        image = draw_psf(computed.kernel, pixel_arcmin=pixel_arcmin)
+    replace_atomically(out, lambda part: write_image(part, image))
 
 
 def _report(summary: dict[str, Any]) -> None:
