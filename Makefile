@@ -4,16 +4,19 @@
 PYTHON := .venv/bin/python
 ARGS ?=
 RESULTS := tests/benchmarks/results
-# Tests that measure time run alone; the others run in parallel.
-UNTIMED := -m "not clock and not slow and not gpu"
-TIMED := -m "clock and not slow and not gpu"
-PARALLEL := -n auto --maxprocesses 4 --dist loadfile
-NO_TESTS := test $$? -eq 5 # pytest's exit status if ARGS selects none of these tests
+# `make test` is one call: a failed test hides no other.  On two cores, two workers that take
+# the next test as they become free end together; tests of a file share its fixtures.
+TESTS := tests/unit tests/numerical tests/end_to_end
+PYTEST := $(PYTHON) -m pytest
+# Tests run in a random order: `make test ORDER_SEED=7` repeats one.
+ORDER_SEED ?= 1
+PARALLEL := -n auto --maxprocesses 4 --dist loadfile -p randomly --randomly-seed $(ORDER_SEED)
+OFTEN := not clock and not slow and not gpu
 # Excluded: soak takes 30 minutes, gpu needs a hardware GPU, and witness a path tracer.
 BENCHES := $(filter-out gpu soak witness,$(patsubst tests/benchmarks/bench_%.py,%,$(sort $(wildcard tests/benchmarks/bench_*.py))))
 
 .DEFAULT_GOAL := help
-.PHONY: demo docs web test test-timed test-training test-examples test-batch-ray test-headset test-layer test-layer-applications test-web test-workflows validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-workflows setup-witness setup-peers peers release release-check setup-release setup-release-check
+.PHONY: demo docs web test test-gl test-clients test-tools test-timed test-training test-examples test-batch-ray test-headset test-layer test-layer-applications test-web test-workflows validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-workflows setup-witness setup-peers peers release release-check setup-release setup-release-check
 
 demo: setup  ## filter two scenes through six eyes; writes out/demo/
 	$(PYTHON) -m filter_service demo $(ARGS)
@@ -24,12 +27,20 @@ web: setup-page  ## open a web page for your own prescription and photograph
 docs: setup-docs  ## build the documentation in strict mode; writes out/docs/
 	NO_MKDOCS_2_WARNING=1 .docs/bin/python -m mkdocs build --quiet --strict $(ARGS)
 
-test: setup-test  ## run the tests, except slow ones and those that measure time or need a GPU
-	$(PYTHON) -m pytest $(UNTIMED) $(PARALLEL) tests/unit tests/numerical $(ARGS) || $(NO_TESTS)
-	$(PYTHON) -m pytest $(UNTIMED) $(PARALLEL) tests/end_to_end $(ARGS) || $(NO_TESTS)
+test: setup-test  ## run the tests of the product: optics, frames, service, command line
+	$(PYTEST) -m "$(OFTEN) and (brief or not (gl or clients or tools))" $(PARALLEL) $(TESTS) $(ARGS)
+
+test-gl: setup-test  ## run the tests of the OpenGL engine at length, on any driver
+	$(PYTEST) -m "$(OFTEN) and gl and not brief" $(PARALLEL) $(TESTS) $(ARGS)
+
+test-clients: setup-test  ## run the tests of the headset, layer, batch, report and examples
+	$(PYTEST) -m "$(OFTEN) and clients" $(PARALLEL) $(TESTS) $(ARGS)
+
+test-tools: setup-test  ## run the tests of benchmarks, scripts of releases and setup, corpus
+	$(PYTEST) -m "$(OFTEN) and tools and not (gl or clients)" $(PARALLEL) $(TESTS) $(ARGS)
 
 test-timed: setup-test  ## run the tests that measure time, one at a time
-	$(PYTHON) -m pytest $(TIMED) tests/end_to_end $(ARGS)
+	$(PYTEST) -m "clock and not slow and not gpu" tests/end_to_end $(ARGS)
 
 test-training: setup-training  ## run the training tests, with torch, and a short training run
 	$(PYTHON) -m pytest tests/training $(ARGS)
@@ -58,7 +69,7 @@ test-workflows: setup-workflows  ## lint the workflows in .github/ with actionli
 	.workflows/bin/zizmor --offline --no-progress --quiet --persona auditor .github/workflows
 
 test-web: setup-web  ## test `ocufilter web` in headless Chromium
-	$(PYTHON) -m pytest tests/web $(ARGS)
+	$(PYTEST) $(PARALLEL) tests/web $(ARGS)
 
 validate: setup-test setup-web  ## run the slow tests and every benchmark; writes JSON results
 	$(PYTHON) -m pytest -m "slow and not gpu" --ignore tests/training $(ARGS)

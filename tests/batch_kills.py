@@ -35,6 +35,11 @@ def kill(arguments, out, chance):
     while process.poll() is None and line_count(out) < target:
         time.sleep(0.002)
     time.sleep(chance.uniform(0.0, 0.03))  # somewhere in the next frame
+    return kill_now(process, out, chance)
+
+
+def kill_now(process, out, chance):
+    """Kill a batch; half of the time its workers, too.  Return if it was at work."""
     was_at_work = process.poll() is None
     process.kill()
     if chance.random() < 0.5:
@@ -53,7 +58,7 @@ def workers_of(out):
             with open(f"/proc/{folder}/cmdline", "rb") as file:
                 words = file.read().split(b"\0")
             with open(f"/proc/{folder}/environ", "rb") as file:
-                ours = f"{MARK}={out}".encode() in file.read().split(b"\0")
+                ours = os.fsencode(f"{MARK}={out}") in file.read().split(b"\0")
         except OSError:
             continue
         if ours and b"clients.batch.process_pool" in words:

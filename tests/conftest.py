@@ -1,9 +1,11 @@
 """Shared fixtures: a seed per test, strict arithmetic, one OpenGL context."""
 
+import gc
 import os
 import random
 import zlib
 from dataclasses import dataclass
+from pathlib import Path
 
 # two cores are what the project plans for; must be set before numba is imported
 os.environ.setdefault("NUMBA_NUM_THREADS", str(min(2, os.cpu_count() or 1)))
@@ -19,7 +21,22 @@ np.seterr(divide="raise", over="raise", invalid="raise", under="ignore")
 
 SESSION_GPU = pytest.StashKey()
 
+MOST_LONG_CASES = 100
+"""Of one collection: what `make test` may hold of cases longer than the budget."""
+
 ENGINES = ("native", "gl")
+
+PSF_METHODS = ("enz", "fourier", "geometric")
+SMALL_PSF = {"pupil_diameter_mm": 3.0, "wavelength_nm": 550.0, "pixel_pitch_mrad": 1.3}
+
+
+def pytest_configure(config):
+    """Record durations if the environment asks for it."""
+    path = os.environ.get("OCUFILTER_DURATIONS")
+    if path:
+        from tests.audit.durations import Durations
+
+        config.pluginmanager.register(Durations(Path(path)), "durations")
 
 
 def _seed(node_id: str) -> int:
@@ -33,6 +50,32 @@ def _seed(node_id: str) -> int:
 def seeded(request):
     """Give every test its own fixed seed, whatever ran before it."""
     random.seed(_seed(request.node.nodeid))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def loaded(request):
+    """Load in each worker what many tests share: no case pays for it as the first.
+
+    A process that runs a few files itself loads what those need.
+    """
+    if not hasattr(request.config, "workerinput"):
+        return
+    from clients.figures.style import new_figure
+    from estimator.psf.compute import compute_psfs
+    from filter_service.filtering.compile_loops import PARTS, compile_part
+    from tests.reference import render_passes
+    from tests.reference.psf_integral import reference_kernel
+
+    for part in PARTS:
+        compile_part(part)
+    for method in PSF_METHODS:
+        compute_psfs(np.zeros((1, 28)), method=method, **SMALL_PSF)
+    reference_kernel(np.zeros(28), radius_px=2, **SMALL_PSF)
+    render_passes.gather_once()
+    new_figure(9.0, 9.0).subplots()
+    # A full collection of all that is loaded takes 0.3 s, in whichever case it falls.
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture
@@ -89,12 +132,13 @@ class Engine:
 def pytest_generate_tests(metafunc):
     """Run tests of the renderer on both engines; gl among the slow ones.
 
-    Those marked ``both_engines`` run on gl every time.
+    Those marked ``both_engines`` run on gl in `make test-gl` as well.
     """
     if "engine" not in metafunc.fixturenames:
         return
     always = metafunc.definition.get_closest_marker("both_engines") is not None
-    gl = pytest.param("gl", marks=() if always else pytest.mark.slow)
+    marks = [pytest.mark.gl, *[pytest.mark.slow] * (not always)]
+    gl = pytest.param("gl", marks=marks)
     metafunc.parametrize("engine", ["native", gl], indirect=True, scope="session")
 
 
@@ -110,6 +154,44 @@ def engine(request):
 def gl_engine(gpu):
     """The engine of compute shaders, for what is its own."""
     return Engine("gl", gpu)
+
+
+def _refusal_of_long(items):
+    """Return what is wrong with the marks ``long`` of selected cases, or ''."""
+    marked = [(item, mark) for item in items for mark in item.iter_markers("long")]
+    for item, mark in marked:
+        reason = mark.args[0] if len(mark.args) == 1 else None
+        if mark.kwargs or not isinstance(reason, str) or not reason.strip():
+            given = mark.kwargs or mark.args or "none"
+            return (
+                f"{item.nodeid}: the mark long takes one reason, a text; it has {given}"
+            )
+    count = len({item.nodeid for item, _ in marked})
+    if count > MOST_LONG_CASES:
+        return f"{count} cases are marked long; allowed: at most {MOST_LONG_CASES}"
+    return ""
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config, items):
+    """Refuse marks ``long`` without a reason, and too many cases that have one.
+
+    A worker of xdist cannot refuse: it selects nothing and tells its controller.
+    """
+    refusal = _refusal_of_long(items)
+    if refusal and hasattr(config, "workeroutput"):
+        config.workeroutput["refusal"] = refusal
+        items.clear()
+    elif refusal:
+        raise pytest.UsageError(refusal)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node):
+    """Refuse what a worker of xdist could not."""
+    refusal = getattr(node, "workeroutput", {}).get("refusal")
+    if refusal:
+        raise pytest.UsageError(refusal)
 
 
 def uses_gl(item):

@@ -2,6 +2,7 @@
 
 import ast
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -28,6 +29,12 @@ def python_files(package: str) -> list[Path]:
 def imports_of(path: Path) -> list[Import]:
     """Every module a file imports, inside functions too; ``from a import b`` is a.b."""
     name = path.relative_to(ROOT).as_posix()
+    return [Import(name, line, module) for line, module in _imports(path, name)]
+
+
+@cache
+def _imports(path: Path, name: str) -> list[tuple[int, str]]:
+    """Return line and module of each import; files do not change in a session."""
     found = []
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -37,7 +44,7 @@ def imports_of(path: Path) -> list[Import]:
             modules = [f"{node.module}.{alias.name}" for alias in node.names]
         else:
             continue
-        found += [Import(name, node.lineno, module) for module in modules]
+        found += [(node.lineno, module) for module in modules]
     return found
 
 

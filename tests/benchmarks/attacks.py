@@ -13,6 +13,7 @@ import sys
 import time
 from collections import Counter
 from contextlib import suppress
+from functools import partial
 
 import zmq
 
@@ -252,6 +253,125 @@ def valid_profiles(endpoint: str, duration_s: float) -> dict:
     return counts
 
 
+def _zernike_set() -> dict:
+    terms = [(n, m) for n in range(2, 7) for m in range(-n, n + 1, 2)]
+    measured = {"pupil_diameter_mm": 4.0, "wavelength_nm": 550.0}
+    return {
+        "kind": "zernike_set",
+        "measurements": [
+            {
+                **measured,
+                "h_deg": k % 10 * 4.0,
+                "v_deg": k // 10 * 4.0,
+                "zernike_um": {f"{n},{m}": 0.01 / (1 + n + k) for n, m in terms},
+            }
+            for k in range(100)
+        ],
+    }
+
+
+def _surfaces() -> dict:
+    """Return the eye that takes longest to check: 20 surfaces in 8 states."""
+
+    def surfaces(state: int) -> list[dict]:
+        return [
+            {
+                "radius_mm": [8.0 + 0.01 * i, 8.1 + 0.01 * i],
+                "z_mm": 0.35 * i,
+                "medium_after": ("cornea", "aqueous", "lens")[i % 3],
+                "decentration_mm": [0.01 * state, 0.0],
+                "tilt_deg": [0.1, 0.0],
+                "offset_mm": [0.0] * 6 + [1e-6 * (1 + state)] * 22,
+                "offset_radius_mm": 4.0,
+                "form": {"kind": "even_asphere", "coefficients": [0.0, 1e-9]},
+            }
+            for i in range(20)
+        ]
+
+    return {
+        "kind": "surfaces",
+        "stop_z_mm": 3.3,
+        "retina": {"radius_mm": -12, "z_mm": 24.2},
+        "surfaces": surfaces(0),
+        "states": [
+            {"accommodation_dpt": float(k), "surfaces": surfaces(k)}
+            for k in range(1, 9)
+        ],
+    }
+
+
+FLOODS = {
+    "preset": {"kind": "preset", "name": "keratoconus"},
+    "prescription": {"kind": "prescription", "sphere_dpt": -3, "age_years": 30},
+    "zernike_set": _zernike_set(),
+    "surfaces": _surfaces(),
+    "published": {"kind": "published", "name": "arizona"},
+    "pseudophakic": {
+        "kind": "pseudophakic",
+        "axial_length_mm": 23.6,
+        "keratometry_dpt": [42.5, 43.75],
+        "keratometry_axis_deg": 175,
+        "acd_mm": 3.1,
+        "lens_thickness_mm": 4.6,
+        "implant": {"power_dpt": 21},
+    },
+    "text": {"kind": "preset", "name": "myopia", "pad": ["x" * 4000] * 230},
+    "items": {"kind": "preset", "name": "myopia", "pad": [0.5] * 16_000},
+}
+"""Profiles of a flood: valid ones, and two to the size limits that are refused late."""
+
+FLOOD_HZ = 60.0
+
+
+def flood(endpoint: str, duration_s: float, kind: str) -> dict:
+    """Profiles of one kind, 60 a second on each of three eyes."""
+    context, client = dealer(endpoint)
+    client.send_multipart(encode(Hello("flood")))
+    camera = small_frame(1).views[0].camera
+    body = json.dumps(FLOODS[kind]).encode()
+    print("begun", flush=True)
+    counts, start_s, n = Counter(), time.monotonic(), 0
+    while (passed_s := time.monotonic() - start_s) < duration_s:
+        while n < 3 * FLOOD_HZ * passed_s:
+            eye = ("both", "left", "right")[n % 3]
+            header = encode(ProfileRequest(n, views=(camera,), eye=eye))[0]
+            with suppress(zmq.Again):
+                client.send_multipart([header, body], zmq.NOBLOCK)
+            n += 1
+        _read(client, counts)
+        time.sleep(0.002)
+    counts["sent"] = n
+    client.close(linger=0)
+    context.term()
+    return counts
+
+
+def stream(endpoint: str, duration_s: float) -> dict:
+    """A second session that streams frames, two in flight: no attack, but what any
+    flood is compared with."""
+    counts = Counter()
+    context, client = dealer(endpoint, sndtimeo=10_000)
+    frame = small_frame(1)
+    request = ProfileRequest(1, FLOODS["prescription"], views=(frame.views[0].camera,))
+    for message in (Hello("stream"), request):
+        client.send_multipart(encode(message))
+    while not counts["ready"] and client.poll(20_000):
+        _read(client, counts)
+    parts = [bytes(part) for part in encode(frame)]
+    print("begun", flush=True)
+    n_sent, end_s = 0, time.monotonic() + duration_s
+    while time.monotonic() < end_s:
+        n_answered = sum(counts[k] for k in ("result", "dropped"))
+        if n_sent < 2 + n_answered:
+            client.send_multipart(parts)
+            n_sent += 1
+        elif client.poll(10):
+            _read(client, counts)
+    client.close(linger=0)
+    context.term()
+    return counts
+
+
 def _read(client, counts: Counter) -> None:
     while client.poll(0):
         reply = decode_reply(client.recv_multipart())
@@ -423,9 +543,9 @@ ATTACKS = {
     for function in (
         *(bare, one_byte, half_greeted, silent_dealers, chosen_ids),
         *(profiles, valid_profiles, pings, unread, parts, parts_in_session, hoard),
-        *(raw_sockets, mutated_messages),
+        *(raw_sockets, mutated_messages, stream),
     )
-}
+} | {f"flood_{kind}": partial(flood, kind=kind) for kind in FLOODS}
 
 
 def main() -> None:

@@ -9,8 +9,9 @@ against the first; connections that say nothing also under limits of open files,
 keys and without.  Errors: the client's rate over its baseline, its longest wait for a
 picture, the time until a newcomer is welcomed, processor time afterwards, lost
 processes.  Then the assertion of libzmq that a guessed routing id sets off, files that
-are no keys, and heavy clients beside light ones on the native engine.  Writes
-results/abuse.json.
+are no keys, and heavy clients beside light ones on the native engine.  On that engine,
+too, floods of profiles: a client's rate beside each over its rate beside a second
+session that streams frames.  Writes results/abuse.json.
 """
 
 import argparse
@@ -35,22 +36,30 @@ from filter_service.camera import tangents_from_fov
 from filter_service.errors import FilterError
 from filter_service.keys import KeyRing
 from filter_service.service.router import SEED_VARIABLE
-from tests.benchmarks.attacks import ATTACKS
+from tests.benchmarks.attacks import ATTACKS, FLOODS
 from tests.benchmarks.harness import Row, publish
 from tests.benchmarks.mutated_messages import view_of
 
 COMMAND = (sys.executable, "-m", "tests.end_to_end.double_service", "--filter-ms", "5")
 ATTACK = (sys.executable, "-m", "tests.benchmarks.attacks")
-OTHER_ATTACKS = [name for name in ATTACKS if name not in ("bare", "one_byte")]
+OTHER_ATTACKS = [
+    name
+    for name in ATTACKS
+    if name not in ("bare", "one_byte", "stream") and not name.startswith("flood_")
+]
 LIMITS = ((256, False), (256, True), (1024, False), (1024, True))
 SIZE_PX = (320, 180)
 ATTACK_S, QUICK_S = 6.0, 2.0
+N_WINDOWS = 3
 
 
 class Guest:
     """A client that streams in a thread and counts what comes back."""
 
-    def __init__(self, endpoint: str, key_file: Path | None = None) -> None:
+    def __init__(
+        self, endpoint: str, key_file: Path | None = None, body: dict | None = None
+    ) -> None:
+        self._body = body or {"kind": "double", "mark": 7}
         self.n_filtered = 0
         self.errors: Counter[str] = Counter()
         self._arrived_s: list[float] = []
@@ -73,7 +82,8 @@ class Guest:
         with FilterClient(
             self._endpoint, key_file=self._key_file, timeout_s=20.0, max_in_flight=2
         ) as client:
-            client.set_profile({"kind": "double", "mark": 7}, views=[view])
+            client.set_profile(self._body, views=[view])
+            mark = self._body.get("mark")
             while not self._is_over.is_set():
                 if client.n_unanswered < 2:
                     client.submit(view, pupil_diameter_mm=4.0, focus_dpt=0.0)
@@ -81,7 +91,7 @@ class Guest:
                     if isinstance(event, FilteredFrame):
                         self.n_filtered += 1
                         self._arrived_s.append(time.monotonic())
-                        if event.color[0, 0, 0] != 7:
+                        if mark is not None and event.color[0, 0, 0] != mark:
                             self.errors["wrong eye"] += 1
                     elif hasattr(event, "code"):
                         self.errors[event.code] += 1
@@ -357,6 +367,57 @@ def fairness_rows(n_heavy_frames: int, heavy_px: int) -> list[Row]:
     ]
 
 
+def flood_rows(kinds: Sequence[str], duration_s: float) -> list[Row]:
+    """Return a client's rate beside floods of profiles and beside another stream.
+
+    Windows alternate, because the rest of the machine is not idle.
+    """
+    rows: list[Row] = []
+    settings = {"max_sessions": 8, "engine": "native"}
+    body = {"kind": "prescription", "sphere_dpt": -2}
+    with (
+        ServiceProcess(settings, start_timeout_s=120.0) as service,
+        Guest(service.endpoint, body=body) as guest,
+    ):
+        while not guest.n_filtered:
+            time.sleep(0.1)
+        before = service.pids()
+        for kind in kinds:
+            rates_hz: dict[str, list[float]] = {"stream": [], f"flood_{kind}": []}
+            silences_s, counts = [], {}
+            for name in [*rates_hz] * N_WINDOWS:
+                attack = subprocess.Popen(
+                    [*ATTACK, name, service.endpoint, str(duration_s + 1.0)],
+                    stdout=subprocess.PIPE,
+                    text=True,
+                )
+                assert attack.stdout.readline() == "begun\n"
+                time.sleep(0.5)
+                hz, silence_s = guest.watch(duration_s)
+                rates_hz[name].append(hz)
+                printed = json.loads(attack.communicate()[0])
+                if name != "stream":
+                    silences_s.append(silence_s)
+                    counts = printed
+            base_hz, hz = (float(np.median(found)) for found in rates_hz.values())
+            setting = ", ".join(f"{value} {key}" for key, value in counts.items())
+            lost = sum(service.pids().get(k) != pid for k, pid in before.items())
+            rows += [
+                Row(
+                    *("abuse", f"flood of {kind}", f"{base_hz:.0f}/s", setting[:60]),
+                    *(N_WINDOWS, 1e3 / base_hz, 1e3 / max(hz, 1e-3)),
+                    *(service.memory_mb, what, float(value), "beside a stream"),
+                )
+                for what, value in (
+                    ("rate ratio", hz / base_hz),
+                    ("longest silence, s", max(silences_s)),
+                    ("processes lost", lost),
+                    ("errors of the client", sum(guest.errors.values())),
+                )
+            ]
+    return rows
+
+
 def measure(duration_s: float) -> list[Row]:
     """Return the rows of all attacks."""
     is_quick = duration_s < ATTACK_S
@@ -366,6 +427,7 @@ def measure(duration_s: float) -> list[Row]:
         rows += attack_rows(names, duration_s, n_files=n_files, has_keys=has_keys)
     rows += assertion_rows()
     rows += key_file_rows(duration_s if is_quick else 30.0)
+    rows += flood_rows(list(FLOODS)[-1:] if is_quick else list(FLOODS), duration_s)
     return rows + fairness_rows(*((4, 1024) if is_quick else (20, 4096)))
 
 

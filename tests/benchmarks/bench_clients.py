@@ -25,9 +25,9 @@ from pathlib import Path
 from typing import Any
 
 from clients.filter_client import FilterClient, FilteredFrame, ViewState
+from clients.latency.stream import EYES, StreamSettings, make_frames
 from clients.service_process import ServiceProcess
 from filter_service.messages import Dropped, ErrorReply
-from tests.benchmarks.bench_roundtrip import EYES, Settings, make_frames
 from tests.benchmarks.harness import Row, publish
 
 SIZE_PX = (640, 360)
@@ -63,7 +63,7 @@ class Stream:
 
     def _stream(self, client: FilterClient, barrier: threading.Barrier) -> None:
         right = self._profile(1) if self.n_eyes == 2 else None
-        settings = Settings(
+        settings = StreamSettings(
             *SIZE_PX,
             *(self.n_eyes, 0.0, 1.0, self._profile(0), {}, 4.0, 0.0, "srgb8", 2),
             right_profile=right,

@@ -3,11 +3,13 @@
     python -m tests.benchmarks.bench_files [--quick] [--json]
 
 Valid files of all kinds that are read - pictures, depth, arrays, OpenEXR, profiles,
-spectra, lists, calibrations, states, manifests, videos, glTF, stored eyes - are
-changed: bytes flipped, cut, removed and repeated, sizes that claim much, numbers and
-words replaced, brackets nested.  100,000 of them are read by processes of their own,
-and 500 given to `ocufilter` as a program.  Errors: of readers, what is raised beside
-`InvalidFile` and what libraries write to stderr; of the program, an exit code that is
+lens files, spectra, lists, calibrations, states, manifests, videos, glTF, stored eyes,
+configurations, keys, links of the page, data sets - are changed: bytes flipped, cut,
+removed and repeated, sizes that claim much, numbers and words replaced, brackets
+nested, values of JSON replaced by extreme numbers and other types.  Profiles are also
+drawn from the JSON Schema.  100,000 are read by processes of their own, and 500 given
+to `ocufilter` as a program.  Errors: of readers, what is raised beside the documented
+errors and what libraries write to stderr; of the program, an exit code that is
 neither 2 with one line on stderr nor 0; of all, processes that die, the longest read
 in s of the processor and the most memory in MB.  Writes results/files.json.
 """
@@ -16,7 +18,6 @@ import argparse
 import json
 import logging
 import os
-import random
 import resource
 import subprocess
 import sys
@@ -28,7 +29,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.benchmarks.file_mutants import Kind, kinds, mutated
+from tests.benchmarks.file_mutants import Kind, kinds, mutant
 from tests.benchmarks.harness import ROOT, Row, publish
 
 N_READS, N_COMMANDS = 100_000, 500
@@ -45,15 +46,12 @@ ADDRESS_SPACE_BYTES = 6 << 30
 """Of a reading process, so that a file that asks for more is found and not the machine
 brought down; memory itself is measured."""
 
+VALID, REFUSED = "valid", "refused"
+MAX_CHARACTERS = 5000
+"""Length limit of a message."""
+
 TEMPORARY = "/dev/shm" if os.path.isdir("/dev/shm") else None
 REFERENCE = f"at most {MAX_READ_S:g} s, {MAX_MEMORY_MB:g} MB"
-
-
-def mutant(kind: Kind, number: int) -> tuple[str, bytes]:
-    """Return name and content of a changed file; the same for the same number."""
-    chance = random.Random(f"{kind.name} {number}")
-    name = chance.choice(sorted(kind.files))
-    return name, mutated(kind.files[name], chance)
 
 
 # --- reads ----------------------------------------------------------------------
@@ -65,8 +63,6 @@ def read_some(name: str, first: int, count: int, folder: Path) -> None:
     A line: number, s, s of the processor, what was raised, bytes that were written to
     stdout or stderr, MB.
     """
-    from estimator import InvalidFile
-
     logging.getLogger("ocufilter").addHandler(logging.NullHandler())
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE_BYTES, ADDRESS_SPACE_BYTES))
     kind = next(k for k in kinds(folder) if k.name == name)
@@ -85,13 +81,9 @@ def read_some(name: str, first: int, count: int, folder: Path) -> None:
         start_s, start_cpu_s = time.perf_counter(), time.process_time()
         try:
             kind.read(path)
-            raised = "valid"
-        except InvalidFile as error:
-            raised = "InvalidFile"
-            if "\n" in str(error):
-                raised = "InvalidFile of several lines"
+            raised = VALID
         except BaseException as error:
-            raised = f"{type(error).__name__}: {str(error)[:100]!r}"
+            raised = outcome_of(kind, error)
         took_s = time.perf_counter() - start_s
         cpu_s = time.process_time() - start_cpu_s
         sys.stdout.flush()
@@ -100,6 +92,16 @@ def read_some(name: str, first: int, count: int, folder: Path) -> None:
         peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
         result = [number, took_s, cpu_s, raised, written, peak_mb]
         print(json.dumps(result), file=out, flush=True)
+
+
+def outcome_of(kind: Kind, error: BaseException) -> str:
+    """Return `REFUSED` for a documented error of one line, else what was raised."""
+    said = str(error)
+    if type(error) not in kind.errors:
+        return f"{type(error).__name__}: {said[:100]!r}"
+    if not said.isprintable() or len(said) > MAX_CHARACTERS:
+        return f"{type(error).__name__} of {len(said)} characters: {said[:100]!r}"
+    return REFUSED
 
 
 class Reads:
@@ -134,7 +136,7 @@ class Reads:
             self.times_s.append(took_s)
             self.raised[raised.split(":")[0]] += 1
             self.peak_mb = max(self.peak_mb, peak_mb)
-            if raised not in ("valid", "InvalidFile"):
+            if raised not in (VALID, REFUSED):
                 self.wrong.append(f"{number}: {raised}")
             if written:
                 self.wrong.append(f"{number}: {written} bytes on stdout or stderr")
@@ -151,8 +153,7 @@ class Reads:
 
     def rows(self) -> list[Row]:
         """Return them as rows."""
-        refused = self.raised["InvalidFile"]
-        setting = f"{refused} refused, {self.raised['valid']} valid"
+        setting = f"{self.raised[REFUSED]} refused, {self.raised[VALID]} valid"
         values = (
             ("wrong answers", len(self.wrong)),
             ("longest read, s", self.longest_s),

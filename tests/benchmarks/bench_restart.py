@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from clients.filter_client import FilterClient, FilteredFrame
+from clients.latency.stream import StreamSettings, make_frames
 from clients.service_process import ServiceProcess
-from tests.benchmarks.bench_roundtrip import Settings, make_frames
 from tests.benchmarks.harness import Row, publish
 
 PROFILE = {"kind": "prescription", "eye_side": "OD", "sphere_dpt": -2}
@@ -47,7 +47,7 @@ def stream_until(client: FilterClient, view, is_wanted) -> FilteredFrame:
 def rows_of(case: str, settings: dict, repeats: int) -> list[Row]:
     """Kill the process again and again; return times to the first frame and whole."""
     frames = make_frames(
-        Settings(1280, 720, 1, RATE_HZ, 1.0, PROFILE, {}, 4.0, 0.0, "srgb8", 1)
+        StreamSettings(1280, 720, 1, RATE_HZ, 1.0, PROFILE, {}, 4.0, 0.0, "srgb8", 1)
     )
     view = frames[0][0]
     first_ms, whole_ms, errors = [], [], []

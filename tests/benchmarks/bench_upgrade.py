@@ -26,9 +26,9 @@ from pathlib import Path
 import numpy as np
 
 from clients.filter_client import FilterClient, FilteredFrame, RgbdView
+from clients.latency.stream import StreamSettings, make_frames
 from clients.service_process import SERVE_COMMAND, ServiceProcess
 from filter_service.messages import Dropped, ErrorReply
-from tests.benchmarks.bench_roundtrip import Settings, make_frames
 from tests.benchmarks.harness import Row, publish
 
 PROFILE = {"kind": "prescription", "eye_side": "OD", "sphere_dpt": -2}
@@ -141,7 +141,7 @@ WAYS = {"live stream": stream, "filter calls": filter_frames}
 def upgrade(way: str, old: tuple[str, ...], settings: dict) -> tuple[Run, float]:
     """Upgrade the service under one client; return the run and the memory in MB."""
     frames = make_frames(
-        Settings(640, 360, 1, RATE_HZ, 1.0, PROFILE, {}, 4.0, 0.0, "srgb8", 1)
+        StreamSettings(640, 360, 1, RATE_HZ, 1.0, PROFILE, {}, 4.0, 0.0, "srgb8", 1)
     )
     view = frames[0][0]
     run = Run()

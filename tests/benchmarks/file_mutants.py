@@ -14,11 +14,23 @@ import numpy as np
 import OpenEXR
 from PIL import Image
 
+from estimator import InvalidFile, ProfileError
+from estimator.profiles.files import InvalidProfileFile
+from filter_service.psfs.store_file import PAGE_BYTES, PREAMBLE
+from tests.schema_profiles import disturbed, drawn_profile
 from tests.unit.gltf_bytes import glb, triangle_bytes, triangle_header
+
+DATA = Path(__file__).parents[1] / "data"
+CORPUS = DATA.with_name("corpus")
+PEOPLE = DATA / "peripheral_wavefronts.npz"
+PUBLISHED = DATA.parents[1] / "estimator" / "profiles" / "published"
 
 SIDES = (48, 64)
 SIZES = (0, 1, 2**15, 2**16 - 1, 2**24, 2**31 - 1, 2**31, 2**32 - 1)
-NUMBERS = (b"0", b"-1", b"65536", b"2147483647", b"99999999999999999999", b"1e999")
+NUMBERS = (
+    *(b"0", b"-1", b"65536", b"2147483647", b"99999999999999999999", b"1e999"),
+    *(b"5e-324", b"-5e-324", b"1e308", b"-1e308", b"nan", b"inf"),
+)
 WORDS = (b"NaN", b"null", b"[]", b"{}", b'"x"', b"\\ud800", b"\xff\xfe", b"\0")
 LONGEST_BYTES = 4_000_000
 
@@ -65,6 +77,10 @@ class Kind:
         Contents of valid files by the name that each has.
     read : callable
         What reads a file by its path.
+    errors : tuple of type
+        What `read` may raise, subclasses not included.
+    make : callable, optional
+        Returns the content of a file instead of a changed one.
     command : callable, optional
         Returns the arguments of `ocufilter` that have a file read, for its path and a
         folder with valid files beside.
@@ -74,23 +90,33 @@ class Kind:
     files: dict[str, bytes]
     read: Callable[[Path], object]
     command: Callable[[Path, Path], list[str]] | None = None
+    errors: tuple[type[Exception], ...] = (InvalidFile, InvalidProfileFile)
+    make: Callable[[random.Random], bytes] | None = None
 
 
 def kinds(folder: Path) -> list[Kind]:
     """Return all kinds; valid files are written to a folder, and read from there."""
     from clients.batch.layout_middlebury import read_calibration
     from clients.batch.layout_tum import tum_frames
-    from clients.batch.manifest import Manifest
+    from clients.batch.manifest import Manifest, ManifestDiffers
     from clients.batch.states import read_states
     from clients.batch.video_reading import VideoReader
     from clients.commands.display_file import display_of_file
     from clients.headset.gltf_scene import load_gltf
     from clients.web.eye_form import read_profile_file
+    from clients.web.page_state import PageState
     from clients.web.picture import photo_picture
+    from clients.web.shared_entries import fragment_of, restore
+    from estimator.periphery.measured_eyes import load_measured_eyes
     from estimator.profiles.files import load_profile
+    from estimator.profiles.parse import parse_profile
     from filter_service.image_files import read_color, read_depth
+    from filter_service.keys import load_client_key
     from filter_service.psfs.store_cache import StoreCache
+    from filter_service.service.config import load_config
+    from training.datasets import DataError, read_manifest, recipe_of
 
+    settings_errors = (ValueError, InvalidFile)
     pictures = _pictures(folder)
     write_beside(folder, pictures)
 
@@ -115,6 +141,17 @@ def kinds(folder: Path) -> list[Kind]:
     def video(path: Path) -> object:
         with VideoReader(path) as reader:
             return [reader.color(k) for k in (0, reader.count - 1)]
+
+    def link(path: Path) -> object:
+        state = PageState()
+        restore(state, path.read_text("latin-1"))
+        return fragment_of(state, "chart"), state.problems()
+
+    def training_set(path: Path) -> object:
+        return recipe_of(read_manifest(path.parent))
+
+    def drawn(path: Path) -> object:
+        return parse_profile(json.loads(path.read_bytes()))
 
     def store(path: Path) -> object:
         cache = StoreCache(str(path.parent), max_mb=100)
@@ -157,10 +194,29 @@ def kinds(folder: Path) -> list[Kind]:
             lambda path: read_states(path, [f"{k:06d}" for k in range(5)]),
             _states_command,
         ),
-        Kind("manifest", {"manifest.jsonl": _manifest(folder)}, manifest),
+        Kind(
+            "manifest",
+            {"manifest.jsonl": _manifest(folder)},
+            manifest,
+            errors=(InvalidFile, ManifestDiffers),
+        ),
         Kind("video", _videos(folder), video),
         Kind("glTF", _scenes(pictures), load_gltf, _scene_command),
         Kind("stored eye", {"ab-cd.psfs": _store(folder)}, store),
+        Kind("lens file", _lens_files(), profile),
+        Kind("given eye", _given_eyes(), profile),
+        Kind("configuration", _configuration(), load_config, errors=settings_errors),
+        Kind("key", _key(), load_client_key, errors=(ValueError,)),
+        Kind("link", _links(), link, errors=()),
+        Kind("training set", _training_set(), training_set, errors=(DataError,)),
+        Kind("people", {"people.npz": PEOPLE.read_bytes()}, load_measured_eyes),
+        Kind(
+            "profile of the schema",
+            {"drawn.json": b""},
+            drawn,
+            errors=(ProfileError,),
+            make=_drawn_profile,
+        ),
     ]
 
 
@@ -353,11 +409,112 @@ def _store(folder: Path) -> bytes:
     return (folder / "store").read_bytes()
 
 
+def _lens_files() -> dict[str, bytes]:
+    """Return eyes that optiland saved, and the one of them that .zmx can express."""
+    eyes = json.loads((DATA / "optiland_files.json").read_bytes())["files"]
+    files = {
+        f"{name.replace(' ', '_')}.json": json.dumps(eye["json"]).encode()
+        for name, eye in eyes.items()
+    }
+    files["eye.zmx"] = eyes["even asphere, centered"]["zmx"].encode("latin-1")
+    return files
+
+
+def _given_eyes() -> dict[str, bytes]:
+    """Return eyes by their surfaces, their implant, and several wavefronts."""
+    files = {path.name: path.read_bytes() for path in PUBLISHED.glob("*.json")}
+    for number, one in enumerate(json.loads((CORPUS / "profiles.json").read_bytes())):
+        if one["name"].endswith(".json"):
+            files[f"corpus_{number}.json"] = one["text"].encode()
+    return files
+
+
+def _configuration() -> dict[str, bytes]:
+    return {"service.toml": (CORPUS / "service.toml").read_bytes()}
+
+
+def _key() -> dict[str, bytes]:
+    """Return a client's key file, with the keys of libzmq's documentation."""
+    public, secret = (
+        "Yne@$w-vo<fVvi]a<NY6T1ed:M$fCG*[IaLV{hID",
+        "D:)Q[IlAW!ahhC2ac:9*A}h:p?([4%wOTJ%JR%cs",
+    )
+    text = f"name = 'a client'\npublic = '{public}'\nsecret = '{secret}'\n"
+    return {"client.key": f"{text}server = '{public}'\n".encode()}
+
+
+def _links() -> dict[str, bytes]:
+    """Return entries of the page; `mutated` encodes them."""
+    worn = {"kind": "iol", "design": "trifocal", "texts": {"sphere_dpt": "-2"}}
+    right = {
+        "preset": "keratoconus",
+        "source": "preset",
+        "higher_order": False,
+        "texts": {"sphere_dpt": "-2.5", "axis_deg": "20"},
+        "correction": worn,
+    }
+    entries = {
+        "v": 1,
+        "shown": "both",
+        "scene": "chart",
+        "focus_set": True,
+        "values": {"pupil_diameter_mm": 5.5, "focus_dpt": 2},
+        "eyes": {"OD": right, "OS": {"source": "file", "file": "a.json"}},
+    }
+    return {"entries.link": base64.urlsafe_b64encode(json.dumps(entries).encode())}
+
+
+def _training_set() -> dict[str, bytes]:
+    manifest = {"format": 1, "domain": "on_axis", "n_rows": 96, "rows_per_shard": 32}
+    manifest |= {"seed": 5, "sampling": "sobol", "population_ratio": 0.25}
+    return {"manifest.json": json.dumps(manifest).encode()}
+
+
+def _drawn_profile(chance: random.Random) -> bytes:
+    """Return a valid profile, or one with a few strange values."""
+    body = drawn_profile(chance)
+    if chance.random() < 0.5:
+        body = disturbed(body, chance, chance.choice((1, 1, 2, 3)))
+    return json.dumps(body).encode()
+
+
 # --- changes --------------------------------------------------------------------
+
+
+def mutant(kind: Kind, number: int) -> tuple[str, bytes]:
+    """Return name and content of a changed file; the same for the same number."""
+    chance = random.Random(f"{kind.name} {number}")
+    name = chance.choice(sorted(kind.files))
+    content = kind.files[name]
+    if kind.make is not None:
+        return name, kind.make(chance)
+    if name.endswith(".link") and chance.random() < 0.8:
+        entries = mutated(base64.urlsafe_b64decode(content), chance)
+        return name, base64.urlsafe_b64encode(entries).rstrip(b"=")
+    if name.endswith(".psfs") and chance.random() < 0.7:
+        return name, _resealed(content, chance)
+    return name, mutated(content, chance)
+
+
+def _resealed(content: bytes, chance: random.Random) -> bytes:
+    """Return a stored eye with another header whose checksum is right."""
+    magic, n_header, start, n_bytes, _, data_sum = PREAMBLE.unpack_from(content)
+    header = mutated(content[PREAMBLE.size :][:n_header], chance)
+    start = max(start, -(-(PREAMBLE.size + len(header)) // PAGE_BYTES) * PAGE_BYTES)
+    sums = zlib.crc32(header), data_sum
+    head = PREAMBLE.pack(magic, len(header), start, n_bytes, *sums) + header
+    return head.ljust(start, b"\0") + content[len(content) - n_bytes :]
 
 
 def mutated(content: bytes, chance: random.Random) -> bytes:
     """Return a file with one to three changes."""
+    if content[:1] == b"{" and chance.random() < 0.6:
+        try:
+            value = json.loads(content)
+        except ValueError:
+            value = None
+        if value:
+            return json.dumps(disturbed(value, chance, chance.choice((1, 2)))).encode()
     changed = bytearray(content)
     for _ in range(chance.choice((1, 1, 1, 2, 3))):
         changes = TEXT_CHANGES if _is_text(content) else CHANGES

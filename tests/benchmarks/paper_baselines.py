@@ -83,7 +83,7 @@ def predecessor(
         for step, scale in ((0, 1.0 - above), (1, above)):
             layers.append(node[:, None] * (radius + 1) + whole + step)
             weights.append(share * scale)
-    color, evaluations = _splat(
+    color, evaluations = splat_sources(
         view,
         state,
         sources,
@@ -227,7 +227,7 @@ def _splat_texture(
             weights.append(share)
     layers, weights = np.stack(layers, axis=-1), np.stack(weights, axis=-1)
     used_px = np.where(weights > 0.0, texture.radius_px[layers], 0.0)
-    return _splat(
+    return splat_sources(
         view,
         state,
         sources,
@@ -239,7 +239,7 @@ def _splat_texture(
     )
 
 
-def _splat(
+def splat_sources(
     view: RgbdView,
     state: EyeState,
     sources: Sources,

@@ -192,7 +192,7 @@ def counted_work(renderer: FilterRenderer, view: RgbdView, handle) -> FrameWork:
         views=1.0,
         pixels=size_px[0] * size_px[1],
         fragments=float(blocks[:, 0].sum()),
-        searched=_searched(int(plan[PLAN_REACH]), bins, tiles),
+        searched=searched_blocks(int(plan[PLAN_REACH]), bins, tiles),
         tests=_tested(windows, blocks[:, 0].reshape(tiles[1], tiles[0])),
         entries=float(lengths.sum()),
         sorted_entries=float(lengths[(lists[:, 1] != 0) & (lengths > 1)].sum()),
@@ -205,7 +205,9 @@ def counted_work(renderer: FilterRenderer, view: RgbdView, handle) -> FrameWork:
     )
 
 
-def _searched(reach_px: int, bins: tuple[int, ...], tiles: tuple[int, ...]) -> float:
+def searched_blocks(
+    reach_px: int, bins: tuple[int, ...], tiles: tuple[int, ...]
+) -> float:
     """Return the blocks that `count_bins` searches, of all bins."""
     steps = -(-int(np.ceil(reach_px + REACH_MARGIN_PX)) // TILE_SIZE_PX)
     sides = []

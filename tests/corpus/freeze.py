@@ -7,8 +7,6 @@ import argparse
 import base64
 import json
 import shutil
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
@@ -24,6 +22,7 @@ from estimator.profiles.files import load_profile
 from filter_service import messages
 from filter_service.protocol_schema import protocol_schema
 from filter_service.service.config import load_config
+from tests.commands import run_command
 from tests.source_tree import ROOT
 from tests.unit.test_protocol_document import bodies, examples, parts_of
 
@@ -151,8 +150,8 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
 
 def printed_json(arguments: list[str]) -> Any:
     """Return what a command prints with ``--json``."""
-    command = [sys.executable, "-m", "filter_service", *arguments, "--json"]
-    finished = subprocess.run(command, cwd=ROOT, capture_output=True, check=True)
+    finished = run_command(*arguments, "--json")
+    finished.check_returncode()
     return json.loads(finished.stdout)
 
 
@@ -216,14 +215,8 @@ def write_batch(folder: Path) -> None:
 
 def run_batch(frames: Path, out: Path) -> str:
     """Run or resume the batch; return what it prints."""
-    command = [sys.executable, "-m", "filter_service", "batch", str(frames)]
-    finished = subprocess.run(
-        [*command, *BATCH, "-o", str(out)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    finished = run_command("batch", frames, *BATCH, "-o", out)
+    finished.check_returncode()
     return finished.stdout
 
 

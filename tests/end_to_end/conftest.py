@@ -1,5 +1,6 @@
 """Real service processes on random ports; everything has a limit of 10 s."""
 
+import contextlib
 import sys
 
 import moderngl
@@ -9,20 +10,28 @@ import zmq
 
 from clients.filter_client import FilterClient, RgbdView, tangents_from_fov
 from clients.scenes.scene_view import SceneView
-from clients.service_process import ServiceProcess
+from clients.service_process import SERVE_COMMAND, ServiceProcess
 from filter_service.messages import (
+    Bye,
     Camera,
     Frame,
     Hello,
+    Ping,
     ProfileRequest,
     ViewHeader,
     ViewImages,
     decode_reply,
     encode,
 )
+from tests.end_to_end.service_pool import ServicePool
 
 TIMEOUT_S = 10.0
+START_TIMEOUT_S = 60.0
+"""Of a service with real engines, which tests of both kinds share."""
+
 DOUBLE = (sys.executable, "-m", "tests.end_to_end.double_service")
+QUICK_DOUBLE = (*DOUBLE, "--filter-ms", "2")
+USUAL = {"alive_interval_s": 0.1, "max_sessions": 16}
 
 
 @pytest.fixture
@@ -44,15 +53,56 @@ def start_service():
 
 
 @pytest.fixture(scope="session")
-def shared_service():
-    """One service with the double for all tests that leave it as it was."""
-    settings = {"alive_interval_s": 0.1, "max_sessions": 8}
-    command = (*DOUBLE, "--filter-ms", "2")
-    with ServiceProcess(
-        settings, command=command, start_timeout_s=TIMEOUT_S
-    ) as service:
-        yield service
-        assert service.stop(TIMEOUT_S) == 0
+def service_pool(pytestconfig):
+    """Services that the tests of a worker use one after the other."""
+    durations = pytestconfig.pluginmanager.get_plugin("durations")
+    apart = contextlib.nullcontext if durations is None else durations.apart
+    pool = ServicePool(START_TIMEOUT_S, apart)
+    yield pool
+    pool.close()
+
+
+@pytest.fixture
+def use_service(service_pool):
+    """Use running services, with the double unless a command is given.
+
+    A test that leaves one as it was, without sessions, leaves it to the next test.  One
+    whose subject is the start or end of a process starts its own by `start_service`.
+    """
+    used = []
+
+    def use(*, command=QUICK_DOUBLE, **settings):
+        used.append(service_pool.lend(command, settings))
+        return used[-1]
+
+    yield use
+    for service in used:
+        service_pool.take_back(service)
+
+
+@pytest.fixture
+def shared_service(use_service):
+    """The service with the double that most tests use."""
+    return use_service(**USUAL)
+
+
+@pytest.fixture
+def real_service(use_service):
+    """The service with its own engine and defaults."""
+    return use_service(command=SERVE_COMMAND)
+
+
+@pytest.fixture
+def brief_service(use_service):
+    """The service with the double that soon ends sessions and builds."""
+    return use_service(alive_interval_s=0.05, session_keep_s=0.3, cancel_grace_s=0.2)
+
+
+@pytest.fixture
+def small_service(use_service):
+    """The service with the double that takes little of everything."""
+    limits = {"max_part_mb": 1, "max_profile_kb": 1, "max_image_mb": 10}
+    return use_service(max_sessions=2, credit=3, **limits)
 
 
 @pytest.fixture
@@ -86,15 +136,24 @@ class RawClient:
         self.send(encode(message))
         return self.receive()
 
-    def begin(self, mark=1, **frame_size):
+    def begin(self, mark=1, more=None, **frame_size):
         """Say hello, send a profile for `small_frame` and wait until it is ready."""
         welcome = self.ask(Hello("raw"))
-        body = {"kind": "double", "mark": mark}
+        body = {"kind": "double", "mark": mark, **(more or {})}
         camera = small_frame(0, **frame_size).views[0].camera
         accepted = self.ask(ProfileRequest(mark, body, views=(camera,)))
         assert accepted.type_name == "accepted"
         assert self.receive().type_name == "ready"
         return welcome
+
+    def end(self):
+        """End the session, if there is one, and close."""
+        with contextlib.suppress(zmq.ZMQError):  # it is closed, or nobody answers
+            self.socket.sndtimeo = self.socket.rcvtimeo = 100
+            self.send(encode(Bye()))
+            while self.ask(Ping()).type_name != "pong":
+                pass
+        self.close()
 
     def close(self):
         self.socket.close(linger=0)
@@ -102,7 +161,7 @@ class RawClient:
 
 
 @pytest.fixture
-def raw_client():
+def raw_client(use_service):  # whose services are reset after the clients end
     clients = []
 
     def connect(service, **options):
@@ -111,7 +170,7 @@ def raw_client():
 
     yield connect
     for client in clients:
-        client.close()
+        client.end()
 
 
 def small_frame(frame_id, *, width_px=16, height_px=8, **changes):

@@ -24,6 +24,7 @@ class StoreDouble:
     camera: Camera
     follows_field: bool
     ballast: np.ndarray
+    filter_ms: float | None
     n_released: int = 0
     computed_count: int = 1
 
@@ -53,7 +54,7 @@ class RenderedDouble(FrameCounts):
 
 
 class EngineDouble:
-    """Inverts colors and takes the time it is told to take."""
+    """Inverts colors in the time that the profile or else the command states."""
 
     name = "numpy double"
 
@@ -86,7 +87,8 @@ class EngineDouble:
         if pupil_diameter_mm == 8.75:
             raise ArithmeticError("the double breaks at 8.75 mm")
         start_s = time.perf_counter()
-        time.sleep(self.filter_ms / 1000)
+        filter_ms = self.filter_ms if handle.filter_ms is None else handle.filter_ms
+        time.sleep(filter_ms / 1000)
         if output == "srgb8":
             color = 255 - _as_bytes(view.color)
         else:
@@ -126,6 +128,9 @@ class ProfileDouble:
 
 
 def read_profile(body):
+    if body.get("crash_reading"):
+        os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(body.get("read_s", 0.0))
     if body.get("kind") != "double":
         raise UnknownProfile(f"it is {body.get('kind')!r}", field="kind")
     mark = body.get("mark")
@@ -143,7 +148,8 @@ def build(job, *, progress, cancelled):
         raise ValueError("the double was told to fail")
     _work(body.get("build_s", 0.0), body, progress, cancelled)
     ballast = np.full(int(body.get("ballast_mb", 0.1) * 1e6), body["mark"], np.uint8)
-    store = StoreDouble(body["mark"], job.camera, job.settings.follows_field, ballast)
+    follows_field, filter_ms = job.settings.follows_field, body.get("filter_ms")
+    store = StoreDouble(body["mark"], job.camera, follows_field, ballast, filter_ms)
     return BuiltStore(store, ("a double",))
 
 

@@ -38,6 +38,12 @@ def expected(color, depth_m=2.0, **state):
         return eye.filter(color, depth_m, **{**STATE, **state}, whole=True).color
 
 
+@pytest.fixture(scope="module", autouse=True)
+def first_picture():
+    """Open a filter; before, the process loads what all filters use."""
+    expected(np.zeros((SIDE_PX, SIDE_PX, 3), np.uint8))
+
+
 def transform(**more):
     from ocufilter_torch import SeenThrough
 
@@ -70,6 +76,7 @@ def test_a_transform_takes_floats_as_srgb(color):
     assert np.abs(255.0 * seen - expected(color)).max() < 0.51 + 1e-3
 
 
+@pytest.mark.clients
 def test_a_transform_goes_to_other_processes(color):
     seen = transform()
     seen(color)
@@ -156,6 +163,7 @@ def camera_program(monkeypatch, camera, *arguments):
     runpy.run_path(str(ADAPTERS / "virtual_camera.py"), run_name="__main__")
 
 
+@pytest.mark.clients
 def test_a_virtual_camera_is_sent_what_the_eye_sees(monkeypatch, video, color):
     sent = []
 

@@ -1,11 +1,15 @@
 """`ocufilter batch`: the same bytes whoever makes them, in any order, after kills."""
 
+import fcntl
+import hashlib
 import json
 import os
 import random
 import shutil
 import signal
 import time
+from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +18,11 @@ from PIL import Image
 from clients.batch import program
 from clients.batch.exact_filter import ExactFilter
 from clients.batch.job import Job, batch_settings
+from clients.batch.layouts import LayoutOptions, list_frames
+from clients.batch.manifest import Manifest
+from clients.batch.source import FieldOfView
 from clients.batch.states import States
+from clients.batch.work import Unit, UnitRunner
 from filter_service import Camera, RgbdView
 from filter_service.image_files import read_color
 from tests.batch_kills import (
@@ -26,6 +34,7 @@ from tests.batch_kills import (
     wait_for_orphans,
     workers_of,
 )
+from tests.commands import run_command
 from tests.numerical.synthetic import psnr_db
 
 TIMEOUT_S = 120
@@ -37,10 +46,9 @@ MODE = ("--settings", '{"mode": "on-axis", "eye_model": "wavefront"}')
 
 
 def run(*arguments, code=0):
-    process = start(*arguments)
-    out, error = process.communicate(timeout=TIMEOUT_S)
-    assert process.returncode == code, error
-    return out, error
+    finished = run_command("batch", *arguments)
+    assert finished.returncode == code, finished.stderr
+    return finished.stdout, finished.stderr
 
 
 def write_frame(folder, name, rng):
@@ -84,6 +92,7 @@ def usual(room, tmp_path_factory):
     return out
 
 
+@pytest.mark.long("an eye is built over all pupils")
 def test_one_worker_makes_what_the_filter_makes(room, usual):
     states = States(4.0, 0.0)
     mode = json.loads(MODE[1])
@@ -122,12 +131,14 @@ def test_the_manifest_tells_of_every_frame(room, usual):
     assert "far point" in summary["notes"][0]["example"]
 
 
+@pytest.mark.clients
 def test_two_workers_of_two_threads_make_the_same_bytes(room, usual, tmp_path):
     common = (room, *PROFILES, *MODE, "--fov-deg", 20, "-o", tmp_path / "out")
     run(*common, "--workers", 2, "--threads", 2)
     assert pictures(tmp_path / "out") == pictures(usual)
 
 
+@pytest.mark.clients
 def test_the_other_engine_makes_the_same_pictures_and_says_so(room, usual, tmp_path):
     out = tmp_path / "out"
     run(room, *PROFILES, *MODE, "--fov-deg", 20, "-o", out, "--engine", "gl")
@@ -149,9 +160,10 @@ def finish_after_kills(room, out, n_kills):
     run(*arguments, "-o", out)
     wait_for_orphans(out)
     run(*arguments, "-o", out)  # clears what those left
-    assert not [path for path in out.rglob(".*") if ".part" in path.suffixes]
+    assert not list(out.rglob(".ocufilter-*"))
 
 
+@pytest.mark.clients
 def test_killed_at_random_moments_and_finished_nothing_is_lost(room, usual, tmp_path):
     out = tmp_path / "out"
     finish_after_kills(room, out, 1)
@@ -202,6 +214,7 @@ def test_killed_twenty_times_and_finished_nothing_is_lost(long_room, usual, tmp_
     assert pictures(out) == ten_times(pictures(usual))
 
 
+@pytest.mark.clients
 def test_a_rerun_does_only_what_is_missing(room, usual, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(usual, out)
@@ -212,9 +225,21 @@ def test_a_rerun_does_only_what_is_missing(room, usual, tmp_path):
     (out / "normal/004.png").write_bytes(b"cut short")
     with (out / "manifest.jsonl").open("ab") as file:
         file.write(b'{"kind": "frame", "profile": "myo')  # a power cut
-    (out / "myopia/.005.abc.part.png").write_bytes(b"half")
+    zeros = out / "normal/006.png"  # whose size is right
+    zeros.write_bytes(bytes(zeros.stat().st_size))
+    half = out / f"myopia/.ocufilter-{'0f' * 16}.part.png"
+    half.write_bytes(b"half")
+    of_the_user = {
+        out / name: b"of the user"
+        for name in (".mine.part.txt", "myopia/.005.abc.part.png", "myopia/.part")
+    }
+    for path, content in of_the_user.items():
+        path.write_bytes(content)
     told, _ = run(*arguments)
-    assert "80 of 80 images, 2 of them in this run" in told
+    assert "80 of 80 images, 3 of them in this run" in told
+    assert {path: path.read_bytes() for path in of_the_user} == of_the_user
+    for path in of_the_user:
+        path.unlink()
     assert pictures(out) == pictures(usual)
 
 
@@ -238,6 +263,48 @@ def test_another_job_in_the_same_folder_is_refused(room, usual, tmp_path, capsys
     assert "contains 'thesis.pdf' and no manifest.jsonl" in error
 
 
+def test_overwrite_beside_a_running_batch_removes_nothing(
+    room, usual, tmp_path, capsys
+):
+    out = tmp_path / "out"
+    shutil.copytree(usual, out)
+    arguments = (room, *PROFILES, *MODE, "--fov-deg", 20, "-o", out, "--overwrite")
+    with (out / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        error = refusal(capsys, *arguments)
+    assert "another batch is running there" in error
+    for name in ("manifest.jsonl", "manifest.json"):
+        assert (out / name).read_bytes() == (usual / name).read_bytes()
+    assert pictures(out) == pictures(usual)
+
+
+@pytest.mark.parametrize("name", ["myopia", ".segments"])
+def test_a_folder_of_results_that_is_a_link_is_refused(room, tmp_path, name, capsys):
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    common = (room, *PROFILES, *MODE, "--fov-deg", 20, "-o", out)
+    with Manifest(out_folder(out), {}):
+        (out / name).symlink_to(elsewhere)
+    assert f"{name}' leads outside" in refusal(capsys, *common, "--overwrite")
+    assert not list(elsewhere.iterdir())
+
+
+def out_folder(out):
+    out.mkdir()
+    return out
+
+
+@pytest.mark.clients
+def test_a_worker_does_not_follow_a_link_to_elsewhere(room, tmp_path):
+    """The link appears while the batch runs."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "out/myopia").symlink_to(tmp_path / "elsewhere")
+    (record,) = run_unit(room, tmp_path / "out", States(4.0, 0.0))
+    assert "leads outside" in record["error"]
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
 @pytest.mark.slow
 def test_overwrite_begins_anew(room, tmp_path):
     common = (room, "-p", "myopia", *MODE, "--fov-deg", 20, "-o", tmp_path / "out")
@@ -249,6 +316,86 @@ def test_overwrite_begins_anew(room, tmp_path):
     assert read_color(tmp_path / "out/myopia/000.exr").max() < 1.2
 
 
+def run_unit(room, out, states):
+    """Filter the first frame of a room as a worker does; return its record."""
+    optics = LayoutOptions(optics=FieldOfView(20.0))
+    _, frames = list_frames(room, "pairs", optics)
+    settings = batch_settings(json.loads(MODE[1]), states)
+    job = Job({"myopia": {"kind": "preset", "name": "myopia"}}, settings, states)
+    with closing(UnitRunner(job, out)) as runner:
+        return list(runner.run(Unit(0, "myopia", tuple(frames[:1]))))
+
+
+@pytest.mark.long("prepares an eye in its own process")
+def test_the_bytes_that_are_decoded_are_hashed(room, usual, tmp_path, rng):
+    """A file changes after it has been read, when the state of its frame is asked."""
+    copy = tmp_path / "room"
+    shutil.copytree(room, copy)
+
+    class Replacing(States):
+        def of(self, name, depth_m):
+            write_frame(copy, name, rng)
+            return super().of(name, depth_m)
+
+    (record,) = run_unit(copy, tmp_path / "out", Replacing(4.0, 0.0))
+    files = [room / part / "000.png" for part in ("color", "depth")]
+    assert [one["sha256"] for one in record["inputs"]] == [
+        hashlib.sha256(path.read_bytes()).hexdigest() for path in files
+    ]
+    seen = (tmp_path / "out/myopia/000.png").read_bytes()
+    assert seen == (usual / "myopia/000.png").read_bytes()
+
+
+@pytest.mark.clients
+def test_names_of_any_bytes_are_resumed(tmp_path, rng):
+    """Also of folders, and of two names that look alike."""
+    names = [b"caf\xe9", rb"caf\xe9", b"two\nlines", "\u4e2d".encode() * 83]
+    room = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xe9 room"))
+    for part in ("color", "depth"):
+        (room / part).mkdir(parents=True)
+    for name in names:
+        write_frame(room, os.fsdecode(name), rng)
+    (room / "depth" / os.fsdecode(b"no color \xe9\n.png")).write_bytes(b"")
+    out = room / "out"
+    common = (room, "-p", "myopia", *MODE, "--fov-deg", 20, "-o", out, "--workers", 1)
+    told, error = run(*common, "--json", code=1)
+    assert json.loads(told)["frames_done"] == {"myopia": 4}
+    assert error.count("\n") == 2  # the frame and the number of them
+    found = {os.fsencode(path.name) for path in (out / "myopia").iterdir()}
+    assert found == {name + b".png" for name in names}
+    lines = (out / "manifest.jsonl").read_text(encoding="ascii").splitlines()
+    for line in (*lines, (out / "manifest.json").read_text(encoding="ascii")):
+        json.dumps(json.loads(line), ensure_ascii=False).encode()  # valid Unicode
+    (out / "myopia" / os.fsdecode(names[1] + b".png")).unlink()
+    told, _ = run(*common, code=1)
+    assert "4 of 5 images, 1 of them in this run" in told
+
+
+@pytest.mark.clients
+def test_frames_of_another_camera_are_filtered_again(room, tmp_path):
+    common = (room, "-p", "myopia", *MODE, "-o", tmp_path / "out", "--limit", 2)
+    run(*common, "--fov-deg", 20, "--workers", 1)
+    before = pictures(tmp_path / "out")
+    told, _ = run(*common, "--fov-deg", 30, "--workers", 1)
+    assert "2 of 2 images, 2 of them in this run" in told
+    now = pictures(tmp_path / "out")
+    assert all(now[name] != before[name] for name in before)
+
+
+@pytest.mark.clients
+def test_a_video_of_zeros_is_joined_again(room, tmp_path):
+    out = tmp_path / "out"
+    common = (room, "-p", "myopia", *VIDEO, "ffv1", "-o", out, "--limit", 3)
+    run(*common, "--workers", 1)
+    video = out / "myopia.mkv"
+    before = video.read_bytes()
+    video.write_bytes(bytes(len(before)))
+    told, _ = run(*common, "--workers", 1)
+    assert "0 of them in this run" in told
+    assert video.read_bytes() == before
+
+
+@pytest.mark.long("two runs, each with a process that builds an eye")
 def test_bad_files_are_named_and_the_rest_goes_on(tmp_path, rng):
     room = tmp_path / "room"
     for name in ("color", "depth"):
@@ -314,6 +461,7 @@ def test_videos_are_the_same_bytes_by_two_workers_and_after_a_kill(
     assert (len(frames), rate_hz) == (10 * COUNT, 24.0)
 
 
+@pytest.mark.clients
 def test_a_dry_run_measures_and_writes_nothing(room, tmp_path):
     out = tmp_path / "out"
     common = (room, "-p", "myopia", *MODE, "--fov-deg", 20, "-o", out, "--dry-run")
@@ -342,6 +490,7 @@ def test_a_dry_run_of_frames_that_cannot_be_read_fails_with_each_error_once(tmp_
     assert out.count("error: ") == 3  # each names its file
 
 
+@pytest.mark.clients
 def test_a_dry_run_groups_notes_as_a_run_does(room, tmp_path):
     """Six frames of the measured eye, each with a focus of its own beyond reach."""
     lines = [f"{n:03d},4,{0.1 * n:.2f}" for n in range(COUNT)]
@@ -354,6 +503,7 @@ def test_a_dry_run_groups_notes_as_a_run_does(room, tmp_path):
     assert "6 frames: focus" in notes[0]
 
 
+@pytest.mark.clients
 def test_profiles_may_be_json_and_photographs_are_turned_upright(tmp_path, rng):
     room = tmp_path / "room"
     for name in ("color", "depth"):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from clients.filter_client import FilterClient, FilteredFrame, RgbdView
-from clients.service_process import ServiceProcess
 from filter_service.camera import tangents_from_fov
 from filter_service.messages import Accepted, Ready
 
@@ -27,16 +26,10 @@ def noise_view(rng, width_px, height_px):
     return RgbdView(color, depth_m, tangents_from_fov(40.0, width_px, height_px))
 
 
-@pytest.fixture(scope="module")
-def service():
-    with ServiceProcess(start_timeout_s=30.0) as service:
-        yield service
-
-
 @pytest.fixture
-def prepared(service, rng):
+def prepared(real_service, rng):
     """Two clients with their views and what they see alone."""
-    clients = [FilterClient(service.endpoint, timeout_s=60.0) for _ in range(2)]
+    clients = [FilterClient(real_service.endpoint, timeout_s=60.0) for _ in range(2)]
     with clients[0], clients[1]:
         found = []
         for client, size in zip(clients, (LONG, SHORT), strict=True):
@@ -85,7 +78,7 @@ def test_another_eye_is_accepted_and_made_ready_meanwhile(prepared):
     assert quick.filter(small, **SEE).color.tobytes() != small_alone.tobytes()
 
 
-def test_a_client_may_leave_in_the_middle_of_its_frame(service, prepared):
+def test_a_client_may_leave_in_the_middle_of_its_frame(real_service, prepared):
     (slow, large, _), (quick, small, small_alone) = prepared
     slow.submit(large, **SEE)
     time.sleep(0.2)
@@ -96,15 +89,14 @@ def test_a_client_may_leave_in_the_middle_of_its_frame(service, prepared):
         time.sleep(0.05)
     assert quick.ping()[1].n_sessions == 1
     assert quick.filter(small, **SEE).color.tobytes() == small_alone.tobytes()
-    assert service.process.poll() is None
+    assert real_service.process.poll() is None
 
 
-def test_the_service_stops_in_the_middle_of_a_frame(rng):
-    with ServiceProcess(start_timeout_s=30.0) as service:
-        with FilterClient(service.endpoint, timeout_s=60.0) as client:
-            view = noise_view(rng, *LONG)
-            client.set_profile(MYOPIA, settings=NARROW, views=[view])
-            client.filter(view, **SEE)
-            client.submit(view, **SEE)
-            time.sleep(0.2)
-            assert service.stop(4.0) == 0
+def test_the_service_stops_in_the_middle_of_a_frame(real_service, rng):
+    with FilterClient(real_service.endpoint, timeout_s=60.0) as client:
+        view = noise_view(rng, *LONG)
+        client.set_profile(MYOPIA, settings=NARROW, views=[view])
+        client.filter(view, **SEE)
+        client.submit(view, **SEE)
+        time.sleep(0.2)
+        assert real_service.stop(4.0) == 0

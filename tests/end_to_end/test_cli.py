@@ -5,21 +5,27 @@ import os
 import shutil
 import subprocess
 import sys
+from importlib.metadata import version
 
 import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image
 
+import clients
+import estimator
+import filter_service
 from estimator.networks.card import NETWORK_NAMES
+from tests.commands import full_disk
+from tests.commands import run_command as run
 from tests.source_tree import ROOT
 
 TIMEOUT_S = 120
 WIDTH_PX, HEIGHT_PX = 48, 32
 
 
-def run(*arguments, cwd=ROOT, **environment):
-    """Run the program; cwd is the checkout unless a test says otherwise."""
+def run_process(*arguments, cwd=ROOT, **environment):
+    """Run the program in a process of its own, for what is read at its start."""
     return subprocess.run(
         [sys.executable, "-m", "filter_service", *map(str, arguments)],
         cwd=cwd,
@@ -74,6 +80,7 @@ PLAIN = ("--mode", "on-axis", "--eye-model", "wavefront")
 IDENTITY = ("--no-diffraction", "--no-chromatic", "--pupil-mm", "3", *PLAIN)
 
 
+@pytest.mark.long("seven probes, each in a process of its own")
 def test_doctor_reports_a_machine_that_can_serve():
     report = run_json("doctor")
     assert report["ok"]
@@ -89,10 +96,29 @@ def test_doctor_reports_a_machine_that_can_serve():
     assert checks["networks"]
     assert set(report["networks"]) == set(NETWORK_NAMES)
     assert all(card["n_parameters"] > 0 for card in report["networks"].values())
+    assert report["version"] == version("ocufilter")
 
 
+def test_the_version_is_that_of_the_installed_package():
+    finished = run("--version")
+    assert (finished.returncode, finished.stderr) == (0, "")
+    assert finished.stdout == f"ocufilter {version('ocufilter')}\n"
+    assert {p.__version__ for p in (clients, estimator, filter_service)} == {
+        version("ocufilter")
+    }
+
+
+@pytest.mark.parametrize("command", [(), ("status",), ("keys", "add")])
+def test_help_has_a_short_name(command):
+    short, long = run(*command, "-h"), run(*command, "--help")
+    assert short.returncode == long.returncode == 0, short.stderr
+    assert short.stdout == long.stdout
+    assert "usage:" in short.stdout.lower()
+
+
+@pytest.mark.slow
 def test_doctor_without_opengl_says_that_the_service_works_and_the_demo_does_not():
-    finished = run("doctor", "--json", **NO_OPENGL)
+    finished = run_process("doctor", "--json", **NO_OPENGL)
     assert finished.returncode == 0
     report = json.loads(finished.stdout)
     assert report["works"]["serve"]
@@ -102,6 +128,7 @@ def test_doctor_without_opengl_says_that_the_service_works_and_the_demo_does_not
     assert any("apt-get install" in command for command in report["install"])
 
 
+@pytest.mark.long("the program looks for devices twice")
 def test_a_device_that_is_not_there_is_refused_with_those_that_are(scene):
     folder, _ = scene
     arguments = filter_arguments(folder, *IDENTITY, "--engine", "gl")
@@ -116,7 +143,8 @@ def test_a_device_that_is_not_there_is_refused_with_those_that_are(scene):
 
 def test_a_picture_needs_no_opengl(scene):
     folder, linear = scene
-    finished = run(*filter_arguments(folder, *IDENTITY), "--json", **NO_OPENGL)
+    arguments = filter_arguments(folder, *IDENTITY)
+    finished = run(*arguments, "--json", **NO_OPENGL)
     assert finished.returncode == 0, finished.stderr
     assert json.loads(finished.stdout)["engine"] == "native"
     assert psnr_db(np.load(folder / "out.npy"), linear) >= 60.0
@@ -144,7 +172,7 @@ def test_an_unaberrated_eye_gives_the_image_back(scene):
 
 def test_exr_and_npy_outputs_hold_the_same_linear_light(scene):
     folder, _ = scene
-    defocus = ("--pupil-mm", "3")
+    defocus = ("--pupil-mm", "3", *PLAIN)
     run_json(*filter_arguments(folder, *defocus, profile="myopia"))
     run_json(*filter_arguments(folder, *defocus, profile="myopia", out="out.exr"))
     with OpenEXR.File(str(folder / "out.exr")) as file:
@@ -192,7 +220,8 @@ def test_missing_depth_is_filled_and_counted(scene):
     depth_m = np.load(folder / "depth.npy")
     depth_m[3, 5:9] = [0.0, -1.0, np.nan, 2.0]
     np.save(folder / "depth.npy", depth_m)
-    assert run_json(*filter_arguments(folder))["missing_depth_count"] == 3
+    summary = run_json(*filter_arguments(folder, *IDENTITY))
+    assert summary["missing_depth_count"] == 3
 
 
 def write_depth(folder, *stored_m):
@@ -329,14 +358,17 @@ def test_a_wrong_profile_is_named_with_what_may_have_been_meant(scene, profile, 
 
 def test_progress_names_what_is_done(scene):
     folder, _ = scene
-    finished = run(*filter_arguments(folder))
+    finished = run(*filter_arguments(folder, *PLAIN))
     stages = [line.partition("] ")[2] for line in finished.stderr.splitlines()]
     assert "preparing: frame, 100 %" in stages
     assert any(stage.startswith("preparing: PSFs, ") for stage in stages)
     assert not any("psfs" in stage for stage in stages)
 
 
-@pytest.mark.parametrize("pupil_mm", [2.90511, 3.333333])
+@pytest.mark.parametrize(
+    "pupil_mm", [2.90511, pytest.param(3.333333, marks=pytest.mark.slow)]
+)
+@pytest.mark.long("an eye is estimated and traced")
 def test_a_pupil_is_never_outside_what_was_prepared_for_it(scene, pupil_mm):
     folder, _ = scene
     extra = ("--pupil-mm", pupil_mm, "--mode", "quality", "--json")
@@ -356,7 +388,7 @@ def test_a_pupil_above_the_measured_one_is_capped_and_said(scene):
 
 def test_a_traced_eye_says_how_it_was_found(scene):
     folder, _ = scene
-    traced = filter_arguments(folder, "--eye-model", "traced")
+    traced = filter_arguments(folder, "--eye-model", "traced", "--mode", "on-axis")
     notes = run_json(*traced)["notes"]
     assert "refined from a table's eye" in notes[0]
     assert not any("network" in note or "accuracy" in note for note in notes)
@@ -367,7 +399,7 @@ def test_a_traced_eye_says_how_it_was_found(scene):
 
 def test_cones_weigh_the_pupil_where_that_is_asked_for(scene):
     folder, _ = scene
-    pupil = ("--pupil-mm", 5)
+    pupil = ("--pupil-mm", 5, *PLAIN)
     images = []
     for extra in ((), ("--stiles-crawford",)):
         run_json(*filter_arguments(folder, *pupil, *extra, profile="astigmatism"))
@@ -546,6 +578,7 @@ def test_other_commands_refuse_bad_input_with_one_line(arguments, named):
     assert named in refusal(*arguments)
 
 
+@pytest.mark.tools
 def test_benchmarks_say_that_they_need_a_checkout(tmp_path):
     (tmp_path / "estimator").symlink_to(ROOT / "estimator")
     for package in ("filter_service", "clients"):
@@ -570,5 +603,44 @@ def test_benchmarks_say_that_they_need_a_checkout(tmp_path):
 def test_help_without_arguments_teaches_the_commands():
     finished = run()
     assert finished.returncode == 0
-    for command in ("demo", "serve", "filter", "psf", "bench", "doctor", "prepare"):
+    for command in ("demo", "serve", "latency", "filter", "psf", "bench", "doctor"):
         assert f"\n  {command} " in finished.stdout
+
+
+STATE = ("--pupil-mm", 3, "--wavelength-nm", 555)
+FINE = ("--pixel-arcmin", 0.25)
+
+
+@pytest.mark.long("computes what it then cannot write")
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (("psf", "myopia", *STATE, *FINE, "-o"), "psf.npy"),
+        (("psf", "myopia", *STATE, *FINE, "-o"), "psf.png"),
+        (("field", "$a", *STATE, "--h-deg", 0, "--plot"), "field.png"),
+        (("estimate", "$a", "--plot"), "eye.png"),
+    ],
+)
+def test_a_full_disk_leaves_the_earlier_file(tmp_path, words, name):
+    """And a name that matplotlib would take for a formula does no harm."""
+    profile = tmp_path / "a.json"
+    profile.write_text(
+        json.dumps({"kind": "prescription", "sphere_dpt": -2, "name": r"$\nope$"})
+    )
+    out = tmp_path / name
+    out.write_text("earlier")
+    with full_disk():
+        ended = run(*(profile if word == "$a" else word for word in words), out)
+    assert ended.returncode == 1
+    assert "too large" in ended.stderr or "requested and" in ended.stderr  # np.save
+    assert out.read_text() == "earlier"
+    assert {path.name for path in tmp_path.iterdir()} == {"a.json", name}
+
+
+@pytest.mark.long("computes a PSF")
+def test_a_name_of_a_file_that_is_no_utf_8_ends_no_command(tmp_path):
+    out = tmp_path / os.fsdecode(b"\xff.npy")
+    ended = run("psf", "myopia", *STATE, *FINE, "-o", out)
+    assert ended.returncode == 0, ended.stderr
+    assert out.exists()
+    assert r"\udcff.npy: myopia" in ended.stdout

@@ -26,6 +26,8 @@ from tests.corpus.freeze import (
 )
 from tests.end_to_end import test_javascript as javascript
 
+pytestmark = pytest.mark.tools
+
 
 def frozen(name):
     return json.loads((FOLDER / name).read_text(encoding="utf-8"))
@@ -140,13 +142,13 @@ def test_commands_print_the_json_that_they_did(tmp_path):
 
 
 @javascript.needs_node
-def test_the_javascript_client_of_before_works(start_service, tmp_path, monkeypatch):
+def test_the_javascript_client_of_before_works(shared_service, tmp_path, monkeypatch):
     for name in ("filter_client.js", "check.js"):
         shutil.copy(FOLDER / "js" / name, tmp_path / name)
     for name in ("node_modules", "package.json"):
         (tmp_path / name).symlink_to(javascript.FOLDER / name)
     monkeypatch.setattr(javascript, "FOLDER", tmp_path)
     profiles = [json.dumps({"kind": "double", "mark": mark}) for mark in (5, 7, 8)]
-    found = javascript.checked(start_service(), *profiles)
+    found = javascript.checked(shared_service, *profiles)
     assert found["stereo"] == [235, 225]
     assert found["eyesAgain"] == [7, 8]

@@ -23,7 +23,7 @@ from clients.scenes.catalog import build_scene
 from clients.service_process import CHECKOUT, ServiceProcess
 from filter_service.progress import INTERVAL_S
 
-pytestmark = pytest.mark.clock
+pytestmark = pytest.mark.clients
 
 N_FRAMES = 4
 SIZE_PX = (160, 90)
@@ -45,6 +45,7 @@ def demo_run(tmp_path_factory):
     return folder, report, [*lines, ("", time.monotonic())]
 
 
+@pytest.mark.clock
 def test_demo_says_into_a_pipe_what_it_does(demo_run):
     *_, lines = demo_run
     text = "".join(line for line, _ in lines)
@@ -112,11 +113,18 @@ def _detail(image):
     return np.abs(np.diff(image.astype(int).mean(axis=-1), axis=1)).mean()
 
 
+def primitives_only(name):
+    """The scene that takes the least time to build."""
+    return build_scene("primitives")
+
+
 def test_demo_reports_a_service_that_does_not_start(monkeypatch, capsys, tmp_path):
     command = (sys.executable, "-c", "print('no GL here'); raise SystemExit(3)")
     broken = functools.partial(ServiceProcess, command=command)
     monkeypatch.setattr(demo, "ServiceProcess", broken)
-    assert demo.main(["--out", str(tmp_path), "--frames", "1"]) == 1
+    monkeypatch.setattr(demo, "build_scene", primitives_only)
+    arguments = ["--out", str(tmp_path), "--frames", "1", "--size", "64x36"]
+    assert demo.main(arguments) == 1
     error = capsys.readouterr().err
     assert "code 3" in error
     assert "no GL here" in error
@@ -125,16 +133,14 @@ def test_demo_reports_a_service_that_does_not_start(monkeypatch, capsys, tmp_pat
 def test_demo_reports_a_service_that_dies_on_the_way(monkeypatch, capsys, tmp_path):
     change_eye, services = demo.change_eye, []
 
-    def primitives_only(name):
-        return build_scene("primitives")
-
     def recorded(**options):
         services.append(ServiceProcess(**options))
         return services[0]
 
-    def change_then_kill(*args, **settings):
-        change = change_eye(*args, **settings)
+    def change_then_kill(client, *args, **settings):
+        change = change_eye(client, *args, **settings)
         services[0].process.kill()
+        client.timeout_s = 3.0  # for a frame that is sent after the connection ended
         return change
 
     monkeypatch.setattr(demo, "build_scene", primitives_only)
@@ -209,7 +215,9 @@ def test_settings_cover_the_whole_path():
     assert high >= 4.0
 
 
-def test_the_gaze_goes_round_the_image_as_far_as_was_asked(monkeypatch, capsys):
+def test_the_gaze_goes_round_the_image_as_far_as_was_asked(
+    shared_service, monkeypatch, capsys
+):
     asked = []
 
     def submit(client, views, **state):
@@ -218,15 +226,14 @@ def test_the_gaze_goes_round_the_image_as_far_as_was_asked(monkeypatch, capsys):
 
     original = pyrender_stream.FilterClient.submit
     monkeypatch.setattr(pyrender_stream.FilterClient, "submit", submit)
-    with ServiceProcess(
-        command=(sys.executable, "-m", "tests.end_to_end.double_service")
-    ) as service:
-        arguments = ["--endpoint", service.endpoint, "--size", "64x36", "--frames", "4"]
-        monkeypatch.setattr(
-            pyrender_stream, "read_profile", lambda name: {"kind": "double", "mark": 1}
-        )
-        assert pyrender_stream.main([*arguments, "--look-around", "20"]) == 0
-        assert pyrender_stream.main([*arguments, "--look-around", "31"]) == 2
+    monkeypatch.setattr(
+        pyrender_stream, "read_profile", lambda name: {"kind": "double", "mark": 1}
+    )
+    endpoint = shared_service.endpoint
+    arguments = ["--endpoint", endpoint, "--size", "64x36", "--frames", "4"]
+    arguments += ["--scene", "primitives"]
+    assert pyrender_stream.main([*arguments, "--look-around", "20"]) == 0
+    assert pyrender_stream.main([*arguments, "--look-around", "31"]) == 2
     assert asked[0] == (0.0, 10.0)
     assert len(asked) == 4
     assert all(np.hypot(h, 2 * v) == pytest.approx(20) for h, v in asked)
@@ -272,6 +279,6 @@ def test_a_profile_that_is_none_is_named_with_its_option(tmp_path, name, text, w
     with pytest.raises(ValueError, match=words):
         read_profile(str(path), "--left")
     path.unlink()
-    if path.suffix != ".txt":  # a name, as of a preset
-        with pytest.raises(ValueError, match=r"--left .*does not exist"):
-            read_profile(str(path), "--left")
+    said = "is not known" if path.suffix == ".txt" else "does not exist"
+    with pytest.raises(ValueError, match=rf"--left .*{said}"):
+        read_profile(str(path), "--left")

@@ -73,10 +73,9 @@ def test_of_as_many_sessions_the_device_that_had_less_to_do_is_taken(
     assert sessions_on(service) == [1, 2]
 
 
-def test_each_eye_is_on_its_device_and_all_frames_are_counted(
-    start_service, raw_client
-):
-    service = start_service(devices=TWO)
+def test_each_eye_is_on_its_device_and_all_frames_are_counted(use_service, raw_client):
+    service = use_service(devices=TWO)
+    n_before = [device["n_rendered"] for device in devices_of(service)]
     raws = [raw_client(service) for _ in range(4)]
     for mark, raw in enumerate(raws, start=1):
         raw.begin(mark=mark)
@@ -85,15 +84,17 @@ def test_each_eye_is_on_its_device_and_all_frames_are_counted(
             answer = raw.ask(small_frame(frame_id))
             assert (answer.frame_id, answer.colors[0][0, 0, 0]) == (frame_id, mark)
     pong = raws[0].ask(Ping(1.0))
-    assert [device.n_rendered for device in pong.devices] == [6, 6]
-    assert (pong.n_rendered, pong.n_sessions, pong.is_ready) == (12, 4, True)
+    n_rendered = [device.n_rendered for device in pong.devices]
+    assert [now - n for now, n in zip(n_rendered, n_before, strict=True)] == [6, 6]
+    assert pong.n_rendered == sum(n_rendered)
+    assert (pong.n_sessions, pong.is_ready) == (4, True)
 
 
-def test_devices_filter_side_by_side(start_service, raw_client):
-    service = start_service(devices=TWO, filter_ms=1500)
+def test_devices_filter_side_by_side(use_service, raw_client):
+    service = use_service(devices=TWO)
     first, second = raw_client(service), raw_client(service)
-    first.begin(mark=1)
-    second.begin(mark=2)
+    first.begin(mark=1, more={"filter_ms": 800})
+    second.begin(mark=2, more={"filter_ms": 800})
     for frame_id, raw in enumerate((first, second)):
         raw.send(encode(small_frame(frame_id)))
     wait_until(lambda: all(d["is_filtering"] for d in devices_of(service)))

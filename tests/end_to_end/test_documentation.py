@@ -20,7 +20,15 @@ def example_of(path) -> str:
     return "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
 
 
-@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+@pytest.mark.long("a process of its own traces and computes eyes")
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(p, marks=[] if p.stem == "python" else pytest.mark.clients)
+        for p in PAGES
+    ],
+    ids=lambda path: path.stem,
+)
 def test_the_examples_of_a_page_run(path, tmp_path):
     script = tmp_path / "example.py"
     script.write_text(example_of(path), encoding="utf-8")
@@ -40,6 +48,11 @@ def test_the_examples_of_a_page_run(path, tmp_path):
         assert printed == "[(90, 160, 3), (90, 160, 3)]\n"
     if path.stem == "stream":
         assert re.fullmatch(r"\(90, 160, 3\) [\d.]+ ms\n", printed)
+    if path.stem == "pyrender":
+        lines = [line.split(") ") for line in printed.splitlines()]
+        assert [shape for shape, _ in lines] == ["(90, 160, 3"] * 3
+        pupils_mm = [float(state.split()[0]) for _, state in lines]
+        assert (pupils_mm[0], pupils_mm[2]) == (3.0, 5.0)
     if path.stem == "measurements":
         eye_length_mm, error_um = map(float, printed.splitlines()[0].split())
         assert 20.0 < eye_length_mm < 30.0
@@ -47,6 +60,7 @@ def test_the_examples_of_a_page_run(path, tmp_path):
         assert printed.splitlines()[-1] == "1.0"
 
 
+@pytest.mark.clients
 def test_the_readme_s_example_prints_what_it_shows(tmp_path):
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     example = re.search(r"```python\n(.*?)```\n\n```text\n(.*?)```", readme, re.DOTALL)

@@ -34,6 +34,7 @@ def test_estimated_parameters_are_a_profile_of_their_own(tmp_path):
     assert abs(again["refraction_dpt"] - found["refraction_dpt"]) < 1.0  # other pupil
 
 
+@pytest.mark.long("an eye is estimated and drawn")
 def test_plot_is_a_picture_with_a_report(tmp_path):
     path = tmp_path / "eye.png"
     finished = run("estimate", "myopia", "--plot", path)
@@ -65,6 +66,7 @@ def test_beyond_the_network_s_training_the_eye_is_refined_with_a_note(tmp_path):
     assert any("zernike_j4_um" in note for note in found["notes"])
 
 
+@pytest.mark.long("a search is given 0.5 s")
 def test_search_stops_when_told():
     found = run_json("estimate", "myopia", "--method", "search", "--max-time-s", "0.5")
     assert found["method"] == "search"

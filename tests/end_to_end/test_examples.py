@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from tests.end_to_end.printed_script import printed_by
@@ -42,6 +43,11 @@ def detail(part: np.ndarray) -> float:
     return float(np.abs(np.diff(part[..., 1], axis=1)).mean())
 
 
+def steepest(part: np.ndarray) -> float:
+    """Return the largest step between neighboring pixels: less where edges blur."""
+    return float(np.abs(np.diff(part[..., 1], axis=1)).max())
+
+
 def cell(page: np.ndarray, row: int, column: int, shape) -> np.ndarray:
     """One picture of a page of `save_pictures`."""
     rows, columns = shape
@@ -50,6 +56,7 @@ def cell(page: np.ndarray, row: int, column: int, shape) -> np.ndarray:
     return page[top : top + round(height) - 26, left : left + round(width) - 6]
 
 
+@pytest.mark.clients
 def test_the_first_picture_by_itself_in_another_folder(tmp_path):
     said = printed_by(EXAMPLES / "01_first_picture.py", cwd=tmp_path)
     assert said.strip() == str(OUT / "01_first_picture.png")
@@ -59,6 +66,7 @@ def test_the_first_picture_by_itself_in_another_folder(tmp_path):
     assert detail(seen) < 0.6 * detail(scene)
 
 
+@pytest.mark.clients
 def test_an_aberrometers_file_gives_points_and_a_curve(run, capsys):
     page = run("02_aberrometer_to_field")
     assert page.std() > 50.0
@@ -67,6 +75,7 @@ def test_an_aberrometers_file_gives_points_and_a_curve(run, capsys):
     assert "periphery: " in said
 
 
+@pytest.mark.clients
 def test_of_three_cards_the_one_looked_at_is_sharp(run):
     page = run("03_own_scene")
     far = cell(page, 1, 1, (2, 2))  # looks at 5 m
@@ -74,6 +83,7 @@ def test_of_three_cards_the_one_looked_at_is_sharp(run):
     assert detail(far_card) > 2.0 * detail(near)
 
 
+@pytest.mark.clients
 @pytest.mark.slow
 def test_of_two_eyes_the_short_sighted_one_blurs_what_is_far(run):
     page = run("04_stereo")
@@ -81,6 +91,7 @@ def test_of_two_eyes_the_short_sighted_one_blurs_what_is_far(run):
     assert detail(right) > 1.2 * detail(left)
 
 
+@pytest.mark.clients
 def test_through_focus_the_card_is_sharp_where_it_hangs(run):
     page = run("05_through_focus")
     row = [detail(cell(page, 0, column, (3, 5))) for column in range(5)]
@@ -88,6 +99,7 @@ def test_through_focus_the_card_is_sharp_where_it_hangs(run):
     assert row[2] > 1.3 * max(row[0], row[4])
 
 
+@pytest.mark.clients
 @pytest.mark.slow
 def test_streamed_frames_change_with_the_eye(run, capsys):
     page = run("06_streaming")
@@ -96,6 +108,7 @@ def test_streamed_frames_change_with_the_eye(run, capsys):
     assert re.search(r"24 frames, \d+ ms each", capsys.readouterr().out)
 
 
+@pytest.mark.clients
 def test_the_data_set_has_its_labels(run, tmp_path):
     run("07_augment_data_set")
     folder = tmp_path / OUT / "letters"
@@ -107,11 +120,35 @@ def test_the_data_set_has_its_labels(run, tmp_path):
     assert len({(folder / row["file"]).read_bytes() for row in rows}) == len(rows)
 
 
+@pytest.mark.clients
+def test_of_three_meshes_the_one_looked_at_is_sharp_through_two_cameras(run, capsys):
+    page = run("09_pyrender")
+    assert "12 frames of 3 meshes by each camera" in capsys.readouterr().out
+    for row in (0, 1):
+        near, far = (cell(page, row, column, (2, 3)) for column in (1, 2))
+        box, ring = np.s_[40:150, 55:115], np.s_[:140, 220:]
+        assert steepest(near[box]) > 1.3 * steepest(far[box])
+        assert steepest(far[ring]) > 1.3 * steepest(near[ring])
+
+
+@pytest.mark.clients
+def test_a_mesh_of_trimesh_blurs_where_the_eye_focuses_before_it(
+    run, tmp_path, monkeypatch
+):
+    path = tmp_path / "ring.stl"
+    trimesh.creation.annulus(1.0, 2.0, 1.0).export(path)
+    monkeypatch.setattr("sys.argv", ["10_trimesh.py", str(path)])
+    page = run("10_trimesh")
+    mesh, sharp, blurred = (cell(page, 0, column, (1, 3)) for column in (0, 1, 2))
+    assert steepest(sharp) > 0.7 * steepest(mesh)
+    assert steepest(blurred) < 0.7 * steepest(sharp)
+
+
 def test_every_example_is_on_the_page_with_its_picture():
     named = re.findall(r"\[`(\d\d_\w+\.(?:py|ipynb))`\]\(\1\)", PAGE)
     files = sorted(p.name for p in EXAMPLES.glob("[0-9]*"))
     assert named == files
-    assert len(SCRIPTS) == 7
+    assert len(SCRIPTS) == 9
     for name in files:
         assert f"](pictures/{Path(name).stem}.jpg)" in PAGE
     pictures = list((EXAMPLES / "pictures").glob("*.jpg"))

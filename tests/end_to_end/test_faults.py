@@ -181,7 +181,7 @@ def await_standby(service, other_than=None):
 
 
 def test_who_stands_by_takes_over_and_another_stands_by(start_service, monkeypatch):
-    monkeypatch.setenv("OCUFILTER_TEST_STANDBY_AFTER_S", "0.5")
+    monkeypatch.setenv("OCUFILTER_TEST_STANDBY_AFTER_S", "0.1")
     service = start_service(standby=True)
     view = make_view()
     with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
@@ -204,14 +204,13 @@ def test_who_stands_by_takes_over_and_another_stands_by(start_service, monkeypat
 
 
 def test_a_session_is_taken_up_by_its_key_and_by_nothing_else(
-    start_service, raw_client
+    shared_service, raw_client
 ):
-    service = start_service(alive_interval_s=0.05)
-    first = raw_client(service)
+    first = raw_client(shared_service)
     welcome = first.begin(mark=7)
     assert not welcome.is_resumed
     first.close()
-    stranger, second = raw_client(service), raw_client(service)
+    stranger, second = raw_client(shared_service), raw_client(shared_service)
     answer = stranger.ask(Hello("stranger", "0" * 32))
     assert not answer.is_resumed
     assert answer.session_id != welcome.session_id
@@ -222,12 +221,11 @@ def test_a_session_is_taken_up_by_its_key_and_by_nothing_else(
     assert (result.type_name, result.colors[0][0, 0, 0]) == ("result", 7)
 
 
-def test_a_session_ends_when_its_client_stays_away(start_service, raw_client):
-    service = start_service(alive_interval_s=0.05, session_keep_s=0.3)
-    first, second = raw_client(service), raw_client(service)
+def test_a_session_ends_when_its_client_stays_away(brief_service, raw_client):
+    first, second = raw_client(brief_service), raw_client(brief_service)
     key = first.begin().session_key
     first.close()
-    wait_until(lambda: "the client did not reconnect" in service.log)
+    wait_until(lambda: "the client did not reconnect" in brief_service.log)
     assert not second.ask(Hello("late", key)).is_resumed
 
 
@@ -243,10 +241,9 @@ def test_a_clean_end_is_told(start_service, raw_client):
 # Who waits for whom
 
 
-def test_the_front_end_answers_while_a_frame_is_filtered(start_service, raw_client):
-    service = start_service(filter_ms=1500)
-    raw, other = raw_client(service), raw_client(service)
-    raw.begin()
+def test_the_front_end_answers_while_a_frame_is_filtered(shared_service, raw_client):
+    raw, other = raw_client(shared_service), raw_client(shared_service)
+    raw.begin(more={"filter_ms": 1000})
     raw.send(encode(small_frame(1)))
     time.sleep(0.1)
     took_ms = []
@@ -260,19 +257,18 @@ def test_the_front_end_answers_while_a_frame_is_filtered(start_service, raw_clie
 
 
 @pytest.mark.parametrize("flood", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_clients_share_time_whatever_their_frames_take(start_service, flood):
+def test_clients_share_time_whatever_their_frames_take(shared_service, flood):
     """One has frames twice as wide; the double takes as long for each view."""
-    service = start_service(filter_ms=30)
     view = make_view()
     with (
-        FilterClient(service.endpoint, max_in_flight=2) as slow,
-        FilterClient(service.endpoint, max_in_flight=2) as quick,
+        FilterClient(shared_service.endpoint, max_in_flight=2) as slow,
+        FilterClient(shared_service.endpoint, max_in_flight=2) as quick,
     ):
         views = {slow: [view] * 2, quick: [view]}
         for client, shown in views.items():
-            client.set_profile(EYE, views=shown[:1])
+            client.set_profile(EYE | {"filter_ms": 30}, views=shown[:1])
         used_ms = dict.fromkeys(views, 0.0)
-        end_s = time.monotonic() + 4.0
+        end_s = time.monotonic() + 3.0
         while time.monotonic() < end_s:
             for client, shown in views.items():
                 wanted = 8 if flood and client is slow else 2
@@ -284,16 +280,17 @@ def test_clients_share_time_whatever_their_frames_take(start_service, flood):
     assert used_ms[slow] == pytest.approx(used_ms[quick], rel=0.15)
 
 
-def test_a_storm_of_profiles_mixes_no_eyes_and_ends_with_the_newest(start_service):
-    service = start_service(filter_ms=5)
+def test_a_storm_of_profiles_mixes_no_eyes_and_ends_with_the_newest(shared_service):
     view = make_view()
-    with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
-        client.set_profile(EYE | {"mark": 0}, views=[view])
+    with FilterClient(shared_service.endpoint, timeout_s=TIMEOUT_S) as client:
+        client.set_profile(EYE | {"mark": 0, "filter_ms": 5}, views=[view])
         marks = {}
         for mark in range(1, 101):
             accepted = client._link  # the storm does not wait for answers
             request = ProfileRequest(
-                1000 + mark, EYE | {"mark": mark}, views=(view.camera,)
+                1000 + mark,
+                EYE | {"mark": mark, "filter_ms": 5},
+                views=(view.camera,),
             )
             accepted.profile = request
             accepted.queue_message(encode(request))
@@ -346,14 +343,13 @@ def test_deep_headers_are_refused_and_nothing_ends(shared_service, raw_client):
 
 
 def test_who_sends_too_much_that_is_wrong_is_not_heard_for_a_while(
-    start_service, raw_client
+    shared_service, raw_client
 ):
-    service = start_service()
-    raw, other = raw_client(service), raw_client(service)
+    raw, other = raw_client(shared_service), raw_client(shared_service)
     for _ in range(500):
         raw.send([b"\xc1"])
     assert other.ask(Ping(1.0)).t == 1.0
-    time.sleep(1.5)
+    time.sleep(1.1)
     answers = 0
     while raw.socket.poll(100):
         assert raw.receive().code == "bad_message"
@@ -362,9 +358,8 @@ def test_who_sends_too_much_that_is_wrong_is_not_heard_for_a_while(
     assert raw.ask(Ping(2.0)).t == 2.0
 
 
-def test_a_message_of_very_many_parts_is_thrown_away_unread(start_service, raw_client):
-    service = start_service()
-    raw, other = raw_client(service), raw_client(service)
+def test_a_message_of_very_many_parts_is_thrown_away_unread(shared_service, raw_client):
+    raw, other = raw_client(shared_service), raw_client(shared_service)
     raw.begin()  # without a session it is cut off
     other.begin()
     count = 200_000
@@ -443,10 +438,9 @@ def test_a_client_that_leaves_with_messages_queued_does_no_harm(
         staying.close()
 
 
-def test_dropped_frames_say_when_to_try_again(start_service):
-    service = start_service()
+def test_dropped_frames_say_when_to_try_again(shared_service):
     view = make_view()
-    with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
+    with FilterClient(shared_service.endpoint, timeout_s=TIMEOUT_S) as client:
         client.set_profile(EYE | {"build_s": 5}, views=[view], wait=False)
         client.submit(view, **SEE)
         drops = []
@@ -456,13 +450,12 @@ def test_dropped_frames_say_when_to_try_again(start_service):
         assert drops[0].retry_after_ms > 0
 
 
-def test_the_log_has_time_stamps_and_nothing_of_a_profile(start_service):
-    service = start_service()
+def test_the_log_has_time_stamps_and_nothing_of_a_profile(shared_service):
     view = make_view()
-    with FilterClient(service.endpoint, client_name="lab") as client:
+    with FilterClient(shared_service.endpoint, client_name="lab") as client:
         client.set_profile(EYE | {"mark": 77, "secret": "patient 12"}, views=[view])
         client.filter(view, **SEE)
-    lines = service.log.splitlines()
-    begins = [line for line in lines if "session 1 started" in line]
+    lines = shared_service.log.splitlines()
+    begins = [line for line in lines if "started ('lab')" in line]
     assert re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d", begins[0])
-    assert "patient" not in service.log
+    assert "patient" not in shared_service.log

@@ -165,6 +165,30 @@ def test_a_frame_before_hello_and_before_a_profile_is_answered(
     assert (reply.code, reply.frame_id) == ("no_profile", 6)
 
 
+@pytest.mark.parametrize("size", [(320, 180), (640, 360), (1920, 1080)])
+def test_a_large_frame_before_hello_is_answered(shared_service, raw_client, size):
+    for frame_id in range(3):
+        raw = raw_client(shared_service)
+        width_px, height_px = size
+        frame = small_frame(frame_id, width_px=width_px, height_px=height_px)
+        reply = raw.ask(frame)
+        assert (reply.code, reply.frame_id) == ("no_session", frame_id)
+
+
+def test_hello_again_tells_what_is_still_filtered(shared_service, raw_client):
+    raw = raw_client(shared_service)
+    welcome = raw.begin(more={"filter_ms": 500})
+    assert (welcome.is_resumed, welcome.n_unanswered) == (False, 0)
+    raw.send(encode(small_frame(3)))
+    for n_unanswered in (1, 0):
+        again = raw.ask(Hello("raw", welcome.session_key))
+        assert (again.is_resumed, again.session_id) == (True, welcome.session_id)
+        assert (again.profile_ids, again.n_unanswered) == ({"both": 1}, n_unanswered)
+        if n_unanswered:
+            assert raw.receive().frame_id == 3
+    assert not raw.ask(Hello("raw")).is_resumed, "no key was given"
+
+
 def broken_frames():
     color, depth_m = bytes(16 * 8 * 3), bytes(16 * 8 * 4)
     header = msgpack.unpackb(encode(small_frame(3))[0])
@@ -217,12 +241,11 @@ def test_a_broken_message_is_answered_by_field_and_the_session_lives_on(
 
 
 def test_a_part_beyond_the_limit_ends_only_the_connection_that_sent_it(
-    start_service, raw_client
+    small_service, raw_client
 ):
-    service = start_service(max_part_mb=1, max_profile_kb=1)
-    good, bad = raw_client(service), raw_client(service)
+    good, bad = raw_client(small_service), raw_client(small_service)
     good.begin()
-    bad.begin()
+    key = bad.begin().session_key
     bad.send([encode(small_frame(1))[0], bytes(2**20 + 1)])
     assert good.ask(small_frame(1)).type_name == "result"
     # libzmq connects again by itself; to the service it is somebody new.
@@ -230,14 +253,28 @@ def test_a_part_beyond_the_limit_ends_only_the_connection_that_sent_it(
     with pytest.raises(zmq.Again):
         bad.receive()
     assert bad.ask(small_frame(2)).code == "no_session"
+    assert bad.ask(Hello("raw", key)).is_resumed
+
+
+def test_of_three_frames_at_once_the_third_exceeds_a_credit_of_two(
+    shared_service, raw_client
+):
+    raw = raw_client(shared_service)
+    raw.begin(more={"filter_ms": 100})
+    for frame_id in (1, 2, 3):
+        raw.send(encode(small_frame(frame_id)))
+    replies = {reply.frame_id: reply for reply in (raw.receive() for _ in range(3))}
+    assert replies[3].code == "credit_exceeded"
+    assert replies[2].type_name == "result"
+    first = replies[1]
+    assert first.type_name == "result" or first.reason == "superseded"
 
 
 def test_a_client_that_ignores_its_credit_is_told_and_every_frame_is_answered(
-    start_service, raw_client
+    shared_service, raw_client
 ):
-    service = start_service(filter_ms=100)
-    raw = raw_client(service)
-    assert raw.begin().credit == 2
+    raw = raw_client(shared_service)
+    assert raw.begin(more={"filter_ms": 100}).credit == 2
     count = 12
     for frame_id in range(count):
         raw.send(encode(small_frame(frame_id)))
@@ -251,10 +288,9 @@ def test_a_client_that_ignores_its_credit_is_told_and_every_frame_is_answered(
     assert raw.ask(small_frame(count)).type_name == "result"
 
 
-def test_of_two_waiting_frames_the_newer_is_filtered(start_service, raw_client):
-    service = start_service(filter_ms=300, credit=3)
-    raw = raw_client(service)
-    raw.begin()
+def test_of_two_waiting_frames_the_newer_is_filtered(small_service, raw_client):
+    raw = raw_client(small_service)
+    raw.begin(more={"filter_ms": 300})
     raw.send(encode(small_frame(1)))
     time.sleep(0.05)  # frame 1 is being filtered when the others come
     raw.send(encode(small_frame(2)))
@@ -266,11 +302,11 @@ def test_of_two_waiting_frames_the_newer_is_filtered(start_service, raw_client):
 
 
 def test_bye_ends_a_session_and_too_many_sessions_are_refused(
-    start_service, raw_client
+    small_service, raw_client
 ):
-    service = start_service(max_sessions=1)
-    first, second = raw_client(service), raw_client(service)
-    first.begin()
+    other, first, second = (raw_client(small_service) for _ in range(3))
+    for client in (other, first):
+        client.begin()
     assert second.ask(Hello("second")).code == "too_many_sessions"
     first.send(encode(Bye()))
     assert first.ask(Ping(2.5)).t == 2.5

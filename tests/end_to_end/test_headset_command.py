@@ -16,19 +16,14 @@ from clients.headset.simulated_runtime import (
     SimulatedRuntime,
 )
 from clients.service_process import CHECKOUT
+from tests.commands import run_command
 
 
-def run_program(*arguments, timeout_s=120.0):
-    return subprocess.run(
-        [sys.executable, "-m", "filter_service", "headset", *arguments],
-        cwd=CHECKOUT,
-        capture_output=True,
-        text=True,
-        timeout=timeout_s,
-        check=False,
-    )
+def run_program(*arguments, **options):
+    return run_command("headset", *arguments, **options)
 
 
+@pytest.mark.long("two eyes are estimated and traced")
 def test_the_command_shows_a_scene_in_a_simulated_headset(tmp_path):
     finished = run_program(
         *("--simulated", "--size", "96x108", "--scene", "primitives", "--frames", "5"),
@@ -43,11 +38,11 @@ def test_the_command_shows_a_scene_in_a_simulated_headset(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"left.png", "right.png"}
 
 
+@pytest.mark.clients
 def test_a_counted_run_ends_where_no_service_answers():
     finished = run_program(
         *("--simulated", "--size", "96x108", "--scene", "primitives", "--seconds", "2"),
         *("--service", "tcp://127.0.0.1:1"),
-        timeout_s=40.0,
     )
     assert finished.returncode == 1
     assert "tcp://127.0.0.1:1" in finished.stderr
@@ -72,6 +67,7 @@ def make(context):
 """
 
 
+@pytest.mark.clients
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_signal_ends_it_with_its_report_and_its_pictures(tmp_path, name):
     command = (
@@ -108,20 +104,14 @@ def test_a_signal_ends_it_with_its_report_and_its_pictures(tmp_path, name):
     assert (tmp_path / "pictures" / "left.png").is_file()
 
 
+@pytest.mark.clients
 def test_a_program_of_ones_own_renders(tmp_path):
     (tmp_path / "own_scenery.py").write_text(OWN_SCENERY)
-    finished = subprocess.run(
-        [
-            *(sys.executable, "-m", "filter_service", "headset", "--simulated"),
-            *("--scene", "own_scenery:make", "--size", "48x54", "--frames", "2"),
-            *("--settings", json.dumps({"tolerance": "loose", "mode": "on-axis"})),
-            *("--out", "pictures", "--seconds", "60"),
-        ],
+    finished = run_program(
+        *("--simulated", "--scene", "own_scenery:make", "--size", "48x54"),
+        *("--settings", json.dumps({"tolerance": "loose", "mode": "on-axis"})),
+        *("--frames", "2", "--out", "pictures", "--seconds", "60"),
         cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
     )
     assert finished.returncode == 0, finished.stderr
     from PIL import Image

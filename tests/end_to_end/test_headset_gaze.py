@@ -28,6 +28,18 @@ from tests.end_to_end.headset_doubles import (
 )
 
 
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"age_years": 200.0}, "age_years is 200.0; allowed: 3 to 120"),
+        ({"age_years": 25.0, "pupil_diameter_mm": 30.0}, "allowed: 0.5 to 9"),
+    ],
+)
+def test_a_wrong_person_is_refused_before_there_is_a_picture(wrong, said):
+    with pytest.raises(ValueError, match=said):
+        StereoGaze(**wrong)
+
+
 def test_focus_follows_the_depth_at_the_gaze_and_not_vergence():
     """A wall at 2 m, seen 20 deg aside: the ray is longer than the depth."""
     look = StereoGaze(age_years=25.0, gaze_range_deg=(40.0, 30.0))

@@ -33,7 +33,9 @@ def same_depth(a_m, b_m, tolerance=1e-4):
         return (a_m == b_m) | (np.abs(a_m - b_m) <= tolerance * np.minimum(a_m, b_m))
 
 
-@pytest.mark.parametrize("name", sorted(PATHS))
+@pytest.mark.parametrize(
+    "name", ["primitives", pytest.param("courtyard", marks=pytest.mark.clients)]
+)
 def test_edges_that_are_not_symmetric_cut_out_a_part(name, show):
     scene = build_scene(name)
     pose = path_moments(PATHS[name], 5)[1].pose

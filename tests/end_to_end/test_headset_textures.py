@@ -1,9 +1,9 @@
 """Headset frames that stay in textures, from the renderer to the shown image."""
 
+import importlib
 import json
-import subprocess
-import sys
 import time
+from functools import cache
 
 import moderngl
 import numpy as np
@@ -28,14 +28,22 @@ from clients.scenes.catalog import build_scene
 from clients.scenes.scene_view import open_context, read_texture
 from filter_service import FilterSettings
 from filter_service.gl import current_context
+from tests.commands import run_command
 from tests.end_to_end.headset_doubles import viewer_of
 from tests.numerical.gl_calls import CountedContext
-from tests.source_tree import ROOT
+
+pytestmark = pytest.mark.gl
 
 SIZE_PX = (96, 108)
 SETTINGS = FilterSettings(pupil_range_mm=(3.0, 5.0), tolerance="loose")
 PROFILES = {"left": "myopia", "right": "keratoconus"}
-SCENE = build_scene("courtyard")
+
+
+@cache
+def courtyard():
+    return build_scene("courtyard")
+
+
 WAIT_S = 90.0
 
 
@@ -49,7 +57,7 @@ class Headset:
     def __init__(self, context, profiles=PROFILES):
         self.said = []
         self.scenery = SceneScenery(
-            context, SCENE, upright(viewpoint(SCENE)), supersampling=1
+            context, courtyard(), upright(viewpoint(courtyard())), supersampling=1
         )
         self.seeing = LocalFilter(SETTINGS, self.said.append, context)
         self.look = StereoGaze(age_years=30.0)
@@ -90,7 +98,7 @@ def context():
 def test_pictures_are_those_of_arrays(context):
     headset = Headset(context)
     seen = headset.until_filtered()
-    for _ in range(30):
+    for _ in range(6):
         last = headset.frame()
     with context:
         found = [read_texture(color)[..., :3] for color in last.colors]
@@ -158,18 +166,20 @@ def stereo_frames(headset, presenter, target, count):
 
 def test_a_frame_transfers_no_image_and_waits_for_nothing(monkeypatch):
     """Renderer, gaze, focus, pupils, filter and the headset's image: all of a frame."""
+    courtyard()  # its shadow maps leave no context current
     real = open_context(430)
     with real:
         counted = CountedContext()
+        importlib.import_module("filter_service.gl.gpu")  # with the class, not this:
         monkeypatch.setattr(current_context, "CurrentContext", lambda: counted)
         context = moderngl.create_context(context=counted, require=430)
         target = context.framebuffer([context.texture(SIZE_PX, 4)])
         presenter, headset = Presenter(context, SIZE_PX), Headset(context)
         headset.until_filtered()
-        stereo_frames(headset, presenter, target, 60)
+        stereo_frames(headset, presenter, target, 15)
         context.finish()
         counted.clear()
-        count = 30
+        count = 8
         stereo_frames(headset, presenter, target, count)
         image_bytes = SIZE_PX[0] * SIZE_PX[1]
         assert counted.waits == []
@@ -209,17 +219,19 @@ def test_a_session_in_textures(context):
     "textures", ["yes", pytest.param("no", marks=pytest.mark.slow)]
 )
 def test_the_command_writes_the_last_images(tmp_path, textures):
-    command = [sys.executable, "-m", "filter_service", "headset", "--simulated"]
-    command += ["--size", "96x100", "--frames", "4", "--seconds", "30"]
+    command = [
+        "headset",
+        "--simulated",
+        "--size",
+        "96x100",
+        "--frames",
+        "4",
+        "--seconds",
+        "30",
+    ]
     command += ["--textures", textures, "--left", "myopia", "--right", "myopia"]
     command += ["--settings", '{"tolerance": "loose", "pupil_range_mm": [3, 5]}']
-    ran = subprocess.run(
-        [*command, "--out", str(tmp_path), "--json"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    ran = run_command(*command, "--out", tmp_path, "--json")
     assert ran.returncode == 0, ran.stderr
     assert json.loads(ran.stdout)["filtered"] == 4
     for eye in ("left", "right"):

@@ -1,16 +1,16 @@
 """The smallest client, `clients/hello.py`, gets a filtered picture."""
 
 import numpy as np
+import pytest
 from PIL import Image
 
-from clients.service_process import ServiceProcess
 from tests.end_to_end.printed_script import printed_by
 
 
-def test_the_smallest_client_writes_a_blurred_picture(tmp_path):
+@pytest.mark.clients
+def test_the_smallest_client_writes_a_blurred_picture(real_service, tmp_path):
     out = tmp_path / "seen.png"
-    with ServiceProcess() as service:
-        printed_by("-m", "clients.hello", out, service.endpoint, cwd=tmp_path)
+    printed_by("-m", "clients.hello", out, real_service.endpoint, cwd=tmp_path)
     seen = np.asarray(Image.open(out)).astype(int)
     assert seen.shape == (270, 480, 3)
     # squares of 15 px: near on the left, in reach of a myopic eye, lost on the right

@@ -15,7 +15,7 @@ from clients.filter_client import FilterClient
 from clients.service_process import CHECKOUT, ServiceProcess
 from filter_service.errors import FilterError
 from filter_service.keys import KeyRing, load_client_key
-from filter_service.messages import Hello, Ping, Share, encode
+from filter_service.messages import Hello, Ping, encode
 from filter_service.service.router import SEED_VARIABLE
 from tests.benchmarks.attacks import spoken_to
 from tests.end_to_end.conftest import (
@@ -77,7 +77,7 @@ def test_connections_without_a_session_keep_nobody_out(
         streaming.set_profile(EYE, views=[view])
         before = service.pids()
         attack = subprocess.Popen(
-            [*ATTACK, attack_name, service.endpoint, "4"],
+            [*ATTACK, attack_name, service.endpoint, "3"],
             cwd=CHECKOUT,
             stdout=subprocess.PIPE,
             text=True,
@@ -97,26 +97,23 @@ def test_connections_without_a_session_keep_nobody_out(
         assert service.pids() == before
         if attack_name == "one_byte":  # the others never got out of the kernel
             assert "closed the oldest without a session" in service.log
-        time.sleep(0.5)
+        time.sleep(0.3)
         begin_s = cpu_s(before["front-end"])
-        time.sleep(1.0)
-        assert cpu_s(before["front-end"]) - begin_s < 0.1, (
+        time.sleep(0.6)
+        assert cpu_s(before["front-end"]) - begin_s < 0.06, (
             "idle, it takes a tenth at most"
         )
 
 
-def test_too_few_descriptors_are_told_at_the_start():
-    with pytest.raises(RuntimeError, match=r"may open 64 files; expected at least 120"):
-        ServiceProcess(command=limited(64))
-
-
-def test_a_connection_without_a_session_cannot_fill_the_memory(start_service):
-    service = start_service()
-    with spoken_to(service.endpoint) as connection, pytest.raises(ConnectionError):
+def test_a_connection_without_a_session_cannot_fill_the_memory(shared_service):
+    with (
+        spoken_to(shared_service.endpoint) as connection,
+        pytest.raises(ConnectionError),
+    ):
         while True:  # parts of a message without an end
             connection.sendall(b"\x03" + (10**5).to_bytes(8, "big") + bytes(10**5))
             time.sleep(0.01)
-    assert "bytes and no message" in service.log
+    assert "bytes and no message" in shared_service.log
 
 
 # Routing ids
@@ -140,8 +137,8 @@ def named(raw_client):
     return connect
 
 
-def test_a_routing_id_opens_no_session(start_service, named):
-    service = start_service()
+def test_a_routing_id_opens_no_session(shared_service, named):
+    service = shared_service
     victim = named(service, b"camera")
     welcome = victim.begin(mark=7)
     victim.socket.close(linger=0)  # without a word
@@ -160,17 +157,16 @@ def test_a_routing_id_opens_no_session(start_service, named):
 
 
 def test_replies_on_their_way_do_not_reach_who_takes_the_routing_id(
-    start_service, named
+    shared_service, named
 ):
-    service = start_service(filter_ms=60)
     for attempt in range(5):
         name = b"camera %d" % attempt
-        victim = named(service, name)
-        victim.begin(mark=7)
+        victim = named(shared_service, name)
+        key = victim.begin(mark=7, more={"filter_ms": 60}).session_key
         victim.send(encode(small_frame(1)))
         time.sleep(0.02)
         victim.socket.close(linger=0)
-        thief = named(service, name)
+        thief = named(shared_service, name)
         thief.socket.rcvtimeo = 300
         received = []
         while True:
@@ -183,6 +179,8 @@ def test_replies_on_their_way_do_not_reach_who_takes_the_routing_id(
             if len(received) > 30:
                 break
         assert set(received) <= {"pong"}
+        again = named(shared_service, b"again %d" % attempt)
+        assert again.ask(Hello("camera", key)).is_resumed
 
 
 def test_a_session_key_is_worth_nothing_with_another_client_s_key(
@@ -205,7 +203,7 @@ def test_ids_of_each_process_begin_elsewhere(start_service):
     service = start_service()
     before = service.pids()
     attack = subprocess.run(
-        [*ATTACK, "chosen_ids", service.endpoint, "2"],
+        [*ATTACK, "chosen_ids", service.endpoint, "1"],
         cwd=CHECKOUT,
         capture_output=True,
         text=True,
@@ -276,7 +274,7 @@ def test_bad_key_files_are_skipped_and_named_once(start_service, ring, tmp_path)
         for name, make in BAD_KEY_FILES.items():
             make(ring.folder / "clients" / f"{name}.toml")
             assert client.filter(view, **SEE).color[0, 0, 0] == 5
-        end_s = time.monotonic() + 2.5
+        end_s = time.monotonic() + 1.5
         n_changes = 0
         while time.monotonic() < end_s:  # and its own commands do no harm
             ring.add("brief", tmp_path / "brief.toml")
@@ -284,7 +282,7 @@ def test_bad_key_files_are_skipped_and_named_once(start_service, ring, tmp_path)
             (tmp_path / "brief.toml").unlink()
             n_changes += 1
             client.filter(view, **SEE)
-        assert n_changes > 50
+        assert n_changes > 30
         assert service.pids() == before
     for name in BAD_KEY_FILES:
         assert service.log.count(f"{name}.toml") == 1, name
@@ -292,13 +290,15 @@ def test_bad_key_files_are_skipped_and_named_once(start_service, ring, tmp_path)
 
 def test_rights_and_a_pair_that_does_not_fit_are_told(ring, tmp_path):
     def refusal():
-        with pytest.raises(RuntimeError) as caught:
-            ServiceProcess({"keys_dir": str(ring.folder)}, command=(*DOUBLE,))
+        with pytest.raises(ValueError) as caught:
+            ring.check()
         return str(caught.value)
 
     server = ring.folder / "server.toml"
     ring.folder.chmod(0o777)
     assert "has mode 0777: other users can change it; expected 0700" in refusal()
+    with pytest.raises(RuntimeError, match="other users can change it; expected 0700"):
+        ServiceProcess({"keys_dir": str(ring.folder)}, command=DOUBLE)
     ring.folder.chmod(0o700)
     server.chmod(0o644)
     assert "has mode 0644: other users can read it; expected 0600" in refusal()
@@ -322,7 +322,7 @@ def test_floods_do_not_stop_a_stream(start_service):
         before = service.pids()
         for name in ("profiles", "pings", "unread", "parts"):
             attack = subprocess.Popen(
-                [*ATTACK, name, service.endpoint, "2"],
+                [*ATTACK, name, service.endpoint, "1.2"],
                 cwd=CHECKOUT,
                 stdout=subprocess.DEVNULL,
             )
@@ -346,20 +346,6 @@ def test_a_flooding_connection_is_ignored_and_then_closed(start_service, raw_cli
         raw.socket.send_multipart(parts)
     wait_until(lambda: ": too many messages" in service.log)
     assert other.ask(Ping(2.0)).t == 2.0
-
-
-def test_one_session_cannot_take_all_memory(start_service, raw_client):
-    service = start_service(max_image_mb=200)
-    hoarder, other = raw_client(service), raw_client(service)
-    hoarder.ask(Hello("hoarder"))
-    taken_mb = 0
-    while (reply := hoarder.ask(Share(10 * 10**6))).slot is not None:
-        taken_mb += 10
-    assert taken_mb == 40
-    assert "allowed: 50000000 in total" in reply.reason
-    other.begin(mark=3)
-    assert other.ask(small_frame(1)).colors[0][0, 0, 0] == 3
-    assert other.ask(Share(10 * 10**6)).slot is not None
 
 
 # The owner's files, and faults
@@ -437,11 +423,10 @@ def test_a_process_that_never_stays_does_not_end_the_service(start_service, raw_
 
 def test_a_service_gives_up_where_its_owner_says_so(start_service):
     service = start_service(give_up_after_s=0.5)
-    for _ in range(4):
-        try:
-            ended_again(service, "front-end", 1)
-        except (AssertionError, OSError, KeyError):
-            break
-        time.sleep(0.3)
+    front_end = service.pids()["front-end"]
+    os.kill(front_end, signal.SIGKILL)
+    wait_until(lambda: service.pids().get("front-end", front_end) != front_end)
+    time.sleep(0.5)
+    os.kill(service.pids()["front-end"], signal.SIGKILL)
     assert service.process.wait(TIMEOUT_S) == 1
     assert "(give_up_after_s is 0.5)" in service.log

@@ -9,7 +9,7 @@ import subprocess
 
 import pytest
 
-from clients.service_process import CHECKOUT, ServiceProcess
+from clients.service_process import CHECKOUT, SERVE_COMMAND
 from tests.end_to_end.conftest import TIMEOUT_S
 from tests.end_to_end.test_lifecycle import wait_until
 
@@ -26,7 +26,7 @@ needs_node = pytest.mark.skipif(
 def checked(service, *profiles, meanwhile=lambda: None):
     """Return what `check.js` prints; something may happen in the middle of it."""
     with subprocess.Popen(
-        ["node", "check.js", service.endpoint, *profiles],
+        ["node", "check.js", service.endpoint, *profiles, "--wait"],
         cwd=FOLDER,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -43,6 +43,7 @@ def checked(service, *profiles, meanwhile=lambda: None):
     return json.loads(printed)
 
 
+@pytest.mark.clients
 @needs_node
 @pytest.mark.parametrize(
     "name", ["front-end", pytest.param("render", marks=pytest.mark.slow)]
@@ -75,27 +76,44 @@ def test_frames_eyes_errors_and_a_lost_connection_from_javascript(start_service,
     assert found["pong"] == 1
 
 
-@pytest.fixture(scope="module")
-def real_service():
-    with ServiceProcess({"engine": "native"}, start_timeout_s=120.0) as service:
-        yield service
+@pytest.fixture
+def native_service(use_service):
+    return use_service(command=SERVE_COMMAND, engine="native")
 
 
+@pytest.mark.clients
 @needs_node
-def test_the_check_passes_with_profiles_that_the_service_knows(real_service):
-    found = checked(real_service, PROFILE)
+def test_the_check_passes_with_profiles_that_the_service_knows(native_service):
+    """As a user runs it: at a terminal, where nobody enters a line."""
+    ours, theirs = os.openpty()
+    try:
+        finished = subprocess.run(
+            ["node", "check.js", native_service.endpoint, PROFILE],
+            cwd=FOLDER,
+            stdin=theirs,
+            capture_output=True,
+            text=True,
+            timeout=3 * TIMEOUT_S,
+        )
+    finally:
+        os.close(ours)
+        os.close(theirs)
+    assert finished.returncode == 0, finished.stderr
+    found = json.loads(finished.stdout)
     assert found["profile"] == ["profile_invalid", "kind"]
+    assert found["again"][0] == found["session"]
 
 
+@pytest.mark.clients
 @needs_node
-def test_the_example_of_its_readme_runs(real_service, tmp_path):
+def test_the_example_of_its_readme_runs(native_service, tmp_path):
     text = (FOLDER / "README.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```js\n(.*?)```", text, re.DOTALL)
     client = (FOLDER / "filter_client.js").as_uri()
     example = example.replace("./filter_client.js", client)
     file = tmp_path / "example.mjs"
     file.write_text(
-        example.replace("tcp://127.0.0.1:5577", real_service.endpoint),
+        example.replace("tcp://127.0.0.1:5577", native_service.endpoint),
         encoding="utf-8",
     )
     finished = subprocess.run(

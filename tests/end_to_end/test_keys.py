@@ -2,16 +2,15 @@
 
 import json
 import stat
-import subprocess
-import sys
 
 import pytest
 
 from clients.filter_client import FilterClient
-from clients.service_process import CHECKOUT
+from clients.service_process import ServiceProcess
 from filter_service.errors import AuthenticationFailed, FilterError
 from filter_service.keys import KeyRing, load_client_key
-from tests.end_to_end.conftest import TIMEOUT_S, make_view
+from tests.commands import run_command as ocufilter
+from tests.end_to_end.conftest import QUICK_DOUBLE, TIMEOUT_S, make_view
 
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
 EYE = {"kind": "double", "mark": 5}
@@ -22,6 +21,21 @@ def ring(tmp_path):
     ring = KeyRing(tmp_path / "keys")
     ring.create()
     return ring
+
+
+@pytest.fixture(scope="module")
+def keyed(tmp_path_factory):
+    """A service that asks for keys, and the keys, to which each test adds its own."""
+    ring = KeyRing(tmp_path_factory.mktemp("keyed") / "keys")
+    ring.create()
+    service = ServiceProcess(
+        {"bind": "tcp://0.0.0.0:*", "keys_dir": str(ring.folder)},
+        command=QUICK_DOUBLE,
+        start_timeout_s=TIMEOUT_S,
+    )
+    yield ring, service, service.endpoint.replace("0.0.0.0", "127.0.0.1")
+    assert service.stop(TIMEOUT_S) == 0
+    service.kill()  # removes its folder
 
 
 def filtered(client):
@@ -61,12 +75,9 @@ def test_names_and_files_that_are_wrong_are_said(ring, tmp_path):
         load_client_key(bad)
 
 
-def test_a_client_with_a_key_is_served_over_any_interface(
-    start_service, ring, tmp_path
-):
+def test_a_client_with_a_key_is_served_over_any_interface(keyed, tmp_path):
+    ring, _, endpoint = keyed
     ring.add("lab", tmp_path / "lab.toml")
-    service = start_service(bind="tcp://0.0.0.0:*", keys_dir=str(ring.folder))
-    endpoint = service.endpoint.replace("0.0.0.0", "127.0.0.1")
     with FilterClient(
         endpoint, key_file=tmp_path / "lab.toml", timeout_s=TIMEOUT_S
     ) as client:
@@ -74,9 +85,8 @@ def test_a_client_with_a_key_is_served_over_any_interface(
         assert filtered(client).color[0, 0, 0] == 5
 
 
-def test_who_has_no_key_is_told_so_at_once(start_service, ring, tmp_path):
-    ring.add("lab", tmp_path / "lab.toml")
-    service = start_service(keys_dir=str(ring.folder))
+def test_who_has_no_key_is_told_so_at_once(keyed, tmp_path):
+    ring, service, endpoint = keyed
     stranger, elsewhere = KeyRing(tmp_path / "a"), KeyRing(tmp_path / "b")
     stranger.create()
     (stranger.folder / "server.toml").write_text(
@@ -86,7 +96,7 @@ def test_who_has_no_key_is_told_so_at_once(start_service, ring, tmp_path):
     elsewhere.add("lab", tmp_path / "wrong server.toml")
     for file in ("unknown.toml", "wrong server.toml", None):
         key_file = None if file is None else tmp_path / file
-        client = FilterClient(service.endpoint, key_file=key_file)
+        client = FilterClient(endpoint, key_file=key_file)
         try:
             with pytest.raises(AuthenticationFailed, match="ocufilter keys add"):
                 client.hello(timeout_s=TIMEOUT_S)
@@ -95,15 +105,31 @@ def test_who_has_no_key_is_told_so_at_once(start_service, ring, tmp_path):
     assert "its key is not allowed" in service.log
 
 
-def test_keys_may_be_given_and_taken_while_the_service_runs(
-    start_service, ring, tmp_path
-):
-    service = start_service(keys_dir=str(ring.folder))
+def test_the_latency_command_needs_a_key_and_no_shared_memory(keyed, tmp_path):
+    ring, _, endpoint = keyed
+    ring.add("timed", tmp_path / "timed.toml")
+    elsewhere = KeyRing(tmp_path / "b")
+    elsewhere.create()
+    elsewhere.add("timed", tmp_path / "wrong.toml")
+    for key in ((), ("--key", tmp_path / "wrong.toml")):
+        refused = ocufilter("latency", endpoint, *key, "--timeout", TIMEOUT_S)
+        assert refused.returncode == 1
+        assert "ocufilter keys add" in refused.stderr
+        assert refused.stderr.count("\n") == 1
+    options = ("--key", tmp_path / "timed.toml", "--transport", "shared-memory")
+    refused = ocufilter("latency", endpoint, *options)
+    assert refused.returncode == 2
+    assert "allowed: tcp, auto" in refused.stderr
+    assert refused.stderr.count("\n") == 1
+
+
+def test_keys_may_be_given_and_taken_while_the_service_runs(keyed, tmp_path):
+    ring, _, endpoint = keyed
     for name in ("early", "late"):
         ring.add(name, tmp_path / f"{name}.toml")
     with (
-        FilterClient(service.endpoint, key_file=tmp_path / "early.toml") as early,
-        FilterClient(service.endpoint, key_file=tmp_path / "late.toml") as late,
+        FilterClient(endpoint, key_file=tmp_path / "early.toml") as early,
+        FilterClient(endpoint, key_file=tmp_path / "late.toml") as late,
     ):
         filtered(early)
         filtered(late)
@@ -111,23 +137,13 @@ def test_keys_may_be_given_and_taken_while_the_service_runs(
         with pytest.raises(FilterError, match="the key was removed"):
             early.filter(make_view(), **SEE)
         assert late.filter(make_view(), **SEE).color[0, 0, 0] == 5
-    again = FilterClient(service.endpoint, key_file=tmp_path / "early.toml")
+    again = FilterClient(endpoint, key_file=tmp_path / "early.toml")
     with pytest.raises(AuthenticationFailed):
         again.hello(timeout_s=TIMEOUT_S)
     again.close()
 
 
-def ocufilter(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "filter_service", *arguments],
-        cwd=CHECKOUT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-
-
+@pytest.mark.long("a service starts, and six commands run")
 def test_keys_and_status_from_the_command_line(start_service, tmp_path):
     folder, file = str(tmp_path / "keys"), str(tmp_path / "lab.toml")
     added = ocufilter("keys", "add", "lab", "--dir", folder, "--out", file)

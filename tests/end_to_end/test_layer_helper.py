@@ -3,29 +3,34 @@
 import contextlib
 import os
 import socket
+import tempfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from clients.arguments import profile_title
 from clients.headset.local_filter import LocalFilter
 from clients.headset.stereo_gaze import StereoGaze
 from clients.openxr_layer import program, wire
-from clients.openxr_layer.helper import HelperOptions, LayerHelper
+from clients.openxr_layer.helper import MAX_WAITING, HelperOptions, LayerHelper
 from clients.openxr_layer.helper_socket import ask
 from filter_service import Camera, EyeFilter, FilterSettings, RgbdView
 from filter_service.messages import body_of_eye
 from tests.end_to_end.layer_double import LayerDouble, RunningHelper
 
 SIZE_PX = (96, 72)
+NOBODY = 65534
 PUPIL_MM, FOCUS_DPT = 4.0, 1.0
 SETTINGS = FilterSettings(
+    mode="on-axis",  # quick to prepare: these tests are about messages and memory
+    eye_model="wavefront",
     pupil_range_mm=(PUPIL_MM, PUPIL_MM),
     focus_range_dpt=(FOCUS_DPT, FOCUS_DPT),
     object_range_dpt=(0.0, 4.0),
 )
 PROFILES = {
-    "left": {"kind": "prescription", "sphere_dpt": -3.0},
+    "left": {"kind": "prescription", "sphere_dpt": -15.0},
     "right": {"kind": "prescription", "sphere_dpt": 0.0},
 }
 
@@ -120,7 +125,15 @@ def tangents_of(frame, index):
 
 @pytest.mark.parametrize(
     ("color_format", "dtype", "output"),
-    [(wire.SRGB8, np.uint8, "srgb8"), (wire.LINEAR16F, np.float16, "linear16")],
+    [
+        pytest.param(
+            *(wire.SRGB8, np.uint8, "srgb8"),
+            marks=pytest.mark.long("two eyes are computed twice"),
+        ),
+        pytest.param(
+            *(wire.LINEAR16F, np.float16, "linear16"), marks=pytest.mark.clients
+        ),
+    ],
 )
 def test_frames_are_those_of_the_eye_filter(
     helper, path, connect, color_format, dtype, output
@@ -147,6 +160,7 @@ def test_frames_are_those_of_the_eye_filter(
     layer.close()
 
 
+@pytest.mark.clients
 def test_linear_bytes(helper, path, connect):
     layer = connect()
     layer.welcome()
@@ -164,6 +178,7 @@ def test_linear_bytes(helper, path, connect):
     layer.close()
 
 
+@pytest.mark.clients
 def test_blended_layers_keep_their_alpha(helper, path, connect):
     layer = connect()
     layer.welcome()
@@ -178,6 +193,7 @@ def test_blended_layers_keep_their_alpha(helper, path, connect):
     layer.close()
 
 
+@pytest.mark.clients
 def test_views_that_are_upside_down(helper, path, connect):
     layer = connect()
     layer.welcome()
@@ -198,6 +214,7 @@ def test_views_that_are_upside_down(helper, path, connect):
     layer.close()
 
 
+@pytest.mark.clients
 def test_without_depth_everything_is_at_the_flat_distance(path, connect):
     with running_helper(path, flat_dpt=2.0, is_split=True) as helper:
         layer = connect()
@@ -317,18 +334,32 @@ def test_profiles_are_changed_and_errors_told(helper, path, connect):
         ask(path, {"right": "x" * 200_000})
 
 
-def test_requests_that_are_nested_too_deeply_are_refused(helper, path):
+@pytest.mark.parametrize(
+    "text", [b"[" * 90_000, b"5", b'"left"', b'["left"]', b'{"left": 1e999}', b"\xff"]
+)
+def test_requests_that_are_none_are_refused(helper, path, text):
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
         connection.settimeout(20.0)
         connection.connect(str(path))
-        connection.send(wire.CONTROL.to_bytes(4, "little") + b"[" * 90_000)
+        connection.send(wire.CONTROL.to_bytes(4, "little") + text)
         assert b"error" in connection.recv(10_000)
     assert ask(path, {})["program"] is None
+    assert helper.changed == []
 
 
 def test_names_are_printed_without_control_characters(helper, path, connect):
     connect("\x1b[2J").welcome()
-    assert helper.lines == ["?[2J: connected"]
+    assert helper.lines == ["\\x1b[2J: connected"]
+
+
+def test_a_profile_s_name_cannot_forge_lines(capsys):
+    profile = {"name": "eye\nlayer: forged\x1b[2J\u202e" + "x" * 9000}
+    program.say(f"left eye: {profile_title(profile)}")
+    program.say("a\rb")
+    (first, second) = capsys.readouterr().err.splitlines()
+    assert first.startswith("layer: left eye: eye\\nlayer: forged\\x1b[2J\\u202exxx")
+    assert len(first) < 200
+    assert second == "layer: a\\rb"
 
 
 def test_notes_on_depth_are_not_repeated_for_other_numbers(helper, path, connect):
@@ -357,21 +388,53 @@ def test_a_socket_that_was_left_behind_is_replaced(path):
     assert not path.exists()
 
 
-def test_silent_connections_are_bounded(helper, path):
-    silent = []
-    for _ in range(12):
-        made = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        made.settimeout(20.0)
-        made.connect(str(path))
-        silent.append(made)
-    assert silent[-1].recv(10) == b""
-    for made in silent:
-        made.close()
-    for _ in range(1000):  # until it has noticed
-        with contextlib.suppress(OSError):
-            assert ask(path, {})["program"] is None
-            return
-    raise AssertionError("it does not answer")
+def test_silent_connections_are_bounded_and_keep_nobody_out(helper, path, connect):
+    with contextlib.ExitStack() as stack:
+        silent = []
+        for _ in range(MAX_WAITING + 4):
+            made = stack.enter_context(
+                socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            )
+            made.settimeout(20.0)
+            made.connect(str(path))
+            silent.append(made)
+        assert silent[0].recv(10) == b"", "the oldest one is still open"
+        assert ask(path, {"left": "myopia"})["program"] is None
+        assert helper.changed == [("left", "myopia")]
+        assert connect().welcome().max_age_ms == 150
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can act as another user")
+def test_a_profile_is_not_sent_to_another_user_s_process():
+    """A socket in a folder that everybody may write to."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:
+        Path(folder).chmod(0o777)
+        path = Path(folder) / "layer.sock"
+        told, tell = os.pipe()
+        child = os.fork()
+        if child == 0:  # few calls, as other threads of the test may hold locks
+            code = 1
+            try:
+                os.setuid(NOBODY)
+                made = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+                made.settimeout(20.0)
+                made.bind(str(path))
+                made.listen()
+                os.write(tell, b".")
+                connection, _ = made.accept()
+                code = 0 if connection.recv(100_000) == b"" else 2
+            finally:
+                os._exit(code)
+        os.close(tell)
+        is_listening = os.read(told, 1) == b"."
+        os.close(told)
+        try:
+            assert is_listening
+            with pytest.raises(PermissionError, match="another user's process"):
+                ask(path, {"left": "myopia"})
+        finally:
+            status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert status == 0, "it received the profile"
 
 
 # The command
@@ -390,6 +453,12 @@ def test_silent_connections_are_bounded(helper, path):
         (["serve", "--left", "{}x"], "--left is not JSON"),
         (["run"], "there is no program; put it after --"),
         (["set"], "there is no profile; use --profile, --left or --right"),
+        (["set", "--left", "miopia"], "'miopia' is not known (did you mean 'myopia'?)"),
+        (["set", "--left", '{"kind": "preset", "name": "x"}'], "--left: profile field"),
+        (
+            ["serve", "--left", "nobody"],
+            "--left nobody: profile: 'nobody' is not known",
+        ),
     ],
 )
 def test_options_are_checked(arguments, message, capsys, tmp_path):

@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -91,6 +92,36 @@ def test_a_client_recovers_when_the_service_is_killed_and_started_again(start_se
         assert again.log.count("session 1 started") == 1
 
 
+@pytest.mark.parametrize("call", ["set_profile", "filter", "ping"])
+def test_a_reply_that_is_lost_with_the_connection_is_not_waited_for(
+    start_service, call
+):
+    service = start_service()
+    view = make_view()
+    building = EYE | {"build_s": 1.0}
+    with (
+        FilterClient(service.endpoint, timeout_s=2 * TIMEOUT_S) as client,
+        FilterClient(service.endpoint) as other,
+        ThreadPoolExecutor(1) as thread,
+    ):
+        pid = service.pids()["front-end"]
+        if call == "ping":
+            os.kill(pid, signal.SIGSTOP)
+            found = thread.submit(client.ping)
+            time.sleep(0.2)
+        elif call == "set_profile":
+            found = thread.submit(client.set_profile, building, views=[view])
+        else:
+            client.set_profile(building)  # without a camera to prepare for
+            found = thread.submit(client.filter, view, **SEE)
+        if call != "ping":
+            wait_until(lambda: other.ping()[1].is_building)
+            os.kill(pid, signal.SIGSTOP)
+            time.sleep(1.5)  # the eye becomes ready
+        os.kill(pid, signal.SIGKILL)
+        assert found.result(TIMEOUT_S)
+
+
 def test_frames_on_their_way_to_a_killed_service_are_reported_as_lost(start_service):
     service = start_service(filter_ms=5000)
     view = make_view()
@@ -151,8 +182,8 @@ def test_every_frame_of_a_stream_is_reported_while_the_service_is_upgraded(
 
 
 @pytest.mark.parametrize("name", ["supervisor", "front-end", "render"])
-def test_a_service_that_is_stopped_for_a_moment_is_used_again(start_service, name):
-    service = start_service()
+def test_a_service_that_is_stopped_for_a_moment_is_used_again(shared_service, name):
+    service = shared_service
     view = make_view()
     with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
         client.set_profile(EYE, views=[view])
@@ -170,8 +201,8 @@ def test_a_service_that_is_stopped_for_a_moment_is_used_again(start_service, nam
         assert service.pids()[name] == pid
 
 
-def test_a_client_that_is_killed_leaves_no_session(start_service):
-    service = start_service(alive_interval_s=0.1, session_keep_s=0.5)
+def test_a_client_that_is_killed_leaves_no_session(brief_service):
+    service = brief_service
     program = (
         "import sys, time\n"
         "from clients.filter_client import FilterClient\n"
@@ -208,16 +239,15 @@ def test_a_client_that_does_not_read_for_long_keeps_its_session(start_service):
     assert "disconnected" not in service.log
 
 
-def test_two_clients_get_their_own_eye_and_a_fair_share(start_service):
-    service = start_service(filter_ms=10)
+def test_two_clients_get_their_own_eye_and_a_fair_share(shared_service):
     view = make_view()
     with (
-        FilterClient(service.endpoint, max_in_flight=2) as first,
-        FilterClient(service.endpoint, max_in_flight=1) as second,
+        FilterClient(shared_service.endpoint, max_in_flight=2) as first,
+        FilterClient(shared_service.endpoint, max_in_flight=1) as second,
     ):
         clients = {7: first, 8: second}
         for mark, client in clients.items():
-            client.set_profile(EYE | {"mark": mark}, views=[view])
+            client.set_profile(EYE | {"mark": mark, "filter_ms": 10}, views=[view])
         counts = dict.fromkeys(clients, 0)
         end_s = time.monotonic() + 1.5
         while time.monotonic() < end_s:
@@ -269,24 +299,24 @@ def test_an_endpoint_in_use_is_said(shared_service):
         )
 
 
-def test_an_ipc_path_that_is_taken_is_left_alone(start_service, tmp_path):
+def test_an_ipc_path_that_is_no_socket_is_left_alone(start_service, tmp_path):
     precious = tmp_path / "precious.txt"
     precious.write_text("mine")
     with pytest.raises(RuntimeError, match="is not a socket"):
         start_service(bind=f"ipc://{precious}")
     assert precious.read_text() == "mine"
-    path = tmp_path / "ocufilter"
-    start_service(bind=f"ipc://{path}")
-    with pytest.raises(RuntimeError, match="another service"):
-        start_service(bind=f"ipc://{path}")
 
 
-def test_an_ipc_endpoint_serves_its_owner_only(start_service, raw_client, tmp_path):
+def test_an_ipc_endpoint_serves_its_owner_only_and_is_not_taken(
+    start_service, raw_client, tmp_path
+):
     path = tmp_path / "ocufilter"
     service = start_service(bind=f"ipc://{path}")
     assert path.stat().st_mode & 0o777 == 0o600
     raw = raw_client(service)
     assert raw.begin().transports == ("ipc", "shm")
+    with pytest.raises(RuntimeError, match="another service"):
+        start_service(bind=f"ipc://{path}")
     assert raw.ask(small_frame(1)).type_name == "result"
     assert raw.ask(Ping(1.0)).t == 1.0
     assert service.stop(TIMEOUT_S) == 0

@@ -11,13 +11,13 @@ from typer.testing import CliRunner
 
 from clients.commands.program import app
 from clients.filter_client import FilterClient
-from clients.service_process import ServiceProcess
+from clients.service_process import SERVE_COMMAND
 from filter_service import Camera, EyeFilter, FilterSettings, RgbdView
 from tests.batch_kills import start
 
 FOV_DEG = 50.0
 SEE = {"pupil_diameter_mm": 4.3, "focus_dpt": 0.7}
-WIDTH, HEIGHT = 160, 90
+WIDTH, HEIGHT = 96, 54
 CAMERA = Camera.from_fov(FOV_DEG, width_px=WIDTH, height_px=HEIGHT)
 
 
@@ -27,7 +27,7 @@ def image():
     color = rng.integers(0, 256, (HEIGHT // 3, WIDTH // 4, 3)).astype(np.uint8)
     color = color.repeat(3, axis=0).repeat(4, axis=1)
     depth_m = np.full((HEIGHT, WIDTH), 2.5, np.float32)
-    depth_m[20:60, 30:90] = 0.5
+    depth_m[12:36, 18:54] = 0.5
     return color, depth_m
 
 
@@ -51,6 +51,7 @@ def run(*arguments):
     return result.output
 
 
+@pytest.mark.long("an eye is traced and computed")
 def test_the_command_gives_the_same(in_process, files, tmp_path):
     color, depth = files
     printed = run(
@@ -64,17 +65,17 @@ def test_the_command_gives_the_same(in_process, files, tmp_path):
     assert FilterSettings(**settings) == FilterSettings()  # those that it went by
 
 
-def test_the_service_gives_the_same(in_process, image):
-    with (
-        ServiceProcess({"engine": "native"}, start_timeout_s=60.0) as service,
-        FilterClient(service.endpoint, timeout_s=60.0) as client,
-    ):
+@pytest.mark.long("a service traces and computes an eye")
+def test_the_service_gives_the_same(in_process, image, use_service):
+    service = use_service(command=SERVE_COMMAND, engine="native")
+    with FilterClient(service.endpoint, timeout_s=60.0) as client:
         client.set_profile("keratoconus", views=[CAMERA])
         view = RgbdView(*image, CAMERA.tangents)
         seen = client.filter(view, **SEE, output="linear")
     np.testing.assert_array_equal(seen.color, in_process)
 
 
+@pytest.mark.clients
 def test_a_batch_gives_the_same(in_process, files, tmp_path):
     room = tmp_path / "room"
     (room / "color").mkdir(parents=True)

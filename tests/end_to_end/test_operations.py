@@ -1,6 +1,7 @@
 """What runs a service for days: counters, signals, the unit."""
 
 import configparser
+import contextlib
 import json
 import os
 import re
@@ -16,10 +17,16 @@ import urllib.request
 import pytest
 
 from clients.filter_client import FilterClient
+from clients.service_process import ServiceProcess
 from filter_service.errors import TooManySessions
 from filter_service.service.config import load_config
 from filter_service.service.metrics import METRICS
-from tests.end_to_end.conftest import TIMEOUT_S, make_view
+from tests.end_to_end.conftest import (
+    QUICK_DOUBLE,
+    START_TIMEOUT_S,
+    TIMEOUT_S,
+    make_view,
+)
 from tests.source_tree import ROOT
 
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
@@ -42,8 +49,8 @@ def counters(port):
     }
 
 
-def test_counters_count(start_service, port):
-    service = start_service(metrics_port=port)
+def test_counters_count(use_service, port):
+    service = use_service(metrics_port=port)
     view = make_view()
     with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
         client.set_profile(EYE, views=[view])
@@ -57,6 +64,7 @@ def test_counters_count(start_service, port):
     assert found["ocufilter_memory_bytes"] > 20e6
 
 
+@pytest.mark.long("a service starts")
 def test_a_port_that_is_taken_is_said(start_service, port):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", port))
@@ -65,12 +73,78 @@ def test_a_port_that_is_taken_is_said(start_service, port):
             start_service(metrics_port=port)
 
 
-def test_a_closed_terminal_does_not_end_the_service(start_service):
-    service = start_service()
-    service.process.send_signal(signal.SIGHUP)
+def test_a_closed_terminal_does_not_end_the_service(shared_service):
+    shared_service.process.send_signal(signal.SIGHUP)
     time.sleep(0.3)
-    with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
+    with FilterClient(shared_service.endpoint, timeout_s=TIMEOUT_S) as client:
         assert client.ping()[1].is_ready
+
+
+@contextlib.contextmanager
+def service_that_writes(folder, stdout, stderr):
+    """Start a service with the double; return its endpoint once it is ready."""
+    ready, config = folder / "ready", folder / "service.toml"
+    config.write_text(f'bind = "tcp://127.0.0.1:*"\nready_file = "{ready}"\n')
+    command = [*QUICK_DOUBLE, "--config", str(config)]
+    outputs = {"stdout": stdout, "stderr": stderr}
+    with subprocess.Popen(command, cwd=ROOT, **outputs) as process:
+        try:
+            end_s = time.monotonic() + START_TIMEOUT_S
+            while not ready.exists():
+                assert process.poll() is None, "the service ended"
+                assert time.monotonic() < end_s
+                time.sleep(0.05)
+            yield ready.read_text().strip()
+            process.terminate()
+            assert process.wait(TIMEOUT_S) == 0
+        finally:
+            process.kill()
+
+
+@pytest.fixture
+def full_pipe():
+    """Return the end of a pipe that takes no byte any more."""
+    reading, writing = os.pipe2(os.O_NONBLOCK)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(writing, 65536 * b"x")
+    os.set_blocking(writing, True)
+    yield writing
+    os.close(reading)
+    os.close(writing)
+
+
+def filter_once(endpoint):
+    with FilterClient(endpoint, timeout_s=TIMEOUT_S) as client:
+        view = make_view()
+        client.set_profile(EYE, views=[view])
+        client.filter(view, **SEE)
+
+
+def test_a_log_that_nobody_reads_stops_no_client(tmp_path, full_pipe):
+    with service_that_writes(tmp_path, subprocess.DEVNULL, full_pipe) as endpoint:
+        for _ in range(3):
+            filter_once(endpoint)
+
+
+def test_an_output_that_nobody_reads_stops_no_start(tmp_path, full_pipe):
+    with service_that_writes(tmp_path, full_pipe, subprocess.DEVNULL) as endpoint:
+        filter_once(endpoint)
+
+
+@pytest.mark.parametrize("full", ["stdout", "stderr"])
+def test_a_full_disk_behind_its_output_ends_no_service(tmp_path, full):
+    """And the other output is as usual."""
+    paths = {"stdout": tmp_path / "out", "stderr": tmp_path / "err"}
+    paths[full] = "/dev/full"
+    with open(paths["stdout"], "w") as out, open(paths["stderr"], "w") as err:
+        with service_that_writes(tmp_path, out, err) as endpoint:
+            filter_once(endpoint)
+    if full == "stdout":
+        log = paths["stderr"].read_text()
+        assert "stdout cannot be written: No space left on device" in log
+    else:
+        assert paths["stdout"].read_text() == f"ocufilter: serving on {endpoint}\n"
 
 
 def hang_up(service, old, new, said):
@@ -85,8 +159,16 @@ def hang_up(service, old, new, said):
     time.sleep(0.1)  # the door has it from the keeper
 
 
-def test_limits_change_while_clients_are_served(start_service):
-    service = start_service(max_sessions=1, max_width_px=640)
+@pytest.fixture(scope="module")
+def reloaded():
+    """A service whose settings tests change, and change back."""
+    settings = {"max_sessions": 1, "max_width_px": 640, "threads": 1}
+    with ServiceProcess(settings, command=QUICK_DOUBLE) as service:
+        yield service
+
+
+def test_limits_change_while_clients_are_served(reloaded):
+    service = reloaded
     with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
         view = make_view()
         client.set_profile(EYE, views=[view])
@@ -105,10 +187,12 @@ def test_limits_change_while_clients_are_served(start_service):
         with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as other:
             assert other.welcome.limits.max_width_px == 1280
         client.filter(view, **SEE)
+    hang_up(service, "max_sessions = 2", "max_sessions = 1", "max_sessions is now 1")
+    hang_up(service, "width_px = 1280", "width_px = 640", "px is now 640")
 
 
-def test_what_cannot_change_is_said_and_a_wrong_file_changes_nothing(start_service):
-    service = start_service(max_sessions=1, threads=1)
+def test_what_cannot_change_is_said_and_a_wrong_file_changes_nothing(reloaded):
+    service = reloaded
     hang_up(
         *(service, "threads = 1", "threads = 2"),
         "threads: takes effect after a restart of the service",
@@ -119,8 +203,12 @@ def test_what_cannot_change_is_said_and_a_wrong_file_changes_nothing(start_servi
     )
     with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
         assert client.ping()[1].is_ready
+    wrong, right = "max_sessions = 1000", "max_sessions = 1"
+    text = service.config_file.read_text(encoding="utf-8")
+    service.config_file.write_text(text.replace(wrong, right), encoding="utf-8")
 
 
+@pytest.mark.long("a service starts")
 def test_the_log_is_json_for_programs(start_service):
     service = start_service(log_format="json")
     with FilterClient(service.endpoint, timeout_s=TIMEOUT_S, client_name="x") as client:

@@ -1,13 +1,18 @@
 """More frames than can be filtered, and clients that do not read: age and memory."""
 
+import json
+import subprocess
 import time
 
 import numpy as np
 import pytest
 
 from clients.filter_client import Dropped, FilterClient, FilteredFrame
+from clients.service_process import CHECKOUT
 from filter_service.messages import Ping, encode
+from tests.benchmarks.bench_abuse import ATTACK, Guest
 from tests.end_to_end.conftest import make_view, small_frame
+from tests.end_to_end.test_lifecycle import wait_until
 
 pytestmark = pytest.mark.clock
 
@@ -117,3 +122,42 @@ def test_a_client_that_floods_is_held_back_and_costs_bounded_memory(
     assert max(memory_mb) - before_mb < 60.0 < flood_mb / 3
     answers = [flooder.receive() for _ in range(n_frames)]
     assert sorted(a.frame_id for a in answers) == list(range(n_frames))
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *("surfaces", "items"),
+        *(pytest.param(k, marks=pytest.mark.slow) for k in ("zernike_set", "text")),
+    ],
+)
+def test_a_flood_of_profiles_takes_no_more_than_a_second_stream(real_service, kind):
+    """Rates beside each in turn: the machine may have other work."""
+    body = {"kind": "prescription", "sphere_dpt": -2}
+    rates_hz = {"stream": [], f"flood_{kind}": []}
+    silences_s = []
+    before = real_service.pids()
+    with Guest(real_service.endpoint, body=body) as guest:
+        wait_until(lambda: guest.n_filtered, limit_s=60.0)
+        for name in [*rates_hz] * 2:
+            attack = subprocess.Popen(
+                [*ATTACK, name, real_service.endpoint, "3"],
+                cwd=CHECKOUT,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+            assert attack.stdout.readline() == "begun\n"
+            time.sleep(0.5)
+            hz, silence_s = guest.watch(2.0)
+            rates_hz[name].append(hz)
+            counts = json.loads(attack.communicate()[0])
+            if name == "stream":
+                assert counts["result"] > 0
+            else:
+                silences_s.append(silence_s)
+                assert counts["sent"] > 100
+        assert not guest.errors
+    beside_stream_hz, beside_flood_hz = map(max, rates_hz.values())
+    assert beside_flood_hz > 0.8 * beside_stream_hz
+    assert min(silences_s) < 1.0
+    assert real_service.pids() == before

@@ -1,13 +1,11 @@
 """`ocufilter filter --plan`: what would be computed, said before anything is."""
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
-from tests.source_tree import ROOT
+from tests.commands import run_command as run
 
 WIDTH_PX, HEIGHT_PX = 64, 48
 
@@ -25,16 +23,7 @@ def arguments(tmp_path, rng):
     ]
 
 
-def run(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "filter_service", *arguments],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-
-
+@pytest.mark.long("a plan of a traced eye")
 def test_the_plan_is_said_and_nothing_is_written(arguments, tmp_path):
     finished = run(*arguments, "--mode", "dynamic", "--plan")
     assert finished.returncode == 0, finished.stderr
@@ -43,21 +32,20 @@ def test_the_plan_is_said_and_nothing_is_written(arguments, tmp_path):
     assert not (tmp_path / "out.npy").exists()
 
 
+@pytest.mark.long("two plans of a traced eye")
 def test_the_plan_as_json_follows_mode_tolerance_and_gaze(arguments):
     plans = [
         run(*arguments, "--mode", "quality", "--plan", "--json", *more)
         for more in (
-            [],
-            ["--tolerance", "fine", "--gaze-h-deg", "10"],
-            ["--grid", "paper"],
+            ["--tolerance", "loose"],
+            ["--gaze-h-deg", "10"],
         )
     ]
-    normal, fine, paper = (json.loads(p.stdout) for p in plans)
-    assert fine["psf_count"] > normal["psf_count"] > 0
-    assert fine["interpolation_db"] > normal["interpolation_db"] + 2.0
-    assert normal["h_deg"][0] == pytest.approx(-normal["h_deg"][-1])
-    assert fine["h_deg"][-1] < normal["h_deg"][-1] - 5.0
-    assert (paper["psf_count"], len(paper["h_deg"])) == (17577, 31)
+    loose, normal = (json.loads(p.stdout) for p in plans)
+    assert normal["psf_count"] > loose["psf_count"] > 0
+    assert normal["interpolation_db"] > loose["interpolation_db"] + 2.0
+    assert loose["h_deg"][0] == pytest.approx(-loose["h_deg"][-1])
+    assert normal["h_deg"][-1] < loose["h_deg"][-1] - 5.0
     axes = {"h", "v", "pupil", "accommodation", "defocus"}
     assert set(normal["error_db_by_axis"]) == axes
 

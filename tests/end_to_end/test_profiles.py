@@ -1,18 +1,21 @@
 """Profile changes while frames stream: no gap, no mix, every failure said."""
 
+import json
 import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from clients.filter_client import FilteredFrame
+from clients.filter_client import FilterClient, FilteredFrame
 from filter_service import errors
 from filter_service.messages import (
     Accepted,
     Dropped,
     ErrorReply,
+    Hello,
     ProfileRequest,
+    Progress,
     Ready,
     encode,
 )
@@ -131,14 +134,89 @@ def test_every_profile_of_a_burst_has_an_ending(shared_service, raw_client):
     assert set(endings.values()) == {"build_cancelled"}
 
 
-def test_a_build_that_does_not_listen_is_ended_by_force(start_service, raw_client):
-    from clients.filter_client import FilterClient
+LARGE = "x" * 3000
+"""Text that makes a profile too large to be read between two frames."""
 
-    service = start_service(cancel_grace_s=0.2)
+
+def test_frames_go_on_while_a_large_profile_is_read(client):
     view = make_view()
-    with FilterClient(service.endpoint, timeout_s=10.0) as client:
+    client.set_profile(double(5), views=[view])
+    number = client.request_profile(double(6, pad=LARGE, read_s=0.5))
+    marks = []
+    while not marks or marks[-1] == 5:
+        marks.append(mark_of(client.filter(view, **SEE)))
+    assert marks.count(5) > 5
+    assert marks[-1] == 6
+    names = [type(e).__name__ for e in client.poll() if e.profile_id == number]
+    assert (names[0], names[-1]) == ("Accepted", "Ready")
+
+
+def test_the_newest_of_several_large_profiles_is_read(shared_service, raw_client):
+    raw = raw_client(shared_service)
+    raw.begin()
+    time.sleep(0.1)  # of profiles that follow sooner, only the last would be read
+    for profile_id in (1, 2, 3, 4):
+        body = {"kind": "double", "mark": profile_id, "pad": LARGE, "read_s": 0.5}
+        raw.send(encode(ProfileRequest(profile_id, body)))
+    replies = [raw.receive() for _ in range(6)]
+    assert [(r.profile_id, getattr(r, "code", r.type_name)) for r in replies] == [
+        (2, "build_cancelled"),
+        (3, "build_cancelled"),
+        (1, "accepted"),
+        (1, "ready"),
+        (4, "accepted"),
+        (4, "ready"),
+    ]
+
+
+@pytest.mark.parametrize("pad", ["", LARGE], ids=["small", "large"])
+def test_a_profile_is_refused_alike_whatever_its_size(shared_service, raw_client, pad):
+    raw = raw_client(shared_service)
+    raw.begin()
+    header = encode(ProfileRequest(9, {}))[0]
+    for body, code, field in (
+        ({"kind": "double", "mark": 999, "pad": pad}, "profile_invalid", "mark"),
+        ({"kind": "nobody", "pad": pad}, "profile_invalid", "kind"),
+        ({"kind": "double", "pad": [pad, 1e999]}, "bad_message", "profile.pad[1]"),
+        ({"kind": "double", "pad": pad + 5000 * "x"}, "bad_message", "profile.pad"),
+        (b'{"kind": 1, "pad": "%b"' % pad.encode(), "bad_message", "profile"),
+    ):
+        data = body if isinstance(body, bytes) else json.dumps(body).encode()
+        raw.send([header, data])
+        reply = raw.receive()
+        assert (reply.code, reply.field, reply.profile_id) == (code, field, 9)
+    assert raw.ask(small_frame(1)).type_name == "result"
+
+
+def test_a_frame_after_a_large_first_profile_waits_for_it(shared_service, raw_client):
+    raw = raw_client(shared_service)
+    raw.ask(Hello("raw"))
+    body = {"kind": "double", "mark": 3, "pad": LARGE, "read_s": 0.2}
+    raw.send(encode(ProfileRequest(1, body)))
+    dropped = raw.ask(small_frame(1))
+    assert (dropped.frame_id, dropped.reason) == (1, "preparing")
+    accepted = raw.receive()
+    assert (accepted.type_name, accepted.is_building) == ("accepted", True)
+    assert raw.receive().type_name == "ready"
+    assert raw.ask(small_frame(2)).colors[0][0, 0, 0] == 3
+
+
+def test_a_process_that_dies_reading_is_told_and_the_next_profile_is_read(client):
+    view = make_view()
+    client.set_profile(double(5), views=[view])
+    with pytest.raises(errors.WorkerCrashed, match="reads profiles was killed by SIG"):
+        client.set_profile(double(6, pad=LARGE, crash_reading=True))
+    assert mark_of(client.filter(view, **SEE)) == 5
+    client.set_profile(double(7, pad=LARGE), views=[view])
+    assert mark_of(client.filter(view, **SEE)) == 7
+
+
+def test_a_build_that_does_not_listen_is_ended_by_force(brief_service):
+    view = make_view()
+    with FilterClient(brief_service.endpoint, timeout_s=10.0) as client:
         client.set_profile(double(5, build_s=60.0, deaf=True), views=[view], wait=False)
-        time.sleep(1.0)  # it runs
+        while not any(isinstance(event, Progress) for event in client.poll(10.0)):
+            pass  # it runs
         client.set_profile(double(6), views=[view], timeout_s=10.0)
         assert mark_of(client.filter(view, **SEE)) == 6
 
@@ -240,15 +318,6 @@ def test_set_profile_waits_until_it_is_ready(client):
         assert mark_of(client.filter(view, **SEE)) == 32
     with pytest.raises(ValueError, match="'first'"):
         client.set_profile(body, wait="last")
-
-
-def test_a_profile_that_fails_leaves_the_old_eye(client):
-    view = make_view()
-    client.set_profile(double(51), views=[view])
-    client.filter(view, **SEE)
-    with pytest.raises(errors.BuildFailed, match="told to fail"):
-        client.set_profile(double(53, fail=True))
-    assert mark_of(client.filter(view, **SEE)) == 51
 
 
 def test_over_the_field_a_shifted_camera_is_prepared_for_anew(client):

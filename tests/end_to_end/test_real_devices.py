@@ -12,7 +12,12 @@ from clients.filter_client import FilterClient, FilteredFrame
 from clients.service_process import ServiceProcess
 from tests.end_to_end.test_real_service import MYOPIA, NARROW, PLAIN, SEE, edge_view
 
-SETTINGS = NARROW | {"focus_range_dpt": (0, 0), "prepare": "ranges"}  # the same again
+SETTINGS = NARROW | {
+    "mode": "on-axis",
+    "eye_model": "wavefront",
+    "focus_range_dpt": (0, 0),
+    "prepare": "ranges",  # the same again
+}
 TIMEOUT_S = 20.0
 
 
@@ -38,6 +43,7 @@ def pair(two_engines):
         client.close()
 
 
+@pytest.mark.gl
 def test_each_engine_has_one_thread_and_gives_the_same_picture(two_engines, pair):
     view = edge_view()
     for client in pair:

@@ -13,24 +13,26 @@ import numpy as np
 import pytest
 
 from clients.filter_client import FilterClient, FilteredFrame, RgbdView
-from clients.service_process import CHECKOUT, ServiceProcess
+from clients.service_process import CHECKOUT
 from filter_service import EyeFilter, FilterSettings, ViewState, errors
 from filter_service.camera import tangents_from_fov
 from filter_service.messages import Camera, Dropped, body_of_eye
+from tests.benchmarks import bench_roundtrip
+from tests.commands import run_command, run_main
 from tests.numerical.surface_bodies import RELAXED
 
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0, "output": "linear"}
 # A narrow range of pupils and distances keeps the builds of these tests short.
 NARROW = {"pupil_range_mm": (3.9, 4.1), "object_range_dpt": (0, 1)}
+ON_AXIS = NARROW | {"mode": "on-axis"}
+"""Where the field is not the subject."""
+
+ONE_STATE = {"pupil_range_mm": (4.0, 4.0), "focus_range_dpt": (0.0, 0.0)}
+ONE_STATE |= {"object_range_dpt": (0.5, 0.5), "tolerance": "loose"}
+"""That of `SEE` and `edge_view`."""
+
 MYOPIA = {"kind": "prescription", "eye_side": "OD", "sphere_dpt": -12}
 PLAIN = {"kind": "prescription", "eye_side": "OD", "sphere_dpt": 0}
-
-
-@pytest.fixture(scope="module")
-def real_service():
-    with ServiceProcess(start_timeout_s=30.0) as service:
-        yield service
-        assert service.stop(10.0) == 0
 
 
 @pytest.fixture
@@ -72,7 +74,7 @@ def test_eyes_given_by_surfaces_are_filtered_and_a_blocked_one_is_refused(real_c
         ("implant", IMPLANT),
         ("strong implant", IMPLANT | {"implant": {"power_dpt": 30}}),
     ):
-        ready = real_client.set_profile(profile, settings=NARROW, views=[view])
+        ready = real_client.set_profile(profile, settings=ON_AXIS, views=[view])
         assert "as given by its surfaces" in " ".join(ready.notes)
         found = real_client.filter(view, **SEE | {"focus_dpt": 0.5})
         widths_px[name] = edge_width_px(found.color)
@@ -84,7 +86,7 @@ def test_eyes_given_by_surfaces_are_filtered_and_a_blocked_one_is_refused(real_c
         errors.FilterError, match=r"surfaces\[\d\]: outside a clear radius"
     ):
         real_client.set_profile(
-            RELAXED | {"surfaces": blocked}, settings=NARROW, views=[view]
+            RELAXED | {"surfaces": blocked}, settings=ON_AXIS, views=[view]
         )
     assert real_client.filter(view, **SEE).color.shape == view.color.shape
 
@@ -93,7 +95,7 @@ def test_a_myopic_eye_blurs_a_far_edge_and_a_normal_one_does_not(real_client):
     view = edge_view()
     widths_px = []
     for profile in (PLAIN, MYOPIA):
-        ready = real_client.set_profile(profile, settings=NARROW, views=[view])
+        ready = real_client.set_profile(profile, settings=ON_AXIS, views=[view])
         assert ready.psf_count > 0
         reply = real_client.filter(view, **SEE)
         widths_px.append(edge_width_px(reply.color))
@@ -103,6 +105,27 @@ def test_a_myopic_eye_blurs_a_far_edge_and_a_normal_one_does_not(real_client):
     # About 11 dpt of defocus over 4 mm blur by 44 mrad, with 8 mrad per pixel.
     assert widths_px[0] <= 1
     assert 4 <= widths_px[1] <= 6
+
+
+def test_the_code_of_a_note_does_not_depend_on_its_numbers(real_client):
+    view = edge_view(32, 18)
+    body = {"kind": "prescription", "sphere_dpt": -4, "vertex_mm": 12}
+    ready = real_client.set_profile(body, settings=NARROW, views=[view])
+    codes = [detail.code for detail in ready.note_details]
+    assert len(codes) == len(ready.notes)
+    assert {"focus_accuracy", "typical_aberrations", "plane_of_powers"} < {*codes}
+    assert "other" not in codes
+    headers = [
+        real_client.filter(view, **SEE | {"focus_dpt": focus_dpt}).header
+        for focus_dpt in np.linspace(0.0, 3.0, 35)
+    ]
+    assert len({header.notes for header in headers}) == 35
+    assert {d.code for h in headers for d in h.note_details} == {
+        "focus_beyond_far_point"
+    }
+    values = headers[7].note_details[0].values
+    assert values["focus_dpt"] == pytest.approx(7 * 3.0 / 34)
+    assert values["far_point_dpt"] == pytest.approx(3.76, abs=0.2)
 
 
 def test_a_hidden_layer_is_seen_past_a_blurred_edge(real_client):
@@ -116,7 +139,7 @@ def test_a_hidden_layer_is_seen_past_a_blurred_edge(real_client):
         hidden_color=np.zeros_like(seen.color),
         hidden_depth_m=hidden_m.astype(np.float32),
     )
-    settings = NARROW | {"object_range_dpt": (0, 10)}
+    settings = ON_AXIS | {"object_range_dpt": (0, 10)}
     real_client.set_profile(PLAIN, settings=settings, views=[seen])
     one, two = real_client.filter([seen, layered], **SEE).colors
     # 10 dpt over 4 mm blur by 2.5 px; 1.5 px inside the edge the near white covers all
@@ -128,6 +151,7 @@ def test_a_hidden_layer_is_seen_past_a_blurred_edge(real_client):
     np.testing.assert_allclose(one[45, 120:140], two[45, 120:140], atol=1e-3)
 
 
+@pytest.mark.long("a process starts and renders a scene")
 def test_a_scene_streams_with_what_it_hides(real_service):
     arguments = ("--scene", "primitives", "--profile", "emmetropia", "--hidden")
     finished = subprocess.run(
@@ -151,7 +175,7 @@ def test_a_scene_streams_with_what_it_hides(real_service):
 
 def test_one_profile_sent_twice_and_two_views_work(real_client):
     view = edge_view()
-    settings = NARROW | {"prepare": "ranges"}  # the same again
+    settings = ON_AXIS | {"prepare": "ranges"}  # the same again
     colors = []
     for _ in range(2):
         real_client.set_profile(MYOPIA, settings=settings, views=[view])
@@ -162,6 +186,7 @@ def test_one_profile_sent_twice_and_two_views_work(real_client):
         np.testing.assert_array_equal(color, colors[0])
 
 
+@pytest.mark.long("four eyes are traced and computed")
 def test_two_eyes_see_what_each_sees_alone_in_this_process(real_client):
     """An asymmetric pair through two profiles, two pupils and two gazes."""
     left_tangents, right_tangents = (-0.5, 0.3, 0.3, -0.4), (-0.3, 0.5, 0.3, -0.4)
@@ -200,11 +225,7 @@ def test_two_eyes_see_what_each_sees_alone_in_this_process(real_client):
 
 def test_a_frame_turns_the_gaze_and_is_told_when_it_turns_too_far(real_client):
     view = edge_view()
-    settings = NARROW | {
-        "focus_range_dpt": (0, 0),
-        "tolerance": "loose",
-        "gaze_range_deg": (15.0, 0.0),
-    }
+    settings = ONE_STATE | {"gaze_range_deg": (15.0, 0.0)}
     eye = {"kind": "preset", "name": "keratoconus"}
     real_client.set_profile(eye, settings=settings, views=[view])
     straight, aside, beyond = (
@@ -227,7 +248,7 @@ def test_a_frame_turns_the_gaze_and_is_told_when_it_turns_too_far(real_client):
 def test_a_gaze_far_to_the_side_is_prepared(real_client):
     """The axis, on which the eye focuses, is not in the picture then."""
     view = edge_view()
-    settings = {**NARROW, "gaze_deg": (50.0, 0.0)}
+    settings = {**ONE_STATE, "gaze_deg": (50.0, 0.0)}
     ready = real_client.set_profile("myopia", settings=settings, views=[view])
     assert ready.is_complete
     seen = real_client.filter(view, **SEE)
@@ -255,7 +276,7 @@ def test_bright_half_floats_scale_through_the_service(real_client):
     bright = RgbdView(
         (100 * view.color - 10).astype(np.float16), view.depth_m, view.tangents
     )
-    real_client.set_profile(MYOPIA, settings=NARROW, views=[view])
+    real_client.set_profile(MYOPIA, settings=ON_AXIS, views=[view])
     plain = real_client.filter(view, **SEE)
     seen = real_client.filter(bright, **SEE | {"output": "linear16"})
     assert seen.color.dtype == np.float16
@@ -264,9 +285,10 @@ def test_bright_half_floats_scale_through_the_service(real_client):
     assert seen.header.views[0].color.dtype == "float16"
 
 
+@pytest.mark.long("frames are filtered until an eye is built")
 def test_frames_go_on_while_an_eye_is_built_and_each_names_its_own(real_client):
     view = edge_view()
-    old = real_client.set_profile(PLAIN, settings=NARROW, views=[view])
+    old = real_client.set_profile(PLAIN, settings=ON_AXIS, views=[view])
     new = real_client.set_profile(
         MYOPIA, settings={"pupil_range_mm": (3, 5)}, wait=False
     )
@@ -309,16 +331,17 @@ def test_a_plan_beyond_the_memory_budget_is_refused_with_the_numbers(real_client
     assert caught.value.allowed == "2000 MB"
 
 
+@pytest.mark.long("processes start and three eyes are computed")
 def test_a_killed_worker_is_told_and_the_next_build_works(real_service, real_client):
     view = edge_view()
-    real_client.set_profile(PLAIN, settings=NARROW, views=[view])
+    real_client.set_profile(PLAIN, settings=ON_AXIS, views=[view])
     render = real_service.pids()["render"]
     children = Path(f"/proc/{render}/task").glob("*/children")
     pids = {int(pid) for file in children for pid in file.read_text().split()}
     workers = [
         pid
         for pid in pids
-        if b"building.worker" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        if b"from_profile:build" in Path(f"/proc/{pid}/cmdline").read_bytes()
     ]
     assert len(workers) == 1
 
@@ -330,10 +353,11 @@ def test_a_killed_worker_is_told_and_the_next_build_works(real_service, real_cli
             {"kind": "preset", "name": "keratoconus"}, views=[view], on_progress=kill
         )
     assert edge_width_px(real_client.filter(view, **SEE).color) <= 1
-    real_client.set_profile(MYOPIA, settings=NARROW, views=[view])
+    real_client.set_profile(MYOPIA, settings=ON_AXIS, views=[view])
     assert edge_width_px(real_client.filter(view, **SEE).color) >= 4
 
 
+@pytest.mark.tools
 def test_the_latency_benchmark_reports_stages_that_explain_the_age(
     real_service, tmp_path
 ):
@@ -364,29 +388,18 @@ def test_the_latency_benchmark_reports_stages_that_explain_the_age(
 
 
 def test_the_benchmark_refuses_nonsense_by_option():
-    finished = subprocess.run(
-        [sys.executable, "-m", "tests.benchmarks.bench_roundtrip", "--size", "12"],
-        cwd=CHECKOUT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    finished = run_main(bench_roundtrip.main, "--size", "12")
     assert finished.returncode == 2
     assert "--size is '12'" in finished.stderr
 
 
 def test_a_remote_interface_is_refused_by_the_program():
-    finished = subprocess.run(
-        [sys.executable, "-m", "filter_service", "serve", "--bind", "tcp://0.0.0.0:1"],
-        cwd=CHECKOUT,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    finished = run_command("serve", "--bind", "tcp://0.0.0.0:1")
     assert finished.returncode == 2
     assert "ocufilter keys add" in finished.stderr
 
 
+@pytest.mark.long("an eye is estimated, traced and computed")
 def test_an_eye_is_estimated_and_traced_with_progress_and_answers_larger_pupils(
     real_client,
 ):
@@ -415,12 +428,7 @@ def test_each_part_of_an_eye_names_its_error(real_client):
 
 def test_lateral_color_is_asked_of_a_traced_eye(real_client):
     view = edge_view()
-    settings = {
-        **NARROW,
-        "focus_range_dpt": (0, 0),
-        "tolerance": "loose",
-        "lateral_color": True,
-    }
+    settings = ONE_STATE
     images = {}
     for eye_model, lateral in (
         ("traced", True),
@@ -442,10 +450,9 @@ def test_lateral_color_is_asked_of_a_traced_eye(real_client):
 def test_cones_weigh_the_pupil_where_that_is_asked_for(real_client, eye_model):
     view = edge_view()
     settings = {
-        **NARROW,
-        "focus_range_dpt": (0, 0),
+        **ONE_STATE,
+        "mode": "on-axis",
         "prepare": "ranges",
-        "tolerance": "loose",
         "eye_model": eye_model,
     }
     images = {}

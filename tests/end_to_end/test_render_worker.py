@@ -1,6 +1,8 @@
 """The loop that filters, on a link of the test's own: order, and faults."""
 
+import os
 import pickle
+import socket
 import threading
 import time
 
@@ -10,8 +12,10 @@ from filter_service.building.limits import BuildLimits
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.filtering.builder import Builder
 from filter_service.messages import ProfileRequest, SharedPlaces
+from filter_service.service import render_worker
 from filter_service.service.process_channel import HEAD, Link
 from filter_service.service.render_worker import RenderWorker
+from filter_service.service.render_worker_process import handle_control
 from filter_service.shared_memory import Slot
 from tests.end_to_end.conftest import TIMEOUT_S, small_frame
 from tests.end_to_end.doubles import EngineDouble, read_profile
@@ -52,7 +56,8 @@ class FrontEnd:
         loop.connect(self.theirs[0])
         self.said = []
         self.thread = threading.Thread(
-            target=loop.run, args=(self.theirs[1], lambda message, _: False)
+            target=loop.run,
+            args=(self.theirs[1], lambda *message: handle_control(loop, *message)),
         )
         self.thread.start()
         for number in (1, 2):
@@ -116,6 +121,32 @@ def test_what_comes_in_a_rest_does_not_overtake_what_came_before(front_end, rest
     front_end.tell_at_once(frame, ("open", "b", 2, {}))
     assert front_end.answer_to(2).code == "no_profile", "not no_session: it was open"
     assert front_end.answer_to(1).type_name == "result"
+
+
+def test_a_front_end_that_comes_in_a_rest_is_heard(front_end, resting, monkeypatch):
+    """The link to it has the descriptor of the one to its predecessor."""
+    monkeypatch.setattr(render_worker, "IDLE_WAIT_S", 60.0)
+    old, (new, theirs) = front_end.link, Link.pair()
+    used = [os.dup(0)]
+    while used[-1] < front_end.theirs[0].fileno():
+        used.append(os.dup(0))
+
+    def replace():
+        old._socket.shutdown(socket.SHUT_RDWR)
+        resting.between()
+        front_end.control.send(("link", 0), [theirs.fileno()])
+
+    resting.in_the_middle = replace
+    front_end.frame(1, "a")
+    front_end.link = new
+    front_end.answer_to(1)
+    time.sleep(0.1)  # it waits
+    front_end.frame(2, "a")
+    assert front_end.answer_to(2).frame_id == 2
+    for end in (old, theirs):
+        end.close()
+    for descriptor in used:
+        os.close(descriptor)
 
 
 def test_a_frame_that_cannot_be_answered_is_answered(front_end):

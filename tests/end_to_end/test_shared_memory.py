@@ -81,7 +81,7 @@ def test_a_result_stays_as_it_is_as_long_as_somebody_has_it(shared_client):
         if value % 3:
             kept.pop(0)
         del reply
-        gc.collect()
+        gc.collect(1)  # all that these frames made
         for known, color in kept:
             assert np.all(color == 255 - known)
 
@@ -104,21 +104,21 @@ def test_a_lent_view_is_rendered_into_and_not_copied(shared_client):
         del reply  # else its slot is in use, and another is asked for
 
 
-def test_a_client_may_do_without(start_service):
-    service = start_service(shared_memory=False)
+def test_a_client_may_do_without(use_service, shared_service):
+    service = use_service(shared_memory=False)
     with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
         assert "shm" not in client.hello().transports
         view = make_view()
         client.set_profile(EYE, views=[view])
         for _ in range(4):
             assert not client.filter(view, **SEE).header.in_memory
-    raw_service = start_service()
-    with FilterClient(raw_service.endpoint, shared_memory=False) as client:
+    with FilterClient(shared_service.endpoint, shared_memory=False) as client:
         client.set_profile(EYE, views=[view])
         for _ in range(4):
             assert not client.filter(view, **SEE).header.in_memory
 
 
+@pytest.mark.long("a service starts, and a process of it again")
 @pytest.mark.parametrize("name", ["front-end", "render"])
 def test_memory_is_shared_again_after_a_process_was_killed(start_service, name):
     service = start_service()
@@ -134,8 +134,8 @@ def test_memory_is_shared_again_after_a_process_was_killed(start_service, name):
         np.testing.assert_array_equal(after.color, before.color)
 
 
-def test_nothing_is_left_behind_and_memory_goes_back(start_service):
-    service = start_service()
+def test_nothing_is_left_behind_and_memory_goes_back(shared_service):
+    service = shared_service
     view = make_view(1024, 1024)
     before_mb = service.memory_mb
     for _ in range(8):
@@ -146,8 +146,8 @@ def test_nothing_is_left_behind_and_memory_goes_back(start_service):
 
 
 @pytest.fixture
-def raw(start_service, raw_client):
-    client = raw_client(start_service())
+def raw(shared_service, raw_client):
+    client = raw_client(shared_service)
     client.begin()
     return client
 
@@ -185,9 +185,9 @@ def test_places_are_checked(raw):
     assert (good.type_name, good.in_memory) == ("result", True)
 
 
-def test_a_slot_in_use_is_not_taken_twice(start_service, raw_client):
-    raw = raw_client(start_service(filter_ms=300))
-    raw.begin()
+def test_a_slot_in_use_is_not_taken_twice(shared_service, raw_client):
+    raw = raw_client(shared_service)
+    raw.begin(more={"filter_ms": 300})
     first, second, third = (raw.ask(Share(4096)) for _ in range(3))
     raw.send(encode(in_memory(1, first.slot, second.slot)))
     answer = raw.ask(in_memory(2, first.slot, third.slot))
@@ -199,9 +199,8 @@ def test_a_slot_in_use_is_not_taken_twice(start_service, raw_client):
     assert raw.ask(in_memory(3, first.slot, third.slot)).in_memory
 
 
-def test_memory_has_bounds(start_service, raw_client):
-    service = start_service(max_image_mb=10)
-    raw = raw_client(service)
+def test_memory_has_bounds_for_each_session(small_service, raw_client):
+    raw, other = raw_client(small_service), raw_client(small_service)
     raw.ask(Hello("raw"))
     given = [raw.ask(Share(800_000)) for _ in range(5)]
     assert [g.slot is not None for g in given] == [True] * 3 + [False] * 2
@@ -210,8 +209,9 @@ def test_memory_has_bounds(start_service, raw_client):
     assert answer.slot is None
     many = [raw.ask(Share(64)) for _ in range(20)]
     assert sum(m.slot is not None for m in many) == 13
-    raw.close()
-    wait_until(lambda: raw_client(service).ask(Hello("other")).type_name == "welcome")
+    other.begin(mark=3)
+    assert other.ask(small_frame(1)).colors[0][0, 0, 0] == 3
+    assert other.ask(Share(800_000)).slot is not None
 
 
 def test_a_slot_is_sealed_and_full_from_the_start():

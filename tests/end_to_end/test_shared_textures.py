@@ -32,12 +32,16 @@ from tests.end_to_end.exported_textures import (
     size_of,
 )
 from tests.end_to_end.test_lifecycle import wait_until
+from tests.numerical.synthetic import assert_same_frame, is_same_frame
+
+pytestmark = pytest.mark.gl
 
 WIDTH, HEIGHT = SIZE_PX = 150, 101
 CAMERA = Camera(WIDTH, HEIGHT, tangents_from_fov(20.0, WIDTH, HEIGHT))
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 6.5}
 MAX_IMAGE_MB = 8
 LOST = "the render worker exited"
+LONG = pytest.mark.long("a service builds an eye, and frames by a software renderer")
 MAX_BOUND = 3
 """Textures of a frame.  Mesa 25 frees them when another frame binds others."""
 
@@ -111,7 +115,7 @@ def is_usable(gl, client):
     for number in used.numbers:
         client.unshare_texture(number)
     found = gl.read(exported[2])[..., :3]
-    return np.array_equal(found, of_arrays(client, seed=7).color)
+    return is_same_frame(found, of_arrays(client, seed=7).color)
 
 
 def leaks(service):
@@ -138,8 +142,10 @@ def has_few_maps(service, before=(0, 0, 0)):
 # ----- images
 
 
-@pytest.mark.parametrize("is_top_first", [True, False])
-@pytest.mark.parametrize("kind", ["rgba8", "srgb8_a8", "rgba16f"])
+@pytest.mark.parametrize("is_top_first", [pytest.param(True, marks=LONG), False])
+@pytest.mark.parametrize(
+    "kind", [pytest.param("rgba8", marks=pytest.mark.brief), "srgb8_a8", "rgba16f"]
+)
 def test_images_and_counts_are_those_of_arrays(client, gl, kind, is_top_first):
     color, depth_m = scene()
     output, flip = "srgb8", slice(None, None, 1 if is_top_first else -1)
@@ -160,7 +166,7 @@ def test_images_and_counts_are_those_of_arrays(client, gl, kind, is_top_first):
     )
     found = client.filter_textures([(CAMERA, used)], **SEE)
     image = gl.read(exported[2])[flip][..., :3]
-    np.testing.assert_array_equal(image, expected.color)
+    assert_same_frame(image, expected.color)
     ours, theirs = found.header, expected.header
     assert (found.colors, ours.in_memory) == ((), True)
     assert ours.views[0].color == theirs.views[0].color
@@ -208,7 +214,7 @@ def test_each_view_has_its_eye(client, gl):
     views = [RgbdView(*scene(seed), CAMERA.tangents) for seed in (1, 2)]
     expected = client.filter(views, states=states, **SEE)
     for exported, color in zip((left, right), expected.colors, strict=True):
-        np.testing.assert_array_equal(gl.read(exported[2])[..., :3], color)
+        assert_same_frame(gl.read(exported[2])[..., :3], color)
 
 
 def test_two_clients_have_only_their_own_textures(service, client, gl):
@@ -225,7 +231,7 @@ def test_two_clients_have_only_their_own_textures(service, client, gl):
             wait_until(lambda one=one: one.poll(0.1))
         for one, textures, seed in ((client, exported, 1), (other, others, 2)):
             found = gl.read(textures[2])[..., :3]
-            np.testing.assert_array_equal(found, of_arrays(one, seed).color)
+            assert_same_frame(found, of_arrays(one, seed).color)
 
 
 # ----- textures and sessions that end

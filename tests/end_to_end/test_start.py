@@ -60,17 +60,32 @@ with ExitStack() as closing:
 print(json.dumps(sorted(compiled() - before)))
 """
 
+STOPPED_DURING_THE_START = """
+import sys
+from filter_service.service import {module}
+from filter_service.service.config import load_config
+from filter_service.service.process_channel import Link
+
+near, end = Link.pair()
+near.send(("config", load_config(bind="tcp://127.0.0.1:*", engine="native")))
+near.send(("stop",))
+double = "tests.end_to_end.double_service:open_builder"
+sys.argv[1:] = [str(end.detach()), double, "render"]
+{module}.main()
+print("true")
+"""
+
 NOT_BEFORE_READY = {"numba", "llvmlite", "scipy", "matplotlib", "rich", "PIL"}
 """By the native engine; that of GL plans frames when it compiles its shaders."""
 
 
-def _printed(script):
+def _printed(script, *, timeout_s=120):
     ran = subprocess.run(
         [sys.executable, "-c", script],
         cwd=ROOT,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=timeout_s,
         check=False,
     )
     assert ran.returncode == 0, ran.stderr
@@ -94,5 +109,12 @@ def test_what_stands_before_the_frames_is_light(module, heavy):
     assert not set(_printed(LIGHT.format(module=module))) & heavy
 
 
+@pytest.mark.long("a process loads both engines")
 def test_what_is_loaded_ahead_is_all_that_frames_need():
     assert _printed(AFTER_READY) == []
+
+
+@pytest.mark.parametrize("module", ["front_end_process", "render_worker_process"])
+def test_a_process_that_is_stopped_during_its_start_ends(module, monkeypatch):
+    monkeypatch.setenv("OCUFILTER_TEST_FILTER_MS", "0")
+    assert _printed(STOPPED_DURING_THE_START.format(module=module), timeout_s=20)

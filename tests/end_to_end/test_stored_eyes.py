@@ -14,9 +14,9 @@ SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0, "output": "linear"}
 SETTINGS = {
     "mode": "dynamic",
     "tolerance": "loose",
-    "pupil_range_mm": (2.5, 6.0),
-    "focus_range_dpt": (0.0, 2.0),
-    "object_range_dpt": (0.0, 2.0),
+    "pupil_range_mm": (3.5, 4.5),
+    "focus_range_dpt": (0.0, 1.0),
+    "object_range_dpt": (0.0, 1.0),
 }
 EYE = {"kind": "prescription", "eye_side": "OD", "sphere_dpt": -2, "age_years": 20}
 FROM_DISK = "eye from the disk cache"
@@ -82,6 +82,7 @@ def test_every_frame_shows_one_of_the_two_eyes(built):
     assert not np.array_equal(old[0].color, last.color)
 
 
+@pytest.mark.long("a service starts and computes an eye")
 def test_a_restarted_service_takes_the_eye_from_disk(built, folder, view):
     _, last = built
     with (
@@ -101,6 +102,7 @@ def test_a_restarted_service_takes_the_eye_from_disk(built, folder, view):
         assert FROM_DISK not in other.notes
 
 
+@pytest.mark.slow
 def test_a_damaged_file_costs_a_build_and_a_word(built, folder, view):
     _, last = built
     for path in folder.glob("*.psfs"):

@@ -16,7 +16,10 @@ from filter_service import (
 from filter_service.errors import RenderFailed
 from tests.numerical.gl_textures import Textures, callers_context
 from tests.numerical.scene_frames import scene_view
+from tests.numerical.synthetic import assert_same_frame
 from tests.numerical.test_gl_objects import counted_objects
+
+pytestmark = pytest.mark.gl
 
 SIZE_PX = WIDTH, HEIGHT = 160, 90
 STATE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}
@@ -57,6 +60,8 @@ def shown_image(textures, target):
     return textures.read(target, SIZE_PX)[::-1, :, :3].astype(int)
 
 
+@pytest.mark.brief
+@pytest.mark.long("three filters build eyes")
 def test_frames_are_those_of_arrays(scene):
     with callers_context():
         textures = Textures()
@@ -72,7 +77,7 @@ def test_frames_are_those_of_arrays(scene):
             eye.set_profile("keratoconus")
             later = eye.filter_textures(view, target, **STATE)
             assert later.generation == 1  # until the new eye is ready
-            np.testing.assert_array_equal(shown_image(textures, target), found)
+            assert np.abs(shown_image(textures, target) - found).max() <= 1
             while later.generation == 1:
                 later = frame_of(eye, view, target)
                 time.sleep(0.01)
@@ -184,7 +189,7 @@ def test_frames_begun_early_are_those_of_filter(scene, where):
         eye.wait()
         other = eye.filter([views[0]], whole=True, **states[0]).color
         for finish, color in zip(begun, expected, strict=True):
-            np.testing.assert_array_equal(finish().color, color)
+            assert_same_frame(finish().color, color, is_exact=where == "native")
         assert (other != expected[0]).any()
         stored = len(eye.prepared_stores)
         eye.filter([views[0]], **states[0])  # frees what is no longer used

@@ -30,6 +30,7 @@ def _seen(state, body=MYOPE):
     return point_spread(body, state)[1]["half_light_arcmin"]
 
 
+@pytest.mark.clients
 def test_answers_failures_and_newer_questions():
     async def questions(figure_worker):
         state = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.0}
@@ -57,6 +58,7 @@ def test_answers_failures_and_newer_questions():
     assert last == (3, 1)
 
 
+@pytest.mark.clients
 def test_light_of_a_point_spreads_as_rays_have_it():
     """A disc of pupil times defocus: half of its light within 1 / sqrt(2) of it."""
     sharp = PointState((0.0, 0.0), 3.0, 4.0, 0.0)

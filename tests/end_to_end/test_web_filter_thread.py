@@ -69,6 +69,7 @@ def psnr_db(first, second):
     return -10.0 * np.log10(max(np.mean((first - second) ** 2), 1e-12))
 
 
+@pytest.mark.long("eyes are built, for a preview and in full")
 def test_small_then_full_and_the_full_one_is_the_filters_own(filter_thread, screen):
     filter_thread.request("page", request(1))
     preview, full = screen.until("full", 1)
@@ -85,6 +86,7 @@ def test_small_then_full_and_the_full_one_is_the_filters_own(filter_thread, scre
     assert psnr_db(view.color, expected) < 15.0
 
 
+@pytest.mark.long("eyes are built, for a preview and in full")
 def test_of_wishes_that_wait_the_newest_is_seen(filter_thread, screen):
     for number in range(1, 41):
         filter_thread.request("page", request(number, sphere_dpt=-number / 8.0))
@@ -93,6 +95,7 @@ def test_of_wishes_that_wait_the_newest_is_seen(filter_thread, screen):
     assert len(shown) < 40  # most were never begun
 
 
+@pytest.mark.long("eyes are built, for a preview and in full")
 def test_both_eyes_are_seen_each_through_its_own(filter_thread, screen):
     both = request(1, eyes=("OD", "OS"))
     both.bodies["OS"]["sphere_dpt"] = 0.0
@@ -111,6 +114,7 @@ def test_a_header_and_a_file_travel_together(filter_thread, screen):
     assert Image.open(io.BytesIO(data[4 + length :])).size == (60, 40)
 
 
+@pytest.mark.long("eyes are built, for a preview and in full")
 def test_what_cannot_be_seen_is_told_and_the_next_is_seen(filter_thread, screen):
     filter_thread.request("page", request(1, pupil_mm=40.0))
     (failed, *_) = screen.until("failed", 1)
@@ -119,6 +123,7 @@ def test_what_cannot_be_seen_is_told_and_the_next_is_seen(filter_thread, screen)
     screen.until("full", 2)
 
 
+@pytest.mark.long("eyes are built, for a preview and in full")
 def test_a_fault_of_one_page_does_not_end_the_others(filter_thread, screen):
     other = Screen()
     filter_thread.open("other", other.seen.put)

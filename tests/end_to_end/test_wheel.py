@@ -15,8 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from clients.service_process import ServiceProcess
 from tests.release.smoke import REQUEST
 from tests.source_tree import ROOT
+
+pytestmark = pytest.mark.tools
 
 TIMEOUT_S = 300  # where no kernel of numba's has been compiled yet
 WIDTH_PX, HEIGHT_PX = 24, 16
@@ -254,6 +257,17 @@ def test_serve_answers_a_client(installed):
     assert finished.returncode == 0, finished.stderr
 
 
+def test_latency_measures_a_service_in_another_process(run_json, installed):
+    plain = ("--mode", "on-axis", "--eye-model", "wavefront")
+    few = ("--size", "64x36", "--frames", 3, "--plot", "latency.png", *plain)
+    with ServiceProcess(start_timeout_s=TIMEOUT_S) as service:
+        (row,) = run_json("latency", service.endpoint, *few)["rows"]
+    frames = row["frames"]
+    assert frames["filtered"] + sum(frames["dropped"].values()) == 3
+    assert row["error"]["psnr_db"] > 35
+    assert (installed.cwd / "latency.png").read_bytes().startswith(b"\x89PNG")
+
+
 def test_estimate_finds_an_eye(run_json):
     found = run_json("estimate", "emmetropia")
     assert found["mean_abs_error_um"] <= 5e-4
@@ -284,7 +298,7 @@ def test_the_demo_is_there(run):
 
 
 EXTRAS = (
-    *("glfw", "OpenGL"),
+    *("glfw", "OpenGL", "pyrender", "trimesh"),
     *("xr", "nicegui", "fastapi", "uvicorn", "av", "ray"),
     *("prometheus_client", "skimage"),
 )

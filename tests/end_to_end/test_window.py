@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from clients.service_process import CHECKOUT, ServiceProcess
+from clients.service_process import CHECKOUT
 
 pytestmark = pytest.mark.clock
 
@@ -46,7 +46,7 @@ class Watched(window.LiveWindow):
             window._close_on_escape(self._window, glfw.KEY_ESCAPE, 0, glfw.PRESS, 0)
         return super().show(left, right, title)
 
-pyrender_stream.LiveWindow = Watched
+window.LiveWindow = Watched
 code = pyrender_stream.main(sys.argv[1:])
 assert Watched.n_shown == 4, Watched.n_shown
 sys.exit(code)
@@ -87,15 +87,18 @@ def test_window_shows_both_pictures_exactly_and_closes_on_escape(display):
     assert finished.returncode == 0, finished.stderr
 
 
-def test_live_stream_shows_answers_until_escape(display):
-    with ServiceProcess() as service:
-        finished = _python(
-            STREAM_UNTIL_ESCAPE,
-            "--window",
-            *("--endpoint", service.endpoint),
-            *("--scene", "primitives", "--size", "96x54", "--frames", "5"),
-            display=display,
-        )
+@pytest.mark.parametrize(
+    "renderer", ["own", pytest.param("pyrender", marks=pytest.mark.clients)]
+)
+def test_live_stream_shows_answers_until_escape(display, real_service, renderer):
+    finished = _python(
+        STREAM_UNTIL_ESCAPE,
+        "--window",
+        *("--endpoint", real_service.endpoint),
+        *("--scene", "primitives", "--size", "96x54", "--frames", "5"),
+        *("--renderer", renderer),
+        display=display,
+    )
     assert finished.returncode == 0, finished.stderr
     assert "frames filtered" in finished.stdout
 

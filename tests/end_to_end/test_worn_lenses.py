@@ -53,7 +53,8 @@ def true_kernel(object_dpt):
     return found
 
 
-@pytest.mark.parametrize("by", ["gl", "native"])
+@pytest.mark.parametrize("by", ["native", pytest.param("gl", marks=pytest.mark.gl)])
+@pytest.mark.long("an eye with two foci is computed over pupils and distances")
 def test_a_point_is_seen_through_all_foci(by):
     """Between the nodes of the cache too, in pupil and distance."""
     color = np.zeros((96, 96, 3), np.float32)

@@ -19,6 +19,8 @@
 set -eu
 here=$(cd "$(dirname "$0")" && pwd)
 checkout=$(cd "$here/../.." && pwd)
+PATH=$PATH:/usr/sbin:/sbin # chroot; Debian's accounts lack it
+export PATH
 
 if [ "${1:-}" != --mounting ]; then
     root=${HEADSET_ROOT:-$checkout/.headset}
@@ -63,5 +65,6 @@ exec chroot "$root" env -i PATH=$path HOME=/root LC_ALL=C.UTF-8 TERM="${TERM:-du
     PYTHONPYCACHEPREFIX=/var/cache/ocufilter/python \
     NUMBA_CACHE_DIR=/var/cache/ocufilter/numba \
     OCUFILTER_NATIVE_LIBRARY=/opt/ocufilter/loops.so \
+    OCUFILTER_DURATIONS=/var/cache/ocufilter/durations.json \
     PYTEST_ADDOPTS="-o cache_dir=/var/cache/ocufilter/pytest" \
     sh -c 'cd /checkout && exec "$@"' sh "$@"

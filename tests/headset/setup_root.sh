@@ -20,11 +20,14 @@
 # the C sources have changed.
 #
 # Exit status: 0 on success, 1 if a step failed (its last lines are printed), and 77 if
-# the chroot cannot be created on this machine.
+# the chroot cannot be created on this machine; the reason is also written to the file
+# OCUFILTER_SKIP_REASON.
 set -eu
 here=$(cd "$(dirname "$0")" && pwd)
 checkout=$(cd "$here/../.." && pwd)
 . "$checkout/ask_sudo.sh"
+PATH=$PATH:/usr/sbin:/sbin # chroot and debootstrap; Debian's accounts lack them
+export PATH
 kind=
 if [ "${1:-}" = --yes ]; then
     OCUFILTER_SETUP_YES=1
@@ -60,8 +63,9 @@ QT_STAMP=$root/.ocufilter-qt
 
 say() { printf 'headset: %s\n' "$*" >&2; }
 
-cannot() {
+cannot() { # .ci/run reports the reason of a skipped suite
     say "$*"
+    echo "$*" >"${OCUFILTER_SKIP_REASON:-/dev/null}"
     exit 77
 }
 
@@ -91,9 +95,12 @@ check_rights() {
         $as_root --preserve-env sh "$here/setup_root.sh" $kind "$root" || exit $?
         exit 0
     fi
-    if ! unshare --mount --net sh -c 'mount -t tmpfs tmpfs /mnt && chroot / true' \
-        2>/dev/null; then
-        cannot "private mounts, private networks or chroot are not permitted here"
+    for program in unshare mount chroot; do
+        command -v $program >/dev/null || cannot "$program is not in PATH ($PATH)"
+    done
+    if ! refusal=$(unshare --mount --net sh -c \
+        'mount -t tmpfs tmpfs /mnt && chroot / true' 2>&1); then
+        cannot "the kernel permits no private mounts, network or chroot: $refusal"
     fi
 }
 

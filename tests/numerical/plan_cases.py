@@ -223,7 +223,17 @@ def _corners(eye, spec, plan, states, object_dpt, axes):
 ALL_AXES = ("h", "v", "pupil", "accommodation", "defocus")
 
 
-def sampled_errors(eye, spec, plan, *, count, seed=0, axes=ALL_AXES, spectrum=None):
+def sampled_errors(
+    eye,
+    spec,
+    plan,
+    *,
+    count,
+    seed=0,
+    axes=ALL_AXES,
+    spectrum=None,
+    sample_count=4096,
+):
     """Mean square errors (count,) of images at random states, blended against exact.
 
     Parameters
@@ -231,9 +241,11 @@ def sampled_errors(eye, spec, plan, *, count, seed=0, axes=ALL_AXES, spectrum=No
     axes : tuple
         Which axes are interpolated: with "defocus" all must be; the others alone or
         together.
+    sample_count : int
+        States that the random ones are chosen from.
     """
-    sample = sample_states(eye, spec, 4096)
-    chosen = np.random.default_rng(seed).choice(4096, count, replace=False)
+    sample = sample_states(eye, spec, sample_count)
+    chosen = np.random.default_rng(seed).choice(sample_count, count, replace=False)
     sample = sample.select(chosen)
     return state_errors(
         eye,

@@ -8,7 +8,9 @@ import hashlib
 import json
 import math
 import os
+from collections import OrderedDict
 from dataclasses import dataclass
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +38,8 @@ ECCENTRICITIES_DEG = {(0, 0): 0, (16, 12): 20, (33, 24): 40}
 DENSITIES_MRAD = CASES["pixel_pitch_mrad"]
 KEPT_REFERENCES = Path(__file__).parents[2] / "out" / "psf_references"
 PUPILS_MM = tuple(CASES["pupil_diameters_mm"])
+N_REMEMBERED = 16
+_remembered: OrderedDict[tuple, np.ndarray] = OrderedDict()
 
 
 def zernike_from_terms(terms: dict[str, float]) -> np.ndarray:
@@ -121,16 +125,20 @@ def compared_radius_px(blur_radius_px: float) -> int:
     return int(np.ceil(blur_radius_px)) + 5
 
 
+@lru_cache(maxsize=N_REMEMBERED)
 def truth(
     name: str, pupil_mm: float, wavelength_nm: float, pitch_mrad: float, radius_px: int
 ) -> np.ndarray:
-    return reference_kernel(
+    """Return the reference of a case, read-only; the last ones are remembered."""
+    kernel = reference_kernel(
         case_zernike_um(name, pupil_mm),
         pupil_diameter_mm=pupil_mm,
         wavelength_nm=wavelength_nm,
         pixel_pitch_mrad=pitch_mrad,
         radius_px=radius_px,
     )
+    kernel.flags.writeable = False
+    return kernel
 
 
 @dataclass(frozen=True)
@@ -164,7 +172,27 @@ class Window:
         return kernel[rows, middle + x - self.radius_px :][:, : 2 * self.radius_px + 1]
 
     def reference(self, zernike_um: np.ndarray, options: dict) -> np.ndarray:
-        """Reference in the window, which whole pixels of tilt bring to the middle."""
+        """Reference in the window, which whole pixels of tilt bring to the middle.
+
+        The last ones are remembered.
+        """
+        key = (
+            self,
+            *(
+                (name, np.ndarray.tobytes(value) if np.ndim(value) else value)
+                for name, value in sorted(
+                    (options | {"zernike_um": zernike_um}).items()
+                )
+            ),
+        )
+        if key not in _remembered:
+            _remembered[key] = self._reference(zernike_um, options)
+            _remembered[key].flags.writeable = False
+            if len(_remembered) > N_REMEMBERED:
+                _remembered.popitem(last=False)
+        return _remembered[key]
+
+    def _reference(self, zernike_um: np.ndarray, options: dict) -> np.ndarray:
         jacobian = checked_scale(
             options.get("pixel_pitch_mrad"), options.get("pixel_from_mrad"), 1
         )[0]
@@ -218,11 +246,13 @@ def _smooth_noise(rng: np.random.Generator, size_px: int) -> np.ndarray:
     return np.clip(0.35 + 0.18 * noise / noise.std(), 0.0, 1.0)
 
 
+@cache
 def make_test_image(size_px: int = 512) -> np.ndarray:
     """(512, 512) float64 linear, peak 1: photo-like, black text on white, small marks.
 
     The upper half is 1/f noise with hard-edged objects, the lower left text, the lower
     right marks of 1 to 3 px, white on black: the hardest content for a PSF's tails.
+    The array is shared and read-only.
     """
     rng = np.random.default_rng(20)
     half = size_px // 2
@@ -243,6 +273,7 @@ def make_test_image(size_px: int = 512) -> np.ndarray:
             h, w = rng.integers(1, 4, 2)
             marks[y : y + h, x : x + w] = 1.0
     image[half:, half:] = marks
+    image.flags.writeable = False
     return image
 
 

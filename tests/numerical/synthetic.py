@@ -76,3 +76,43 @@ class Bench:
         layers = self.layers(**options)
         state = layers.reads, layers.layer_zero_dpt[:1], layers.layer_dpt
         return layer_blur_px(self.store, *state)
+
+
+MAX_ROUNDED_SHARE = 1e-3
+"""Of the bytes of a frame that a driver computes: those that may round otherwise."""
+
+
+def is_same_frame(found, expected, *, is_exact=False):
+    """Whether two images hold the same frame.
+
+    What the native engine computes is equal to the byte (``is_exact``).  OpenGL leaves
+    the rounding of divisions, roots and fused products to the driver, and llvmpipe's
+    depends on the processor: a sum that lies at the edge between two bytes may fall on
+    either side in another program.  Of a thousand bytes one may differ, by one step;
+    half floats by two units in the last place, floats by 1e-5 of white.
+    """
+    if found.shape != expected.shape or found.dtype != expected.dtype:
+        return False
+    if is_exact or np.array_equal(found, expected):
+        return bool(np.array_equal(found, expected))
+    if found.dtype == np.uint8:
+        steps = np.abs(found.astype(int) - expected.astype(int))
+        return bool(steps.max() <= 1 and np.mean(steps > 0) <= MAX_ROUNDED_SHARE)
+    relative = 2.0**-9 if found.dtype == np.float16 else 1e-5
+    return bool(
+        np.allclose(
+            found.astype(float), expected.astype(float), rtol=relative, atol=1e-5
+        )
+    )
+
+
+def assert_same_frame(found, expected, *, is_exact=False):
+    """Fail unless `is_same_frame`; say how the images differ."""
+    if is_same_frame(found, expected, is_exact=is_exact):
+        return
+    assert (found.shape, found.dtype) == (expected.shape, expected.dtype)
+    steps = np.abs(found.astype(float) - expected.astype(float))
+    raise AssertionError(
+        f"{np.count_nonzero(steps)} of {steps.size} values differ, by up to "
+        f"{steps.max():g}; the first at {np.argwhere(steps > 0)[:1].tolist()}"
+    )

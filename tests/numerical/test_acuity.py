@@ -41,8 +41,16 @@ def typical(pupil_mm, defocus_dpt=0.0):
     return zernike_um
 
 
-@pytest.mark.parametrize("pupil_mm", [2.0, 4.0, 7.0])
-@pytest.mark.parametrize("wavelength_nm", [450.0, 555.0, 640.0])
+@pytest.mark.parametrize(
+    ("pupil_mm", "wavelength_nm"),
+    [
+        (2.0, 450.0),
+        (2.0, 640.0),
+        (4.0, 555.0),
+        (7.0, 640.0),
+        pytest.param(7.0, 450.0, marks=pytest.mark.slow),
+    ],
+)
 def test_a_perfect_pupil_has_its_transfer_in_closed_form(pupil_mm, wavelength_nm):
     found = optical_transfer(
         NONE_UM, zernike_radius_mm=pupil_mm / 2, wavelength_nm=wavelength_nm
@@ -54,7 +62,8 @@ def test_a_perfect_pupil_has_its_transfer_in_closed_form(pupil_mm, wavelength_nm
     assert np.abs(found.transfer_ratio.imag).max() < 1e-12
 
 
-@pytest.mark.parametrize("pupil_mm", [3.0, 6.0])
+@pytest.mark.long("sphere and cylinder are searched")
+@pytest.mark.parametrize("pupil_mm", [3.0, pytest.param(6.0, marks=pytest.mark.slow)])
 def test_the_best_correction_of_a_lens_is_its_opposite(pupil_mm):
     zernike_um = np.zeros(28)
     zernike_um[3:6] = 0.4, -1.1, 0.7
@@ -64,17 +73,17 @@ def test_the_best_correction_of_a_lens_is_its_opposite(pupil_mm):
     assert np.array_equal(found[6:], zernike_um[6:])
 
 
+@pytest.mark.long("sphere and cylinder are searched")
 def test_no_lens_of_a_grid_beats_the_best_correction():
-    pupil = {"zernike_radius_mm": 2.5, "wavelength_nm": 555.0}
-    zernike_um = typical(5.0)
+    pupil = {"zernike_radius_mm": 2.0, "wavelength_nm": 555.0}
+    zernike_um = typical(4.0)
     zernike_um[[7, 12]] += 0.3, 0.1
     best = predict_acuity(best_correction_um(zernike_um, **pupil), **pupil)
     tried = zernike_um.copy()
-    for m_um in np.linspace(-0.6, 0.6, 5):
-        for j0_um in (-0.3, 0.0, 0.3):
-            tried[3:6] = 0.0, m_um, j0_um
-            other = predict_acuity(tried, **pupil)
-            assert other.visual_strehl_ratio < best.visual_strehl_ratio + 0.001
+    for m_um, j0_um in ((0.0, 0.0), (-0.3, 0.0), (0.3, 0.0), (0.0, -0.3), (0.3, 0.3)):
+        tried[3:6] = 0.0, m_um, j0_um
+        other = predict_acuity(tried, **pupil)
+        assert other.visual_strehl_ratio < best.visual_strehl_ratio + 0.001
 
 
 def test_large_defocus_has_the_transfer_of_a_disc():
@@ -122,15 +131,30 @@ def test_the_mean_eye_falls_with_the_pupil_below_the_perfect_one():
     assert wide < 0.5 * narrow
 
 
-@pytest.mark.parametrize("pupil_mm", [2.0, 4.0, 6.0])
+@pytest.mark.parametrize(
+    "pupil_mm", [2.0, 4.0, pytest.param(6.0, marks=pytest.mark.slow)]
+)
 def test_people_in_focus_read_what_young_adults_do(pupil_mm):
     """Best corrected -0.13 to -0.16 logMAR, +-0.06 (Elliott et al. 1995)."""
     found = predict_acuity(typical(pupil_mm, 0.1), zernike_radius_mm=pupil_mm / 2)
     assert found.log_mar == pytest.approx(-0.15, abs=0.12)
 
 
-@pytest.mark.parametrize("pupil_mm", [2.0, 3.0, 4.0, 6.0])
-@pytest.mark.parametrize("defocus_dpt", [1.0, 2.0, 3.0, 4.0])
+@pytest.mark.parametrize(
+    ("defocus_dpt", "pupil_mm"),
+    [
+        *((defocus_dpt, 2.0) for defocus_dpt in (1.0, 2.0, 3.0, 4.0)),
+        (2.0, 3.0),
+        (4.0, 4.0),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in (
+                *((1.0, 3.0), (3.0, 3.0), (4.0, 3.0), (1.0, 4.0), (2.0, 4.0)),
+                *((3.0, 4.0), (1.0, 6.0), (2.0, 6.0), (3.0, 6.0), (4.0, 6.0)),
+            )
+        ),
+    ],
+)
 def test_out_of_focus_acuity_follows_pupil_times_defocus(pupil_mm, defocus_dpt):
     """Smith 1991: the smallest angle is linear in pupil x defocus.
 
@@ -145,20 +169,22 @@ def test_out_of_focus_acuity_follows_pupil_times_defocus(pupil_mm, defocus_dpt):
 
 def test_acuity_and_strehl_ratio_fall_with_defocus():
     found = [
-        predict_acuity(typical(4.0, d), zernike_radius_mm=2.0)
-        for d in (0.25, 0.5, 1.0, 2.0, 4.0)
+        predict_acuity(typical(3.0, d), zernike_radius_mm=1.5) for d in (0.25, 1.0, 4.0)
     ]
     assert np.all(np.diff([a.log_mar for a in found]) > 0.0)
     assert np.all(np.diff([a.visual_strehl_ratio for a in found]) < 0.0)
 
 
-def test_a_perfect_eye_has_a_ratio_of_one_and_tilt_does_not_matter():
+def test_a_perfect_eye_has_a_ratio_of_one():
     perfect = predict_acuity(NONE_UM, zernike_radius_mm=1.5)
     assert perfect.visual_strehl_ratio == pytest.approx(1.0)
-    tilted = typical(5.0)
+
+
+def test_tilt_does_not_matter():
+    tilted = typical(3.0)
     tilted[1:3] = [3.0, -2.0]
-    assert predict_acuity(tilted, zernike_radius_mm=2.5) == predict_acuity(
-        typical(5.0), zernike_radius_mm=2.5
+    assert predict_acuity(tilted, zernike_radius_mm=1.5) == predict_acuity(
+        typical(3.0), zernike_radius_mm=1.5
     )
 
 
@@ -180,8 +206,7 @@ def test_the_transfer_is_the_autocorrelation_of_the_pupil():
     found = optical_transfer(
         zernike_um, zernike_radius_mm=radius_mm, wavelength_nm=wavelength_nm
     )
-    step_mm = 0.01
-    x, y = np.meshgrid(*[np.arange(-4.0, 4.0, step_mm)] * 2)
+    x, y = np.meshgrid(*[np.arange(-2.0, 2.01, 0.02)] * 2)  # where a pupil is open
 
     def pupil(x_mm, y_mm):
         inside = np.hypot(x_mm, y_mm) <= radius_mm
@@ -189,7 +214,8 @@ def test_the_transfer_is_the_autocorrelation_of_the_pupil():
         w_um = zernike_values(*unit) @ zernike_um
         return inside * np.exp(2j * np.pi * w_um * 1e3 / wavelength_nm)
 
-    whole = (np.abs(pupil(x, y)) ** 2).sum()
+    unmoved = pupil(x, y)
+    whole = (np.abs(unmoved) ** 2).sum()
     per_mm_cpd = np.radians(1.0) * 1e6 / wavelength_nm
     middle = found.frequency_cpd.size // 2
     ours, truths = [], []
@@ -199,7 +225,7 @@ def test_the_transfer_is_the_autocorrelation_of_the_pupil():
             (shift_mm, 0.0, (middle, middle + k)),
             (0.0, shift_mm, (middle + k, middle)),
         ):
-            overlap = pupil(x + move_x, y + move_y) * np.conj(pupil(x, y))
+            overlap = pupil(x + move_x, y + move_y) * np.conj(unmoved)
             ours.append(found.transfer_ratio[at])
             truths.append(overlap.sum() / whole)
     # Which conjugate depends on which way the image is turned: one for all points.
@@ -229,7 +255,10 @@ def test_people_pass_on_what_the_mean_eye_does():
                 *(residual_dpt * noise * [1.0, 0.5, 0.5]), zernike_radius_mm=2.0
             )
             seen = optical_transfer(
-                zernike_um, zernike_radius_mm=2.0, wavelength_nm=555.0
+                zernike_um,
+                zernike_radius_mm=2.0,
+                wavelength_nm=555.0,
+                frequency_step_cpd=1.0,
             )
             passed.append(seen.modulation(at_cpd))
         error = np.mean(passed, axis=0) - expected
@@ -256,7 +285,7 @@ def test_the_retina_samples_as_published():
 def test_through_focus_is_best_where_the_eye_looks():
     """An eye 2 dpt short-sighted reads best at half a meter."""
     zernike_um = typical(3.0, 2.0)
-    at_dpt = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
+    at_dpt = np.array([0.0, 2.0, 3.0])
     log_mar, ratio = acuity_through_focus(
         zernike_um, zernike_radius_mm=1.5, object_dpt=at_dpt
     )
@@ -267,6 +296,7 @@ def test_through_focus_is_best_where_the_eye_looks():
     assert log_mar[off] == pytest.approx(law, abs=0.23)
 
 
+@pytest.mark.long("an eye is traced and read at three directions")
 def test_over_the_field_the_retina_limits_sharp_eyes():
     table = field_table(
         parse_profile({"kind": "prescription", "sphere_dpt": 0.0}),

@@ -3,6 +3,10 @@
 import subprocess
 import sys
 
+import pytest
+
+pytestmark = pytest.mark.tools
+
 SCRIPT = """
 import sys
 from dataclasses import replace

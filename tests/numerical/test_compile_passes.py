@@ -1,6 +1,7 @@
 """After warming up, frames meet no shader that is not compiled."""
 
 import numpy as np
+import pytest
 
 from filter_service.constants import SORT_CAPACITIES
 from filter_service.gl.gpu import Gpu
@@ -29,6 +30,7 @@ def compiled_loops():
     }
 
 
+@pytest.mark.gl
 def test_no_program_is_compiled_by_the_first_frames(rng):
     gpu = Gpu()
     compile_passes(FilterRenderer(gpu))

@@ -132,6 +132,7 @@ def test_kernels_are_those_of_the_true_profile(name, pupil_mm, limit):
     assert np.abs(found - true).max() < limit
 
 
+@pytest.mark.long("the true profile of a lens is sampled")
 def test_the_light_of_foci_interferes_through_small_pupils():
     """Why kernels are not sums of those of each focus."""
     rings = worn_eye(**DESIGNS["edof"]).rings
@@ -144,6 +145,7 @@ def test_the_light_of_foci_interferes_through_small_pupils():
     assert errors[1] < 0.06
 
 
+@pytest.mark.long("transfer of published lenses at 32 distances")
 def test_published_modulation_is_met():
     table = PUBLISHED["transfer"]
     at_cpd = [table["line_pairs_per_mm"] * MM_PER_DEG]
@@ -299,7 +301,11 @@ def test_a_traced_eye_sees_through_each_part_of_a_progressive_lens():
     assert defocus[0][1] - defocus[1][1] > 0.3
 
 
-@pytest.mark.parametrize(("v_deg", "pupil_mm"), [(0.0, 4.0), (-25.0, 3.0)])
+@pytest.mark.long("light is carried from lens to pupil")
+@pytest.mark.parametrize(
+    ("v_deg", "pupil_mm"),
+    [pytest.param(0.0, 4.0, marks=pytest.mark.slow), (-25.0, 3.0)],
+)
 def test_lenslets_are_what_carries_light_from_lens_to_pupil(v_deg, pupil_mm):
     """Straight down the clear middle is seen, lower down the honeycomb."""
     eye = lenslet_eye(gaze_deg=[0.0, v_deg])
@@ -335,6 +341,7 @@ def test_lenslets_are_those_of_each_direction():
     assert together[1].kernel.max() != together[2].kernel.max()
 
 
+@pytest.mark.long("acuity through two lenses at three distances")
 def test_acuity_through_focus_has_the_foci_of_a_lens():
     """A monofocal lens blurs near what a bifocal one shows."""
     bifocal = worn_eye(**DESIGNS["bifocal"]).rings
@@ -423,6 +430,7 @@ def test_a_traced_eye_with_an_intraocular_lens_is_not_said_to_be_out_of_reach():
     assert eye.notes(pupil_diameter_mm=4.0, focus_dpt=0.0) == ()
 
 
+@pytest.mark.long("acuity through a lens at several distances")
 def test_people_read_so_much_through_an_extended_depth_of_focus():
     table = PUBLISHED["people"]["edof"]
     limit = table["tolerance_log_mar"]

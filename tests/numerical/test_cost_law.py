@@ -19,6 +19,8 @@ from tests.benchmarks.field_pictures import plot_costs
 from tests.benchmarks.splat_work import splat_work
 from tests.numerical.tile_lists import expected_lists, lights_tile, unpack_fragments
 
+pytestmark = pytest.mark.tools
+
 SIZE = (96, 64)
 
 

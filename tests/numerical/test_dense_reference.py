@@ -11,11 +11,11 @@ from tests.benchmarks.image_measures import ciede2000, measures, ssim
 from tests.benchmarks.layered_baselines import barsky, celaya, depth_objects, gonzalez
 from tests.benchmarks.paper_baselines import (
     RULES,
-    _splat,
     paper_dynamic,
     paper_on_axis,
     paper_quality,
     predecessor,
+    splat_sources,
 )
 from tests.benchmarks.paper_layout import (
     ON_AXIS,
@@ -35,6 +35,8 @@ from tests.numerical.test_renderer_field import (
     splat_exactly,
     tangents_of,
 )
+
+pytestmark = pytest.mark.tools
 
 WIDTH, HEIGHT = 56, 42
 
@@ -172,7 +174,7 @@ def test_baselines_add_up_as_they_say(rng, rule):
     layer_of = np.repeat(node_of.reshape(-1, 1, 1), 3, axis=1)
     each = np.full(node_of.size, radius)
     ones = np.ones(layer_of.shape)
-    seen, _ = _splat(view, state, sources, layers, layer_of, ones, each, rule)
+    seen, _ = splat_sources(view, state, sources, layers, layer_of, ones, each, rule)
     assert np.allclose(seen, gathered(state, view, rule), atol=1e-6)
     shared = dense_reference(view, state, bins=False, kept=False)
     assert np.allclose(seen, shared, atol=1e-6) == (rule == "coverage")

@@ -95,13 +95,13 @@ def _errors_um(profiles):
 
 
 def test_random_eyes_are_met(rng):
-    errors_um = _errors_um([p for p, _ in random_eye_profiles(15, rng)])
+    errors_um = _errors_um([p for p, _ in random_eye_profiles(8, rng)])
     assert np.median(errors_um) <= MEDIAN_LIMIT_UM / 20.0
     assert errors_um.max() <= MEDIAN_LIMIT_UM
 
 
 def test_population_wavefronts_are_met(rng):
-    errors_um = _errors_um(population_profiles(15, rng))
+    errors_um = _errors_um(population_profiles(8, rng))
     assert np.median(errors_um) <= MEDIAN_LIMIT_UM / 20.0
     assert errors_um.max() <= MEDIAN_LIMIT_UM
 
@@ -240,10 +240,11 @@ def test_start_table_traces_and_stays_in_the_allowed_ranges():
     assert np.all(np.isfinite(zernike_um))
 
 
+@pytest.mark.long("a search is given 0.4 s")
 def test_search_gets_nearer_the_longer_it_runs():
     profile = preset("astigmatism")
     short, longer = (
-        estimate_eye(profile, method="search", max_time_s=t) for t in (0.05, 1.0)
+        estimate_eye(profile, method="search", max_time_s=t) for t in (0.05, 0.4)
     )
     assert longer.n_evaluations > short.n_evaluations
     assert longer.mean_abs_error_um < short.mean_abs_error_um

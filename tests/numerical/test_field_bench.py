@@ -13,9 +13,11 @@ from tests.benchmarks.bench_field import (
     target_rows,
 )
 from tests.benchmarks.field_methods import FOCUS_RANGE_DPT, METHODS, PAPER_RANGES
-from tests.benchmarks.field_pictures import _medians, error_figure, plot_errors
+from tests.benchmarks.field_pictures import error_figure, plot_errors
 from tests.benchmarks.published_figures import CONDITIONS, published
 from tests.numerical.scene_frames import SCENES
+
+pytestmark = pytest.mark.tools
 
 ROW = FieldRow(
     bench="field",
@@ -105,16 +107,22 @@ def test_layouts_that_are_not_written_to_be_fast_have_no_time():
     assert not any(name.startswith(("paper", "predecessor")) for name in timed)
 
 
-def test_the_plot_has_a_point_for_each_size():
-    points = [("a", 40.0, 40.0), ("a", 20.0, 60.0), ("a", 30.0, 40.0), ("b", 5.0, 20.0)]
-    times_ms, errors = _medians(points)
-    assert times_ms == [5.0, 30.0]
-    assert errors == pytest.approx([0.1, 0.01])
-
-
 def _points(axes):
     """Points (n, 2) of each line by its label or number."""
     return {line.get_label(): line.get_xydata() for line in axes.get_lines()}
+
+
+def test_the_plot_has_the_medians_of_each_size():
+    points = [
+        ("2x2", 40.0, 40.0),
+        ("2x2", 20.0, 60.0),
+        ("2x2", 30.0, 40.0),
+        ("1x2", 5.0, 20.0),
+    ]
+    rows = [replace(ROW, size=s, median_ms=ms, error=db) for s, ms, db in points]
+    time, *_ = error_figure(rows).axes
+    found = _points(time)["ours quality"]
+    np.testing.assert_allclose(found, [[5.0, 0.1], [30.0, 0.01]])
 
 
 def test_each_axis_has_one_kind_of_error_and_only_times_taken_alike(tmp_path):

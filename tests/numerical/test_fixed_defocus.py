@@ -12,7 +12,15 @@ WIDE = {
 }
 
 
-@pytest.mark.parametrize("name", ["emmetropia", "keratoconus", "cataract"])
+@pytest.mark.long("an eye is traced over its widest ranges")
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("emmetropia", marks=pytest.mark.slow),
+        "keratoconus",
+        pytest.param("cataract", marks=pytest.mark.slow),
+    ],
+)
 def test_defocus_equals_that_of_the_wavefronts(name, rng):
     """Through small, whole and cut-off pupils, relaxed and accommodating."""
     spec = spec_for(320, 180, **WIDE)
@@ -37,7 +45,7 @@ def test_defocus_equals_that_of_the_wavefronts(name, rng):
 
 def test_a_state_that_was_not_traced_is_refused():
     spec = spec_for(320, 180, **WIDE)
-    eye = traced_eye("emmetropia", spec)
+    eye = traced_eye("keratoconus", spec)
     at_state = eye.defocus_at(h_deg=[0.0], v_deg=[0.0], wavelength_nm=[536.0])
     with pytest.raises(ValueError, match="pupil_diameter_mm 12 to 12: traced are"):
         at_state(pupil_diameter_mm=12.0, accommodation_dpt=0.0)

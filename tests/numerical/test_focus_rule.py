@@ -52,9 +52,8 @@ def defocus_dpt(model, residual, *, pupil_mm, accommodation_dpt):
     wave_um = polynomial_in_mm(found.zernike_um, found.zernike_radius_mm).ravel()
     wave_um = wave_um + residual.on_axis_um(pupil_mm)[0]
     x, y = points_mm(found.ellipse_mm.ravel(), pupil_mm / 2.0)
-    values_um = sum(
-        c * x**a * y**b for c, (a, b) in zip(wave_um, EXPONENTS, strict=True)
-    )
+    of_x, of_y = (np.vander(v, EXPONENTS.max() + 1, increasing=True) for v in (x, y))
+    values_um = (of_x[:, EXPONENTS[:, 0]] * of_y[:, EXPONENTS[:, 1]]) @ wave_um
     columns = np.stack([np.ones_like(x), x, y, x**2 + y**2], axis=-1)
     return -2.0 * np.linalg.lstsq(columns, values_um)[0][3]
 

@@ -86,8 +86,15 @@ CASES = {
 }
 
 
+@pytest.fixture(scope="module")
+def stores():
+    """Make the stores of all cases, some of which several cases share."""
+    for (name, settings), *_ in CASES.values():
+        store_for(name, **settings)
+
+
 @pytest.fixture(params=CASES)
-def case(request, rng):
+def case(request, rng, stores):
     """Store, layers, image cells and used pairs."""
     (name, settings), pupil_mm, focus_dpt, share, gaze_deg = CASES[request.param]
     store = store_for(name, **settings)
@@ -99,7 +106,7 @@ def case(request, rng):
     return store, layers, image, used
 
 
-def test_the_cases_read_one_two_and_three_neighbors():
+def test_the_cases_read_one_two_and_three_neighbors(stores):
     found = set()
     for (name, settings), pupil_mm, focus_dpt, *_ in CASES.values():
         store = store_for(name, **settings)

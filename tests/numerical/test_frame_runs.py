@@ -6,6 +6,8 @@ import pytest
 from tests.benchmarks.frame_runs import CHANGE, states_towards, timed_frames
 from tests.numerical.synthetic import Bench, texture
 
+pytestmark = pytest.mark.tools
+
 SIZE = {"width_px": 64, "height_px": 40, "vertical_fov_deg": 30.0}
 WIDE = {"pupil_range_mm": (3.0, 5.0), "focus_range_dpt": (0.0, 2.0)}
 POINT = {"pupil_range_mm": (5.0, 5.0), "focus_range_dpt": (0.5, 0.5)}

@@ -15,6 +15,8 @@ from filter_service.rgbd_view import RgbdView
 from tests.numerical.plan_cases import spec_for, traced_eye
 from tests.numerical.scene_frames import scene_view
 
+pytestmark = pytest.mark.gl
+
 SIZE = {"width_px": 160, "height_px": 90}
 STATES = [
     {"pupil_diameter_mm": pupil_mm, "focus_dpt": focus_dpt}

@@ -21,6 +21,8 @@ from tests.numerical.gl_textures import SETS, ViewTextures, callers_context
 from tests.numerical.plan_cases import spec_for, traced_eye
 from tests.numerical.scene_frames import scene_view
 
+pytestmark = pytest.mark.gl
+
 KINDS = (
     *("Buffer", "Texture", "Query", "Program", "Shader", "Framebuffer"),
     *("Sampler", "VertexArray", "Renderbuffer"),

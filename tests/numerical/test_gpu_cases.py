@@ -7,9 +7,11 @@ from tests.benchmarks.gpu_cases import STATE, TextureCase, open_case
 from tests.benchmarks.pass_work import (
     RATES,
     PassWork,
-    _searched,
     rates_of,
+    searched_blocks,
 )
+
+pytestmark = pytest.mark.tools
 
 SIZE_PX = (192, 108)
 
@@ -41,7 +43,7 @@ def test_searched_blocks():
         for x in range(12)
         for y in range(7)
     )
-    assert _searched(reach_px, bins, tiles) == expected
+    assert searched_blocks(reach_px, bins, tiles) == expected
 
 
 def test_the_longest_bound_counts():

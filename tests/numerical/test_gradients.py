@@ -226,7 +226,16 @@ def _directions(eye, origin, chief, targets):
     return direction
 
 
-@pytest.mark.parametrize("h_deg", [0.0, 13.0, 27.0, 40.0])
+@pytest.mark.long("rays are integrated in small steps by another program")
+@pytest.mark.parametrize(
+    "h_deg",
+    [
+        pytest.param(0.0, marks=pytest.mark.slow),
+        pytest.param(13.0, marks=pytest.mark.slow),
+        pytest.param(27.0, marks=pytest.mark.slow),
+        40.0,
+    ],
+)
 def test_wavefronts_match_an_independent_integration(h_deg):
     eye, stop_mm = liou_brennan(), 4.0
     found = wavefront_grid(

@@ -65,7 +65,17 @@ def scene(rng):
     return RgbdView(color, np.ascontiguousarray(depth_m), CAMERA.tangents)
 
 
-@pytest.mark.parametrize("name", list(HARD))
+OFTEN = ("+20 dpt worn", "keratoconus")
+
+
+@pytest.mark.long("an eye is traced and planned over its widest ranges")
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name not in OFTEN))
+        for name in HARD
+    ],
+)
 def test_hard_eyes_are_finite_and_smooth_through_sweeps(rng, name):
     renderer, handle, _ = prepared(HARD[name])
     view = scene(rng)
@@ -94,7 +104,11 @@ def test_hard_eyes_are_finite_and_smooth_through_sweeps(rng, name):
 def test_any_display_is_filtered(rng, display):
     body = {"kind": "preset", "name": "keratoconus"}
     renderer, handle, _ = prepared(
-        body, display=display, pupil_range_mm=(4.0, 4.0), focus_range_dpt=(1.0, 1.0)
+        body,
+        mode="on-axis",
+        display=display,
+        pupil_range_mm=(4.0, 4.0),
+        focus_range_dpt=(1.0, 1.0),
     )
     view = scene(rng)
     seen = renderer.render(view, handle, pupil_diameter_mm=4.0, focus_dpt=1.0)
@@ -122,7 +136,8 @@ def test_blur_beyond_all_kernels_is_refused_in_words():
 
 def test_an_eye_that_nobody_has_is_named():
     for name in ("-20 dpt", "+20 dpt"):
-        *_, notes = prepared(
-            HARD[name], pupil_range_mm=(3.0, 3.0), focus_range_dpt=(0.0, 0.0)
+        settings = FilterSettings(
+            mode="on-axis", pupil_range_mm=(3.0, 3.0), focus_range_dpt=(0.0, 0.0)
         )
+        _, notes = eye_for_spec(parse_profile(HARD[name]), GridSpec(CAMERA, settings))
         assert any("unusual for a person" in note for note in notes)

@@ -5,6 +5,8 @@ import pytest
 from tests.benchmarks.bench_host import case_rows, hardware_like
 from tests.benchmarks.gpu_cases import open_case
 
+pytestmark = pytest.mark.tools
+
 
 @pytest.fixture(scope="module")
 def case():

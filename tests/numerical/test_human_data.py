@@ -179,18 +179,28 @@ def test_a_perfect_prediction_differs_by_nothing(people):
     assert found.difference > 0.05
 
 
-def test_people_have_the_higher_orders_that_are_published(people):
-    found = {f.setting: f for f in higher_order_findings([], people)}
-    own = [f for f in higher_order_findings([], people) if f.count > 1]
+@pytest.fixture(scope="module")
+def higher_orders(people):
+    return list(higher_order_findings([], people))
+
+
+@pytest.fixture(scope="module")
+def refractions(people):
+    return list(refraction_findings([], people))
+
+
+def test_people_have_the_higher_orders_that_are_published(higher_orders):
+    findings = higher_orders
+    found = {f.setting: f for f in findings}
+    own = [f for f in findings if f.count > 1]
     assert found["mean, 6 mm"].theirs == 0.327
     means = [f for f in own if f.setting == "mean, 4 mm"]
     assert means[0].ours == pytest.approx(0.086, abs=0.002)  # orders 3 and 4 alone
 
 
-def test_the_periphery_of_myopes_is_relatively_hyperopic(people):
-    found = list(refraction_findings([], people))
+def test_the_periphery_of_myopes_is_relatively_hyperopic(refractions):
     for side in ("-30", "+30"):
-        of_side = [f for f in found if f"{side} deg" in f.setting]
+        of_side = [f for f in refractions if f"{side} deg" in f.setting]
         assert np.all(np.diff([f.theirs for f in of_side]) > 0.4)
         assert np.all(np.diff([f.ours for f in of_side]) > 0.3)
 
@@ -207,6 +217,7 @@ def test_a_figure_is_a_row_and_a_line(capsys):
     assert line == "a b c 0.750 0.500 0.250 -0.125 - 0.125 - d"
 
 
+@pytest.mark.tools
 def test_the_picture_is_drawn_and_small(tmp_path, people):
     findings = [*straylight_findings(), *higher_order_findings([], people)]
     names = {"typical eye": 1, "their own fields": 3}

@@ -6,6 +6,8 @@ from scipy.signal import fftconvolve
 
 from tests.benchmarks.lens_reference import NOTHING, Lens, lens_picture
 
+pytestmark = pytest.mark.tools
+
 LENS = Lens(5.0, 0.5, (1.25, 1.25))
 PX_PER_DPT = 2.0
 SHAPE = (30, 44)

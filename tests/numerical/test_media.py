@@ -141,8 +141,8 @@ def test_scattered_light_is_that_of_the_direct_sum(rng):
 
     Its pixels are larger than cells usually are: 3 % is what cells leave between them.
     """
-    width, height, sub = 44, 30, 4
-    camera = Camera.from_fov(20.0, width_px=width, height_px=height)
+    width, height, sub = 28, 24, 3
+    camera = Camera.from_fov(16.0, width_px=width, height_px=height)
     straylight = Straylight(60.0)
     blocks = rng.random((height // 6, width // 4, 3)).astype(np.float32) ** 4
     color = np.kron(blocks, np.ones((6, 4, 1), np.float32))
@@ -181,13 +181,13 @@ def test_the_smallest_pictures_are_finite(size):
     camera = Camera.from_fov(10.0, width_px=size[0], height_px=size[1])
     color = np.ones((size[1], size[0], 3), np.float32)
     seen = hazed(color, camera, Straylight())
-    assert seen == pytest.approx(1.0, rel=1e-4)
+    np.testing.assert_allclose(seen, 1.0, rtol=1e-4)
 
 
 def test_light_scales():
     first = hazed(lamp(WIDE, 50, 300, 1.0), WIDE, Straylight())
     second = hazed(lamp(WIDE, 50, 300, 4096.0), WIDE, Straylight())
-    assert second == pytest.approx(4096.0 * first, rel=1e-4, abs=1e-9)
+    np.testing.assert_allclose(second, 4096.0 * first, rtol=1e-4, atol=1e-9)
 
 
 def test_bytes_are_those_of_the_srgb_curve():

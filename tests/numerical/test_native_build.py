@@ -46,7 +46,31 @@ def test_processors_with_avx2_use_it():
         pytest.skip("needs Linux and the native engine")
     flags = re.search(r"^flags\s*:(.*)$", cpuinfo.read_text(), re.MULTILINE)
     has_avx2 = flags is not None and {"avx2", "fma"} <= set(flags[1].split())
-    assert compiled_library().variant == ("avx2" if has_avx2 else "portable")
+    is_portable = os.environ.get("OCUFILTER_NATIVE_VARIANT") == "portable"
+    expected = "avx2" if has_avx2 and not is_portable else "portable"
+    assert compiled_library().variant == expected
+
+
+def run_with_variant(variant):
+    """A new process that prints the variant which it uses."""
+    code = (
+        "from filter_service.native.library import compiled_library as library\n"
+        "print(library().variant)"
+    )
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "OCUFILTER_NATIVE_VARIANT": variant},
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_the_environment_selects_the_variant():
+    if library_path() is None:
+        pytest.skip("needs the native engine")
+    assert run_with_variant("portable").stdout == "portable\n"
+    refused = run_with_variant("sse9")
+    assert "OCUFILTER_NATIVE_VARIANT='sse9'; allowed: auto, portable" in refused.stderr
 
 
 def test_packed_words_are_those_of_python():
@@ -80,6 +104,7 @@ def test_fields_of_records_are_those_of_the_source_in_order(file, name, record):
 
 
 @needs_compiler
+@pytest.mark.tools
 @pytest.mark.parametrize("variant", ["-O3", "-O0"])
 def test_sources_compile_without_a_warning(tmp_path, variant):
     flags = ("-Wall", "-Wextra", "-Wshadow", "-Wconversion", "-Wno-sign-conversion")

@@ -143,7 +143,7 @@ def random_zernike(rng, count, waves):
     return zernike_um
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     waves=st.sampled_from([0.05, 0.5, 2.0, 6.0]),
@@ -185,10 +185,19 @@ def test_random_wavefronts_have_the_kernels_of_the_python_engine(
         assert ours.lost_energy_ratio[k] <= 1.4 * (1.0 - KEPT)
 
 
-@pytest.mark.parametrize("name", CASE_NAMES)
+SLOW_CASES = ("emm_1D", "myopia4D")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW_CASES))
+        for name in CASE_NAMES
+    ],
+)
 def test_cases_are_as_near_the_quadrature_as_the_python_engine(name):
-    # small pixels take the quadrature minutes
-    pupil_mm, pitch_mrad, radius_px = 4.0, 2.0, 24
+    # small pixels take the quadrature minutes, and 4 mm ten times as long as 2.5 mm
+    pupil_mm, pitch_mrad, radius_px = 2.5, 1.5, 18
     zernike_um = case_zernike_um(name, pupil_mm)
     wavefronts = wavefronts_of(zernike_um, pupil_mm=pupil_mm, pitch_mrad=pitch_mrad)
     ours, _, left = computed(wavefronts)
@@ -217,11 +226,11 @@ def test_apodized_pupils_and_wide_primaries_are_those_of_the_python_engine():
         [[590.0, 610.0, 640.0], [510.0, 536.0, 560.0], [440.0, 460.0, 480.0]]
     )
     wavefronts = wavefronts_of(
-        random_zernike(rng, 6, 1.5), pupil_mm=6.0, wavelength_nm=wide_nm
+        random_zernike(rng, 4, 1.5), pupil_mm=6.0, wavelength_nm=wide_nm
     )
     ours, *_ = computed(wavefronts, stiles_crawford=effect)
     theirs = twin(wavefronts, stiles_crawford=effect)
-    for k in range(18):
+    for k in range(12):
         assert error_ratio(kernel(ours, k), kernel(theirs, k)) <= 0.03, k
 
 
@@ -310,12 +319,12 @@ def test_processors_without_vectors_have_the_same_kernels():
 def test_pupils_behind_rings_are_those_of_the_python_engine(lens):
     rings = LENSES[lens]
     rng = np.random.default_rng(7)
-    wavefronts = wavefronts_of(random_zernike(rng, 4, 0.8), pupil_mm=4.5)
+    wavefronts = wavefronts_of(random_zernike(rng, 3, 0.8), pupil_mm=4.5)
     ours, methods, left = computed(wavefronts, rings=NodeRings.of(rings, wavefronts))
     assert not left.size
-    assert methods == {"fourier": 12}
+    assert methods == {"fourier": 9}
     theirs = twin(wavefronts, rings=rings)
-    for k in range(12):
+    for k in range(9):
         assert error_ratio(kernel(ours, k), kernel(theirs, k)) <= 0.03, k
     without, *_ = computed(wavefronts)
     assert error_ratio(kernel(ours, 1), kernel(without, 1)) > 0.1

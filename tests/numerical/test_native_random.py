@@ -23,6 +23,11 @@ ROUNDING_DB = 75.0
 """Weights of 15 bits and sums in float32, where a pixel may be made of two weights."""
 
 
+MANY = settings(
+    deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+)
+
+
 @st.composite
 def frames(draw):
     """Size, kernel radius, seed of all numbers, and how distances lie."""
@@ -59,14 +64,7 @@ def random_view(rng, bench, case):
     return RgbdView(color, depth_m, bench.tangents, "radial")
 
 
-@settings(
-    max_examples=120,
-    deadline=None,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.too_slow],
-)
-@given(frames())
-def test_random_frames_are_those_of_the_twin(case):
+def assert_twin_makes_the_same(case):
     rng = np.random.default_rng(case["seed"])
     height_px, width_px = case["size"]
     kernel = random_kernel(rng, case["radius_px"])
@@ -81,6 +79,19 @@ def test_random_frames_are_those_of_the_twin(case):
     assert np.isfinite(result.color).all()
     assert psnr_db(result.color, truth) >= ROUNDING_DB
     bench.renderer.close()
+
+
+@settings(MANY, max_examples=10)
+@given(frames())
+def test_random_frames_are_those_of_the_twin(case):
+    assert_twin_makes_the_same(case)
+
+
+@pytest.mark.slow
+@settings(MANY, max_examples=60)
+@given(frames())
+def test_many_random_frames_are_those_of_the_twin(case):
+    assert_twin_makes_the_same(case)
 
 
 @settings(max_examples=20, deadline=None, derandomize=True)

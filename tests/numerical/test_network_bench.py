@@ -29,6 +29,8 @@ from tests.numerical.traced_networks import (
     trace_focus,
 )
 
+pytestmark = pytest.mark.tools
+
 OFF_UM = 0.1
 FOCUSES_DPT = np.array([0.125, 4.125])
 PUPILS_MM = np.array([3.0, 5.0])

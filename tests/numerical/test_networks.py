@@ -279,7 +279,7 @@ def test_of_several_measurements_the_axial_one_is_asked_of():
 
 
 def test_refined_eyes_do_not_depend_on_where_they_start(rng):
-    for profile, _ in random_eye_profiles(5, rng):
+    for profile, _ in random_eye_profiles(2, rng):
         table = estimate_eye(profile, starts=("table",))
         network = estimate_eye(profile, starts=("network",))
         both = estimate_eye(profile, starts=("table", "network"))
@@ -337,6 +337,7 @@ def test_an_unknown_start_is_refused():
         estimate_eye(profile, starts=("guess",))
 
 
+@pytest.mark.long("a process imports and estimates")
 def test_everything_runs_with_torch_absent_and_without_a_warning():
     script = (
         "import sys\n"

@@ -80,8 +80,15 @@ def relative(profile, focus_dpt, pupil_mm):
     return power_dpt[1:] - power_dpt[0], zernike_um[1:, 8] - zernike_um[0, 8]
 
 
-@pytest.mark.parametrize("name", ["emmetropia", "keratoconus"])
-@pytest.mark.parametrize("focus_dpt", [2.0, 6.0])
+@pytest.mark.parametrize(
+    ("focus_dpt", "name"),
+    [
+        (6.0, "emmetropia"),
+        pytest.param(6.0, "keratoconus", marks=pytest.mark.slow),
+        pytest.param(2.0, "emmetropia", marks=pytest.mark.slow),
+        pytest.param(2.0, "keratoconus", marks=pytest.mark.slow),
+    ],
+)
 def test_refraction_off_the_axis_is_that_of_the_relaxed_eye(name, focus_dpt):
     profile = preset(name, age_years=20)
     relaxed_dpt, _ = relative(profile, None, 4.0)
@@ -89,10 +96,10 @@ def test_refraction_off_the_axis_is_that_of_the_relaxed_eye(name, focus_dpt):
     assert found_dpt == pytest.approx(relaxed_dpt, abs=5e-3)
 
 
-@pytest.mark.parametrize("pupil_mm", [2.0, 6.0])
+@pytest.mark.parametrize("pupil_mm", [pytest.param(2.0, marks=pytest.mark.slow), 6.0])
 def test_other_pupils_and_coma_change_no_more_than_in_people(pupil_mm):
     profile = preset("emmetropia", age_years=20)
-    found = [relative(profile, dpt, pupil_mm) for dpt in (None, 2.0, 4.0, 6.0)]
+    found = [relative(profile, dpt, pupil_mm) for dpt in (None, 4.0, 6.0)]
     sphere_dpt = np.array([power_dpt[:, 0] for power_dpt, _ in found])
     # studies: none, or 0.1 to 0.5 dpt more myopic over several diopters
     assert np.all(sphere_dpt[-1] - sphere_dpt[0] < 0.35)
@@ -126,11 +133,13 @@ def test_the_eye_model_alone_turns_hyperopic():
     assert np.all(near_dpt[:, 0] - relaxed_dpt[:, 0] > 1.2)
 
 
-@pytest.mark.parametrize("name", ["myopia", "cataract"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("myopia", marks=pytest.mark.slow), "cataract"]
+)
 def test_the_slope_of_the_refraction_over_the_pupil_is_continuous(name):
     eye, _ = prepare_eye(
         preset(name),
-        pupil_diameters_mm=np.arange(2.0, 8.1),
+        pupil_diameters_mm=[2.0, 4.0, 6.0, 8.0],
         wavelengths_nm=[555.0],
         field_range_deg=((-40.0, 40.0), (-1.0, 1.0)),
     )
@@ -153,7 +162,7 @@ def test_the_slope_of_the_refraction_over_the_pupil_is_continuous(name):
 
 def test_drawn_peripheries_have_the_mean_and_the_spread_of_people():
     told = peripheral_change(preset("emmetropia"))
-    count = 1000
+    count = 300
     drawn = [peripheral_change(preset("emmetropia", sample=k)) for k in range(count)]
     drawn_um = np.array([change.knots_um for change in drawn])
     sphere_um = drawn_um.reshape(count, len(TERMS), -1)[:, TERMS.index(4)]
@@ -333,7 +342,7 @@ def test_the_stated_uncertainty_is_that_of_people(people):
     inside = []
     for out in folds(people.people, 5):
         population = Population.fit(people.people.select(~out))
-        for eye in np.flatnonzero(out):
+        for eye in np.flatnonzero(out)[::5]:
             change = peripheral_change(
                 profile_of(people.people.axis_um[eye]), population
             )

@@ -14,10 +14,12 @@ from filter_service.rendering.gl.kernel_passes import FrameState, KernelPasses, 
 from tests.numerical import plan_twin
 from tests.numerical.test_frame_plan import CASES, store_for
 
+pytestmark = pytest.mark.gl
+
 SUM_RTOL = 3e-5
 """Sums of 32-bit floats; shares between nodes of defocus are differences of them."""
 
-MOST_PAIRS = 500
+MOST_PAIRS = 150
 """More of the made-up kernels, which are large, would not fit a software renderer."""
 
 
@@ -71,7 +73,20 @@ def any_texel_count(monkeypatch):
     monkeypatch.setattr(image_cells, "TEXELS_PER_PIXEL", np.inf)
 
 
-@pytest.fixture(params=CASES)
+BRIEF = "pupil on a node"
+LONG = pytest.mark.long("an eye is planned, by a software renderer as well")
+SAME_PASSES = (
+    # of another case of the loops, with as many neighbors and nodes
+    *("lowest end", "highest end", "accommodation on a node", "several accommodations"),
+)
+PLANNED = [
+    pytest.param(name, marks=[pytest.mark.brief, LONG] if name == BRIEF else [])
+    for name in CASES
+    if name not in SAME_PASSES
+]
+
+
+@pytest.fixture
 def case(request, rng, gpu):
     """A plan, and used pairs."""
     (name, settings), pupil_mm, focus_dpt, share, gaze_deg = CASES[request.param]
@@ -144,6 +159,7 @@ def assert_work(planned, work_list, numbers, sizes):
     assert found == expected
 
 
+@pytest.mark.parametrize("case", PLANNED, indirect=True)
 def test_kernels_are_those_of_the_compiled_loops(case):
     planned, used = case
     planned.plan_until_complete(used)
@@ -192,6 +208,11 @@ def test_kernels_are_those_of_the_compiled_loops(case):
     assert planned.count(c.PLAN_BASE_TEXELS) == sizes[:, 0].sum()
 
 
+@pytest.mark.parametrize(
+    "case",
+    [BRIEF, "every pair", "two planes", "a single layer"],
+    indirect=True,
+)
 def test_a_state_that_stays_keeps_its_kernels(case, rng):
     planned, used = case
     planned.plan_until_complete(used)
@@ -225,12 +246,8 @@ def planned_case(gpu):
 
 
 def test_missing_psfs_are_reported_and_others_take_their_weight(gpu):
-    (name, settings), pupil_mm, focus_dpt, *_ = CASES["between all nodes"]
-    store = store_for(name, **settings)
-    layers = frame_layers(store, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt)
-    planned = Planned(
-        gpu, store, layers, image_cells.image_cells(store.spec, store.plan)
-    )
+    planned = planned_case(gpu)
+    store, layers = planned.store, planned.layers
     used = np.zeros((planned.image.count, interval_count(layers)), bool)
     used[0, 0] = used[5, 3] = True
     assert planned.plan(used)
@@ -262,27 +279,12 @@ def test_missing_psfs_are_reported_and_others_take_their_weight(gpu):
 
 
 def test_a_plan_that_does_not_fit_is_made_again(gpu, monkeypatch):
+    """With more kernels than records, and more texels than any plan has at first."""
     monkeypatch.setattr(kernel_passes, "FIRST_RECORDS", 7)
-    monkeypatch.setattr(
-        kernel_passes.Capacity, "__init__", _small_capacity(kernel_passes.Capacity)
-    )
-    (name, settings), pupil_mm, focus_dpt, *_ = CASES["between all nodes"]
-    store = store_for(name, **settings)
-    layers = frame_layers(store, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt)
-    planned = Planned(
-        gpu, store, layers, image_cells.image_cells(store.spec, store.plan)
-    )
-    used = np.zeros((planned.image.count, interval_count(layers)), bool)
+    planned = planned_case(gpu)
+    used = np.zeros((planned.image.count, interval_count(planned.layers)), bool)
     used[::10, ::40] = True
     assert not planned.plan(used)
     planned.plan_until_complete(used)
     assert planned.count(c.PLAN_KERNELS) == used.sum() > 7
-
-
-def _small_capacity(kind):
-    whole = kind.__init__
-
-    def init(self, kernels, nodes, texels=64, node_texels=64):
-        whole(self, kernels, nodes, texels, node_texels)
-
-    return init
+    assert planned.count(c.PLAN_TEXELS) > kernel_passes.FIRST_TEXELS

@@ -142,8 +142,8 @@ def filtering_db(kernels, others):
 @pytest.mark.parametrize(
     ("corner_deg", "gaze_deg"),
     [
-        ((22, 32, 8, 15), (0, 0)),
-        ((-33, -23, -16, -9), (0, 0)),
+        pytest.param((22, 32, 8, 15), (0, 0), marks=pytest.mark.slow),
+        pytest.param((-33, -23, -16, -9), (0, 0), marks=pytest.mark.slow),
         ((2, 12, 4, 11), (-14, 9)),
     ],
 )
@@ -214,9 +214,12 @@ def splat_exactly(bench, color, depth_m):
     return light[inside] / weight[inside]
 
 
-@pytest.mark.parametrize("name", ["emmetropia", "keratoconus"])
+@pytest.mark.long("every pixel's PSF is computed")
+@pytest.mark.parametrize(
+    "name", [pytest.param("emmetropia", marks=pytest.mark.slow), "keratoconus"]
+)
 def test_whole_field_agrees_with_the_exact_psf_of_every_pixel(engine, rng, name):
-    width, height = 96, 72
+    width, height = 64, 48
     bench = FieldBench(
         engine, name, tangents(width, height, 40.0), size=(width, height)
     )

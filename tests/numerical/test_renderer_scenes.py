@@ -15,6 +15,7 @@ from tests.reference import render_passes as reference
 
 SIZE = {"width_px": 320, "height_px": 180}
 STATE = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.5}
+OFTEN = ("keratoconus", "myopia")
 MERGING = [(eye, scene) for eye in ("myopia", "astigmatism") for scene in SCENES]
 """Cases in which at least half of the pixels merge."""
 
@@ -30,10 +31,24 @@ def eye_store(eye, scene):
     return build_psf_store(parse_profile({"kind": "preset", "name": eye}), spec)
 
 
+@pytest.fixture(scope="module")
+def often():
+    """Render the scenes and compute the eyes of the cases that run often."""
+    for scene in SCENES:
+        for eye in OFTEN:
+            eye_store(eye, scene)
+
+
 @pytest.mark.parametrize("accumulation", ["coverage", "paper"])
 @pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("eye", preset_names())
-def test_passes_agree_with_the_sorted_gather(engine, eye, scene, accumulation):
+@pytest.mark.parametrize(
+    "eye",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name not in OFTEN))
+        for name in preset_names()
+    ],
+)
+def test_passes_agree_with_the_sorted_gather(engine, often, eye, scene, accumulation):
     view, store = scene_view(scene, **SIZE), eye_store(eye, scene)
     renderer = engine.new_renderer()
     handle = renderer.load(store)

@@ -188,6 +188,7 @@ def test_plane_through_a_myope_is_true_convolution(engine, rng, object_dpt):
     assert psnr_db(result.color[inside, inside], truth[inside, inside]) >= 60.0
 
 
+@pytest.mark.long("the exact PSFs of 160 distances")
 def test_slanted_plane_is_the_normalized_gather(engine, rng):
     bench = Bench(engine, MYOPE, **NARROW)
     eye = MeasuredWavefront.from_profile(parse_profile(MYOPE))

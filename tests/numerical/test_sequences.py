@@ -24,6 +24,8 @@ from tests.benchmarks.sequences import (
     path,
 )
 
+pytestmark = pytest.mark.tools
+
 FRAMES = 12
 FIRST = {"camera": 60, "pupil": 70, "focus": 80, "gaze": 58}
 """Frames at which the parts of the paths start."""

@@ -29,6 +29,7 @@ from tests.reference import render_passes as reference
 PUPILS_MM = (3.0, 4.0, 5.0, 6.0)
 GREEN_NM = RGB_WAVELENGTHS_NM[1]
 AXIS = {"h_deg": 0.0, "v_deg": 0.0}
+NORMAL = {"kind": "prescription", "sphere_dpt": 0.0}
 
 
 def traced(body, *, wavelengths_nm=RGB_WAVELENGTHS_NM, pupils_mm=PUPILS_MM):
@@ -117,7 +118,7 @@ def test_an_object_at_the_focus_is_in_focus(sphere_dpt, focus_dpt, pupil_mm):
 
 
 def test_a_focus_that_was_not_traced_is_said():
-    estimated = estimate_eye(parse_profile({"kind": "prescription", "sphere_dpt": 0.0}))
+    estimated = estimate_eye(parse_profile(NORMAL))
     eye = TracedEye.trace(
         estimated,
         pupil_diameters_mm=PUPILS_MM,
@@ -130,6 +131,17 @@ def test_a_focus_that_was_not_traced_is_said():
         assert "outside the prepared range" in note
         used_dpt = eye.reachable_focus_dpt(4.0, pupil_diameter_mm=pupil_mm)
         assert 1.98 < used_dpt < 3.0
+
+
+@pytest.mark.parametrize("focus_range_dpt", [(0.0, 2.0), (1.0, 2.0), (2.0, 6.0)])
+def test_accommodations_are_no_denser_than_blending_needs(focus_range_dpt):
+    """Nodes are at most 1 dpt apart, and one node fewer would be more than that."""
+    _, eye = traced(NORMAL, wavelengths_nm=(555.0,), pupils_mm=(3.0, 5.0))
+    nodes_dpt = eye.accommodation_nodes_dpt(focus_range_dpt, pupil_range_mm=(3.0, 5.0))
+    range_dpt = nodes_dpt[-1] - nodes_dpt[0]
+    assert range_dpt > 0.9 * (focus_range_dpt[1] - focus_range_dpt[0])
+    assert np.diff(nodes_dpt).max() <= 1.0 + 1e-9
+    assert nodes_dpt.size == 2 or range_dpt > nodes_dpt.size - 2
 
 
 def test_worn_correction_moves_the_far_point():
@@ -161,7 +173,7 @@ def test_blended_kernels_equal_traced_ones_between_nodes():
     spec = grid_spec(
         camera=Camera(1000, 1000, (-0.65, 0.65, 0.65, -0.65)),
         pupil_range_mm=(4.0, 5.0),
-        focus_range_dpt=(0, 6),
+        focus_range_dpt=(2, 5),
     )
 
     eye, notes = eye_for_spec(parse_profile(body), spec)

@@ -191,7 +191,7 @@ def test_aberrations_are_added_once():
 
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_finds_the_eye_with_them(method):
-    found = estimate_eye(profile(age_years=40), method=method, max_time_s=0.5)
+    found = estimate_eye(profile(age_years=40), method=method, max_time_s=0.1)
     assert found.profile.zernike_um[SPHERICAL] == pytest.approx(0.128, abs=5e-4)
     assert [NOTE in note for note in found.notes] == [True] + [False] * (
         len(found.notes) - 1

@@ -7,16 +7,20 @@ import numpy as np
 import pytest
 
 from filter_service.errors import BadMessage, NotPrepared, OutOfGpuMemory, RenderFailed
-from filter_service.gl.gpu import Gpu
+from filter_service.gl.gpu import GROWTH, Gpu
 from filter_service.gl.imported_textures import TextureImporter
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import TextureRequest
 from filter_service.rendering.gl import texture_frames
 from filter_service.rendering.gl.renderer import FilterRenderer
+from filter_service.rendering.gl.texture_frames import HEADROOM
+from filter_service.settings import RenderOptions
 from filter_service.texture_view import TextureMemory, TextureView
 from tests.numerical.gl_textures import Textures
-from tests.numerical.synthetic import Bench, depth_scene, texture
+from tests.numerical.synthetic import Bench, assert_same_frame, depth_scene, texture
 from tests.numerical.test_textures import FIELD, HEIGHT, MYOPIA, SIZE_PX, STATES, WIDTH
+
+pytestmark = pytest.mark.gl
 
 
 @pytest.fixture(scope="module")
@@ -66,37 +70,32 @@ def waiting(own_gpu, bench, rng):
     return Waiting(own_gpu, bench, rng, bench.store)
 
 
-def test_every_frame_is_complete_and_has_its_own_counts(
-    waiting, bench, own_gpu, monkeypatch
-):
-    waits = []
-    wait = own_gpu.wait
-    monkeypatch.setattr(own_gpu, "wait", lambda: waits.append(1) or wait())
-    for n_frames, state in enumerate(STATES, 1):
+def test_every_frame_is_complete_and_has_its_own_counts(waiting, bench):
+    for state in STATES[::3]:
         shown = waiting.filter(**state)
         view = bench.view(waiting.color, depth_scene())
         expected = bench.render(view, output="srgb8", **state)
-        np.testing.assert_array_equal(waiting.image(), expected.color)
+        assert_same_frame(waiting.image(), expected.color)
         earlier = shown.earlier
         assert earlier.number == shown.number
         assert (earlier.is_filtered, earlier.is_complete) == (True, True)
         for name in ("clamped_depth_count", "overflow_count", "kernel_count"):
             assert earlier.counts[name] == getattr(expected, name)
         assert shown.notes == tuple(expected.notes)
-        assert len(waits) == n_frames, "one fence for each frame"
 
 
 def test_missing_psfs_and_small_buffers_make_it_repeat(own_gpu, bench, rng):
-    """A store without PSFs, and lists that a former frame made too small."""
+    """A store without PSFs; lists of a new context, and those of a frame with few."""
     waiting = Waiting(own_gpu, bench, rng, PsfStore(**bench.store.parts))
-    for state in (STATES[0], STATES[-1]):
-        for name in ("ENTRIES", "ENTRIES_SPARE"):
-            own_gpu._buffers.pop(name, None)
-        shown = waiting.filter(**state)
+    view, counts = bench.view(waiting.color, depth_scene()), []
+    for focus_dpt, merge in ((8.0, True), (6.0, False)):
+        state = {"pupil_diameter_mm": 5.0, "focus_dpt": focus_dpt}
+        shown = waiting.filter(**state, options=RenderOptions(merge=merge))
         assert (shown.earlier.is_filtered, shown.earlier.is_complete) == (True, True)
-        view = bench.view(waiting.color, depth_scene())
-        expected = bench.render(view, output="srgb8", **state)
-        np.testing.assert_array_equal(waiting.image(), expected.color)
+        expected = bench.render(view, output="srgb8", merge=merge, **state)
+        assert_same_frame(waiting.image(), expected.color)
+        counts.append(expected.entry_count)
+    assert counts[1] > HEADROOM * GROWTH * counts[0]
 
 
 def test_a_frame_whose_time_is_over_computes_no_psfs(own_gpu, bench, rng):
@@ -107,8 +106,8 @@ def test_a_frame_whose_time_is_over_computes_no_psfs(own_gpu, bench, rng):
 
 
 def test_a_frame_is_not_repeated_forever(waiting, monkeypatch):
+    """The lists of a new context are too small for any frame."""
     monkeypatch.setattr(texture_frames, "MAX_REPEATS", 1)
-    monkeypatch.setattr(texture_frames.TextureFrames, "_read", lambda *_, **__: False)
     with pytest.raises(OutOfGpuMemory, match="exceed the buffers"):
         waiting.filter(**STATES[0])
 
@@ -118,6 +117,7 @@ def test_opengl_without_the_extension_imports_nothing(own_gpu):
         TextureImporter(["GL_EXT_memory_object"], is_software=True)
 
 
+@pytest.mark.brief
 def test_a_descriptor_is_closed_whatever_it_is(waiting, tmp_path):
     file = (tmp_path / "plain").open("w+b")
     before = set(os.listdir("/proc/self/fd"))

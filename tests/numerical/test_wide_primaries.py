@@ -68,9 +68,12 @@ def test_a_white_point_is_seen_as_through_the_whole_spectrum(name):
     assert wide_db > single_db + 0.5
 
 
-@pytest.mark.parametrize("name", ["emmetropia", "keratoconus"])
+@pytest.mark.long("an eye is traced at nine wavelengths")
+@pytest.mark.parametrize(
+    "name", [pytest.param("emmetropia", marks=pytest.mark.slow), "keratoconus"]
+)
 def test_wavelengths_of_a_primary_see_the_same_object(name):
-    spec = spec_for(mode="dynamic", **WIDE)
+    spec = spec_for(mode="dynamic", focus_range_dpt=(0.0, 3.0), **WIDE)
     eye = traced_eye(name, spec)
     rng = np.random.default_rng(2)
     count = 12
@@ -121,10 +124,14 @@ def test_the_mean_of_kernels_of_many_sizes():
     assert mean_batch(batch, 1) is batch
 
 
+@pytest.mark.long("two plans of traced eyes")
 def test_wide_primaries_cost_twice_the_time_and_no_psf_more():
     plans = []
     for wide in (False, True):
-        spec = spec_for(mode="dynamic", tolerance="loose", wide_primaries=wide)
+        ranges = {"pupil_range_mm": (4.0, 4.4), "focus_range_dpt": (0.0, 0.5)}
+        spec = spec_for(
+            *(160, 90), mode="dynamic", tolerance="loose", wide_primaries=wide, **ranges
+        )
         plans.append(unchecked_plan(traced_eye("myopia", spec), spec).prediction)
     assert plans[1].psf_count == plans[0].psf_count
     # Nodes of wide primaries follow from the mean of two wavefronts, not the middle's.

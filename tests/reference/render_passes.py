@@ -12,6 +12,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from filter_service.camera import Camera
 from filter_service.constants import (
     DISCONTINUITY_PX,
     MIN_BLUR_RANGE,
@@ -19,7 +20,7 @@ from filter_service.constants import (
     PAPER_FAR_M,
     PAPER_TIE_BREAK_M,
 )
-from filter_service.psfs.frame_layers import FrameLayers
+from filter_service.psfs.frame_layers import FrameLayers, frame_layers
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame import (
     border_px_of,
@@ -34,6 +35,7 @@ from filter_service.rendering.frame_kernels import (
     interval_count,
 )
 from filter_service.rendering.image_cells import ImageCells, image_cells
+from filter_service.rendering.perfect_eye import PUPIL_MM, TANGENTS, perfect_store
 from filter_service.rendering.srgb import linear_from_srgb
 from filter_service.rgbd_view import RgbdView
 from tests.reference.packed_kernels import square_kernel
@@ -198,6 +200,14 @@ def gather(
     )
     rows, columns = (slice(border_px, n - border_px) for n in out.shape[:2])
     return out[rows, columns]
+
+
+def gather_once() -> None:
+    """Gather one pixel, which compiles the loops or loads them."""
+    store = perfect_store(Camera(1, 1, TANGENTS))
+    layers = frame_layers(store, pupil_diameter_mm=PUPIL_MM, focus_dpt=0.0)
+    light = np.ones((1, 1, 3), np.float32)
+    gather(RgbdView(light, light[..., 0].copy(), TANGENTS), store, layers)
 
 
 def surface_vergences_dpt(view: RgbdView, layers: FrameLayers) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.release import aarch64, build, contents, pythons
+from tests.release import aarch64, build, contents, pins, pythons
 from tests.release.commands import BUILD, ROOT, TOOLS, Failed, run, say
 
 DIST = ROOT / "dist"
@@ -83,6 +83,7 @@ def quick() -> None:
     for path in built[0]:
         print(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB; two builds are equal")
     print(check_metadata(built[0]), end="")
+    print(pins.check_pins())
 
 
 def table(rows: list[dict]) -> str:
@@ -140,6 +141,7 @@ def release(options: argparse.Namespace) -> None:
     contents.check_description(*built)
     checks.append("the contents are complete; twine check --strict")
     checks += check_metadata(built).splitlines()
+    checks.append(pins.check_pins())
     check_without_compiler(sdist, BUILD / "without-compiler")
     checks.append("the sdist builds without a compiler and says what is missing")
     say("comparing the library for aarch64, under emulation, with that for x86-64")

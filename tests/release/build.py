@@ -140,7 +140,9 @@ def _build(source: Path, out: Path, *options: str, **environment) -> None:
 
 def _unpack(archive: Path, folder: Path) -> None:
     with tarfile.open(archive) as opened:
-        opened.extractall(folder, filter="data")
+        if hasattr(tarfile, "data_filter"):  # since Python 3.11.4
+            opened.extraction_filter = tarfile.data_filter
+        opened.extractall(folder)
     for path in [folder, *folder.rglob("*")]:  # whatever the umask of this process
         executable = path.is_dir() or path.stat().st_mode & 0o100
         path.chmod(0o755 if executable else 0o644)

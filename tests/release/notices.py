@@ -45,6 +45,7 @@ STATED_ELSEWHERE = {
     "pyphen": "GPL-2.0-or-later OR LGPL-2.1-or-later OR MPL-1.1",  # three classifiers
     "docutils": "BSD-2-Clause AND GPL-3.0-or-later",  # of one Emacs file; COPYING.rst
     "openexr": "BSD-3-Clause",  # LICENSE.md
+    "pyglet": "BSD-3-Clause",  # LICENSE
     "uvloop": "MIT OR Apache-2.0",  # two classifiers
 }
 """Licenses of packages whose metadata have no single name; where they are stated."""
@@ -56,6 +57,7 @@ DATA_SUFFIXES = (
 MADE_HERE = (
     *("constraints.txt", "package.json", ".schema.json", "expected.json"),
     *("tests/benchmarks/results/", "training/results/", "tests/corpus/"),
+    "tests/audit/",
 )
 """Names and folders of files that need no entry: settings and own results."""
 

@@ -13,7 +13,16 @@ from packaging.utils import canonicalize_name
 from tests.source_tree import ROOT
 
 USER_EXTRAS = (
-    *("clients", "headset", "batch", "batch-ray", "report", "web", "metrics"),
+    *(
+        "clients",
+        "pyrender",
+        "headset",
+        "batch",
+        "batch-ray",
+        "report",
+        "web",
+        "metrics",
+    ),
 )
 """Extras for users; all others are for developers."""
 

@@ -55,6 +55,20 @@ assert 128 < seen.color[18, 32, 1] < 255  # the edge is blurred
 assert code == 0, code
 """
 
+LATENCY = """
+import json, subprocess, sys
+from clients import ServiceProcess
+
+options = ["--mode", "on-axis", "--eye-model", "wavefront", "--size", "64x36"]
+options += ["--frames", "5", "--plot", "latency.png", "--json"]
+with ServiceProcess(command=[sys.argv[1], "serve"]) as service:
+    command = [sys.argv[1], "latency", service.endpoint, *options]
+    told = subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout
+(row,) = json.loads(told)["rows"]
+assert row["frames"]["filtered"], row
+assert row["error"]["psnr_db"] > 35, row
+"""
+
 
 def doctor(environment: Environment, *, needs_native: bool = True) -> None:
     """Check that `ocufilter doctor` finds a machine that can filter."""
@@ -89,6 +103,11 @@ def serve(environment: Environment) -> None:
     """Start a service, filter a frame through it, and stop it."""
     program = environment.inside("venv/bin/ocufilter")
     environment.run("python", "-c", REQUEST, program)
+
+
+def latency(environment: Environment) -> None:
+    """Measure a service in another process."""
+    environment.run("python", "-c", LATENCY, environment.inside("venv/bin/ocufilter"))
 
 
 def batch(environment: Environment) -> None:
@@ -138,4 +157,10 @@ def web(environment: Environment) -> None:
         raise Failed(f"web: exit status {page.returncode}")
 
 
-COMMANDS = {"serve": serve, "batch": batch, "report": report, "web": web}
+COMMANDS = {
+    "serve": serve,
+    "latency": latency,
+    "batch": batch,
+    "report": report,
+    "web": web,
+}

@@ -17,6 +17,7 @@ from training.datasets import (
     label,
     load,
     read_manifest,
+    recipe_of,
     shard_file,
     split,
     write_manifest,
@@ -110,6 +111,26 @@ def test_a_folder_of_another_set_is_refused(tmp_path):
     write_manifest(tmp_path, SMALL, commit="none")
     with pytest.raises(DataError, match="another data set"):
         generate(Recipe("on_axis", 96, rows_per_shard=32, seed=6), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[" * 5000, "5", "[]", '{"format": [1]}', '{"format": 1e999}', "\0"]
+)
+def test_a_damaged_manifest_is_refused(tmp_path, text):
+    (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(DataError):
+        read_manifest(tmp_path)
+
+
+def test_a_damaged_shard_or_field_is_refused(tmp_path):
+    generate(SMALL, tmp_path)
+    manifest = read_manifest(tmp_path)
+    with pytest.raises(DataError, match="n_rows"):
+        recipe_of({**manifest, "n_rows": [12, {}]})
+    file = shard_file(tmp_path, 1)
+    file.write_bytes(file.read_bytes()[:-200])
+    with pytest.raises(DataError, match=f"{file.name}: damaged"):
+        load(tmp_path)
 
 
 def test_rows_that_light_does_not_pass_are_counted():

@@ -128,6 +128,11 @@ def test_a_bounded_network_keeps_to_its_range():
             "data.domain 'focus': the task 'focus' needs 'lens'",
         ),
         ("task = ", "Invalid value"),
+        ("a = " + "[" * 5000, "not TOML"),
+        ('task = ["eye"]', "task ['eye']: must be of type str"),
+        ('task = "eye"\ntraining = 3', "training 3: must be of type dict"),
+        ('task = "focus"\n[data]\nfolder = 3', "data.folder 3: must be of type str"),
+        ('task = "focus"\n[model]\nwidth = false', "model.width False: must be"),
     ],
 )
 def test_a_run_file_that_is_wrong_says_where(tmp_path, text, says):

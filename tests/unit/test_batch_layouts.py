@@ -1,16 +1,20 @@
 """Layouts of data sets, read against numbers worked out by hand."""
 
 import math
+import re
+from contextlib import closing
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from clients.batch.job import Job
 from clients.batch.layout_nyu import counted_depth_m, registered_m
 from clients.batch.layouts import LayoutOptions, list_frames, optics_of
 from clients.batch.source import FieldOfView, Pinhole, Scaled, center_depth_m
 from clients.batch.states import States, read_states
-from clients.batch.work import UnitRunner
+from clients.batch.work import Unit, UnitRunner
+from filter_service.settings import FilterSettings
 
 FOV = LayoutOptions(optics=FieldOfView(40.0))
 
@@ -327,7 +331,16 @@ def test_frames_of_videos_are_read_by_their_numbers_in_any_order(tmp_path, rng):
             np.testing.assert_array_equal(reader.integers(index), depths[index])
 
 
+class ReadOnly(States):
+    """States that end the work on a frame once it is read."""
+
+    def of(self, name, depth_m):
+        raise ValueError(f"read {depth_m.min():g} m to {depth_m.max():g} m")
+
+
 def test_depth_of_a_video_is_scaled_and_other_pixels_are_refused(tmp_path):
+    from clients.batch.video_reading import VideoReader
+
     colors = [np.full((32, 48, 3), 99, np.uint8)] * 3
     write_video(tmp_path / "c.mkv", colors, "ffv1", "bgr0", "rgb24")
     depths = [np.full((32, 48), 1000 * (k + 1), np.uint16) for k in range(3)]
@@ -338,15 +351,15 @@ def test_depth_of_a_video_is_scaled_and_other_pixels_are_refused(tmp_path):
         "video",
         ["000000", "000001", "000002"],
     )
-    runner = UnitRunner.__new__(UnitRunner)  # its reading alone
-    runner._readers = {}
-    color, depth_m = runner._read(frames[2])
-    assert (color == 99).all()
-    np.testing.assert_allclose(depth_m, 1.5)
     told = LayoutOptions(tmp_path / "c.mkv", FieldOfView(40.0))
-    _, frames = list_frames(tmp_path / "c.mkv", "auto", told)
-    with pytest.raises(ValueError, match=r"pixels are .*; allowed: lossless 16-bit"):
-        runner._read(frames[0])
+    _, others = list_frames(tmp_path / "c.mkv", "auto", told)
+    with VideoReader(frames[2].color) as reader:
+        assert (reader.color(frames[2].color_index) == 99).all()
+    job = Job({}, FilterSettings(), ReadOnly(4.0, 0.0))
+    with closing(UnitRunner(job, tmp_path)) as runner:
+        read, refused = runner.run(Unit(0, "eye", (frames[2], others[0])))
+    assert read["error"] == "read 1.5 m to 1.5 m"
+    assert re.search("pixels are .*; allowed: lossless 16-bit", refused["error"])
 
 
 def test_a_video_wants_as_many_depths_as_it_has_frames(tmp_path):

@@ -74,7 +74,9 @@ def test_values_out_of_range_are_refused_by_name(name, value):
         ("credit = true", "credit is True; allowed: int"),
         ("bind = 5577", "bind is 5577; allowed: str"),
         ("ready_file = 3", "ready_file is 3; allowed: str"),
-        ("credit = ", "not a valid TOML file"),
+        ("credit = ", "not TOML"),
+        ("a = " + "[" * 5000, r"--config.*not TOML \(maximum recursion depth"),
+        ("alive_interval_s = " + "9" * 400, "alive_interval_s is 9+; allowed: float"),
     ],
 )
 def test_wrong_files_are_refused_by_name(tmp_path, text, message):

@@ -9,9 +9,19 @@ import pytest
 
 from tests.source_tree import ROOT
 
+pytestmark = pytest.mark.tools
+
 MAKE = """#!/bin/sh
 echo "made $1"
 case " $BROKEN " in *" $1 "*) exit 2 ;; esac
+"""
+CLEAN_CLONE = """
+if [ $# = 0 ]; then exit $CLONE_STATUS; fi
+echo "cloned $*"
+"""
+SETUP_ROOT = """
+if [ "$HEADSET_STATUS" = 77 ]; then echo "no chroot" >"$OCUFILTER_SKIP_REASON"; fi
+exit $HEADSET_STATUS
 """
 
 
@@ -23,7 +33,9 @@ def _suites() -> list[str]:
 def test_every_suite_that_is_named_runs():
     page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     named = re.findall(
-        r"^\| `make (check|docs|release-check|test|test-[a-z-]+)` ", page, re.MULTILINE
+        r"^\| `make (check|demo|docs|release-check|test|test-[a-z-]+)` ",
+        page,
+        re.MULTILINE,
     )
     assert sorted(_suites()) == sorted(named)
 
@@ -39,20 +51,25 @@ def test_the_hosted_workflow_runs_the_same_suites():
 @pytest.fixture
 def run(tmp_path):
     """Return how to run a copy of the script with stand-ins for make and the set-up."""
-    programs = {"bin/make": MAKE, "tests/headset/setup_root.sh": "exit $HEADSET_STATUS"}
+    programs = {
+        "bin/make": MAKE,
+        "tests/headset/setup_root.sh": SETUP_ROOT,
+        "tests/clean_clone.sh": CLEAN_CLONE,
+    }
     for name, text in programs.items():
         path = tmp_path / name
-        path.parent.mkdir(parents=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
         path.chmod(0o755)
     (tmp_path / ".ci").mkdir()
     shutil.copy(ROOT / ".ci/run", tmp_path / ".ci/run")
 
-    def run(*suites, broken="", headset_status=0):
+    def run(*suites, broken="", headset_status=0, clone_status=77):
         environment = {
             "PATH": f"{tmp_path}/bin:{os.environ['PATH']}",
             "BROKEN": broken,
             "HEADSET_STATUS": str(headset_status),
+            "CLONE_STATUS": str(clone_status),
             "XDG_CACHE_HOME": str(tmp_path / "cache"),
         }
         return subprocess.run(
@@ -93,8 +110,16 @@ def test_a_failed_suite_does_not_stop_the_others(run):
 def test_a_suite_that_cannot_run_here_is_skipped_and_reported(run):
     finished = run(headset_status=77)
     assert finished.returncode == 0
-    assert _summary(finished)["test-headset"].startswith("skipped")
+    assert _summary(finished)["test-headset"] == "skipped: no chroot"
     assert "made test-headset" not in finished.stdout
+
+
+def test_what_a_new_user_runs_runs_in_a_clean_clone_where_that_is_possible(run):
+    finished = run("check", "demo", "test", clone_status=0)
+    assert re.findall(r"^cloned \S+ (.*)$", finished.stdout, re.M) == ["demo", "test"]
+    assert re.findall(r"^made (.*)$", finished.stdout, re.M) == ["check"]
+    outcomes = {"check": "passed", "demo": "passed", "test": "passed"}
+    assert _summary(finished) == outcomes
 
 
 def test_a_headset_root_that_cannot_be_finished_is_a_failure(run):

@@ -75,7 +75,7 @@ def test_without_opengl_shaders_are_not_tried():
 
 CHECKS = (
     *("python", "service packages", "gl", "compute", "shaders", "native", "threads"),
-    *("client packages", "window packages", "display"),
+    *("client packages", "window packages", "pyrender packages", "display"),
 )
 
 

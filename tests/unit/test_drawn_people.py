@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from clients.commands.program import _exit_code
 from estimator import drawn_profiles, load_profile, parse_profile
 from estimator.field.drawn_fields import DrawnFields, drawn_fields
 from estimator.field.field_table import field_table
 from estimator.field.plot import field_figure
+from tests.commands import run_command
 
 MYOPE = {"kind": "prescription", "sphere_dpt": -2.0, "age_years": 30}
 STATES = {
@@ -18,7 +18,7 @@ STATES = {
     "pupil_diameter_mm": 4.0,
     "wavelength_nm": 555.0,
 }
-PEOPLE = 4
+PEOPLE = 2
 
 
 def test_persons_are_the_first_samples():
@@ -84,24 +84,22 @@ def tables():
     ]
 
 
-def _field(capsys, tmp_path, *arguments):
+def _field(tmp_path, *arguments):
     path = tmp_path / "eye.json"
     path.write_text(json.dumps(MYOPE), encoding="utf-8")
     at = ["--pupil-mm", "4", "--wavelength-nm", "555", "--h-deg=-20,0,20"]
-    code = _exit_code(["field", str(path), *at, *arguments])
-    written = capsys.readouterr()
-    assert code == 0, written.err
-    assert written.err == ""
-    return written.out
+    ended = run_command("field", path, *at, *arguments)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    return ended.stdout
 
 
-def test_json_adds_percentiles_and_keeps_the_rest(capsys, tmp_path, tables):
-    plain = json.loads(_field(capsys, tmp_path, "--json"))
-    found = json.loads(_field(capsys, tmp_path, "--json", "--people", str(PEOPLE)))
+def test_json_adds_percentiles_and_keeps_the_rest(tmp_path, tables):
+    plain = json.loads(_field(tmp_path, "--json"))
+    found = json.loads(_field(tmp_path, "--json", "--people", str(PEOPLE)))
     assert found["people"] == PEOPLE
     assert len(found["notes"]) == len(plain["notes"]) + 1
     assert (
-        "4 persons: the higher orders on the axis and the periphery"
+        f"{PEOPLE} persons: the higher orders on the axis and the periphery"
         in (found["notes"][-1])
     )
     quantities = {
@@ -123,9 +121,9 @@ def test_json_adds_percentiles_and_keeps_the_rest(capsys, tmp_path, tables):
                 assert percentiles[name][str(p)] == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_table_has_median_and_range(capsys, tmp_path, tables):
-    lines = _field(capsys, tmp_path, "--people", str(PEOPLE)).splitlines()
-    assert "median and 5th..95th percentile of 4 persons" in lines
+def test_the_table_has_median_and_range(tmp_path, tables):
+    lines = _field(tmp_path, "--people", str(PEOPLE)).splitlines()
+    assert f"median and 5th..95th percentile of {PEOPLE} persons" in lines
     rows = [line.split() for line in lines[-3:]]
     for k, row in enumerate(rows):
         m_dpt = [table.power_dpt[k, 0] for table in tables]
@@ -148,13 +146,13 @@ def test_the_table_has_median_and_range(capsys, tmp_path, tables):
         ),
     ],
 )
-def test_bad_counts_are_one_line(profile, arguments, said, capsys):
+def test_bad_counts_are_one_line(profile, arguments, said):
     at = ["--pupil-mm", "4", "--wavelength-nm", "555"]
-    assert _exit_code(["field", profile, *at, *arguments]) != 0
-    written = capsys.readouterr()
-    assert written.out == ""
-    assert said in written.err
-    assert written.err.count("\n") == 1
+    ended = run_command("field", profile, *at, *arguments)
+    assert ended.returncode != 0
+    assert ended.stdout == ""
+    assert said in ended.stderr
+    assert ended.stderr.count("\n") == 1
 
 
 def _drawn(tables):
@@ -179,7 +177,7 @@ def test_line_plots_have_the_bands_around_the_median(tables):
         for k, h_deg in enumerate(STATES["h_deg"]):
             assert y[x == h_deg].min() == pytest.approx(low[k])
             assert y[x == h_deg].max() == pytest.approx(high[k])
-    assert "4 drawn persons" in figure.get_suptitle()
+    assert f"{PEOPLE} drawn persons" in figure.get_suptitle()
 
 
 def test_maps_have_lines_of_half_the_band():

@@ -27,6 +27,8 @@ from clients.figures.field_maps import blur_arcmin
 from clients.figures.psfs import centered, psf_picture, ray_directions_mrad
 from clients.figures.study import FIELD_H_DEG, FIELD_V_DEG
 from estimator import load_profile
+from estimator.estimate.plot import surface_line_mm
+from estimator.optics.surfaces import Surface
 from tests.source_tree import package_imports
 
 MYOPE = {
@@ -68,7 +70,8 @@ def test_rms_by_order_is_that_of_the_coefficients():
     assert rms_um(zernike_um) == pytest.approx(higher)
 
 
-@pytest.mark.parametrize("pupil_mm", [3.0, 5.0])
+@pytest.mark.long("the best correction of the eye is found")
+@pytest.mark.parametrize("pupil_mm", [pytest.param(3.0, marks=pytest.mark.slow), 5.0])
 def test_a_perfect_eye_passes_on_what_diffraction_lets(perfect, pupil_mm):
     cpd = np.linspace(0.0, 60.0, 13)
     ratio = cpd / (math.radians(1.0) * pupil_mm * 1e-3 / 555e-9)
@@ -124,6 +127,7 @@ def test_a_point_lies_in_the_middle_of_its_picture_with_all_its_light(cone):
         assert abs((places.min() + places.max()) / 2 - middle) < 0.12 * len(kernel)
 
 
+@pytest.mark.long("acuity at four distances, in focus and out of it")
 def test_acuity_gets_worse_with_defocus_and_is_kept_by_accommodation(perfect):
     distances_dpt = np.array([0.0, 1.0, 2.0, 4.0])
     far = through_focus_log_mar(perfect, 4.0, distances_dpt)
@@ -151,6 +155,7 @@ TRIFOCAL = {
 }
 
 
+@pytest.mark.slow
 def test_three_foci_make_three_humps_where_the_additions_put_them():
     eye = EyeStudy.of(IOL | {"correction": TRIFOCAL})
     # a lens 4.6 mm behind a cornea of 43.04 dpt, in light of 555 instead of 550 nm
@@ -168,6 +173,7 @@ def test_three_foci_make_three_humps_where_the_additions_put_them():
     assert np.array_equal(sharp, at_foci)  # no lens of its own is left
 
 
+@pytest.mark.long("transfer and point of two lenses")
 def test_the_light_of_a_bifocal_lens_is_halved_in_contrast_and_point():
     single, double = (
         EyeStudy.of(IOL | {"correction": lens})
@@ -224,19 +230,34 @@ def test_the_strongest_prescriptions_have_a_point(sphere_dpt):
     assert kernel.sum() == pytest.approx(1.0, abs=0.01)
 
 
-@pytest.mark.parametrize("pupil_mm", [3.0, 5.0])
+OLD = {"kind": "prescription", "age_years": 70}
+STRONG = {"kind": "prescription", "sphere_dpt": -20.0, "higher_order": "none"}
+
+
+NOT_WORSE = [
+    ("keratoconus", 3.0),
+    ("post_lasik", 3.0),
+    ("post_lasik", 5.0),
+    (OLD | {"sphere_dpt": 0.0}, 3.0),
+    (OLD | {"sphere_dpt": 0.0}, 5.0),
+    (OLD | {"sphere_dpt": -0.25}, 3.0),
+    (OLD | {"sphere_dpt": -0.25}, 5.0),
+    (STRONG, 3.0),
+    (STRONG, 5.0),
+]
+
+
+@pytest.mark.long("the best correction of the eye is found")
 @pytest.mark.parametrize(
-    "profile",
+    ("profile", "pupil_mm"),
     [
-        "keratoconus",
-        "post_lasik",
-        {"kind": "prescription", "sphere_dpt": 0.0, "age_years": 70},
-        {"kind": "prescription", "sphere_dpt": -0.25, "age_years": 70},
-        {"kind": "prescription", "sphere_dpt": -20.0, "higher_order": "none"},
+        ("keratoconus", 5.0),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in NOT_WORSE),
     ],
 )
-def test_the_best_correction_is_not_worse_than_none(profile, pupil_mm):
-    seen = EyeStudy.of(profile).far(pupil_mm)
+def test_the_best_correction_is_not_worse_than_none(cone, profile, pupil_mm):
+    study = cone if profile == "keratoconus" else EyeStudy.of(profile)
+    seen = study.far(pupil_mm)
     assert seen.best_corrected.is_as_good_as(seen)
 
 
@@ -282,9 +303,10 @@ def test_rms_bars_are_of_the_smaller_circle(perfect, cone):
     ("figure_of", "axes_count"),
     [
         (wavefront_map_figure, 4),  # two of them are color bars
-        (psfs_figure, 4),
-        (mtf_figure, 1),
-        (field_maps_figure, 8),
+        # reports of a left eye draw these as well
+        pytest.param(psfs_figure, 4, marks=pytest.mark.slow),
+        pytest.param(mtf_figure, 1, marks=pytest.mark.slow),
+        pytest.param(field_maps_figure, 8, marks=pytest.mark.slow),
         (cross_section_figure, 1),
         (terms_figure, 1),
     ],
@@ -296,8 +318,11 @@ def test_figures_of_a_left_eye_are_drawn(left, figure_of, axes_count, tmp_path):
     assert (tmp_path / "figure.svg").stat().st_size > 5000
 
 
-def test_texts_of_distances_stay_within_the_axes(cone):
-    figure = through_focus_acuity_figure(cone)
+def test_texts_of_distances_stay_within_the_axes():
+    """Through lenslets, where no acuity is computed, all texts are the same."""
+    lens = {"kind": "lenslets", "sphere_dpt": 0.0, "vertex_mm": 12.0}
+    eye = EyeStudy.of(IOL | {"correction": lens | {"gaze_deg": [0, -25]}})
+    figure = through_focus_acuity_figure(eye)
     figure.draw_without_rendering()
     axes = figure.axes[0]
     right_px = axes.get_window_extent().x1
@@ -348,3 +373,11 @@ def test_figures_work_without_pyplot():
 def test_a_bad_profile_is_named():
     with pytest.raises(ValueError, match="nobody"):
         EyeStudy.of("nobody")
+
+
+def test_a_sphere_is_drawn_up_to_its_rim():
+    sphere = Surface((6.0, 6.0), 0.0, z_mm=2.0, medium_after="aqueous")
+    points_mm = surface_line_mm(sphere, half_height_mm=7.0, n_points=57)
+    y_mm = np.linspace(-6.0, 6.0, 49)
+    expected_mm = np.stack([8.0 - np.sqrt(36.0 - y_mm**2), y_mm], axis=-1)
+    np.testing.assert_allclose(points_mm, expected_mm, atol=1e-12)

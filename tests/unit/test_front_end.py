@@ -1,18 +1,28 @@
 """What bounds hostile peers in the front end, piece by piece."""
 
+import contextlib
+import errno
 import json
 import logging
 import os
 import socket
+import stat
 import time
+from contextlib import contextmanager
+from pathlib import Path
 
 import msgpack
 import pytest
 import zmq
 
-from filter_service.atomic_files import write_atomically
+from filter_service.atomic_files import replace_atomically, write_atomically
 from filter_service.errors import BadMessage, OutOfMemory
-from filter_service.log_lines import ONCE_A_SECOND, RepeatFilter
+from filter_service.log_lines import (
+    MAX_WAITING_LINES,
+    ONCE_A_SECOND,
+    LineWriter,
+    RepeatFilter,
+)
 from filter_service.service.connections import Connections
 from filter_service.service.descriptors import BASE_COUNT, DescriptorLimit
 from filter_service.service.dropped_parts import drop_parts, drop_parts_in_python
@@ -116,32 +126,68 @@ def test_a_file_that_has_the_descriptor_now_is_left_alone(clients):
     assert not is_closed(clients.ends[2])
 
 
-def test_what_is_sent_without_a_session_is_limited(clients):
-    with_session = {2}
-    connections = Connections(9, with_session)
-    held = []
-    for number in (1, 2):
-        client, descriptor = clients.connect()
-        connections.add(descriptor, number)
-        connections.find(number, descriptor)
-        held.append((client, descriptor))
-    connections.check_unread(1.0)
-    for client, descriptor in held:
-        client.setblocking(False)
-        sent = 0
-        while sent < 400_000:
-            try:
-                sent += client.send(bytes(65536))
-            except BlockingIOError:
-                break
-            os.read(descriptor, 65536)
-        assert sent > 300_000
-    connections.check_unread(2.0)
-    assert not connections.is_open(1)
-    assert connections.is_open(2)
+@pytest.fixture
+def incomplete(clients):
+    """Connect clients that have sent so many bytes of a message."""
+
+    def connect(connections, sizes_bytes):
+        for number, size_bytes in sizes_bytes.items():
+            client, descriptor = clients.connect()
+            connections.add(descriptor, number)
+            connections.find(number, descriptor)
+            connections.check_unread(0.1 * number)
+            for _ in range(size_bytes // 10_000):
+                client.sendall(bytes(10_000))
+                os.read(descriptor, 10_000)
+        return connections
+
+    return connect
+
+
+def open_numbers(connections):
+    return [number for number in range(1, 5) if connections.is_open(number)]
+
+
+def test_a_large_message_without_a_session_may_be_incomplete_for_ten_seconds(
+    incomplete,
+):
+    connections = incomplete(Connections(9, {2}), {1: 400_000, 2: 400_000, 3: 200_000})
+    connections.check_unread(5.0)
+    connections.check_unread(10.1)
+    assert open_numbers(connections) == [1, 2, 3]
+    connections.check_unread(10.3)
+    assert open_numbers(connections) == [2, 3]
+
+
+def test_a_complete_message_begins_the_time_anew(incomplete):
+    connections = incomplete(Connections(9, set()), {1: 400_000})
+    connections.check_unread(5.0)
+    connections.find(1, -1)
+    connections.check_unread(6.0)
+    connections.check_unread(20.0)
+    assert open_numbers(connections) == [1]
+
+
+def test_the_largest_incomplete_messages_go_first(incomplete):
+    sizes_bytes = {1: 300_000, 2: 600_000, 3: 400_000, 4: 100_000}
+    limited = Connections(9, set(), max_unread_bytes=800_000)
+    connections = incomplete(limited, sizes_bytes)
+    connections.check_unread(6.0)
+    assert open_numbers(connections) == [1, 3, 4]
 
 
 # Rates
+
+
+def test_other_work_of_a_session_counts_like_its_frames():
+    queue = FairQueue()
+    for name in ("a", "b"):
+        queue.mark_waiting(name)
+    queue.charge("a", 0.2)
+    assert queue.pop_next(["a", "b"]) == "b"
+    queue.record_frame("b", 0.3, 0.0, 0.0, 0.3)
+    queue.mark_waiting("b")
+    assert queue.pop_next(["a", "b"]) == "a"
 
 
 def test_refusals_and_requests_are_counted_by_the_second():
@@ -163,7 +209,9 @@ def test_frames_alone_are_never_too_many():
     assert all(rates.verdict(0.0) is Verdict.HANDLE for _ in range(10_000))
 
 
-def test_log_lines_that_repeat_are_left_out_and_counted():
+def test_log_lines_that_repeat_are_left_out_and_counted(monkeypatch):
+    now_s = [100.0]
+    monkeypatch.setattr("filter_service.log_lines.time.monotonic", lambda: now_s[0])
     records, log = [], logging.Logger("test")
     handler = logging.Handler()
     handler.emit = records.append
@@ -175,9 +223,53 @@ def test_log_lines_that_repeat_are_left_out_and_counted():
     for _ in range(5):
         log.warning("no descriptors", extra=ONCE_A_SECOND)
     assert len(records) == 11
-    time.sleep(1.05)
+    now_s[0] += 0.99
     log.warning("session %d begins", 50)
-    assert records[-1].getMessage() == "session 50 begins (40 similar lines omitted)"
+    assert len(records) == 11
+    now_s[0] += 0.02
+    log.warning("session %d begins", 51)
+    assert records[-1].getMessage() == "session 51 begins (41 similar lines omitted)"
+
+
+def test_lines_that_nobody_reads_are_dropped_beyond_a_number_and_counted():
+    reading, writing = os.pipe2(os.O_NONBLOCK)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(writing, b"x")
+    os.set_blocking(reading, True)
+    os.set_blocking(writing, True)
+    log = logging.Logger("test")
+    log.addHandler(LineWriter(writing))
+    n_lines = MAX_WAITING_LINES + 50
+    for number in range(n_lines):
+        log.warning("line %d", number)
+    with os.fdopen(reading, encoding="utf-8") as lines:
+        assert lines.readline().lstrip("x") == "line 0\n"
+        for number in range(1, MAX_WAITING_LINES):
+            assert lines.readline() == f"line {number}\n"
+        log.warning("next")
+        # one more if the thread had taken a line when the others came
+        read = list(iter(lines.readline, "next\n"))
+    n_dropped = int(read.pop().removesuffix(" log lines could not be written\n"))
+    assert MAX_WAITING_LINES + len(read) + n_dropped == n_lines
+    log.warning("the reader is gone")
+    log.error("which ends nothing")
+    log.handlers[0].flush()
+    os.close(writing)
+
+
+def test_a_line_is_written_when_the_call_returns(tmp_path):
+    file = tmp_path / "log"
+    with file.open("w") as written:
+        log = logging.Logger("test")
+        log.addHandler(LineWriter(written.fileno()))
+        for number in range(20):
+            log.warning("line %d", number)
+            log.handlers[0].flush()  # on a busy machine, a call does not wait so long
+            assert file.read_text().splitlines()[-1] == f"line {number}"
+        log.warning("%d and more", "no number")
+        log.handlers[0].flush()
+        assert "could not be formatted" in file.read_text().splitlines()[-1]
 
 
 # Fairness
@@ -335,15 +427,15 @@ def test_parts_are_dropped_in_slices_up_to_the_end_of_the_message(drop):
 )
 def test_profiles_are_bounded_before_they_are_read(body, text):
     with pytest.raises(BadMessage, match=text):
-        unpack_profile(body, 2**20)
+        unpack_profile(body)
 
 
 def test_paths_of_refused_values_are_whole():
     body = {"a": [0, {"b c": [[1.0, float("inf")]]}]}
     with pytest.raises(BadMessage) as caught:
-        unpack_profile(msgpack.packb(body), 10_000)
+        unpack_profile(msgpack.packb(body))
     assert caught.value.field == "profile.a[1].b c[0][1]"
-    assert unpack_profile(json.dumps({"a": "x" * MAX_TEXT}).encode(), 10_000)
+    assert unpack_profile(json.dumps({"a": "x" * MAX_TEXT}).encode())
 
 
 # Files and processes
@@ -361,6 +453,39 @@ def test_an_atomic_write_follows_no_link_and_can_refuse_to_replace(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "other"]
 
 
+def test_a_write_that_fails_leaves_the_earlier_file(tmp_path):
+    def fail(part):
+        part.write_text("half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    target = tmp_path / "file.png"
+    target.write_text("earlier")
+    with pytest.raises(OSError, match="No space"):
+        replace_atomically(target, fail)
+    assert target.read_text() == "earlier"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+@pytest.mark.parametrize(
+    ("earlier", "is_private", "expected"),
+    [(0o600, False, 0o600), (0o644, False, 0o644), (0o644, True, 0o600)],
+)
+def test_a_file_written_anew_is_no_more_public(tmp_path, earlier, is_private, expected):
+    target = tmp_path / "file.txt"
+    target.touch()
+    target.chmod(earlier)
+    replace_atomically(
+        target, lambda part: part.write_text("new"), is_private=is_private
+    )
+    assert target.read_text() == "new"
+    assert stat.S_IMODE(target.stat().st_mode) == expected
+
+
+def test_a_device_is_written_and_not_replaced():
+    replace_atomically(Path("/dev/null"), lambda part: part.write_text("gone"))
+    assert Path("/dev/null").is_char_device()
+
+
 def test_pauses_before_restarts_grow_to_a_minute_and_end_with_a_stable_process():
     restarts = _Restarts()
     pauses_s = [restarts.record_exit(float(i), float(i)) for i in range(11)]
@@ -371,12 +496,19 @@ def test_pauses_before_restarts_grow_to_a_minute_and_end_with_a_stable_process()
 # The socket
 
 
+@contextmanager
+def routing(connections):
+    box = Router("tcp://127.0.0.1:*", 10**6, 4, connections=connections)
+    try:
+        yield box
+    finally:
+        box.close()
+
+
 @pytest.fixture
 def router():
-    connections = Connections(9, set())
-    box = Router("tcp://127.0.0.1:*", 10**6, 4, connections=connections)
-    yield box
-    box.close()
+    with routing(Connections(9, set())) as box:
+        yield box
 
 
 def received_within(router, limit_s=5.0):
@@ -389,31 +521,39 @@ def received_within(router, limit_s=5.0):
     raise AssertionError("nothing was received")
 
 
-def test_a_connection_that_comes_between_is_known_before_it_has_a_number(
-    router, monkeypatch
-):
+class Between(Connections):
+    """Calls a function once, after the monitor has told of a connection."""
+
+    def __init__(self, call):
+        super().__init__(9, set())
+        self.calls = [call]
+
+    def evict(self):
+        super().evict()
+        if self.calls:
+            self.calls.pop()()
+
+
+def test_a_connection_that_comes_between_is_known_before_it_has_a_number():
     """It was not, on a busy machine: its client was never answered."""
     context = zmq.Context()
-    dealer = context.socket(zmq.DEALER)
-    answer = router._authenticator.handle_requests
-    calls = []
+    first, dealer = context.socket(zmq.DEALER), context.socket(zmq.DEALER)
 
-    def late():
-        if not calls:  # after the monitor was read, and before requests are answered
-            dealer.connect(router.endpoint)
-            dealer.send(b"hello")
-            time.sleep(0.2)
-        calls.append(1)
-        answer()
+    def connect():  # after the monitor was read, and before requests are answered
+        dealer.connect(router.endpoint)
+        dealer.send(b"hello")
+        time.sleep(0.2)
 
-    monkeypatch.setattr(router._authenticator, "handle_requests", late)
     try:
-        message = received_within(router)
-        assert bytes(message.parts[0]) == b"hello"
-        assert message.connection is not None
-        outcome, _ = router.send(message.peer, [b"welcome"])
-        assert (outcome, dealer.recv()) == (Outcome.SENT, b"welcome")
+        with routing(Between(connect)) as router:
+            first.connect(router.endpoint)
+            message = received_within(router)
+            assert bytes(message.parts[0]) == b"hello"
+            assert message.connection is not None
+            outcome, _ = router.send(message.peer, [b"welcome"])
+            assert (outcome, dealer.recv()) == (Outcome.SENT, b"welcome")
     finally:
+        first.close(linger=0)
         dealer.close(linger=0)
         context.term()
 

@@ -2,12 +2,13 @@
 
 import logging
 import os
+from contextlib import ExitStack
 
 import pytest
 
 from clients.commands.doctor_checks import gl_devices
 from filter_service.errors import RenderFailed
-from filter_service.filtering import choose_engine
+from filter_service.filtering.choose_engine import open_engine
 from filter_service.gl import choose_device
 from filter_service.gl.choose_device import by_preference, open_on_device
 from filter_service.gl.egl_devices import (
@@ -88,6 +89,7 @@ def test_a_real_device_that_fails_is_passed_over(monkeypatch, caplog):
     assert "device 99 (pulled out): requested device index 99" in caplog.text
 
 
+@pytest.mark.gl
 def test_a_context_opens_on_each_device_that_doctor_lists():
     listed = gl_devices()
     assert [device["index"] for device in listed] == list(range(len(listed)))
@@ -147,15 +149,13 @@ def test_the_named_device_wins_over_the_backend_s_variable(monkeypatch):
 
 
 def test_a_named_device_asks_for_gl(monkeypatch):
-    asked = []
     monkeypatch.setenv(GL_DEVICE_VARIABLE, "0")
-    monkeypatch.setattr(
-        choose_engine, "_gl", lambda closing, reason, **_: asked.append(reason)
-    )
-    choose_engine.open_engine("auto", None)
-    assert asked == ["a device is selected"]
-    monkeypatch.setattr(choose_engine, "_native", lambda closing, reason: reason)
-    assert choose_engine.open_engine("native", None) == "as requested"
+    with ExitStack() as closing:
+        found = [open_engine(choice, closing) for choice in ("auto", "native")]
+        assert [(one.name, one.reason) for one in found] == [
+            ("gl", "a device is selected"),
+            ("native", "as requested"),
+        ]
 
 
 def test_names_are_asked_for_where_the_device_has_them():

@@ -7,6 +7,8 @@ from tests.gl_witness.compare import differences, summary
 from tests.gl_witness.filter_frames import Filtered
 from tests.gl_witness.layers import Messages
 
+pytestmark = pytest.mark.tools
+
 BANNER = """UNASSIGNED-khronos-validation-instance(INFO / SPEC): msgNum: 1 - Active:
     Current Enables: VK_VALIDATION_FEATURE_ENABLE_GPU_ASSISTED_EXT.
     Current Disables: None.

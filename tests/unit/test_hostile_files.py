@@ -11,11 +11,11 @@ import pytest
 from PIL import Image
 
 from clients.arguments import read_object
-from clients.batch.atomic_files import write_whole
+from clients.batch.atomic_files import below, write_whole
 from clients.batch.layout_middlebury import read_calibration
 from clients.batch.layout_nyu import KinectCounts
 from clients.batch.layout_tum import tum_frames
-from clients.batch.manifest import Manifest, below, records_of
+from clients.batch.manifest import Manifest, records_of
 from clients.batch.states import read_states
 from clients.commands.display_file import display_of_file
 from clients.headset.gltf_scene import load_gltf
@@ -622,7 +622,7 @@ def test_links_are_not_followed_where_files_are_written(tmp_path, monkeypatch):
     with pytest.raises(InvalidFile, match="cannot be opened"):
         Manifest(tmp_path, {})
     monkeypatch.setattr("secrets.token_hex", lambda n: "0")
-    (tmp_path / ".a.0.part.txt").symlink_to(victim)
+    (tmp_path / ".ocufilter-0.part.txt").symlink_to(victim)
     with pytest.raises(FileExistsError):
         write_whole(tmp_path / "a.txt", lambda path: path.write_text("lost"))
     assert victim.read_text() == "kept"

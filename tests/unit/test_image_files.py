@@ -147,6 +147,9 @@ def test_outputs_are_checked_before_any_work(tmp_path):
         check_output(tmp_path / "out.jpg")
     with pytest.raises(ValueError, match="folder"):
         check_output(tmp_path / "missing" / "out.png")
+    (tmp_path / "folder.png").mkdir()
+    with pytest.raises(ValueError, match="it is a folder"):
+        check_output(tmp_path / "folder.png")
 
 
 def test_a_type_that_does_not_fit_the_file_is_refused(tmp_path, linear):

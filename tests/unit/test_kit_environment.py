@@ -16,6 +16,8 @@ from packaging.requirements import Requirement
 from tests.gpu_kit import environment
 from tests.source_tree import ROOT
 
+pytestmark = pytest.mark.tools
+
 
 def packages(name: str) -> set[str]:
     """A list of names in make.sh."""

@@ -13,6 +13,8 @@ from tests.gpu_kit.runner import DONE, FAILED, LEFT_OUT, NOT_BEGUN, Budget
 from tests.gpu_kit.steps import Step, all_steps
 from tests.source_tree import ROOT
 
+pytestmark = pytest.mark.tools
+
 ROWS = {"gl_renderer": "Card 9", "torch": "", "rows": [{"method": "a", "n": 1}]}
 
 

@@ -1,11 +1,13 @@
 """The wire types: round trips, and every way a message can be wrong."""
 
 import json
+import math
 
 import msgpack
 import numpy as np
 import pytest
 
+from estimator.note import Note
 from filter_service import errors, messages
 from filter_service.messages import (
     LINEAR,
@@ -19,6 +21,8 @@ from filter_service.messages import (
     decode_request,
     encode,
 )
+from filter_service.service.shared_memory_frame import with_images
+from filter_service.shared_memory import Slot, aligned_starts
 from tests.unit.message_parts import (
     CAMERA,
     REPLIES,
@@ -41,6 +45,21 @@ def test_what_a_client_says_arrives_unchanged(message):
 @pytest.mark.parametrize("message", REPLIES, ids=lambda m: m.type_name)
 def test_what_the_service_says_arrives_unchanged(message):
     assert decode_reply(as_bytes(encode(message))) == message
+
+
+def test_images_in_shared_memory_are_read_only_for_the_filter():
+    """The client has them, too, and may send them again."""
+    sent = frame()
+    arrays = [sent.images[0].color, sent.images[0].depth_m]
+    starts, size_bytes = aligned_starts([array.nbytes for array in arrays])
+    slot = Slot.create(1, size_bytes)
+    slot.put(arrays, starts)
+    (found,) = with_images(sent, slot, starts, ()).images
+    for array, expected in zip((found.color, found.depth_m), arrays, strict=True):
+        np.testing.assert_array_equal(array, expected)
+        with pytest.raises(ValueError, match="read-only"):
+            array[:] = 0
+    slot.close()
 
 
 @pytest.mark.parametrize(
@@ -128,11 +147,16 @@ def test_a_result_carries_its_images_and_stage_times():
         stage_times_ms={"decode_ms": 1.0, "other_ms": 2.0},
         gaze_deg=(3.5, -2.0),
         overflow_count=7,
-        notes=("capped",),
+        notes=(Note("pupil_capped", "capped", used_mm=4.5, near_dpt=math.inf), "plain"),
         colors=(color,),
     )
     received = decode_reply(as_bytes(encode(sent)))
     assert received == sent
+    assert received.notes == ("capped", "plain")
+    assert [(d.code, d.values) for d in received.note_details] == [
+        ("pupil_capped", {"used_mm": 4.5}),
+        ("other", {}),
+    ]
     np.testing.assert_array_equal(received.colors[0], color)
 
 
@@ -388,8 +412,13 @@ def test_an_error_reply_becomes_the_exception_it_was_made_of():
 
 
 def test_every_error_has_a_code_of_its_own():
-    codes = [error_class.code for error_class in errors.ERROR_CLASSES.values()]
-    assert len(errors._with_subclasses(errors.FilterError)) == len(set(codes))
+    classes = [
+        found
+        for found in vars(errors).values()
+        if isinstance(found, type) and issubclass(found, errors.FilterError)
+    ]
+    assert len(classes) > 10
+    assert sorted(found.code for found in classes) == sorted(errors.ERROR_CLASSES)
 
 
 def test_ids_of_a_broken_message_are_still_found():

@@ -33,6 +33,8 @@ from tests.benchmarks.published_figures import CONDITIONS
 from tests.source_tree import ROOT
 from training.statistics import PUBLISHED, ROWS
 
+pytestmark = pytest.mark.tools
+
 QUOTES = ROOT / "tests" / "data" / "paper_quotes.txt"
 EYES = {
     "Emmet": "emmetropia",

@@ -28,6 +28,8 @@ from tests.benchmarks.peer_optiland_script import (
 from tests.benchmarks.peer_problem import NotInstalled
 from tests.grid_specs import grid_spec
 
+pytestmark = pytest.mark.tools
+
 TANGENTS = (-0.27, 0.27, 0.15, -0.15)
 CAMERA = Camera(TANGENTS, (36, 20))
 RNG = np.random.default_rng(5)

@@ -12,12 +12,14 @@ import pytest
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import PARAMETERS, EyeParameters
 from estimator.profiles import bodies, reference
+from estimator.profiles.bodies import MEASURED_KINDS, TRACED_KINDS
 from estimator.profiles.correction_bodies import CorrectionBody
 from estimator.profiles.given_bodies import KINDS, ProfileBody
 from estimator.profiles.parse import parse_profile, preset_names
 from filter_service import errors, messages
 from filter_service import protocol_schema as schema
 from filter_service.wire import replies
+from tests.source_tree import ROOT
 from tests.unit.test_profile_bodies import WRONG
 
 IN_ORDER = (
@@ -88,11 +90,30 @@ def test_an_example_is_read_and_shows_every_field(name):
     assert again == msgpack.unpackb(msgpack.packb(header))
 
 
+def test_kinds_are_measured_or_traced():
+    """The second are listed by hand, because their bodies load slowly."""
+    assert sorted(KINDS) == sorted(MEASURED_KINDS + TRACED_KINDS)
+
+
 def test_the_settings_shown_are_the_defaults():
     shown = dict(EXAMPLES["profile"]["settings"])
     shown.pop("age_years")
     defaults = messages.FilterSettings().fields()
     assert json.loads(json.dumps(defaults)) == shown
+
+
+def test_the_codes_of_notes_are_those_of_the_code():
+    section = PAGE[PAGE.index("| codes of `ready`") : PAGE.index("**shared** answers")]
+    rows = [line.split("|")[1] for line in section.splitlines() if line[:3] == "| `"]
+    shown = set(re.findall(r"`(\w+)`", "".join(rows)))
+    sources = [
+        path.read_text(encoding="utf-8")
+        for package in ("estimator", "filter_service")
+        for path in (ROOT / package).rglob("*.py")
+    ]
+    named = set(re.findall(r'\bNote\(\s*"(\w+)"', "".join(sources)))
+    assert named - shown == {"directions_outside"}, "not of a frame"
+    assert all(f'"{code}"' in "".join(sources) for code in shown)
 
 
 def test_the_stage_times_of_the_example_are_of_the_stated_form():
@@ -199,6 +220,7 @@ def test_the_parameters_of_an_eye_are_listed_with_their_ranges():
         assert limits == row.allowed
 
 
+@pytest.mark.long("300 profiles are validated by an independent validator")
 def test_the_schema_of_profiles_accepts_and_refuses_as_the_parser_does():
     """The standard's own keywords, read by an independent validator."""
     validator = jsonschema.Draft202012Validator(reference.profile_schema())

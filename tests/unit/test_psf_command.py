@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from clients.commands.program import _exit_code
+from tests.commands import run_command
 from tests.unit.test_wavefront_command import eye_file
 
 VIEW = ["--pupil-mm", "3", "--wavelength-nm", "549", "--pixel-arcmin", "2"]
@@ -14,28 +14,27 @@ __all__ = ["eye_file"]  # a fixture
 
 
 @pytest.fixture
-def psf(capsys, tmp_path):
+def psf(tmp_path):
     """Facts and kernel of a successful call."""
 
     def call(*arguments):
         out = tmp_path / "psf.npy"
-        words = ["psf", *map(str, arguments), *VIEW, "-o", str(out), "--json"]
-        assert _exit_code(words) == 0
-        return json.loads(capsys.readouterr().out), np.load(out)
+        ended = run_command("psf", *arguments, *VIEW, "-o", out, "--json")
+        assert ended.returncode == 0, ended.stderr
+        return json.loads(ended.stdout), np.load(out)
 
     return call
 
 
 @pytest.fixture
-def refusal(capsys, tmp_path):
+def refusal(tmp_path):
     """Error line of a refused call."""
 
     def call(*arguments):
-        words = ["psf", *arguments, *VIEW, "-o", str(tmp_path / "psf.npy")]
-        assert _exit_code(words) == 2
-        err = capsys.readouterr().err
-        assert err.count("\n") == 1
-        return err
+        ended = run_command("psf", *arguments, *VIEW, "-o", tmp_path / "psf.npy")
+        assert ended.returncode == 2
+        assert ended.stderr.count("\n") == 1
+        return ended.stderr
 
     return call
 

@@ -10,6 +10,8 @@ from tests.release import __main__ as release
 from tests.release import build, contents, pythons
 from tests.release.commands import Failed
 
+pytestmark = pytest.mark.tools
+
 WHEEL = "ocufilter-0-py3-none-manylinux_2_28_x86_64.whl"
 
 

@@ -14,6 +14,8 @@ from tests.release import metadata, notices, sbom
 from tests.release.requirements import USER_EXTRAS, declared, installed, project
 from tests.source_tree import ROOT
 
+pytestmark = pytest.mark.tools
+
 CHANGELOG = (
     "# Changelog\n\n## Unreleased\n\n## 1.2.0 - 2026-01-02\n\n## 1.1.0 - 2025-01-02\n"
 )

@@ -1,10 +1,14 @@
 """What a report says: its numbers, where they come from, and how it is written."""
 
+import base64
+import io
 import json
 import math
 import re
+import stat
 import sys
 from dataclasses import replace
+from html import escape
 from html.parser import HTMLParser
 from importlib.metadata import version
 
@@ -14,7 +18,10 @@ from pypdf import PdfReader
 
 from clients.figures import (
     EyeStudy,
+    draw_acuity_of_several,
+    draw_mtf_of_several,
     draw_psfs,
+    draw_rms_by_order,
     field_maps_figure,
     wavefront_map_figure,
 )
@@ -33,7 +40,7 @@ from clients.report.charts import picture_side_px
 from clients.report.correction_text import correction_text, near_text
 from clients.report.facts import EyeFacts, facts_of
 from clients.report.html_page import STYLE, html_of
-from clients.report.labels import distinct_labels
+from clients.report.labels import distinct_labels, own_name
 from clients.report.make import document_of, write_report
 from clients.report.method_text import entered_text, method_text
 from clients.report.numbers import Refraction, measured_numbers, spectacles_for
@@ -43,6 +50,7 @@ from clients.report.provenance import provenance_table
 from clients.report.sources import SOURCES, Citations
 from clients.report.tables import change_text, refraction_table, vision_table
 from estimator import load_profile, parse_profile
+from tests.commands import full_disk, run_command
 
 SPECTACLES = {"sphere_dpt": -4.0, "cylinder_dpt": -1.0, "axis_deg": 20.0}
 MYOPE = {
@@ -64,6 +72,41 @@ def myope() -> EyeFacts:
 def corrected() -> EyeFacts:
     lens = {**SPECTACLES, "vertex_mm": 12.0}
     return facts_of(MYOPE | {"correction": lens}, label="worn", has_charts=False)
+
+
+@pytest.fixture(scope="module")
+def lasik() -> EyeFacts:
+    return facts_of("post_lasik", has_charts=False)
+
+
+@pytest.fixture(scope="module")
+def command(tmp_path_factory):
+    """The command, and the page that it wrote."""
+    folder = tmp_path_factory.mktemp("html")
+    profile, out = folder / "eye.json", folder / "eye.html"
+    profile.write_text(json.dumps(MYOPE))
+    words = ("--name", "A. Myope", "--reference", "<A-1047>", "--no-charts", "--json")
+    return run_command("report", profile, "-o", out, *words), out
+
+
+@pytest.fixture(scope="module")
+def myope_text(command) -> str:
+    return command[1].read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def gray_charts():
+    gray = np.full((8, 8, 3), 128, np.uint8)
+    return {(p, d): gray for p in (3.0, 5.0) for d in (0.4, 1.0, 6.0)}
+
+
+@pytest.fixture(scope="module")
+def pdf(corrected, gray_charts, tmp_path_factory) -> PdfReader:
+    shown = replace(corrected, charts=gray_charts)
+    out = tmp_path_factory.mktemp("pdf") / "eye.pdf"
+    record = Record(patient="P. Doe", examiner="E. Roe", reference="A-1047")
+    write_report([shown], out, record)
+    return PdfReader(out)
 
 
 def test_the_refraction_is_what_was_entered_at_the_cornea(myope):
@@ -138,8 +181,23 @@ def _rows(profile) -> dict[str, tuple[str, str]]:
     return {row[0]: row[1:] for row in table.rows}
 
 
-def test_what_is_assumed_is_told_from_what_was_measured():
-    entered = _rows(MYOPE)
+@pytest.fixture(scope="module")
+def entered():
+    return _rows(MYOPE)
+
+
+@pytest.fixture(scope="module")
+def hazy():
+    lens = {"sphere_dpt": -1.0, "vertex_mm": 12.0}
+    return _rows({"kind": "preset", "name": "cataract", "correction": lens})
+
+
+@pytest.fixture(scope="module")
+def example():
+    return _rows("post_lasik")
+
+
+def test_what_is_assumed_is_told_from_what_was_measured(entered):
     assert entered["Refraction"][0] == "entered"
     assert entered["Higher orders"][0] == "assumed"
     assert "60 years" in entered["Higher orders"][1]
@@ -148,6 +206,7 @@ def test_what_is_assumed_is_told_from_what_was_measured():
     assert none["Higher orders"][1].startswith("none")
 
 
+@pytest.mark.clients
 def test_an_eye_given_by_its_surfaces_has_a_report():
     profile = {
         "kind": "pseudophakic",
@@ -161,17 +220,16 @@ def test_an_eye_given_by_its_surfaces_has_a_report():
     assert "dispersion of the media" in text
 
 
-def test_a_pupil_wider_than_the_measured_one_is_named():
-    rows = _rows("post_lasik")
+def test_a_pupil_wider_than_the_measured_one_is_named(example):
+    rows = example
     assert rows["Higher orders"][0] == "example"
     assert rows["Pupil of 5 mm"][0] == "assumed"
     assert "3 mm measured" in rows["Pupil of 5 mm"][1]
     assert "age not given" in rows["Accommodation"][1]
 
 
-def test_haze_and_the_worn_lens_are_told():
-    lens = {"sphere_dpt": -1.0, "vertex_mm": 12.0}
-    rows = _rows({"kind": "preset", "name": "cataract", "correction": lens})
+def test_haze_and_the_worn_lens_are_told(hazy):
+    rows = hazy
     assert "log s 1.22" in rows["Straylight"][1]
     assert rows["Correction worn"][1] == "spectacles −1.00 dpt sph at 12 mm"
 
@@ -232,6 +290,7 @@ def test_what_is_worn_is_told_in_plain_words(lens, said):
     assert correction_text(parse_profile(body).correction) == said
 
 
+@pytest.mark.clients
 def test_a_report_through_lenslets_says_what_is_not_known():
     lens = {"kind": "lenslets", "sphere_dpt": -3, "gaze_deg": [0, -25]}
     body = {"kind": "prescription", "sphere_dpt": -3.0, "correction": lens}
@@ -239,6 +298,7 @@ def test_a_report_through_lenslets_says_what_is_not_known():
     assert not facts.numbers["pupils"][0]["as_it_is"]["is_told"]
     assert facts.numbers["charts"][0]["log_mar"] is None
     text = html_of(document_of([facts]))
+    assert "Reference" not in text  # none was given
     assert text.count("<td>not known</td>") >= 4
     assert "no model of reading through them is known" in text
     assert "an eye that is looking 25° down" in text
@@ -271,8 +331,8 @@ class _Balance(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_html_is_one_file_that_names_what_its_pictures_show(myope):
-    text = html_of(document_of([myope]))
+def test_html_is_one_file_that_names_what_its_pictures_show(myope_text):
+    text = myope_text
     found = _Balance()
     found.feed(text)
     assert not found.open
@@ -354,11 +414,22 @@ def test_charts_of_a_strong_blur_have_fewer_pixels():
     assert blurred == pytest.approx(190 * 8.2 * 60 / reach_arcmin, rel=0.03)
 
 
-def test_charts_that_exist_are_shown_with_what_is_read(myope):
-    gray = np.full((8, 8, 3), 128, np.uint8)
-    charts = {(p, d): gray for p in (3.0, 5.0) for d in (0.4, 1.0, 6.0)}
-    shown = EyeFacts(myope.study, "x", myope.numbers, charts)
-    row = document_of([shown]).sections[0].rows[3]
+@pytest.mark.clients
+def test_charts_that_exist_are_shown_with_what_is_read(myope, gray_charts):
+    """Each has what is read, and the sizes of its rows; the smallest read is marked."""
+    numbers = myope.numbers | {
+        "charts": [entry | {"log_mar": 0.43} for entry in myope.numbers["charts"]]
+    }
+    shown = EyeFacts(myope.study, "x", numbers, gray_charts)
+    document = document_of([shown])
+    row = document.sections[0].rows[3]
+    picture = row.blocks[0]
+    assert len(picture.marks) == 13
+    assert picture.marks[0].text == "1.0 · 0.10"
+    assert [m.text for m in picture.marks if m.is_emphasized] == ["0.4 · 0.40"]
+    text = html_of(document)
+    assert text.count('class="read"') == 6
+    assert "◂ 0.4 · 0.40" in text
     assert all(isinstance(block, Picture) for block in row.blocks)
     log_mar = shown.chart_numbers[3.0, 6.0]["log_mar"]
     assert row.blocks[2].caption == (
@@ -366,21 +437,19 @@ def test_charts_that_exist_are_shown_with_what_is_read(myope):
     )
 
 
-def test_a_pdf_is_tagged_and_starts_with_the_whole_summary(corrected, tmp_path):
-    gray = np.full((8, 8, 3), 128, np.uint8)
-    charts = {(p, d): gray for p in (3.0, 5.0) for d in (0.4, 1.0, 6.0)}
-    shown = EyeFacts(corrected.study, "x", corrected.numbers, charts)
-    out = tmp_path / "eye.pdf"
-    write_report([shown], out, Record(reference="A-1047"))
-    read = PdfReader(out)
-    assert read.root_object["/MarkInfo"]["/Marked"]
-    assert "/StructTreeRoot" in read.root_object
-    assert read.root_object["/Lang"] == "en"
-    first = read.pages[0].extract_text()
-    assert "Reference A-1047" in first
-    assert "6 m, 3 mm: logMAR" in first  # caption of the summary's last chart
-    assert "page 1 of 3" in first
-    assert len(read.pages) == 3
+@pytest.fixture(scope="module")
+def first_page(pdf) -> str:
+    return pdf.pages[0].extract_text()
+
+
+def test_a_pdf_is_tagged_and_starts_with_the_whole_summary(pdf, first_page):
+    assert pdf.root_object["/MarkInfo"]["/Marked"]
+    assert "/StructTreeRoot" in pdf.root_object
+    assert pdf.root_object["/Lang"] == "en"
+    assert "Reference A-1047" in first_page
+    assert "6 m, 3 mm: logMAR" in first_page  # caption of the summary's last chart
+    assert "page 1 of 3" in first_page
+    assert len(pdf.pages) == 3
 
 
 def test_body_text_is_at_least_9_pt():
@@ -390,22 +459,21 @@ def test_body_text_is_at_least_9_pt():
     assert min(sizes_pt) >= 9.0
 
 
-def test_a_report_says_what_when_and_of_which_profile_it_is(myope, corrected):
-    text = html_of(document_of([myope], Record(reference="<A-1047>")))
+def test_a_report_says_what_when_and_of_which_profile_it_is(
+    myope, myope_text, corrected
+):
+    text = myope_text
     digest = myope.study.profile.digest[:16]
     assert "<span>Reference &lt;A-1047&gt;</span>" in text
     assert f"<span>Profile {digest}</span>" in text
     assert f"<span>Version ocufilter {version('ocufilter')}</span>" in text
     assert re.search(r"<span>Date \d{4}-\d\d-\d\d \d\d:\d\d ", text)
-    assert "Reference" not in html_of(document_of([myope]))
     assert corrected.study.profile.digest[:16] != digest
 
 
-def test_every_page_says_whose_report_it_is(corrected, tmp_path):
-    out = tmp_path / "eye.pdf"
-    record = Record(patient="P. Doe", examiner="E. Roe", reference="A-1047")
-    write_report([corrected], out, record)
-    pages = [page.extract_text() for page in PdfReader(out).pages]
+@pytest.mark.clients
+def test_every_page_says_whose_report_it_is(pdf):
+    pages = [page.extract_text() for page in pdf.pages]
     for k, text in enumerate(pages):
         assert "Eye report: worn · Patient P. Doe · Reference A-1047 · 20" in text
         assert f"page {k + 1} of {len(pages)}" in text
@@ -418,6 +486,65 @@ def test_a_text_that_is_too_long_is_refused(capsys, tmp_path):
     assert "patient has 61 characters; allowed: at most 60" in capsys.readouterr().err
 
 
+NAMES = (r"$\nope$", "_worn: $5 & $6")
+"""matplotlib takes the first for a wrong formula, and omits the second."""
+
+
+@pytest.mark.parametrize(
+    ("draw", "pupil"),
+    [
+        (draw_rms_by_order, {}),
+        (draw_mtf_of_several, {"pupil_mm": 3.0}),
+        (draw_acuity_of_several, {"pupil_mm": 3.0}),
+    ],
+)
+@pytest.mark.long("computes curves of two eyes")
+def test_names_are_drawn_as_they_are_written(myope, corrected, draw, pupil):
+    figure = new_figure(80, 60)
+    draw(figure.subplots(), (myope.study, corrected.study), labels=NAMES, **pupil)
+    svg = io.BytesIO()
+    figure.savefig(svg, format="svg")
+    for name in NAMES:
+        assert f"<!-- {escape(name, quote=False)} -->" in svg.getvalue().decode()
+
+
+@pytest.mark.clients
+def test_a_comparison_draws_names_as_they_are_written(myope, corrected):
+    eyes = [
+        replace(facts, label=name)
+        for facts, name in zip((myope, corrected), NAMES, strict=True)
+    ]
+    text = html_of(document_of(eyes))
+    assert escape("Eye report: {} → {}".format(*NAMES)) in text
+    images = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', text)
+    figures = [base64.b64decode(image).decode() for image in images]
+    for name in NAMES:
+        shown = f"<!-- {escape(name, quote=False)} -->"
+        # bars, transfer, acuity and PSFs; the title of the map has another line
+        assert sum(shown in figure for figure in figures) >= 6
+
+
+def test_a_name_in_a_profile_is_one_line_that_fits(tmp_path):
+    body = {"kind": "prescription", "sphere_dpt": -1.0, "name": 70 * "n" + "\n\x1b"}
+    assert own_name(parse_profile(body)) == 57 * "n" + "..."
+    body["name"] = "a\n\x1b[2J"
+    assert own_name(parse_profile(body)) == r"a\n\x1b[2J"
+
+
+@pytest.mark.long("draws the figures of a report")
+def test_a_report_that_cannot_be_written_leaves_the_earlier_one(myope, tmp_path):
+    out = tmp_path / "eye.html"
+    out.write_text("earlier")
+    with full_disk(), pytest.raises(OSError, match="too large"):
+        write_report([myope], out)
+    assert [path.name for path in tmp_path.iterdir()] == ["eye.html"]
+    assert out.read_text() == "earlier"
+
+
+def test_a_report_can_be_read_by_its_owner_only(command):
+    assert stat.S_IMODE(command[1].stat().st_mode) == 0o600
+
+
 def test_the_first_page_says_where_entered_powers_are_measured(myope):
     note = refraction_table(myope).note
     assert note.startswith("Entered: −4.00 −1.00 x 20 at 12 mm, −3.82 ")
@@ -427,12 +554,11 @@ def test_the_first_page_says_where_entered_powers_are_measured(myope):
     assert entered_text(load_profile("keratoconus")) == ""
 
 
-def test_a_star_is_explained_only_where_it_stands(myope, corrected):
+def test_a_star_is_explained_only_where_it_stands(myope, corrected, lasik):
     def notes(*facts):
         table = document_of(list(facts)).sections[0].rows[1 - (len(facts) == 1)]
         return table.blocks[-1].note
 
-    lasik = facts_of("post_lasik", has_charts=False)
     assert "*" not in notes(myope, corrected)
     assert "*" in notes(lasik)
     assert "*" in notes(myope, lasik)
@@ -443,16 +569,16 @@ def test_a_change_is_that_of_the_numbers_shown():
     assert change_text(1.0, 1.004) == "0.00"
 
 
-def test_accommodation_is_the_distance_of_both_points_shown():
-    facts = facts_of("keratoconus", has_charts=False)
+def test_accommodation_is_the_distance_of_both_points_shown(lasik):
+    facts = lasik
     rows = {row[0]: row for row in vision_table(facts).rows}
     for k, pupil in enumerate(facts.numbers["pupils"]):
         reach_dpt = pupil["near_point_dpt"] - pupil["far_point_dpt"]
         assert rows["accommodation, dpt"][k + 1] == f"{reach_dpt:.1f}"
     assert "accommodates" not in refraction_table(facts).note
     document = document_of([replace(facts, label="Right eye")])
-    assert document.title == "Eye report: Right eye, keratoconus"
-    assert "example eye (preset keratoconus)" in document.subtitle
+    assert document.title == "Eye report: Right eye, post_lasik"
+    assert "example eye (preset post_lasik)" in document.subtitle
     assert refraction_table(facts).head[1] == "example"
 
 
@@ -476,22 +602,6 @@ def test_the_method_is_told_without_options_and_program_text(myope):
         assert word not in text
 
 
-def test_rows_of_a_chart_have_sizes_and_the_smallest_read_is_marked(myope):
-    gray = np.full((8, 8, 3), 128, np.uint8)
-    charts = {(p, d): gray for p in (3.0, 5.0) for d in (0.4, 1.0, 6.0)}
-    numbers = myope.numbers | {
-        "charts": [entry | {"log_mar": 0.43} for entry in myope.numbers["charts"]]
-    }
-    shown = replace(myope, numbers=numbers, charts=charts)
-    picture = document_of([shown]).sections[0].rows[3].blocks[0]
-    assert len(picture.marks) == 13
-    assert picture.marks[0].text == "1.0 · 0.10"
-    assert [m.text for m in picture.marks if m.is_emphasized] == ["0.4 · 0.40"]
-    text = html_of(document_of([shown]))
-    assert text.count('class="read"') == 6
-    assert "◂ 0.4 · 0.40" in text
-
-
 def test_a_progressive_lens_is_named_beside_the_near_chart():
     lens = {"kind": "progressive", "sphere_dpt": -2, "add_dpt": 2, "vertex_mm": 12}
     body = {"kind": "prescription", "sphere_dpt": 0.0, "correction": lens}
@@ -511,8 +621,8 @@ def test_what_two_eyes_share_is_told_once(myope, corrected):
     assert note.count("As spectacles at 12 mm: −4.00 dpt sph") == 2
 
 
-def test_the_disclaimer_of_a_page_follows_its_content(myope):
-    text = html_of(document_of([myope]))
+def test_the_disclaimer_of_a_page_follows_its_content(myope_text):
+    text = myope_text
     assert text.index("<footer>") > text.rindex("</section>")
 
 
@@ -525,6 +635,7 @@ def test_a_digest_is_that_of_the_eye_and_not_of_its_name_or_format(tmp_path):
     )
 
 
+@pytest.mark.clients
 def test_figures_of_assumed_aberrations_say_so(myope):
     def titles(figure):
         return [axes.get_title("left") for axes in figure.axes]
@@ -569,8 +680,12 @@ def test_a_missing_pdf_library_is_named_before_any_work(monkeypatch, capsys, tmp
         ([], "report: the following arguments are required: profile"),
         (["myopia", "-o", "a.pdf", "--fast"], "unrecognized arguments: --fast"),
         (["myopia"], "report: --out is missing; expected a .html or .pdf file"),
-        (["myopia", "-o", "eye.docx"], "expected a .html or .pdf file"),
-        (["myopia", "-o", "nowhere/eye.pdf"], "folder nowhere does not exist"),
+        (["myopia", "-o", "eye.docx"], "allowed: a name that ends in .html, .pdf"),
+        (["myopia", "-o", "nowhere/eye.pdf"], "its folder does not exist"),
+        (["myopia", "-o", "eye.html", "--name", "a\nb"], "--name contains '\\n'"),
+        (["myopia", "-o", "eye.html", "--name", "\udcff"], "--name contains '\\udcff'"),
+        (["myopia", "-o", "eye.html", "--patient", "\x1b[2J"], "patient contains"),
+        (["myopia", "-o", "eye.html", "--after-name", 61 * "x"], "has 61 characters"),
         (["myopia", "gone.json", "-o", "eye.pdf"], "file 'gone.json' does not exist"),
     ],
 )
@@ -586,12 +701,8 @@ def test_bad_input_is_one_line_and_no_file(
     assert not list(tmp_path.iterdir())
 
 
-def test_the_command_writes_a_pdf_and_prints_the_numbers_alone(capsys, tmp_path):
-    profile, out = tmp_path / "eye.json", tmp_path / "eye.pdf"
-    profile.write_text(json.dumps(MYOPE))
-    assert main([str(profile), "-o", str(out), "--no-charts", "--json"]) == 0
-    written = capsys.readouterr()
-    assert written.err == ""
-    found = json.loads(written.out)["eye"]["refraction"]
+def test_the_command_writes_a_report_and_prints_the_numbers_alone(command):
+    ended, _ = command
+    assert (ended.returncode, ended.stderr) == (0, "")
+    found = json.loads(ended.stdout)["eye"]["refraction"]
     assert found["M_dpt"] == pytest.approx(sum(AT_CORNEA) / 2, abs=0.01)
-    assert len(PdfReader(out).pages) == 3

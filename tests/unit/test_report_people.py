@@ -31,12 +31,17 @@ MEASURED = {
     "wavelength_nm": 555.0,
     "zernike_um": {"2,0": 0.5, "3,-1": 0.15, "4,0": 0.1},
 }
-PEOPLE = 3
+PEOPLE = 2
 
 
 @pytest.fixture(scope="module")
 def young() -> EyeFacts:
-    return facts_of(YOUNG, label="Y", has_charts=False, people=PEOPLE)
+    facts = facts_of(YOUNG, label="Y", has_charts=False, people=PEOPLE)
+    # which keeps what it computes for figures
+    draw_mtf(new_figure(90, 60).subplots(), facts.study)
+    draw_through_focus_acuity(new_figure(90, 60).subplots(), facts.study)
+    draw_field_line(new_figure(90, 60).subplots(), facts.study, facts.people)
+    return facts
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +67,10 @@ def measured_text(measured) -> str:
 
 @pytest.fixture(scope="module")
 def person() -> EyeStudy:
-    return EyeStudy.of(YOUNG | {"sample": 1})
+    study = EyeStudy.of(YOUNG | {"sample": 1})
+    for pupil_mm in (3.0, 5.0):
+        modulation(study, pupil_mm, is_corrected=True)
+    return study
 
 
 def _band(collection, at):
@@ -124,7 +132,12 @@ def test_bands_are_percentiles_of_the_persons(young):
     assert axes.lines[0].get_ydata() == pytest.approx(np.median(m_dpt, axis=0))
 
 
-def test_numbers_and_tables_have_the_range(young):
+@pytest.fixture(scope="module")
+def young_text(young) -> str:
+    return html_of(document_of([young]))
+
+
+def test_numbers_and_tables_have_the_range(young, young_text):
     drawn = json.loads(json.dumps(young.numbers, allow_nan=False))["people"]
     assert drawn["count"] == PEOPLE
     m_dpt = young.people.field.power_dpt[..., 0]
@@ -135,14 +148,18 @@ def test_numbers_and_tables_have_the_range(young):
     at_10 = drawn["pupils"][1]["modulation_best_corrected"]["10_cpd"]["50"]
     values = young.people.modulation[5.0][:, FREQUENCY_CPD == 10.0]
     assert at_10 == pytest.approx(np.median(values))
-    text = html_of(document_of([young]))
+    text = young_text
     rms = drawn["pupils"][0]["higher_order_rms_um"]
     assert f"<td>{rms['50']:.2f} ({rms['5']:.2f} to {rms['95']:.2f})</td>" in text
     assert "M along the horizontal meridian, median and bands of drawn" in text
-    assert "3 persons: the higher orders on the axis and the periphery drawn" in text
+    assert (
+        f"{PEOPLE} persons: the higher orders on the axis and the periphery drawn"
+        in text
+    )
     assert "accommodating through 3 mm" in text
 
 
+@pytest.mark.clients
 def test_a_measured_axis_has_no_band(measured, measured_text):
     people = measured.people
     assert people.modulation == people.log_mar == {}
@@ -154,6 +171,7 @@ def test_a_measured_axis_has_no_band(measured, measured_text):
     assert "the same, drawn persons" not in text
 
 
+@pytest.mark.clients
 def test_a_report_without_people_mentions_none(measured, measured_text):
     alone = EyeFacts(
         measured.study,
@@ -165,6 +183,7 @@ def test_a_report_without_people_mentions_none(measured, measured_text):
     assert text.count("<img") == measured_text.count("<img") - 1
 
 
+@pytest.mark.clients
 def test_lenslets_leave_the_axis_without_bands():
     lens = {"kind": "lenslets", "sphere_dpt": -1, "gaze_deg": [0, -25]}
     study = EyeStudy.of(YOUNG | {"correction": lens})
@@ -192,6 +211,7 @@ def test_bad_people_are_one_line_and_no_file(arguments, said, capsys, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.clients
 def test_progress_covers_the_persons(measured, fractions):
     done = [fraction for fraction, _ in fractions]
     assert done == sorted(done)

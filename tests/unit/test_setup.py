@@ -9,11 +9,13 @@ import pytest
 
 from tests.source_tree import ROOT
 
-PINS = dict(
-    line.split("==")
+pytestmark = pytest.mark.tools
+
+PINNED = [
+    line.partition("==")[0]
     for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     if line and not line.startswith("#")
-)
+]
 
 
 def _normal(name: str) -> str:
@@ -25,12 +27,13 @@ def _required() -> list[str]:
     project = tomllib.loads(text)["project"]
     extras = project["optional-dependencies"]
     listed = [*project["dependencies"], *extras["clients"], *extras["dev"]]
+    listed += extras["pyrender"]
     listed += [*extras["peers"], *extras["web"], *extras["web-test"]]
     return [re.match(r"[\w.-]+", requirement)[0] for requirement in listed]
 
 
 def test_every_requirement_has_a_pin():
-    pinned = {_normal(name) for name in PINS}
+    pinned = {_normal(name) for name in PINNED}
     assert [name for name in _required() if _normal(name) not in pinned] == []
 
 
@@ -49,7 +52,7 @@ def test_loops_are_compiled_with_no_more_than_the_packages_that_come_first():
     setup = (ROOT / "setup.sh").read_text(encoding="utf-8")
     first = re.search(r'^COMPILER_PACKAGES="(.*)"$', setup, re.MULTILINE)[1].split()
     brought_along = {"llvmlite", "glcontext", "typing_extensions"}  # by the others
-    brought_along.add("yaml")  # optional to numba; the extra `web` brings it
+    brought_along |= {"yaml", "coverage"}  # optional to numba, of `web` and `dev`
     ran = subprocess.run(
         [sys.executable, "-c", IMPORTED_TO_COMPILE],
         cwd=ROOT,

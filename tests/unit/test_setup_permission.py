@@ -10,6 +10,8 @@ import pytest
 
 from tests.source_tree import ROOT
 
+pytestmark = pytest.mark.tools
+
 PROGRAMS = {
     "id": 'echo "$FAKE_UID"',
     "sudo": 'echo "sudo $*" >>"$LOG"',

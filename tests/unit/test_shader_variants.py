@@ -13,6 +13,8 @@ from filter_service.gl.shader_source import (
 from tests.shader_check import Compilers, check, complaints
 from tests.shader_variants import KINDS, Variant, all_variants, renderer_variants
 
+pytestmark = pytest.mark.tools
+
 CONDITION = re.compile(
     r"^\s*#\s*(?:el)?if(?:n?def\s+|\s+defined\()(\w+)\)?\s*$", flags=re.MULTILINE
 )

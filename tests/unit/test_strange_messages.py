@@ -45,13 +45,7 @@ def decodes_or_is_refused(parts):
         str(error)
 
 
-@settings(max_examples=400, deadline=None)
-@given(st.lists(st.binary(max_size=200), max_size=4))
-def test_random_bytes_never_do_more_than_be_refused(parts):
-    decodes_or_is_refused(parts)
-
-
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.sampled_from(REQUESTS), field_names, json_like, st.data())
 def test_a_message_with_one_strange_field_never_does_more_than_be_refused(
     message, name, value, data
@@ -68,24 +62,15 @@ def test_a_message_with_one_strange_field_never_does_more_than_be_refused(
     decodes_or_is_refused([msgpack.packb(header), *parts[1:]])
 
 
-@settings(max_examples=300, deadline=None)
-@given(st.sampled_from(REQUESTS), st.data())
-def test_a_message_with_one_strange_byte_never_does_more_than_be_refused(message, data):
-    parts = as_bytes(encode(message))
-    index = data.draw(st.integers(0, len(parts) - 1))
-    place = data.draw(st.integers(0, max(0, len(parts[index]) - 1)))
-    byte = data.draw(st.binary(max_size=2))
-    parts[index] = parts[index][:place] + byte + parts[index][place + 1 :]
-    decodes_or_is_refused(parts)
-
-
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.dictionaries(st.text(max_size=8), json_like, max_size=4))
 def test_strange_profiles_never_do_more_than_be_refused(body):
     decodes_or_is_refused(profile_parts(msgpack.packb(body)))
 
 
-def test_ten_thousand_mutated_messages_never_do_more_than_be_refused():
-    rng, kinds = random.Random(2), examples()
-    for _ in range(10_000):
+def test_three_thousand_mutated_messages_never_do_more_than_be_refused():
+    """Bytes and fields of another value, parts and fields that lack, and noise."""
+    rng = random.Random(2)
+    kinds = examples() + [as_bytes(encode(message)) for message in REQUESTS]
+    for _ in range(3_000):
         decodes_or_is_refused(mutated(rng, rng.choice(kinds)))

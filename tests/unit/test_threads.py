@@ -4,6 +4,8 @@ import subprocess
 import sys
 import textwrap
 
+import pytest
+
 from filter_service.threads import (
     UNSAFE_THREADING_LAYER,
     require_safe_threading_layer,
@@ -26,6 +28,7 @@ def test_this_machine_has_a_safe_layer():
     assert require_safe_threading_layer() != UNSAFE_THREADING_LAYER
 
 
+@pytest.mark.long("a process starts")
 def test_a_machine_without_openmp_and_tbb_is_told_what_to_install():
     answer = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(WITHOUT_SAFE_LAYERS)],

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from clients.commands.program import _exit_code
 from estimator.optics.zernike import rescale_pupil
+from tests.commands import run_command
 from tests.numerical.schematic_eyes import reference
 
 CASE = next(
@@ -44,16 +44,16 @@ def eye_file(tmp_path):
     return path
 
 
-def _json(capsys, *arguments):
-    assert _exit_code(["wavefront", *map(str, arguments), "--json"]) == 0
-    out = capsys.readouterr().out
-    assert out.count("\n") == 1
-    return json.loads(out)
+def _json(*arguments):
+    ended = run_command("wavefront", *arguments, "--json")
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.count("\n") == 1
+    return json.loads(ended.stdout)
 
 
 @pytest.mark.parametrize(("fit", "key"), [("opd", "C_um"), ("slope", "C_slope_um")])
-def test_reference_set_through_the_command_line(eye_file, capsys, fit, key):
-    found = _json(capsys, eye_file, *VIEW, "--fit", fit)
+def test_reference_set_through_the_command_line(eye_file, fit, key):
+    found = _json(eye_file, *VIEW, "--fit", fit)
     radius_mm = CASE["circle"]["radius_mm"]
     zernike_um = rescale_pupil(
         found["zernike_um"], radius_ratio=radius_mm / found["zernike_radius_mm"]
@@ -65,36 +65,35 @@ def test_reference_set_through_the_command_line(eye_file, capsys, fit, key):
     assert abs(ellipse["ratio"] - CASE["pupil_ellipse"]["ratio"]) < 1e-6
 
 
-def test_pupil_and_stop_are_told_apart(eye_file, capsys):
+def test_pupil_and_stop_are_told_apart(eye_file):
     view = ["--wavelength-nm", "555"]
-    stop = _json(capsys, eye_file, "--stop-mm", "4", *view)
-    pupil = _json(capsys, eye_file, "--pupil-mm", "4", *view)
+    stop = _json(eye_file, "--stop-mm", "4", *view)
+    pupil = _json(eye_file, "--pupil-mm", "4", *view)
     assert abs(4.0 / pupil["stop_diameter_mm"] - 1.13325) < 1e-5
     assert pupil["zernike_radius_mm"] < 2.0 < stop["zernike_radius_mm"]
 
 
-def test_a_near_object_makes_the_eye_hyperopic_by_its_vergence(eye_file, capsys):
+def test_a_near_object_makes_the_eye_hyperopic_by_its_vergence(eye_file):
     view = ["--stop-mm", "1", "--wavelength-nm", "555"]
-    far = _json(capsys, eye_file, *view)
-    near = _json(capsys, eye_file, *view, "--object-dpt", "3")
+    far = _json(eye_file, *view)
+    near = _json(eye_file, *view, "--object-dpt", "3")
     change_um = near["zernike_um"][4] - far["zernike_um"][4]
     added_dpt = -4 * np.sqrt(3) * change_um / far["zernike_radius_mm"] ** 2
     assert 3.0 < added_dpt < 3.05  # seen at the cornea, 3 mm nearer
 
 
-def test_without_json_it_prints_a_table(eye_file, capsys):
-    assert _exit_code(["wavefront", str(eye_file), *VIEW]) == 0
-    out = capsys.readouterr().out
-    assert len(out.splitlines()) == 29
-    assert "circle of 2.2570 mm" in out
+def test_without_json_it_prints_a_table(eye_file):
+    ended = run_command("wavefront", eye_file, *VIEW)
+    assert ended.returncode == 0
+    assert len(ended.stdout.splitlines()) == 29
+    assert "circle of 2.2570 mm" in ended.stdout
 
 
-def _refused(capsys, *arguments):
-    code = _exit_code(["wavefront", *map(str, arguments)])
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1
-    return code, captured.err
+def _refused(*arguments):
+    ended = run_command("wavefront", *arguments)
+    assert ended.stdout == ""
+    assert ended.stderr.count("\n") == 1
+    return ended.returncode, ended.stderr
 
 
 @pytest.mark.parametrize(
@@ -105,42 +104,42 @@ def _refused(capsys, *arguments):
         ([*VIEW, "--h-deg", "90"], "--h-deg is 90; allowed: -75 to 75"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_2(eye_file, capsys, arguments, message):
-    code, text = _refused(capsys, eye_file, *arguments)
+def test_bad_input_is_one_line_and_exit_code_2(eye_file, arguments, message):
+    code, text = _refused(eye_file, *arguments)
     assert code == 2
     assert message in text
 
 
-def test_surfaces_in_one_state_do_not_accommodate(eye_file, capsys):
-    facts = _json(capsys, eye_file, *VIEW, "--focus-dpt", "2")
+def test_surfaces_in_one_state_do_not_accommodate(eye_file):
+    facts = _json(eye_file, *VIEW, "--focus-dpt", "2")
     assert "nearer than the near point" in " ".join(facts["notes"])
 
 
-def test_a_wrong_surface_is_named(eye_file, capsys):
+def test_a_wrong_surface_is_named(eye_file):
     body = json.loads(eye_file.read_text(encoding="utf-8"))
     del body["surfaces"][2]["z_mm"]
     eye_file.write_text(json.dumps(body), encoding="utf-8")
-    code, text = _refused(capsys, eye_file, *VIEW)
+    code, text = _refused(eye_file, *VIEW)
     assert code == 2
     assert "surfaces.2.z_mm" in text
 
 
-def test_a_lost_chief_ray_is_a_failure_in_words(eye_file, capsys):
+def test_a_lost_chief_ray_is_a_failure_in_words(eye_file):
     body = json.loads(eye_file.read_text(encoding="utf-8"))
     body["surfaces"][1]["clear_radius_mm"] = 0.2
     eye_file.write_text(json.dumps(body), encoding="utf-8")
-    code, text = _refused(capsys, eye_file, *VIEW)
+    code, text = _refused(eye_file, *VIEW)
     assert code == 1
     assert "no chief ray: outside a clear radius" in text
 
 
-def test_the_45_parameters_are_an_eye_too(tmp_path, capsys):
+def test_the_45_parameters_are_an_eye_too(tmp_path):
     from estimator.eye.parameters import EyeParameters
 
     path = tmp_path / "mean.json"
     body = {"kind": "eye", "parameters": EyeParameters.mean_eye().to_mapping()}
     path.write_text(json.dumps(body), encoding="utf-8")
     view = ["--pupil-mm", "4", "--wavelength-nm", "555", "--h-deg", "10"]
-    relaxed = _json(capsys, path, *view)
-    focused = _json(capsys, path, *view, "--focus-dpt", "4")
+    relaxed = _json(path, *view)
+    focused = _json(path, *view, "--focus-dpt", "4")
     assert focused["zernike_um"][4] - relaxed["zernike_um"][4] > 0.5

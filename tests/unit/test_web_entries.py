@@ -1,5 +1,6 @@
 """What is typed on the page becomes a profile, or an explanation."""
 
+import base64
 import json
 
 import pytest
@@ -333,3 +334,40 @@ def test_a_link_sets_all_entries_also_those_that_it_leaves_out():
     found = restore(state, fragment_of(PageState(), "courtyard"))
     assert state == PageState()
     assert (found.scene, found.problems) == ("courtyard", [])
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        {"values": {"pupil_diameter_mm": 10**400}},
+        {"values": {"pupil_diameter_mm": 10**18}},
+        {"values": {"focus_dpt": float("nan"), "age_years": 1e308}},
+        {"values": [12, {}], "shown": ["both"], "scene": {}},
+        {"eyes": {"OD": {"preset": ["myopia"], "source": {}}}},
+        {"eyes": {"OD": {"preset": {"a": 1}, "texts": {"sphere_dpt": [1]}}}},
+        {"eyes": {"OD": {"correction": {"kind": [], "design": {}}}}},
+        {"eyes": {"OD": {"correction": {"kind": "iol", "design": ["trifocal"]}}}},
+        {"eyes": {"OD": {"correction": {"kind": "iol", "texts": {"add_dpt": {}}}}}},
+        {"eyes": {"OD": json.loads("[" * 30 + "]" * 30)}},
+        {"eyes": {"OD": {"texts": {"sphere_dpt": "\ud800"}}}},
+    ],
+)
+def test_a_link_of_other_types_is_told_and_changes_nothing(entries):
+    state = PageState()
+    text = json.dumps({"v": 1, **entries}).encode()
+    found = restore(state, base64.urlsafe_b64encode(text).decode())
+    assert all(isinstance(problem, str) for problem in found.problems)
+    assert state.values == PageState().values
+    assert [form.preset for form in state.eyes.values()] == ["myopia", "myopia"]
+    assert state.eyes["OD"].texts == EyeForm("OD").texts
+    fragment_of(state, "chart")
+    state.problems()
+
+
+@pytest.mark.parametrize(
+    "text", [b"[" * 3000, b"\xff", b"5", b"{}", b'{"v": NaN}', b""]
+)
+def test_a_link_that_is_none_is_told(text):
+    found = restore(PageState(), base64.urlsafe_b64encode(text).decode())
+    assert found.scene is None
+    assert "no entries" in found.problems[0]

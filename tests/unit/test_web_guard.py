@@ -17,7 +17,9 @@ async def _inside(scope, receive, send):
     await send({"type": kind, "status": 200})
 
 
-def _asked(kind="http", query=b"", *headers, host=HOST, guard=None, **options):
+def _asked(
+    kind="http", query=b"", *headers, host=HOST, guard=None, scheme="http", **options
+):
     """Return what the guard sends, as dicts."""
     sent = []
     if guard is None:
@@ -25,6 +27,7 @@ def _asked(kind="http", query=b"", *headers, host=HOST, guard=None, **options):
 
     async def ask():
         scope = {"type": kind, "query_string": query, "headers": [host, *headers]}
+        scope["scheme"] = scheme
 
         async def receive():
             return {"type": "websocket.connect"}
@@ -50,6 +53,13 @@ def test_the_token_in_the_address_becomes_a_cookie_and_leaves_the_address():
     assert headers[b"set-cookie"].startswith(b"ocufilter-8765=a-token; ")
     assert b"HttpOnly" in headers[b"set-cookie"]
     assert b"SameSite=Lax" in headers[b"set-cookie"]
+
+
+@pytest.mark.parametrize(("scheme", "is_secure"), [("http", False), ("https", True)])
+def test_the_cookie_is_secure_if_the_page_is_read_through_tls(scheme, is_secure):
+    start, _ = _asked("http", b"token=a-token", scheme=scheme)
+    cookie = dict(start["headers"])[b"set-cookie"]
+    assert (b"; Secure" in cookie) == is_secure
 
 
 @pytest.mark.parametrize("kind", ["http", "websocket"])

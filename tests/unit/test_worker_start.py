@@ -1,55 +1,111 @@
-"""Where the worker process imports from: where this one does, and nowhere else."""
+"""The worker process: what it imports, and the progress that it reports."""
 
+import os
 import socket
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
-from filter_service.building.worker_handle import WorkerHandle
+import pytest
+
+from filter_service.building.jobs import BuildJob, BuiltStore
+from filter_service.building.worker_handle import (
+    BuildDone,
+    BuildError,
+    BuildProgress,
+    WorkerHandle,
+)
+from filter_service.camera import Camera
+from filter_service.settings import FilterSettings
 from tests.source_tree import ROOT
 
+JOB = BuildJob(None, FilterSettings(), Camera(8, 8, (-0.1, 0.1, 0.1, -0.1)))
 
-def gets_ready():
-    worker = WorkerHandle("tests.end_to_end.doubles:build", warm_up="")
+
+def build(job, *, progress, cancelled):
+    """Report three stages twice, each sooner after the other than reports may be."""
+    for fraction, stage in [(0.0, "eye"), (0.1, "aberrations"), (0.2, "psfs")]:
+        progress(fraction, stage)
+        progress(fraction + 0.01, stage)
+    return BuiltStore(None)
+
+
+@contextmanager
+def started():
+    """Start a worker whose builds report three stages."""
+    worker = WorkerHandle(f"{__name__}:build", warm_up="")
     worker.start()
-    deadline_s = time.monotonic() + 20.0
     try:
-        while not worker._is_ready and not worker.n_restarts:
-            assert time.monotonic() < deadline_s
-            worker.poll()
-            time.sleep(0.02)
-        return not worker.n_restarts
+        yield worker
     finally:
         worker.close()
 
 
-def test_a_file_of_the_current_folder_is_not_taken_for_a_module(tmp_path, monkeypatch):
+def events_until(worker, is_so):
+    """Poll until an event or the worker is as asked; return the events."""
+    deadline_s, events = time.monotonic() + 20.0, []
+    while not is_so(events):
+        assert time.monotonic() < deadline_s
+        events += worker.poll()
+        time.sleep(0.01)
+    return events
+
+
+def reports_of_build(worker):
+    """Run one build; return the progress that it reports."""
+    done = BuildDone(worker.submit(JOB), BuiltStore(None))
+    events = events_until(worker, lambda events: done in events)
+    assert not [event for event in events if isinstance(event, BuildError)]
+    progress = [event for event in events if isinstance(event, BuildProgress)]
+    return [(event.fraction, event.stage) for event in progress]
+
+
+def built(*, pause_s=0.0):
+    """Run two builds in one worker; return the progress that each reports."""
+    with started() as worker:
+        reports = [reports_of_build(worker)]
+        time.sleep(pause_s)
+        reports.append(reports_of_build(worker))
+        time.sleep(pause_s)
+        assert worker.n_restarts == 0
+    return reports
+
+
+def test_the_worker_imports_from_the_path_and_not_from_the_current_folder(
+    tmp_path, monkeypatch
+):
+    """Entries of the path that are not text are skipped, as imports skip them."""
     (tmp_path / "estimator.py").write_text("raise SystemExit('not ours')\n")
     monkeypatch.chdir(tmp_path)
     elsewhere = [entry for entry in sys.path if entry]
-    monkeypatch.setattr(sys, "path", [str(ROOT), *elsewhere])
-    assert gets_ready()
+    path = [str(ROOT), *elsewhere, Path("anywhere")]
+    monkeypatch.setattr(sys, "path", path)
+    assert built()
 
 
-def test_an_entry_of_the_path_that_is_no_text_is_skipped_as_imports_skip_it(
-    monkeypatch,
-):
-    monkeypatch.setattr(sys, "path", [*sys.path, Path("anywhere")])
-    assert gets_ready()
+def test_every_stage_is_reported_once_however_short_it_is():
+    expected = [(0.0, "eye"), (0.1, "aberrations"), (0.2, "psfs")]
+    assert built() == [expected, expected]
 
 
 def test_a_default_timeout_of_sockets_does_not_end_the_worker():
     """Such as PsychoPy sets: sockets are then not blocking, on both ends of a pair."""
     socket.setdefaulttimeout(5.0)
     try:
-        worker = WorkerHandle("tests.end_to_end.doubles:build", warm_up="")
-        worker.start()
-        end_s = time.monotonic() + 3.0
-        while time.monotonic() < end_s:
-            worker.poll()
-            time.sleep(0.02)
-        assert worker._is_ready
-        assert not worker.n_restarts
-        worker.close()
+        assert built(pause_s=0.1)
     finally:
         socket.setdefaulttimeout(None)
+
+
+@pytest.mark.long("a process starts twice")
+def test_the_pipe_to_a_new_process_has_another_descriptor():
+    """Under the number of the old one, a selector did not notice it."""
+    with started() as worker:
+        reports_of_build(worker)
+        before = worker.file_descriptor
+        with socket.socket(fileno=os.dup(before)) as pipe:
+            pipe.shutdown(socket.SHUT_RDWR)  # the process exits
+        events_until(worker, lambda _: worker.n_restarts)
+        assert worker.file_descriptor not in (None, before)
+        assert reports_of_build(worker)

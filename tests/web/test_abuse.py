@@ -3,13 +3,16 @@
 import http.client
 import io
 import json
+import os
 import re
 import socket
 import subprocess
 import sys
 import threading
 import time
-from contextlib import contextmanager
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -67,10 +70,10 @@ class Target:
 
 
 @contextmanager
-def attacked():
+def attacked(*options):
     """Start the program; in the end it still answers, and has told of no fault."""
     command = [sys.executable, "-m", "clients.web.program"]
-    command += ["--no-browser", "--port", "0", "--json"]
+    command += ["--no-browser", "--port", "0", "--json", *options]
     with subprocess.Popen(
         command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as program:
@@ -147,6 +150,32 @@ def test_who_is_refused_cannot_go_on_sending(target):
             sock.sendall(100_000 * b"x")
 
 
+def test_a_log_that_nobody_reads_stops_no_visitor():
+    """Whoever has no token can cause as many lines as it likes."""
+    reading, writing = os.pipe2(os.O_NONBLOCK)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(writing, 65536 * b"x")
+    os.set_blocking(writing, True)
+    command = [sys.executable, "-m", "clients.web.program"]
+    command += ["--no-browser", "--port", "0", "--json"]
+    with subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=writing, text=True
+    ) as program:
+        try:
+            address = json.loads(program.stdout.readline())["address"]
+            target = Target(address, program.pid)
+            for _ in range(20):
+                with target.connect() as sock:
+                    sock.sendall(b"no request\r\n\r\n")
+                    _refused(sock)
+            assert target.answers()
+        finally:
+            program.kill()
+            os.close(reading)
+            os.close(writing)
+
+
 @pytest.mark.parametrize("host", ["evil.com", "127.0.0.1.evil.com", "[::1", "a@b:c:d"])
 def test_the_name_of_another_site_is_refused(target, host):
     assert target.ask_inside("GET", "/", Host=host)[0] == 421
@@ -216,11 +245,39 @@ def test_a_body_without_a_length_ends_at_the_limit(target):
     assert target.memory_mb() < before_mb + 30
 
 
+@pytest.mark.parametrize(
+    ("options", "protocol", "is_secure"),
+    [
+        ((), "https", False),
+        (("--proxy-host", "eye.example.org"), "http", False),
+        (("--proxy-host", "eye.example.org"), "https", True),
+    ],
+)
+def test_the_cookie_is_secure_behind_a_proxy_with_tls(options, protocol, is_secure):
+    with attacked(*options) as target:
+        query = urlsplit(target.address).query
+        forwarded = {"X-Forwarded-Proto": protocol}
+        _, headers, _ = target.ask("GET", "/?" + query, None, forwarded)
+        assert ("; Secure" in headers["set-cookie"]) == is_secure
+
+
 def test_pages_that_nobody_looks_at_are_limited(target):
     statuses = [target.ask_inside("GET", "/")[0] for _ in range(MAX_PAGES + 8)]
     assert statuses[0] == 200
     assert statuses[-1] == 503
     assert 503 not in statuses[: MAX_PAGES // 2]
+
+
+def test_pages_loaded_at_once_are_all_served_up_to_the_limit():
+    """Building them takes longer together than NiceGUI waits for one."""
+    for n_loads in (12, MAX_PAGES + 20):
+        with attacked() as target, ThreadPoolExecutor(n_loads) as pool:
+            loads = range(n_loads)
+            answers = pool.map(lambda _: target.ask_inside("GET", "/")[0], loads)
+            statuses = Counter(answers)
+        assert statuses == Counter({200: min(n_loads, MAX_PAGES)}) + Counter(
+            {503: max(n_loads - MAX_PAGES, 0)}
+        )
 
 
 # --- what is sent from the page ------------------------------------------------
@@ -238,24 +295,39 @@ def photo_entry(browser, target):
     return page, urlsplit(sent.value.url).path
 
 
+class Upload:
+    """Sends to the entry of a photo what no browser would send."""
+
+    def __init__(self, browser, target) -> None:
+        self.browser, self.target, self.page = browser, target, None
+
+    def open(self):
+        """Open a page, or another where a busy machine has lost the last one."""
+        if self.page is None or self(b"a.png", b"") == 404:
+            self.page, self.path = photo_entry(self.browser, self.target)
+        return self
+
+    def __call__(self, name: bytes, content: bytes):
+        body = b'--B\r\nContent-Disposition: form-data; name="f"; filename="'
+        body += name + b'"\r\nContent-Type: image/png\r\n\r\n' + content
+        kinds = "multipart/form-data; boundary=B"
+        status, _ = self.target.ask_inside(
+            "POST", self.path, body + b"\r\n--B--\r\n", Content_Type=kinds
+        )
+        return status
+
+
 @pytest.fixture(scope="module")
-def upload(browser):
-    """Return how to send to the entry of a photo what no browser would send."""
+def module_upload(browser):
     with attacked() as target:
-        page, path = photo_entry(browser, target)
+        upload = Upload(browser, target)
+        yield upload
+        upload.page.context.close()
 
-        def send(name: bytes, content: bytes):
-            body = b'--B\r\nContent-Disposition: form-data; name="f"; filename="'
-            body += name + b'"\r\nContent-Type: image/png\r\n\r\n' + content
-            kinds = "multipart/form-data; boundary=B"
-            status, _ = target.ask_inside(
-                "POST", path, body + b"\r\n--B--\r\n", Content_Type=kinds
-            )
-            return status
 
-        send.page, send.target, send.path = page, target, path
-        yield send
-        page.context.close()
+@pytest.fixture
+def upload(module_upload):
+    return module_upload.open()
 
 
 def _png(width_px, height_px):
@@ -412,17 +484,50 @@ def test_a_request_that_does_not_come_is_not_waited_for(first):
         assert time.monotonic() - begin_s < 2.0
 
 
-def test_connections_are_limited_and_free_again():
-    with serving(head_s=0.5, max_connections=4) as connect:
-        idle = [connect() for _ in range(4)]
-        with connect() as fifth:
-            assert _refused(fifth) == b""
-        for sock in idle:
-            assert _refused(sock) == b""  # after half a second
+def get(connect):
+    """Return the beginning of the answer to a request on a new connection."""
+    with connect() as sock:
+        sock.sendall(REQUEST)
+        return sock.recv(1000)[:12]
+
+
+def test_the_silent_connections_make_way_for_a_visitor():
+    """With a limit that no test reaches for the time to send a request."""
+    with serving(head_s=300.0, max_connections=4) as connect:
+        with connect() as kept:
+            kept.sendall(REQUEST)
+            assert kept.recv(1000).startswith(b"HTTP/1.1 200")
+            half = [connect() for _ in range(3)]
+            for sock in half:
+                sock.sendall(REQUEST[:-2])
+            more = []
+            for sock in half:  # each new one closes the oldest of the silent
+                more.append(connect())
+                more[-1].sendall(REQUEST[:-2])
+                assert _refused(sock) == b""
+                sock.close()
+            assert get(connect) == b"HTTP/1.1 200"
+            kept.sendall(REQUEST)
+            assert kept.recv(1000).startswith(b"HTTP/1.1 200")
+        for sock in more:
             sock.close()
-        with connect() as sock:
-            sock.sendall(REQUEST)
-            assert sock.recv(1000).startswith(b"HTTP/1.1 200")
+
+
+def test_a_connection_in_use_does_not_make_way():
+    with serving(max_connections=3) as connect:
+        open_ones = [connect() for _ in range(3)]
+        for sock in open_ones:
+            sock.sendall(REQUEST[:-2] + UPGRADE)
+            assert sock.recv(1000).startswith(b"HTTP/1.1 101")
+        with connect() as fourth:
+            assert _refused(fourth) == b""
+        for sock in open_ones:
+            sock.sendall(b"\x81\x82\0\0\0\0hi")
+            assert sock.recv(1000) == b"\x81\x02hi"
+            sock.close()
+        deadline_s = time.monotonic() + TIMEOUT_S
+        while (answer := get(connect)) != b"HTTP/1.1 200":
+            assert time.monotonic() < deadline_s, answer
 
 
 def test_a_connection_that_asks_again_and_again_stays():

@@ -97,20 +97,20 @@ def test_the_focus_ring_of_a_slider_does_not_cross_a_label(page):
             assert overlap_px(ring, head) == 0.0
 
 
-@pytest.mark.parametrize(
-    ("scene", "text"),
-    [("Photo", "No photo yet: upload one"), ("3D file", "No 3D file yet: upload one")],
-)
-def test_a_scene_without_a_file_says_so_in_place(page, scene, text):
-    page.choose(scene)
-    page.page.locator(".oc-view").get_by_text(text).wait_for()
-    assert not page.page.locator(".oc-view canvas").first.is_visible()
-    page.choose("Picture")
-    page.page.locator(".q-notification").get_by_text(text).wait_for()
-    number = page.number()
-    page.choose("Courtyard")
-    page.settle(after=number)
-    assert page.page.locator(".oc-view canvas").first.is_visible()
+def test_a_scene_without_a_file_says_so_in_place(page):
+    for scene, text in (
+        ("Photo", "No photo yet: upload one"),
+        ("3D file", "No 3D file yet: upload one"),
+    ):
+        page.choose(scene)
+        page.page.locator(".oc-view").get_by_text(text).wait_for()
+        assert not page.page.locator(".oc-view canvas").first.is_visible()
+        page.choose("Picture")
+        page.page.locator(".q-notification").get_by_text(text).wait_for()
+        number = page.number()
+        page.choose("Courtyard")
+        page.settle(after=number)
+        assert page.page.locator(".oc-view canvas").first.is_visible()
 
 
 def test_the_age_is_beside_the_prescription(page):

@@ -1,0 +1,1 @@
+"""What the tests cost and catch: durations, coverage and deliberate faults."""
