@@ -264,7 +264,7 @@ class Page:
                     heading = ui.html(title, tag="h3", sanitize=False)
                     heading.classes("oc-eye-title")
                     self.panels[side] = EyePanel(
-                        self.state.eyes[side], self.request, self._take_file
+                        self.state.eyes[side], self._change_eye, self._take_file
                     )
                 self._boxes[side] = (box, heading)
             self._show_boxes()
@@ -272,13 +272,24 @@ class Page:
 
     # Event handlers
 
-    def request(self) -> None:
-        """Request a picture for the current entries; report invalid entries."""
-        request = self.state.request()
+    def _change_eye(self) -> None:
+        """Request a picture if a profile has changed; report invalid entries."""
+        if self.state.read_profiles():
+            self.request()
+        else:
+            self._report_problems()
+            self.link.schedule_update()
+
+    def _report_problems(self) -> None:
         problems = self.state.problems()
         if problems and self.state.valid_profiles:
             problems.append("The pictures show the last valid entries.")
         self._problem.text = "\n".join(problems)
+
+    def request(self) -> None:
+        """Request a picture for the current entries; report invalid entries."""
+        request = self.state.request()
+        self._report_problems()
         if request is None:
             return
         self._prepare()

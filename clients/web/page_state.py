@@ -178,16 +178,22 @@ class PageState:
         self.values.update(first_values())
         self.shown, self.is_focus_set = "OD", False
 
-    def request(self) -> PictureRequest | None:
-        """Return the request for the current state; None without a picture or an eye.
+    def read_profiles(self) -> bool:
+        """Read the profiles of the eyes shown; return whether any has changed.
 
         An eye with an invalid entry keeps its last profile: see `problems`.
         """
+        before = dict(self.valid_profiles)
         for side in self.sides:
             try:
                 self.valid_profiles[side] = self.body(side)
             except ValueError:
                 continue
+        return self.valid_profiles != before
+
+    def request(self) -> PictureRequest | None:
+        """Return the request for the current state; None without a picture or an eye."""
+        self.read_profiles()
         bodies = {
             side: self.valid_profiles[side]
             for side in self.sides

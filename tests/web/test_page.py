@@ -51,7 +51,7 @@ def test_a_slider_moves_the_picture_and_its_words(page):
 
 
 def test_a_wrong_entry_is_explained_and_the_eye_stays(page):
-    before = page.seen()
+    before, drawn = page.seen(), page.drawn()
     for text, said in (
         ("abc", "“abc” is not a number; allowed: −30 to 30 dpt"),
         ("-99", "-99 is out of range; allowed: −30 to 30 dpt"),
@@ -60,6 +60,7 @@ def test_a_wrong_entry_is_explained_and_the_eye_stays(page):
         page.page.get_by_text(said, exact=True).wait_for()
         page.page.get_by_text("The pictures show the last valid entries.").wait_for()
         page.page.wait_for_timeout(500)
+        assert page.drawn() == drawn  # not even a preview of the same eye
         np.testing.assert_array_equal(page.seen(), before)
     number = page.number()
     page.entry("sphere_dpt").fill("-1")
@@ -68,11 +69,12 @@ def test_a_wrong_entry_is_explained_and_the_eye_stays(page):
 
 
 def test_half_a_number_is_no_eye(page):
-    before = page.seen()
+    before, drawn = page.seen(), page.drawn()
     page.entry("sphere_dpt").fill("")
     page.entry("sphere_dpt").press_sequentially("-99", delay=60)
     page.page.get_by_text("is out of range").first.wait_for()
     page.page.wait_for_timeout(800)
+    assert page.drawn() == drawn
     np.testing.assert_array_equal(page.seen(), before)
 
 
