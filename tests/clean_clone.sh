@@ -6,7 +6,7 @@
 #   sh tests/clean_clone.sh                      only whether that is possible here
 #
 # Exit status: 77 if the system has no Python that can be used, or this is no clone.  The
-# variables ORDER_SEED and OCUFILTER_DURATIONS are passed on.
+# variables ORDER_SEED, OCUFILTER_DURATIONS and ARGS are passed on.
 set -eu
 cd "$(dirname "$0")/.."
 account=/usr/local/bin:/usr/bin:/bin
@@ -25,7 +25,7 @@ for target in "$@"; do
     echo "clean clone: make $target with $("$python" --version)"
     env -i HOME="$HOME" PATH="$account" \
         OCUFILTER_SETUP_YES="${OCUFILTER_SETUP_YES:-}" ORDER_SEED="${ORDER_SEED:-1}" \
-        OCUFILTER_DURATIONS="${OCUFILTER_DURATIONS:-}" \
+        OCUFILTER_DURATIONS="${OCUFILTER_DURATIONS:-}" ARGS="${ARGS:-}" \
         make -C "$folder" "$target" || status=$?
 done
 exit "${status:-0}"

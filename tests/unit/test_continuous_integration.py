@@ -1,5 +1,6 @@
 """`.ci/run` runs every suite that CONTRIBUTING.md names, and reports each outcome."""
 
+import json
 import os
 import re
 import shutil
@@ -13,6 +14,11 @@ pytestmark = pytest.mark.tools
 
 MAKE = """#!/bin/sh
 echo "made $1"
+if [ -n "${FAILING:-}" ] && [ -z "$ARGS" ]; then
+    mkdir -p .pytest_cache/v/cache
+    printf '%s' "$FAILING" >.pytest_cache/v/cache/lastfailed
+    exit 2
+fi
 case " $BROKEN " in *" $1 "*) exit 2 ;; esac
 """
 CLEAN_CLONE = """
@@ -64,8 +70,11 @@ def run(tmp_path):
     (tmp_path / ".ci").mkdir()
     shutil.copy(ROOT / ".ci/run", tmp_path / ".ci/run")
 
-    def run(*suites, broken="", headset_status=0, clone_status=77):
+    def run(*suites, broken="", failing=(), headset_status=0, clone_status=77):
         environment = {
+            "FAILING": json.dumps(dict.fromkeys(failing, True), indent=2)
+            if failing
+            else "",
             "PATH": f"{tmp_path}/bin:{os.environ['PATH']}",
             "BROKEN": broken,
             "HEADSET_STATUS": str(headset_status),
@@ -105,6 +114,31 @@ def test_a_failed_suite_does_not_stop_the_others(run):
     assert list(outcomes) == _suites()
     failed = [name for name, outcome in outcomes.items() if "FAILED" in outcome]
     assert failed == ["check", "test-web"]
+
+
+def test_a_test_that_passes_the_second_time_is_named(run):
+    finished = run("test-web", failing=["tests/web/a.py::test_b[c-d]", "e.py::f"])
+    assert finished.returncode == 0
+    assert re.findall(r"^made (.*)$", finished.stdout, re.M) == 2 * ["test-web"]
+    named = "passed, the second time: tests/web/a.py::test_b[c-d], e.py::f"
+    assert _summary(finished) == {"test-web": named}
+
+
+@pytest.mark.parametrize(
+    ("failing", "broken", "n_runs"),
+    [
+        (["a.py::b"], "test-web", 2),
+        ([f"a.py::b{k}" for k in range(4)], "", 1),
+    ],
+    ids=["again", "many"],
+)
+def test_a_suite_fails_by_tests_that_fail_twice_and_by_many(
+    run, failing, broken, n_runs
+):
+    finished = run("test-web", failing=failing, broken=broken)
+    assert finished.returncode == 1
+    assert finished.stdout.count("made test-web") == n_runs
+    assert "FAILED: exit status 2" in _summary(finished)["test-web"]
 
 
 def test_a_suite_that_cannot_run_here_is_skipped_and_reported(run):
