@@ -213,10 +213,14 @@ def _report(summary: dict[str, Any]) -> None:
         n, m = nm_from_index(j)
         if j > 0:
             print_line(f"{j:>3}  ({n},{m:>2})  {value:>+12.6f}")
-    ellipse = summary["pupil_ellipse"]
+    ellipse, pupil_mm = summary["pupil_ellipse"], summary["pupil_diameter_mm"]
+    given = f"stop diameter {summary['stop_diameter_mm']:g} mm"
+    if pupil_mm is not None:
+        given = f"entrance pupil diameter {pupil_mm:g} mm"
     print_line(
         f"{summary['eye']}, {summary['wavelength_nm']:g} nm, h {summary['h_deg']:g} "
-        f"v {summary['v_deg']:g} deg: circle of {summary['zernike_radius_mm']:.4f} mm, "
-        f"pupil {ellipse['semi_major_mm']:.4f} x {ellipse['semi_minor_mm']:.4f} mm, "
-        f"residual {summary['rms_residual_um']:.2g} um"
+        f"v {summary['v_deg']:g} deg, {given}; at the cornea: circle radius "
+        f"{summary['zernike_radius_mm']:.4f} mm, pupil semi-axes "
+        f"{ellipse['semi_major_mm']:.4f} x {ellipse['semi_minor_mm']:.4f} mm, residual "
+        f"{summary['rms_residual_um']:.2g} um"
     )

@@ -16,7 +16,10 @@ pseudophakic         from biometry and an implant to an eye
 published            schematic eyes from the literature with their sources
 reference            JSON Schema, tables and limits of the typed profiles
 files                .json, .abp, .csv and .zmx profiles, and eyes by name
-lens_files           eyes in Zemax and optiland files
+coefficient_files    tables of coefficients in .abp and .csv files
+zemax_files          eyes in .zmx files
+optiland_files       eyes in JSON files of optiland
+lens_files           from surfaces of a lens file to the body of an eye
 presets.json         the six presets
 measured_wavefront   a measurement used in closed form, without an eye model
 typical_aberrations  higher-order aberrations added to a prescription, by age

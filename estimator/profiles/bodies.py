@@ -39,11 +39,14 @@ PUBLISHED_NAMES = tuple(sorted(path.stem for path in PUBLISHED.glob("*.json")))
 
 MAX_MEASUREMENTS = 100
 MAX_COEFFICIENT_UM = 200.0
+MAX_FILE_NOTES, MAX_NOTE_CHARACTERS = 10, 300
 
 MEASUREMENTS_ALLOWED = (
     f"a list of 1 to {MAX_MEASUREMENTS} measurements, one at h = v = 0"
 )
-COEFFICIENTS_ALLOWED = f"an object of 'n,m': um with n from 0 to {MAX_RADIAL_ORDER}"
+COEFFICIENTS_ALLOWED = (
+    f"an object of 'n,m': um with n from 0 to {MAX_RADIAL_ORDER}; higher orders are 0"
+)
 
 FieldAngleDeg = Annotated[float, Meta(ge=-50.0, le=50.0)]
 """Field angle of a measurement; instruments measure to 40 deg or so."""
@@ -56,7 +59,7 @@ CoefficientsUm = Annotated[
     dict[str, Annotated[float, Meta(ge=-MAX_COEFFICIENT_UM, le=MAX_COEFFICIENT_UM)]],
     Meta(
         description=f'`"n,m"`: µm, n from 0 to {MAX_RADIAL_ORDER}, each term at most '
-        "once; other terms are 0",
+        "once; other terms are 0, also if they are given",
         extra={ALLOWED: COEFFICIENTS_ALLOWED},
     ),
 ]
@@ -93,6 +96,16 @@ class StraylightBody(Body, kw_only=True):
         ]
         | UnsetType
     ) = UNSET
+
+
+class FileNoteBody(Body, kw_only=True):
+    """A note of the reader of a file."""
+
+    code: Literal["file_comments", "file_configurations", "file_dispersion"]
+    text: Annotated[str, Meta(max_length=MAX_NOTE_CHARACTERS)]
+    values: Annotated[
+        dict[str, float], Meta(max_length=8, description="numbers of the text")
+    ] = msgspec.field(default_factory=dict)
 
 
 class CommonBody(Body, kw_only=True):
@@ -148,6 +161,14 @@ class CommonBody(Body, kw_only=True):
             description="apply the magnification of the `correction`, which it requires"
         ),
     ] = False
+    notes: Annotated[
+        list[FileNoteBody],
+        Meta(
+            max_length=MAX_FILE_NOTES,
+            description="what the reader of a file did not use; replies repeat it",
+            extra={ALLOWED: f"a list of up to {MAX_FILE_NOTES} notes"},
+        ),
+    ] = msgspec.field(default_factory=list)
 
 
 class WavefrontBody(CommonBody, kw_only=True):

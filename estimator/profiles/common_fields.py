@@ -11,6 +11,7 @@ from estimator.bounded_files import printable
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import RetinaShape
 from estimator.media.straylight import CATARACTS, DEFAULT_AGE_YEARS, Straylight
+from estimator.note import note_of
 from estimator.optics.zernike import (
     MAX_RADIAL_ORDER,
     N_TERMS,
@@ -62,9 +63,12 @@ def common_fields(body: bodies.CommonBody, kind: str) -> dict[str, Any]:
         "straylight": _straylight(body.straylight, age_years),
         "yellowing": body.yellowing,
         "spectacle_magnification": body.spectacle_magnification,
-        "notes": vertex_notes(
-            body if isinstance(body, bodies.PrescriptionBody) else None,
-            body.correction,
+        "notes": (
+            *(note_of(n.code, printable(n.text), n.values) for n in body.notes),
+            *vertex_notes(
+                body if isinstance(body, bodies.PrescriptionBody) else None,
+                body.correction,
+            ),
         ),
     }
 
@@ -140,7 +144,9 @@ def coefficients_um(
     named: dict[int, str] = {}
     for key, value_um in entries.items():
         field = f"{path}{name}.{key}"
-        j = _term_index(key, field)
+        j = _term_index(key, field, value_um)
+        if j >= N_TERMS:  # zero
+            continue
         if j in named:
             problem = f"names the same term as {named[j]!r}"
             raise ProfileError(field, problem, "each term once")
@@ -149,7 +155,7 @@ def coefficients_um(
     return flip_horizontal(zernike_um) if frame == "examiner" else zernike_um
 
 
-def _term_index(key: str, name: str) -> int:
+def _term_index(key: str, name: str, value_um: float) -> int:
     allowed = bodies.COEFFICIENTS_ALLOWED
     try:
         n, m = (int(part) for part in key.split(","))
@@ -159,6 +165,6 @@ def _term_index(key: str, name: str) -> int:
         j = index_from_nm(n, m)
     except ValueError as error:
         raise ProfileError(name, str(error), allowed) from None
-    if n > MAX_RADIAL_ORDER:
-        raise ProfileError(name, f"radial order {n}", allowed)
+    if n > MAX_RADIAL_ORDER and value_um != 0.0:
+        raise ProfileError(name, f"radial order {n}, {value_um:g} um", allowed)
     return j

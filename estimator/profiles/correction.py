@@ -46,6 +46,9 @@ SPECTACLES = (SpectaclesBody, ProgressiveBody, LensletsBody)
 ASKS_FROM_DPT = 4.0
 """Power above which 12 mm change it by 0.2 dpt or more, which a refraction resolves."""
 
+LEAST_VERTEX_MM = 5.0
+"""Spectacles are farther away; less may be in meters or centimeters."""
+
 SHOWN_DPT = 0.005
 
 MAX_DENOMINATOR, RATIO_TOLERANCE = 4, 0.03
@@ -139,6 +142,8 @@ def _vertex_note(name: str, body: "VertexBody") -> str:
     else:
         place = "at the cornea"
     note = f"{name}: {rx.format_prescription(lens)} {place}"
+    if 0.0 < lens.vertex_mm < LEAST_VERTEX_MM:
+        note += "; is vertex_mm in mm? Spectacles usually have 12 to 14 mm"
     if body.vertex_mm is UNSET and strongest_dpt >= ASKS_FROM_DPT:
         note += (
             "; vertex_mm is missing: the powers of spectacles need it, usually "

@@ -23,6 +23,7 @@ SCHEMA_DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
 INTRODUCTIONS: dict[type[msgspec.Struct], str] = {
     bodies.CommonBody: "Fields of every kind of profile.",
+    bodies.FileNoteBody: "Each entry of `notes`.",
     bodies.PresetBody: "Kind `preset`: an eye by its name.",
     bodies.PrescriptionBody: "Kind `prescription`.",
     bodies.ZernikeBody: "Kind `zernike`: one measured wavefront on the axis.",

@@ -49,6 +49,14 @@ EYE = {
 }
 ABP = "# an eye\nAp = 5\nWa = 587.56\nZ[2, 0] = 1.4\nZ[3,-1]=0.1\n"
 CSV = "# pupil_diameter_mm: 5\n# wavelength_nm: 555\nn,m,um\n2,0,1.5\n3,-1,-0.25\n"
+SHEET = (
+    "sep=;\n# Frame: examiner\n# eye: left\n# Pupil diameter (mm): 6,0\n"
+    "# Wavelength: 555 nm\n# Patient: A\nj;n;m;um\n4;2;0;3,2\n7;3;\u22121;0,25\n"
+)
+ZMX_ENDING = (
+    'BLNK\nOPDX 0 1 0 9.2E-1\nTOL TOFF   0   0 0\nMNUM 2 1\nMOFF   0   1 ""\n'
+    "THIC   2   1 0.5 0 0\n"
+)
 DISPLAY = "nm,r,g,b\n" + "".join(
     f"{nm},{np.exp(-(((nm - 610) / 20) ** 2)):.4f},"
     f"{np.exp(-(((nm - 540) / 20) ** 2)):.4f},"
@@ -174,6 +182,8 @@ def kinds(folder: Path) -> list[Kind]:
                 "e.json": json.dumps(EYE).encode(),
                 "p.abp": ABP.encode(),
                 "p.csv": CSV.encode(),
+                "sheet.csv": SHEET.encode(),
+                "windows.csv": SHEET.encode("utf-16"),
             },
             profile,
             lambda path, beside: [*as_color, str(path), *_images(beside)],
@@ -416,7 +426,12 @@ def _lens_files() -> dict[str, bytes]:
         f"{name.replace(' ', '_')}.json": json.dumps(eye["json"]).encode()
         for name, eye in eyes.items()
     }
-    files["eye.zmx"] = eyes["even asphere, centered"]["zmx"].encode("latin-1")
+    zmx = eyes["even asphere, centered"]["zmx"]
+    files["eye.zmx"] = zmx.encode("latin-1")
+    files["windows.zmx"] = (zmx + ZMX_ENDING).encode("utf-16")
+    old = json.loads((DATA / "optiland_old_files.json").read_bytes())["files"]
+    for version, eye in old.items():
+        files[f"version_{version}.json"] = json.dumps(eye["json"]).encode()
     return files
 
 

@@ -12,6 +12,9 @@ from estimator.profiles.files import load_profile
 from tests.numerical.optiland_eye import FROZEN_FILES, FROZEN_FORMS, WAVELENGTH_NM
 
 FILES = json.loads(FROZEN_FILES.read_text(encoding="utf-8"))["files"]
+OLD_FILES = json.loads(
+    FROZEN_FILES.with_name("optiland_old_files.json").read_text(encoding="utf-8")
+)["files"]
 TRACED = json.loads(FROZEN_FORMS.read_text(encoding="utf-8"))["eyes"]
 
 
@@ -42,6 +45,14 @@ def test_an_eye_saved_by_optiland_has_its_rays(tmp_path, name):
     eye = loaded(tmp_path, name, "json").surfaces.relaxed
     assert len(eye.surfaces) == 4
     assert_same_rays(eye, name, 1e-12)
+
+
+@pytest.mark.parametrize("version", OLD_FILES)
+def test_an_eye_saved_by_an_older_optiland_has_its_rays(tmp_path, version):
+    path = tmp_path / "eye.json"
+    path.write_text(json.dumps(OLD_FILES[version]["json"]), encoding="utf-8")
+    eye = load_profile(path).surfaces.relaxed
+    assert_same_rays(eye, OLD_FILES[version]["eye"], 1e-12)
 
 
 def test_a_zemax_file_of_optiland_has_its_rays(tmp_path):
@@ -101,7 +112,10 @@ SURF 7
 """
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-16", "latin-1"])
+ENCODINGS = ["utf-8", "utf-16", "utf-16-le", "utf-16-be", "latin-1"]
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
 def test_dummy_surfaces_are_dropped_and_the_stop_is_kept(tmp_path, encoding):
     path = tmp_path / "eye.zmx"
     path.write_bytes(ZMX.encode(encoding))
@@ -119,6 +133,66 @@ def test_dummy_surfaces_are_dropped_and_the_stop_is_kept(tmp_path, encoding):
     assert (lens.d_line_index, lens.abbe_number) == (1.42, 50.0)
 
 
+OPERANDS = """\
+  SSID 3
+  FIMP
+
+  COAT AR
+  HIDE 0 0 0 0 0 0 0 0 0 0 0 0 0
+  MIRR 2 0
+  SLAB 1
+  VDSZ 0 0
+  PZUP 5.0 1 0 0
+  MAZH 0 0
+  MEMA 10.4 0 0 0 1 ""
+  POPS 0 0 0 0 0 0 0 0 1 1 1 1 0 0 0 0
+"""
+ENDING = """\
+BLNK
+EFFL 0 2 0 0 0 0 17 1 0 0
+OPDX 0 1 0 9.2E-1 -1.E-1 -9.E-1 0 2.0E-1 0 0
+TOL TOFF   0   0 0.0000000000000000E+00 0.0000000000000000E+00   0 0 0 0 0
+MNUM {configurations} 2
+MOFF   0   1 "" 0 0 0 1 1 0 0.0 "" 0
+THIC   2   1 0.5 0 0 1 1 1 0 0.0 "" 0
+"""
+"""What OpticStudio writes in every surface, and behind the last one."""
+
+
+@pytest.mark.parametrize("indented", [True, False])
+def test_operands_without_effect_on_rays_are_ignored(tmp_path, indented):
+    text = ZMX.replace("  TYPE STANDARD\n", f"  TYPE STANDARD\n{OPERANDS}")
+    text += ENDING.format(configurations=2)
+    if not indented:  # only the names tell where the surfaces end
+        text = "".join(line.lstrip() for line in text.splitlines(keepends=True))
+    plain, path = tmp_path / "plain.zmx", tmp_path / "eye.zmx"
+    plain.write_text(ZMX, encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
+    expected, found = load_profile(plain), load_profile(path)
+    assert found.digest == expected.digest
+    assert not expected.notes
+    (note,) = found.notes
+    assert note == "the file has 2 configurations: number 2 is used"
+    assert note.code == "file_configurations"
+    assert note.values == {"configuration_count": 2, "configuration_index": 2}
+
+
+def test_a_partial_dispersion_is_named_in_a_note(tmp_path):
+    path = tmp_path / "eye.zmx"
+    path.write_text(ZMX.replace("1.42 50 0", "1.42 50 0.01"), encoding="utf-8")
+    (note,) = load_profile(path).notes
+    assert note.startswith("surface 5: the deviation of the partial dispersion")
+    assert note.code == "file_dispersion"
+
+
+def test_a_floating_aperture_has_the_semi_diameter(tmp_path):
+    path = tmp_path / "eye.zmx"
+    text = ZMX.replace("CLAP 0 4.5 0", "DIAM 4.25 0 0 0 1\n  FLAP 0 4.5 0")
+    path.write_text(text, encoding="utf-8")
+    eye = load_profile(path).surfaces.relaxed
+    assert [s.clear_radius_mm for s in eye.surfaces] == [math.inf, 4.25, math.inf]
+
+
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
@@ -128,9 +202,12 @@ def test_dummy_surfaces_are_dropped_and_the_stop_is_kept(tmp_path, encoding):
         ("PARM 1 0.2", "PARM 3 5", "COORDBRK tilts"),
         ("CLAP 0 4.5", "CLAP 1 4.5", "CLAP with an inner radius"),
         ("CURV 0.1\n", "CURV 0.1\n  XDAT 1 2\n", "operand 'XDAT'"),
+        ("CURV 0.1\n", "CURV 0.1\n  SCBD 1 0 0 9 0\n", "operand 'SCBD'"),
+        ("DISZ INFINITY", "DISZ INFINITY\n  GLAS ___BLANK 1 0 1.3 0", "surface 0.*air"),
+        ("CLAP 0 4.5", "FLAP 0 0", "FLAP with an inner radius, or without"),
         ("CURV 0.1\n", "CURV nan\n", "CURV 'nan' is not a number"),
         ("___BLANK 1 0 1.42", "N-BK7 0 0 1.5", "'N-BK7' is in a catalog"),
-        ("___BLANK 1 0 1.42", "MIRROR 0 0 1.5", "'MIRROR' is in a catalog"),
+        ("___BLANK 1 0 1.42", "MIRROR 0 0 1.5", "surface 5 .*is a mirror"),
         ("  STOP\n", "", "the file has no stop"),
         ("DISZ 3.9", "DISZ 900", r"z_mm.*out of range"),
     ],
@@ -164,7 +241,17 @@ def _change(surface, **parts):
     [
         (_change(1, type="ParaxialSurface"), "surface 1.*'ParaxialSurface'"),
         (_change(1, geometry={"type": "ForbesGeometry"}), "'ForbesGeometry'"),
-        (_change(2, material_post={"type": "Material"}), "surface 2.*'Material'"),
+        (
+            _change(2, material_post={"type": "Material", "name": "SK16"}),
+            "surface 2.*'SK16' is in a catalog, not in the file",
+        ),
+        (_change(0, material_post={"index": 1.33}), "surface 0.*is not air"),
+        (_change(2, type="ImageSurface"), "surface 2.*'ImageSurface'"),
+        (_change(2, is_reflective=True), "surface 2.*is_reflective: true"),
+        (
+            lambda d: _change(1, interaction_model=None)(d),
+            "surface 1.*interaction_model: None is not an object",
+        ),
         (_change(2, interaction_model={"is_reflective": True}), "surface 2"),
         (_change(1, geometry={"cs": None}), "surface 1.*cs: None is not an object"),
         (_change(1, geometry={"radius": "7"}), "surface 1.*radius: '7'"),

@@ -86,7 +86,9 @@ def test_without_json_it_prints_a_table(eye_file):
     ended = run_command("wavefront", eye_file, *VIEW)
     assert ended.returncode == 0
     assert len(ended.stdout.splitlines()) == 29
-    assert "circle of 2.2570 mm" in ended.stdout
+    assert "stop diameter 4 mm; at the cornea: circle radius 2.2570 mm" in ended.stdout
+    named = run_command("wavefront", eye_file, "--pupil-mm", "4", *VIEW[2:])
+    assert "entrance pupil diameter 4 mm; at the cornea: circle ra" in named.stdout
 
 
 def _refused(*arguments):

@@ -1,0 +1,344 @@
+"""Tables of Zernike coefficients: ``.abp`` of the paper's framework, and ``.csv``.
+
+Both have settings, such as the pupil, in lines of their own or in comments:
+``# frame: examiner``.  A setting without its unit, or in another one, is refused, and
+so is a comment that looks like a setting; other comments of the form ``# key: value``
+are named in a note.
+"""
+
+import re
+from dataclasses import dataclass, field
+from typing import Any
+
+from estimator.bounded_files import numbered_lines
+from estimator.eye.checked_fields import ProfileError
+
+UNITS = {"pupil_diameter": "mm", "wavelength": "nm", "age": "years"}
+"""Settings that are numbers, with the unit that ends their field's name."""
+
+TEXTS = {"name": "name", "frame": "frame", "eye_side": "eye_side", "eye": "eye_side"}
+"""Settings that are texts, with their fields."""
+
+SIDES = dict.fromkeys(("od", "right", "r"), "OD") | dict.fromkeys(
+    ("os", "left", "l"), "OS"
+)
+SETTINGS = (
+    "pupil_diameter_mm, wavelength_nm, frame (eye or examiner), eye_side (OD or OS), "
+    "age_years, name"
+)
+
+MATTERING = {
+    *("pupil", "diameter", "radius", "aperture", "wavelength", "lambda"),
+    *("eye", "side", "od", "os", "frame", "age", "axis", "h_deg", "v_deg", "kind"),
+    *("unit", "units", "normalization", "normalisation", "noll", "index"),
+    *("correction", "sphere", "cylinder", "vertex", "retina", "periphery"),
+    *("sample", "straylight", "yellowing"),
+}
+"""Words of settings: a comment with one of them as its key is refused."""
+
+UNSTATED = {"eye_side": {"os", "left"}, "frame": {"examiner"}}
+"""Settings with words of remarks that contradict their defaults."""
+
+UM = {"um", "µm", "\u03bcm", "micron", "microns", "micrometer", "micrometers"}
+TERM_COLUMNS = {"j", "index", "term", "name", "mode"}
+"""Columns that repeat what n and m say."""
+
+ONE_EXAMINATION = "one examination in a file"
+TABLE = (
+    "one eye in a file: rows 'n,m,um' of coefficients, or a .json profile, as "
+    '{"kind": "prescription", "sphere_dpt": -2}'
+)
+MAX_SHOWN_NAMES, MAX_SHOWN = 4, 30
+MAX_KEY_WORDS = 3
+MAX_NUMBER_CHARACTERS, MAX_REMARK_CHARACTERS = 60, 100
+MAX_ORDER = 9999
+
+_YEARS = {"year": "years", "y": "years"}
+_AMOUNT = re.compile(
+    r"([-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d{1,4})?)\s*([A-Za-zµ\u03bc]*)"
+)
+_ABP_TERM = re.compile(r"Z\s*\[([^,;\]]+)[,;]([^\]]+)\]\s*=(.*)", re.IGNORECASE)
+_ABP_KEYS = {"ap": "pupil_diameter_mm", "wa": "wavelength_nm"}
+_CELLS = re.compile(r"(\w+)\s*[,;\t ]\s*(.+)")
+_KEY_UNIT = re.compile(r"(.+)_(mm|nm|um|µm|\u03bcm|m|cm|years|year|y)")
+
+
+def abp_body(text: str, name: str) -> dict[str, Any]:
+    """Return the body of an ``.abp`` file.
+
+    It has lines ``Ap = 5.0`` (mm), ``Wa = 587.56`` (nm), ``Z[n, m] = um``, and ``#``
+    comments.  Missing terms are zero.  A missing Ap or Wa is an error of the profile;
+    the framework silently falls back to defaults.
+
+    Parameters
+    ----------
+    name : str
+        Name of the profile, if the file states none.
+
+    Raises
+    ------
+    ProfileError
+        A line cannot be read; its number is the error's field.
+    """
+    table = _Table()
+    for number, line in numbered_lines(text):
+        where = f"line {number}"
+        content, _, comment = line.partition("#")
+        table.comment(comment, where)
+        if not (content := content.strip()):
+            continue
+        if term := _ABP_TERM.fullmatch(content):
+            table.term(term[1], term[2], term[3], where)
+            continue
+        key, value = _pair(content)
+        if not table.setting(_ABP_KEYS.get(key.lower(), key), value, where):
+            allowed = f"'Ap = mm', 'Wa = nm', 'Z[n, m] = um', a # comment, {SETTINGS}"
+            raise ProfileError(where, f"cannot read '{content:.60}'", allowed)
+    return table.body(name)
+
+
+def csv_body(text: str, name: str) -> dict[str, Any]:
+    """Return the body of a ``.csv`` file of rows ``n,m,um``.
+
+    Cells end in a comma, a semicolon, a tab or a space.  Numbers have a decimal point,
+    or, unless cells end in commas, a decimal comma.
+
+    Parameters
+    ----------
+    name : str
+        Name of the profile, if the file states none.
+
+    Raises
+    ------
+    ProfileError
+        A line cannot be read; its number is the error's field.
+    """
+    table = _Table()
+    header: list[str] = []
+    columns = (0, 1, 2)
+    lines = list(numbered_lines(text))
+    for number, line in lines:
+        where = f"line {number}"
+        content, _, comment = line.strip().lstrip('"').partition("#")
+        cells = _cells(content or comment)
+        is_header = {"n", "m"} <= {cell.lower() for cell in cells}
+        if not (is_header and not content):  # a header may be a comment
+            table.comment(comment, where)
+            cells = _cells(content)
+        if not cells or cells == header or content.lower().startswith("sep="):
+            continue
+        if len(cells) == 2 and table.setting(cells[0], cells[1], where):
+            continue
+        if (header and not is_header) or _AMOUNT.match(cells[0]):
+            if len(cells) != columns[2] + 1:
+                problem = f"cannot read '{content.strip():.60}'"
+                allowed = "n,m,um with decimal points, or n;m;um"
+                raise ProfileError(where, problem, allowed)
+            n, m, value = (cells[column] for column in columns)
+            table.term(n, m, value, where)
+        else:
+            header, columns = cells, _columns(cells, where, lines[number:])
+    return table.body(name)
+
+
+def _pair(text: str) -> tuple[str, str]:
+    """Return what is before and behind the first colon or equals sign, or empty."""
+    found = re.search("[:=]", text)
+    if found is None:
+        return "", ""
+    return text[: found.start()].strip(), text[found.end() :].strip()
+
+
+def _cells(content: str) -> list[str]:
+    """Return the cells of a row without empty ones at its end."""
+    separator = next((c for c in ";\t," if c in content), None)
+    cells = [cell.strip().strip('"').strip() for cell in content.split(separator)]
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _columns(
+    cells: list[str], where: str, below: list[tuple[int, str]]
+) -> tuple[int, int, int]:
+    """Return the columns of n, m and the coefficient from a header.
+
+    Raises
+    ------
+    ProfileError
+        There is no such column, or there are several.
+    """
+    names = [cell.lower() for cell in cells]
+    shown = ", ".join(f"'{cell:.{MAX_SHOWN}}'" for cell in cells[:MAX_SHOWN_NAMES])
+    shown += ", ..." if len(cells) > MAX_SHOWN_NAMES else ""
+    if len(cells) == 1:
+        raise ProfileError(where, f"cannot read {shown}", f"n,m,um, or {SETTINGS}")
+    if not {"n", "m"} <= set(names):
+        rows = [row[0] for _, line in below if (row := _cells(line.partition("#")[0]))]
+        listed = ", ".join(f"'{row:.{MAX_SHOWN}}'" for row in rows[:MAX_SHOWN_NAMES])
+        listed += ", ..." if len(rows) > MAX_SHOWN_NAMES else ""
+        problem = f"a table with the columns {shown}"
+        if len(rows) > 1:
+            problem += f" and {len(rows)} rows, {listed}: which examination?"
+        raise ProfileError(where, problem, TABLE)
+    found = [
+        column
+        for column, name in enumerate(names)
+        if name not in ("n", "m", "") and name not in TERM_COLUMNS
+    ]
+    if len(found) > 1:
+        problem = f"several columns of coefficients in {shown}: which examination?"
+        raise ProfileError(where, problem, ONE_EXAMINATION)
+    if not found or not set(re.split(r"[^a-zµ\u03bc]+", names[found[0]])) & UM:
+        problem = f"the columns {shown} state no coefficients in um"
+        raise ProfileError(where, problem, "the columns n,m,um")
+    if found[0] != len(names) - 1:  # a cell behind it may be half a decimal number
+        problem = f"columns behind '{cells[found[0]]:.{MAX_SHOWN}}'"
+        raise ProfileError(where, problem, "coefficients in the last column")
+    return names.index("n"), names.index("m"), found[0]
+
+
+def _plain(text: str) -> str:
+    """Return a number's text with an ASCII minus sign."""
+    return text.strip().replace("\u2212", "-")
+
+
+@dataclass
+class _Table:
+    """What was read of a file.
+
+    Attributes
+    ----------
+    settings : dict
+        Fields of the profile.
+    lines : dict
+        Where each field and term was given.
+    ignored : list of str
+        Keys of comments without effect.
+    remarks : list of tuple
+        Other comments, with their lines.
+    """
+
+    settings: dict[str, Any] = field(default_factory=dict)
+    zernike_um: dict[str, float] = field(default_factory=dict)
+    lines: dict[str, str] = field(default_factory=dict)
+    ignored: list[str] = field(default_factory=list)
+    remarks: list[tuple[str, str]] = field(default_factory=list)
+
+    def body(self, name: str) -> dict[str, Any]:
+        """Return the profile."""
+        if not self.zernike_um:
+            raise ProfileError("zernike_um", "the file has no coefficients", TABLE)
+        body = {
+            "kind": "zernike",
+            "name": name,
+            "frame": "eye",
+            "zernike_um": self.zernike_um,
+            **self.settings,
+        }
+        for setting, words in UNSTATED.items():
+            if setting in self.settings:
+                continue
+            for where, comment in self.remarks:
+                if words & set(re.split(r"[^a-z]+", comment.lower())):
+                    problem = f"the comment '{comment:.60}' does not state '{setting}'"
+                    raise ProfileError(where, problem, SETTINGS)
+        if self.ignored:
+            keys = ", ".join(f"'{key}'" for key in self.ignored[:MAX_SHOWN_NAMES])
+            keys += ", ..." if len(self.ignored) > MAX_SHOWN_NAMES else ""
+            note = f"comments of the file without effect: {keys}"
+            values = {"comment_count": len(self.ignored)}
+            body["notes"] = [{"code": "file_comments", "text": note, "values": values}]
+        return body
+
+    def comment(self, text: str, where: str) -> None:
+        """Read the setting that a comment states, if any."""
+        text = text.lstrip("# \t").rstrip('",;\t ')
+        key, value = _pair(text)
+        if not key:
+            cells = _CELLS.fullmatch(text)  # "frame examiner", or cells of a table
+            is_pair = cells and (cells[1].lower() == "frame" or "_" in cells[1])
+            if not (cells and is_pair and self.setting(cells[1], cells[2], where)):
+                self.remarks.append((where, text[:MAX_REMARK_CHARACTERS]))
+            return
+        if self.setting(key, value, where):
+            return
+        words = set(re.split(r"[^a-z]+", key.lower()))
+        if (words | {key.lower()}) & MATTERING:
+            raise ProfileError(where, f"'{key:.60}' is not a setting", SETTINGS)
+        if len(key.split()) <= MAX_KEY_WORDS:  # more are a sentence
+            self.ignored.append(key[:MAX_SHOWN])
+
+    def setting(self, key: str, value: str, where: str) -> bool:
+        """Read a setting; return whether the key names one."""
+        stem = re.sub(r"[^a-z0-9µ\u03bc]+", "_", key.lower()).strip("_")
+        value = value.strip().strip('"').strip()
+        if stem in TEXTS:
+            self._set(TEXTS[stem], _text(TEXTS[stem], value), where)
+            return True
+        if stem in ("unit", "units"):
+            if value.lower() not in UM:
+                raise ProfileError(where, f"coefficients in '{value:.30}'", "um")
+            return True
+        with_unit = _KEY_UNIT.fullmatch(stem)
+        stem, unit = with_unit.groups() if with_unit else (stem, "")
+        if stem not in UNITS:
+            return False
+        name = f"{stem}_{UNITS[stem]}"
+        amount, stated = _amount(value, where)
+        units = {_YEARS.get(one, one) for one in (unit, stated) if one}
+        if units != {UNITS[stem]}:
+            found = " and ".join(f"'{one:.30}'" for one in sorted(units)) or "no unit"
+            problem = f"'{key:.60}' has {found}"
+            raise ProfileError(where, problem, f"{UNITS[stem]}, as in '{name}'")
+        self._set(name, amount, where)
+        return True
+
+    def term(self, n: str, m: str, value: str, where: str) -> None:
+        """Read a coefficient."""
+        key = ",".join(str(_whole(index, where)) for index in (n, m))
+        amount, unit = _amount(value, where)
+        if unit and unit not in UM:
+            raise ProfileError(where, f"'{value:.60}' is in '{unit}'", "um")
+        self._once(key, where)
+        self.zernike_um[key] = amount
+
+    def _set(self, name: str, value: object, where: str) -> None:
+        self._once(name, where)
+        self.settings[name] = value
+
+    def _once(self, name: str, where: str) -> None:
+        """Reject a duplicate, because neither value can be trusted."""
+        if name in self.lines:
+            problem = (
+                f"'{name}' is given twice, first in {self.lines[name]}: which "
+                "examination?"
+            )
+            raise ProfileError(where, problem, ONE_EXAMINATION)
+        self.lines[name] = where
+
+
+def _text(name: str, value: str) -> str:
+    """Return the text of a setting as profiles have it; they validate it."""
+    if name == "frame":
+        return value.lower()
+    return SIDES.get(value.lower(), value) if name == "eye_side" else value
+
+
+def _whole(text: str, where: str) -> int:
+    """Return an order or a frequency, which programs may write as 2.0."""
+    amount, unit = _amount(text, where)
+    if unit or not (amount.is_integer() and abs(amount) <= MAX_ORDER):
+        problem = f"'{text.strip():.30}' is not an order or frequency"
+        raise ProfileError(where, problem, "n,m as whole numbers")
+    return int(amount)
+
+
+def _amount(text: str, where: str) -> tuple[float, str]:
+    """Return a number and the unit behind it, which may be empty."""
+    plain = _plain(text)
+    found = _AMOUNT.fullmatch(plain) if len(plain) <= MAX_NUMBER_CHARACTERS else None
+    if found is None:
+        problem = f"'{text.strip():.60}' is not a number"
+        raise ProfileError(where, problem, "a number, as -0.25")
+    return float(found[1].replace(",", ".")), found[2].lower()

@@ -1,0 +1,239 @@
+"""Eyes in sequential Zemax files (``.zmx``): conics, even aspheres, decentrations."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from estimator.eye.checked_fields import ProfileError
+from estimator.profiles.lens_files import (
+    MAX_ELEMENTS,
+    Element,
+    Medium,
+    glass,
+    refused,
+    surfaces_body,
+)
+
+READ = {
+    *("TYPE", "CURV", "DISZ", "CONI", "GLAS", "STOP", "CLAP", "FLAP", "DIAM", "PARM"),
+}
+"""Operands of a surface that are read."""
+
+WITHOUT_EFFECT = {
+    # comments, display, numbers for reference
+    *("COMM", "FCMI", "HIDE", "SSID", "ELEM", "COFN", "FIMP", "SLAB"),
+    # coatings, physical optics, mechanical and other semi-diameters
+    *("COAT", "MIRR", "POPS", "MEMA", "OEMA"),
+    # variables and solves of values that the file has as well
+    *("VDSZ", "VPAR", "VCON", "PPAR", "PZUP", "MAZH", "QOFF"),
+}
+"""Operands of a surface that change no ray.  They are ignored."""
+
+END_OF_SURFACES = {"BLNK", "TOL", "MNUM", "MOFF", "TRAC"}
+"""Operands behind the last surface, where lines are not indented: the merit function,
+tolerances and configurations."""
+
+EVEN_TERMS = 8
+
+
+@dataclass
+class _File:
+    """Operands of a file with their values: its own, and those of each surface."""
+
+    own: dict[str, list[str]] = field(default_factory=dict)
+    surfaces: list[dict[str, list[str]]] = field(default_factory=list)
+    parameters: list[dict[int, float]] = field(default_factory=list)
+
+
+def zmx_body(text: str, name: str) -> dict[str, Any]:
+    """Return the body of the eye in a sequential Zemax file.
+
+    Parameters
+    ----------
+    name : str
+        Name of the profile, if the file states none.
+
+    Raises
+    ------
+    ProfileError
+        The file is not sequential or not in mm, or an element is not understood.
+    """
+    file = _operands(text)
+    mode = (file.own.get("MODE") or ["SEQ"])[0]
+    unit = (file.own.get("UNIT") or ["MM"])[0]
+    if mode != "SEQ":
+        raise ProfileError("MODE", f"{mode!r:.20} is not sequential", "SEQ")
+    if unit != "MM":
+        raise ProfileError("UNIT", f"{unit!r:.20}", "MM")
+    body = surfaces_body(_elements(file), " ".join(file.own.get("NAME", [])) or name)
+    if notes := _notes(file):
+        body["notes"] = notes
+    return body
+
+
+def _operands(text: str) -> _File:
+    """Return the operands of a file.
+
+    A surface's operands are indented, those behind the last surface are not.  If its
+    first operand is not, the latter are known by their names.
+    """
+    file = _File()
+    is_in_surface, is_indented = False, None
+    for line in text.splitlines():
+        if not (words := line.split()):
+            continue
+        operand, *values = words
+        if operand == "SURF":
+            if len(file.surfaces) > MAX_ELEMENTS:
+                raise ProfileError(
+                    "surfaces", "the file has too many", f"up to {MAX_ELEMENTS}"
+                )
+            file.surfaces.append({})
+            file.parameters.append({})
+            is_in_surface, is_indented = True, None
+            continue
+        if is_indented is None:
+            is_indented = line[0].isspace()
+        if is_indented and not line[0].isspace() and operand not in READ:
+            is_in_surface = False
+        if not is_indented and operand in END_OF_SURFACES:
+            is_in_surface = False
+        if not is_in_surface:
+            file.own.setdefault(operand, values)
+        elif operand == "PARM" and len(values) > 1:
+            surface = len(file.surfaces) - 1
+            index = int(_number(values[0], surface, "PARM"))
+            file.parameters[-1][index] = _number(values[1], surface, "PARM")
+        else:
+            file.surfaces[-1].setdefault(operand, values)
+    return file
+
+
+def _notes(file: _File) -> list[dict[str, Any]]:
+    """Return notes on what the file has besides the eye that is read."""
+    notes: list[dict[str, Any]] = []
+    configurations = [int(v) for v in file.own.get("MNUM", [])[:2] if v.isdecimal()]
+    if len(configurations) == 2 and 1 < configurations[0] < 1000:
+        count, current = configurations
+        text = f"the file has {count} configurations: number {current} is used"
+        numbers = {"configuration_count": count, "configuration_index": current}
+        notes.append({"code": "file_configurations", "text": text, "values": numbers})
+    for number, surface in enumerate(file.surfaces):
+        deviation = float(_model_glass(surface.get("GLAS", []), number)[2])
+        if deviation:
+            text = (
+                f"surface {number}: the deviation of the partial dispersion of its "
+                f"glass, {deviation:g}, is not used"
+            )
+            values = {"partial_dispersion_ratio": deviation}
+            notes.append({"code": "file_dispersion", "text": text, "values": values})
+    return notes[:MAX_ELEMENTS]
+
+
+def _elements(file: _File) -> list[Element]:
+    if file.surfaces and "GLAS" in file.surfaces[0]:
+        raise refused(0, "GLAS in front of the eye", "an eye in air")
+    elements: list[Element] = []
+    z_mm, x_mm, y_mm = 0.0, 0.0, 0.0
+    for number, (block, parms) in enumerate(
+        zip(file.surfaces, file.parameters, strict=True)
+    ):
+        if number == 0:  # the object
+            continue
+        kind = (block.get("TYPE") or ["STANDARD"])[0]
+        if kind not in ("STANDARD", "EVENASPH", "COORDBRK"):
+            allowed = "STANDARD, EVENASPH, COORDBRK"
+            raise refused(number, f"type {kind!r:.20} is not understood", allowed)
+        if unknown := sorted(set(block) - READ - WITHOUT_EFFECT):
+            problem = f"operand {unknown[0]!r:.20} is not understood"
+            raise refused(number, problem, "files without it")
+        if kind == "COORDBRK":
+            if any(parms.get(i, 0.0) for i in (3, 4, 5)):
+                raise refused(number, "COORDBRK tilts", "COORDBRK that decenters only")
+            x_mm, y_mm = x_mm + parms.get(1, 0.0), y_mm + parms.get(2, 0.0)
+        else:
+            elements.append(_element(number, block, parms, kind))
+            elements[-1].z_mm = z_mm
+            if x_mm or y_mm:
+                elements[-1].shape["decentration_mm"] = [x_mm, y_mm]
+        if number < len(file.surfaces) - 1:
+            z_mm += _number((block.get("DISZ") or ["0"])[0], number, "DISZ")
+    return elements
+
+
+def _element(
+    number: int, block: Mapping[str, list[str]], parms: Mapping[int, float], kind: str
+) -> Element:
+    curvature = _number((block.get("CURV") or ["0"])[0], number, "CURV")
+    element = Element(
+        number,
+        radius_mm=1.0 / curvature if curvature else None,
+        is_stop="STOP" in block,
+        medium=_medium(number, block["GLAS"]) if "GLAS" in block else None,
+    )
+    conic = _number((block.get("CONI") or ["0"])[0], number, "CONI")
+    if conic:
+        element.shape["conic_constant"] = conic
+    if not element.is_stop and (radius_mm := _clear_radius_mm(number, block)):
+        element.shape["clear_radius_mm"] = radius_mm
+    if kind == "EVENASPH":
+        terms = [parms.get(i, 0.0) for i in range(1, EVEN_TERMS + 1)]
+        if any(terms):
+            element.shape["form"] = {"kind": "even_asphere", "coefficients": terms}
+    return element
+
+
+def _clear_radius_mm(number: int, block: Mapping[str, list[str]]) -> float | None:
+    """Return the radius of a surface's aperture; a floating one has its semi-diameter.
+
+    A semi-diameter without an aperture clips no ray.
+    """
+    for operand in ("CLAP", "FLAP"):
+        if operand not in block:
+            continue
+        inner_mm, outer_mm = (
+            _number(v, number, operand) for v in (*block[operand], "0", "0")[:2]
+        )
+        if operand == "FLAP" and block.get("DIAM"):
+            outer_mm = _number(block["DIAM"][0], number, "DIAM")
+        if inner_mm != 0.0 or outer_mm <= 0.0:
+            problem = f"{operand} with an inner radius, or without a radius"
+            raise refused(number, problem, f"{operand} 0 and a radius")
+        return outer_mm
+    return None
+
+
+def _model_glass(values: Sequence[str], number: int) -> tuple[float, float, float]:
+    """Return index, Abbe number and deviation of a model glass; 0 for other glasses."""
+    if len(values) < 5 or _number(values[1], number, "GLAS") != 1.0:
+        return 0.0, 0.0, 0.0
+    index, abbe, deviation = (
+        _number(v, number, "GLAS") for v in (*values[3:6], "0")[:3]
+    )
+    return index, abbe, deviation
+
+
+def _medium(number: int, values: Sequence[str]) -> Medium:
+    """Return a model glass; catalog glasses are not in the file."""
+    name = values[0] if values else ""
+    if name.upper() == "MIRROR":
+        raise refused(number, "is a mirror", "refracting surfaces")
+    index, abbe, _ = _model_glass(values, number)
+    if index < 1.0:
+        raise refused(
+            number,
+            f"glass {name!r:.30} is in a catalog, not in the file",
+            "model glasses, with index and Abbe number",
+        )
+    return glass(index, abbe)
+
+
+def _number(text: str, number: int, operand: str) -> float:
+    try:
+        value = float(text.replace(",", "."))
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise refused(number, f"{operand} {text!r:.30} is not a number", "a number")
+    return value
