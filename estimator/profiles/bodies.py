@@ -44,9 +44,7 @@ MAX_FILE_NOTES, MAX_NOTE_CHARACTERS = 10, 300
 MEASUREMENTS_ALLOWED = (
     f"a list of 1 to {MAX_MEASUREMENTS} measurements, one at h = v = 0"
 )
-COEFFICIENTS_ALLOWED = (
-    f"an object of 'n,m': um with n from 0 to {MAX_RADIAL_ORDER}; higher orders are 0"
-)
+COEFFICIENTS_ALLOWED = f"an object of 'n,m': um with n from 0 to {MAX_RADIAL_ORDER}"
 
 FieldAngleDeg = Annotated[float, Meta(ge=-50.0, le=50.0)]
 """Field angle of a measurement; instruments measure to 40 deg or so."""

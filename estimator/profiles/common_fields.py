@@ -166,5 +166,6 @@ def _term_index(key: str, name: str, value_um: float) -> int:
     except ValueError as error:
         raise ProfileError(name, str(error), allowed) from None
     if n > MAX_RADIAL_ORDER and value_um != 0.0:
-        raise ProfileError(name, f"radial order {n}, {value_um:g} um", allowed)
+        problem = f"radial order {n}, {value_um:g} um"
+        raise ProfileError(name, problem, f"{allowed}; higher orders are 0")
     return j

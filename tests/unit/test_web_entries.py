@@ -178,8 +178,8 @@ def test_a_file_is_taken_as_what_it_is():
             r"'p.json': kind: 'cat' is unknown.*prescription",
         ),
         ("p.csv", b"\xff\xfe\x00", r"is not a text file"),
-        ("my eye.csv", b"n;m;um", r"'my eye.csv': line 1.*allowed: n,m,um"),
-        ("o.abp", b"Ap = 6,0", r"'o.abp': line 1: '6,0' is not.*as -0.25"),
+        ("my eye.csv", b"n;m", r"'my eye.csv': line 1.*allowed: the columns n,m,um"),
+        ("o.abp", b"Ap = 6,0,1", r"'o.abp': line 1: '6,0,1' is not.*as -0.25"),
     ],
 )
 def test_a_file_that_is_no_profile_changes_nothing(name, content, said):
