@@ -30,11 +30,17 @@ SETTINGS = (
 MATTERING = {
     *("pupil", "diameter", "radius", "aperture", "wavelength", "lambda"),
     *("eye", "side", "od", "os", "frame", "age", "axis", "h_deg", "v_deg", "kind"),
-    *("unit", "units", "normalization", "normalisation", "noll", "index"),
+    *("unit", "units"),
     *("correction", "sphere", "cylinder", "vertex", "retina", "periphery"),
     *("sample", "straylight", "yellowing"),
 }
 """Words of settings: a comment with one of them as its key is refused."""
+
+CONVENTIONS = {"convention", "conventions", "standard", "normalization", "ordering"}
+"""Words of keys whose value has to name the terms of OSA/ANSI."""
+
+OTHER_CONVENTIONS = {"noll", "fringe", "malacara", "waves"}
+"""Words that no comment may have."""
 
 UNSTATED = {"eye_side": {"os", "left"}, "frame": {"examiner"}}
 """Settings with words of remarks that contradict their defaults."""
@@ -254,6 +260,10 @@ class _Table:
     def comment(self, text: str, where: str) -> None:
         """Read the setting that a comment states, if any."""
         text = text.lstrip("# \t").rstrip('",;\t ')
+        other = OTHER_CONVENTIONS & set(re.split(r"[^a-z]+", text.lower()))
+        if other:
+            problem = f"the comment '{text:.60}' names '{other.pop()}'"
+            raise ProfileError(where, problem, "terms of OSA/ANSI in um")
         key, value = _pair(text)
         if not key:
             cells = _CELLS.fullmatch(text)  # "frame examiner", or cells of a table
@@ -264,6 +274,10 @@ class _Table:
         if self.setting(key, value, where):
             return
         words = set(re.split(r"[^a-z]+", key.lower()))
+        if words & CONVENTIONS:
+            if not re.search("osa|ansi|z80|24157", value.lower()):
+                raise ProfileError(where, f"'{key:.60}' is '{value:.60}'", "OSA/ANSI")
+            return
         if (words | {key.lower()}) & MATTERING:
             raise ProfileError(where, f"'{key:.60}' is not a setting", SETTINGS)
         if len(key.split()) <= MAX_KEY_WORDS:  # more are a sentence

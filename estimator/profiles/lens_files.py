@@ -80,6 +80,9 @@ def surfaces_body(elements: Sequence[Element], name: str) -> dict[str, Any]:
     if not stops:
         raise ProfileError("stop_z_mm", "the file has no stop", "a surface as the stop")
     *refracting, retina = elements
+    if "offset_mm" in retina.shape:
+        raise refused(retina.number, "Zernike terms of the retina", "another form")
+    retina.shape.pop("clear_radius_mm", None)  # the retina ends where light ends
     media: dict[str, Medium] = {}
     surfaces: list[dict[str, Any]] = []
     before: Medium | None = None

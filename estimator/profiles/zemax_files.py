@@ -1,4 +1,7 @@
-"""Eyes in sequential Zemax files (``.zmx``): conics, even aspheres, decentrations."""
+"""Eyes in sequential Zemax files (``.zmx``).
+
+Surfaces are conics, even aspheres, biconics and toroids; coordinate breaks decenter.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -22,11 +25,11 @@ READ = {
 
 WITHOUT_EFFECT = {
     # comments, display, numbers for reference
-    *("COMM", "FCMI", "HIDE", "SSID", "ELEM", "COFN", "FIMP", "SLAB"),
-    # coatings, physical optics, mechanical and other semi-diameters
-    *("COAT", "MIRR", "POPS", "MEMA", "OEMA"),
+    *("COMM", "FCMI", "HIDE", "SCOL", "SSID", "ELEM", "COFN", "FIMP", "SLAB"),
+    # coatings, physical optics, thermal expansion, mechanical and other semi-diameters
+    *("COAT", "MIRR", "POPS", "TCED", "MEMA", "OEMA"),
     # variables and solves of values that the file has as well
-    *("VDSZ", "VPAR", "VCON", "PPAR", "PZUP", "MAZH", "QOFF"),
+    *("VDSZ", "VPAR", "VCON", "PPAR", "PZUP", "PKUP", "MAZH", "CHZH", "EDGE", "QOFF"),
 }
 """Operands of a surface that change no ray.  They are ignored."""
 
@@ -34,6 +37,7 @@ END_OF_SURFACES = {"BLNK", "TOL", "MNUM", "MOFF", "TRAC"}
 """Operands behind the last surface, where lines are not indented: the merit function,
 tolerances and configurations."""
 
+TYPES = ("STANDARD", "EVENASPH", "BICONICX", "TOROIDAL", "COORDBRK")
 EVEN_TERMS = 8
 
 
@@ -142,10 +146,11 @@ def _elements(file: _File) -> list[Element]:
         if number == 0:  # the object
             continue
         kind = (block.get("TYPE") or ["STANDARD"])[0]
-        if kind not in ("STANDARD", "EVENASPH", "COORDBRK"):
-            allowed = "STANDARD, EVENASPH, COORDBRK"
-            raise refused(number, f"type {kind!r:.20} is not understood", allowed)
-        if unknown := sorted(set(block) - READ - WITHOUT_EFFECT):
+        if kind not in TYPES:
+            problem = f"type {kind!r:.20} is not understood"
+            raise refused(number, problem, ", ".join(TYPES))
+        unknown = sorted(set(block) - READ - WITHOUT_EFFECT)
+        if unknown:
             problem = f"operand {unknown[0]!r:.20} is not understood"
             raise refused(number, problem, "files without it")
         if kind == "COORDBRK":
@@ -166,21 +171,31 @@ def _element(
     number: int, block: Mapping[str, list[str]], parms: Mapping[int, float], kind: str
 ) -> Element:
     curvature = _number((block.get("CURV") or ["0"])[0], number, "CURV")
+    radius_mm = 1.0 / curvature if curvature else None
+    conic = _number((block.get("CONI") or ["0"])[0], number, "CONI")
     element = Element(
         number,
-        radius_mm=1.0 / curvature if curvature else None,
+        radius_mm=radius_mm,
         is_stop="STOP" in block,
         medium=_medium(number, block["GLAS"]) if "GLAS" in block else None,
     )
-    conic = _number((block.get("CONI") or ["0"])[0], number, "CONI")
+    shape = element.shape
     if conic:
-        element.shape["conic_constant"] = conic
-    if not element.is_stop and (radius_mm := _clear_radius_mm(number, block)):
-        element.shape["clear_radius_mm"] = radius_mm
+        shape["conic_constant"] = conic
+    if not element.is_stop and (clear_radius_mm := _clear_radius_mm(number, block)):
+        shape["clear_radius_mm"] = clear_radius_mm
     if kind == "EVENASPH":
         terms = [parms.get(i, 0.0) for i in range(1, EVEN_TERMS + 1)]
         if any(terms):
-            element.shape["form"] = {"kind": "even_asphere", "coefficients": terms}
+            shape["form"] = {"kind": "even_asphere", "coefficients": terms}
+    elif kind in ("BICONICX", "TOROIDAL"):  # CURV and CONI are those along y
+        element.radius_mm = [parms.get(1) or None, radius_mm]
+        shape["form"] = {"kind": "toroid"}
+        if kind == "BICONICX":
+            conics = [parms.get(2, 0.0), conic]
+            shape["form"] = {"kind": "two_conics", "conic_constants": conics}
+        elif any(value for parameter, value in parms.items() if parameter > 1):
+            raise refused(number, "TOROIDAL with other terms", "a radius of rotation")
     return element
 
 

@@ -8,7 +8,8 @@ import pytest
 
 from estimator.bounded_files import InvalidFile
 from estimator.optics.raytrace import RayStatus, trace_rays
-from estimator.profiles.files import load_profile
+from estimator.profiles.files import load_profile, profile_body
+from estimator.profiles.parse import parse_profile
 from tests.numerical.optiland_eye import FROZEN_FILES, FROZEN_FORMS, WAVELENGTH_NM
 
 FILES = json.loads(FROZEN_FILES.read_text(encoding="utf-8"))["files"]
@@ -138,6 +139,8 @@ OPERANDS = """\
   FIMP
 
   COAT AR
+  SCOL 4 0
+  TCED 23.5 0 0
   HIDE 0 0 0 0 0 0 0 0 0 0 0 0 0
   MIRR 2 0
   SLAB 1
@@ -185,6 +188,42 @@ def test_a_partial_dispersion_is_named_in_a_note(tmp_path):
     assert note.code == "file_dispersion"
 
 
+@pytest.mark.parametrize(
+    ("kind", "x_mm", "form"),
+    [
+        ("BICONICX", 9.5, {"kind": "two_conics", "conic_constants": [-0.4, -1.5]}),
+        ("TOROIDAL", 9.5, {"kind": "toroid"}),
+        ("TOROIDAL", 0.0, {"kind": "toroid"}),
+    ],
+)
+def test_a_surface_with_two_radii_has_that_along_y_in_curv(tmp_path, kind, x_mm, form):
+    path = tmp_path / "eye.zmx"
+    changed = f"TYPE {kind}\n  CURV 0.1\n  CONI -1.5\n  PARM 1 {x_mm}\n"
+    changed += "  PARM 2 -0.4\n" if kind == "BICONICX" else ""
+    text = ZMX.replace("TYPE STANDARD\n  CURV 0.1\n", changed)
+    path.write_text(text, encoding="utf-8")
+    body = profile_body(path)
+    surface = body["surfaces"][1]
+    assert surface["radius_mm"] == [x_mm or None, 10.0]
+    assert (surface["conic_constant"], surface["form"]) == (-1.5, form)
+    # as the same eye in JSON
+    assert load_profile(path).digest == parse_profile(body).digest
+
+
+def test_an_aperture_of_the_retina_is_ignored(tmp_path):
+    plain, path = tmp_path / "plain.zmx", tmp_path / "eye.zmx"
+    plain.write_text(ZMX, encoding="utf-8")
+    path.write_text(ZMX + "  CLAP 0 9 0\n", encoding="utf-8")
+    assert load_profile(path).digest == load_profile(plain).digest
+
+
+def test_a_surface_without_a_type_is_a_conic(tmp_path):
+    plain, path = tmp_path / "plain.zmx", tmp_path / "eye.zmx"
+    plain.write_text(ZMX, encoding="utf-8")
+    path.write_text(ZMX.replace("  TYPE STANDARD\n", ""), encoding="utf-8")
+    assert load_profile(path).digest == load_profile(plain).digest
+
+
 def test_a_floating_aperture_has_the_semi_diameter(tmp_path):
     path = tmp_path / "eye.zmx"
     text = ZMX.replace("CLAP 0 4.5 0", "DIAM 4.25 0 0 0 1\n  FLAP 0 4.5 0")
@@ -198,7 +237,12 @@ def test_a_floating_aperture_has_the_semi_diameter(tmp_path):
     [
         ("MODE SEQ", "MODE NSC", "MODE.*'NSC' is not sequential"),
         ("UNIT MM", "UNIT IN", "UNIT.*'IN'"),
-        ("TYPE STANDARD\n  CURV 0.1\n", "TYPE BICONICX\n  CURV 0.1\n", "'BICONICX'"),
+        ("TYPE STANDARD\n  CURV 0.1\n", "TYPE ODDASPHE\n  CURV 0.1\n", "'ODDASPHE'"),
+        (
+            "TYPE STANDARD\n  CURV 0.1\n",
+            "TYPE TOROIDAL\n  PARM 1 9\n  PARM 3 1E-5\n  CURV 0.1\n",
+            "surface 5 .*TOROIDAL with other terms",
+        ),
         ("PARM 1 0.2", "PARM 3 5", "COORDBRK tilts"),
         ("CLAP 0 4.5", "CLAP 1 4.5", "CLAP with an inner radius"),
         ("CURV 0.1\n", "CURV 0.1\n  XDAT 1 2\n", "operand 'XDAT'"),
@@ -244,6 +288,17 @@ def _change(surface, **parts):
         (
             _change(2, material_post={"type": "Material", "name": "SK16"}),
             "surface 2.*'SK16' is in a catalog, not in the file",
+        ),
+        (
+            lambda d: {
+                "surface_group": {
+                    "surfaces": [
+                        *d["surface_group"]["surfaces"][:-1],
+                        FILES["offset"]["json"]["surface_group"]["surfaces"][1],
+                    ]
+                }
+            },
+            "surface 6.*Zernike terms of the retina",
         ),
         (_change(0, material_post={"index": 1.33}), "surface 0.*is not air"),
         (_change(2, type="ImageSurface"), "surface 2.*'ImageSurface'"),

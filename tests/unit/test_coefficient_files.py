@@ -60,7 +60,8 @@ def test_a_comment_that_states_a_setting_counts(tmp_path, suffix, comments):
         "# Wavelength: 555nm\n# Pupil diameter (mm): 6.0\n",
         "# WAVELENGTH [nm] = 555,0\n# pupil-diameter = 6,0 mm\n# age: 30 years\n",
         "pupil_diameter_mm,6.0\nwavelength_nm,555\n",
-        "# wavelength_nm: 555\n# pupil_diameter_mm = 6\n# units: µm\n",
+        "# wavelength_nm: 555\n# pupil_diameter_mm = 6\n# units: µm\n"
+        "# Zernike standard: OSA\n# ordering: ANSI Z80.28\n",
     ],
 )
 def test_settings_in_any_case_and_with_their_unit(tmp_path, settings):
@@ -78,13 +79,17 @@ def test_settings_in_any_case_and_with_their_unit(tmp_path, settings):
         ("# pupil radius (mm): 3", "line 1: 'pupil radius .mm.' is not a setting"),
         ("# h_deg: 20", "'h_deg' is not a setting"),
         ("# eye side of the examiner: left", "is not a setting"),
-        ("# units: waves", "line 1: coefficients in 'waves'; allowed: um"),
+        ("# units: waves", "line 1: the comment 'units: waves' names 'waves'"),
+        ("# units: nm", "line 1: coefficients in 'nm'; allowed: um"),
         ("# wavelength: 0.555 um", "'wavelength' has 'um'; allowed: nm"),
         ("# wavelength_nm: 0.555 um", "'wavelength_nm' has 'nm' and 'um'"),
         ("# wavelength: 555", "'wavelength' has no unit; allowed: nm, as in"),
         ("# wavelength 2 (nm): 555", "'wavelength 2 .nm.' is not a setting"),
         ("# frame: camera", "frame: 'camera' is unknown"),
         ("# eye: Anna", "eye_side: 'Anna' is unknown"),
+        ("# Zernike standard: Malacara", "names 'malacara'; allowed: terms of OSA"),
+        ("# Zernike coefficients by Noll", "line 1: .* names 'noll'; allowed: terms"),
+        ("# ordering: by frequency", "'ordering' is 'by frequency'; allowed: OSA/A"),
         ("# left eye", "line 1: the comment 'left eye' does not state 'eye_side'"),
         ("# OS", "does not state 'eye_side'"),
         ("# as the examiner sees it", "does not state 'frame'"),
