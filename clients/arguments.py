@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-from estimator import InvalidFile, preset_names, profile_body, published_names
+from estimator import InvalidFile, profile_body
 from estimator.bounded_files import loads_bounded, printable
 
 MAX_ARGUMENT_BYTES = 1_000_000
@@ -27,21 +26,13 @@ def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
     """
     if text.lstrip().startswith("{"):
         return read_object(option, text)
-    path = Path(text)
-    if text in published_names():
-        return {"kind": "published", "name": text}
-    if text in preset_names():
-        return {"kind": "preset", "name": text}
     try:
-        body = profile_body(path)
+        return profile_body(text)
     except InvalidFile as error:
         name = option.removeprefix("--")
-        raise InvalidFile(path, error.found, error.allowed, name) from None
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{option} {path}: {error}") from None
-    if not isinstance(body, dict):
-        raise ValueError(f"{option} {path} is {body!r}; allowed: a JSON object")
-    return body
+        raise InvalidFile(text, error.found, error.allowed, name) from None
+    except ValueError as error:
+        raise ValueError(f"{option} {text}: {error}") from None
 
 
 def profile_title(profile: Mapping[str, Any]) -> str:

@@ -104,7 +104,7 @@ def _summary(found: "EstimatedEye") -> dict[str, Any]:
         "determined_ratio": found.determined_ratio,
         "refraction_dpt": found.refraction_dpt,
         "amplitude_dpt": found.amplitude_dpt,
-        "notes": list(found.notes),
+        "notes": [*found.notes, *profile.notes],
     }
 
 

@@ -152,8 +152,8 @@ def field(
         return
     for note in notes:
         print_line(f"note: {note}")
+    print_line(f"{eye.name}, entrance pupil diameter {pupil_mm:g} mm")
     if drawn is None:
-        print_line(f"{eye.name}, entrance pupil diameter {pupil_mm:g} mm")
         _print_table(found)
     else:
         _print_drawn(found, drawn)

@@ -177,7 +177,7 @@ def _measured(source: str, focus_dpt: float | None, **view: Any) -> _State:
     profile = load_profile(source)
     measured = MeasuredWavefront.from_profile(profile)
     found = measured.state(focus_dpt=focus_dpt or 0.0, **view)
-    notes = tuple(found.notes)
+    notes = (*found.notes, *profile.notes)
     if profile.higher_order == "typical":
         notes = (*notes, WITHOUT_TYPICAL)
     return _State(

@@ -163,7 +163,7 @@ def load_surfaces(
 
     profile = load_profile(source)
     found = eye_model(profile)
-    notes = found.notes
+    notes = (*found.notes, *profile.notes)
     if profile.correction is not None:
         notes = (*notes, "the coefficients do not include the correction")
     relaxed = found.relaxed

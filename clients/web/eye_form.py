@@ -134,7 +134,8 @@ class EyeForm:
     def load_body(self, body: Mapping[str, Any], name: str) -> None:
         """Load the entries from a profile."""
         body = dict(body)
-        self.loaded_name = name if Path(name).suffix in PROFILE_SUFFIXES else ""
+        is_file = Path(name).suffix.lower() in PROFILE_SUFFIXES
+        self.loaded_name = name if is_file else ""
         correction = body.pop("correction", None)
         if correction is not None:
             self.wears_correction = True

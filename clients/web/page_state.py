@@ -192,7 +192,7 @@ class PageState:
         return self.valid_profiles != before
 
     def request(self) -> PictureRequest | None:
-        """Return the request for this state, or None without a picture or an eye."""
+        """Return the request for the current state; None without a picture or eye."""
         self.read_profiles()
         bodies = {
             side: self.valid_profiles[side]

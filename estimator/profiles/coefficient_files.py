@@ -142,6 +142,9 @@ def csv_body(text: str, name: str) -> dict[str, Any]:
                 raise ProfileError(where, problem, allowed)
             n, m, value = (cells[column] for column in columns)
             table.term(n, m, value, where)
+        elif not (is_header or re.search("[,;\t]", content)):
+            problem = f"cannot read '{content.strip():.60}'"
+            raise ProfileError(where, problem, f"n,m,um, or {SETTINGS}")
         else:
             header, columns = cells, _columns(cells, where, lines[number:])
     return table.body(name)
@@ -177,8 +180,6 @@ def _columns(
     names = [cell.lower() for cell in cells]
     shown = ", ".join(f"'{cell:.{MAX_SHOWN}}'" for cell in cells[:MAX_SHOWN_NAMES])
     shown += ", ..." if len(cells) > MAX_SHOWN_NAMES else ""
-    if len(cells) == 1:
-        raise ProfileError(where, f"cannot read {shown}", f"n,m,um, or {SETTINGS}")
     if not {"n", "m"} <= set(names):
         rows = [row[0] for _, line in below if (row := _cells(line.partition("#")[0]))]
         listed = ", ".join(f"'{row:.{MAX_SHOWN}}'" for row in rows[:MAX_SHOWN_NAMES])

@@ -270,7 +270,7 @@ def test_profile_is_a_preset_json_or_a_file(tmp_path):
         ),
         ("eye.json", "{", "--left .*not JSON"),
         ("eye.abp", "Q = 1", "--left .*eye.abp': line 1: cannot read 'Q = 1'; allowed"),
-        ("eye.txt", "{}", "--left .*eye.txt.* allowed: a preset"),
+        ("eye.png", "{}", "--left .*eye.png.* allowed: a preset"),
     ],
 )
 def test_a_profile_that_is_none_is_named_with_its_option(tmp_path, name, text, words):
@@ -279,6 +279,6 @@ def test_a_profile_that_is_none_is_named_with_its_option(tmp_path, name, text, w
     with pytest.raises(ValueError, match=words):
         read_profile(str(path), "--left")
     path.unlink()
-    said = "is not known" if path.suffix == ".txt" else "does not exist"
+    said = "is not known" if path.suffix == ".png" else "does not exist"
     with pytest.raises(ValueError, match=rf"--left .*{said}"):
         read_profile(str(path), "--left")

@@ -27,8 +27,11 @@ def test_estimate_prints_the_eye_its_coefficients_and_its_error():
 def test_estimated_parameters_are_a_profile_of_their_own(tmp_path):
     found = run_json("estimate", "keratoconus")
     path = tmp_path / "eye.json"
-    path.write_text(json.dumps({"kind": "eye", "parameters": found["parameters"]}))
+    note = {"code": "file_comments", "text": "comments without effect: 'a'"}
+    body = {"kind": "eye", "parameters": found["parameters"], "notes": [note]}
+    path.write_text(json.dumps(body))
     again = run_json("estimate", path)
+    assert again["notes"][-1] == note["text"]
     assert again["method"] == "given"
     assert again["parameters"] == found["parameters"]
     assert abs(again["refraction_dpt"] - found["refraction_dpt"]) < 1.0  # other pupil

@@ -121,6 +121,13 @@ def test_json_adds_percentiles_and_keeps_the_rest(tmp_path, tables):
                 assert percentiles[name][str(p)] == pytest.approx(expected, abs=1e-6)
 
 
+def test_the_table_has_the_radius_beside_the_pupil(tmp_path):
+    *_, pupil, header, _, axis, _ = _field(tmp_path).splitlines()
+    assert pupil == "prescription, entrance pupil diameter 4 mm"
+    assert header.split()[-2:] == ["radius", "mm"]
+    assert float(axis.split()[-1]) == pytest.approx(2.0, abs=0.01)
+
+
 def test_the_table_has_median_and_range(tmp_path, tables):
     lines = _field(tmp_path, "--people", str(PEOPLE)).splitlines()
     assert f"median and 5th..95th percentile of {PEOPLE} persons" in lines

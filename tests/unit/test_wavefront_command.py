@@ -82,6 +82,19 @@ def test_a_near_object_makes_the_eye_hyperopic_by_its_vergence(eye_file):
     assert 3.0 < added_dpt < 3.05  # seen at the cornea, 3 mm nearer
 
 
+@pytest.mark.parametrize("command", ["wavefront", "psf"])
+def test_the_notes_of_the_profile_are_printed(eye_file, tmp_path, command):
+    body = json.loads(eye_file.read_text(encoding="utf-8"))
+    text = "comments of the file without effect: 'Patient'"
+    body["notes"] = [{"code": "file_comments", "text": text, "values": {}}]
+    eye_file.write_text(json.dumps(body), encoding="utf-8")
+    out = ["--pixel-arcmin", "1", "-o", tmp_path / "psf.npy"]
+    view = ["--pupil-mm", "4", "--wavelength-nm", "555"]
+    ended = run_command(command, eye_file, *view, *(out if command == "psf" else []))
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert f"note: {text}\n" in ended.stdout
+
+
 def test_without_json_it_prints_a_table(eye_file):
     ended = run_command("wavefront", eye_file, *VIEW)
     assert ended.returncode == 0
