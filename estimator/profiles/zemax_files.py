@@ -117,22 +117,26 @@ def _operands(text: str) -> _File:
 def _notes(file: _File) -> list[dict[str, Any]]:
     """Return notes on what the file has besides the eye that is read."""
     notes: list[dict[str, Any]] = []
-    configurations = [int(v) for v in file.own.get("MNUM", [])[:2] if v.isdecimal()]
-    if len(configurations) == 2 and 1 < configurations[0] < 1000:
+    words = file.own.get("MNUM", [])[:2]
+    configurations = [int(v) for v in words if v.isdecimal() and len(v) < 5]
+    if len(configurations) == 2 and configurations[0] > 1:
         count, current = configurations
         text = f"the file has {count} configurations: number {current} is used"
         numbers = {"configuration_count": count, "configuration_index": current}
         notes.append({"code": "file_configurations", "text": text, "values": numbers})
-    for number, surface in enumerate(file.surfaces):
-        deviation = float(_model_glass(surface.get("GLAS", []), number)[2])
-        if deviation:
-            text = (
-                f"surface {number}: the deviation of the partial dispersion of its "
-                f"glass, {deviation:g}, is not used"
-            )
-            values = {"partial_dispersion_ratio": deviation}
-            notes.append({"code": "file_dispersion", "text": text, "values": values})
-    return notes[:MAX_ELEMENTS]
+    deviations = {
+        number: deviation
+        for number, surface in enumerate(file.surfaces)
+        if (deviation := _model_glass(surface.get("GLAS", []), number)[2])
+    }
+    if deviations:
+        text = (
+            "the deviation of the partial dispersion is not used: glass of surface "
+            + ", ".join(map(str, deviations))
+        )
+        largest = {"partial_dispersion_ratio": max(deviations.values(), key=abs)}
+        notes.append({"code": "file_dispersion", "text": text, "values": largest})
+    return notes
 
 
 def _elements(file: _File) -> list[Element]:

@@ -162,6 +162,13 @@ THIC   2   1 0.5 0 0 1 1 1 0 0.0 "" 0
 """What OpticStudio writes in every surface, and behind the last one."""
 
 
+@pytest.mark.parametrize("count", ["1", "x", "", "9" * 5000])
+def test_one_configuration_needs_no_note(tmp_path, count):
+    path = tmp_path / "eye.zmx"
+    path.write_text(ZMX + ENDING.format(configurations=count), encoding="utf-8")
+    assert not load_profile(path).notes
+
+
 @pytest.mark.parametrize("indented", [True, False])
 def test_operands_without_effect_on_rays_are_ignored(tmp_path, indented):
     text = ZMX.replace("  TYPE STANDARD\n", f"  TYPE STANDARD\n{OPERANDS}")
@@ -180,12 +187,18 @@ def test_operands_without_effect_on_rays_are_ignored(tmp_path, indented):
     assert note.values == {"configuration_count": 2, "configuration_index": 2}
 
 
-def test_a_partial_dispersion_is_named_in_a_note(tmp_path):
+def test_partial_dispersions_are_named_in_a_note(tmp_path):
     path = tmp_path / "eye.zmx"
-    path.write_text(ZMX.replace("1.42 50 0", "1.42 50 0.01"), encoding="utf-8")
+    text = ZMX.replace("1.42 50 0", "1.42 50 0.01").replace(
+        "1.336 0 0", "1.336 0 -0.02"
+    )
+    path.write_text(text, encoding="utf-8")
     (note,) = load_profile(path).notes
-    assert note.startswith("surface 5: the deviation of the partial dispersion")
-    assert note.code == "file_dispersion"
+    assert note.endswith("partial dispersion is not used: glass of surface 5, 6")
+    assert (note.code, note.values) == (
+        "file_dispersion",
+        {"partial_dispersion_ratio": -0.02},
+    )
 
 
 @pytest.mark.parametrize(
