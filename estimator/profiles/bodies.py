@@ -39,7 +39,7 @@ PUBLISHED_NAMES = tuple(sorted(path.stem for path in PUBLISHED.glob("*.json")))
 
 MAX_MEASUREMENTS = 100
 MAX_COEFFICIENT_UM = 200.0
-MAX_FILE_NOTES, MAX_NOTE_CHARACTERS = 10, 300
+MAX_FILE_NOTES, MAX_NOTE_CHARACTERS = 10, 400
 
 MEASUREMENTS_ALLOWED = (
     f"a list of 1 to {MAX_MEASUREMENTS} measurements, one at h = v = 0"
