@@ -20,7 +20,12 @@ Importing this package loads no submodules, which keeps clients light.
     constants        constants shared by Python and GLSL
     image_files      color and depth files
     atomic_files     atomic file writes
+    pictures         colors and depth of pictures, upright and in sRGB
+    pnm_files        PGM and PPM files
+    exr_files        OpenEXR files
     bounded_images   image decoders with memory limits
+    bounded_npy      .npy files within limits
+    color_encoding   color profiles and codes, and conversion to sRGB
     gl_device        selection of the OpenGL device
     version          version of the installed package
     threads          numba's threading layer

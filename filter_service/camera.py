@@ -30,21 +30,151 @@ Tangent = Annotated[float, Meta(ge=-MAX_TANGENT, le=MAX_TANGENT)]
 Tangents = tuple[Tangent, Tangent, Tangent, Tangent]
 
 
+PIXEL_ASPECT_LIMITS = (0.1, 10.0)
+"""Width of a pixel relative to its height: 2 in anamorphic film, 0.9 to 1.5 in DV."""
+
+
 def tangents_from_fov(
-    vertical_fov_deg: float, width_px: int, height_px: int
+    vertical_fov_deg: float,
+    width_px: int,
+    height_px: int,
+    *,
+    pixel_aspect_ratio: float = 1.0,
 ) -> tuple[float, float, float, float]:
-    """Return (left, right, up, down) of a symmetric camera with square pixels.
+    """Return (left, right, up, down) of a symmetric camera.
+
+    Parameters
+    ----------
+    pixel_aspect_ratio : float
+        Width of a pixel relative to its height.
 
     Raises
     ------
     ValueError
-        If the field of view is impossible for a pinhole.
+        If the field of view or the ratio of the sides is impossible for a pinhole.
     """
     if not 0 < vertical_fov_deg < 174:
         raise ValueError(f"vertical_fov_deg is {vertical_fov_deg}; allowed: 0 to 174")
     up = math.tan(math.radians(vertical_fov_deg) / 2)
-    right = up * width_px / height_px
+    right = up * pixel_aspect_ratio * width_px / height_px
+    if right > MAX_TANGENT and up <= MAX_TANGENT:
+        raise BadMessage(
+            f"a vertical field of view of {vertical_fov_deg:g} deg reaches "
+            f"{math.degrees(math.atan(right)):.3g} deg to each side of an image of "
+            f"{width_px}x{height_px} px",
+            field="camera",
+            allowed=f"{math.degrees(math.atan(MAX_TANGENT)):.3g} deg; the width and "
+            "height of one image",
+        )
     return (-right, right, up, -up)
+
+
+@dataclass(frozen=True)
+class PixelGrid:
+    """Pixels of an image as a part of the picture that a camera took.
+
+    Attributes
+    ----------
+    width_px, height_px : int
+        Size of the image.
+    left_px, top_px : int
+        Place of its first pixel in the picture; negative if the image is larger.
+    full_width_px, full_height_px : int
+        Size of the picture; 0 is that of the image.
+    pixel_aspect_ratio : float
+        Width of a pixel relative to its height.
+    """
+
+    width_px: int
+    height_px: int
+    left_px: int = 0
+    top_px: int = 0
+    full_width_px: int = 0
+    full_height_px: int = 0
+    pixel_aspect_ratio: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Replace a size of 0."""
+        for name in ("width_px", "height_px"):
+            full = getattr(self, f"full_{name}") or getattr(self, name)
+            object.__setattr__(self, f"full_{name}", full)
+
+    @property
+    def is_part(self) -> bool:
+        """Return whether the image is not the whole picture."""
+        return self.window != (0, 0, self.width_px, self.height_px)
+
+    @property
+    def window(self) -> tuple[int, int, int, int]:
+        """Return the place of the first pixel and the size of the picture."""
+        return self.left_px, self.top_px, self.full_width_px, self.full_height_px
+
+    def difference(self, other: PixelGrid) -> tuple[str, str] | None:
+        """Return size or place of another image and of this one, if they differ."""
+        size, other_size = (
+            f"{grid.width_px}x{grid.height_px}" for grid in (self, other)
+        )
+        if size != other_size:
+            return f"{other_size} px", size
+        if self.window == other.window or not (self.is_part and other.is_part):
+            return None
+        own, others = (
+            f"at {grid.left_px},{grid.top_px} px of {grid.full_width_px}x"
+            f"{grid.full_height_px}"
+            for grid in (self, other)
+        )
+        return others, own
+
+    def fov_tangents(self, vertical_fov_deg: float) -> Tangents:
+        """Return the tangents of the image if the picture has a field of view.
+
+        Raises
+        ------
+        ValueError
+            As `tangents_from_fov`.
+        """
+        left, right, up, down = tangents_from_fov(
+            vertical_fov_deg,
+            self.full_width_px,
+            self.full_height_px,
+            pixel_aspect_ratio=self.pixel_aspect_ratio,
+        )
+        if not self.is_part:
+            return left, right, up, down
+        across, along = (
+            (right - left) / self.full_width_px,
+            (up - down) / self.full_height_px,
+        )
+        first, top = left + across * self.left_px, up - along * self.top_px
+        return (
+            first,
+            first + across * self.width_px,
+            top,
+            top - along * self.height_px,
+        )
+
+    def intrinsics_tangents(
+        self,
+        focal_x_px: float,
+        focal_y_px: float,
+        center_x_px: float,
+        center_y_px: float,
+    ) -> Tangents:
+        """Return the tangents of the image for the intrinsics of the picture.
+
+        Raises
+        ------
+        BadMessage
+            As `Camera.from_intrinsics`.
+        """
+        return Camera.from_intrinsics(
+            focal_x_px,
+            focal_y_px,
+            center_x_px - self.left_px,
+            center_y_px - self.top_px,
+            width_px=self.width_px,
+            height_px=self.height_px,
+        ).tangents
 
 
 def read_intrinsics(text: str) -> tuple[float, float, float, float]:

@@ -1,13 +1,15 @@
 """Reading of color and depth files, and writing of filtered images.
 
-Color is uint8 sRGB (8-bit PNG, JPEG, ``.npy``) or float linear (``.npy``, ``.exr``);
-negative and non-finite values are passed on to the filter.  The OpenEXR
-library reads and writes its format, Pillow the others, including 32-bit float TIFF and
-PFM.
+Color is uint8 sRGB (8-bit PNG, JPEG, ``.npy``), or linear sRGB in floats (16-bit PNG,
+``.npy``, ``.exr``); negative and non-finite values are passed on to the filter.  The
+OpenEXR library reads and writes its format, Pillow the others, including 32-bit float
+TIFF and PFM.
 """
 
 import math
 import os
+import warnings
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -15,13 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from estimator.bounded_files import InvalidFile
-from filter_service.bounded_images import (
-    read_exr_channels,
-    read_npy,
-    read_picture_rgb,
-    read_picture_values,
-)
+from estimator.bounded_files import InvalidFile, printable
+from filter_service.bounded_npy import read_npy
+from filter_service.camera import PixelGrid
+from filter_service.color_encoding import SRGB
+from filter_service.exr_files import read_exr_color, read_exr_depth, write_exr
+from filter_service.pictures import read_picture_color, read_picture_values, shown
 
 COLOR_SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".npy", ".exr")
 DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff", ".exr", ".pfm", ".pgm")
@@ -31,13 +32,74 @@ LINEAR_SUFFIXES = (".npy", ".exr")
 METERS_PER_INTEGER_STEP = 0.001
 """Default depth scale of integer files: millimeters, as from depth cameras."""
 
+NO_RETURN = 65535
+"""Value of 16-bit depth where a camera measured nothing, or as far as it can."""
+
 ROW_VALUES = 1 << 20
 """Values converted at a time, so that no float64 copy of a large image is held."""
 
+SAMPLED_VALUES = 1 << 20
+"""Values that are examined for likely mistakes of units."""
 
-def read_color(
+FARTHEST_NEAR_M, NEAREST_FAR_M = 50.0, 0.05
+"""Depth is doubtful if all of it is farther or nearer: outdoors, the ground is nearer
+than 50 m, and no eye focuses at 5 cm."""
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """Content of a color or depth file.
+
+    Attributes
+    ----------
+    pixels : (height, width, 3) or (height, width)
+    grid : PixelGrid
+        Place and shape of the pixels.
+    notes : tuple of str
+        What the pixels do not show, or likely mistakes; each names the file.
+    """
+
+    pixels: NDArray[Any]
+    grid: PixelGrid
+    notes: tuple[str, ...] = ()
+
+    def plain(self) -> NDArray[Any]:
+        """Return the pixels; warn of each note, and of pixels that are not plain."""
+        notes = list(self.notes)
+        if self.grid.is_part or self.grid.pixel_aspect_ratio != 1.0:
+            notes.append(f"the pixels need a camera for {self.grid}")
+        for note in notes:
+            warnings.warn(note, stacklevel=3)
+        return self.pixels
+
+
+def read_color(path: Path, *, option: str = "color") -> NDArray[Any]:
+    """Return the pixels of `read_color_file`; each note becomes a `UserWarning`.
+
+    Raises
+    ------
+    InvalidFile
+    """
+    return read_color_file(path, option=option).plain()
+
+
+def read_depth(
+    path: Path, *, depth_scale: float | None = None, option: str = "depth"
+) -> NDArray[np.float32]:
+    """Return the depth of `read_depth_file`; each note becomes a `UserWarning`.
+
+    Raises
+    ------
+    InvalidFile
+    ValueError
+        If the scale is not positive.
+    """
+    return read_depth_file(path, depth_scale=depth_scale, option=option).plain()
+
+
+def read_color_file(
     path: Path, *, option: str = "color", content: bytes | None = None
-) -> NDArray[Any]:
+) -> ImageFile:
     """Read a color image.
 
     Parameters
@@ -49,8 +111,9 @@ def read_color(
 
     Returns
     -------
-    (height, width, 3)
-        uint8 sRGB, or float32 or float16 linear.  An alpha channel is dropped.
+    ImageFile
+        Pixels (height, width, 3): uint8 sRGB, or float32 or float16 linear sRGB.
+        Color profiles are applied, and pixels that are not opaque are over black.
 
     Raises
     ------
@@ -59,24 +122,29 @@ def read_color(
         have an unsupported type or shape.
     """
     suffix = _known_suffix(option, path, COLOR_SUFFIXES, content)
+    notes: list[str] = []
+    grid = None
     pixels: NDArray[Any]
     if suffix == ".exr":
-        pixels = _exr_color(path, option, content)
+        pixels, grid = read_exr_color(path, notes, option=option, content=content)
     elif suffix == ".npy":
         pixels = read_npy(path, option=option, content=content)
     else:
         source = path if content is None else content
-        pixels = read_picture_rgb(source, name=str(path), option=option)
-    return _checked_color(pixels, path, option)
+        pixels, notes = read_picture_color(source, name=str(path), option=option)
+    pixels = _checked_color(pixels, path, option, notes)
+    if suffix in LINEAR_SUFFIXES and pixels.dtype != np.uint8:
+        _note_bright(pixels, notes)
+    return _image_file(path, pixels, grid, notes)
 
 
-def read_depth(
+def read_depth_file(
     path: Path,
     *,
     depth_scale: float | None = None,
     option: str = "depth",
     content: bytes | None = None,
-) -> NDArray[np.float32]:
+) -> ImageFile:
     """Read a depth image in meters.
 
     Parameters
@@ -91,8 +159,9 @@ def read_depth(
 
     Returns
     -------
-    depth_m : (height, width), m
-        As stored: +inf is infinity; 0, negative and NaN are missing.
+    ImageFile
+        float32 pixels (height, width), m, as stored: +inf is infinity; 0, negative and
+        NaN are missing.  65535 of 16 bits becomes 0.
 
     Raises
     ------
@@ -102,27 +171,132 @@ def read_depth(
     ValueError
         If the scale is not positive.
     """
+    stored = read_stored_depth(path, option=option, content=content)
+    values, notes = stored.pixels, [*stored.notes]
+    if depth_scale is None:
+        if values.dtype == np.uint8:  # in mm it would end at 25 cm
+            allowed = "16 bits in mm, 32-bit float in m; with --depth-scale also 8 bits"
+            _raise_invalid(option, path, "8 bits deep", allowed)
+        if values.dtype.kind != "f" and path.suffix.lower() == ".npy":
+            notes.append(
+                named_note(
+                    path, "integers are millimeters unless --depth-scale is given"
+                )
+            )
+    depth_m, new = depth_of(values, depth_scale)
+    return replace(
+        stored,
+        pixels=depth_m,
+        notes=(*notes, *(named_note(path, note) for note in new)),
+    )
+
+
+def read_stored_depth(
+    path: Path, *, option: str = "depth", content: bytes | None = None
+) -> ImageFile:
+    """Read the numbers of a depth file, of one channel, as stored.
+
+    The parameters and errors are those of `read_depth_file`.
+    """
     suffix = _known_suffix(option, path, DEPTH_SUFFIXES, content)
+    notes: list[str] = []
+    grid = None
     if suffix == ".exr":
-        stored = _exr_depth(path, option, content)
+        stored, grid = read_exr_depth(path, notes, option=option, content=content)
     elif suffix == ".npy":
         stored = read_npy(path, option=option, content=content)
     else:
         source = path if content is None else content
-        stored = read_picture_values(source, name=str(path), option=option)
+        stored, notes = read_picture_values(source, name=str(path), option=option)
     if stored.ndim == 3 and stored.shape[2] == 1:
         stored = stored[:, :, 0]
     if stored.ndim != 2 or stored.size == 0 or stored.dtype.kind not in "uif":
         found = f"{stored.dtype} of shape {stored.shape}"
         _raise_invalid(option, path, found, "one channel, integer or float")
+    return _image_file(path, stored, grid, notes)
+
+
+def depth_of(
+    stored: NDArray[Any], depth_scale: float | None = None
+) -> tuple[NDArray[np.float32], list[str]]:
+    """Return stored numbers as depth in meters, and notes on doubtful values.
+
+    Parameters
+    ----------
+    depth_scale : float, optional
+        Meters per stored unit; by default 0.001 for integers and 1 for floats.
+
+    Raises
+    ------
+    ValueError
+        If the scale is not positive.
+    """
+    is_float = stored.dtype.kind == "f"
     if depth_scale is None:
-        if stored.dtype == np.uint8:  # in mm it would end at 25 cm
-            allowed = "16 bits in mm, 32-bit float in m; with --depth-scale also 8 bits"
-            _raise_invalid(option, path, "8 bits deep", allowed)
-        depth_scale = 1.0 if stored.dtype.kind == "f" else METERS_PER_INTEGER_STEP
+        depth_scale = 1.0 if is_float else METERS_PER_INTEGER_STEP
     if not (math.isfinite(depth_scale) and depth_scale > 0.0):
         raise ValueError(f"--depth-scale is {depth_scale}; allowed: a positive number")
-    return _scaled(stored, depth_scale)
+    depth_m = _scaled(stored, depth_scale)
+    notes: list[str] = []
+    if stored.dtype == np.uint16:
+        none = stored == NO_RETURN
+        if none.any():
+            depth_m[none] = 0.0
+            share = 100.0 * float(none.mean())
+            notes.append(f"{share:.2g} % of the depth is {NO_RETURN}: missing")
+    _note_doubtful_depth(depth_m, notes)
+    return depth_m, notes
+
+
+def _note_doubtful_depth(depth_m: NDArray[np.float32], notes: list[str]) -> None:
+    """Note depth whose unit or sign is probably wrong."""
+    some_m = _sampled(depth_m)
+    known_m = some_m[(some_m > 0.0) & np.isfinite(some_m)]
+    if not known_m.size:
+        if (some_m < 0.0).any():
+            notes.append(
+                "all depth is negative and therefore missing; view-space z of OpenGL "
+                "must be negated"
+            )
+        return
+    near_m, far_m = (float(value) for value in np.percentile(known_m, (1, 99)))
+    if near_m > FARTHEST_NEAR_M or far_m < NEAREST_FAR_M:
+        notes.append(
+            f"depth of {near_m:.3g} to {far_m:.3g} m is unusual; is it in meters? "
+            "Otherwise pass --depth-scale, in meters per unit"
+        )
+
+
+def _note_bright(linear: NDArray[Any], notes: list[str]) -> None:
+    """Note light of which most is brighter than white."""
+    some = _sampled(linear)
+    with np.errstate(invalid="ignore"):
+        share = float((some > 1.0).mean())
+    if share > 0.5:
+        top = float(np.nanmax(some))
+        notes.append(
+            f"{100.0 * share:.0f} % of the light is above 1, which is white, up to "
+            f"{top:.4g}; is it 0 to {255 if top <= 255.5 else 65535}?"
+        )
+
+
+def _sampled(values: NDArray[Any]) -> NDArray[Any]:
+    """Return values at regular places, at most about `SAMPLED_VALUES`."""
+    rows = max(1, math.ceil(values.size / SAMPLED_VALUES))
+    return values[:: math.isqrt(rows - 1) + 1, :: math.isqrt(rows - 1) + 1]
+
+
+def named_note(path: Path, note: str) -> str:
+    """Return a note on a file with the file's name, as one line."""
+    return printable(f"'{path.name}': {note}", most=500)
+
+
+def _image_file(
+    path: Path, pixels: NDArray[Any], grid: PixelGrid | None, notes: list[str]
+) -> ImageFile:
+    height_px, width_px = pixels.shape[:2]
+    named = tuple(named_note(path, note) for note in notes)
+    return ImageFile(pixels, grid or PixelGrid(width_px, height_px), named)
 
 
 def _scaled(stored: NDArray[Any], depth_scale: float) -> NDArray[np.float32]:
@@ -159,7 +333,13 @@ def check_output(path: Path, suffixes: tuple[str, ...] = OUTPUT_SUFFIXES) -> Non
         _raise_invalid("out", path, "it is a folder", "the name of a file")
 
 
-def write_image(path: Path, image: NDArray[Any], *, png_level: int = 6) -> None:
+def write_image(
+    path: Path,
+    image: NDArray[Any],
+    *,
+    png_level: int = 6,
+    grid: PixelGrid | None = None,
+) -> None:
     """Write uint8 sRGB to ``.png``, or linear floats to ``.npy`` or ``.exr``.
 
     Parameters
@@ -167,6 +347,8 @@ def write_image(path: Path, image: NDArray[Any], *, png_level: int = 6) -> None:
     png_level : int, 0 to 9
         Compression level of a PNG: 1 takes a quarter of the time of 6, and the file is
         a fifth larger.
+    grid : PixelGrid, optional
+        Place and shape of the pixels, which only OpenEXR stores.
 
     Raises
     ------
@@ -182,7 +364,7 @@ def write_image(path: Path, image: NDArray[Any], *, png_level: int = 6) -> None:
     if suffix == ".npy":
         np.save(path, image)
     elif suffix == ".exr":
-        _write_exr(path, image)
+        write_exr(path, image, grid)
     else:
         Image.fromarray(image).save(path, compress_level=png_level)
 
@@ -212,59 +394,22 @@ def _known_suffix(
     return suffix
 
 
-def _exr_color(path: Path, option: str, content: bytes | None) -> NDArray[np.float32]:
-    def choose(names: set[str]) -> tuple[str, ...]:
-        if not set("RGB") <= names:
-            found = f"channels {', '.join(sorted(names))}"
-            _raise_invalid(option, path, found[:200], "channels R, G and B")
-        return tuple("RGB")
-
-    channels = read_exr_channels(path, choose, option=option, content=content)
-    shapes = {channel.shape for channel in channels.values()}
-    if len(shapes) > 1:
-        _raise_invalid(
-            option, path, "channels of different sizes", "R, G and B of one size"
-        )
-    rgb = np.empty((*shapes.pop(), 3), np.float32)
-    for k, name in enumerate("RGB"):
-        rgb[:, :, k] = channels.pop(name)
-    return rgb
-
-
-def _exr_depth(path: Path, option: str, content: bytes | None) -> NDArray[np.float32]:
-    def choose(names: set[str]) -> tuple[str, ...]:
-        for name in ("Z", "Y", "R"):
-            if name in names:
-                return (name,)
-        found = f"channels {', '.join(sorted(names))}"
-        _raise_invalid(option, path, found[:200], "a channel Z, Y or R")
-
-    channels = read_exr_channels(path, choose, option=option, content=content)
-    return channels.popitem()[1]
-
-
-def _write_exr(path: Path, linear_rgb: NDArray[Any]) -> None:
-    import OpenEXR
-
-    header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-    }
-    channels = {"RGB": np.ascontiguousarray(linear_rgb)}
-    with OpenEXR.File(header, channels) as file:
-        file.write(str(path))
-
-
-def _checked_color(pixels: NDArray[Any], path: Path, option: str) -> NDArray[Any]:
+def _checked_color(
+    pixels: NDArray[Any], path: Path, option: str, notes: list[str]
+) -> NDArray[Any]:
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4) or pixels.size == 0:
         _raise_invalid(option, path, f"shape {pixels.shape}", "(height, width, 3 or 4)")
+    alpha = pixels[:, :, 3] if pixels.shape[2] == 4 else None
     pixels = np.ascontiguousarray(pixels[:, :, :3])
     if pixels.dtype == np.uint8:
-        return pixels
+        return pixels if alpha is None else shown(pixels, alpha, SRGB, notes)
     if pixels.dtype.kind != "f":
         _raise_invalid(
             option, path, f"type {pixels.dtype}", "uint8 sRGB or float linear"
         )
+    if alpha is not None and not (alpha == 1.0).all():
+        found = "a fourth channel that is not 1"
+        _raise_invalid(option, path, found, "three channels: light over a background")
     if pixels.dtype == np.float16:
         return pixels
     with np.errstate(over="ignore"):  # infinity is handled by the filter

@@ -22,5 +22,6 @@ manifest           record of the finished frames
 run                runs the missing frames of a batch
 dry_run            estimate of time and cost
 video_reading      random access to video frames
+video_color        colors, orientation and pixel shape of video frames
 video_writing      writing and joining of video segments
 """

@@ -18,6 +18,7 @@ import math
 import re
 from pathlib import Path
 
+from clients.batch.layout_pairs import in_order
 from clients.batch.source import Disparity, Pinhole, SourceFrame
 from estimator.bounded_files import InvalidFile, read_text
 
@@ -57,7 +58,8 @@ def _scenes(source: Path) -> list[Path]:
 
     if is_scene(source):
         return [source]
-    return sorted(path for path in source.iterdir() if path.is_dir() and is_scene(path))
+    names = [path.name for path in source.iterdir() if path.is_dir() and is_scene(path)]
+    return [source / name for name in in_order(names)]
 
 
 def read_calibration(path: Path) -> tuple[Pinhole, Disparity]:

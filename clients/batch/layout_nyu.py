@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_left
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from clients.batch.layout_pairs import pair_frames
 from clients.batch.source import Pinhole, Scaled, SourceFrame
 from estimator import InvalidFile
-from filter_service.image_files import read_depth
+from filter_service.image_files import ImageFile, read_stored_depth
 
 COLOR_CAMERA = Pinhole(
     518.85790117450188,
@@ -59,17 +59,18 @@ SHIFT_M = np.array(
 COUNT_SCALE_M, COUNT_AT_INFINITY = 351.3, 1092.5
 MAX_DEPTH_M = 10.0
 MAX_COUNT = 65535
-_RAW = re.compile(r"^([rd])-(\d+\.\d+)-\d+\.(?:ppm|pgm)$")
-_EXTRACTED = re.compile(r"^(\d+_colors|sync_depth_\d+)\.(?:png|jpg)$")
+_RAW = re.compile(r"^([rd])-(\d+\.\d+)-\d+\.(?i:ppm|pgm)$")
+_EXTRACTED = re.compile(r"^(\d+_colors|sync_depth_\d+)\.(?i:png|jpg)$")
 
 
 @dataclass(frozen=True)
 class KinectCounts:
     """Depth format of the raw counts of the Kinect's depth camera."""
 
-    def read(self, path: Path, content: bytes | None = None) -> NDArray[np.float32]:
+    def read(self, path: Path, content: bytes | None = None) -> ImageFile:
         """Return the depth in the view of the color camera, m; 0 if unknown."""
-        stored = read_depth(path, depth_scale=1.0, option="", content=content)
+        file = read_stored_depth(path, option="", content=content)
+        stored = file.pixels
         width_px, height_px = COLOR_CAMERA.size_px or (0, 0)
         if stored.shape != (height_px, width_px):
             found = f"{stored.shape[1]}x{stored.shape[0]} px"
@@ -78,11 +79,14 @@ class KinectCounts:
             )
         if not ((stored >= 0.0) & (stored <= MAX_COUNT)).all():
             raise InvalidFile(path, "numbers that are not counts", f"0 to {MAX_COUNT}")
-        return self.of_integers(stored.astype(np.uint16))
+        depth_m, _ = self.of_integers(stored.astype(np.uint16))
+        return replace(file, pixels=depth_m)
 
-    def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
+    def of_integers(
+        self, stored: NDArray[np.uint16]
+    ) -> tuple[NDArray[np.float32], list[str]]:
         """Return the depth for the numbers as stored, with swapped bytes."""
-        return registered_m(counted_depth_m(stored.byteswap()))
+        return registered_m(counted_depth_m(stored.byteswap())), []
 
 
 def counted_depth_m(counts: NDArray[np.uint16]) -> NDArray[np.float64]:
@@ -126,7 +130,7 @@ def is_nyu(source: Path) -> bool:
 def nyu_frames(source: Path) -> list[SourceFrame]:
     """Return the frames of a folder; frames of raw dumps are named by their times."""
     times: dict[str, dict[float, Path]] = {"r": {}, "d": {}}
-    for path in sorted(source.iterdir()):
+    for path in source.iterdir():
         if match := _RAW.match(path.name):
             times[match[1]][float(match[2])] = path
     if not times["r"]:

@@ -3,11 +3,16 @@
 color/0001.png      depth/0001.exr       two folders with known names
 0001_color.png      0001_depth.npy       one folder, names with a known word
 0001.jpg            0001.npy             one folder, distinguished by file type
+
+Names of folders may have any case.  Names of files meet if they are the same text,
+however it is encoded: macOS stores letters with accents as two characters.
 """
 
 from __future__ import annotations
 
 import re
+import unicodedata
+from collections.abc import Iterable
 from pathlib import Path
 from typing import cast
 
@@ -18,6 +23,30 @@ COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images", "left", "frames")
 DEPTH_FOLDERS = ("depth", "depths", "depth_m", "depthmap", "depthmaps")
 COLOR_WORDS = ("colors", "color", "colour", "rgb", "image", "img")
 DEPTH_WORDS = ("sync_depth", "depth", "z")
+
+
+_NUMBER = re.compile(r"(\d+)", re.ASCII)
+_DECIMAL = re.compile(r"(\d+)(\.\d+)", re.ASCII)
+
+
+def same_text(name: str) -> str:
+    """Return a name whose letters with accents are one character each (NFC)."""
+    return unicodedata.normalize("NFC", name)
+
+
+def in_order(names: Iterable[str]) -> list[str]:
+    """Return names sorted as people count: 2 before 10, and times as decimals."""
+    return sorted(names, key=_counted)
+
+
+def _counted(name: str) -> tuple[list[str | float], str]:
+    """Return a key: text and numbers in turn, so that like is compared with like."""
+    text = same_text(name)
+    if match := _DECIMAL.fullmatch(text):
+        return ["", int(match[1]), ".", float(match[2])], name
+    parts = _NUMBER.split(text)
+    numbered = [int(part) if k % 2 else part for k, part in enumerate(parts)]
+    return [*numbered], name
 
 
 def _at_an_end(words: tuple[str, ...]) -> re.Pattern[str]:
@@ -43,7 +72,7 @@ def pair_frames(
     """
     colors, depths = _colors_and_depths(source, depth)
     frames = []
-    for name in sorted(colors.keys() | depths.keys()):
+    for name in in_order(colors.keys() | depths.keys()):
         color, depth_file = colors.get(name), depths.get(name)
         fault = None
         if color is None or depth_file is None:
@@ -92,16 +121,22 @@ _PICTURES = (".png", ".jpg", ".jpeg", ".ppm")
 
 
 def images_in(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """Return the files of a folder with these suffixes, sorted by name."""
-    return sorted(
-        path
+    """Return the files of a folder with these suffixes, in the order of their names."""
+    found = {
+        path.name: path
         for path in folder.iterdir()
         if path.suffix.lower() in suffixes and not path.name.startswith(".")
-    )
+    }
+    return [found[name] for name in in_order(found)]
 
 
 def _sub_folder(source: Path, names: tuple[str, ...]) -> Path | None:
-    return next((source / name for name in names if (source / name).is_dir()), None)
+    folders = [path for path in sorted(source.iterdir()) if path.is_dir()]
+    for name in names:
+        for path in (source / name, *folders):
+            if path.name.lower() == name and path.is_dir():
+                return path
+    return None
 
 
 def _named(paths: list[Path], word: re.Pattern[str]) -> dict[str, Path]:
@@ -112,6 +147,7 @@ def _named(paths: list[Path], word: re.Pattern[str]) -> dict[str, Path]:
         name = path.stem
         if match is not None:
             name = (name[: match.start()] + name[match.end() :]) or path.stem
+        name = same_text(name)
         if name in found:
             raise ValueError(
                 f"'{path}' and '{found[name]}' have the same name '{name}'"

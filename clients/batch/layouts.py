@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
 from clients.batch import layout_middlebury, layout_nyu, layout_pairs, layout_tum
@@ -23,12 +24,16 @@ from clients.batch.source import (
     SourceFrame,
 )
 from filter_service.camera import read_intrinsics
-from filter_service.image_files import DEPTH_SUFFIXES
+from filter_service.image_files import COLOR_SUFFIXES, DEPTH_SUFFIXES
 
 VIDEO_SUFFIXES = (
     *(".mkv", ".mp4", ".mov", ".avi", ".webm"),
     *(".m4v", ".mpg", ".mpeg", ".ts"),
 )
+
+
+MAX_EXAMINED_FILES = 1000
+"""Files whose kinds an error names."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ LAYOUTS = ("auto", *DETECTED, "pairs", "video")
 def list_frames(
     source: Path, layout: str, options: LayoutOptions
 ) -> tuple[str, list[SourceFrame]]:
-    """Return the layout of a data set, and its frames sorted by name.
+    """Return the layout of a data set, and its frames in the order of their names.
 
     Raises
     ------
@@ -89,9 +94,23 @@ def list_frames(
             source, options.depth, _optics(options), _scaled(options)
         )
     if not frames:
-        raise ValueError(f"'{source}': no frames of the layout {layout}")
+        raise ValueError(_nothing_found(source, layout, options.depth))
     _check_names(frames)
     return layout, [_with_options(frame, options) for frame in frames]
+
+
+def _nothing_found(source: Path, layout: str, depth: Path | None) -> str:
+    """Return an error with the kinds of files that there are."""
+    if depth is not None and not any(depth.iterdir()):
+        return f"--depth '{depth}': no files"
+    paths = islice(source.rglob("*"), MAX_EXAMINED_FILES)
+    kinds = {path.suffix or path.name for path in paths if not path.is_dir()}
+    found = ", ".join(sorted(kinds)[:8]) or "none"
+    allowed = (
+        f"images ({', '.join(COLOR_SUFFIXES)}) in color/ and as many of depth "
+        f"({', '.join(DEPTH_SUFFIXES)}) in depth/, or names that end in _depth"
+    )
+    return f"'{source}': no frames of the layout {layout}; files: {found}; {allowed}"
 
 
 def _layout_of(source: Path, layout: str) -> str:
@@ -119,20 +138,22 @@ def _video_frames(
     source: Path, depth: Path | None, optics: Optics, scaled: Scaled
 ) -> list[SourceFrame]:
     """Return the frames of a video, named by their numbers."""
-    from clients.batch.video_reading import frame_count
+    from clients.batch.video_reading import VideoReader
 
     if depth is None:
         raise ValueError(
             f"--depth is not given; allowed for '{source}': a 16-bit gray video, or a "
             "folder of depth images"
         )
-    count = frame_count(source)
+    with VideoReader(source) as reader:
+        count, times_s = reader.count, reader.variable_times_s
     depths: list[tuple[Path, int | None]]
     if depth.is_dir():
         files = images_in(depth, DEPTH_SUFFIXES)
         depths = [(path, None) for path in files]
     elif depth.is_file():
-        depths = [(depth, k) for k in range(frame_count(depth))]
+        with VideoReader(depth) as reader:
+            depths = [(depth, k) for k in range(reader.count)]
     else:
         raise ValueError(f"--depth '{depth}': no such file or folder")
     if len(depths) != count:
@@ -141,7 +162,16 @@ def _video_frames(
             f"'{source}'"
         )
     return [
-        SourceFrame(f"{k:06d}", source, path, optics, scaled, k, depth_index)
+        SourceFrame(
+            f"{k:06d}",
+            source,
+            path,
+            optics,
+            scaled,
+            k,
+            depth_index,
+            time_s=None if times_s is None else times_s[k],
+        )
         for k, (path, depth_index) in enumerate(depths)
     ]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -145,7 +146,7 @@ def _add_results(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--fps",
         type=float,
-        help="frame rate of videos (default: that of the input video, or 30)",
+        help="frame rate of videos (default: the times of the input video, or 30)",
     )
     group.add_argument(
         "--overwrite",
@@ -201,6 +202,8 @@ def batch_of(options: argparse.Namespace) -> Batch:
     )
     layout, frames = list_frames(options.input, options.layout, layout_options)
     frames = frames[: options.limit]
+    if options.fps is not None:
+        frames = [replace(frame, time_s=None) for frame in frames]
     states = _states(options, [frame.name for frame in frames])
     job = Job(
         profiles=read_profiles(options.profile),

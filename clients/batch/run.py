@@ -371,6 +371,8 @@ def _join_videos(batch: Batch, manifest: Manifest) -> None:
     from clients.batch.video_writing import VIDEO_KINDS, join_segments
 
     kind, rate_hz = VIDEO_KINDS[batch.job.format], batch.job.rate_hz
+    given = [frame.time_s for frame in batch.frames if frame.time_s is not None]
+    times_s = given if len(given) == len(batch.frames) else None
     for profile in batch.job.profiles:
         target = video_of(batch, profile)
         if manifest.has_video(profile, target, content_of):
@@ -384,7 +386,7 @@ def _join_videos(batch: Batch, manifest: Manifest) -> None:
             continue
 
         def join(path: Path, segments: list[tuple[int, Path]] = segments) -> None:
-            join_segments(path, segments, kind=kind, rate_hz=rate_hz)
+            join_segments(path, segments, kind=kind, rate_hz=rate_hz, times_s=times_s)
 
         content = write_whole(target, join)
         manifest.append(

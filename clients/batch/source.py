@@ -6,35 +6,39 @@ Layouts list frames; workers read their files.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service import Camera, tangents_from_fov
-from filter_service.image_files import METERS_PER_INTEGER_STEP, read_depth
-
-Tangents = tuple[float, float, float, float]
+from filter_service.camera import PixelGrid, Tangents
+from filter_service.image_files import (
+    ImageFile,
+    depth_of,
+    read_depth_file,
+    read_stored_depth,
+)
 
 
 class Optics(Protocol):
     """Interface of camera models."""
 
-    def tangents(self, width_px: int, height_px: int) -> Tangents:
+    def tangents(self, grid: PixelGrid) -> Tangents:
         """Return the tangents of the left, right, upper and lower edge of an image."""
 
 
 @dataclass(frozen=True)
 class FieldOfView:
-    """Symmetric camera with square pixels, given by its vertical field of view."""
+    """Symmetric camera, given by its vertical field of view."""
 
     fov_deg: float
 
-    def tangents(self, width_px: int, height_px: int) -> Tangents:
+    def tangents(self, grid: PixelGrid) -> Tangents:
         """Return the tangents of the image edges."""
-        return tangents_from_fov(self.fov_deg, width_px, height_px)
+        return grid.fov_tangents(self.fov_deg)
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class Pinhole:
     center_y_px: float
     size_px: tuple[int, int] | None = None
 
-    def tangents(self, width_px: int, height_px: int) -> Tangents:
+    def tangents(self, grid: PixelGrid) -> Tangents:
         """Return the tangents of the image edges, half a pixel beyond pixel centers.
 
         Raises
@@ -58,33 +62,31 @@ class Pinhole:
         ValueError
             If the camera is for images of another size.
         """
-        if self.size_px not in (None, (width_px, height_px)):
+        size_px = grid.full_width_px, grid.full_height_px
+        if self.size_px not in (None, size_px):
             raise ValueError(
-                f"{width_px}x{height_px} px, but the camera of this layout is for "
+                f"{size_px[0]}x{size_px[1]} px, but the camera of this layout is for "
                 f"{self.size_px[0]}x{self.size_px[1]}; allowed: that size, "
                 "--intrinsics or --fov-deg"
             )
-        return Camera.from_intrinsics(
-            self.focal_x_px,
-            self.focal_y_px,
-            self.center_x_px,
-            self.center_y_px,
-            width_px=width_px,
-            height_px=height_px,
-        ).tangents
+        return grid.intrinsics_tangents(
+            self.focal_x_px, self.focal_y_px, self.center_x_px, self.center_y_px
+        )
 
 
 class DepthForm(Protocol):
     """Interface of depth formats."""
 
-    def read(self, path: Path, content: bytes | None = None) -> NDArray[np.float32]:
+    def read(self, path: Path, content: bytes | None = None) -> ImageFile:
         """Return the depth in a file, m; 0, negative and NaN are missing.
 
         If the content of the file is given, the file is not read.
         """
 
-    def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
-        """Return the depth in a video frame, m."""
+    def of_integers(
+        self, stored: NDArray[np.uint16]
+    ) -> tuple[NDArray[np.float32], list[str]]:
+        """Return the depth in a video frame, m, and notes."""
 
 
 @dataclass(frozen=True)
@@ -93,16 +95,16 @@ class Scaled:
 
     depth_scale_m: float | None = None
 
-    def read(self, path: Path, content: bytes | None = None) -> NDArray[np.float32]:
+    def read(self, path: Path, content: bytes | None = None) -> ImageFile:
         """Return the depth in a file, m."""
         scale_m = self.depth_scale_m
-        return read_depth(path, depth_scale=scale_m, option="", content=content)
+        return read_depth_file(path, depth_scale=scale_m, option="", content=content)
 
-    def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
-        """Return the depth in a video frame, m."""
-        scale_m = self.depth_scale_m or METERS_PER_INTEGER_STEP
-        with np.errstate(over="ignore"):
-            return (stored * np.float64(scale_m)).astype(np.float32)
+    def of_integers(
+        self, stored: NDArray[np.uint16]
+    ) -> tuple[NDArray[np.float32], list[str]]:
+        """Return the depth in a video frame, m, and notes."""
+        return depth_of(stored, self.depth_scale_m)
 
 
 @dataclass(frozen=True)
@@ -116,16 +118,18 @@ class Disparity:
     baseline_m: float
     offset_px: float
 
-    def read(self, path: Path, content: bytes | None = None) -> NDArray[np.float32]:
+    def read(self, path: Path, content: bytes | None = None) -> ImageFile:
         """Return the depth in a file, m; 0 if the disparity is unknown."""
-        stored = read_depth(path, depth_scale=1.0, option="", content=content)
-        return self._depth_m(stored)
+        stored = read_stored_depth(path, option="", content=content)
+        return replace(stored, pixels=self._depth_m(stored.pixels))
 
-    def of_integers(self, stored: NDArray[np.uint16]) -> NDArray[np.float32]:
-        """Return the depth in a video frame, m."""
-        return self._depth_m(stored.astype(np.float32))
+    def of_integers(
+        self, stored: NDArray[np.uint16]
+    ) -> tuple[NDArray[np.float32], list[str]]:
+        """Return the depth in a video frame, m, and no notes."""
+        return self._depth_m(stored), []
 
-    def _depth_m(self, disparity_px: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _depth_m(self, disparity_px: NDArray[Any]) -> NDArray[np.float32]:
         apart_px = disparity_px.astype(np.float64) + self.offset_px
         known = np.isfinite(apart_px) & (apart_px > 0.0)
         depth_m = np.zeros(disparity_px.shape)
@@ -150,6 +154,8 @@ class SourceFrame:
         Depth format.
     color_index, depth_index : int, optional
         Frame numbers in videos.
+    time_s : Fraction, optional
+        Time in a video of color whose frame rate varies.
     fault : str, optional
         Reason why the frame cannot be used, if known before it is read.
     """
@@ -161,6 +167,7 @@ class SourceFrame:
     depth_form: DepthForm
     color_index: int | None = None
     depth_index: int | None = None
+    time_s: Fraction | None = None
     fault: str | None = None
 
     @property
@@ -181,20 +188,18 @@ class BadFrame(ValueError):
     """The frame cannot be used; the message names its file."""
 
 
-def check_sizes(
-    frame: SourceFrame, color: NDArray[Any], depth_m: NDArray[np.float32]
-) -> None:
-    """Check that color and depth have the same size.
+def check_sizes(frame: SourceFrame, color: ImageFile, depth: ImageFile) -> None:
+    """Check that color and depth have the same size and place.
 
     Raises
     ------
     BadFrame
         If they differ.
     """
-    if color.shape[:2] != depth_m.shape:
+    if (problem := color.grid.difference(depth.grid)) is not None:
+        found, wanted = problem
         raise BadFrame(
-            f"'{frame.depth}': {depth_m.shape[1]}x{depth_m.shape[0]} px; allowed: "
-            f"the size of '{frame.color}', {color.shape[1]}x{color.shape[0]}"
+            f"'{frame.depth}': {found}; allowed: the size of '{frame.color}', {wanted}"
         )
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clients.batch.layout_pairs import same_text
 from clients.batch.source import center_depth_m
 from estimator.bounded_files import InvalidFile, read_text
 from filter_service.settings import MAX_PUPIL_MM, MAX_VERGENCE_DPT, MIN_PUPIL_MM
@@ -114,7 +115,7 @@ def read_states(
 def _states_of(
     text: str, path: Path, names: Sequence[str]
 ) -> dict[str, tuple[float | None, float | None]]:
-    known = set(names)
+    known = {same_text(name): name for name in names}
     by_number = {int(name): name for name in names if _is_number(name)}
     rows = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True)
     columns = rows.fieldnames or []
@@ -127,7 +128,9 @@ def _states_of(
         name = row["frame"]
         if name is None:
             raise InvalidFile(path, f"{where}: no frame", "a name", "states")
-        if name not in known and _is_number(name):
+        if same_text(name) in known:
+            name = known[same_text(name)]
+        elif _is_number(name):
             name = by_number.get(int(name), name)
         state = []
         for column, low, high in (

@@ -2,19 +2,28 @@
 
 A frame is found by its time.  The reader lists the times of all packets without
 decoding them, then seeks to the key frame that precedes a frame and decodes from there.
+Frames are returned upright and in sRGB (`clients.batch.video_color`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import av
 import numpy as np
 from numpy.typing import NDArray
 
+from clients.batch.video_color import (
+    color_of,
+    orientation_of,
+    pixel_aspect_ratio_of,
+)
 from estimator.bounded_files import InvalidFile, reason_of
+from filter_service.camera import PixelGrid
+from filter_service.image_files import ImageFile, named_note
+from filter_service.pictures import upright
 
 GRAY = ("gray16le", "gray16be")
 
@@ -33,18 +42,6 @@ FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi,mpeg,mpegts,mpegvideo"
 reference other files."""
 
 OPTIONS = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
-
-
-def frame_count(path: Path) -> int:
-    """Return the number of frames of a video.
-
-    Raises
-    ------
-    InvalidFile
-        If it cannot be read or has no frames.
-    """
-    with VideoReader(path) as reader:
-        return reader.count
 
 
 def frames_per_second(path: Path) -> float:
@@ -103,6 +100,18 @@ class VideoReader:
         return len(self._times)
 
     @property
+    def variable_times_s(self) -> list[Fraction] | None:
+        """Return the time of each frame, s, from 0 on; None if the rate is constant."""
+        tick_s = self._stream.time_base or Fraction(1, 1)
+        times_s = [(time - self._times[0]) * tick_s for time in self._times]
+        rate_hz = self.rate_hz
+        is_constant = all(
+            abs(float(time_s) - k / rate_hz) <= 1.01 * tick_s
+            for k, time_s in enumerate(times_s)
+        )
+        return None if is_constant else times_s
+
+    @property
     def rate_hz(self) -> float:
         """Return the mean frame rate, or 30 if the file does not contain it."""
         try:
@@ -110,18 +119,39 @@ class VideoReader:
         except (ZeroDivisionError, OverflowError):
             return 30.0
 
-    def color(self, index: int) -> NDArray[np.uint8]:
-        """Return a frame in sRGB, (height, width, 3).
+    def color(self, index: int) -> ImageFile:
+        """Return a frame, upright.
+
+        Returns
+        -------
+        ImageFile
+            Pixels (height, width, 3): uint8 sRGB; float32 linear sRGB if the video has
+            more than 8 bits or is HDR.
 
         Raises
         ------
         InvalidFile
             If the frame cannot be read.
         """
-        return self._array(self._frame(index), format="rgb24")
+        frame = self._frame(index)
+        self._check_size(frame)
+        try:
+            pixels, notes = color_of(frame, self._stream.codec_context)
+            orientation = orientation_of(frame)
+            ratio = pixel_aspect_ratio_of(self._stream)
+        except Exception as error:  # PyAV raises many types of exceptions
+            raise self._unreadable("pixels cannot be read", error) from None
+        if ratio != 1.0:
+            ratio = 1.0 / ratio if orientation >= 5 else ratio
+            notes.append(f"pixels are {ratio:.4g} times as wide as high")
+        pixels = upright(pixels, orientation)
+        height_px, width_px = pixels.shape[:2]
+        grid = PixelGrid(width_px, height_px, pixel_aspect_ratio=ratio)
+        named = tuple(named_note(self._path, note) for note in notes)
+        return ImageFile(pixels, grid, named)
 
     def integers(self, index: int) -> NDArray[np.uint16]:
-        """Return a frame of 16-bit gray as stored, (height, width).
+        """Return a frame of 16-bit gray as stored, upright, (height, width).
 
         Raises
         ------
@@ -135,7 +165,12 @@ class VideoReader:
                 f"pixels are {frame.format.name}",
                 "lossless 16-bit gray, as from `ffmpeg -pix_fmt gray16le -c:v ffv1`",
             )
-        return self._array(frame).astype(np.uint16)
+        self._check_size(frame)
+        try:
+            stored = frame.to_ndarray().astype(np.uint16)
+            return upright(stored, orientation_of(frame))
+        except Exception as error:  # PyAV raises many types of exceptions
+            raise self._unreadable("pixels cannot be read", error) from None
 
     def _unreadable(self, what: str, error: Exception) -> InvalidFile:
         found = f"{what} ({reason_of(error)})"
@@ -216,11 +251,7 @@ class VideoReader:
                 found = f"{n_without:,} packets without a frame"
                 raise InvalidFile(self._path, found, "an intact video")
 
-    def _array(self, frame: av.VideoFrame, **how: str) -> NDArray[Any]:
+    def _check_size(self, frame: av.VideoFrame) -> None:
         if frame.width * frame.height > MAX_VIDEO_PIXELS:
             found = f"a frame of {frame.width}x{frame.height} px"
             raise InvalidFile(self._path, found, f"at most {MAX_VIDEO_PIXELS:,} pixels")
-        try:
-            return frame.to_ndarray(**how)
-        except Exception as error:  # PyAV raises many types of exceptions
-            raise self._unreadable("pixels cannot be read", error) from None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -14,8 +14,17 @@ from numpy.typing import NDArray
 EncodingFailed = av.FFmpegError
 """Base class of the errors of the encoder and the file formats."""
 
+BT709, LIMITED = 1, 1
+"""Codes of H.273 and of FFmpeg."""
+
+MAX_RATIO = 1000
+"""Largest denominator of the shape of a pixel."""
+
 MAX_DENOMINATOR = 1001
 """Largest denominator of a frame rate; that of NTSC, 30000/1001, is exact."""
+
+VARIABLE_TICK_S = Fraction(1, 90_000)
+"""Unit of the times of a video whose frame rate varies, as in MPEG."""
 
 BIT_EXACT = {"fflags": "+bitexact"}
 """Options that keep version names and random numbers out of files."""
@@ -53,6 +62,7 @@ def write_segment(
     *,
     kind: VideoKind,
     rate_hz: float,
+    pixel_aspect_ratio: Callable[[], float] = lambda: 1.0,
 ) -> None:
     """Write frames to a Matroska file.
 
@@ -67,6 +77,9 @@ def write_segment(
         Encoding.
     rate_hz : float
         Frame rate.
+    pixel_aspect_ratio : callable
+        Returns the width of a pixel relative to its height; called once the first frame
+        is there.
 
     Raises
     ------
@@ -79,7 +92,13 @@ def write_segment(
         for number, image in frames:
             if stream is None:
                 stream = _add_stream(container, image.shape, kind, rate)
+                ratio = Fraction(pixel_aspect_ratio()).limit_denominator(MAX_RATIO)
+                stream.codec_context.sample_aspect_ratio = ratio
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), "rgb24")
+            if kind.pixels.startswith("yuv"):
+                frame = frame.reformat(
+                    format=kind.pixels, dst_colorspace="ITU709", threads=1
+                )
             frame.pts, frame.time_base = number, 1 / rate
             container.mux(stream.encode(frame))
         if stream is not None:
@@ -98,6 +117,11 @@ def _add_stream(
     stream.width, stream.height, stream.pix_fmt = width_px, height_px, kind.pixels
     stream.codec_context.time_base = 1 / rate
     stream.codec_context.thread_count = 1
+    if kind.pixels.startswith("yuv"):
+        # Without tags, players guess the matrix from the size of the picture.
+        context = stream.codec_context
+        context.colorspace = context.color_primaries = context.color_trc = BT709
+        context.color_range = LIMITED
     return stream
 
 
@@ -117,7 +141,12 @@ def check_sides(width_px: int, height_px: int, kind: VideoKind) -> None:
 
 
 def join_segments(
-    path: Path, segments: Sequence[tuple[int, Path]], *, kind: VideoKind, rate_hz: float
+    path: Path,
+    segments: Sequence[tuple[int, Path]],
+    *,
+    kind: VideoKind,
+    rate_hz: float,
+    times_s: Sequence[Fraction] | None = None,
 ) -> None:
     """Join segments to a video without decoding them.
 
@@ -131,9 +160,12 @@ def join_segments(
     kind : VideoKind
         Encoding of the segments.
     rate_hz : float
-        Frame rate.
+        Frame rate of the segments.
+    times_s : sequence of Fraction, optional
+        Time of each frame of the video, if its frame rate varies.
     """
     rate = Fraction(rate_hz).limit_denominator(MAX_DENOMINATOR)
+    tick_s = 1 / rate if times_s is None else VARIABLE_TICK_S
     container_format = {".mkv": "matroska", ".mp4": "mp4"}[kind.suffix]
     with av.open(
         str(path), "w", format=container_format, options=BIT_EXACT
@@ -146,12 +178,22 @@ def join_segments(
                 own = source.streams.video[0]
                 if stream is None:
                     stream = container.add_stream_from_template(own)
-                    stream.time_base = 1 / rate
+                    stream.time_base = tick_s
                 for packet in source.demux(own):
                     if packet.pts is None:
                         continue
                     number = first + round(packet.pts * packet.time_base * rate)
-                    packet.pts = packet.dts = number
-                    packet.duration = 1
-                    packet.time_base, packet.stream = 1 / rate, stream
+                    packet.pts = packet.dts = _ticks(times_s, number)
+                    packet.duration = _ticks(times_s, number + 1) - packet.pts
+                    packet.time_base, packet.stream = tick_s, stream
                     container.mux(packet)
+
+
+def _ticks(times_s: Sequence[Fraction] | None, number: int) -> int:
+    """Return the time of a frame; after the last one, it is shown as long as before."""
+    if times_s is None:
+        return number
+    if number < len(times_s):
+        return round(times_s[number] / VARIABLE_TICK_S)
+    last_s, before_s = times_s[-1], times_s[-2] if len(times_s) > 1 else 0
+    return round((2 * last_s - before_s) / VARIABLE_TICK_S)

@@ -19,7 +19,13 @@ from clients.batch.source import BadFrame, SourceFrame, check_sizes
 from estimator.bounded_files import read_bytes
 from filter_service import Filtered, FilterError, RgbdView
 from filter_service.bounded_images import MAX_FILE_BYTES
-from filter_service.image_files import read_color, write_image
+from filter_service.camera import PixelGrid
+from filter_service.image_files import (
+    ImageFile,
+    named_note,
+    read_color_file,
+    write_image,
+)
 
 if TYPE_CHECKING:
     from clients.batch.video_reading import VideoReader
@@ -58,9 +64,10 @@ class Unit:
 
 @dataclass
 class FilteredPicture:
-    """A filtered frame, and its record without the file."""
+    """A filtered frame, the place of its pixels, and its record without the file."""
 
     filtered: Filtered
+    grid: PixelGrid
     record: Record
 
 
@@ -115,7 +122,7 @@ class UnitRunner:
         color = seen.filtered.color
 
         def write(path: Path) -> None:
-            write_image(path, color, png_level=PNG_LEVEL)
+            write_image(path, color, png_level=PNG_LEVEL, grid=seen.grid)
 
         try:
             written = write_whole(self._place(file), write)
@@ -130,8 +137,10 @@ class UnitRunner:
 
         assert unit.segment is not None
         records: list[Record] = []
+        ratio = 1.0
 
         def images() -> Iterator[tuple[int, NDArray[np.uint8]]]:
+            nonlocal ratio
             shape = None
             for number, frame in enumerate(unit.frames):
                 if not is_wanted():
@@ -142,6 +151,7 @@ class UnitRunner:
                     image = seen.filtered.color
                     shape = shape or image.shape
                     if image.shape == shape:
+                        ratio = seen.grid.pixel_aspect_ratio
                         yield number, image  # encoded before the next line runs
                         records.append(seen.record | {"cpu_ms": _cpu_ms_since(cpu_s)})
                         continue
@@ -150,7 +160,13 @@ class UnitRunner:
 
         def write(path: Path) -> None:
             kind, rate_hz = VIDEO_KINDS[self._job.format], self._job.rate_hz
-            write_segment(path, images(), kind=kind, rate_hz=rate_hz)
+            write_segment(
+                path,
+                images(),
+                kind=kind,
+                rate_hz=rate_hz,
+                pixel_aspect_ratio=lambda: ratio,
+            )
             path.touch()  # exists even without frames
 
         try:
@@ -189,10 +205,11 @@ class UnitRunner:
         if frame.fault is not None:
             raise BadFrame(frame.fault)
         start_s = time.perf_counter()
-        color, depth_m, inputs = self._read(frame)
-        check_sizes(frame, color, depth_m)
-        height_px, width_px = depth_m.shape
-        view = RgbdView(color, depth_m, frame.optics.tangents(width_px, height_px))
+        color, depth, inputs = self._read(frame)
+        check_sizes(frame, color, depth)
+        depth_m = depth.pixels
+        tangents = frame.optics.tangents(color.grid)
+        view = RgbdView(color.pixels, depth_m, tangents)
         pupil_mm, focus_dpt = self._job.states.of(frame.name, depth_m)
         read_ms, start_s = _ms_since(start_s), time.perf_counter()
         built_s = self._filter.build_s
@@ -208,18 +225,16 @@ class UnitRunner:
             "missing_depth_count": int(seen.missing_depth_count),
             "clamped_depth_count": int(seen.clamped_depth_count),
             "overflow_count": int(seen.overflow_count),
-            "notes": list(seen.notes),
+            "notes": [*color.notes, *depth.notes, *seen.notes],
             "inputs": inputs,
             "source": frame.described(),
             "ms": {"read": read_ms, "filter": _ms_since(start_s)},
         }
         if built_now:
             record["ms"]["build"] = 1e3 * (self._filter.build_s - built_s)
-        return FilteredPicture(seen, record)
+        return FilteredPicture(seen, color.grid, record)
 
-    def _read(
-        self, frame: SourceFrame
-    ) -> tuple[NDArray[Any], NDArray[np.float32], list[Record]]:
+    def _read(self, frame: SourceFrame) -> tuple[ImageFile, ImageFile, list[Record]]:
         """Return color, depth and the records of the image files.
 
         Each file is read once: the bytes that are decoded are those that are hashed,
@@ -235,14 +250,18 @@ class UnitRunner:
             return content
 
         if frame.color_index is None:
-            color = read_color(frame.color, option="", content=content_of(frame.color))
+            content = content_of(frame.color)
+            color = read_color_file(frame.color, option="", content=content)
         else:
             color = self._reader(frame.color).color(frame.color_index)
         if frame.depth_index is None:
             content = content_of(frame.depth)
             return color, frame.depth_form.read(frame.depth, content), inputs
         stored = self._reader(frame.depth).integers(frame.depth_index)
-        return color, frame.depth_form.of_integers(stored), inputs
+        depth_m, notes = frame.depth_form.of_integers(stored)
+        grid = PixelGrid(depth_m.shape[1], depth_m.shape[0])
+        named = tuple(named_note(frame.depth, note) for note in notes)
+        return color, ImageFile(depth_m, grid, named), inputs
 
     def _reader(self, path: Path) -> VideoReader:
         if path not in self._readers:

@@ -19,7 +19,7 @@ from clients.commands.console import (
 )
 from clients.commands.plan_text import print_plan
 from clients.commands.setting_options import with_setting_options
-from filter_service.camera import Camera, read_intrinsics
+from filter_service.camera import read_intrinsics
 from filter_service.settings import (
     MAX_PUPIL_MM,
     MAX_RENDER_TOLERANCE,
@@ -35,7 +35,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from estimator.profiles.parse import EyeProfile
+    from filter_service.camera import PixelGrid, Tangents
     from filter_service.filtering.filtered import EyeEvent, Filtered
+    from filter_service.image_files import ImageFile
     from filter_service.planning.nodes import CachePlan
     from filter_service.rgbd_view import RgbdView
     from filter_service.settings import FilterSettings
@@ -54,7 +56,7 @@ def filter_image(
         Path,
         typer.Option(
             metavar="IMG",
-            help="PNG or JPEG (sRGB), .npy (uint8 sRGB or linear floats) or .exr.  "
+            help="PNG, JPEG, PPM, .npy (uint8 sRGB or linear floats) or .exr.  "
             "Linear light may be above 1 and below 0.",
         ),
     ],
@@ -76,8 +78,9 @@ def filter_image(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Depth in meters: .npy, 32-bit float TIFF or .exr; or a 16-bit PNG "
-            "with --depth-scale.  inf is infinity; 0, negative and NaN are missing.",
+            help="Depth: floats in meters (.npy, TIFF, .exr, .pfm), or integers in "
+            "millimeters or units of --depth-scale (16-bit PNG, .pgm, TIFF, .npy).  "
+            "inf is infinity; 0, negative, NaN and 65535 of 16 bits are missing.",
         ),
     ] = None,
     distance_m: Annotated[
@@ -185,11 +188,11 @@ def filter_image(
     image_files.check_output(out)
     output = _output(out, half=half)
     eye = load_profile(profile)
-    view = _read_view(
+    view, grid, file_notes = _read_view(
         color,
         depth,
         distance_m=distance_m,
-        camera_of=partial(_camera, fov_deg, focal_px, intrinsics),
+        tangents_of=partial(_tangents, fov_deg, focal_px, intrinsics),
         depth_kind=depth_kind,
         depth_scale=depth_scale,
         hidden_paths=(hidden_color, hidden_depth),
@@ -217,7 +220,7 @@ def filter_image(
             output=output,
         )
     replace_atomically(
-        out, lambda part: image_files.write_image(part, filtered.seen.color)
+        out, lambda part: image_files.write_image(part, filtered.seen.color, grid=grid)
     )
     whole_ms = 1e3 * (time.perf_counter() - started_s)
     summary = _summary(
@@ -228,6 +231,7 @@ def filter_image(
         view=view,
         object_dpt=object_dpt,
         whole_ms=whole_ms,
+        file_notes=file_notes,
     )
     if json_output:
         print_json(summary)
@@ -244,23 +248,28 @@ def _check_one_of(options: dict[str, object]) -> None:
         raise ValueError(f"{found}: {problem}; allowed: one of {', '.join(options)}")
 
 
-def _camera(
+def _tangents(
     fov_deg: float | None,
     focal_px: float | None,
     intrinsics: str | None,
-    width_px: int,
-    height_px: int,
-) -> Camera:
-    """Return the camera of an image, from the one option that was given."""
+    grid: "PixelGrid",
+) -> "Tangents":
+    """Return the tangents of an image's edges, from the one option that was given."""
     if fov_deg is not None:
         check_range("--fov-deg", fov_deg, FOV_LIMITS_DEG)
-        return Camera.from_fov(fov_deg, width_px=width_px, height_px=height_px)
+        return grid.fov_tangents(fov_deg)
     if focal_px is not None:
         check_range("--focal-px", focal_px, FOCAL_LIMITS_PX)
-        lens = (focal_px, focal_px, (width_px - 1) / 2.0, (height_px - 1) / 2.0)
+        width_px, height_px = grid.full_width_px, grid.full_height_px
+        lens = (
+            focal_px / grid.pixel_aspect_ratio,
+            focal_px,
+            (width_px - 1) / 2.0,
+            (height_px - 1) / 2.0,
+        )
     else:
         lens = read_intrinsics(intrinsics or "")
-    return Camera.from_intrinsics(*lens, width_px=width_px, height_px=height_px)
+    return grid.intrinsics_tangents(*lens)
 
 
 def _planned(
@@ -339,73 +348,79 @@ def _read_view(
     depth_path: Path | None,
     *,
     distance_m: float | None,
-    camera_of: Callable[[int, int], Camera],
+    tangents_of: Callable[["PixelGrid"], "Tangents"],
     depth_kind: DepthKind,
     depth_scale: float | None,
     hidden_paths: tuple[Path | None, Path | None] = (None, None),
-) -> "RgbdView":
+) -> tuple["RgbdView", "PixelGrid", list[str]]:
+    """Return the view, the place of its pixels, and notes on the files."""
     import numpy as np
 
-    from filter_service.image_files import read_color, read_depth
+    from filter_service.image_files import read_color_file, read_depth_file
     from filter_service.rgbd_view import RgbdView
 
-    color = read_color(color_path)
+    color = read_color_file(color_path)
+    notes = [*color.notes]
     if depth_path is None:
-        depth_m = np.full(color.shape[:2], distance_m, np.float32)
+        depth_m = np.full(color.pixels.shape[:2], distance_m, np.float32)
     else:
-        depth_m = read_depth(depth_path, depth_scale=depth_scale)
-        _check_size("depth", depth_path, depth_m, color)
+        depth = read_depth_file(depth_path, depth_scale=depth_scale)
+        _check_place("depth", depth_path, depth, color)
+        depth_m = depth.pixels
+        notes += depth.notes
     hidden_color, hidden_depth_m = _read_hidden(
-        *hidden_paths, color=color, depth_scale=depth_scale
+        *hidden_paths, color=color, depth_scale=depth_scale, notes=notes
     )
-    height_px, width_px = color.shape[:2]
-    return RgbdView(
-        color=color,
+    view = RgbdView(
+        color=color.pixels,
         depth_m=depth_m,
-        tangents=camera_of(width_px, height_px).tangents,
+        tangents=tangents_of(color.grid),
         depth_kind=depth_kind,
         hidden_color=hidden_color,
         hidden_depth_m=hidden_depth_m,
     )
+    return view, color.grid, notes
 
 
 def _read_hidden(
     color_path: Path | None,
     depth_path: Path | None,
     *,
-    color: "NDArray[Any]",
+    color: "ImageFile",
     depth_scale: float | None,
+    notes: list[str],
 ) -> tuple["NDArray[Any] | None", "NDArray[Any] | None"]:
-    """Return color and depth of the hidden layer, or None for both."""
-    from filter_service.image_files import read_color, read_depth
+    """Return color and depth of the hidden layer, or None for both; add notes."""
+    from filter_service.image_files import read_color_file, read_depth_file
 
     if color_path is None and depth_path is None:
         return None, None
     if color_path is None or depth_path is None:
         missing = "--hidden-color" if color_path is None else "--hidden-depth"
         raise ValueError(f"{missing} is not given; allowed: both files or neither")
-    hidden = read_color(color_path, option="hidden-color")
-    _check_size("hidden-color", color_path, hidden, color)
-    if hidden.dtype != color.dtype:
+    hidden = read_color_file(color_path, option="hidden-color")
+    _check_place("hidden-color", color_path, hidden, color)
+    if hidden.pixels.dtype != color.pixels.dtype:
         raise ValueError(
-            f"--hidden-color '{color_path}': {hidden.dtype}; "
-            f"allowed: {color.dtype}, as the color image"
+            f"--hidden-color '{color_path}': {hidden.pixels.dtype}; "
+            f"allowed: {color.pixels.dtype}, as the color image"
         )
-    depth_m = read_depth(depth_path, depth_scale=depth_scale, option="hidden-depth")
-    _check_size("hidden-depth", depth_path, depth_m, color)
-    return hidden, depth_m
+    depth = read_depth_file(depth_path, depth_scale=depth_scale, option="hidden-depth")
+    _check_place("hidden-depth", depth_path, depth, color)
+    notes += [*hidden.notes, *depth.notes]
+    return hidden.pixels, depth.pixels
 
 
-def _check_size(
-    option: str, path: Path, image: "NDArray[Any]", color: "NDArray[Any]"
+def _check_place(
+    option: str, path: Path, image: "ImageFile", color: "ImageFile"
 ) -> None:
-    if image.shape[:2] == color.shape[:2]:
+    if (problem := color.grid.difference(image.grid)) is None:
         return
+    found, wanted = problem
     text = (
-        f"--{option} '{path}': {image.shape[1]}x{image.shape[0]} px; allowed: "
-        f"the size of the color image, {color.shape[1]}x{color.shape[0]}"
+        f"--{option} '{path}': {found}; allowed: the size of the color image, {wanted}"
     )
-    if image.shape[:2] == color.shape[1::-1]:
+    if image.pixels.shape[:2] == color.pixels.shape[1::-1]:
         text += " (photographs are rotated upright according to their EXIF data)"
     raise ValueError(text)
 
@@ -419,6 +434,7 @@ def _summary(
     view: "RgbdView",
     object_dpt: tuple[float, float],
     whole_ms: float,
+    file_notes: list[str],
 ) -> dict[str, Any]:
     seen = filtered.seen
     height_px, width_px = seen.color.shape[:2]
@@ -441,7 +457,7 @@ def _summary(
         "engine": filtered.engine,
         "renderer": filtered.renderer,
         "settings": vars(settings),
-        "notes": [*filtered.eye_notes, *seen.notes],
+        "notes": [*file_notes, *filtered.eye_notes, *seen.notes],
     }
 
 

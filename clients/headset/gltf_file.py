@@ -18,7 +18,7 @@ from clients.headset.gltf_arrays import accessor_array, accessor_count
 from clients.headset.gltf_container import Container
 from clients.headset.gltf_nodes import placed_meshes
 from clients.scenes.geometry import Array
-from filter_service.bounded_images import check_picture, read_picture_rgb
+from filter_service.pictures import check_picture, read_texture
 
 MAX_TRIANGLES = 2_000_000
 MAX_VERTICES = 6_000_000
@@ -293,7 +293,7 @@ class _Textures:
             return None
         if index not in self._decoded:
             content, name = self._content(index), self._name(index)
-            self._decoded[index] = read_picture_rgb(content, name=name, upright=False)
+            self._decoded[index] = read_texture(content, name=name)
         return self._decoded[index]
 
     def _image_of(self, material: dict[str, Any]) -> int | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -14,8 +13,8 @@ from PIL import Image
 
 from estimator import InvalidFile
 from filter_service import Camera, RgbdView
-from filter_service.bounded_images import read_picture_rgb
-from filter_service.image_files import read_depth
+from filter_service.image_files import named_note, read_depth_file
+from filter_service.pictures import read_picture_srgb8
 
 MAX_WIDTH_PX, MAX_HEIGHT_PX = 960, 720
 """Size limit of the full picture; larger pictures are reduced."""
@@ -34,7 +33,7 @@ used decoders."""
 
 DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff", ".exr")
 FAR_DPT = 0.0
-DEPTH_HELP = ".npy or .exr in meters, 16-bit .png in millimeters, float .tif"
+DEPTH_HELP = "floats in meters (.npy, .exr, .tif), integers in millimeters (.png, .npy)"
 
 
 class ChartRow(NamedTuple):
@@ -58,6 +57,7 @@ class Picture:
     focus_dpt, pupil_diameter_mm : an initial state, or None
     chart_rows : the rows of a chart, from the top
     follows_gaze : whether its center stays on the line of sight
+    notes : on what the files do not show, or likely mistakes
     """
 
     title: str
@@ -68,6 +68,7 @@ class Picture:
     pupil_diameter_mm: float | None = None
     chart_rows: tuple[ChartRow, ...] = ()
     follows_gaze: bool = False
+    notes: tuple[str, ...] = ()
 
     @property
     def aspect_ratio(self) -> float:
@@ -204,22 +205,23 @@ def photo_picture(
     InvalidFile
         If a file is not a picture, or the depth has another shape.
     """
-    color = _photo_color(name, content)
+    color, notes = _photo_color(name, content)
     height_px, width_px = color.shape[:2]
     depth_m = None
     if depth is not None:
-        depth_m = _photo_depth(*depth, shape=(height_px, width_px))
+        depth_m, depth_notes = _photo_depth(*depth, shape=(height_px, width_px))
+        notes += depth_notes
     factor = max(1.0, width_px / MAX_WIDTH_PX, height_px / MAX_HEIGHT_PX)
     right = math.tan(math.radians(width_deg) / 2.0)
     up = right * height_px / width_px
     tangents, title = (-right, right, up, -up), Path(name).name[:60]
     if depth_m is not None:
         view = coarser(RgbdView(color, depth_m, tangents), math.ceil(factor))
-        return picture_of(title, view)
+        return replace(picture_of(title, view), notes=notes)
     color = _resized(color, round(width_px / factor), round(height_px / factor))
     view = RgbdView(color, np.ones(color.shape[:2], np.float32), tangents)
     flat = picture_of(title, view, distance_dpt=math.nan)
-    return flat.at(distance_dpt)
+    return replace(flat.at(distance_dpt), notes=notes)
 
 
 def _resized(
@@ -237,11 +239,15 @@ def _resized(
     return srgb8_from_linear(np.stack([np.asarray(p) for p in planes], axis=-1))
 
 
-def _photo_color(name: str, content: bytes) -> NDArray[np.uint8]:
-    allowed = "an 8-bit JPEG, PNG, WebP or TIFF picture"
+def _photo_color(
+    name: str, content: bytes
+) -> tuple[NDArray[np.uint8], tuple[str, ...]]:
+    allowed = "a JPEG, PNG, WebP or TIFF picture"
     _check_size(name, content)
     try:
-        color = read_picture_rgb(content, name=name[:60], formats=PHOTO_FORMATS)
+        color, notes = read_picture_srgb8(
+            content, name=name[:60], formats=PHOTO_FORMATS
+        )
     except InvalidFile as error:
         if error.found.startswith("cannot be read"):
             raise InvalidFile(name[:60], "not a picture", allowed) from None
@@ -251,30 +257,28 @@ def _photo_color(name: str, content: bytes) -> NDArray[np.uint8]:
         size = f"{color.shape[1]} × {color.shape[0]} px"
         allowed = f"{MIN_SIDE_PX} or more, and at most {MAX_SIDE_RATIO} to 1"
         raise InvalidFile(name[:60], size, allowed)
-    return color
+    return color, tuple(named_note(Path(name), note) for note in notes)
 
 
 def _photo_depth(
     name: str, content: bytes, *, shape: tuple[int, int]
-) -> NDArray[np.float32]:
+) -> tuple[NDArray[np.float32], tuple[str, ...]]:
     _check_size(name, content)
     suffix = Path(name).suffix.lower()
     if suffix not in DEPTH_SUFFIXES:
         allowed = ", ".join(DEPTH_SUFFIXES)
         raise ValueError(f"“{name:.60}” is not a depth file; allowed: {allowed}")
-    with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
-        path = Path(folder) / f"depth{suffix}"
-        path.write_bytes(content)
-        try:
-            depth_m = read_depth(path, option="")
-        except InvalidFile as error:
-            shown = Path(name).name[:60]
-            raise InvalidFile(shown, error.found, error.allowed) from None
+    shown = Path(name).name[:60]
+    try:
+        file = read_depth_file(Path(f"depth{suffix}"), option="", content=content)
+    except InvalidFile as error:
+        raise InvalidFile(shown, error.found, error.allowed) from None
+    depth_m = file.pixels
     if depth_m.shape != shape:
         found, wanted = (f"{w} × {h} px" for h, w in (depth_m.shape, shape))
         allowed = f"the size of the photo, {wanted}"
         raise InvalidFile(name[:60], found, allowed)
-    return depth_m
+    return depth_m, file.notes
 
 
 def _check_size(name: str, content: bytes) -> None:

@@ -64,6 +64,7 @@ class ScenePanel:
         self._n_waiting = 0
         self._photo: NamedFile | None = None
         self._depth: NamedFile | None = None
+        self._notes: tuple[str, ...] = ()
         self._width_deg = 35
         with ui.element("div").classes("oc-scene"):
             self._kinds = (
@@ -116,7 +117,7 @@ class ScenePanel:
         text = f"In use: {', '.join(names)}" if names else ""
         if names and self._photo is None:
             text += ". Now upload the photo that this depth belongs to."
-        self._used.text = text
+        self._used.text = ". Note: ".join((text, *self._notes))
 
     @property
     def kind(self) -> str:
@@ -181,7 +182,7 @@ class ScenePanel:
 
     async def _show_photo(self, photo: NamedFile, depth: NamedFile | None) -> None:
         """Show a photo; if one of its files is rejected, keep the previous ones."""
-        await self._compute(
+        picture = await self._compute(
             photo_picture,
             *photo,
             width_deg=self._width_deg,
@@ -189,6 +190,7 @@ class ScenePanel:
             depth=depth,
         )
         self._photo, self._depth = photo, depth
+        self._notes = () if picture is None else picture.notes
         self._show_files()
 
     async def _compute(

@@ -118,7 +118,7 @@ def kinds(folder: Path) -> list[Kind]:
     from estimator.periphery.measured_eyes import load_measured_eyes
     from estimator.profiles.files import load_profile
     from estimator.profiles.parse import parse_profile
-    from filter_service.image_files import read_color, read_depth
+    from filter_service.image_files import read_color_file, read_depth_file
     from filter_service.keys import load_client_key
     from filter_service.psfs.store_cache import StoreCache
     from filter_service.service.config import load_config
@@ -129,7 +129,7 @@ def kinds(folder: Path) -> list[Kind]:
     write_beside(folder, pictures)
 
     def depth(path: Path) -> object:
-        return read_depth(path, depth_scale=0.001)
+        return read_depth_file(path, depth_scale=0.001)
 
     def photo(path: Path) -> object:
         content = path.read_bytes()
@@ -170,10 +170,10 @@ def kinds(folder: Path) -> list[Kind]:
 
     as_color = ("filter", "--fov-deg", "50", "--plan", "--profile")
     return [
-        Kind("color", of(".png", ".jpg", ".ppm"), read_color, _color_command),
+        Kind("color", of(".png", ".jpg", ".ppm"), read_color_file, _color_command),
         Kind("depth", of("g16.png", ".tif", ".pfm", ".pgm"), depth, _depth_command),
-        Kind("npy", of(".npy"), _either(read_color, depth), _color_command),
-        Kind("OpenEXR", of(".exr"), _either(read_color, depth), _color_command),
+        Kind("npy", of(".npy"), _either(read_color_file, depth), _color_command),
+        Kind("OpenEXR", of(".exr"), _either(read_color_file, depth), _color_command),
         Kind("photo", of("c.png", ".jpg", ".webp", ".tif"), photo),
         Kind(
             "profile",

@@ -40,7 +40,9 @@ MAY_IMPORT = {
         "filter_service.settings",
         "filter_service.camera",  # and its options
         "filter_service.image_files",  # pictures and depth in files
-        "filter_service.bounded_images",  # and those that were sent
+        "filter_service.pictures",  # and those that were sent
+        "filter_service.bounded_images",  # and their limits
+        "filter_service.color_encoding",  # colors of videos
         "estimator.bounded_files",  # text and JSON of files
         "estimator.profile_body",  # a profile as plain values
         "estimator.parse_profile",  # and whether it is one
@@ -189,9 +191,10 @@ HOME = {
         "estimator/field/plot.py",  # `ocufilter field --plot`
         "training/learning_curve.py",
     ),
-    "OpenEXR": ("filter_service/bounded_images.py", "filter_service/image_files.py"),
+    "OpenEXR": ("filter_service/exr_files.py",),
     "PIL": (
-        "filter_service/bounded_images.py",  # reads
+        "filter_service/bounded_images.py",  # opens
+        "filter_service/pictures.py",  # reads
         "filter_service/image_files.py",  # writes
         "filter_service/psfs/picture.py",
         "clients/*",  # captions, textures, contact sheet

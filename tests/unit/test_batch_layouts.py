@@ -14,6 +14,7 @@ from clients.batch.layouts import LayoutOptions, list_frames, optics_of
 from clients.batch.source import FieldOfView, Pinhole, Scaled, center_depth_m
 from clients.batch.states import States, read_states
 from clients.batch.work import Unit, UnitRunner
+from filter_service.camera import PixelGrid
 from filter_service.settings import FilterSettings
 
 FOV = LayoutOptions(optics=FieldOfView(40.0))
@@ -66,22 +67,22 @@ def test_tum_joins_what_is_nearest_in_time_and_uses_each_once(tum):
     ]
 
 
-def test_tum_depth_is_5000_units_a_meter_and_0_is_missing(tum):
+def test_tum_depth_is_5000_units_a_meter_and_0_and_65535_are_missing(tum):
     _, frames = list_frames(tum, "auto", LayoutOptions())
-    depth_m = frames[0].depth_form.read(frames[0].depth)
-    np.testing.assert_allclose(depth_m, [[1.0, 0.0, 0.0002, 13.107]], rtol=1e-6)
+    depth_m = frames[0].depth_form.read(frames[0].depth).pixels
+    np.testing.assert_allclose(depth_m, [[1.0, 0.0, 0.0002, 0.0]], rtol=1e-6)
 
 
 def test_tum_has_the_camera_of_the_driver_unless_told_otherwise(tum):
     _, frames = list_frames(tum, "auto", LayoutOptions())
-    left, right, up, down = frames[0].optics.tangents(640, 480)
+    left, right, up, down = frames[0].optics.tangents(PixelGrid(640, 480))
     np.testing.assert_allclose([left, right], [-320 / 525, 320 / 525])
     np.testing.assert_allclose([up, down], [240 / 525, -240 / 525])
     _, frames = list_frames(
         tum, "auto", LayoutOptions(optics=Pinhole(100.0, 50.0, 0.0, 0.0))
     )
     np.testing.assert_allclose(
-        frames[0].optics.tangents(4, 2), [-0.005, 0.035, 0.01, -0.03]
+        frames[0].optics.tangents(PixelGrid(4, 2)), [-0.005, 0.035, 0.01, -0.03]
     )
 
 
@@ -124,7 +125,7 @@ def test_middlebury_depth_is_focal_length_times_baseline_over_disparity(tmp_path
     layout, frames = list_frames(tmp_path, "auto", LayoutOptions())
     assert layout == "middlebury"
     assert [frame.name for frame in frames] == ["Adirondack", "Piano"]
-    depth_m = frames[0].depth_form.read(frames[0].depth)
+    depth_m = frames[0].depth_form.read(frames[0].depth).pixels
     # 4000 px 0.2 m = 800 px m; over 200, 400, unknown, 100; 160, 800, unknown, 1600
     np.testing.assert_allclose(depth_m, [[4, 2, 0, 8], [5, 1, 0, 0.5]])
 
@@ -133,7 +134,7 @@ def test_middlebury_has_its_calibrations_camera(tmp_path):
     write_scene(tmp_path)
     _, (frame,) = list_frames(tmp_path, "auto", LayoutOptions())
     np.testing.assert_allclose(
-        frame.optics.tangents(4, 2),
+        frame.optics.tangents(PixelGrid(4, 2)),
         [-1.75 / 4000, 2.25 / 4000, 1.0 / 4000, -1.0 / 4000],
     )
     assert frame.name == tmp_path.name
@@ -155,9 +156,9 @@ def test_nyu_pairs_are_millimeters_with_the_color_camera_of_the_toolbox(tmp_path
     write_integers(tmp_path / "00001_depth.png", [[1500, 0, 9999, 1]] * 2)
     layout, (frame,) = list_frames(tmp_path, "auto", LayoutOptions())
     assert (layout, frame.name) == ("nyu", "00001")
-    depth_m = frame.depth_form.read(frame.depth)
+    depth_m = frame.depth_form.read(frame.depth).pixels
     np.testing.assert_allclose(depth_m[0], [1.5, 0.0, 9.999, 0.001], rtol=1e-6)
-    left, right, _, _ = frame.optics.tangents(640, 480)
+    left, right, _, _ = frame.optics.tangents(PixelGrid(640, 480))
     np.testing.assert_allclose(right - left, 640 / 518.857901, rtol=1e-8)
 
 
@@ -166,7 +167,7 @@ def test_a_camera_of_other_images_is_refused(tmp_path):
     write_integers(tmp_path / "00001_depth.png", [[1, 2, 3, 4]] * 2)
     _, (frame,) = list_frames(tmp_path, "auto", LayoutOptions())
     with pytest.raises(ValueError, match=r"4x2 px, but the camera .* is for 640x480"):
-        frame.optics.tangents(4, 2)
+        frame.optics.tangents(PixelGrid(4, 2))
 
 
 def test_pairs_that_are_only_like_nyu_are_not_taken_for_it(tmp_path):
@@ -215,7 +216,7 @@ def test_nyu_raw_frames_take_the_depth_nearest_in_time(tmp_path):
     layout, frames = list_frames(tmp_path, "auto", LayoutOptions())
     assert layout == "nyu"
     assert [frame.depth.name for frame in frames] == ["d-99.90-9.pgm", "d-100.45-9.pgm"]
-    depth_m = frames[0].depth_form.read(frames[0].depth)
+    depth_m = frames[0].depth_form.read(frames[0].depth).pixels
     known_m = depth_m[depth_m > 0.0]
     assert known_m.size > 0.5 * depth_m.size
     # a flat wall, seen by a camera that is turned by less than half a degree
@@ -247,7 +248,7 @@ def test_pairs_in_two_folders_take_every_kind_of_depth(tmp_path, suffix):
         Image.fromarray(depth_m).save(path)
     layout, (frame,) = list_frames(tmp_path, "auto", FOV)
     assert (layout, frame.name) == ("pairs", "a")
-    np.testing.assert_array_equal(frame.depth_form.read(frame.depth), depth_m)
+    np.testing.assert_array_equal(frame.depth_form.read(frame.depth).pixels, depth_m)
 
 
 def test_pairs_beside_each_other_are_told_apart_by_their_names(tmp_path):
@@ -277,7 +278,7 @@ def test_a_scale_that_is_told_is_used(tmp_path):
     _, (frame,) = list_frames(tmp_path, "auto", told)
     assert frame.depth_form == Scaled(0.25)
     np.testing.assert_array_equal(
-        frame.depth_form.read(frame.depth)[0], [0.25, 0.5, 0.75, 1.0]
+        frame.depth_form.read(frame.depth).pixels[0], [0.25, 0.5, 0.75, 1.0]
     )
 
 
@@ -293,7 +294,7 @@ def test_without_a_calibration_the_field_of_view_is_asked_for(tmp_path):
 
 
 def test_a_field_of_view_is_the_vertical_one():
-    left, right, up, down = FieldOfView(90.0).tangents(200, 100)
+    left, right, up, down = FieldOfView(90.0).tangents(PixelGrid(200, 100))
     np.testing.assert_allclose([left, right, up, down], [-2.0, 2.0, 1.0, -1.0])
 
 
@@ -325,7 +326,7 @@ def test_frames_of_videos_are_read_by_their_numbers_in_any_order(tmp_path, rng):
     with VideoReader(tmp_path / "c.mp4") as reader:
         assert (reader.count, reader.rate_hz) == (20, 25.0)
         for index in (0, 1, 2, 13, 3, 19, 12, 13):
-            assert abs(reader.color(index).mean() - grays[index]) < 3.0
+            assert abs(reader.color(index).pixels.mean() - grays[index]) < 3.0
     with VideoReader(tmp_path / "d.mkv") as reader:
         for index in (7, 8, 2, 19):
             np.testing.assert_array_equal(reader.integers(index), depths[index])
@@ -354,7 +355,7 @@ def test_depth_of_a_video_is_scaled_and_other_pixels_are_refused(tmp_path):
     told = LayoutOptions(tmp_path / "c.mkv", FieldOfView(40.0))
     _, others = list_frames(tmp_path / "c.mkv", "auto", told)
     with VideoReader(frames[2].color) as reader:
-        assert (reader.color(frames[2].color_index) == 99).all()
+        assert (reader.color(frames[2].color_index).pixels == 99).all()
     job = Job({}, FilterSettings(), ReadOnly(4.0, 0.0))
     with closing(UnitRunner(job, tmp_path)) as runner:
         read, refused = runner.run(Unit(0, "eye", (frames[2], others[0])))

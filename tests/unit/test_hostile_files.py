@@ -567,7 +567,7 @@ def test_videos_that_are_none(tmp_path, content):
     video_reading = pytest.importorskip("clients.batch.video_reading")
     path = tmp_path / "a.mkv"
     path.write_bytes(content)
-    refused(video_reading.frame_count, path, "cannot be read")
+    refused(video_reading.VideoReader, path, "cannot be read")
 
 
 def test_a_video_of_frames_that_are_too_large(tmp_path, monkeypatch):
@@ -577,11 +577,12 @@ def test_a_video_of_frames_that_are_too_large(tmp_path, monkeypatch):
     path = tmp_path / "a.mkv"
     frames = [(k, np.zeros((64, 64, 3), np.uint8)) for k in range(4)]
     write_segment(path, iter(frames), kind=VIDEO_KINDS["ffv1"], rate_hz=30.0)
-    assert video_reading.frame_count(path) == 4
+    with video_reading.VideoReader(path) as reader:
+        assert reader.count == 4
     monkeypatch.setattr(video_reading, "MAX_VIDEO_FRAMES", 3)
-    refused(video_reading.frame_count, path, "more than 3 frames")
+    refused(video_reading.VideoReader, path, "more than 3 frames")
     monkeypatch.setattr(video_reading, "MAX_VIDEO_PIXELS", 1000)
-    refused(video_reading.frame_count, path, "64x64 px")
+    refused(video_reading.VideoReader, path, "64x64 px")
 
 
 # ----- what is written, and told of it

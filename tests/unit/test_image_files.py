@@ -15,7 +15,7 @@ from filter_service.image_files import (
 
 @pytest.fixture
 def linear(rng):
-    return rng.random((5, 7, 3), dtype=np.float32) * 40.0  # above 1: no clipping
+    return rng.random((5, 7, 3), dtype=np.float32) ** 8 * 40.0  # above 1: no clipping
 
 
 @pytest.mark.parametrize("suffix", [".npy", ".exr"])
@@ -25,8 +25,9 @@ def test_linear_light_survives_a_file_exactly(tmp_path, linear, suffix):
     np.testing.assert_array_equal(read_color(path), linear)
 
 
-def test_png_keeps_srgb_bytes_and_drops_alpha(tmp_path, rng):
+def test_png_keeps_srgb_bytes_and_opaque_alpha(tmp_path, rng):
     srgb = rng.integers(0, 256, (5, 7, 4), dtype=np.uint8)
+    srgb[..., 3] = 255
     Image.fromarray(srgb).save(tmp_path / "rgba.png")
     np.testing.assert_array_equal(read_color(tmp_path / "rgba.png"), srgb[:, :, :3])
 
@@ -52,12 +53,12 @@ def test_exr_channels_come_back_in_rgb_order(tmp_path):
 @pytest.mark.parametrize(
     ("dtype", "depth_scale", "expected_m"),
     [
-        (np.float32, None, [1500.0, np.inf, 0.0]),
-        (np.float64, 0.5, [750.0, np.inf, 0.0]),
+        (np.float32, None, [15.0, np.inf, 0.0]),
+        (np.float64, 0.5, [7.5, np.inf, 0.0]),
     ],
 )
 def test_float_depth_keeps_infinity_and_holes(tmp_path, dtype, depth_scale, expected_m):
-    np.save(tmp_path / "depth.npy", np.array([[1500.0, np.inf, 0.0]], dtype))
+    np.save(tmp_path / "depth.npy", np.array([[15.0, np.inf, 0.0]], dtype))
     depth_m = read_depth(tmp_path / "depth.npy", depth_scale=depth_scale)
     assert depth_m.dtype == np.float32
     np.testing.assert_array_equal(depth_m, [expected_m])

@@ -1,0 +1,440 @@
+"""Color and depth of pictures that Pillow decodes, and of PPM and PGM files.
+
+Colors are sRGB of 8 bits, or linear light if the file has 16 bits or is HDR.  Color
+profiles, opacity and orientation are applied.  Pillow reads 16-bit RGB as 8 bits, and
+scales PGM values of other maxima than 255 to 65535, so these are read here.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ExifTags, Image, ImageCms
+
+from filter_service.bounded_images import (
+    FORMATS,
+    Container,
+    InvalidImage,
+    Source,
+    check_deep_pixels,
+    decoded,
+    open_picture,
+)
+from filter_service.color_encoding import (
+    ADOBE_RGB,
+    BT709,
+    SRGB,
+    Codes,
+    Curve,
+    Encoding,
+    encoding_of_codes,
+    encoding_of_icc,
+    over_black,
+    power_curve,
+    srgb8_of,
+    srgb_curve,
+    srgb_from_primaries,
+)
+from filter_service.pnm_files import is_pnm, pnm_color, pnm_values
+
+GAMMA_OF_SRGB = (1.0 / 2.2, 0.005)
+"""Value of gAMA that programs write with sRGB, and the tolerance."""
+
+GAMMA_LIMITS = (0.1, 10.0)
+
+# Bytes of the second decoding of a PNG of 16 bits: rows are decoded alike, and the mode
+# selects which bytes Pillow keeps.
+_LOW_BYTES = {"RGB;16B": "RGB;16L", "RGBA;16B": "RGBA;16L"}
+_GRAY_ALPHA = "LA;16B"
+_WITH_ALPHA = ("LA", "PA", "RGBA", "La", "RGBa")
+
+
+@dataclass
+class _Stored:
+    """Pixels as stored, and what is needed to show them.
+
+    Attributes
+    ----------
+    codes : (height, width, 3), uint8 or uint16
+    alpha : (height, width) of the same type, or None
+    encoding : Encoding
+    orientation : int
+        As in EXIF: 1 is upright.
+    """
+
+    codes: Codes
+    alpha: Codes | None = None
+    encoding: Encoding = SRGB
+    orientation: int = 1
+    notes: list[str] = field(default_factory=list)
+
+
+def read_picture_color(
+    source: Source,
+    *,
+    name: str = "",
+    option: str = "",
+    formats: Sequence[str] = FORMATS,
+) -> tuple[NDArray[np.uint8] | NDArray[np.float32], list[str]]:
+    """Return the colors of an image, upright, and notes on what they do not show.
+
+    Parameters
+    ----------
+    source : Path or bytes
+        The file, or its content.
+    name : str
+        Name of the image in error messages; its path by default.
+    option : str
+        Option that requested it, for error messages.
+    formats : sequence of str
+        Pillow's names of the accepted formats, regardless of the file's suffix.
+
+    Returns
+    -------
+    color : (height, width, 3)
+        uint8 sRGB; float32 linear sRGB if the image has 16 bits or is HDR.
+    notes : list of str
+
+    Raises
+    ------
+    InvalidFile
+    """
+    with open_picture(source, name, option) as file:
+        stored = _stored(file, formats)
+        return shown(
+            upright(stored.codes, stored.orientation),
+            None if stored.alpha is None else upright(stored.alpha, stored.orientation),
+            stored.encoding,
+            stored.notes,
+        ), stored.notes
+
+
+def read_picture_srgb8(
+    source: Source, *, name: str = "", formats: Sequence[str] = FORMATS
+) -> tuple[NDArray[np.uint8], list[str]]:
+    """Return the colors of an image as 8-bit sRGB; see `read_picture_color`.
+
+    Raises
+    ------
+    InvalidFile
+    """
+    color, notes = read_picture_color(source, name=name, formats=formats)
+    if color.dtype != np.uint8:
+        if (share := float((color > 1.001).any(axis=2).mean())) > 0.0:
+            notes.append(f"{100.0 * share:.2g} % of the pixels are brighter than white")
+        return srgb8_of(cast("NDArray[np.float32]", color)), notes
+    return cast("NDArray[np.uint8]", color), notes
+
+
+def read_texture(source: Source, *, name: str = "") -> NDArray[np.uint8]:
+    """Return the RGB values of a glTF texture (height, width, 3) as stored.
+
+    The format requires that color profiles and orientation are ignored, and opacity is
+    a property of the material.
+
+    Raises
+    ------
+    InvalidFile
+    """
+    with open_picture(source, name, "") as file, decoded(file) as (image, _):
+        if image.mode.startswith(("I", "F")):
+            raise InvalidImage(f"mode {image.mode}", "8 bits per channel")
+        return _converted(image, "RGB")
+
+
+def read_picture_values(
+    source: Source, *, name: str = "", option: str = ""
+) -> tuple[NDArray[Any], list[str]]:
+    """Return the stored values of an image, upright, as needed for depth files.
+
+    Raises
+    ------
+    InvalidFile
+    """
+    notes: list[str] = []
+    with open_picture(source, name, option) as file:
+        if is_pnm(file):
+            return pnm_values(file)[0], notes
+        with decoded(file) as (image, container):
+            if image.mode in ("P", "PA"):
+                raise InvalidImage("a palette of colors", "one channel of numbers")
+            raw = _raw_mode(image)
+            values = np.asarray(image)
+            if raw.startswith("I;16") and values.dtype != np.uint16:
+                values = values.astype(np.uint16)
+            _note_pages(image, container, notes)
+            return upright(values, _orientation(image)), notes
+
+
+def check_picture(source: Source, *, name: str = "", option: str = "") -> int:
+    """Check an image's format and size without decoding it; return its pixel count.
+
+    Raises
+    ------
+    InvalidFile
+    """
+    with open_picture(source, name, option) as file, decoded(file) as (image, _):
+        return image.width * image.height
+
+
+def shown(
+    codes: Codes, alpha: Codes | None, encoding: Encoding, notes: list[str]
+) -> NDArray[np.uint8] | NDArray[np.float32]:
+    """Return codes (height, width, 3) in sRGB or linear light, over black.
+
+    Parameters
+    ----------
+    codes : uint8 or uint16
+    alpha : (height, width) of the same type, or None
+        Opacity.
+    notes : list of str
+        A note is added if pixels are transparent.
+    """
+    top = np.iinfo(codes.dtype).max
+    if alpha is not None:
+        share = float((alpha < top).mean())
+        if share == 0.0:
+            alpha = None
+        else:
+            notes.append(
+                f"{100.0 * share:.2g} % of the pixels are transparent; black is behind "
+                "them"
+            )
+    if codes.dtype == np.uint8 and not encoding.is_hdr:
+        codes8 = cast("NDArray[np.uint8]", codes)
+        srgb = codes8 if encoding is SRGB else encoding.srgb8(codes8)
+        if alpha is None:
+            return np.ascontiguousarray(srgb)
+        return over_black(srgb, cast("NDArray[np.uint8]", alpha))
+    linear = encoding.linear(codes)
+    if alpha is not None:
+        linear *= (alpha / np.float32(top))[..., None]
+    return linear
+
+
+def upright(values: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Return an image without its orientation of EXIF, 1 to 8; others are upright."""
+    if orientation in (5, 6, 7, 8):
+        values = np.swapaxes(values, 0, 1)
+    if orientation in (2, 3, 6, 7):
+        values = values[:, ::-1]
+    if orientation in (3, 4, 7, 8):
+        values = values[::-1]
+    return np.ascontiguousarray(values)
+
+
+# --- pixels ------------------------------------------------------------------
+
+
+def _stored(file: BinaryIO, formats: Sequence[str]) -> _Stored:
+    if "PPM" in formats and is_pnm(file):
+        return _Stored(pnm_color(file))
+    with decoded(file, formats) as (image, container):
+        raw = _raw_mode(image)
+        notes: list[str] = []
+        codes: Codes
+        alpha: Codes | None
+        is_deep = image.format == "PNG" and ";16" in raw
+        if is_deep or image.mode.startswith("I;16"):
+            codes, alpha = _deep_codes(file, image, raw)
+            tables = None
+            encoding = _encoding(image, container, notes)
+            if isinstance(encoding, bytes):
+                raise InvalidImage(
+                    "16 bits per channel with a color profile of lookup tables",
+                    "8 bits, or a profile of a matrix and curves",
+                )
+        else:
+            if image.mode.startswith(("I", "F")):
+                raise InvalidImage(f"mode {image.mode}", "8 or 16 bits per channel")
+            if ";16" in raw:
+                notes.append("16 bits per channel are read as 8")
+            image.load()
+            encoding = _encoding(image, container, notes)
+            tables = encoding if isinstance(encoding, bytes) else None
+            codes, alpha = _codes(image, tables, notes)
+        _note_pages(image, container, notes)
+        _note_resolution(image, notes)
+        if isinstance(encoding, bytes):
+            encoding = SRGB
+        return _Stored(codes, alpha, encoding, _orientation(image), notes)
+
+
+def _raw_mode(image: Image.Image) -> str:
+    """Return how pixels are stored, in Pillow's words; only before they are decoded."""
+    tiles = getattr(image, "tile", None)
+    if not tiles:
+        return ""
+    how = tiles[0][3]
+    return str(how if isinstance(how, str) or not how else how[0])
+
+
+def _codes(
+    image: Image.Image, tables: bytes | None, notes: list[str]
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+    """Return RGB of 8 bits, and the opacity if there is any."""
+    alpha = None
+    if image.mode in _WITH_ALPHA or "transparency" in image.info:
+        rgba = _converted(image, "RGBA")
+        codes, alpha = rgba[..., :3], np.ascontiguousarray(rgba[..., 3])
+        if tables is None:
+            return np.ascontiguousarray(codes), alpha
+    if tables is not None:
+        plain = image if image.mode in ("RGB", "CMYK") else image.convert("RGB")
+        try:
+            srgb = ImageCms.profileToProfile(
+                plain,
+                ImageCms.ImageCmsProfile(io.BytesIO(tables)),
+                ImageCms.createProfile("sRGB"),
+                renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
+                outputMode="RGB",
+            )
+            assert srgb is not None
+            return _converted(srgb, "RGB"), alpha
+        except (ImageCms.PyCMSError, OSError):
+            notes.append(_unusable("it does not fit the image"))
+    return _converted(image, "RGB"), alpha
+
+
+def _converted(image: Image.Image, mode: str) -> NDArray[np.uint8]:
+    """Convert to RGB or RGBA, some rows at a time to limit memory."""
+    width, height = image.size
+    pixels = np.empty((height, width, len(mode)), np.uint8)
+    step = max(1, (1 << 22) // max(1, width))
+    image.load()
+    for top in range(0, height, step):
+        rows = image.crop((0, top, width, min(top + step, height)))
+        pixels[top : top + step] = np.asarray(rows.convert(mode))
+    return pixels
+
+
+def _deep_codes(
+    file: BinaryIO, image: Image.Image, raw: str
+) -> tuple[NDArray[np.uint16], NDArray[np.uint16] | None]:
+    """Return RGB of 16 bits, and the opacity if there is any."""
+    check_deep_pixels(image.width, image.height)
+    key = image.info.get("transparency")
+    if raw == _GRAY_ALPHA:
+        _set_raw_mode(image, "RGBA")  # the four bytes of gray and opacity
+        pairs = np.asarray(image).reshape(image.height, image.width, 2, 2)
+        values = pairs[..., 0].astype(np.uint16) << 8 | pairs[..., 1]
+        return np.repeat(values[..., :1], 3, axis=2), values[..., 1].copy()
+    if raw not in _LOW_BYTES:
+        gray = np.asarray(image).astype(np.uint16)
+        codes = np.repeat(gray[..., None], 3, axis=2)
+    else:
+        codes = np.asarray(image).astype(np.uint16)
+        codes <<= 8
+        file.seek(0)
+        with Image.open(file, formats=("PNG",)) as again:
+            _set_raw_mode(again, _LOW_BYTES[raw])
+            codes |= np.asarray(again)
+        if raw.startswith("RGBA"):
+            return codes[..., :3].copy(), codes[..., 3].copy()
+    if key is None:
+        return codes, None
+    is_seen = (codes != np.asarray(key, np.uint16)).any(axis=2)
+    return codes, np.where(is_seen, np.uint16(65535), np.uint16(0))
+
+
+def _set_raw_mode(image: Image.Image, raw: str) -> None:
+    decoder, extents, offset, _ = image.tile[0]  # type: ignore[attr-defined]
+    image.tile = [(decoder, extents, offset, raw)]  # type: ignore[attr-defined]
+
+
+# --- color, orientation and pages --------------------------------------------
+
+
+def _encoding(
+    image: Image.Image, container: Container, notes: list[str]
+) -> Encoding | bytes:
+    """Return an image's encoding; the bytes of a profile that has lookup tables."""
+    try:
+        if container.color_codes is not None:
+            found = encoding_of_codes(*container.color_codes)
+        elif profile := image.info.get("icc_profile"):
+            icc = encoding_of_icc(profile)
+            if icc is None:
+                return bytes(profile)
+            if image.mode == "CMYK":
+                raise ValueError("it does not fit the image")
+            found = icc
+        else:
+            found = _tagged_encoding(image)
+    except ValueError as error:
+        notes.append(_unusable(str(error)))
+        found = SRGB
+    if image.mode == "CMYK":
+        notes.append("CMYK without a color profile; its colors are approximate")
+    return SRGB if found is SRGB or found.is_srgb() else found
+
+
+def _unusable(reason: str) -> str:
+    return f"its color profile cannot be used ({reason}); sRGB is assumed"
+
+
+def _tagged_encoding(image: Image.Image) -> Encoding:
+    """Return the encoding by gAMA and cHRM of a PNG, or by EXIF."""
+    if image.format == "PNG" and "srgb" not in image.info:
+        curve: Curve = srgb_curve
+        primaries: tuple[float, ...] = BT709
+        if (gamma := image.info.get("gamma")) is not None:
+            low, high = GAMMA_LIMITS
+            if not low <= gamma <= high:
+                raise ValueError(f"gAMA of {gamma:g}")
+            usual, tolerance = GAMMA_OF_SRGB
+            if abs(gamma - usual) > tolerance:
+                curve = power_curve(1.0 / gamma)
+        if (white_first := image.info.get("chromaticity")) is not None:
+            primaries = (*white_first[2:], *white_first[:2])
+        return Encoding("PNG", (curve,) * 3, srgb_from_primaries(primaries))
+    if _is_adobe_rgb(image):
+        curve = power_curve(563.0 / 256.0)
+        return Encoding("Adobe RGB", (curve,) * 3, srgb_from_primaries(ADOBE_RGB))
+    return SRGB
+
+
+def _is_adobe_rgb(image: Image.Image) -> bool:
+    """Return whether EXIF says Adobe RGB, as cameras do instead of a profile (DCF)."""
+    if image.format not in ("JPEG", "MPO"):
+        return False
+    with suppress(Exception):  # Pillow raises nearly anything on damaged EXIF
+        exif = image.getexif()
+        index = exif.get_ifd(ExifTags.IFD.Interop).get(1)
+        return bool(index == "R03")
+    return False
+
+
+def _orientation(image: Image.Image) -> int:
+    found = image.getexif().get(ExifTags.Base.Orientation, 1)
+    return found if isinstance(found, int) else 1
+
+
+def _note_pages(image: Image.Image, container: Container, notes: list[str]) -> None:
+    if container.has_more_pages:
+        notes.append("it has more than one page; the first is read")
+    elif image.format in ("PNG", "WEBP") and getattr(image, "is_animated", False):
+        notes.append("it is animated; the first frame is read")
+
+
+def _note_resolution(image: Image.Image, notes: list[str]) -> None:
+    """Note pixels that are not square according to the resolution of the file."""
+    given = image.info.get("aspect") or image.info.get("dpi")
+    if image.info.get("jfif_unit") == 0:
+        given = image.info.get("jfif_density")
+    if not given:
+        return
+    with suppress(TypeError, ValueError, ZeroDivisionError, OverflowError):
+        across, down = (float(value) for value in given)
+        ratio = down / across
+        if 0.1 <= ratio <= 10.0 and abs(ratio - 1.0) > 0.01:
+            notes.append(
+                f"its resolution says pixels {ratio:.3g} times as wide as high; they "
+                "are taken as square, unless --intrinsics says otherwise"
+            )
