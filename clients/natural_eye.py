@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from clients.option_values import likely_unit
 from clients.scenes.geometry import linear_from_srgb
 from estimator.dynamics import AccommodationResponse, PupilReflex
 from filter_service.messages import Camera
@@ -80,6 +81,7 @@ class NaturalEye:
             raise ValueError(
                 f"pupil_diameter_mm is {pupil_diameter_mm}; allowed: {low_mm:g} to "
                 f"{high_mm:g}"
+                + likely_unit("pupil_diameter_mm", pupil_diameter_mm, PUPIL_RANGE_MM)
             )
         self._age_years = age_years
         self._field_area_deg2 = field_area_deg2

@@ -38,6 +38,7 @@ from clients.natural_eye import (
     distance_at,
     luminance_cd_m2,
 )
+from clients.option_values import a_number
 from clients.scene_renderer import SceneFrame, back_and_forth, scene_frames
 from clients.scenes.catalog import SCENE_BUILDERS, build_scene
 from clients.scenes.paths import PATHS, Moment, path_moments
@@ -221,7 +222,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--m-per-unit",
         default=1.0,
-        type=float,
+        type=a_number,
         metavar="M",
         help="meters per unit of the file, such as 0.001 (default: 1)",
     )
@@ -236,7 +237,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--ipd-mm",
         default=USUAL_IPD_MM,
-        type=float,
+        type=a_number,
         metavar="MM",
         help=f"interpupillary distance, for --stereo (default: {USUAL_IPD_MM:g})",
     )
@@ -270,7 +271,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--look-around",
         default=0.0,
-        type=float,
+        type=a_number,
         metavar="DEG",
         help=f"radius of a circular gaze movement, 0 to {MAX_LOOK_AROUND_DEG:g}",
     )
@@ -283,7 +284,7 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--age",
         default=USUAL_AGE_YEARS,
-        type=float,
+        type=a_number,
         metavar="YEARS",
         help=f"age of the person, for --natural (default: {USUAL_AGE_YEARS:g})",
     )

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from filter_service.camera import Camera, Tangents
 from filter_service.errors import BadMessage
 from filter_service.settings import DEPTH_KINDS, DepthKind
+from filter_service.validation import show
 
 ColorImage = NDArray[np.uint8] | NDArray[np.float32] | NDArray[np.float16]
 """(height, width, 3): 8-bit sRGB, or linear light."""
@@ -62,6 +63,8 @@ class RgbdView:
     def __post_init__(self) -> None:
         """Validate the arrays."""
         color, depth_m = self.color, self.depth_m
+        _check_plain("color", color, "an array (height, width, 3)")
+        _check_plain("depth", depth_m, "an array (height, width)")
         if color.ndim != 3 or color.shape[2] != 3 or 0 in color.shape:
             raise BadMessage(
                 f"it has shape {color.shape}",
@@ -99,6 +102,7 @@ class RgbdView:
             wanted = f"{seen.dtype} of shape {seen.shape}"
             found = "missing"
             if image is not None:
+                _check_plain(field, image, wanted)
                 found = f"{image.dtype} of shape {image.shape}"
             if found != wanted:
                 raise BadMessage(f"it is {found}", field=field, allowed=wanted)
@@ -138,6 +142,18 @@ class RgbdView:
         """Return color and depth, and those of the hidden layer if there is one."""
         surfaces = zip(self.surface_colors, self.surface_depths_m, strict=True)
         return tuple(image for surface in surfaces for image in surface)
+
+
+def _check_plain(field: str, image: object, allowed: str) -> None:
+    """Reject what is not an array, and masked arrays, whose mask would be lost."""
+    if isinstance(image, np.ma.MaskedArray):
+        raise BadMessage(
+            f"it is a masked array with {np.ma.count_masked(image)} masked values",
+            field=field,
+            allowed="a plain array, as from its method filled(0)",
+        )
+    if not isinstance(image, np.ndarray):
+        raise BadMessage(f"it is {show(image)}", field=field, allowed=allowed)
 
 
 def as_views(

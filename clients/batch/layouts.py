@@ -110,7 +110,8 @@ def _nothing_found(source: Path, layout: str, depth: Path | None) -> str:
         f"images ({', '.join(COLOR_SUFFIXES)}) in color/ and as many of depth "
         f"({', '.join(DEPTH_SUFFIXES)}) in depth/, or names that end in _depth"
     )
-    return f"'{source}': no frames of the layout {layout}; files: {found}; {allowed}"
+    problem = f"no frames of the layout {layout}; files: {found}"
+    return f"'{source}': {problem}; allowed: {allowed}"
 
 
 def _layout_of(source: Path, layout: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -21,6 +22,7 @@ from clients.batch.layouts import LAYOUTS, LayoutOptions, list_frames, optics_of
 from clients.batch.run import Batch
 from clients.batch.source import SourceFrame
 from clients.batch.states import CENTER, States, read_states
+from clients.option_values import a_number, check_range, likely_number
 from estimator import InvalidFile, load_profile, profile_body, thread_count
 from filter_service.settings import (
     MAX_PUPIL_MM,
@@ -93,9 +95,9 @@ def _add_source(group: argparse._ArgumentGroup) -> None:
         "--depth", type=Path, metavar="PATH", help="folder or video of depth"
     )
     group.add_argument(
-        "--depth-scale", type=float, metavar="M", help="meters per unit of depth"
+        "--depth-scale", type=a_number, metavar="M", help="meters per unit of depth"
     )
-    group.add_argument("--fov-deg", type=float, help="vertical field of view, deg")
+    group.add_argument("--fov-deg", type=a_number, help="vertical field of view, deg")
     group.add_argument("--intrinsics", metavar="FX,FY,CX,CY", help="camera in px")
     group.add_argument(
         "--limit", type=int, metavar="N", help="use the first N frames only"
@@ -104,7 +106,10 @@ def _add_source(group: argparse._ArgumentGroup) -> None:
 
 def _add_eye(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
-        "--pupil-mm", type=float, default=4.0, help="entrance pupil, mm (default: 4)"
+        "--pupil-mm",
+        type=a_number,
+        default=4.0,
+        help="entrance pupil, mm (default: 4)",
     )
     group.add_argument(
         "--focus-dpt",
@@ -127,7 +132,7 @@ def _add_eye(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument(
         "--render-tolerance",
-        type=float,
+        type=a_number,
         default=1.0,
         help="rendering error relative to the default; 0 is exact (default: 1)",
     )
@@ -145,7 +150,7 @@ def _add_results(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument(
         "--fps",
-        type=float,
+        type=a_number,
         help="frame rate of videos (default: the times of the input video, or 30)",
     )
     group.add_argument(
@@ -159,7 +164,10 @@ def _add_results(group: argparse._ArgumentGroup) -> None:
         help="estimate time and cost, and stop",
     )
     group.add_argument(
-        "--price-per-core-hour", type=float, metavar="X", help="price for --dry-run"
+        "--price-per-core-hour",
+        type=a_number,
+        metavar="X",
+        help="price for --dry-run",
     )
     group.add_argument("--json", action="store_true", help="print one JSON object")
 
@@ -243,9 +251,8 @@ def _check(options: argparse.Namespace) -> None:
     }
     for name, (low, high) in limits.items():
         value = getattr(options, name)
-        if value is not None and not low <= value <= high:
-            option = name.replace("_", "-")
-            raise ValueError(f"--{option} is {value:g}; allowed: {low:g} to {high:g}")
+        if value is not None:
+            check_range(f"--{name.replace('_', '-')}", value, (low, high))
     if options.format in VIDEO_FORMATS:
         import clients.batch.video_writing  # noqa: F401  (raises if it is not installed)
     if options.half and options.format not in LINEAR_FORMATS:
@@ -262,9 +269,11 @@ def _states(options: argparse.Namespace, names: Sequence[str]) -> States:
         except ValueError:
             focus_dpt = float("nan")
         if not 0.0 <= focus_dpt <= MAX_VERGENCE_DPT:
+            hint = f"; allowed: 0 to {MAX_VERGENCE_DPT:g}"
+            if math.isnan(focus_dpt):
+                hint = likely_number(options.focus_dpt)
             raise ValueError(
-                f"--focus-dpt is '{options.focus_dpt}'; allowed: 0 to "
-                f"{MAX_VERGENCE_DPT:g}, or {CENTER}"
+                f"--focus-dpt is '{options.focus_dpt:.60}'{hint}, or {CENTER}"
             )
     listed = None
     if options.states is not None:

@@ -118,15 +118,15 @@ def _deep_pixels(frame: av.VideoFrame, *, has_alpha: bool) -> NDArray[np.uint16]
     if frame.colorspace == UNSPECIFIED and frame.height >= HD_HEIGHT_PX:
         weights = BT709_WEIGHTS
     is_full = frame.color_range == FULL_RANGE
-    low, luma_span, chroma_span = (
-        (0, 65535, 65535) if is_full else (16 << 8, 219 << 8, 224 << 8)
-    )
+    zeros = (0 if is_full else 16 << 8, 32768, 32768)
+    spans = (65535,) * 3 if is_full else (219 << 8, 224 << 8, 224 << 8)
     red, blue = weights
     for top in range(0, frame.height, ROWS):
         rows = slice(top, top + ROWS)
-        y, u, v = (plane[rows].astype(np.float32) for plane in stored[:3])
-        y = (y - low) / luma_span
-        u, v = (u - 32768) / chroma_span, (v - 32768) / chroma_span
+        y, u, v = (
+            (plane[rows].astype(np.float32) - np.float32(zero)) / np.float32(span)
+            for plane, zero, span in zip(stored[:3], zeros, spans, strict=True)
+        )
         r, b = y + 2.0 * (1.0 - red) * v, y + 2.0 * (1.0 - blue) * u
         g = (y - red * r - blue * b) / (1.0 - red - blue)
         rgb = np.clip(np.stack([r, g, b], axis=-1), 0.0, 1.0)

@@ -29,19 +29,6 @@ def print_json(data: dict[str, Any]) -> None:
     print_line(json.dumps(data, allow_nan=False))
 
 
-def check_range(option: str, value: float, limits: tuple[float, float]) -> None:
-    """Check that a number is within ``limits`` and not NaN.
-
-    Raises
-    ------
-    ValueError
-        If it is not.  The message names the option, the value and the range.
-    """
-    low, high = limits
-    if not low <= value <= high:
-        raise ValueError(f"{option} is {value:g}; allowed: {low:g} to {high:g}")
-
-
 @contextmanager
 def progress_bar(title: str, *, quiet: bool) -> Iterator[Callable[[float, str], None]]:
     """Report progress on stderr: a bar on a terminal, occasional lines elsewhere.

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from clients.commands.console import Json, check_range, print_json, print_line
+from clients.commands.console import Json, print_json, print_line
 from clients.commands.wavefront import (
     FOCUS_LIMITS_DPT,
     PUPIL_LIMITS_MM,
     WAVELENGTH_LIMITS_NM,
 )
+from clients.option_values import check_range
 
 if TYPE_CHECKING:
     from estimator.field.drawn_fields import DrawnFields

@@ -12,13 +12,13 @@ import typer
 
 from clients.commands.console import (
     Json,
-    check_range,
     print_json,
     print_line,
     progress_bar,
 )
 from clients.commands.plan_text import print_plan
 from clients.commands.setting_options import with_setting_options
+from clients.option_values import check_range
 from filter_service.camera import read_intrinsics
 from filter_service.settings import (
     MAX_PUPIL_MM,

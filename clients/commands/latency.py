@@ -90,9 +90,9 @@ def latency(
     from itertools import product
 
     from clients.arguments import read_profile, read_size_px
-    from clients.commands.console import check_range
     from clients.latency import report
     from clients.latency.measure import Case, Target, compare, measure
+    from clients.option_values import check_range
     from filter_service.atomic_files import replace_atomically
     from filter_service.errors import FilterError
     from filter_service.image_files import check_output

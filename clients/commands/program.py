@@ -27,6 +27,7 @@ from clients.commands.psf import psf
 from clients.commands.serve import prepare, serve
 from clients.commands.status import status
 from clients.commands.wavefront import wavefront
+from clients.option_values import given_value, likely_number
 from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
 
 EXIT_FAILURE = 1
@@ -114,16 +115,16 @@ def _exit_code(arguments: list[str]) -> int:
     except Exception as error:
         if "--traceback" in arguments[:1]:
             raise
-        code, text = _code_and_text(error)
+        code, text = _code_and_text(error, arguments)
         sys.stderr.write(f"ocufilter: {' '.join(text.split())}\n")
         return code
 
 
-def _code_and_text(error: Exception) -> tuple[int, str]:
+def _code_and_text(error: Exception, arguments: list[str]) -> tuple[int, str]:
     from filter_service.errors import FilterError
 
     if isinstance(error, TyperException):
-        return error.exit_code, error.format_message()
+        return error.exit_code, _with_value(error, arguments)
     if isinstance(error, FilterError):
         return EXIT_BAD_INPUT if error.field else EXIT_FAILURE, str(error)
     if isinstance(error, CommandFailed):
@@ -134,6 +135,16 @@ def _code_and_text(error: Exception) -> tuple[int, str]:
         return EXIT_FAILURE, str(error)
     kind = type(error).__name__
     return EXIT_FAILURE, f"{kind}: {error} (see ocufilter --traceback ...)"
+
+
+def _with_value(error: TyperException, arguments: list[str]) -> str:
+    """Return the message of an error; Typer's does not name a wrong number."""
+    text = error.format_message()
+    options: list[str] = getattr(getattr(error, "param", None), "opts", [])
+    value = given_value(options, arguments)
+    if value is None or "valid number" not in text:
+        return text
+    return f"{options[0]} is '{value:.60}'{likely_number(value)}"
 
 
 if __name__ == "__main__":

@@ -11,7 +11,6 @@ import typer
 from clients.commands.console import (
     CommandFailed,
     Json,
-    check_range,
     print_json,
     print_line,
 )
@@ -20,6 +19,7 @@ from clients.commands.wavefront import (
     ellipse_facts,
     load_surfaces,
 )
+from clients.option_values import check_range
 
 if TYPE_CHECKING:
     import numpy as np

@@ -8,10 +8,10 @@ import typer
 from clients.commands.console import (
     CommandFailed,
     Json,
-    check_range,
     print_json,
     print_line,
 )
+from clients.option_values import check_range
 
 if TYPE_CHECKING:
     from estimator.optics.surfaces import EyeSurfaces

@@ -12,6 +12,7 @@ from clients.arguments import read_object, read_profile
 from clients.headset.controls import HELP
 from clients.headset.runtime import EYES, Eye
 from clients.natural_eye import USUAL_AGE_YEARS, USUAL_WHITE_CD_M2
+from clients.option_values import a_number
 from filter_service import FilterSettings
 
 TRACKED_RANGE_DEG = (15.0, 10.0)
@@ -61,12 +62,12 @@ def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Names
     )
     where.add_argument(
         "--rate-hz",
-        type=float,
+        type=a_number,
         help="with --simulated: frame rate (default: 72)",
     )
     where.add_argument(
         "--scale",
-        type=float,
+        type=a_number,
         help="image size relative to the headset's, 0.1 to 2 (default: 1)",
     )
     where.add_argument(
@@ -77,7 +78,9 @@ def arguments_of(argv: Sequence[str] | None, description: str) -> argparse.Names
         "--frames", type=int, metavar="N", help="stop after N filtered frames"
     )
     end.add_argument(
-        "--seconds", type=float, help="stop this long after the first filtered frame"
+        "--seconds",
+        type=a_number,
+        help="stop this long after the first filtered frame",
     )
     end.add_argument(
         "--out", type=Path, metavar="DIR", help="folder for the last filtered images"
@@ -101,26 +104,26 @@ def add_eye_arguments(parser: argparse.ArgumentParser) -> None:
     eyes.add_argument("--right", metavar="PROFILE", help="profile of the right eye")
     eyes.add_argument(
         "--age",
-        type=float,
+        type=a_number,
         default=USUAL_AGE_YEARS,
         metavar="YEARS",
         help=f"age of the person (default: {USUAL_AGE_YEARS:g})",
     )
     eyes.add_argument(
         "--pupil-mm",
-        type=float,
+        type=a_number,
         metavar="MM",
         help="fixed pupil diameter (default: the pupil follows the light)",
     )
     eyes.add_argument(
         "--focus-dpt",
-        type=float,
+        type=a_number,
         metavar="D",
         help="fixed focus (default: focus follows the viewed distance)",
     )
     eyes.add_argument(
         "--white-cd-m2",
-        type=float,
+        type=a_number,
         default=USUAL_WHITE_CD_M2,
         metavar="L",
         help="luminance of the display's white, which drives the pupil "

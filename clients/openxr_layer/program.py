@@ -39,6 +39,7 @@ from clients.openxr_layer import manifest
 from clients.openxr_layer.eyes import Eyes
 from clients.openxr_layer.helper import USUAL_AGE_MS, HelperOptions, LayerHelper
 from clients.openxr_layer.helper_socket import SOCKET_VARIABLE, ask, socket_path
+from clients.option_values import a_number
 from estimator import ProfileError, parse_profile
 from estimator.bounded_files import printable
 from filter_service import FilterSettings
@@ -101,7 +102,7 @@ def _add_helper_arguments(parser: argparse.ArgumentParser) -> None:
     add_service_arguments(where)
     where.add_argument(
         "--flat-dpt",
-        type=float,
+        type=a_number,
         default=1.0,
         metavar="D",
         help="distance of everything in programs that submit no depth, 1/m; 0 is "

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from filter_service.camera import Camera, distinct_cameras, is_same_camera
+from filter_service.rgbd_view import RgbdView, as_views
 from tests.grid_specs import grid_spec
 
 CAMERA = Camera(200, 100, (-0.5, 0.5, 0.25, -0.25))  # 5 mrad
@@ -41,3 +42,41 @@ def test_sizes_from_numpy_become_numbers_that_travel():
     camera = Camera(np.int64(200), np.int32(100), CAMERA.tangents)
     assert camera == CAMERA
     assert (type(camera.width_px), type(camera.height_px)) == (int, int)
+
+
+def test_sides_of_several_images_are_named():
+    """Of 2 images of 129 rows, taken for one of 2 rows and 129 columns."""
+    images = np.zeros((2, 129, 100, 3))
+    height_px, width_px = images.shape[:2]
+    with pytest.raises(ValueError, match=r"50 deg reaches 88\.1 deg .* of 129x2 px"):
+        Camera.from_fov(50.0, width_px=width_px, height_px=height_px)
+
+
+COLOR, DEPTH_M = np.zeros((4, 6, 3), np.uint8), np.ones((4, 6), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("color", "depth_m", "said"),
+    [
+        (COLOR, 2.0, r"depth: it is 2\.0 \(allowed: an array \(height, width\)\)"),
+        (COLOR, DEPTH_M.tolist(), r"depth: it is \[\[1\.0, "),
+        (COLOR, DEPTH_M[None], r"depth: it is float32 of shape \(1, 4, 6\)"),
+        (COLOR, np.ma.masked_equal(DEPTH_M, 1.0), "masked array with 24 masked values"),
+        (np.ma.array(COLOR), DEPTH_M, r"color: it is a masked array .*filled\(0\)"),
+        (COLOR[None], DEPTH_M, r"color: it has shape \(1, 4, 6, 3\)"),
+        (COLOR.tolist(), DEPTH_M, "color: a list of list"),
+        (None, DEPTH_M, "color: a NoneType"),
+    ],
+)
+def test_what_is_no_image_is_refused_by_name(color, depth_m, said):
+    camera = Camera.from_fov(50.0, width_px=6, height_px=4)
+    with pytest.raises(ValueError, match=said):
+        as_views(color, depth_m, camera)
+
+
+def test_a_hidden_layer_is_an_array_too():
+    tangents = Camera.from_fov(50.0, width_px=6, height_px=4).tangents
+    with pytest.raises(ValueError, match=r"hidden_depth: it is 2\.0"):
+        RgbdView(COLOR, DEPTH_M, tangents, "planar", COLOR, 2.0)
+    with pytest.raises(ValueError, match="hidden_color: it is a masked array"):
+        RgbdView(COLOR, DEPTH_M, tangents, "planar", np.ma.array(COLOR), DEPTH_M)

@@ -8,7 +8,9 @@ from PIL import Image
 from filter_service.image_files import (
     check_output,
     read_color,
+    read_color_file,
     read_depth,
+    read_depth_file,
     write_image,
 )
 
@@ -156,3 +158,69 @@ def test_outputs_are_checked_before_any_work(tmp_path):
 def test_a_type_that_does_not_fit_the_file_is_refused(tmp_path, linear):
     with pytest.raises(ValueError, match="uint8"):
         write_image(tmp_path / "out.png", linear)
+
+
+# --- units ---------------------------------------------------------------------
+
+
+def depth_file(path, values, **how):
+    np.save(path, np.asarray(values))
+    return read_depth_file(path, **how)
+
+
+def test_integers_of_an_array_are_millimeters_with_a_note(tmp_path):
+    found = depth_file(tmp_path / "a.npy", np.full((4, 5), 1500, np.int32))
+    np.testing.assert_allclose(found.pixels, 1.5)
+    (note,) = found.notes
+    assert note == "'a.npy': integers are millimeters unless --depth-scale is given"
+    told = depth_file(tmp_path / "a.npy", np.full((4, 5), 2, np.int32), depth_scale=1.0)
+    np.testing.assert_array_equal(told.pixels, 2.0)
+    assert not told.notes
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (np.linspace(211.0, 502.0, 20), "depth of 214 to 499 m is unusual"),
+        (np.linspace(0.001, 0.005, 20), "depth of 0.00104 to 0.00496 m is unusual"),
+        (-np.linspace(1.0, 5.0, 20), "all depth is negative and therefore missing"),
+    ],
+)
+def test_doubtful_depth_gets_a_note(tmp_path, values, said):
+    values = values.reshape(4, 5).astype(np.float32)
+    found = depth_file(tmp_path / "a.npy", values)
+    np.testing.assert_array_equal(found.pixels, values)
+    (note,) = found.notes
+    assert said in note
+    with pytest.warns(UserWarning, match="a.npy"):
+        read_depth(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize(
+    "values",
+    [[0.3, 2.0, np.inf, np.nan], [np.inf] * 4, [0.0] * 4, [-1.0, 3.0, 80.0, 9e9]],
+)
+def test_usual_depth_gets_no_note(tmp_path, values):
+    assert not depth_file(tmp_path / "a.npy", np.float32([values])).notes
+
+
+@pytest.mark.parametrize("suffix", [".png", ".npy", ".tif"])
+def test_65535_is_no_return(tmp_path, suffix):
+    values = np.array([[1500, 65535, 65534, 0]], np.uint16)
+    path = tmp_path / f"a{suffix}"
+    np.save(path, values) if suffix == ".npy" else Image.fromarray(values).save(path)
+    found = read_depth_file(path)
+    np.testing.assert_allclose(found.pixels, [[1.5, 0.0, 65.534, 0.0]], rtol=1e-6)
+    assert "25 % of the depth is 65535: missing" in found.notes[-1]
+
+
+def test_floats_of_0_to_255_get_a_note(tmp_path, rng):
+    light = rng.integers(0, 256, (4, 5, 3)).astype(np.float32)
+    np.save(tmp_path / "a.npy", light)
+    found = read_color_file(tmp_path / "a.npy")
+    np.testing.assert_array_equal(found.pixels, light)
+    assert found.notes[0].endswith("is it 0 to 255?")
+    light /= 255.0
+    light[0, 0] = 50.0  # a lamp
+    np.save(tmp_path / "a.npy", light)
+    assert not read_color_file(tmp_path / "a.npy").notes
