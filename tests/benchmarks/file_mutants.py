@@ -19,6 +19,15 @@ from estimator.profiles.files import InvalidProfileFile
 from filter_service.psfs.store_file import PAGE_BYTES, PREAMBLE
 from tests.schema_profiles import disturbed, drawn_profile
 from tests.unit.gltf_bytes import glb, triangle_bytes, triangle_header
+from tests.unit.image_bytes import (
+    GRAY,
+    GRAY_ALPHA,
+    RGB,
+    RGBA,
+    matrix_profile,
+    png,
+    table_profile,
+)
 
 DATA = Path(__file__).parents[1] / "data"
 CORPUS = DATA.with_name("corpus")
@@ -174,7 +183,7 @@ def kinds(folder: Path) -> list[Kind]:
         Kind("depth", of("g16.png", ".tif", ".pfm", ".pgm"), depth, _depth_command),
         Kind("npy", of(".npy"), _either(read_color_file, depth), _color_command),
         Kind("OpenEXR", of(".exr"), _either(read_color_file, depth), _color_command),
-        Kind("photo", of("c.png", ".jpg", ".webp", ".tif"), photo),
+        Kind("photo", of("c.png", "_p3.png", "16.png", ".jpg", ".webp", ".tif"), photo),
         Kind(
             "profile",
             {
@@ -315,6 +324,9 @@ def _pictures(folder: Path) -> dict[str, bytes]:
         picture.save(folder / name, **how)
         files[name] = (folder / name).read_bytes()
     files["plain.pgm"] = b"P2\n# c\n8 4 65535\n" + b"1200 " * 32
+    files["odd.pgm"] = b"P5 8 4 4000 " + bytes([4, 176]) * 32
+    files["c16.ppm"] = b"P6\n8 4\n1023\n" + bytes([1, 44]) * 96
+    files |= _deep_pictures(folder, color)
     for name, array in {
         "c.npy": color,
         "c_float.npy": color / np.float64(255.0),
@@ -344,6 +356,41 @@ def _pictures(folder: Path) -> dict[str, bytes]:
         with OpenEXR.File(header, arrays) as file:
             file.write(str(folder / name))
         files[name] = (folder / name).read_bytes()
+    header = {
+        "type": OpenEXR.scanlineimage,
+        "dataWindow": ((3, 2), (width + 2, height + 1)),
+        "displayWindow": ((0, 0), (99, 79)),
+        "pixelAspectRatio": 2.0,
+        "chromaticities": (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.3217, 0.3377),
+    }
+    with OpenEXR.File(header, {"RGBA": np.dstack([linear, metres])}) as file:
+        file.write(str(folder / "c_part.exr"))
+    files["c_part.exr"] = (folder / "c_part.exr").read_bytes()
+    return files
+
+
+def _deep_pictures(folder: Path, color: np.ndarray) -> dict[str, bytes]:
+    """Return PNGs of 16 bits, and pictures with color profiles and tags."""
+    deep = color.astype(np.uint16) * 257
+    four = np.dstack([deep, deep[..., 0]])
+    profile = zlib.compress(matrix_profile())
+    gama, cicp = (b"gAMA", struct.pack(">L", 100000)), (b"cICP", bytes([9, 16, 0, 1]))
+    made = {
+        "c_gray16.png": (deep[..., :1], GRAY, ()),
+        "c_rgb16.png": (deep, RGB, ((b"iCCP", b"p\0\0" + profile),)),
+        "c_la16.png": (four[..., 2:], GRAY_ALPHA, ()),
+        "c_rgba16.png": (four, RGBA, (cicp,)),
+        "c_key16.png": (deep, RGB, ((b"tRNS", bytes(6)),)),
+        "c_p3.png": (color, RGB, ((b"iCCP", b"p\0\0" + profile), gama)),
+        "c_gama.png": (color, RGB, (gama,)),
+        "c_cicp.png": (color, RGB, (cicp,)),
+    }
+    files = {}
+    for name, (values, kind, chunks) in made.items():
+        files[name] = png(folder / name, values, kind, *chunks).read_bytes()
+    ink = Image.fromarray(color).convert("CMYK")
+    ink.save(folder / "c_ink.jpg", icc_profile=table_profile(b"CMYK", [50] * 16))
+    files["c_ink.jpg"] = (folder / "c_ink.jpg").read_bytes()
     return files
 
 
@@ -376,6 +423,31 @@ def _videos(folder: Path) -> dict[str, bytes]:
         join_segments(folder / name, [(0, segment)], **how)
         files[name] = (folder / name).read_bytes()
         segment.unlink()
+    return files | _tagged_videos(folder, frames)
+
+
+def _tagged_videos(folder: Path, frames: np.ndarray) -> dict[str, bytes]:
+    """Return a turned video, one of HLG with 10 bits, and one with opacity."""
+    import av
+
+    hlg = {"colorspace": 9, "color_primaries": 9, "color_trc": 18, "color_range": 1}
+    files = {}
+    for name, codec, pixels, tags in (
+        ("turned.mov", "png", "rgb24", {}),
+        ("hlg.mkv", "ffv1", "yuv420p10le", hlg),
+        ("opacity.mkv", "ffv1", "bgra", {}),
+    ):
+        with av.open(str(folder / name), "w") as container:
+            stream = container.add_stream(codec, rate=10)
+            stream.width, stream.height, stream.pix_fmt = SIDES[1], SIDES[0], pixels
+            stream.set_display_rotation(90)
+            for key, value in tags.items():
+                setattr(stream.codec_context, key, value)
+            for image in frames:
+                frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode(None))
+        files[name] = (folder / name).read_bytes()
     return files
 
 

@@ -6,7 +6,6 @@ import zlib
 from fractions import Fraction
 
 import numpy as np
-import OpenEXR
 import pytest
 import tifffile
 from PIL import Image, ImageCms, ImageOps
@@ -16,15 +15,25 @@ from filter_service.image_files import (
     read_color,
     read_color_file,
     read_depth_file,
-    write_image,
 )
 from filter_service.pictures import read_picture_srgb8, read_texture
+from tests.unit.image_bytes import (
+    GRAY,
+    GRAY_ALPHA,
+    P3_COLUMNS,
+    RGB,
+    RGBA,
+    SRGB_PARA,
+    gamma,
+    icc,
+    matrix_profile,
+    named,
+    png,
+    pnm,
+    table_profile,
+)
 
 HEIGHT_PX, WIDTH_PX = 9, 13
-
-P3_COLUMNS = ((0.51512, 0.24120, -0.00105), (0.29198, 0.69225, 0.04189))
-P3_COLUMNS += ((0.15710, 0.06657, 0.78407),)
-"""Red, green and blue of Display P3 in XYZ of D50, from Apple's profile."""
 
 
 @pytest.fixture
@@ -60,29 +69,7 @@ def noted(path, said):
     return found.pixels
 
 
-# --- PNG, written chunk by chunk ------------------------------------------------
-
-
-def chunk(kind, data):
-    end = struct.pack(">I", zlib.crc32(kind + data))
-    return struct.pack(">I", len(data)) + kind + data + end
-
-
-def png(path, values, kind, *chunks):
-    """Write a PNG without filters; kind is its type of color."""
-    values = np.asarray(values)
-    depth = 8 * values.dtype.itemsize
-    height, width = values.shape[:2]
-    rows = values.astype(values.dtype.newbyteorder(">")).reshape(height, -1)
-    data = b"".join(b"\0" + row.tobytes() for row in rows)
-    head = struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, 0)
-    parts = [chunk(b"IHDR", head), *(chunk(name, body) for name, body in chunks)]
-    parts += [chunk(b"IDAT", zlib.compress(data)), chunk(b"IEND", b"")]
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
-    return path
-
-
-GRAY, RGB, GRAY_ALPHA, RGBA = 0, 2, 4, 6
+# --- opacity and 16 bits --------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -191,53 +178,6 @@ def test_alpha_of_arrays(tmp_path, srgb):
 # --- color profiles --------------------------------------------------------------
 
 
-def icc(space, tags, connection=b"XYZ "):
-    """Return a profile of version 2."""
-    head = bytearray(128)
-    head[8:12] = bytes([2, 0x10, 0, 0])
-    head[12:24] = b"mntr" + space + connection
-    head[36:40] = b"acsp"
-    head[64:80] = struct.pack(">4l", 0, 63190, 65536, 54061)  # relative; D50
-    table, data = b"", b""
-    start = 128 + 4 + 12 * len(tags)
-    for name, content in tags.items():
-        content += bytes(-len(content) % 4)
-        table += struct.pack(">4sLL", name, start + len(data), len(content))
-        data += content
-    whole = bytes(head) + struct.pack(">L", len(tags)) + table + data
-    return struct.pack(">L", len(whole)) + whole[4:]
-
-
-def named(text):
-    return b"desc" + bytes(4) + struct.pack(">L", len(text) + 1) + text + bytes(79)
-
-
-def column(values):
-    numbers = struct.pack(">3l", *(round(65536 * value) for value in values))
-    return b"XYZ " + bytes(4) + numbers
-
-
-def gamma(exponent):
-    return b"curv" + bytes(4) + struct.pack(">LH", 1, round(256 * exponent))
-
-
-SRGB_PARA = b"para" + bytes(4) + struct.pack(">HH", 3, 0)
-SRGB_PARA += struct.pack(
-    ">5l",
-    *(round(65536 * v) for v in (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)),
-)
-
-
-def matrix_profile(columns=P3_COLUMNS, curve=SRGB_PARA):
-    tags = {b"desc": named(b"a display"), b"cprt": b"text" + bytes(8)}
-    tags |= {b"wtpt": column((0.9642, 1.0, 0.8249))}
-    tags |= {
-        b"%sXYZ" % c: column(v)
-        for c, v in zip((b"r", b"g", b"b"), columns, strict=True)
-    }
-    return icc(b"RGB ", tags | {b"%sTRC" % c: curve for c in (b"r", b"g", b"b")})
-
-
 def test_the_green_of_a_phone_is_brighter_than_that_of_srgb(tmp_path):
     """By CSS Color 4: 1.0420 of 0.5776 of green light; red is below 0."""
     image = Image.new("RGB", (5, 4), (30, 200, 60))
@@ -294,19 +234,6 @@ def test_a_gray_profile_is_applied(tmp_path):
     expected = srgb8_of(gray / 255.0)
     found = read_color(tmp_path / "a.png")
     np.testing.assert_array_equal(found, np.repeat(expected[..., None], 3, axis=2))
-
-
-def table_profile(space, lightness):
-    """Return a profile of a lookup table: L* of the corners, a and b are 0."""
-    n = {b"CMYK": 4, b"RGB ": 3}[space]
-    ramp = bytes(range(256))
-    corners = b"".join(bytes([round(2.55 * value), 128, 128]) for value in lightness)
-    assert len(lightness) == 2**n
-    head = b"mft1" + bytes(4) + bytes([n, 3, 2, 0])
-    identity = struct.pack(">9l", *(65536 * (k % 4 == 0) for k in range(9)))
-    table = head + identity + ramp * n + corners + ramp * 3
-    tags = {b"desc": named(b"a printer"), b"A2B0": table, b"A2B1": table}
-    return icc(space, tags, connection=b"Lab ")
 
 
 def test_a_jpeg_for_printing_is_converted_by_its_profile(tmp_path):
@@ -466,16 +393,6 @@ def test_a_tiff_of_16_bits_on_the_page(tmp_path, deep):
     np.testing.assert_allclose(found[..., 1], deep[..., 0] / 257.0, atol=0.51)
 
 
-def pnm(path, kind, values, top):
-    dtype = ">u2" if top > 255 else np.uint8
-    head = f"{kind}\n# a comment\n{values.shape[1]} {values.shape[0]}\n{top}\n"
-    body = values.astype(dtype).tobytes()
-    if kind in ("P2", "P3"):
-        body = " ".join(map(str, values.ravel())).encode()
-    path.write_bytes(head.encode() + body)
-    return path
-
-
 @pytest.mark.parametrize("kind", ["P3", "P6"])
 @pytest.mark.parametrize("top", [200, 255, 1023, 65535])
 def test_a_ppm_of_any_maximum(tmp_path, rng, kind, top):
@@ -519,117 +436,6 @@ def test_a_texture_of_gltf_is_as_stored(srgb):
     file = io.BytesIO()
     Image.fromarray(rgba).save(file, "PNG", icc_profile=matrix_profile())
     np.testing.assert_array_equal(read_texture(file.getvalue()), srgb)
-
-
-# --- OpenEXR -------------------------------------------------------------------------
-
-
-def exr(path, channels, **header):
-    header = {"type": OpenEXR.scanlineimage, **header}
-    with OpenEXR.File(header, channels) as file:
-        file.write(str(path))
-    return path
-
-
-@pytest.fixture
-def light(rng):
-    return rng.random((4, 6, 3), np.float32)
-
-
-def test_a_part_of_a_picture_is_seen_as_a_part(tmp_path, light):
-    """2 px from the left and 1 px from the top of 12x8 px."""
-    path = exr(
-        tmp_path / "a.exr",
-        {"RGB": light},
-        dataWindow=((2, 1), (7, 4)),
-        displayWindow=((0, 0), (11, 7)),
-    )
-    found = read_color_file(path)
-    assert "6x4 px of a picture of 12x8" in found.notes[0]
-    # 2 px of the picture, at 1 px depth, per 90 deg: 4 px are 1
-    np.testing.assert_allclose(found.grid.fov_tangents(90.0), [-1.0, 0.5, 0.75, -0.25])
-    tangents = found.grid.intrinsics_tangents(4.0, 4.0, 5.5, 3.5)
-    np.testing.assert_allclose(tangents, [-1.0, 0.5, 0.75, -0.25])
-    write_image(tmp_path / "b.exr", found.pixels, grid=found.grid)
-    again = read_color_file(tmp_path / "b.exr")
-    assert again.grid == found.grid
-    np.testing.assert_array_equal(again.pixels, light)
-
-
-def test_parts_at_different_places_do_not_fit(tmp_path, light):
-    window = {"displayWindow": ((0, 0), (11, 7))}
-    color, depth = (
-        read(exr(tmp_path / "a.exr", channels, dataWindow=at, **window))
-        for read, channels, at in (
-            (read_color_file, {"RGB": light}, ((2, 1), (7, 4))),
-            (read_depth_file, {"Z": light[..., 0].copy()}, ((3, 1), (8, 4))),
-        )
-    )
-    assert color.grid.difference(depth.grid) == (
-        "at 3,1 px of 12x8",
-        "at 2,1 px of 12x8",
-    )
-    assert color.grid.difference(color.grid) is None
-
-
-def test_the_shape_of_pixels_is_part_of_the_camera(tmp_path, light):
-    found = read_color_file(
-        exr(tmp_path / "a.exr", {"RGB": light}, pixelAspectRatio=2.0)
-    )
-    assert "pixels are 2 times as wide as high" in found.notes[0]
-    left, right, up, _ = found.grid.fov_tangents(90.0)
-    np.testing.assert_allclose([left, right, up], [-3.0, 3.0, 1.0])
-    path = exr(tmp_path / "a.exr", {"RGB": light}, pixelAspectRatio=20.0)
-    with pytest.raises(
-        ValueError, match=r"pixelAspectRatio of 20; allowed: 0\.1 to 10"
-    ):
-        read_color_file(path)
-
-
-def test_chromaticities_of_exr_are_converted(tmp_path):
-    """White stays white; a color of ACES AP1 by the matrix of the Academy."""
-    ap1 = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
-    light = np.ones((2, 3, 3), np.float32)
-    light[0, 0] = (0.5, 0.2, 0.1)
-    found = read_color(exr(tmp_path / "a.exr", {"RGB": light}, chromaticities=ap1))
-    np.testing.assert_allclose(found[1], 1.0, atol=2e-4)
-    to_srgb = [
-        [1.70505, -0.62179, -0.08326],
-        [-0.13026, 1.14080, -0.01055],
-        [-0.02400, -0.12897, 1.15297],
-    ]
-    np.testing.assert_allclose(found[0, 0], to_srgb @ light[0, 0], atol=5e-4)
-
-
-def test_opacity_gray_and_parts_of_exr(tmp_path, light):
-    alpha = np.ones(light.shape[:2], np.float32)
-    alpha[0] = 0.5
-    path = exr(tmp_path / "a.exr", {"RGBA": np.dstack([light, alpha])})
-    np.testing.assert_array_equal(noted(path, "25 % of the pixels are"), light)
-    gray = read_color(exr(tmp_path / "a.exr", {"Y": light[..., 0].copy()}))
-    np.testing.assert_array_equal(gray, np.repeat(light[..., :1], 3, axis=2))
-    with pytest.raises(ValueError, match="channels V; allowed: channels R, G and B"):
-        read_color(exr(tmp_path / "a.exr", {"V": light[..., 0].copy()}))
-    parts = [
-        OpenEXR.Part({"name": name, "type": OpenEXR.scanlineimage}, {"RGB": image})
-        for name, image in (("left", light), ("right", light / 2))
-    ]
-    with OpenEXR.File(parts) as file:
-        file.write(str(tmp_path / "b.exr"))
-    found = noted(tmp_path / "b.exr", "it has 2 parts; the first is read")
-    np.testing.assert_array_equal(found, light)
-
-
-def test_colors_are_no_depth(tmp_path, light):
-    with pytest.raises(ValueError, match="colors in R, G and B; allowed: a channel Z"):
-        read_depth_file(exr(tmp_path / "a.exr", {"RGB": light}))
-    same = np.repeat(light[..., :1], 3, axis=2)
-    found = read_depth_file(exr(tmp_path / "a.exr", {"RGB": same}))
-    np.testing.assert_array_equal(found.pixels, light[..., 0])
-    image = Image.fromarray(np.zeros((4, 6), np.uint8)).convert("P")
-    image.save(tmp_path / "a.png")
-    with pytest.raises(ValueError, match="a palette of colors; allowed: one channel"):
-        read_depth_file(tmp_path / "a.png", depth_scale=0.1)
 
 
 def test_curves_of_profiles():
