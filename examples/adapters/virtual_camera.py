@@ -10,14 +10,16 @@ Windows and macOS the OBS virtual camera.
 
 import argparse
 import sys
+from pathlib import Path
 
 import numpy as np
 
 from filter_service import Camera, EyeFilter
 
 try:
-    import av
     import pyvirtualcam
+
+    from clients.batch.video_reading import VideoReader  # requires av
 except ModuleNotFoundError as error:
     sys.exit(f"virtual_camera: {error.name} is missing: pip install av pyvirtualcam")
 
@@ -42,19 +44,19 @@ options = parser.parse_args()
 def frames():
     """Yield the frames of the video, (height, width, 3), in an endless loop."""
     while True:
-        with av.open(options.video) as container:
-            for frame in container.decode(video=0):
-                yield frame.to_ndarray(format="rgb24")
+        for index in range(reader.count):
+            yield reader.color(index).pixels
 
 
 try:
-    container = av.open(options.video)
+    reader = VideoReader(Path(options.video))
+    first, rate_hz = reader.color(0), reader.rate_hz
 except (OSError, ValueError) as error:
     sys.exit(f"virtual_camera: {error}")
-with container:
-    stream = container.streams.video[0]
-    size, rate_hz = (stream.width, stream.height), float(stream.average_rate or 30)
-lens = Camera.from_fov(options.fov_deg, width_px=size[0], height_px=size[1])
+for note in first.notes:
+    print(f"virtual_camera: note: {note}")
+size = first.grid.width_px, first.grid.height_px
+lens = Camera(*size, first.grid.fov_tangents(options.fov_deg))
 depth_m = np.full(size[::-1], options.distance_m, np.float32)
 state = {"pupil_diameter_mm": options.pupil_mm, "focus_dpt": options.focus_dpt}
 try:
