@@ -80,7 +80,7 @@ def read_exr_color(
     alpha = channels.pop("A", None)
     if alpha is not None and (share := float((alpha < 1.0).mean())) > 0.0:
         notes.append(
-            f"{100.0 * share:.2g} % of the pixels are transparent; black is behind them"
+            f"{100.0 * share:.3g} % of the pixels are transparent; black is behind them"
         )
     names = list("RGB" if "R" in channels else "YYY")
     rgb = np.stack([channels[name] for name in names], axis=-1)

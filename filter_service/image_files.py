@@ -38,7 +38,7 @@ NO_RETURN = 65535
 ROW_VALUES = 1 << 20
 """Values converted at a time, so that no float64 copy of a large image is held."""
 
-SAMPLED_VALUES = 1 << 20
+SAMPLED_VALUES = 1 << 16
 """Values that are examined for likely mistakes of units."""
 
 FARTHEST_NEAR_M, NEAREST_FAR_M = 50.0, 0.05
@@ -243,7 +243,7 @@ def depth_of(
         if none.any():
             depth_m[none] = 0.0
             share = 100.0 * float(none.mean())
-            notes.append(f"{share:.2g} % of the depth is {NO_RETURN}: missing")
+            notes.append(f"{share:.3g} % of the depth is {NO_RETURN}: missing")
     _note_doubtful_depth(depth_m, notes)
     return depth_m, notes
 

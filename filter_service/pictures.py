@@ -57,21 +57,19 @@ _WITH_ALPHA = ("LA", "PA", "RGBA", "La", "RGBa")
 
 @dataclass
 class _Stored:
-    """Pixels as stored, and what is needed to show them.
+    """Pixels as stored, but upright, and what is needed to show them.
 
     Attributes
     ----------
     codes : (height, width, 3), uint8 or uint16
     alpha : (height, width) of the same type, or None
     encoding : Encoding
-    orientation : int
-        As in EXIF: 1 is upright.
+    notes : list of str
     """
 
     codes: Codes
     alpha: Codes | None = None
     encoding: Encoding = SRGB
-    orientation: int = 1
     notes: list[str] = field(default_factory=list)
 
 
@@ -107,12 +105,8 @@ def read_picture_color(
     """
     with open_picture(source, name, option) as file:
         stored = _stored(file, formats)
-        return shown(
-            upright(stored.codes, stored.orientation),
-            None if stored.alpha is None else upright(stored.alpha, stored.orientation),
-            stored.encoding,
-            stored.notes,
-        ), stored.notes
+        color = shown(stored.codes, stored.alpha, stored.encoding, stored.notes)
+        return color, stored.notes
 
 
 def read_picture_srgb8(
@@ -127,7 +121,7 @@ def read_picture_srgb8(
     color, notes = read_picture_color(source, name=name, formats=formats)
     if color.dtype != np.uint8:
         if (share := float((color > 1.001).any(axis=2).mean())) > 0.0:
-            notes.append(f"{100.0 * share:.2g} % of the pixels are brighter than white")
+            notes.append(f"{100.0 * share:.3g} % of the pixels are brighter than white")
         return srgb8_of(cast("NDArray[np.float32]", color)), notes
     return cast("NDArray[np.uint8]", color), notes
 
@@ -203,7 +197,7 @@ def shown(
             alpha = None
         else:
             notes.append(
-                f"{100.0 * share:.2g} % of the pixels are transparent; black is behind "
+                f"{100.0 * share:.3g} % of the pixels are transparent; black is behind "
                 "them"
             )
     if codes.dtype == np.uint8 and not encoding.is_hdr:
@@ -263,7 +257,12 @@ def _stored(file: BinaryIO, formats: Sequence[str]) -> _Stored:
         _note_resolution(image, notes)
         if isinstance(encoding, bytes):
             encoding = SRGB
-        return _Stored(codes, alpha, encoding, _orientation(image), notes)
+        orientation = _orientation(image)
+    # Pillow's copy of the pixels is gone: each step holds two copies at most.
+    codes = upright(codes, orientation)
+    if alpha is not None:
+        alpha = upright(alpha, orientation)
+    return _Stored(codes, alpha, encoding, notes)
 
 
 def _raw_mode(image: Image.Image) -> str:
@@ -331,16 +330,23 @@ def _deep_codes(
     else:
         codes = np.asarray(image).astype(np.uint16)
         codes <<= 8
+        _release(image)
         file.seek(0)
         with Image.open(file, formats=("PNG",)) as again:
             _set_raw_mode(again, _LOW_BYTES[raw])
             codes |= np.asarray(again)
+            _release(again)
         if raw.startswith("RGBA"):
-            return codes[..., :3].copy(), codes[..., 3].copy()
+            return np.ascontiguousarray(codes[..., :3]), codes[..., 3].copy()
     if key is None:
         return codes, None
     is_seen = (codes != np.asarray(key, np.uint16)).any(axis=2)
     return codes, np.where(is_seen, np.uint16(65535), np.uint16(0))
+
+
+def _release(image: Image.Image) -> None:
+    """Free the pixels of an image, but not what its file says."""
+    image.im = Image.new(image.mode, (1, 1)).im
 
 
 def _set_raw_mode(image: Image.Image, raw: str) -> None:

@@ -148,7 +148,7 @@ def _check_plain(field: str, image: object, allowed: str) -> None:
     """Reject what is not an array, and masked arrays, whose mask would be lost."""
     if isinstance(image, np.ma.MaskedArray):
         raise BadMessage(
-            f"it is a masked array with {np.ma.count_masked(image)} masked values",
+            f"it is a masked array with {np.asarray(image.mask).sum()} masked values",
             field=field,
             allowed="a plain array, as from its method filled(0)",
         )
