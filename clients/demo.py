@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from clients.arguments import size_px_argument
 from clients.demo_eyes import EYES
-from clients.extra import what_to_install
 from clients.filter_client import FilterClient, FilteredFrame
 from clients.frame_log import FrameLog
 from clients.pyrender_stream import path_settings
@@ -41,19 +40,13 @@ from clients.sheet import (
     video_frame,
 )
 from clients.streaming import change_eye, filter_in_order
+from clients.video import write_video
 from filter_service.atomic_files import replace_atomically
 from filter_service.errors import FilterError, RenderFailed
 from filter_service.progress import Progress
 
 if TYPE_CHECKING:
     from PIL import Image
-
-try:
-    from clients.video import write_video
-except ModuleNotFoundError as error:
-    if __name__ != "__main__":
-        raise
-    sys.exit(f"demo: {what_to_install(error)}")
 
 FRAMES_PER_SECOND = 12
 DETAIL_CORNERS = {"courtyard": (0.32, 0.19), "primitives": (0.42, 0.30)}

@@ -1,4 +1,4 @@
-"""Video output: H.264 in MP4 if the encoder works, otherwise an animated GIF."""
+"""Video output: H.264 in MP4 if PyAV has the encoder, otherwise an animated GIF."""
 
 from __future__ import annotations
 
@@ -9,12 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from clients.batch.video_writing import (
-    VIDEO_KINDS,
-    EncodingFailed,
-    join_segments,
-    write_segment,
-)
 from filter_service.atomic_files import replace_atomically
 
 _GIF_WIDTH_PX = 1200
@@ -25,7 +19,7 @@ def write_video(
     frames: Callable[[], Iterable[NDArray[np.uint8]]],
     frames_per_second: int,
 ) -> Path:
-    """Write frames to stem.mp4, or to stem.gif if the encoder fails.
+    """Write frames to stem.mp4, or to stem.gif without PyAV or a working encoder.
 
     Parameters
     ----------
@@ -42,37 +36,47 @@ def write_video(
     Path
         The file written.
     """
-    target, segment = stem.with_suffix(".mp4"), stem.with_suffix(".mkv")
-    kind, rate_hz = VIDEO_KINDS["h264"], frames_per_second
     try:
-        write_segment(segment, enumerate(frames()), kind=kind, rate_hz=rate_hz)
+        from clients.batch import video_writing
+    except ModuleNotFoundError:  # PyAV is in the extras
+        return _write_gif(stem, frames(), frames_per_second)
+    target, segment = stem.with_suffix(".mp4"), stem.with_suffix(".mkv")
+    kind, rate_hz = video_writing.VIDEO_KINDS["h264"], frames_per_second
+    try:
+        video_writing.write_segment(
+            segment, enumerate(frames()), kind=kind, rate_hz=rate_hz
+        )
         replace_atomically(
             target,
-            lambda part: join_segments(
+            lambda part: video_writing.join_segments(
                 part, [(0, segment)], kind=kind, rate_hz=rate_hz
             ),
         )
-    except (OSError, ValueError, EncodingFailed):  # libx264 is missing or fails
-        target = stem.with_suffix(".gif")
-        replace_atomically(
-            target, lambda part: _write_gif(part, frames(), frames_per_second)
-        )
-    segment.unlink(missing_ok=True)
-    return target
+        return target
+    except (OSError, ValueError, video_writing.EncodingFailed):
+        # libx264 is missing or fails
+        return _write_gif(stem, frames(), frames_per_second)
+    finally:
+        segment.unlink(missing_ok=True)
 
 
 def _write_gif(
-    target: Path, frames: Iterable[NDArray[np.uint8]], frames_per_second: int
-) -> None:
+    stem: Path, frames: Iterable[NDArray[np.uint8]], frames_per_second: int
+) -> Path:
+    target = stem.with_suffix(".gif")
     images = []
     for frame in frames:
         image = Image.fromarray(frame)
         image.thumbnail((_GIF_WIDTH_PX, _GIF_WIDTH_PX))
         images.append(image.quantize(128))
-    images[0].save(
+    replace_atomically(
         target,
-        save_all=True,
-        append_images=images[1:],
-        duration=round(1000 / frames_per_second),
-        loop=0,
+        lambda part: images[0].save(
+            part,
+            save_all=True,
+            append_images=images[1:],
+            duration=round(1000 / frames_per_second),
+            loop=0,
+        ),
     )
+    return target

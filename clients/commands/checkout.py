@@ -30,6 +30,7 @@ def bench(
 
     ocufilter bench psf --quick
 
+    Requires a checkout; `ocufilter latency` measures a running service without one.
     Other options are passed to the benchmark:
 
     ocufilter bench roundtrip --transport shm --stereo

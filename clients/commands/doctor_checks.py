@@ -346,7 +346,7 @@ def what_works(ok: dict[str, bool]) -> dict[str, bool]:
     shaders = ok["gl"] and ok["compute"] and ok["shaders"]
     filters = psf and (ok["native"] or shaders)
     serve = filters and ok["threads"]
-    demo = serve and ok["client packages"] and ok["gl"]  # which renders its scenes
+    demo = serve and ok["gl"]  # which renders its scenes
     return {
         "psf": psf,
         "filter": filters,

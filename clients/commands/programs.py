@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import typer
 
 from clients.commands.console import CommandFailed, Json, print_json, print_line
-from clients.extra import what_to_install
 
 
 def demo(
@@ -28,8 +27,8 @@ def demo(
 ) -> None:
     """Stream two scenes through six eyes and write a video and a contact sheet.
 
-    Starts a service of its own and a client that connects to it.  Writes a video,
-    contact_sheet.png and latency.json.
+    Starts a service of its own and a client that connects to it.  Writes a video (a GIF
+    without the package av), contact_sheet.png and latency.json.
 
     ocufilter demo --out out/demo --frames 24 --size 480x270
     """
@@ -41,10 +40,7 @@ def demo(
 
         width_px, height_px = read_size_px(size)
         arguments += ["--size", f"{width_px}x{height_px}"]
-    try:
-        _run("clients.demo", [*arguments, *["--json"] * json_output])
-    except ModuleNotFoundError as error:
-        raise CommandFailed(what_to_install(error)) from None
+    _run("clients.demo", [*arguments, *["--json"] * json_output])
 
 
 def headset(context: typer.Context) -> None:

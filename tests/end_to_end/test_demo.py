@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import clients.batch
 from clients import demo, pyrender_stream, sheet, video
 from clients.arguments import read_profile, read_size_px
+from clients.batch import video_writing
 from clients.batch.video_reading import VideoReader
 from clients.demo_eyes import EYES
 from clients.frame_log import FrameLog, percentiles
@@ -155,11 +157,15 @@ def test_demo_reports_a_service_that_dies_on_the_way(monkeypatch, capsys, tmp_pa
 
 
 @pytest.mark.parametrize(
-    "broken", [{"codec": "no_such_encoder"}, {"options": (("preset", "none"),)}]
+    "broken", [{"codec": "no_such_encoder"}, {"options": (("preset", "none"),)}, None]
 )
-def test_gif_stands_in_where_the_encoder_fails(broken, monkeypatch, tmp_path):
-    kind = replace(video.VIDEO_KINDS["h264"], **broken)
-    monkeypatch.setitem(video.VIDEO_KINDS, "h264", kind)
+def test_gif_stands_in_where_the_encoder_fails_or_lacks(broken, monkeypatch, tmp_path):
+    if broken is None:
+        monkeypatch.setitem(sys.modules, "clients.batch.video_writing", None)
+        monkeypatch.delattr(clients.batch, "video_writing")
+    else:
+        kind = replace(video_writing.VIDEO_KINDS["h264"], **broken)
+        monkeypatch.setitem(video_writing.VIDEO_KINDS, "h264", kind)
     shades = [np.full((20, 40, 3), shade, np.uint8) for shade in (0, 120, 250)]
     written = video.write_video(tmp_path / "film", lambda: iter(shades), 10)
     assert written == tmp_path / "film.gif"

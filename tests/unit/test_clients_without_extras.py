@@ -22,7 +22,6 @@ WITHOUT_A_PACKAGE = (
 @pytest.mark.parametrize(
     ("package", "command", "arguments"),
     [
-        pytest.param("av", INSTALL, ("clients.demo",), marks=pytest.mark.clients),
         ("glfw", INSTALL, ("clients.pyrender_stream", "--window")),
         ("pyrender", PYRENDER_INSTALL, ("clients.pyrender_stream", "--file", "a.stl")),
     ],

@@ -79,6 +79,11 @@ CHECKS = (
 )
 
 
+def test_the_demo_needs_no_package_of_the_extras():
+    ok = dict.fromkeys(CHECKS, True) | {"client packages": False}
+    assert doctor_checks.what_works(ok)["demo"]
+
+
 @pytest.mark.parametrize("lost", ["gl", "compute", "shaders"])
 def test_filter_and_serve_need_the_shaders_or_the_loops(lost):
     ok = dict.fromkeys(CHECKS, True)
