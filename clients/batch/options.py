@@ -36,9 +36,9 @@ Filter folders and videos of color and depth on all cores, each frame through ea
 profile.  Run the same command again to continue an interrupted batch.
 
   ocufilter batch rgbd_dataset_freiburg1_desk -p myopia -p keratoconus -o seen
-  ocufilter batch room/ -p me.json --fov-deg 50 --focus-dpt center -o seen
+  ocufilter batch room/ -p me.json --fov-deg 50 --focus-dpt center -o room_seen
   ocufilter batch walk.mp4 --depth walk_depth.mkv --fov-deg 60 -p myopia \\
-      --format h264 -o seen
+      --format h264 -o walk_seen
 """
 
 LAYOUT_HELP = """\

@@ -10,8 +10,9 @@ as an array or a file, instead of a constant distance.  If the stimulus is shown
 vertical field of view, an observer without refractive error receives the retinal image
 of the simulated eye, limited by diffraction and the observer's own aberrations.
 
-`pip install examples/adapters` registers the class as `psychopy.visual.SeenImageStim`.
-The filter is imported with the first stimulus, so an unused plugin costs nothing.
+Where ocufilter is installed, `pip install examples/adapters` registers the class as
+`psychopy.visual.SeenImageStim`.  The filter is imported with the first stimulus, so an
+unused plugin costs nothing.
 """
 
 from pathlib import Path

@@ -20,7 +20,6 @@ from filter_service.messages import (
     Ready,
     decode_request,
 )
-from tests.benchmarks.bench_roundtrip import parse_arguments, read_settings
 from tests.source_tree import ROOT
 
 FOLDER = ROOT / "clients"
@@ -398,15 +397,17 @@ def test_the_budget_has_the_gpus_figures():
         assert [float(low), float(high)] == [round(min(found), 1), round(max(found), 1)]
 
 
-def test_the_commands_that_it_shows_are_known():
+def test_the_commands_that_it_shows_belong_together():
     commands = re.findall(r"^    ocufilter (.*)$", PAGE, re.MULTILINE)
     shown = {command.split()[0]: command.split()[1:] for command in commands}
-    assert set(shown) == {"serve", "status", "bench"}
+    assert set(shown) == {"serve", "status", "latency", "layer"}
     assert shown["serve"] == ["--bind", *shown["status"]]
-    name, *options = shown["bench"]
-    settings = read_settings(parse_arguments(options))
-    assert (name, settings.transport, settings.n_views) == ("roundtrip", "shm", 2)
-    assert (settings.width_px, settings.height_px) == (1832, 1920)
+    endpoint, *options = shown["latency"]
+    assert [endpoint] == shown["status"]
+    frame = headers()[1]["views"][0]
+    assert "--stereo" in options
+    size = options[options.index("--size") + 1]
+    assert size == f"{frame['width_px']}x{frame['height_px']}"
 
 
 def test_files_that_the_page_names_exist():

@@ -16,6 +16,7 @@ import pytest
 from PIL import Image
 
 from clients.service_process import ServiceProcess
+from tests.page_commands import ENDPOINT, PAGES, SLOW, commands_of, make_files
 from tests.release.smoke import REQUEST
 from tests.source_tree import ROOT
 
@@ -24,6 +25,7 @@ pytestmark = pytest.mark.tools
 TIMEOUT_S = 300  # where no kernel of numba's has been compiled yet
 WIDTH_PX, HEIGHT_PX = 24, 16
 PACKAGES = ("clients", "estimator", "filter_service")
+BRIEF_PAGES = ("docs/how-to/deploy.md", "docs/how-to/eye-models.md")
 
 HELD = (
     *(f"{package}/**/{name}" for package in PACKAGES for name in ("*.py", "*.pyi")),
@@ -40,6 +42,9 @@ HELD = (
     "filter_service/*.schema.json",
     "filter_service/service/ocufilter.service",
     "clients/assets/*",
+    "clients/js/*.js",
+    "clients/js/package.json",
+    "clients/js/README.md",
     "clients/web/*.css",
     "clients/web/*.js",
 )
@@ -144,14 +149,14 @@ def bring_compiled_kernels(site):
             os.utime(path, ns=(source.stat().st_mtime_ns,) * 2)
 
 
-def start(installed, *command):
+def start(installed, *command, cwd=None, **variables):
     """Run in an empty folder, with nothing that leads to the checkout."""
     leads = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "NUMBA_CACHE_DIR")
     environment = {k: v for k, v in os.environ.items() if k not in leads}
     return subprocess.run(
         [str(word) for word in command],
-        cwd=installed.cwd,
-        env=environment,
+        cwd=cwd or installed.cwd,
+        env=environment | variables,
         capture_output=True,
         text=True,
         timeout=TIMEOUT_S,
@@ -291,16 +296,34 @@ def test_a_benchmark_of_the_tests_needs_a_checkout(installed):
     assert "checkout" in one_line(start(installed, *module, "bench", "psf"), 1)
 
 
-def test_the_demo_is_there(run):
-    finished = run("demo", "--help")
-    assert finished.returncode == 0
-    assert "--frames" in finished.stdout
+@pytest.fixture
+def psychopy(installed):
+    """PsychoPy's metadata, which pip reads, without its gigabyte of packages."""
+    folder = installed.site / "psychopy-2026.2.5.dist-info"
+    folder.mkdir()
+    text = "Metadata-Version: 2.1\nName: psychopy\nVersion: 2026.2.5\n"
+    (folder / "METADATA").write_text(text)
+    yield
+    shutil.rmtree(folder)
+
+
+def test_the_adapters_install_where_the_wheel_is(installed, psychopy, tmp_path):
+    adapters = tmp_path / "adapters"
+    shutil.copytree(ROOT / "examples" / "adapters", adapters)  # a build leaves files
+    install = ("install", "-q", "--no-index", "--no-build-isolation", adapters)
+    pip("--python", str(installed.python), *map(str, install))
+    script = (
+        "from importlib.metadata import entry_points as e\n"
+        "print(*(x.value for x in e(group='psychopy.visual')))"
+    )
+    finished = start(installed, installed.python, "-c", script)
+    assert finished.stdout == "psychopy_ocufilter:SeenImageStim\n"
 
 
 EXTRAS = (
     *("glfw", "OpenGL", "pyrender", "trimesh"),
     *("xr", "nicegui", "fastapi", "uvicorn", "av", "ray"),
-    *("prometheus_client", "skimage"),
+    *("prometheus_client", "skimage", "weasyprint"),
 )
 WITHOUT_EXTRAS = f"import sys\nsys.modules.update(dict.fromkeys({EXTRAS!r}))\n"
 
@@ -315,11 +338,60 @@ def bare(installed, tmp_path_factory):
     switch.unlink()
 
 
+def test_help_names_a_first_command_that_runs(bare, tmp_path):
+    shown = start(bare, bare.ocufilter, "--help").stdout
+    first = re.search(r"Start\s+with\s+`ocufilter (\w+)`", shown)[1]
+    words = (bare.ocufilter, first, "--frames", 2, "--size", "64x36")
+    finished = start(bare, *words, cwd=tmp_path)
+    assert finished.returncode == 0, finished.stderr
+    with Image.open(tmp_path / "out" / "demo" / "demo.gif") as film:
+        assert film.n_frames == 2
+    assert (tmp_path / "out" / "demo" / "contact_sheet.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("page", "is_brief"),
+    [
+        *((page, True) for page in BRIEF_PAGES),
+        *(
+            pytest.param(page, False, marks=pytest.mark.slow)
+            for page in PAGES
+            if any(command.ends for command in commands_of(page))
+        ),
+    ],
+)
+def test_commands_of_a_page_run_or_name_what_to_install(bare, page, is_brief, tmp_path):
+    make_files(tmp_path)
+    for command in commands_of(page):
+        if is_brief and command.is_one_of(SLOW):
+            continue
+        if command.ends and ENDPOINT not in command.arguments:
+            words = (bare.ocufilter, *command.arguments)
+            home = dict.fromkeys(("HOME", "XDG_CONFIG_HOME"), str(tmp_path))
+            finished = start(bare, *words, cwd=tmp_path, **home)
+            command.check(finished.returncode, finished.stderr, may_lack=True)
+
+
+@pytest.mark.parametrize(
+    ("page", "file"),
+    [
+        ("docs/how-to/deploy.md", ".config/systemd/user/ocufilter.service"),
+        ("clients/js/README.md", "ocufilter-js/filter_client.js"),
+    ],
+)
+def test_files_of_the_package_are_where_pages_say(installed, page, file, tmp_path):
+    script = "\n".join(c.text for c in commands_of(page) if c.copies)
+    path = f"{installed.python.parent}:{os.environ['PATH']}"
+    words = ("sh", "-ec", script)
+    finished = start(installed, *words, cwd=tmp_path, HOME=str(tmp_path), PATH=path)
+    assert finished.returncode == 0, finished.stderr
+    assert (tmp_path / file).is_file()
+
+
 @pytest.mark.parametrize(
     ("command", "package"),
     [
         (("headset",), "ocufilter[headset]"),
-        (("demo",), "ocufilter[clients]"),
         (("web", "--no-browser"), "ocufilter[web]"),
         (
             ("batch", "a.mp4", "-p", "myopia", "-o", "out", "--fov-deg", 50),

@@ -18,6 +18,10 @@ LIBRARIES = {
     "clients/openxr_layer/_layer.so",
 }
 MACHINES = {"x86_64": 62, "aarch64": 183}  # e_machine of ELF
+EXAMPLES = tuple(
+    f"examples/**/*.{suffix}"
+    for suffix in ("csv", "ipynb", "jpg", "md", "png", "py", "toml")
+)
 SOURCES = ("setup.py", "pyproject.toml", "README.md", "CHANGELOG.md", "CONVENTIONS.md")
 
 
@@ -54,7 +58,7 @@ def check_wheel(path: Path, libraries: set[str] = LIBRARIES) -> None:
 
 
 def check_sdist(path: Path) -> None:
-    """Check that the sdist has the packages, the C sources, and no tests."""
+    """Check that the sdist has the packages, C sources and examples, and no tests."""
     with tarfile.open(path) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
     patterns = ("filter_service/**/*.[ch]", "clients/**/*.[ch]")
@@ -62,7 +66,8 @@ def check_sdist(path: Path) -> None:
     sources = {p.relative_to(ROOT).as_posix() for p in found}
     sources = {name for name in sources if "/node_modules/" not in name}
     files = {p.relative_to(ROOT).as_posix() for n in HELD for p in ROOT.glob(n)}
-    missing = (sources | files | set(SOURCES)) - names
+    examples = {p.relative_to(ROOT).as_posix() for n in EXAMPLES for p in ROOT.glob(n)}
+    missing = (sources | files | examples | set(SOURCES)) - names
     surplus = {name for name in names if name.startswith(("tests/", "training/"))}
     if missing or surplus:
         raise Failed(f"{path.name}: missing {missing}, surplus {surplus}")

@@ -8,6 +8,7 @@ import subprocess
 import time
 import urllib.request
 
+from tests.page_commands import ENDPOINT, PAGES, SLOW, commands_of, make_files
 from tests.release.commands import Failed
 from tests.release.environment import Environment
 
@@ -157,7 +158,22 @@ def web(environment: Environment) -> None:
         raise Failed(f"web: exit status {page.returncode}")
 
 
+def pages(environment: Environment) -> None:
+    """Run the brief commands of the pages, as printed."""
+    make_files(environment.work)
+    for command in {c.text: c for page in PAGES for c in commands_of(page)}.values():
+        is_brief = command.ends and not command.is_one_of(SLOW)
+        if is_brief and ENDPOINT not in command.text:
+            process = environment.start("ocufilter", *command.arguments)
+            _, errors = process.communicate(timeout=300)
+            try:
+                command.check(process.returncode, errors, may_lack=True)
+            except AssertionError as error:
+                raise Failed(f"pages: {error}") from None
+
+
 COMMANDS = {
+    "pages": pages,
     "serve": serve,
     "latency": latency,
     "batch": batch,

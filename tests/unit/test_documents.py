@@ -1,14 +1,10 @@
-"""Documents name files, links, targets, commands and profiles that exist."""
+"""Documents name files, links, targets and profiles that exist."""
 
 import json
 import re
-import shlex
-from functools import cache
 
 import pytest
-from typer.testing import CliRunner
 
-from clients.commands.program import app
 from estimator.profiles.parse import parse_profile, preset_names
 from tests.source_tree import ROOT
 
@@ -26,9 +22,6 @@ GENERATED = {
 }
 """Pages that only the built documentation has."""
 
-OWN_OPTIONS = ("batch", "bench", "headset", "layer", "report", "web")
-"""Commands whose programs parse their options themselves."""
-
 
 def text_of(document: str) -> str:
     return (ROOT / document).read_text(encoding="utf-8")
@@ -36,23 +29,6 @@ def text_of(document: str) -> str:
 
 def make_targets() -> set[str]:
     return set(re.findall(r"^([a-z][a-z-]*):", text_of("Makefile"), re.MULTILINE))
-
-
-@cache
-def help_of(*arguments: str) -> str:
-    result = CliRunner().invoke(app, [*arguments, "--help"])
-    assert result.exit_code == 0, result.output
-    return result.output
-
-
-def indented_commands() -> list[tuple[str, list[str]]]:
-    found = []
-    for document in DOCUMENTS:
-        text = text_of(document).replace("\\\n", " ")
-        for line in re.findall(r"^    (ocufilter .*)$", text, re.MULTILINE):
-            words = shlex.split(line, comments=True)[1:]
-            found.append((document, words))
-    return found
 
 
 @pytest.mark.parametrize("document", DOCUMENTS)
@@ -94,17 +70,6 @@ def test_every_public_make_target_is_phony_and_explained():
     assert make_targets() == phony
     explained = set(re.findall(r"^([a-z-]+):.*  ## ", makefile, re.MULTILINE))
     assert {name for name in phony if not name.startswith("setup")} == explained
-
-
-@pytest.mark.parametrize(("document", "words"), indented_commands())
-def test_commands_and_their_options_are_known_to_help(document, words):
-    text = help_of(words[0])
-    if words[0] in OWN_OPTIONS:
-        return
-    options = [w.partition("=")[0] for w in words if re.match(r"--?[a-z]", w)]
-    if words[0] in ("keys", "eyes"):
-        text = help_of(*words[:2])
-    assert not [o for o in options if o not in re.split(r"[\s,]", text)], document
 
 
 def test_the_readme_is_short():
