@@ -338,9 +338,20 @@ def bare(installed, tmp_path_factory):
     switch.unlink()
 
 
-def test_help_names_a_first_command_that_runs(bare, tmp_path):
+def first_command(bare):
+    """Return the command that `ocufilter --help` tells to start with."""
     shown = start(bare, bare.ocufilter, "--help").stdout
-    first = re.search(r"Start\s+with\s+`ocufilter (\w+)`", shown)[1]
+    return re.search(r"Start\s+with\s+`ocufilter (\w+)`", shown)[1]
+
+
+def test_the_first_command_needs_no_extra(bare):
+    module = (bare.python, "-m", f"clients.{first_command(bare)}", "--frames", 0)
+    assert "allowed: 1 or more" in start(bare, *module).stderr
+
+
+@pytest.mark.slow
+def test_the_first_command_runs(bare, tmp_path):
+    first = first_command(bare)
     words = (bare.ocufilter, first, "--frames", 2, "--size", "64x36")
     finished = start(bare, *words, cwd=tmp_path)
     assert finished.returncode == 0, finished.stderr

@@ -24,6 +24,7 @@ COLUMNS = {
     "first_filter_s": "first picture, s",
     "second_filter_s": "next picture, s",
     "doctor_s": "doctor, s",
+    "demo_s": "demo, s",
     "pages_s": "commands of pages, s",
     "serve_s": "serve, s",
     "web_s": "web, s",

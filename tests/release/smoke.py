@@ -172,7 +172,16 @@ def pages(environment: Environment) -> None:
                 raise Failed(f"pages: {error}") from None
 
 
+def demo(environment: Environment) -> None:
+    """Run the demo, without the packages of the extras."""
+    environment.run("ocufilter", "demo", "--frames", "2", "--size", "64x36")
+    for name in ("demo.gif", "contact_sheet.png"):
+        if not (environment.work / "out" / "demo" / name).exists():
+            raise Failed(f"demo: no {name}")
+
+
 COMMANDS = {
+    "demo": demo,
     "pages": pages,
     "serve": serve,
     "latency": latency,
