@@ -70,9 +70,16 @@ class Command:
         return f"{self.page}:{self.line}"
 
     @property
+    def words(self) -> list[str]:
+        """The program and its arguments."""
+        return shlex.split(self.text)
+
+    @property
     def arguments(self) -> list[str] | None:
         """Arguments of `ocufilter`, if this command runs it."""
-        words = shlex.split(self.text)
+        if "ocufilter" not in self.text:
+            return None
+        words = self.words
         while words and (re.fullmatch(r"\w+=.*", words[0]) or words[0] in AS_ANOTHER):
             words = words[AS_ANOTHER.get(words[0], 1) :]
         if not words or Path(words[0]).name != "ocufilter":

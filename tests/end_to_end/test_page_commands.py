@@ -13,9 +13,10 @@ import pytest
 from packaging.requirements import Requirement
 from typer.core import TyperCommand
 
+from clients import pyrender_stream
 from filter_service.service.config import load_config
 from filter_service.version import __version__
-from tests.commands import run_command
+from tests.commands import run_command, run_main
 from tests.end_to_end.printed_script import printed_by
 from tests.page_commands import (
     ENDPOINT,
@@ -80,6 +81,20 @@ def arguments_once(commands):
 )
 def test_the_program_reads_the_arguments(read, command):
     finished = read(command.arguments)
+    assert finished.returncode == 0, (command.text, finished.stderr)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        command
+        for command in (*OF_PAGES, *commands_of_help())
+        if command.text.startswith("python -m clients.pyrender_stream ")
+    ],
+    ids=str,
+)
+def test_the_streaming_program_reads_the_arguments(read, command, tmp_path):
+    finished = run_main(pyrender_stream.main, *command.words[3:], cwd=tmp_path)
     assert finished.returncode == 0, (command.text, finished.stderr)
 
 
@@ -264,5 +279,5 @@ def test_the_folder_of_the_javascript_client_is_printed(tmp_path):
         for command in commands_of("docs/how-to/game-engine.md")
         if command.text.startswith("python -c")
     )
-    folder = Path(printed_by(*shlex.split(command.text)[1:], cwd=tmp_path).strip())
+    folder = Path(printed_by(*command.words[1:], cwd=tmp_path).strip())
     assert (folder / "filter_client.js").samefile(ROOT / "clients/js/filter_client.js")

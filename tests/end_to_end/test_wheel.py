@@ -16,6 +16,7 @@ import pytest
 from PIL import Image
 
 from clients.service_process import ServiceProcess
+from tests.end_to_end import test_documentation, test_examples
 from tests.page_commands import ENDPOINT, PAGES, SLOW, commands_of, make_files
 from tests.release.smoke import REQUEST
 from tests.source_tree import ROOT
@@ -381,6 +382,26 @@ def test_commands_of_a_page_run_or_name_what_to_install(bare, page, is_brief, tm
             home = dict.fromkeys(("HOME", "XDG_CONFIG_HOME"), str(tmp_path))
             finished = start(bare, *words, cwd=tmp_path, **home)
             command.check(finished.returncode, finished.stderr, may_lack=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", test_documentation.PAGES, ids=lambda path: path.stem)
+def test_python_examples_of_a_page_run(installed, path, tmp_path):
+    script = tmp_path / "example.py"
+    script.write_text(test_documentation.example_of(path), encoding="utf-8")
+    finished = start(installed, installed.python, script)
+    assert finished.returncode == 0, finished.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", test_examples.SCRIPTS, ids=lambda path: path.stem)
+def test_an_example_runs(installed, path, tmp_path):
+    examples = tmp_path / "examples"
+    shutil.copytree(path.parent, examples)
+    script = (installed.python, f"examples/{path.name}")
+    finished = start(installed, *script, cwd=tmp_path)
+    assert finished.returncode == 0, finished.stderr
+    assert list((tmp_path / "out" / "examples").glob(f"{path.stem}.*"))
 
 
 @pytest.mark.parametrize(
