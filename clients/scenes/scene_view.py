@@ -42,7 +42,8 @@ def open_context(version: int = 330) -> moderngl.Context:
         )
     except Exception as error:  # moderngl raises no narrower type
         raise RenderFailed(
-            f"scenes require OpenGL {version / 100:.1f} through EGL: {error}"
+            f"scenes require OpenGL {version / 100:.1f} through EGL: {error}; run "
+            "'ocufilter doctor' to see what is missing"
         ) from error
     # A new EGL context is current; leaving the block releases it.
     with context:

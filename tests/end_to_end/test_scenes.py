@@ -13,6 +13,8 @@ from clients.scenes.geometry import box, patch, placed, sphere
 from clients.scenes.lighting import Lights, baker
 from clients.scenes.paths import PATHS, look_at, path_moments
 from clients.scenes.scene_buffers import LEAST_GAP_DPT
+from clients.scenes.scene_view import open_context
+from filter_service.errors import RenderFailed
 
 UNITS_PER_M = 180.0
 
@@ -239,6 +241,12 @@ def current_context():
     egl = ctypes.CDLL("libEGL.so.1")
     egl.eglGetCurrentContext.restype = ctypes.c_void_p
     return egl.eglGetCurrentContext()
+
+
+def test_without_opengl_the_command_that_helps_is_named(monkeypatch):
+    monkeypatch.setenv("GLCONTEXT_LINUX_LIBEGL", "libnothing.so")
+    with pytest.raises(RenderFailed, match="libnothing.so.*'ocufilter doctor'"):
+        open_context()
 
 
 def test_unknown_scene_is_refused_with_the_known_ones():
