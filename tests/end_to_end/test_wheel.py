@@ -313,12 +313,8 @@ def test_the_adapters_install_where_the_wheel_is(installed, psychopy, tmp_path):
     shutil.copytree(ROOT / "examples" / "adapters", adapters)  # a build leaves files
     install = ("install", "-q", "--no-index", "--no-build-isolation", adapters)
     pip("--python", str(installed.python), *map(str, install))
-    script = (
-        "from importlib.metadata import entry_points as e\n"
-        "print(*(x.value for x in e(group='psychopy.visual')))"
-    )
-    finished = start(installed, installed.python, "-c", script)
-    assert finished.stdout == "psychopy_ocufilter:SeenImageStim\n"
+    (point,) = installed.site.glob("psychopy_ocufilter-*.dist-info/entry_points.txt")
+    assert "SeenImageStim = psychopy_ocufilter:SeenImageStim" in point.read_text()
 
 
 EXTRAS = (
@@ -329,8 +325,8 @@ EXTRAS = (
 WITHOUT_EXTRAS = f"import sys\nsys.modules.update(dict.fromkeys({EXTRAS!r}))\n"
 
 
-@pytest.fixture(scope="module")
-def bare(installed, tmp_path_factory):
+@pytest.fixture
+def bare(installed):
     """The wheel with none of the packages of its extras, which come by a .pth file."""
     (installed.site / "without_extras.py").write_text(WITHOUT_EXTRAS)
     switch = installed.site / "without_extras.pth"
@@ -358,26 +354,22 @@ def test_the_first_command_runs(bare, tmp_path):
     assert finished.returncode == 0, finished.stderr
     with Image.open(tmp_path / "out" / "demo" / "demo.gif") as film:
         assert film.n_frames == 2
-    assert (tmp_path / "out" / "demo" / "contact_sheet.png").exists()
 
 
 @pytest.mark.parametrize(
     ("page", "is_brief"),
-    [
-        *((page, True) for page in BRIEF_PAGES),
-        *(
-            pytest.param(page, False, marks=pytest.mark.slow)
-            for page in PAGES
-            if any(command.ends for command in commands_of(page))
-        ),
+    [(page, True) for page in BRIEF_PAGES]
+    + [
+        pytest.param(page, False, marks=pytest.mark.slow)
+        for page in PAGES
+        if any(command.ends for command in commands_of(page))
     ],
 )
 def test_commands_of_a_page_run_or_name_what_to_install(bare, page, is_brief, tmp_path):
     make_files(tmp_path)
     for command in commands_of(page):
-        if is_brief and command.is_one_of(SLOW):
-            continue
-        if command.ends and ENDPOINT not in command.arguments:
+        is_left_out = is_brief and command.is_one_of(SLOW)
+        if command.ends and ENDPOINT not in command.arguments and not is_left_out:
             words = (bare.ocufilter, *command.arguments)
             home = dict.fromkeys(("HOME", "XDG_CONFIG_HOME"), str(tmp_path))
             finished = start(bare, *words, cwd=tmp_path, **home)
