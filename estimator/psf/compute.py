@@ -329,7 +329,8 @@ def compute_psf_batch(
         "auto" uses `switch.geometric_shares`.  "enz" raises outside the domain of the
         series; "enz_unchecked" does not, for tables that show where the series fails.
     accuracy : {"normal", "fine"}
-        Relative L2 error of wave-optical PSFs: at most 3e-2 or 1e-2.
+        Relative L2 error of wave-optical PSFs: at most 3e-2 or 1e-2.  "enz" is always
+        "fine".
     enz_degree : int
         Largest Zernike degree of the ENZ series; that of the paper by default.
     diffraction : bool
@@ -388,7 +389,7 @@ def compute_psf_batch(
                 np.arange(shares.size),
                 degree=enz_degree,
                 is_checked=method == "enz",
-                accuracy=ACCURACY["fine"],
+                accuracy=ACCURACY["fine" if method == "enz" else accuracy],
                 **common,
             )
         else:

@@ -9,6 +9,7 @@ feasible for eyes with small aberrations and for small pupils.
 
 import math
 from concurrent.futures import Executor
+from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,8 +20,8 @@ from estimator.optics.zernike import monomial_matrix, zernike_values
 from estimator.psf.enz_series import (
     LogAmplitude,
     hankel_table,
+    radial_basis,
     radial_nodes,
-    radial_polynomial,
     zernike_betas,
 )
 from estimator.psf.fourier import FourierAccuracy, pixel_filter, plan_grids
@@ -45,6 +46,11 @@ DEGREE_PER_WAVE = 2.0 * math.pi
 
 _RADIAL_STEPS = 32
 """Samples of V per lambda / pupil radius; cubic interpolation has an error of 4e-5."""
+
+_INTEGRATED_STEPS, _TAPS, _KAISER_BETA = 4, 8, 11.7
+"""Samples per lambda / pupil radius that are integrated, and the filter by which the
+others follow: V has no frequency above one cycle, half of what these samples carry.
+Its error is 2e-6, and the table takes an eighth of the time."""
 
 
 class EnzOutsideDomain(ValueError):
@@ -119,6 +125,27 @@ def _intensities(
             out[j, i] = total.real * total.real + total.imag * total.imag
 
 
+def _refined(samples: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return `_RADIAL_STEPS` samples of a table for `_INTEGRATED_STEPS`.
+
+    The first and last `_TAPS` - 1 samples (n, m) only serve the filter.
+    """
+    ratio = _RADIAL_STEPS // _INTEGRATED_STEPS
+    at = np.arange(1 - _TAPS, _TAPS + 1)[:, None] - np.arange(ratio) / ratio
+    window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(1.0 - (at / _TAPS) ** 2, 0.0)))
+    weights = np.sinc(at) * window / np.i0(_KAISER_BETA)
+    near = np.lib.stride_tricks.sliding_window_view(samples, 2 * _TAPS, axis=0)
+    found = np.moveaxis(near @ weights, 2, 1)
+    return found.reshape(-1, samples.shape[1])
+
+
+@cache
+def _coarse_modes() -> NDArray[np.float64]:
+    """Return the 28 modes at points of the pupil, for peak-to-valley aberrations."""
+    rho, angle = np.meshgrid(np.linspace(0, 1, 25), np.linspace(0, 2 * np.pi, 73))
+    return zernike_values(rho * np.cos(angle), rho * np.sin(angle))
+
+
 class _Series:
     """ENZ series of one PSF: expansion, domain check and pixel integration."""
 
@@ -154,9 +181,7 @@ class _Series:
     def _expand(
         self, frames: "PupilFrames", is_checked: bool
     ) -> dict[int, NDArray[np.complex128]]:
-        rho, angle = np.meshgrid(np.linspace(0, 1, 25), np.linspace(0, 2 * np.pi, 73))
-        x, y = rho * np.cos(angle), rho * np.sin(angle)
-        waves = zernike_values(x, y) @ self.residual_um / self.wavelength_um
+        waves = _coarse_modes() @ self.residual_um / self.wavelength_um
         self.needed = math.ceil(DEGREE_PER_WAVE * float(np.ptp(waves)))
         domain = {"index": self.index, "degree": self.degree, "needed": self.needed}
         if is_checked and self.needed > 1.4 * self.degree:
@@ -169,6 +194,7 @@ class _Series:
         )
         captured = sum(float((np.abs(b) ** 2).sum()) for b in betas.values())
         captured /= float(self.survey.passed_ratio[self.index])
+        self.captured_ratio = captured
         if is_checked and captured < MIN_CAPTURED_RATIO:
             domain["needed"] = max(self.needed, self.degree + 1)
             raise EnzOutsideDomain(**domain, captured=captured)
@@ -178,20 +204,19 @@ class _Series:
         """Return 2 (-i)^|m| sum_n beta sqrt(n+1) V_n^m at radii -1, 0, 1 ... steps."""
         rho, weight = radial_nodes(self.degree, abs(self.defocus_rad), reach)
         weight = weight * rho * np.exp(1j * self.defocus_rad * rho**2)
+        _, _, radial = radial_basis(self.degree, rho.size)
         weighted = np.empty((rho.size, 2 * self.degree + 1), np.complex128)
         for m in range(-self.degree, self.degree + 1):
-            ring = np.zeros(rho.size, np.complex128)
-            for k, beta in enumerate(self.betas[m]):
-                n = abs(m) + 2 * k
-                ring += beta * math.sqrt(n + 1.0) * radial_polynomial(n, m, rho)
+            ring = self.betas[m] @ radial[abs(m)]
             weighted[:, m + self.degree] = 2.0 * (-1j) ** abs(m) * weight * ring
-        r = np.arange(math.ceil(reach * _RADIAL_STEPS) + 4) / _RADIAL_STEPS
-        table = np.empty((r.size + 1, weighted.shape[1]), np.complex128)
-        hankel_table(r, rho, weighted, table[1:])
-        # J_m has the parity of m; the sample before 0 permits cubic interpolation at 0.
+        count = math.ceil(reach * _INTEGRATED_STEPS) + 2 + _TAPS
+        known = np.empty((count, weighted.shape[1]), np.complex128)
+        hankel_table(np.arange(count) / _INTEGRATED_STEPS, rho, weighted, known)
+        # J_m has the parity of m.
         signs = (-1.0) ** np.abs(np.arange(-self.degree, self.degree + 1))
-        table[0] = signs * table[2]
-        return table
+        table = _refined(np.concatenate([signs * known[_TAPS - 1 : 0 : -1], known]))
+        # The sample before 0 permits cubic interpolation at 0.
+        return np.concatenate([signs * table[1:2], table])
 
     def kernel(self, radius: int, accuracy: FourierAccuracy) -> NDArray[np.float32]:
         """Return the kernel (2R+1, 2R+1), in shares of the light.
@@ -203,7 +228,8 @@ class _Series:
             extent_px=survey.extent_px[p], unit_px=survey.unit_px[p], accuracy=accuracy
         )
         k = np.maximum(
-            plan.samples_per_px_count[0], np.ceil(2.0 / survey.unit_px[self.index])
+            plan.samples_per_px_count[0],
+            np.ceil(accuracy.oversampling / survey.unit_px[self.index]),
         ).astype(int)
         half_px = plan.length_count[0] / plan.samples_per_px_count[0] / 2.0
         middle = (survey.slope_low_px + survey.slope_high_px)[self.index] / 2.0
@@ -246,6 +272,16 @@ class _Series:
         passed = float(self.survey.passed_ratio[self.index])
         light: NDArray[np.float64] = out * area / self.wavelength_um**2 / passed
         return light
+
+
+def captured_ratios(
+    survey: PupilSurvey, degree: int = PAPER_DEGREE
+) -> NDArray[np.float64]:
+    """Return the share (P,) of the light of each pupil that a series contains."""
+    count = survey.passed_ratio.size
+    return np.array(
+        [_Series(survey, p, degree, False).captured_ratio for p in range(count)]
+    )
 
 
 _FILTER_REACH = 8

@@ -13,6 +13,7 @@ f/2 + 15 terms, a table of weights, and separate limits at r = 0 and f = 0.
 import math
 from collections.abc import Callable
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -134,8 +135,8 @@ def _legendre(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return np.polynomial.legendre.leggauss(count)
 
 
-@lru_cache(maxsize=8)
-def _basis(
+@lru_cache(maxsize=32)
+def radial_basis(
     degree: int, n_nodes: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], dict[int, NDArray[np.float64]]]:
     """Return nodes, weights and sqrt(n+1) R_n^m as {m: (n, nodes)}, m = 0 .. degree."""
@@ -183,15 +184,22 @@ def zernike_betas(
     every wavefront that the degree can represent.  The sum of |beta|² is the captured
     share of the energy.
     """
-    n_nodes, n_angles = 2 * degree + 40, 4 * degree + 64
-    rho, weight, radial = _basis(degree, n_nodes)
-    angle = 2.0 * math.pi * np.arange(n_angles) / n_angles
-    x, y = rho[:, None] * np.cos(angle), rho[:, None] * np.sin(angle)
-    field = np.exp(2j * math.pi / wavelength_um * (zernike_values(x, y) @ zernike_um))
+    rho, weight, radial, x, y, modes = _pupil_nodes(degree)
+    field = np.exp(2j * math.pi / wavelength_um * (modes @ zernike_um))
     if log_amplitude is not None:
         field = field * np.exp(log_amplitude(x, y))
-    harmonics = np.fft.fft(field, axis=1) / n_angles
+    harmonics = np.fft.fft(field, axis=1) / x.shape[1]
     return {
         m: 2.0 * (radial[abs(m)] * (weight * rho)) @ harmonics[:, m]
         for m in range(-degree, degree + 1)
     }
+
+
+@lru_cache(maxsize=2)
+def _pupil_nodes(degree: int) -> tuple[Any, ...]:
+    """Return `radial_basis`, and points (x, y) of the pupil with their 28 modes."""
+    n_angles = 4 * degree + 64
+    rho, weight, radial = radial_basis(degree, 2 * degree + 40)
+    angle = 2.0 * math.pi * np.arange(n_angles) / n_angles
+    x, y = rho[:, None] * np.cos(angle), rho[:, None] * np.sin(angle)
+    return rho, weight, radial, x, y, zernike_values(x, y)
