@@ -34,6 +34,7 @@ TurnDeg = Annotated[float, Meta(ge=0.0, le=MAX_GAZE_DEG)]
 RenderTolerance = Annotated[float, Meta(ge=0.0, le=MAX_RENDER_TOLERANCE)]
 Years = Annotated[float, Meta(ge=3.0, le=120.0)]
 
+Pipeline = Literal["exact", "published"]
 Mode = Literal["on-axis", "quality", "dynamic"]
 Grid = Literal["planned", "paper"]
 Prepare = Literal["stream", "ranges"]
@@ -44,6 +45,15 @@ Engine = Literal["auto", "gl", "native"]
 Accumulation = Literal["coverage", "paper"]
 DepthKind = Literal["planar", "radial"]
 Output = Literal["srgb8", "linear", "linear16"]
+
+PUBLISHED_ONLY: dict[str, object] = {
+    "diffraction": True,
+    "eye_model": "traced",
+    "lateral_color": False,
+    "stiles_crawford": False,
+    "wide_primaries": False,
+}
+"""Settings of which the published pipeline models one value only."""
 
 TOLERANCES: tuple[str, ...] = get_args(Tolerance)
 """From the loosest to the finest."""
@@ -104,6 +114,14 @@ class FilterSettings(Record):
         If a value is out of range; the error names the setting.
     """
 
+    pipeline: Annotated[
+        Pipeline,
+        _doc(
+            "exact: ray tracing and exact PSFs; published: the method of Csoba & "
+            "Kunkli (2023), with neural networks, ENZ PSFs, and their grid and "
+            "accumulation, which is slower and less exact."
+        ),
+    ] = "exact"
     mode: Annotated[
         Mode,
         _doc(
@@ -112,7 +130,11 @@ class FilterSettings(Record):
         ),
     ] = "dynamic"
     grid: Annotated[
-        Grid, _doc("planned: PSFs where this eye needs them; paper: its grid.")
+        Grid,
+        _doc(
+            "planned: PSFs where this eye needs them; paper: the fixed grid of the "
+            "published pipeline, which implies it."
+        ),
     ] = "planned"
     tolerance: Annotated[
         Tolerance,
@@ -218,6 +240,21 @@ class FilterSettings(Record):
             check_rising(value, kind, name)
             object.__setattr__(self, name, value)
         display_wavelengths_nm(self.display)
+        if self.pipeline == "published":
+            object.__setattr__(self, "grid", "paper")
+            for name, modeled in PUBLISHED_ONLY.items():
+                if getattr(self, name) != modeled:
+                    raise BadMessage(
+                        f"it is {getattr(self, name)!r} with pipeline 'published'",
+                        field=name,
+                        allowed=f"{modeled!r}, or pipeline 'exact'",
+                    )
+
+    def frame_options(self, options: RenderOptions) -> RenderOptions:
+        """Return a frame's options; the published pipeline has its own accumulation."""
+        if self.pipeline == "exact":
+            return options
+        return replace(options, accumulation="paper", peripheral_merging=False)
 
     @property
     def follows_field(self) -> bool:

@@ -497,8 +497,9 @@ def _report(summary: dict[str, Any]) -> None:
         )
     )
     print_line(
-        f"mode {settings['mode']}, grid {settings['grid']}, tolerance "
-        f"{settings['tolerance']}, eye model {settings['eye_model']}; {ranges}"
+        f"pipeline {settings['pipeline']}, mode {settings['mode']}, grid "
+        f"{settings['grid']}, tolerance {settings['tolerance']}, eye model "
+        f"{settings['eye_model']}; {ranges}"
     )
     print_line(
         f"{summary['out']}: {summary['width_px']}x{summary['height_px']} through "

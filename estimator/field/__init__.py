@@ -12,6 +12,7 @@ fixed_defocus           total defocus at fixed fields
 defocus_loops           compiled loop of fixed_defocus
 traced_eye              an estimated eye, ray-traced over the field
 prepare                 entry point: from a profile to such an eye
+network_eye             the same by network: the eye of the published pipeline
 field_table             wavefronts in many directions, at the cornea
 drawn_fields            these of drawn persons
 plot                    maps of a field table

@@ -17,6 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from estimator.optics.units import UM_PER_MM
 from estimator.optics.zernike import EXPONENTS, N_TERMS
 
+_ANGLES = 2.0 * np.pi * np.arange(16) / 16
+_RIM = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+
 
 @cache
 def _slope_products() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -80,3 +83,45 @@ def moved_polynomial(
     k3 = _squared_slopes(start + step / 2.0 * k2)
     k4 = _squared_slopes(start + step * k3)
     return polynomial_um + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+
+
+def moved_rim(
+    rim_mm: NDArray[np.float64],
+    polynomial_um: NDArray[np.float64],
+    *,
+    depth_mm: ArrayLike,
+) -> NDArray[np.float64]:
+    """Return rims (..., 5), center and matrix, where their rays meet deeper planes.
+
+    Parameters
+    ----------
+    rim_mm : (..., 5)
+    polynomial_um : (..., 28), um/mm^degree
+        Wavefronts before the transfer.
+    depth_mm : (...)
+    """
+    x, y, xx, xy, yy = np.moveaxis(rim_mm, -1, 0)[..., None]
+    cosine, sine = _RIM.T
+    px, py = x + xx * cosine + xy * sine, y + xy * cosine + yy * sine
+    slopes = np.zeros((*px.shape, 2))
+    for k in range(3, N_TERMS):
+        (a, b), factor = EXPONENTS[k], polynomial_um[..., k, None]
+        if a:
+            slopes[..., 0] += factor * a * px ** (a - 1) * py**b
+        if b:
+            slopes[..., 1] += factor * b * px**a * py ** (b - 1)
+    step = np.asarray(depth_mm, dtype=np.float64)[..., None, None] / UM_PER_MM
+    moved = np.stack([px, py], axis=-1) + step * slopes
+    center = moved.mean(axis=-2)
+    matrix = 2.0 * np.swapaxes(moved, -1, -2) @ _RIM / len(_RIM)
+    # The symmetric root of the square has the same rim as the matrix.
+    square = matrix @ np.swapaxes(matrix, -1, -2)
+    root = np.sqrt(np.linalg.det(square))
+    scale = 1.0 / np.sqrt(square[..., 0, 0] + square[..., 1, 1] + 2.0 * root)
+    columns = [
+        *(center[..., 0], center[..., 1]),
+        scale * (square[..., 0, 0] + root),
+        scale * square[..., 0, 1],
+        scale * (square[..., 1, 1] + root),
+    ]
+    return np.stack(columns, axis=-1)

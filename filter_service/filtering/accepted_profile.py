@@ -13,6 +13,7 @@ from estimator.profiles.parse import EyeProfile
 from filter_service.camera import Camera, distinct_cameras, is_same_camera
 from filter_service.errors import FilterError
 from filter_service.rendering.engine import LoadedStore
+from filter_service.rendering.media_effects import MediaEffects
 from filter_service.settings import FilterSettings
 
 
@@ -87,6 +88,13 @@ class AcceptedProfile:
     was_ready: bool = False
     failures: list[tuple[Camera, FilterError]] = field(default_factory=list)
     accepted_s: float = field(default_factory=time.monotonic)
+
+    @property
+    def media_effects(self) -> MediaEffects | None:
+        """Return the effects of the media, which the published pipeline lacks."""
+        if self.settings.pipeline == "published":
+            return None
+        return MediaEffects.of(self.profile, self.settings.display)
 
     def shares_store(self, first: Camera, second: Camera) -> bool:
         """Return whether both cameras can share a store of this eye."""

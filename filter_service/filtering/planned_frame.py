@@ -14,7 +14,7 @@ from filter_service.filtering.filtered import Filtered, ViewResult, summed_times
 from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
 from filter_service.rendering.engine import Pending, ViewRequest
 from filter_service.rendering.filtered_view import summed_counts
-from filter_service.rendering.media_effects import MediaEffects, begin_through_media
+from filter_service.rendering.media_effects import begin_through_media
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
 
@@ -70,6 +70,7 @@ class PlannedFrame:
         self,
         *,
         gazes_deg: Sequence[GazeDegrees],
+        options: RenderOptions = DEFAULT_OPTIONS,
         out: Sequence[NDArray[Any] | None] | None = None,
         **values: Any,
     ) -> Callable[[], Filtered]:
@@ -81,7 +82,8 @@ class PlannedFrame:
         plan = self.plan
         arrays = out or [None] * len(self.views)
         started_s = time.monotonic()
-        effects = MediaEffects.of(plan.eye.profile, plan.eye.settings.display)
+        effects = plan.eye.media_effects
+        options = plan.eye.settings.frame_options(options)
         begun = [
             begin_through_media(
                 self.builder.engine,
@@ -91,6 +93,7 @@ class PlannedFrame:
                     self.pupil_diameter_mm,
                     self.focus_dpt,
                     gaze_deg,
+                    options=options,
                     out=array,
                     **values,
                 ),

@@ -22,7 +22,7 @@ from filter_service.rendering.engine import (
     TextureRequest,
 )
 from filter_service.rendering.filtered_view import FrameCounts
-from filter_service.rendering.media_effects import UNCHANGED, MediaEffects
+from filter_service.rendering.media_effects import UNCHANGED
 from filter_service.rendering.sampled_frame import SampledView
 from filter_service.settings import DEFAULT_OPTIONS, RenderOptions
 from filter_service.texture_view import GlTexture, TextureView
@@ -136,8 +136,7 @@ class PlannedTextures:
         RenderError
         """
         view, target = self.views[index]
-        profile, settings = self.plan.eye.profile, self.plan.eye.settings
-        effects = MediaEffects.of(profile, settings.display)
+        effects = self.plan.eye.media_effects
         if effects is not None and effects.need_arrays is not None:
             raise BadMessage(
                 f"it has {effects.need_arrays}",
@@ -159,7 +158,7 @@ class PlannedTextures:
                     else target_is_top_first
                 ),
                 gain_ratio=UNCHANGED if effects is None else effects.gain_ratio,
-                options=options,
+                options=self.plan.eye.settings.frame_options(options),
                 waits=waits,
                 until_s=until_s,
             )

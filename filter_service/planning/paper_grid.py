@@ -10,6 +10,7 @@ Csoba & Kunkli 2023, section 7.2.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
 from filter_service.planning.defocus_nodes import DefocusNodes
@@ -32,6 +33,25 @@ FOCI_DPT = {
 DISTANCES_DPT = (0.125, 8.125)
 
 
+def paper_ranges(
+    spec: GridSpec,
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the ranges of the nodes of pupil, mm, and focus, dpt."""
+    settings = spec.settings
+    pupils_mm = np.clip(PUPILS_MM[settings.mode], *settings.pupil_range_mm)
+    foci_dpt = np.clip(FOCI_DPT[settings.mode], *settings.focus_range_dpt)
+    return (
+        (float(pupils_mm[0]), float(pupils_mm[-1])),
+        (float(foci_dpt[0]), float(foci_dpt[-1])),
+    )
+
+
+def paper_pupils_mm(eye: EyeOptics, spec: GridSpec) -> NDArray[np.float64]:
+    """Return the nodes (n,) of the pupil, clamped to the ranges of settings and eye."""
+    pupils_mm = np.clip(PUPILS_MM[spec.settings.mode], *spec.settings.pupil_range_mm)
+    return np.unique([eye.usable_pupil_mm(pupil_mm) for pupil_mm in pupils_mm])
+
+
 def paper_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
     """Return the nodes of field, pupil and accommodation.
 
@@ -44,9 +64,8 @@ def paper_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
         np.linspace(-reach, reach, count)
         for reach, count in zip(reach_deg, ANGLE_COUNTS[mode], strict=True)
     )
-    pupils_mm = np.clip(PUPILS_MM[mode], *settings.pupil_range_mm)
     foci_dpt = np.clip(FOCI_DPT[mode], *settings.focus_range_dpt)
-    usable_mm = np.unique([eye.usable_pupil_mm(pupil_mm) for pupil_mm in pupils_mm])
+    usable_mm = paper_pupils_mm(eye, spec)
     widest_mm = float(usable_mm[-1])
     accommodations_dpt = np.unique(
         [eye.accommodation_dpt(f, pupil_diameter_mm=widest_mm) for f in foci_dpt]

@@ -417,7 +417,9 @@ def _smaller_specs(spec: GridSpec) -> list[tuple[str, GridSpec]]:
         last = steps[-1][1] if steps else spec
         steps.append((" and ".join(words), last.with_settings(**settings)))
 
-    if spec.settings.grid == "paper":
+    if spec.settings.pipeline == "published":
+        step('pipeline "exact"', pipeline="exact", grid="planned")
+    elif spec.settings.grid == "paper":
         step('grid "planned"', grid="planned")
     if spec.settings.mode == "quality":
         step('mode "dynamic"', mode="dynamic")

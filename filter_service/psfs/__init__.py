@@ -2,7 +2,7 @@
 
 eye_for_spec     the eye of a profile over the ranges of a cache
 compute_kernels  from nodes to packed kernels
-psf_engine       choice of the PSF engine: C or Python
+psf_engine       choice of the PSF engine: C, Python or the ENZ series
 native_psfs      the engine in C
 boxes            boxes that kernels are cropped to
 pack             kernels cropped to boxes, in 16 bits

@@ -3,17 +3,25 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from estimator.corrections.progressive import ProgressiveLens
 from estimator.corrections.worn_lens import WornLens, depends_on_gaze
 from estimator.field.eye_optics import EyeOptics
+from estimator.field.network_eye import network_eye
 from estimator.field.prepare import prepare_eye
 from estimator.field.trace_range import FieldRange
 from estimator.field.traced_eye import MAX_PUPIL_MM
+from estimator.networks.card import NetworkUnavailable
 from estimator.note import Note
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import EyeProfile
-from filter_service.errors import BuildCancelled
-from filter_service.planning.grid import GridSpec, pupil_nodes_mm
+from estimator.psf.compute import plan_psfs
+from estimator.psf.enz import PAPER_DEGREE, captured_ratios
+from filter_service.errors import BadMessage, BuildCancelled
+from filter_service.planning.field_directions import field_range_deg
+from filter_service.planning.grid import GREEN, GridSpec, pupil_nodes_mm
+from filter_service.planning.paper_grid import paper_ranges
 
 NO_LATERAL_COLOR = Note(
     "lateral_color_ignored",
@@ -56,6 +64,8 @@ def eye_for_spec(
             progress(fraction, stage)
 
     settings = spec.settings
+    if settings.pipeline == "published":
+        return _published_eye(profile, spec, report)
     if isinstance(profile.correction, WornLens) and profile.correction.rings:
         _check_diffraction(settings.diffraction)
     if settings.age_years is not None:
@@ -83,6 +93,69 @@ def eye_for_spec(
     if depends_on_gaze(profile.correction) and any(settings.gaze_range_deg):
         notes = (*notes, ONE_GAZE)
     return eye, notes
+
+
+def _published_eye(
+    profile: EyeProfile, spec: GridSpec, report: Callable[[float, str], None]
+) -> tuple[EyeOptics, tuple[str, ...]]:
+    """Return the eye by network, with notes on the errors of the whole pipeline."""
+    settings = spec.settings
+    if settings.age_years is not None:
+        profile = replace(profile, age_years=settings.age_years)
+    pupil_range_mm, focus_range_dpt = paper_ranges(spec)
+    try:
+        eye, notes = network_eye(
+            profile,
+            pupil_range_mm=pupil_range_mm,
+            focus_range_dpt=focus_range_dpt,
+            wavelengths_nm=spec.traced_wavelengths_nm,
+            field_range_deg=_with_axis(spec.field_range_deg),
+            progress=report,
+        )
+    except NetworkUnavailable as error:
+        raise BadMessage(
+            f"'published' cannot be used: {error}",
+            field="settings.pipeline",
+            allowed="exact",
+        ) from error
+    return eye, (*notes, _series_note(eye, spec))
+
+
+def _series_note(eye: EyeOptics, spec: GridSpec) -> Note:
+    """Return a note on the light that the ENZ series represents."""
+    (_, right_deg), (_, up_deg) = _with_axis(
+        field_range_deg(spec.camera, gaze_deg=spec.settings.gaze_deg)
+        if spec.follows_field
+        else ((0.0, 0.0), (0.0, 0.0))
+    )
+    (_, pupil_mm), (focus_dpt, _) = paper_ranges(spec)
+    pupil_mm = eye.usable_pupil_mm(pupil_mm)
+    found = eye.wavefronts(
+        h_deg=np.array([0.0, right_deg]),
+        v_deg=np.array([0.0, up_deg]),
+        pupil_diameter_mm=pupil_mm,
+        accommodation_dpt=eye.accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm),
+        wavelength_nm=spec.channel_wavelengths_nm[GREEN],
+        total_defocus_dpt=0.0,  # which the series includes exactly
+    )
+    plan = plan_psfs(
+        found.zernike_um,
+        pupil_diameter_mm=found.circle_diameter_mm,
+        pupil_ellipse=found.pupil_ellipse,
+        wavelength_nm=spec.channel_wavelengths_nm[GREEN],
+        pixel_pitch_mrad=spec.pixel_pitch_mrad,
+        method="enz_unchecked",
+    )
+    on_axis, at_corner = captured_ratios(plan.survey).tolist()
+    text = (
+        f"PSFs by the ENZ series to degree {PAPER_DEGREE}, which represents "
+        f"{on_axis:.1%} of the light of a {pupil_mm:g} mm pupil on the axis"
+    )
+    values = {"pupil_diameter_mm": pupil_mm, "on_axis_ratio": on_axis}
+    if spec.follows_field:
+        text += f" and {at_corner:.1%} at the corner of the image"
+        values["corner_ratio"] = at_corner
+    return Note("enz_series", text, **values)
 
 
 def _check_diffraction(diffraction: bool) -> None:

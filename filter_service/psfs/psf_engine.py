@@ -1,4 +1,4 @@
-"""Choice of the PSF engine: C, or Python if there was no C compiler.
+"""Choice of the PSF engine: C, Python if there was no C compiler, or the ENZ series.
 
 There is no GPU engine.  On a machine with an H200, 16 cores compute the paper's set of
 201,825 PSFs in C in 0.64 s.  Compute shaders took 3.2 s and three to five times the
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 from estimator.psf.compute import PsfBatch, compute_psf_batch
 from filter_service.psfs.native_psfs import NativePsfs, native_psfs
@@ -42,9 +42,19 @@ PYTHON = PsfEngine(compute_psf_batch, PYTHON_BATCH)
 """Fallback if the package was installed without a C compiler."""
 
 
+ENZ_BATCH = 8
+"""Such PSFs between two checks: they take about a hundred times as long."""
+
+PUBLISHED = PsfEngine(partial(compute_psf_batch, method="enz_unchecked"), ENZ_BATCH)
+"""Engine of the published pipeline: the ENZ series to its Zernike degree, also where
+the aberrations require a higher one."""
+
+
 @cache
-def psf_engine() -> PsfEngine:
-    """Return the compiled engine, or `PYTHON` if it was not built."""
+def psf_engine(pipeline: str = "exact") -> PsfEngine:
+    """Return the engine of a pipeline; for "exact" `PYTHON` if C was not built."""
+    if pipeline == "published":
+        return PUBLISHED
     native = native_psfs()
     if native is None:
         return PYTHON

@@ -257,7 +257,7 @@ class PsfStore:
         until_s : float, optional
             Time of `time.monotonic` at which to stop, after the current batch.
         batch_count : int, optional
-            PSFs per batch; by default that of the engine.
+            PSFs per batch, at most those of the engine, which are the default.
         between : callable, optional
             Called after each batch but the last.
         progress : callable, optional
@@ -277,7 +277,7 @@ class PsfStore:
         from filter_service.psfs.compute_kernels import computed_kernels
         from filter_service.psfs.psf_engine import psf_engine
 
-        self.engine = self.engine or psf_engine()
+        self.engine = self.engine or psf_engine(self.spec.settings.pipeline)
         started_s = time.perf_counter()
         if psfs is None:
             self.plan_all()
@@ -286,7 +286,8 @@ class PsfStore:
         if not self.spec.settings.chromatic:  # channels share kernels
             psfs = RGB * np.unique(psfs // RGB)
         psfs = psfs[~self.tables.is_computed[psfs]]
-        step = batch_count or self.engine.batch_count
+        step = self.engine.batch_count
+        step = min(batch_count or step, step)
         batches = np.array_split(psfs, -(-psfs.size // step) or 1)
         for number, batch in enumerate(batches):
             # `between` may have computed some of them.

@@ -184,8 +184,11 @@ class EdgeLight:
         if pixels is None:
             return None
         store = request.handle.store
+        settings = store.spec.settings
         # Light of ring lenses does not come from the edge alone.
-        if not store.spec.settings.diffraction or store.eye.rings is not None:
+        if not settings.diffraction or store.eye.rings is not None:
+            return None
+        if settings.pipeline == "published":  # which ends at its kernels
             return None
         fill = partial(store.fill, until_s=request.until_s)
         return cls(EyeAtFrame.of(engine, request), request.view, pixels, white, fill)

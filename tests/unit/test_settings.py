@@ -16,6 +16,7 @@ from filter_service.errors import BadMessage
 from filter_service.settings import (
     DEFAULTS,
     FilterSettings,
+    RenderOptions,
     as_settings,
     setting_help,
     setting_types,
@@ -47,6 +48,35 @@ def test_a_wrong_setting_is_named_with_what_is_allowed(changes, field, allowed):
     assert isinstance(caught.value, BadMessage)
     assert caught.value.field == field
     assert allowed in caught.value.allowed
+
+
+def test_the_published_pipeline_has_its_own_grid_and_accumulation():
+    settings = FilterSettings(pipeline="published", mode="on-axis")
+    assert settings.grid == "paper"
+    assert settings.covering(pupils_mm=(1.0,)).pipeline == "published"
+    asked = RenderOptions(merge=False, render_tolerance=0.0, peripheral_merging=True)
+    assert settings.frame_options(asked) == RenderOptions(
+        accumulation="paper", merge=False, render_tolerance=0.0
+    )
+    assert DEFAULTS.frame_options(asked) is asked
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("diffraction", False),
+        ("eye_model", "wavefront"),
+        ("lateral_color", True),
+        ("stiles_crawford", True),
+        ("wide_primaries", True),
+    ],
+)
+def test_settings_that_the_published_pipeline_does_not_model_are_refused(name, value):
+    with pytest.raises(BadMessage, match="with pipeline 'published'") as caught:
+        FilterSettings(pipeline="published", **{name: value})
+    assert caught.value.field == name
+    assert "or pipeline 'exact'" in caught.value.allowed
+    assert getattr(FilterSettings(**{name: value}), name) == value
 
 
 def test_lists_integers_and_numpys_numbers_are_as_good():
@@ -158,7 +188,7 @@ def test_some_settings_may_be_given_by_name():
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"mod": "quality"}, r"settings: .*'mod'.* \(allowed: mode, grid, "),
+        ({"mod": "quality"}, r"settings: .*'mod'.* \(allowed: pipeline, mode, grid, "),
         ({"mode": "best"}, r"mode: .*'best'"),
         ("quality", r"settings: .*str.* \(allowed: FilterSettings, or"),
     ],
