@@ -88,7 +88,10 @@ class MeasuredResidual:
         at_cornea_um = polynomial_in_mm(
             remove_central_tilt(profile.zernike_um), radius_mm
         )
-        residue_um = moved_polynomial(at_cornea_um, depth_mm=depth_mm) - traced_um[0]
+        moved_um = moved_polynomial(
+            at_cornea_um, depth_mm=depth_mm, radius_mm=radius_mm
+        )
+        residue_um = moved_um - traced_um[0]
         residue_um[0] = 0.0
         eye_dpt = total_defocus_dpt(
             zernike_from_polynomial(traced_um, radius_mm), radius_mm

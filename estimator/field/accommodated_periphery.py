@@ -72,7 +72,9 @@ def held_refraction_um(
     depth_mm = eye.accommodating.entrance_pupil_mm
 
     def at_cornea_um(polynomial_um: NDArray[Any]) -> NDArray[np.float64]:
-        moved_um = moved_polynomial(polynomial_um, depth_mm=-depth_mm)
+        moved_um = moved_polynomial(
+            polynomial_um, depth_mm=-depth_mm, radius_mm=CIRCLE_MM
+        )
         return zernike_from_polynomial(moved_um, CIRCLE_MM)[..., SECOND_ORDER]
 
     on_axis_um = at_cornea_um(traced_um[-1])

@@ -119,7 +119,9 @@ def field_table(
     radius_mm = found.circle_diameter_mm / 2.0
     # `TracedEye` has wavefronts in the entrance pupil, instruments at the cornea.
     at_cornea_um = moved_polynomial(
-        polynomial_in_mm(found.zernike_um, radius_mm), depth_mm=-eye.entrance_pupil_mm
+        polynomial_in_mm(found.zernike_um, radius_mm),
+        depth_mm=-eye.entrance_pupil_mm,
+        radius_mm=radius_mm,
     )
     zernike_um = zernike_from_polynomial(at_cornea_um, radius_mm)
     return FieldTable(

@@ -267,7 +267,9 @@ def network_grid(
     depth_mm = _depths_mm(eye, h_deg, v_deg)[..., None, None, None]
     rim_mm = moved_rim(found.rim_mm, polynomial_um, depth_mm=depth_mm)
     radius_mm = circumscribed_radius_mm(rim_mm)
-    moved_um = moved_polynomial(polynomial_um, depth_mm=depth_mm)
+    moved_um = moved_polynomial(
+        polynomial_um, depth_mm=depth_mm, radius_mm=found.zernike_radius_mm
+    )
     n_h, n_v, _, *n_others = shape
     return AberrationGrid(
         h_deg=h_deg,

@@ -61,21 +61,14 @@ class PeripheralResidual:
     ):
         self.change = change
         usual = clamped_eye(change, eye)
-        self._traced = FieldInterpolation(
-            aberration_grid(
-                usual,
-                h_deg=field_nodes_deg(*field_range_deg[0]),
-                v_deg=field_nodes_deg(*field_range_deg[1]),
-                pupil_diameters_mm=[2.0 * CIRCLE_MM],
-                accommodations_dpt=[0.0],
-                wavelengths_nm=[REFERENCE_WAVELENGTH_NM],
-                n_rings=FIELD_RINGS,
-                n_azimuths=FIELD_AZIMUTHS,
-            )
+        self._traced = _traced(
+            usual, *(field_nodes_deg(*limits) for limits in field_range_deg)
         )
         self._depth_mm = usual.accommodating.entrance_pupil_mm
         self._at_cornea_um = _on_circle(usual)
-        self._on_axis_um = self._difference_um(np.zeros(1), np.zeros(1))
+        axis_deg = np.zeros(1)  # which may lie outside the range
+        on_axis = _traced(usual, axis_deg, axis_deg)
+        self._on_axis_um = self._difference_um(on_axis, axis_deg, axis_deg)
 
     @property
     def passes(self) -> bool:
@@ -86,17 +79,18 @@ class PeripheralResidual:
         self, h_deg: NDArray[np.float64], v_deg: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Return monomials (n, 28), um/mm^degree, at fields (n,) within the range."""
-        return self._difference_um(h_deg, v_deg) - self._on_axis_um
+        return self._difference_um(self._traced, h_deg, v_deg) - self._on_axis_um
 
     def _difference_um(
-        self, h_deg: NDArray[Any], v_deg: NDArray[Any]
+        self, traced: FieldInterpolation, h_deg: NDArray[Any], v_deg: NDArray[Any]
     ) -> NDArray[np.float64]:
         population_um = self._at_cornea_um + self.change.zernike_um(h_deg, v_deg)
         population_um = moved_polynomial(
             polynomial_in_mm(remove_central_tilt(population_um), CIRCLE_MM),
             depth_mm=self._depth_mm,
+            radius_mm=CIRCLE_MM,
         )
-        traced_um, _ = self._traced.at(
+        traced_um, _ = traced.at(
             h_deg=h_deg,
             v_deg=v_deg,
             pupil_diameter_mm=np.full(h_deg.size, 2.0 * CIRCLE_MM),
@@ -107,6 +101,23 @@ class PeripheralResidual:
         known = np.isin(np.arange(N_TERMS), TERMS)
         difference_um = remove_central_tilt(np.where(known, difference_um, 0.0))
         return polynomial_in_mm(difference_um, CIRCLE_MM)
+
+
+def _traced(
+    eye: EstimatedEye, h_deg: NDArray[Any], v_deg: NDArray[Any]
+) -> FieldInterpolation:
+    """Trace the relaxed eye through `CIRCLE_MM` at the nodes of a grid."""
+    grid = aberration_grid(
+        eye,
+        h_deg=h_deg,
+        v_deg=v_deg,
+        pupil_diameters_mm=[2.0 * CIRCLE_MM],
+        accommodations_dpt=[0.0],
+        wavelengths_nm=[REFERENCE_WAVELENGTH_NM],
+        n_rings=FIELD_RINGS,
+        n_azimuths=FIELD_AZIMUTHS,
+    )
+    return FieldInterpolation(grid)
 
 
 def clamped_eye(change: PeripheralChange, eye: EstimatedEye) -> EstimatedEye:

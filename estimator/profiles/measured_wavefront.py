@@ -101,7 +101,9 @@ class MeasuredWavefront(FocusingEye):
         at_cornea_um = remove_central_tilt(profile.zernike_um)
         zernike_um = zernike_from_polynomial(
             moved_polynomial(
-                polynomial_in_mm(at_cornea_um, radius_mm), depth_mm=depth_mm
+                polynomial_in_mm(at_cornea_um, radius_mm),
+                depth_mm=depth_mm,
+                radius_mm=radius_mm,
             ),
             radius_mm,
         )

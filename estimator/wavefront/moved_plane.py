@@ -2,71 +2,83 @@
 
 Instruments and networks give wavefronts at the cornea, but PSFs are computed in the
 entrance pupil.  By the eikonal equation, dW/dz = -|grad W|² / 2 for slopes of a few
-mrad/mm.  If the chief ray has zero slope, terms up to the sixth order depend only on
-each other.
+mrad/mm.  Its solution follows rays: each moves by its slope, and W grows by half the
+squared slope.  A moved wavefront has terms of all orders, and 28 are fitted to it.
 """
 
-from collections import Counter
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.optics.units import UM_PER_MM
-from estimator.optics.zernike import EXPONENTS, N_TERMS
+from estimator.optics.zernike import EXPONENTS, MAX_RADIAL_ORDER, N_TERMS
+from estimator.wavefront.field_wavefronts import DEGREE
+from estimator.wavefront.nodes import circle_nodes
 
 _ANGLES = 2.0 * np.pi * np.arange(16) / 16
 _RIM = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 
+N_MOMENTS = 2 * MAX_RADIAL_ORDER + 1
+"""Powers of x or y in products of two monomials, from 0."""
+
 
 @cache
-def _slope_products() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return index triples (n, 3) and factors (n,) of |grad W|².
-
-    Monomials i and j of W contribute their product times a factor to monomial k.
-    """
-    index = {tuple(e): k for k, e in enumerate(EXPONENTS.tolist())}
-    found: Counter[tuple[int, int, int]] = Counter()
-    for i, (a, b) in enumerate(EXPONENTS.tolist()):
-        for j, (c, d) in enumerate(EXPONENTS.tolist()):
-            for factor, term in (
-                (a * c, (a + c - 2, b + d)),
-                (b * d, (a + c, b + d - 2)),
-            ):
-                if factor and term in index:
-                    found[min(i, j), max(i, j), index[term]] += factor
-    return np.array(list(found)), np.array(list(found.values()), np.float64)
+def _rays() -> NDArray[np.float64]:
+    """Return x, y and weight (96, 3) of nodes over the unit circle."""
+    rings, weights, azimuths, _ = circle_nodes()
+    points = (azimuths[:, None, :] * rings[:, None]).reshape(-1, 2)
+    return np.column_stack([points, np.tile(weights, len(azimuths))])
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
-def _add_products(
-    polynomial_um: NDArray[np.float64],
-    terms: NDArray[np.int64],
-    factors: NDArray[np.float64],
-    out: NDArray[np.float64],
+def _add_rays(
+    tables_um: NDArray[np.float64],
+    reach: NDArray[np.float64],
+    rays: NDArray[np.float64],
+    moments: NDArray[np.float64],
+    products_um: NDArray[np.float64],
 ) -> None:
-    for n in range(polynomial_um.shape[0]):
-        for m in range(terms.shape[0]):
-            i, j, k = terms[m]
-            out[n, k] += factors[m] * polynomial_um[n, i] * polynomial_um[n, j]
+    """Add moved rays to moments (n, a, b) of their positions, and to those of W.
 
-
-def _squared_slopes(polynomial_um: NDArray[Any]) -> NDArray[np.float64]:
-    found = np.zeros_like(polynomial_um)
-    flat = np.ascontiguousarray(polynomial_um).reshape(-1, N_TERMS)
-    _add_products(flat, *_slope_products(), found.reshape(-1, N_TERMS))
-    return found
+    Lengths are relative to the radius of the circle.  ``tables_um[n, a, b]`` is the
+    coefficient of x^a y^b, and rays move by reach times the gradient.
+    """
+    order = tables_um.shape[1] - 1
+    for n in range(tables_um.shape[0]):
+        for k in range(rays.shape[0]):
+            x, y, weight = rays[k]
+            value = slope_x = slope_y = 0.0
+            for a in range(order, -1, -1):
+                row = row_y = 0.0
+                for b in range(order - a, -1, -1):
+                    row_y = row_y * y + row
+                    row = row * y + tables_um[n, a, b]
+                slope_x = slope_x * x + value
+                value = value * x + row
+                slope_y = slope_y * x + row_y
+            x += reach[n] * slope_x
+            y += reach[n] * slope_y
+            value += reach[n] / 2.0 * (slope_x**2 + slope_y**2)
+            power_x = weight
+            for a in range(2 * order + 1):
+                power = power_x
+                for b in range(2 * order + 1 - a):
+                    moments[n, a, b] += power
+                    if a + b <= order:
+                        products_um[n, a, b] += power * value
+                    power *= y
+                power_x *= x
 
 
 def moved_polynomial(
-    polynomial_um: NDArray[np.float64], *, depth_mm: ArrayLike
+    polynomial_um: NDArray[np.float64], *, depth_mm: ArrayLike, radius_mm: ArrayLike
 ) -> NDArray[np.float64]:
     """Return wavefronts (..., 28) in a plane deeper in the eye.
 
-    The transfer is one Runge-Kutta step of fourth order; its error is 1e-5 dpt for
-    30 dpt over 3 mm.
+    The result is the least-squares fit to the rays through a circle.  Without the fit,
+    in keratoconus over 5 mm, the error would be 0.042 um instead of 0.001 um.
 
     Parameters
     ----------
@@ -74,15 +86,30 @@ def moved_polynomial(
         Monomials; see `field_wavefronts.polynomial_in_mm`.
     depth_mm : (...)
         Distance between the planes; negative if the new plane is in front.
+    radius_mm : (...)
+        Radius of the circle about the chief ray, in the plane of the given wavefronts.
     """
-    step = np.asarray(depth_mm, dtype=np.float64)[..., None] / (-2.0 * UM_PER_MM)
-    start = polynomial_um.copy()
-    start[..., 1:3] = 0.0  # tilt is an artifact of the fit: the chief ray has no slope
-    k1 = _squared_slopes(start)
-    k2 = _squared_slopes(start + step / 2.0 * k1)
-    k3 = _squared_slopes(start + step / 2.0 * k2)
-    k4 = _squared_slopes(start + step * k3)
-    return polynomial_um + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+    shape, count = polynomial_um.shape[:-1], polynomial_um[..., 0].size
+    depth_mm, radius_mm = (
+        np.broadcast_to(np.asarray(values, np.float64), shape).reshape(count, 1)
+        for values in (depth_mm, radius_mm)
+    )
+    scale = radius_mm**DEGREE
+    tables_um = np.zeros((count, MAX_RADIAL_ORDER + 1, MAX_RADIAL_ORDER + 1))
+    start_um = polynomial_um.reshape(count, -1) * scale
+    start_um[:, 1:3] = 0.0  # tilt is an artifact of the fit: the chief ray has no slope
+    tables_um[:, *EXPONENTS.T] = start_um
+    moments = np.zeros((count, N_MOMENTS, N_MOMENTS))
+    products_um = np.zeros_like(tables_um)
+    reach = depth_mm[:, 0] / (UM_PER_MM * radius_mm[:, 0] ** 2)
+    _add_rays(tables_um, reach, _rays(), moments, products_um)
+    pairs = EXPONENTS[:, None] + EXPONENTS
+    normal = moments[:, pairs[..., 0], pairs[..., 1]]
+    fitted_um = np.linalg.solve(normal, products_um[:, *EXPONENTS.T, None])[..., 0]
+    moved_um = (fitted_um / scale).reshape(polynomial_um.shape)
+    moved_um[..., 0] = polynomial_um[..., 0]
+    moved_um[..., 1:3] += polynomial_um[..., 1:3]
+    return moved_um
 
 
 def moved_rim(

@@ -51,7 +51,9 @@ def axis_error_um(profile):
     radius_mm = pupil_mm / 2.0
     at_cornea_um = polynomial_in_mm(remove_central_tilt(profile.zernike_um), radius_mm)
     in_pupil_um = moved_polynomial(
-        at_cornea_um, depth_mm=estimated.accommodating.entrance_pupil_mm
+        at_cornea_um,
+        depth_mm=estimated.accommodating.entrance_pupil_mm,
+        radius_mm=radius_mm,
     )
     error_um = ours_um - zernike_from_polynomial(in_pupil_um, radius_mm)
     return float(np.sqrt(np.sum(error_um[1:] ** 2)))
@@ -185,7 +187,9 @@ def test_a_wavefront_is_carried_to_another_plane_as_rays_go(depth_mm):
     )
     polynomial_um = polynomial_in_mm(outer.zernike_um, outer.zernike_radius_mm)
     for step_mm in (depth_mm, whole_mm - depth_mm):
-        polynomial_um = moved_polynomial(polynomial_um, depth_mm=step_mm)
+        polynomial_um = moved_polynomial(
+            polynomial_um, depth_mm=step_mm, radius_mm=inner.zernike_radius_mm
+        )
     ours_um = zernike_from_polynomial(polynomial_um, inner.zernike_radius_mm)
     assert np.abs(ours_um - inner.zernike_um)[..., 1:].max() < 1e-4
 

@@ -46,7 +46,9 @@ def test_wavefronts_over_the_field_are_those_of_the_aberration_network(keratocon
     # Their own plane is the cornea.
     polynomial_um = polynomial_in_mm(expected.zernike_um, expected.zernike_radius_mm)
     depth_mm = np.full(3, eye.entrance_pupil_mm)
-    polynomial_um = moved_polynomial(polynomial_um, depth_mm=depth_mm)
+    polynomial_um = moved_polynomial(
+        polynomial_um, depth_mm=depth_mm, radius_mm=expected.zernike_radius_mm
+    )
     seen = eye.wavefronts(
         h_deg=h_deg, v_deg=v_deg, accommodation_dpt=0.0, total_defocus_dpt=0.0, **STATE
     )

@@ -47,7 +47,9 @@ def measured_in_pupil_um(profile, depth_mm):
     radius_mm = profile.pupil_diameter_mm / 2.0
     at_cornea_um = remove_central_tilt(profile.zernike_um)
     moved_um = moved_polynomial(
-        polynomial_in_mm(at_cornea_um, radius_mm), depth_mm=depth_mm
+        polynomial_in_mm(at_cornea_um, radius_mm),
+        depth_mm=depth_mm,
+        radius_mm=radius_mm,
     )
     return zernike_from_polynomial(moved_um, radius_mm)
 
