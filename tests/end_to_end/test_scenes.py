@@ -245,7 +245,7 @@ def current_context():
 
 def test_without_opengl_the_command_that_helps_is_named(monkeypatch):
     monkeypatch.setenv("GLCONTEXT_LINUX_LIBEGL", "libnothing.so")
-    with pytest.raises(RenderFailed, match="libnothing.so.*'ocufilter doctor'"):
+    with pytest.raises(RenderFailed, match=r"libnothing\.so.*'ocufilter doctor'"):
         open_context()
 
 
