@@ -196,6 +196,9 @@ def _angles(option: str, text: str) -> list[float]:
 
 
 def _directions(found: "FieldTable") -> list[dict[str, Any]]:
+    from clients.commands.wavefront import ellipse_facts
+    from estimator.wavefront.results import PupilEllipse
+
     return [
         {
             "h_deg": float(h),
@@ -205,7 +208,7 @@ def _directions(found: "FieldTable") -> list[dict[str, Any]]:
             "M_dpt": power_dpt[0],
             "J0_dpt": power_dpt[1],
             "J45_dpt": power_dpt[2],
-            "pupil_ellipse": _ellipse(*ellipse),
+            "pupil_ellipse": ellipse_facts(PupilEllipse.of(ellipse)),
         }
         for h, v, zernike_um, radius_mm, power_dpt, ellipse in zip(
             found.h_deg,
@@ -213,21 +216,10 @@ def _directions(found: "FieldTable") -> list[dict[str, Any]]:
             found.zernike_um,
             found.zernike_radius_mm,
             found.power_dpt.tolist(),
-            found.pupil_ellipse.tolist(),
+            found.pupil_ellipse,
             strict=True,
         )
     ]
-
-
-def _ellipse(
-    x_mm: float, y_mm: float, major_mm: float, minor_mm: float, angle_rad: float
-) -> dict[str, Any]:
-    from clients.commands.wavefront import ellipse_facts
-    from estimator.wavefront.results import PupilEllipse
-
-    return ellipse_facts(
-        PupilEllipse(x_mm, y_mm, major_mm, minor_mm, math.degrees(angle_rad))
-    )
 
 
 def _print_table(found: "FieldTable") -> None:

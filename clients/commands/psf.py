@@ -8,16 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from clients.commands.console import (
-    CommandFailed,
-    Json,
-    print_json,
-    print_line,
-)
+from clients.commands.console import Json, print_json, print_line
 from clients.commands.wavefront import (
     FIELD_LIMITS_DEG,
     ellipse_facts,
-    load_surfaces,
 )
 from clients.option_values import check_range
 
@@ -25,7 +19,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from estimator.corrections.rings import Rings
     from estimator.psf.kernel_types import Psf
     from estimator.psf.stiles_crawford import StilesCrawford
 
@@ -37,11 +30,6 @@ ARCMIN_PER_DEG = 60.0
 
 MAX_RADIUS_PX = 1023
 """Largest radius of a kernel written to a file; the service has a lower limit."""
-
-WITHOUT_TYPICAL = (
-    "on-axis, this is the prescription alone, without the higher-order aberrations "
-    "that are typical for the age; `ocufilter filter` and off-axis PSFs include them"
-)
 
 
 class Method(StrEnum):
@@ -61,10 +49,10 @@ class _State:
     zernike_um: "np.ndarray"
     zernike_radius_mm: float
     pupil_diameter_mm: float
-    ellipse: dict[str, Any] | None
+    ellipse: "np.ndarray"
     eye_side: str | None
     notes: tuple[str, ...]
-    rings: "Rings | None" = None
+    screen: Any
 
 
 def psf(
@@ -111,8 +99,9 @@ def psf(
     """Compute one PSF, integrated over pixels that are square in visual angle.
 
     The kernel is an array [y, x] in image orientation (rows grow downward), with the
-    chief ray at its center and unit sum.  On-axis, a measured wavefront is used as it
-    is; off-axis, the eye is estimated and ray-traced, with its elliptical pupil.
+    chief ray at its center and unit sum.  It is the PSF of the filter: that of the
+    traced eye with its elliptical pupil, which has the measured wavefront on the axis
+    and the periphery of people with such an axis.
 
     ocufilter psf keratoconus --pupil-mm 5 --wavelength-nm 549
     --pixel-arcmin 1 --h-deg 20 -o psf.png
@@ -129,16 +118,15 @@ def psf(
     from filter_service.image_files import check_output
 
     check_output(out, (".npy", ".png"))
-    is_traced = h_deg != 0.0 or v_deg != 0.0 or _has_surfaces(eye)
-    view = {
-        "pupil_diameter_mm": pupil_mm,
-        "object_dpt": object_dpt,
-        "wavelength_nm": wavelength_nm,
-    }
-    if is_traced:
-        state = _traced(eye, focus_dpt, h_deg=h_deg, v_deg=v_deg, **view)
-    else:
-        state = _measured(eye, focus_dpt, **view)
+    state = _state(
+        eye,
+        focus_dpt,
+        pupil_diameter_mm=pupil_mm,
+        object_dpt=object_dpt,
+        wavelength_nm=wavelength_nm,
+        h_deg=h_deg,
+        v_deg=v_deg,
+    )
     computed, predicted_db = _compute(
         state,
         wavelength_nm=wavelength_nm,
@@ -164,60 +152,24 @@ def psf(
         _report(summary)
 
 
-def _has_surfaces(source: str) -> bool:
+def _state(source: str, focus_dpt: float | None, **view: Any) -> _State:
+    from estimator.field.field_table import field_table
     from estimator.profiles.files import load_profile
-
-    return load_profile(source).surfaces is not None
-
-
-def _measured(source: str, focus_dpt: float | None, **view: Any) -> _State:
-    from estimator.profiles.files import load_profile
-    from estimator.profiles.measured_wavefront import MeasuredWavefront
 
     profile = load_profile(source)
-    measured = MeasuredWavefront.from_profile(profile)
-    found = measured.state(focus_dpt=focus_dpt or 0.0, **view)
-    notes = (*found.notes, *profile.notes)
-    if profile.higher_order == "typical":
-        notes = (*notes, WITHOUT_TYPICAL)
+    if focus_dpt is None and profile.surfaces is None:
+        focus_dpt = 0.0
+    found = field_table(profile, focus_dpt=focus_dpt, **view)
+    wave, rings = found.in_pupil, found.eye.rings
     return _State(
         name=profile.name,
-        zernike_um=found.zernike_um,
-        zernike_radius_mm=found.pupil_diameter_mm / 2.0,
-        pupil_diameter_mm=found.pupil_diameter_mm,
-        ellipse=None,
-        eye_side=profile.eye_side,
-        notes=notes,
-        rings=measured.rings,
-    )
-
-
-def _traced(source: str, focus_dpt: float | None, **view: Any) -> _State:
-    from estimator.profiles.files import load_profile
-    from estimator.wavefront.aberrations import wavefront_aberrations
-
-    if focus_dpt is None and not _has_surfaces(source):
-        focus_dpt = 0.0
-    name, surfaces, notes = load_surfaces(
-        source, focus_dpt, pupil_mm=view["pupil_diameter_mm"]
-    )
-    found = wavefront_aberrations(surfaces, **view)
-    if not found.rms_residual_um >= 0.0:
-        raise CommandFailed(
-            f"{name}, h {view['h_deg']:g} v {view['v_deg']:g} deg: "
-            + (
-                "; ".join(found.notes)
-                or "too few rays pass through the pupil for a fit"
-            )
-        )
-    return _State(
-        name=name,
-        zernike_um=found.zernike_um,
-        zernike_radius_mm=found.zernike_radius_mm,
+        zernike_um=wave.zernike_um[0],
+        zernike_radius_mm=float(wave.circle_diameter_mm[0]) / 2.0,
         pupil_diameter_mm=view["pupil_diameter_mm"],
-        ellipse=ellipse_facts(found.pupil_ellipse),
-        eye_side=load_profile(source).eye_side,
-        notes=(*notes, *found.notes),
+        ellipse=wave.pupil_ellipse[0],
+        eye_side=profile.eye_side,
+        notes=found.notes,
+        screen=rings and rings.seen_from(view["h_deg"], view["v_deg"]),
     )
 
 
@@ -242,14 +194,9 @@ def _compute(
         "pixel_pitch_mrad": MRAD_PER_RAD * math.radians(pixel_arcmin / ARCMIN_PER_DEG),
         "method": method,
         "max_radius_px": MAX_RADIUS_PX,
-        "pupil_screen": state.rings and state.rings.seen_from(0.0, 0.0),
+        "pupil_screen": state.screen,
+        "pupil_ellipse": state.ellipse,
     }
-    if state.ellipse is not None:
-        names = ("centre_x_mm", "centre_y_mm", "semi_major_mm", "semi_minor_mm")
-        options["pupil_ellipse"] = [
-            *(state.ellipse[name] for name in names),
-            math.radians(state.ellipse["major_axis_deg"]),
-        ]
     wavefront = state.zernike_um[None, :]
     computed = compute_psfs(wavefront, **options)[0]
     plan = plan_psfs(wavefront, **options)
@@ -258,12 +205,13 @@ def _compute(
 
 
 def _facts(computed: "Psf", state: _State) -> dict[str, Any]:
+    from estimator.wavefront.results import PupilEllipse
     from filter_service.psfs.picture import half_light_radius_px
 
     return {
         "pupil_diameter_mm": state.pupil_diameter_mm,
         "zernike_radius_mm": state.zernike_radius_mm,
-        "pupil_ellipse": state.ellipse,
+        "pupil_ellipse": ellipse_facts(PupilEllipse.of(state.ellipse)),
         "method": computed.method,
         "radius_px": int(computed.radius_px),
         "blur_radius_px": float(computed.blur_radius_px),

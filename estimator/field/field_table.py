@@ -12,6 +12,7 @@ from estimator.note import Note
 from estimator.optics import prescription as rx
 from estimator.profiles.parse import EyeProfile
 from estimator.wavefront.field_wavefronts import (
+    FieldWavefronts,
     polynomial_in_mm,
     zernike_from_polynomial,
 )
@@ -23,8 +24,9 @@ RELAXED_DPT = -60.0
 COMA = [7, 8]
 FIRST_HIGHER = 6
 
-LEAST_EXTENT_DEG = 1.0
-"""Smallest half extent of the traced field about the axis."""
+MAX_NODES = 100
+"""Largest grid of the requested azimuths and elevations that is traced as it is.
+Of more directions, a grid of nodes is traced: errors of 2e-5 um."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,9 @@ class FieldTable:
         M, J0 and J45 of these wavefronts.
     pupil_ellipse : (n, 5)
         Pupil within the circle: center x, y and semi-axes, mm, and angle, rad.
+    in_pupil : FieldWavefronts
+        The same n wavefronts in the plane of the entrance pupil.
+    eye : TracedEye
     notes : tuple of str
     """
 
@@ -51,6 +56,8 @@ class FieldTable:
     zernike_radius_mm: NDArray[np.float64]
     power_dpt: NDArray[np.float64]
     pupil_ellipse: NDArray[np.float64]
+    in_pupil: FieldWavefronts
+    eye: TracedEye
     notes: tuple[str, ...]
 
     @property
@@ -76,6 +83,7 @@ def field_table(
     pupil_diameter_mm: float,
     wavelength_nm: float,
     focus_dpt: float | None = None,
+    object_dpt: float = 0.0,
 ) -> FieldTable:
     """Return the wavefronts of an eye in directions (n,).
 
@@ -87,6 +95,8 @@ def field_table(
     pupil_diameter_mm, wavelength_nm : float
     focus_dpt : float, optional
         Focus distance; the eye is relaxed by default.
+    object_dpt : float, optional
+        Distance of the source; 0 is infinity.
 
     Raises
     ------
@@ -94,13 +104,16 @@ def field_table(
         The eye cannot be traced, or not through a pupil of this diameter.
     """
     h_deg, v_deg = np.broadcast_arrays(np.atleast_1d(h_deg), np.atleast_1d(v_deg))
+    nodes_deg = np.unique(h_deg).astype(float), np.unique(v_deg).astype(float)
+    n_nodes = nodes_deg[0].size * nodes_deg[1].size
     at_dpt = RELAXED_DPT if focus_dpt is None else focus_dpt
     eye, notes = prepare_eye(
         profile,
         pupil_diameters_mm=[pupil_diameter_mm],
         focus_range_dpt=(at_dpt, at_dpt),
         wavelengths_nm=[wavelength_nm],
-        field_range_deg=(_around_axis(h_deg), _around_axis(v_deg)),
+        field_range_deg=((h_deg.min(), h_deg.max()), (v_deg.min(), v_deg.max())),
+        nodes_deg=nodes_deg if n_nodes <= MAX_NODES else None,
     )
     eye = cast(TracedEye, eye)  # the default of `prepare_eye`
     if eye.usable_pupil_mm(pupil_diameter_mm) < pupil_diameter_mm:
@@ -115,7 +128,11 @@ def field_table(
         "accommodation_dpt": eye.grid.accommodations_dpt[0],
         "wavelength_nm": wavelength_nm,
     }
-    found = eye.wavefronts(**states, total_defocus_dpt=eye.total_defocus_dpt(**states))
+    total_dpt = eye.total_defocus_dpt(**states) + eye.vergence.vergence_dpt(object_dpt)
+    found = eye.wavefronts(**states, total_defocus_dpt=total_dpt)
+    if focus_dpt is not None:
+        view = {"pupil_diameter_mm": pupil_diameter_mm, "focus_dpt": focus_dpt}
+        notes = (*notes, *eye.notes(**view))
     radius_mm = found.circle_diameter_mm / 2.0
     # `TracedEye` has wavefronts in the entrance pupil, instruments at the cornea.
     at_cornea_um = moved_polynomial(
@@ -131,14 +148,9 @@ def field_table(
         zernike_radius_mm=radius_mm,
         power_dpt=rx.power_vectors_dpt(zernike_um, radius_mm),
         pupil_ellipse=found.pupil_ellipse,
+        in_pupil=found,
+        eye=eye,
         notes=(*notes, *_edge_notes(eye, h_deg, v_deg)),
-    )
-
-
-def _around_axis(angles_deg: NDArray[Any]) -> tuple[float, float]:
-    return (
-        min(float(angles_deg.min()), -LEAST_EXTENT_DEG),
-        max(float(angles_deg.max()), LEAST_EXTENT_DEG),
     )
 
 

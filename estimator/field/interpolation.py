@@ -50,6 +50,10 @@ same parity.  Rims deviate from their paraxial form with A² and, to a lesser de
 A⁴."""
 
 
+FieldNodes = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Azimuths (n_h,) and elevations (n_v,), deg, ascending, of a grid over the field."""
+
+
 def stretched(angle_deg: ArrayLike) -> NDArray[np.float64]:
     """Map angles (...) to a variable in which wavefronts are polynomials of low degree.
 
@@ -69,6 +73,14 @@ def field_nodes_deg(low_deg: float, high_deg: float) -> NDArray[np.float64]:
     far = max(outer - stretched(FAR_DEG), 0.0)
     wanted = 2.0 + NODES_PER_EXTENT * math.sqrt(half * outer) + FAR_NODES * far
     return _chebyshev_deg(0.5 * (low + high), half, math.ceil(wanted))
+
+
+def range_nodes_deg(
+    field_range_deg: tuple[tuple[float, float], tuple[float, float]],
+) -> FieldNodes:
+    """Return `field_nodes_deg` of azimuths and elevations."""
+    across, along = field_range_deg
+    return field_nodes_deg(*across), field_nodes_deg(*along)
 
 
 def fewer_field_nodes_deg(

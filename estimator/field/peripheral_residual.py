@@ -28,7 +28,7 @@ from estimator.field.aberration_grid import (
     FIELD_RINGS,
     aberration_grid,
 )
-from estimator.field.interpolation import FieldInterpolation, field_nodes_deg
+from estimator.field.interpolation import FieldInterpolation, FieldNodes
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import N_TERMS, flip_horizontal, remove_central_tilt
 from estimator.periphery.change import PeripheralChange
@@ -49,21 +49,20 @@ class PeripheralResidual:
     change : PeripheralChange
     eye : EstimatedEye
         Eye to whose wavefronts the phase is added.
-    field_range_deg : ((h_low, h_high), (v_low, v_high))
-        Fields without vignetting.
+    nodes_deg : (n_h,), (n_v,)
+        Azimuths and elevations of a grid over fields without vignetting, between which
+        the phase is interpolated.
     """
 
     def __init__(
         self,
         change: PeripheralChange,
         eye: EstimatedEye,
-        field_range_deg: tuple[tuple[float, float], tuple[float, float]],
+        nodes_deg: FieldNodes,
     ):
         self.change = change
         usual = clamped_eye(change, eye)
-        self._traced = _traced(
-            usual, *(field_nodes_deg(*limits) for limits in field_range_deg)
-        )
+        self._traced = _traced(usual, *nodes_deg)
         self._depth_mm = usual.accommodating.entrance_pupil_mm
         self._at_cornea_um = _on_circle(usual)
         axis_deg = np.zeros(1)  # which may lie outside the range

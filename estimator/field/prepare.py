@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 from estimator.estimate.given_surfaces import eye_model as model_of
 from estimator.field.eye_optics import EyeOptics
 from estimator.field.few_colors import few_colors_grid
+from estimator.field.interpolation import FieldNodes
 from estimator.field.notes import eye_notes, periphery_note
 from estimator.field.trace_range import ON_AXIS_DEG, FieldRange
 from estimator.field.traced_eye import TracedEye
@@ -31,6 +32,7 @@ def prepare_eye(
     focus_range_dpt: tuple[float, float] = (0.0, 0.0),
     wavelengths_nm: ArrayLike = RGB_WAVELENGTHS_NM,
     field_range_deg: FieldRange = ON_AXIS_DEG,
+    nodes_deg: FieldNodes | None = None,
     eye_model: str = "traced",
     accuracy: str = "exact",
     progress: Callable[[float, str], None] | None = None,
@@ -48,6 +50,10 @@ def prepare_eye(
     wavelengths_nm : (n,)
     field_range_deg : ((h_low, h_high), (v_low, v_high))
         Azimuths and elevations.
+    nodes_deg : (n_h,), (n_v,), optional
+        Azimuths and elevations of the range, ends included, whose wavefronts are exact;
+        others are not interpolated well.  By default, all are interpolated between
+        nodes of its own.
     eye_model : {"traced", "wavefront"}
         "traced" estimates a 45-parameter eye and traces its wavefronts.  "wavefront"
         uses the measurement in closed form, at no cost, but does not model pupils
@@ -96,6 +102,7 @@ def prepare_eye(
         focus_range_dpt=focus_range_dpt,
         wavelengths_nm=wavelengths_nm,
         field_range_deg=field_range_deg,
+        nodes_deg=nodes_deg,
         field_grid=few_colors_grid,
         progress=lambda done: report(
             ESTIMATION_SHARE + (1.0 - ESTIMATION_SHARE) * done, "aberrations"

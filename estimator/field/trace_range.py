@@ -13,7 +13,11 @@ from estimator.field.aberration_grid import (
     FIELD_RINGS,
     AberrationGrid,
 )
-from estimator.field.interpolation import FieldInterpolation, field_nodes_deg
+from estimator.field.interpolation import (
+    FieldInterpolation,
+    FieldNodes,
+    range_nodes_deg,
+)
 from estimator.field.peripheral_residual import PeripheralResidual
 from estimator.periphery.change import peripheral_change
 from estimator.wavefront.aberrations import TRACED_FIELD_LIMIT_DEG
@@ -61,9 +65,16 @@ def trace_field(
     axis: FieldInterpolation,
     field_range_deg: FieldRange,
     field_grid: Callable[..., AberrationGrid],
+    nodes_deg: FieldNodes | None = None,
     **axes: Any,
 ) -> tuple[FieldInterpolation, FieldRange]:
     """Trace a range of fields, which is shrunk until it is unvignetted.
+
+    Parameters
+    ----------
+    nodes_deg : (n_h,), (n_v,), optional
+        Nodes of the whole range, unless it is shrunk or exceeds
+        `TRACED_FIELD_LIMIT_DEG`; by default those of `field_nodes_deg`.
 
     Returns
     -------
@@ -73,12 +84,15 @@ def trace_field(
     limited = np.clip(field_range_deg, -TRACED_FIELD_LIMIT_DEG, TRACED_FIELD_LIMIT_DEG)
     share = 1.0
     while share > SMALLEST_SHARE:
-        (h_low, h_high), (v_low, v_high) = traced = (share * limited).tolist()
+        traced = (share * limited).tolist()
+        is_whole = np.array_equal(traced, field_range_deg)
+        if nodes_deg is None or not is_whole:
+            nodes_deg = range_nodes_deg(traced)
         field = FieldInterpolation(
             field_grid(
                 eye,
-                h_deg=field_nodes_deg(h_low, h_high),
-                v_deg=field_nodes_deg(v_low, v_high),
+                h_deg=nodes_deg[0],
+                v_deg=nodes_deg[1],
                 n_rings=FIELD_RINGS,
                 n_azimuths=FIELD_AZIMUTHS,
                 **axes,
@@ -91,18 +105,18 @@ def trace_field(
 
 
 def peripheral_residual(
-    eye: EyeModel, field_range_deg: FieldRange
+    eye: EyeModel, nodes_deg: FieldNodes
 ) -> PeripheralResidual | None:
-    """Return the phase of the population's periphery for an eye.
+    """Return the phase of the population's periphery for an eye, over a grid.
 
     It is None if the eye has the periphery of the model, because the profile requests
     it or the phase cannot be traced over the whole range.
     """
     if isinstance(eye, GivenSurfaces) or eye.profile.periphery == "model":
         return None
-    if not np.any(field_range_deg):
+    if not np.any(np.concatenate(nodes_deg)):
         return None
-    residual = PeripheralResidual(peripheral_change(eye.profile), eye, field_range_deg)
+    residual = PeripheralResidual(peripheral_change(eye.profile), eye, nodes_deg)
     return residual if residual.passes else None
 
 

@@ -24,6 +24,7 @@ from estimator.field.accommodated_periphery import held_refraction_um
 from estimator.field.fixed_defocus import FixedDefocus
 from estimator.field.interpolation import (
     FieldInterpolation,
+    FieldNodes,
     accommodation_nodes_dpt,
 )
 from estimator.field.peripheral_residual import PeripheralResidual
@@ -136,6 +137,7 @@ class TracedEye(FocusingEye):
         focus_range_dpt: tuple[float, float],
         wavelengths_nm: ArrayLike,
         field_range_deg: FieldRange = ON_AXIS_DEG,
+        nodes_deg: FieldNodes | None = None,
         field_grid: Callable[..., AberrationGrid] = aberration_grid,
         progress: Callable[[float], None] | None = None,
     ) -> "TracedEye":
@@ -148,6 +150,9 @@ class TracedEye(FocusingEye):
             two smaller ones are traced, from which others are interpolated.
         field_range_deg : ((h_low, h_high), (v_low, v_high))
             Azimuths and elevations; ((0, 0), (0, 0)) is the axis alone.
+        nodes_deg : (n_h,), (n_v,), optional
+            Azimuths and elevations that are traced, ends of the range included; others
+            are not interpolated well.  By default Chebyshev nodes.
         field_grid : callable, optional
             Function that traces the grid; `few_colors.few_colors_grid` takes half the
             time of the default.
@@ -186,13 +191,15 @@ class TracedEye(FocusingEye):
             axis,
             field_range_deg,
             field_grid,
+            nodes_deg=nodes_deg,
             pupil_diameters_mm=field_pupils_mm(
                 axis_grid.pupil_diameters_mm[0], largest_open_pupil_mm(axis_grid)
             ),
             **states,
             progress=scaled_progress(progress, axis_share, 1.0),
         )
-        periphery = peripheral_residual(eye, traced_range_deg)
+        traced_deg = field.grid.h_deg, field.grid.v_deg
+        periphery = peripheral_residual(eye, traced_deg)
         if periphery is not None and field.grid.accommodations_dpt.any():
             phase_um = held_refraction_um(eye, field.grid, periphery)
             if np.isfinite(phase_um).all():

@@ -1,5 +1,6 @@
 """Result types for wavefronts and their pupils."""
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +31,12 @@ class PupilEllipse:
     semi_major_mm: float
     semi_minor_mm: float
     major_axis_deg: float
+
+    @classmethod
+    def of(cls, columns: NDArray[np.float64]) -> "PupilEllipse":
+        """Return the ellipse of center, semi-axes, mm, and angle, rad, (5,)."""
+        x_mm, y_mm, major_mm, minor_mm, angle_rad = columns.tolist()
+        return cls(x_mm, y_mm, major_mm, minor_mm, math.degrees(angle_rad))
 
     @property
     def axis_ratio(self) -> float:
