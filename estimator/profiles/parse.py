@@ -16,11 +16,14 @@ from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters
 from estimator.optics import prescription as rx
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
+from estimator.optics.zernike import remove_central_tilt
 from estimator.profiles import bodies
 from estimator.profiles.common_fields import coefficients_um, common_fields
 from estimator.profiles.correction import prescription
 from estimator.profiles.eye_profile import EYE_PUPIL_MM, EyeProfile, Measurement
 from estimator.profiles.validation import KIND, convert
+from estimator.wavefront.field_wavefronts import polynomial_in_mm, rays_cross
 
 __all__ = [
     "EyeProfile",
@@ -111,6 +114,15 @@ def _higher_order(
 
 
 def _primary(first: Measurement, *others: Measurement) -> dict[str, Any]:
+    radius_mm = first.pupil_diameter_mm / 2.0
+    at_cornea_um = polynomial_in_mm(remove_central_tilt(first.zernike_um), radius_mm)
+    depth_mm = TYPICAL_ENTRANCE_PUPIL_MM
+    if rays_cross(at_cornea_um, depth_mm=depth_mm, radius_mm=radius_mm):
+        raise ProfileError(
+            "zernike_um",
+            "its rays cross between cornea and pupil",
+            f"coefficients of an eye, in um, on a circle of {2.0 * radius_mm:g} mm",
+        )
     return {
         "pupil_diameter_mm": first.pupil_diameter_mm,
         "wavelength_nm": first.wavelength_nm,

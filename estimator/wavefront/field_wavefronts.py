@@ -5,14 +5,16 @@ on the circle of the fit.  The rim of a pupil is represented by its center and a
 symmetric matrix, which vary smoothly even where the axes of the ellipse are equal.
 """
 
+import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.optics import prescription as rx
-from estimator.optics.units import SPHERE_PER_C20
+from estimator.optics.units import SPHERE_PER_C20, UM_PER_MM
 from estimator.optics.zernike import (
     EXPONENTS,
     inverse_monomial_matrix,
@@ -133,6 +135,37 @@ def zernike_from_polynomial(
     zernike_um = (polynomial_um * radius_mm**DEGREE) @ inverse_monomial_matrix()
     zernike_um[..., 0] = 0.0
     return zernike_um
+
+
+@cache
+def _curvatures() -> NDArray[np.float64]:
+    """Return xx, xy and yy derivatives (3, n, 28) of monomials in a unit circle."""
+    radii = np.linspace(0.0, 1.0, 9)[:, None]
+    x, y = (radii * circular(_ANGLES) for circular in (np.cos, np.sin))
+    found = np.zeros((3, x.size, DEGREE.size))
+    for k, (a, b) in enumerate(EXPONENTS.tolist()):
+        for row, (i, j) in enumerate(((2, 0), (1, 1), (0, 2))):
+            if a >= i and b >= j:
+                factor = math.perm(a, i) * math.perm(b, j)
+                found[row, :, k] = (factor * x ** (a - i) * y ** (b - j)).ravel()
+    return found
+
+
+def rays_cross(
+    polynomial_um: NDArray[np.float64], *, depth_mm: float, radius_mm: float
+) -> bool:
+    """Return whether rays within a circle cross before a plane deeper in the eye.
+
+    The wavefront has several values there, which no polynomial represents.
+
+    Parameters
+    ----------
+    polynomial_um : (28,), um/mm^degree
+    """
+    scaled = polynomial_um * radius_mm ** (DEGREE - 2.0)
+    xx, xy, yy = depth_mm / UM_PER_MM * (_curvatures() @ scaled)
+    area = (1.0 + xx) * (1.0 + yy) - xy**2
+    return bool((area <= 0.0).any() or (xx + yy <= -2.0).any())
 
 
 def c20_by_degree(polynomial_um: NDArray[np.float64]) -> NDArray[np.float64]:

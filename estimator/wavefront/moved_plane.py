@@ -20,6 +20,8 @@ from estimator.wavefront.nodes import circle_nodes
 _ANGLES = 2.0 * np.pi * np.arange(16) / 16
 _RIM = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 
+TILT = [1, 2]
+
 N_MOMENTS = 2 * MAX_RADIAL_ORDER + 1
 """Powers of x or y in products of two monomials, from 0."""
 
@@ -97,7 +99,8 @@ def moved_polynomial(
     scale = radius_mm**DEGREE
     tables_um = np.zeros((count, MAX_RADIAL_ORDER + 1, MAX_RADIAL_ORDER + 1))
     start_um = polynomial_um.reshape(count, -1) * scale
-    start_um[:, 1:3] = 0.0  # tilt is an artifact of the fit: the chief ray has no slope
+    # tilt is an artifact of the fit: the chief ray has no slope
+    start_um[:, TILT] = 0.0
     tables_um[:, *EXPONENTS.T] = start_um
     moments = np.zeros((count, N_MOMENTS, N_MOMENTS))
     products_um = np.zeros_like(tables_um)
@@ -108,7 +111,7 @@ def moved_polynomial(
     fitted_um = np.linalg.solve(normal, products_um[:, *EXPONENTS.T, None])[..., 0]
     moved_um = (fitted_um / scale).reshape(polynomial_um.shape)
     moved_um[..., 0] = polynomial_um[..., 0]
-    moved_um[..., 1:3] += polynomial_um[..., 1:3]
+    moved_um[..., TILT] += polynomial_um[..., TILT]
     return moved_um
 
 

@@ -642,9 +642,15 @@ HOPELESS = {
     "kind": "zernike",
     "pupil_diameter_mm": 2,
     "wavelength_nm": 580.0,
-    "zernike_um": {"6,0": 100, "4,-4": 0.04},
+    "zernike_um": {"2,0": -43, "4,-4": 0.04},
     "age_years": 3,
 }
+
+
+@pytest.mark.parametrize("zernike_um", [{"6,0": 100}, {"2,0": -48}, {"3,1": 90}])
+def test_rays_that_cross_before_the_pupil_are_refused(zernike_um):
+    with pytest.raises(ProfileError, match="rays cross between cornea and pupil"):
+        parse_profile({**HOPELESS, "zernike_um": zernike_um})
 
 
 @pytest.mark.filterwarnings("error")

@@ -70,9 +70,7 @@ def test_off_axis_the_eye_is_traced_through_its_elliptical_pupil(psf):
     assert 0.5 * _spread_px(kernel) < _spread_px(other) < 0.99 * _spread_px(kernel)
 
 
-@pytest.mark.parametrize(
-    ("h_deg", "v_deg"), [(30.0, 0.0), (-20.0, 10.0), (0.0, 0.0)]
-)
+@pytest.mark.parametrize(("h_deg", "v_deg"), [(30.0, 0.0), (-20.0, 10.0), (0.0, 0.0)])
 def test_it_is_the_psf_of_frames(psf, h_deg, v_deg):
     """Without the periphery of people, 30 deg had a round spot along the other axis."""
     _, kernel = psf("emmetropia", "--h-deg", h_deg, "--v-deg", v_deg)
