@@ -8,6 +8,7 @@ implant_bodies       the same for implants and biometry
 validation           conversion of plain data to these types, and its errors
 eye_profile          the parsed profile
 common_fields        from the fields that all types share to those of a profile
+repeats              repeated measurements of one direction, averaged or refused
 parse                from a typed profile to an `EyeProfile`
 correction           from a typed correction to a lens
 given_eyes           from a typed profile to an eye given by its surfaces

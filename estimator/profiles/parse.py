@@ -22,6 +22,7 @@ from estimator.profiles import bodies
 from estimator.profiles.common_fields import coefficients_um, common_fields
 from estimator.profiles.correction import prescription
 from estimator.profiles.eye_profile import EYE_PUPIL_MM, EyeProfile, Measurement
+from estimator.profiles.repeats import merged_repeats
 from estimator.profiles.validation import KIND, convert
 from estimator.wavefront.field_wavefronts import polynomial_in_mm, rays_cross
 
@@ -161,6 +162,7 @@ def _zernike_set(body: bodies.ZernikeSetBody) -> EyeProfile:
         )
         for number, entry in enumerate(body.measurements)
     ]
+    measurements, notes = merged_repeats(measurements)
     on_axis = [m for m in measurements if m.is_on_axis]
     if not on_axis:
         raise ProfileError(
@@ -168,11 +170,13 @@ def _zernike_set(body: bodies.ZernikeSetBody) -> EyeProfile:
         )
     first = max(on_axis, key=lambda m: m.pupil_diameter_mm)
     others = [m for m in measurements if m is not first]
+    common = common_fields(body, "zernike set")
+    common["notes"] = (*common["notes"], *notes)
     return EyeProfile(
         kind="zernike_set",
         **_primary(first, *others),
         max_pupil_diameter_mm=first.pupil_diameter_mm,
-        **common_fields(body, "zernike set"),
+        **common,
     )
 
 
