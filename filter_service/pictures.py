@@ -29,6 +29,7 @@ from filter_service.bounded_images import (
 from filter_service.color_encoding import (
     ADOBE_RGB,
     BT709,
+    HDR_WHITE_CD_M2,
     SRGB,
     Codes,
     Curve,
@@ -188,9 +189,14 @@ def shown(
     alpha : (height, width) of the same type, or None
         Opacity.
     notes : list of str
-        A note is added if pixels are transparent.
+        Notes are added if pixels are transparent, or brighter than white.
     """
     top = np.iinfo(codes.dtype).max
+    if encoding.is_hdr:
+        notes.append(
+            f"{encoding.name}: {HDR_WHITE_CD_M2:g} cd/m2 is white; only npy and exr "
+            "keep brighter light"
+        )
     if alpha is not None:
         share = float((alpha < top).mean())
         if share == 0.0:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from filter_service.camera import PIXEL_ASPECT_LIMITS
 from filter_service.color_encoding import (
-    HDR_WHITE_CD_M2,
     SRGB,
     UNSPECIFIED,
     Encoding,
@@ -146,16 +145,10 @@ def _encoding(matrix: int, context: av.VideoCodecContext, notes: list[str]) -> E
             "neither is assumed"
         )
     try:
-        encoding = _encoding_of(primaries, transfer)
+        return _encoding_of(primaries, transfer)
     except ValueError as error:
         notes.append(f"{error}; sRGB is assumed")
         return SRGB
-    if encoding.is_hdr:
-        notes.append(
-            f"{encoding.name}: {HDR_WHITE_CD_M2:g} cd/m2 is white; only npy and exr "
-            "keep brighter light"
-        )
-    return encoding
 
 
 @cache

@@ -142,9 +142,11 @@ def _with_value(error: TyperException, arguments: list[str]) -> str:
     text = error.format_message()
     options: list[str] = getattr(getattr(error, "param", None), "opts", [])
     value = given_value(options, arguments)
-    if value is None or "valid number" not in text:
+    if value is None or not ("valid number" in text or "valid integer" in text):
         return text
-    return f"{options[0]} is '{value:.60}'{likely_number(value)}"
+    is_whole = "valid integer" in text
+    allowed = "; allowed: an integer" if is_whole else likely_number(value)
+    return f"{options[0]} is '{value:.60}'{allowed}"
 
 
 if __name__ == "__main__":

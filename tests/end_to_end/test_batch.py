@@ -9,6 +9,7 @@ import shutil
 import signal
 import time
 from contextlib import closing
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -429,6 +430,52 @@ def decoded(path):
             frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)
         ]
         return frames, float(container.streams.video[0].average_rate)
+
+
+@pytest.mark.clients
+@pytest.mark.parametrize("fps", [None, 5])
+def test_a_turned_video_of_variable_rate_keeps_its_times(tmp_path, fps):
+    """As a phone writes it: sideways, with a flag, and slower in the dark."""
+    import av
+
+    ticks = [0, 100, 200, 800, 1500]
+    with av.open(str(tmp_path / "a.mov"), "w") as container:
+        stream = container.add_stream("png", rate=10)
+        stream.width, stream.height, stream.pix_fmt = WIDTH_PX, HEIGHT_PX, "rgb24"
+        stream.set_display_rotation(90)
+        stream.codec_context.time_base = Fraction(1, 1000)
+        for k, ticks_ms in enumerate(ticks):
+            image = np.full((HEIGHT_PX, WIDTH_PX, 3), 40 * k, np.uint8)
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            frame.pts, frame.time_base = ticks_ms, Fraction(1, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    (tmp_path / "depth").mkdir()
+    for k in range(len(ticks)):
+        depth_m = np.full((WIDTH_PX, HEIGHT_PX), 2.0, np.float32)  # upright
+        np.save(tmp_path / f"depth/{k}.npy", depth_m)
+    out = tmp_path / "out"
+    arguments = (tmp_path / "a.mov", "--depth", tmp_path / "depth", *MODE)
+    given = () if fps is None else ("--fps", fps)
+    run(
+        *arguments,
+        "-p",
+        "myopia",
+        "--fov-deg",
+        20,
+        "--format",
+        "ffv1",
+        *given,
+        "-o",
+        out,
+    )
+    with av.open(str(out / "myopia.mkv")) as container:
+        found = list(container.decode(video=0))
+    times_s = np.array(ticks) / 1000.0 if fps is None else np.arange(5) / fps
+    np.testing.assert_allclose([frame.time for frame in found], times_s, atol=1e-3)
+    assert (found[0].width, found[0].height) == (HEIGHT_PX, WIDTH_PX)
+    means = [frame.to_ndarray(format="rgb24").mean() for frame in found]
+    np.testing.assert_allclose(means, 40 * np.arange(5), atol=1.0)
 
 
 VIDEO = (*MODE, "--fov-deg", 20, "--fps", 24, "--format")

@@ -31,6 +31,7 @@ FILTER += ("-o", "b.png", "--distance-m", "2")
         ("--pupil-mm 0.004", "is 0.004; allowed: 0.5 to 9 mm (0.004 m is 4 mm)"),
         ("--distance-m 0.01", "is 0.01; allowed: 0.05 to inf m"),
         ("--gaze-h-deg 5deg", "is '5deg'; allowed: a number without 'deg', as in 5"),
+        ("--render-tolerance 9", "is 9; allowed: 0 to 8"),
     ],
 )
 def test_a_command_names_the_value_and_the_likely_mistake(capsys, given, said):
@@ -48,6 +49,11 @@ def test_a_wavelength_in_micrometers_is_recognized(capsys, command):
     given = ("navarro", "--pupil-mm", "4", "--wavelength-nm", "0.555")
     line = refused(capsys, *command, *given)
     assert line.endswith(" nm (0.555 um is 555 nm)")
+
+
+def test_a_number_that_is_not_whole_is_named(capsys):
+    line = refused(capsys, "demo", "--frames", "2.5")
+    assert line == "ocufilter: --frames is '2.5'; allowed: an integer"
 
 
 def test_a_program_of_its_own_says_the_same(capsys):

@@ -307,7 +307,7 @@ def test_codes_of_a_png_take_precedence(tmp_path):
     np.testing.assert_array_equal(found[0, 0], [0, 204, 13])
     pq = (b"cICP", bytes([9, 16, 0, 1]))
     white = np.full((2, 2, 3), 148, np.uint8)  # 58 %: 203 cd/m2
-    found = read_color(png(tmp_path / "a.png", white, RGB, pq))
+    found = noted(png(tmp_path / "a.png", white, RGB, pq), "PQ: 203 cd/m2 is white")
     np.testing.assert_allclose(found, 1.0, rtol=0.02)
     unknown = (b"cICP", bytes([99, 13, 0, 1]))
     noted(png(tmp_path / "a.png", codes, RGB, unknown), "unknown color codes 99 and 13")

@@ -89,6 +89,21 @@ def test_files_that_are_no_pictures_are_refused_with_what_is_allowed(
     assert "/ocufilter-" not in str(refused.value)
 
 
+def test_notes_on_the_files_of_a_photo_go_with_its_picture(color):
+    rgba = np.dstack([color, np.full(color.shape[:2], 255, np.uint8)])
+    rgba[: len(rgba) // 2, :, 3] = 0
+    depth = ("d.npy", _npy(np.full(color.shape[:2], 1500, np.uint16)))
+    where = {"width_deg": 40.0, "distance_dpt": 1.0}
+    picture = photo_picture("p.png", _png(rgba), **where, depth=depth)
+    transparent, integers = picture.notes
+    assert transparent.startswith("'p.png': 50 % of the pixels are transparent")
+    assert "integers are millimeters" in integers
+    assert not picture.view.color[0].any()
+    np.testing.assert_allclose(picture.view.depth_m, 1.5)
+    assert not photo_picture("p.png", _png(color), **where).notes
+    assert photo_picture("p.png", _png(rgba), **where).at(2.0).notes == (transparent,)
+
+
 def test_a_large_photo_is_made_smaller():
     picture = photo_picture(
         "p.png", _png(np.full((1000, 1501, 3), 90, np.uint8)), **FLAT
