@@ -64,8 +64,6 @@ class _Stored:
     ----------
     codes : (height, width, 3), uint8 or uint16
     alpha : (height, width) of the same type, or None
-    encoding : Encoding
-    notes : list of str
     """
 
     codes: Codes
@@ -243,7 +241,6 @@ def _stored(file: BinaryIO, formats: Sequence[str]) -> _Stored:
         is_deep = image.format == "PNG" and ";16" in raw
         if is_deep or image.mode.startswith("I;16"):
             codes, alpha = _deep_codes(file, image, raw)
-            tables = None
             encoding = _encoding(image, container, notes)
             if isinstance(encoding, bytes):
                 raise InvalidImage(
@@ -257,12 +254,12 @@ def _stored(file: BinaryIO, formats: Sequence[str]) -> _Stored:
                 notes.append("16 bits per channel are read as 8")
             image.load()
             encoding = _encoding(image, container, notes)
-            tables = encoding if isinstance(encoding, bytes) else None
+            tables, encoding = (
+                (encoding, SRGB) if isinstance(encoding, bytes) else (None, encoding)
+            )
             codes, alpha = _codes(image, tables, notes)
         _note_pages(image, container, notes)
         _note_resolution(image, notes)
-        if isinstance(encoding, bytes):
-            encoding = SRGB
         orientation = _orientation(image)
     # Pillow's copy of the pixels is gone: each step holds two copies at most.
     codes = upright(codes, orientation)

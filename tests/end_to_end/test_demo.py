@@ -105,7 +105,7 @@ def test_demo_writes_a_video_of_all_frames_and_a_contact_sheet(demo_run):
 def _decoded(path, width, height):
     """All frames (n, h, w, 3) of a video of that size."""
     with VideoReader(Path(path)) as reader:
-        frames = np.stack([reader.color(index) for index in range(reader.count)])
+        frames = np.stack([reader.color(k).pixels for k in range(reader.count)])
     assert frames.shape[1:] == (height, width, 3)
     return frames
 
