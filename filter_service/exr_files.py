@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.bounded_files import InvalidFile
+from estimator.bounded_files import InvalidFile, printable
 from filter_service.bounded_images import (
     GLOBALS_LOCK,
     MAX_DECODED_BYTES,
@@ -30,7 +30,7 @@ from filter_service.bounded_images import (
     size_of,
 )
 from filter_service.camera import PIXEL_ASPECT_LIMITS, PixelGrid
-from filter_service.color_encoding import srgb_from_primaries
+from filter_service.color_encoding import BLOCK_PIXELS, srgb_from_primaries
 
 MAX_WINDOW_PX = 1 << 20
 """Side of the display window, of which the data window is a part."""
@@ -65,11 +65,14 @@ def read_exr_color(
     """
 
     def choose(names: set[str]) -> tuple[str, ...]:
-        chosen = ("R", "G", "B") if set("RGB") <= names else ("Y",)
+        layer = _layer(names, "RGB")
+        chosen = ("Y",) if layer is None else tuple(f"{layer}{c}" for c in "RGB")
         if not set(chosen) <= names or {"RY", "BY"} & names:
             found = f"channels {', '.join(sorted(names))}"
-            raise_invalid(path, found[:200], "channels R, G and B, or Y", option)
-        return (*chosen, "A") if "A" in names else chosen
+            allowed = "channels R, G and B of one layer, or Y"
+            raise_invalid(path, found[:200], allowed, option)
+        opacity = f"{layer or ''}A"
+        return (*chosen, opacity) if opacity in names else chosen
 
     image = _read_exr(path, choose, option=option, content=content)
     channels = image.channels
@@ -77,22 +80,53 @@ def read_exr_color(
         raise_invalid(
             path, "channels of different sizes", "R, G and B of one size", option
         )
-    alpha = channels.pop("A", None)
+    names = list(channels)
+    alpha = channels.pop(names.pop()) if names[-1].endswith("A") else None
     if alpha is not None and (share := float((alpha < 1.0).mean())) > 0.0:
         notes.append(
             f"{100.0 * share:.3g} % of the pixels are transparent; black is behind them"
         )
-    names = list("RGB" if "R" in channels else "YYY")
-    rgb = np.stack([channels[name] for name in names], axis=-1)
+    rgb = np.empty((*channels[names[0]].shape, 3), np.float32)
+    for k in range(3):
+        rgb[:, :, k] = channels[names[0]] if len(names) == 1 else channels.pop(names[k])
+    if len(names) == 3:
+        _note_layer(names[0], notes)
+        _convert(rgb, image.chromaticities, notes)
+    return rgb, _noted_grid(image, notes)
+
+
+def _layer(names: set[str], channels: str) -> str | None:
+    """Return the prefix of the only layer with these channels, "" if they have none."""
+    if set(channels) <= names:
+        return ""
+    layers = {name[:-1] for name in names if name.endswith("." + channels[0])}
+    layers -= {name[:-1] for name in names if name.endswith(".X")}  # vectors
+    whole = [p for p in layers if all(f"{p}{c}" in names for c in channels)]
+    return whole[0] if len(whole) == 1 else None
+
+
+def _note_layer(name: str, notes: list[str]) -> None:
+    if "." in name:
+        layer = printable(name.rpartition(".")[0], most=80)
+        notes.append(f"the layer '{layer}' is read")
+
+
+def _convert(
+    rgb: NDArray[np.float32], chromaticities: tuple[float, ...] | None, notes: list[str]
+) -> None:
+    """Convert light to linear sRGB in place, some rows at a time."""
     try:
-        if image.chromaticities is not None and names[0] == "R":
-            to_srgb = srgb_from_primaries(image.chromaticities)
-            if to_srgb is not None:
-                with np.errstate(invalid="ignore", over="ignore"):
-                    rgb = rgb @ to_srgb.T.astype(np.float32)
+        to_srgb = chromaticities and srgb_from_primaries(chromaticities)
     except ValueError as error:
         notes.append(f"{error}; those of sRGB are assumed")
-    return rgb, _noted_grid(image, notes)
+        return
+    if to_srgb is None:
+        return
+    matrix = np.asarray(to_srgb).T.astype(np.float32)
+    step = max(1, BLOCK_PIXELS // rgb.shape[1])
+    with np.errstate(invalid="ignore", over="ignore"):
+        for top in range(0, len(rgb), step):
+            rgb[top : top + step] = rgb[top : top + step] @ matrix
 
 
 def read_exr_depth(
@@ -104,13 +138,15 @@ def read_exr_depth(
     """
 
     def choose(names: set[str]) -> tuple[str, ...]:
-        for wanted in (("Z",), ("Y",), ("R", "G", "B"), ("R",)):
-            if set(wanted) <= names:
-                return wanted
+        for wanted in ("Z", "Y", "RGB", "R"):
+            layer = _layer(names, wanted)
+            if layer is not None:
+                return tuple(f"{layer}{channel}" for channel in wanted)
         found = f"channels {', '.join(sorted(names))}"
         raise_invalid(path, found[:200], "a channel Z, Y or R", option)
 
     image = _read_exr(path, choose, option=option, content=content)
+    _note_layer(next(iter(image.channels)), notes)
     first, *others = image.channels.values()
     if not all(np.array_equal(first, other, equal_nan=True) for other in others):
         raise_invalid(path, "colors in R, G and B", "a channel Z, Y or R", option)

@@ -105,7 +105,7 @@ def test_opacity_gray_and_parts_of_exr(tmp_path, light):
     np.testing.assert_array_equal(read_noted(path, "25 % of the pixels are"), light)
     gray = read_color(exr(tmp_path / "a.exr", {"Y": light[..., 0].copy()}))
     np.testing.assert_array_equal(gray, np.repeat(light[..., :1], 3, axis=2))
-    with pytest.raises(ValueError, match="channels V; allowed: channels R, G and B"):
+    with pytest.raises(ValueError, match="channels V; allowed: channels R, G and B of"):
         read_color(exr(tmp_path / "a.exr", {"V": light[..., 0].copy()}))
     parts = [
         OpenEXR.Part({"name": name, "type": OpenEXR.scanlineimage}, {"RGB": image})
@@ -115,6 +115,31 @@ def test_opacity_gray_and_parts_of_exr(tmp_path, light):
         file.write(str(tmp_path / "b.exr"))
     found = read_noted(tmp_path / "b.exr", "it has 2 parts; the first is read")
     np.testing.assert_array_equal(found, light)
+
+
+def layers(light, *names):
+    return {
+        f"{n}.{c}": light[..., k].copy() for n in names for k, c in enumerate("RGB")
+    }
+
+
+def test_the_only_layer_of_a_renderer_is_read(tmp_path, light):
+    """As Blender names channels: ViewLayer.Combined.R and ViewLayer.Depth.Z."""
+    combined = layers(light, "ViewLayer.Combined")
+    combined["ViewLayer.Combined.A"] = np.full(light.shape[:2], 0.5, np.float32)
+    combined["ViewLayer.Depth.Z"] = light[..., 0] + 1.0
+    path = exr(tmp_path / "a.exr", combined)
+    color, depth = read_color_file(path), read_depth_file(path)
+    np.testing.assert_array_equal(color.pixels, light)
+    assert "100 % of the pixels are transparent" in color.notes[0]
+    assert color.notes[1] == "'a.exr': the layer 'ViewLayer.Combined' is read"
+    np.testing.assert_array_equal(depth.pixels, light[..., 0] + 1.0)
+    assert "the layer 'ViewLayer.Depth' is read" in depth.notes[0]
+    path = exr(tmp_path / "a.exr", layers(light, "a.diffuse", "a.glossy"))
+    with pytest.raises(
+        ValueError, match=r"channels a\.diffuse\.B, .*of one layer, or Y"
+    ):
+        read_color_file(path)
 
 
 def test_colors_are_no_depth(tmp_path, light):
