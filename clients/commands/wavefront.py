@@ -23,6 +23,11 @@ FIELD_LIMITS_DEG = (-75.0, 75.0)
 OBJECT_LIMITS_DPT = (-20.0, 20.0)
 FOCUS_LIMITS_DPT = (0.0, 20.0)
 
+OF_THE_MODEL = (
+    "the coefficients are those of the estimated eye model; `ocufilter field` and "
+    "`psf` include the rest of the measurement and the periphery of people"
+)
+
 
 class Fit(StrEnum):
     """Quantity that the least-squares fit is made to."""
@@ -164,6 +169,8 @@ def load_surfaces(
     profile = load_profile(source)
     found = eye_model(profile)
     notes = (*found.notes, *profile.notes)
+    if not profile.is_given:
+        notes = (*notes, OF_THE_MODEL)
     if profile.correction is not None:
         notes = (*notes, "the coefficients do not include the correction")
     relaxed = found.relaxed

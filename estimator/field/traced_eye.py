@@ -47,9 +47,6 @@ from estimator.wavefront.field_wavefronts import (
     with_defocus,
 )
 
-MAX_PUPIL_MM = 8.0
-"""Largest diameter to which an iris opens."""
-
 ACCOMMODATION_STEP_DPT = 1.0
 """Largest step between accommodations whose PSFs are blended.  PSFs are blended at
 equal total defocus, so only the slow change of the other aberrations is

@@ -11,7 +11,6 @@ from estimator.field.eye_optics import EyeOptics
 from estimator.field.network_eye import network_eye
 from estimator.field.prepare import prepare_eye
 from estimator.field.trace_range import FieldRange
-from estimator.field.traced_eye import MAX_PUPIL_MM
 from estimator.networks.card import NetworkUnavailable
 from estimator.note import Note
 from estimator.profiles.measured_wavefront import MeasuredWavefront
@@ -74,10 +73,9 @@ def eye_for_spec(
     if isinstance(lens, ProgressiveLens | WornLens) and depends_on_gaze(lens):
         lens = lens.with_gaze_offset(settings.gaze_deg)
         profile = replace(profile, correction=lens)
-    low_mm, high_mm = (min(p, MAX_PUPIL_MM) for p in settings.pupil_range_mm)
     eye, notes = prepare_eye(
         profile,
-        pupil_diameters_mm=pupil_nodes_mm((low_mm, high_mm)),
+        pupil_diameters_mm=pupil_nodes_mm(settings.pupil_range_mm),
         focus_range_dpt=settings.focus_range_dpt,
         wavelengths_nm=spec.traced_wavelengths_nm,
         field_range_deg=_with_axis(spec.field_range_deg),

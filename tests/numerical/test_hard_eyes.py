@@ -141,3 +141,16 @@ def test_an_eye_that_nobody_has_is_named():
         )
         _, notes = eye_for_spec(parse_profile(HARD[name]), GridSpec(CAMERA, settings))
         assert any("unusual for a person" in note for note in notes)
+
+
+def test_pupils_are_traced_up_to_the_limit_of_the_setting():
+    settings = FilterSettings(
+        mode="on-axis", pupil_range_mm=(8.2, 9.0), focus_range_dpt=(0.0, 0.0)
+    )
+    eye, _ = eye_for_spec(
+        parse_profile({"kind": "preset", "name": "emmetropia"}),
+        GridSpec(CAMERA, settings),
+    )
+    assert eye.usable_pupil_mm(9.0) == pytest.approx(9.0)
+    notes = eye.notes(pupil_diameter_mm=9.0, focus_dpt=0.0)
+    assert "pupil_capped" not in [note.code for note in notes]

@@ -95,6 +95,11 @@ def test_the_notes_of_the_profile_are_printed(eye_file, tmp_path, command):
     assert f"note: {text}\n" in ended.stdout
 
 
+def test_a_measurement_is_told_from_its_eye_model():
+    found = _json("emmetropia", "--pupil-mm", "4", "--wavelength-nm", "555")
+    assert any("`ocufilter field` and `psf` include the rest" in note for note in found["notes"])
+
+
 def test_without_json_it_prints_a_table(eye_file):
     ended = run_command("wavefront", eye_file, *VIEW)
     assert ended.returncode == 0
