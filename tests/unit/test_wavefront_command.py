@@ -97,7 +97,7 @@ def test_the_notes_of_the_profile_are_printed(eye_file, tmp_path, command):
 
 def test_a_measurement_is_told_from_its_eye_model():
     found = _json("emmetropia", "--pupil-mm", "4", "--wavelength-nm", "555")
-    assert any("`ocufilter field` and `psf` include the rest" in note for note in found["notes"])
+    assert "`ocufilter field` and `psf` include the rest" in " ".join(found["notes"])
 
 
 def test_without_json_it_prints_a_table(eye_file):
