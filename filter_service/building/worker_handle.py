@@ -83,12 +83,18 @@ class BuildError:
 BuildEvent = BuildProgress | BuildDone | BuildPart | BuildError
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Worker:
     """A running process and the pipe to it."""
 
     process: subprocess.Popen[bytes]
     pipe: Connection
+    is_killed: bool = False
+
+    def kill(self) -> None:
+        """Kill the process; it gets no more jobs."""
+        self.process.kill()
+        self.is_killed = True
 
 
 @dataclass
@@ -206,10 +212,6 @@ class WorkerHandle:
             if now_s >= self._start_at_s:
                 self.start()
             return events
-        if self._kill_at_s is not None and now_s > self._kill_at_s:
-            log.warning("a canceled build did not stop; killing its process")
-            worker.process.kill()
-        self._watch(worker, now_s)
         try:
             while worker.pipe.poll(0):
                 self._receive(worker.pipe, events)
@@ -217,11 +219,19 @@ class WorkerHandle:
                     break
         except (EOFError, OSError, pickle.UnpicklingError):
             events += self._recover(worker)
+        else:
+            self._watch(worker, now_s)
         self._start_next()
         return events
 
     def _watch(self, worker: _Worker, now_s: float) -> None:
-        """Kill a worker that a signal has stopped, or whose build takes too long."""
+        """Kill a worker that a signal has stopped, or whose build does not end.
+
+        Messages were read before: nobody may have polled since the build has ended.
+        """
+        if self._kill_at_s is not None and now_s > self._kill_at_s:
+            log.warning("a canceled build did not stop; killing its process")
+            worker.kill()
         if now_s < self._next_watch_s:
             return
         self._next_watch_s = now_s + WATCH_INTERVAL_S
@@ -229,14 +239,14 @@ class WorkerHandle:
             log.error(
                 "a build took longer than %g s; killing its process", self.build_limit_s
             )
-            worker.process.kill()
+            worker.kill()
         if not is_stopped(worker.process.pid):
             self._stopped_since_s = None
         elif self._stopped_since_s is None:
             self._stopped_since_s = now_s
         elif now_s - self._stopped_since_s > STOPPED_LIMIT_S:
             log.error("the build worker does not respond; killing it")
-            worker.process.kill()
+            worker.kill()
 
     def _receive(self, pipe: Connection, events: list[BuildEvent]) -> None:
         message = pipe.recv()
@@ -262,6 +272,9 @@ class WorkerHandle:
 
     def _start_next(self) -> None:
         """Send the next job, unless the worker is busy or not yet ready."""
+        worker = self._worker
+        if worker is None or worker.is_killed:
+            return
         if self._running is None and self._is_ready and self._queue:
             ticket, job = self._queue.popleft()
             self._running = ticket

@@ -52,6 +52,21 @@ def events_until(worker, is_so):
     return events
 
 
+def test_a_build_that_ended_after_it_was_canceled_costs_no_process():
+    """Nobody polled for longer than the grace: the next build was killed for it."""
+    with started() as worker:
+        worker.cancel_grace_s = 0.0
+        events_until(worker, lambda events: worker._is_ready)
+        worker.cancel(worker.submit(JOB))
+        while not worker._worker.pipe.poll(0.05):
+            pass
+        time.sleep(0.05)  # the build has sent all its messages
+        done = BuildDone(worker.submit(JOB), BuiltStore(None))
+        events = events_until(worker, lambda events: done in events)
+        assert not [event for event in events if isinstance(event, BuildError)]
+        assert worker.n_restarts == 0
+
+
 def reports_of_build(worker):
     """Run one build; return the progress that it reports."""
     done = BuildDone(worker.submit(JOB), BuiltStore(None))
