@@ -95,7 +95,7 @@ class EyeView:
         if self._full is None:
             self._full = _ProfiledFilter(EyeFilter())
         settings = FULL.covering(foci_dpt=(request.focus_dpt,)).changed(
-            gaze_deg=request.gaze_deg
+            gaze_deg=request.gaze_deg, pipeline=request.pipeline
         )
         view = request.picture.view
         if self._merge_factor > 1:
@@ -108,7 +108,8 @@ class EyeView:
         if full is None or full.profile_key is None:
             return
         body, settings, _ = full.profile_key
-        if (body, settings.gaze_deg) != (request.bodies[self.side], request.gaze_deg):
+        wanted = (request.bodies[self.side], request.gaze_deg, request.pipeline)
+        if (body, settings.gaze_deg, settings.pipeline) != wanted:
             full.filter.close()
             self._full, self._merge_factor = None, 1
 

@@ -40,6 +40,9 @@ if TYPE_CHECKING:
 
 STYLE = (Path(__file__).parent / "style.css").read_text(encoding="utf-8")
 SHOWN = {"OD": "Right eye", "OS": "Left eye", "both": "Both"}
+PIPELINES = {"exact": "Exact", "published": "Method of 2023 (slow)"}
+"""Names of `filter_service.settings.Pipeline`."""
+
 FIGURES_DELAY_S = 0.35
 """Delay after the last change before figures are redrawn."""
 
@@ -165,6 +168,7 @@ class Page:
         for panel in self.panels.values():
             panel.show()
         self._show_values()
+        self._pipelines.value = self.state.pipeline
         self._shown.value = self.state.shown  # shows the eyes, too
 
     def _show_values(self) -> None:
@@ -232,6 +236,18 @@ class Page:
                     ui.button(
                         label, on_click=lambda _, near=is_reading: self._look(near)
                     ).props("outline dense no-caps size=sm").classes("oc-download")
+                ui.element("span").classes("oc-grow")
+                self._pipelines = (
+                    ui.toggle(
+                        PIPELINES,
+                        value=self.state.pipeline,
+                        on_change=self._choose_pipeline,
+                    )
+                    .props(
+                        "no-caps unelevated dense size=sm role=group aria-label=Method"
+                    )
+                    .classes("oc-toggle")
+                )
 
     def _slider(self, number: NumberField) -> None:
         name = number.name
@@ -356,6 +372,10 @@ class Page:
     def _look(self, is_reading: bool) -> None:
         self.state.look(is_reading=is_reading)
         self._show_values()
+        self.request()
+
+    def _choose_pipeline(self, event: events.ValueChangeEventArguments) -> None:
+        self.state.pipeline = event.value
         self.request()
 
     async def _take_file(self, side: EyeSide, name: str, content: bytes) -> None:

@@ -12,6 +12,7 @@ from clients.web.eye_form import SIDES, EyeForm, EyeSide, NoFile, read_profile_f
 from clients.web.numbers import NumberField
 from clients.web.picture import Picture, ScenePoint
 from clients.web.picture_requests import PictureRequest
+from filter_service.settings import Pipeline
 
 Shown = Literal["OD", "OS", "both"]
 
@@ -51,6 +52,7 @@ class PageState:
     valid_profiles : the last valid profile of each eye
     shown : which eye, or both
     is_focus_set : whether the user set the focus, so that it ignores the distance
+    pipeline : that of full pictures; previews are exact
     """
 
     eyes: dict[EyeSide, EyeForm] = field(
@@ -60,6 +62,7 @@ class PageState:
     is_focus_set: bool = False
     picture: Picture | None = None
     shown: Shown = "OD"
+    pipeline: Pipeline = "exact"
     number: int = 0
     valid_profiles: dict[EyeSide, Mapping[str, Any]] = field(default_factory=dict)
 
@@ -176,7 +179,7 @@ class PageState:
         for form in self.eyes.values():
             form.reset()
         self.values.update(first_values())
-        self.shown, self.is_focus_set = "OD", False
+        self.shown, self.is_focus_set, self.pipeline = "OD", False, "exact"
 
     def read_profiles(self) -> bool:
         """Read the profiles of the eyes shown; return whether any has changed.
@@ -214,6 +217,7 @@ class PageState:
             pupil_diameter_mm=self.values[PUPIL.name],
             focus_dpt=self.values[FOCUS.name],
             gaze_deg=self.picture_gaze_deg,
+            pipeline=self.pipeline,
         )
 
     def scene_point(self, x: float, y: float) -> ScenePoint | None:

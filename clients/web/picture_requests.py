@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from clients.web.eye_form import EyeSide
 from clients.web.picture import Picture
+from filter_service.settings import Pipeline
 
 Kind = Literal["scene", "preview", "full", "failed"]
 
@@ -30,6 +31,7 @@ class PictureRequest:
     pupil_diameter_mm: float
     focus_dpt: float
     gaze_deg: tuple[float, float]
+    pipeline: Pipeline = "exact"
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from clients.web.correction_form import DESIGNS, KINDS, CorrectionForm
 from clients.web.eye_form import SIDES, EyeForm, Source, preset_titles
 from clients.web.page_state import CONDITIONS, PageState, Shown
 from estimator.bounded_files import loads_bounded
+from filter_service.settings import Pipeline
 
 VERSION = 1
 MAX_CHARACTERS = 8000
@@ -48,6 +49,8 @@ def fragment_of(state: PageState, scene: str) -> str:
     entries: dict[str, Any] = {"v": VERSION}
     if state.shown != new.shown:
         entries["shown"] = state.shown
+    if state.pipeline != new.pipeline:
+        entries["pipeline"] = state.pipeline
     if scene in SCENES[1:]:
         entries["scene"] = scene
     values = {name: v for name, v in state.values.items() if v != new.values[name]}
@@ -101,6 +104,7 @@ def restore(state: PageState, fragment: str) -> Restored:
     state.reset()
     state.is_focus_set = entries.get("focus_set") is True
     state.shown = _choice(entries, "shown", get_args(Shown)) or state.shown
+    state.pipeline = _choice(entries, "pipeline", get_args(Pipeline)) or state.pipeline
     found.scene = _choice(entries, "scene", SCENES) or SCENES[0]
     values = _mapping(entries.get("values"))
     for number in CONDITIONS:

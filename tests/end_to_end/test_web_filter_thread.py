@@ -105,6 +105,18 @@ def test_both_eyes_are_seen_each_through_its_own(filter_thread, screen):
     assert full["OD"].std() < 0.8 * full["OS"].std()
 
 
+@pytest.mark.clients
+def test_the_published_pipeline_is_that_of_the_filter(filter_thread, screen):
+    filter_thread.request("page", dataclasses.replace(request(1), pipeline="published"))
+    full = screen.until("full", 1)[-1]
+    view = request(1).picture.view
+    with EyeFilter(
+        request(1).bodies["OD"], view.camera, {"pipeline": "published"}
+    ) as other:
+        seen = other.filter([view], pupil_diameter_mm=4.0, focus_dpt=0.0, whole=True)
+    assert psnr_db(pixels(full), seen.color) > 50.0
+
+
 def test_a_header_and_a_file_travel_together(filter_thread, screen):
     filter_thread.request("page", request(1))
     data = screen.until("preview", 1)[-1].packed()

@@ -309,6 +309,25 @@ def test_the_focus_follows_the_distance_until_it_is_set():
     assert again.values[FOCUS.name] == 1.0
 
 
+def test_the_pipeline_is_in_requests_and_links():
+    state = PageState()
+    assert (
+        '"pipeline"'
+        not in base64.urlsafe_b64decode(fragment_of(state, "courtyard") + "==").decode()
+    )
+    state.set_picture(a_picture())
+    assert state.request().pipeline == "exact"
+    state.pipeline = "published"
+    again = PageState(picture=a_picture())
+    restore(again, fragment_of(state, "courtyard"))
+    assert again.request().pipeline == "published"
+    again.reset()
+    assert again.pipeline == "exact"
+    text = json.dumps({"v": 1, "pipeline": "best"}).encode()
+    restore(again, base64.urlsafe_b64encode(text).decode())
+    assert again.pipeline == "exact"
+
+
 def test_a_click_focuses_on_a_rounded_distance():
     state = PageState()
     state.set_picture(a_picture())  # 2 m away on the axis
