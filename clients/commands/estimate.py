@@ -38,8 +38,8 @@ def estimate(
         Method,
         typer.Option(
             help="network: the eye network alone, checked by ray tracing; refined: "
-            "least squares on traced coefficients, from the network's or a table's "
-            "first guess; search: the pattern search of the paper."
+            "least squares on traced coefficients, from a table's first guess; search: "
+            "the pattern search of the paper."
         ),
     ] = Method.REFINED,
     max_time_s: Annotated[
