@@ -55,14 +55,13 @@ def predicted_cost(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> PlanCost:
     texels = float(np.mean(box_texels(spec, survey)))
     cores = thread_count()
     per_psf = len(spec.primary_wavelengths_nm)
-    time_us = (
-        per_psf
-        * relative_core_time()
-        * sum(
-            TERM_US[name] * float(np.mean(values))
-            for name, values in cost_terms(spec, survey).items()
-        )
+    wavefront_us = sum(
+        TERM_US[name] * float(np.mean(values))
+        for name, values in cost_terms(spec, survey).items()
     )
+    if spec.settings.pipeline == "published":
+        wavefront_us = SERIES_US
+    time_us = per_psf * relative_core_time() * wavefront_us
     return {
         "psf_count": count,
         "memory_mb": BYTES_PER_TEXEL * texels * count / 1e6,
@@ -146,6 +145,11 @@ TERM_US = {"psf": 56.5, "wave": 2.24e-4, "texels": 0.0134}
 `machine_speed` scales it for other machines.  36 batches of 768 PSFs of three eyes and
 three image sizes, 56 to 465 us per PSF, took 0.77 to 1.19 of the prediction
 (`python -m tests.benchmarks.bench_plan --calibrate` repeats the fit)."""
+
+
+SERIES_US = 1.5e5
+"""Processor time of a PSF by the ENZ series on an AMD EPYC: 29 to 250 ms through six
+eyes (`ocufilter bench published`)."""
 
 
 def cost_terms(spec: GridSpec, survey: PupilSurvey) -> dict[str, NDArray[np.float64]]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 
 from estimator.psf.compute import PsfBatch, compute_psf_batch
+from estimator.threads import thread_count
 from filter_service.psfs.native_psfs import NativePsfs, native_psfs
 
 PYTHON_BATCH = 768
@@ -42,19 +43,18 @@ PYTHON = PsfEngine(compute_psf_batch, PYTHON_BATCH)
 """Fallback if the package was installed without a C compiler."""
 
 
-ENZ_BATCH = 8
-"""Such PSFs between two checks: they take about a hundred times as long."""
-
-PUBLISHED = PsfEngine(partial(compute_psf_batch, method="enz_unchecked"), ENZ_BATCH)
-"""Engine of the published pipeline: the ENZ series to its Zernike degree, also where
-the aberrations require a higher one."""
-
-
 @cache
 def psf_engine(pipeline: str = "exact") -> PsfEngine:
-    """Return the engine of a pipeline; for "exact" `PYTHON` if C was not built."""
+    """Return the engine of a pipeline.
+
+    That of "exact" is the compiled one, or `PYTHON` if it was not built.  That of
+    "published" is the ENZ series to the paper's Zernike degree, also where the
+    aberrations require a higher one.  Its PSFs take up to 0.25 s of a core, so there is
+    one for each thread between two checks.
+    """
     if pipeline == "published":
-        return PUBLISHED
+        series = partial(compute_psf_batch, method="enz_unchecked")
+        return PsfEngine(series, thread_count())
     native = native_psfs()
     if native is None:
         return PYTHON

@@ -11,10 +11,18 @@ from estimator.networks.card import NetworkUnavailable
 from estimator.networks.inference import network_aberrations
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.profiles.files import load_profile
+from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
 from estimator.wavefront.aberrations import wavefront_grid
 from estimator.wavefront.field_wavefronts import polynomial_in_mm, rim_from_ellipse
 from estimator.wavefront.moved_plane import moved_polynomial, moved_rim
+from filter_service.filtering.accepted_profile import AcceptedProfile
+from filter_service.planning.cost import predicted_cost
+from filter_service.planning.plan import plan_cache
+from filter_service.psfs.psf_engine import psf_engine
+from filter_service.psfs.store import PsfStore
+from filter_service.settings import FilterSettings
+from tests.grid_specs import grid_spec
 
 FIELD_DEG = ((-45.0, 45.0), (-24.0, 24.0))
 STATE = {"pupil_diameter_mm": 4.0, "wavelength_nm": REFERENCE_WAVELENGTH_NM}
@@ -123,6 +131,34 @@ def test_fields_beyond_the_training_range_have_the_wavefront_at_its_edge():
         h_deg=[edge_deg, 60.0], accommodation_dpt=0.0, **STATE
     )
     assert at_dpt[0] == at_dpt[1]
+
+
+def test_its_psfs_are_those_of_the_series_few_at_a_time():
+    spec = grid_spec(
+        **{"width_px": 32, "height_px": 18, "tangents": (-0.02, 0.02, 0.01, -0.01)},
+        **{"pipeline": "published", "pupil_range_mm": (3.0, 3.0)},
+        focus_range_dpt=(0.125, 0.125),
+    )
+    eye = MeasuredWavefront.from_profile(load_profile("emmetropia"))
+    plan, breaks = plan_cache(eye, spec), []
+    store = PsfStore(eye, spec, plan)
+    psfs = np.arange(2 * psf_engine("published").batch_count + 1)
+    store.fill(psfs, batch_count=256, between=lambda: breaks.append(store.methods))
+    assert store.methods == {"enz_unchecked": psfs.size}
+    assert len(breaks) == 2
+    exact = predicted_cost(eye, spec.with_settings(pipeline="exact"), plan)
+    own = predicted_cost(eye, spec, plan)
+    assert own["psf_count"] == exact["psf_count"]
+    assert own["build_s"] > 20.0 * exact["build_s"]
+
+
+@pytest.mark.parametrize(
+    ("pipeline", "has_haze"), [("published", False), ("exact", True)]
+)
+def test_media_are_left_out(pipeline, has_haze):
+    settings = FilterSettings(pipeline=pipeline)
+    accepted = AcceptedProfile(1, 1, load_profile("cataract"), settings)
+    assert (accepted.media_effects is not None) == has_haze
 
 
 ON_AXIS = ((0.0, 0.0), (0.0, 0.0))

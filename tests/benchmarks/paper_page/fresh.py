@@ -35,6 +35,7 @@ RUNS = (
     Run("paper_layouts", "tests.benchmarks.paper_page.layouts", 0.2, 0.2),
     Run("layers", "tests.benchmarks.bench_layers", 4.0, 1.0),
     Run("networks", "tests.benchmarks.bench_networks", 8.0, 1.5),
+    Run("published", "tests.benchmarks.bench_published", 8.0, 2.0),
     Run("paper_figures", "tests.benchmarks.paper_page.pictures", 12.0, 1.0, False),
     Run("field", "tests.benchmarks.bench_field", 90.0, 1.5),
 )

@@ -12,7 +12,7 @@ from tests.benchmarks.paper_page.figures import first_figure, picture_sections
 from tests.benchmarks.paper_page.measured import Measured
 from tests.benchmarks.paper_page.numbers import median_text, range_text, value_text
 from tests.benchmarks.paper_page.published import published
-from tests.benchmarks.paper_page.rendering import psf_section
+from tests.benchmarks.paper_page.rendering import pipeline_section, psf_section
 from tests.benchmarks.paper_page.rendering import sections as rendering_sections
 from tests.benchmarks.paper_page.rows import (
     APART,
@@ -60,6 +60,7 @@ def all_sections(measured: Measured) -> list[Section]:
         *rendering_sections(measured),
         *picture_sections(measured),
         psf_section(measured),
+        pipeline_section(measured),
     ]
     order = {"Figure": 0, "Table": 1, "Section": 2}
 

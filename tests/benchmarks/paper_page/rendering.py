@@ -382,3 +382,31 @@ def psf_section(measured: Measured) -> Section:
             ),
         ),
     )
+
+
+PIPELINE_MEASURES = {
+    "error": DECIBELS,
+    "prepare_ms": Measure("time to the first frame", "ms"),
+    "median_ms": Measure("time of a frame", "ms"),
+}
+
+
+def pipeline_section(measured: Measured) -> Section:
+    """The whole published pipeline, which one setting runs, beside the default."""
+    blocks = []
+    for column, measure in PIPELINE_MEASURES.items():
+        lines = []
+        for eye in CONDITIONS:
+            rebuilt, ours = (
+                measured.value("published", column, method=pipeline, case=eye)
+                for pipeline in ("published", "exact")
+            )
+            lines.append(Line(EYE_NAMES[eye], None, None, rebuilt, ours))
+        blocks.append(
+            Block(
+                *("The paper, end to end", measure, tuple(lines)),
+                is_own=True,
+                rebuilt_as='pipeline="published", 128x72, two cores',
+            )
+        )
+    return section("Section 4", ("published",), blocks)
