@@ -34,7 +34,8 @@ def test_a_set_leads_with_its_widest_axial_measurement():
 
 def test_frame_of_a_set_holds_for_all_unless_one_says_otherwise():
     coma = ONE | {"zernike_um": {"3,1": 0.2}}
-    profile = parse_profile(a_set(coma, coma | {"frame": "eye"}, frame="examiner"))
+    elsewhere = coma | {"frame": "eye", "h_deg": 10.0}
+    profile = parse_profile(a_set(coma, elsewhere, frame="examiner"))
     examiner, eye = (m.zernike_um for m in profile.measurements)
     assert np.array_equal(examiner, flip_horizontal(eye))
 
