@@ -37,6 +37,9 @@ END_OF_SURFACES = {"BLNK", "TOL", "MNUM", "MOFF", "TRAC"}
 """Operands behind the last surface, where lines are not indented: the merit function,
 tolerances and configurations."""
 
+MM_PER_UNIT = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "METER": 1000.0}
+"""Units of length of a file, as OpticStudio writes them."""
+
 TYPES = ("STANDARD", "EVENASPH", "BICONICX", "TOROIDAL", "COORDBRK")
 EVEN_TERMS = 8
 
@@ -61,15 +64,16 @@ def zmx_body(text: str, name: str) -> dict[str, Any]:
     Raises
     ------
     ProfileError
-        The file is not sequential or not in mm, or an element is not understood.
+        The file is not sequential, or an element is not understood.
     """
     file = _operands(text)
     mode = (file.own.get("MODE") or ["SEQ"])[0]
     unit = (file.own.get("UNIT") or ["MM"])[0]
     if mode != "SEQ":
         raise ProfileError("MODE", f"{mode!r:.20} is not sequential", "SEQ")
-    if unit != "MM":
-        raise ProfileError("UNIT", f"{unit!r:.20}", "MM")
+    if unit not in MM_PER_UNIT:
+        raise ProfileError("UNIT", f"{unit!r:.20}", ", ".join(MM_PER_UNIT))
+    _convert_to_mm(file, MM_PER_UNIT[unit])
     body = surfaces_body(_elements(file), " ".join(file.own.get("NAME", [])) or name)
     if notes := _notes(file):
         body["notes"] = notes
@@ -112,6 +116,27 @@ def _operands(text: str) -> _File:
         else:
             file.surfaces[-1].setdefault(operand, values)
     return file
+
+
+def _convert_to_mm(file: _File, scale: float) -> None:
+    """Multiply the lengths of all surfaces behind the object."""
+    powers = {"CURV": -1, "DISZ": 1, "DIAM": 1, "CLAP": 1, "FLAP": 1}
+    for number, surface in enumerate(file.surfaces):
+        if number == 0 or scale == 1.0:
+            continue
+        for operand in powers.keys() & surface.keys():
+            count = 2 if operand in ("CLAP", "FLAP") else 1
+            values = surface[operand]
+            for k, value in enumerate(values[:count]):
+                length = _number(value, number, operand)
+                values[k] = repr(length * scale ** powers[operand])
+        kind = (surface.get("TYPE") or ["STANDARD"])[0]
+        terms = file.parameters[number]
+        for term in terms:
+            if kind == "EVENASPH" and 1 <= term <= EVEN_TERMS:  # of r^(2 term)
+                terms[term] *= scale ** (1 - 2 * term)
+            elif term == 1 or (term == 2 and kind == "COORDBRK"):
+                terms[term] *= scale
 
 
 def _notes(file: _File) -> list[dict[str, Any]]:

@@ -1,7 +1,9 @@
 """Eyes in lens files that optiland wrote, against the rays that it traced."""
 
+import dataclasses
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from estimator.bounded_files import InvalidFile
 from estimator.optics.raytrace import RayStatus, trace_rays
 from estimator.profiles.files import load_profile, profile_body
 from estimator.profiles.parse import parse_profile
+from estimator.wavefront.aberrations import wavefront_aberrations
 from tests.numerical.optiland_eye import FROZEN_FILES, FROZEN_FORMS, WAVELENGTH_NM
 
 FILES = json.loads(FROZEN_FILES.read_text(encoding="utf-8"))["files"]
@@ -237,6 +240,45 @@ def test_a_surface_without_a_type_is_a_conic(tmp_path):
     assert load_profile(path).digest == load_profile(plain).digest
 
 
+@pytest.mark.parametrize(
+    ("unit", "unit_mm"), [("IN", 25.4), ("CM", 10.0), ("METER", 1000.0)]
+)
+def test_lengths_in_other_units_are_converted(tmp_path, unit, unit_mm):
+    asphere = "TYPE EVENASPH\n  PARM 1 0.002\n  PARM 3 1E-05\n  CURV 0.1\n"
+    in_mm = ZMX.replace("TYPE STANDARD\n  CURV 0.1\n", asphere)
+    biconic = "TYPE BICONICX\n  PARM 1 -7.0\n  PARM 2 -0.5\n  CURV -0.16667\n"
+    in_mm = in_mm.replace("TYPE STANDARD\n  CURV -0.16667\n", biconic)
+
+    def converted(match):
+        operand, value = match[1], float(match[2])
+        power = {"CURV ": 1, "PARM 3 ": 5}.get(operand, -1)
+        if (operand, value) == ("PARM 1 ", 0.002):
+            power = 1
+        if (operand, value) == ("PARM 2 ", -0.5):  # a conic constant
+            power = 0
+        return f"{operand}{value * unit_mm**power!r}"
+
+    lengths = r"(CURV |DISZ |DIAM |CLAP 0 |PARM [123] )(-?[0-9.E-]+)"
+    in_unit = re.sub(lengths, converted, in_mm).replace("UNIT MM", f"UNIT {unit}")
+    eyes = []
+    for text in (in_mm, in_unit):
+        path = tmp_path / "eye.zmx"
+        path.write_text(text, encoding="utf-8")
+        eyes.append(load_profile(path).surfaces.relaxed)
+    mm, other = eyes
+    assert other.stop_z_mm == pytest.approx(mm.stop_z_mm)
+    for one, two in zip(
+        (*mm.surfaces, mm.retina), (*other.surfaces, other.retina), strict=True
+    ):
+        for field in dataclasses.fields(one):
+            expected, found = getattr(one, field.name), getattr(two, field.name)
+            if isinstance(expected, float | tuple):
+                assert found == pytest.approx(expected, rel=1e-12), field.name
+    state = {"wavelength_nm": 555.0, "stop_diameter_mm": 3.0, "h_deg": 10.0}
+    expected, found = (wavefront_aberrations(eye, **state) for eye in eyes)
+    assert found.zernike_um == pytest.approx(expected.zernike_um, abs=1e-9)
+
+
 def test_a_floating_aperture_has_the_semi_diameter(tmp_path):
     path = tmp_path / "eye.zmx"
     text = ZMX.replace("CLAP 0 4.5 0", "DIAM 4.25 0 0 0 1\n  FLAP 0 4.5 0")
@@ -249,7 +291,7 @@ def test_a_floating_aperture_has_the_semi_diameter(tmp_path):
     ("before", "after", "message"),
     [
         ("MODE SEQ", "MODE NSC", "MODE.*'NSC' is not sequential"),
-        ("UNIT MM", "UNIT IN", "UNIT.*'IN'"),
+        ("UNIT MM", "UNIT FURLONG", "UNIT.*'FURLONG'.*MM, CM, IN, METER"),
         ("TYPE STANDARD\n  CURV 0.1\n", "TYPE ODDASPHE\n  CURV 0.1\n", "'ODDASPHE'"),
         (
             "TYPE STANDARD\n  CURV 0.1\n",
