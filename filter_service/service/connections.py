@@ -30,6 +30,12 @@ MAX_INCOMPLETE_S = 10.0
 """Time for which such a connection may have sent more than that.  After a restart of
 the service, a client that has not noticed sends a frame, to be told `no_session`."""
 
+DISTRUST_S, MAX_DISTRUSTED = 60.0, 1000
+"""Time for which connections from the address of a flood of message parts may not have
+sent more than `MAX_UNREAD_BYTES`, and the largest number of such addresses.  Parts can
+be counted only in complete messages, and until six million are read, for 0.6 s, no
+other message is."""
+
 CHECK_INTERVAL_S = 0.01
 MAX_CHECKED = 64
 """Connections checked per interval, 0.006 ms each."""
@@ -139,6 +145,7 @@ class Connections:
         self._next_check_s = 0.0
         self._to_check: list[Connection] = []
         self._unread: set[Connection] = set()  # with a large incomplete message
+        self._distrusted_until_s: dict[str, float] = {}  # by address, oldest first
         self._n_ending = 0  # shut down, not yet reported as ended
 
     def __len__(self) -> int:
@@ -266,6 +273,13 @@ class Connections:
         """Return the `time.monotonic` at which `check_unread` is next due."""
         return self._next_check_s if self._to_check or self._unread else math.inf
 
+    def distrust(self, connection: Connection, now_s: float) -> None:
+        """Allow no large incomplete messages from the address of a connection."""
+        self._distrusted_until_s.pop(connection.address, None)
+        self._distrusted_until_s[connection.address] = now_s + DISTRUST_S
+        if len(self._distrusted_until_s) > MAX_DISTRUSTED:
+            self._distrusted_until_s.pop(next(iter(self._distrusted_until_s)))
+
     def check_unread(self, now_s: float) -> None:
         """Close connections without a session that hold too much of a message.
 
@@ -284,7 +298,11 @@ class Connections:
         excess_bytes = sum(c.unread_bytes for c in self._unread)
         excess_bytes -= self._max_unread_bytes
         for connection in sorted(self._unread, key=lambda c: -c.unread_bytes):
-            is_late = now_s - connection.unread_since_s > MAX_INCOMPLETE_S
+            trusted_s = self._distrusted_until_s.get(connection.address, 0.0)
+            is_late = (
+                now_s - connection.unread_since_s > MAX_INCOMPLETE_S
+                or now_s < trusted_s
+            )
             if is_late or excess_bytes > 0:
                 excess_bytes -= connection.unread_bytes
                 self._shut_down(connection)

@@ -402,6 +402,7 @@ class FrontEnd:
                 is_many = received.n_dropped_parts > MAX_ACCIDENTAL_PARTS
                 if received.connection is not None and is_many:
                     received.connection.rates.exhaust()
+                    self._connections.distrust(received.connection, received_s)
                 n_parts = len(parts) - 1 + received.n_dropped_parts
                 raise BadMessage(
                     f"{n_parts} parts follow the header",

@@ -159,6 +159,24 @@ def test_a_large_message_without_a_session_may_be_incomplete_for_ten_seconds(
     assert open_numbers(connections) == [2, 3]
 
 
+def test_after_a_flood_of_parts_its_address_may_not_send_large_messages(incomplete):
+    connections = incomplete(Connections(9, {2}), {1: 400_000, 2: 400_000, 3: 200_000})
+    connections.check_unread(5.0)
+    assert open_numbers(connections) == [1, 2, 3]
+    connections.distrust(connections.find(3, -1), 5.0)
+    connections.check_unread(5.1)
+    assert open_numbers(connections) == [2, 3]
+
+
+def test_a_flood_of_parts_is_forgiven_after_a_minute(incomplete):
+    connections = Connections(9, set())
+    connections = incomplete(connections, {1: 10_000})
+    connections.distrust(connections.find(1, -1), -60.0)
+    connections = incomplete(connections, {2: 400_000})
+    connections.check_unread(5.0)
+    assert open_numbers(connections) == [1, 2]
+
+
 def test_a_complete_message_begins_the_time_anew(incomplete):
     connections = incomplete(Connections(9, set()), {1: 400_000})
     connections.check_unread(5.0)
