@@ -118,7 +118,7 @@ release-check: setup-release-check  ## build the sdist and a wheel twice; check 
 
 clean:  ## remove generated files, including .venv but not out/
 	rm -rf .venv .release .workflows .witness .batch_ray .docs .peers .examples .gl_witness .headset .headset-applications build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis clients/js/node_modules tests/web/node_modules tests/workflows/node_modules
-	find filter_service -name '_*.so' -delete
+	find clients estimator filter_service -name '_*.so' -delete
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 help:  ## list the targets

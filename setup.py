@@ -13,17 +13,27 @@ from setuptools import Extension, find_packages, setup
 from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_ext import build_ext
 
-NATIVE = "filter_service/native/source"
+CORE = "estimator/native/source"
+FRAMES = "filter_service/native/source"
 LAYER = "clients/openxr_layer/source"
 FLAGS = ["-std=gnu11", "-g0", "-fvisibility=hidden"]
 WITHOUT = {
-    "_loops": "the native engine is missing: frames will be filtered with OpenGL, "
-    "which is slow without a GPU.  Install a C compiler (Debian: apt install gcc "
-    "libc6-dev)",
-    "_drop_parts": "the service will take ten times as long to drop messages with "
-    "millions of parts.  Install a C compiler (Debian: apt install gcc libc6-dev)",
-    "_layer": "`ocufilter layer` will not work.  Install a C compiler and headers "
-    "(Debian: apt install gcc libc6-dev libopenxr-dev libgl-dev libegl-dev libx11-dev)",
+    "estimator.native._core": (
+        "PSFs will be computed in Python, ten times as slow, and frames filtered with "
+        "OpenGL.  Install a C compiler (Debian: apt install gcc libc6-dev)"
+    ),
+    "filter_service.native._loops": (
+        "the native engine is missing: frames will be filtered with OpenGL, which is "
+        "slow without a GPU.  Install a C compiler (Debian: apt install gcc libc6-dev)"
+    ),
+    "filter_service.service._drop_parts": (
+        "the service will take ten times as long to drop messages with millions of "
+        "parts.  Install a C compiler (Debian: apt install gcc libc6-dev)"
+    ),
+    "clients.openxr_layer._layer": (
+        "`ocufilter layer` will not work.  Install a C compiler and headers (Debian: "
+        "apt install gcc libc6-dev libopenxr-dev libgl-dev libegl-dev libx11-dev)"
+    ),
 }
 
 
@@ -54,8 +64,31 @@ class BuildLibraries(build_ext):
             path = self.get_ext_fullpath(extension.name)
             if not os.path.exists(path):
                 name = extension.name.rpartition(".")[2]
-                remedy = f"{WITHOUT[name]}, and install ocufilter again."
+                remedy = f"{WITHOUT[extension.name]}, and install ocufilter again."
                 print(f"ocufilter: {name} was not built; {remedy}", file=sys.stderr)
+
+
+def loops(name, folder, include_dirs=()):
+    """Return the extension of a library of loops."""
+    return Extension(
+        name,
+        sources=sorted(glob(f"{folder}/*.c")),
+        depends=sorted(
+            header for own in (folder, *include_dirs) for header in glob(f"{own}/*.h")
+        ),
+        include_dirs=list(include_dirs),
+        libraries=["m"],
+        extra_compile_args=[
+            *FLAGS,
+            "-O3",
+            "-pthread",
+            "-fno-math-errno",
+            "-fno-trapping-math",
+            "-Wno-psabi",
+        ],
+        extra_link_args=["-pthread"],
+        optional=True,
+    )
 
 
 class AnyPythonWheel(bdist_wheel):
@@ -81,22 +114,8 @@ setup(
     # is gl, and dropping messages with millions of parts takes ten times as long.
     # Without the headers of OpenXR, OpenGL and X11, `ocufilter layer` says what to do.
     ext_modules=[
-        Extension(
-            "filter_service.native._loops",
-            sources=sorted(glob(f"{NATIVE}/*.c")),
-            depends=sorted(glob(f"{NATIVE}/*.h")),
-            libraries=["m"],
-            extra_compile_args=[
-                *FLAGS,
-                "-O3",
-                "-pthread",
-                "-fno-math-errno",
-                "-fno-trapping-math",
-                "-Wno-psabi",
-            ],
-            extra_link_args=["-pthread"],
-            optional=True,
-        ),
+        loops("estimator.native._core", CORE),
+        loops("filter_service.native._loops", FRAMES, [CORE]),
         Extension(
             "filter_service.service._drop_parts",
             sources=["filter_service/service/drop_parts.c"],

@@ -173,7 +173,8 @@ make_venv() {
 }
 
 install_packages() {
-    sources=$(echo filter_service/native/source/* filter_service/service/*.c)
+    sources=$(find clients estimator filter_service -name node_modules -prune -o \
+        -name '*.[ch]' -print | sort)
     wanted=$(pwd; cat setup.sh setup.py pyproject.toml constraints.txt $sources | cksum)
     if [ "$(cat $STAMP 2>/dev/null || true)" = "$wanted" ]; then return; fi
     if ! $VENV/bin/python -m pip --version >/dev/null 2>&1; then make_venv; fi

@@ -15,6 +15,7 @@ From a profile to PSFs: `load_profile`, `estimate_eye` or `prepare_eye`, `comput
     periphery/     measured changes of wavefronts off the axis
     estimate/      estimation of an eye from a measurement
     field/         wavefronts of an eye over its visual field
+    native/        the compiled core: threads, PSFs
     note           notes for the user, with codes and numbers
     bounded_files  size-limited reading of untrusted text and JSON
     threads        number of threads to use

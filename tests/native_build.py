@@ -1,4 +1,4 @@
-"""Builds the native engine's loops as the package does, or with other flags."""
+"""Builds the C libraries as the package does, or with other flags."""
 
 import contextlib
 import runpy
@@ -14,8 +14,12 @@ from tests.source_tree import ROOT
 COMPILER = shutil.which("cc") or shutil.which("gcc")
 
 
-def extension(ending="_loops"):
-    """The extension module of the loops, or another one, as setup.py has it."""
+LIBRARIES = ("_core", "_loops")
+"""Libraries of loops, which `OCUFILTER_LIBRARY_DIR` may select from another folder."""
+
+
+def extension(ending):
+    """An extension module as setup.py has it."""
     given = {}
     stand_in = ModuleType("setuptools")  # a bare machine may not have it
     stand_in.Extension = lambda name, **options: SimpleNamespace(name=name, **options)
@@ -31,22 +35,29 @@ def extension(ending="_loops"):
     return next(module for module in modules if module.name.endswith(ending))
 
 
-def build_library(folder: Path, *flags: str) -> Path:
-    """Compile the sources into a shared library; flags come behind the package's."""
-    own = extension()
-    out = folder / "loops.so"
+def build_library(ending: str, folder: Path, *flags: str, source=ROOT) -> Path:
+    """Compile a library, with flags behind the package's; ``source`` is a tree."""
+    own = extension(ending)
+    out = folder / f"{ending}.so"
     subprocess.run(
         [
             *(COMPILER, "-shared", "-fPIC", *own.extra_compile_args, *flags),
+            *(f"-I{name}" for name in getattr(own, "include_dirs", ())),
             *("-o", str(out), *own.sources, *own.extra_link_args),
             *(f"-l{name}" for name in own.libraries),
         ],
-        cwd=ROOT,
+        cwd=source,
         check=True,
         capture_output=True,
         text=True,
     )
     return out
+
+
+def build_libraries(folder: Path, *flags: str) -> None:
+    """Compile all libraries of loops into a folder."""
+    for ending in LIBRARIES:
+        build_library(ending, folder, *flags)
 
 
 def runtime_of(sanitizer: str) -> Path | None:

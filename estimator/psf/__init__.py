@@ -2,6 +2,7 @@
 
 compute            entry point: many PSFs in one call
 arguments          argument checks
+compiled           the engine in C: packed kernels
 kernel_types       result type, kernel buffer, kernel disc
 pupil              pupils in pixel coordinates
 survey             wavefront slopes and kernel radii, before any PSF is computed

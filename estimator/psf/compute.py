@@ -18,7 +18,7 @@ from estimator.psf.arguments import (
     checked_zernike_um,
 )
 from estimator.psf.enz import PAPER_DEGREE, EnzOutsideDomain, enz_kernels
-from estimator.psf.fourier import FourierAccuracy, fourier_kernels
+from estimator.psf.fourier import ACCURACY, fourier_kernels
 from estimator.psf.geometric import geometric_kernels
 from estimator.psf.kernel_types import (
     KernelBuffer,
@@ -55,15 +55,6 @@ __all__ = [
 ]
 
 METHODS = ("auto", "fourier", "geometric", "enz", "enz_unchecked")
-
-ACCURACY = {
-    "normal": FourierAccuracy(
-        oversampling=1.0, min_samples_per_px=7, margin=8.0, filter_half_width=4
-    ),
-    "fine": FourierAccuracy(
-        oversampling=2.0, min_samples_per_px=8, margin=16.0, filter_half_width=8
-    ),
-}
 
 MIN_ENERGY_RATIO = 0.999
 

@@ -67,6 +67,16 @@ class FourierAccuracy:
     filter_half_width: int
 
 
+ACCURACY = {
+    "normal": FourierAccuracy(
+        oversampling=1.0, min_samples_per_px=7, margin=8.0, filter_half_width=4
+    ),
+    "fine": FourierAccuracy(
+        oversampling=2.0, min_samples_per_px=8, margin=16.0, filter_half_width=8
+    ),
+}
+
+
 @dataclass(frozen=True)
 class FourierPlan:
     """Grids of M PSFs; columns are x and y.

@@ -1,6 +1,7 @@
-"""Compiled C loops: PSFs, and frames on machines without a GPU.
+"""Compiled C loops of frames.
 
 library        Python interface of the compiled library
+functions      signatures of its functions
 records        argument records, field by field
 source/        C source code
 """

@@ -1,2 +1,3 @@
-from .library import compiled_library as compiled_library
-from .library import library_path as library_path
+from .library import PATH as PATH
+from .library import Loops as Loops
+from .library import loops as loops

@@ -52,6 +52,7 @@ HELD = (
 """Files of the checkout that a wheel holds, and no others."""
 
 COMPILED = {
+    "estimator/native/_core.so",
     "filter_service/native/_loops.so",
     "filter_service/service/_drop_parts.so",
 }

@@ -9,7 +9,7 @@ import sysconfig
 import zipfile
 from pathlib import Path
 
-from tests.native_build import COMPILER, build_library
+from tests.native_build import COMPILER, LIBRARIES, build_libraries
 
 EXPECTED = {
     "numpy": "numpy",
@@ -93,13 +93,14 @@ def _ask(python: Path, script: str) -> str:
     return ran.stdout.strip()
 
 
-def native_library(folder: Path) -> Path | None:
-    """Build the native engine's loops; None without a compiler."""
+def native_libraries(folder: Path) -> Path | None:
+    """Return the folder with the compiled libraries; None without a compiler."""
     if COMPILER is None:
         return None
     folder.mkdir(parents=True, exist_ok=True)
-    library = folder / "loops.so"
-    return library if library.exists() else build_library(folder)
+    if not all((folder / f"{name}.so").exists() for name in LIBRARIES):
+        build_libraries(folder)
+    return folder
 
 
 def loads(library: str) -> bool:
@@ -121,7 +122,7 @@ def variables(
     loaders : Path or None
         Folder with the loaders of OpenGL, where the machine has none.
     native : Path or None
-        Library of the native engine.
+        Folder of the compiled libraries.
     """
     own = dict(os.environ)
     own |= {
@@ -133,7 +134,7 @@ def variables(
         "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",  # those of the machine are not ours
     }
     if native is not None:
-        own["OCUFILTER_NATIVE_LIBRARY"] = str(native)
+        own["OCUFILTER_LIBRARY_DIR"] = str(native)
     libraries = [own.get("LD_LIBRARY_PATH", "")]
     libraries += [folder for folder in DRIVER_FOLDERS if Path(folder).is_dir()]
     if loaders is not None:

@@ -176,15 +176,15 @@ class Run:
 
 
 def _native() -> tuple[Path | None, str]:
-    """The native engine's library, and what there is to say of it."""
+    """The folder of the compiled libraries, and what there is to say of it."""
     try:
-        library = environment.native_library(TREE / "out")
+        folder = environment.native_libraries(TREE / "out")
     except subprocess.CalledProcessError as error:
         line = (error.stderr.strip().splitlines() or ["no word"])[-1]
         return None, f"the native engine could not be compiled: {line}"
-    if library is None:
+    if folder is None:
         return None, "no C compiler: no native engine, and nothing compared with it"
-    return library, "native engine compiled"
+    return folder, "native engine compiled"
 
 
 def _loaders(kit: Path, wanted: str) -> Path | None:

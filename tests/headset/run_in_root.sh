@@ -64,7 +64,7 @@ chroot "$root" /usr/sbin/ip link set lo up
 exec chroot "$root" env -i PATH=$path HOME=/root LC_ALL=C.UTF-8 TERM="${TERM:-dumb}" \
     PYTHONPYCACHEPREFIX=/var/cache/ocufilter/python \
     NUMBA_CACHE_DIR=/var/cache/ocufilter/numba \
-    OCUFILTER_NATIVE_LIBRARY=/opt/ocufilter/loops.so \
+    OCUFILTER_LIBRARY_DIR=/opt/ocufilter \
     OCUFILTER_DURATIONS=/var/cache/ocufilter/durations.json \
     PYTEST_ADDOPTS="-o cache_dir=/var/cache/ocufilter/pytest" \
     sh -c 'cd /checkout && exec "$@"' sh "$@"

@@ -196,13 +196,13 @@ follow_checkout() { # import the project from the mounted checkout
 
 build_loops() { # for the native engine; the host's build is for its own Python
     in_root python -c 'from pathlib import Path
-from tests.native_build import build_library
-build_library(Path("/opt/ocufilter"))'
+from tests.native_build import build_libraries
+build_libraries(Path("/opt/ocufilter"))'
 }
 
 install_project() {
     wanted=$(cd "$checkout"; cat tests/headset/setup_root.sh pyproject.toml \
-        constraints.txt filter_service/native/source/* | cksum)
+        constraints.txt estimator/native/source/* filter_service/native/source/* | cksum)
     if [ "$(cat "$PYTHON_STAMP" 2>/dev/null || true)" = "$wanted" ]; then return; fi
     rm -f "$PYTHON_STAMP"
     copy_host_settings

@@ -1,20 +1,27 @@
-"""The native engine's sources: numbers, files, warnings, sanitizers."""
+"""The C sources: numbers, records, functions, warnings, sanitizers, threads."""
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from estimator.native import LibraryUnavailable, core
+from estimator.native import functions as core_functions
+from estimator.native import library as core_library
+from estimator.native import records as core_records
 from filter_service import constants
-from filter_service.native import records
-from filter_service.native.library import compiled_library, library_path
-from tests.native_build import COMPILER, build_library, runtime_of
+from filter_service.native import functions, library, loops, records
+from filter_service.psfs import store_cache
+from tests.native_build import COMPILER, build_libraries, build_library, runtime_of
 from tests.source_tree import ROOT
 
 SOURCE = ROOT / "filter_service" / "native" / "source"
+CORE = ROOT / "estimator" / "native" / "source"
 
 FRAMES = (
     "tests/numerical/test_renderer_hard.py",
@@ -42,20 +49,21 @@ def test_numbers_of_the_sources_are_those_of_python():
 def test_processors_with_avx2_use_it():
     """However the library was linked: one that says no is correct but slow."""
     cpuinfo = Path("/proc/cpuinfo")
-    if not cpuinfo.exists() or library_path() is None:
-        pytest.skip("needs Linux and the native engine")
+    if not cpuinfo.exists():
+        pytest.skip("needs Linux")
     flags = re.search(r"^flags\s*:(.*)$", cpuinfo.read_text(), re.MULTILINE)
     has_avx2 = flags is not None and {"avx2", "fma"} <= set(flags[1].split())
     is_portable = os.environ.get("OCUFILTER_NATIVE_VARIANT") == "portable"
     expected = "avx2" if has_avx2 and not is_portable else "portable"
-    assert compiled_library().variant == expected
+    assert core().variant == loops().variant == expected
 
 
 def run_with_variant(variant):
     """A new process that prints the variant which it uses."""
     code = (
-        "from filter_service.native.library import compiled_library as library\n"
-        "print(library().variant)"
+        "from filter_service.native import loops\n"
+        "from estimator.native import core\n"
+        "print(loops().variant, core().variant)"
     )
     return subprocess.run(
         [sys.executable, "-c", code],
@@ -66,9 +74,7 @@ def run_with_variant(variant):
 
 
 def test_the_environment_selects_the_variant():
-    if library_path() is None:
-        pytest.skip("needs the native engine")
-    assert run_with_variant("portable").stdout == "portable\n"
+    assert run_with_variant("portable").stdout == "portable portable\n"
     refused = run_with_variant("sse9")
     assert "OCUFILTER_NATIVE_VARIANT='sse9'; allowed: auto, portable" in refused.stderr
 
@@ -85,13 +91,13 @@ def test_packed_words_are_those_of_python():
 @pytest.mark.parametrize(
     ("file", "name", "record"),
     [
-        ("frame.h", "frame", records.Frame),
-        ("psf_job.h", "psf_job", records.PsfJob),
-        ("psf_job.h", "psf_tables", records.PsfTables),
+        (SOURCE / "frame.h", "frame", records.Frame),
+        (CORE / "psf_job.h", "psf_job", core_records.PsfJob),
+        (CORE / "psf_job.h", "psf_tables", core_records.PsfTables),
     ],
 )
 def test_fields_of_records_are_those_of_the_source_in_order(file, name, record):
-    text = (SOURCE / file).read_text(encoding="utf-8")
+    text = file.read_text(encoding="utf-8")
     before = text[: text.index(f"}} {name};")]
     body = before[before.rindex("typedef struct {") :]
     body = re.sub(r"/\*.*?\*/", "", body, flags=re.S)
@@ -103,12 +109,125 @@ def test_fields_of_records_are_those_of_the_source_in_order(file, name, record):
     assert declared == [field for field, *_ in record._fields_]
 
 
+@pytest.mark.parametrize(
+    ("source", "own"),
+    [(CORE / "core.h", core_functions), (SOURCE / "loops.h", functions)],
+)
+def test_signatures_are_those_of_the_source(source, own):
+    """Every function of the table, with parameters of the same kinds in C."""
+    table = re.findall(r"FUNCTION\((\w+)\)", source.read_text(encoding="utf-8"))
+    assert set(table) == set(own.FUNCTIONS)
+    texts = [path.read_text(encoding="utf-8") for path in source.parent.glob("*.h")]
+    for name, signature in own.FUNCTIONS.items():
+        pattern = rf"^static (\w+) {name}\(([^)]*)\)\s*\{{"
+        found = [re.search(pattern, text, re.MULTILINE) for text in texts]
+        result, parameters = next(match for match in found if match).groups()
+        head, arrow, _ = signature.partition("->")
+        assert (result == "void") != bool(arrow), name
+        kinds = [kind_in_c(each) for each in parameters.split(",")]
+        assert kinds == head.split(), name
+
+
+C_TYPES = {
+    "uint8_t": "u1",
+    "uint16_t": "u2",
+    "uint32_t": "u4",
+    "uint64_t": "u8",
+    "int8_t": "i1",
+    "int16_t": "i2",
+    "int32_t": "i4",
+    "int64_t": "i8",
+    "float": "f4",
+    "double": "f8",
+    "_Bool": "?",
+    "bool": "?",
+}
+
+
+def kind_in_c(parameter):
+    """The kind of a parameter, as `FUNCTIONS` has it."""
+    words = parameter.replace("const", "").replace("*", " * ").split()
+    if words[0] == "pool":
+        return "pool"
+    if "*" not in words:
+        return C_TYPES[words[0]]
+    return f"{C_TYPES[words[0]]}[]" if words[0] in C_TYPES else "record"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ((), "takes 2 arguments, not 0"),
+        ((core_records.PsfJob(), np.zeros(3)), r"argument 1: .*uint16, got float64"),
+        ((core_records.PsfJob(), np.zeros((4, 4), np.uint16).T), "contiguous"),
+        ((core_records.PsfJob(), [1]), "got list"),
+        ((np.zeros(3), None), "argument 0"),
+    ],
+)
+def test_arguments_of_another_kind_are_refused(arguments, reason):
+    with pytest.raises(TypeError, match=reason):
+        core().call("take_psfs", *arguments)
+
+
+def test_a_library_of_another_version_is_refused(monkeypatch):
+    monkeypatch.setattr(core_library, "ABI", 0)
+    with pytest.raises(LibraryUnavailable, match=r"_core\.so .*install the package"):
+        core_library.Core(core().path)
+    with pytest.raises(LibraryUnavailable, match=r"_loops\.so .*install the package"):
+        library.Loops(loops().path)
+
+
+def test_a_process_has_one_pool():
+    """Frames, PSFs and a second engine share the threads of the largest handle."""
+    code = (
+        "import os, numpy as np\n"
+        "from estimator.native import core\n"
+        "from estimator.psf.compiled import compiled_psfs\n"
+        "from filter_service.rendering.native import NativeRenderer\n"
+        "from filter_service.rendering.perfect_eye import change_by_perfect_eye\n"
+        "before = len(os.listdir('/proc/self/task'))\n"
+        "engines = [NativeRenderer(n_threads=4), NativeRenderer(n_threads=3)]\n"
+        "engines[0].begin, compiled_psfs()\n"
+        "for engine in engines: change_by_perfect_eye(engine)\n"
+        "print(len(os.listdir('/proc/self/task')) - before)\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "OCUFILTER_THREADS": "4"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert ran.stdout == "3\n"  # and the caller
+
+
 @needs_compiler
 @pytest.mark.tools
 @pytest.mark.parametrize("variant", ["-O3", "-O0"])
 def test_sources_compile_without_a_warning(tmp_path, variant):
     flags = ("-Wall", "-Wextra", "-Wshadow", "-Wconversion", "-Wno-sign-conversion")
-    build_library(tmp_path, *flags, "-Werror", variant)
+    build_libraries(tmp_path, *flags, "-Werror", variant)
+
+
+@needs_compiler
+@pytest.mark.tools
+def test_a_changed_constant_changes_the_key_of_the_cache(tmp_path, monkeypatch):
+    keys = set()
+    for name, margin in (("same", "7.5 "), ("again", "7.5 "), ("other", "7.25")):
+        tree, folder = tmp_path / f"tree-{name}", tmp_path / name
+        folder.mkdir()
+        shutil.copytree(CORE, tree / CORE.relative_to(ROOT))
+        source = tree / CORE.relative_to(ROOT) / "psfs.h"
+        text = source.read_text(encoding="utf-8")
+        assert "#define RAYS_MARGIN_PX 7.5 " in text
+        changed = text.replace("RAYS_MARGIN_PX 7.5 ", f"RAYS_MARGIN_PX {margin}")
+        source.write_text(changed, encoding="utf-8")
+        build_library("_core", folder, "-O0", source=tree)
+        monkeypatch.setenv("OCUFILTER_LIBRARY_DIR", str(folder))
+        store_cache.code_version.cache_clear()
+        keys.add(store_cache.code_version())
+    store_cache.code_version.cache_clear()
+    assert len(keys) == 2
 
 
 @needs_compiler
@@ -119,10 +238,10 @@ def test_hard_frames_pass_under_sanitizers(tmp_path, sanitizer):
     if runtime is None:
         pytest.skip(f"the compiler has no library for -fsanitize={sanitizer}")
     flags = ("-O1", "-g", f"-fsanitize={sanitizer}", "-fno-sanitize-recover=all")
-    library = build_library(tmp_path, *flags)
+    build_libraries(tmp_path, *flags)
     environment = {
         **os.environ,
-        "OCUFILTER_NATIVE_LIBRARY": str(library),
+        "OCUFILTER_LIBRARY_DIR": str(tmp_path),
         "OCUFILTER_THREADS": "4",
         "LD_PRELOAD": str(runtime),
         # Python and numba keep memory to their end

@@ -8,17 +8,17 @@ from hypothesis import strategies as st
 from estimator.corrections.kinoform import Kinoform
 from estimator.corrections.lenslets import Lenslets
 from estimator.corrections.rings import DiffractiveRings, RefractiveZones
+from estimator.native import Core, core
 from estimator.psf import fourier
+from estimator.psf.compiled import CompiledPsfs, fft_lengths
 from estimator.psf.compute import compute_psf_batch
 from estimator.psf.kernel_types import PsfTooLarge
 from estimator.psf.stiles_crawford import StilesCrawford
-from filter_service.native.library import Library, library_path
 from filter_service.planning.node_wavefronts import NodeWavefronts
 from filter_service.psfs.compute_kernels import mean_batch, pack_pool
 from filter_service.psfs.native_psfs import (
     NativePsfs,
     NodeRings,
-    fft_lengths,
     native_psfs,
 )
 from filter_service.psfs.pack import pack_kernels
@@ -294,10 +294,10 @@ def test_kernels_do_not_depend_on_the_batch_or_on_threads():
     rng = np.random.default_rng(5)
     zernike_um = random_zernike(rng, 30, 3.0)
     whole, *_ = computed(wavefronts_of(zernike_um))
-    library = native_psfs().library
-    alone = NativePsfs(library, library.new_threads(1))
+    library = core()
+    alone = NativePsfs(CompiledPsfs(library, library.new_threads(1)))
     backward, *_ = computed(wavefronts_of(zernike_um[::-1]), engine=alone)
-    library.end_threads(alone.threads)
+    library.end_threads(alone.engine.threads)
     for k in range(90):
         other = 3 * (29 - k // 3) + k % 3
         np.testing.assert_array_equal(whole.reach_px[k], backward.reach_px[other])
@@ -305,12 +305,12 @@ def test_kernels_do_not_depend_on_the_batch_or_on_threads():
 
 
 def test_processors_without_vectors_have_the_same_kernels():
-    library = Library(library_path(), portable=True)
-    portable = NativePsfs(library, library.new_threads(2))
+    library = Core(core().path, portable=True)
+    portable = NativePsfs(CompiledPsfs(library, library.new_threads(2)))
     assert library.variant == "portable"
     wavefronts = wavefronts_of(random_zernike(np.random.default_rng(6), 8, 2.0))
     ours, theirs = (computed(wavefronts, engine=e)[0] for e in (None, portable))
-    library.end_threads(portable.threads)
+    library.end_threads(portable.engine.threads)
     for k in range(24):
         assert error_ratio(kernel(theirs, k), kernel(ours, k)) <= 0.01, k
 

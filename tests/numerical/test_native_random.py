@@ -98,7 +98,7 @@ def test_many_random_frames_are_those_of_the_twin(case):
 @given(frames())
 def test_threads_and_processors_give_the_same_picture(case):
     """To the bit for any number of threads; to rounding on processors without AVX2."""
-    from filter_service.native.library import Library, library_path
+    from filter_service.native import Loops, loops
     from filter_service.rendering.native import NativeRenderer
 
     rng = np.random.default_rng(case["seed"])
@@ -113,7 +113,7 @@ def test_threads_and_processors_give_the_same_picture(case):
     other = NativeRenderer(n_threads=case["n_threads"])
     same = other.render(view, other.load(bench.store), **STATE).color
     assert same.tobytes() == usual.tobytes()
-    portable = NativeRenderer(Library(library_path(), portable=True))
+    portable = NativeRenderer(Loops(loops().path, portable=True))
     assert "portable" in portable.name
     plain = portable.render(view, portable.load(bench.store), **STATE).color
     assert psnr_db(plain, usual.astype(float)) >= 100.0

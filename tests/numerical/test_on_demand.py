@@ -186,15 +186,17 @@ def test_the_worker_plans_ahead_until_it_is_asked_for_something_else(monkeypatch
 
 
 def test_a_frame_is_the_same_on_one_thread(streamed, views, alone):
-    from filter_service.psfs.native_psfs import NativePsfs, native_psfs
+    from estimator.native import core
+    from estimator.psf.compiled import CompiledPsfs
+    from filter_service.psfs.native_psfs import NativePsfs
     from filter_service.psfs.psf_engine import psf_engine
     from filter_service.rendering.native import NativeRenderer
 
-    library = native_psfs().library
-    own = NativePsfs(library, library.new_threads(1))
+    threads = core().new_threads(1)
+    own = NativePsfs(CompiledPsfs(core(), threads))
     store = PsfStore(*streamed, engine=replace(psf_engine(), native=own))
     found = pictures(NativeRenderer(n_threads=1), store, frames(views))
-    library.end_threads(own.threads)
+    core().end_threads(threads)
     assert found == alone
 
 

@@ -13,6 +13,7 @@ from tests.release.build import GLIBC
 from tests.release.commands import ROOT, TOOLS, Failed, run
 
 LIBRARIES = {
+    "estimator/native/_core.so",
     "filter_service/native/_loops.so",
     "filter_service/service/_drop_parts.so",
     "clients/openxr_layer/_layer.so",
@@ -61,7 +62,9 @@ def check_sdist(path: Path) -> None:
     """Check that the sdist has the packages, C sources and examples, and no tests."""
     with tarfile.open(path) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    patterns = ("filter_service/**/*.[ch]", "clients/**/*.[ch]")
+    patterns = [
+        f"{name}/**/*.[ch]" for name in ("clients", "estimator", "filter_service")
+    ]
     found = (path for pattern in patterns for path in ROOT.glob(pattern))
     sources = {p.relative_to(ROOT).as_posix() for p in found}
     sources = {name for name in sources if "/node_modules/" not in name}

@@ -71,9 +71,10 @@ EXAMPLES_IMPORT = {"trimesh", "numpy", "PIL", "matplotlib", "common"}
 
 EYE_ROOMS = {
     # room of the estimator: the other rooms that it may import
-    "optics": (),
-    "wavefront": ("optics",),
-    "psf": ("optics",),
+    "native": (),
+    "optics": ("native",),
+    "wavefront": ("native", "optics"),
+    "psf": ("native", "optics"),
     "corrections": ("wavefront", "optics"),
     "media": (),
     "acuity": ("optics",),
@@ -84,7 +85,7 @@ EYE_ROOMS = {
     "networks": ("eye", "optics"),
     "estimate": ("networks", "profiles", "eye", "wavefront", "optics"),
     "field": (
-        *("estimate", "networks", "periphery", "profiles"),
+        *("native", "estimate", "networks", "periphery", "profiles"),
         *("eye", "corrections", "wavefront", "optics"),
     ),
 }

@@ -1,5 +1,7 @@
 """What `ocufilter doctor` makes of the shaders."""
 
+from pathlib import Path
+
 import pytest
 
 from clients.commands import doctor_checks
@@ -104,10 +106,10 @@ def test_the_native_engine_s_probe_filters_a_perfect_eye():
 
 
 def test_without_a_compiled_library_a_compiler_is_named(monkeypatch):
-    monkeypatch.setattr(library, "library_path", lambda: None)
-    library.compiled_library.cache_clear()
+    monkeypatch.setattr(library, "PATH", Path("_loops.so"))
+    library.loops.cache_clear()
     check = check_native(probe_native())
-    library.compiled_library.cache_clear()
+    library.loops.cache_clear()
     assert not check.ok
     assert "gcc" in check.fix
     assert "not built" in check.detail

@@ -88,10 +88,10 @@ def test_variables_name_what_is_there(tmp_path, monkeypatch):
     monkeypatch.delenv("__EGL_VENDOR_LIBRARY_FILENAMES", raising=False)
     python = tmp_path / "venv/bin/python"
     common = {"python": python, "commit": "abc1234"}
-    own = environment.variables(**common, loaders=Path("/gl"), native=tmp_path / "l.so")
+    own = environment.variables(**common, loaders=Path("/gl"), native=tmp_path / "l")
     assert own["OCUFILTER_COMMIT"] == "abc1234"
     assert own["LD_LIBRARY_PATH"] == f"/gl:/elsewhere:{tmp_path}"
-    assert own["OCUFILTER_NATIVE_LIBRARY"] == str(tmp_path / "l.so")
+    assert own["OCUFILTER_LIBRARY_DIR"] == str(tmp_path / "l")
     assert own["__EGL_VENDOR_LIBRARY_FILENAMES"] == "/a.json:/b.json"
     assert own["PATH"].startswith(str(python.parent) + ":")
     bare = environment.variables(**common, loaders=None, native=None)

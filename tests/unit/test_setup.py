@@ -72,8 +72,9 @@ def test_set_up_names_no_host(name):
 
 def test_make_clean_removes_compiled_loops_and_leaves_results(tmp_path):
     kept, removed = "out/demo/video.mp4", "filter_service/native/_loops.abi3.so"
+    libraries = ("estimator/native/_core.so", "clients/openxr_layer/_layer.so")
     cached = "estimator/__pycache__/a.nbi"
-    for name in (kept, removed, cached):
+    for name in (kept, removed, cached, *libraries):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).write_text("")
     make = ["make", "-f", ROOT / "Makefile", "clean"]

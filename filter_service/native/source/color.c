@@ -12,7 +12,7 @@ static float first_light_of(unsigned byte) {
     return byte < 256 ? (float)linear_of_srgb((byte - 0.5) / 255.0) : INFINITY;
 }
 
-void make_color_tables(void) {
+__attribute__((constructor)) static void make_color_tables(void) {
     for (int byte = 0; byte < 256; ++byte)
         linear_of_byte[byte] = (float)linear_of_srgb(byte / 255.0);
     unsigned byte = 0;

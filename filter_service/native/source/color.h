@@ -21,8 +21,6 @@ typedef struct {
 } byte_step;
 extern byte_step byte_steps[LAST_STEP - FIRST_STEP + 1];
 
-void make_color_tables(void);
-
 INLINE uint32_t bits_of(float value) {
     uint32_t bits;
     memcpy(&bits, &value, sizeof bits);

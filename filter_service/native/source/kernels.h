@@ -2,6 +2,7 @@
 
 #include <math.h>
 
+#include "dither.h"
 #include "frame.h"
 #include "vectors.h"
 
@@ -45,14 +46,6 @@ static void place_kernels(frame *f) {
     uint64_t floats = 2 * (MAX_LEVEL + 1) * 4 * (largest + 64);
     if (floats > f->blend_scratch_floats) f->blend_scratch_floats = floats;
 }
-
-/* Ordered dither of 4 x 4 texels, added before truncation to steps of 15 bits.  Rounding
- * alone loses all of a tail that is darker than half a step, 1e-3 of the light of a wide
- * kernel. */
-static const float before_cut[4][4] = {{0.03125f, 0.53125f, 0.15625f, 0.65625f},
-                                       {0.78125f, 0.28125f, 0.90625f, 0.40625f},
-                                       {0.21875f, 0.71875f, 0.09375f, 0.59375f},
-                                       {0.96875f, 0.46875f, 0.84375f, 0.34375f}};
 
 INLINE i32x4 steps_of(f32x4 texel, f32x4 per_light, float added) {
     return __builtin_convertvector(texel * per_light + all4(added), i32x4);

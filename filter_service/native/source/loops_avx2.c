@@ -6,7 +6,7 @@
 #pragma GCC target("avx2,fma")
 #endif
 #define OCU_AVX2
-#define OCU_VARIANT loops_avx2
+#define OCU_VARIANT variant_avx2
 #define OCU_NAME "avx2"
 #include "loops.h"
 #if defined(__clang__)

@@ -20,9 +20,6 @@ INLINE reach read_reach(const uint8_t *bytes) {
 INLINE int reach_width(reach r) { return r.left + r.right + 1; }
 INLINE int reach_height(reach r) { return r.up + r.down + 1; }
 
-INLINE int larger_int(int a, int b) { return a > b ? a : b; }
-INLINE int smaller_int(int a, int b) { return a < b ? a : b; }
-
 INLINE reach wider(reach a, reach b) {
     return (reach){larger_int(a.left, b.left), larger_int(a.right, b.right),
                    larger_int(a.up, b.up), larger_int(a.down, b.down)};

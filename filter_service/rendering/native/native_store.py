@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.native.library import Library
+from filter_service.native import Loops
 from filter_service.native.records import RESOLUTIONS, ShrinkJob
 from filter_service.psfs.boxes import box_sizes, pack_reach, unpack_reach
 from filter_service.psfs.read_kernels import StoreTables
@@ -98,7 +98,7 @@ class NativeStore(FrameStore):
         """Mark the store as released; the last reference frees its memory."""
         self.is_released = True
 
-    def sync(self, library: Library, threads: int) -> None:
+    def sync(self, library: Loops, threads: int) -> None:
         """Add the kernels that were computed since the last call.
 
         The caller passes its own threads, because the renderer that loaded the store
@@ -119,7 +119,7 @@ class NativeStore(FrameStore):
         fine.reach[psfs] = store.tables.reach_words[psfs]
         self.resolutions[0] = fine._replace(words=store.words)
         for resolution in range(1, RESOLUTIONS):
-            library.shrink(self._shrink_job(resolution, psfs, threads))
+            library.call("shrink", self._shrink_job(resolution, psfs, threads))
 
     def _shrink_job(
         self, resolution: int, psfs: NDArray[np.int64], threads: int

@@ -10,9 +10,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.native import core
 from estimator.threads import thread_count
 from filter_service.errors import RenderFailed
-from filter_service.native.library import Library, compiled_library
+from filter_service.native import Loops, loops
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.detection import merge_gaze
@@ -42,7 +43,7 @@ class NativeRenderer(OneView):
 
     Parameters
     ----------
-    loops : Library, optional
+    library : Loops, optional
         Compiled loops; by default the fastest ones that this CPU supports.
     n_threads : int, optional
         Thread count; by default one per core.
@@ -53,11 +54,11 @@ class NativeRenderer(OneView):
         The compiled loops are missing.
     """
 
-    def __init__(self, loops: Library | None = None, n_threads: int | None = None):
-        self._loops = loops or compiled_library()
-        self._threads = self._loops.new_threads(n_threads or thread_count())
-        self._n_threads = self._loops.thread_count(self._threads)
-        self._end = weakref.finalize(self, self._loops.end_threads, self._threads)
+    def __init__(self, library: Loops | None = None, n_threads: int | None = None):
+        self._loops = library or loops()
+        self._threads = core().new_threads(n_threads or thread_count())
+        self._n_threads = core().thread_count(self._threads)
+        self._end = weakref.finalize(self, core().end_threads, self._threads)
         self._between: object = None
         self._pause_callback: Callable[[], None] | None = None
         self._is_syncing = False
@@ -100,7 +101,7 @@ class NativeRenderer(OneView):
             function()
             self._paused_s += time.perf_counter() - started_s
 
-        self._between = self._loops.call_between(self._threads, pause, interval_s)
+        self._between = core().call_between(self._threads, pause, interval_s)
         self._pause_callback = pause
         return True
 
@@ -176,12 +177,12 @@ class NativeRenderer(OneView):
                 white_level=white,
                 is_encoded=request.output == "srgb8",
             )
-            self._loops.run("merge", frame.c)
+            self._loops.call("merge", frame.c)
         sizes = self._blend(timer, frame, plan, eye)
         with timer.wall("splat_ms"):
             picture = output_array(request)
             frame.set_picture(picture)
-            self._loops.run("splat", frame.c)
+            self._loops.call("splat", frame.c)
         if frame.c.failed:
             raise RenderFailed("out of memory for the fragment lists of a frame")
         return FilteredView(
@@ -221,7 +222,7 @@ class NativeRenderer(OneView):
         with timer.wall("fragments_ms"):
             frame.set_view(whole, border_px)
             used = frame.set_state(layers, image, change_dpt)
-            self._loops.run("pixels", frame.c)
+            self._loops.call("pixels", frame.c)
         return missing_count, used
 
     def _planned(
@@ -267,10 +268,10 @@ class NativeRenderer(OneView):
                 return sizes
         eye.blended = None
         with timer.wall("psf_blend_ms"):
-            self._loops.run("place", frame.c)
+            self._loops.call("place", frame.c)
             sizes = BlendSizes.of(frame.c)
             frame.set_blend_buffers(sizes)
-            self._loops.run("blend", frame.c)
+            self._loops.call("blend", frame.c)
         eye.blended = plan, levels.copy(), sizes
         return sizes
 

@@ -6,6 +6,7 @@
 
 #include "pool.h"
 
+#define RGB 3
 #define N_TERMS 28            /* of a wavefront: degree 6 */
 #define N_POWERS 7
 #define N_EDGE 48             /* points of a survey on the pupil's edge */
@@ -38,10 +39,9 @@ typedef struct {
     double min_cells, max_cells, cells_per_px;
     double min_edge_points, edge_points_per_px, min_curvature_ratio;
     double far_px, near_px;
-    double centroid_ratio;
     int32_t fresnel_count, edge_half_width, edge_steps;
     int32_t filter_stride, filter_count, filter_half_width;
-    int32_t length_count, n_rings, n_ring, cut_steps;
+    int32_t length_count, n_rings, n_ring;
 } psf_tables;
 
 enum { PSF_DONE = 0, PSF_NOT_HERE = 1, PSF_NO_MEMORY = 2 };
@@ -66,6 +66,7 @@ typedef struct {
     double ring_steps_per_mm2;
     double ring_lattice_mm[3];        /* of a honeycomb: pitch, inner and outer radius */
     double cut_ratio;                 /* share of the light that is cropped */
+    double centroid_ratio;            /* most that this shifts the centroid */
     double oversampling, margin;
     const int64_t *groups, *channels; /* (count,) */
     const double *total_dpt;          /* (count,) */
@@ -77,7 +78,7 @@ typedef struct {
     void *results;                    /* of the threads, until take_all_psfs */
     int32_t count, primaries;
     int32_t max_radius_px, is_diffracting;
-    int32_t min_samples_per_px, ring_count;
+    int32_t min_samples_per_px, ring_count, cut_steps;
 } psf_job;
 
 #endif

@@ -38,6 +38,9 @@ INLINE f32x8 all8(float value) {
 
 INLINE f32x4 all4(float value) { return (f32x4){value, value, value, value}; }
 
+INLINE int larger_int(int a, int b) { return a > b ? a : b; }
+INLINE int smaller_int(int a, int b) { return a < b ? a : b; }
+
 /* Not fmaxf and fminf, which would be library calls. */
 INLINE float larger_float(float a, float b) { return a > b ? a : b; }
 INLINE float smaller_float(float a, float b) { return a < b ? a : b; }

@@ -2,6 +2,8 @@
  * that keeps its light, with 16 bits per weight (filter_service/psfs/pack.py).  Only texels
  * that are kept, and the spot with its surroundings, are computed. */
 
+#include "dither.h"
+
 #define MOST_PRIMARIES 16
 #define MOST_REACH_PX 255
 #define WEIGHT_MAX 65535.0
@@ -188,12 +190,11 @@ static int reach_of_side(const light_of_plane *l, int side, double share, int mo
 /* Chooses reaches that crop a share of the light, less if that shifts the centroid. */
 static void choose_box(const psf_job *job, const light_of_plane *l, double spread_px,
                        int most, int reaches[SIDES]) {
-    const psf_tables *tables = job->tables;
-    double limit = tables->centroid_ratio * larger_double(spread_px, 1.0);
+    double limit = job->centroid_ratio * larger_double(spread_px, 1.0);
     double share = job->cut_ratio / SIDES;
-    for (int step = 0; step <= tables->cut_steps; ++step) {
+    for (int step = 0; step <= job->cut_steps; ++step) {
         double cut[SIDES], moment[SIDES];
-        if (step == tables->cut_steps) share = 0.0;
+        if (step == job->cut_steps) share = 0.0;
         for (int side = 0; side < SIDES; ++side)
             reaches[side] = reach_of_side(l, side, share, most, cut + side, moment + side);
         double shift = 0.0;
@@ -423,4 +424,46 @@ static void compute_psf_item(void *argument, int item, int thread) {
         job->sizes[psf] = 0;
         job->outcome[psf] = compute_psf(job, psf, w);
     }
+}
+
+/* Computes the PSFs of a job; 0 if out of memory.  `take_psfs` must follow. */
+static int psfs(psf_job *job) {
+    size_t n_threads = (size_t)pool_size(job->threads), count = (size_t)job->count;
+    psf_results *results = calloc(1, sizeof *results);
+    if (results == NULL) return 0;
+    job->results = results;
+    results->work = calloc(n_threads, sizeof *results->work);
+    results->first = calloc(count + 1, sizeof *results->first);
+    results->thread = calloc(count + 1, sizeof *results->thread);
+    if (results->work == NULL || results->first == NULL || results->thread == NULL) return 0;
+    int items = (job->count + PSFS_AN_ITEM - 1) / PSFS_AN_ITEM;
+    pool_run(job->threads, items, compute_psf_item, job);
+    return 1;
+}
+
+/* Copies the kernels, concatenated, and frees the job's memory; with NULL, only frees. */
+static void take_psfs(psf_job *job, uint16_t *words) {
+    psf_results *results = job->results;
+    job->results = NULL;
+    if (results == NULL) return;
+    for (int psf = 0; words != NULL && psf < job->count; ++psf) {
+        size_t size = (size_t)job->sizes[psf];
+        if (size == 0) continue; // refused: its thread may hold no words at all
+        memcpy(words, results->work[results->thread[psf]].words + results->first[psf],
+               sizeof *words * size);
+        words += size;
+    }
+    int n_threads = results->work == NULL ? 0 : pool_size(job->threads);
+    for (int thread = 0; thread < n_threads; ++thread) {
+        psf_work *w = results->work + thread;
+        free_wave_work(&w->waves);
+        free(w->plane.at);
+        free(w->part.at);
+        free(w->kept.at);
+        free(w->words);
+    }
+    free(results->work);
+    free(results->first);
+    free(results->thread);
+    free(results);
 }

@@ -1,0 +1,19 @@
+/* All functions of the library, compiled once for each variant (core_any.c, core_avx2.c). */
+#include "variant.h"
+#include "vectors.h"
+
+#include "psf_job.h"
+#include "psf_pupils.h"
+#include "psf_tails.h"
+#include "psf_rays.h"
+#include "psf_fft.h"
+#include "psf_waves.h"
+#include "psfs.h"
+
+static const named_function functions[] = {
+    FUNCTION(psfs),
+    FUNCTION(take_psfs),
+    {NULL, NULL},
+};
+
+const variant OCU_VARIANT = {OCU_NAME, functions};

@@ -1,0 +1,4 @@
+/* Variant for every processor that the compiler supports. */
+#define OCU_VARIANT variant_any
+#define OCU_NAME "portable"
+#include "core.h"
