@@ -25,7 +25,10 @@ from typing import Any
 
 import estimator
 import filter_service
+from estimator import native as core
+from estimator.native import in_use
 from estimator.profiles.parse import EyeProfile
+from filter_service import native as loops
 from filter_service.gl.shader_source import SHADER_ROOT
 from filter_service.planning.grid import GridSpec
 from filter_service.psfs.cache_folder import check_is_private
@@ -49,6 +52,8 @@ _WRITING = threading.Lock()
 
 log = logging.getLogger("ocufilter.cache")
 
+LIBRARIES = (core.PATH, loops.PATH)
+
 
 @dataclass(frozen=True)
 class Stored:
@@ -69,8 +74,9 @@ class Stored:
 def code_version() -> str:
     """Return a hash of the files that determine the content of a store.
 
-    They are both packages and the PSF shaders.  Omitting a relevant file would produce
-    wrong images, whereas including an irrelevant one only costs a build.
+    They are both packages, the PSF shaders and the compiled libraries in use.  Omitting
+    a relevant file would produce wrong images, whereas including an irrelevant one only
+    costs a build.
     """
     service_folder = Path(filter_service.__file__).parent
     estimator_folder = Path(estimator.__file__).parent
@@ -82,6 +88,7 @@ def code_version() -> str:
         ),
         *service_folder.rglob("*.py"),
         *SHADER_ROOT.rglob("psf*"),
+        *(path for path in map(in_use, LIBRARIES) if path.exists()),
     ]
     digest = hashlib.blake2b(digest_size=16)
     for path in sorted(files):

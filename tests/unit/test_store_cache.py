@@ -295,18 +295,21 @@ def test_the_key_follows_every_file_of_the_code(tmp_path, monkeypatch):
         module = getattr(store_cache, package)
         monkeypatch.setattr(module, "__file__", str(source))
     monkeypatch.setattr(store_cache, "SHADER_ROOT", tmp_path / "shaders")
+    monkeypatch.setenv("OCUFILTER_LIBRARY_DIR", str(tmp_path / "libraries"))
     shader = tmp_path / "shaders" / "passes" / "psf_sum.comp.glsl"
     shader.parent.mkdir(parents=True)
     for path in (
         tmp_path / "estimator" / "presets.json",
         tmp_path / "filter_service" / "psfs" / "build.py",
         shader,
+        tmp_path / "libraries" / "_core.so",
+        tmp_path / "libraries" / "_loops.so",
     ):
         keys.add(key())
         path.parent.mkdir(exist_ok=True)
         path.write_text("changed")
         keys.add(key())
-    assert len(keys) == 4
+    assert len(keys) == 6
 
 
 def test_what_is_no_data_is_not_stored(cache, stored, caplog, tmp_path):
