@@ -1,8 +1,12 @@
-"""Zernike circle polynomials to radial order 6, with OSA/ANSI index and normalization.
+"""Zernike circle polynomials to radial order 10, with OSA/ANSI index and normalization.
 
-Coefficients are arrays of 28 in um, index = j, element 0 is piston; the radius of their
+Coefficients are arrays in um, index = j, element 0 is piston; the radius of their
 circle is a separate argument.  Values, gradients and rescaled coefficients are computed
 from monomials x^a y^b, without approximation.
+
+The last axis of an array has all terms up to an order: 28 up to order 6, the default,
+and at most 66 up to order 10.  Terms and monomials are sorted by order, so that the
+first terms of a longer array are those of a shorter one.
 """
 
 import math
@@ -14,15 +18,74 @@ from numpy.typing import ArrayLike, NDArray
 
 MAX_RADIAL_ORDER = 6
 N_TERMS = (MAX_RADIAL_ORDER + 1) * (MAX_RADIAL_ORDER + 2) // 2
+"""Radial order and number of terms by default."""
 
-EXPONENTS: NDArray[np.int64] = np.array(
-    [
-        (degree - b, b)
-        for degree in range(MAX_RADIAL_ORDER + 1)
-        for b in range(degree + 1)
-    ]
-)
-"""Exponents (a, b) of the monomials x^a y^b, (28, 2), by degree."""
+HIGHEST_ORDER = 10
+MAX_TERMS = (HIGHEST_ORDER + 1) * (HIGHEST_ORDER + 2) // 2
+"""Highest radial order, and its number of terms."""
+
+
+@cache
+def radial_order(n_terms: int) -> int:
+    """Return the radial order of an array's number of terms, 6 for 28.
+
+    Raises
+    ------
+    ValueError
+        No order up to 10 has this number of terms.
+    """
+    order = (math.isqrt(8 * max(n_terms, 0) + 1) - 3) // 2
+    if (order + 1) * (order + 2) // 2 != n_terms or not 0 <= order <= HIGHEST_ORDER:
+        allowed = [(n + 1) * (n + 2) // 2 for n in range(HIGHEST_ORDER + 1)]
+        raise ValueError(
+            f"{n_terms} Zernike terms: allowed are {', '.join(map(str, allowed))}"
+        )
+    return order
+
+
+@cache
+def exponents(n_terms: int = N_TERMS) -> NDArray[np.int64]:
+    """Return the exponents (a, b) of the monomials x^a y^b, (n_terms, 2), by degree."""
+    found = np.array(
+        [
+            (degree - b, b)
+            for degree in range(radial_order(n_terms) + 1)
+            for b in range(degree + 1)
+        ]
+    )
+    found.setflags(write=False)
+    return found
+
+
+# a copy: compiled loops take a writable array
+EXPONENTS: NDArray[np.int64] = exponents().copy()
+"""Exponents of the default terms, (28, 2)."""
+
+
+@cache
+def monomial_degrees(n_terms: int = N_TERMS) -> NDArray[np.int64]:
+    """Return the degree (n_terms,) of each monomial."""
+    degrees: NDArray[np.int64] = exponents(n_terms).sum(axis=1)
+    degrees.setflags(write=False)
+    return degrees
+
+
+def padded_terms(coefficients: ArrayLike, n_terms: int) -> NDArray[np.float64]:
+    """Return coefficients or monomials (..., n_terms) with zeros for added terms.
+
+    Raises
+    ------
+    ValueError
+        There are more terms than that.
+    """
+    coefficients = np.asarray(coefficients, dtype=np.float64)
+    missing = n_terms - coefficients.shape[-1]
+    if missing < 0:
+        raise ValueError(f"{coefficients.shape[-1]} terms: must be at most {n_terms}")
+    if not missing:
+        return coefficients
+    zeros = np.zeros((*coefficients.shape[:-1], missing))
+    return np.concatenate([coefficients, zeros], axis=-1)
 
 
 def nm_from_index(index: int) -> tuple[int, int]:
@@ -87,19 +150,19 @@ def _radial_coefficients(n: int, m: int) -> list[tuple[int, float]]:
 
 
 @cache
-def monomial_matrix() -> NDArray[np.float64]:
+def monomial_matrix(n_terms: int = N_TERMS) -> NDArray[np.float64]:
     """Return the coefficients of every Zernike polynomial in the monomial basis.
 
     Returns
     -------
-    matrix : (28, 28)
+    matrix : (n_terms, n_terms)
         ``matrix[j, t]`` is the coefficient of ``x**a * y**b`` in Z_j, with
-        ``(a, b) = EXPONENTS[t]``; ``zernike_um @ matrix`` are the monomial coefficients
-        of a wavefront.
+        ``(a, b) = exponents(n_terms)[t]``; ``zernike_um @ matrix`` are the monomial
+        coefficients of a wavefront.
     """
-    column = {tuple(e): t for t, e in enumerate(EXPONENTS.tolist())}
-    matrix = np.zeros((N_TERMS, N_TERMS))
-    for j in range(N_TERMS):
+    column = {tuple(e): t for t, e in enumerate(exponents(n_terms).tolist())}
+    matrix = np.zeros((n_terms, n_terms))
+    for j in range(n_terms):
         n, m = nm_from_index(j)
         norm = math.sqrt((2 - (m == 0)) * (n + 1))
         harmonic = _solid_harmonic(abs(m))[0 if m >= 0 else 1]
@@ -114,59 +177,68 @@ def monomial_matrix() -> NDArray[np.float64]:
 
 
 @cache
-def inverse_monomial_matrix() -> NDArray[np.float64]:
-    """Return the inverse (28, 28) of `monomial_matrix`."""
-    inverse = np.linalg.inv(monomial_matrix()).astype(np.float64)
+def inverse_monomial_matrix(n_terms: int = N_TERMS) -> NDArray[np.float64]:
+    """Return the inverse (n_terms, n_terms) of `monomial_matrix`."""
+    inverse = np.linalg.inv(monomial_matrix(n_terms)).astype(np.float64)
     inverse.flags.writeable = False
     return inverse
 
 
 def wavefront_polynomial(zernike_um: ArrayLike) -> NDArray[np.float64]:
-    """Return the monomial coefficients (..., 28), um, of W on the unit circle.
+    """Return the monomial coefficients (..., n_terms), um, of W on the unit circle.
 
-    W is the sum of C_j Z_j over coefficients (..., 28), um.
+    W is the sum of C_j Z_j over coefficients (..., n_terms), um.
     """
-    return np.asarray(zernike_um, dtype=np.float64) @ monomial_matrix()
+    zernike_um = np.asarray(zernike_um, dtype=np.float64)
+    return zernike_um @ monomial_matrix(zernike_um.shape[-1])
 
 
 def _powers(x: NDArray[np.float64], highest: int) -> NDArray[np.float64]:
     return np.stack([x**k for k in range(highest + 1)])
 
 
-def zernike_values(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-    """Return the values of the 28 polynomials.
+def zernike_values(
+    x: ArrayLike, y: ArrayLike, *, n_terms: int = N_TERMS
+) -> NDArray[np.float64]:
+    """Return the values of the polynomials.
 
     Parameters
     ----------
     x, y : (...), unit pupil
         Positions on the unit circle, x to the person's right, y up.
+    n_terms : int
 
     Returns
     -------
-    values : (..., 28)
+    values : (..., n_terms)
     """
     x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
-    px, py = _powers(x, MAX_RADIAL_ORDER), _powers(y, MAX_RADIAL_ORDER)
-    monomials = px[EXPONENTS[:, 0]] * py[EXPONENTS[:, 1]]
-    return np.moveaxis(monomials, 0, -1) @ monomial_matrix().T
+    a, b = exponents(n_terms).T
+    px, py = _powers(x, radial_order(n_terms)), _powers(y, radial_order(n_terms))
+    values: NDArray[np.float64] = (
+        np.moveaxis(px[a] * py[b], 0, -1) @ monomial_matrix(n_terms).T
+    )
+    return values
 
 
-def zernike_gradient(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
-    """Return the gradients of the 28 polynomials, per unit of the normalized pupil.
+def zernike_gradient(
+    x: ArrayLike, y: ArrayLike, *, n_terms: int = N_TERMS
+) -> NDArray[np.float64]:
+    """Return the gradients of the polynomials, per unit of the normalized pupil.
 
     Returns
     -------
-    gradient : (..., 2, 28)
+    gradient : (..., 2, n_terms)
         d/dx and d/dy.
     """
     x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
-    px, py = _powers(x, MAX_RADIAL_ORDER), _powers(y, MAX_RADIAL_ORDER)
-    a, b = EXPONENTS[:, 0], EXPONENTS[:, 1]
+    px, py = _powers(x, radial_order(n_terms)), _powers(y, radial_order(n_terms))
+    a, b = exponents(n_terms).T
     shape = (-1,) + (1,) * x.ndim
     d_x = a.reshape(shape) * px[np.maximum(a - 1, 0)] * py[b]
     d_y = b.reshape(shape) * px[a] * py[np.maximum(b - 1, 0)]
     monomials = np.stack([np.moveaxis(d_x, 0, -1), np.moveaxis(d_y, 0, -1)], axis=-2)
-    return monomials @ monomial_matrix().T
+    return monomials @ monomial_matrix(n_terms).T
 
 
 def rescale_pupil(zernike_um: ArrayLike, *, radius_ratio: ArrayLike) -> NDArray[Any]:
@@ -174,13 +246,13 @@ def rescale_pupil(zernike_um: ArrayLike, *, radius_ratio: ArrayLike) -> NDArray[
 
     Parameters
     ----------
-    zernike_um : (..., 28), um
+    zernike_um : (..., n_terms), um
     radius_ratio : (...)
         New radius over old one.  Ratios above 1 extrapolate the wavefront.
 
     Returns
     -------
-    zernike_um : (..., 28), um
+    zernike_um : (..., n_terms), um
 
     Raises
     ------
@@ -194,30 +266,32 @@ def rescale_pupil(zernike_um: ArrayLike, *, radius_ratio: ArrayLike) -> NDArray[
     ratio = np.asarray(radius_ratio, dtype=np.float64)
     if not np.all(ratio > 0):
         raise ValueError(f"pupil radius ratio {radius_ratio!s}: must be positive")
-    degree = EXPONENTS.sum(axis=1)
-    scaled = wavefront_polynomial(zernike_um) * ratio[..., None] ** degree
-    return np.linalg.solve(monomial_matrix().T, scaled[..., None])[..., 0]
+    polynomial_um = wavefront_polynomial(zernike_um)
+    n_terms = polynomial_um.shape[-1]
+    scaled = polynomial_um * ratio[..., None] ** monomial_degrees(n_terms)
+    return np.linalg.solve(monomial_matrix(n_terms).T, scaled[..., None])[..., 0]
 
 
 @cache
-def _horizontal_parity() -> NDArray[np.float64]:
-    terms = [nm_from_index(j) for j in range(N_TERMS)]
+def _horizontal_parity(n_terms: int) -> NDArray[np.float64]:
+    terms = [nm_from_index(j) for j in range(n_terms)]
     odd_in_x = [(m > 0 and m % 2 == 1) or (m < 0 and m % 2 == 0) for _, m in terms]
     return np.where(odd_in_x, -1.0, 1.0)
 
 
 def flip_horizontal(zernike_um: ArrayLike) -> NDArray[np.float64]:
-    """Mirror coefficients (..., 28) in x.
+    """Mirror coefficients (..., n_terms) in x.
 
     This converts between the examiner's and the eye's frame, and between OD and OS.
     """
-    return np.asarray(zernike_um, dtype=np.float64) * _horizontal_parity()
+    zernike_um = np.asarray(zernike_um, dtype=np.float64)
+    return zernike_um * _horizontal_parity(zernike_um.shape[-1])
 
 
 def remove_central_tilt(zernike_um: ArrayLike) -> NDArray[np.float64]:
-    """Return coefficients (..., 28) with C(1,±1) such that W has zero slope at 0."""
+    """Return coefficients (..., n_terms) with C(1,±1) for zero slope of W at 0."""
     zernike_um = np.array(zernike_um, dtype=np.float64)
-    slope = zernike_gradient(0.0, 0.0)
+    slope = zernike_gradient(0.0, 0.0, n_terms=zernike_um.shape[-1])
     for row, j in ((0, index_from_nm(1, 1)), (1, index_from_nm(1, -1))):
         zernike_um[..., j] -= zernike_um @ slope[row] / slope[row, j]
     return zernike_um
