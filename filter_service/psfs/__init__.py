@@ -6,7 +6,6 @@ psf_engine       choice of the PSF engine: C, Python or the ENZ series
 native_psfs      the engine in C
 boxes            boxes that kernels are cropped to
 pack             kernels cropped to boxes, in 16 bits
-pack_loops       compiled loops of pack
 store            the PSFs of an eye
 frame_layers     interpolation for a state, and the layers of a frame
 field_defocus    change of defocus over the field

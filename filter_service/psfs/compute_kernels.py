@@ -1,17 +1,14 @@
 """Computation of packed kernels from the wavefronts of nodes."""
 
-import os
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
 from estimator.psf.compute import PsfBatch
-from estimator.threads import thread_count
 from filter_service.constants import RGB
 from filter_service.planning.cost import COMPUTED_BEYOND
 from filter_service.planning.grid import GridSpec
@@ -105,19 +102,8 @@ def generic_kernels(
         min_energy_ratio=1.0 - COMPUTED_BEYOND * (1.0 - spec.kept_energy_ratio),
     )
     batch = mean_batch(batch, n_primaries)
-    packed = pack_kernels(
-        batch, kept_energy_ratio=spec.kept_energy_ratio, pool=pack_pool()
-    )
+    packed = pack_kernels(batch, kept_energy_ratio=spec.kept_energy_ratio)
     return packed, _methods(batch)
-
-
-@cache
-def pack_pool() -> ThreadPoolExecutor:
-    """Return the thread pool that crops kernels."""
-    return ThreadPoolExecutor(thread_count())
-
-
-os.register_at_fork(after_in_child=pack_pool.cache_clear)  # threads are not inherited
 
 
 def _methods(batch: PsfBatch) -> Counter[str]:

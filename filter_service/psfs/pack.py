@@ -1,24 +1,21 @@
 """Packing of computed kernels: cropped to their boxes, 16 bits per weight.
 
 Off axis, kernels are elongated and displaced from their center.  The box that contains
-the light of such a kernel has a third of the area of the disc about the center.
-Threads share a batch and run compiled loops over its kernels.
+the light of such a kernel has a third of the area of the disc about the center.  The
+engine in C packs its own kernels; this module packs those of other engines.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import Executor
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.psf.compute import PsfBatch
-from filter_service.psfs.boxes import SIDES, box_sizes
-from filter_service.psfs.pack_loops import crop, quantize
-
-PSFS_PER_TASK = 64
+from filter_service.constants import WEIGHT_MAX
+from filter_service.psfs.boxes import CUT_STEPS, MAX_CENTROID_SHIFT_RATIO, SIDES
 
 
 @dataclass(frozen=True)
@@ -69,9 +66,7 @@ class PackedKernels:
         )
 
 
-def pack_kernels(
-    batch: PsfBatch, *, kept_energy_ratio: float, pool: Executor
-) -> PackedKernels:
+def pack_kernels(batch: PsfBatch, *, kept_energy_ratio: float) -> PackedKernels:
     """Crop and quantize a batch of kernels.
 
     Parameters
@@ -81,33 +76,69 @@ def pack_kernels(
     """
     count = len(batch)
     reach_px = np.empty((count, SIDES), np.int64)
-    cut_ratio = np.empty(count)
-    tasks = [slice(k, k + PSFS_PER_TASK) for k in range(0, count, PSFS_PER_TASK)]
-
-    def shared(work: Callable[..., None], *arrays: NDArray[np.generic]) -> None:
-        list(pool.map(lambda part: work(*(a[part] for a in arrays)), tasks))
-
-    shared(
-        lambda *parts: crop(batch.flat_kernels, 1.0 - kept_energy_ratio, *parts),
-        *(batch.offset_count, batch.radius_px, reach_px, cut_ratio),
-    )
-    widths, heights = box_sizes(reach_px)
-    sizes = widths * heights
-    offsets = np.cumsum(sizes) - sizes
-    weights = np.empty(int(sizes.sum()), np.uint16)
     radius_px = np.empty(count, np.int64)
-    peak_ratio, spread_px = np.empty(count), np.empty(count)
-    shared(
-        lambda *parts: quantize(batch.flat_kernels, weights, *parts),
-        *(batch.offset_count, batch.radius_px, offsets, reach_px),
-        *(radius_px, peak_ratio, spread_px),
-    )
+    peak_ratio, spread_px, cut_ratio = np.empty((3, count))
+    weights = []
+    for p in range(count):
+        kernel = batch[p].kernel.astype(np.float64)
+        reach_px[p] = left, right, up, down = _reaches(kernel, 1.0 - kept_energy_ratio)
+        full = len(kernel) // 2
+        box = kernel[full - up : full + down + 1, full - left : full + right + 1]
+        held, peak = box.sum(), box.max()
+        steps = (box * (WEIGHT_MAX / peak) + 0.5).astype(np.uint16)
+        row, column = np.nonzero(steps)
+        farthest = np.max((row - up) ** 2 + (column - left) ** 2)
+        weights.append(steps.ravel())
+        radius_px[p] = math.ceil(math.sqrt(farthest) - 0.5)
+        peak_ratio[p], spread_px[p] = peak / held, _spread_px(box)
+        cut_ratio[p] = 1.0 - held / kernel.sum()
+    sizes = np.array([own.size for own in weights])
     return PackedKernels(
-        weights=weights,
-        offsets=offsets,
+        weights=np.concatenate(weights),
+        offsets=np.cumsum(sizes) - sizes,
         reach_px=reach_px,
         radius_px=radius_px,
         peak_ratio=peak_ratio,
         spread_px=spread_px,
         lost_energy_ratio=batch.lost_energy_ratio + cut_ratio,
     )
+
+
+def _spread_px(kernel: NDArray[np.float64]) -> float:
+    """Return the radius of the uniform disc with the same sum of squares."""
+    return float(kernel.sum() / math.sqrt(math.pi * np.square(kernel).sum()))
+
+
+def _reaches(kernel: NDArray[np.float64], cut_ratio: float) -> tuple[int, ...]:
+    """Return the reaches (4,) of a kernel (n, n).
+
+    Each side of the box may remove a quarter of ``cut_ratio``.  The share is halved
+    until the shift of the centroid is within `MAX_CENTROID_SHIFT_RATIO`.
+    """
+    lines = kernel.sum(axis=0), kernel.sum(axis=1)
+    limit_px = MAX_CENTROID_SHIFT_RATIO * max(_spread_px(kernel), 1.0)
+    side_ratio = cut_ratio / SIDES
+    for step in range(CUT_STEPS + 1):
+        allowed = side_ratio * lines[0].sum() if step < CUT_STEPS else 0.0
+        ends = [_ends(line, allowed) for line in lines]
+        if max(abs(shift_px) for *_, shift_px in ends) <= limit_px:
+            break
+        side_ratio /= 2.0
+    return tuple(reach for *reaches, _ in ends for reach in reaches)
+
+
+def _ends(line: NDArray[np.float64], allowed: float) -> tuple[int, int, float]:
+    """Return the reaches before and after the center, and the shift of the centroid.
+
+    Each end of the line removes at most the allowed light.
+    """
+    full = len(line) // 2
+    places = np.arange(-full, full + 1)
+    first, after = (
+        int(np.searchsorted(np.cumsum(side), allowed, side="right"))
+        for side in (line[:full], line[:full:-1])
+    )
+    kept = slice(first, line.size - after)
+    shift_px = (line @ places) / max(line.sum(), 1e-12)
+    kept_px = (line[kept] @ places[kept]) / max(line[kept].sum(), 1e-12)
+    return full - first, full - after, float(kept_px - shift_px)

@@ -12,7 +12,6 @@ where only storage errs, and half-way between nodes of all axes at once.
 import argparse
 import json
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,17 +84,14 @@ def build_part(eye, spec, plan: CachePlan, count: int) -> Built:
     states = plan_states(spec, plan, count)
     total = plan.prediction.psf_count
     size, spent_s, done = 0, 0.0, 0
-    with ThreadPoolExecutor(2) as pool:
-        for first in range(0, states.h_deg.size, PART):
-            part = states.select(slice(first, first + PART))
-            start_s = time.process_time()
-            batch = exact_kernels(eye, spec, part)
-            packed = pack_kernels(
-                batch, kept_energy_ratio=spec.kept_energy_ratio, pool=pool
-            )
-            spent_s += time.process_time() - start_s
-            size += packed.weights.nbytes
-            done += len(batch)
+    for first in range(0, states.h_deg.size, PART):
+        part = states.select(slice(first, first + PART))
+        start_s = time.process_time()
+        batch = exact_kernels(eye, spec, part)
+        packed = pack_kernels(batch, kept_energy_ratio=spec.kept_energy_ratio)
+        spent_s += time.process_time() - start_s
+        size += packed.weights.nbytes
+        done += len(batch)
     return Built(
         memory_mb=size * total / done / 1e6,
         build_s=spent_s * total / done / plan.prediction.core_count,
@@ -193,28 +189,25 @@ def paper_rows(eyes, n_states, n_psfs) -> list[Row]:
 def calibrate(n_psfs: int) -> dict[str, float]:
     """Fit the cost model's constants to processor time over very different batches."""
     terms, spent_us, counts = [], [], []
-    with ThreadPoolExecutor(2) as pool:
-        for name in ("emmetropia", "keratoconus", "astigmatism"):
-            for width_px in (480, 1280, 2000):
-                spec = spec_for(width_px, width_px * 9 // 16, mode="dynamic")
-                eye = traced_eye(name, spec)
-                states = plan_states(spec, unchecked_plan(eye, spec), n_psfs)
-                order = np.argsort(states.pupil_diameter_mm, kind="stable")
-                for rows in np.array_split(order, max(2, n_psfs // PART)):
-                    part = states.select(rows)
-                    times_us = []
-                    for _ in range(3):
-                        start_s = time.process_time()
-                        batch = exact_kernels(eye, spec, part)
-                        pack_kernels(
-                            batch, kept_energy_ratio=spec.kept_energy_ratio, pool=pool
-                        )
-                        times_us.append(1e6 * (time.process_time() - start_s))
-                    survey = survey_pupils(state_frames(eye, spec, part))
-                    found = cost_terms(spec, survey)
-                    terms.append([values.sum() for values in found.values()])
-                    spent_us.append(min(times_us))
-                    counts.append(rows.size)
+    for name in ("emmetropia", "keratoconus", "astigmatism"):
+        for width_px in (480, 1280, 2000):
+            spec = spec_for(width_px, width_px * 9 // 16, mode="dynamic")
+            eye = traced_eye(name, spec)
+            states = plan_states(spec, unchecked_plan(eye, spec), n_psfs)
+            order = np.argsort(states.pupil_diameter_mm, kind="stable")
+            for rows in np.array_split(order, max(2, n_psfs // PART)):
+                part = states.select(rows)
+                times_us = []
+                for _ in range(3):
+                    start_s = time.process_time()
+                    batch = exact_kernels(eye, spec, part)
+                    pack_kernels(batch, kept_energy_ratio=spec.kept_energy_ratio)
+                    times_us.append(1e6 * (time.process_time() - start_s))
+                survey = survey_pupils(state_frames(eye, spec, part))
+                found = cost_terms(spec, survey)
+                terms.append([values.sum() for values in found.values()])
+                spent_us.append(min(times_us))
+                counts.append(rows.size)
     terms, spent_us = np.array(terms), np.array(spent_us)
     constants, _ = nnls(terms / spent_us[:, None], np.ones(len(spent_us)))
     ratio = terms @ constants / spent_us

@@ -5,7 +5,6 @@ and accommodation and two of defocus each, every kernel computed, none from a st
 """
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -301,10 +300,7 @@ def _difference(exact, kernels, weights):
 
 
 def _stored(spec, batch):
-    with ThreadPoolExecutor(2) as pool:
-        packed = pack_kernels(
-            batch, kept_energy_ratio=spec.kept_energy_ratio, pool=pool
-        )
+    packed = pack_kernels(batch, kept_energy_ratio=spec.kept_energy_ratio)
     return [
         square_kernel(packed.weights, int(offset), reach_px, int(reach_px.max()))
         for offset, reach_px in zip(packed.offsets, packed.reach_px, strict=True)

@@ -15,7 +15,7 @@ from estimator.psf.compute import compute_psf_batch
 from estimator.psf.kernel_types import PsfTooLarge
 from estimator.psf.stiles_crawford import StilesCrawford
 from filter_service.planning.node_wavefronts import NodeWavefronts
-from filter_service.psfs.compute_kernels import mean_batch, pack_pool
+from filter_service.psfs.compute_kernels import mean_batch
 from filter_service.psfs.native_psfs import (
     NativePsfs,
     NodeRings,
@@ -104,9 +104,7 @@ def twin(wavefronts, *, diffraction=True, stiles_crawford=None, rings=None):
         )
     finally:
         fourier.plan_grids.__kwdefaults__ = usual
-    return pack_kernels(
-        mean_batch(batch, primaries), kept_energy_ratio=KEPT, pool=pack_pool()
-    )
+    return pack_kernels(mean_batch(batch, primaries), kept_energy_ratio=KEPT)
 
 
 def kernel(packed, k, radius_px=255):

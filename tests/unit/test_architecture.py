@@ -167,7 +167,6 @@ HOME = {
         "estimator/optics/gradients/*",  # indices at a point
         "estimator/wavefront/*",  # aiming and fitting
         "filter_service/rendering/reference*.py",  # twins of the passes
-        "filter_service/psfs/pack_loops.py",  # loops over single kernels
         "estimator/field/defocus_loops.py",  # of a traced eye in a new state
         "filter_service/planning/blur_loops.py",
         "filter_service/planning/spread_loops.py",  # planning an eye
