@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from estimator.estimate.measured_residual import OVERSHOOT
+from estimator.field.interpolation import SMOOTH_NODES
 from estimator.optics.units import SPHERE_PER_C20
 from estimator.wavefront.field_wavefronts import (
     N_NEWTON_STEPS,
@@ -18,10 +19,6 @@ from estimator.wavefront.field_wavefronts import (
     N_SAMPLED,
     NEWTON_STEP_RAD,
 )
-
-SMOOTH_NODES = 3
-"""Number of traced pupils whose interpolation is smooth; see
-`interpolation.pupil_weights`."""
 
 N_DEGREES = 3
 """Degrees 2, 4 and 6, which contribute to C(2,0)."""
@@ -38,26 +35,6 @@ sine of the farthest point so far."""
 
 _OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
 _VECTOR_OPTIONS = {**_OPTIONS, "fastmath": {"arcp", "contract"}}
-
-
-@njit(**_OPTIONS)
-def weights_at(nodes, at):
-    """Return Lagrange weights (n,) of the polynomial through nodes (n,)."""
-    weights = np.ones(nodes.size)
-    for i in range(nodes.size):
-        for j in range(nodes.size):
-            if j != i:
-                weights[i] *= (at - nodes[j]) / (nodes[i] - nodes[j])
-    return weights
-
-
-@njit(**_OPTIONS)
-def all_weights(nodes, at):
-    """Return Lagrange weights (n, n_nodes) at positions (n,)."""
-    weights = np.empty((at.size, nodes.size))
-    for n in range(at.size):
-        weights[n] = weights_at(nodes, at[n])
-    return weights
 
 
 @njit(**_OPTIONS)

@@ -7,7 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.estimate.measured_residual import MeasuredResidual
-from estimator.field.interpolation import POWER, FieldInterpolation, FieldValues
+from estimator.field.interpolation import (
+    POWER,
+    FieldInterpolation,
+    FieldValues,
+    lagrange_weights,
+)
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.field_wavefronts import C20_DEGREES, DEGREE, c20_by_degree
 
@@ -81,7 +86,7 @@ class _Grid:
 
     def inputs_at(self, accommodation_dpt: float) -> tuple[NDArray[np.float64], ...]:
         """Return the arguments of the compiled loop for an accommodation."""
-        from estimator.field.defocus_loops import weights_at
-
-        weights = weights_at(self._accommodations_dpt, float(accommodation_dpt))
+        (weights,) = lagrange_weights(
+            self._accommodations_dpt, np.array([accommodation_dpt])
+        )
         return self._nodes_mm, self._powers, weights, self._values

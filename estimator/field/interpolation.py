@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.eye.tracing import OPEN_RATIO
 from estimator.field.aberration_grid import AberrationGrid
-from estimator.field.defocus_loops import SMOOTH_NODES, all_weights
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.field_wavefronts import (
     DEGREE,
@@ -38,6 +37,9 @@ STRETCH = 1.75
 
 DPT_PER_NODE = 2.0
 """Largest mean step between traced accommodations."""
+
+SMOOTH_NODES = 3
+"""Number of traced pupils whose interpolation is smooth; see `pupil_weights`."""
 
 _CHUNK = 16384
 _RIM_SCALE = np.array([2, 2, 1, 1, 1])
@@ -113,9 +115,14 @@ def lagrange_weights(
     nodes: NDArray[np.float64], at: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the Lagrange weights (n, n_nodes) of nodes at positions (n,)."""
-    weights: NDArray[np.float64] = all_weights(
-        np.asarray(nodes, np.float64), np.asarray(at, np.float64)
-    )
+    nodes, at = np.asarray(nodes, np.float64), np.asarray(at, np.float64)
+    gaps = nodes[:, None] - nodes
+    np.fill_diagonal(gaps, 1.0)
+    weights = np.empty((at.size, nodes.size))
+    for i, own_gaps in enumerate(gaps):
+        ratios = (at[:, None] - nodes) / own_gaps
+        ratios[:, i] = 1.0
+        weights[:, i] = ratios.prod(axis=1)
     return weights
 
 

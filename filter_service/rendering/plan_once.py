@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator.field.defocus_loops import N_DEGREES, fill_defocus, weights_at
+from estimator.field.defocus_loops import N_DEGREES, fill_defocus
 from estimator.media.straylight import Straylight
 from estimator.wavefront.field_wavefronts import N_RIM
 from filter_service.camera import Camera
@@ -95,5 +95,4 @@ def _defocus_once() -> None:
     grid = np.arange(2.0, 4.0), np.ones(count), np.ones(1), np.ones((1, 1, 2, 1, count))
     index, sums = np.zeros(1, np.int64), np.zeros((1, N_DEGREES))
     fields, added = (index, index, np.ones(1)), (sums, sums, 1.0)
-    weights_at(np.zeros(1), 0.0)
     fill_defocus(2.0, grid, grid, fields, added, np.empty(1))
