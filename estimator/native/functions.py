@@ -13,4 +13,9 @@ A result is an ``int``.
 FUNCTIONS = {
     "psfs": "record -> int",
     "take_psfs": "record u2[]",
+    "psf_discs": "record -> int",
+    "frame_pupils": f"pool record i8 {4 * 'f8[] '} {4 * 'f8[] '}",
+    "survey_pupils": f"pool record i8 {4 * 'f8[] '} {6 * 'f8[] '}",
+    "needed_radii": f"i8 {4 * 'f8[] '} f8 i8 i8[]",
+    "edge_lights_outside": f"i8 {5 * 'f8[] '}",
 }

@@ -81,6 +81,7 @@ class PsfJob(c.Structure):
         ("centroid_ratio", c.c_double),
         ("oversampling", c.c_double),
         ("margin", c.c_double),
+        ("nodes", POINTER),
         ("groups", POINTER),
         ("channels", POINTER),
         ("total_dpt", POINTER),
@@ -103,10 +104,39 @@ class PsfJob(c.Structure):
     )
 
 
+class PsfDiscsJob(c.Structure):
+    """Job that computes PSFs over discs."""
+
+    _fields_ = (
+        ("job", POINTER),
+        ("box_um", POINTER),
+        ("half_width", POINTER),
+        ("shear", POINTER),
+        ("log_amplitude", POINTER),
+        ("wavelength_um", POINTER),
+        ("low_px", POINTER),
+        ("high_px", POINTER),
+        ("edge_px", POINTER),
+        ("normal", POINTER),
+        ("edge_um", POINTER),
+        ("passed_ratio", POINTER),
+        ("pixel_from_mrad", POINTER),
+        ("ring_offset_mm", POINTER),
+        ("ring_channels", POINTER),
+        ("rays_ratio", POINTER),
+        ("radius_px", POINTER),
+        ("first", POINTER),
+        ("kernels", POINTER),
+        ("light_ratio", POINTER),
+        ("outcome", POINTER),
+        ("count", c.c_int64),
+    )
+
+
 def pointer_to(array: np.ndarray) -> int:
     """Return the address of an array's first element; the caller keeps it alive."""
     return int(array.ctypes.data)
 
 
-SIZES = (c.sizeof(PsfJob), c.sizeof(PsfTables))
+SIZES = tuple(c.sizeof(record) for record in (PsfJob, PsfTables, PsfDiscsJob))
 """Expected result of `ocu_sizes`."""

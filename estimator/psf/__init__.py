@@ -2,15 +2,14 @@
 
 compute            entry point: many PSFs in one call
 arguments          argument checks
-compiled           the engine in C: packed kernels
+compiled           the engine in C
+discs              its PSFs over discs of given radii
 kernel_types       result type, kernel buffer, kernel disc
 pupil              pupils in pixel coordinates
 survey             wavefront slopes and kernel radii, before any PSF is computed
 switch             choice of wave or ray optics, by predicted error
-fourier            wave optics by FFT
-fourier_kernels    its compiled loops
-geometric          ray optics plus diffraction at the edge of the pupil
-geometric_kernels  its compiled loops
+fourier            sampling of wave-optical PSFs
+tables             tables and constants of the engine
 enz                wave optics by the extended Nijboer-Zernike series
 enz_series         functions and coefficients of the series
 tail               mean diffracted light far outside the geometric spot

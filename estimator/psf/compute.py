@@ -17,9 +17,9 @@ from estimator.psf.arguments import (
     checked_scale,
     checked_zernike_um,
 )
+from estimator.psf.discs import fill_discs
 from estimator.psf.enz import PAPER_DEGREE, EnzOutsideDomain, enz_kernels
-from estimator.psf.fourier import ACCURACY, fourier_kernels
-from estimator.psf.geometric import geometric_kernels
+from estimator.psf.fourier import ACCURACY, FourierAccuracy, plan_grids
 from estimator.psf.kernel_types import (
     KernelBuffer,
     Psf,
@@ -250,7 +250,6 @@ def plan_psfs(
         survey = survey.with_screen(
             ScreenTables.from_screen(
                 pupil_screen,
-                half_width_um_per_px=survey.frames.half_width_um_per_px,
                 pixel_from_mrad=pixel_from_mrad,
                 pupil_ellipse=pupil_ellipses(ellipse, circle_mm),
                 wavelength_nm=wavelength_nm,
@@ -370,24 +369,47 @@ def compute_psf_batch(
         max_radius_px=max_radius_px,
         min_energy_ratio=min_energy_ratio,
     )
-    shares = plan.geometric_ratio
-    output = empty_buffer(plan.radius_px, shares)
-    with ThreadPoolExecutor(workers or thread_count()) as pool:
-        common: dict[str, Any] = {"output": output, "pool": pool}
-        if method.startswith("enz"):
+    output = empty_buffer(plan.radius_px, plan.geometric_ratio)
+    if method.startswith("enz"):
+        with ThreadPoolExecutor(workers or thread_count()) as pool:
             enz_kernels(
                 plan.survey,
-                np.arange(shares.size),
+                np.arange(len(output.radius_px)),
                 degree=enz_degree,
                 is_checked=method == "enz",
                 accuracy=ACCURACY["fine" if method == "enz" else accuracy],
-                **common,
+                output=output,
+                pool=pool,
             )
-        else:
-            wave, rays = np.flatnonzero(shares < 1.0), np.flatnonzero(shares > 0.0)
-            fourier_kernels(plan.survey, wave, accuracy=ACCURACY[accuracy], **common)
-            geometric_kernels(plan.survey, rays, diffraction=diffraction, **common)
+    else:
+        _fill_discs(plan, output, accuracy=ACCURACY[accuracy], diffraction=diffraction)
     return finished_batch(plan.survey, output, diffraction, method)
+
+
+def _fill_discs(
+    plan: PsfPlan,
+    output: KernelBuffer,
+    *,
+    accuracy: FourierAccuracy,
+    diffraction: bool,
+) -> None:
+    """Compute kernels by wave or ray optics into a buffer.
+
+    Raises
+    ------
+    ValueError
+        A wavefront requires an FFT that is too long.
+    """
+    survey = plan.survey
+    is_done = fill_discs(survey, plan.geometric_ratio, accuracy, diffraction, output)
+    if not is_done.all():
+        missing = np.flatnonzero(~is_done)
+        plan_grids(
+            extent_px=survey.extent_px[missing],
+            unit_px=survey.unit_px[missing],
+            accuracy=accuracy,
+        )
+        raise ValueError(f"PSF {missing[0]} cannot be computed by wave optics")
 
 
 def compute_psfs(zernike_um: ArrayLike, **options: Any) -> list[Psf]:

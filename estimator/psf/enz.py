@@ -24,9 +24,10 @@ from estimator.psf.enz_series import (
     radial_nodes,
     zernike_betas,
 )
-from estimator.psf.fourier import FourierAccuracy, pixel_filter, plan_grids
+from estimator.psf.fourier import FourierAccuracy, plan_grids
 from estimator.psf.kernel_types import KernelBuffer, finish_kernel
 from estimator.psf.survey import PupilSurvey
+from estimator.psf.tables import pixel_filter
 from estimator.psf.tail import add_tail
 
 if TYPE_CHECKING:
@@ -321,8 +322,10 @@ def enz_kernels(
         Largest Zernike degree of the expansion.
     is_checked : bool
         Whether to check the domain of the series.
-    accuracy, output, pool
-        See `fourier.fourier_kernels`.
+    accuracy : FourierAccuracy
+    output : KernelBuffer
+    pool : Executor
+        Thread pool.
 
     Raises
     ------

@@ -6,15 +6,13 @@ ellipse, described by its bounding box and a shear.  PSFs are therefore computed
 directly on the pixel grid, without resampling.
 """
 
-import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from estimator.optics.zernike import EXPONENTS, N_TERMS
+from estimator.optics.zernike import N_TERMS
+from estimator.psf.compiled import compiled_psfs
 
 ELLIPSE_COLUMNS = 5
 """Center x, y, semi-major and semi-minor axis (mm), angle of the major axis (rad)."""
@@ -47,122 +45,6 @@ class PupilFrames:
     shear_ratio: NDArray[np.float64]
     log_amplitude: NDArray[np.float64]
     wavelength_nm: NDArray[np.float64]
-
-
-def _bos_nodes() -> NDArray[np.float64]:
-    """Return 28 nodes that determine a polynomial of degree 6: rings of 13, 9, 5, 1."""
-    points = [
-        (radius * math.cos(angle), radius * math.sin(angle))
-        for radius, count in ((1.0, 13), (0.78, 9), (0.43, 5), (0.0, 1))
-        for angle in 2.0 * math.pi * np.arange(count) / count
-    ]
-    return np.array(points)
-
-
-def _monomials(points: NDArray[Any]) -> NDArray[np.float64]:
-    return points[:, :1] ** EXPONENTS[:, 0] * points[:, 1:] ** EXPONENTS[:, 1]
-
-
-NODES = _bos_nodes()
-FROM_NODES = np.ascontiguousarray(np.linalg.inv(_monomials(NODES)))
-_POWER_X = np.ascontiguousarray(EXPONENTS[:, 0])
-_POWER_Y = np.ascontiguousarray(EXPONENTS[:, 1])
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
-def _substitute(
-    source: NDArray[np.float64],
-    matrix: NDArray[np.float64],
-    shift: NDArray[np.float64],
-    nodes: NDArray[np.float64],
-    from_nodes: NDArray[np.float64],
-    power_x: NDArray[np.int64],
-    power_y: NDArray[np.int64],
-    out: NDArray[np.float64],
-) -> None:
-    """Write the monomials of source(shift + matrix w) to ``out``, from node values."""
-    values = np.zeros(source.size)
-    xs, ys = np.empty(7), np.empty(7)
-    xs[0] = ys[0] = 1.0
-    for k in range(nodes.shape[0]):
-        x = shift[0] + matrix[0, 0] * nodes[k, 0] + matrix[0, 1] * nodes[k, 1]
-        y = shift[1] + matrix[1, 0] * nodes[k, 0] + matrix[1, 1] * nodes[k, 1]
-        for i in range(1, 7):
-            xs[i] = xs[i - 1] * x
-            ys[i] = ys[i - 1] * y
-        for j in range(source.size):
-            values[k] += source[j] * xs[power_x[j]] * ys[power_y[j]]
-    out[:] = 0.0
-    for j in range(source.size):
-        for k in range(source.size):
-            out[j] += from_nodes[j, k] * values[k]
-    out[0] = 0.0
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
-def _frames(
-    polynomial: NDArray[np.float64],
-    radius: NDArray[np.float64],
-    jacobian: NDArray[np.float64],
-    ellipse: NDArray[np.float64],
-    tables: tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]],
-    box: NDArray[np.float64],
-    disc: NDArray[np.float64],
-    half: NDArray[np.float64],
-    shear: NDArray[np.float64],
-) -> None:
-    """Fill the arrays of `PupilFrames`."""
-    nodes, from_nodes, power_x, power_y = tables
-    matrix, shift, lower = np.empty((2, 2)), np.empty(2), np.zeros((2, 2))
-    lower[0, 0] = 1.0
-    zero = np.zeros(2)
-    for p in range(polynomial.shape[0]):
-        cx, cy, major, minor, angle = ellipse[p]
-        cosine, sine = math.cos(angle), math.sin(angle)
-        exx = major * major * cosine * cosine + minor * minor * sine * sine
-        eyy = major * major * sine * sine + minor * minor * cosine * cosine
-        exy = (major * major - minor * minor) * cosine * sine
-        j = jacobian[p]
-        det = j[0, 0] * j[1, 1] - j[0, 1] * j[1, 0]
-        # Inverse transpose of J: from the pupil's u to t.
-        txx, txy = j[1, 1] / det, -j[1, 0] / det
-        tyx, tyy = -j[0, 1] / det, j[0, 0] / det
-        sxx = txx * txx * exx + 2.0 * txx * txy * exy + txy * txy * eyy
-        syy = tyx * tyx * exx + 2.0 * tyx * tyy * exy + tyy * tyy * eyy
-        sxy = txx * tyx * exx + (txx * tyy + txy * tyx) * exy + txy * tyy * eyy
-        half[p, 0], half[p, 1] = math.sqrt(sxx), math.sqrt(syy)
-        shear[p] = sxy / (half[p, 0] * half[p, 1])
-        for i in range(2):
-            for q in range(2):
-                matrix[i, q] = j[q, i] * half[p, q] / radius[p]
-        shift[0], shift[1] = cx / radius[p], cy / radius[p]
-        is_same = shift[0] == 0.0 and shift[1] == 0.0 and shear[p] == 0.0
-        is_same = is_same and abs(matrix[0, 1]) + abs(matrix[1, 0]) == 0.0
-        is_same = is_same and abs(matrix[0, 0] - 1.0) + abs(matrix[1, 1] - 1.0) < 1e-14
-        if is_same:
-            for k in range(1, polynomial.shape[1]):
-                box[p, k] = polynomial[p, k]
-            box[p, 0] = 0.0
-        else:
-            _substitute(
-                polynomial[p],
-                matrix,
-                shift,
-                nodes,
-                from_nodes,
-                power_x,
-                power_y,
-                box[p],
-            )
-        if shear[p] == 0.0:
-            for k in range(box.shape[1]):
-                disc[p, k] = box[p, k]
-        else:
-            lower[1, 0] = shear[p]
-            lower[1, 1] = math.sqrt(1.0 - shear[p] * shear[p])
-            _substitute(
-                box[p], lower, zero, nodes, from_nodes, power_x, power_y, disc[p]
-            )
 
 
 def _log_amplitudes(
@@ -229,16 +111,14 @@ def pupil_frames(
     jacobian = np.ascontiguousarray(pixel_from_mrad, dtype=np.float64)
     box, disc = np.empty((count, N_TERMS)), np.empty((count, N_TERMS))
     half, shear = np.empty((count, 2)), np.empty(count)
-    _frames(
+    compiled_psfs().call(
+        "frame_pupils",
+        count,
         np.ascontiguousarray(polynomial_um, dtype=np.float64),
         np.ascontiguousarray(circle_radius_mm, dtype=np.float64),
-        jacobian,
         np.ascontiguousarray(pupil_ellipse, dtype=np.float64),
-        (NODES, FROM_NODES, _POWER_X, _POWER_Y),
-        box,
-        disc,
-        half,
-        shear,
+        jacobian,
+        *(box, disc, half, shear),
     )
     return PupilFrames(
         box_polynomial_um=box,

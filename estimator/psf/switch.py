@@ -14,19 +14,14 @@ from numpy.typing import NDArray
 
 from estimator.optics.zernike import inverse_monomial_matrix
 from estimator.psf.survey import PupilSurvey
-
-BASE_DB = 41.56
-PER_RMS_DB = 7.40
-PER_PIXEL_DB = 5.88
-PER_NARROW_DB = 2.58
-"""PSNR of ray optics: constant, and slopes per decade of the RMS in waves, of the pixel
-in lambda/D, and of one plus `PupilSurvey.narrow_ratio`."""
-
-GEOMETRIC_FROM_DB = 51.0
-CROSS_FADE_DB = 0.5
-"""Predicted PSNR from which kernels of both engines are blended, and width of the
-blend, above which only ray optics is used.  The blend is narrow because it costs both
-engines; the step that it smooths has a PSNR above 50 dB."""
+from estimator.psf.tables import (
+    BASE_DB,
+    CROSS_FADE_DB,
+    GEOMETRIC_FROM_DB,
+    PER_NARROW_DB,
+    PER_PIXEL_DB,
+    PER_RMS_DB,
+)
 
 WAVE_DB = 54.0
 """PSNR exceeded by wave optics, and by the ENZ series within its domain."""

@@ -66,7 +66,6 @@ def state_survey(eye: EyeOptics, spec: GridSpec, states: PupilStates) -> PupilSu
     return survey.with_screen(
         ScreenTables.from_screen(
             eye.rings.seen_from(states.h_deg, states.v_deg),
-            half_width_um_per_px=survey.frames.half_width_um_per_px,
             pixel_from_mrad=spec.node_pixel_from_mrad(states.h_deg, states.v_deg),
             pupil_ellipse=eye.wavefronts(**vars(states)).pupil_ellipse,
             wavelength_nm=states.wavelength_nm,

@@ -17,6 +17,7 @@ from estimator.psf.compiled import CompiledPsfs, compiled_psfs
 from estimator.psf.compute import ACCURACY
 from estimator.psf.screens import BEYOND_EDGE, ONE_CENTER, TABLE_COUNT
 from estimator.psf.stiles_crawford import StilesCrawford
+from filter_service.constants import RGB
 from filter_service.planning.node_wavefronts import NodeWavefronts
 from filter_service.psfs.boxes import CUT_STEPS, MAX_CENTROID_SHIFT_RATIO
 from filter_service.psfs.pack import PackedKernels
@@ -146,6 +147,7 @@ class NativePsfs:
             arrays["ring_reach_mrad"] = rings.reach_mrad
         found = self.engine.compute(
             arrays,
+            groups * RGB + channels,
             groups,
             channels,
             ring_tables=None if rings is None else rings.amplitude_ratio,
@@ -180,7 +182,6 @@ class NativePsfs:
 
 
 @cache
-def native_psfs() -> NativePsfs | None:
-    """Return the engine of this process, or None if the library is missing."""
-    engine = compiled_psfs()
-    return None if engine is None else NativePsfs(engine)
+def native_psfs() -> NativePsfs:
+    """Return the engine of this process."""
+    return NativePsfs(compiled_psfs())

@@ -1,4 +1,4 @@
-"""Choice of the PSF engine: C, Python if there was no C compiler, or the ENZ series.
+"""Choice of the PSF engine: packed kernels in C, or the ENZ series.
 
 There is no GPU engine.  On a machine with an H200, 16 cores compute the paper's set of
 201,825 PSFs in C in 0.64 s.  Compute shaders took 3.2 s and three to five times the
@@ -15,7 +15,6 @@ from estimator.psf.compute import PsfBatch, compute_psf_batch
 from estimator.threads import thread_count
 from filter_service.psfs.native_psfs import NativePsfs, native_psfs
 
-PYTHON_BATCH = 768
 NATIVE_BATCH = 1024
 """PSFs between checks of progress and cancellation: about 0.05 s on two cores."""
 
@@ -39,23 +38,15 @@ class PsfEngine:
     native: NativePsfs | None = None
 
 
-PYTHON = PsfEngine(compute_psf_batch, PYTHON_BATCH)
-"""Fallback if the package was installed without a C compiler."""
-
-
 @cache
 def psf_engine(pipeline: str = "exact") -> PsfEngine:
     """Return the engine of a pipeline.
 
-    That of "exact" is the compiled one, or `PYTHON` if it was not built.  That of
-    "published" is the ENZ series to the paper's Zernike degree, also where the
-    aberrations require a higher one.  Its PSFs take up to 0.25 s of a core, so there is
-    one for each thread between two checks.
+    That of "exact" is the compiled one.  That of "published" is the ENZ series to the
+    paper's Zernike degree, also where the aberrations require a higher one.  Its PSFs
+    take up to 0.25 s of a core, so there is one for each thread between two checks.
     """
     if pipeline == "published":
         series = partial(compute_psf_batch, method="enz_unchecked")
         return PsfEngine(series, thread_count())
-    native = native_psfs()
-    if native is None:
-        return PYTHON
-    return PsfEngine(compute_psf_batch, NATIVE_BATCH, native)
+    return PsfEngine(compute_psf_batch, NATIVE_BATCH, native_psfs())

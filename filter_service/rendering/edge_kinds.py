@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.psf.survey import N_EDGE
+from estimator.psf.tables import N_EDGE
 from filter_service.constants import RGB
 from filter_service.planning.grid import GREEN
 from filter_service.psfs.frame_layers import FrameLayers

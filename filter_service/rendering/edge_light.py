@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.psf.survey import N_EDGE
+from estimator.psf.tables import N_EDGE
 from filter_service.constants import RGB
 from filter_service.rendering.bright_pixels import BrightPixels
 from filter_service.rendering.edge_kinds import EdgeElements, EyeAtFrame, SourceKinds

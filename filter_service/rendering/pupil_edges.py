@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from estimator.optics.zernike import wavefront_polynomial
 from estimator.psf.pupil import pupil_frames
-from estimator.psf.survey import N_EDGE, survey_pupils
+from estimator.psf.survey import survey_pupils
+from estimator.psf.tables import N_EDGE
 from filter_service.constants import RGB
 from filter_service.planning.slopes import apodization
 from filter_service.psfs.store import PsfStore

@@ -1,4 +1,4 @@
-"""Time per packed kernel: the C engine and its Python twin.
+"""Time per packed kernel: boxes computed directly, and discs that are packed.
 
     python -m tests.benchmarks.bench_kernels [--quick] [--json]
 
@@ -19,12 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.optics.units import SPHERE_PER_C20
+from estimator.psf.compute import compute_psf_batch
 from filter_service.constants import RGB
 from filter_service.planning.node_wavefronts import NodeWavefronts
 from filter_service.planning.plan import plan_cache
 from filter_service.psfs.compute_kernels import computed_kernels, generic_kernels
 from filter_service.psfs.pack import PackedKernels
-from filter_service.psfs.psf_engine import PYTHON, psf_engine
+from filter_service.psfs.psf_engine import PsfEngine, psf_engine
 from filter_service.psfs.store import PsfStore
 from tests.benchmarks.harness import Row, memory_mb, publish
 from tests.benchmarks.psf_rates import FOCUSES_DPT, PUPILS_MM, traced_slices
@@ -46,6 +47,8 @@ WIDEST_PX = 40
 """Reach of sampled kernels: the quadrature of wider ones takes minutes."""
 
 Compute = Callable[[NDArray[np.int64]], PackedKernels]
+
+DISCS = PsfEngine(compute_psf_batch, 1024)
 
 
 def unit_kernel(
@@ -128,9 +131,9 @@ def rows_of(
             )
     ratio = rows[2].median_ms / rows[0].median_ms
     print(
-        f"{case:24} C {1e3 * rows[0].median_ms:6.1f} us ({rows[0].setting}), twin "
+        f"{case:24} C {1e3 * rows[0].median_ms:6.1f} us ({rows[0].setting}), discs "
         f"{1e3 * rows[2].median_ms:6.1f} us: {ratio:.1f} times; L2 median, p95: "
-        f"C {rows[0].error:.4f}, {rows[1].error:.4f}, twin {rows[2].error:.4f}, "
+        f"C {rows[0].error:.4f}, {rows[1].error:.4f}, discs {rows[2].error:.4f}, "
         f"{rows[3].error:.4f}",
         flush=True,
     )
@@ -151,7 +154,7 @@ def lattice_rows(eye_name: str, count: int) -> list[Row]:
         name: lambda some, engine=engine: computed_kernels(
             eye, spec, store.nodes, some, engine
         )[0]
-        for name, engine in (("C", psf_engine()), ("twin", PYTHON))
+        for name, engine in (("C", psf_engine()), ("discs", DISCS))
     }
 
     def total_dpt(some):
@@ -183,13 +186,13 @@ def engines_of(wavefronts: NodeWavefronts, eye, spec) -> dict[str, Compute]:
         assert not left.size
         return packed
 
-    def by_twin(psfs):
+    def by_discs(psfs):
         return generic_kernels(
-            *(eye, spec, wavefronts, PYTHON),
+            *(eye, spec, wavefronts, DISCS),
             *(psfs // RGB, psfs % RGB, np.zeros(psfs.size)),
         )[0]
 
-    return {"C": by_c, "twin": by_twin}
+    return {"C": by_c, "discs": by_discs}
 
 
 def nodes_of(zernike_um, circle_mm, ellipse, wavelength_nm, jacobian) -> NodeWavefronts:

@@ -9,8 +9,7 @@ from estimator.corrections.kinoform import Kinoform
 from estimator.corrections.lenslets import Lenslets
 from estimator.corrections.rings import DiffractiveRings, RefractiveZones
 from estimator.native import Core, core
-from estimator.psf import fourier
-from estimator.psf.compiled import CompiledPsfs, fft_lengths
+from estimator.psf.compiled import CompiledPsfs
 from estimator.psf.compute import compute_psf_batch
 from estimator.psf.kernel_types import PsfTooLarge
 from estimator.psf.stiles_crawford import StilesCrawford
@@ -35,9 +34,6 @@ LENSES = {
         power_dpt=3.5, diameter_mm=1.03, pitch_mm=1.5, inner_mm=0.5, outer_mm=16.0
     ),
 }
-
-if native_psfs() is None:
-    pytest.skip("the native engine was not built here", allow_module_level=True)
 
 
 def wavefronts_of(
@@ -82,28 +78,23 @@ def computed(wavefronts, *, engine=None, **options):
 
 
 def twin(wavefronts, *, diffraction=True, stiles_crawford=None, rings=None):
-    """The same kernels by `estimator.psf`, with FFTs of the same lengths."""
+    """The same kernels by `compute_psf_batch` and `pack_kernels`."""
     groups, channels, total_dpt = asked(wavefronts)
     primaries = wavefronts.wavelength_nm.shape[1]
     found = wavefronts.at(groups, channels, total_dpt)
     each = np.repeat(groups, primaries)
     directions_deg = wavefronts.h_deg[each], wavefronts.v_deg[each]
-    usual = fourier.plan_grids.__kwdefaults__
-    fourier.plan_grids.__kwdefaults__ = usual | {"lengths": fft_lengths()}
-    try:
-        batch = compute_psf_batch(
-            found.zernike_um,
-            pupil_diameter_mm=found.circle_diameter_mm,
-            pupil_ellipse=found.pupil_ellipse,
-            stiles_crawford=stiles_crawford,
-            pupil_screen=rings and rings.seen_from(*directions_deg),
-            wavelength_nm=wavefronts.wavelength_nm[channels].ravel(),
-            pixel_from_mrad=wavefronts.pixel_from_mrad[each],
-            diffraction=diffraction,
-            min_energy_ratio=1.0 - 0.2 * (1.0 - KEPT),
-        )
-    finally:
-        fourier.plan_grids.__kwdefaults__ = usual
+    batch = compute_psf_batch(
+        found.zernike_um,
+        pupil_diameter_mm=found.circle_diameter_mm,
+        pupil_ellipse=found.pupil_ellipse,
+        stiles_crawford=stiles_crawford,
+        pupil_screen=rings and rings.seen_from(*directions_deg),
+        wavelength_nm=wavefronts.wavelength_nm[channels].ravel(),
+        pixel_from_mrad=wavefronts.pixel_from_mrad[each],
+        diffraction=diffraction,
+        min_energy_ratio=1.0 - 0.2 * (1.0 - KEPT),
+    )
     return pack_kernels(mean_batch(batch, primaries), kept_energy_ratio=KEPT)
 
 

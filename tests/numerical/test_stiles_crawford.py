@@ -12,7 +12,7 @@ from estimator.psf.compute import compute_psf_batch
 from estimator.psf.stiles_crawford import StilesCrawford
 from filter_service.planning.plan import plan_cache
 from filter_service.psfs.eye_for_spec import eye_for_spec
-from filter_service.psfs.psf_engine import PYTHON
+from filter_service.psfs.psf_engine import PsfEngine
 from filter_service.psfs.store import build_psf_store
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec
@@ -23,6 +23,8 @@ SIZE_PX = 161
 MIDDLE_PX = SIZE_PX // 2
 LIGHT = 1000.0
 SIDES = ("OD", "OS")
+
+DISCS = PsfEngine(compute_psf_batch, 1024)  # packed by `pack_kernels`
 
 
 def myope(sphere_dpt, eye_side="OD"):
@@ -184,13 +186,13 @@ def test_apodized_kernels_are_narrower_and_lose_no_light(mode):
 def test_off_the_pupil_counts_alike_and_engines_hear_of_no_effect():
     spec = spec_for(pupil_mm=4.0)
     eye, _ = eye_for_spec(myope(-1.0), spec)
-    build = partial(build_psf_store, eye, engine=PYTHON)
+    build = partial(build_psf_store, eye, engine=DISCS)
 
     def compute(*arguments, stiles_crawford, **options):
         assert stiles_crawford is None
         return compute_psf_batch(*arguments, **options)
 
-    plain = build_psf_store(eye, spec, engine=replace(PYTHON, compute=compute))
+    plain = build_psf_store(eye, spec, engine=replace(DISCS, compute=compute))
     off = build(spec.with_settings(stiles_crawford=False))
     on = build(spec.with_settings(stiles_crawford=True))
     for name in ("kernels", "offsets", "reach_px", "radius_px", "peak_ratio"):

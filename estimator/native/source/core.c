@@ -9,6 +9,7 @@
 EXPORT void ocu_sizes(int32_t *sizes) {
     sizes[0] = (int32_t)sizeof(psf_job);
     sizes[1] = (int32_t)sizeof(psf_tables);
+    sizes[2] = (int32_t)sizeof(psf_discs_job);
 }
 
 EXPORT pool *ocu_pool_new(int n_threads) { return pool_new(n_threads); }

@@ -9,10 +9,17 @@
 #include "psf_fft.h"
 #include "psf_waves.h"
 #include "psfs.h"
+#include "psf_discs.h"
+#include "psf_surveys.h"
 
 static const named_function functions[] = {
     FUNCTION(psfs),
     FUNCTION(take_psfs),
+    FUNCTION(psf_discs),
+    FUNCTION(frame_pupils),
+    FUNCTION(survey_pupils),
+    FUNCTION(needed_radii),
+    FUNCTION(edge_lights_outside),
     {NULL, NULL},
 };
 

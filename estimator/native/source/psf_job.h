@@ -6,7 +6,6 @@
 
 #include "pool.h"
 
-#define RGB 3
 #define N_TERMS 28            /* of a wavefront: degree 6 */
 #define N_POWERS 7
 #define N_EDGE 48             /* points of a survey on the pupil's edge */
@@ -14,6 +13,7 @@
 #define SURVEY_STRIDE 200
 #define ELLIPSE_COLUMNS 5
 #define LOG_AMPLITUDES 6
+#define PIXEL_CORNER_PX 0.21   /* to the corner of a pixel; see survey.py */
 
 /* Tables of the modules of estimator/psf, so that each number is defined once. */
 typedef struct {
@@ -46,7 +46,7 @@ typedef struct {
 
 enum { PSF_DONE = 0, PSF_NOT_HERE = 1, PSF_NO_MEMORY = 2 };
 
-/* Wavefronts of nodes, (groups, 3, primaries, ...), and the requested PSFs. */
+/* Wavefronts of nodes, (nodes, primaries, ...), and the requested PSFs. */
 typedef struct {
     pool *threads;
     const psf_tables *tables;
@@ -55,30 +55,47 @@ typedef struct {
     const double *circle_diameter_mm; /* (...) */
     const double *pupil_ellipse;      /* (..., 5) */
     const double *pixel_from_mrad;    /* (groups, 2, 2) */
-    const double *wavelength_nm;      /* (3, primaries) */
-    const double *apodization_per_mm2; /* (3, primaries), or none */
+    const double *wavelength_nm;      /* (channels, primaries) */
+    const double *apodization_per_mm2; /* (channels, primaries), or none */
     double apodization_center_mm[2];
     /* Rings in the pupils; none if there is no table. */
     const double *ring_offset_mm;     /* (..., 2): of the pupil's center from the rings' */
     const double *ring_reach_mrad;    /* (...): reach of their light beyond the rays */
-    const float *ring_tables;         /* (3, primaries, ring_count, 2): complex amplitude
+    const float *ring_tables;         /* (channels, primaries, ring_count, 2): amplitude
                                        * by squared distance */
     double ring_steps_per_mm2;
     double ring_lattice_mm[3];        /* of a honeycomb: pitch, inner and outer radius */
     double cut_ratio;                 /* share of the light that is cropped */
     double centroid_ratio;            /* most that this shifts the centroid */
     double oversampling, margin;
-    const int64_t *groups, *channels; /* (count,) */
+    const int64_t *nodes, *groups, *channels; /* (count,) */
     const double *total_dpt;          /* (count,) */
     int64_t *reach_px;                /* (count, 4): results */
     int64_t *radius_px;
     int64_t *sizes;                   /* texels */
     double *peak_ratio, *spread_px, *lost_ratio, *rays_ratio;
     int32_t *outcome;                 /* PSF_DONE, or the reason for no kernel */
-    void *results;                    /* of the threads, until take_all_psfs */
+    void *results;                    /* of the threads, until take_psfs */
     int32_t count, primaries;
     int32_t max_radius_px, is_diffracting;
     int32_t min_samples_per_px, ring_count, cut_steps;
 } psf_job;
+
+/* Surveyed pupils (count, ...) and kernels over discs of given radii. */
+typedef struct {
+    const psf_job *job;               /* threads, tables, sampling, rings */
+    const double *box_um, *half_width, *shear, *log_amplitude; /* of `PupilFrames` */
+    const double *wavelength_um;
+    const double *low_px, *high_px, *edge_px, *normal, *edge_um, *passed_ratio;
+    const double *pixel_from_mrad;
+    const double *ring_offset_mm;     /* none if there are no rings */
+    const int64_t *ring_channels;
+    const double *rays_ratio;         /* share of ray optics */
+    const int64_t *radius_px, *first; /* radii, and offsets in the kernels */
+    float *kernels;                   /* zeros, to which kernels are added */
+    double *light_ratio;              /* share of the light in the disc */
+    int32_t *outcome;
+    int64_t count;
+} psf_discs_job;
 
 #endif

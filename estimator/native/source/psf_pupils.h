@@ -89,8 +89,9 @@ static void substitute(const psf_tables *tables, const double *source,
     out[0] = 0.0;
 }
 
-/* Computes half sides, shear, and the wavefront over box and disc. */
-static void frame_pupil(const psf_tables *tables, const double *zernike_um,
+/* Computes half sides, shear, and the wavefront over box and disc, from monomials (28,) over
+ * a circle. */
+static void frame_pupil(const psf_tables *tables, const double *monomials_um,
                         double radius_mm, const double *ellipse, const double *jacobian,
                         pupil *own) {
     double cosine = cos(ellipse[4]), sine = sin(ellipse[4]);
@@ -112,9 +113,7 @@ static void frame_pupil(const psf_tables *tables, const double *zernike_um,
     for (int i = 0; i < 2; ++i)
         for (int q = 0; q < 2; ++q)
             matrix[2 * i + q] = jacobian[2 * q + i] * own->half[q] / radius_mm;
-    double monomials[N_TERMS];
-    times_matrix(zernike_um, tables->monomials, monomials);
-    substitute(tables, monomials, matrix, shift, own->box);
+    substitute(tables, monomials_um, matrix, shift, own->box);
     if (own->shear == 0.0) {
         memcpy(own->disc, own->box, sizeof own->disc);
         return;

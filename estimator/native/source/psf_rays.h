@@ -1,5 +1,8 @@
-/* Ray optics with Fresnel diffraction at the edge; derived in
- * estimator/psf/geometric_kernels.py. */
+/* Ray optics: footprints of pupil cells, plus diffraction at the pupil's edge.
+ *
+ * If blur is wider than diffraction, light deviates from ray optics only near the image of the
+ * edge of the pupil, where it follows Fresnel diffraction at a straight edge.  Without
+ * diffraction, the method is exact at any blur; the PSF of a perfect eye is one pixel. */
 
 typedef float f32x2 __attribute__((vector_size(8)));
 
@@ -7,7 +10,24 @@ typedef float f32x2 __attribute__((vector_size(8)));
 typedef struct {
     float *pixels;
     int left, top, width, height;
+    int radius;               /* of the disc about the chief ray that is used; 0: all */
 } canvas;
+
+/* Largest x of the disc x^2 + y^2 <= (radius + 1/2)^2. */
+INLINE int disc_reach(int radius, int y) {
+    return (int)sqrt(square(radius + 0.5) - square(y));
+}
+
+/* First and last column of a row that are used. */
+INLINE int first_column(const canvas *c, int row) {
+    if (c->radius == 0) return 0;
+    return larger_int(0, -disc_reach(c->radius, c->top - row) - c->left);
+}
+
+INLINE int last_column(const canvas *c, int row) {
+    if (c->radius == 0) return c->width - 1;
+    return smaller_int(c->width - 1, disc_reach(c->radius, c->top - row) - c->left);
+}
 
 #define MOST_CELLS 192
 #define PROFILE_STEPS 17      /* of 1/2 px near the edge's image, of 1 px farther out */
@@ -387,8 +407,9 @@ static void lift_to_tail(const tail *t, const canvas *c, float from_px) {
     for (int row = 0; row < c->height; ++row) {
         float *to = c->pixels + row * c->width;
         float y = (float)(c->top - row);
-        for (int column = 0; column < c->width; column += LANES) {
-            int count = smaller_int(LANES, c->width - column);
+        int last = last_column(c, row);
+        for (int column = first_column(c, row); column <= last; column += LANES) {
+            int count = smaller_int(LANES, last + 1 - column);
             f32x8 light = all8(INFINITY);
             memcpy(&light, to + column, sizeof(float) * (size_t)count);
             if (!any8(light < brightest)) continue;

@@ -1,5 +1,7 @@
-/* Wave optics, derived in estimator/psf/fourier.py and fourier_kernels.py.  Fields are
- * filled, transformed and summed in strips of sixteen columns that fit in the cache. */
+/* Wave optics.  PSF(p) = |int_pupil exp(2 pi i (W - p.t) / lambda) dt|^2 / (lambda^2 A) in the
+ * coordinates of estimator/psf/pupil.py, with A the pupil's area there.  Fields are filled,
+ * transformed and summed in strips of sixteen columns that fit in the cache.  All arithmetic
+ * is in single precision. */
 
 /* Sampling of one PSF, x before y. */
 typedef struct {

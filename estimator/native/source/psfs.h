@@ -22,6 +22,14 @@ typedef struct {
     int64_t count, room;
 } psf_work;
 
+static void free_work(psf_work *w) {
+    free_wave_work(&w->waves);
+    free(w->plane.at);
+    free(w->part.at);
+    free(w->kept.at);
+    free(w->words);
+}
+
 typedef struct {
     psf_work *work;           /* one per thread */
     int64_t *first;           /* (count,) in the words of the thread */
@@ -35,16 +43,16 @@ INLINE int clamp_int(int value, int low, int high) {
 /* Prepares the pupil of one primary. */
 static void prepare_pupil(const psf_job *job, int psf, int primary, pupil *own) {
     const psf_tables *tables = job->tables;
-    int64_t group = job->groups[psf], channel = job->channels[psf];
-    int64_t node = (group * RGB + channel) * job->primaries + primary;
-    int64_t color = channel * job->primaries + primary;
-    double zernike_um[N_TERMS];
+    int64_t group = job->groups[psf], node = job->nodes[psf] * job->primaries + primary;
+    int64_t color = job->channels[psf] * job->primaries + primary;
+    double zernike_um[N_TERMS], monomials_um[N_TERMS];
     for (int t = 0; t < N_TERMS; ++t)
         zernike_um[t] = job->zernike_um[node * N_TERMS + t]
                         + job->total_dpt[psf] * job->per_dpt_um[node * N_TERMS + t];
+    times_matrix(zernike_um, tables->monomials, monomials_um);
     const double *ellipse = job->pupil_ellipse + node * ELLIPSE_COLUMNS;
     const double *jacobian = job->pixel_from_mrad + group * 4;
-    frame_pupil(tables, zernike_um, job->circle_diameter_mm[node] / 2.0, ellipse, jacobian,
+    frame_pupil(tables, monomials_um, job->circle_diameter_mm[node] / 2.0, ellipse, jacobian,
                 own);
     own->wavelength_um = job->wavelength_nm[color] / 1000.0;
     memset(own->log_amplitude, 0, sizeof own->log_amplitude);
@@ -95,12 +103,15 @@ static void widen_box(const pupil *own, const grid *g, int is_diffracting, int b
 static void lift_beyond(const tail *t, const grid *g, const canvas *c) {
     for (int row = 0; row < c->height; ++row) {
         int y = c->top - row, is_done = y >= g->window[2] && y <= g->window[3];
-        for (int column = 0; column < c->width; column += LANES) {
+        int last = last_column(c, row);
+        for (int column = first_column(c, row); column <= last; column += LANES) {
+            int x0 = c->left + column;
+            if (is_done && x0 >= g->window[0] && x0 + LANES - 1 <= g->window[1]) continue;
             f32x8 nearest, farthest, x = NUMBERS8 + all8((float)(c->left + column));
             float found[LANES];
             tail_distances8(t, x, (float)y, &nearest, &farthest);
             store8(found, tail_light8(t, x, (float)y, nearest, farthest));
-            for (int i = 0; i < LANES && column + i < c->width; ++i) {
+            for (int i = 0; i < LANES && column + i <= last; ++i) {
                 int at = c->left + column + i;
                 if (is_done && at >= g->window[0] && at <= g->window[1]) continue;
                 c->pixels[row * c->width + column + i] = found[i];
@@ -369,7 +380,7 @@ static int32_t compute_psf(const psf_job *job, int psf, psf_work *w) {
     for (int p = 0; p < job->primaries; ++p) {
         pupil *own = pupils + p;
         prepare_pupil(job, psf, p, own);
-        if (!(own->blur_px >= 0.0 && own->blur_px + 0.21 <= job->max_radius_px))
+        if (!(own->blur_px >= 0.0 && own->blur_px + PIXEL_CORNER_PX <= job->max_radius_px))
             return PSF_NOT_HERE;
         if (own->rays_ratio < 1.0 && !plan_grid(job, own, grids + p)) return PSF_NOT_HERE;
         widen_box(own, grids + p, job->is_diffracting, box);
@@ -389,7 +400,7 @@ static int32_t compute_psf(const psf_job *job, int psf, psf_work *w) {
             double weight = own->weight
                             * (by_rays ? own->rays_ratio : 1.0 - own->rays_ratio);
             if (weight <= 0.0) continue;
-            canvas c = {is_first ? plane : part, box[0], box[3], width, height};
+            canvas c = {is_first ? plane : part, box[0], box[3], width, height, 0};
             memset(c.pixels, 0, sizeof(float) * (size_t)count);
             if (by_rays) {
                 spot_of_rays(job->tables, own, job->is_diffracting, &c);
@@ -408,7 +419,7 @@ static int32_t compute_psf(const psf_job *job, int psf, psf_work *w) {
             is_first = 0;
         }
     job->rays_ratio[psf] = rays_ratio;
-    canvas c = {plane, box[0], box[3], width, height};
+    canvas c = {plane, box[0], box[3], width, height, 0};
     return pack_plane(job, psf, pupils, tails, &c, w);
 }
 
@@ -454,14 +465,7 @@ static void take_psfs(psf_job *job, uint16_t *words) {
         words += size;
     }
     int n_threads = results->work == NULL ? 0 : pool_size(job->threads);
-    for (int thread = 0; thread < n_threads; ++thread) {
-        psf_work *w = results->work + thread;
-        free_wave_work(&w->waves);
-        free(w->plane.at);
-        free(w->part.at);
-        free(w->kept.at);
-        free(w->words);
-    }
+    for (int thread = 0; thread < n_threads; ++thread) free_work(results->work + thread);
     free(results->work);
     free(results->first);
     free(results->thread);
