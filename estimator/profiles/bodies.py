@@ -99,7 +99,9 @@ class StraylightBody(Body, kw_only=True):
 class FileNoteBody(Body, kw_only=True):
     """A note of the reader of a file."""
 
-    code: Literal["file_comments", "file_configurations", "file_dispersion"]
+    code: Literal[
+        "file_axis", "file_comments", "file_configurations", "file_dispersion"
+    ]
     text: Annotated[str, Meta(max_length=MAX_NOTE_CHARACTERS)]
     values: Annotated[
         dict[str, float], Meta(max_length=8, description="numbers of the text")

@@ -4,6 +4,8 @@ import math
 from collections.abc import Mapping
 from typing import Any, NoReturn
 
+import numpy as np
+
 from estimator.eye.checked_fields import ProfileError
 from estimator.optics.zernike import N_TERMS, nm_from_index
 from estimator.profiles.lens_files import (
@@ -13,6 +15,7 @@ from estimator.profiles.lens_files import (
     Medium,
     glass,
     surfaces_body,
+    turned,
 )
 
 GEOMETRIES = (
@@ -142,19 +145,17 @@ def _element(number: int, surface: _Part, *, is_last: bool) -> Element:
     axes = geometry.part("cs")
     if axes.value("reference_cs") is not None:
         axes.refuse("reference_cs", "is not understood", "null")
-    x_mm, y_mm, z_mm = (axes.number(name) for name in ("x", "y", "z"))
-    turns = [axes.number(name) for name in ("rx", "ry", "rz")]
+    about_x, about_y, about_z = (
+        turned(k, axes.number(name)) for k, name in enumerate(("rx", "ry", "rz"))
+    )
     element = Element(
         number,
-        z_mm=z_mm,
+        vertex_mm=np.array([axes.number(name) for name in ("x", "y", "z")]),
+        axes=about_z @ about_y @ about_x,
         is_stop=surface.flag("is_stop"),
         medium=_medium(surface.part("material_post")),
     )
     shape = element.shape
-    if x_mm or y_mm:
-        shape["decentration_mm"] = [x_mm, y_mm]
-    if any(turns):
-        shape["rotation_deg"], shape["tilt_deg"] = _turns_deg(*turns)
     _shape(element, geometry)
     if surface.optional("aperture") is not None:
         aperture = surface.part("aperture")
@@ -209,21 +210,6 @@ def _zernike_sag(geometry: _Part) -> dict[str, Any]:
         n, m = nm_from_index(j)
         offsets.append(term * math.sqrt((2 - (m == 0)) * (n + 1)))
     return {"offset_mm": offsets, "offset_radius_mm": geometry.number("norm_radius")}
-
-
-def _turns_deg(rx: float, ry: float, rz: float) -> tuple[float, list[float]]:
-    """Return rotation and tilts for turns about x, then y, then z, in radians.
-
-    A profile turns a surface about z first, then about x, then about y.
-    """
-    (cx, sx), (cy, sy), (cz, sz) = ((math.cos(a), math.sin(a)) for a in (rx, ry, rz))
-    # rows of Rz Ry Rx that hold the other angles
-    first = cz * sy * cx + sz * sx
-    second = (sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx)
-    about_x = -math.asin(max(-1.0, min(1.0, second[2])))
-    about_y = math.atan2(first, cy * cx)
-    about_z = math.atan2(second[0], second[1])
-    return math.degrees(about_z), [math.degrees(about_x), math.degrees(about_y)]
 
 
 def _medium(material: _Part) -> Medium | None:

@@ -1,12 +1,16 @@
 """Eyes in sequential Zemax files (``.zmx``).
 
-Surfaces are conics, even aspheres, biconics and toroids; coordinate breaks decenter.
+Surfaces are conics, even aspheres, biconics and toroids; coordinate breaks decenter and
+tilt them.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from estimator.eye.checked_fields import ProfileError
 from estimator.profiles.lens_files import (
@@ -16,10 +20,17 @@ from estimator.profiles.lens_files import (
     glass,
     refused,
     surfaces_body,
+    turned,
 )
+
+TILTS = ("SCBD 1", "SCBD 2")
+"""Coordinate breaks before and behind a surface that belong to it.  Their values are
+the order flag, whether the others are picked up, the decentrations along x and y, and
+the tilts about x, y and z."""
 
 READ = {
     *("TYPE", "CURV", "DISZ", "CONI", "GLAS", "STOP", "CLAP", "FLAP", "DIAM", "PARM"),
+    *TILTS,
 }
 """Operands of a surface that are read."""
 
@@ -30,6 +41,7 @@ WITHOUT_EFFECT = {
     *("COAT", "MIRR", "POPS", "TCED", "MEMA", "OEMA"),
     # variables and solves of values that the file has as well
     *("VDSZ", "VPAR", "VCON", "PPAR", "PZUP", "PKUP", "MAZH", "CHZH", "EDGE", "QOFF"),
+    "SCBD 3",  # the surface whose axes a coordinate break returns to
 }
 """Operands of a surface that change no ray.  They are ignored."""
 
@@ -40,8 +52,19 @@ tolerances and configurations."""
 MM_PER_UNIT = {"MM": 1.0, "CM": 10.0, "IN": 25.4, "METER": 1000.0}
 """Units of length of a file, as OpticStudio writes them."""
 
+LENGTHS = {
+    "CURV": (-1, slice(1)),
+    **dict.fromkeys(("DISZ", "DIAM"), (1, slice(1))),
+    **dict.fromkeys(("CLAP", "FLAP"), (1, slice(2))),
+    **dict.fromkeys(TILTS, (1, slice(2, 4))),
+}
+"""Powers of the unit of length in the values of operands, and which values."""
+
 TYPES = ("STANDARD", "EVENASPH", "BICONICX", "TOROIDAL", "COORDBRK")
 EVEN_TERMS = 8
+
+LARGEST = 1e100
+"""Largest number: sums of larger ones could overflow.  Limits of a profile follow."""
 
 
 @dataclass
@@ -75,7 +98,7 @@ def zmx_body(text: str, name: str) -> dict[str, Any]:
         raise ProfileError("UNIT", f"{unit!r:.20}", ", ".join(MM_PER_UNIT))
     _convert_to_mm(file, MM_PER_UNIT[unit])
     body = surfaces_body(_elements(file), " ".join(file.own.get("NAME", [])) or name)
-    if notes := _notes(file):
+    if notes := [*body.get("notes", []), *_notes(file)]:
         body["notes"] = notes
     return body
 
@@ -92,6 +115,8 @@ def _operands(text: str) -> _File:
         if not (words := line.split()):
             continue
         operand, *values = words
+        if operand == "SCBD" and values:
+            operand, *values = f"SCBD {values[0]}", *values[1:]
         if operand == "SURF":
             if len(file.surfaces) > MAX_ELEMENTS:
                 raise ProfileError(
@@ -120,16 +145,15 @@ def _operands(text: str) -> _File:
 
 def _convert_to_mm(file: _File, scale: float) -> None:
     """Multiply the lengths of all surfaces behind the object."""
-    powers = {"CURV": -1, "DISZ": 1, "DIAM": 1, "CLAP": 1, "FLAP": 1}
     for number, surface in enumerate(file.surfaces):
         if number == 0 or scale == 1.0:
             continue
-        for operand in powers.keys() & surface.keys():
-            count = 2 if operand in ("CLAP", "FLAP") else 1
-            values = surface[operand]
-            for k, value in enumerate(values[:count]):
-                length = _number(value, number, operand)
-                values[k] = repr(length * scale ** powers[operand])
+        for operand in LENGTHS.keys() & surface.keys():
+            power, lengths = LENGTHS[operand]
+            surface[operand][lengths] = [
+                repr(_number(value, number, operand) * scale**power)
+                for value in surface[operand][lengths]
+            ]
         kind = (surface.get("TYPE") or ["STANDARD"])[0]
         terms = file.parameters[number]
         for term in terms:
@@ -168,7 +192,7 @@ def _elements(file: _File) -> list[Element]:
     if file.surfaces and "GLAS" in file.surfaces[0]:
         raise refused(0, "GLAS in front of the eye", "an eye in air")
     elements: list[Element] = []
-    z_mm, x_mm, y_mm = 0.0, 0.0, 0.0
+    vertex_mm, axes = np.zeros(3), np.eye(3)
     for number, (block, parms) in enumerate(
         zip(file.surfaces, file.parameters, strict=True)
     ):
@@ -182,18 +206,47 @@ def _elements(file: _File) -> list[Element]:
         if unknown:
             problem = f"operand {unknown[0]!r:.20} is not understood"
             raise refused(number, problem, "files without it")
+        before, behind = (_tilts(block.get(o, []), number, o) for o in TILTS)
         if kind == "COORDBRK":
-            if any(parms.get(i, 0.0) for i in (3, 4, 5)):
-                raise refused(number, "COORDBRK tilts", "COORDBRK that decenters only")
-            x_mm, y_mm = x_mm + parms.get(1, 0.0), y_mm + parms.get(2, 0.0)
-        else:
+            before = [parms.get(k, 0.0) for k in (6, 1, 2, 3, 4, 5)]
+        vertex_mm, axes = _broken(vertex_mm, axes, before)
+        if kind != "COORDBRK":
             elements.append(_element(number, block, parms, kind))
-            elements[-1].z_mm = z_mm
-            if x_mm or y_mm:
-                elements[-1].shape["decentration_mm"] = [x_mm, y_mm]
+        elif "STOP" in block:  # a plane without refraction
+            medium = elements[-1].medium if elements else None
+            elements.append(Element(number, medium=medium, is_stop=True))
+        if elements and elements[-1].number == number:
+            elements[-1].vertex_mm, elements[-1].axes = vertex_mm, axes
+        vertex_mm, axes = _broken(vertex_mm, axes, behind)
         if number < len(file.surfaces) - 1:
-            z_mm += _number((block.get("DISZ") or ["0"])[0], number, "DISZ")
+            thickness_mm = _number((block.get("DISZ") or ["0"])[0], number, "DISZ")
+            vertex_mm = vertex_mm + thickness_mm * axes[:, 2]
     return elements
+
+
+def _tilts(values: Sequence[str], number: int, operand: str) -> list[float]:
+    """Return order flag, decentrations and tilts of a surface."""
+    found = [_number(value, number, operand) for value in values[:7]]
+    order, _, *parts = found + [0.0] * (7 - len(found))
+    return [order, *parts]
+
+
+def _broken(
+    vertex_mm: NDArray[np.float64], axes: NDArray[np.float64], parts: Sequence[float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the frame behind a coordinate break.
+
+    The frame is decentered, then tilted about its x, y and z axes, each of which the
+    tilts before have turned.  With an order flag, the sequence is reversed, so that
+    the negative parts of a break undo it.
+    """
+    order, x_mm, y_mm, *tilts_deg = parts
+    shift_mm = np.array([x_mm, y_mm, 0.0])
+    x, y, z = (turned(k, math.radians(tilts_deg[k])) for k in range(3))
+    if order:
+        axes = axes @ z @ y @ x
+        return vertex_mm + axes @ shift_mm, axes
+    return vertex_mm + axes @ shift_mm, axes @ x @ y @ z
 
 
 def _element(
@@ -278,6 +331,6 @@ def _number(text: str, number: int, operand: str) -> float:
         value = float(text.replace(",", "."))
     except ValueError:
         value = math.nan
-    if not math.isfinite(value):
+    if not abs(value) <= LARGEST:  # NaN is not
         raise refused(number, f"{operand} {text!r:.30} is not a number", "a number")
     return value

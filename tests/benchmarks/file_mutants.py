@@ -492,7 +492,7 @@ def _store(folder: Path) -> bytes:
 
 
 def _lens_files() -> dict[str, bytes]:
-    """Return eyes that optiland saved, and the one of them that .zmx can express."""
+    """Return eyes that optiland saved, .zmx of one of them, and of tilted eyes."""
     eyes = json.loads((DATA / "optiland_files.json").read_bytes())["files"]
     files = {
         f"{name.replace(' ', '_')}.json": json.dumps(eye["json"]).encode()
@@ -501,6 +501,11 @@ def _lens_files() -> dict[str, bytes]:
     zmx = eyes["even asphere, centered"]["zmx"]
     files["eye.zmx"] = zmx.encode("latin-1")
     files["windows.zmx"] = (zmx + ZMX_ENDING).encode("utf-16")
+    broken = json.loads((DATA / "optiland_breaks.json").read_bytes())["files"]
+    zmx = broken["tilted eye"]["zmx"]["several"]
+    files["tilted.zmx"] = zmx.encode()
+    tilts = "  STOP\n  SCBD 1 0 0 0.1 0.2 2.5 0 1\n  SCBD 2 1 2 -0.1 -0.2 -2.5 0 -1\n"
+    files["surface_tilts.zmx"] = zmx.replace("  STOP\n", tilts).encode()
     old = json.loads((DATA / "optiland_old_files.json").read_bytes())["files"]
     for version, eye in old.items():
         files[f"version_{version}.json"] = json.dumps(eye["json"]).encode()

@@ -1,8 +1,9 @@
 """Random eyes traced by optiland, an independent package.
 
     python -m tests.numerical.optiland_eye     writes tests/data/optiland_eye.json,
-                                               optiland_forms.json and
-                                               optiland_files.json
+                                               optiland_forms.json,
+                                               optiland_files.json and
+                                               optiland_breaks.json
 
 optiland brings VTK and 0.5 GB with it, so it is an extra of its own
 (`pip install -c constraints.txt -e .[crosscheck]`): its rays are kept in that file, and
@@ -26,6 +27,7 @@ from tests.numerical.surface_bodies import parsed_eye
 FROZEN = Path(__file__).parents[1] / "data" / "optiland_eye.json"
 FROZEN_FORMS = FROZEN.with_name("optiland_forms.json")
 FROZEN_FILES = FROZEN.with_name("optiland_files.json")
+FROZEN_BREAKS = FROZEN.with_name("optiland_breaks.json")
 SEED = 20231
 WAVELENGTH_NM = 555.0
 
@@ -279,6 +281,132 @@ def saved_files(body):
     return found
 
 
+# ----- .zmx files with coordinate breaks
+
+BROKEN_HEAD = (
+    "MODE SEQ\nUNIT MM X W X CM MR CPMM\nENPD 3.0\nFTYP 0 0 1 1 0 0 0\n"
+    "WAVM 1 0.555 1\nPWAV 1\nXFLN 0\nYFLN 0\nFWGN 1\n"
+)
+BROKEN_INDICES = (1.0, 1.0, 1.376, *[1.3374] * 3, 1.42, *[1.336] * 3)
+"""Indices behind the surfaces of a broken eye, without its breaks."""
+
+
+def coordinate_break(shift_mm, tilts_deg, *, order=0):
+    """Lines of a coordinate break."""
+    parts = enumerate([*shift_mm, *tilts_deg, order], 1)
+    return ["TYPE COORDBRK", *(f"PARM {k} {v!r}" for k, v in parts if v), "DISZ 0"]
+
+
+def single_breaks(shift_mm, tilts_deg, *, order=0):
+    """Lines of breaks of one part each, which have one meaning in every program."""
+    turns = [np.where(np.arange(3) == k, tilts_deg, 0.0).tolist() for k in range(3)]
+    parts = [(shift_mm, [0.0] * 3), *(([0.0, 0.0], turn) for turn in turns)]
+    return [coordinate_break(*part) for part in (parts[::-1] if order else parts)]
+
+
+def broken_file(rng, *, single, turned):
+    """A .zmx file of an eye whose cornea, stop, lens and retina are tilted.
+
+    ``single`` writes breaks of one part each, ``turned`` tilts the whole eye.
+    """
+
+    def element(*lines, radius=0.0, to=0.0, index=None, conic=0.0):
+        curvature = 1.0 / radius if radius else 0.0
+        glass = [f"GLAS ___BLANK 1 0 {index} 0 0 0 0 0 0 0"] if index else []
+        lines = lines or ("TYPE STANDARD",)
+        shape = [f"CURV {curvature!r}", f"DISZ {to}", f"CONI {conic}"]
+        blocks.append([*lines, *shape, *glass])
+
+    def tilted(part):
+        blocks.extend(single_breaks(*part[:2], order=part[2]) if single else [])
+        blocks.extend([] if single else [coordinate_break(*part[:2], order=part[2])])
+
+    def drawn(shift_mm, tilt_deg, turn_deg, order=0):
+        tilts = rng.uniform(-1.0, 1.0, 3) * [tilt_deg, tilt_deg, turn_deg]
+        shift = rng.uniform(-shift_mm, shift_mm, 2)
+        return np.round(shift, 4).tolist(), np.round(tilts, 4).tolist(), order
+
+    def undone(shift, tilts, order):
+        return [-v for v in shift], [-v for v in tilts], 1 - order
+
+    blocks = [["TYPE STANDARD", "CURV 0.0", "DISZ INFINITY"]]
+    element(to=8.0)
+    whole, cornea = drawn(0.5, 8, 30), drawn(0.3, 4, 60, 1)
+    stop, lens, retina = drawn(0.2, 3, 20), drawn(0.3, 5, 90), drawn(0.3, 4, 10, 1)
+    if turned:
+        tilted(whole)
+    tilted(cornea)
+    element(radius=7.8, to=0.5, index=1.376, conic=-0.3)
+    element(radius=6.5, to=-0.5, index=1.3374, conic=-0.4)
+    tilted(undone(*cornea))
+    element(to=3.5, index=1.3374)
+    tilted(stop)
+    element("TYPE STANDARD", "STOP", to=0.05, index=1.3374)
+    tilted(lens)
+    toroid = ("TYPE TOROIDAL", "PARM 1 11.0")
+    element(*toroid, radius=11.5, to=3.7, index=1.42, conic=-1.2)
+    element(radius=-6.0, to=-3.7, index=1.336, conic=-1.0)
+    tilted(undone(*lens))
+    element(to=19.6, index=1.336)
+    tilted(retina)
+    element(radius=-12.0)
+    surfaces = (
+        "".join(f"  {line}\n" for line in [f"SURF {number}", *block])[2:]
+        for number, block in enumerate(blocks)
+    )
+    return BROKEN_HEAD + "".join(surfaces)
+
+
+def traced_breaks(text, rays):
+    """What optiland traces through a file: points and paths, and the stop's axes.
+
+    optiland 0.6.3 composes several tilts of one break in another order than
+    OpticStudio and ignores order flags, so the breaks must have one part each.
+    """
+    from optiland.fileio import load_zemax_file
+    from optiland.materials import IdealMaterial
+    from optiland.rays import RealRays
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "eye.zmx"
+        # where optiland looks for the radius of rotation
+        path.write_text(text.replace("PARM 1 11.0", "PARM 2 11.0"), encoding="utf-8")
+        surfaces = load_zemax_file(str(path)).surfaces
+    for index, surface in zip(BROKEN_INDICES, surfaces, strict=True):
+        surface.material_post = IdealMaterial(n=index)
+        surface.geometry.tol, surface.geometry.max_iter = 1e-14, 200
+    count = len(rays)
+    bundle = RealRays(*rays.T, np.ones(count), np.full(count, WAVELENGTH_NM / 1000.0))
+    surfaces.trace(bundle, skip=1)
+    stop = next(surface for surface in surfaces if surface.is_stop)
+    at_mm, axes = stop.geometry.cs.get_effective_transform()
+    points = np.stack([np.array(getattr(surfaces, name)) for name in "xyz"], -1)
+    kept = [1, 2, 4, 5, 6, 8]  # without planes that refract nothing
+    return {
+        "rays": rays.tolist(),
+        "points_mm": np.moveaxis(points, 0, 1)[:, kept].tolist(),
+        "paths_mm": np.array(surfaces.opd).T[:, kept].tolist(),
+        "stop_mm": np.ravel(at_mm).tolist(),
+        "stop_axes": np.array(axes).tolist(),
+    }
+
+
+def broken_files():
+    """Files with breaks, in both ways, and what optiland traces."""
+    found = {}
+    for name, turned in (("tilted parts", False), ("tilted eye", True)):
+        files = {
+            way: broken_file(
+                np.random.default_rng(SEED + 2), single=way == "single", turned=turned
+            )
+            for way in ("single", "several")
+        }
+        rays = random_rays(np.random.default_rng(SEED + 3), 12)
+        rays[:, 2] += 8.0  # the eye is behind a dummy surface
+        found[name] = {"zmx": files, **traced_breaks(files["single"], rays)}
+    return found
+
+
 def main():
     """Write the frozen eyes, rays and optiland's answer."""
     head = {
@@ -297,6 +425,8 @@ def main():
     files = {name: saved_files(body) for name, body in bodies.items()}
     text = json.dumps({**head, "files": files})
     FROZEN_FILES.write_text(text + "\n", encoding="utf-8")
+    text = json.dumps({**head, "files": broken_files()})
+    FROZEN_BREAKS.write_text(text + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -298,10 +298,9 @@ def test_a_floating_aperture_has_the_semi_diameter(tmp_path):
             "TYPE TOROIDAL\n  PARM 1 9\n  PARM 3 1E-5\n  CURV 0.1\n",
             "surface 5 .*TOROIDAL with other terms",
         ),
-        ("PARM 1 0.2", "PARM 3 5", "COORDBRK tilts"),
         ("CLAP 0 4.5", "CLAP 1 4.5", "CLAP with an inner radius"),
         ("CURV 0.1\n", "CURV 0.1\n  XDAT 1 2\n", "operand 'XDAT'"),
-        ("CURV 0.1\n", "CURV 0.1\n  SCBD 1 0 0 9 0\n", "operand 'SCBD'"),
+        ("CURV 0.1\n", "CURV 0.1\n  SCBD 4 0 0 9 0\n", "operand 'SCBD 4'"),
         ("DISZ INFINITY", "DISZ INFINITY\n  GLAS ___BLANK 1 0 1.3 0", "surface 0.*air"),
         ("CLAP 0 4.5", "FLAP 0 0", "FLAP with an inner radius, or without"),
         ("CURV 0.1\n", "CURV nan\n", "CURV 'nan' is not a number"),
@@ -319,10 +318,33 @@ def test_what_is_not_understood_is_refused_by_name(tmp_path, before, after, mess
         load_profile(path)
 
 
-@pytest.mark.parametrize("name", ["tilted conic", "toroid"])
-def test_tilts_in_zemax_files_are_refused(tmp_path, name):
-    with pytest.raises(InvalidFile, match="COORDBRK"):
-        loaded(tmp_path, name, "zmx")
+@pytest.mark.parametrize("place", ["shifted", "tilted"])
+def test_the_axis_is_that_of_the_stop(tmp_path, place):
+    plain = load_profile(_written(tmp_path, lambda data: data))
+    stop = {"shifted": {"x": 0.3}, "tilted": {"ry": math.radians(4.0)}}[place]
+
+    def moved(data):
+        data["surface_group"]["surfaces"][3]["geometry"]["cs"].update(stop)
+        return data
+
+    found = load_profile(_written(tmp_path, moved))
+    cornea = found.surfaces.relaxed.surfaces[0]
+    if place == "shifted":
+        assert cornea.decentration_mm == pytest.approx((-0.3, 0.0))
+        assert not found.notes
+        return
+    stop_mm = plain.surfaces.relaxed.stop_z_mm
+    assert cornea.tilt_deg == pytest.approx((0.0, -4.0))
+    x_mm = stop_mm * math.sin(math.radians(4.0))
+    assert cornea.decentration_mm == pytest.approx((x_mm, 0.0))
+    assert found.notes[0].values == pytest.approx({"axis_h_deg": 4, "axis_v_deg": 0})
+
+
+def _written(folder, change):
+    data = json.loads(json.dumps(FILES["tilted conic"]["json"]))
+    path = folder / "eye.json"
+    path.write_text(json.dumps(change(data)), encoding="utf-8")
+    return path
 
 
 def _change(surface, **parts):
@@ -373,8 +395,6 @@ def _change(surface, **parts):
     ],
 )
 def test_an_optic_that_is_not_understood_is_refused(tmp_path, change, message):
-    data = json.loads(json.dumps(FILES["tilted conic"]["json"]))
-    path = tmp_path / "eye.json"
-    path.write_text(json.dumps(change(data)), encoding="utf-8")
+    path = _written(tmp_path, change)
     with pytest.raises(InvalidFile, match=message):
         load_profile(path)
