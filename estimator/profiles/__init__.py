@@ -18,6 +18,7 @@ published            schematic eyes from the literature with their sources
 reference            JSON Schema, tables and limits of the typed profiles
 files                .json, .abp, .csv and .zmx profiles, and eyes by name
 coefficient_files    tables of coefficients in .abp and .csv files
+coefficient_table    settings and terms of such a file
 zemax_files          eyes in .zmx files
 optiland_files       eyes in JSON files of optiland
 lens_files           from surfaces of a lens file to the body of an eye

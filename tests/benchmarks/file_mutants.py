@@ -62,6 +62,10 @@ SHEET = (
     "sep=;\n# Frame: examiner\n# eye: left\n# Pupil diameter (mm): 6,0\n"
     "# Wavelength: 555 nm\n# Patient: A\nj;n;m;um\n4;2;0;3,2\n7;3;\u22121;0,25\n"
 )
+WIDE = (
+    '# units: um\n"pupil_diameter_mm","wavelength_nm","eye","Z(2,0)","Z2_2","C3-1"\n'
+    "6.0,555,OS,3.2,0.25,-0.125\n"
+)
 ZMX_ENDING = (
     'BLNK\nOPDX 0 1 0 9.2E-1\nTOL TOFF   0   0 0\nMNUM 2 1\nMOFF   0   1 ""\n'
     "THIC   2   1 0.5 0 0\n"
@@ -193,6 +197,7 @@ def kinds(folder: Path) -> list[Kind]:
                 "p.csv": CSV.encode(),
                 "sheet.csv": SHEET.encode(),
                 "windows.csv": SHEET.encode("utf-16"),
+                "wide.csv": WIDE.encode(),
             },
             profile,
             lambda path, beside: [*as_color, str(path), *_images(beside)],

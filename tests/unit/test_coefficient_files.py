@@ -21,6 +21,12 @@ BODY = {"kind": "zernike", "zernike_um": TERMS, "pupil_diameter_mm": 6.0} | {
 }
 
 
+WIDE = (
+    "# units: um\npupil_diameter_mm,wavelength_nm,Z2_0,Z2_2,Z2_-2,Z3_1\n"
+    "6.0,555,1.0,0.5,-0.5,0.6\n"
+)
+
+
 def loaded(tmp_path, content, suffix="csv"):
     path = tmp_path / f"eye.{suffix}"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -110,11 +116,62 @@ def test_other_comments_are_named_in_a_note(tmp_path):
     found = loaded(tmp_path, comments + SETTINGS + ROWS)
     assert_same_eye(found)
     (note,) = found.notes
-    assert note == "comments of the file without effect: 'Patient', 'Date'"
+    assert note == "entries of the file without effect: 'Patient', 'Date'"
     assert (note.code, note.values) == ("file_comments", {"comment_count": 2.0})
     # commands and the service get the note with the profile
     assert parse_profile(profile_body(tmp_path / "eye.csv")).notes == (note,)
     assert found.digest == loaded(tmp_path, SETTINGS + ROWS).digest
+
+
+def wide_rows(*, start="Z(", between=",", end=") um", **values):
+    """A row of settings and terms, with names of a style."""
+    names = [start + between.join(key.split(",")) + end for key in TERMS]
+    row = {"pupil_diameter_mm": 6.0, "wavelength (nm)": 555, **values}
+    return [[*row, *names], [*row.values(), *TERMS.values()]]
+
+
+@pytest.mark.parametrize(
+    ("style", "how"),
+    [
+        ({}, {}),  # quoted, because names have commas
+        ({}, {"delimiter": ";"}),
+        ({}, {"quoting": csv.QUOTE_ALL}),
+        ({"start": "c_", "between": "_", "end": "_um"}, {}),
+        ({"start": "z", "between": "", "end": " [µm]"}, {}),
+        ({"start": "Z[", "between": ", ", "end": "] (micron)"}, {"delimiter": "\t"}),
+    ],
+)
+def test_a_row_with_a_column_for_each_term(tmp_path, style, how):
+    found = loaded(tmp_path, written(wide_rows(**style), **how))
+    assert_same_eye(found)
+    assert not found.notes
+
+
+def test_columns_of_a_wide_row_are_settings_or_named_in_a_note(tmp_path):
+    rows = wide_rows(**{"": 0, "Eye": "left", "frame": "examiner", "Patient": "Anna"})
+    found = loaded(tmp_path, "# unit: um\n" + written(rows))
+    assert_same_eye(found, frame="examiner", eye_side="OS")
+    (note,) = found.notes
+    assert note == "entries of the file without effect: 'Patient'"
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        WIDE,
+        WIDE.replace("# units: um\n", "")
+        .replace("Z3_1", "Z3_1,units")
+        .replace("0.6", "0.6,um"),
+        WIDE.replace(",", ";").replace(".", ","),
+        WIDE.replace(",", " "),
+        # settings in lines of their own, behind the row too
+        "# units: um\n# Z2_0,Z2_2,Z2_-2,Z3_1\n1.0,0.5,-0.5,0.6\n" + SETTINGS,
+        # "Z20" is a term among such as "Z2-2"
+        SETTINGS + "Z20 um,Z22 um,Z2-2 um,Z31 um\n1.0,0.5,\u22120.5,0.6\n",
+    ],
+)
+def test_wide_rows_of_other_programs(tmp_path, content):
+    assert_same_eye(loaded(tmp_path, content))
 
 
 def written(rows, **how):
@@ -188,9 +245,29 @@ def test_a_table_that_numpy_writes(tmp_path, order):
             r"\.\.\. and 2 rows, 'Anna', 'Ben': which examination.*\"prescription\"",
         ),
         (
-            "eye,pupil_mm,Z2_0,Z2_2\nOD,6,1.0,0.5\n",
-            "line 1: a table with the columns 'eye', 'pupil_mm', 'Z2_0', 'Z2_2'; al",
+            WIDE.replace("6.0,555", "6.0,555,OD").replace("_nm", "_nm,eye")
+            + "5.0,555,OS,1,2,3,4\n",
+            "line 2: a table with the columns 'pupil_diameter_mm', 'wavelength_nm', "
+            "'eye', .* and 2 rows, '6.0', '5.0': which examination",
         ),
+        (WIDE.partition("\n6")[0], "line 2: a table with the columns"),
+        (
+            "eye,pupil_mm,Z2_0 um,Z2_2 um\nOD,6,1.0,0.5\n",
+            "line 2: 'pupil_mm' is not a setting; allowed: pupil_diameter_mm",
+        ),
+        (
+            "pupil_diameter_mm,Z2_0,Z2_2\n6,1.0,0.5\n",
+            "line 1: the columns 'Z2_0', 'Z2_2' state no unit; allowed: 'Z.n,m. um'",
+        ),
+        ("Z2_0 um,Z2_2 nm\n1,2\n", "line 1: the column 'Z2_2 nm' does not tell n fr"),
+        ("Z2_0 um,Z5 um\n1,2\n", "line 1: the column 'Z5 um' does not tell n from m"),
+        ("Z20 um,Z22 um\n1,2\n", "line 1: the column 'Z20 um' does not tell n from"),
+        ("Z3 um,Z4 um\n1,2\n", "line 1: a table with the columns 'Z3 um', 'Z4 um'"),
+        ("Z2_0 um,Z2_0 um\n1,2\n", "line 2: '2,0' is given twice"),
+        ("Z2_0 um,Noll\n1,2\n", "line 2: the column 'Noll' names 'noll'"),
+        ("Z2_0 um,axis\n1,2\n", "line 2: 'axis' is not a setting"),
+        ("Z2_0 um,Z2_2 um,\n1,x\n", "line 2: 'x' is not a number"),
+        ("Z2_0 um,Z2_2 um\n1,2,3\n", "line 2: cannot read '1,2,3'.* 2 cells, as in l"),
         # visisipy: coefficients by Noll's index, in waves
         (",coefficient,value\n0,1,0.48\n", "the columns '', 'coefficient', 'value'"),
         ("n,m,value\n2,0,1\n", "'n', 'm', 'value' state no coefficients in um"),

@@ -85,7 +85,7 @@ def test_a_near_object_makes_the_eye_hyperopic_by_its_vergence(eye_file):
 @pytest.mark.parametrize("command", ["wavefront", "psf"])
 def test_the_notes_of_the_profile_are_printed(eye_file, tmp_path, command):
     body = json.loads(eye_file.read_text(encoding="utf-8"))
-    text = "comments of the file without effect: 'Patient'"
+    text = "entries of the file without effect: 'Patient'"
     body["notes"] = [{"code": "file_comments", "text": text, "values": {}}]
     eye_file.write_text(json.dumps(body), encoding="utf-8")
     out = ["--pixel-arcmin", "1", "-o", tmp_path / "psf.npy"]
