@@ -5,3 +5,4 @@ from .library import LibraryUnavailable as LibraryUnavailable
 from .library import core as core
 from .library import in_use as in_use
 from .library import selected as selected
+from .library import shared_threads as shared_threads

@@ -13,6 +13,7 @@ import numpy as np
 
 from estimator.native import records
 from estimator.native.functions import FUNCTIONS
+from estimator.threads import thread_count
 
 PATH = Path(__file__).parent / "_core.so"
 FOLDER_VARIABLE = "OCUFILTER_LIBRARY_DIR"
@@ -245,6 +246,17 @@ def selected(path: Path) -> tuple[Path, bool]:
             f"{VARIANT_VARIABLE}={variant!r}; allowed: {', '.join(VARIANTS)}"
         )
     return path, variant == "portable"
+
+
+@cache
+def shared_threads() -> int:
+    """Return a handle for loops on all threads; the process keeps it.
+
+    Raises
+    ------
+    LibraryUnavailable
+    """
+    return core().new_threads(thread_count())
 
 
 @cache

@@ -7,4 +7,7 @@ FUNCTIONS = {
     "blend": "record",
     "splat": "record",
     "shrink": "record",
+    "cell_means": "pool f4[] i8 i8[] f8[] i8 i8 i8[] f8[] i8 i8 f4[]",
+    "add_scattered": "pool f4[] i8 i8 f4[] i8 i8 f8[] f8[] f8 f8[]",
+    "resample": "pool f4[] f4[] i8 i8 f8[] f8[] f4[] f4[]",
 }

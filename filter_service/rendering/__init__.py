@@ -47,9 +47,7 @@ edge_light       light of bright pixels beyond their kernels
 edge_light_loops  compiled loops of edge_light and edge_kinds
 visibility_loops  compiled loops: which points of the pupil see a pixel
 haze             straylight of the ocular media
-haze_loops       compiled loops of haze
 spectacles       spectacle magnification
-spectacle_loops  compiled loop of spectacles
 plan_once        warm-up of frame planning
 gl/              engine of compute shaders
 native/          engine of compiled loops

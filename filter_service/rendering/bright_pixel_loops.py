@@ -1,4 +1,4 @@
-"""Compiled loops of `bright_pixels.py`, see `haze_loops`."""
+"""Compiled loops of `bright_pixels.py`, see `haze.run_in_threads`."""
 
 import math
 

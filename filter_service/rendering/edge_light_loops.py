@@ -1,7 +1,7 @@
 """Compiled loops of `edge_light.py` and `edge_kinds.py`.
 
 Those that take ``start`` and ``end`` process a part of their range, for threads; see
-`haze_loops`.
+`haze.run_in_threads`.
 """
 
 import math

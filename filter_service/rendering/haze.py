@@ -23,9 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.media.straylight import Straylight
+from estimator.native import shared_threads
 from estimator.threads import thread_count
 from filter_service.camera import Camera
 from filter_service.constants import RGB
+from filter_service.native import loops
 
 CELL_DEG = 0.5
 """Edge of a cell, unless that exceeds `MAX_CELLS`.
@@ -49,22 +51,17 @@ def add_haze(
     gain_ratio: tuple[float, float, float] = (1.0, 1.0, 1.0),
 ) -> None:
     """Add straylight to linear light (height, width, 3) and apply gains, in place."""
-    from filter_service.rendering.haze_loops import add_scattered, mean_light
-
     grid = haze_grid(camera, straylight)
-    rows, columns = grid.rows, grid.columns
+    height, width, _ = color.shape
     coarse = np.empty((*grid.shape, RGB), np.float32)
-    cells = (rows.first_px, rows.shares, columns.first_px, columns.shares)
-    run_in_threads(mean_light, rows.count, color, *cells, coarse)
-    run_in_threads(
-        add_scattered,
-        len(color),
-        color,
-        grid.scatter(coarse),
-        rows.position,
-        columns.position,
-        1.0 - grid.fraction,
-        np.array(gain_ratio),
+    axes = [(a.first_px, a.shares, *a.shares.shape) for a in (grid.rows, grid.columns)]
+    call, threads = loops().call, shared_threads()
+    call("cell_means", threads, color, width, *axes[0], *axes[1], coarse)
+    call(
+        "add_scattered",
+        *(threads, color, height, width, grid.scatter(coarse), *grid.shape),
+        *(grid.rows.position, grid.columns.position),
+        *(1.0 - grid.fraction, np.array(gain_ratio, np.float64)),
     )
 
 
@@ -115,7 +112,7 @@ class HazeGrid:
     def scatter(self, coarse: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the light (n, m, 3) that is scattered into each cell."""
         beyond = self._outside * _edge_light(coarse)
-        return (self._spread(coarse) + beyond).astype(np.float32)
+        return (self._spread(coarse) + beyond).astype(np.float32, order="C")
 
     def _spread(self, coarse: NDArray[Any]) -> NDArray[Any]:
         from scipy import fft

@@ -34,7 +34,6 @@ from filter_service.rendering.perfect_eye import (
     TANGENTS,
     perfect_store,
 )
-from filter_service.rendering.spectacles import seen_through
 from filter_service.rgbd_view import RgbdView
 
 
@@ -54,7 +53,6 @@ def plan_once() -> None:
     _defocus_once()
     light = np.ones((SIDE_PX, SIDE_PX, RGB), np.float32)
     view = RgbdView(light, light[..., 0].copy(), store.spec.camera.tangents)
-    seen_through(view, ((0.9, 0.0), (0.0, 0.9)))
     MediaEffects(Straylight()).apply(light, view)
     encoded(light, "srgb8")
     _light_edges_once(store, layers, image)

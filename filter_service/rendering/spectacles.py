@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.native import shared_threads
 from estimator.optics import prescription as rx
 from estimator.profiles.parse import EyeProfile
+from filter_service.native import loops
 from filter_service.rendering.srgb import linear_from_srgb
 from filter_service.rgbd_view import RgbdView
 
@@ -42,8 +44,6 @@ def spectacle_magnification(profile: EyeProfile) -> Matrix | None:
 
 def seen_through(view: RgbdView, magnification: Matrix) -> RgbdView:
     """Return the view as seen through spectacles, in linear light."""
-    from filter_service.rendering.spectacle_loops import resample
-
     left, right, up, down = view.tangents
     steps = (right - left) / view.width_px, (down - up) / view.height_px
     frame = np.array([left, up, *steps])
@@ -53,9 +53,13 @@ def seen_through(view: RgbdView, magnification: Matrix) -> RgbdView:
         light, meters = getattr(view, color), getattr(view, depth)
         if light is None:
             continue
-        light = _linear(light)
+        light, meters = map(np.ascontiguousarray, (_linear(light), meters))
         resampled, resampled_m = np.empty_like(light), np.empty_like(meters)
-        resample(light, meters, frame, to_source, resampled, resampled_m)
+        loops().call(
+            "resample",
+            *(shared_threads(), light, meters, *meters.shape, frame, to_source),
+            *(resampled, resampled_m),
+        )
         images |= {color: resampled, depth: resampled_m}
     return replace(view, **images)
 

@@ -1,4 +1,4 @@
-"""Compiled loops that find which points of the pupil see a source, see `haze_loops`."""
+"""Compiled loops that find which points of the pupil see a source."""
 
 import math
 

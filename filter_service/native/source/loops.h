@@ -19,6 +19,8 @@
 #include "picture.h"
 #include "splat.h"
 #include "shrink.h"
+#include "haze.h"
+#include "spectacles.h"
 
 static void pixels(frame *f) {
     f->missing_count = f->clamped_count = f->bad_color_count = 0;
@@ -73,6 +75,9 @@ static const named_function functions[] = {
     FUNCTION(blend),
     FUNCTION(splat),
     FUNCTION(shrink),
+    FUNCTION(cell_means),
+    FUNCTION(add_scattered),
+    FUNCTION(resample),
     {NULL, NULL},
 };
 
