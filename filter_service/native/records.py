@@ -141,6 +141,103 @@ class ShrinkJob(c.Structure):
     )
 
 
+class StoreTables(c.Structure):
+    """Tables of a store, see `filter_service.psfs.read_kernels`."""
+
+    _fields_ = (
+        ("values_dpt", POINTER),
+        ("starts", POINTER),
+        ("channel_shift_dpt", POINTER),
+        ("offsets", POINTER),
+        ("reach_words", POINTER),
+        ("radius_px", POINTER),
+        ("blur_px", POINTER),
+        ("spread_px", POINTER),
+        ("peak_ratio", POINTER),
+        ("is_computed", POINTER),
+        ("last_used", POINTER),
+    )
+
+
+class StateReads(c.Structure):
+    """Nodes that a state reads, see `filter_service.psfs.read_kernels`."""
+
+    _fields_ = (
+        ("groups", POINTER),
+        ("scales", POINTER),
+        ("weights", POINTER),
+        ("count", c.c_int64),
+    )
+
+
+class MapTables(c.Structure):
+    """Maps of cells, see `filter_service.rendering.cell_maps`."""
+
+    _fields_ = (
+        ("node_from_cell", POINTER),
+        ("cell_from_node", POINTER),
+        ("area_ratio", POINTER),
+        ("box_ratio", POINTER),
+        ("stretch_ratio", POINTER),
+        ("change_ratio", POINTER),
+    )
+
+
+class RecipeJob(c.Structure):
+    """Job that plans node kernels; `source/kernel_job.h` documents the fields."""
+
+    _fields_ = (
+        ("tables", StoreTables),
+        ("reads", StateReads),
+        ("fields", POINTER),
+        ("total_dpt", POINTER),
+        ("words", POINTER),
+        ("reach_px", POINTER),
+        ("radius_px", POINTER),
+        ("peak_ratio", POINTER),
+        ("spread_px", POINTER),
+        ("missing", POINTER),
+        ("count", c.c_int64),
+        ("frame_number", c.c_uint32),
+    )
+
+
+class SizeJob(c.Structure):
+    """Job that plans kernels; `source/kernel_job.h` documents the fields."""
+
+    _fields_ = (
+        ("cell_maps", MapTables),
+        ("cell_weight_ratio", POINTER),
+        ("cells", POINTER),
+        ("parts", POINTER),
+        ("node_reach_px", POINTER),
+        ("node_radius_px", POINTER),
+        ("node_peak_ratio", POINTER),
+        ("near_spread_px", POINTER),
+        ("far_spread_px", POINTER),
+        ("weight_ratio", POINTER),
+        ("maps", POINTER),
+        ("reach_px", POINTER),
+        ("radius_px", POINTER),
+        ("peak_ratio", POINTER),
+        ("spread_px", POINTER),
+        ("count", c.c_int64),
+    )
+
+
+def pointers(**arrays: np.ndarray) -> dict[str, int]:
+    """Return the addresses of contiguous arrays, which the caller keeps alive.
+
+    Raises
+    ------
+    TypeError
+    """
+    for name, array in arrays.items():
+        if not array.flags.c_contiguous:
+            raise TypeError(f"{name}: strides {array.strides}; expected contiguous")
+    return {name: int(array.ctypes.data) for name, array in arrays.items()}
+
+
 SIZES = (
     c.sizeof(Frame),
     FRAGMENT.itemsize,
@@ -150,5 +247,7 @@ SIZES = (
     RECIPE_IMAGE_BYTES,
     c.sizeof(ShrinkJob),
     FRAGMENT_LIGHT.itemsize,
+    c.sizeof(RecipeJob),
+    c.sizeof(SizeJob),
 )
 """Expected result of `ocu_sizes`."""

@@ -32,11 +32,9 @@ gaze             gaze of a frame, clamped to the prepared range
 detection        limits of merging by the angle from the gaze
 image_cells      cells of the image that share kernels
 cell_maps        linear maps from their pixels to those of stored kernels
-map_loops        compiled loops of cell_maps
 frame_states     cached plans for an unchanged pupil, focus and gaze
 sampled_frame    sampled depths of a frame, and the PSFs that it needs
 frame_kernels    plan of a frame's kernels
-kernel_loops     compiled loops of frame_kernels
 srgb             conversion between encoded images and linear light
 media_effects    effects of ocular media and spectacles
 bright_pixels    pixels much brighter than white

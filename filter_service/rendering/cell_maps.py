@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from filter_service.native import loops
+
 
 class MapTables(NamedTuple):
     """Maps of cells, and quantities derived from the maps.
@@ -37,7 +39,8 @@ class MapTables(NamedTuple):
 class CellMaps:
     """Maps of cells, each to its three field nodes.
 
-    A part of a kernel is resampled by its map only if `map_loops.needs_map` is true.
+    A part of a kernel is resampled by its map only if the map changes it noticeably,
+    see `MIN_SHIFT_RATIO`.
 
     Attributes
     ----------
@@ -51,13 +54,11 @@ class CellMaps:
     @cached_property
     def tables(self) -> MapTables:
         """Maps in one memory layout, with the ratios derived from them."""
-        from filter_service.rendering.map_loops import fill_ratios
-
         maps = np.array(self.node_from_cell, np.float64, order="C")
         ratios = np.empty((4, *maps.shape[:2]))
         inverse = np.empty_like(maps)
-        fill_ratios(maps, inverse, ratios)
-        return MapTables(maps, inverse, *(ratio.copy() for ratio in ratios))
+        loops().call("map_ratios", maps, maps.size // 4, inverse, ratios)
+        return MapTables(maps, inverse, *ratios)
 
     @property
     def largest_stretch_ratio(self) -> float:

@@ -3,8 +3,6 @@
 A frame has one kernel for each (cell, interval) pair that its pixels use.  A kernel
 contains the weights at both ends of its interval.  It is a weighted sum of the node
 kernels of three field nodes, and each node kernel is a weighted sum of cached kernels.
-The compiled loops are imported when a frame first needs them: importing numba takes
-0.3 s.
 """
 
 from collections.abc import Callable
@@ -15,8 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.constants import RECIPE_TAPS, RECIPE_WORDS, RGB
+from filter_service.constants import RECIPE_WORDS, RGB
 from filter_service.errors import NotPrepared
+from filter_service.native import loops, records
+from filter_service.native.records import pointers
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.read_kernels import StoreTables
 from filter_service.psfs.store import PsfStore
@@ -127,38 +127,37 @@ def frame_kernels(
     NotPrepared
         The deadline of ``fill`` has passed.
     """
-    from filter_service.rendering.kernel_loops import fill_kernels, list_nodes
-
     n_fields, maps = len(layers.layer_zero_dpt), image.maps.tables
-    weight_ratio = np.ascontiguousarray(image.weight_ratio)
-    cells, intervals, parts, *pairs = list_nodes(
-        np.ascontiguousarray(used),
-        np.ascontiguousarray(image.nodes),
-        weight_ratio,
-        n_fields,
-    )
+    cells, intervals, parts, *pairs = _list_nodes(used, image, n_fields)
     nodes = _node_kernels(
         store, tables or store.tables, fill or store.fill, layers, *pairs
     )
-    spread_px = nodes.recipe_spread_px[np.stack([nodes.near, nodes.far], axis=-1)]
-    arrays = {
+    inputs = {
+        "cell_weight_ratio": np.ascontiguousarray(image.weight_ratio),
+        "cells": cells,
+        "parts": parts,
+        "node_reach_px": nodes.reach_px,
+        "node_radius_px": nodes.radius_px,
+        "node_peak_ratio": nodes.peak_ratio,
+        "near_spread_px": nodes.recipe_spread_px[nodes.near],
+        "far_spread_px": nodes.recipe_spread_px[nodes.far],
+    }
+    found = {
         "weight_ratio": np.empty(parts.shape),
         "maps": np.empty((*parts.shape, 2, 2)),
-        "reach_px": np.empty((cells.size, 4), np.int64),
-        "radius_px": np.empty(cells.size, np.int64),
-        "peak_ratio": np.empty(cells.size),
-        "spread_px": np.empty((cells.size, 2)),
+        "reach_px": np.zeros((cells.size, 4), np.int64),
+        "radius_px": np.zeros(cells.size, np.int64),
+        "peak_ratio": np.zeros(cells.size),
+        "spread_px": np.zeros((cells.size, 2)),
     }
-    fill_kernels(
-        maps,
-        weight_ratio,
-        cells,
-        parts,
-        (nodes.reach_px, nodes.radius_px, nodes.peak_ratio, spread_px),
-        tuple(arrays.values()),
+    job = records.SizeJob(
+        cell_maps=records.MapTables(**pointers(**maps._asdict())),
+        count=cells.size,
+        **pointers(**inputs, **found),
     )
+    loops().call("fill_sizes", job)
     return FrameKernels(
-        nodes=nodes, cells=cells, intervals=intervals, parts=parts, **arrays
+        nodes=nodes, cells=cells, intervals=intervals, parts=parts, **found
     )
 
 
@@ -169,14 +168,7 @@ def missing_psfs(
     used: NDArray[np.bool_],
 ) -> NDArray[np.int64]:
     """Return the indices (n,) of needed PSFs that have not been computed yet."""
-    from filter_service.rendering.kernel_loops import list_nodes
-
-    *_, fields, intervals = list_nodes(
-        np.ascontiguousarray(used),
-        np.ascontiguousarray(image.nodes),
-        np.ascontiguousarray(image.weight_ratio),
-        len(layers.layer_zero_dpt),
-    )
+    *_, fields, intervals = _list_nodes(used, image, len(layers.layer_zero_dpt))
     found: list[NDArray[np.int64]] = []
 
     def note(psfs: NDArray[np.int64]) -> None:
@@ -188,6 +180,46 @@ def missing_psfs(
     return found[0] if found else np.zeros(0, np.int64)
 
 
+def _list_nodes(
+    used: NDArray[np.bool_], image: ImageCells, n_fields: int
+) -> tuple[NDArray[np.int64], ...]:
+    """List the kernels of used pairs, and the node kernels that they consist of.
+
+    A node with zero weight is replaced by the node with the largest weight.
+
+    Returns
+    -------
+    cells, intervals : (n,)
+        Pairs of the kernels.
+    parts : (n, 3)
+        Their node kernels.
+    fields, node_intervals : (m,)
+        Field node and interval of each node kernel.
+    """
+    nodes, weight_ratio = image.nodes, image.weight_ratio
+    heaviest = np.take_along_axis(nodes, weight_ratio.argmax(axis=1)[:, None], axis=1)
+    nodes = np.where(weight_ratio > 0.0, nodes, heaviest)
+    n_intervals = used.shape[1]
+    cells, intervals = np.divmod(np.flatnonzero(used), n_intervals)
+    pairs = nodes[cells] * n_intervals + intervals[:, None]
+    found, parts = _numbered(pairs, n_fields * n_intervals)
+    return cells, intervals, parts, *np.divmod(found, n_intervals)
+
+
+def _numbered(
+    values: NDArray[np.int64], count: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the distinct values (m,), ascending, and each value's number among them.
+
+    `numpy.unique` sorts; this takes a table of ``count`` possible values.
+    """
+    number = np.zeros(count, np.int64)
+    number[values] = 1
+    found = np.flatnonzero(number)
+    number[found] = np.arange(found.size)
+    return found, number[values]
+
+
 def _node_kernels(
     store: PsfStore,
     tables: StoreTables,
@@ -196,30 +228,40 @@ def _node_kernels(
     fields: NDArray[Any],
     intervals: NDArray[Any],
 ) -> NodeKernels:
-    from filter_service.rendering.kernel_loops import fill_recipes, list_recipes
-
-    near, far, recipe_fields, recipe_layers = list_recipes(
-        fields, intervals, len(layers.layer_zero_dpt), len(layers.layer_dpt)
-    )
-    count = recipe_fields.size
-    recipes = np.zeros((count, RGB, 3, RECIPE_TAPS), dtype=np.uint32)
+    """Plan node kernels (n,), with a recipe for each field node and layer in use."""
+    n_layers = len(layers.layer_dpt)
+    ends = np.minimum(np.stack([intervals, intervals + 1]), n_layers - 1)
+    ends += fields * n_layers
+    found, (near, far) = _numbered(ends, len(layers.layer_zero_dpt) * n_layers)
+    recipe_fields, recipe_layers = np.divmod(found, n_layers)
+    count = found.size
+    recipes = np.zeros((count, RGB, RECIPE_WORDS), np.uint32)
     reach_px, radius_px = np.empty((count, 4), np.int64), np.empty(count, np.int64)
     peak_ratio, spread_px = np.empty(count), np.empty(count)
     missing = np.empty(store.psf_count, np.int64)
+    total_dpt = layers.layer_dpt[recipe_layers, None]
+    total_dpt = total_dpt + layers.layer_zero_dpt[recipe_fields]
+    job = records.RecipeJob(
+        tables=records.StoreTables(**pointers(**tables._asdict())),
+        reads=records.StateReads(
+            **pointers(**layers.reads._asdict()), count=layers.reads.groups.size
+        ),
+        count=count,
+        **pointers(
+            fields=recipe_fields,
+            total_dpt=total_dpt,
+            words=recipes,
+            reach_px=reach_px,
+            radius_px=radius_px,
+            peak_ratio=peak_ratio,
+            spread_px=spread_px,
+            missing=missing,
+        ),
+    )
     while True:
         store.frame_number += 1
-        n_missing = fill_recipes(
-            tables,
-            layers.reads,
-            recipe_fields,
-            layers.layer_dpt[recipe_layers, None]
-            + layers.layer_zero_dpt[recipe_fields],
-            recipes,
-            recipes.view(np.float32),
-            (reach_px, radius_px, peak_ratio, spread_px),
-            missing,
-            np.uint32(store.frame_number),
-        )
+        job.frame_number = store.frame_number
+        n_missing = loops().call("fill_recipes", job)
         if not n_missing:
             break
         fill(missing[:n_missing].copy())
@@ -229,7 +271,7 @@ def _node_kernels(
         reach_px=np.maximum(reach_px[near], reach_px[far]),
         radius_px=np.maximum(radius_px[near], radius_px[far]),
         peak_ratio=np.maximum(peak_ratio[near], peak_ratio[far]),
-        recipes=recipes.reshape(count, RGB, RECIPE_WORDS),
+        recipes=recipes,
         recipe_spread_px=spread_px,
     )
 

@@ -4,7 +4,7 @@
 // Out: KERNEL_OF, KERNEL_PAIRS (cell, interval), NODE_OF, NODE_PAIRS (field node,
 //      interval), PLAN.
 // Dispatch: one thread per word of USED.
-// Twin: filter_service.rendering.kernel_loops.list_nodes.
+// Twin: filter_service.rendering.frame_kernels.frame_kernels.
 
 layout(local_size_x = THREADS) in;
 

@@ -3,7 +3,7 @@
 // In:  KERNEL_PAIRS, CELLS, NODE_OF, NODES.
 // Out: KERNELS (common/kernels.glsl), PARTS, WORK, PLAN.
 // Dispatch: groups of GROUP_THREADS take the new kernels in turn.
-// Twin: filter_service.rendering.kernel_loops.fill_kernels.
+// Twin: tests/numerical/plan_twin.py (frame_kernels).
 
 layout(local_size_x = GROUP_THREADS) in;
 

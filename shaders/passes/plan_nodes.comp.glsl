@@ -9,7 +9,7 @@
 // Out: RECIPES, NODES (near recipe, far recipe, first texel, reach; peak, spread at both
 //      ends, radius), WORK, READ_PSFS (a bit per PSF that is read), PLAN.
 // Dispatch: groups of GROUP_THREADS take the new nodes in turn.
-// Twin: filter_service.rendering.kernel_loops.fill_recipes.
+// Twin: tests/numerical/plan_twin.py (node_kernels).
 // Source: Csoba & Kunkli 2023, section 6.4.
 
 layout(local_size_x = GROUP_THREADS) in;

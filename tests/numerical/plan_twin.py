@@ -1,6 +1,6 @@
 """How a frame is planned, stated plainly: arrays of everything, numpy alone.
 
-Twins of `psfs/read_kernels.py`, of `rendering` (`kernel_loops.py`, `cell_maps.py`), of
+Twins of `psfs/read_kernels.py`, of `rendering` (`frame_kernels.py`, `cell_maps.py`), of
 the passes that plan kernels, and of the layers' distances.
 """
 

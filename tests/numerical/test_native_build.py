@@ -92,6 +92,11 @@ def test_packed_words_are_those_of_python():
     ("file", "name", "record"),
     [
         (SOURCE / "frame.h", "frame", records.Frame),
+        (SOURCE / "kernel_job.h", "store_tables", records.StoreTables),
+        (SOURCE / "kernel_job.h", "state_reads", records.StateReads),
+        (SOURCE / "kernel_job.h", "map_tables", records.MapTables),
+        (SOURCE / "kernel_job.h", "recipe_job", records.RecipeJob),
+        (SOURCE / "kernel_job.h", "size_job", records.SizeJob),
         (CORE / "psf_job.h", "psf_job", core_records.PsfJob),
         (CORE / "psf_job.h", "psf_tables", core_records.PsfTables),
     ],

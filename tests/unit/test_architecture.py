@@ -172,11 +172,9 @@ HOME = {
         "filter_service/planning/spread_loops.py",  # planning an eye
         "filter_service/psfs/read_loops.py",  # planning a frame
         "filter_service/psfs/layer_loops.py",
-        "filter_service/rendering/map_loops.py",
         "filter_service/rendering/bright_pixel_loops.py",
         "filter_service/rendering/edge_light_loops.py",
         "filter_service/rendering/visibility_loops.py",
-        "filter_service/rendering/kernel_loops.py",
         "clients/commands/doctor_probes.py",  # asks which threads it runs on
         "filter_service/threads.py",
     ),

@@ -41,7 +41,7 @@ IMPORTED_TO_COMPILE = """
 import sys
 from filter_service.building import compile_builds
 from filter_service.filtering import compile_loops
-from filter_service.rendering import kernel_loops, map_loops, plan_once
+from filter_service.rendering import plan_once
 for name, module in sys.modules.items():
     if "." not in name and "site-packages" in (getattr(module, "__file__", "") or ""):
         print(name)

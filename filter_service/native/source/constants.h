@@ -25,5 +25,9 @@
 #define RGB 3
 #define RECIPE_TAPS 6
 #define FIELD_CORNERS 3
+#define MIN_SHIFT_PX 0.5
+#define MIN_SHIFT_RATIO 0.1
+#define MAX_REACH_PX 255
+#define WEIGHT_MAX 65535.0
 
 #endif

@@ -3,6 +3,7 @@
 
 #include "entry.h"
 #include "frame.h"
+#include "kernel_job.h"
 
 /* Sizes of the records, which the caller compares with its own. */
 EXPORT void ocu_sizes(int32_t *sizes) {
@@ -14,4 +15,6 @@ EXPORT void ocu_sizes(int32_t *sizes) {
     sizes[5] = (int32_t)sizeof(recipe_image);
     sizes[6] = (int32_t)sizeof(shrink_job);
     sizes[7] = (int32_t)sizeof(fragment_light);
+    sizes[8] = (int32_t)sizeof(recipe_job);
+    sizes[9] = (int32_t)sizeof(size_job);
 }

@@ -19,6 +19,7 @@
 #include "picture.h"
 #include "splat.h"
 #include "shrink.h"
+#include "kernel_plan.h"
 #include "haze.h"
 #include "spectacles.h"
 
@@ -75,6 +76,9 @@ static const named_function functions[] = {
     FUNCTION(blend),
     FUNCTION(splat),
     FUNCTION(shrink),
+    FUNCTION(map_ratios),
+    FUNCTION(fill_recipes),
+    FUNCTION(fill_sizes),
     FUNCTION(cell_means),
     FUNCTION(add_scattered),
     FUNCTION(resample),

@@ -1,0 +1,118 @@
+/* Plan of a frame's kernels: the recipes of node kernels, and the sizes of kernels.  Computed
+ * for a few thousand kernels whenever pupil, focus or gaze changes. */
+#ifndef OCU_KERNEL_PLAN_H
+#define OCU_KERNEL_PLAN_H
+
+#include "cell_maps.h"
+#include "kernel_job.h"
+#include "store_reads.h"
+
+/* Sizes of recipes, or of node kernels. */
+typedef struct {
+    int64_t reach_px[4], radius_px;
+    double peak_ratio, spread_px;
+} node_size;
+
+/* Adds a PSF with its weight to a channel of a recipe; returns whether it is missing and was
+ * not counted before. */
+INLINE int add_tap(const recipe_job *job, int64_t psf, double weight, uint32_t *word,
+                   node_size *size) {
+    const store_tables *tables = &job->tables;
+    if (weight > 0.0) {
+        int is_new = tables->last_used[psf] != job->frame_number;
+        tables->last_used[psf] = job->frame_number;
+        if (!tables->is_computed[psf]) return is_new;
+    }
+    uint32_t sides_px = tables->reach_words[psf];
+    double per_peak = weight * (double)tables->peak_ratio[psf];
+    float factor = (float)(per_peak / WEIGHT_MAX);
+    size->peak_ratio += per_peak;
+    size->spread_px += weight * (double)tables->spread_px[psf];
+    word[0] = tables->offsets[psf];
+    word[RECIPE_TAPS] = sides_px;
+    memcpy(word + 2 * RECIPE_TAPS, &factor, sizeof factor);
+    if (weight > 0.0) {
+        if (tables->radius_px[psf] > size->radius_px) size->radius_px = tables->radius_px[psf];
+        for (int side = 0; side < 4; ++side) {
+            int64_t reach_px = (sides_px >> 8 * side) & 255u;
+            if (reach_px > size->reach_px[side]) size->reach_px[side] = reach_px;
+        }
+    }
+    return 0;
+}
+
+/* Writes recipes, and the sizes of the resulting kernels.  Returns the number of missing PSFs;
+ * if it is not zero, the recipes are not valid. */
+static int64_t fill_recipes(recipe_job *job) {
+    const state_reads *reads = &job->reads;
+    int64_t n_missing = 0, psfs[RECIPE_TAPS];
+    int64_t uppers[RGB][RECIPE_TAPS / 2];
+    double weights[RECIPE_TAPS];
+    for (int64_t n = 0; n < job->count; ++n) {
+        int64_t field = job->fields[n];
+        int is_other = n == 0 || field != job->fields[n - 1];
+        for (int64_t corner = 0; is_other && corner < reads->count; ++corner) {
+            int64_t first = job->tables.starts[reads->groups[corner] + field];
+            for (int channel = 0; channel < RGB; ++channel) uppers[channel][corner] = first;
+        }
+        node_size found = {.spread_px = INFINITY};
+        for (int channel = 0; channel < RGB; ++channel) {
+            channel_taps(&job->tables, reads, field, channel, job->total_dpt[RGB * n + channel],
+                         uppers[channel], psfs, weights);
+            uint32_t *words = job->words + 3 * RECIPE_TAPS * (RGB * n + channel);
+            double highest = found.peak_ratio, narrowest_px = found.spread_px;
+            found.peak_ratio = found.spread_px = 0.0;
+            for (int64_t tap = 0; tap < 2 * reads->count; ++tap)
+                if (add_tap(job, psfs[tap], weights[tap], words + tap, &found))
+                    job->missing[n_missing++] = psfs[tap];
+            found.peak_ratio = at_least(found.peak_ratio, highest);
+            found.spread_px = at_most(found.spread_px, narrowest_px);
+        }
+        memcpy(job->reach_px + 4 * n, found.reach_px, sizeof found.reach_px);
+        job->radius_px[n] = found.radius_px;
+        job->peak_ratio[n] = found.peak_ratio;
+        job->spread_px[n] = found.spread_px;
+    }
+    return n_missing;
+}
+
+/* Writes the map and weight of part j of kernel k, and widens the kernel. */
+INLINE void fill_part(const size_job *job, int64_t k, int64_t j) {
+    const map_tables *maps = &job->cell_maps;
+    int64_t at = FIELD_CORNERS * k + j, part = job->parts[at];
+    int64_t corner = FIELD_CORNERS * job->cells[k] + j;
+    double weight = job->cell_weight_ratio[corner];
+    int64_t side_px[4], widest_px = job->node_radius_px[part];
+    memcpy(side_px, job->node_reach_px + 4 * part, sizeof side_px);
+    double area = 1.0, box = 1.0;
+    double *own = job->maps + 4 * at;
+    if (needs_map(maps->change_ratio[corner], widest_px)) {
+        memcpy(own, maps->node_from_cell + 4 * corner, 4 * sizeof *own);
+        area = maps->area_ratio[corner];
+        box = maps->box_ratio[corner];
+        map_reach(maps->cell_from_node + 4 * corner, side_px);
+        double wider_px = maps->stretch_ratio[corner] * ((double)widest_px + 1.0);
+        widest_px = (int64_t)at_most(ceil(wider_px), MAX_REACH_PX);
+    } else {
+        own[0] = own[3] = 1.0;
+        own[1] = own[2] = 0.0;
+    }
+    job->weight_ratio[at] = weight * box;
+    job->peak_ratio[k] += job->node_peak_ratio[part] * weight * area;
+    double share = weight / sqrt(area);
+    job->spread_px[2 * k] += job->near_spread_px[part] * share;
+    job->spread_px[2 * k + 1] += job->far_spread_px[part] * share;
+    if (!(weight > 0.0)) return;
+    if (widest_px > job->radius_px[k]) job->radius_px[k] = widest_px;
+    for (int side = 0; side < 4; ++side)
+        if (side_px[side] > job->reach_px[4 * k + side])
+            job->reach_px[4 * k + side] = side_px[side];
+}
+
+/* Writes the maps, weights and sizes of kernels; these arrays are zero before. */
+static void fill_sizes(size_job *job) {
+    for (int64_t k = 0; k < job->count; ++k)
+        for (int64_t j = 0; j < FIELD_CORNERS; ++j) fill_part(job, k, j);
+}
+
+#endif
