@@ -238,6 +238,33 @@ def pointers(**arrays: np.ndarray) -> dict[str, int]:
     return {name: int(array.ctypes.data) for name, array in arrays.items()}
 
 
+class NodeJob(c.Structure):
+    """Job that counts the intervals between nodes, see `source/node_job.h`."""
+
+    _fields_ = (
+        ("covariance", POINTER),
+        ("unit_px", POINTER),
+        ("light_ratio", POINTER),
+        ("foci_dpt", POINTER),
+        ("groups", POINTER),
+        ("lows", POINTER),
+        ("highs", POINTER),
+        ("shifts_dpt", POINTER),
+        ("needed", POINTER),
+        ("error", c.c_double),
+        ("doubling", c.c_double),
+        ("blur_exponent", c.c_double),
+        ("sharp_px", c.c_double),
+        ("own_share", c.c_double),
+        ("diffraction_share", c.c_double),
+        ("n", c.c_int64),
+        ("n_groups", c.c_int64),
+        ("n_foci", c.c_int64),
+        ("n_shifts", c.c_int64),
+        ("n_samples", c.c_int64),
+    )
+
+
 SIZES = (
     c.sizeof(Frame),
     FRAGMENT.itemsize,
@@ -249,5 +276,6 @@ SIZES = (
     FRAGMENT_LIGHT.itemsize,
     c.sizeof(RecipeJob),
     c.sizeof(SizeJob),
+    c.sizeof(NodeJob),
 )
 """Expected result of `ocu_sizes`."""

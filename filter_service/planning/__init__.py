@@ -8,10 +8,8 @@ error_law         image error of blending two PSFs
 readable          defocus that frames read at a node
 axis_nodes        nodes along one axis
 defocus_nodes     nodes of defocus, group by group
-spread_loops      compiled loops of defocus_nodes
 node_wavefronts   wavefronts of the field nodes in one state
 node_blur         geometric blur of nodes
-blur_loops        compiled loop of node_blur
 nodes             a plan, and interpolation between its nodes
 paper_grid        the paper's fixed grids as plans
 cost              memory and build time of a plan

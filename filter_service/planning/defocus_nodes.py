@@ -15,9 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
+from estimator.native.records import pointer_to
 from filter_service.constants import RGB
 from filter_service.errors import GridTooLarge
+from filter_service.native import loops
+from filter_service.native.records import NodeJob
 from filter_service.planning.error_law import (
+    BLUR_EXPONENT,
+    DIFFRACTION_SHARE,
+    DOUBLING,
+    OWN_SHARE,
+    SHARP_PX,
     half_way_error,
     mean_square,
     spot_covariance,
@@ -189,21 +197,60 @@ class _Rays:
         shifts = np.zeros((1, lows.size))
         if shifts_dpt is not None:
             shifts = shifts_dpt[place].T
-        # Imported here: reading a plan must not load numba.
-        from filter_service.planning.spread_loops import needed_intervals
-
-        needed = np.zeros((lows.size, _SAMPLES))
-        needed_intervals(
-            *(self.covariance, self.unit_px, self.light_ratio, self.foci_dpt),
-            *(index[place], lows, highs, shifts),
-            self.half_way_error,
-            needed,
-        )
+        needed = self._needed_intervals(index[place], lows, highs, shifts)
         values, sizes = _spread(lows, highs, needed)
         first = np.cumsum(counts) - counts
         return RaggedNodes.joined(
             values, np.add.reduceat(sizes, first.astype(np.int64))
         )
+
+    def _needed_intervals(
+        self,
+        groups: NDArray[np.int64],
+        lows: NDArray[np.float64],
+        highs: NDArray[np.float64],
+        shifts_dpt: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Return the intervals (n, n_samples) needed up to each sample of ranges (n,).
+
+        Parameters
+        ----------
+        shifts_dpt : (n_shifts, n)
+            Chromatic shifts, added to the defocus of nodes.
+        """
+        needed = np.empty((lows.size, _SAMPLES))
+        arrays = {
+            "covariance": self.covariance,
+            "unit_px": self.unit_px,
+            "light_ratio": self.light_ratio,
+            "foci_dpt": self.foci_dpt,
+            "lows": lows,
+            "highs": highs,
+            "shifts_dpt": shifts_dpt,
+            "needed": needed,
+        }
+        kept = {
+            name: np.ascontiguousarray(array, np.float64)
+            for name, array in arrays.items()
+        }
+        groups = np.ascontiguousarray(groups, np.int64)
+        job = NodeJob(
+            **{name: pointer_to(array) for name, array in kept.items()},
+            groups=pointer_to(groups),
+            error=self.half_way_error,
+            doubling=DOUBLING,
+            blur_exponent=BLUR_EXPONENT,
+            sharp_px=SHARP_PX,
+            own_share=OWN_SHARE,
+            diffraction_share=DIFFRACTION_SHARE,
+            n=lows.size,
+            n_groups=self.unit_px.size,
+            n_foci=self.foci_dpt.size,
+            n_shifts=len(shifts_dpt),
+            n_samples=_SAMPLES,
+        )
+        loops().call("needed_intervals", job)
+        return needed
 
     def limited(
         self, ranges_dpt: NDArray[np.float64], spec: GridSpec, groups: PupilStates
@@ -279,9 +326,6 @@ def _spread(
     lows: NDArray[np.float64], highs: NDArray[np.float64], needed: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return the nodes that cover ranges (n,), and the number in each range."""
-    # Imported here: reading a plan must not load numba.
-    from filter_service.planning.spread_loops import spread_nodes
-
     is_range = highs - lows >= EXACT_DPT
     bad = np.flatnonzero(is_range & ~(needed[:, -1] <= MAX_GROUP_NODES))  # or NaN
     if bad.size:
@@ -292,6 +336,13 @@ def _spread(
             field="settings.object_range_dpt",
             allowed=f"ranges and an eye that need at most {MAX_GROUP_NODES:,}",
         )
-    return spread_nodes(
-        np.ascontiguousarray(lows), np.ascontiguousarray(highs), needed, EXACT_DPT
+    # PSFs may be so wide that no difference is visible: two nodes.
+    steps = np.maximum(np.ceil(needed[:, -1] - 1e-9), 1.0)
+    counts = np.where(is_range, 1.0 + steps, 1.0).astype(np.int64)
+    nodes = np.empty(counts.sum())
+    count = loops().call(
+        "spread_nodes",
+        *(np.ascontiguousarray(lows), np.ascontiguousarray(highs)),
+        *(np.ascontiguousarray(needed), counts, nodes, *needed.shape),
     )
+    return nodes[:count], counts

@@ -14,6 +14,7 @@ from estimator.field.eye_optics import EyeOptics
 from estimator.optics.zernike import wavefront_polynomial
 from estimator.psf.pupil import pupil_frames
 from filter_service.constants import RGB
+from filter_service.native import loops
 from filter_service.planning.grid import GREEN, GridSpec
 from filter_service.planning.node_wavefronts import NodeWavefronts
 from filter_service.planning.nodes import RaggedNodes
@@ -67,9 +68,6 @@ def node_blur_px(
 
     With several foci, these are the rays of the nearest focus.
     """
-    # Imported here: reading a plan must not load numba.
-    from filter_service.planning.blur_loops import fill_blur_px
-
     foci_dpt = np.zeros((RGB, 1))
     if eye.rings is not None:
         own_dpt = [
@@ -78,13 +76,13 @@ def node_blur_px(
         foci_dpt = np.full((RGB, max(map(len, own_dpt))), np.inf)
         for channel, found in enumerate(own_dpt):
             foci_dpt[channel, : len(found)] = found
+    zero_px, per_dpt = (np.ascontiguousarray(px.swapaxes(1, 2)) for px in rays)
     blur_px = np.empty(RGB * nodes.values_dpt.size, np.float32)
-    fill_blur_px(
-        *(np.ascontiguousarray(px) for px in rays),
-        np.array(nodes.values_dpt, np.float64),
-        np.array(nodes.starts, np.int64),
-        np.array(channel_shift_dpt, np.float64, order="C"),
-        foci_dpt,
-        blur_px,
+    loops().call(
+        "node_blur",
+        *(zero_px, per_dpt, nodes.values_dpt, nodes.starts),
+        np.ascontiguousarray(channel_shift_dpt),
+        *(foci_dpt, blur_px),
+        *(len(zero_px), zero_px.shape[2], foci_dpt.shape[1]),
     )
     return blur_px * np.repeat(shrink_ratio, RGB * nodes.counts).astype(np.float32)

@@ -97,6 +97,7 @@ def test_packed_words_are_those_of_python():
         (SOURCE / "kernel_job.h", "map_tables", records.MapTables),
         (SOURCE / "kernel_job.h", "recipe_job", records.RecipeJob),
         (SOURCE / "kernel_job.h", "size_job", records.SizeJob),
+        (SOURCE / "node_job.h", "node_job", records.NodeJob),
         (CORE / "psf_job.h", "psf_job", core_records.PsfJob),
         (CORE / "psf_job.h", "psf_tables", core_records.PsfTables),
     ],

@@ -95,7 +95,7 @@ FILTER_ROOMS = {
     "gl": (),
     "native": (),
     "wire": (),
-    "planning": (),
+    "planning": ("native",),
     "psfs": ("planning", "gl", "native"),
     "rendering": ("psfs", "planning", "gl", "native"),
     "building": ("psfs", "planning"),
@@ -168,8 +168,6 @@ HOME = {
         "estimator/wavefront/*",  # aiming and fitting
         "filter_service/rendering/reference*.py",  # twins of the passes
         "estimator/field/defocus_loops.py",  # of a traced eye in a new state
-        "filter_service/planning/blur_loops.py",
-        "filter_service/planning/spread_loops.py",  # planning an eye
         "filter_service/psfs/read_loops.py",  # planning a frame
         "filter_service/psfs/layer_loops.py",
         "filter_service/rendering/bright_pixel_loops.py",

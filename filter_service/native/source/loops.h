@@ -22,6 +22,7 @@
 #include "kernel_plan.h"
 #include "haze.h"
 #include "spectacles.h"
+#include "defocus_nodes.h"
 
 static void pixels(frame *f) {
     f->missing_count = f->clamped_count = f->bad_color_count = 0;
@@ -82,6 +83,9 @@ static const named_function functions[] = {
     FUNCTION(cell_means),
     FUNCTION(add_scattered),
     FUNCTION(resample),
+    FUNCTION(needed_intervals),
+    FUNCTION(spread_nodes),
+    FUNCTION(node_blur),
     {NULL, NULL},
 };
 
