@@ -7,9 +7,10 @@
 
 /* Sizes of the records, which the caller compares with its own. */
 EXPORT void ocu_sizes(int32_t *sizes) {
-    sizes[0] = (int32_t)sizeof(psf_job);
-    sizes[1] = (int32_t)sizeof(psf_tables);
-    sizes[2] = (int32_t)sizeof(psf_discs_job);
+    int n = 0;
+    sizes[n++] = (int32_t)sizeof(psf_job);
+    sizes[n++] = (int32_t)sizeof(psf_tables);
+    sizes[n++] = (int32_t)sizeof(psf_discs_job);
 }
 
 EXPORT pool *ocu_pool_new(int n_threads) { return pool_new(n_threads); }
