@@ -21,12 +21,17 @@ from estimator.optics.chromatic import chromatic_refraction_dpt
 from estimator.optics.paraxial import entrance_pupil_mm
 from estimator.optics.surfaces import media_indices, pack_eye
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
-from estimator.optics.zernike import EXPONENTS, N_TERMS, remove_central_tilt
+from estimator.optics.zernike import (
+    EXPONENTS,
+    N_TERMS,
+    monomial_degrees,
+    padded_terms,
+    remove_central_tilt,
+    summed_terms,
+)
 from estimator.profiles.parse import EyeProfile
 from estimator.wavefront.aberrations import on_axis_zernike, wavefront_grid
 from estimator.wavefront.field_wavefronts import (
-    C20_DEGREES,
-    DEGREE,
     c20_by_degree,
     polynomial_in_mm,
     total_defocus_dpt,
@@ -54,7 +59,7 @@ class MeasuredResidual:
 
     Attributes
     ----------
-    residue_um : (28,), um/mm^degree
+    residue_um : (n_terms,), um/mm^degree
         Measurement minus the eye, at the measured wavelength.
     radius_mm : float
         Radius of the measured pupil.  In a wider one the residual is stretched (see
@@ -91,7 +96,7 @@ class MeasuredResidual:
         moved_um = moved_polynomial(
             at_cornea_um, depth_mm=depth_mm, radius_mm=radius_mm
         )
-        residue_um = moved_um - traced_um[0]
+        residue_um = summed_terms(moved_um, -traced_um[0])
         residue_um[0] = 0.0
         eye_dpt = total_defocus_dpt(
             zernike_from_polynomial(traced_um, radius_mm), radius_mm
@@ -116,16 +121,18 @@ class MeasuredResidual:
         return float(np.sqrt(np.sum(zernike_um[3:] ** 2)))
 
     def color_um(self, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return monomials (n, 28) that correct the color of its wavelengths (n,)."""
+        """Return monomials (n, n_terms) that correct the color of wavelengths (n,)."""
         place = np.searchsorted(self.wavelengths_nm, wavelength_nm)
-        return self.color_dpt[place][..., None] * _BOWL
+        bowl = padded_terms(_BOWL, self.residue_um.size)
+        return self.color_dpt[place][..., None] * bowl
 
     def residues_um(
         self, radius_mm: NDArray[np.float64], share: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return monomials (n, 28) of the residual in pupils (n,), scaled by shares."""
+        """Return monomials (n, n_terms) of the residual in pupils, scaled by shares."""
         stretch = stretch_ratio(radius_mm / self.radius_mm)[..., None]
-        return share[..., None] * self.residue_um * stretch**DEGREE
+        degree = monomial_degrees(self.residue_um.size)
+        return share[..., None] * self.residue_um * stretch**degree
 
     @staticmethod
     def left_share(h_deg: ArrayLike, v_deg: ArrayLike) -> NDArray[np.float64]:
@@ -134,7 +141,7 @@ class MeasuredResidual:
         return np.exp(-squared / FADE_DEG**2)
 
     def on_axis_um(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
-        """Return monomials (n, 28) at 555 nm on the axis, in pupils (n,)."""
+        """Return monomials (n, n_terms) at 555 nm on the axis, in pupils (n,)."""
         radius_mm = np.atleast_1d(np.asarray(pupil_diameter_mm, dtype=np.float64)) / 2
         color_um = self.color_um(np.full(radius_mm.size, REFERENCE_WAVELENGTH_NM))
         return self.residues_um(radius_mm, np.ones(radius_mm.size)) + color_um
@@ -146,15 +153,19 @@ class MeasuredResidual:
         if pupil_ratio > 1.0:
             stretch = float(stretch_ratio(np.array(pupil_ratio)))
         measured_um, color_um = self._on_axis_c20
-        degrees = zip(C20_DEGREES, measured_um, color_um, strict=True)
         return -SPHERE_PER_C20 * sum(
             (measured * stretch**degree + color) * radius_mm ** (degree - 2)
-            for degree, measured, color in degrees
+            for degree, measured, color in zip(
+                range(2, 2 * len(measured_um) + 1, 2),
+                measured_um,
+                color_um,
+                strict=True,
+            )
         )
 
     @cached_property
     def _on_axis_c20(self) -> tuple[list[float], list[float]]:
-        """Contributions (3,) of the residual and its color to C(2,0)."""
+        """Contributions (n,) of the residual and its color to C(2,0), by degree."""
         color_um = self.color_um(np.array([REFERENCE_WAVELENGTH_NM]))[0]
         measured, color = (
             c20_by_degree(part_um).tolist() for part_um in (self.residue_um, color_um)

@@ -62,7 +62,7 @@ class ResidualPhase(Protocol):
     """Phase added to that of the traced eye, see `estimate.measured_residual`."""
 
     def on_axis_um(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
-        """Return monomials (n, 28) at 555 nm in the plane of pupils (n,)."""
+        """Return monomials (n, n_terms) at 555 nm in the plane of pupils (n,)."""
 
     def on_axis_dpt(self, pupil_diameter_mm: float) -> float:
         """Return their least-squares M in a pupil."""

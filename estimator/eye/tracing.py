@@ -16,7 +16,7 @@ from estimator.optics.media import refractive_index
 from estimator.optics.paraxial import entrance_pupils_mm
 from estimator.optics.prescription import C20
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
-from estimator.optics.zernike import N_TERMS, rescale_pupil
+from estimator.optics.zernike import N_TERMS, rescale_pupil, summed_terms
 from estimator.wavefront.aberrations import eyes_aberrations, on_axis_zernike
 from estimator.wavefront.field_wavefronts import (
     circumscribed_radius_mm,
@@ -116,7 +116,7 @@ def seen_refraction_of_vectors(
     vectors: NDArray[np.float64],
     *,
     pupil_diameter_mm: ArrayLike,
-    added_um: NDArray[np.float64] | float = 0.0,
+    added_um: NDArray[np.float64] | None = None,
     retina: RetinaShape | None = None,
 ) -> NDArray[np.float64]:
     """Return M (P,), dpt, on axis at 555 nm over the light in each entrance pupil.
@@ -126,8 +126,8 @@ def seen_refraction_of_vectors(
 
     Parameters
     ----------
-    added_um : (P, 28), um/mm^degree
-        Wavefront added to that of the eye.
+    added_um : (P, n_terms), um/mm^degree
+        Wavefront added to that of the eye; none by default.
     """
     packed = pack_eyes(vectors, retina=retina)
     indices = eye_indices(REFERENCE_WAVELENGTH_NM)
@@ -146,7 +146,7 @@ def seen_refraction_dpt(
     *,
     pupil_z_mm: ArrayLike,
     pupil_diameter_mm: ArrayLike,
-    added_um: NDArray[np.float64] | float = 0.0,
+    added_um: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Return `seen_refraction_of_vectors` of packed eyes (P, ...).
 
@@ -165,7 +165,9 @@ def seen_refraction_dpt(
     polynomial_um = polynomial_in_mm(found.zernike_um, found.zernike_radius_mm)
     rim_mm = rim_from_ellipse(found.ellipse_mm)
     scale = pupils_mm / 2.0 / circumscribed_radius_mm(rim_mm)
-    seen_dpt = pupil_refraction_dpt(polynomial_um + added_um, rim_mm * scale[:, None])
+    if added_um is not None:
+        polynomial_um = summed_terms(polynomial_um, added_um)
+    seen_dpt = pupil_refraction_dpt(polynomial_um, rim_mm * scale[:, None])
     return np.where(found.open_ratio > OPEN_RATIO, seen_dpt, np.nan)
 
 

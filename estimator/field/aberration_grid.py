@@ -30,7 +30,7 @@ class AberrationGrid:
     ----------
     h_deg, v_deg, pupil_diameters_mm, accommodations_dpt, wavelengths_nm : (n,)
         Nodes of the axes; pupils are entrance pupils at 555 nm.
-    zernike_um : (n_h, n_v, n_pupils, n_accommodations, n_wavelengths, 28)
+    zernike_um : (n_h, n_v, n_pupils, n_accommodations, n_wavelengths, n_terms)
         NaN where the chief ray fails.
     zernike_radius_mm, rms_residual_um, open_ratio : without the last axis
     ellipse_mm : with 5 as the last axis

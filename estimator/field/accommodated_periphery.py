@@ -24,7 +24,7 @@ from estimator.field.aberration_grid import (
 from estimator.field.peripheral_residual import PeripheralResidual
 from estimator.optics.prescription import C2M2, C20, C22
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
-from estimator.optics.zernike import N_TERMS
+from estimator.optics.zernike import N_TERMS, summed_terms
 from estimator.periphery.meridian import CIRCLE_MM
 from estimator.wavefront.aberrations import wavefront_grid
 from estimator.wavefront.field_wavefronts import (
@@ -59,16 +59,17 @@ def held_refraction_um(
         Second-degree monomials; NaN where the eye could not be traced.
     """
     h_deg, v_deg = np.meshgrid(grid.h_deg, grid.v_deg, indexing="ij")
-    shape = *h_deg.shape, 1 + grid.accommodations_dpt.size, N_TERMS
+    shape = *h_deg.shape, 1 + grid.accommodations_dpt.size
     directions_deg = np.stack([h_deg.ravel(), v_deg.ravel()], axis=-1)
     traced_um = _traced_um(
         eye,
         accommodations_dpt=np.append(0.0, grid.accommodations_dpt),
         directions_deg=np.append(directions_deg, [[0.0, 0.0]], axis=0),
     )
-    traced_um += eye.rest([REFERENCE_WAVELENGTH_NM]).on_axis_um(2.0 * CIRCLE_MM)
+    rest_um = eye.rest([REFERENCE_WAVELENGTH_NM]).on_axis_um(2.0 * CIRCLE_MM)
+    traced_um = summed_terms(traced_um, rest_um)
     changed_um = periphery.at(*directions_deg.T)
-    field_um = (traced_um[:-1] + changed_um[:, None]).reshape(shape)
+    field_um = summed_terms(traced_um[:-1], changed_um[:, None]).reshape(*shape, -1)
     depth_mm = eye.accommodating.entrance_pupil_mm
 
     def at_cornea_um(polynomial_um: NDArray[Any]) -> NDArray[np.float64]:
@@ -79,10 +80,12 @@ def held_refraction_um(
 
     on_axis_um = at_cornea_um(traced_um[-1])
     wanted_um = at_cornea_um(field_um[:, :, :1]) + on_axis_um - on_axis_um[0]
-    phase_um = np.zeros_like(field_um)
+    phase_um = np.zeros((*shape, N_TERMS))
     for _ in range(ITERATIONS):
-        missing_um = np.zeros_like(field_um)
-        missing_um[..., SECOND_ORDER] = wanted_um - at_cornea_um(field_um + phase_um)
+        missing_um = np.zeros_like(phase_um)
+        missing_um[..., SECOND_ORDER] = wanted_um - at_cornea_um(
+            summed_terms(field_um, phase_um)
+        )
         step_um = polynomial_in_mm(missing_um, CIRCLE_MM)
         step_um[..., 0] = 0.0  # piston
         phase_um += step_um

@@ -1,7 +1,7 @@
 """Compiled loop for the total defocus at fixed fields, for one state of the eye.
 
 It runs for every frame whose pupil or focus has changed.  Total defocus depends only on
-three sums of monomials, by degree, and on the rim of the pupil.
+sums of monomials of degrees 2, 4 and 6, or up to 10, and on the rim of the pupil.
 `TracedFields.wavefronts` is the NumPy equivalent for complete wavefronts.
 """
 
@@ -19,9 +19,6 @@ from estimator.wavefront.field_wavefronts import (
     N_SAMPLED,
     NEWTON_STEP_RAD,
 )
-
-N_DEGREES = 3
-"""Degrees 2, 4 and 6, which contribute to C(2,0)."""
 
 _ANGLES = 2.0 * np.pi * np.arange(N_SAMPLED) / N_SAMPLED
 _COSINES, _SINES = np.cos(_ANGLES), np.sin(_ANGLES)
@@ -47,18 +44,20 @@ def fill_defocus(pupil_mm, field, axis, state, added, found_dpt):
     field, axis : (nodes_mm, powers, weights, values)
         Grids over the field and on the axis: pupils (n_pupils,), powers (8,) of the
         pupil with which sums and rims change, weights (n_accommodations,) of this
-        accommodation, and values (n_fields, n_channels, n_pupils, n_accommodations, 8).
+        accommodation, and values (n_fields, n_channels, n_pupils, n_accommodations, 8):
+        three sums, or more, and the rim.
     state : (number, channel, open_mm)
         Index of the field, index of the wavelength and unvignetted pupil, mm, of each
         of the n requests.
     added : (always, fading, fading_mm)
-        Sums (n, 3) to add: constant ones, and those of a phase that is stretched in
-        pupils with a radius above ``fading_mm``.
+        Sums (n, k) to add, at least as many as the grid has: constant ones, and those
+        of a phase that is stretched in pupils with a radius above ``fading_mm``.
     found_dpt : (n,) out
     """
     number, channel, open_mm = state
     always, fading, fading_mm = added
-    values = np.empty((N_DEGREES + N_RIM, number.size))
+    values = np.empty((field[3].shape[-1], number.size))
+    n_degrees = values.shape[0] - N_RIM
     weight, own_weight = np.empty((2, len(values))), np.empty((2, len(values)))
     lower = _pupil_weights(pupil_mm, field, weight)
     scale = _scales(pupil_mm, axis)
@@ -74,11 +73,12 @@ def fill_defocus(pupil_mm, field, axis, state, added, found_dpt):
             _between(number[k], channel[k], field, own_lower, own_weight, values[:, k])
         _scale_rim(values[:, k], own_mm, own_scale)
         fade[k] = _stretch_ratio(0.5 * own_mm / fading_mm)
-    radius_mm = _circumscribed_mm(values[N_DEGREES:])
+    radius_mm = _circumscribed_mm(values[n_degrees:])
     for k in range(number.size):
         total, fading_power, radius_power = 0.0, fade[k] ** 2, 1.0
-        for d in range(N_DEGREES):
-            part = values[d, k] + always[k, d] + fading[k, d] * fading_power
+        for d in range(always.shape[1]):
+            traced = values[d, k] if d < n_degrees else 0.0
+            part = traced + always[k, d] + fading[k, d] * fading_power
             total += part * radius_power
             fading_power *= fade[k] ** 2
             radius_power *= radius_mm[k] ** 2
@@ -97,13 +97,13 @@ def _stretch_ratio(pupil_ratio):
 def _scales(pupil_mm, axis):
     """Return ratios (n_channels,) of the requested to the traced pupil, on axis."""
     count = axis[3].shape[1]
-    values = np.empty((N_DEGREES + N_RIM, count))
+    values = np.empty((axis[3].shape[-1], count))
     weight = np.empty((2, len(values)))
     lower = _pupil_weights(pupil_mm, axis, weight)
     for channel in range(count):
         _between(0, channel, axis, lower, weight, values[:, channel])
         _scale_rim(values[:, channel], pupil_mm, 1.0)
-    return 0.5 * pupil_mm / _circumscribed_mm(values[N_DEGREES:])
+    return 0.5 * pupil_mm / _circumscribed_mm(values[values.shape[0] - N_RIM :])
 
 
 @njit(**_OPTIONS)
@@ -160,9 +160,10 @@ def _between(number, channel, grid, lower, weight, found):
 @njit(**_OPTIONS)
 def _scale_rim(values, pupil_mm, scale):
     """Scale a rim, stored relative to the pupil (its center, to the square)."""
-    for k in range(N_DEGREES, N_DEGREES + N_RIM):
+    first = values.size - N_RIM
+    for k in range(first, values.size):
         values[k] *= pupil_mm * scale
-        if k < N_DEGREES + 2:
+        if k < first + 2:
             values[k] *= pupil_mm
 
 

@@ -36,7 +36,7 @@ class FieldTable:
     Attributes
     ----------
     h_deg, v_deg : (n,)
-    zernike_um : (n, 28)
+    zernike_um : (n, n_terms)
         Coefficients at the cornea.
     zernike_radius_mm : (n,)
         Radius of their circle about the chief ray.

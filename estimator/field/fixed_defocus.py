@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from estimator.estimate.measured_residual import MeasuredResidual
 from estimator.field.interpolation import (
-    POWER,
     FieldInterpolation,
     FieldValues,
     lagrange_weights,
+    pupil_powers,
 )
-from estimator.optics.zernike import N_TERMS
-from estimator.wavefront.field_wavefronts import C20_DEGREES, DEGREE, c20_by_degree
+from estimator.optics.zernike import monomial_degrees, padded_terms
+from estimator.wavefront.field_wavefronts import N_RIM, c20_by_degree
 
 
 class FixedDefocus:
@@ -28,7 +28,7 @@ class FixedDefocus:
         Residual of the estimate.
     residual_weight : (n,)
         Weight of the residual.
-    added_um : (n, 28)
+    added_um : (n, n_terms)
         Phase that does not depend on the pupil.
     open_mm : (n,), optional
         Unvignetted pupil diameters; unlimited by default.
@@ -49,7 +49,14 @@ class FixedDefocus:
         count = values.field.size
         open_mm = np.full(count, np.inf) if open_mm is None else open_mm
         self._state = values.field, values.channel, np.ascontiguousarray(open_mm)
-        fading = residual_weight[:, None] * c20_by_degree(residual.residue_um)
+        n_terms = max(
+            added_um.shape[-1],
+            residual.residue_um.size,
+            values.values.shape[-1] - N_RIM,
+        )
+        added_um = padded_terms(added_um, n_terms)
+        residue_um = padded_terms(residual.residue_um, n_terms)
+        fading = residual_weight[:, None] * c20_by_degree(residue_um)
         self._added = (
             c20_by_degree(added_um),
             np.ascontiguousarray(fading),
@@ -77,12 +84,12 @@ class _Grid:
         self._nodes_mm = np.array(interpolation.grid.pupil_diameters_mm, np.float64)
         self._accommodations_dpt = interpolation.grid.accommodations_dpt
         whole = values.values
-        sums, rims = c20_by_degree(whole[..., :N_TERMS]), whole[..., N_TERMS:]
+        sums, rims = c20_by_degree(whole[..., :-N_RIM]), whole[..., -N_RIM:]
         self._values = np.ascontiguousarray(np.concatenate([sums, rims], axis=-1))
-        of_degree = [
-            float(POWER[:N_TERMS][degree == DEGREE][0]) for degree in C20_DEGREES
-        ]
-        self._powers = np.array([*of_degree, *POWER[N_TERMS:]])
+        n_terms = whole.shape[-1] - N_RIM
+        powers, degrees = pupil_powers(n_terms), 2 + 2 * np.arange(sums.shape[-1])
+        first = np.searchsorted(monomial_degrees(n_terms), degrees)
+        self._powers = np.concatenate([powers[first], powers[-N_RIM:]])
 
     def inputs_at(self, accommodation_dpt: float) -> tuple[NDArray[np.float64], ...]:
         """Return the arguments of the compiled loop for an accommodation."""

@@ -3,13 +3,13 @@
 Wavefronts are interpolated as polynomials in mm of the pupil plane, rims as center and
 matrix.  Interpolation is polynomial over the field, with Chebyshev nodes in the angles
 of `stretched`, and over accommodation.  Over the pupil, it follows the orders that a
-fit of sixth order omits; see `POWER`.
+fit omits; see `pupil_powers`.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.eye.tracing import OPEN_RATIO
 from estimator.field.aberration_grid import AberrationGrid
-from estimator.optics.zernike import N_TERMS
+from estimator.optics.zernike import N_TERMS, monomial_degrees, radial_order
 from estimator.wavefront.field_wavefronts import (
-    DEGREE,
     N_RIM,
     distinct_rows,
     polynomial_in_mm,
@@ -45,15 +44,22 @@ _CHUNK = 16384
 _RIM_SCALE = np.array([2, 2, 1, 1, 1])
 """A rim's center scales with the square of the pupil, its axes with the pupil."""
 
-POWER = np.concatenate([8 - DEGREE - DEGREE % 2, np.full(N_RIM, 2.3)])
-"""Powers of the pupil diameter A with which values change.  A fit of order 6 omits
-order 8 (7 if odd), which adds a part proportional to A^(8 - degree) to monomials of the
-same parity.  Rims deviate from their paraxial form with A² and, to a lesser degree,
-A⁴."""
-
 
 FieldNodes = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Azimuths (n_h,) and elevations (n_v,), deg, ascending, of a grid over the field."""
+
+
+@cache
+def pupil_powers(n_terms: int = N_TERMS) -> NDArray[np.float64]:
+    """Return powers (n_terms + 5,) of the pupil diameter A with which values change.
+
+    A fit of order 6 omits order 8 (7 if odd), which adds a part proportional to
+    A^(8 - degree) to monomials of the same parity.  Rims deviate from their paraxial
+    form with A² and, to a lesser degree, A⁴.
+    """
+    order, degree = radial_order(n_terms), monomial_degrees(n_terms)
+    omitted = order + 1 + (order + 1 - degree) % 2
+    return np.concatenate([omitted - degree, np.full(N_RIM, 2.3)])
 
 
 def stretched(angle_deg: ArrayLike) -> NDArray[np.float64]:
@@ -127,9 +133,9 @@ def lagrange_weights(
 
 
 def pupil_weights(
-    nodes_mm: NDArray[np.float64], pupil_mm: NDArray[Any]
+    nodes_mm: NDArray[np.float64], pupil_mm: NDArray[Any], n_terms: int = N_TERMS
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the weights of traced pupils at pupils (n,); see `POWER`.
+    """Return the weights of traced pupils at pupils (n,); see `pupil_powers`.
 
     Of two or more than three traced pupils, the next smaller and the next larger one
     have weights.  Three have one smooth function, with a second power of the diameter:
@@ -140,19 +146,20 @@ def pupil_weights(
     -------
     lower : (n,)
         Index of the first pupil with a weight, which is 1 minus the other weights.
-    weights : (n, k, 33)
+    weights : (n, k, n_terms + 5)
         Weights of the k next pupils; k is 0 for one traced pupil, otherwise 1 or 2.
     """
+    power = pupil_powers(n_terms)
     if nodes_mm.size == 1:
         return np.zeros(pupil_mm.size, np.int64), np.zeros(
-            (pupil_mm.size, 0, POWER.size)
+            (pupil_mm.size, 0, power.size)
         )
     if nodes_mm.size == SMOOTH_NODES:
         ratio = nodes_mm / nodes_mm[-1]
 
         def rises(ratios: NDArray[Any]) -> NDArray[np.float64]:
-            """Return powers (n, 2, 33) of ratios (n,), minus those of the first."""
-            powers = np.stack([POWER, POWER + 2.0])
+            """Return powers (n, 2, m) of ratios (n,), minus those of the first."""
+            powers = np.stack([power, power + 2.0])
             found: NDArray[np.float64] = (
                 ratios[:, None, None] ** powers - ratio[0] ** powers
             )
@@ -165,8 +172,8 @@ def pupil_weights(
     lower = np.searchsorted(nodes_mm, pupil_mm, side="right") - 1
     lower = np.clip(lower, 0, nodes_mm.size - 2)
     high_mm = nodes_mm[lower + 1]
-    least = (nodes_mm[lower] / high_mm)[:, None] ** POWER
-    weight = ((pupil_mm / high_mm)[:, None] ** POWER - least) / (1.0 - least)
+    least = (nodes_mm[lower] / high_mm)[:, None] ** power
+    weight = ((pupil_mm / high_mm)[:, None] ** power - least) / (1.0 - least)
     return lower, weight[:, None]
 
 
@@ -197,7 +204,7 @@ class FieldValues:
 
     Attributes
     ----------
-    values : (n_fields, n_channels, n_pupils, n_accommodations, 33)
+    values : (n_fields, n_channels, n_pupils, n_accommodations, n_terms + 5)
     first_pupil : int
         Index in the grid of the first pupil in `values`.
     field, channel : (n,)
@@ -241,6 +248,7 @@ class FieldInterpolation:
             ],
             axis=-1,
         )
+        self._n_terms = grid.zernike_um.shape[-1]
         is_open = self.is_open(grid)
         nodes_mm = grid.pupil_diameters_mm
         for i in range(1, len(pupils_mm)):
@@ -248,7 +256,7 @@ class FieldInterpolation:
             values[:, :, i][closed] = values[:, :, i - 1][closed]
             if i == len(pupils_mm) - 1 == SMOOTH_NODES - 1:
                 # so that the smooth interpolation ignores the closed pupil
-                reach = pupil_weights(nodes_mm[:2], nodes_mm[2:])[1][0, 0]
+                reach = self._pupil_weights(nodes_mm[2:], nodes_mm[:2])[1][0, 0]
                 low, high = values[:, :, 0][closed], values[:, :, 1][closed]
                 values[:, :, i][closed] = low + reach * (high - low)
         passed_mm = pupils_mm[..., 0] * np.sqrt(grid.open_ratio)
@@ -256,8 +264,8 @@ class FieldInterpolation:
         self.passes = bool(is_open[:, :, 0].all() and has_chief_rays)
         self.open_pupil_mm = passed_mm.max(axis=2).min(axis=(2, 3))
         self.all_open = bool(is_open.all())
-        # (n_h, n_v, n_wavelengths, n_pupils, n_accommodations, 33), contiguous for
-        # matrix products.
+        # (n_h, n_v, n_wavelengths, n_pupils, n_accommodations, n_terms + 5),
+        # contiguous for matrix products.
         self._values = np.ascontiguousarray(np.moveaxis(values, 4, 2))
 
     def add(self, phase_um: NDArray[np.float64]) -> None:
@@ -267,7 +275,15 @@ class FieldInterpolation:
         ----------
         phase_um : (n_h, n_v, n_accommodations, 28), um/mm^degree
         """
-        self._values[..., :N_TERMS] += phase_um[:, :, None, None]
+        self._values[..., : phase_um.shape[-1]] += phase_um[:, :, None, None]
+
+    def _pupil_weights(
+        self, pupil_mm: NDArray[Any], nodes_mm: NDArray[np.float64] | None = None
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return `pupil_weights` of the grid's nodes, or of other ones."""
+        if nodes_mm is None:
+            nodes_mm = self.grid.pupil_diameters_mm
+        return pupil_weights(nodes_mm, pupil_mm, self._n_terms)
 
     @staticmethod
     def is_open(grid: AberrationGrid) -> NDArray[np.bool_]:
@@ -299,7 +315,7 @@ class FieldInterpolation:
         accommodation_dpt: NDArray[np.float64],
         wavelength_nm: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return polynomials (n, 28), um/mm^degree, and rims (n, 5), mm, of states.
+        """Return polynomials, um/mm^degree, and rims (n, 5), mm, of states (n,).
 
         Raises
         ------
@@ -345,9 +361,7 @@ class FieldInterpolation:
         pupils = slice(0, None)
         if pupil_diameter_mm is not None:
             # Few calls need all wavelengths and pupils.
-            lower, shares = pupil_weights(
-                self.grid.pupil_diameters_mm, pupil_diameter_mm
-            )
+            lower, shares = self._pupil_weights(pupil_diameter_mm)
             pupils = slice(int(lower.min()), int(lower.max()) + 1 + shares.shape[1])
         values = self._over_field(h_deg[first], v_deg[first], channels, pupils)
         return FieldValues(values, pupils.start, field, channel)
@@ -359,16 +373,14 @@ class FieldInterpolation:
         pupil_diameter_mm: NDArray[np.float64],
         accommodation_dpt: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return polynomials (n, 28), um/mm^degree, and rims (n, 5), mm, of states."""
+        """Return polynomials, um/mm^degree, and rims (n, 5), mm, of states (n,)."""
         weights = _evaluate_distinct(
             lambda dpt: lagrange_weights(self.grid.accommodations_dpt, dpt),
             accommodation_dpt,
         )
-        lower, shares = _evaluate_distinct(
-            partial(pupil_weights, self.grid.pupil_diameters_mm), pupil_diameter_mm
-        )
+        lower, shares = _evaluate_distinct(self._pupil_weights, pupil_diameter_mm)
         lower = lower - states.first_pupil
-        found = np.empty((lower.size, N_TERMS + N_RIM))
+        found = np.empty((lower.size, self._n_terms + N_RIM))
         for start in range(0, lower.size, _CHUNK):
             part = slice(start, start + _CHUNK)
             at = states.field[part], states.channel[part]
@@ -381,8 +393,8 @@ class FieldInterpolation:
             found[part] = low
             for k, high in enumerate(higher):
                 found[part] += shares[part, k] * (high - low)
-        rim_mm = found[:, N_TERMS:] * pupil_diameter_mm[:, None] ** _RIM_SCALE
-        return found[:, :N_TERMS], rim_mm
+        rim_mm = found[:, -N_RIM:] * pupil_diameter_mm[:, None] ** _RIM_SCALE
+        return found[:, :-N_RIM], rim_mm
 
     def chief_shift_mrad(
         self,
@@ -415,7 +427,7 @@ class FieldInterpolation:
         channels: NDArray[Any],
         pupils: slice,
     ) -> NDArray[np.float64]:
-        """Return values (n, n_channels, n_pupils, n_accommodations, 33) at fields."""
+        """Return values (n, n_channels, n_pupils, n_accommodations, m) at fields."""
         over_h = lagrange_weights(stretched(self.grid.h_deg), stretched(h_deg))
         over_v = lagrange_weights(stretched(self.grid.v_deg), stretched(v_deg))
         weights = (over_h[:, :, None] * over_v[:, None, :]).reshape(h_deg.size, -1)

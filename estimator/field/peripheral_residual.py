@@ -30,7 +30,12 @@ from estimator.field.aberration_grid import (
 )
 from estimator.field.interpolation import FieldInterpolation, FieldNodes
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
-from estimator.optics.zernike import N_TERMS, flip_horizontal, remove_central_tilt
+from estimator.optics.zernike import (
+    N_TERMS,
+    flip_horizontal,
+    remove_central_tilt,
+    summed_terms,
+)
 from estimator.periphery.change import PeripheralChange
 from estimator.periphery.meridian import CIRCLE_MM, TERMS
 from estimator.profiles.parse import EyeProfile, Measurement
@@ -96,7 +101,9 @@ class PeripheralResidual:
             accommodation_dpt=np.zeros(h_deg.size),
             wavelength_nm=np.full(h_deg.size, REFERENCE_WAVELENGTH_NM),
         )
-        difference_um = zernike_from_polynomial(population_um - traced_um, CIRCLE_MM)
+        difference_um = zernike_from_polynomial(
+            summed_terms(population_um, -traced_um), CIRCLE_MM
+        )[..., :N_TERMS]
         known = np.isin(np.arange(N_TERMS), TERMS)
         difference_um = remove_central_tilt(np.where(known, difference_um, 0.0))
         return polynomial_in_mm(difference_um, CIRCLE_MM)

@@ -14,6 +14,7 @@ from estimator.estimate.measured_residual import MeasuredResidual
 from estimator.field.fixed_defocus import FixedDefocus
 from estimator.field.interpolation import FieldInterpolation
 from estimator.field.peripheral_residual import PeripheralResidual
+from estimator.optics.zernike import summed_terms
 from estimator.wavefront.field_wavefronts import (
     circumscribed_radius_mm,
     distinct_rows,
@@ -53,7 +54,7 @@ class TracedFields:
     ----------
     field, on_axis : FieldInterpolation
         Interpolation over the field, and one that contains the axis.
-    correction_um : (28,) or (n, 28), um/mm^degree
+    correction_um : (n_terms,) or (n, n_terms), um/mm^degree
         Wavefront of the correction, which is subtracted.
     residual : MeasuredResidual
         Residual of the estimate, which is added.
@@ -89,10 +90,11 @@ class TracedFields:
         )
         self._residual = residual
         self._residual_weight = residual.left_share(h_deg, v_deg)
-        self._added_um = residual.color_um(wavelength_nm) - correction_um
+        self._added_um = summed_terms(residual.color_um(wavelength_nm), -correction_um)
         if periphery is not None:
             self._residual_weight = np.ones(h_deg.size)
-            self._added_um += _evaluate_distinct(periphery.at, h_deg, v_deg)
+            change_um = _evaluate_distinct(periphery.at, h_deg, v_deg)
+            self._added_um = summed_terms(self._added_um, change_um)
         zeros = np.zeros(h_deg.size)
         self._axis_states = on_axis.values(
             h_deg=zeros, v_deg=zeros, wavelength_nm=wavelength_nm, **pupils
@@ -104,11 +106,18 @@ class TracedFields:
         pupil_diameter_mm: NDArray[np.float64],
         accommodation_dpt: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Return coefficients (n, 28), um, rims (n, 5) and radii (n,), mm, of states.
+        """Return coefficients, um, rims (n, 5) and radii (n,), mm, of states.
 
         Parameters
         ----------
         pupil_diameter_mm, accommodation_dpt : (n,)
+
+        Returns
+        -------
+        zernike_um : (n, n_terms), um
+            As many terms as the residual or the traced wavefronts have.
+        rim_mm : (n, 5)
+        radius_mm : (n,)
         """
         pupil_mm = self._usable_mm(pupil_diameter_mm)
         polynomial_um, rim_mm = self._field.between(
@@ -120,7 +129,7 @@ class TracedFields:
         radius_mm = circumscribed_radius_mm(rim_mm)
         residue_um = self._residual.residues_um(pupil_mm / 2.0, self._residual_weight)
         zernike_um = zernike_from_polynomial(
-            polynomial_um + self._added_um + residue_um, radius_mm
+            summed_terms(polynomial_um, self._added_um, residue_um), radius_mm
         )
         return zernike_um, rim_mm, radius_mm
 

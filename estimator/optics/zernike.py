@@ -115,6 +115,15 @@ def index_from_nm(n: int, m: int) -> int:
     return (n * (n + 2) + m) // 2
 
 
+def summed_terms(*parts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sum of coefficients or monomials, with the most terms of its parts."""
+    n_terms = max(part.shape[-1] for part in parts)
+    total = padded_terms(parts[0], n_terms)
+    for part in parts[1:]:
+        total = total + padded_terms(part, n_terms)
+    return total
+
+
 _Terms = dict[tuple[int, int], int]
 """Coefficients of monomials by their exponents."""
 

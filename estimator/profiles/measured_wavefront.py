@@ -24,7 +24,11 @@ from estimator.optics.vergence import (
     ObjectVergence,
     refraction_at_cornea_dpt,
 )
-from estimator.optics.zernike import remove_central_tilt, rescale_pupil
+from estimator.optics.zernike import (
+    remove_central_tilt,
+    rescale_pupil,
+    summed_terms,
+)
 from estimator.profiles.parse import EyeProfile
 from estimator.wavefront.field_wavefronts import (
     N_RIM,
@@ -71,7 +75,7 @@ def profile_amplitude_dpt(profile: EyeProfile) -> float:
 class WavefrontState:
     """Wavefront of the eye at one pupil, object, focus and wavelength.
 
-    ``zernike_um`` (28,) is on the circle of ``pupil_diameter_mm``; ``notes`` list
+    ``zernike_um`` (n_terms,) is on the circle of ``pupil_diameter_mm``; ``notes`` list
     requests that could not be met.
     """
 
@@ -87,7 +91,7 @@ class MeasuredWavefront(FocusingEye):
     ----------
     eye_side : str
         OD or OS.
-    zernike_um : (28,)
+    zernike_um : (n_terms,)
         Coefficients in the plane of a typical entrance pupil, correction subtracted.
     refraction_dpt : float
         M at the cornea and 555 nm at the measured pupil, through the correction.
@@ -108,10 +112,11 @@ class MeasuredWavefront(FocusingEye):
             radius_mm,
         )
         if profile.correction is not None:
-            zernike_um = zernike_um - zernike_from_polynomial(
+            correction_um = zernike_from_polynomial(
                 worn_polynomial(profile.correction, entrance_pupil_mm=depth_mm),
                 radius_mm,
             )
+            zernike_um = summed_terms(zernike_um, -correction_um)
         self.rings = rings_of(profile.correction)
         self.vergence = ObjectVergence.seen_through(
             profile.correction, entrance_pupil_mm=depth_mm
@@ -173,7 +178,7 @@ class MeasuredWavefront(FocusingEye):
     def zernike_with_defocus(
         self, *, pupil_diameter_mm: float, added_defocus_dpt: float
     ) -> NDArray[np.float64]:
-        """Return coefficients (28,), um, with vergence added to the relaxed eye.
+        """Return coefficients (n_terms,), um, with vergence added to the relaxed eye.
 
         ``added_defocus_dpt`` is object vergence minus accommodation plus chromatic
         shift; C(2,0) changes by -added r²/(4 sqrt 3), everything else is the
@@ -300,7 +305,7 @@ class MeasuredWavefront(FocusingEye):
         )
 
     def _on_circles(self, radius_mm: NDArray[Any]) -> NDArray[np.float64]:
-        """Return measured coefficients (P, 28) on circles (P,), piston zero."""
+        """Return measured coefficients (P, n) on circles (P,), piston zero."""
         polynomial_um = polynomial_in_mm(self.zernike_um, self.zernike_radius_mm)
         return zernike_from_polynomial(polynomial_um, radius_mm)
 

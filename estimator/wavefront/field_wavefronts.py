@@ -16,22 +16,21 @@ from numpy.typing import ArrayLike, NDArray
 from estimator.optics import prescription as rx
 from estimator.optics.units import SPHERE_PER_C20, UM_PER_MM
 from estimator.optics.zernike import (
-    EXPONENTS,
+    N_TERMS,
+    exponents,
     inverse_monomial_matrix,
+    monomial_degrees,
     wavefront_polynomial,
 )
 
-DEGREE: NDArray[np.int64] = EXPONENTS.sum(axis=1)
-"""Degree of each monomial, (28,)."""
+DEGREE: NDArray[np.int64] = monomial_degrees()
+"""Degree of each of the default monomials, (28,)."""
 
 TILT_Y, TILT_X = 1, 2
 """Index of C(1,-1) and C(1,1)."""
 
 N_RIM = 5
 """Columns of a rim: x, y of the center and xx, xy, yy of the matrix, mm."""
-
-C20_DEGREES = (2, 4, 6)
-"""Degrees of the monomials that contribute to C(2,0)."""
 
 N_SAMPLED, N_NEWTON_STEPS, NEWTON_STEP_RAD = 16, 4, 0.2
 """Search for the farthest point of a rim: number of samples, and number and largest
@@ -46,7 +45,7 @@ class FieldWavefronts:
 
     Attributes
     ----------
-    zernike_um : (P, 28), um
+    zernike_um : (P, n_terms), um
         Coefficients on the circle; tilt is kept, piston is zero.
     circle_diameter_mm : (P,)
         Diameter of the circle about the chief ray that circumscribes the pupil.
@@ -119,31 +118,34 @@ def circumscribed_radius_mm(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 def polynomial_in_mm(
     zernike_um: NDArray[np.float64], radius_mm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return monomials (..., 28), um/mm^degree, of coefficients on circles (...)."""
+    """Return monomials (..., n), um/mm^degree, of coefficients on circles (...)."""
     radius_mm = np.asarray(radius_mm, dtype=np.float64)[..., None]
-    return wavefront_polynomial(zernike_um) / radius_mm**DEGREE
+    degree = monomial_degrees(zernike_um.shape[-1])
+    return wavefront_polynomial(zernike_um) / radius_mm**degree
 
 
 def zernike_from_polynomial(
     polynomial_um: NDArray[np.float64], radius_mm: ArrayLike
 ) -> NDArray[np.float64]:
-    """Return coefficients (..., 28), um, on circles (...), of monomials in mm.
+    """Return coefficients (..., n_terms), um, on circles (...), of monomials in mm.
 
     Piston is zero.
     """
     radius_mm = np.asarray(radius_mm, dtype=np.float64)[..., None]
-    zernike_um = (polynomial_um * radius_mm**DEGREE) @ inverse_monomial_matrix()
+    n_terms = polynomial_um.shape[-1]
+    scaled_um = polynomial_um * radius_mm ** monomial_degrees(n_terms)
+    zernike_um = scaled_um @ inverse_monomial_matrix(n_terms)
     zernike_um[..., 0] = 0.0
     return zernike_um
 
 
 @cache
-def _curvatures() -> NDArray[np.float64]:
-    """Return xx, xy and yy derivatives (3, n, 28) of monomials in a unit circle."""
+def _curvatures(n_terms: int) -> NDArray[np.float64]:
+    """Return xx, xy and yy derivatives (3, n, n_terms) of monomials in a circle."""
     radii = np.linspace(0.0, 1.0, 9)[:, None]
     x, y = (radii * circular(_ANGLES) for circular in (np.cos, np.sin))
-    found = np.zeros((3, x.size, DEGREE.size))
-    for k, (a, b) in enumerate(EXPONENTS.tolist()):
+    found = np.zeros((3, x.size, n_terms))
+    for k, (a, b) in enumerate(exponents(n_terms).tolist()):
         for row, (i, j) in enumerate(((2, 0), (1, 1), (0, 2))):
             if a >= i and b >= j:
                 factor = math.perm(a, i) * math.perm(b, j)
@@ -160,25 +162,29 @@ def rays_cross(
 
     Parameters
     ----------
-    polynomial_um : (28,), um/mm^degree
+    polynomial_um : (n_terms,), um/mm^degree
     """
-    scaled = polynomial_um * radius_mm ** (DEGREE - 2.0)
-    xx, xy, yy = depth_mm / UM_PER_MM * (_curvatures() @ scaled)
+    n_terms = polynomial_um.size
+    scaled = polynomial_um * radius_mm ** (monomial_degrees(n_terms) - 2.0)
+    xx, xy, yy = depth_mm / UM_PER_MM * (_curvatures(n_terms) @ scaled)
     area = (1.0 + xx) * (1.0 + yy) - xy**2
     return bool((area <= 0.0).any() or (xx + yy <= -2.0).any())
 
 
 def c20_by_degree(polynomial_um: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return contributions (..., 3), um, of `C20_DEGREES` to C(2,0) on 1 mm radius.
+    """Return contributions (..., n), um, of degrees 2, 4 ... to C(2,0) on 1 mm radius.
 
     On a radius of r mm, the contribution of a degree is r**degree times as large.
 
     Parameters
     ----------
-    polynomial_um : (..., 28), um/mm^degree
+    polynomial_um : (..., n_terms), um/mm^degree
     """
-    share = inverse_monomial_matrix()[:, rx.C20] * polynomial_um
-    sums = [share[..., degree == DEGREE].sum(axis=-1) for degree in C20_DEGREES]
+    n_terms = polynomial_um.shape[-1]
+    share = inverse_monomial_matrix(n_terms)[:, rx.C20] * polynomial_um
+    own_degree = monomial_degrees(n_terms)
+    degrees = range(2, int(own_degree[-1]) + 1, 2)
+    sums = [share[..., degree == own_degree].sum(axis=-1) for degree in degrees]
     return np.stack(sums, axis=-1)
 
 
@@ -197,7 +203,7 @@ def correction_polynomial(
         Depth of the entrance pupil behind the cornea.
     """
     if correction is None:
-        return np.zeros(DEGREE.size)
+        return np.zeros(N_TERMS)
     zernike_um = rx.zernike_from_power_vector(
         *rx.power_vector(correction, depth_mm=entrance_pupil_mm), zernike_radius_mm=1.0
     )
@@ -222,7 +228,7 @@ def with_defocus(
 
     Parameters
     ----------
-    zernike_um : (P, 28)
+    zernike_um : (P, n_terms)
     rim_mm : (P, 5)
     radius_mm : (P,)
         Radius of the circle of the coefficients.
@@ -242,7 +248,7 @@ def with_tilt(
     radius_mm: ArrayLike,
     shift_mrad: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return wavefronts (P, 28) with a tilt that shifts their PSFs by (P, 2), mrad.
+    """Return wavefronts (P, n) with a tilt that shifts their PSFs by (P, 2), mrad.
 
     A PSF is at +grad W (um/mm = mrad), and Z(1,1) = 2 x / r.
     """

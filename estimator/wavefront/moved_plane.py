@@ -3,7 +3,8 @@
 Instruments and networks give wavefronts at the cornea, but PSFs are computed in the
 entrance pupil.  By the eikonal equation, dW/dz = -|grad W|² / 2 for slopes of a few
 mrad/mm.  Its solution follows rays: each moves by its slope, and W grows by half the
-squared slope.  A moved wavefront has terms of all orders, and 28 are fitted to it.
+squared slope.  A moved wavefront has terms of all orders, and the terms up to a radial
+order are fitted to it.
 """
 
 from functools import cache
@@ -13,8 +14,13 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.optics.units import UM_PER_MM
-from estimator.optics.zernike import EXPONENTS, MAX_RADIAL_ORDER, N_TERMS
-from estimator.wavefront.field_wavefronts import DEGREE
+from estimator.optics.zernike import (
+    HIGHEST_ORDER,
+    MAX_RADIAL_ORDER,
+    exponents,
+    monomial_degrees,
+    radial_order,
+)
 from estimator.wavefront.nodes import circle_nodes
 
 _ANGLES = 2.0 * np.pi * np.arange(16) / 16
@@ -22,14 +28,15 @@ _RIM = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 
 TILT = [1, 2]
 
-N_MOMENTS = 2 * MAX_RADIAL_ORDER + 1
-"""Powers of x or y in products of two monomials, from 0."""
-
 
 @cache
-def _rays() -> NDArray[np.float64]:
-    """Return x, y and weight (96, 3) of nodes over the unit circle."""
-    rings, weights, azimuths, _ = circle_nodes()
+def _rays(order: int) -> NDArray[np.float64]:
+    """Return x, y and weight (n, 3) of nodes over the unit circle.
+
+    96 nodes determine sixth-order fits, 260 those of tenth order.
+    """
+    sampling = () if order <= MAX_RADIAL_ORDER else (HIGHEST_ORDER, 26)
+    rings, weights, azimuths, _ = circle_nodes(*sampling)
     points = (azimuths[:, None, :] * rings[:, None]).reshape(-1, 2)
     return np.column_stack([points, np.tile(weights, len(azimuths))])
 
@@ -45,9 +52,10 @@ def _add_rays(
     """Add moved rays to moments (n, a, b) of their positions, and to those of W.
 
     Lengths are relative to the radius of the circle.  ``tables_um[n, a, b]`` is the
-    coefficient of x^a y^b, and rays move by reach times the gradient.
+    coefficient of x^a y^b, and rays move by reach times the gradient.  The size of
+    ``products_um`` is that of the fit.
     """
-    order = tables_um.shape[1] - 1
+    order, fitted = tables_um.shape[1] - 1, products_um.shape[1] - 1
     for n in range(tables_um.shape[0]):
         for k in range(rays.shape[0]):
             x, y, weight = rays[k]
@@ -64,52 +72,62 @@ def _add_rays(
             y += reach[n] * slope_y
             value += reach[n] / 2.0 * (slope_x**2 + slope_y**2)
             power_x = weight
-            for a in range(2 * order + 1):
+            for a in range(2 * fitted + 1):
                 power = power_x
-                for b in range(2 * order + 1 - a):
+                for b in range(2 * fitted + 1 - a):
                     moments[n, a, b] += power
-                    if a + b <= order:
+                    if a + b <= fitted:
                         products_um[n, a, b] += power * value
                     power *= y
                 power_x *= x
 
 
 def moved_polynomial(
-    polynomial_um: NDArray[np.float64], *, depth_mm: ArrayLike, radius_mm: ArrayLike
+    polynomial_um: NDArray[np.float64],
+    *,
+    depth_mm: ArrayLike,
+    radius_mm: ArrayLike,
+    n_terms: int | None = None,
 ) -> NDArray[np.float64]:
-    """Return wavefronts (..., 28) in a plane deeper in the eye.
+    """Return wavefronts (..., n_terms) in a plane deeper in the eye.
 
     The result is the least-squares fit to the rays through a circle.  Without the fit,
     in keratoconus over 5 mm, the error would be 0.042 um instead of 0.001 um.
 
     Parameters
     ----------
-    polynomial_um : (..., 28), um/mm^degree
+    polynomial_um : (..., n_given_terms), um/mm^degree
         Monomials; see `field_wavefronts.polynomial_in_mm`.
     depth_mm : (...)
         Distance between the planes; negative if the new plane is in front.
     radius_mm : (...)
         Radius of the circle about the chief ray, in the plane of the given wavefronts.
+    n_terms : int, optional
+        Number of terms of the result, at least that of the given ones, which is the
+        default.
     """
     shape, count = polynomial_um.shape[:-1], polynomial_um[..., 0].size
+    given = polynomial_um.shape[-1]
+    order, fitted = radial_order(given), radial_order(n_terms or given)
     depth_mm, radius_mm = (
         np.broadcast_to(np.asarray(values, np.float64), shape).reshape(count, 1)
         for values in (depth_mm, radius_mm)
     )
-    scale = radius_mm**DEGREE
-    tables_um = np.zeros((count, MAX_RADIAL_ORDER + 1, MAX_RADIAL_ORDER + 1))
-    start_um = polynomial_um.reshape(count, -1) * scale
+    tables_um = np.zeros((count, order + 1, order + 1))
+    start_um = polynomial_um.reshape(count, -1) * radius_mm ** monomial_degrees(given)
     # tilt is an artifact of the fit: the chief ray has no slope
     start_um[:, TILT] = 0.0
-    tables_um[:, *EXPONENTS.T] = start_um
-    moments = np.zeros((count, N_MOMENTS, N_MOMENTS))
-    products_um = np.zeros_like(tables_um)
+    tables_um[:, *exponents(given).T] = start_um
+    moments = np.zeros((count, 2 * fitted + 1, 2 * fitted + 1))
+    products_um = np.zeros((count, fitted + 1, fitted + 1))
     reach = depth_mm[:, 0] / (UM_PER_MM * radius_mm[:, 0] ** 2)
-    _add_rays(tables_um, reach, _rays(), moments, products_um)
-    pairs = EXPONENTS[:, None] + EXPONENTS
+    _add_rays(tables_um, reach, _rays(fitted), moments, products_um)
+    powers = exponents(n_terms or given)
+    pairs = powers[:, None] + powers
     normal = moments[:, pairs[..., 0], pairs[..., 1]]
-    fitted_um = np.linalg.solve(normal, products_um[:, *EXPONENTS.T, None])[..., 0]
-    moved_um = (fitted_um / scale).reshape(polynomial_um.shape)
+    fitted_um = np.linalg.solve(normal, products_um[:, *powers.T, None])[..., 0]
+    moved_um: NDArray[np.float64] = fitted_um / radius_mm ** powers.sum(axis=1)
+    moved_um = moved_um.reshape(*shape, -1)
     moved_um[..., 0] = polynomial_um[..., 0]
     moved_um[..., TILT] += polynomial_um[..., TILT]
     return moved_um
@@ -126,7 +144,7 @@ def moved_rim(
     Parameters
     ----------
     rim_mm : (..., 5)
-    polynomial_um : (..., 28), um/mm^degree
+    polynomial_um : (..., n_terms), um/mm^degree
         Wavefronts before the transfer.
     depth_mm : (...)
     """
@@ -134,8 +152,9 @@ def moved_rim(
     cosine, sine = _RIM.T
     px, py = x + xx * cosine + xy * sine, y + xy * cosine + yy * sine
     slopes = np.zeros((*px.shape, 2))
-    for k in range(3, N_TERMS):
-        (a, b), factor = EXPONENTS[k], polynomial_um[..., k, None]
+    powers = exponents(polynomial_um.shape[-1]).tolist()
+    for k, (a, b) in enumerate(powers[3:], 3):
+        factor = polynomial_um[..., k, None]
         if a:
             slopes[..., 0] += factor * a * px ** (a - 1) * py**b
         if b:

@@ -10,20 +10,22 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.optics.zernike import EXPONENTS
-
-N_RINGS, N_AZIMUTHS = 5, 14
-"""Quadrature that is exact for products of sixth and second order."""
+from estimator.optics.zernike import MAX_RADIAL_ORDER, exponents, radial_order
 
 
 @cache
-def _disc() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return quadrature points (n, 2) and weights (n,) of the unit disc."""
-    unit, weights = np.polynomial.legendre.leggauss(N_RINGS)
+def _disc(order: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return quadrature points (n, 2) and weights (n,) of the unit disc.
+
+    They are exact for products of this order and the second.
+    """
+    order = max(order, MAX_RADIAL_ORDER)
+    n_rings, n_azimuths = order // 2 + 2, order + 8
+    unit, weights = np.polynomial.legendre.leggauss(n_rings)
     radius = np.sqrt(0.5 + 0.5 * unit)
-    angle = 2.0 * np.pi * np.arange(N_AZIMUTHS) / N_AZIMUTHS
+    angle = 2.0 * np.pi * np.arange(n_azimuths) / n_azimuths
     points = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    shares = np.repeat(0.5 * weights / N_AZIMUTHS, N_AZIMUTHS)
+    shares = np.repeat(0.5 * weights / n_azimuths, n_azimuths)
     return points.reshape(-1, 2), shares
 
 
@@ -34,18 +36,19 @@ def pupil_refraction_dpt(
 
     Parameters
     ----------
-    polynomial_um : (..., 28), um/mm^degree
+    polynomial_um : (..., n_terms), um/mm^degree
         Monomials; see `field_wavefronts.polynomial_in_mm`.
     rim_mm : (..., 5)
         Center and matrix; see `field_wavefronts.rim_from_ellipse`.
     """
-    points, shares = _disc()
+    n_terms = polynomial_um.shape[-1]
+    points, shares = _disc(radial_order(n_terms))
     cosine, sine = points.T
     x, y, xx, xy, yy = np.moveaxis(rim_mm, -1, 0)[..., None]
     px, py = x + xx * cosine + xy * sine, y + xy * cosine + yy * sine
     wave_um = sum(
         polynomial_um[..., k, None] * px**a * py**b
-        for k, (a, b) in enumerate(EXPONENTS.tolist())
+        for k, (a, b) in enumerate(exponents(n_terms).tolist())
     )
     # 1, x and y are orthogonal over the unit disc: project out piston and tilt.
     plane = np.stack([np.ones_like(cosine), 2.0 * cosine, 2.0 * sine])

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator.field.defocus_loops import N_DEGREES, fill_defocus
+from estimator.field.defocus_loops import fill_defocus
 from estimator.media.straylight import Straylight
 from estimator.wavefront.field_wavefronts import N_RIM
 from filter_service.camera import Camera
@@ -89,8 +89,9 @@ def _plan_nodes_once(store: PsfStore) -> None:
 
 def _defocus_once() -> None:
     """Run the defocus loops of traced eyes; the perfect eye is a wavefront only."""
-    count = N_DEGREES + N_RIM
+    n_degrees = 3  # of 28 terms
+    count = n_degrees + N_RIM
     grid = np.arange(2.0, 4.0), np.ones(count), np.ones(1), np.ones((1, 1, 2, 1, count))
-    index, sums = np.zeros(1, np.int64), np.zeros((1, N_DEGREES))
+    index, sums = np.zeros(1, np.int64), np.zeros((1, n_degrees))
     fields, added = (index, index, np.ones(1)), (sums, sums, 1.0)
     fill_defocus(2.0, grid, grid, fields, added, np.empty(1))

@@ -38,7 +38,7 @@ def myope():
     return estimate_eye(parse_profile({"kind": "preset", "name": "myopia"})).parameters
 
 
-def refraction_dpt(parameters, pupil_diameter_mm, retina=None, added_um=0.0):
+def refraction_dpt(parameters, pupil_diameter_mm, retina=None, added_um=None):
     """Traced in the plane of the entrance pupil, over what of it light fills."""
     return seen_refraction_of_vectors(
         parameters.to_vector()[None],

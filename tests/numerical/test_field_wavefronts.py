@@ -17,12 +17,16 @@ from estimator.profiles.parse import parse_profile, preset_names
 from estimator.psf.compute import compute_psf_batch
 from estimator.wavefront.aberrations import wavefront_grid
 from estimator.wavefront.field_wavefronts import (
+    N_RIM,
+    c20_by_degree,
     circumscribed_radius_mm,
     ellipse_from_rim,
     polynomial_in_mm,
     rim_from_ellipse,
+    total_defocus_dpt,
     zernike_from_polynomial,
 )
+from estimator.wavefront.pupil_refraction import pupil_refraction_dpt
 
 WIDE_DEG = ((-45.0, 45.0), (-25.0, 25.0))
 BLUE_NM = 464.0
@@ -431,3 +435,18 @@ def test_rims_and_their_circles():
     y = cy + xy * np.cos(angle) + yy * np.sin(angle)
     highest_mm = np.hypot(x, y).max(axis=1)
     assert circumscribed_radius_mm(rim_mm) == pytest.approx(highest_mm, rel=1e-7)
+
+
+@pytest.mark.parametrize("n_terms", [28, 36, 66])
+def test_refraction_over_a_round_pupil_is_that_of_its_coefficients(rng, n_terms):
+    """Zernike terms are orthogonal, so higher orders have no part in M."""
+    zernike_um, radius_mm = rng.normal(size=(3, n_terms)), np.array([1.0, 2.2, 3.4])
+    polynomial_um = polynomial_in_mm(zernike_um, radius_mm)
+    rim_mm = np.zeros((3, N_RIM))
+    rim_mm[:, 2] = rim_mm[:, 4] = radius_mm
+    expected_dpt = total_defocus_dpt(zernike_um, radius_mm)
+    assert pupil_refraction_dpt(polynomial_um, rim_mm) == pytest.approx(expected_dpt)
+    by_degree_um = c20_by_degree(polynomial_um)
+    degree = 2 + 2 * np.arange(by_degree_um.shape[-1])
+    sums_um = (by_degree_um * radius_mm[:, None] ** degree).sum(axis=-1)
+    assert sums_um == pytest.approx(zernike_um[:, 4])

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from estimator import load_profile, prepare_eye
-from estimator.optics.zernike import EXPONENTS, remove_central_tilt
+from estimator.optics.zernike import (
+    MAX_TERMS,
+    N_TERMS,
+    exponents,
+    nm_from_index,
+    remove_central_tilt,
+)
 from estimator.wavefront.field_wavefronts import polynomial_in_mm
 from estimator.wavefront.moved_plane import moved_polynomial
 from tests.numerical.eye_cases import population_profiles
@@ -15,7 +21,9 @@ DEPTH_MM = 3.05
 def wave(polynomial_um, x, y):
     """W, um, and its slopes, mrad, at points in mm: term by term."""
     found = np.zeros((3, *x.shape))
-    for value, (a, b) in zip(polynomial_um, EXPONENTS.tolist(), strict=True):
+    for value, (a, b) in zip(
+        polynomial_um, exponents(polynomial_um.size).tolist(), strict=True
+    ):
         found[0] += value * x**a * y**b
         found[1] += value * a * x ** max(a - 1, 0) * y**b
         found[2] += value * b * x**a * y ** max(b - 1, 0)
@@ -33,15 +41,16 @@ def exact_wave(polynomial_um, depth_mm, x, y):
     return value + depth_mm * (slope_x**2 + slope_y**2) / 2e3
 
 
-def moved_error_um(zernike_um, measured_mm, pupil_mm, depth_mm=DEPTH_MM):
+def moved_error_um(zernike_um, measured_mm, pupil_mm, depth_mm=DEPTH_MM, n_terms=None):
     polynomial_um = polynomial_in_mm(remove_central_tilt(zernike_um), measured_mm / 2)
     across = np.linspace(-pupil_mm / 2, pupil_mm / 2, 25)
     x, y = np.meshgrid(across, across)
     inside = np.hypot(x, y) <= pupil_mm / 2
     x, y = x[inside], y[inside]
     moved_um = moved_polynomial(
-        polynomial_um, depth_mm=depth_mm, radius_mm=pupil_mm / 2
+        polynomial_um, depth_mm=depth_mm, radius_mm=pupil_mm / 2, n_terms=n_terms
     )
+    assert moved_um.size == (n_terms or polynomial_um.size)
     untilted_um = polynomial_um.copy()
     untilted_um[1:3] = 0.0
     moved_um[1:3] -= polynomial_um[1:3]
@@ -58,6 +67,27 @@ def test_keratoconus_is_moved_as_rays_are(stretch, pupil_mm, depth_mm):
     zernike_um = stretch * profile.zernike_um
     error_um = moved_error_um(zernike_um, profile.pupil_diameter_mm, pupil_mm, depth_mm)
     assert error_um < 0.005
+
+
+@pytest.mark.parametrize("depth_mm", [DEPTH_MM, -DEPTH_MM])
+def test_more_terms_follow_the_rays_of_severe_keratoconus(depth_mm):
+    profile = load_profile("keratoconus")
+    wave = 1.5 * profile.zernike_um, profile.pupil_diameter_mm, 6.0, depth_mm
+    assert moved_error_um(*wave) > 0.005
+    errors_um = [moved_error_um(*wave, n_terms=n) for n in (36, 45, 55, MAX_TERMS)]
+    assert errors_um == sorted(errors_um, reverse=True)
+    assert errors_um[0] < 0.004
+    assert errors_um[-1] < 0.0003
+
+
+@pytest.mark.parametrize("pupil_mm", [4.0, 6.0])
+def test_a_wavefront_of_tenth_order_keeps_its_terms(rng, pupil_mm):
+    orders = np.array([nm_from_index(j)[0] for j in range(MAX_TERMS)])
+    typical_um = np.array([0, 0, 1.5, 0.3, 0.2, 0.08, 0.05, 0.03, 0.02, 0.015, 0.01])
+    zernike_um = rng.normal(size=MAX_TERMS) * typical_um[orders]
+    assert moved_error_um(zernike_um, 6.0, pupil_mm) < 0.005
+    # the first 28 terms alone are another wavefront
+    assert np.linalg.norm(zernike_um[N_TERMS:]) > 0.05
 
 
 def test_usual_eyes_are_moved_as_rays_are(rng):
