@@ -24,15 +24,14 @@ def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
     ValueError
         If the profile cannot be read.  The message names the option and the file.
     """
-    if text.lstrip().startswith("{"):
-        return read_object(option, text)
     try:
         return profile_body(text)
     except InvalidFile as error:
         name = option.removeprefix("--")
         raise InvalidFile(text, error.found, error.allowed, name) from None
     except ValueError as error:
-        raise ValueError(f"{option} {text}: {error}") from None
+        shown = printable(text, most=MAX_TITLE_CHARACTERS)
+        raise ValueError(f"{option} {shown}: {error}") from None
 
 
 def profile_title(profile: Mapping[str, Any]) -> str:

@@ -162,12 +162,10 @@ def _is_path(source: str | Path) -> bool:
 
 def _inline(text: str) -> dict[str, Any]:
     try:
-        data = text.encode("utf-8", "surrogateescape")
-        body: dict[str, Any] = loads_bounded(data, max_bytes=MAX_PROFILE_BYTES)
-    except ValueError as error:
-        problem = f"not JSON ({reason_of(error)})"
-        raise ProfileError("profile", problem, "one JSON object") from None
-    return body
+        return _json_body(text, "profile")
+    except ProfileError as error:
+        field = error.field or "profile"
+        raise ProfileError(field, error.problem, error.allowed) from None
 
 
 def _text(path: Path) -> str:
@@ -195,19 +193,25 @@ def _text(path: Path) -> str:
     return text
 
 
-def _read_json(text: str, path: Path) -> dict[str, Any]:
+def _json_body(text: str, name: str) -> dict[str, Any]:
+    """Return the body in a JSON text; an optic of optiland may have no name."""
+    data = text.encode("utf-8", "surrogateescape")
     try:
-        body = loads_bounded(text.encode(), max_bytes=2 * MAX_PROFILE_BYTES)
+        body = loads_bounded(data, max_bytes=2 * MAX_PROFILE_BYTES)
     except ValueError as error:
         problem = f"not JSON ({reason_of(error)})"
         raise ProfileError("", problem, "one JSON object") from None
     if not isinstance(body, dict):
         raise ProfileError("", f"{body!r:.60} is not an object", "one JSON object")
     if is_optiland(body):
-        return optiland_body(body, path.stem)
+        return optiland_body(body, name)
     if "surfaces" in body:  # files of schematic eyes need not state their kind
         body.setdefault("kind", "surfaces")
     return body
+
+
+def _read_json(text: str, path: Path) -> dict[str, Any]:
+    return _json_body(text, path.stem)
 
 
 def _read_abp(text: str, path: Path) -> dict[str, Any]:

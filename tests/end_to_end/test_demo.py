@@ -23,6 +23,7 @@ from clients.frame_log import FrameLog, percentiles
 from clients.pyrender_stream import path_settings
 from clients.scenes.catalog import build_scene
 from clients.service_process import CHECKOUT, ServiceProcess
+from estimator.profiles.files import profile_body
 from filter_service.progress import INTERVAL_S
 
 pytestmark = pytest.mark.clients
@@ -264,6 +265,23 @@ def test_profile_is_a_preset_json_or_a_file(tmp_path):
     path.with_suffix(".ABP").write_text(ABP)
     found = read_profile(str(path.with_suffix(".ABP")))
     assert (found["pupil_diameter_mm"], found["zernike_um"]) == (5.0, {"2,0": 1.5})
+
+
+def test_inline_json_is_read_as_a_file_is(tmp_path):
+    frozen = Path(__file__).parents[1] / "data" / "optiland_files.json"
+    optic = json.loads(frozen.read_text())["files"]["toroid"]["json"]
+    surface = {"radius_mm": 7.8, "z_mm": 0, "medium_after": "cornea"}
+    eye = {"surfaces": [surface], "stop_z_mm": 3, "retina": {"radius_mm": -12}}
+    path = tmp_path / "profile.json"
+    for content in (optic, eye):
+        text = json.dumps(content)
+        path.write_text(text)
+        found = read_profile(text)
+        assert found["kind"] == "surfaces"
+        assert found == read_profile(str(path)) == profile_body(text)
+    broken = json.dumps({**optic, "surface_group": 3})
+    with pytest.raises(ValueError, match=r"--left .*surface_group': 3 is not"):
+        read_profile(broken, "--left")
 
 
 @pytest.mark.parametrize(

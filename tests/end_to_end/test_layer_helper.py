@@ -450,7 +450,7 @@ def test_a_profile_is_not_sent_to_another_user_s_process():
         (["serve", "--wait-ms", "-5"], "--wait-ms is -5; allowed: 0 to 600000"),
         (["serve", "--max-age-ms", "0"], "--max-age-ms is 0; allowed: 1 to 600000"),
         (["serve", "--focus-dpt", "99"], "focus_dpt is 99.0; allowed: 0 to 20"),
-        (["serve", "--left", "{}x"], "--left is not JSON"),
+        (["serve", "--left", "{}x"], "--left {}x: profile: not JSON"),
         (["run"], "there is no program; put it after --"),
         (["set"], "there is no profile; use --profile, --left or --right"),
         (["set", "--left", "miopia"], "'miopia' is not known (did you mean 'myopia'?)"),

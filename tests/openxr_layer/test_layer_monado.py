@@ -166,7 +166,7 @@ def test_profiles_change_while_frames_are_filtered(run, display, tmp_path):
             program.wait_until(lambda said: "left eye: myopia" in said)
             program.wait_until(lambda said: said.count("eye: ready") >= 5)
             for text, message in (
-                ('{"kind":', "--left is not JSON"),
+                ('{"kind":', "profile: not JSON"),
                 ("nobody", "'nobody' is not known"),
             ):
                 wrong = subprocess.run(
