@@ -16,4 +16,9 @@ FUNCTIONS = {
     "needed_intervals": "record",
     "spread_nodes": "f8[] f8[] f8[] i8[] f8[] i8 i8 -> int",
     "node_blur": "f8[] f8[] f8[] i8[] f8[] f8[] f4[] i8 i8 i8",
+    "count_bright": "pool i4[] i2[] i8 i8 i8 i8[]",
+    "list_bright": "pool i4[] i2[] i8 i8 i8 i8[] i8[] i8[]",
+    "fade_light": "f4[] i8 f8 f8 f8 f4[] f8[]",
+    "merge_pixels": "i8[] i8[] i8[] f8[] i8 i8 i4[] i8 i8 i8[] f8[] i8[] -> int",
+    "dim_pixels": "i8[] i8[] i8[] f4[] i8 i8[] f8[] f4[] i8",
 }

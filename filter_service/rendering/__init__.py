@@ -38,7 +38,6 @@ frame_kernels    plan of a frame's kernels
 srgb             conversion between encoded images and linear light
 media_effects    effects of ocular media and spectacles
 bright_pixels    pixels much brighter than white
-bright_pixel_loops  compiled loops of bright_pixels
 pupil_edges      edges of the pupils of a store's nodes
 edge_kinds       kinds of bright pixels, and the edges that send their light
 edge_light       light of bright pixels beyond their kernels

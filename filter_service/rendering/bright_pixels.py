@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.native import shared_threads
 from filter_service.constants import RGB
+from filter_service.native import loops
 from filter_service.rendering.frame import fill_missing_depth, stretch_at
-from filter_service.rendering.haze import run_in_threads
 from filter_service.rgbd_view import RgbdView
 
 FADE_WHITE = 4.0, 8.0
@@ -97,8 +98,6 @@ class BrightPixels:
     ) -> BrightPixels | None:
         if not surface.size:
             return None
-        from filter_service.rendering.bright_pixel_loops import merge_pixels
-
         n, power = surface.size, 0
         source, at = np.empty(n, np.int64), np.empty(n, np.int64)
         sums = np.empty((n, 6))
@@ -107,8 +106,10 @@ class BrightPixels:
         while True:
             shape = [-(-size // 2**power) for size in (view.height_px, view.width_px)]
             index = np.full((view.surface_count, *shape), -1, np.int32)
-            count = merge_pixels(
-                *(y_px, x_px, surface, light, (power, index), source, sums, at)
+            count = loops().call(
+                "merge_pixels",
+                *(y_px, x_px, surface, light, n, power, index, *shape),
+                *(source, sums, at),
             )
             if count <= MAX_SOURCES:
                 break
@@ -137,25 +138,22 @@ def _bright(
     NDArray[np.int64], NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]
 ]:
     """Return y, x, share (n,) and light (n, 3) of the bright pixels of an image."""
-    from filter_service.rendering.bright_pixel_loops import (
-        count_bright,
-        fade_light,
-        list_bright,
-    )
-
     color = np.ascontiguousarray(color)
-    bits = color.reshape(len(color), -1).view(f"i{color.itemsize}")
+    bits = color.view(f"i{color.itemsize}")
+    images = (bits, None) if color.dtype == np.float32 else (None, bits)
     limit = np.array(min(FADE_WHITE[0] * white, float(np.finfo(color.dtype).max)))
     limit_bits = limit.astype(color.dtype).view(bits.dtype)[()]
     offsets = np.zeros(len(color) + 1, np.int64)
-    run_in_threads(count_bright, len(color), bits, limit_bits, offsets[1:])
+    call, image = loops().call, (shared_threads(), *images, *color.shape[:2])
+    call("count_bright", *image, limit_bits, offsets[1:])
     n = int(np.cumsum(offsets, out=offsets)[-1])
-    y_px, x_px = np.empty(n, np.int64), np.empty(n, np.int64)
+    # Zero: a caller may change the image in the meantime.
+    y_px, x_px = np.zeros(n, np.int64), np.zeros(n, np.int64)
     share, light = np.empty(n, np.float32), np.empty((n, RGB))
     if n:
-        run_in_threads(list_bright, len(color), bits, limit_bits, offsets, y_px, x_px)
-        bright = color.reshape(-1, RGB)[y_px * color.shape[1] + x_px]
-        fade_light(bright.astype(np.float32), white, FADE_WHITE, share, light)
+        call("list_bright", *image, limit_bits, offsets, y_px, x_px)
+        bright = color[y_px, x_px].astype(np.float32)
+        call("fade_light", bright, n, white, *FADE_WHITE, share, light)
     return y_px, x_px, share, light
 
 

@@ -16,13 +16,13 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.psf.tables import N_EDGE
 from filter_service.constants import RGB
+from filter_service.native import loops
 from filter_service.rendering.bright_pixels import BrightPixels
 from filter_service.rendering.edge_kinds import EdgeElements, EyeAtFrame, SourceKinds
 from filter_service.rendering.engine import FrameEngine, ViewRequest
@@ -117,10 +117,6 @@ def _faded(rho_px: NDArray[np.float64], edge_px: float) -> NDArray[np.float64]:
     """Return a smooth step from 0 to 1 at a distance."""
     part = np.clip((rho_px / edge_px - 1.0) / (FADE_RATIO - 1.0), 0.0, 1.0)
     return part * part * (3.0 - 2.0 * part)
-
-
-def _copy_rows(start: int, end: int, source: Any, target: Any) -> None:
-    target[start:end] = source[start:end]
 
 
 class EdgeLight:
@@ -382,8 +378,6 @@ class EdgeLight:
 
     def _dimmed(self, view: RgbdView) -> RgbdView:
         """Return the view without the share of light that is beyond the kernels."""
-        from filter_service.rendering.bright_pixel_loops import dim_pixels
-
         n = self._kinds.cell.size
         ratio = np.empty((2 * n, RGB))  # with near light, and with distant light only
         for radius_px, near in self._near.items():
@@ -401,12 +395,15 @@ class EdgeLight:
             here = slice(None)
             if view.surface_count > 1:
                 here = pixels.surface == surface
-            dimmed = np.empty(color.shape, color.dtype)
-            run_in_threads(_copy_rows, len(color), color, dimmed)
+            dimmed = color.copy()
             y_px, x_px = pixels.y_px[here], pixels.x_px[here]
             source, share = pixels.source[here], pixels.share_ratio[here]
             if color.dtype == np.float32:
-                dim_pixels(y_px, x_px, source, share, kind, ratio, dimmed)
+                loops().call(
+                    "dim_pixels",
+                    *(y_px, x_px, source, share, share.size, kind, ratio),
+                    *(dimmed, dimmed.shape[1]),
+                )
             else:
                 part = share[:, None] * ratio[kind[source]]
                 dimmed[y_px, x_px] = dimmed[y_px, x_px] * (1.0 - part)

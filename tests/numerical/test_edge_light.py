@@ -346,6 +346,26 @@ def test_shared_kernels_and_merged_pixels_are_near_the_exact_sum(
     assert error <= 0.15 * np.sqrt(np.mean((exact - plain)[room] ** 2))
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float16])
+def test_bright_pixels_are_those_with_a_value_above_the_limit(rng, dtype):
+    color = rng.uniform(0.0, 3.0, (37, 51, 3))
+    color.reshape(-1)[rng.integers(0, color.size, 40)] = rng.uniform(3.0, 12.0, 40)
+    color[0, 0], color[-1, -1] = 9.0, [np.inf, 5.0, np.nan]
+    color[3, 4:7, 1] = np.inf, np.nan, -np.inf
+    color = color.astype(dtype)
+    view = RgbdView(color, np.ones((37, 51), np.float32), (-0.3, 0.3, 0.2, -0.2))
+    pixels = BrightPixels.of(view, 1.25)
+    brightest = np.where(np.isfinite(color), color, 0.0).astype(float).max(axis=2)
+    low, high = FADE_WHITE
+    part = np.clip((brightest / 1.25 - low) / (high - low), 0.0, 1.0)
+    y_px, x_px = np.nonzero(part)
+    np.testing.assert_array_equal(pixels.y_px, y_px)
+    np.testing.assert_array_equal(pixels.x_px, x_px)
+    share = (3.0 * part**2 - 2.0 * part**3)[y_px, x_px]
+    np.testing.assert_allclose(pixels.share_ratio, share, rtol=1e-6)
+    assert 0 < np.count_nonzero(share < 1.0) < share.size
+
+
 def test_many_bright_pixels_are_merged_with_all_their_light(rng):
     color = np.zeros((200, 300, 3), np.float32)
     color[20:120, 30:230] = rng.uniform(10.0, 90.0, (100, 200, 3))

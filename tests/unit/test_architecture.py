@@ -170,7 +170,6 @@ HOME = {
         "estimator/field/defocus_loops.py",  # of a traced eye in a new state
         "filter_service/psfs/read_loops.py",  # planning a frame
         "filter_service/psfs/layer_loops.py",
-        "filter_service/rendering/bright_pixel_loops.py",
         "filter_service/rendering/edge_light_loops.py",
         "filter_service/rendering/visibility_loops.py",
         "clients/commands/doctor_probes.py",  # asks which threads it runs on

@@ -23,6 +23,7 @@
 #include "haze.h"
 #include "spectacles.h"
 #include "defocus_nodes.h"
+#include "bright_pixels.h"
 
 static void pixels(frame *f) {
     f->missing_count = f->clamped_count = f->bad_color_count = 0;
@@ -86,6 +87,11 @@ static const named_function functions[] = {
     FUNCTION(needed_intervals),
     FUNCTION(spread_nodes),
     FUNCTION(node_blur),
+    FUNCTION(count_bright),
+    FUNCTION(list_bright),
+    FUNCTION(fade_light),
+    FUNCTION(merge_pixels),
+    FUNCTION(dim_pixels),
     {NULL, NULL},
 };
 
