@@ -9,7 +9,6 @@ accommodated_periphery  refraction off the axis at every accommodation
 trace_range             traced part of the field
 traced_fields           wavefronts at fixed fields, as pupil and accommodation change
 fixed_defocus           total defocus at fixed fields
-defocus_loops           compiled loop of fixed_defocus
 traced_eye              an estimated eye, ray-traced over the field
 prepare                 entry point: from a profile to such an eye
 network_eye             the same by network: the eye of the published pipeline

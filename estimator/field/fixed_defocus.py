@@ -1,19 +1,22 @@
 """Total defocus of a traced eye at fixed fields, as pupil and accommodation change.
 
-Terms that depend only on field and wavelength are computed once; see `defocus_loops`.
+Terms that depend only on field and wavelength are computed once.  For a state, total
+defocus depends only on sums of monomials, by degree, and on the rim of the pupil.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.estimate.measured_residual import MeasuredResidual
+from estimator.estimate.measured_residual import OVERSHOOT, MeasuredResidual
 from estimator.field.interpolation import (
     FieldInterpolation,
     FieldValues,
-    lagrange_weights,
     pupil_powers,
 )
-from estimator.optics.zernike import monomial_degrees, padded_terms
+from estimator.native import core
+from estimator.native.records import DefocusGrid, DefocusJob, pointer_to
+from estimator.optics.units import SPHERE_PER_C20
+from estimator.optics.zernike import MAX_TERMS, monomial_degrees, padded_terms
 from estimator.wavefront.field_wavefronts import N_RIM, c20_by_degree
 
 
@@ -44,56 +47,64 @@ class FixedDefocus:
         added_um: NDArray[np.float64],
         open_mm: NDArray[np.float64] | None,
     ):
-        self._grids = tuple(_Grid(*part) for part in (field, on_axis))
         values = field[1]
         count = values.field.size
         open_mm = np.full(count, np.inf) if open_mm is None else open_mm
-        self._state = values.field, values.channel, np.ascontiguousarray(open_mm)
-        n_terms = max(
-            added_um.shape[-1],
-            residual.residue_um.size,
-            values.values.shape[-1] - N_RIM,
+        fading = residual_weight[:, None] * _sums(residual.residue_um)
+        self._grids = [_grid_arrays(*part) for part in (field, on_axis)]
+        self._arrays = {
+            "fields": np.ascontiguousarray(values.field, np.int64),
+            "channels": np.ascontiguousarray(values.channel, np.int64),
+            "open_mm": np.ascontiguousarray(open_mm, np.float64),
+            "always": _sums(added_um),
+            "fading": fading,
+        }
+        grids = [
+            DefocusGrid(*map(pointer_to, arrays), *arrays[-1].shape[1:4])
+            for arrays in self._grids
+        ]
+        self._job = DefocusJob(
+            *grids,
+            **{name: pointer_to(array) for name, array in self._arrays.items()},
+            fading_mm=residual.radius_mm,
+            overshoot=OVERSHOOT,
+            sphere_per_c20=SPHERE_PER_C20,
+            count=count,
         )
-        added_um = padded_terms(added_um, n_terms)
-        residue_um = padded_terms(residual.residue_um, n_terms)
-        fading = residual_weight[:, None] * c20_by_degree(residue_um)
-        self._added = (
-            c20_by_degree(added_um),
-            np.ascontiguousarray(fading),
-            float(residual.radius_mm),
+        self._scratch_count = grids[1].channel_count + sum(
+            grid.accommodation_count for grid in grids
         )
 
     def at(
         self, *, pupil_diameter_mm: float, accommodation_dpt: float
     ) -> NDArray[np.float64]:
         """Return the least-squares refraction (n,), dpt, on the circle of the pupil."""
-        from estimator.field.defocus_loops import fill_defocus
-
-        found_dpt = np.empty(self._state[0].size)
-        grids = (grid.inputs_at(accommodation_dpt) for grid in self._grids)
-        fill_defocus(
-            float(pupil_diameter_mm), *grids, self._state, self._added, found_dpt
-        )
+        scratch, found_dpt = np.empty(self._scratch_count), np.empty(self._job.count)
+        job = DefocusJob.from_buffer_copy(self._job)
+        job.scratch, job.found_dpt = pointer_to(scratch), pointer_to(found_dpt)
+        job.pupil_mm = pupil_diameter_mm
+        job.accommodation_dpt = accommodation_dpt
+        core().call("fill_defocus", job)
         return found_dpt
 
 
-class _Grid:
-    """Nodes of a grid, and its values: sums of monomials by degree, and rims."""
+def _sums(polynomial_um: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return sums of monomials (..., 5) of degrees 2, 4 ... 10."""
+    return c20_by_degree(padded_terms(polynomial_um, MAX_TERMS))
 
-    def __init__(self, interpolation: FieldInterpolation, values: FieldValues):
-        self._nodes_mm = np.array(interpolation.grid.pupil_diameters_mm, np.float64)
-        self._accommodations_dpt = interpolation.grid.accommodations_dpt
-        whole = values.values
-        sums, rims = c20_by_degree(whole[..., :-N_RIM]), whole[..., -N_RIM:]
-        self._values = np.ascontiguousarray(np.concatenate([sums, rims], axis=-1))
-        n_terms = whole.shape[-1] - N_RIM
-        powers, degrees = pupil_powers(n_terms), 2 + 2 * np.arange(sums.shape[-1])
-        first = np.searchsorted(monomial_degrees(n_terms), degrees)
-        self._powers = np.concatenate([powers[first], powers[-N_RIM:]])
 
-    def inputs_at(self, accommodation_dpt: float) -> tuple[NDArray[np.float64], ...]:
-        """Return the arguments of the compiled loop for an accommodation."""
-        (weights,) = lagrange_weights(
-            self._accommodations_dpt, np.array([accommodation_dpt])
-        )
-        return self._nodes_mm, self._powers, weights, self._values
+def _grid_arrays(
+    interpolation: FieldInterpolation, values: FieldValues
+) -> tuple[NDArray[np.float64], ...]:
+    """Return the arrays of a `DefocusGrid`: sums of monomials by degree, and rims."""
+    grid, whole = interpolation.grid, values.values
+    sums, n_terms = _sums(whole[..., :-N_RIM]), whole.shape[-1] - N_RIM
+    powers, degrees = pupil_powers(n_terms), 2 + 2 * np.arange(sums.shape[-1])
+    # Sums of degrees that the fit omits are zero, with any power.
+    first = np.minimum(np.searchsorted(monomial_degrees(n_terms), degrees), n_terms - 1)
+    return (
+        np.ascontiguousarray(grid.pupil_diameters_mm, np.float64),
+        np.concatenate([powers[first], powers[-N_RIM:]]),
+        np.ascontiguousarray(grid.accommodations_dpt, np.float64),
+        np.concatenate([sums, whole[..., -N_RIM:]], axis=-1),
+    )

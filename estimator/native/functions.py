@@ -18,4 +18,5 @@ FUNCTIONS = {
     "survey_pupils": f"pool record i8 {4 * 'f8[] '} {6 * 'f8[] '}",
     "needed_radii": f"i8 {4 * 'f8[] '} f8 i8 i8[]",
     "edge_lights_outside": f"i8 {5 * 'f8[] '}",
+    "fill_defocus": "record",
 }

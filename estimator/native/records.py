@@ -133,10 +133,48 @@ class PsfDiscsJob(c.Structure):
     )
 
 
+class DefocusGrid(c.Structure):
+    """Traced values, see `source/defocus_job.h`."""
+
+    _fields_ = (
+        ("pupils_mm", POINTER),
+        ("powers", POINTER),
+        ("accommodations_dpt", POINTER),
+        ("values", POINTER),
+        ("channel_count", c.c_int64),
+        ("pupil_count", c.c_int64),
+        ("accommodation_count", c.c_int64),
+    )
+
+
+class DefocusJob(c.Structure):
+    """Job that computes the total defocus of fixed fields."""
+
+    _fields_ = (
+        ("field", DefocusGrid),
+        ("axis", DefocusGrid),
+        ("fields", POINTER),
+        ("channels", POINTER),
+        ("open_mm", POINTER),
+        ("always", POINTER),
+        ("fading", POINTER),
+        ("fading_mm", c.c_double),
+        ("scratch", POINTER),
+        ("found_dpt", POINTER),
+        ("pupil_mm", c.c_double),
+        ("accommodation_dpt", c.c_double),
+        ("overshoot", c.c_double),
+        ("sphere_per_c20", c.c_double),
+        ("count", c.c_int64),
+    )
+
+
 def pointer_to(array: np.ndarray) -> int:
     """Return the address of an array's first element; the caller keeps it alive."""
     return int(array.ctypes.data)
 
 
-SIZES = tuple(c.sizeof(record) for record in (PsfJob, PsfTables, PsfDiscsJob))
+SIZES = tuple(
+    c.sizeof(record) for record in (PsfJob, PsfTables, PsfDiscsJob, DefocusJob)
+)
 """Expected result of `ocu_sizes`."""

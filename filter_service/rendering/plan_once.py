@@ -8,9 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from estimator.field.defocus_loops import fill_defocus
 from estimator.media.straylight import Straylight
-from estimator.wavefront.field_wavefronts import N_RIM
 from filter_service.camera import Camera
 from filter_service.constants import RGB
 from filter_service.planning.nodes import PlanAxes
@@ -50,7 +48,6 @@ def plan_once() -> None:
     depth_m[0, 0] = np.nan
     fill_missing_depth(depth_m)
     _plan_nodes_once(store)
-    _defocus_once()
     light = np.ones((SIDE_PX, SIDE_PX, RGB), np.float32)
     view = RgbdView(light, light[..., 0].copy(), store.spec.camera.tangents)
     MediaEffects(Straylight()).apply(light, view)
@@ -85,13 +82,3 @@ def _plan_nodes_once(store: PsfStore) -> None:
         defocus_error=1e-3,
     )
     NodePlanner(store.eye, spec, axes).nodes(0, 0)
-
-
-def _defocus_once() -> None:
-    """Run the defocus loops of traced eyes; the perfect eye is a wavefront only."""
-    n_degrees = 3  # of 28 terms
-    count = n_degrees + N_RIM
-    grid = np.arange(2.0, 4.0), np.ones(count), np.ones(1), np.ones((1, 1, 2, 1, count))
-    index, sums = np.zeros(1, np.int64), np.zeros((1, n_degrees))
-    fields, added = (index, index, np.ones(1)), (sums, sums, 1.0)
-    fill_defocus(2.0, grid, grid, fields, added, np.empty(1))

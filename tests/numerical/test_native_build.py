@@ -10,10 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from estimator.field import interpolation
 from estimator.native import LibraryUnavailable, core
 from estimator.native import functions as core_functions
 from estimator.native import library as core_library
 from estimator.native import records as core_records
+from estimator.optics import zernike
+from estimator.wavefront import field_wavefronts
 from filter_service import constants
 from filter_service.native import functions, library, loops, records
 from filter_service.psfs import store_cache
@@ -88,6 +91,20 @@ def test_packed_words_are_those_of_python():
     assert int(defined["RESOLUTIONS"], 0) == records.RESOLUTIONS
 
 
+def test_numbers_of_rims_are_those_of_python():
+    text = (CORE / "field_defocus.h").read_text(encoding="utf-8")
+    defined = dict(re.findall(r"#define (\w+) ([\d.]+)\b", text))
+    expected = {
+        "N_DEGREES": zernike.HIGHEST_ORDER // 2,
+        "N_RIM": field_wavefronts.N_RIM,
+        "SMOOTH_PUPILS": interpolation.SMOOTH_NODES,
+        "RIM_SAMPLES": field_wavefronts.N_SAMPLED,
+        "NEWTON_STEPS": field_wavefronts.N_NEWTON_STEPS,
+        "NEWTON_STEP_RAD": field_wavefronts.NEWTON_STEP_RAD,
+    }
+    assert {name: float(defined[name]) for name in expected} == expected
+
+
 @pytest.mark.parametrize(
     ("file", "name", "record"),
     [
@@ -100,6 +117,8 @@ def test_packed_words_are_those_of_python():
         (SOURCE / "node_job.h", "node_job", records.NodeJob),
         (CORE / "psf_job.h", "psf_job", core_records.PsfJob),
         (CORE / "psf_job.h", "psf_tables", core_records.PsfTables),
+        (CORE / "defocus_job.h", "defocus_grid", core_records.DefocusGrid),
+        (CORE / "defocus_job.h", "defocus_job", core_records.DefocusJob),
     ],
 )
 def test_fields_of_records_are_those_of_the_source_in_order(file, name, record):

@@ -167,7 +167,6 @@ HOME = {
         "estimator/optics/gradients/*",  # indices at a point
         "estimator/wavefront/*",  # aiming and fitting
         "filter_service/rendering/reference*.py",  # twins of the passes
-        "estimator/field/defocus_loops.py",  # of a traced eye in a new state
         "filter_service/psfs/read_loops.py",  # planning a frame
         "filter_service/psfs/layer_loops.py",
         "filter_service/rendering/edge_light_loops.py",

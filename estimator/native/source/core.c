@@ -1,6 +1,7 @@
 /* Entry points of the library, and the thread pool of the process. */
 #include <stdint.h>
 
+#include "defocus_job.h"
 #include "entry.h"
 #include "pool.h"
 #include "psf_job.h"
@@ -11,6 +12,7 @@ EXPORT void ocu_sizes(int32_t *sizes) {
     sizes[n++] = (int32_t)sizeof(psf_job);
     sizes[n++] = (int32_t)sizeof(psf_tables);
     sizes[n++] = (int32_t)sizeof(psf_discs_job);
+    sizes[n++] = (int32_t)sizeof(defocus_job);
 }
 
 EXPORT pool *ocu_pool_new(int n_threads) { return pool_new(n_threads); }

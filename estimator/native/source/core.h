@@ -11,6 +11,7 @@
 #include "psfs.h"
 #include "psf_discs.h"
 #include "psf_surveys.h"
+#include "field_defocus.h"
 
 static const named_function functions[] = {
     FUNCTION(psfs),
@@ -20,6 +21,7 @@ static const named_function functions[] = {
     FUNCTION(survey_pupils),
     FUNCTION(needed_radii),
     FUNCTION(edge_lights_outside),
+    FUNCTION(fill_defocus),
     {NULL, NULL},
 };
 
