@@ -55,6 +55,7 @@ class PsfTables(c.Structure):
         ("length_count", c.c_int32),
         ("n_rings", c.c_int32),
         ("n_ring", c.c_int32),
+        ("order", c.c_int32),
     )
 
 

@@ -10,15 +10,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.optics.arrays import broadcast_copy
-from estimator.optics.zernike import N_TERMS
+from estimator.optics.zernike import HIGHEST_ORDER, MAX_RADIAL_ORDER
 from estimator.psf.pupil import ELLIPSE_COLUMNS
+
+TERM_COUNTS = tuple(
+    (order + 1) * (order + 2) // 2
+    for order in range(MAX_RADIAL_ORDER, HIGHEST_ORDER + 1)
+)
 
 
 def checked_zernike_um(zernike_um: ArrayLike) -> NDArray[np.float64]:
-    """Return finite coefficients (P, 28)."""
+    """Return finite coefficients (P, n_terms), of a radial order from 6 to 10."""
     array = np.asarray(zernike_um, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != N_TERMS:
-        raise ValueError(f"zernike_um has shape {array.shape}: must be (P, {N_TERMS})")
+    if array.ndim != 2 or array.shape[1] not in TERM_COUNTS:
+        raise ValueError(
+            f"zernike_um has shape {array.shape}: must be (P, n), n one of "
+            f"{', '.join(map(str, TERM_COUNTS))}"
+        )
     if not np.all(np.isfinite(array)):
         raise ValueError("zernike_um: must be finite, got NaN or infinite coefficients")
     return array

@@ -107,7 +107,7 @@ class CompiledPsfs:
         radius_px, sizes = np.zeros((2, count), np.int64)
         peak, spread, lost, rays = np.zeros((4, count))
         outcome = np.empty(count, np.int32)
-        tables, _ = psf_tables()
+        tables, _ = psf_tables(kept["zernike_um"].shape[-1])
         job = PsfJob(
             threads=self.threads,
             tables=ctypes.addressof(tables),
@@ -136,10 +136,16 @@ class CompiledPsfs:
             outcome == PSF_DONE,
         )
 
-    def call(self, name: str, count: int, *arrays: NDArray[np.float64]) -> None:
-        """Call a function that takes threads, tables, a count and arrays."""
-        tables, _ = psf_tables()
-        self.core.call(name, self.threads, tables, count, *arrays)
+    def call(
+        self, name: str, polynomials: NDArray[np.float64], *arrays: NDArray[np.float64]
+    ) -> None:
+        """Call a function that takes threads, tables, a count and arrays.
+
+        The first array is polynomials (count, n_terms).
+        """
+        count, n_terms = polynomials.shape
+        tables, _ = psf_tables(n_terms)
+        self.core.call(name, self.threads, tables, count, polynomials, *arrays)
 
     def _words(
         self, job: PsfJob, outcome: NDArray[np.int32], sizes: NDArray[np.int64]

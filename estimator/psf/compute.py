@@ -294,8 +294,9 @@ def compute_psf_batch(
 
     Parameters
     ----------
-    zernike_um : (P, 28), um
-        Coefficients of the wavefronts.  Tilt shifts the kernel; piston has no effect.
+    zernike_um : (P, n_terms), um
+        Coefficients of the wavefronts, 28 to 66 (orders 6 to 10).  Tilt shifts the
+        kernel; piston has no effect.
     pupil_diameter_mm : (P,) or scalar
         Diameter of the circle of the coefficients, which is the pupil unless
         ``pupil_ellipse`` is given.

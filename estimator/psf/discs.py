@@ -41,7 +41,11 @@ def fill_discs(
     least_unit_px = survey.unit_px.min(initial=np.inf)
     samples_per_px = accuracy.oversampling / max(least_unit_px, 1e-9)
     is_usual = samples_per_px < FILTER_COUNT
-    tables, _ = psf_tables(half_width, FILTER_COUNT if is_usual else MAX_LENGTH)
+    tables, _ = psf_tables(
+        frames.box_polynomial_um.shape[1],
+        half_width,
+        FILTER_COUNT if is_usual else MAX_LENGTH,
+    )
     job = PsfJob(
         threads=engine.threads,
         tables=ctypes.addressof(tables),

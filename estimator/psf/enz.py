@@ -141,10 +141,11 @@ def _refined(samples: NDArray[np.complex128]) -> NDArray[np.complex128]:
 
 
 @cache
-def _coarse_modes() -> NDArray[np.float64]:
-    """Return the 28 modes at points of the pupil, for peak-to-valley aberrations."""
+def _coarse_modes(n_terms: int) -> NDArray[np.float64]:
+    """Return the modes at points of the pupil, for peak-to-valley aberrations."""
     rho, angle = np.meshgrid(np.linspace(0, 1, 25), np.linspace(0, 2 * np.pi, 73))
-    return zernike_values(rho * np.cos(angle), rho * np.sin(angle))
+    x, y = rho * np.cos(angle), rho * np.sin(angle)
+    return zernike_values(x, y, n_terms=n_terms)
 
 
 class _Series:
@@ -156,9 +157,9 @@ class _Series:
         self.wavelength_um = float(frames.wavelength_nm[index]) / 1000.0
         self.half = frames.half_width_um_per_px[index]
         self.shear = float(frames.shear_ratio[index])
-        zernike_um = np.linalg.solve(
-            monomial_matrix().T, frames.disc_polynomial_um[index]
-        )
+        polynomial_um = frames.disc_polynomial_um[index]
+        matrix = monomial_matrix(polynomial_um.size)
+        zernike_um = np.linalg.solve(matrix.T, polynomial_um)
         # W = sqrt(3) C20 (2 rho² - 1) + ...; tilt 2 C rho cos and sin.
         per_um = 2.0 * math.pi / self.wavelength_um
         self.defocus_rad = per_um * 2.0 * math.sqrt(3.0) * zernike_um[4]
@@ -182,7 +183,8 @@ class _Series:
     def _expand(
         self, frames: "PupilFrames", is_checked: bool
     ) -> dict[int, NDArray[np.complex128]]:
-        waves = _coarse_modes() @ self.residual_um / self.wavelength_um
+        modes = _coarse_modes(self.residual_um.size)
+        waves = modes @ self.residual_um / self.wavelength_um
         self.needed = math.ceil(DEGREE_PER_WAVE * float(np.ptp(waves)))
         domain = {"index": self.index, "degree": self.degree, "needed": self.needed}
         if is_checked and self.needed > 1.4 * self.degree:

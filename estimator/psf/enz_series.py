@@ -165,7 +165,7 @@ def zernike_betas(
 
     Parameters
     ----------
-    zernike_um : (28,)
+    zernike_um : (n_terms,)
         Coefficients on the unit disc, including piston, tilt and defocus.
     wavelength_um : float
     degree : int
@@ -184,7 +184,7 @@ def zernike_betas(
     every wavefront that the degree can represent.  The sum of |beta|² is the captured
     share of the energy.
     """
-    rho, weight, radial, x, y, modes = _pupil_nodes(degree)
+    rho, weight, radial, x, y, modes = _pupil_nodes(degree, zernike_um.size)
     field = np.exp(2j * math.pi / wavelength_um * (modes @ zernike_um))
     if log_amplitude is not None:
         field = field * np.exp(log_amplitude(x, y))
@@ -196,10 +196,10 @@ def zernike_betas(
 
 
 @lru_cache(maxsize=2)
-def _pupil_nodes(degree: int) -> tuple[Any, ...]:
-    """Return `radial_basis`, and points (x, y) of the pupil with their 28 modes."""
+def _pupil_nodes(degree: int, n_terms: int) -> tuple[Any, ...]:
+    """Return `radial_basis`, and points (x, y) of the pupil with their modes."""
     n_angles = 4 * degree + 64
     rho, weight, radial = radial_basis(degree, 2 * degree + 40)
     angle = 2.0 * math.pi * np.arange(n_angles) / n_angles
     x, y = rho[:, None] * np.cos(angle), rho[:, None] * np.sin(angle)
-    return rho, weight, radial, x, y, zernike_values(x, y)
+    return rho, weight, radial, x, y, zernike_values(x, y, n_terms=n_terms)

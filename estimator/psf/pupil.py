@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.optics.zernike import N_TERMS
 from estimator.psf.compiled import compiled_psfs
 
 ELLIPSE_COLUMNS = 5
@@ -24,9 +23,9 @@ class PupilFrames:
 
     Attributes
     ----------
-    box_polynomial_um : (P, 28), um
+    box_polynomial_um : (P, n_terms), um
         Monomials of W over the bounding box, x and y in [-1, 1], without piston.
-    disc_polynomial_um : (P, 28), um
+    disc_polynomial_um : (P, n_terms), um
         Monomials of W over the unit disc w.  The point of the box is
         (w_x, r w_x + s w_y) with r = ``shear_ratio`` and s = sqrt(1 - r²).
     half_width_um_per_px : (P, 2)
@@ -96,7 +95,7 @@ def pupil_frames(
 
     Parameters
     ----------
-    polynomial_um : (P, 28), um
+    polynomial_um : (P, n_terms), um
         Monomials on the unit circle; piston is ignored.
     circle_radius_mm, wavelength_nm : (P,)
     pixel_from_mrad : (P, 2, 2)
@@ -109,11 +108,10 @@ def pupil_frames(
     count = polynomial_um.shape[0]
     pupil_ellipse = pupil_ellipses(pupil_ellipse, circle_radius_mm)
     jacobian = np.ascontiguousarray(pixel_from_mrad, dtype=np.float64)
-    box, disc = np.empty((count, N_TERMS)), np.empty((count, N_TERMS))
+    box, disc = np.empty(polynomial_um.shape), np.empty(polynomial_um.shape)
     half, shear = np.empty((count, 2)), np.empty(count)
     compiled_psfs().call(
         "frame_pupils",
-        count,
         np.ascontiguousarray(polynomial_um, dtype=np.float64),
         np.ascontiguousarray(circle_radius_mm, dtype=np.float64),
         np.ascontiguousarray(pupil_ellipse, dtype=np.float64),

@@ -115,7 +115,6 @@ def survey_pupils(frames: PupilFrames) -> PupilSurvey:
     wavelength_um = frames.wavelength_nm / 1000.0
     compiled_psfs().call(
         "survey_pupils",
-        count,
         frames.disc_polynomial_um,
         frames.half_width_um_per_px,
         frames.shear_ratio,

@@ -32,7 +32,8 @@ _N_PLANE = 3
 
 def rms_waves_ratio(survey: PupilSurvey) -> NDArray[np.float64]:
     """Return the RMS (P,) of wavefronts without tilt over their pupils, in waves."""
-    zernike_um = survey.frames.disc_polynomial_um @ inverse_monomial_matrix()
+    polynomial_um = survey.frames.disc_polynomial_um
+    zernike_um = polynomial_um @ inverse_monomial_matrix(polynomial_um.shape[1])
     rms_um: NDArray[np.float64] = np.sqrt((zernike_um[:, _N_PLANE:] ** 2).sum(axis=1))
     return rms_um / (survey.frames.wavelength_nm / 1000.0)
 

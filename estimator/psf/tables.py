@@ -11,10 +11,11 @@ from scipy.special import fresnel, i0, sici
 
 from estimator.native.records import PsfTables, pointer_to
 from estimator.optics.zernike import (
-    EXPONENTS,
     N_TERMS,
+    exponents,
     inverse_monomial_matrix,
     monomial_matrix,
+    radial_order,
 )
 
 VECTOR = 8
@@ -186,16 +187,15 @@ def _sample_points() -> tuple[NDArray[Any], NDArray[Any]]:
     return np.concatenate(x), np.concatenate(y)
 
 
-def _monomial_slopes() -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return sample points (2, n) and the slopes (28, n) of every monomial there."""
-    x, y = _sample_points()
-    a, b = EXPONENTS[:, :1], EXPONENTS[:, 1:]
+POINTS = np.stack(_sample_points())
+
+
+def _monomial_slopes(n_terms: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the slopes (n_terms, n) of every monomial at `POINTS`."""
+    (x, y), a, b = POINTS, *np.split(exponents(n_terms), 2, axis=1)
     d_x = a * x ** np.maximum(a - 1, 0) * y**b
     d_y = b * x**a * y ** np.maximum(b - 1, 0)
-    return np.stack([x, y]), d_x, d_y
-
-
-POINTS, *SLOPES = _monomial_slopes()
+    return d_x, d_y
 
 
 _N_RADIAL = 8
@@ -216,22 +216,44 @@ def _passed_points() -> tuple[NDArray[Any], NDArray[Any]]:
 PASSED_POWERS, RING_WEIGHTS = _passed_points()
 
 
-def _bos_nodes() -> NDArray[np.float64]:
-    """Return 28 nodes that determine a polynomial of degree 6: rings of 13, 9, 5, 1."""
+_RADII = {6: (1.0, 0.78, 0.43, 0.0)}
+
+
+def polynomial_nodes(n_terms: int) -> NDArray[np.float64]:
+    """Return nodes (n_terms, 2) that determine a polynomial.
+
+    Those of order 6 are on rings of 13, 9, 5 and 1.  The radii for other orders are
+    zeros of a Chebyshev polynomial.
+    """
+    order = radial_order(n_terms)
+    counts = range(2 * order + 1, 0, -4)
+    angles = math.pi * (np.arange(len(counts)) + 0.5) / (order + 1)
+    radii = _RADII.get(order, np.cos(angles))
     points = [
         (radius * math.cos(angle), radius * math.sin(angle))
-        for radius, count in ((1.0, 13), (0.78, 9), (0.43, 5), (0.0, 1))
+        for radius, count in zip(radii, counts, strict=True)
         for angle in 2.0 * math.pi * np.arange(count) / count
     ]
     return np.array(points)
 
 
-def _monomials(points: NDArray[Any]) -> NDArray[np.float64]:
-    return points[:, :1] ** EXPONENTS[:, 0] * points[:, 1:] ** EXPONENTS[:, 1]
-
-
-NODES = _bos_nodes()
-FROM_NODES = np.ascontiguousarray(np.linalg.inv(_monomials(NODES)))
+def _wavefront_tables(n_terms: int) -> dict[str, NDArray[np.generic]]:
+    """Return the tables that depend on the number of Zernike terms."""
+    n_points = POINTS.shape[1]
+    slopes = np.zeros((2, n_terms, -(-n_points // VECTOR) * VECTOR), np.float32)
+    for padded, values in zip(slopes, _monomial_slopes(n_terms), strict=True):
+        padded[:, :n_points] = values
+        padded[:, n_points:] = values[:, -1:]
+    nodes, (a, b) = polynomial_nodes(n_terms), exponents(n_terms).T
+    from_nodes = np.linalg.inv(nodes[:, :1] ** a * nodes[:, 1:] ** b)
+    return {
+        "monomials": monomial_matrix(n_terms),
+        "zernike_terms": inverse_monomial_matrix(n_terms),
+        "node_xy": nodes.T,
+        "from_nodes": from_nodes.T,
+        "slope_x": slopes[0],
+        "slope_y": slopes[1],
+    }
 
 
 def _with_changes(
@@ -244,18 +266,10 @@ def _with_changes(
 
 
 @cache
-def psf_tables(
-    filter_half_width: int = 4, filter_count: int = FILTER_COUNT
-) -> tuple[PsfTables, dict[str, NDArray[np.generic]]]:
-    """Return the tables of the engine, and the arrays that they point to.
-
-    Parameters
-    ----------
-    filter_half_width : int
-        Extent of the pixel filters beyond the pixel, samples.
-    filter_count : int
-        Largest number of samples per pixel.
-    """
+def _common_tables(
+    filter_half_width: int, filter_count: int
+) -> dict[str, NDArray[np.generic]]:
+    """Return the tables that depend on the sampling alone, or on nothing."""
     filters = [pixel_filter(k + 1, filter_half_width) for k in range(filter_count)]
     stride = -(-filters[-1].size // VECTOR) * VECTOR
     table = np.zeros((filter_count, stride), np.float32)
@@ -265,30 +279,41 @@ def psf_tables(
     first = np.cumsum(lengths) - lengths
     turns = np.concatenate([np.arange(n) / n for n in lengths])
     twiddles = np.stack([np.cos(2 * np.pi * turns), -np.sin(2 * np.pi * turns)], axis=1)
-    n_points = POINTS.shape[1]
-    slopes = np.zeros((2, N_TERMS, -(-n_points // VECTOR) * VECTOR), np.float32)
-    for padded, values in zip(slopes, SLOPES, strict=True):
-        padded[:, :n_points] = values
-        padded[:, n_points:] = values[:, -1:]
-    fresnel = fresnel_table()
     contents: dict[str, NDArray[np.generic]] = {
-        "monomials": monomial_matrix(),
-        "zernike_terms": inverse_monomial_matrix(),
-        "node_xy": NODES.T,
-        "from_nodes": FROM_NODES.T,
-        "slope_x": slopes[0],
-        "slope_y": slopes[1],
         "edge_xy": POINTS[:, :N_EDGE].astype(np.float32),
         "passed_powers": PASSED_POWERS,
         "ring_weights": RING_WEIGHTS,
-        "fresnel": _with_changes(fresnel),
+        "fresnel": _with_changes(fresnel_table()),
         "edge_response": _with_changes(edge_response()),
         "pixel_filters": table,
         "lengths": lengths.astype(np.int32),
         "twiddle_first": first.astype(np.int32),
         "twiddles": twiddles.astype(np.float32),
     }
-    arrays = {name: np.ascontiguousarray(array) for name, array in contents.items()}
+    return {name: np.ascontiguousarray(array) for name, array in contents.items()}
+
+
+@cache
+def psf_tables(
+    n_terms: int = N_TERMS,
+    filter_half_width: int = 4,
+    filter_count: int = FILTER_COUNT,
+) -> tuple[PsfTables, dict[str, NDArray[np.generic]]]:
+    """Return the tables of the engine, and the arrays that they point to.
+
+    Parameters
+    ----------
+    n_terms : int
+        Number of Zernike terms of the wavefronts.
+    filter_half_width : int
+        Extent of the pixel filters beyond the pixel, samples.
+    filter_count : int
+        Largest number of samples per pixel.
+    """
+    arrays = _common_tables(filter_half_width, filter_count) | {
+        name: np.ascontiguousarray(array)
+        for name, array in _wavefront_tables(n_terms).items()
+    }
     tables = PsfTables(
         **{name: pointer_to(array) for name, array in arrays.items()},
         cosine=COSINE_OF_TURNS,
@@ -309,14 +334,15 @@ def psf_tables(
         min_curvature_ratio=MIN_CURVATURE_RATIO,
         far_px=FAR_PX,
         near_px=NEAR_PX,
-        fresnel_count=fresnel.size,
+        fresnel_count=len(arrays["fresnel"]),
         edge_half_width=EDGE_HALF_WIDTH,
         edge_steps=EDGE_STEPS,
-        filter_stride=stride,
+        filter_stride=arrays["pixel_filters"].shape[1],
         filter_count=filter_count,
         filter_half_width=filter_half_width,
-        length_count=lengths.size,
+        length_count=FAST_LENGTHS.size,
         n_rings=RING_WEIGHTS.size + 1,
         n_ring=N_RING,
+        order=radial_order(n_terms),
     )
     return tables, arrays

@@ -4,13 +4,14 @@ The landing point of a ray is the slope of its wavefront.  The difference of two
 the distance between their rays from the same points of the pupil.
 """
 
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
-from estimator.optics.zernike import EXPONENTS, wavefront_polynomial
+from estimator.optics.zernike import exponents, wavefront_polynomial
 from estimator.psf.pupil import PupilFrames, pupil_frames
 from estimator.psf.screens import ScreenTables
 from estimator.psf.stiles_crawford import StilesCrawford
@@ -96,23 +97,21 @@ def main_light_ratio(
     return np.maximum(np.concatenate(ratios), LEAST_LIGHT)
 
 
-def _sample_slopes() -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return weights (n,) and slopes (28, n) of every monomial over the unit disc."""
+def _sample_points() -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Return weights (n,) and positions x and y (n,) over the unit disc."""
     node, weight = np.polynomial.legendre.leggauss(N_RINGS)
     radius = np.sqrt((node + 1.0) / 2.0)[:, None]
     # Each ring is rotated by its own angle, so that rings do not line up.
     turn = np.arange(N_RINGS)[:, None] / N_RINGS
     angle = 2.0 * np.pi * (np.arange(N_AZIMUTHS) + turn) / N_AZIMUTHS
-    x, y = (radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()
-    a, b = EXPONENTS[:, :1], EXPONENTS[:, 1:]
     return (
         np.repeat(weight / 2.0, N_AZIMUTHS) / N_AZIMUTHS,
-        a * x ** np.maximum(a - 1, 0) * y**b,
-        b * x**a * y ** np.maximum(b - 1, 0),
+        (radius * np.cos(angle)).ravel(),
+        (radius * np.sin(angle)).ravel(),
     )
 
 
-WEIGHTS, _SLOPE_X, _SLOPE_Y = _sample_slopes()
+WEIGHTS, _X, _Y = _sample_points()
 """Shares (n,) of the pupil that its sample points represent.
 
 The planner uses the same weights with the Stiles-Crawford effect, which reduces the
@@ -121,10 +120,21 @@ than without the effect (three presets).
 """
 
 
+@cache
+def _monomial_slopes(n_terms: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return the slopes (n_terms, n) of every monomial at the sample points."""
+    a, b = np.split(exponents(n_terms), 2, axis=1)
+    return (
+        a * _X ** np.maximum(a - 1, 0) * _Y**b,
+        b * _X**a * _Y ** np.maximum(b - 1, 0),
+    )
+
+
 def slopes_px(frames: PupilFrames) -> NDArray[np.float64]:
     """Return slopes (P, n, 2), px, x right, y up, at the same points of each pupil."""
-    along_x = frames.disc_polynomial_um @ _SLOPE_X
-    along_y = frames.disc_polynomial_um @ _SLOPE_Y
+    slope_x, slope_y = _monomial_slopes(frames.disc_polynomial_um.shape[1])
+    along_x = frames.disc_polynomial_um @ slope_x
+    along_y = frames.disc_polynomial_um @ slope_y
     shear = frames.shear_ratio[:, None]
     scale = np.sqrt(1.0 - shear * shear)
     half = frames.half_width_um_per_px

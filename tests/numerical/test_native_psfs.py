@@ -9,6 +9,7 @@ from estimator.corrections.kinoform import Kinoform
 from estimator.corrections.lenslets import Lenslets
 from estimator.corrections.rings import DiffractiveRings, RefractiveZones
 from estimator.native import Core, core
+from estimator.optics.zernike import padded_terms, zernike_gradient
 from estimator.psf.compiled import CompiledPsfs
 from estimator.psf.compute import compute_psf_batch
 from estimator.psf.kernel_types import PsfTooLarge
@@ -54,8 +55,8 @@ def wavefronts_of(
     )
     jacobian = np.eye(2) / pitch_mrad if jacobian is None else jacobian
     return NodeWavefronts(
-        zernike_um=np.broadcast_to(zernike_um[:, None, None], (*shape, 28)).copy(),
-        per_dpt_um=np.zeros((*shape, 28)),
+        zernike_um=np.tile(zernike_um[:, None, None], (1, 3, primaries, 1)),
+        per_dpt_um=np.zeros((*shape, zernike_um.shape[1])),
         circle_diameter_mm=np.full(shape, pupil_mm),
         pupil_ellipse=np.broadcast_to(ellipse, (*shape, 5)).copy(),
         wavelength_nm=wavelength_nm,
@@ -206,6 +207,73 @@ def test_cases_are_as_near_the_quadrature_as_the_python_engine(name):
     )
     assert error <= max(1.1 * other, other + 0.002)
     assert error <= 0.04
+
+
+@pytest.mark.parametrize("n_terms", [36, 66])
+def test_wavefronts_of_higher_order_are_near_the_quadrature(n_terms):
+    rng = np.random.default_rng(n_terms)
+    zernike_um = padded_terms(random_zernike(rng, 1, 0.3)[0], n_terms).copy()
+    zernike_um[28:] = 0.06 * rng.standard_normal(n_terms - 28)
+    pupil = {"pupil_mm": 2.0, "pitch_mrad": 1.0}
+    ellipse, radius_px = (0.02, -0.03, 0.95, 0.7, 0.6), 9
+    ours, methods, left = computed(wavefronts_of(zernike_um, ellipse=ellipse, **pupil))
+    assert not left.size
+    assert methods["fourier"] == 3
+    truth, of_28 = (
+        reference_kernel(
+            wave_um,
+            pupil_diameter_mm=2.0,
+            wavelength_nm=536.0,
+            radius_px=radius_px,
+            pixel_pitch_mrad=1.0,
+            pupil_ellipse=ellipse,
+        )
+        for wave_um in (zernike_um, zernike_um[:28])
+    )
+    middle = slice(255 - radius_px, 255 + radius_px + 1)
+    found = kernel(ours, 1)[middle, middle]
+    found = found / found.sum()
+    assert error_ratio(found, truth / truth.sum()) <= 0.02
+    assert error_ratio(found, of_28 / of_28.sum()) > 0.2
+
+
+@pytest.mark.parametrize("n_terms", [36, 66])
+def test_rays_of_higher_order_land_where_its_slopes_point(n_terms):
+    """The moments of a spot are those of the slopes over the pupil."""
+    rng = np.random.default_rng(n_terms)
+    zernike_um = padded_terms(random_zernike(rng, 1, 6.0)[0], n_terms).copy()
+    zernike_um[28:] = 0.1 * rng.standard_normal(n_terms - 28)
+    ours, methods, _ = computed(
+        wavefronts_of(zernike_um, pupil_mm=6.0, pitch_mrad=0.3),
+        diffraction=False,
+        kept_energy_ratio=1.0,
+    )
+    assert methods["geometric"] == 3
+    radius, weight = np.polynomial.legendre.leggauss(24)
+    angle = 2.0 * np.pi * np.arange(48) / 48
+    radius = np.sqrt(0.5 + 0.5 * radius)[:, None]
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    slope_px = zernike_gradient(x, y, n_terms=n_terms) @ zernike_um / 3.0 / 0.3
+    mean_px = np.einsum("r,rak->k", weight, slope_px) / 96
+    spread_px2 = np.einsum("r,rak->k", weight, (slope_px - mean_px) ** 2) / 96
+    found, pixels = kernel(ours, 1), np.arange(-255, 256)
+    along = found.sum(axis=0), found.sum(axis=1)[::-1]  # x right, y up
+    for share, mean, spread in zip(along, mean_px, spread_px2, strict=True):
+        own_mean = share @ pixels
+        assert own_mean == pytest.approx(mean, abs=0.02)
+        own_spread = share @ (pixels - own_mean) ** 2
+        # pixels and footprints widen it a little; orders above 6, by 2.8 or more
+        assert own_spread == pytest.approx(spread, rel=0.002, abs=0.7)
+
+
+@pytest.mark.parametrize("waves", [0.3, 6.0])
+def test_terms_of_zero_change_no_kernel(waves):
+    zernike_um = random_zernike(np.random.default_rng(5), 4, waves)
+    ours, *_ = computed(wavefronts_of(zernike_um))
+    longer, *_ = computed(wavefronts_of(padded_terms(zernike_um, 66)))
+    assert np.array_equal(ours.reach_px, longer.reach_px)
+    difference = ours.weights.astype(int) - longer.weights
+    assert np.abs(difference).max() <= 1
 
 
 def test_apodized_pupils_and_wide_primaries_are_those_of_the_python_engine():

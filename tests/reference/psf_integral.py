@@ -15,7 +15,12 @@ import scipy.special
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.optics.zernike import EXPONENTS, wavefront_polynomial, zernike_gradient
+from estimator.optics.zernike import (
+    exponents,
+    radial_order,
+    wavefront_polynomial,
+    zernike_gradient,
+)
 from estimator.psf.arguments import checked_scale
 from estimator.psf.stiles_crawford import StilesCrawford
 
@@ -56,7 +61,8 @@ class _Pupil:
         """Return the largest |dW/dw| over the pupil, um, from a dense polar grid."""
         rho, angle = np.meshgrid(np.linspace(0, 1, 33), np.linspace(0, 2 * np.pi, 129))
         x, y = self.circle_point(rho * np.cos(angle), rho * np.sin(angle))
-        gradient = zernike_gradient(x, y) @ self.zernike_um
+        gradient = zernike_gradient(x, y, n_terms=self.zernike_um.size)
+        gradient = gradient @ self.zernike_um
         gradient = gradient / self.circle_mm @ self.matrix_mm
         return float(np.hypot(gradient[..., 0], gradient[..., 1]).max())
 
@@ -160,10 +166,11 @@ def _chord_integrals(phase_rad, weight, x, start, step, offsets, out):
 def _polynomial_values(coefficients, x, y):
     powers_x, powers_y = ([np.ones_like(value)] for value in (x, y))
     for powers, value in ((powers_x, x), (powers_y, y)):
-        for _ in range(6):
+        for _ in range(radial_order(coefficients.size)):
             powers.append(powers[-1] * value)
     total = np.zeros(np.broadcast_shapes(x.shape, y.shape))
-    for (a, b), c in zip(EXPONENTS.tolist(), coefficients, strict=True):
+    powers = exponents(coefficients.size).tolist()
+    for (a, b), c in zip(powers, coefficients, strict=True):
         if c != 0.0:
             total += c * powers_x[a] * powers_y[b]
     return total
@@ -230,7 +237,7 @@ def reference_field(
 
     Parameters
     ----------
-    zernike_um : (28,), um
+    zernike_um : (n_terms,), um
     theta_x_mrad, theta_y_mrad : (nx,), (ny,)
         Directions, x right, y up; ``theta_x_mrad`` evenly spaced.
     pupil_ellipse : (5,), optional
@@ -279,7 +286,7 @@ def reference_kernel(
 
     Parameters
     ----------
-    zernike_um : (28,), um
+    zernike_um : (n_terms,), um
         Wavefront on the circle of the given diameter; tilt counts.
     radius_px : int
     pixel_pitch_mrad, pixel_from_mrad, pupil_ellipse, stiles_crawford

@@ -21,7 +21,9 @@ static double add_disc(const float *from, int radius, double share, float *to) {
 
 /* Reads a surveyed pupil. */
 static void take_pupil(const psf_discs_job *discs, int64_t psf, pupil *own) {
-    memcpy(own->box, discs->box_um + psf * N_TERMS, sizeof own->box);
+    int n_terms = terms_of(discs->job->tables->order);
+    own->order = discs->job->tables->order;
+    memcpy(own->box, discs->box_um + psf * n_terms, sizeof *own->box * (size_t)n_terms);
     memcpy(own->half, discs->half_width + psf * 2, sizeof own->half);
     own->shear = discs->shear[psf];
     own->root = sqrt(1.0 - square(own->shear));

@@ -6,8 +6,10 @@
 
 #include "pool.h"
 
-#define N_TERMS 28            /* of a wavefront: degree 6 */
-#define N_POWERS 7
+#define MOST_ORDER 10         /* degree of a wavefront's polynomial: 6 to 10 */
+#define MOST_POWERS (MOST_ORDER + 1)
+#define MOST_TERMS 66
+#define TURN_POWERS 7         /* of the polynomials for cosine and sine */
 #define N_EDGE 48             /* points of a survey on the pupil's edge */
 #define N_SURVEY 193          /* all points of a survey, padded to SURVEY_STRIDE */
 #define SURVEY_STRIDE 200
@@ -17,11 +19,12 @@
 
 /* Tables of the modules of estimator/psf, so that each number is defined once. */
 typedef struct {
-    const double *monomials;        /* (28, 28): row j, the monomials of Zernike term j */
+    /* For n terms, 28 to 66. */
+    const double *monomials;        /* (n, n): row j, the monomials of Zernike term j */
     const double *zernike_terms;    /* its inverse */
-    const double *node_xy;          /* (2, 28): points that fix a polynomial */
-    const double *from_nodes;       /* (28, 28): row k, effect of value k on each term */
-    const float *slope_x, *slope_y; /* (28, SURVEY_STRIDE): of monomials at points */
+    const double *node_xy;          /* (2, n): points that fix a polynomial */
+    const double *from_nodes;       /* (n, n): row k, effect of value k on each term */
+    const float *slope_x, *slope_y; /* (n, SURVEY_STRIDE): of monomials at points */
     const float *edge_xy;           /* (2, N_EDGE) */
     const double *passed_powers;    /* (6, n_rings * n_ring) */
     const double *ring_weights;     /* (n_rings - 1,); the last ring is the edge */
@@ -32,7 +35,7 @@ typedef struct {
     const int32_t *lengths;         /* (length_count,) of FFTs, ascending */
     const int32_t *twiddle_first;   /* (length_count,) pairs */
     const float *twiddles;          /* exp(-2 pi i p / n), n pairs for each length */
-    float cosine[N_POWERS], sine[N_POWERS]; /* polynomials of turns, in squares */
+    float cosine[TURN_POWERS], sine[TURN_POWERS]; /* polynomials of turns, in squares */
     double fresnel_limit;
     double least_margin_px;
     double base_db, per_rms_db, per_pixel_db, per_narrow_db, rays_from_db, fade_db;
@@ -42,6 +45,7 @@ typedef struct {
     int32_t fresnel_count, edge_half_width, edge_steps;
     int32_t filter_stride, filter_count, filter_half_width;
     int32_t length_count, n_rings, n_ring;
+    int32_t order;                  /* of the n terms */
 } psf_tables;
 
 enum { PSF_DONE = 0, PSF_NOT_HERE = 1, PSF_NO_MEMORY = 2 };
@@ -50,8 +54,8 @@ enum { PSF_DONE = 0, PSF_NOT_HERE = 1, PSF_NO_MEMORY = 2 };
 typedef struct {
     pool *threads;
     const psf_tables *tables;
-    const double *zernike_um;         /* (..., 28) at 0 dpt */
-    const double *per_dpt_um;         /* (..., 28) */
+    const double *zernike_um;         /* (..., n) at 0 dpt */
+    const double *per_dpt_um;         /* (..., n) */
     const double *circle_diameter_mm; /* (...) */
     const double *pupil_ellipse;      /* (..., 5) */
     const double *pixel_from_mrad;    /* (groups, 2, 2) */

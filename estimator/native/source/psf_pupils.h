@@ -4,8 +4,9 @@
 #include <math.h>
 
 typedef struct {
-    double box[N_TERMS];      /* um, over the bounding box */
-    double disc[N_TERMS];     /* over the unit disc */
+    int order;
+    double box[MOST_TERMS];   /* um, over the bounding box */
+    double disc[MOST_TERMS];  /* over the unit disc */
     double half[2], shear, root; /* um per px; root: sqrt(1 - shear^2) */
     double log_amplitude[LOG_AMPLITUDES];
     double wavelength_um;
@@ -49,6 +50,13 @@ INLINE double square(double value) { return value * value; }
 INLINE double larger_double(double a, double b) { return a > b ? a : b; }
 INLINE double smaller_double(double a, double b) { return a < b ? a : b; }
 
+INLINE int terms_of(int order) { return (order + 1) * (order + 2) / 2; }
+
+/* Calls an inline function with the order of most eyes as a constant, so that its loops are
+ * unrolled for it. */
+#define FOR_ORDER(order, function, ...) \
+    ((order) == 6 ? function(6, __VA_ARGS__) : function(order, __VA_ARGS__))
+
 /* Exponents of x and y of term t; terms are ordered by degree. */
 INLINE void exponents(int t, int *x, int *y) {
     int degree = 0;
@@ -57,40 +65,68 @@ INLINE void exponents(int t, int *x, int *y) {
     *x = degree - *y;
 }
 
-/* out (28,) = in (28,) times a matrix (28, 28). */
-static void times_matrix(const double *in, const double *matrix, double *out) {
-    double sum[N_TERMS] = {0.0};
-    for (int j = 0; j < N_TERMS; ++j)
-        for (int t = 0; t < N_TERMS; ++t) sum[t] += in[j] * matrix[j * N_TERMS + t];
-    memcpy(out, sum, sizeof sum);
+/* Terms by powers of y and x. */
+INLINE void fill_dense(int order, const double *terms, double scale,
+                       double dense[MOST_POWERS][MOST_POWERS]) {
+    for (int t = 0; t < terms_of(order); ++t) {
+        int x, y;
+        exponents(t, &x, &y);
+        dense[y][x] = terms[t] / scale;
+    }
+}
+
+/* out (n,) = in (n,) times a matrix (n, n). */
+INLINE void times_matrix(int order, const double *in, const double *matrix, double *out) {
+    double sum[MOST_TERMS];
+    int n = terms_of(order);
+    for (int t = 0; t < n; ++t) sum[t] = 0.0;
+    for (int j = 0; j < n; ++j)
+        for (int t = 0; t < n; ++t) sum[t] += in[j] * matrix[j * n + t];
+    memcpy(out, sum, sizeof *sum * (size_t)n);
 }
 
 /* Coefficients of source(shift + matrix w), without the constant. */
-static void substitute(const psf_tables *tables, const double *source,
+INLINE void substitute(int order, const psf_tables *tables, const double *source,
                        const double matrix[4], const double shift[2], double *out) {
-    double xs[N_POWERS][N_TERMS], ys[N_POWERS][N_TERMS], values[N_TERMS] = {0.0};
-    const double *u = tables->node_xy, *v = u + N_TERMS;
-    for (int k = 0; k < N_TERMS; ++k) {
+    double xs[MOST_POWERS][MOST_TERMS], ys[MOST_POWERS][MOST_TERMS], values[MOST_TERMS];
+    int n = terms_of(order);
+    const double *u = tables->node_xy, *v = u + n;
+    for (int k = 0; k < n; ++k) {
+        values[k] = 0.0;
         xs[0][k] = ys[0][k] = 1.0;
         xs[1][k] = shift[0] + matrix[0] * u[k] + matrix[1] * v[k];
         ys[1][k] = shift[1] + matrix[2] * u[k] + matrix[3] * v[k];
     }
-    for (int i = 2; i < N_POWERS; ++i)
-        for (int k = 0; k < N_TERMS; ++k) {
+    for (int i = 2; i <= order; ++i)
+        for (int k = 0; k < n; ++k) {
             xs[i][k] = xs[i - 1][k] * xs[1][k];
             ys[i][k] = ys[i - 1][k] * ys[1][k];
         }
     int t = 1;
-    for (int degree = 1; degree < N_POWERS; ++degree)
+    for (int degree = 1; degree <= order; ++degree)
         for (int b = 0; b <= degree; ++b, ++t)
-            for (int k = 0; k < N_TERMS; ++k)
+            for (int k = 0; k < n; ++k)
                 values[k] += source[t] * xs[degree - b][k] * ys[b][k];
-    times_matrix(values, tables->from_nodes, out);
+    times_matrix(order, values, tables->from_nodes, out);
     out[0] = 0.0;
 }
 
-/* Computes half sides, shear, and the wavefront over box and disc, from monomials (28,) over
- * a circle. */
+/* Computes the wavefront over box and disc from monomials over a circle, of which `matrix`
+ * and `shift` are the box. */
+INLINE void place_wavefront(int order, const psf_tables *tables, const double *monomials_um,
+                            const double matrix[4], const double shift[2], pupil *own) {
+    own->order = order;
+    substitute(order, tables, monomials_um, matrix, shift, own->box);
+    if (own->shear == 0.0) {
+        memcpy(own->disc, own->box, sizeof *own->disc * (size_t)terms_of(order));
+        return;
+    }
+    const double lower[4] = {1.0, 0.0, own->shear, own->root}, none[2] = {0.0, 0.0};
+    substitute(order, tables, own->box, lower, none, own->disc);
+}
+
+/* Computes half sides, shear, and the wavefront over box and disc, from monomials over a
+ * circle. */
 static void frame_pupil(const psf_tables *tables, const double *monomials_um,
                         double radius_mm, const double *ellipse, const double *jacobian,
                         pupil *own) {
@@ -113,13 +149,7 @@ static void frame_pupil(const psf_tables *tables, const double *monomials_um,
     for (int i = 0; i < 2; ++i)
         for (int q = 0; q < 2; ++q)
             matrix[2 * i + q] = jacobian[2 * q + i] * own->half[q] / radius_mm;
-    substitute(tables, monomials_um, matrix, shift, own->box);
-    if (own->shear == 0.0) {
-        memcpy(own->disc, own->box, sizeof own->disc);
-        return;
-    }
-    const double lower[4] = {1.0, 0.0, own->shear, own->root}, none[2] = {0.0, 0.0};
-    substitute(tables, own->box, lower, none, own->disc);
+    FOR_ORDER(tables->order, place_wavefront, tables, monomials_um, matrix, shift, own);
 }
 
 /* Computes the apodization -k |u - u0|^2 over the box, and the light that passes. */
@@ -173,11 +203,12 @@ INLINE double sum8(f32x8 v) {
 }
 
 /* Evaluates slopes of the wavefront, in pixels. */
-static void survey_pupil(const psf_tables *tables, pupil *own) {
-    float sheared = (float)(own->shear / own->root), terms[N_TERMS];
+INLINE void survey_slopes(int order, const psf_tables *tables, pupil *own) {
+    float sheared = (float)(own->shear / own->root), terms[MOST_TERMS];
+    int n_terms = terms_of(order);
     f32x8 per_x = all8((float)(1.0 / own->half[0]));
     f32x8 per_y = all8((float)(1.0 / (own->root * own->half[1])));
-    for (int t = 0; t < N_TERMS; ++t) terms[t] = (float)own->disc[t];
+    for (int t = 0; t < n_terms; ++t) terms[t] = (float)own->disc[t];
     /* Moments are about the first point, as float32 sums of large slopes would lose their
      * differences. */
     f32x8 low_x = all8(INFINITY), low_y = low_x, high_x = -low_x, high_y = -low_x;
@@ -185,7 +216,7 @@ static void survey_pupil(const psf_tables *tables, pupil *own) {
           myy = zero, about_x = zero, about_y = zero;
     for (int first = 0; first < SURVEY_STRIDE; first += 8) {
         f32x8 gx = zero, gy = zero;
-        for (int t = 1; t < N_TERMS; ++t) {
+        for (int t = 1; t < n_terms; ++t) {
             f32x8 c = all8(terms[t]);
             gx += c * load8(tables->slope_x + t * SURVEY_STRIDE + first);
             gy += c * load8(tables->slope_y + t * SURVEY_STRIDE + first);
@@ -230,12 +261,22 @@ static void survey_pupil(const psf_tables *tables, pupil *own) {
     own->narrow_ratio = sqrt(larger_double(0.0, least)) * 2.0 / own->wavelength_um;
 }
 
+static void survey_pupil(const psf_tables *tables, pupil *own) {
+    FOR_ORDER(own->order, survey_slopes, tables, own);
+}
+
+/* RMS of the wavefront without tilt over the pupil, um. */
+INLINE double rms_of_order(int order, const psf_tables *tables, const pupil *own) {
+    double terms[MOST_TERMS], sum = 0.0;
+    times_matrix(order, own->disc, tables->zernike_terms, terms);
+    for (int t = 3; t < terms_of(order); ++t) sum += square(terms[t]);
+    return sqrt(sum);
+}
+
 /* Share of ray optics, from the predicted error of rays alone. */
 static double share_of_rays(const psf_tables *tables, const pupil *own) {
-    double terms[N_TERMS], rms = 0.0;
-    times_matrix(own->disc, tables->zernike_terms, terms);
-    for (int t = 3; t < N_TERMS; ++t) rms += square(terms[t]);
-    rms = larger_double(sqrt(rms) / own->wavelength_um, 1e-6);
+    double rms_um = FOR_ORDER(own->order, rms_of_order, tables, own);
+    double rms = larger_double(rms_um / own->wavelength_um, 1e-6);
     double unit_px = own->wavelength_um
                      / (2.0 * smaller_double(own->half[0], own->half[1]));
     double db = tables->base_db + tables->per_rms_db * log10(rms)

@@ -71,16 +71,16 @@ INLINE void add_squares(float *pixels, int other, i32x8 at, uint32_t lit, f32x8 
 
 /* Coefficients in x of W, dW/dy and d^2W/dy^2 at several y. */
 typedef struct {
-    float of_w[N_POWERS][MOST_CELLS], of_dy[N_POWERS][MOST_CELLS],
-        of_dyy[N_POWERS][MOST_CELLS];
+    float of_w[MOST_POWERS][MOST_CELLS], of_dy[MOST_POWERS][MOST_CELLS],
+        of_dyy[MOST_POWERS][MOST_CELLS];
 } cell_terms;
 
-static void fill_cell_terms(double dense[N_POWERS][N_POWERS], const double *y, int count,
-                           cell_terms *rows) {
+INLINE void fill_cell_terms(int order, double dense[MOST_POWERS][MOST_POWERS],
+                            const double *y, int count, cell_terms *rows) {
     double value[MOST_CELLS], first[MOST_CELLS], second[MOST_CELLS];
-    for (int a = 0; a < N_POWERS; ++a) {
+    for (int a = 0; a <= order; ++a) {
         for (int j = 0; j < count; ++j) value[j] = first[j] = second[j] = 0.0;
-        for (int b = N_POWERS - 1 - a; b >= 0; --b)
+        for (int b = order - a; b >= 0; --b)
             for (int j = 0; j < count; ++j) {
                 second[j] = second[j] * y[j] + 2.0 * first[j];
                 first[j] = first[j] * y[j] + value[j];
@@ -161,22 +161,36 @@ INLINE void add_footprints(const canvas *c, f32x8 x0, f32x8 y0, f32x8 wide, f32x
 /* Data shared by a row of cells. */
 typedef struct {
     const canvas *c;
-    float w[N_POWERS], d[N_POWERS], e[N_POWERS]; /* in x */
+    /* Polynomials in x of the slopes and of the second derivatives. */
+    float sx[MOST_POWERS], sy[MOST_POWERS];
+    float hxx[MOST_POWERS], hxy[MOST_POWERS], hyy[MOST_POWERS];
     float cell, factor_x, factor_y, cell_x, cell_y, per_cell_x, per_cell_y;
 } pupil_row;
 
-#define SIX(c1, c2, c3, c4, c5, c6) \
-    (all8(c1) + x * (all8(c2) + x * (all8(c3) + x * (all8(c4) + x * (all8(c5) \
-     + x * all8(c6))))))
+INLINE void take_row(int order, const cell_terms *rows, int j, pupil_row *r) {
+    for (int k = 0; k < order; ++k) {
+        r->sx[k] = (float)(k + 1) * rows->of_w[k + 1][j];
+        r->sy[k] = rows->of_dy[k][j];
+    }
+    for (int k = 0; k + 1 < order; ++k) {
+        r->hxx[k] = (float)((k + 1) * (k + 2)) * rows->of_w[k + 2][j];
+        r->hxy[k] = (float)(k + 1) * rows->of_dy[k + 1][j];
+        r->hyy[k] = rows->of_dyy[k][j];
+    }
+}
 
-INLINE void splat_cells(const pupil_row *r, f32x8 x, f32x8 weight) {
-    const float *w = r->w, *d = r->d, *e = r->e;
+INLINE f32x8 polynomial8(const float *c, int count, f32x8 x) {
+    f32x8 sum = all8(c[count - 1]);
+    for (int k = count - 2; k >= 0; --k) sum = all8(c[k]) + x * sum;
+    return sum;
+}
+
+INLINE void splat_cells(int order, const pupil_row *r, f32x8 x, f32x8 weight) {
     f32x8 half = all8(0.5f);
-    f32x8 sx = SIX(w[1], 2 * w[2], 3 * w[3], 4 * w[4], 5 * w[5], 6 * w[6]);
-    f32x8 sy = SIX(d[0], d[1], d[2], d[3], d[4], d[5]);
-    f32x8 hxx = SIX(2 * w[2], 6 * w[3], 12 * w[4], 20 * w[5], 30 * w[6], 0.0f);
-    f32x8 hxy = SIX(d[1], 2 * d[2], 3 * d[3], 4 * d[4], 5 * d[5], 0.0f);
-    f32x8 hyy = SIX(e[0], e[1], e[2], e[3], e[4], 0.0f);
+    f32x8 sx = polynomial8(r->sx, order, x), sy = polynomial8(r->sy, order, x);
+    f32x8 hxx = polynomial8(r->hxx, order - 1, x);
+    f32x8 hxy = polynomial8(r->hxy, order - 1, x);
+    f32x8 hyy = polynomial8(r->hyy, order - 1, x);
     f32x8 tiny = all8(1e-24f);
     f32x8 square_x = hxx * hxx + hxy * hxy + tiny, square_y = hxy * hxy + hyy * hyy + tiny;
     f32x8 per_x = inverse_root8(square_x), per_y = inverse_root8(square_y);
@@ -186,7 +200,6 @@ INLINE void splat_cells(const pupil_row *r, f32x8 x, f32x8 weight) {
                    all8(r->factor_y) * sy - half * high, wide, high,
                    all8(r->per_cell_x) * per_x, all8(r->per_cell_y) * per_y, weight);
 }
-#undef SIX
 
 /* Weights of cells that the pupil's edge may cross: their area inside a straight edge. */
 INLINE f32x8 edge_weights(const pupil *own, f32x8 x, float y, float cell) {
@@ -210,7 +223,8 @@ INLINE f32x8 apodized(const pupil *own, f32x8 x, double y, f32x8 weight) {
 }
 
 /* Adds the footprints of all cells of the pupil; returns their weight. */
-static double splat_pupil(const pupil *own, double dense[N_POWERS][N_POWERS], int n_cells,
+INLINE double splat_pupil(int order, const pupil *own,
+                          double dense[MOST_POWERS][MOST_POWERS], int n_cells,
                           const canvas *c) {
     double cell = 2.0 / n_cells, room = square(own->root), shear = own->shear;
     float factor_x = (float)(1.0 / own->half[0]), factor_y = (float)(1.0 / own->half[1]);
@@ -224,7 +238,7 @@ static double splat_pupil(const pupil *own, double dense[N_POWERS][N_POWERS], in
     double ys[MOST_CELLS];
     cell_terms rows;
     for (int j = 0; j < n_cells; ++j) ys[j] = (j + 0.5) * cell - 1.0;
-    fill_cell_terms(dense, ys, n_cells, &rows);
+    fill_cell_terms(order, dense, ys, n_cells, &rows);
     for (int j = 0; j < n_cells; ++j) {
         double y = ys[j], middle = 1.0 + shear * y;
         double edge = square(1.0 + 0.5 * cell) - y * y;
@@ -235,11 +249,7 @@ static double splat_pupil(const pupil *own, double dense[N_POWERS][N_POWERS], in
         int core_first = (int)ceil((middle - core) / cell);
         int core_end = (int)floor((middle + core) / cell);
         if (core_end <= core_first) core_first = core_end = end;
-        for (int a = 0; a < N_POWERS; ++a) {
-            r.w[a] = rows.of_w[a][j];
-            r.d[a] = rows.of_dy[a][j];
-            r.e[a] = rows.of_dyy[a][j];
-        }
+        take_row(order, &rows, j, &r);
         /* The lanes are far from each other: neighbors share pixels, and a load would have
          * to wait for the preceding store. */
         int span = (core_end - core_first + LANES - 1) / LANES;
@@ -249,7 +259,7 @@ static double splat_pupil(const pupil *own, double dense[N_POWERS][N_POWERS], in
             f32x8 weight = (f32x8)((i32x8)one & (number < all8((float)core_end)));
             if (own->is_apodized) weight = apodized(own, x, y, weight);
             total += weight;
-            splat_cells(&r, x, weight);
+            splat_cells(order, &r, x, weight);
         }
         /* Both ends of the row. */
         int before = core_first - first, count = before + larger_int(0, end - core_end);
@@ -264,7 +274,7 @@ static double splat_pupil(const pupil *own, double dense[N_POWERS][N_POWERS], in
             weight = (f32x8)((i32x8)weight & (number < all8((float)count)));
             if (own->is_apodized) weight = apodized(own, x, y, weight);
             total += weight;
-            splat_cells(&r, x, weight);
+            splat_cells(order, &r, x, weight);
         }
     }
     double sum = 0.0;
@@ -313,28 +323,24 @@ INLINE void add_boxes(const canvas *c, f32x8 x, f32x8 y, float per_size, f32x8 l
 
 /* Cosine and sine of turns in [-1/2, 1/2]. */
 INLINE f32x8 cosine8(const psf_tables *tables, f32x8 z) {
-    f32x8 sum = all8(tables->cosine[N_POWERS - 1]);
-    for (int k = N_POWERS - 2; k >= 0; --k) sum = all8(tables->cosine[k]) + z * sum;
-    return sum;
+    return polynomial8(tables->cosine, TURN_POWERS, z);
 }
 
 INLINE f32x8 sine8(const psf_tables *tables, f32x8 t, f32x8 z) {
-    f32x8 sum = all8(tables->sine[N_POWERS - 1]);
-    for (int k = N_POWERS - 2; k >= 0; --k) sum = all8(tables->sine[k]) + z * sum;
-    return t * sum;
+    return t * polynomial8(tables->sine, TURN_POWERS, z);
 }
 
 /* Adds the effect of diffraction at the pupil's edge to the spot, for eight distant edge
  * points at a time. */
-static void add_edge_light(const psf_tables *tables, const pupil *own,
-                           double dense[N_POWERS][N_POWERS], const canvas *c) {
+INLINE void add_edge_light(int order, const psf_tables *tables, const pupil *own,
+                           double dense[MOST_POWERS][MOST_POWERS], const canvas *c) {
     double extent = larger_double(own->high[0] - own->low[0], own->high[1] - own->low[1]);
     int span = (int)ceil(larger_double(tables->min_edge_points,
                                        tables->edge_points_per_px * extent) / LANES);
     int count = span * LANES;
-    float terms[N_POWERS][N_POWERS];
-    for (int b = 0; b < N_POWERS; ++b)
-        for (int a = 0; a < N_POWERS; ++a) terms[b][a] = (float)dense[b][a];
+    float terms[MOST_POWERS][MOST_POWERS];
+    for (int b = 0; b <= order; ++b)
+        for (int a = 0; a <= order; ++a) terms[b][a] = (float)dense[b][a];
     f32x8 zero = all8(0.0f), two = all8(2.0f), sign = all8(-0.0f);
     f32x8 per_ax = all8((float)(1.0 / own->half[0])), per_ay = all8((float)(1.0 / own->half[1]));
     f32x8 sheared = all8((float)(own->shear / own->root)), shear = all8((float)own->shear);
@@ -351,9 +357,9 @@ static void add_edge_light(const psf_tables *tables, const pupil *own,
         nx /= length;
         ny /= length;
         f32x8 sx = zero, sy = zero, hxx = zero, hxy = zero, hyy = zero, value = zero;
-        for (int a = N_POWERS - 1; a >= 0; --a) {
+        for (int a = order; a >= 0; --a) {
             f32x8 w = zero, dy = zero, dyy = zero;
-            for (int b = N_POWERS - 1 - a; b >= 0; --b) {
+            for (int b = order - a; b >= 0; --b) {
                 dyy = dyy * y + two * dy;
                 dy = dy * y + w;
                 w = w * y + all8(terms[b][a]);
@@ -428,21 +434,17 @@ static void lift_to_tail(const tail *t, const canvas *c, float from_px) {
 /* Computes a spot, in shares of the light that the pupil passes. */
 static void spot_of_rays(const psf_tables *tables, const pupil *own, int is_diffracting,
                          const canvas *c) {
-    double dense[N_POWERS][N_POWERS] = {{0.0}};
-    for (int t = 0; t < N_TERMS; ++t) {
-        int x, y;
-        exponents(t, &x, &y);
-        dense[y][x] = own->box[t];
-    }
+    double dense[MOST_POWERS][MOST_POWERS] = {{0.0}};
+    fill_dense(own->order, own->box, 1.0, dense);
     double extent = larger_double(own->high[0] - own->low[0], own->high[1] - own->low[1]);
     double cells = larger_double(tables->min_cells / own->root, tables->cells_per_px * extent);
     int n_cells = (int)smaller_double(tables->max_cells, ceil(cells));
-    double weight = splat_pupil(own, dense, n_cells, c);
+    double weight = FOR_ORDER(own->order, splat_pupil, own, dense, n_cells, c);
     float scale = (float)(1.0 / weight);
     int count = c->width * c->height;
     for (int i = 0; i < count; ++i) c->pixels[i] *= scale;
     if (!is_diffracting) return;
-    add_edge_light(tables, own, dense, c);
+    FOR_ORDER(own->order, add_edge_light, tables, own, dense, c);
     for (int i = 0; i < count; ++i) c->pixels[i] = larger_float(c->pixels[i], 0.0f);
     tail t = tail_of(tables, own);
     lift_to_tail(&t, c, (float)tables->far_px);

@@ -13,12 +13,14 @@ static void frame_some(void *argument, int item, int thread) {
     frames_job *job = argument;
     (void)thread;
     int64_t first = (int64_t)item * PUPILS_AN_ITEM, end = first + PUPILS_AN_ITEM;
+    int n_terms = terms_of(job->tables->order);
+    size_t size = sizeof(double) * (size_t)n_terms;
     for (int64_t p = first; p < end && p < job->count; ++p) {
         pupil own;
-        frame_pupil(job->tables, job->monomials_um + p * N_TERMS, job->radius_mm[p],
+        frame_pupil(job->tables, job->monomials_um + p * n_terms, job->radius_mm[p],
                     job->ellipse + p * ELLIPSE_COLUMNS, job->jacobian + p * 4, &own);
-        memcpy(job->box + p * N_TERMS, own.box, sizeof own.box);
-        memcpy(job->disc + p * N_TERMS, own.disc, sizeof own.disc);
+        memcpy(job->box + p * n_terms, own.box, size);
+        memcpy(job->disc + p * n_terms, own.disc, size);
         memcpy(job->half + p * 2, own.half, sizeof own.half);
         job->shear[p] = own.shear;
     }
@@ -28,7 +30,7 @@ INLINE int items_of(int64_t count, int an_item) {
     return (int)((count + an_item - 1) / an_item);
 }
 
-/* Computes `PupilFrames` from monomials (count, 28) over circles. */
+/* Computes `PupilFrames` from monomials (count, n_terms) over circles. */
 static void frame_pupils(pool *threads, const psf_tables *tables, int64_t count,
                          const double *monomials_um, const double *radius_mm,
                          const double *ellipse, const double *jacobian, double *box,
@@ -49,9 +51,11 @@ static void survey_some(void *argument, int item, int thread) {
     surveys_job *job = argument;
     (void)thread;
     int64_t first = (int64_t)item * PUPILS_AN_ITEM, end = first + PUPILS_AN_ITEM;
+    int n_terms = terms_of(job->tables->order);
     for (int64_t p = first; p < end && p < job->count; ++p) {
         pupil own;
-        memcpy(own.disc, job->disc + p * N_TERMS, sizeof own.disc);
+        own.order = job->tables->order;
+        memcpy(own.disc, job->disc + p * n_terms, sizeof(double) * (size_t)n_terms);
         memcpy(own.half, job->half + p * 2, sizeof own.half);
         own.shear = job->shear[p];
         own.root = sqrt(1.0 - square(own.shear));

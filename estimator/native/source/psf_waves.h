@@ -18,6 +18,7 @@ typedef struct {
     scratch between;          /* (columns, 2, padded length of y), real and imaginary */
     scratch sums;             /* (pixels, padded length of y) */
     scratch line;
+    scratch phase_terms;      /* (rows, order + 1) */
     double mask_samples[2], mask_shear, mask_amplitudes[LOG_AMPLITUDES];
     int mask_rows, mask_columns;
 } wave_work;
@@ -29,6 +30,7 @@ static void free_wave_work(wave_work *w) {
     free(w->between.at);
     free(w->sums.at);
     free(w->line.at);
+    free(w->phase_terms.at);
 }
 
 /* Plans the smallest grid whose window holds the spot and its margins; 0 if no FFT does. */
@@ -193,8 +195,9 @@ static void apply_rings(const psf_job *job, const pupil *own, const grid *g,
 }
 
 /* Computes mask times exp(2 pi i W) of one strip; rows beyond the pupil are zero. */
-static void fill_strip(const psf_tables *tables, const grid *g, const float *mask,
-                       float (*phase_terms)[N_POWERS], int first_column, strip_row *to) {
+INLINE void fill_strip(int order, const psf_tables *tables, const grid *g,
+                       const float *mask, const float *phase_terms, int first_column,
+                       strip_row *to) {
     float x[STRIP];
     for (int i = 0; i < STRIP; ++i)
         x[i] = (float)((first_column + i - 0.5 * (g->size[0] - 1)) * 2.0 / g->samples[0]);
@@ -207,9 +210,9 @@ static void fill_strip(const psf_tables *tables, const grid *g, const float *mas
                 continue;
             }
             f32x8 u = load8(x + 8 * h);
-            const float *c = phase_terms[j];
-            f32x8 t = all8(c[6]);
-            for (int k = N_POWERS - 2; k >= 0; --k) t = all8(c[k]) + u * t;
+            const float *c = phase_terms + (size_t)j * (size_t)(order + 1);
+            f32x8 t = all8(c[order]);
+            for (int k = order - 1; k >= 0; --k) t = all8(c[k]) + u * t;
             t -= floor8(t + half);
             to[j].re[h] = share * cosine8(tables, t * t);
             to[j].im[h] = share * sine8(tables, t, t * t);
@@ -243,24 +246,23 @@ static void sum_strip(const psf_tables *tables, const grid *g, const strip_row *
     }
 }
 
-#define MOST_LENGTH 4096
-
 /* Coefficients in x of the phase, in turns, for each row of the grid. */
-static void fill_phase_terms(double turns[N_POWERS][N_POWERS], const grid *g,
-                             float (*terms)[N_POWERS]) {
+INLINE void fill_phase_terms(int order, double turns[MOST_POWERS][MOST_POWERS],
+                             const grid *g, float *terms) {
     enum { BLOCK = 64 };
     for (int first = 0; first < g->size[1]; first += BLOCK) {
         int count = smaller_int(BLOCK, g->size[1] - first);
         double y[BLOCK], value[BLOCK];
         for (int j = 0; j < BLOCK; ++j)
             y[j] = (first + j - 0.5 * (g->size[1] - 1)) * 2.0 / g->samples[1];
-        for (int a = 0; a < N_POWERS; ++a) {
+        for (int a = 0; a <= order; ++a) {
             for (int j = 0; j < BLOCK; ++j) value[j] = 0.0;
-            for (int b = N_POWERS - 1 - a; b >= 0; --b)
+            for (int b = order - a; b >= 0; --b)
                 for (int j = 0; j < BLOCK; ++j) value[j] = value[j] * y[j] + turns[b][a];
             /* Whole turns are removed before the cast, which keeps 1e-6 of the rest. */
+            float *to = terms + first * (order + 1) + a;
             for (int j = 0; j < count; ++j)
-                terms[first + j][a] = (float)(a == 0 ? value[j] - floor(value[j]) : value[j]);
+                to[j * (order + 1)] = (float)(a == 0 ? value[j] - floor(value[j]) : value[j]);
         }
     }
 }
@@ -287,27 +289,23 @@ static int spot_of_waves(const psf_job *job, const pupil *own, const grid *g, wa
     strip_row *other = room_for(&w->second, strip_floats);
     float *between = room_for(&w->between, columns_padded * 2 * padded);
     float *sums = room_for(&w->sums, sum_count), *line = room_for(&w->line, line_count);
+    float *phase_terms = room_for(&w->phase_terms, (size_t)rows * MOST_POWERS);
     if (rows_of == NULL || other == NULL || between == NULL || sums == NULL || line == NULL
-        || !fill_mask(tables, own, g, w))
+        || phase_terms == NULL || !fill_mask(tables, own, g, w))
         return 0;
-    double turns[N_POWERS][N_POWERS] = {{0.0}};
-    for (int t = 0; t < N_TERMS; ++t) {
-        int x, y;
-        exponents(t, &x, &y);
-        turns[y][x] = own->box[t] / own->wavelength_um;
-    }
+    double turns[MOST_POWERS][MOST_POWERS] = {{0.0}};
+    fill_dense(own->order, own->box, own->wavelength_um, turns);
     for (int axis = 0; axis < 2; ++axis) {
         double center_px = (double)g->center[axis] / g->per_px[axis];
         double *tilt = axis == 0 ? &turns[0][1] : &turns[1][0];
         *tilt -= own->half[axis] * center_px / own->wavelength_um;
     }
-    float phase_terms[MOST_LENGTH][N_POWERS];
-    fill_phase_terms(turns, g, phase_terms);
+    FOR_ORDER(own->order, fill_phase_terms, turns, g, phase_terms);
     const float *tw_x = tables->twiddles + 2 * tables->twiddle_first[g->length_number[0]];
     const float *tw_y = tables->twiddles + 2 * tables->twiddle_first[g->length_number[1]];
     for (int first = 0; first < columns; first += STRIP) {
         const float *mask = (const float *)w->mask.at + (size_t)first * (size_t)rows;
-        fill_strip(tables, g, mask, phase_terms, first, rows_of);
+        FOR_ORDER(own->order, fill_strip, tables, g, mask, phase_terms, first, rows_of);
         if (own->rings != NULL) apply_rings(job, own, g, first, rows_of);
         const strip_row *done = fft_strip(rows_of, other, n_y, tw_y);
         turn_strip(done, n_y, padded, between + (size_t)first * 2 * padded);

@@ -45,11 +45,12 @@ static void prepare_pupil(const psf_job *job, int psf, int primary, pupil *own) 
     const psf_tables *tables = job->tables;
     int64_t group = job->groups[psf], node = job->nodes[psf] * job->primaries + primary;
     int64_t color = job->channels[psf] * job->primaries + primary;
-    double zernike_um[N_TERMS], monomials_um[N_TERMS];
-    for (int t = 0; t < N_TERMS; ++t)
-        zernike_um[t] = job->zernike_um[node * N_TERMS + t]
-                        + job->total_dpt[psf] * job->per_dpt_um[node * N_TERMS + t];
-    times_matrix(zernike_um, tables->monomials, monomials_um);
+    double zernike_um[MOST_TERMS], monomials_um[MOST_TERMS];
+    int n_terms = terms_of(tables->order);
+    for (int t = 0; t < n_terms; ++t)
+        zernike_um[t] = job->zernike_um[node * n_terms + t]
+                        + job->total_dpt[psf] * job->per_dpt_um[node * n_terms + t];
+    FOR_ORDER(tables->order, times_matrix, zernike_um, tables->monomials, monomials_um);
     const double *ellipse = job->pupil_ellipse + node * ELLIPSE_COLUMNS;
     const double *jacobian = job->pixel_from_mrad + group * 4;
     frame_pupil(tables, monomials_um, job->circle_diameter_mm[node] / 2.0, ellipse, jacobian,
