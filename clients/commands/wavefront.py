@@ -1,4 +1,4 @@
-"""`ocufilter wavefront`: ray-trace an eye's aberrations in one field direction."""
+"""`ocufilter wavefront`: an eye's aberrations in one field direction."""
 
 from enum import StrEnum
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,17 +15,19 @@ from clients.option_values import check_range
 
 if TYPE_CHECKING:
     from estimator.optics.surfaces import EyeSurfaces
+    from estimator.profiles.parse import EyeProfile
     from estimator.wavefront.results import Aberrations, PupilEllipse
 
-PUPIL_LIMITS_MM = (0.05, 12.0)
+STOP_LIMITS_MM = (0.05, 12.0)
+PUPIL_LIMITS_MM = (0.1, 12.0)
 WAVELENGTH_LIMITS_NM = (365.0, 1014.0)
 FIELD_LIMITS_DEG = (-75.0, 75.0)
 OBJECT_LIMITS_DPT = (-20.0, 20.0)
 FOCUS_LIMITS_DPT = (0.0, 20.0)
 
 OF_THE_MODEL = (
-    "the coefficients are those of the estimated eye model; `ocufilter field` and "
-    "`psf` include the rest of the measurement and the periphery of people"
+    "--fit slope is that of the estimated eye model, without the rest of the "
+    "measurement and the periphery of people; --fit opd includes them"
 )
 
 
@@ -41,8 +43,7 @@ def wavefront(
         str,
         typer.Argument(
             help="Name of a preset or schematic eye, or a .json, .abp, .csv or .zmx "
-            "profile.  "
-            "A measurement is converted to an eye model first."
+            "profile."
         ),
     ],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength, nm.")],
@@ -67,58 +68,102 @@ def wavefront(
         float, typer.Option(help="Distance of the source, dpt; 0 is infinity.")
     ] = 0.0,
     fit: Annotated[
-        Fit, typer.Option(help="Fit the wavefront (opd) or its slopes.")
+        Fit,
+        typer.Option(
+            help="Fit the traced wavefront (opd) or its slopes; slopes are those of "
+            "the eye model."
+        ),
     ] = Fit.OPD,
     json_output: Json = False,
 ) -> None:
-    """Trace the wavefront of an eye and print its Zernike coefficients.
+    """Print the Zernike coefficients of an eye's wavefront in one direction.
 
-    Coefficients are OSA, um, on the circle about the chief ray that encloses the
-    projected pupil.
+    Coefficients are OSA, um, at the cornea.  A measurement, prescription or preset has
+    the wavefront of frames and of the commands field and psf, on the circle of the
+    entrance pupil: the measured one on the axis and the periphery of people with such
+    an axis, through the correction.  An eye that is given by its surfaces or parameters
+    is traced as it is, to where the chief ray meets the cornea, on the circle there
+    that encloses the projected pupil.
 
     ocufilter wavefront eye.json --stop-mm 4 --wavelength-nm 555 --h-deg 20
     """
     _check(stop_mm, pupil_mm, wavelength_nm, h_deg, v_deg, focus_dpt, object_dpt)
 
+    from estimator.profiles.files import load_profile
     from estimator.wavefront.aberrations import wavefront_aberrations
 
-    name, surfaces, notes = load_surfaces(
-        eye, focus_dpt, pupil_mm=pupil_mm, stop_mm=stop_mm
+    profile = load_profile(eye)
+    surfaces, seen_mm, notes = _surfaces(
+        profile, focus_dpt, pupil_mm=pupil_mm, stop_mm=stop_mm
     )
+    view: dict[str, Any] = {
+        "wavelength_nm": wavelength_nm,
+        "h_deg": h_deg,
+        "v_deg": v_deg,
+        "object_dpt": object_dpt,
+    }
     found = wavefront_aberrations(
         surfaces,
-        wavelength_nm=wavelength_nm,
         stop_diameter_mm=stop_mm,
         pupil_diameter_mm=pupil_mm,
-        h_deg=h_deg,
-        v_deg=v_deg,
-        object_dpt=object_dpt,
         fit=fit.value,
+        **view,
     )
     if not found.rms_residual_um >= 0.0:
         raise CommandFailed(
-            f"{name}, h {h_deg:g} v {v_deg:g} deg: "
+            f"{profile.name}, h {h_deg:g} v {v_deg:g} deg: "
             + (
                 "; ".join(found.notes)
                 or "too few rays pass through the pupil for a fit"
             )
         )
+    facts = _facts(found)
+    if profile.is_given:
+        notes = (*notes, *found.notes)
+    elif fit is Fit.SLOPE:
+        notes = (*notes, OF_THE_MODEL, *found.notes)
+    else:
+        of_frames, notes = _of_frames(profile, focus_dpt, seen_mm, view)
+        facts |= of_frames
     summary = {
-        **_facts(found),
-        "eye": name,
+        **facts,
+        "eye": profile.name,
         "fit": fit.value,
-        "wavelength_nm": wavelength_nm,
-        "h_deg": h_deg,
-        "v_deg": v_deg,
-        "object_dpt": object_dpt,
+        **view,
         "focus_dpt": focus_dpt,
         "pupil_diameter_mm": pupil_mm,
-        "notes": [*notes, *found.notes],
+        "notes": list(notes),
     }
     if json_output:
         print_json(summary)
     else:
         _report(summary)
+
+
+def _of_frames(
+    profile: "EyeProfile",
+    focus_dpt: float | None,
+    pupil_mm: float,
+    view: dict[str, Any],
+) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return the facts of the wavefront that frames use, and the notes on it."""
+    from estimator.field.field_table import field_table
+    from estimator.wavefront.results import PupilEllipse
+
+    found = field_table(
+        profile, focus_dpt=focus_dpt, pupil_diameter_mm=pupil_mm, **view
+    )
+    if any(getattr(note, "code", "") == "directions_outside" for note in found.notes):
+        raise CommandFailed(
+            f"{profile.name}, h {view['h_deg']:g} v {view['v_deg']:g} deg: "
+            f"light passes a pupil of {pupil_mm:g} mm only nearer to the axis"
+        )
+    facts = {
+        "zernike_um": found.zernike_um[0].tolist(),
+        "zernike_radius_mm": float(found.zernike_radius_mm[0]),
+        "pupil_ellipse": ellipse_facts(PupilEllipse.of(found.pupil_ellipse[0])),
+    }
+    return facts, found.notes
 
 
 def _check(
@@ -133,7 +178,7 @@ def _check(
     if (stop_mm is None) == (pupil_mm is None):
         raise ValueError("--stop-mm, --pupil-mm: allowed: exactly one of them")
     if stop_mm is not None:
-        check_range("--stop-mm", stop_mm, PUPIL_LIMITS_MM)
+        check_range("--stop-mm", stop_mm, STOP_LIMITS_MM)
     if pupil_mm is not None:
         check_range("--pupil-mm", pupil_mm, PUPIL_LIMITS_MM)
     check_range("--wavelength-nm", wavelength_nm, WAVELENGTH_LIMITS_NM)
@@ -144,42 +189,38 @@ def _check(
     check_range("--object-dpt", object_dpt, OBJECT_LIMITS_DPT)
 
 
-def load_surfaces(
-    source: str,
+def _surfaces(
+    profile: "EyeProfile",
     focus_dpt: float | None,
     *,
-    pupil_mm: float | None = None,
-    stop_mm: float | None = None,
-) -> tuple[str, "EyeSurfaces", tuple[str, ...]]:
-    """Return the name, surfaces and notes of an eye.
+    pupil_mm: float | None,
+    stop_mm: float | None,
+) -> tuple["EyeSurfaces", float, tuple[str, ...]]:
+    """Return the surfaces of an eye, its entrance pupil in mm, and notes on it.
 
     Parameters
     ----------
-    source : str
-        Preset name or path of a file.
+    profile : EyeProfile
     focus_dpt : float or None
         Focus distance through the given pupil or stop; the eye is relaxed if None.
-    pupil_mm, stop_mm : float, optional
+    pupil_mm, stop_mm : float or None
         Diameter of the entrance pupil or of the iris.
     """
     from estimator.estimate.given_surfaces import eye_model
-    from estimator.profiles.files import load_profile
     from estimator.wavefront.aberrations import pupil_magnification
 
-    profile = load_profile(source)
     found = eye_model(profile)
     notes = (*found.notes, *profile.notes)
-    if not profile.is_given:
-        notes = (*notes, OF_THE_MODEL)
     if profile.correction is not None:
         notes = (*notes, "the coefficients do not include the correction")
     relaxed = found.relaxed
-    if focus_dpt is None:
-        return profile.name, relaxed, notes
     if stop_mm is not None:
         pupil_mm = stop_mm * pupil_magnification(relaxed)
+    assert pupil_mm is not None
+    if focus_dpt is None:
+        return relaxed, pupil_mm, notes
     focused = found.focused(focus_dpt, pupil_diameter_mm=pupil_mm)
-    return profile.name, focused.surfaces, (*notes, *focused.notes)
+    return focused.surfaces, pupil_mm, (*notes, *focused.notes)
 
 
 def ellipse_facts(ellipse: "PupilEllipse") -> dict[str, Any]:

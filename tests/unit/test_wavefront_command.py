@@ -5,7 +5,12 @@ import json
 import numpy as np
 import pytest
 
+from estimator.estimate.given_surfaces import eye_model
+from estimator.field.field_table import field_table
 from estimator.optics.zernike import rescale_pupil
+from estimator.profiles.files import load_profile
+from estimator.wavefront.aberrations import pupil_magnification
+from estimator.wavefront.results import PupilEllipse
 from tests.commands import run_command
 from tests.numerical.schematic_eyes import reference
 
@@ -95,9 +100,43 @@ def test_the_notes_of_the_profile_are_printed(eye_file, tmp_path, command):
     assert f"note: {text}\n" in ended.stdout
 
 
-def test_a_measurement_is_told_from_its_eye_model():
-    found = _json("emmetropia", "--pupil-mm", "4", "--wavelength-nm", "555")
-    assert "`ocufilter field` and `psf` include the rest" in " ".join(found["notes"])
+@pytest.mark.parametrize(
+    ("name", "given", "options"),
+    [
+        ("emmetropia", "--pupil-mm", {"h_deg": 30.0, "v_deg": -10.0}),
+        ("astigmatism", "--pupil-mm", {"h_deg": 0.0, "v_deg": 0.0, "focus_dpt": 1.0}),
+        ("emmetropia", "--stop-mm", {"h_deg": -20.0, "v_deg": 0.0, "object_dpt": 2.0}),
+    ],
+)
+def test_a_measurement_has_the_wavefront_of_frames(name, given, options):
+    """It was that of the eye model alone: 0.7 um of defocus less at 20 deg."""
+    words = [(f"--{key.replace('_', '-')}", value) for key, value in options.items()]
+    view = ["--wavelength-nm", 555, *(word for pair in words for word in pair)]
+    found = _json(name, given, 4, *view)
+    pupil_mm = 4.0
+    profile = load_profile(name)
+    if given == "--stop-mm":
+        pupil_mm *= pupil_magnification(eye_model(profile).relaxed)
+    state = {"pupil_diameter_mm": pupil_mm, "wavelength_nm": 555.0}
+    expected = field_table(profile, **state, **options)
+    assert found["zernike_um"] == pytest.approx(expected.zernike_um[0], abs=1e-12)
+    assert found["zernike_radius_mm"] == expected.zernike_radius_mm[0]
+    ratio = PupilEllipse.of(expected.pupil_ellipse[0]).axis_ratio
+    assert found["pupil_ellipse"]["ratio"] == ratio
+    assert not any("eye model" in note for note in found["notes"])
+
+
+def test_slopes_are_those_of_the_eye_model():
+    view = ["--pupil-mm", "4", "--wavelength-nm", "555"]
+    found = _json("emmetropia", *view, "--fit", "slope")
+    assert "--fit opd includes" in " ".join(found["notes"])
+
+
+def test_a_direction_that_light_does_not_pass_is_a_failure():
+    view = ["--pupil-mm", "12", "--wavelength-nm", "555", "--h-deg", "60"]
+    code, text = _refused("emmetropia", *view)
+    assert code == 1
+    assert "h 60 v 0 deg: light passes a pupil of 12 mm only nearer to the a" in text
 
 
 def test_without_json_it_prints_a_table(eye_file):
@@ -122,6 +161,7 @@ def _refused(*arguments):
         (["--wavelength-nm", "555"], "--stop-mm, --pupil-mm: allowed: exactly one"),
         (["--stop-mm", "4", "--wavelength-nm", "300"], "--wavelength-nm is 300"),
         ([*VIEW, "--h-deg", "90"], "--h-deg is 90; allowed: -75 to 75"),
+        (["--pupil-mm", "0.05", *VIEW[2:]], "--pupil-mm is 0.05; allowed: 0.1 to 12"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(eye_file, arguments, message):
