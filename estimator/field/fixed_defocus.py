@@ -16,7 +16,7 @@ from estimator.field.interpolation import (
 from estimator.native import core
 from estimator.native.records import DefocusGrid, DefocusJob, pointer_to
 from estimator.optics.units import SPHERE_PER_C20
-from estimator.optics.zernike import MAX_TERMS, monomial_degrees, padded_terms
+from estimator.optics.zernike import HIGHEST_ORDER, monomial_degrees
 from estimator.wavefront.field_wavefronts import N_RIM, c20_by_degree
 
 
@@ -89,8 +89,11 @@ class FixedDefocus:
 
 
 def _sums(polynomial_um: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return sums of monomials (..., 5) of degrees 2, 4 ... 10."""
-    return c20_by_degree(padded_terms(polynomial_um, MAX_TERMS))
+    """Return sums (..., 5) of monomials by degree: 2, 4 ... 10, some of them zero."""
+    found = c20_by_degree(polynomial_um)
+    sums = np.zeros((*found.shape[:-1], HIGHEST_ORDER // 2))
+    sums[..., : found.shape[-1]] = found
+    return sums
 
 
 def _grid_arrays(
