@@ -21,4 +21,8 @@ FUNCTIONS = {
     "fade_light": "f4[] i8 f8 f8 f8 f4[] f8[]",
     "merge_pixels": "i8[] i8[] i8[] f8[] i8 i8 i4[] i8 i8 i8[] f8[] i8[] -> int",
     "dim_pixels": "i8[] i8[] i8[] f4[] i8 i8[] f8[] f4[] i8",
+    "gather_points": "f8[] i8[] f8[] i8 i8 i8 i8[] i8 i8[] i8[] f4[] -> int",
+    "add_sources": "pool i8[] i8[] f4[] i8 f4[] i8 f4[] i8 i8",
+    "add_plane": "pool f4[] i8 i8 f4[] i8 i8",
+    "add_and_encode": "pool f4[] i8 i8 f4[] i8 i8 u1[]",
 }

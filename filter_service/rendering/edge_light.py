@@ -20,6 +20,7 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.native import shared_threads
 from estimator.psf.tables import N_EDGE
 from filter_service.constants import RGB
 from filter_service.native import loops
@@ -74,6 +75,12 @@ treated as seen by the entire pupil, with less light."""
 MAX_NEAR_PRODUCTS = 6_000_000
 """Products per channel that pixel-by-pixel light may take; if there are more, sources
 are merged in squares of 3, 9 or 27 pixels."""
+
+
+def add_plane(coarse: NDArray[np.float32], image: NDArray[np.float32]) -> None:
+    """Add light on pixels of twice the size, interpolated, to an image (h, w, 3)."""
+    sizes = coarse.shape[:2], image.shape[:2]
+    loops().call("add_plane", shared_threads(), coarse, *sizes[0], image, *sizes[1])
 
 
 @lru_cache(maxsize=1)
@@ -477,35 +484,37 @@ class EdgeLight:
         number : (n,)
             Their kernels.
         """
-        from filter_service.rendering.edge_light_loops import add_kernels, gather_points
-
         order = np.flatnonzero(here)
         order = order[np.argsort(number[order], kind="stable")]
         height, width = self._pixels.size_px
         shape = tuple(-(-n // pitch_px) + 2 for n in (height, width))
-        at, kernel, light = gather_points(
+        most = 4 * order.size  # each source is divided between four pixels
+        at, kernel = np.empty((most, 2), np.int64), np.empty(most, np.int64)
+        light = np.zeros((most, RGB), np.float32)
+        count = loops().call(
+            "gather_points",
             self._pixels.source_px[self._sources[order]],
-            number[order],
-            self._light[order],
-            pitch_px,
-            pitch_px > self._pixels.edge_px,
-            np.full(shape, -1, np.int64),
+            *(number[order], self._light[order], order.size),
+            *(pitch_px, pitch_px > self._pixels.edge_px),
+            *(np.full(shape, -1, np.int64), shape[1], at, kernel, light),
         )
         if is_image:  # centers of squares of an odd number of pixels
-            at = pitch_px * at + pitch_px // 2
-        run_in_threads(add_kernels, len(plane), at, kernel, light, kernels, plane)
+            at[:count] = pitch_px * at[:count] + pitch_px // 2
+        loops().call(
+            "add_sources",
+            *(shared_threads(), at, kernel, light, count, kernels, kernels.shape[1]),
+            *(plane, *plane.shape[:2]),
+        )
 
     def _add_planes(
         self, color: NDArray[np.float32], planes: dict[int, NDArray[np.float32]]
     ) -> NDArray[np.float32]:
         """Add planes to each other, from coarse to fine; return that of 2 pixels."""
-        from filter_service.rendering.edge_light_loops import add_coarse
-
         pitch_px = max(planes, default=1)
         while pitch_px > 2:
             coarse, pitch_px = planes[pitch_px], pitch_px // 2
             if pitch_px not in planes:
                 shape = tuple(-(-n // pitch_px) for n in color.shape[:2])
                 planes[pitch_px] = np.zeros((*shape, RGB), np.float32)
-            run_in_threads(add_coarse, len(planes[pitch_px]), coarse, planes[pitch_px])
+            add_plane(coarse, planes[pitch_px])
         return planes.get(2, np.empty((0, 0, RGB), np.float32))

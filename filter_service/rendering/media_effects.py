@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,23 +14,25 @@ from numpy.typing import NDArray
 
 from estimator.media.absorption import channel_gains
 from estimator.media.straylight import Straylight
+from estimator.native import shared_threads
 from estimator.profiles.parse import EyeProfile
 from filter_service.constants import RGB
 from filter_service.displays import display_wavelengths_nm
+from filter_service.native import loops
+from filter_service.rendering.edge_light import EdgeLight, add_plane
 from filter_service.rendering.engine import FrameEngine, Pending, ViewRequest
 from filter_service.rendering.filtered_view import FilteredView
-from filter_service.rendering.haze import add_haze, run_in_threads
+from filter_service.rendering.haze import add_haze
 from filter_service.rendering.spectacles import (
     Matrix,
     seen_through,
     spectacle_magnification,
 )
-from filter_service.rendering.srgb import half_from_linear, srgb_from_linear
+from filter_service.rendering.srgb import half_from_linear
 from filter_service.rendering.white_level import white_level
 from filter_service.rgbd_view import RgbdView
 
 UNCHANGED = (1.0, 1.0, 1.0)
-ENCODE_STEPS = 1 << 16
 NOTHING = np.empty((0, 0, RGB), np.float32)
 
 
@@ -114,8 +115,6 @@ def begin_through_media(
         stages.end("media_ms")
     edge_light = None
     if view.color.dtype != np.uint8:
-        from filter_service.rendering.edge_light import EdgeLight
-
         request = replace(request, white_level=white_level(view.color))
         edge_light = EdgeLight.of(engine, request)
     if edge_light is not None:
@@ -123,8 +122,6 @@ def begin_through_media(
         stages.end("edge_light_ms")
     elif effects is None:
         return engine.begin(request)
-    from filter_service.rendering.edge_light_loops import add_coarse
-
     begun = engine.begin(replace(request, output="linear", out=None))
 
     def finish() -> FilteredView:
@@ -135,7 +132,7 @@ def begin_through_media(
         if edge_light is not None:
             coarse = edge_light.add(color)
         if coarse.size and (effects is not None or request.output != "srgb8"):
-            run_in_threads(add_coarse, len(color), coarse, color)
+            add_plane(coarse, color)
             coarse = NOTHING
         if edge_light is not None:
             stages.end("edge_light_ms")
@@ -163,13 +160,10 @@ def encoded(
         return color
     if output == "linear16":
         return half_from_linear(color)
-    from filter_service.rendering.edge_light_loops import add_and_encode
-
     found = np.empty(color.shape, np.uint8)
-    run_in_threads(add_and_encode, len(color), coarse, color, _encoding(), found)
+    loops().call(
+        "add_and_encode",
+        *(shared_threads(), coarse, *coarse.shape[:2]),
+        *(np.ascontiguousarray(color), *color.shape[:2], found),
+    )
     return found
-
-
-@lru_cache(maxsize=1)
-def _encoding() -> NDArray[np.uint8]:
-    return srgb_from_linear(np.linspace(0.0, 1.0, ENCODE_STEPS))

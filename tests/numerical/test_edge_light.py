@@ -366,6 +366,15 @@ def test_bright_pixels_are_those_with_a_value_above_the_limit(rng, dtype):
     assert 0 < np.count_nonzero(share < 1.0) < share.size
 
 
+def test_a_pixel_without_light_is_no_source():
+    """A value that is not a number is above the limit of a view that is dark."""
+    color = np.zeros((8, 9, 3), np.float32)
+    color[2, 3], color[4, 5, 1] = 1.0, np.nan
+    view = RgbdView(color, np.ones((8, 9), np.float32), (-0.3, 0.3, 0.2, -0.2))
+    pixels = BrightPixels.of(view, 0.0)
+    assert (pixels.x_px.tolist(), pixels.y_px.tolist()) == ([3], [2])
+
+
 def test_many_bright_pixels_are_merged_with_all_their_light(rng):
     color = np.zeros((200, 300, 3), np.float32)
     color[20:120, 30:230] = rng.uniform(10.0, 90.0, (100, 200, 3))

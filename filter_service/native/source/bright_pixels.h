@@ -92,7 +92,7 @@ static void fade_light(const float *color, int64_t count, double white, double l
             light[c] = isfinite(color[c]) ? clipped((double)color[c], 0.0, MAX_SOURCE_LIGHT) : 0.0;
             brightest = at_least(light[c], brightest);
         }
-        double part = 1.0;
+        double part = brightest > 0.0 ? 1.0 : 0.0;
         if (brightest < high * white) {
             part = at_least((brightest / white - low) / (high - low), 0.0);
             part = part * part * (3.0 - 2.0 * part);

@@ -24,6 +24,7 @@
 #include "spectacles.h"
 #include "defocus_nodes.h"
 #include "bright_pixels.h"
+#include "planes.h"
 
 static void pixels(frame *f) {
     f->missing_count = f->clamped_count = f->bad_color_count = 0;
@@ -92,6 +93,10 @@ static const named_function functions[] = {
     FUNCTION(fade_light),
     FUNCTION(merge_pixels),
     FUNCTION(dim_pixels),
+    FUNCTION(gather_points),
+    FUNCTION(add_sources),
+    FUNCTION(add_plane),
+    FUNCTION(add_and_encode),
     {NULL, NULL},
 };
 
