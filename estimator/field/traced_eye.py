@@ -103,6 +103,7 @@ class TracedEye(FocusingEye):
         field_range_deg: FieldRange = ON_AXIS_DEG,
         traced_range_deg: FieldRange = ON_AXIS_DEG,
         periphery: PeripheralResidual | None = None,
+        only_nodes: bool = False,
     ):
         self.grid = axis.grid
         self.eye_side = eye.profile.eye_side
@@ -115,7 +116,10 @@ class TracedEye(FocusingEye):
         self.traced_range_deg = traced_range_deg
         self.periphery = periphery
         self._field = field or axis
-        has_axis = all(low <= 0.0 <= high for low, high in traced_range_deg)
+        # pupils are relative to those on the axis, which other nodes do not give
+        has_axis = not only_nodes and all(
+            low <= 0.0 <= high for low, high in traced_range_deg
+        )
         self._on_axis = self._field if has_axis else axis
         self.entrance_pupil_mm = eye.accommodating.entrance_pupil_mm
         self.rings = rings_of(eye.profile.correction)
@@ -210,6 +214,7 @@ class TracedEye(FocusingEye):
             field_range_deg=field_range_deg,
             traced_range_deg=traced_range_deg,
             periphery=periphery,
+            only_nodes=nodes_deg is not None,
         )
 
     def refraction_at_dpt(
