@@ -117,7 +117,11 @@ def surfaces_body(elements: Sequence[Element], name: str) -> dict[str, Any]:
     surfaces: list[dict[str, Any]] = []
     before: Medium | None = None
     for element in refracting:
-        if element.medium != before:
+        is_aperture = "clear_radius_mm" in element.shape
+        if is_aperture and element.medium == before and not surfaces:
+            problem = "is an aperture in front of the eye"
+            raise refused(element.number, problem, "apertures within the eye")
+        if element.medium != before or is_aperture:
             surfaces.append(
                 {
                     "radius_mm": element.radius_mm,

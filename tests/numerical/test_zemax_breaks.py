@@ -205,6 +205,17 @@ def test_breaks_in_inches(tmp_path):
     assert_same_geometry(found, expected)
 
 
+def test_an_aperture_of_a_plane_within_the_eye_clips_rays(tmp_path):
+    plane = ["TYPE STANDARD", "CLAP 0 1.5 0", "DISZ 0.5", "GLAS X 1 0 1.42 0 0"]
+    eye = eye_in(tmp_path, back=[plane])
+    depths_mm = [surface.z_mm for surface in eye.surfaces]
+    assert depths_mm == pytest.approx([0.0, 3.7, 7.6, 8.1])
+    assert [s.clear_radius_mm for s in eye.surfaces] == [math.inf] * 2 + [1.5, math.inf]
+    path = written(tmp_path, changes={"dummy": ["CLAP 0 2 0"]})
+    with pytest.raises(InvalidFile, match="surface 1 .*is an aperture in front of"):
+        load_profile(path)
+
+
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
