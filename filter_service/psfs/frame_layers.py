@@ -1,5 +1,6 @@
 """Interpolation of PSFs for one state of an eye, and the layers of a frame."""
 
+import math
 from bisect import bisect_left
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,16 +14,19 @@ from estimator.eye.focusing import OUT_OF_REACH_DPT
 from estimator.note import Note
 from estimator.optics.vergence import ObjectVergence
 from filter_service.constants import MERGE_MIN_SPREAD_PX
+from filter_service.native import loops
 from filter_service.planning.grid import (
     BASE_OBJECT_STEP_DPT,
     GREEN,
     LAYER_BLUR_RATIO,
+    LAYER_GAP_STEPS,
+    MIN_BLUR_STEP_PX,
     GridSpec,
 )
 from filter_service.planning.nodes import PlanAxes
 from filter_service.planning.readable import usable_pupils_mm
 from filter_service.psfs.field_defocus import FieldDefocus
-from filter_service.psfs.read_kernels import StateReads, StoreTables
+from filter_service.psfs.read_kernels import StateReads, StoreTables, layer_blur_px
 from filter_service.psfs.store import PsfStore
 
 CURVE_MARGIN_DPT = 1.0
@@ -75,8 +79,6 @@ class FrameLayers:
     @cached_property
     def layer_blur_px(self) -> NDArray[np.float64]:
         """Largest geometric blur radius (n_layers,) over field and channels."""
-        from filter_service.psfs.read_loops import layer_blur_px
-
         blur_px = layer_blur_px(
             self.tables, self.reads, self.layer_zero_dpt, self.layer_dpt
         )
@@ -121,9 +123,6 @@ def frame_layers(
     ----------
     Csoba & Kunkli 2023, section 6.4 (cached neighbors of pupil and focus) and 6.2.
     """
-    # Imported here: the service must be ready before it loads numba.
-    from filter_service.psfs.layer_loops import layer_distances_dpt
-
     plan, eye = store.plan, store.eye
     pupil_mm, notes = _usable_pupil(store, pupil_diameter_mm)
     accommodation_dpt = eye.accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
@@ -142,11 +141,9 @@ def frame_layers(
     )
     low_dpt, high_dpt = change.range_dpt
     axis_zero_dpt = layer_zero_dpt[plan.axis_node]
-    curves = [_step_curve(store, *corner[:2]) for corner in corners]
-    layer_dpt = layer_distances_dpt(
-        np.concatenate(curves, axis=1),
-        np.array([0, *accumulate(curve.shape[1] for curve in curves)]),
-        *(reads.scales, reads.weights, float(axis_zero_dpt[GREEN])),
+    layer_dpt = _layer_distances_dpt(
+        [_step_curve(store, *corner[:2]) for corner in corners],
+        *(reads, float(axis_zero_dpt[GREEN])),
         (far_near_dpt[0] + low_dpt, far_near_dpt[1] + high_dpt),
         np.append(_in_focus_dpt(store, axis_zero_dpt), _plane_ends_dpt(store, change)),
         step_ratio,
@@ -185,8 +182,6 @@ def _step_curve(store: PsfStore, pupil: int, accommodation: int) -> NDArray[np.f
     between the nodes interpolate it, so that no frame reads the blur of all nodes: that
     would take 0.1 to 0.3 ms.
     """
-    from filter_service.psfs.layer_loops import step_curve
-
     found = store.step_curves.get((pupil, accommodation))
     if found is not None:
         return found
@@ -208,15 +203,65 @@ def _step_curve(store: PsfStore, pupil: int, accommodation: int) -> NDArray[np.f
     in_focus_dpt = _in_focus_dpt(store, axis_zero_dpt)
     is_inside = (in_focus_dpt > regular[0]) & (in_focus_dpt < regular[-1])
     at_dpt = np.unique(np.append(regular, in_focus_dpt[is_inside]))
-    steps = step_curve(
-        store.tables,
-        _state_reads(store, pupil_mm, ((pupil, accommodation, 1.0),)),
-        *(zero_dpt, at_dpt, spec.blur_px_per_dpt(pupil_mm)),
-        LAYER_BLUR_RATIO[spec.settings.mode],
+    reads = _state_reads(store, pupil_mm, ((pupil, accommodation, 1.0),))
+    blur_ratio = LAYER_BLUR_RATIO[spec.settings.mode]
+    steps = np.empty((4, at_dpt.size))
+    loops().call(
+        "step_curve",
+        *(store.tables.record(), reads.record()),
+        *(np.ascontiguousarray(zero_dpt), at_dpt, steps, len(zero_dpt), at_dpt.size),
+        *(blur_ratio, MIN_BLUR_STEP_PX, LAYER_GAP_STEPS * blur_ratio),
+        *(max(spec.blur_px_per_dpt(pupil_mm), 1e-12), BASE_OBJECT_STEP_DPT),
     )
-    found = np.stack([at_dpt + axis_zero_dpt[GREEN], steps])
+    found = np.stack([at_dpt + axis_zero_dpt[GREEN], steps[0]])
     store.step_curves[pupil, accommodation] = found
     return found
+
+
+def _layer_distances_dpt(
+    curves: list[NDArray[np.float64]],
+    reads: StateReads,
+    zero_dpt: float,
+    range_dpt: tuple[float, float],
+    ends_dpt: NDArray[np.float64],
+    step_ratio: float,
+) -> NDArray[np.float64]:
+    """Return the vergences (n_layers,) of a frame's layers over a range, ascending.
+
+    Parameters
+    ----------
+    curves : list of (2, n)
+        Step curve of each node around the state; see `_step_curve`.
+    zero_dpt : float
+        Total defocus of the eye at 0 dpt.
+    ends_dpt : (n,)
+        Vergences that always are layers: the ends of object ranges, and vergences at
+        which some channel is in focus, so that the blur is monotonic between layers.
+
+    References
+    ----------
+    Csoba & Kunkli 2023, Eq. 8: L = ceil(|R(k+1) - R(k)|) - 1 transitional layers, here
+    with steps proportional to R, and none where R is constant.
+    """
+    low_dpt, high_dpt = range_dpt
+    count = 1 + math.ceil((high_dpt - low_dpt) / BASE_OBJECT_STEP_DPT - 1e-9)
+    inside = ends_dpt[(ends_dpt > low_dpt) & (ends_dpt < high_dpt)]
+    regular = np.linspace(low_dpt, high_dpt, max(count, 1))
+    at_dpt = np.unique(np.append(regular, inside))
+    if at_dpt.size == 1:
+        return at_dpt
+    starts = np.array([0, *accumulate(curve.shape[1] for curve in curves)])
+    steps = np.empty(at_dpt.size)
+    loops().call(
+        "steps_of_state",
+        *(np.concatenate(curves, axis=1), starts, reads.scales, reads.weights),
+        *(at_dpt, steps, len(curves), at_dpt.size, zero_dpt, step_ratio),
+    )
+    ends = np.unique(np.searchsorted(at_dpt, np.append(inside, high_dpt)))
+    count = loops().call("layers_between", at_dpt, steps, ends, None, ends.size)
+    found_dpt = np.empty(count)
+    loops().call("layers_between", at_dpt, steps, ends, found_dpt, ends.size)
+    return found_dpt
 
 
 def _edge_reach_px(spec: GridSpec, pupil_mm: float) -> float:

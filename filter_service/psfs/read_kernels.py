@@ -1,4 +1,4 @@
-"""Plain arrays from which `read_loops` interpolates the kernels of a state."""
+"""Plain arrays from which the loops in C interpolate the kernels of a state."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import RGB
+from filter_service.native import loops, records
+from filter_service.native.records import pointers
 from filter_service.planning.nodes import PlanNodes
 
 PSF_TABLES = (
@@ -67,6 +69,10 @@ class StoreTables(NamedTuple):
             last_used=none.astype(np.uint32),
         )
 
+    def record(self) -> records.StoreTables:
+        """Return the C record, which is valid as long as the tables."""
+        return records.StoreTables(**pointers(**self._asdict()))
+
     def grown(self, nodes: PlanNodes) -> StoreTables:
         """Return tables extended to ``nodes``, which start with those of the tables.
 
@@ -105,3 +111,29 @@ class StateReads(NamedTuple):
     groups: NDArray[np.int64]
     scales: NDArray[np.float64]
     weights: NDArray[np.float64]
+
+    def record(self) -> records.StateReads:
+        """Return the C record, which is valid as long as the arrays."""
+        return records.StateReads(**pointers(**self._asdict()), count=self.groups.size)
+
+
+def layer_blur_px(
+    tables: StoreTables,
+    reads: StateReads,
+    zero_dpt: NDArray[np.float64],
+    at_dpt: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the geometric blur radii (n_fields * 3, n), px, of n ascending layers.
+
+    Parameters
+    ----------
+    zero_dpt : (n_fields, 3)
+        Total defocus of field nodes and channels at 0 dpt.
+    """
+    blur_px = np.empty((zero_dpt.size, at_dpt.size))
+    loops().call(
+        "layer_blur",
+        *(tables.record(), reads.record(), np.ascontiguousarray(zero_dpt), at_dpt),
+        *(blur_px, len(zero_dpt), at_dpt.size),
+    )
+    return blur_px

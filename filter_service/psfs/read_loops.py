@@ -5,7 +5,6 @@ have a few thousand entries, and the loops run once per frame whose pupil or foc
 changed.
 """
 
-import numpy as np
 from numba import njit
 
 from filter_service.constants import RGB
@@ -35,63 +34,6 @@ def bracket(tables, group, t, start):
     span = values_dpt[upper] - values_dpt[lower]
     share = (t - values_dpt[lower]) / (span if span > 0.0 else 1.0)
     return lower, upper, clipped(share, 0.0, 1.0)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def add_blur_row(tables, reads, field, channel, zero_dpt, at_dpt, row_px):
-    """Add the geometric blur radius (n,), px, of a channel at n ascending layers.
-
-    Blur is linear between nodes, so that each interval of nodes takes one division.
-
-    Parameters
-    ----------
-    zero_dpt : float
-        Total defocus of the channel at 0 dpt.
-    row_px : (n,) out
-    """
-    values_dpt, n = tables.values_dpt, at_dpt.size
-    for corner in range(reads.groups.size):
-        group = reads.groups[corner] + field
-        weight, scale = reads.weights[corner], reads.scales[corner]
-        offset_dpt = zero_dpt * scale - tables.channel_shift_dpt[group, channel]
-        node, last = tables.starts[group], tables.starts[group + 1] - 1
-        blur_px = weight * tables.blur_px[RGB * node + channel]
-        k = 0
-        while k < n and at_dpt[k] * scale + offset_dpt <= values_dpt[node]:
-            row_px[k] += blur_px
-            k += 1
-        while k < n:
-            t = at_dpt[k] * scale + offset_dpt
-            while node < last and values_dpt[node + 1] < t:
-                node += 1
-            if node == last:
-                break
-            low_dpt, high_dpt = values_dpt[node], values_dpt[node + 1]
-            low_px = weight * tables.blur_px[RGB * node + channel]
-            high_px = weight * tables.blur_px[RGB * (node + 1) + channel]
-            slope = (high_px - low_px) / (high_dpt - low_dpt)
-            while t <= high_dpt:
-                row_px[k] += low_px + slope * (t - low_dpt)
-                k += 1
-                if k == n:
-                    break
-                t = at_dpt[k] * scale + offset_dpt
-        blur_px = weight * tables.blur_px[RGB * last + channel]
-        while k < n:
-            row_px[k] += blur_px
-            k += 1
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def layer_blur_px(tables, reads, zero_dpt, at_dpt):
-    """Return the geometric blur radius (n_fields * 3, n), px, of n ascending layers."""
-    n_fields = zero_dpt.shape[0]
-    found_px = np.zeros((n_fields * RGB, at_dpt.size))
-    for field in range(n_fields):
-        for channel in range(RGB):
-            zero, row_px = zero_dpt[field, channel], found_px[field * RGB + channel]
-            add_blur_row(tables, reads, field, channel, zero, at_dpt, row_px)
-    return found_px
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -242,10 +242,8 @@ def _node_kernels(
     total_dpt = layers.layer_dpt[recipe_layers, None]
     total_dpt = total_dpt + layers.layer_zero_dpt[recipe_fields]
     job = records.RecipeJob(
-        tables=records.StoreTables(**pointers(**tables._asdict())),
-        reads=records.StateReads(
-            **pointers(**layers.reads._asdict()), count=layers.reads.groups.size
-        ),
+        tables=tables.record(),
+        reads=layers.reads.record(),
         count=count,
         **pointers(
             fields=recipe_fields,

@@ -12,7 +12,7 @@ from filter_service.constants import RECIPE_TAPS, RGB
 from filter_service.planning.plan import unchecked_plan
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.pack import PackedKernels
-from filter_service.psfs.read_loops import layer_blur_px
+from filter_service.psfs.read_kernels import layer_blur_px
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering import frame_kernels
 from filter_service.rendering.cell_maps import CellMaps

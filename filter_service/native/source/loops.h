@@ -23,6 +23,7 @@
 #include "haze.h"
 #include "spectacles.h"
 #include "defocus_nodes.h"
+#include "layers.h"
 #include "bright_pixels.h"
 #include "planes.h"
 
@@ -88,6 +89,10 @@ static const named_function functions[] = {
     FUNCTION(needed_intervals),
     FUNCTION(spread_nodes),
     FUNCTION(node_blur),
+    FUNCTION(layer_blur),
+    FUNCTION(step_curve),
+    FUNCTION(steps_of_state),
+    FUNCTION(layers_between),
     FUNCTION(count_bright),
     FUNCTION(list_bright),
     FUNCTION(fade_light),
