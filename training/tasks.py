@@ -29,7 +29,7 @@ from estimator.optics.prescription import C20
 from estimator.optics.raytrace import RayStatus
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
 from estimator.wavefront.aberrations import eyes_aberrations, on_axis_zernike
-from estimator.wavefront.kernels import magnifications
+from estimator.wavefront.compiled import magnifications
 
 N_EYE = len(PARAMETER_NAMES)
 COMPARED_NAMES = ZERNIKE_NAMES[2:]

@@ -18,12 +18,12 @@ from estimator.optics.prescription import C20
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
 from estimator.optics.zernike import N_TERMS, rescale_pupil, summed_terms
 from estimator.wavefront.aberrations import eyes_aberrations, on_axis_zernike
+from estimator.wavefront.compiled import magnifications
 from estimator.wavefront.field_wavefronts import (
     circumscribed_radius_mm,
     polynomial_in_mm,
     rim_from_ellipse,
 )
-from estimator.wavefront.kernels import magnifications
 from estimator.wavefront.pupil_refraction import pupil_refraction_dpt
 
 OPEN_RATIO = 0.999

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.estimate.given_surfaces import EyeModel
 from estimator.eye.focusing import FocusedSurfaces
-from estimator.wavefront.aberrations import wavefront_grid
-from estimator.wavefront.chief_rays import chief_shift_mrad
+from estimator.wavefront.aberrations import wavefront_grids
+from estimator.wavefront.chief_rays import chief_shifts_mrad
 from estimator.wavefront.nodes import N_AZIMUTHS, N_RINGS
 
 FIELD_RINGS, FIELD_AZIMUTHS = 5, 14
@@ -77,8 +77,7 @@ def aberration_grid(
     states : (n_accommodations,), optional
         Eye at each accommodation, if already computed.
     progress : callable, optional
-        Callback with the completed fraction after each accommodation; may raise to
-        cancel.
+        Callback with 1 when the grid is traced; may raise to cancel.
 
     References
     ----------
@@ -95,37 +94,31 @@ def aberration_grid(
         )
     )
     fields_deg = np.stack(np.meshgrid(h_deg, v_deg, indexing="ij"), axis=-1)
-    parts, shifts = [], []
     if states is None:
         states = eye.accommodating.states_at(nodes_dpt)
-    for k, state in enumerate(states):
-        found = wavefront_grid(
-            state.surfaces,
-            fields_deg=fields_deg.reshape(-1, 2),
-            wavelengths_nm=wavelengths_nm,
-            pupil_diameters_mm=pupils_mm,
-            plane="pupil",
-            n_rings=n_rings,
-            n_azimuths=n_azimuths,
-        )
-        parts.append(found)
-        shifts.append(
-            chief_shift_mrad(
-                state.surfaces,
-                fields_deg=fields_deg.reshape(-1, 2),
-                wavelengths_nm=wavelengths_nm,
-            )
-        )
-        if progress is not None:
-            progress((k + 1) / len(nodes_dpt))
+    eyes = [state.surfaces for state in states]
+    found = wavefront_grids(
+        eyes,
+        fields_deg=fields_deg.reshape(-1, 2),
+        wavelengths_nm=wavelengths_nm,
+        pupil_diameters_mm=pupils_mm,
+        plane="pupil",
+        n_rings=n_rings,
+        n_azimuths=n_azimuths,
+    )
+    shift_mrad = chief_shifts_mrad(
+        eyes, fields_deg=fields_deg.reshape(-1, 2), wavelengths_nm=wavelengths_nm
+    )
+    if progress is not None:
+        progress(1.0)
 
     def stacked(name: str) -> NDArray[Any]:
         # (accommodation, field, wavelength, pupil, ...) to the order of the axes
-        values = np.stack([getattr(part, name) for part in parts])
+        values: NDArray[Any] = getattr(found, name)
         values = np.moveaxis(values, (1, 3, 0, 2), (0, 1, 2, 3))
         return values.reshape(len(h_deg), len(v_deg), *values.shape[1:])
 
-    shift_mrad = np.moveaxis(np.stack(shifts), 0, 1)
+    shift_mrad = np.moveaxis(shift_mrad, 0, 1)
     return AberrationGrid(
         h_deg=h_deg,
         v_deg=v_deg,

@@ -66,8 +66,7 @@ def few_colors_grid(
     states : (n_accommodations,), optional
         Eye at each accommodation, if already computed.
     progress : callable, optional
-        Callback with the completed fraction after each accommodation; may raise to
-        cancel.
+        Callback with the completed fraction; may raise to cancel.
     **sampling
         Pupils and rays, see `aberration_grid`.
 

@@ -1,4 +1,4 @@
-"""The compiled core: thread pool, PSFs.
+"""The compiled core: thread pool, rays and wavefronts, PSFs.
 
 library        Python interface of compiled libraries
 functions      signatures of this library's functions

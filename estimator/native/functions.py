@@ -19,4 +19,11 @@ FUNCTIONS = {
     "needed_radii": f"i8 {4 * 'f8[] '} f8 i8 i8[]",
     "edge_lights_outside": f"i8 {5 * 'f8[] '}",
     "fill_defocus": "record",
+    "trace_rays": "pool f8[] i8 f8[] f8[] i8 i8 f8[] f8[] f8[] i8[]",
+    "trace_pupils": "record -> int",
+    "trace_circles": "record -> int",
+    "trace_shifts": "record -> int",
+    "magnifications": "f8[] i8 i8 f8[] i8 f8[]",
+    "gradient_indices": "f8[] i8 f8[] i8 f8[]",
+    "add_moved_rays": "f8[] f8[] f8[] f8[] f8[] i8 i8 i8 i8",
 }

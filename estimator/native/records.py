@@ -170,12 +170,45 @@ class DefocusJob(c.Structure):
     )
 
 
+class WavefrontJob(c.Structure):
+    """Job that traces wavefronts or chief rays, see `source/wavefront_job.h`."""
+
+    _fields_ = (
+        ("threads", POINTER),
+        ("packed", POINTER),
+        ("indices", POINTER),
+        ("eyes", POINTER),
+        ("index_rows", POINTER),
+        ("reference_rows", POINTER),
+        ("fields_rad", POINTER),
+        ("radii_mm", POINTER),
+        ("pupil_z_mm", POINTER),
+        ("rings", POINTER),
+        ("ring_weights", POINTER),
+        ("azimuths", POINTER),
+        ("monomials", POINTER),
+        ("projection", POINTER),
+        ("results", POINTER),
+        ("object_dpt", c.c_double),
+        ("count", c.c_int64),
+        ("n_rows", c.c_int64),
+        ("n_indices", c.c_int64),
+        ("n_radii", c.c_int64),
+        ("n_rings", c.c_int64),
+        ("n_azimuths", c.c_int64),
+        ("n_terms", c.c_int64),
+        ("at_pupil", c.c_int64),
+        ("by_slopes", c.c_int64),
+    )
+
+
 def pointer_to(array: np.ndarray) -> int:
     """Return the address of an array's first element; the caller keeps it alive."""
     return int(array.ctypes.data)
 
 
 SIZES = tuple(
-    c.sizeof(record) for record in (PsfJob, PsfTables, PsfDiscsJob, DefocusJob)
+    c.sizeof(record)
+    for record in (PsfJob, PsfTables, PsfDiscsJob, DefocusJob, WavefrontJob)
 )
 """Expected result of `ocu_sizes`."""

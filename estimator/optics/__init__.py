@@ -12,9 +12,6 @@ chromatic         chromatic difference of refraction of the mean eye
 prescription      spectacle prescriptions, power vectors, Zernike coefficients
 surfaces          surfaces of an eye, and their packing for compiled code
 raytrace          exact ray tracing, with a status per ray
-raytrace_kernels  its compiled loops
-surface_kernels   intersection with one surface and refraction, compiled
-gradient_kernels  rays through gradient-index media, compiled
 paraxial          power, cardinal points and entrance pupil
 vergence          object distances and vergences in the plane of the entrance pupil
 pupil_screen      interface of a complex amplitude in the pupil, for wave optics

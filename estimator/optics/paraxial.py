@@ -6,13 +6,14 @@ decentrations have no effect to first order.  Positions are in mm from the corne
 powers in dpt.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.optics.gradient_kernels import axial_index, paraxial_gap
+from estimator.optics.gradients import index_values
 from estimator.optics.packed import (
     ADDED_CURVATURE,
     CURVATURE_X,
@@ -35,6 +36,9 @@ from estimator.optics.surfaces import (
 )
 from estimator.optics.units import MM_PER_M
 from estimator.optics.zernike import EXPONENTS
+
+PARAXIAL_MM, PARAXIAL_STEPS = 1e-6, 200
+"""Distance from the axis of paraxial rays, and their steps through a gradient."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +107,36 @@ def _gap(
     if packed[i, GRADIENT] == 0.0:
         reduced_mm = (to_mm - from_mm) / indices[i + 1]
         return np.array([[1.0, reduced_mm], [0.0, 1.0]])
-    matrix = np.eye(2)
     start, origin_mm = int(packed[i, GRADIENT]), packed[i, VERTEX + 2]
-    paraxial_gap(indices, start, from_mm - origin_mm, to_mm - origin_mm, matrix)
+    return _gradient_gap(indices, start, from_mm - origin_mm, to_mm - origin_mm)
+
+
+def _gradient_gap(
+    indices: NDArray[np.float64], first: int, from_mm: float, to_mm: float
+) -> NDArray[np.float64]:
+    """Return the first-order transfer (2, 2) through a gradient between two depths.
+
+    It acts on (height h, index * slope p): dh/dz = p / n(z), dp/dz = h d²n/dr².  With
+    Runge-Kutta steps of order 4, the relative error of the power is 1e-12 for published
+    models of the crystalline lens.
+    """
+    points_mm = np.zeros((2 * PARAXIAL_STEPS + 1, 3))
+    points_mm[:, 0] = PARAXIAL_MM
+    points_mm[:, 2] = np.linspace(from_mm, to_mm, len(points_mm))
+    values = index_values(indices, first, points_mm)
+    index = np.sqrt(values[:, 0])
+    rates = np.zeros((len(points_mm), 2, 2))  # at both ends and the middle of each step
+    rates[:, 0, 1] = 1.0 / index
+    rates[:, 1, 0] = values[:, 1] / (index * PARAXIAL_MM)
+    step_mm, unit = (to_mm - from_mm) / PARAXIAL_STEPS, np.eye(2)
+    starts, middles, ends = rates[:-2:2], rates[1::2], rates[2::2]
+    second = middles @ (unit + 0.5 * step_mm * starts)
+    third = middles @ (unit + 0.5 * step_mm * second)
+    fourth = ends @ (unit + step_mm * third)
+    steps = unit + step_mm / 6.0 * (starts + 2.0 * second + 2.0 * third + fourth)
+    matrix = unit
+    for each in steps:
+        matrix = each @ matrix
     return matrix
 
 
@@ -118,8 +149,9 @@ def _index_behind(
     """
     if i < 0 or packed[i, GRADIENT] == 0.0:
         return float(indices[i + 1])
-    depth_mm = z_mm - packed[i, VERTEX + 2]
-    return float(axial_index(indices, int(packed[i, GRADIENT]), depth_mm))
+    at_mm = np.array([[0.0, 0.0, z_mm - packed[i, VERTEX + 2]]])
+    squared = index_values(indices, int(packed[i, GRADIENT]), at_mm)[0, 0]
+    return math.sqrt(squared)
 
 
 def system_matrix(
@@ -141,11 +173,9 @@ def system_matrix(
     return matrix
 
 
-def _entrance_pupil(
-    packed: NDArray[Any], indices: NDArray[Any], stop_z_mm: float
-) -> tuple[float, float]:
+def _entrance_pupil(packed: NDArray[Any], indices: NDArray[Any]) -> tuple[float, float]:
     """Return the position of the entrance pupil, and its magnification."""
-    n_before = int(packed[-1, N_BEFORE_STOP])
+    n_before, stop_z_mm = int(packed[-1, N_BEFORE_STOP]), packed[-1, STOP_Z]
     matrix = system_matrix(packed, indices, first=0, last=n_before)
     z_mm = _vertices_mm(packed)
     gap = _gap(packed, indices, n_before - 1, (z_mm[n_before - 1], stop_z_mm))
@@ -206,7 +236,7 @@ def cardinal_points(eye: EyeSurfaces, *, wavelength_nm: float) -> CardinalPoints
     front_mm, back_mm, retina_mm = z_mm[0], z_mm[n_surfaces - 1], z_mm[-1]
     object_focus, image_focus = front_mm + n_air * d / c, back_mm - n_last * a / c
     object_focal, image_focal = n_air / c, -n_last / c
-    pupil_mm, ratio = _entrance_pupil(packed, indices, eye.stop_z_mm)
+    pupil_mm, ratio = _entrance_pupil(packed, indices)
     # Negative slope over height, in air, of the rays that focus at the posterior pole.
     reach = (retina_mm - back_mm) / n_last
     refraction = MM_PER_M * (a + c * reach) / (b + d * reach)
@@ -230,8 +260,12 @@ def cardinal_points(eye: EyeSurfaces, *, wavelength_nm: float) -> CardinalPoints
 
 def entrance_pupil_mm(eye: EyeSurfaces, *, wavelength_nm: float) -> float:
     """Return the position of the entrance pupil, mm behind the corneal apex."""
-    packed, indices = pack_eye(eye), media_indices(eye, wavelength_nm)
-    return _entrance_pupil(packed, indices, eye.stop_z_mm)[0]
+    return entrance_pupil_of_packed(pack_eye(eye), media_indices(eye, wavelength_nm))
+
+
+def entrance_pupil_of_packed(packed: NDArray[Any], indices: NDArray[Any]) -> float:
+    """Return `entrance_pupil_mm` of a packed eye at the wavelength of an index row."""
+    return _entrance_pupil(packed, indices)[0]
 
 
 def refraction_dpt(eye: EyeSurfaces, *, wavelength_nm: float) -> float:

@@ -6,7 +6,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.optics import surface_kernels as kernels
+from estimator.native import core, shared_threads
 from estimator.optics.packed import (
     CLEAR_SQUARED,
     GRADIENT,
@@ -14,7 +14,6 @@ from estimator.optics.packed import (
     NEAR_GRADIENT,
     VERTEX,
 )
-from estimator.optics.raytrace_kernels import trace_bundle
 from estimator.optics.surfaces import (
     EyeSurfaces,
     check_eye,
@@ -29,14 +28,24 @@ START_MM = 20.0
 
 
 class RayStatus(IntEnum):
-    """Outcome of tracing a ray; failures are data, not exceptions."""
+    """Outcome of tracing a ray; failures are data, not exceptions.
 
-    TRACED = kernels.TRACED
-    MISSED = kernels.MISSED
-    CLIPPED = kernels.CLIPPED
-    TOTAL_REFLECTION = kernels.TOTAL_REFLECTION
-    OUT_OF_ORDER = kernels.OUT_OF_ORDER
-    NOT_CONVERGED = kernels.NOT_CONVERGED
+    Attributes
+    ----------
+    MISSED
+        No intersection with the sheet of a surface through its vertex.
+    CLIPPED
+        Outside a clear radius.
+    OUT_OF_ORDER
+        Surfaces cross: the next one lies behind the ray.
+    """
+
+    TRACED = 0
+    MISSED = 1
+    CLIPPED = 2
+    TOTAL_REFLECTION = 3
+    OUT_OF_ORDER = 4
+    NOT_CONVERGED = 5
 
 
 STATUS_WORDS = {
@@ -117,14 +126,42 @@ def trace_rays(
     if not (np.all(np.isfinite(start_mm)) and np.all(along > 0.0)):
         sign = "negative" if reverse else "positive"
         raise ValueError(f"expected directions with {sign} z and finite start_mm")
-    packed = pack_eye(eye)
-    shape = (len(start_mm), len(packed) + 1)
-    points_mm, cosines = np.empty((*shape, 3)), np.empty((*shape, 3))
-    path_mm, status = np.empty(shape), np.empty(len(start_mm), np.int64)
-    trace_bundle(
-        packed,
+    return trace_packed(
+        pack_eye(eye),
         media_indices(eye, wavelength_nm),
         np.concatenate([start_mm, direction / length], axis=1),
+        reverse=reverse,
+    )
+
+
+def trace_packed(
+    packed: NDArray[np.float64],
+    indices: NDArray[np.float64],
+    rays: NDArray[np.float64],
+    *,
+    reverse: bool = False,
+) -> TracedRays:
+    """Trace rays through a packed eye; see `trace_rays`.
+
+    Parameters
+    ----------
+    packed : (n_surfaces + 1, N_COLUMNS)
+    indices : (n,)
+        Index row, see `surfaces.media_indices`.
+    rays : (n_rays, 6)
+        Start points, mm, and direction cosines.
+    """
+    shape = (len(rays), len(packed) + 1)
+    points_mm, cosines = np.empty((*shape, 3)), np.empty((*shape, 3))
+    path_mm, status = np.empty(shape), np.empty(len(rays), np.int64)
+    core().call(
+        "trace_rays",
+        shared_threads(),
+        packed,
+        len(packed),
+        indices,
+        rays,
+        len(rays),
         reverse,
         points_mm,
         cosines,
@@ -183,16 +220,11 @@ def check_order(eye: EyeSurfaces) -> None:
     rays[:, 2], rays[:, 5] = packed[:, VERTEX + 2].min() - START_MM, 1.0
     packed[:, NEAR_GRADIENT] = packed[:, GRADIENT] = 0.0  # straight lines everywhere
     packed[:, CLEAR_SQUARED] = np.inf
-    shape = (len(rays), len(packed) + 1)
-    points_mm, status = np.empty((*shape, 3)), np.empty(len(rays), np.int64)
-    cosines, path_mm = np.empty((*shape, 3)), np.empty(shape)
-    trace_bundle(
-        packed, np.ones(len(packed)), rays, False, points_mm, cosines, path_mm, status
-    )
-    crossed = np.flatnonzero(status == kernels.OUT_OF_ORDER)
+    found = trace_packed(packed, np.ones(len(packed)), rays)
+    crossed = np.flatnonzero(found.status_index == RayStatus.OUT_OF_ORDER)
     if not len(crossed):
         return
-    element = int(np.isnan(points_mm[crossed[0], :, 2]).argmax())
+    element = int(np.isnan(found.points_mm[crossed[0], :, 2]).argmax())
     i = element - (element > packed[-1, N_BEFORE_STOP])
     name = f"surfaces[{i}]" if i < len(eye.surfaces) else "retina"
     x_mm, y_mm = rays[crossed[0], :2]

@@ -16,7 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.optics.dispersion import Dispersion
 from estimator.optics.forms import FORMS, Form
-from estimator.optics.gradients import GRADIENTS, INDEX_FUNCTIONS, Gradient
+from estimator.optics.gradients import (
+    GRADIENTS,
+    INDEX_FUNCTIONS,
+    Gradient,
+    index_values,
+)
 from estimator.optics.media import refractive_index
 from estimator.optics.packed import (
     ADDED_CURVATURE,
@@ -458,10 +463,12 @@ def _check_gradients(eye: EyeSurfaces) -> None:
             raise ValueError(
                 f"{name}: {gradient.steps} steps, allowed are 1 to {MAX_STEPS}"
             )
-        numbers = np.array(gradient.numbers(GRADIENT_LAYOUT_NM))
-        for z_mm in np.linspace(0.0, depths_mm[i + 1] - depths_mm[i], 5).tolist():
-            squared = gradient.index(numbers, 0, 0.0, 0.0, z_mm)[0]
-            low, high = INDEX_LIMITS
+        on_axis_mm = np.zeros((5, 3))
+        on_axis_mm[:, 2] = np.linspace(0.0, depths_mm[i + 1] - depths_mm[i], 5)
+        medium = _gradient_columns(gradient, GRADIENT_LAYOUT_NM)
+        squares = index_values(medium, 0, on_axis_mm)[:, 0]
+        low, high = INDEX_LIMITS
+        for z_mm, squared in zip(on_axis_mm[:, 2], squares, strict=True):
             if not low**2 <= squared <= high**2:
                 raise ValueError(
                     f"{name}: squared index {squared:.4g} on the axis at depth "

@@ -1,17 +1,13 @@
 """Wavefronts of an eye, from rays traced from the retina outward.
 
-aberrations        Zernike coefficients by field, pupil and wavelength; of many eyes
-results            result types
-circle             wavefront on a given circle outside the eye, regardless of the stop
-bundle             ray bundle that fills the stop, and its fit
-kernels            compiled chief ray, ray aiming and optical path differences
-nodes              quadrature nodes over the stop or a circle
-fit                least-squares fit of Zernike coefficients and of the pupil's rim
-chief_rays         chief rays by wavelength: lateral color
-chief_ray_kernels  its compiled loops
-field_wavefronts   wavefronts over the field with their pupils, input of the PSF engines
-moved_plane        transfer of a wavefront to another plane along the chief ray
-pupil_refraction   least-squares refraction over the area of the pupil
+aberrations       Zernike coefficients by field, pupil and wavelength; of many eyes
+results           result types
+compiled          calls of the compiled tracer for fields of many packed eyes
+nodes             quadrature nodes over the stop or a circle
+chief_rays        chief rays by wavelength: lateral color
+field_wavefronts  wavefronts over the field with their pupils, input of the PSF engines
+moved_plane       transfer of a wavefront to another plane along the chief ray
+pupil_refraction  least-squares refraction over the area of the pupil
 
 Wavefronts are given in a plane normal to the chief ray, outside the eye: where the
 chief ray meets the cornea, or where it crosses the plane of the paraxial *entrance

@@ -8,24 +8,17 @@ stretched along the minor axis of the projected pupil, whose ellipse is returned
 """
 
 import math
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.optics.arrays import broadcast_copy
-from estimator.optics.paraxial import entrance_pupil_mm
+from estimator.optics.paraxial import entrance_pupil_of_packed
 from estimator.optics.raytrace import RayStatus
-from estimator.optics.surfaces import EyeSurfaces, check_eye, media_indices, pack_eye
+from estimator.optics.surfaces import EyeSurfaces, media_indices, pack_eye
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
-from estimator.optics.zernike import N_TERMS
-from estimator.threads import thread_count
-from estimator.wavefront import bundle
-from estimator.wavefront.circle import circle_zernike
-from estimator.wavefront.kernels import magnification
+from estimator.wavefront import compiled
 from estimator.wavefront.nodes import N_AZIMUTHS, N_RINGS, circle_nodes, stop_nodes
 from estimator.wavefront.results import Aberrations, FieldResults, PupilEllipse
 
@@ -40,28 +33,31 @@ def pupil_magnification(eye: EyeSurfaces) -> float:
     The ratio is parabasal, about the axial chief ray: the geometric mean of both
     principal meridians.  It is nan if no axial ray passes the center of the stop.
     """
-    return float(
-        magnification(pack_eye(eye), media_indices(eye, REFERENCE_WAVELENGTH_NM))
-    )
+    indices = media_indices(eye, REFERENCE_WAVELENGTH_NM)
+    return float(compiled.magnifications(pack_eye(eye)[None], indices)[0])
 
 
 def _stop_diameters_mm(
-    eye: EyeSurfaces, stop_mm: ArrayLike | None, pupil_mm: ArrayLike | None
+    packed: NDArray[np.float64],
+    reference: NDArray[np.float64],
+    stop_mm: ArrayLike | None,
+    pupil_mm: ArrayLike | None,
 ) -> NDArray[np.float64]:
+    """Return stops (n_eyes, n_stops) of packed eyes with index rows at 555 nm."""
     if (stop_mm is None) == (pupil_mm is None):
         raise ValueError("expected either a stop diameter or a pupil diameter")
     given = np.atleast_1d(np.asarray(pupil_mm if stop_mm is None else stop_mm, float))
     if not np.all((given > 0.0) & (given <= 12.0)):
         raise ValueError(f"stop or pupil {given} mm: allowed is above 0 to 12 mm")
     if stop_mm is not None:
-        return given
-    ratio = pupil_magnification(eye)
-    if not ratio > 0.0:
+        return np.broadcast_to(given, (len(packed), given.size))
+    ratios = compiled.magnifications(packed, reference)
+    if not np.all(ratios > 0.0):
         raise ValueError(
             "no axial ray passes the center of the stop, so the entrance pupil is "
             "unknown: give a stop diameter"
         )
-    return given / ratio
+    return given / ratios[:, None]
 
 
 def _check_view(fields_deg: NDArray[Any], object_dpt: float, fit: str) -> None:
@@ -80,19 +76,6 @@ def _is_at_pupil(plane: str) -> bool:
     if plane not in PLANES:
         raise ValueError(f"plane '{plane}': allowed are {', '.join(PLANES)}")
     return plane == "pupil"
-
-
-def _in_threads(n: int, n_threads: int | None, work: Callable[[slice], None]) -> None:
-    """Divide ``n`` items among threads; compiled code releases the GIL."""
-    n_threads = max(1, min(n_threads or thread_count(), n))
-    bounds = np.linspace(0, n, n_threads + 1).astype(int)
-    parts = [slice(a, b) for a, b in pairwise(bounds)]
-    if n_threads == 1:
-        work(parts[0])
-        return
-    with ThreadPoolExecutor(n_threads) as pool:
-        for done in [pool.submit(work, part) for part in parts]:
-            done.result()
 
 
 def wavefront_grid(
@@ -148,31 +131,73 @@ def wavefront_grid(
     ----------
     Csoba & Kunkli 2023, Algorithm 1.
     """
-    check_eye(eye)
+    found = wavefront_grids(
+        [eye],
+        fields_deg=fields_deg,
+        wavelengths_nm=wavelengths_nm,
+        stop_diameters_mm=stop_diameters_mm,
+        pupil_diameters_mm=pupil_diameters_mm,
+        object_dpt=object_dpt,
+        plane=plane,
+        fit=fit,
+        n_rings=n_rings,
+        n_azimuths=n_azimuths,
+        n_threads=n_threads,
+    )
+    return found.at(0)
+
+
+def wavefront_grids(
+    eyes: Sequence[EyeSurfaces],
+    *,
+    fields_deg: ArrayLike,
+    wavelengths_nm: ArrayLike,
+    stop_diameters_mm: ArrayLike | None = None,
+    pupil_diameters_mm: ArrayLike | None = None,
+    object_dpt: float = 0.0,
+    plane: str = "cornea",
+    fit: str = "opd",
+    n_rings: int = N_RINGS,
+    n_azimuths: int = N_AZIMUTHS,
+    n_threads: int | None = None,
+) -> FieldResults:
+    """Trace `wavefront_grid` of several eyes with the same parts, as states of one eye.
+
+    Returns
+    -------
+    FieldResults
+        Leading axes (n_eyes, n_fields, n_wavelengths, n_stops).
+
+    Raises
+    ------
+    ValueError
+        As `wavefront_grid`, or the eyes have different numbers of surfaces.
+    """
     fields_deg = np.atleast_2d(np.asarray(fields_deg, dtype=np.float64))
     _check_view(fields_deg, object_dpt, fit)
     at_pupil = _is_at_pupil(plane)
-    stops_mm = _stop_diameters_mm(eye, stop_diameters_mm, pupil_diameters_mm)
-    packed, nodes = pack_eye(eye), stop_nodes(n_rings, n_azimuths)
-    indices = media_indices(eye, np.atleast_1d(wavelengths_nm))
-    pupil_z = entrance_pupil_mm(eye, wavelength_nm=REFERENCE_WAVELENGTH_NM)
-    shape = (len(fields_deg), len(indices), len(stops_mm), bundle.N_RESULT)
-    rows, fields_rad = np.empty(shape), np.radians(fields_deg)
-    view = (float(object_dpt), pupil_z, at_pupil, fit == "slope")
-
-    def work(part: slice) -> None:
-        bundle.analyze_fields(
-            packed,
-            indices,
-            fields_rad[part],
-            stops_mm / 2.0,
-            view,
-            nodes,
-            rows[part],
-        )
-
-    _in_threads(len(fields_deg), n_threads, work)
-    return FieldResults.from_rows(rows)
+    packed = compiled.packed_eyes(eyes)
+    indices = np.stack([media_indices(e, np.atleast_1d(wavelengths_nm)) for e in eyes])
+    reference = np.stack([media_indices(e, REFERENCE_WAVELENGTH_NM) for e in eyes])
+    stops_mm = _stop_diameters_mm(
+        packed, reference, stop_diameters_mm, pupil_diameters_mm
+    )
+    pupils_z_mm = [
+        entrance_pupil_of_packed(*eye) for eye in zip(packed, reference, strict=True)
+    ]
+    each = len(fields_deg) * indices.shape[1]
+    rows = compiled.stop_rows(
+        compiled.Fields.of_grid(packed, indices, np.radians(fields_deg)),
+        stop_radii_mm=np.repeat(stops_mm / 2.0, each, axis=0),
+        pupil_z_mm=np.repeat(pupils_z_mm, each),
+        nodes=stop_nodes(n_rings, n_azimuths),
+        at_pupil=at_pupil,
+        by_slopes=fit == "slope",
+        object_dpt=float(object_dpt),
+        n_threads=n_threads,
+    )
+    shape = (len(eyes), len(fields_deg), indices.shape[1])
+    return FieldResults.from_rows(rows.reshape(*shape, *rows.shape[1:]))
 
 
 def wavefront_aberrations(
@@ -216,7 +241,12 @@ def wavefront_aberrations(
         A value is out of range, the eye cannot be traced, or a pupil diameter is given
         for an eye without entrance pupil.
     """
-    stops_mm = _stop_diameters_mm(eye, stop_diameter_mm, pupil_diameter_mm)
+    (stops_mm,) = _stop_diameters_mm(
+        pack_eye(eye)[None],
+        media_indices(eye, REFERENCE_WAVELENGTH_NM),
+        stop_diameter_mm,
+        pupil_diameter_mm,
+    )
     found = wavefront_grid(
         eye,
         fields_deg=[[h_deg, v_deg]],
@@ -292,32 +322,21 @@ def eyes_aberrations(
     ValueError
         A value is out of range.
     """
-    packed = np.ascontiguousarray(packed, dtype=np.float64)
     n_eyes = len(packed)
-    indices = broadcast_copy(indices, (n_eyes, np.shape(indices)[-1]))
-    stops_mm = np.broadcast_to(np.asarray(stop_diameters_mm, float), (n_eyes,))
     fields_deg = np.empty((n_eyes, 2))
     fields_deg[:, 0], fields_deg[:, 1] = h_deg, v_deg
     _check_view(fields_deg, 0.0, fit)
-    rows, stop_radii = np.empty((n_eyes, bundle.N_RESULT)), stops_mm / 2.0
-    fields_rad = np.radians(fields_deg)
-    planes_z_mm, nodes = np.empty(n_eyes), stop_nodes(n_rings, n_azimuths)
-    planes_z_mm[:] = pupil_z_mm
-
-    def work(part: slice) -> None:
-        bundle.analyze_eyes(
-            packed[part],
-            indices[part],
-            fields_rad[part],
-            stop_radii[part],
-            planes_z_mm[part],
-            fit == "slope",
-            nodes,
-            rows[part],
-        )
-
-    _in_threads(n_eyes, n_threads, work)
-    return FieldResults.from_rows(rows)
+    stops_mm = np.broadcast_to(np.asarray(stop_diameters_mm, float), (n_eyes,))
+    rows = compiled.stop_rows(
+        compiled.Fields.of_eyes(packed, indices, np.radians(fields_deg)),
+        stop_radii_mm=stops_mm[:, None] / 2.0,
+        pupil_z_mm=pupil_z_mm,
+        nodes=stop_nodes(n_rings, n_azimuths),
+        at_pupil=True,
+        by_slopes=fit == "slope",
+        n_threads=n_threads,
+    )
+    return FieldResults.from_rows(rows[:, 0])
 
 
 def on_axis_zernike(
@@ -358,28 +377,13 @@ def on_axis_zernike(
     status_index : (n_eyes,) int
         Worst `RayStatus`; failed rays are excluded from the fit.
     """
-    packed = np.ascontiguousarray(packed, dtype=np.float64)
-    n_eyes = len(packed)
-    indices = broadcast_copy(indices, (n_eyes, np.shape(indices)[-1]))
-    zernike_um, status = np.empty((n_eyes, N_TERMS)), np.empty(n_eyes, np.int64)
-    field_rad = (math.radians(h_deg), math.radians(v_deg))
-    radii_mm = np.empty(n_eyes)
-    radii_mm[:] = zernike_radius_mm
-    planes_z_mm = np.empty(n_eyes)
-    planes_z_mm[:] = pupil_z_mm
-    nodes = circle_nodes()
-
-    def work(part: slice) -> None:
-        circle_zernike(
-            packed[part],
-            indices[part],
-            field_rad,
-            radii_mm[part],
-            planes_z_mm[part],
-            nodes,
-            zernike_um[part],
-            status[part],
-        )
-
-    _in_threads(n_eyes, n_threads, work)
-    return zernike_um, status
+    direction_rad = np.radians([h_deg, v_deg])
+    return compiled.circle_zernike(
+        compiled.Fields.of_eyes(
+            packed, indices, np.tile(direction_rad, (len(packed), 1))
+        ),
+        radii_mm=zernike_radius_mm,
+        pupil_z_mm=pupil_z_mm,
+        nodes=circle_nodes(),
+        n_threads=n_threads,
+    )

@@ -6,12 +6,15 @@ by tracing from that point back through the center of the stop.  The shift is th
 from u to the apparent direction.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.optics.surfaces import EyeSurfaces, check_eye, media_indices, pack_eye
+from estimator.optics.surfaces import EyeSurfaces, media_indices
 from estimator.optics.units import MRAD_PER_RAD, REFERENCE_WAVELENGTH_NM
-from estimator.wavefront.chief_ray_kernels import fill_chief_shifts
+from estimator.wavefront import compiled
 
 
 def chief_shift_mrad(
@@ -37,10 +40,28 @@ def chief_shift_mrad(
     ValueError
         The eye cannot be traced, or a wavelength is out of range.
     """
-    check_eye(eye)
-    fields_rad = np.radians(np.atleast_2d(np.asarray(fields_deg, dtype=np.float64)))
-    indices = media_indices(eye, np.atleast_1d(wavelengths_nm))
-    shifts = np.empty((len(fields_rad), len(indices), 2))
-    reference = media_indices(eye, REFERENCE_WAVELENGTH_NM)
-    fill_chief_shifts(pack_eye(eye), indices, reference, fields_rad, shifts)
-    return MRAD_PER_RAD * shifts
+    shift_mrad: NDArray[np.float64] = chief_shifts_mrad(
+        [eye], fields_deg=fields_deg, wavelengths_nm=wavelengths_nm
+    )[0]
+    return shift_mrad
+
+
+def chief_shifts_mrad(
+    eyes: Sequence[EyeSurfaces], *, fields_deg: ArrayLike, wavelengths_nm: ArrayLike
+) -> NDArray[np.float64]:
+    """Return `chief_shift_mrad` (n_eyes, ...) of eyes with the same parts.
+
+    Raises
+    ------
+    ValueError
+        As `chief_shift_mrad`, or the eyes have different numbers of surfaces.
+    """
+    packed = compiled.packed_eyes(eyes)
+    directions_rad = np.radians(np.atleast_2d(np.asarray(fields_deg, np.float64)))
+    indices = np.stack([media_indices(e, np.atleast_1d(wavelengths_nm)) for e in eyes])
+    reference = np.stack([media_indices(e, REFERENCE_WAVELENGTH_NM) for e in eyes])
+    fields = compiled.Fields.of_grid(packed, indices, directions_rad)
+    both = replace(fields, indices=np.concatenate([fields.indices, reference]))
+    shifts = compiled.chief_shifts(both, len(fields.indices) + fields.eyes)
+    shape = (len(eyes), len(directions_rad), indices.shape[1], 2)
+    return MRAD_PER_RAD * shifts.reshape(shape)

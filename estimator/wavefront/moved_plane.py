@@ -10,9 +10,9 @@ order are fitted to it.
 from functools import cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from estimator.native import core
 from estimator.optics.units import UM_PER_MM
 from estimator.optics.zernike import (
     HIGHEST_ORDER,
@@ -39,47 +39,6 @@ def _rays(order: int) -> NDArray[np.float64]:
     rings, weights, azimuths, _ = circle_nodes(*sampling)
     points = (azimuths[:, None, :] * rings[:, None]).reshape(-1, 2)
     return np.column_stack([points, np.tile(weights, len(azimuths))])
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
-def _add_rays(
-    tables_um: NDArray[np.float64],
-    reach: NDArray[np.float64],
-    rays: NDArray[np.float64],
-    moments: NDArray[np.float64],
-    products_um: NDArray[np.float64],
-) -> None:
-    """Add moved rays to moments (n, a, b) of their positions, and to those of W.
-
-    Lengths are relative to the radius of the circle.  ``tables_um[n, a, b]`` is the
-    coefficient of x^a y^b, and rays move by reach times the gradient.  The size of
-    ``products_um`` is that of the fit.
-    """
-    order, fitted = tables_um.shape[1] - 1, products_um.shape[1] - 1
-    for n in range(tables_um.shape[0]):
-        for k in range(rays.shape[0]):
-            x, y, weight = rays[k]
-            value = slope_x = slope_y = 0.0
-            for a in range(order, -1, -1):
-                row = row_y = 0.0
-                for b in range(order - a, -1, -1):
-                    row_y = row_y * y + row
-                    row = row * y + tables_um[n, a, b]
-                slope_x = slope_x * x + value
-                value = value * x + row
-                slope_y = slope_y * x + row_y
-            x += reach[n] * slope_x
-            y += reach[n] * slope_y
-            value += reach[n] / 2.0 * (slope_x**2 + slope_y**2)
-            power_x = weight
-            for a in range(2 * fitted + 1):
-                power = power_x
-                for b in range(2 * fitted + 1 - a):
-                    moments[n, a, b] += power
-                    if a + b <= fitted:
-                        products_um[n, a, b] += power * value
-                    power *= y
-                power_x *= x
 
 
 def moved_polynomial(
@@ -121,7 +80,9 @@ def moved_polynomial(
     moments = np.zeros((count, 2 * fitted + 1, 2 * fitted + 1))
     products_um = np.zeros((count, fitted + 1, fitted + 1))
     reach = depth_mm[:, 0] / (UM_PER_MM * radius_mm[:, 0] ** 2)
-    _add_rays(tables_um, reach, _rays(fitted), moments, products_um)
+    rays = _rays(fitted)
+    sizes = (count, len(rays), order, fitted)
+    core().call("add_moved_rays", tables_um, reach, rays, moments, products_um, *sizes)
     powers = exponents(n_terms or given)
     pairs = powers[:, None] + powers
     normal = moments[:, pairs[..., 0], pairs[..., 1]]

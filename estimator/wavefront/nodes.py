@@ -24,6 +24,9 @@ N_CIRCLE_RINGS, N_CIRCLE_AZIMUTHS = 6, 16
 N_REFERENCE_RINGS = 14
 
 Nodes = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+CircleNodes = tuple[
+    NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]
+]
 
 
 def _gauss_nodes(atoms: NDArray[Any], weights: NDArray[Any], n: int) -> NDArray[Any]:

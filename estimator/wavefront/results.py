@@ -1,7 +1,7 @@
 """Result types for wavefronts and their pupils."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from estimator.optics.raytrace import STATUS_WORDS, RayStatus
 from estimator.optics.zernike import N_TERMS
-from estimator.wavefront import bundle
-from estimator.wavefront.fit import N_ELLIPSE
+from estimator.wavefront import compiled
 
 
 @dataclass(frozen=True)
@@ -79,20 +78,25 @@ class FieldResults:
     retinal_point_mm: NDArray[np.float64]
     pupil_point_mm: NDArray[np.float64]
 
+    def at(self, index: int) -> "FieldResults":
+        """Return the results at an index of the first axis."""
+        return FieldResults(*(getattr(self, f.name)[index] for f in fields(self)))
+
     @classmethod
     def from_rows(cls, rows: NDArray[Any]) -> "FieldResults":
-        """Unpack the rows (..., N_RESULT) that the compiled code wrote."""
-        ellipse, retina, plane = bundle.ELLIPSE, bundle.RETINA_POINT, bundle.PLANE_POINT
+        """Unpack rows (..., N_TERMS + N_OTHER); see `compiled.stop_rows`."""
+        other = rows[..., N_TERMS:]
+        retina, plane = compiled.RETINA_POINT, compiled.PLANE_POINT
         return cls(
             zernike_um=rows[..., :N_TERMS],
-            zernike_radius_mm=rows[..., bundle.RADIUS],
-            ellipse_mm=rows[..., ellipse : ellipse + N_ELLIPSE],
-            rms_residual_um=rows[..., bundle.RMS],
-            open_ratio=rows[..., bundle.OPEN_SHARE],
-            chief_status_index=rows[..., bundle.CHIEF_STATUS].astype(np.int64),
-            worst_status_index=rows[..., bundle.WORST_STATUS].astype(np.int64),
-            retinal_point_mm=rows[..., retina : retina + 3],
-            pupil_point_mm=rows[..., plane : plane + 3],
+            zernike_radius_mm=other[..., compiled.RADIUS],
+            ellipse_mm=other[..., compiled.ELLIPSE : compiled.RMS],
+            rms_residual_um=other[..., compiled.RMS],
+            open_ratio=other[..., compiled.OPEN_SHARE],
+            chief_status_index=other[..., compiled.CHIEF_STATUS].astype(np.int64),
+            worst_status_index=other[..., compiled.WORST_STATUS].astype(np.int64),
+            retinal_point_mm=other[..., retina : retina + 3],
+            pupil_point_mm=other[..., plane : plane + 3],
         )
 
 

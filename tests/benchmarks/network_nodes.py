@@ -18,7 +18,7 @@ from estimator.eye.tracing import eye_indices, refraction_of_vectors
 from estimator.networks import inference as networks
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM, RGB_WAVELENGTHS_NM
 from estimator.wavefront.aberrations import eyes_aberrations
-from estimator.wavefront.kernels import magnifications
+from estimator.wavefront.compiled import magnifications
 from estimator.wavefront.nodes import N_AZIMUTHS, N_RINGS
 from estimator.wavefront.results import FieldResults
 from tests.numerical.spot_focus import focus_by_spot

@@ -10,7 +10,6 @@ from estimator.optics.forms import EvenAsphere, TwoConics
 from estimator.optics.paraxial import cardinal_points
 from estimator.optics.raytrace import RayStatus, trace_rays
 from estimator.wavefront.aberrations import wavefront_aberrations
-from tests.numerical.gradient_truth import trace
 from tests.numerical.optiland_eye import (
     FROZEN_FORMS,
     WAVELENGTH_NM,
@@ -20,6 +19,7 @@ from tests.numerical.optiland_eye import (
 )
 from tests.numerical.schematic_eyes import irregular_eye, navarro, reference
 from tests.numerical.surface_bodies import parsed_eye
+from tests.reference.traced_rays import trace
 
 TRACED = json.loads(FROZEN_FORMS.read_text(encoding="utf-8"))["eyes"]
 TOLERANCE_MM = 1e-12

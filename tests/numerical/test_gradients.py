@@ -19,8 +19,8 @@ from estimator.optics.surfaces import EyeSurfaces, Retina, Surface, media_indice
 from estimator.optics.zernike import zernike_values
 from estimator.wavefront.aberrations import pupil_magnification, wavefront_grid
 from estimator.wavefront.nodes import stop_nodes
-from tests.numerical.gradient_truth import trace
 from tests.numerical.schematic_eyes import field_axes, liou_brennan
+from tests.reference.traced_rays import trace
 
 WAVELENGTH_NM = 540.0
 PLANE = (math.inf, math.inf)

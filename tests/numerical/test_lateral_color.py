@@ -12,8 +12,8 @@ from estimator.optics.surfaces import media_indices, pack_eye
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM, RGB_WAVELENGTHS_NM
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
-from estimator.wavefront.chief_ray_kernels import fill_chief_shifts
 from estimator.wavefront.chief_rays import chief_shift_mrad
+from estimator.wavefront.compiled import Fields, chief_shifts
 from filter_service.planning.field_directions import field_deg
 from filter_service.psfs.eye_for_spec import NO_LATERAL_COLOR, eye_for_spec
 from filter_service.psfs.store import build_psf_store
@@ -45,16 +45,16 @@ def test_chief_rays_of_another_program_lie_apart_alike():
     powers = np.array([1, 3, 5, 7])
     odd = np.linalg.solve(fields[:, None] ** powers, height_mm)
     own, other = (case_eye(data, cases[20, nm]) for nm in (555.0, 543.0))
-    shifts = np.empty((2, 1, 2))
-    fill_chief_shifts(
-        pack_eye(own),
-        np.atleast_2d(media_indices(other, 543.0)),
-        media_indices(own, 555.0),
-        np.radians([[0.0, -20.0], [0.0, -40.0]]),  # its light travels upward
-        shifts,
+    fields = Fields(
+        pack_eye(own)[None],
+        np.stack([media_indices(other, 543.0), media_indices(own, 555.0)]),
+        eyes=np.zeros(2, np.int64),
+        rows=np.zeros(2, np.int64),
+        directions_rad=np.radians([[0.0, -20.0], [0.0, -40.0]]),  # light goes upward
     )
+    shifts = chief_shifts(fields, reference_rows=1)
     for (field, low, high), shift in zip(
-        [(20.0, 19.0, 21.0), (40.0, 39.0, 40.0)], shifts[:, 0], strict=True
+        [(20.0, 19.0, 21.0), (40.0, 39.0, 40.0)], shifts, strict=True
     ):
         landed_mm = cases[field, 543.0]["retinal_point_mm"][1]
         seen = np.linspace(low, high, 20001)

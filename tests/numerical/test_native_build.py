@@ -35,8 +35,10 @@ FRAMES = (
     "tests/numerical/test_native_random.py",
     "tests/numerical/test_field_layers.py",
     "tests/numerical/test_native_psfs.py",
+    "tests/numerical/test_native_tracer.py",
 )
-"""Every size and radius, odd depths, hidden layers, kernels over the field, PSFs."""
+"""Every size and radius, odd depths, hidden layers, kernels over the field, PSFs, rays
+of every form."""
 
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
 
@@ -119,6 +121,7 @@ def test_numbers_of_rims_are_those_of_python():
         (CORE / "psf_job.h", "psf_tables", core_records.PsfTables),
         (CORE / "defocus_job.h", "defocus_grid", core_records.DefocusGrid),
         (CORE / "defocus_job.h", "defocus_job", core_records.DefocusJob),
+        (CORE / "wavefront_job.h", "wavefront_job", core_records.WavefrontJob),
     ],
 )
 def test_fields_of_records_are_those_of_the_source_in_order(file, name, record):

@@ -9,7 +9,7 @@ from estimator.eye.tracing import eye_indices
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import zernike_values
 from estimator.wavefront.aberrations import eyes_aberrations
-from estimator.wavefront.kernels import magnification
+from estimator.wavefront.compiled import magnifications
 
 torch = pytest.importorskip("torch")
 
@@ -51,7 +51,7 @@ def as_matrix(ellipse_mm):
 def compiled(vectors, pupil_mm, wavelength_nm, h_deg, v_deg):
     """Columns of 28 coefficients, radius and ellipse of eyes at one view, and ok."""
     packed, reference = pack_eyes(vectors), eye_indices(REFERENCE_WAVELENGTH_NM)
-    ratios = np.array([magnification(eye, reference) for eye in packed])
+    ratios = magnifications(packed, reference)
     found = eyes_aberrations(
         packed,
         eye_indices(wavelength_nm),

@@ -15,8 +15,7 @@ from estimator.optics.packed import (
     VERTEX,
     WITH_OFFSET,
 )
-from estimator.optics.raytrace_kernels import trace_bundle
-from estimator.optics.surface_kernels import TRACED
+from estimator.optics.raytrace import RayStatus, trace_packed
 
 torch = pytest.importorskip("torch")
 
@@ -42,24 +41,12 @@ def _rays(rng):
 
 def _compiled(packed, rays):
     """Points on the surfaces (n_rays, 5, 3), each in its surface's axes."""
-    shape = (len(rays), len(packed) + 1)
-    points, directions = np.empty((*shape, 3)), np.empty((*shape, 3))
-    paths, status = np.empty(shape), np.empty(len(rays), np.int64)
-    trace_bundle(
-        packed,
-        eye_indices(WAVELENGTH_NM),
-        rays,
-        False,
-        points,
-        directions,
-        paths,
-        status,
-    )
-    points = np.delete(points, 2, axis=1)  # without the stop
+    found = trace_packed(packed, eye_indices(WAVELENGTH_NM), rays)
+    points = np.delete(found.points_mm, 2, axis=1)  # without the stop
     for i, row in enumerate(packed):
         axes = row[ROTATION : ROTATION + 9].reshape(3, 3)
         points[:, i] = (points[:, i] - row[VERTEX : VERTEX + 3]) @ axes
-    return points, status
+    return points, found.status_index
 
 
 def _batched(vectors, rays):
@@ -102,7 +89,7 @@ def test_rays_are_those_of_the_compiled_tracer_on_every_form(rng):
     n_compared = 0
     for e in range(N_EYES):
         points, status = _compiled(packed[e], rays)
-        traced = status == TRACED
+        traced = status == RayStatus.TRACED
         error_mm = np.abs(found[e][traced] - points[traced])
         assert error_mm.max(initial=0.0) < TOLERANCE_MM
         n_compared += traced.sum()

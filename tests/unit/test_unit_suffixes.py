@@ -16,6 +16,7 @@ KINDS = ("ratio", "index", "count", "fraction", "constant")
 
 DIMENSIONLESS = {
     "kernel": "shares of light, unit sum",
+    "packed": "columns of eyes in mm, 1/mm and none, as their module says",
     "flat_kernels": "shares of light, kernels one behind the other",
     "log_amplitude": "logarithm of a ratio",
     "color": "light, sRGB or linear as the header says",

@@ -162,7 +162,7 @@ def trace_chief(eye: Eye, axes: Axes, solved: Solved) -> Chief:
 def magnification(eye: Eye) -> Tensor:
     """Return entrance pupil over stop (B,), about the axial chief ray; nan where none.
 
-    As `estimator.wavefront.kernels.magnification`, with the same differences.
+    As `estimator.wavefront.compiled.magnifications`, with the same differences.
     """
     zero = torch.zeros_like(eye.indices[:, 0])
     axes = field_axes(zero, zero)

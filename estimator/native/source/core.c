@@ -5,6 +5,7 @@
 #include "entry.h"
 #include "pool.h"
 #include "psf_job.h"
+#include "wavefront_job.h"
 
 /* Sizes of the records, which the caller compares with its own. */
 EXPORT void ocu_sizes(int32_t *sizes) {
@@ -13,6 +14,7 @@ EXPORT void ocu_sizes(int32_t *sizes) {
     sizes[n++] = (int32_t)sizeof(psf_tables);
     sizes[n++] = (int32_t)sizeof(psf_discs_job);
     sizes[n++] = (int32_t)sizeof(defocus_job);
+    sizes[n++] = (int32_t)sizeof(wavefront_job);
 }
 
 EXPORT pool *ocu_pool_new(int n_threads) { return pool_new(n_threads); }

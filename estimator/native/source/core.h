@@ -13,6 +13,9 @@
 #include "psf_surveys.h"
 #include "field_defocus.h"
 
+#include "moved_plane.h"
+#include "wavefronts.h"
+
 static const named_function functions[] = {
     FUNCTION(psfs),
     FUNCTION(take_psfs),
@@ -22,6 +25,13 @@ static const named_function functions[] = {
     FUNCTION(needed_radii),
     FUNCTION(edge_lights_outside),
     FUNCTION(fill_defocus),
+    FUNCTION(trace_rays),
+    FUNCTION(trace_pupils),
+    FUNCTION(trace_circles),
+    FUNCTION(trace_shifts),
+    FUNCTION(magnifications),
+    FUNCTION(gradient_indices),
+    FUNCTION(add_moved_rays),
     {NULL, NULL},
 };
 

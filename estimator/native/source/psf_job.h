@@ -5,10 +5,8 @@
 #include <stdint.h>
 
 #include "pool.h"
+#include "terms.h"
 
-#define MOST_ORDER 10         /* degree of a wavefront's polynomial: 6 to 10 */
-#define MOST_POWERS (MOST_ORDER + 1)
-#define MOST_TERMS 66
 #define TURN_POWERS 7         /* of the polynomials for cosine and sine */
 #define N_EDGE 48             /* points of a survey on the pupil's edge */
 #define N_SURVEY 193          /* all points of a survey, padded to SURVEY_STRIDE */

@@ -1,6 +1,5 @@
 """Surface forms other than conics, biconics and offset terms, one module each.
 
-base               compiled sag of a biconic and of offset terms
 even_asphere       even powers of the distance from the axis
 two_conics         biconic with a conic constant in each meridian
 toroid             conic profile revolved about an axis across it
@@ -10,20 +9,18 @@ A form is a frozen dataclass whose fields are numbers or tuples of numbers, with
 
 kind : str
     Its name in files.
-sag(packed, row, x, y, out) -> bool
-    Compiled function that writes z, dz/dx, dz/dy in the axes of the surface and returns
-    whether the form is defined at (x, y).  Its parameters start at column FORM_NUMBERS.
 numbers() -> tuple of float
-    The parameters, at most N_FORM_NUMBERS.
+    The parameters, at most N_FORM_NUMBERS, in the packed row from FORM_NUMBERS on.
 added_curvature(curvatures) -> float
     Mean curvature at the vertex in addition to that of the radii.
 
-To add a form, write its module and add its class to `FORMS`, the table that compiled
-code, files and paraxial optics use.  Afterwards delete numba's cache, which does not
-detect changes in other files (`find . -name '*.nb?' -delete`).
+To add a form, write its module and add its class to `FORMS`, the table that files and
+paraxial optics use.  Write its sag and slopes as a header `form_<kind>.h` in
+`estimator/native/source`, and add the function to the table of `forms.h`, in the same
+order.
 """
 
-from typing import Any, ClassVar, Protocol
+from typing import Protocol
 
 from estimator.optics.forms.even_asphere import EvenAsphere
 from estimator.optics.forms.separate_profiles import SeparateProfiles
@@ -33,8 +30,6 @@ from estimator.optics.forms.two_conics import TwoConics
 
 class Form(Protocol):
     """Interface of the classes in `FORMS`."""
-
-    sag: ClassVar[Any]
 
     def numbers(self) -> tuple[float, ...]:
         """Return the parameters for the packed row."""

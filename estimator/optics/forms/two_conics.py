@@ -4,27 +4,8 @@ An ellipsoid with the semi-axes ax, ay and az has the radii ax² / az and ay² /
 the conic constants ax² / az² - 1 and ay² / az² - 1.
 """
 
-import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
-
-from numba import njit
-
-from estimator.optics.packed import CURVATURE_X, CURVATURE_Y, FORM_NUMBERS
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _sag(packed, i, x, y, out):
-    cx, cy = packed[i, CURVATURE_X], packed[i, CURVATURE_Y]
-    kx, ky = 1.0 + packed[i, FORM_NUMBERS], 1.0 + packed[i, FORM_NUMBERS + 1]
-    radicand = 1.0 - kx * cx * cx * x * x - ky * cy * cy * y * y
-    root = math.sqrt(max(radicand, 1e-12))
-    numerator, inverse = cx * x * x + cy * y * y, 1.0 / (1.0 + root)
-    common = numerator * inverse * inverse / root
-    out[0] = numerator * inverse
-    out[1] = x * cx * (2.0 * inverse + common * kx * cx)
-    out[2] = y * cy * (2.0 * inverse + common * ky * cy)
-    return radicand > 0.0
+from typing import ClassVar
 
 
 @dataclass(frozen=True)
@@ -38,7 +19,6 @@ class TwoConics:
     """
 
     kind: ClassVar[str] = "two_conics"
-    sag: ClassVar[Any] = staticmethod(_sag)
 
     conic_constants: tuple[float, float]
 

@@ -5,7 +5,7 @@ plane between the halves, for the posterior half.
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from estimator.optics.dispersion import Dispersion
 from estimator.optics.gradients.polynomial import DEFAULT_STEPS, PolynomialGradient
@@ -23,7 +23,7 @@ class GoncharovDaintyGradient:
     """
 
     kind: ClassVar[str] = "goncharov_dainty"
-    index: ClassVar[Any] = staticmethod(PolynomialGradient.index)
+    index: ClassVar[str] = PolynomialGradient.index
 
     coefficients: tuple[float, float, float, float, float, float, float]
     reference_wavelength_nm: float = 555.0

@@ -2,21 +2,9 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from numba import njit
-
-from estimator.optics.gradients.polynomial import (
-    DEFAULT_STEPS,
-    polynomial,
-    polynomial_numbers,
-)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _index(media, start, x, y, z):
-    squared, sx, sy, sz = polynomial(media, start, x, y, z)
-    return squared, 0.5 * sx, 0.5 * sy, 0.5 * sz
+from estimator.optics.gradients.polynomial import DEFAULT_STEPS, polynomial_numbers
 
 
 @dataclass(frozen=True)
@@ -30,11 +18,11 @@ class SquaredPolynomialGradient:
     coefficients : tuple of tuples, mm^-(2i+j)
         Row i holds m_i0, m_i1, ...
     steps : int
-        Number of integration steps; see `gradient_kernels`.
+        Number of integration steps; see `native/source/gradients.h`.
     """
 
     kind: ClassVar[str] = "squared_polynomial_gradient"
-    index: ClassVar[Any] = staticmethod(_index)
+    index: ClassVar[str] = "squared_polynomial"
 
     coefficients: tuple[tuple[float, ...], ...]
     steps: int = DEFAULT_STEPS

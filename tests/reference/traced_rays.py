@@ -1,8 +1,9 @@
-"""Rays through an eye by SciPy's DOP853 on the ray equation.
+"""Twin of the ray tracer in C: rays through all forms and gradients, one at a time.
 
-d/ds(n dr/ds) = grad n is integrated with rtol 1e-12; surfaces are events, where rays
-are refracted by Snell's law.  This file repeats the formulas of sags and indices and
-shares no code with the tracer; slopes come from complex steps, exact to rounding.
+In a gradient, SciPy's DOP853 integrates d/ds(n dr/ds) = grad n with rtol 1e-12;
+surfaces are events, where rays are refracted by Snell's law.  This file repeats the
+formulas of sags and indices and shares no code with the tracer; slopes come from
+complex steps, exact to rounding.
 """
 
 import math
@@ -10,13 +11,13 @@ import math
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from estimator.optics.forms.even_asphere import EvenAsphere
-from estimator.optics.forms.two_conics import TwoConics
+from estimator.optics.forms import EvenAsphere, SeparateProfiles, Toroid, TwoConics
 from estimator.optics.gradients.goncharov_dainty import GoncharovDaintyGradient
 from estimator.optics.gradients.polynomial import PolynomialGradient
 from estimator.optics.gradients.squared_polynomial import SquaredPolynomialGradient
 from estimator.optics.media import refractive_index
-from estimator.optics.surfaces import Retina, rotation_matrix
+from estimator.optics.surfaces import Retina, Surface, rotation_matrix
+from estimator.optics.zernike import nm_from_index
 
 _STEP = 1e-30
 
@@ -35,17 +36,55 @@ def sag_mm(surface, x, y):
     if isinstance(surface, Retina):
         rx, ry = -abs(rx), -abs(ry)
     kx = ky = surface.conic_constant
-    if isinstance(surface.form, TwoConics):
+    if isinstance(surface.form, (TwoConics, SeparateProfiles)):
         kx, ky = surface.form.conic_constants
-    radicand = 1.0 - (1.0 + kx) * x**2 / rx**2 - (1.0 + ky) * y**2 / ry**2
-    # Steps of an integration may leave the surface's domain; no result does.
-    root = np.sqrt(radicand) if np.real(radicand) > 0.0 else 0.0
-    total = (x**2 / rx + y**2 / ry) / (1.0 + root)
+    if isinstance(surface.form, Toroid):
+        near = rx - _profile(y, ry, ky)
+        total = rx - np.sign(rx) * np.sqrt(near**2 - x**2)
+    elif isinstance(surface.form, SeparateProfiles):
+        total = _profile(x, rx, kx) + _profile(y, ry, ky)
+    else:
+        radicand = 1.0 - (1.0 + kx) * x**2 / rx**2 - (1.0 + ky) * y**2 / ry**2
+        # Steps of an integration may leave the surface's domain; no result does.
+        root = np.sqrt(radicand) if np.real(radicand) > 0.0 else 0.0
+        total = (x**2 / rx + y**2 / ry) / (1.0 + root)
     if isinstance(surface.form, EvenAsphere):
         r2 = x**2 + y**2
         for power, coefficient in enumerate(surface.form.coefficients, start=1):
             total = total + coefficient * r2**power
+    if isinstance(surface, Surface) and surface.offset_mm is not None:
+        rho = surface.offset_radius_mm
+        total = total + _offset(surface.offset_mm, x / rho, y / rho)
     return total
+
+
+def _profile(x, radius, conic):
+    return x**2 / radius / (1.0 + np.sqrt(1.0 - (1.0 + conic) * x**2 / radius**2))
+
+
+def _offset(terms, x, y):
+    """Sum of unnormalized Zernike terms, OSA order."""
+    total = 0.0
+    for j in np.flatnonzero(terms):
+        n, m = nm_from_index(j)
+        powers = [
+            (-1) ** k
+            * math.comb(n - k, k)
+            * math.comb(n - 2 * k, (n - abs(m)) // 2 - k)
+            * (x**2 + y**2) ** ((n - abs(m)) // 2 - k)
+            for k in range((n - abs(m)) // 2 + 1)
+        ]
+        turns = _solid_harmonic(x, y, abs(m))[0 if m >= 0 else 1]
+        total = total + terms[j] * sum(powers) * turns
+    return total
+
+
+def _solid_harmonic(x, y, m):
+    """r^m cos(m t) and r^m sin(m t), which may be complex."""
+    real, imaginary = 1.0, 0.0
+    for _ in range(m):
+        real, imaginary = real * x - imaginary * y, real * y + imaginary * x
+    return real, imaginary
 
 
 def _normal(surface, x, y):

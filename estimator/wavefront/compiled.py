@@ -1,0 +1,295 @@
+"""Calls of the compiled tracer for fields of many packed eyes.
+
+A field has an eye, an index row and a direction.  Its chief ray is traced from air
+through the center of the stop to the retina.  From its retinal point, rays are traced
+out of the eye (Algorithm 1 of the paper), through nodes of the stop or of a circle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from estimator.native import core, shared_threads
+from estimator.native.records import WavefrontJob, pointer_to
+from estimator.optics.packed import N_COLUMNS
+from estimator.optics.surfaces import EyeSurfaces, check_eye, pack_eye
+from estimator.optics.zernike import N_TERMS, monomial_matrix
+from estimator.threads import MAX_THREADS
+from estimator.wavefront.nodes import CircleNodes, Nodes
+
+# --- columns of a result row, after the coefficients ---
+RADIUS = 0
+ELLIPSE = 1
+N_ELLIPSE = 5
+RMS = ELLIPSE + N_ELLIPSE
+OPEN_SHARE = RMS + 1  # unvignetted fraction of the stop's area
+CHIEF_STATUS = OPEN_SHARE + 1
+WORST_STATUS = CHIEF_STATUS + 1
+RETINA_POINT = WORST_STATUS + 1
+PLANE_POINT = RETINA_POINT + 3
+N_OTHER = PLANE_POINT + 3
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Fields (n,) of packed eyes.
+
+    Attributes
+    ----------
+    packed : (n_eyes, n_surfaces + 1, N_COLUMNS)
+        Stacked results of `surfaces.pack_eye`.
+    indices : (n_rows, n_indices)
+        Index rows, see `surfaces.media_indices`.
+    eyes, rows : (n,) int
+        Eye and index row of each field.
+    directions_rad : (n, 2)
+        Azimuth h and elevation v.
+    """
+
+    packed: NDArray[np.float64]
+    indices: NDArray[np.float64]
+    eyes: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    directions_rad: NDArray[np.float64]
+
+    @classmethod
+    def of_eyes(
+        cls,
+        packed: NDArray[np.float64],
+        indices: NDArray[np.float64],
+        directions_rad: NDArray[np.float64],
+    ) -> Fields:
+        """Return a field (h, v) of each eye; ``indices`` is (n,) or (n_eyes, n)."""
+        packed = np.ascontiguousarray(packed, dtype=np.float64)
+        eyes = np.arange(len(packed))
+        rows = np.ascontiguousarray(np.atleast_2d(indices), dtype=np.float64)
+        own = eyes if np.ndim(indices) == 2 else np.zeros_like(eyes)
+        return cls(packed, rows, eyes, own, directions_rad)
+
+    @classmethod
+    def of_grid(
+        cls,
+        packed: NDArray[np.float64],
+        indices: NDArray[np.float64],
+        directions_rad: NDArray[np.float64],
+    ) -> Fields:
+        """Return all combinations of eye, direction and index row, in this order.
+
+        ``indices`` is (n_eyes, n_rows, n), ``directions_rad`` (n_directions, 2).
+        """
+        n_eyes, n_rows, _ = indices.shape
+        shape = (n_eyes, len(directions_rad), n_rows)
+        eyes, directions, rows = np.indices(shape).reshape(3, -1)
+        return cls(
+            packed,
+            np.ascontiguousarray(indices.reshape(n_eyes * n_rows, -1)),
+            eyes,
+            eyes * n_rows + rows,
+            directions_rad[directions],
+        )
+
+
+class _Job:
+    """A record for the compiled code, and the arrays that it points to."""
+
+    def __init__(self, fields: Fields, threads: int):
+        n_eyes, n_rows, n_columns = fields.packed.shape
+        if n_columns != N_COLUMNS:
+            raise ValueError(f"{n_columns} columns of packed eyes: must be {N_COLUMNS}")
+        for name, places, count in (
+            ("eye", fields.eyes, n_eyes),
+            ("index row", fields.rows, len(fields.indices)),
+        ):
+            if places.size and not 0 <= places.min() <= places.max() < count:
+                raise ValueError(f"{name} {places.max()}: there are {count}")
+        self.record = WavefrontJob(
+            threads=threads,
+            count=len(fields.eyes),
+            n_rows=n_rows,
+            n_indices=fields.indices.shape[1],
+        )
+        self._kept: list[NDArray[Any]] = []
+        self.set("packed", fields.packed, fields.packed.shape)
+        self.set("indices", fields.indices, fields.indices.shape)
+        self.set("eyes", fields.eyes, fields.eyes.shape, np.int64)
+        self.set("index_rows", fields.rows, fields.eyes.shape, np.int64)
+        self.set("fields_rad", fields.directions_rad, (len(fields.eyes), 2))
+
+    def set(
+        self,
+        name: str,
+        values: ArrayLike,
+        shape: tuple[int, ...],
+        dtype: type = np.float64,
+    ) -> None:
+        """Point to values, broadcast to a shape."""
+        array: NDArray[Any] = np.ascontiguousarray(
+            np.broadcast_to(values, shape), dtype=dtype
+        )
+        self._kept.append(array)
+        setattr(self.record, name, pointer_to(array))
+
+    def set_nodes(self, nodes: Nodes | CircleNodes, n_terms: int) -> None:
+        rings, weights, azimuths = nodes[:3]
+        self.set("rings", rings, rings.shape)
+        self.set("ring_weights", weights, rings.shape)
+        self.set("azimuths", azimuths, (len(azimuths), 2))
+        self.set("monomials", monomial_matrix(n_terms), (n_terms, n_terms))
+        self.record.n_rings, self.record.n_azimuths = len(rings), len(azimuths)
+        self.record.n_terms = n_terms
+
+    def run(self, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
+        """Call a function that fills results of a shape."""
+        results = np.empty(shape)
+        self.record.results = pointer_to(results)
+        if core().call(name, self.record):
+            raise MemoryError("no memory for wavefronts")
+        return results
+
+
+def packed_eyes(eyes: Sequence[EyeSurfaces]) -> NDArray[np.float64]:
+    """Return eyes (n_eyes, n_surfaces + 1, N_COLUMNS), packed and stacked.
+
+    Raises
+    ------
+    ValueError
+        An eye cannot be traced, or they have different numbers of surfaces.
+    """
+    counts = {len(eye.surfaces) for eye in eyes}
+    if len(counts) != 1:
+        raise ValueError(f"eyes with {sorted(counts)} surfaces: must have as many each")
+    for eye in eyes:
+        check_eye(eye)
+    return np.stack([pack_eye(eye) for eye in eyes])
+
+
+@contextmanager
+def _threads(count: int | None) -> Iterator[int]:
+    """Yield a handle of the thread pool for loops on ``count`` threads, or on all."""
+    if not count:
+        yield shared_threads()
+        return
+    handle = core().new_threads(min(count, MAX_THREADS))
+    try:
+        yield handle
+    finally:
+        core().end_threads(handle)
+
+
+def stop_rows(
+    fields: Fields,
+    *,
+    stop_radii_mm: NDArray[np.float64],
+    pupil_z_mm: ArrayLike,
+    nodes: Nodes,
+    at_pupil: bool,
+    by_slopes: bool,
+    object_dpt: float = 0.0,
+    n_terms: int = N_TERMS,
+    n_threads: int | None = None,
+) -> NDArray[np.float64]:
+    """Return result rows (n, n_stops, n_terms + N_OTHER) of wavefronts over the stop.
+
+    Parameters
+    ----------
+    stop_radii_mm : (n, n_stops)
+    pupil_z_mm : (n,)
+        z of the entrance pupil.
+    nodes : tuple
+        See `nodes.stop_nodes`.
+    at_pupil : bool
+        The plane of the wavefront is that of the entrance pupil where its z is not nan,
+        and otherwise at the cornea.
+    by_slopes : bool
+        Fit the slopes of W instead of W.
+    object_dpt : float
+        Vergence of the source, measured from the entrance pupil along the chief ray.
+    """
+    count, n_stops = stop_radii_mm.shape
+    with _threads(n_threads) as threads:
+        job = _Job(fields, threads)
+        job.set("radii_mm", stop_radii_mm, (len(fields.eyes), n_stops))
+        job.set("pupil_z_mm", pupil_z_mm, (count,))
+        job.set_nodes(nodes, n_terms)
+        job.record.n_radii, job.record.object_dpt = n_stops, object_dpt
+        job.record.at_pupil, job.record.by_slopes = at_pupil, by_slopes
+        return job.run("trace_pupils", (count, n_stops, n_terms + N_OTHER))
+
+
+def circle_zernike(
+    fields: Fields,
+    *,
+    radii_mm: ArrayLike,
+    pupil_z_mm: ArrayLike,
+    nodes: CircleNodes,
+    n_threads: int | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return coefficients (n, n_terms) on circles outside the eye, and statuses (n,).
+
+    Measurements, with which the estimation compares eyes, are given on a circle about
+    the chief ray.
+
+    Parameters
+    ----------
+    radii_mm : (n,)
+    pupil_z_mm : (n,)
+        z of the point of the chief ray in the plane of the circle; nan: the cornea.
+    nodes : tuple
+        See `nodes.circle_nodes`; its projection sets the number of terms.
+
+    Returns
+    -------
+    zernike_um : (n, n_terms)
+        nan if the chief ray or most of the other rays fail.
+    status : (n,) int
+        Worst ray status; failed rays are excluded from the fit.
+    """
+    count, n_terms = len(fields.eyes), len(nodes[3])
+    with _threads(n_threads) as threads:
+        job = _Job(fields, threads)
+        job.set("radii_mm", radii_mm, (count,))
+        job.set("pupil_z_mm", pupil_z_mm, (count,))
+        job.set_nodes(nodes, n_terms)
+        n_nodes = job.record.n_rings * job.record.n_azimuths
+        job.set("projection", nodes[3], (n_terms, n_nodes))
+        rows = job.run("trace_circles", (count, n_terms + 1))
+    return rows[:, :n_terms], rows[:, n_terms].astype(np.int64)
+
+
+def chief_shifts(fields: Fields, reference_rows: ArrayLike) -> NDArray[np.float64]:
+    """Return the shifts (n, 2) of chief rays, as direction cosines; nan if one fails.
+
+    ``reference_rows`` (n,) are the index rows at the reference wavelength.
+    """
+    job = _Job(fields, shared_threads())
+    job.set("reference_rows", reference_rows, fields.rows.shape, np.int64)
+    return job.run("trace_shifts", (len(fields.eyes), 2))
+
+
+def magnifications(
+    packed: NDArray[np.float64], indices: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the magnification (n_eyes,) of the entrance pupils of packed eyes.
+
+    It is parabasal, about the axial chief ray: the geometric mean of both principal
+    meridians; nan if no axial ray passes the center of the stop.
+
+    Parameters
+    ----------
+    packed : (n_eyes, n_surfaces + 1, N_COLUMNS)
+    indices : (n,) or (n_eyes, n)
+        Index rows, see `surfaces.media_indices`.
+    """
+    packed = np.ascontiguousarray(packed)
+    indices = np.ascontiguousarray(indices)
+    step, found = 0, np.empty(len(packed))
+    if indices.ndim == 2:
+        step = indices.shape[1]
+    core().call("magnifications", packed, *packed.shape[:2], indices, step, found)
+    return found
