@@ -212,7 +212,7 @@ def test_an_aperture_of_a_plane_within_the_eye_clips_rays(tmp_path):
     assert depths_mm == pytest.approx([0.0, 3.7, 7.6, 8.1])
     assert [s.clear_radius_mm for s in eye.surfaces] == [math.inf] * 2 + [1.5, math.inf]
     path = written(tmp_path, changes={"dummy": ["CLAP 0 2 0"]})
-    with pytest.raises(InvalidFile, match="surface 1 .*is an aperture in front of"):
+    with pytest.raises(InvalidFile, match=r"surface 1 .*is an aperture in front of"):
         load_profile(path)
 
 
