@@ -260,6 +260,9 @@ MAP_ROUNDING_PX = 1e-4
 MIN_SPREAD_PX = 1e-9
 """Spread of kernels that are empty."""
 
+DEPTH_SQUARE_PX = 16
+"""Edge of the squares of pixels whose nearest depth bounds the search for occluders."""
+
 MAX_REACH_PX = 255
 """Reaches are stored in one byte per side; light that a map moves farther is lost."""
 

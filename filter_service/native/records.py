@@ -202,6 +202,72 @@ class RecipeJob(c.Structure):
     )
 
 
+class VisibilityJob(c.Structure):
+    """Job that finds what sources see; `source/edge_job.h` documents the fields."""
+
+    _fields_ = (
+        ("threads", POINTER),
+        ("x_px", POINTER),
+        ("y_px", POINTER),
+        ("object_dpt", POINTER),
+        ("kinds", POINTER),
+        ("is_hidden", POINTER),
+        ("shift_px", POINTER),
+        ("depth_m", POINTER),
+        ("tangents", POINTER),
+        ("nearest_dpt", POINTER),
+        ("seen", POINTER),
+        ("largest_dpt", c.c_double),
+        ("height", c.c_int64),
+        ("width", c.c_int64),
+        ("rows", c.c_int64),
+        ("columns", c.c_int64),
+        ("count", c.c_int64),
+    )
+
+
+class OmittedJob(c.Structure):
+    """Job that finds where kernels end; `source/edge_job.h` documents the fields."""
+
+    _fields_ = (
+        ("threads", POINTER),
+        ("tables", StoreTables),
+        ("reads", StateReads),
+        ("nodes", POINTER),
+        ("weight_ratio", POINTER),
+        ("layer_dpt", POINTER),
+        ("layer_ratio", POINTER),
+        ("zero_dpt", POINTER),
+        ("maps", POINTER),
+        ("reach_px", POINTER),
+        ("omitted", POINTER),
+        ("side", c.c_int64),
+        ("count", c.c_int64),
+    )
+
+
+class LightJob(c.Structure):
+    """Job that computes light around sources; see `source/edge_job.h`."""
+
+    _fields_ = (
+        ("threads", POINTER),
+        ("share_ratio", POINTER),
+        ("rho_index", POINTER),
+        ("phi_index", POINTER),
+        ("polar", POINTER),
+        ("edges", POINTER),
+        ("kernel_kind", POINTER),
+        ("seen", POINTER),
+        ("radius_px", POINTER),
+        ("omitted", POINTER),
+        ("kernels", POINTER),
+        ("n_phi", c.c_int64),
+        ("n_fine", c.c_int64),
+        ("side", c.c_int64),
+        ("count", c.c_int64),
+    )
+
+
 class SizeJob(c.Structure):
     """Job that plans kernels; `source/kernel_job.h` documents the fields."""
 
@@ -276,6 +342,9 @@ SIZES = (
     FRAGMENT_LIGHT.itemsize,
     c.sizeof(RecipeJob),
     c.sizeof(SizeJob),
+    c.sizeof(VisibilityJob),
+    c.sizeof(OmittedJob),
+    c.sizeof(LightJob),
     c.sizeof(NodeJob),
 )
 """Expected result of `ocu_sizes`."""

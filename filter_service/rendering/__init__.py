@@ -41,8 +41,8 @@ bright_pixels    pixels much brighter than white
 pupil_edges      edges of the pupils of a store's nodes
 edge_kinds       kinds of bright pixels, and the edges that send their light
 edge_light       light of bright pixels beyond their kernels
-edge_light_loops  compiled loops of edge_light and edge_kinds
-visibility_loops  compiled loops: which points of the pupil see a pixel
+light_planes     addition of their light to images
+visibility       which points of the pupil's edge see a source
 haze             straylight of the ocular media
 spectacles       spectacle magnification
 plan_once        warm-up of frame planning

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.psf.tables import N_EDGE
-from filter_service.constants import RGB
 from filter_service.planning.grid import GREEN
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.bright_pixels import BrightPixels
@@ -239,10 +238,9 @@ class EdgeElements:
 
     Attributes
     ----------
-    elements : (n, 3, 8, N_EDGE + 1), float32
+    elements : (n, 3, 8, N_EDGE), float32
         x and y of slopes, tangents and normals, lengths times the strength of the
-        light, and sines of the angle to the next tangent.  The first element is
-        repeated at the end.
+        light, and sines of the angle to the next tangent.
     shift_px : (n, N_EDGE, 2)
         Displacement of rays to the elements, per diopter.
     """
@@ -253,24 +251,7 @@ class EdgeElements:
     @classmethod
     def of(cls, state: EyeAtFrame, kinds: SourceKinds) -> EdgeElements:
         """Blend the edges of the store's nodes, as its kernels are blended."""
-        from filter_service.rendering.edge_light_loops import blend_edges
-
-        layers, image, store = state.layers, state.image, state.handle.store
-        nodes, n = image.nodes[kinds.cell], kinds.cell.size
-        groups = (layers.reads.groups + nodes[..., None]).ravel()
-        slope_px = np.zeros((n, RGB, N_EDGE, 2))
-        half, edge_um = np.zeros((n, RGB, 2, 2)), np.zeros((n, RGB))
-        shift, center = np.zeros((n, 2, 2)), np.zeros((n, 2))
-        maps = image.maps.tables
-        blend_edges(
-            store.tables,
-            layers.reads,
-            state.handle.edges.of(groups),
-            (maps.node_from_cell, maps.cell_from_node),
-            (kinds.cell, nodes, image.weight_ratio[kinds.cell], kinds.layer_dpt),
-            layers.layer_zero_dpt,
-            (slope_px, half, edge_um, shift, center),
-        )
+        slope_px, half, edge_um, shift, center = _blended(state, kinds)
         angle = 2.0 * np.pi * np.arange(N_EDGE) / N_EDGE
         disc = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         along = np.einsum("kcij,mj->kcmi", half, disc[:, ::-1] * [-1.0, 1.0])
@@ -284,9 +265,49 @@ class EdgeElements:
         turn = tangent[..., 0] * after[..., 1] - tangent[..., 1] * after[..., 0]
         scalars = np.stack([length, turn], axis=-1)
         rows = np.concatenate([slope_px, tangent, normal, scalars], axis=-1)
-        elements = np.concatenate([rows, rows[:, :, :1]], axis=2)
         in_pupil = np.einsum("kij,mj->kmi", half[:, GREEN], disc)
         return cls(
-            np.ascontiguousarray(np.swapaxes(elements, 2, 3), np.float32),
+            np.ascontiguousarray(np.swapaxes(rows, 2, 3), np.float32),
             np.einsum("kij,kmj->kmi", shift, in_pupil) + center[:, None],
         )
+
+
+def _blended(state: EyeAtFrame, kinds: SourceKinds) -> tuple[NDArray[np.float64], ...]:
+    """Blend the edges of nodes over field, pupil and accommodation.
+
+    Returns
+    -------
+    slope_px : (n, 3, N_EDGE, 2)
+    half_um_per_px : (n, 3, 2, 2)
+    edge_light_um : (n, 3)
+    shift_px_per_um : (n, 2, 2)
+    center_px_per_dpt : (n, 2)
+        See `EdgeTables`, in pixels of the image.
+    """
+    layers, image, tables = state.layers, state.image, state.handle.store.tables
+    reads, maps = layers.reads, image.maps.tables
+    nodes = image.nodes[kinds.cell]
+    groups = reads.groups + nodes[..., None]  # (n, 3, corners)
+    edges = state.handle.edges.of(groups.ravel())
+    first, last = tables.starts[groups], tables.starts[groups + 1] - 1
+    low_dpt, high_dpt = tables.values_dpt[first], tables.values_dpt[last]
+    moved_dpt = tables.channel_shift_dpt[groups]  # (n, 3, corners, channels)
+    wanted_dpt = kinds.layer_dpt[:, None, None] + layers.layer_zero_dpt[nodes]
+    wanted_dpt = wanted_dpt[:, :, None] * reads.scales[:, None] - moved_dpt
+    total_dpt = np.clip(wanted_dpt, low_dpt[..., None], high_dpt[..., None]) + moved_dpt
+    slope_px = edges.slope_px[groups]
+    slope_px += total_dpt[..., None, None] * edges.slope_px_per_dpt[groups]
+    weight = image.weight_ratio[kinds.cell][..., None] * reads.weights
+    scaled = weight * reads.scales
+    into, back = maps.node_from_cell[kinds.cell], maps.cell_from_node[kinds.cell]
+    half = np.einsum("kjc,kjcmab->kjmab", scaled, edges.half_um_per_px[groups])
+    shift = np.einsum("kjc,kjcab->kjab", weight, edges.shift_px_per_um[groups])
+    center = np.einsum("kjc,kjca->kja", scaled, edges.center_px_per_dpt[groups])
+    of_node = np.einsum("kjc,kjcmsa->kjmsa", weight, slope_px)
+    return (
+        np.einsum("kjra,kjmsa->kmsr", back, of_node),
+        np.einsum("kjar,kjmab->kmrb", into, half),
+        np.einsum("kjc,kjcm->km", weight, edges.edge_light_um[groups]),
+        (back @ shift @ np.swapaxes(back, 2, 3)).sum(axis=1),
+        np.einsum("kjra,kja->kr", back, center),
+    )

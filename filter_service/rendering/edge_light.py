@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from estimator.native import shared_threads
 from estimator.psf.tables import N_EDGE
 from filter_service.constants import RGB
-from filter_service.native import loops
+from filter_service.native import loops, records
+from filter_service.native.records import pointers
 from filter_service.rendering.bright_pixels import BrightPixels
 from filter_service.rendering.edge_kinds import EdgeElements, EyeAtFrame, SourceKinds
 from filter_service.rendering.engine import FrameEngine, ViewRequest
@@ -32,7 +33,8 @@ from filter_service.rendering.frame_kernels import (
     frame_kernels,
     interval_count,
 )
-from filter_service.rendering.haze import run_in_threads
+from filter_service.rendering.light_planes import add_plane, add_sources
+from filter_service.rendering.visibility import seen_by_edges
 from filter_service.rgbd_view import RgbdView
 
 N_PHI = 32
@@ -75,12 +77,6 @@ treated as seen by the entire pupil, with less light."""
 MAX_NEAR_PRODUCTS = 6_000_000
 """Products per channel that pixel-by-pixel light may take; if there are more, sources
 are merged in squares of 3, 9 or 27 pixels."""
-
-
-def add_plane(coarse: NDArray[np.float32], image: NDArray[np.float32]) -> None:
-    """Add light on pixels of twice the size, interpolated, to an image (h, w, 3)."""
-    sizes = coarse.shape[:2], image.shape[:2]
-    loops().call("add_plane", shared_threads(), coarse, *sizes[0], image, *sizes[1])
 
 
 @lru_cache(maxsize=1)
@@ -223,7 +219,8 @@ class EdgeLight:
 
         The first kernels are those of kinds that the entire pupil sees.
         """
-        seen, of_source = self._seen_by_edges(view), self._kinds.of_source
+        of_source = self._kinds.of_source
+        seen = seen_by_edges(view, self._pixels, of_source, self._edges.shift_px)
         light, kernel = self._pixels.light.copy(), of_source.copy()
         n = self._kinds.cell.size
         self._kernel_kind = np.arange(n)
@@ -250,55 +247,22 @@ class EdgeLight:
         order = sources[np.argsort(kernel[sources], kind="stable")]
         return order, kernel[order], light[order]
 
-    def _seen_by_edges(self, view: RgbdView) -> NDArray[np.float32]:
-        """Return which elements (n, N_EDGE) of the edge see sources."""
-        from filter_service.rendering.visibility_loops import (
-            SQUARE_PX,
-            least_in_squares,
-            visible_edges,
-        )
-
-        depth_m = np.ascontiguousarray(view.depth_m)
-        shape = tuple(-(-n // SQUARE_PX) for n in depth_m.shape)
-        least_bits = np.empty(shape, np.int32)
-        run_in_threads(least_in_squares, shape[0], depth_m.view(np.int32), least_bits)
-        nearest_dpt = 1.0 / least_bits.view(np.float32).astype(np.float64)
-        x_px, y_px = self._pixels.source_at_px.T
-        tangents = view.tangents if view.depth_kind == "planar" else (math.nan,) * 4
-        seen = np.empty((x_px.size, N_EDGE), np.float32)
-        run_in_threads(
-            visible_edges,
-            x_px.size,
-            (
-                x_px.copy(),
-                y_px.copy(),
-                self._pixels.object_dpt,
-                self._kinds.of_source,
-                self._pixels.source_surface > 0,
-            ),
-            self._edges.shift_px,
-            (depth_m, np.array(tangents)),
-            nearest_dpt,
-            seen,
-        )
-        return seen
-
     def _tables(self) -> NDArray[np.float32]:
         """Return the distant light (n, N_PHI, n_fine, 3) of all kernels."""
-        from filter_service.rendering.edge_light_loops import fill_polar
-
         n = self._kernel_kind.size
         fine = FINE * (RHO_PX.size - 1) + 1
         found = np.empty((n, N_PHI, fine, RGB), np.float32)
-        run_in_threads(
-            fill_polar,
-            n * N_PHI,
-            self._edges.elements,
-            self._kernel_kind,
-            self._seen,
-            RHO_PX.astype(np.float32),
-            _directions(),
-            found,
+        loops().call(
+            "fill_polar",
+            *(shared_threads(), self._edges.elements, self._kernel_kind, self._seen, n),
+            *(
+                RHO_PX.astype(np.float32),
+                RHO_PX.size,
+                _directions(),
+                N_PHI,
+                FINE,
+                found,
+            ),
         )
         return found
 
@@ -320,42 +284,45 @@ class EdgeLight:
 
     def _near_kernels(self, radius_px: int) -> NDArray[np.float32]:
         """Return the kernels (n, side, side, 3) of light near a source."""
-        from filter_service.rendering.edge_light_loops import omitted_ratio
-
         state, kinds = self._state, self._kinds
         layers, image = state.layers, state.image
         places = _places(0.0, radius_px, 1)
         own = np.flatnonzero(self._radius_px == radius_px)
         omitted = np.empty((own.size, RGB, *places[0].shape), np.float32)
-        steps_dpt = layers.layer_dpt
-        for i, kind in enumerate(own.tolist()):
-            cell, interval = kinds.cell[kind], int(kinds.interval[kind])
-            upper = min(interval + 1, steps_dpt.size - 1)
-            part = kinds.part_ratio[kind]
-            omitted_ratio(
-                state.handle.store.tables,
-                layers.reads,
-                (
-                    image.nodes[cell],
-                    image.weight_ratio[cell],
-                    steps_dpt[[interval, upper]],
-                    np.array([1.0 - part, part]),
-                ),
-                layers.layer_zero_dpt,
-                self._maps[kind],
-                int(self._end_px[kind]),
-                omitted[i],
-            )
+        cells, lower = kinds.cell[own], kinds.interval[own]
+        upper = np.minimum(lower + 1, layers.layer_dpt.size - 1)
+        part = kinds.part_ratio[own]
+        arrays = {
+            "nodes": image.nodes[cells].astype(np.int64),
+            "weight_ratio": image.weight_ratio[cells],
+            "layer_dpt": layers.layer_dpt[np.stack([lower, upper], axis=-1)],
+            "layer_ratio": np.stack([1.0 - part, part], axis=-1),
+            "zero_dpt": np.ascontiguousarray(layers.layer_zero_dpt),
+            "maps": self._maps[own],
+            "reach_px": self._end_px[own],
+            "omitted": omitted,
+        }
+        tables = state.handle.store.tables
+        job = records.OmittedJob(
+            threads=shared_threads(),
+            tables=records.StoreTables(**pointers(**tables._asdict())),
+            reads=records.StateReads(
+                **pointers(**layers.reads._asdict()), count=layers.reads.groups.size
+            ),
+            side=len(places[0]),
+            count=own.size,
+            **pointers(**arrays),
+        )
+        loops().call("fill_omitted", job)
         kernels = self._kernels_with(radius_px)
-        index = np.searchsorted(own, self._kernel_kind[kernels]).astype(np.int64)
-        return self._filled(kernels, places, omitted, index)
+        index = np.searchsorted(own, self._kernel_kind[kernels])
+        return self._filled(kernels, places, omitted[index])
 
     def _filled(
         self,
         own: NDArray[np.int64],
         places: tuple[NDArray[np.float32], ...],
-        omitted: NDArray[np.float32],
-        index: NDArray[np.int64],
+        omitted: NDArray[np.float32] | None = None,
     ) -> NDArray[np.float32]:
         """Return kernels (n, side, side, 3) of light for some of the kernels (n,).
 
@@ -365,22 +332,30 @@ class EdgeLight:
             Which kernels.
         places : 3 of (side, side)
             See `_places`.
-        omitted : (k, 3, side, side)
-            Share of kernels that ends before each pixel; empty for distant light.
-        index : (n,)
-            Row of ``omitted`` of each kernel.
+        omitted : (n, 3, side, side), optional
+            Share of kernels that ends before each pixel; none for distant light.
         """
-        from filter_service.rendering.edge_light_loops import fill_kernels
-
         side, kind = len(places[0]), self._kernel_kind[own]
-        near = (
-            *(self._edges.elements, kind, self._seen[own], self._exact_px[kind]),
-            *(omitted, index),
-        )
         found = np.empty((own.size, side, side, RGB), np.float32)
-        run_in_threads(
-            fill_kernels, own.size * side, places, self._polar[own], near, found
+        arrays = {
+            **dict(zip(("share_ratio", "rho_index", "phi_index"), places, strict=True)),
+            "polar": self._polar[own],
+            "edges": self._edges.elements,
+            "kernel_kind": kind,
+            "seen": self._seen[own],
+            "radius_px": self._exact_px[kind],
+            **({} if omitted is None else {"omitted": omitted}),
+            "kernels": found,
+        }
+        job = records.LightJob(
+            threads=shared_threads(),
+            n_phi=N_PHI,
+            n_fine=self._polar.shape[2],
+            side=side,
+            count=own.size,
+            **pointers(**arrays),
         )
+        loops().call("fill_light", job)
         return found
 
     def _dimmed(self, view: RgbdView) -> RgbdView:
@@ -442,10 +417,7 @@ class EdgeLight:
                         shape = tuple(-(-n // pitch_px) for n in color.shape[:2])
                         planes[pitch_px] = np.zeros((*shape, RGB), np.float32)
                     places = _places(inner_px, 2.0 * inner_px, pitch_px)
-                    none = np.empty((1, RGB, 0, 0), np.float32)
-                    kernels = self._filled(
-                        own, places, none, np.zeros(own.size, np.int64)
-                    )
+                    kernels = self._filled(own, places)
                     number = np.searchsorted(own, self._far_kernel[self._kernel])
                     self._add_grid(planes[pitch_px], here, number, kernels, pitch_px)
                 inner_px, pitch_px = 2.0 * inner_px, 2 * pitch_px
@@ -486,24 +458,16 @@ class EdgeLight:
         """
         order = np.flatnonzero(here)
         order = order[np.argsort(number[order], kind="stable")]
-        height, width = self._pixels.size_px
-        shape = tuple(-(-n // pitch_px) + 2 for n in (height, width))
-        most = 4 * order.size  # each source is divided between four pixels
-        at, kernel = np.empty((most, 2), np.int64), np.empty(most, np.int64)
-        light = np.zeros((most, RGB), np.float32)
-        count = loops().call(
-            "gather_points",
+        add_sources(
+            plane,
             self._pixels.source_px[self._sources[order]],
-            *(number[order], self._light[order], order.size),
-            *(pitch_px, pitch_px > self._pixels.edge_px),
-            *(np.full(shape, -1, np.int64), shape[1], at, kernel, light),
-        )
-        if is_image:  # centers of squares of an odd number of pixels
-            at[:count] = pitch_px * at[:count] + pitch_px // 2
-        loops().call(
-            "add_sources",
-            *(shared_threads(), at, kernel, light, count, kernels, kernels.shape[1]),
-            *(plane, *plane.shape[:2]),
+            self._light[order],
+            number[order],
+            kernels,
+            pitch_px=pitch_px,
+            size_px=self._pixels.size_px,
+            is_split=pitch_px > self._pixels.edge_px,
+            is_image=is_image,
         )
 
     def _add_planes(

@@ -6,7 +6,7 @@ import math
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,9 @@ from filter_service.psfs.frame_layers import FrameLayers, frame_layers
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.detection import merge_spread_px
 from filter_service.rendering.image_cells import ImageCells, image_cells, stored_scale
+from filter_service.rendering.pupil_edges import PupilEdges
 from filter_service.rendering.sampled_frame import SampledFrame, missing_psfs_of
 from filter_service.settings import DEFAULT_OPTIONS, RenderOptions
-
-if TYPE_CHECKING:  # it loads numba
-    from filter_service.rendering.pupil_edges import PupilEdges
 
 LAYER_STEP_RATIOS = (0.2, 2.0)
 """Smallest and largest layer step relative to the default.  With the smallest, layers
@@ -59,8 +57,6 @@ class FrameStore:
     @cached_property
     def edges(self) -> PupilEdges:
         """Edges of the pupils of its nodes."""
-        from filter_service.rendering.pupil_edges import PupilEdges
-
         return PupilEdges(self.store)
 
     @property

@@ -11,12 +11,8 @@ as bright as its edge, so that a uniform image does not change.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -63,23 +59,6 @@ def add_haze(
         *(grid.rows.position, grid.columns.position),
         *(1.0 - grid.fraction, np.array(gain_ratio, np.float64)),
     )
-
-
-def run_in_threads(loop: Callable[..., None], count: int, *arguments: Any) -> None:
-    """Run a loop over the range from 0 to a count, split between threads."""
-    n = thread_count()
-    edges = [count * k // n for k in range(n + 1)]
-    waiting = [_pool().submit(loop, *part, *arguments) for part in pairwise(edges)]
-    for part in waiting:
-        part.result()
-
-
-@lru_cache(maxsize=1)
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(thread_count(), thread_name_prefix="haze")
-
-
-os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
 
 
 class HazeGrid:

@@ -19,10 +19,11 @@ from estimator.profiles.parse import EyeProfile
 from filter_service.constants import RGB
 from filter_service.displays import display_wavelengths_nm
 from filter_service.native import loops
-from filter_service.rendering.edge_light import EdgeLight, add_plane
+from filter_service.rendering.edge_light import EdgeLight
 from filter_service.rendering.engine import FrameEngine, Pending, ViewRequest
 from filter_service.rendering.filtered_view import FilteredView
 from filter_service.rendering.haze import add_haze
+from filter_service.rendering.light_planes import add_plane
 from filter_service.rendering.spectacles import (
     Matrix,
     seen_through,

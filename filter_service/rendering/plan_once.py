@@ -4,8 +4,6 @@ Importing numba and SciPy and loading the compiled loops takes 1 s; the service 
 after it is ready.  Compilation takes 10 s, once per machine.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from estimator.media.straylight import Straylight
@@ -13,19 +11,15 @@ from filter_service.camera import Camera
 from filter_service.constants import RGB
 from filter_service.planning.nodes import PlanAxes
 from filter_service.planning.plan import NodePlanner
-from filter_service.psfs.frame_layers import FrameLayers, frame_layers
+from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import PsfStore
-from filter_service.rendering.bright_pixels import BrightPixels
-from filter_service.rendering.edge_kinds import EyeAtFrame
-from filter_service.rendering.edge_light import EdgeLight
 from filter_service.rendering.frame import fill_missing_depth
 from filter_service.rendering.frame_kernels import (
     frame_kernels,
     interval_count,
 )
-from filter_service.rendering.frame_states import FrameStore
-from filter_service.rendering.image_cells import ImageCells, image_cells
-from filter_service.rendering.media_effects import MediaEffects, encoded
+from filter_service.rendering.image_cells import image_cells
+from filter_service.rendering.media_effects import MediaEffects
 from filter_service.rendering.perfect_eye import (
     PUPIL_MM,
     SIDE_PX,
@@ -51,24 +45,6 @@ def plan_once() -> None:
     light = np.ones((SIDE_PX, SIDE_PX, RGB), np.float32)
     view = RgbdView(light, light[..., 0].copy(), store.spec.camera.tangents)
     MediaEffects(Straylight()).apply(light, view)
-    encoded(light, "srgb8")
-    _light_edges_once(store, layers, image)
-
-
-def _light_edges_once(store: PsfStore, layers: FrameLayers, image: ImageCells) -> None:
-    """Add the light of a lamp beyond its kernel."""
-    color = np.full((SIDE_PX, SIDE_PX, RGB), 1e3, np.float32)
-    view = RgbdView(color, color[..., 0].copy(), store.spec.camera.tangents)
-    BrightPixels.of(replace(view, color=color.astype(np.float16)), 1.0)
-    pixels = BrightPixels.of(view, 1.0)
-    assert pixels is not None
-    change_dpt = layers.field.at(image.corner_h_deg, image.corner_v_deg)
-    state = EyeAtFrame(
-        FrameStore(store, image), layers, image, change_dpt.astype(np.float32)
-    )
-    light = EdgeLight(state, view, pixels, 1.0, store.fill)
-    coarse = light.add(color)
-    encoded(color, "srgb8", coarse)
 
 
 def _plan_nodes_once(store: PsfStore) -> None:

@@ -7,16 +7,14 @@ import numpy as np
 import pytest
 
 from estimator.profiles.parse import parse_profile
-from estimator.psf.survey import N_EDGE
 from filter_service import EyeFilter
 from filter_service.camera import Camera
 from filter_service.planning.plan import plan_cache
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering import bright_pixels, edge_kinds, edge_light
-from filter_service.rendering.bright_pixels import FADE_WHITE, BrightPixels
+from filter_service.rendering.bright_pixels import FADE_WHITE
 from filter_service.rendering.edge_light import EdgeLight
-from filter_service.rendering.edge_light_loops import fill_polar
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.media_effects import begin_through_media, encoded
 from filter_service.rgbd_view import RgbdView
@@ -346,50 +344,6 @@ def test_shared_kernels_and_merged_pixels_are_near_the_exact_sum(
     assert error <= 0.15 * np.sqrt(np.mean((exact - plain)[room] ** 2))
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float16])
-def test_bright_pixels_are_those_with_a_value_above_the_limit(rng, dtype):
-    color = rng.uniform(0.0, 3.0, (37, 51, 3))
-    color.reshape(-1)[rng.integers(0, color.size, 40)] = rng.uniform(3.0, 12.0, 40)
-    color[0, 0], color[-1, -1] = 9.0, [np.inf, 5.0, np.nan]
-    color[3, 4:7, 1] = np.inf, np.nan, -np.inf
-    color = color.astype(dtype)
-    view = RgbdView(color, np.ones((37, 51), np.float32), (-0.3, 0.3, 0.2, -0.2))
-    pixels = BrightPixels.of(view, 1.25)
-    brightest = np.where(np.isfinite(color), color, 0.0).astype(float).max(axis=2)
-    low, high = FADE_WHITE
-    part = np.clip((brightest / 1.25 - low) / (high - low), 0.0, 1.0)
-    y_px, x_px = np.nonzero(part)
-    np.testing.assert_array_equal(pixels.y_px, y_px)
-    np.testing.assert_array_equal(pixels.x_px, x_px)
-    share = (3.0 * part**2 - 2.0 * part**3)[y_px, x_px]
-    np.testing.assert_allclose(pixels.share_ratio, share, rtol=1e-6)
-    assert 0 < np.count_nonzero(share < 1.0) < share.size
-
-
-def test_a_pixel_without_light_is_no_source():
-    """A value that is not a number is above the limit of a view that is dark."""
-    color = np.zeros((8, 9, 3), np.float32)
-    color[2, 3], color[4, 5, 1] = 1.0, np.nan
-    view = RgbdView(color, np.ones((8, 9), np.float32), (-0.3, 0.3, 0.2, -0.2))
-    pixels = BrightPixels.of(view, 0.0)
-    assert (pixels.x_px.tolist(), pixels.y_px.tolist()) == ([3], [2])
-
-
-def test_many_bright_pixels_are_merged_with_all_their_light(rng):
-    color = np.zeros((200, 300, 3), np.float32)
-    color[20:120, 30:230] = rng.uniform(10.0, 90.0, (100, 200, 3))
-    view = RgbdView(color, np.ones((200, 300), np.float32), (-0.3, 0.3, 0.2, -0.2))
-    pixels = BrightPixels.of(view, 1.0)
-    assert pixels.light.shape[0] <= bright_pixels.MAX_SOURCES < pixels.x_px.size
-    np.testing.assert_allclose(
-        pixels.light.sum(axis=0), color.sum(axis=(0, 1), dtype=np.float64), rtol=1e-6
-    )
-    weight = color.sum(axis=2, dtype=np.float64)
-    middle = (weight * np.arange(300)).sum() / weight.sum()
-    own = pixels.light.sum(axis=1)
-    assert (pixels.source_px[:, 0] * own).sum() / own.sum() == pytest.approx(middle)
-
-
 @pytest.mark.parametrize(("diffraction", "rings"), [(False, None), (True, "rings")])
 def test_eyes_without_light_from_the_edge_alone_keep_their_kernels(diffraction, rings):
     """PSFs by rays, and ring lenses, whose steps diffract as well."""
@@ -402,41 +356,6 @@ def test_eyes_without_light_from_the_edge_alone_keep_their_kernels(diffraction, 
     )
     request = ViewRequest(view, SimpleNamespace(store=store), 4.0, 0.0, white_level=1.0)
     assert EdgeLight.of(None, request) is None
-
-
-@pytest.mark.parametrize("blur_px", [0.0, 3.0, -5.0])
-def test_the_light_of_a_round_edge_has_its_closed_form(blur_px):
-    """lambda / (2 pi^3 D rho) [1 / (rho - g)^2 + 1 / (rho + g)^2], in um and um/px."""
-    wavelength_um, radius_um_per_px = 0.55, 1.4
-    angle = 2.0 * np.pi * np.arange(N_EDGE + 1) / N_EDGE
-    normal = np.stack([np.cos(angle), np.sin(angle)])
-    tangent = np.stack([-np.sin(angle), np.cos(angle)])
-    area = np.pi * radius_um_per_px**2
-    turn = np.sin(2.0 * np.pi / N_EDGE)
-    length = radius_um_per_px * 2.0 * np.pi / N_EDGE
-    length *= wavelength_um / (4.0 * np.pi**2 * area)
-    edge = np.concatenate(
-        [
-            blur_px * normal,
-            tangent,
-            normal,
-            np.full((1, N_EDGE + 1), length),
-            np.full((1, N_EDGE + 1), turn),
-        ]
-    )
-    edges = np.broadcast_to(edge.astype(np.float32), (1, 3, 8, N_EDGE + 1)).copy()
-    rho_px = np.array([20.0, 28.0, 40.0, 160.0])
-    directions = np.stack([np.cos([0.0, 0.3, 2.0]), np.sin([0.0, 0.3, 2.0])], axis=-1)
-    polar = np.empty((1, 3, 8 * 3 + 1, 3), np.float32)
-    fill_polar(
-        *(0, 3, edges, np.zeros(1, np.int64), np.ones((1, N_EDGE), np.float32)),
-        *(rho_px.astype(np.float32), directions.astype(np.float32), polar),
-    )
-    low_px, high_px = rho_px - blur_px, rho_px + blur_px
-    exact = wavelength_um / (4.0 * np.pi**3 * radius_um_per_px * rho_px)
-    exact = exact * (1.0 / low_px**2 + 1.0 / high_px**2)
-    found = polar[0, :, ::8, 1] / rho_px**3
-    np.testing.assert_allclose(found, np.broadcast_to(exact, found.shape), rtol=0.012)
 
 
 def test_missing_depth_of_a_lamp_is_that_of_its_surroundings(engine):

@@ -168,8 +168,6 @@ HOME = {
         "estimator/wavefront/*",  # aiming and fitting
         "filter_service/rendering/reference*.py",  # twins of the passes
         "filter_service/psfs/read_loops.py",  # planning a frame
-        "filter_service/rendering/edge_light_loops.py",
-        "filter_service/rendering/visibility_loops.py",
         "clients/commands/doctor_probes.py",  # asks which threads it runs on
         "filter_service/threads.py",
     ),

@@ -28,6 +28,7 @@
 #define MIN_SHIFT_PX 0.5
 #define MIN_SHIFT_RATIO 0.1
 #define MAX_REACH_PX 255
+#define DEPTH_SQUARE_PX 16
 #define WEIGHT_MAX 65535.0
 
 #endif

@@ -2,6 +2,7 @@
 #include <stdint.h>
 
 #include "entry.h"
+#include "edge_job.h"
 #include "frame.h"
 #include "kernel_job.h"
 #include "node_job.h"
@@ -19,5 +20,8 @@ EXPORT void ocu_sizes(int32_t *sizes) {
     sizes[n++] = (int32_t)sizeof(fragment_light);
     sizes[n++] = (int32_t)sizeof(recipe_job);
     sizes[n++] = (int32_t)sizeof(size_job);
+    sizes[n++] = (int32_t)sizeof(visibility_job);
+    sizes[n++] = (int32_t)sizeof(omitted_job);
+    sizes[n++] = (int32_t)sizeof(light_job);
     sizes[n++] = (int32_t)sizeof(node_job);
 }

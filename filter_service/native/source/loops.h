@@ -26,6 +26,8 @@
 #include "layers.h"
 #include "bright_pixels.h"
 #include "planes.h"
+#include "visibility.h"
+#include "edge_light.h"
 
 static void pixels(frame *f) {
     f->missing_count = f->clamped_count = f->bad_color_count = 0;
@@ -98,6 +100,11 @@ static const named_function functions[] = {
     FUNCTION(fade_light),
     FUNCTION(merge_pixels),
     FUNCTION(dim_pixels),
+    FUNCTION(least_in_squares),
+    FUNCTION(see_sources),
+    FUNCTION(fill_polar),
+    FUNCTION(fill_light),
+    FUNCTION(fill_omitted),
     FUNCTION(gather_points),
     FUNCTION(add_sources),
     FUNCTION(add_plane),
