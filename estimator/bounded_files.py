@@ -26,7 +26,7 @@ MAX_DEPTH = 32
 """Nesting limit of JSON objects and arrays.  A glTF file has 8, a profile 4."""
 
 MAX_ITEMS = 100_000
-"""Limit of JSON values.  28 coefficients at 400 field directions are 12,000."""
+"""Limit of JSON values.  66 coefficients at 400 field directions are 27,000."""
 
 MAX_TEXT_BYTES = 8_000_000
 MAX_TEXT_LINES = 200_000

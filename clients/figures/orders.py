@@ -25,7 +25,6 @@ from clients.figures.style import (
 )
 from estimator import nm_from_index, rescale_pupil
 
-ORDERS = (2, 3, 4, 5, 6)
 MIN_AXIS_LIMIT_UM = 0.1
 """Smallest upper limit of an axis; smaller aberrations are negligible."""
 
@@ -40,11 +39,15 @@ def order_range(order: int) -> slice:
 
 
 def rms_by_order_um(zernike_um: NDArray[np.float64]) -> dict[int, float]:
-    """Return the RMS of each order, 2 to 6, µm.
+    """Return the RMS of each order from 2 on, µm.
 
     The total RMS is the root of the sum of their squares.
     """
-    return {n: float(np.linalg.norm(zernike_um[order_range(n)])) for n in ORDERS}
+    highest, _ = nm_from_index(len(zernike_um) - 1)
+    return {
+        n: float(np.linalg.norm(zernike_um[order_range(n)]))
+        for n in range(LOWEST_BLURRING_ORDER, highest + 1)
+    }
 
 
 def rms_um(
@@ -55,7 +58,7 @@ def rms_um(
 
 
 def on_circle_um(study: EyeStudy, radius_mm: float) -> NDArray[np.float64]:
-    """Return a study's measured wavefront on a smaller circle (28,)."""
+    """Return a study's measured wavefront on a smaller circle (n_terms,)."""
     ratio = radius_mm / study.found.zernike_radius_mm
     return rescale_pupil(study.measured_um, radius_ratio=min(ratio, 1.0))
 
@@ -68,13 +71,16 @@ def draw_rms_by_order(
     The second order, which is much larger, is given as text.
     """
     radius_mm = min(study.found.zernike_radius_mm for study in studies)
-    names = [*(str(n) for n in ORDERS[1:]), "3-6"]
+    wavefronts_um = [on_circle_um(study, radius_mm) for study in studies]
+    highest = max(max(rms_by_order_um(wave_um)) for wave_um in wavefronts_um)
+    orders = range(LOWEST_HIGHER_ORDER, highest + 1)
+    names = [*map(str, orders), f"{LOWEST_HIGHER_ORDER}-{highest}"]
     width, positions = 0.8 / len(studies), np.arange(len(names))
     seconds, drawn = [], []
-    for k, (study, color) in enumerate(zip(studies, (BLUE, GREEN), strict=False)):
-        wavefront_um = on_circle_um(study, radius_mm)
+    colored = zip(wavefronts_um, (BLUE, GREEN), strict=False)
+    for k, (wavefront_um, color) in enumerate(colored):
         by_order = rms_by_order_um(wavefront_um)
-        values = [*(by_order[n] for n in ORDERS[1:]), rms_um(wavefront_um)]
+        values = [*(by_order.get(n, 0.0) for n in orders), rms_um(wavefront_um)]
         at = positions + (k - 0.5 * (len(studies) - 1)) * width
         bars = axes.bar(at, values, width * 0.92, color=color)
         drawn.append(bars)

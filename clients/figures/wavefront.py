@@ -42,7 +42,8 @@ def wavefront_values_um(
     along = np.linspace(-1.0, 1.0, n)
     x, y = np.meshgrid(along, -along)
     first = from_order * (from_order + 1) // 2
-    return zernike_values(x, y)[..., first:] @ zernike_um[first:]
+    values = zernike_values(x, y, n_terms=zernike_um.size)
+    return values[..., first:] @ zernike_um[first:]
 
 
 def in_circle(n: int) -> NDArray[np.bool_]:

@@ -210,8 +210,14 @@ def joint_coefficient_table(
     """Return all coefficients of two eyes in three columns."""
     first, second = (facts.numbers["measured"] for facts in (before, after))
     cells = [
-        (_term_text(term), *map(_coefficient_text, (value, second["zernike_um"][term])))
-        for term, value in first["zernike_um"].items()
+        (
+            _term_text(term),
+            *(
+                _coefficient_text(m["zernike_um"].get(term, 0.0))
+                for m in (first, second)
+            ),
+        )
+        for term in first["zernike_um"] | second["zernike_um"]
     ]
     notes = [_circle_text(measured) for measured in (first, second)]
     if notes[0] != notes[1]:

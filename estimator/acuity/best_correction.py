@@ -45,13 +45,13 @@ def best_correction_um(
     pupil_screen: PupilScreen | None = None,
     n_samples: int = N_SAMPLES,
 ) -> NDArray[np.float64]:
-    """Return a wavefront (28,) with sphere and cylinder that maximize visual Strehl.
+    """Return a wavefront (n,) with sphere and cylinder that maximize visual Strehl.
 
     The search starts from the least-squares refraction and from the wavefront as it is.
 
     Parameters
     ----------
-    zernike_um : (28,)
+    zernike_um : (n_terms,)
     pupil_ellipse, pupil_screen : optional
         See `optical_transfer`.
     n_samples : int

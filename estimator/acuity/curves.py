@@ -50,7 +50,7 @@ def acuity_through_focus(
 
     Parameters
     ----------
-    zernike_um : (28,)
+    zernike_um : (n_terms,)
         Wavefront of the eye in its state of accommodation, for an object at infinity.
     zernike_radius_mm : float
         Radius of the circle of the coefficients.
@@ -109,7 +109,7 @@ def acuity_over_field(
 
     Parameters
     ----------
-    zernike_um : (n, 28)
+    zernike_um : (n, n_terms)
     zernike_radius_mm : scalar or (n,)
     pupil_ellipse : (n, 5)
         See `optical_transfer`.

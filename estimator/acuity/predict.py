@@ -86,7 +86,7 @@ def predict_acuity(
 
     Parameters
     ----------
-    zernike_um : (28,)
+    zernike_um : (n_terms,)
         Wavefront, with the vergence of the object in C(2,0).
     zernike_radius_mm : float
         Radius of the circle of the coefficients.

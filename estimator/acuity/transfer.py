@@ -10,8 +10,8 @@ from scipy import fft
 
 from estimator.optics.pupil_screen import PupilScreen
 from estimator.optics.zernike import (
-    EXPONENTS,
-    MAX_RADIAL_ORDER,
+    exponents,
+    radial_order,
     wavefront_polynomial,
     zernike_gradient,
 )
@@ -99,7 +99,7 @@ def optical_transfer(
 
     Parameters
     ----------
-    zernike_um : (28,)
+    zernike_um : (n_terms,)
     zernike_radius_mm : float
         Radius of the circle of the coefficients.
     wavelength_nm : float
@@ -120,7 +120,7 @@ def optical_transfer(
     if pupil_screen is not None and pupil_screen.lattice_mm is not None:
         raise ValueError("pupil_screen: expected rings about one center, got lenslets")
     if not np.all(np.isfinite(zernike_um)):
-        raise ValueError("zernike_um: expected 28 finite coefficients")
+        raise ValueError("zernike_um: expected finite coefficients")
     per_mm_cpd = math.radians(1.0) * NM_PER_MM / wavelength_nm
     count = max(
         _samples(zernike_um, wavelength_nm, pupil_screen, zernike_radius_mm),
@@ -178,9 +178,10 @@ def grid_wavefront_um(
     zernike_um: NDArray[Any], along: NDArray[Any]
 ) -> NDArray[np.float64]:
     """Return the wavefront (n, n), y then x, on coordinates (n,) of the unit square."""
-    by_powers = np.zeros((MAX_RADIAL_ORDER + 1,) * 2)
-    by_powers[EXPONENTS[:, 1], EXPONENTS[:, 0]] = wavefront_polynomial(zernike_um)
-    powers = along[:, None] ** np.arange(MAX_RADIAL_ORDER + 1)
+    n_powers, (a, b) = radial_order(zernike_um.size) + 1, exponents(zernike_um.size).T
+    by_powers = np.zeros((n_powers, n_powers))
+    by_powers[b, a] = wavefront_polynomial(zernike_um)
+    powers = along[:, None] ** np.arange(n_powers)
     return powers @ by_powers @ powers.T
 
 
@@ -196,7 +197,9 @@ def _samples(
     orders of high power deflect at the rim is then aliased, and there is little of it.
     """
     angles = 2.0 * np.pi * np.arange(72) / 72
-    slopes = zernike_gradient(np.cos(angles), np.sin(angles))  # per radius
+    slopes = zernike_gradient(  # per radius
+        np.cos(angles), np.sin(angles), n_terms=zernike_um.size
+    )
     steepest_um = float(np.linalg.norm(slopes @ zernike_um, axis=-1).max())
 
     def samples_for(slope_um: float) -> int:

@@ -37,7 +37,7 @@ from estimator.networks.card import (
 )
 from estimator.note import Note
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
-from estimator.optics.zernike import N_TERMS, remove_central_tilt
+from estimator.optics.zernike import N_TERMS, padded_terms, remove_central_tilt
 from estimator.profiles.measured_wavefront import profile_amplitude_dpt
 from estimator.profiles.parse import EyeProfile
 from estimator.profiles.typical_aberrations import (
@@ -81,7 +81,7 @@ class EstimatedEye:
         Parameters of the relaxed eye.
     profile : EyeProfile
         Profile that was fitted, typical aberrations included.
-    zernike_um, residual_um : (28,), um
+    zernike_um, residual_um : (n_terms,), um
         Coefficients of the eye, and of the eye minus the measurement, on the measured
         circle (``zernike_radius_mm``) at ``wavelength_nm``; for several measurements,
         of the first.  The residual's tilt is relative to the measurement shifted to
@@ -303,6 +303,7 @@ def _answer(
     zernike_um = problem.zernike_of(problem.measurements[0])(vector[None])[0]
     zernike_um[0] = 0.0
     measured_um = remove_central_tilt(problem.profile.zernike_um)
+    zernike_um = padded_terms(zernike_um, measured_um.size)
     residual_um = zernike_um - measured_um
     parameters = EyeParameters.from_vector(vector)
     residual_um[0] = 0.0

@@ -37,7 +37,7 @@ from estimator.wavefront.field_wavefronts import (
     total_defocus_dpt,
     zernike_from_polynomial,
 )
-from estimator.wavefront.moved_plane import moved_polynomial
+from estimator.wavefront.moved_plane import moved_wavefront
 
 FADE_DEG = 15.0
 """Angle from the axis at which 1/e of the residual is left."""
@@ -60,7 +60,8 @@ class MeasuredResidual:
     Attributes
     ----------
     residue_um : (n_terms,), um/mm^degree
-        Measurement minus the eye, at the measured wavelength.
+        Measurement minus the eye, at the measured wavelength.  It has as many terms as
+        the measurement needs in the pupil.
     radius_mm : float
         Radius of the measured pupil.  In a wider one the residual is stretched (see
         `stretch_ratio`): polynomials diverge beyond the measured pupil.
@@ -93,9 +94,7 @@ class MeasuredResidual:
         at_cornea_um = polynomial_in_mm(
             remove_central_tilt(profile.zernike_um), radius_mm
         )
-        moved_um = moved_polynomial(
-            at_cornea_um, depth_mm=depth_mm, radius_mm=radius_mm
-        )
+        moved_um = moved_wavefront(at_cornea_um, depth_mm=depth_mm, radius_mm=radius_mm)
         residue_um = summed_terms(moved_um, -traced_um[0])
         residue_um[0] = 0.0
         eye_dpt = total_defocus_dpt(

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from estimator.eye.parameters import allowed_ranges
 from estimator.networks.inference import network_eye
+from estimator.optics.zernike import N_TERMS
 from estimator.profiles.parse import EyeProfile
 
 
@@ -19,7 +20,7 @@ def network_guess(profile: EyeProfile) -> NDArray[np.float64]:
         No weights, or a wavefront outside the training ranges.
     """
     vector = network_eye(
-        profile.zernike_um,
+        profile.zernike_um[:N_TERMS],
         pupil_diameter_mm=profile.pupil_diameter_mm,
         wavelength_nm=profile.wavelength_nm,
     )

@@ -159,9 +159,9 @@ def _draw_retina(axes: "Axes", eye: EyeSurfaces) -> None:
 
 
 def _draw_coefficients(axes: "Axes", found: EstimatedEye) -> None:
-    from estimator.optics.zernike import N_TERMS, nm_from_index
+    from estimator.optics.zernike import nm_from_index
 
-    index = np.arange(3, N_TERMS)
+    index = np.arange(3, found.zernike_um.size)
     measured_um = found.zernike_um - found.residual_um
     axes.bar(index - 0.2, measured_um[3:], 0.4, label="measured", color="0.6")
     axes.bar(index + 0.2, found.zernike_um[3:], 0.4, label="eye", color="tab:blue")

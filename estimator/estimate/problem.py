@@ -6,6 +6,7 @@ coma, so a measured tilt contains no information about the eye.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from estimator.estimate.prior import Prior, prior_for_refraction
 from estimator.eye.parameters import PARAMETER_NAMES
 from estimator.eye.tracing import zernike_of_vectors
 from estimator.optics import prescription as rx
+from estimator.optics.zernike import N_TERMS
 from estimator.profiles.parse import EyeProfile, Measurement
 
 FIRST_COMPARED = 3
@@ -48,10 +50,14 @@ class EstimationProblem:
 
     def __init__(self, profile: EyeProfile):
         self.profile = profile
-        self.measurements = profile.compared_measurements or (
+        measurements = profile.compared_measurements or (
             Measurement(
                 profile.zernike_um, profile.pupil_diameter_mm, profile.wavelength_nm
             ),
+        )
+        # Terms are orthogonal: the first are the best fit with as many.
+        self.measurements = tuple(
+            replace(m, zernike_um=m.zernike_um[:N_TERMS]) for m in measurements
         )
         self.target_um = np.concatenate(
             [compared_terms(m.zernike_um) for m in self.measurements]

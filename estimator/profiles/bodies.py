@@ -17,7 +17,7 @@ from msgspec import UNSET, Meta, UnsetType
 
 from estimator.eye.parameters import PARAMETERS, Parameter
 from estimator.media.straylight import BROWN
-from estimator.optics.zernike import MAX_RADIAL_ORDER
+from estimator.optics.zernike import HIGHEST_ORDER, MAX_RADIAL_ORDER
 from estimator.profiles.correction_bodies import (
     AxisDeg,
     Body,
@@ -44,7 +44,12 @@ MAX_FILE_NOTES, MAX_NOTE_CHARACTERS = 10, 400
 MEASUREMENTS_ALLOWED = (
     f"a list of 1 to {MAX_MEASUREMENTS} measurements, one at h = v = 0"
 )
-COEFFICIENTS_ALLOWED = f"an object of 'n,m': um with n from 0 to {MAX_RADIAL_ORDER}"
+
+
+def coefficients_allowed(order: int) -> str:
+    """Return what errors say of coefficients up to a radial order."""
+    return f"an object of 'n,m': um with n from 0 to {order}"
+
 
 FieldAngleDeg = Annotated[float, Meta(ge=-50.0, le=50.0)]
 """Field angle of a measurement; instruments measure to 40 deg or so."""
@@ -53,13 +58,20 @@ Frame = Annotated[
     Literal["eye", "examiner"],
     Meta(description="`eye`: x to the person's right; `examiner`: facing the eye"),
 ]
-CoefficientsUm = Annotated[
-    dict[str, Annotated[float, Meta(ge=-MAX_COEFFICIENT_UM, le=MAX_COEFFICIENT_UM)]],
-    Meta(
-        description=f'`"n,m"`: µm, n from 0 to {MAX_RADIAL_ORDER}, each term at most '
-        "once; other terms are 0, also if they are given",
-        extra={ALLOWED: COEFFICIENTS_ALLOWED},
-    ),
+
+
+def _coefficients_meta(order: int) -> Meta:
+    return Meta(
+        description=f'`"n,m"`: µm, n from 0 to {order}, each term at most once; other '
+        "terms are 0, also if they are given",
+        extra={ALLOWED: coefficients_allowed(order)},
+    )
+
+
+_CoefficientUm = Annotated[float, Meta(ge=-MAX_COEFFICIENT_UM, le=MAX_COEFFICIENT_UM)]
+CoefficientsUm = Annotated[dict[str, _CoefficientUm], _coefficients_meta(HIGHEST_ORDER)]
+CorneaCoefficientsUm = Annotated[
+    dict[str, _CoefficientUm], _coefficients_meta(MAX_RADIAL_ORDER)
 ]
 WavelengthNm = Annotated[float, Meta(ge=365.0, le=1014.0)]
 PupilDiameterMm = Annotated[

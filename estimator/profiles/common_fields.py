@@ -13,8 +13,8 @@ from estimator.eye.parameters import RetinaShape
 from estimator.media.straylight import CATARACTS, DEFAULT_AGE_YEARS, Straylight
 from estimator.note import note_of
 from estimator.optics.zernike import (
+    HIGHEST_ORDER,
     MAX_RADIAL_ORDER,
-    N_TERMS,
     flip_horizontal,
     index_from_nm,
 )
@@ -123,9 +123,16 @@ def _straylight(
 
 
 def coefficients_um(
-    entries: Mapping[str, float], frame: str, *, path: str, name: str = "zernike_um"
+    entries: Mapping[str, float],
+    frame: str,
+    *,
+    path: str,
+    name: str = "zernike_um",
+    highest_order: int = HIGHEST_ORDER,
 ) -> NDArray[np.float64]:
-    """Return coefficients (28,), um, in the eye frame.
+    """Return coefficients (n_terms,), um, in the eye frame.
+
+    They are 28, or more for higher orders that are not zero.
 
     Parameters
     ----------
@@ -134,29 +141,36 @@ def coefficients_um(
     frame : {"eye", "examiner"}
     path, name : str
         Path of the object that holds them, and their field, for errors.
+    highest_order : int
+        Highest radial order that may be other than zero.
 
     Raises
     ------
     ProfileError
         A key is not a term, or two keys name the same one.
     """
-    zernike_um = np.zeros(N_TERMS)
-    named: dict[int, str] = {}
+    named: dict[int, tuple[str, float]] = {}
+    order = MAX_RADIAL_ORDER
     for key, value_um in entries.items():
         field = f"{path}{name}.{key}"
-        j = _term_index(key, field, value_um)
-        if j >= N_TERMS:  # zero
-            continue
+        n, j = _term_index(key, field, value_um, highest_order)
         if j in named:
-            problem = f"names the same term as {named[j]!r}"
+            problem = f"names the same term as {named[j][0]!r}"
             raise ProfileError(field, problem, "each term once")
-        named[j] = key
-        zernike_um[j] = value_um
+        named[j] = key, value_um
+        order = max(order, n if value_um else 0)
+    zernike_um = np.zeros((order + 1) * (order + 2) // 2)
+    for j, (_, value_um) in named.items():
+        if j < zernike_um.size:
+            zernike_um[j] = value_um
     return flip_horizontal(zernike_um) if frame == "examiner" else zernike_um
 
 
-def _term_index(key: str, name: str, value_um: float) -> int:
-    allowed = bodies.COEFFICIENTS_ALLOWED
+def _term_index(
+    key: str, name: str, value_um: float, highest_order: int
+) -> tuple[int, int]:
+    """Return the radial order and the index of a term."""
+    allowed = bodies.coefficients_allowed(highest_order)
     try:
         n, m = (int(part) for part in key.split(","))
     except ValueError:
@@ -165,7 +179,7 @@ def _term_index(key: str, name: str, value_um: float) -> int:
         j = index_from_nm(n, m)
     except ValueError as error:
         raise ProfileError(name, str(error), allowed) from None
-    if n > MAX_RADIAL_ORDER and value_um != 0.0:
+    if n > highest_order and value_um != 0.0:
         problem = f"radial order {n}, {value_um:g} um"
         raise ProfileError(name, problem, f"{allowed}; higher orders are 0")
-    return j
+    return n, j

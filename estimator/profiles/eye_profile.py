@@ -31,7 +31,8 @@ of the 45 parameters, because its lens may be smaller."""
 class Measurement:
     """One wavefront in the eye frame, with its field direction.
 
-    ``zernike_um`` (28,) is on the circle of ``pupil_diameter_mm`` about the chief ray.
+    ``zernike_um`` (n_terms,), 28 to 66, is on the circle of ``pupil_diameter_mm`` about
+    the chief ray.
     ``h_deg`` and ``v_deg`` point to the source as the person sees it, independent of
     the frame of the input.
     """
@@ -147,7 +148,7 @@ class EyeProfile:
 
     @cached_property
     def zernike_um(self) -> NDArray[np.float64]:
-        """Return the leading wavefront (28,), um; a given eye is traced once for it.
+        """Return the leading wavefront (n,), um; a given eye is traced once for it.
 
         It is on the circle of ``pupil_diameter_mm``, at ``wavelength_nm``, with
         accommodation relaxed; the correction is *not* yet subtracted.

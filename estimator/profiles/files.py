@@ -20,7 +20,7 @@ from estimator.profiles.zemax_files import zmx_body
 
 PROFILE_SUFFIXES = (".json", ".abp", ".csv", ".zmx")
 MAX_PROFILE_BYTES = 2_000_000
-"""Size limit of a profile file: 28 coefficients at 400 field directions take 0.3 MB of
+"""Size limit of a profile file: 66 coefficients at 400 field directions take 0.7 MB of
 JSON."""
 
 MAX_PROFILE_LINES = 100_000

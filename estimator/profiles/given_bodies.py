@@ -6,8 +6,8 @@ from msgspec import UNSET, Meta, UnsetType
 
 from estimator.profiles.bodies import (
     PUBLISHED_NAMES,
-    CoefficientsUm,
     CommonBody,
+    CorneaCoefficientsUm,
     EyeBody,
     Frame,
     PrescriptionBody,
@@ -86,7 +86,7 @@ class PseudophakicBody(CommonBody, kw_only=True, tag_field="kind", tag="pseudoph
         ]
         | UnsetType
     ) = UNSET
-    cornea_zernike_um: CoefficientsUm | UnsetType = UNSET
+    cornea_zernike_um: CorneaCoefficientsUm | UnsetType = UNSET
     cornea_pupil_diameter_mm: PupilDiameterMm = 6.0
     frame: Frame = "eye"
     acd_mm: ChamberDepthMm | UnsetType = UNSET

@@ -10,6 +10,7 @@ from estimator.eye.checked_fields import ProfileError
 from estimator.eye.surface_model import SurfaceModel
 from estimator.note import Note
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.optics.zernike import MAX_RADIAL_ORDER
 from estimator.profiles import bodies, given_bodies
 from estimator.profiles.common_fields import coefficients_um, common_fields
 from estimator.profiles.correction_bodies import IntraocularBody
@@ -55,7 +56,11 @@ def _pseudophakic(body: given_bodies.PseudophakicBody) -> EyeProfile:
     cornea_um = None
     if body.cornea_zernike_um is not msgspec.UNSET:
         cornea_um = coefficients_um(
-            body.cornea_zernike_um, body.frame, path="", name="cornea_zernike_um"
+            body.cornea_zernike_um,
+            body.frame,
+            path="",
+            name="cornea_zernike_um",
+            highest_order=MAX_RADIAL_ORDER,
         )
     worn = body.correction
     if isinstance(worn, IntraocularBody) and (

@@ -38,7 +38,7 @@ from estimator.wavefront.field_wavefronts import (
     with_defocus,
     zernike_from_polynomial,
 )
-from estimator.wavefront.moved_plane import moved_polynomial
+from estimator.wavefront.moved_plane import moved_wavefront
 
 DEFAULT_AMPLITUDE_DPT = 10.0
 """Amplitude of accommodation of an eye whose age is not given."""
@@ -92,7 +92,8 @@ class MeasuredWavefront(FocusingEye):
     eye_side : str
         OD or OS.
     zernike_um : (n_terms,)
-        Coefficients in the plane of a typical entrance pupil, correction subtracted.
+        Coefficients in the plane of a typical entrance pupil, correction subtracted;
+        as many as the wavefront needs there.
     refraction_dpt : float
         M at the cornea and 555 nm at the measured pupil, through the correction.
     """
@@ -104,7 +105,7 @@ class MeasuredWavefront(FocusingEye):
         depth_mm = TYPICAL_ENTRANCE_PUPIL_MM
         at_cornea_um = remove_central_tilt(profile.zernike_um)
         zernike_um = zernike_from_polynomial(
-            moved_polynomial(
+            moved_wavefront(
                 polynomial_in_mm(at_cornea_um, radius_mm),
                 depth_mm=depth_mm,
                 radius_mm=radius_mm,

@@ -8,7 +8,7 @@ from estimator.eye.checked_fields import ProfileError
 from estimator.note import Note
 from estimator.optics import prescription as rx
 from estimator.optics.chromatic import chromatic_refraction_dpt
-from estimator.optics.zernike import rescale_pupil
+from estimator.optics.zernike import rescale_pupil, summed_terms
 from estimator.profiles.eye_profile import Measurement
 
 SAME_DEG = 0.5
@@ -48,7 +48,10 @@ def merged_repeats(
             group.append(measurement)
     repeated = [group for group in groups if len(group) > 1]
     merged = [
-        replace(group[0], zernike_um=np.mean([m.zernike_um for m in group], axis=0))
+        replace(
+            group[0],
+            zernike_um=summed_terms(*(m.zernike_um for m in group)) / len(group),
+        )
         if len(group) > 1
         else group[0]
         for group in groups
@@ -87,11 +90,14 @@ def _check_agreement(
         rescale_pupil(m.zernike_um, radius_ratio=pupil_mm / m.pupil_diameter_mm)
         for m in (one, other)
     ]
-    powers_dpt = rx.power_vectors_dpt(np.stack(waves_um), pupil_mm / 2.0)
+    powers_dpt = np.stack(
+        [rx.power_vectors_dpt(wave_um, pupil_mm / 2.0) for wave_um in waves_um]
+    )
     wavelengths_nm = np.array([one.wavelength_nm, other.wavelength_nm])
     powers_dpt[:, 0] -= chromatic_refraction_dpt(wavelengths_nm)
     differences_dpt = np.abs(powers_dpt[0] - powers_dpt[1])
-    higher_um = float(np.linalg.norm((waves_um[0] - waves_um[1])[FIRST_HIGHER:]))
+    difference_um = summed_terms(waves_um[0], -waves_um[1])
+    higher_um = float(np.linalg.norm(difference_um[FIRST_HIGHER:]))
     if differences_dpt.max() <= NOISE_DPT and higher_um <= NOISE_UM:
         return
     name = ("M", "J0", "J45")[int(differences_dpt.argmax())]

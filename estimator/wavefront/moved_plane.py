@@ -17,16 +17,24 @@ from estimator.optics.units import UM_PER_MM
 from estimator.optics.zernike import (
     HIGHEST_ORDER,
     MAX_RADIAL_ORDER,
+    MAX_TERMS,
     exponents,
     monomial_degrees,
     radial_order,
 )
+from estimator.wavefront.field_wavefronts import zernike_from_polynomial
 from estimator.wavefront.nodes import circle_nodes
 
 _ANGLES = 2.0 * np.pi * np.arange(16) / 16
 _RIM = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 
 TILT = [1, 2]
+
+
+FIT_ERROR_UM = 0.003
+"""RMS of the terms of a moved wavefront up to `HIGHEST_ORDER` that a fit may omit.
+
+The preset `keratoconus` keeps 28 terms; 1.5 times its coefficients need more."""
 
 
 @cache
@@ -92,6 +100,31 @@ def moved_polynomial(
     moved_um[..., 0] = polynomial_um[..., 0]
     moved_um[..., TILT] += polynomial_um[..., TILT]
     return moved_um
+
+
+def moved_wavefront(
+    polynomial_um: NDArray[np.float64], *, depth_mm: float, radius_mm: float
+) -> NDArray[np.float64]:
+    """Return a wavefront in a deeper plane, with as many terms as it needs there.
+
+    These are those of the given wavefront unless the terms up to `HIGHEST_ORDER` that
+    a fit with as many omits exceed `FIT_ERROR_UM`.
+
+    Parameters
+    ----------
+    polynomial_um : (n_given_terms,), um/mm^degree
+    depth_mm, radius_mm : float
+        As in `moved_polynomial`.
+    """
+    place = {"depth_mm": depth_mm, "radius_mm": radius_mm}
+    whole_um = moved_polynomial(polynomial_um, **place, n_terms=MAX_TERMS)
+    zernike_um = zernike_from_polynomial(whole_um, radius_mm)
+    order = radial_order(polynomial_um.size)
+    while True:
+        n_terms = (order + 1) * (order + 2) // 2
+        if np.linalg.norm(zernike_um[n_terms:]) <= FIT_ERROR_UM:
+            return moved_polynomial(polynomial_um, **place, n_terms=n_terms)
+        order += 1
 
 
 def moved_rim(

@@ -1,8 +1,11 @@
 """What an estimated eye leaves of its measurement: on the axis nothing is lost."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from estimator import load_profile
 from estimator.estimate.estimation import estimate_eye
 from estimator.estimate.measured_residual import (
     FADE_DEG,
@@ -11,7 +14,13 @@ from estimator.estimate.measured_residual import (
 )
 from estimator.field.traced_eye import TracedEye
 from estimator.optics.chromatic import chromatic_refraction_dpt
-from estimator.optics.zernike import remove_central_tilt
+from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
+from estimator.optics.zernike import (
+    nm_from_index,
+    remove_central_tilt,
+    rescale_pupil,
+    zernike_values,
+)
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile, preset_names
 from estimator.wavefront.aberrations import wavefront_grid
@@ -19,9 +28,12 @@ from estimator.wavefront.field_wavefronts import (
     polynomial_in_mm,
     zernike_from_polynomial,
 )
-from estimator.wavefront.moved_plane import moved_polynomial
+from estimator.wavefront.moved_plane import moved_polynomial, moved_wavefront
 from filter_service.planning.grid import pupil_nodes_mm
 from tests.numerical.eye_cases import population_profiles, random_eye_profiles
+from tests.numerical.test_moved_plane import exact_wave
+
+ABERROMETER_FILE = Path(__file__).parents[2] / "examples" / "data" / "aberrometer.csv"
 
 WILD = {
     "kind": "zernike",
@@ -32,9 +44,9 @@ WILD = {
 """Farther from any eye than the 45 parameters reach."""
 
 
-def axis_error_um(profile):
-    """RMS, um, of what the traced eye has on its axis less what was measured."""
-    estimated = estimate_eye(profile)
+def on_axis_um(estimated):
+    """Coefficients of the traced eye on its axis, in the measured pupil."""
+    profile = estimated.profile
     pupil_mm, wavelength_nm = profile.pupil_diameter_mm, profile.wavelength_nm
     eye = TracedEye.trace(
         estimated,
@@ -47,10 +59,15 @@ def axis_error_um(profile):
         **{"accommodation_dpt": 0.0, "wavelength_nm": wavelength_nm},
     }
     total_dpt = eye.total_defocus_dpt(**state)
-    ours_um = eye.wavefronts(**state, total_defocus_dpt=total_dpt).zernike_um[0]
-    radius_mm = pupil_mm / 2.0
+    return eye.wavefronts(**state, total_defocus_dpt=total_dpt).zernike_um[0]
+
+
+def axis_error_um(profile):
+    """RMS, um, of what the traced eye has on its axis less what was measured."""
+    estimated = estimate_eye(profile)
+    ours_um, radius_mm = on_axis_um(estimated), profile.pupil_diameter_mm / 2.0
     at_cornea_um = polynomial_in_mm(remove_central_tilt(profile.zernike_um), radius_mm)
-    in_pupil_um = moved_polynomial(
+    in_pupil_um = moved_wavefront(
         at_cornea_um,
         depth_mm=estimated.accommodating.entrance_pupil_mm,
         radius_mm=radius_mm,
@@ -62,6 +79,76 @@ def axis_error_um(profile):
 @pytest.mark.parametrize("name", preset_names())
 def test_presets_are_exact_on_their_axis(name):
     assert axis_error_um(parse_profile({"kind": "preset", "name": name})) < 1e-9
+
+
+def wavefront(zernike_um, pupil_mm):
+    body = {"kind": "zernike", "pupil_diameter_mm": pupil_mm, "wavelength_nm": 555.0}
+    terms = {"{},{}".format(*nm_from_index(j)): v for j, v in enumerate(zernike_um)}
+    return parse_profile({**body, "zernike_um": terms})
+
+
+def tenth_order():
+    order = np.array([nm_from_index(j)[0] for j in range(66)])
+    size_um = np.array([0, 0, 1.0, 0.3, 0.2, 0.08, 0.05, 0.03, 0.02, 0.015, 0.01])
+    zernike_um = np.random.default_rng(4).normal(size=66) * size_um[order]
+    return wavefront(zernike_um.tolist(), 6.0)
+
+
+def keratoconus(ratio, pupil_mm):
+    profile = parse_profile({"kind": "preset", "name": "keratoconus"})
+    on_pupil = pupil_mm / profile.pupil_diameter_mm
+    zernike_um = ratio * rescale_pupil(profile.zernike_um, radius_ratio=on_pupil)
+    return wavefront(zernike_um.tolist(), pupil_mm)
+
+
+MEASURED = {
+    "keratoconus 5 mm": (keratoconus(1.0, 5.0), 28),
+    "keratoconus 6 mm": (keratoconus(1.0, 6.0), 28),
+    "severe keratoconus 5 mm": (keratoconus(1.5, 5.0), 28),
+    "severe keratoconus 6 mm": (keratoconus(1.5, 6.0), 36),
+    "aberrometer file": (load_profile(ABERROMETER_FILE), 28),
+    "tenth order": (tenth_order(), 66),
+}
+
+
+def ray_error_um(profile, zernike_um, depth_mm):
+    """RMS, um, of a wavefront in the pupil less that of the measurement's rays."""
+    radius_mm = profile.pupil_diameter_mm / 2.0
+    along = np.linspace(-radius_mm, radius_mm, 25)
+    x, y = np.meshgrid(along, along)
+    inside = np.hypot(x, y) <= radius_mm
+    x, y = x[inside], y[inside]
+    measured_um = polynomial_in_mm(remove_central_tilt(profile.zernike_um), radius_mm)
+    measured_um[1:3] = 0.0
+    values = zernike_values(x / radius_mm, y / radius_mm, n_terms=zernike_um.size)
+    error_um = values @ zernike_um - exact_wave(measured_um, depth_mm, x, y)
+    plane = np.stack([np.ones_like(x), x, y])  # tilt moves the image only
+    error_um -= plane.T @ np.linalg.lstsq(plane.T, error_um)[0]
+    return np.sqrt(np.mean(error_um**2))
+
+
+@pytest.mark.parametrize("name", MEASURED)
+def test_a_measured_wavefront_follows_the_rays_into_the_pupil(name):
+    profile, n_terms = MEASURED[name]
+    zernike_um = MeasuredWavefront(profile).zernike_um
+    assert zernike_um.size == n_terms
+    assert ray_error_um(profile, zernike_um, TYPICAL_ENTRANCE_PUPIL_MM) <= 0.005
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name != "tenth order"))
+        for name in MEASURED
+    ],
+)
+def test_a_traced_eye_follows_the_rays_on_its_axis(name):
+    profile, n_terms = MEASURED[name]
+    estimated = estimate_eye(profile)
+    zernike_um = on_axis_um(estimated)
+    assert zernike_um.size == n_terms
+    depth_mm = estimated.accommodating.entrance_pupil_mm
+    assert ray_error_um(profile, zernike_um, depth_mm) <= 0.005
 
 
 def test_a_wavefront_that_no_eye_has_is_exact_too_and_said():

@@ -280,7 +280,7 @@ def test_a_table_that_numpy_writes(tmp_path, order):
         (SETTINGS + "2,0,\n", "line 3: cannot read '2,0,'"),
         (SETTINGS, "the file has no coefficients"),
         ("Listing of Zernike data\n", "line 1: cannot read 'Listing of Zernike data'"),
-        (SETTINGS + ROWS + "7,1,0.1\n", "zernike_um.7,1: radial order 7, 0.1 um"),
+        (SETTINGS + ROWS + "11,1,0.1\n", "zernike_um.11,1: radial order 11, 0.1 um"),
         (SETTINGS + ROWS + "7,2,0\n", "zernike_um.7,2"),
         (b"\0\1\2\3", "is not a text file"),
     ],
@@ -308,6 +308,18 @@ def test_a_json_profile_in_utf_16(tmp_path):
     text = '{"kind": "prescription", "sphere_dpt": -2}'
     found = loaded(tmp_path, text.encode("utf-16"), "json")
     assert found.kind == "prescription"
+
+
+@pytest.mark.parametrize(("order", "n_terms"), [(6, 28), (7, 36), (8, 45), (10, 66)])
+def test_terms_up_to_the_tenth_order_are_read(tmp_path, order, n_terms):
+    rows = f"{order},{-order},0.25\n12,2,0\n"
+    found = loaded(tmp_path, SETTINGS + ROWS + rows)
+    assert found.zernike_um.shape == (n_terms,)
+    assert found.zernike_um[n_terms - order - 1] == 0.25
+    assert np.count_nonzero(found.zernike_um) == len(TERMS) + 1
+    mirrored = loaded(tmp_path, "# frame: examiner\n" + SETTINGS + ROWS + rows)
+    side = -1.0 if order % 2 == 0 else 1.0
+    assert mirrored.zernike_um[n_terms - order - 1] == side * 0.25
 
 
 @pytest.mark.parametrize("frame", ["eye", "examiner"])

@@ -48,7 +48,7 @@ def test_frame_of_a_set_holds_for_all_unless_one_says_otherwise():
         (a_set(ONE | {"h_deg": 20}), "measurements"),
         (a_set(ONE, ONE | {"v_deg": 80}), "measurements.1.v_deg"),
         (a_set(ONE, {}), "measurements.1.zernike_um"),
-        (a_set(ONE | {"zernike_um": {"9,1": 1}}), "measurements.0.zernike_um.9,1"),
+        (a_set(ONE | {"zernike_um": {"11,1": 1}}), "measurements.0.zernike_um.11,1"),
         (a_set(ONE | {"sphere_dpt": 1}), "measurements.0.sphere_dpt"),
         (a_set(ONE | {"kind": "eye"}), "measurements.0.kind"),
         (a_set(3), "measurements.0"),

@@ -35,6 +35,14 @@ def test_repeats_are_averaged_with_a_note(h_deg):
     assert (note.code, note.values["measurement_count"]) == ("repeated_measurements", 2)
 
 
+def test_repeats_of_different_orders_are_averaged():
+    low, high = {"2,0": 1.0}, {"2,0": 1.2, "8,0": 0.1}
+    profile = read(measured(0.0, low), measured(0.0, high))
+    (mean,) = profile.measurements
+    assert mean.zernike_um.shape == (45,)
+    assert mean.zernike_um[[4, 40]] == pytest.approx([1.1, 0.05])
+
+
 @pytest.mark.parametrize(
     ("measurements", "name"),
     [
@@ -48,6 +56,7 @@ def test_repeats_are_averaged_with_a_note(h_deg):
         ),
         ([measured(0.0, {"3,-1": 0.4}), measured(0.0, {"3,-1": 0.0})], "1"),
         ([measured(0.0, {"2,0": 1.0}), measured(0.0, {"2,0": 1.0}, 3.0)], "1"),
+        ([measured(0.0, {"2,0": 1.0, "8,0": 0.4}), measured(0.0, {"2,0": 1.0})], "1"),
     ],
 )
 def test_contradictions_are_refused_by_name(measurements, name):
