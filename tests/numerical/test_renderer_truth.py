@@ -18,6 +18,12 @@ SIZE = {"width_px": 160, "height_px": 120}
 NARROW = {**SIZE, "vertical_fov_deg": 8.0}
 EMMETROPE = {"kind": "prescription", "sphere_dpt": 0.0}
 MYOPE = {"kind": "prescription", "sphere_dpt": -6.0}
+TENTH_ORDER = {
+    "kind": "zernike",
+    "pupil_diameter_mm": 5.0,
+    "wavelength_nm": 555.0,
+    "zernike_um": {"4,0": 0.1, "7,3": 0.2, "8,-4": 0.1, "9,-9": -0.1, "10,2": 0.15},
+}
 PURE = {"diffraction": False, "chromatic": False}
 
 
@@ -186,6 +192,24 @@ def test_plane_through_a_myope_is_true_convolution(engine, rng, object_dpt):
     truth = convolve(image, exact_kernels(eye, bench, d=object_dpt))
     inside = slice(32, -32)
     assert psnr_db(result.color[inside, inside], truth[inside, inside]) >= 60.0
+
+
+def test_plane_through_a_wavefront_of_tenth_order_is_true_convolution(engine, rng):
+    bench = Bench(engine, TENTH_ORDER, **NARROW)
+    profile = parse_profile(TENTH_ORDER)
+    image = texture(rng, 120, 160, cell_px=2)
+    seen = bench.render(bench.view(image, np.inf), merge=False).color
+    inside = slice(32, -32)
+
+    def agreement_db(profile):
+        eye = MeasuredWavefront.from_profile(profile)
+        truth = convolve(image, exact_kernels(eye, bench, d=0.0))
+        return psnr_db(seen[inside, inside], truth[inside, inside])
+
+    assert agreement_db(profile) >= 60.0
+    sixth_order = {k: v for k, v in TENTH_ORDER["zernike_um"].items() if k[0] == "4"}
+    other = parse_profile(TENTH_ORDER | {"zernike_um": sixth_order})
+    assert agreement_db(other) < 45.0
 
 
 @pytest.mark.long("the exact PSFs of 160 distances")
