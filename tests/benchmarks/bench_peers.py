@@ -371,7 +371,7 @@ def isetbio_rows() -> list[PeerRow]:
     """Rows of ISETBio's PSFs and ours."""
     rows = []
     for published in published_psfs():
-        psf, residual_um, taken_ms = our_psf(published)
+        psf, taken_ms = our_psf(published)
         rows.append(
             psf_row(
                 method="ours, PSF",
@@ -381,8 +381,7 @@ def isetbio_rows() -> list[PeerRow]:
                 taken_ms=taken_ms,
                 error=moved_light(psf, published.psf),
                 reference="PSF of ISETBio, from a pupil raster of 0.081 mm",
-                differs=f"28 of 65 Zernike terms, {residual_um:.4f} um RMS left out. "
-                "ISETBio does more: full spectra, cones and retinal circuits",
+                differs="ISETBio does more: full spectra, cones and retinal circuits",
                 missing=None,
             )
         )

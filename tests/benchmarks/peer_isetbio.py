@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.optics.zernike import N_TERMS, nm_from_index
+from estimator.optics.zernike import nm_from_index, rescale_pupil
 from estimator.psf.compute import compute_psf_batch
 
 FILE = Path(__file__).parents[1] / "data" / "isetbio_psfs.npz"
@@ -27,9 +27,6 @@ MRAD_PER_ARCMIN = math.radians(1000.0 / 60.0)
 
 SUBSAMPLES = 3
 """Our pixels per sample: a PSF is integrated over pixels, theirs is not."""
-
-RADIAL_SAMPLES = 201
-"""Across the pupil, where 65 terms are expressed by 28."""
 
 
 @dataclass(frozen=True)
@@ -92,43 +89,17 @@ def zernike_term(j: int, x: NDArray, y: NDArray) -> NDArray[np.float64]:
     return math.sqrt((2 - (m == 0)) * (n + 1)) * radial * turn
 
 
-def fitted_zernike_um(
-    zernike_um: NDArray, *, radius_ratio: float
-) -> tuple[NDArray[np.float64], float]:
-    """Express a wavefront by 28 terms over a smaller circle.
-
-    Returns
-    -------
-    zernike_um : (28,)
-    residual_um : float
-        RMS of what they cannot express.
-    """
-    at = np.linspace(-1.0, 1.0, RADIAL_SAMPLES)
-    x, y = (values.ravel() for values in np.meshgrid(at, at))
-    inside = np.hypot(x, y) <= 1.0
-    x, y = x[inside], y[inside]
-    wavefront_um = sum(
-        value * zernike_term(j, radius_ratio * x, radius_ratio * y)
-        for j, value in enumerate(zernike_um, 1)
-    )
-    terms = np.stack([zernike_term(j, x, y) for j in range(N_TERMS)], axis=1)
-    fitted_um = np.linalg.lstsq(terms, wavefront_um)[0]
-    return fitted_um, float(np.std(wavefront_um - terms @ fitted_um))
-
-
-def our_psf(published: PublishedPsf) -> tuple[NDArray[np.float64], float, float]:
+def our_psf(published: PublishedPsf) -> tuple[NDArray[np.float64], float]:
     """Compute the PSF at the published samples.
 
     Returns
     -------
     psf : like the published one
-    residual_um : float
-        See `fitted_zernike_um`.
     taken_ms : float
         Of the PSF alone.
     """
-    zernike_um, residual_um = fitted_zernike_um(
-        published.zernike_um,
+    zernike_um = rescale_pupil(
+        np.append(0.0, published.zernike_um),
         radius_ratio=published.pupil_diameter_mm / MEASURED_PUPIL_MM,
     )
     reach = SUBSAMPLES * (published.psf.shape[0] // 2)
@@ -150,7 +121,7 @@ def our_psf(published: PublishedPsf) -> tuple[NDArray[np.float64], float, float]
     kernel = computed()
     taken_ms = 1e3 * (time.perf_counter() - start_s)
     psf = kernel[::SUBSAMPLES, ::SUBSAMPLES].astype(np.float64)
-    return psf / psf.sum(), residual_um, taken_ms
+    return psf / psf.sum(), taken_ms
 
 
 def moved_light(psf: NDArray, other: NDArray) -> float:
