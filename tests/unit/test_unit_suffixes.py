@@ -15,6 +15,7 @@ KINDS = ("ratio", "index", "count", "fraction", "constant")
 """Last words that say what kind of pure number this is."""
 
 DIMENSIONLESS = {
+    "axes": "unit vectors",
     "kernel": "shares of light, unit sum",
     "packed": "columns of eyes in mm, 1/mm and none, as their module says",
     "flat_kernels": "shares of light, kernels one behind the other",
