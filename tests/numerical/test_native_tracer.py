@@ -26,7 +26,12 @@ from estimator.optics.surfaces import media_indices, pack_eye
 from estimator.optics.zernike import HIGHEST_ORDER, MAX_TERMS, zernike_values
 from estimator.wavefront import compiled
 from estimator.wavefront.nodes import circle_nodes, stop_nodes
-from tests.numerical.schematic_eyes import field_axes, irregular_eye
+from tests.numerical.schematic_eyes import (
+    field_axes,
+    irregular_eye,
+    navarro,
+    reference,
+)
 from tests.reference.traced_rays import trace
 from tests.source_tree import ROOT
 
@@ -158,6 +163,25 @@ def test_both_variants_trace_alike(rng, monkeypatch):
         np.testing.assert_allclose(found[k], again[k], rtol=0.0, atol=1e-8)
 
 
+@pytest.mark.parametrize("stop_mm", [1.7, 2.0, 3.0])
+def test_a_clear_radius_leaves_the_light_within_it(stop_mm):
+    """Rays are found up to the edge, however far beyond it the stop is open."""
+    eye = navarro(reference())
+    lens = replace(eye.surfaces[2], clear_radius_mm=1.6)
+    eye = replace(eye, surfaces=(*eye.surfaces[:2], lens, eye.surfaces[3]))
+    found = compiled.stop_rows(
+        one_field(eye),
+        stop_radii_mm=np.array([[1.5, stop_mm]]),
+        pupil_z_mm=np.nan,
+        nodes=stop_nodes(5, 14),
+        at_pupil=False,
+        by_slopes=False,
+    )[0, :, 28 + compiled.OPEN_SHARE]
+    assert found[0] == pytest.approx(1.0)
+    # rays converge by 1 % of their distance from the axis behind the stop
+    assert found[1] == pytest.approx((1.6 / stop_mm) ** 2, rel=0.03)
+
+
 def test_unknown_forms_and_gradients_are_missed():
     """A packed eye of another version never calls beyond the tables."""
     packed, rays = pack_eye(irregular_eye()), np.array([[0.0, 0, -9, 0, 0, 1]])
@@ -191,7 +215,7 @@ def enumerated(file):
     """Constants of the enumerations in a header, by name."""
     text = (SOURCE / file).read_text(encoding="utf-8")
     text = re.sub(r"/\*.*?\*/", "", text, flags=re.S)
-    found = {}
+    found = {"N_LANES": 4}
     for body in re.findall(r"\benum \{([^}]*)\}", text):
         for name, value in re.findall(r"(\w+) = ([^,}]+)", body):
             found[name] = eval(value, {}, found) if "sizeof" not in value else None

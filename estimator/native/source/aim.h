@@ -13,6 +13,10 @@
 
 enum { AIM_STEPS = 25 };
 
+/* Most vectors of rays that are traced at the same time: a ray is a chain of dependent
+ * operations, and the processor works on several chains at once. */
+enum { N_GROUPS = 4 };
+
 /* Source of the rays of one field, and the plane of the wavefront. */
 typedef struct {
     eye e;
@@ -53,21 +57,20 @@ INLINE rays launched(const light *l, aims to, flags active) {
     return r;
 }
 
-/* Traces rays from the retinal point through the lens to the stop. */
-static rays back_to_stop(const light *l, aims to, flags active) {
-    rays r = launched(l, to, active);
-    outward(&l->e, l->e.n_before, l->e.n_surfaces, &r);
-    to_stop(&l->e, &r);
-    return r;
+/* Traces rays (n_groups,) from the retinal point through the lens to the stop. */
+static void back_to_stop(const light *l, int n_groups, const aims *to, const flags *active,
+                         rays *r) {
+    for (int g = 0; g < n_groups; ++g) r[g] = launched(l, to[g], active[g]);
+    outward(&l->e, l->e.n_before, l->e.n_surfaces, n_groups, r);
+    for (int g = 0; g < n_groups; ++g) to_stop(&l->e, r + g);
 }
 
 INLINE lanes dot(const double *axis, vector3 v) {
     return axis[0] * v.x + axis[1] * v.y + axis[2] * v.z;
 }
 
-/* Traces rays from the stop to the plane of the wavefront. */
-static samples leave_eye(const light *l, rays *r) {
-    outward(&l->e, 0, l->e.n_before, r);
+/* Samples of rays from the first surface to the plane of the wavefront. */
+INLINE samples in_plane(const light *l, const rays *r) {
     const double *ex = l->outside.row[0], *ey = l->outside.row[1], *u = l->outside.row[2];
     vector3 p = {r->at.x - l->plane[0], r->at.y - l->plane[1], r->at.z - l->plane[2]};
     lanes t = -dot(u, p) / dot(u, r->along);
@@ -76,6 +79,12 @@ static samples leave_eye(const light *l, rays *r) {
     double slope = -UM_PER_MM * l->e.indices[0];
     return (samples){dot(ex, p), dot(ey, p), UM_PER_MM * (l->path - path),
                      slope * dot(ex, r->along), slope * dot(ey, r->along)};
+}
+
+/* Traces rays (n_groups,) from the stop to the plane of the wavefront. */
+static void leave_eye(const light *l, int n_groups, rays *r, samples *found) {
+    outward(&l->e, 0, l->e.n_before, n_groups, r);
+    for (int g = 0; g < n_groups; ++g) found[g] = in_plane(l, r + g);
 }
 
 INLINE rays chosen_rays(flags yes, const rays *a, const rays *b) {
@@ -99,52 +108,115 @@ INLINE void update_responses(responses *m, flags active, lanes da, lanes db, lan
     m->bb = chosen(active, m->bb + eb * vb, m->bb);
 }
 
-/* Aims rays at (x, y) of the stop by Broyden's method, in the lanes of `active`.
+/* Points of the stop, or of a circle, for the lanes of `active`. */
+typedef struct {
+    lanes x, y;
+    flags active;
+} targets;
+
+/* A step of Broyden's method. */
+typedef struct {
+    aims now;       /* directions of the rays so far */
+    lanes mx, my;   /* their distance from the target */
+    lanes da, db;   /* step */
+    lanes share;    /* of the step */
+    lanes nx, ny;   /* distance after it */
+    flags pending;  /* lanes that have not arrived */
+    flags searching; /* of these, those without an acceptable share */
+} search;
+
+INLINE search search_from(aims to, const rays *r, const targets *t) {
+    return (search){.now = to,
+                    .mx = r->at.x - t->x,
+                    .my = r->at.y - t->y,
+                    .pending = r->status == TRACED};
+}
+
+INLINE aims newton_step(const responses *m, lanes mx, lanes my) {
+    return (aims){-(m->aa * mx + m->ab * my), -(m->ba * mx + m->bb * my)};
+}
+
+/* Ends the search of lanes that have arrived; returns whether others remain. */
+INLINE int begin_step(search *s, const responses *m, double tolerance) {
+    s->pending &= ~(s->mx * s->mx + s->my * s->my < tolerance * tolerance);
+    aims step = newton_step(m, s->mx, s->my);
+    s->da = step.a;
+    s->db = step.b;
+    s->share = all_lanes(1.0);
+    s->nx = s->mx;
+    s->ny = s->my;
+    s->searching = s->pending;
+    return any_lane(s->pending);
+}
+
+INLINE aims shared_step(const search *s) {
+    return (aims){s->now.a + s->share * s->da, s->now.b + s->share * s->db};
+}
+
+/* Takes the lanes of a trial that are acceptable, and halves the step of the others; returns
+ * whether there are any. */
+INLINE int take_trial(search *s, const targets *t, const rays *trial, rays *r) {
+    lanes tx = trial->at.x - t->x, ty = trial->at.y - t->y;
+    lanes miss = s->mx * s->mx + s->my * s->my;
+    flags fine = (trial->status == TRACED) & (tx * tx + ty * ty < WORSENING * miss);
+    *r = chosen_rays(fine, trial, r);
+    s->nx = chosen(fine, tx, s->nx);
+    s->ny = chosen(fine, ty, s->ny);
+    s->searching &= ~fine;
+    if (!any_lane(s->searching)) return 0;
+    lanes less = 0.5 * s->share;
+    flags lost = s->searching & (less < SMALLEST_SHARE);
+    flags why = chosen_flags(trial->status == TRACED, all_flags(NOT_CONVERGED), trial->status);
+    r->status = chosen_flags(lost, why, r->status);
+    s->searching &= ~lost;
+    s->pending &= ~lost;
+    s->share = chosen(s->searching, less, s->share);
+    return any_lane(s->searching);
+}
+
+INLINE void end_step(search *s, responses *m) {
+    lanes da = s->share * s->da, db = s->share * s->db;
+    update_responses(m, s->pending, da, db, s->nx - s->mx, s->ny - s->my);
+    s->now.a = chosen(s->pending, s->now.a + da, s->now.a);
+    s->now.b = chosen(s->pending, s->now.b + db, s->now.b);
+    s->mx = s->nx;
+    s->my = s->ny;
+}
+
+/* Aims rays (n_groups,) at the stop by Broyden's method.
  *
- * `to` holds the initial directions and receives the solutions; `m` is updated.  Returns the rays
- * at the stop, whose status is IDLE in the other lanes. */
-static rays aimed(const light *l, lanes x, lanes y, double tolerance, flags active, aims *to,
-                  responses *m) {
-    rays r = back_to_stop(l, *to, active);
-    flags pending = r.status == TRACED;
-    aims now = *to;
-    lanes mx = r.at.x - x, my = r.at.y - y;
+ * `to` holds the initial directions and receives those of the targets, to first order from the
+ * rays; `m` is updated.  Writes the rays at the stop, whose status is IDLE in other lanes. */
+static void aim(const light *l, int n_groups, const targets *t, double tolerance, aims *to,
+                responses *m, rays *r) {
+    search s[N_GROUPS];
+    rays trials[N_GROUPS];
+    aims next[N_GROUPS];
+    flags active[N_GROUPS];
+    for (int g = 0; g < n_groups; ++g) active[g] = t[g].active;
+    back_to_stop(l, n_groups, to, active, r);
+    for (int g = 0; g < n_groups; ++g) s[g] = search_from(to[g], r + g, t + g);
     for (int step = 0; step < AIM_STEPS; ++step) {
-        lanes miss = mx * mx + my * my;
-        pending &= ~(miss < tolerance * tolerance);
-        if (!any_lane(pending)) break;
-        lanes da = -(m->aa * mx + m->ab * my), db = -(m->ba * mx + m->bb * my);
-        lanes share = all_lanes(1.0), nx = mx, ny = my;
-        flags searching = pending;
-        while (any_lane(searching)) {
-            aims next = {now.a + share * da, now.b + share * db};
-            rays trial = back_to_stop(l, next, searching);
-            lanes tx = trial.at.x - x, ty = trial.at.y - y;
-            flags fine = (trial.status == TRACED) & (tx * tx + ty * ty < WORSENING * miss);
-            r = chosen_rays(fine, &trial, &r);
-            nx = chosen(fine, tx, nx);
-            ny = chosen(fine, ty, ny);
-            searching &= ~fine;
-            lanes less = 0.5 * share;
-            flags lost = searching & (less < SMALLEST_SHARE);
-            flags why = chosen_flags(trial.status == TRACED, all_flags(NOT_CONVERGED),
-                                     trial.status);
-            r.status = chosen_flags(lost, why, r.status);
-            searching &= ~lost;
-            pending &= ~lost;
-            share = chosen(searching, less, share);
+        int searches = 0;
+        for (int g = 0; g < n_groups; ++g) searches |= begin_step(s + g, m + g, tolerance);
+        if (!searches) break;
+        while (searches) {
+            for (int g = 0; g < n_groups; ++g) {
+                next[g] = shared_step(s + g);
+                active[g] = s[g].searching;
+            }
+            back_to_stop(l, n_groups, next, active, trials);
+            searches = 0;
+            for (int g = 0; g < n_groups; ++g)
+                searches |= take_trial(s + g, t + g, trials + g, r + g);
         }
-        da *= share;
-        db *= share;
-        update_responses(m, pending, da, db, nx - mx, ny - my);
-        now.a = chosen(pending, now.a + da, now.a);
-        now.b = chosen(pending, now.b + db, now.b);
-        mx = nx;
-        my = ny;
+        for (int g = 0; g < n_groups; ++g) end_step(s + g, m + g);
     }
-    end_rays(&r, pending, NOT_CONVERGED);
-    *to = now;
-    return r;
+    for (int g = 0; g < n_groups; ++g) {
+        end_rays(r + g, s[g].pending, NOT_CONVERGED);
+        aims rest = newton_step(m + g, s[g].mx, s[g].my);
+        to[g] = (aims){s[g].now.a + rest.a, s[g].now.b + rest.b};
+    }
 }
 
 /* Two unit vectors that complete the third row, a direction, to a basis. */
@@ -175,7 +247,8 @@ static void start_from(light *l, const rays *r) {
  * rays, the chief ray first; their status is TRACED only if all of them pass. */
 static int respond(light *l, rays *r) {
     const aims to = {{0.0, DIFFERENCE_COSINE}, {0.0, 0.0, DIFFERENCE_COSINE}};
-    *r = back_to_stop(l, to, first_lanes(3));
+    const flags active = first_lanes(3);
+    back_to_stop(l, 1, &to, &active, r);
     for (int lane = 0; lane < 3; ++lane)
         if (r->status[lane] != TRACED) return (int)r->status[lane];
     l->response = inverse_of(r->at.x, r->at.y, DIFFERENCE_COSINE);
@@ -191,10 +264,8 @@ static int prepare_light(light *l, const double *field_rad) {
     start_from(l, &r);
     status = respond(l, &r);
     if (status != TRACED) return status;
-    memcpy(l->plane, l->retina, sizeof l->plane);
-    l->path = 0.0;
     r.status = ~first_lanes(1) & IDLE;
-    leave_eye(l, &r);
+    outward(&l->e, 0, l->e.n_before, 1, &r);
     l->plane[0] = r.at.x[0];
     l->plane[1] = r.at.y[0];
     l->plane[2] = r.at.z[0];

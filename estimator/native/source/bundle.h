@@ -15,7 +15,7 @@
 #define RIM_TOLERANCE_MM 1e-9 /* an error changes the radius of the circle */
 #define EDGE_MARGIN 1e-6      /* times the stop's radius: exceeds the aiming tolerance */
 
-enum { EDGE_HALVINGS = 40, EXTRAPOLATED = 3 };
+enum { EDGE_HALVINGS = 40, EXTRAPOLATED = 5 };
 
 /* Nodes of a pupil; azimuths are padded to whole vectors. */
 typedef struct {
@@ -32,41 +32,54 @@ INLINE double ring_radius(const pupil_nodes *nodes, int ring) {
     return ring == 0 ? 0.0 : nodes->rings[ring - 1];
 }
 
-/* Extrapolates ray directions from up to three inner rings to ring `ring`. */
-INLINE aims extrapolated(const pupil_nodes *nodes, const aims *known, int ring) {
-    int first = ring > EXTRAPOLATED ? ring - EXTRAPOLATED : 0;
+/* Directions, divided by their radii, at a radius, from those of rings first to last - 1; both
+ * relative to the radius of the stop. */
+INLINE aims through_rings(const pupil_nodes *nodes, const aims *known, int first, int last,
+                          double radius) {
     aims out = {{0.0}, {0.0}};
-    for (int i = first; i < ring; ++i) {
+    for (int i = first; i < last; ++i) {
         double share = 1.0, own = ring_radius(nodes, i);
-        for (int k = first; k < ring; ++k)
-            if (k != i)
-                share *= (ring_radius(nodes, ring) - ring_radius(nodes, k))
-                         / (own - ring_radius(nodes, k));
+        for (int k = first; k < last; ++k)
+            if (k != i) share *= (radius - ring_radius(nodes, k)) / (own - ring_radius(nodes, k));
         out.a += share * known[i].a;
         out.b += share * known[i].b;
     }
     return out;
 }
 
+INLINE aims extrapolated(const pupil_nodes *nodes, const aims *known, int ring) {
+    int first = ring > EXTRAPOLATED ? ring - EXTRAPOLATED : 0;
+    return through_rings(nodes, known, first, ring, ring_radius(nodes, ring));
+}
+
+INLINE aims interpolated(const pupil_nodes *nodes, const aims *known, double radius) {
+    return through_rings(nodes, known, 0, nodes->n_rings + 1, radius);
+}
+
 /* Spokes of N_LANES azimuths. */
 typedef struct {
     lanes cosine, sine;
     flags active;  /* lanes with an azimuth */
-    aims *known;   /* (n_rings + 1,): directions to the chief ray and to each ring */
+    aims *known;   /* (n_rings + 1,): directions to each ring, divided by its radius */
     flags done;    /* number of rings whose rays pass */
     flags status;  /* of the last ray; TRACED in other lanes */
     int first;     /* azimuth of the first lane */
 } spokes;
 
-static spokes spokes_from(const pupil_nodes *nodes, int first, aims *known) {
-    spokes s = {.active = first_lanes(nodes->n_azimuths - first), .known = known,
-                .first = first};
-    for (int lane = 0; lane < N_LANES && first + lane < nodes->n_azimuths; ++lane) {
-        s.cosine[lane] = nodes->azimuths[2 * (first + lane)];
-        s.sine[lane] = nodes->azimuths[2 * (first + lane) + 1];
+/* Prepares the spokes of a pupil (n_groups,); `response` is the inverse matrix of position, about
+ * the chief ray, by direction, and `known` memory for all of them. */
+static void prepare_spokes(const pupil_nodes *nodes, inverse2 response, aims *known, spokes *s) {
+    for (int first = 0; first < nodes->n_azimuths; first += N_LANES, ++s) {
+        *s = (spokes){.active = first_lanes(nodes->n_azimuths - first), .known = known,
+                      .first = first};
+        for (int lane = 0; lane < N_LANES && first + lane < nodes->n_azimuths; ++lane) {
+            s->cosine[lane] = nodes->azimuths[2 * (first + lane)];
+            s->sine[lane] = nodes->azimuths[2 * (first + lane) + 1];
+        }
+        known[0] = (aims){response.aa * s->cosine + response.ab * s->sine,
+                          response.ba * s->cosine + response.bb * s->sine};
+        known += nodes->n_rings + 1;
     }
-    known[0] = (aims){{0.0}, {0.0}};
-    return s;
 }
 
 INLINE void keep_lanes(double *to, flags yes, lanes value) {
@@ -84,35 +97,48 @@ static void keep_samples(const pupil_nodes *nodes, const spokes *s, int ring, fl
     keep_lanes(table->slope_y + at, yes, found->slope_y);
 }
 
-/* Traces rays aimed at (x, y) of the stop out of the eye; returns their status. */
-static flags trace_aimed(const light *l, lanes x, lanes y, double tolerance, flags active,
-                         aims *to, responses *m, samples *found) {
-    rays r = aimed(l, x, y, tolerance, active, to, m);
-    *found = leave_eye(l, &r);
-    return r.status;
-}
-
-INLINE aims first_aim(const responses *m, lanes x, lanes y) {
-    return (aims){m->aa * x + m->ab * y, m->ba * x + m->bb * y};
-}
-
-/* Traces the rings of spokes, whose last ring has the given radii, in the lanes of `active`. */
-static void trace_spokes(const light *l, const pupil_nodes *nodes, lanes radius, flags active,
-                         spokes *s, const sample_table *table) {
-    responses m = all_responses(l->response);
-    s->done = s->status = (flags){0};
-    for (int ring = 1; ring <= nodes->n_rings && any_lane(active); ++ring) {
-        lanes own = radius * nodes->rings[ring - 1], x = own * s->cosine, y = own * s->sine;
-        aims to = ring == 1 ? first_aim(&m, x, y) : extrapolated(nodes, s->known, ring);
+/* Traces the rings of spokes, whose last ring has the radii (n_groups,), in the lanes of
+ * `active`.
+ *
+ * The first directions are extrapolated from inner rings, or interpolated from a stop that is
+ * `reuse` times as large, whose directions are known; 0: none are. */
+static void trace_spokes(const light *l, const pupil_nodes *nodes, int n_groups,
+                         const lanes *radius, const flags *active, double reuse, spokes *s,
+                         const sample_table *table) {
+    responses m[N_GROUPS];
+    targets t[N_GROUPS];
+    for (int g = 0; g < n_groups; ++g) {
+        m[g] = all_responses(l->response);
+        t[g].active = active[g];
+        s[g].done = s[g].status = (flags){0};
+    }
+    for (int ring = 1; ring <= nodes->n_rings; ++ring) {
+        aims to[N_GROUPS];
+        rays r[N_GROUPS];
+        samples found[N_GROUPS];
+        int remains = 0;
+        for (int g = 0; g < n_groups; ++g) {
+            lanes own = radius[g] * nodes->rings[ring - 1];
+            t[g].x = own * s[g].cosine;
+            t[g].y = own * s[g].sine;
+            to[g] = reuse > 0.0 ? interpolated(nodes, s[g].known, nodes->rings[ring - 1] / reuse)
+                                : extrapolated(nodes, s[g].known, ring);
+            to[g] = (aims){own * to[g].a, own * to[g].b};
+            remains |= any_lane(t[g].active);
+        }
+        if (!remains) break;
         double tolerance = ring == nodes->n_rings ? RIM_TOLERANCE_MM : AIM_TOLERANCE_MM;
-        samples found;
-        flags status = trace_aimed(l, x, y, tolerance, active, &to, &m, &found);
-        flags passes = active & (status == TRACED);
-        s->status = chosen_flags(active, status, s->status);
-        s->known[ring] = to;
-        keep_samples(nodes, s, ring, passes, &found, table);
-        active = passes;
-        s->done += passes & 1;
+        aim(l, n_groups, t, tolerance, to, m, r);
+        leave_eye(l, n_groups, r, found);
+        for (int g = 0; g < n_groups; ++g) {
+            lanes own = radius[g] * nodes->rings[ring - 1];
+            flags passes = t[g].active & (r[g].status == TRACED);
+            s[g].status = chosen_flags(t[g].active, r[g].status, s[g].status);
+            if (reuse == 0.0) s[g].known[ring] = (aims){to[g].a / own, to[g].b / own};
+            keep_samples(nodes, s + g, ring, passes, found + g, table);
+            s[g].done += passes & 1;
+            t[g].active = passes;
+        }
     }
 }
 
@@ -132,49 +158,76 @@ static lanes open_radii(const light *l, const pupil_nodes *nodes, lanes radius, 
     }
     for (int i = 0; i < EDGE_HALVINGS; ++i) {
         lanes own = 0.5 * (low + high);
-        lanes share = chosen(low > 0.0, own / low, all_lanes(1.0));
-        aims to = {share * known.a, share * known.b};
+        aims to = {own * known.a, own * known.b};
         responses m = all_responses(l->response);
-        samples found;
-        flags status = trace_aimed(l, own * s->cosine, own * s->sine, AIM_TOLERANCE_MM, active,
-                                   &to, &m, &found);
-        flags passes = status == TRACED;
+        targets t = {own * s->cosine, own * s->sine, active};
+        rays r;
+        aim(l, 1, &t, AIM_TOLERANCE_MM, &to, &m, &r);
+        outward(&l->e, 0, l->e.n_before, 1, &r);
+        flags passes = r.status == TRACED;
         low = chosen(passes, own, low);
         high = chosen(passes, high, own);
-        known.a = chosen(passes, to.a, known.a);
-        known.b = chosen(passes, to.b, known.b);
+        known.a = chosen(passes, to.a / own, known.a);
+        known.b = chosen(passes, to.b / own, known.b);
     }
     return low;
 }
 
-/* Samples the wavefront over the stop; returns the worst status of the rays.
+/* Samples the wavefront over the stop for some spokes (n_groups,); returns the worst status.
  *
  * On vignetted azimuths, the rings are compressed to the open part, whose fraction of the radius
- * is written to `edge` (n_padded,).  The table starts with zeros. */
-static int sample_pupil(const light *l, const pupil_nodes *nodes, double stop_radius_mm,
-                        aims *known, const sample_table *table, double *edge) {
+ * is written to `edge`. */
+static int sample_spokes(const light *l, const pupil_nodes *nodes, double stop_radius_mm,
+                         int n_groups, double reuse, spokes *s, const sample_table *table,
+                         double *edge) {
+    lanes share[N_GROUPS], radius[N_GROUPS];
+    flags active[N_GROUPS];
     int64_t worst = TRACED;
-    for (int first = 0; first < nodes->n_azimuths; first += N_LANES) {
-        spokes s = spokes_from(nodes, first, known);
-        lanes share = all_lanes(1.0);
-        flags active = s.active;
-        for (int attempt = 0; attempt < 2; ++attempt) {
-            lanes radius = stop_radius_mm * share;
-            trace_spokes(l, nodes, radius, active, &s, table);
-            active &= s.status != TRACED;
-            if (!any_lane(active)) break;
+    for (int g = 0; g < n_groups; ++g) {
+        share[g] = all_lanes(1.0);
+        active[g] = s[g].active;
+    }
+    for (int attempt = 0; attempt < 2; ++attempt) {
+        int fails = 0;
+        for (int g = 0; g < n_groups; ++g) radius[g] = stop_radius_mm * share[g];
+        trace_spokes(l, nodes, n_groups, radius, active, reuse, s, table);
+        for (int g = 0; g < n_groups; ++g) {
+            active[g] &= s[g].status != TRACED;
+            fails |= any_lane(active[g]);
+        }
+        if (!fails) break;
+        if (reuse > 0.0) /* unlike the larger stop */
+            return sample_spokes(l, nodes, stop_radius_mm, n_groups, 0.0, s, table, edge);
+        for (int g = 0; g < n_groups; ++g) {
+            if (!any_lane(active[g])) continue;
             for (int lane = 0; lane < N_LANES; ++lane)
-                if (active[lane] && s.status[lane] > worst) worst = s.status[lane];
+                if (active[g][lane] && s[g].status[lane] > worst) worst = s[g].status[lane];
             lanes open = {0.0};
             if (attempt == 0) {
-                open = open_radii(l, nodes, radius, active, &s);
+                open = open_radii(l, nodes, radius[g], active[g], s + g);
                 open = open / stop_radius_mm * (1.0 - EDGE_MARGIN);
             }
-            share = chosen(active, open, share);
+            share[g] = chosen(active[g], open, share[g]);
         }
-        store_lanes(edge + first, share);
     }
+    for (int g = 0; g < n_groups; ++g) store_lanes(edge + s[g].first, share[g]);
     return (int)worst;
+}
+
+/* Samples the wavefront over the stop; returns the worst status of the rays.
+ *
+ * `s` are the spokes of the pupil, and `reuse` is that of `trace_spokes`.  The table starts with
+ * zeros. */
+static int sample_pupil(const light *l, const pupil_nodes *nodes, double stop_radius_mm,
+                        double reuse, spokes *s, const sample_table *table, double *edge) {
+    int worst = TRACED, count = nodes->n_padded / N_LANES;
+    for (int first = 0; first < count; first += N_GROUPS) {
+        int n_groups = count - first < N_GROUPS ? count - first : N_GROUPS;
+        int own = sample_spokes(l, nodes, stop_radius_mm, n_groups, reuse, s + first, table,
+                                edge);
+        if (own > worst) worst = own;
+    }
+    return worst;
 }
 
 #endif

@@ -15,12 +15,11 @@
 
 enum { CIRCLE_STEPS = 20 };
 
-/* Traces rays from the retinal point to the plane of the wavefront. */
-static samples through(const light *l, aims to, flags active, flags *status) {
-    rays r = back_to_stop(l, to, active);
-    samples found = leave_eye(l, &r);
-    *status = r.status;
-    return found;
+/* Traces rays (n_groups,) from the retinal point to the plane of the wavefront. */
+static void through(const light *l, int n_groups, const aims *to, const flags *active, rays *r,
+                    samples *found) {
+    back_to_stop(l, n_groups, to, active, r);
+    leave_eye(l, n_groups, r, found);
 }
 
 INLINE samples chosen_samples(flags yes, const samples *a, const samples *b) {
@@ -28,83 +27,135 @@ INLINE samples chosen_samples(flags yes, const samples *a, const samples *b) {
                      chosen(yes, a->slope_x, b->slope_x), chosen(yes, a->slope_y, b->slope_y)};
 }
 
-/* Aims rays at (x, y) of the circle by Broyden's method, in the lanes of `active`, and
- * extrapolates W to it.  `to` holds the initial directions and receives the solutions; `m` is
- * updated.  Returns the status, IDLE in the other lanes. */
-static flags aim_outside(const light *l, lanes x, lanes y, flags active, aims *to, responses *m,
-                         samples *found) {
-    flags status;
-    aims now = *to;
-    *found = through(l, now, active, &status);
-    flags pending = status == TRACED;
-    for (int step = 0; step < CIRCLE_STEPS; ++step) {
-        lanes mx = found->x - x, my = found->y - y;
-        pending &= ~(mx * mx + my * my < CIRCLE_TOLERANCE_MM * CIRCLE_TOLERANCE_MM);
-        if (!any_lane(pending)) break;
-        lanes da = -(m->aa * mx + m->ab * my), db = -(m->ba * mx + m->bb * my);
-        lanes share = all_lanes(1.0);
-        flags searching = pending;
-        while (any_lane(searching)) {
-            flags own;
-            aims next = {now.a + share * da, now.b + share * db};
-            samples trial = through(l, next, searching, &own);
-            *found = chosen_samples(own == TRACED, &trial, found);
-            searching &= own != TRACED;
-            flags lost = searching & ~(share > CIRCLE_SMALLEST_SHARE);
-            status = chosen_flags(lost, own, status);
-            searching &= ~lost;
-            pending &= ~lost;
-            share = chosen(searching, 0.5 * share, share);
-        }
-        da *= share;
-        db *= share;
-        update_responses(m, pending, da, db, found->x - x - mx, found->y - y - my);
-        now.a = chosen(pending, now.a + da, now.a);
-        now.b = chosen(pending, now.b + db, now.b);
+/* Takes the lanes of a trial whose rays pass, and halves the step of the others; returns whether
+ * there are any. */
+INLINE int take_outside(search *s, const rays *r, const samples *trial, samples *found,
+                        flags *status) {
+    *found = chosen_samples(r->status == TRACED, trial, found);
+    s->searching &= r->status != TRACED;
+    if (!any_lane(s->searching)) return 0;
+    flags lost = s->searching & ~(s->share > CIRCLE_SMALLEST_SHARE);
+    *status = chosen_flags(lost, r->status, *status);
+    s->searching &= ~lost;
+    s->pending &= ~lost;
+    s->share = chosen(s->searching, 0.5 * s->share, s->share);
+    return any_lane(s->searching);
+}
+
+/* Aims rays (n_groups,) at the circle by Broyden's method, and extrapolates W to the targets.
+ * `to` holds the initial directions and receives the solutions; `m` is updated.  Writes the
+ * status, IDLE in other lanes. */
+static void aim_outside(const light *l, int n_groups, const targets *t, aims *to, responses *m,
+                        samples *found, flags *status) {
+    search s[N_GROUPS];
+    rays r[N_GROUPS];
+    samples trials[N_GROUPS];
+    aims next[N_GROUPS];
+    flags active[N_GROUPS];
+    for (int g = 0; g < n_groups; ++g) active[g] = t[g].active;
+    through(l, n_groups, to, active, r, found);
+    for (int g = 0; g < n_groups; ++g) {
+        status[g] = r[g].status;
+        s[g] = (search){.now = to[g], .pending = status[g] == TRACED};
     }
-    status = chosen_flags(pending, all_flags(NOT_CONVERGED), status);
-    found->w -= (found->x - x) * found->slope_x + (found->y - y) * found->slope_y;
-    found->x = x;
-    found->y = y;
-    *to = now;
-    return status;
+    for (int step = 0; step < CIRCLE_STEPS; ++step) {
+        int searches = 0;
+        for (int g = 0; g < n_groups; ++g) {
+            s[g].mx = found[g].x - t[g].x;
+            s[g].my = found[g].y - t[g].y;
+            searches |= begin_step(s + g, m + g, CIRCLE_TOLERANCE_MM);
+        }
+        if (!searches) break;
+        while (searches) {
+            for (int g = 0; g < n_groups; ++g) {
+                next[g] = shared_step(s + g);
+                active[g] = s[g].searching;
+            }
+            through(l, n_groups, next, active, r, trials);
+            searches = 0;
+            for (int g = 0; g < n_groups; ++g)
+                searches |= take_outside(s + g, r + g, trials + g, found + g, status + g);
+        }
+        for (int g = 0; g < n_groups; ++g) {
+            s[g].nx = found[g].x - t[g].x;
+            s[g].ny = found[g].y - t[g].y;
+            end_step(s + g, m + g);
+        }
+    }
+    for (int g = 0; g < n_groups; ++g) {
+        samples *f = found + g;
+        lanes mx = f->x - t[g].x, my = f->y - t[g].y;
+        status[g] = chosen_flags(s[g].pending, all_flags(NOT_CONVERGED), status[g]);
+        f->w -= mx * f->slope_x + my * f->slope_y;
+        f->x = t[g].x;
+        f->y = t[g].y;
+        aims rest = newton_step(m + g, mx, my);
+        to[g] = (aims){s[g].now.a + rest.a, s[g].now.b + rest.b};
+    }
+}
+
+/* Samples some spokes (n_groups,) of a circle; returns the worst status. */
+static int sample_circle_spokes(const light *l, const pupil_nodes *nodes, double radius_mm,
+                                inverse2 response, int n_groups, const spokes *s,
+                                const sample_table *table) {
+    responses m[N_GROUPS];
+    targets t[N_GROUPS];
+    int64_t worst = TRACED;
+    for (int g = 0; g < n_groups; ++g) {
+        m[g] = all_responses(response);
+        t[g].active = s[g].active;
+    }
+    for (int ring = 1; ring <= nodes->n_rings; ++ring) {
+        double own = radius_mm * ring_radius(nodes, ring);
+        double weight = nodes->weights[ring - 1] / nodes->n_azimuths;
+        aims to[N_GROUPS];
+        samples found[N_GROUPS];
+        flags status[N_GROUPS];
+        for (int g = 0; g < n_groups; ++g) {
+            t[g].x = own * s[g].cosine;
+            t[g].y = own * s[g].sine;
+            to[g] = extrapolated(nodes, s[g].known, ring);
+            to[g] = (aims){own * to[g].a, own * to[g].b};
+        }
+        aim_outside(l, n_groups, t, to, m, found, status);
+        for (int g = 0; g < n_groups; ++g) {
+            flags passes = t[g].active & (status[g] == TRACED);
+            for (int lane = 0; lane < N_LANES; ++lane)
+                if (t[g].active[lane] && status[g][lane] > worst) worst = status[g][lane];
+            s[g].known[ring] = (aims){to[g].a / own, to[g].b / own};
+            keep_samples(nodes, s + g, ring, passes, found + g, table);
+            keep_lanes(table->weight + (ring - 1) * nodes->n_padded + s[g].first, passes,
+                       all_lanes(weight));
+            t[g].active = passes;
+        }
+    }
+    return (int)worst;
 }
 
 /* Fills the table, whose weights are 0 where a ray or one nearer to the center fails; returns the
  * worst status. */
 static int sample_circle(const light *l, const pupil_nodes *nodes, double radius_mm, aims *known,
-                         const sample_table *table) {
+                         spokes *s, const sample_table *table) {
     const aims displaced = {{DIFFERENCE_COSINE}, {0.0, DIFFERENCE_COSINE}};
-    flags status;
-    samples found = through(l, displaced, first_lanes(2), &status);
+    const flags active = first_lanes(2);
+    rays r;
+    samples found;
+    through(l, 1, &displaced, &active, &r, &found);
     for (int lane = 0; lane < 2; ++lane)
-        if (status[lane] != TRACED) return (int)status[lane];
+        if (r.status[lane] != TRACED) return (int)r.status[lane];
     double xa = found.x[0] / DIFFERENCE_COSINE, ya = found.y[0] / DIFFERENCE_COSINE;
     double xb = found.x[1] / DIFFERENCE_COSINE, yb = found.y[1] / DIFFERENCE_COSINE;
     double determinant = xa * yb - xb * ya;
     const inverse2 response = {yb / determinant, -xb / determinant, -ya / determinant,
                                xa / determinant};
-    int64_t worst = TRACED;
-    for (int first = 0; first < nodes->n_azimuths; first += N_LANES) {
-        spokes s = spokes_from(nodes, first, known);
-        responses m = all_responses(response);
-        flags active = s.active;
-        for (int ring = 1; ring <= nodes->n_rings && any_lane(active); ++ring) {
-            double own = radius_mm * ring_radius(nodes, ring);
-            lanes x = own * s.cosine, y = own * s.sine;
-            aims to = ring == 1 ? first_aim(&m, x, y) : extrapolated(nodes, known, ring);
-            status = aim_outside(l, x, y, active, &to, &m, &found);
-            flags passes = active & (status == TRACED);
-            for (int lane = 0; lane < N_LANES; ++lane)
-                if (active[lane] && status[lane] > worst) worst = status[lane];
-            known[ring] = to;
-            keep_samples(nodes, &s, ring, passes, &found, table);
-            keep_lanes(table->weight + (ring - 1) * nodes->n_padded + first, passes,
-                       all_lanes(nodes->weights[ring - 1] / nodes->n_azimuths));
-            active = passes;
-        }
+    prepare_spokes(nodes, response, known, s);
+    int worst = TRACED, count = nodes->n_padded / N_LANES;
+    for (int first = 0; first < count; first += N_GROUPS) {
+        int n_groups = count - first < N_GROUPS ? count - first : N_GROUPS;
+        int own = sample_circle_spokes(l, nodes, radius_mm, response, n_groups, s + first, table);
+        if (own > worst) worst = own;
     }
-    return (int)worst;
+    return worst;
 }
 
 /* Multiplies W by the matrix (n_terms, n_azimuths, n_rings); piston is zero. */

@@ -85,6 +85,9 @@ static void write_basis(const zernike_terms *z, const sample_table *s, double ra
     }
 }
 
+/* Length of the rows of a matrix of n columns. */
+INLINE int row_length(int n) { return (n + N_LANES - 1) / N_LANES * N_LANES; }
+
 static double dot_of_samples(const double *a, const double *b, int count) {
     lanes sum = {0.0};
     for (int i = 0; i < count; i += N_LANES) sum += load_lanes(a + i) * load_lanes(b + i);
@@ -96,7 +99,7 @@ static double dot_of_samples(const double *a, const double *b, int count) {
 static void add_normal_equations(const double *basis, const sample_table *s,
                                  const double *values, double scale, int first, int n_terms,
                                  double *weighted, double *matrix, double *right) {
-    int count = s->count, n = n_terms - first;
+    int count = s->count, n = n_terms - first, length = row_length(n);
     for (int i = 0; i < n; ++i) {
         const double *own = basis + (ptrdiff_t)(first + i) * count;
         for (int k = 0; k < count; k += N_LANES)
@@ -112,35 +115,38 @@ static void add_normal_equations(const double *basis, const sample_table *s,
                 for (int m = 0; m < 4; ++m)
                     sums[m] += value * load_lanes(other + (ptrdiff_t)m * count + k);
             }
-            for (int m = 0; m < 4; ++m) matrix[i * n + j + m] += sum_of_lanes(sums[m]);
+            for (int m = 0; m < 4; ++m) matrix[i * length + j + m] += sum_of_lanes(sums[m]);
         }
         for (; j < n; ++j)
-            matrix[i * n + j] +=
+            matrix[i * length + j] +=
                 dot_of_samples(weighted, basis + (ptrdiff_t)(first + j) * count, count);
     }
 }
 
-/* Solves a symmetric system in place from its upper triangle; 0 if it is singular. */
+/* Solves a symmetric system (n, row_length(n)) in place from its upper triangle; 0 if it is
+ * singular.  Vectors also change numbers beside the triangle, which are not used. */
 static int solve_symmetric(double *matrix, double *right, int n) {
+    int length = row_length(n);
     double diagonal[MOST_TERMS];
-    for (int k = 0; k < n; ++k) diagonal[k] = matrix[k * n + k];
+    for (int k = 0; k < n; ++k) diagonal[k] = matrix[k * length + k];
     for (int k = 0; k < n; ++k) {
-        double *row = matrix + (ptrdiff_t)k * n;
+        double *row = matrix + (ptrdiff_t)k * length;
         if (!(row[k] > PIVOT_LIMIT * diagonal[k])) return 0;
         double inverse = 1.0 / sqrt(row[k]);
         for (int j = k; j < n; ++j) row[j] *= inverse;
         for (int i = k + 1; i < n; ++i) {
-            double factor = row[i], *other = matrix + (ptrdiff_t)i * n;
-            for (int j = i; j < n; ++j) other[j] -= factor * row[j];
+            double factor = row[i], *other = matrix + (ptrdiff_t)i * length;
+            for (int j = i / N_LANES * N_LANES; j < length; j += N_LANES)
+                store_lanes(other + j, load_lanes(other + j) - factor * load_lanes(row + j));
         }
     }
     for (int k = 0; k < n; ++k) {
-        const double *row = matrix + (ptrdiff_t)k * n;
+        const double *row = matrix + (ptrdiff_t)k * length;
         right[k] /= row[k];
         for (int j = k + 1; j < n; ++j) right[j] -= right[k] * row[j];
     }
     for (int k = n - 1; k >= 0; --k) {
-        const double *row = matrix + (ptrdiff_t)k * n;
+        const double *row = matrix + (ptrdiff_t)k * length;
         double total = right[k];
         for (int j = k + 1; j < n; ++j) total -= row[j] * right[j];
         right[k] = total / row[k];
@@ -148,7 +154,7 @@ static int solve_symmetric(double *matrix, double *right, int n) {
     return 1;
 }
 
-/* Memory of a fit: (n_terms, count), (n_terms, n_terms) and (count,). */
+/* Memory of a fit: (n_terms, count), (n_terms, row_length(n_terms)) and (count,). */
 typedef struct {
     double *basis, *matrix, *row;
 } fit_work;
@@ -161,7 +167,7 @@ static double fit_zernike(const zernike_terms *z, const sample_table *s, double 
                           int by_slopes, const fit_work *work, double *zernike_um) {
     int first = by_slopes ? 1 : 0, n = z->n_terms - first, count = s->count;
     double right[MOST_TERMS] = {0.0};
-    memset(work->matrix, 0, sizeof(double) * (size_t)n * (size_t)n);
+    memset(work->matrix, 0, sizeof(double) * (size_t)(n * row_length(n)));
     for (int d_y = 0; by_slopes && d_y < 2; ++d_y) {
         write_basis(z, s, radius_mm, 1 - d_y, d_y, work->basis);
         add_normal_equations(work->basis, s, d_y ? s->slope_y : s->slope_x, radius_mm, first,
@@ -187,19 +193,25 @@ static double fit_zernike(const zernike_terms *z, const sample_table *s, double 
         mean += sum_of_lanes(weight * rest);
     }
     mean /= total;
-    for (int i = 0; i < count; ++i)
-        squares += s->weight[i] * (work->row[i] - mean) * (work->row[i] - mean);
+    for (int i = 0; i < count; i += N_LANES) {
+        lanes rest = load_lanes(work->row + i) - mean;
+        squares += sum_of_lanes(load_lanes(s->weight + i) * rest * rest);
+    }
     return sqrt(squares / total);
 }
 
-/* Largest value of a Fourier series within `reach` of an angle, by Newton's method. */
+/* Largest value of a Fourier series within `reach` of an angle, by Newton's method.  Cosines and
+ * sines of multiples follow from those of the angle. */
 static double series_peak(double mean, const double *even, const double *odd, int n_terms,
                           double angle, double reach) {
     double largest = 0.0, start = angle;
     for (int i = 0; i < RIM_STEPS; ++i) {
         double value = mean, slope = 0.0, bend = 0.0;
+        double cosine = cos(angle), sine = sin(angle), c = 1.0, s = 0.0;
         for (int k = 1; k <= n_terms; ++k) {
-            double c = cos(k * angle), s = sin(k * angle);
+            double before = c;
+            c = before * cosine - s * sine;
+            s = before * sine + s * cosine;
             value += even[k] * c + odd[k] * s;
             slope += k * (odd[k] * c - even[k] * s);
             bend -= (double)k * k * (even[k] * c + odd[k] * s);
@@ -213,14 +225,14 @@ static double series_peak(double mean, const double *even, const double *odd, in
     return largest;
 }
 
-/* Largest distance, mm, of rim points (n,), at equally spaced azimuths of the stop, from the
- * chief ray.  `series` is memory for 3 n numbers.
+/* Largest distance, mm, of rim points (n,) from the chief ray.  The azimuths (n, 2), cosine and
+ * sine, are those of the stop, equally spaced; `series` is memory for 3 n numbers.
  *
  * The rim of an unvignetted pupil is smooth: Newton's method finds the maxima of the Fourier
  * series of its squared distance.  A vignetted rim has kinks, so the farthest of its points is
  * used. */
-static double rim_radius(const double *x, const double *y, int n, int is_whole,
-                         double *series) {
+static double rim_radius(const double *x, const double *y, int n, const double *azimuths,
+                         int is_whole, double *series) {
     double largest = 0.0, mean = 0.0, *squared = series, *even = series + n, *odd = even + n;
     for (int i = 0; i < n; ++i) {
         squared[i] = x[i] * x[i] + y[i] * y[i];
@@ -233,9 +245,9 @@ static double rim_radius(const double *x, const double *y, int n, int is_whole,
     for (int k = 1; k <= n_terms; ++k) {
         even[k] = odd[k] = 0.0;
         for (int i = 0; i < n; ++i) {
-            double angle = reach * ((k * i) % n);
-            even[k] += 2.0 / n * squared[i] * cos(angle);
-            odd[k] += 2.0 / n * squared[i] * sin(angle);
+            const double *direction = azimuths + 2 * (k * i % n);
+            even[k] += 2.0 / n * squared[i] * direction[0];
+            odd[k] += 2.0 / n * squared[i] * direction[1];
         }
     }
     for (int i = 0; i < n; ++i)
@@ -248,12 +260,13 @@ static double rim_radius(const double *x, const double *y, int n, int is_whole,
  * its ellipse; NaN if it is none. */
 static void fit_ellipse(const double *x, const double *y, int n, double radius_mm,
                         double *ellipse) {
-    double matrix[CONIC_TERMS * CONIC_TERMS] = {0.0}, right[CONIC_TERMS] = {0.0};
+    enum { LENGTH = 2 * N_LANES };
+    double matrix[CONIC_TERMS * LENGTH] = {0.0}, right[CONIC_TERMS] = {0.0};
     for (int i = 0; i < n; ++i) {
         double u = x[i] / radius_mm, v = y[i] / radius_mm;
         double row[CONIC_TERMS] = {u * u, u * v, v * v, u, v};
         for (int j = 0; j < CONIC_TERMS; ++j) {
-            for (int k = j; k < CONIC_TERMS; ++k) matrix[j * CONIC_TERMS + k] += row[j] * row[k];
+            for (int k = j; k < CONIC_TERMS; ++k) matrix[j * LENGTH + k] += row[j] * row[k];
             right[j] += row[j];
         }
     }

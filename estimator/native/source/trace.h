@@ -36,10 +36,11 @@ static void inward(const eye *e, int first, int last, rays *r) {
     for (int i = first; i < last && any_lane(r->status == TRACED); ++i) cross(e, i, i - 1, i, r);
 }
 
-/* Traces rays in reverse through surfaces last - 1 to first. */
-static void outward(const eye *e, int first, int last, rays *r) {
-    for (int i = last - 1; i >= first && any_lane(r->status == TRACED); --i)
-        cross(e, i, i, i - 1, r);
+/* Traces rays (n_groups,) in reverse through surfaces last - 1 to first. */
+static void outward(const eye *e, int first, int last, int n_groups, rays *r) {
+    for (int i = last - 1; i >= first; --i)
+        for (int g = 0; g < n_groups; ++g)
+            if (any_lane(r[g].status == TRACED)) cross(e, i, i, i - 1, r + g);
 }
 
 /* Traces rays from the last surface straight to the retina. */

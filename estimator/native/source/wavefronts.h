@@ -24,6 +24,7 @@ enum {
 
 /* Memory of a thread. */
 typedef struct {
+    spokes *spokes;
     aims *known;
     sample_table samples;
     double *edge, *rim_x, *rim_y, *series, *ordered;
@@ -50,7 +51,11 @@ static size_t divide_memory(const wavefront_run *run, double *memory, pupil_work
     size_t used = 0;
     const pupil_nodes *nodes = &run->nodes;
     int count = nodes->n_rings * nodes->n_padded, n_terms = run->terms.n_terms;
-    work->known = (aims *)take_doubles(memory, &used, 2 * N_LANES * (nodes->n_rings + 1));
+    int n_groups = nodes->n_padded / N_LANES;
+    work->spokes = (spokes *)take_doubles(memory, &used,
+                                          n_groups * (int)(sizeof(spokes) / sizeof(double)));
+    work->known = (aims *)take_doubles(memory, &used,
+                                       2 * N_LANES * n_groups * (nodes->n_rings + 1));
     work->samples.count = count;
     double **columns[] = {&work->samples.x,       &work->samples.y,
                           &work->samples.w,       &work->samples.slope_x,
@@ -62,7 +67,7 @@ static size_t divide_memory(const wavefront_run *run, double *memory, pupil_work
     work->series = take_doubles(memory, &used, 3 * nodes->n_azimuths);
     work->ordered = take_doubles(memory, &used, count);
     work->fit.basis = take_doubles(memory, &used, n_terms * count);
-    work->fit.matrix = take_doubles(memory, &used, n_terms * n_terms);
+    work->fit.matrix = take_doubles(memory, &used, n_terms * row_length(n_terms));
     work->fit.row = take_doubles(memory, &used, count);
     return used;
 }
@@ -113,7 +118,8 @@ static void analyze_pupil(const wavefront_run *run, pupil_work *work, double dis
     }
     other[OPEN_SHARE] = share;
     if (n_rim < FEWEST_SPOKES) return;
-    double radius = rim_radius(work->rim_x, work->rim_y, n_rim, is_whole, work->series);
+    double radius = rim_radius(work->rim_x, work->rim_y, n_rim, nodes->azimuths, is_whole,
+                               work->series);
     other[RADIUS] = radius;
     fit_ellipse(work->rim_x, work->rim_y, n_rim, radius, other + ELLIPSE);
     if (distance_mm < INFINITY) subtract_object_wave(s, distance_mm);
@@ -144,11 +150,18 @@ static void analyze_field(void *argument, int item, int thread) {
     }
     double distance_mm = INFINITY;
     if (job->object_dpt != 0.0) distance_mm = UM_PER_MM / job->object_dpt - along;
-    for (int i = 0; i < n_radii; ++i) {
+    /* Directions that are known for a stop serve for smaller ones, which come before it. */
+    double known_mm = 0.0;
+    for (int i = n_radii - 1; i >= 0; --i) {
         double *result = results + i * n_results, *other = result + run->terms.n_terms;
+        double radius_mm = job->radii_mm[item * n_radii + i];
         memset(work.samples.x, 0, sizeof(double) * 6 * (size_t)work.samples.count);
-        other[WORST_STATUS] = sample_pupil(&l, &run->nodes, job->radii_mm[item * n_radii + i],
-                                           work.known, &work.samples, work.edge);
+        if (known_mm < radius_mm) prepare_spokes(&run->nodes, l.response, work.known, work.spokes);
+        double reuse = known_mm < radius_mm ? 0.0 : known_mm / radius_mm;
+        status = sample_pupil(&l, &run->nodes, radius_mm, reuse, work.spokes, &work.samples,
+                              work.edge);
+        if (reuse == 0.0) known_mm = status == TRACED ? radius_mm : 0.0;
+        other[WORST_STATUS] = status;
         memcpy(other + RETINA_POINT, l.retina, sizeof l.retina);
         memcpy(other + PLANE_POINT, l.plane, sizeof l.plane);
         analyze_pupil(run, &work, distance_mm, result);
@@ -172,7 +185,7 @@ static void analyze_circle(void *argument, int item, int thread) {
     if (!isnan(pupil_z)) move_plane_inward(&l, distance_along(&l, pupil_z));
     memset(work.samples.x, 0, sizeof(double) * 6 * (size_t)work.samples.count);
     double radius_mm = job->radii_mm[item];
-    status = sample_circle(&l, nodes, radius_mm, work.known, &work.samples);
+    status = sample_circle(&l, nodes, radius_mm, work.known, work.spokes, &work.samples);
     result[n_terms] = status;
     if (status == TRACED) {
         project_circle(nodes, &work.samples, job->projection, n_terms, work.ordered, result);
@@ -196,8 +209,10 @@ static void shift_chief(void *argument, int item, int thread) {
     if (respond(&l, &r) != TRACED) return;
     aims to = {{0.0}, {0.0}};
     responses m = all_responses(l.response);
-    r = aimed(&l, (lanes){0.0}, (lanes){0.0}, SHIFT_TOLERANCE_MM, first_lanes(1), &to, &m);
-    samples found = leave_eye(&l, &r);
+    const targets center = {{0.0}, {0.0}, first_lanes(1)};
+    samples found;
+    aim(&l, 1, &center, SHIFT_TOLERANCE_MM, &to, &m, &r);
+    leave_eye(&l, 1, &r, &found);
     if (r.status[0] != TRACED) return;
     /* The slope of the wavefront is opposite to that of the outgoing ray. */
     shift[0] = -found.slope_x[0] / UM_PER_MM;
