@@ -137,10 +137,18 @@ class EstimatedEye:
         problem = EstimationProblem(self.profile)
         return problem.determined_ratio(self.parameters.to_vector())
 
-    def rest(self, wavelengths_nm: ArrayLike) -> MeasuredResidual:
-        """Return the residual of the measurement and this eye, at wavelengths."""
+    def rest(
+        self, wavelengths_nm: ArrayLike, *, n_traced_terms: int = N_TERMS
+    ) -> MeasuredResidual:
+        """Return the residual of the measurement and this eye, at wavelengths.
+
+        It is added to traced wavefronts of ``n_traced_terms``.
+        """
         return MeasuredResidual.of(
-            self.parameters, self.profile, wavelengths_nm=wavelengths_nm
+            self.parameters,
+            self.profile,
+            wavelengths_nm=wavelengths_nm,
+            n_traced_terms=n_traced_terms,
         )
 
     @property

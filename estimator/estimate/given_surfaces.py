@@ -97,7 +97,9 @@ class GivenSurfaces:
         """Return the largest accommodation, by age and states."""
         return self.accommodating.amplitude_dpt
 
-    def rest(self, wavelengths_nm: ArrayLike) -> MeasuredResidual:
+    def rest(
+        self, wavelengths_nm: ArrayLike, *, n_traced_terms: int = N_TERMS
+    ) -> MeasuredResidual:
         """Return the residual of the measurement: zero."""
         return MeasuredResidual.zero(
             self.profile.pupil_diameter_mm, wavelengths_nm=np.unique(wavelengths_nm)

@@ -82,14 +82,21 @@ class MeasuredResidual:
         profile: EyeProfile,
         *,
         wavelengths_nm: ArrayLike,
+        n_traced_terms: int = N_TERMS,
     ) -> "MeasuredResidual":
-        """Return the residual of an estimated eye; zero for a given eye."""
+        """Return the residual of an estimated eye; zero for a given eye.
+
+        It is added to traced wavefronts of ``n_traced_terms``.
+        """
         wavelengths_nm = np.unique(wavelengths_nm)
         radius_mm, measured_nm = profile.pupil_diameter_mm / 2.0, profile.wavelength_nm
         if profile.is_given:
             return cls.zero(profile.pupil_diameter_mm, wavelengths_nm=wavelengths_nm)
         traced_um, depth_mm = _traced_um(
-            parameters, profile, np.append(measured_nm, wavelengths_nm)
+            parameters,
+            profile,
+            np.append(measured_nm, wavelengths_nm),
+            n_traced_terms,
         )
         at_cornea_um = polynomial_in_mm(
             remove_central_tilt(profile.zernike_um), radius_mm
@@ -190,9 +197,12 @@ def stretch_ratio(pupil_ratio: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _traced_um(
-    parameters: EyeParameters, profile: EyeProfile, wavelengths_nm: NDArray[Any]
+    parameters: EyeParameters,
+    profile: EyeProfile,
+    wavelengths_nm: NDArray[Any],
+    n_terms: int,
 ) -> tuple[NDArray[np.float64], float]:
-    """Return the eye's monomials (n, 28) in the measured pupil, and its depth."""
+    """Return the eye's monomials (n, n_terms) in the measured pupil, and its depth."""
     surfaces = eye_surfaces(parameters, retina=profile.retina)
     depth_mm = entrance_pupil_mm(surfaces, wavelength_nm=REFERENCE_WAVELENGTH_NM)
     found = wavefront_grid(
@@ -201,6 +211,7 @@ def _traced_um(
         wavelengths_nm=wavelengths_nm,
         pupil_diameters_mm=[profile.pupil_diameter_mm],
         plane="pupil",
+        n_terms=n_terms,
     )
     radius_mm: float | NDArray[np.float64]
     if (found.open_ratio > OPEN_RATIO).all():
@@ -213,5 +224,6 @@ def _traced_um(
         media_indices(surfaces, wavelengths_nm),
         zernike_radius_mm=radius_mm,
         pupil_z_mm=depth_mm,
+        n_terms=n_terms,
     )
     return polynomial_in_mm(zernike_um, radius_mm), depth_mm

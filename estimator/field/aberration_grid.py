@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.estimate.given_surfaces import EyeModel
 from estimator.eye.focusing import FocusedSurfaces
+from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.aberrations import wavefront_grids
 from estimator.wavefront.chief_rays import chief_shifts_mrad
 from estimator.wavefront.nodes import N_AZIMUTHS, N_RINGS
@@ -62,6 +63,7 @@ def aberration_grid(
     v_deg: ArrayLike = (0.0,),
     n_rings: int = N_RINGS,
     n_azimuths: int = N_AZIMUTHS,
+    n_terms: int = N_TERMS,
     states: Sequence[FocusedSurfaces] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> AberrationGrid:
@@ -74,6 +76,8 @@ def aberration_grid(
         Nodes of the axes; accommodations must be within the amplitude.
     n_rings, n_azimuths : int
         Sampling of the stop, see `wavefront.nodes`.
+    n_terms : int
+        Number of terms of the fit.
     states : (n_accommodations,), optional
         Eye at each accommodation, if already computed.
     progress : callable, optional
@@ -105,6 +109,7 @@ def aberration_grid(
         plane="pupil",
         n_rings=n_rings,
         n_azimuths=n_azimuths,
+        n_terms=n_terms,
     )
     shift_mrad = chief_shifts_mrad(
         eyes, fields_deg=fields_deg.reshape(-1, 2), wavelengths_nm=wavelengths_nm

@@ -8,19 +8,18 @@ from numpy.typing import NDArray
 
 from estimator.estimate.given_surfaces import EyeModel, GivenSurfaces
 from estimator.eye.tracing import TraceFailed
-from estimator.field.aberration_grid import (
-    FIELD_AZIMUTHS,
-    FIELD_RINGS,
-    AberrationGrid,
-)
+from estimator.field.aberration_grid import AberrationGrid
 from estimator.field.interpolation import (
     FieldInterpolation,
     FieldNodes,
     range_nodes_deg,
 )
 from estimator.field.peripheral_residual import PeripheralResidual
+from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.optics.zernike import HIGHEST_ORDER, MAX_RADIAL_ORDER, N_TERMS
 from estimator.periphery.change import peripheral_change
-from estimator.wavefront.aberrations import TRACED_FIELD_LIMIT_DEG
+from estimator.wavefront.aberrations import TRACED_FIELD_LIMIT_DEG, wavefront_grid
+from estimator.wavefront.nodes import fewest_nodes
 
 FIELD_PUPIL_RATIOS = (0.64, 1.0)
 """Pupils traced over the field, relative to the largest one."""
@@ -28,6 +27,14 @@ FIELD_PUPIL_RATIOS = (0.64, 1.0)
 LARGE_PUPIL_MM = 7.2
 LARGE_FIELD_PUPIL_RATIOS = (0.56, 0.8, 1.0)
 """Pupils traced over the field if the largest exceeds `LARGE_PUPIL_MM`."""
+
+TRACE_ERROR_UM = 0.005
+"""RMS error of traced wavefronts through the measured pupil above which they get more
+terms."""
+
+CHECKED_DEG = [(0, 0), (-20, 0), (20, 0), (-40, 0), (40, 0), (0, -20), (0, 20)]
+"""Directions in which this is checked, whatever the range of fields: an eye has the
+same wavefronts in every range."""
 
 ON_AXIS_DEG = ((0.0, 0.0), (0.0, 0.0))
 SHRINK_RATIO, SMALLEST_SHARE = 0.85, 0.05
@@ -60,6 +67,34 @@ def field_pupils_mm(low_mm: float, high_mm: float) -> NDArray[np.float64]:
     return np.unique(pupils_mm)
 
 
+def traced_terms(eye: EyeModel) -> int:
+    """Return the number of terms that the traced wavefronts of an eye need.
+
+    It is 28, or as many as represent the wavefronts of the relaxed eye through the
+    measured pupil with an RMS error of `TRACE_ERROR_UM`.  A prescription states no
+    higher orders, and a given eye no pupil.
+    """
+    profile = eye.profile
+    if profile.is_given or profile.kind == "prescription":
+        return N_TERMS
+    for order in range(MAX_RADIAL_ORDER, HIGHEST_ORDER + 1):
+        n_terms = (order + 1) * (order + 2) // 2
+        n_rings, n_azimuths = fewest_nodes(n_terms)
+        found = wavefront_grid(
+            eye.relaxed,
+            fields_deg=CHECKED_DEG,
+            wavelengths_nm=[REFERENCE_WAVELENGTH_NM],
+            pupil_diameters_mm=[profile.pupil_diameter_mm],
+            plane="pupil",
+            n_rings=n_rings,
+            n_azimuths=n_azimuths,
+            n_terms=n_terms,
+        )
+        if not (found.rms_residual_um > TRACE_ERROR_UM).any():  # or NaN
+            break
+    return n_terms
+
+
 def trace_field(
     eye: EyeModel,
     axis: FieldInterpolation,
@@ -81,6 +116,7 @@ def trace_field(
     field : FieldInterpolation
     traced_range_deg : ((h_low, h_high), (v_low, v_high))
     """
+    n_rings, n_azimuths = fewest_nodes(axis.grid.zernike_um.shape[-1])
     limited = np.clip(field_range_deg, -TRACED_FIELD_LIMIT_DEG, TRACED_FIELD_LIMIT_DEG)
     share = 1.0
     while share > SMALLEST_SHARE:
@@ -93,8 +129,8 @@ def trace_field(
                 eye,
                 h_deg=nodes_deg[0],
                 v_deg=nodes_deg[1],
-                n_rings=FIELD_RINGS,
-                n_azimuths=FIELD_AZIMUTHS,
+                n_rings=n_rings,
+                n_azimuths=n_azimuths,
                 **axes,
             )
         )

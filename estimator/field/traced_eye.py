@@ -37,6 +37,7 @@ from estimator.field.trace_range import (
     peripheral_residual,
     scaled_progress,
     trace_field,
+    traced_terms,
 )
 from estimator.field.traced_fields import TracedFields, check_limits
 from estimator.note import Note
@@ -127,7 +128,9 @@ class TracedEye(FocusingEye):
         self._correction = worn_polynomial(
             self._lens, entrance_pupil_mm=self.entrance_pupil_mm
         )
-        self._residual = eye.rest(axis.grid.wavelengths_nm)
+        self._residual = eye.rest(
+            axis.grid.wavelengths_nm, n_traced_terms=axis.grid.zernike_um.shape[-1]
+        )
 
     @classmethod
     def trace(
@@ -175,6 +178,7 @@ class TracedEye(FocusingEye):
         states: dict[str, Any] = {
             "accommodations_dpt": accommodation_nodes_dpt(*range_dpt),
             "wavelengths_nm": np.unique(wavelengths_nm),
+            "n_terms": traced_terms(eye),
         }
         on_axis_only = not np.any(field_range_deg)
         axis_share = 1.0 if on_axis_only else AXIS_PROGRESS

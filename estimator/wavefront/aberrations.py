@@ -18,8 +18,16 @@ from estimator.optics.paraxial import entrance_pupil_of_packed
 from estimator.optics.raytrace import RayStatus
 from estimator.optics.surfaces import EyeSurfaces, media_indices, pack_eye
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.optics.zernike import N_TERMS
 from estimator.wavefront import compiled
-from estimator.wavefront.nodes import N_AZIMUTHS, N_RINGS, circle_nodes, stop_nodes
+from estimator.wavefront.nodes import (
+    N_AZIMUTHS,
+    N_RINGS,
+    circle_nodes,
+    circle_sampling,
+    fewest_nodes,
+    stop_nodes,
+)
 from estimator.wavefront.results import Aberrations, FieldResults, PupilEllipse
 
 FITS = ("opd", "slope")
@@ -90,6 +98,7 @@ def wavefront_grid(
     fit: str = "opd",
     n_rings: int = N_RINGS,
     n_azimuths: int = N_AZIMUTHS,
+    n_terms: int = N_TERMS,
     n_threads: int | None = None,
 ) -> FieldResults:
     """Trace the aberrations for all combinations of field, wavelength and pupil.
@@ -113,6 +122,8 @@ def wavefront_grid(
         Least-squares fit of W, or of its slopes (Algorithm 1).
     n_rings, n_azimuths : int
         Sampling of the stop, see `wavefront.nodes`.
+    n_terms : int
+        Number of terms of the fit, which the sampling must determine.
     n_threads : int, optional
         Number of threads; by default as many as the process may use.
 
@@ -142,6 +153,7 @@ def wavefront_grid(
         fit=fit,
         n_rings=n_rings,
         n_azimuths=n_azimuths,
+        n_terms=n_terms,
         n_threads=n_threads,
     )
     return found.at(0)
@@ -159,6 +171,7 @@ def wavefront_grids(
     fit: str = "opd",
     n_rings: int = N_RINGS,
     n_azimuths: int = N_AZIMUTHS,
+    n_terms: int = N_TERMS,
     n_threads: int | None = None,
 ) -> FieldResults:
     """Trace `wavefront_grid` of several eyes with the same parts, as states of one eye.
@@ -176,6 +189,12 @@ def wavefront_grids(
     fields_deg = np.atleast_2d(np.asarray(fields_deg, dtype=np.float64))
     _check_view(fields_deg, object_dpt, fit)
     at_pupil = _is_at_pupil(plane)
+    needed = fewest_nodes(n_terms)
+    if n_rings < needed[0] or n_azimuths < needed[1]:
+        raise ValueError(
+            f"n_rings {n_rings}, n_azimuths {n_azimuths}: must be at least {needed[0]} "
+            f"and {needed[1]} for {n_terms} terms"
+        )
     packed = compiled.packed_eyes(eyes)
     indices = np.stack([media_indices(e, np.atleast_1d(wavelengths_nm)) for e in eyes])
     reference = np.stack([media_indices(e, REFERENCE_WAVELENGTH_NM) for e in eyes])
@@ -194,6 +213,7 @@ def wavefront_grids(
         at_pupil=at_pupil,
         by_slopes=fit == "slope",
         object_dpt=float(object_dpt),
+        n_terms=n_terms,
         n_threads=n_threads,
     )
     shape = (len(eyes), len(fields_deg), indices.shape[1])
@@ -347,6 +367,7 @@ def on_axis_zernike(
     h_deg: float = 0.0,
     v_deg: float = 0.0,
     pupil_z_mm: ArrayLike = math.nan,
+    n_terms: int = N_TERMS,
     n_threads: int | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Trace the wavefronts of many eyes on circles of given radius.
@@ -367,12 +388,14 @@ def on_axis_zernike(
     pupil_z_mm : scalar or (n_eyes,)
         z of the point of the chief ray in the plane of the circle, for example that of
         the entrance pupil; nan for the cornea.
+    n_terms : int
+        Number of terms of the fit.
     n_threads : int, optional
         Number of threads; by default as many as the process may use.
 
     Returns
     -------
-    zernike_um : (n_eyes, 28)
+    zernike_um : (n_eyes, n_terms)
         Coefficients; nan if the chief ray or most of the other rays fail.
     status_index : (n_eyes,) int
         Worst `RayStatus`; failed rays are excluded from the fit.
@@ -384,6 +407,6 @@ def on_axis_zernike(
         ),
         radii_mm=zernike_radius_mm,
         pupil_z_mm=pupil_z_mm,
-        nodes=circle_nodes(),
+        nodes=circle_nodes(*circle_sampling(n_terms), n_terms),
         n_threads=n_threads,
     )

@@ -15,15 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 from estimator.native import core
 from estimator.optics.units import UM_PER_MM
 from estimator.optics.zernike import (
-    HIGHEST_ORDER,
-    MAX_RADIAL_ORDER,
     MAX_TERMS,
     exponents,
     monomial_degrees,
     radial_order,
 )
 from estimator.wavefront.field_wavefronts import zernike_from_polynomial
-from estimator.wavefront.nodes import circle_nodes
+from estimator.wavefront.nodes import circle_nodes, circle_sampling
 
 _ANGLES = 2.0 * np.pi * np.arange(16) / 16
 _RIM = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
@@ -38,13 +36,12 @@ The preset `keratoconus` keeps 28 terms; 1.5 times its coefficients need more.""
 
 
 @cache
-def _rays(order: int) -> NDArray[np.float64]:
+def _rays(n_terms: int) -> NDArray[np.float64]:
     """Return x, y and weight (n, 3) of nodes over the unit circle.
 
     96 nodes determine sixth-order fits, 260 those of tenth order.
     """
-    sampling = () if order <= MAX_RADIAL_ORDER else (HIGHEST_ORDER, 26)
-    rings, weights, azimuths, _ = circle_nodes(*sampling)
+    rings, weights, azimuths, _ = circle_nodes(*circle_sampling(n_terms))
     points = (azimuths[:, None, :] * rings[:, None]).reshape(-1, 2)
     return np.column_stack([points, np.tile(weights, len(azimuths))])
 
@@ -88,7 +85,7 @@ def moved_polynomial(
     moments = np.zeros((count, 2 * fitted + 1, 2 * fitted + 1))
     products_um = np.zeros((count, fitted + 1, fitted + 1))
     reach = depth_mm[:, 0] / (UM_PER_MM * radius_mm[:, 0] ** 2)
-    rays = _rays(fitted)
+    rays = _rays(n_terms or given)
     sizes = (count, len(rays), order, fitted)
     core().call("add_moved_rays", tables_um, reach, rays, moments, products_um, *sizes)
     powers = exponents(n_terms or given)

@@ -13,13 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.optics.zernike import zernike_values
+from estimator.optics.zernike import N_TERMS, radial_order, zernike_values
 
 N_RINGS, N_AZIMUTHS = 8, 24
 """Default sampling of the stop: 192 rays; error of 2e-7 um at 7 mm and 45 deg."""
 
 N_CIRCLE_RINGS, N_CIRCLE_AZIMUTHS = 6, 16
-"""Default sampling of a circle: 96 rays."""
+"""Default sampling of a circle: 96 rays, for 28 terms."""
+
+DENSE_CIRCLE = (10, 26)
+"""Sampling of a circle for up to 66 terms."""
 
 N_REFERENCE_RINGS = 14
 
@@ -66,6 +69,15 @@ def _azimuths(n: int) -> NDArray[np.float64]:
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
+def fewest_nodes(n_terms: int) -> tuple[int, int]:
+    """Return the smallest numbers of rings and azimuths that determine so many terms.
+
+    Sixth-order fits need 5 and 14.
+    """
+    order = radial_order(n_terms)
+    return order // 2 + 2, 2 * order + 2
+
+
 @cache
 def stop_nodes(n_rings: int = N_RINGS, n_azimuths: int = N_AZIMUTHS) -> Nodes:
     """Return quadrature nodes over the stop.
@@ -98,19 +110,27 @@ def stop_nodes(n_rings: int = N_RINGS, n_azimuths: int = N_AZIMUTHS) -> Nodes:
     return np.sqrt(atoms), weights, _azimuths(n_azimuths)
 
 
+def circle_sampling(n_terms: int) -> tuple[int, int]:
+    """Return the numbers of rings and azimuths over a circle for so many terms."""
+    return (N_CIRCLE_RINGS, N_CIRCLE_AZIMUTHS) if n_terms <= N_TERMS else DENSE_CIRCLE
+
+
 @cache
 def circle_nodes(
-    n_rings: int = N_CIRCLE_RINGS, n_azimuths: int = N_CIRCLE_AZIMUTHS
+    n_rings: int = N_CIRCLE_RINGS,
+    n_azimuths: int = N_CIRCLE_AZIMUTHS,
+    n_terms: int = N_TERMS,
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Return nodes over a circle with uniform weight, and the projection of W.
 
-    Rings, weights and azimuths are as in `stop_nodes`; the projection (28, n) maps
-    samples of W to coefficients.
+    Rings, weights and azimuths are as in `stop_nodes`; the projection (n_terms, n)
+    maps samples of W to coefficients.
     """
     legendre_nodes, legendre_weights = np.polynomial.legendre.leggauss(n_rings)
     rings, weights = np.sqrt((legendre_nodes + 1.0) / 2.0), legendre_weights / 2.0
     azimuths = _azimuths(n_azimuths)
     points = (azimuths[:, None, :] * rings[:, None]).reshape(-1, 2)
     share = np.tile(weights, n_azimuths)[:, None] / n_azimuths
-    projection = (zernike_values(points[:, 0], points[:, 1]) * share).T
+    values = zernike_values(points[:, 0], points[:, 1], n_terms=n_terms)
+    projection = (values * share).T
     return rings, weights, azimuths, np.ascontiguousarray(projection)

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.optics.raytrace import STATUS_WORDS, RayStatus
-from estimator.optics.zernike import N_TERMS
 from estimator.wavefront import compiled
 
 
@@ -49,7 +48,7 @@ class FieldResults:
 
     Attributes
     ----------
-    zernike_um : (..., 28)
+    zernike_um : (..., n_terms)
         Coefficients; piston is zero; nan where the chief ray fails.
     zernike_radius_mm : (...)
         Radius of their circle: the largest distance of the rim from the chief ray.
@@ -84,11 +83,12 @@ class FieldResults:
 
     @classmethod
     def from_rows(cls, rows: NDArray[Any]) -> "FieldResults":
-        """Unpack rows (..., N_TERMS + N_OTHER); see `compiled.stop_rows`."""
-        other = rows[..., N_TERMS:]
+        """Unpack rows (..., n_terms + N_OTHER); see `compiled.stop_rows`."""
+        n_terms = rows.shape[-1] - compiled.N_OTHER
+        other = rows[..., n_terms:]
         retina, plane = compiled.RETINA_POINT, compiled.PLANE_POINT
         return cls(
-            zernike_um=rows[..., :N_TERMS],
+            zernike_um=rows[..., :n_terms],
             zernike_radius_mm=other[..., compiled.RADIUS],
             ellipse_mm=other[..., compiled.ELLIPSE : compiled.RMS],
             rms_residual_um=other[..., compiled.RMS],

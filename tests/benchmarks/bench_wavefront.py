@@ -183,7 +183,7 @@ def circle_rows(repeats):
     view = {"zernike_radius_mm": CIRCLE_MM}
     found, _ = on_axis_zernike(packed[:1], indices, **view)
     usual, dense = wavefront.circle_nodes, circle_nodes(12, 40)
-    wavefront.circle_nodes = lambda: dense
+    wavefront.circle_nodes = lambda *_: dense
     exact, _ = on_axis_zernike(packed[:1], indices, **view)
     wavefront.circle_nodes = usual
     error = np.abs(found - exact).max()

@@ -1,5 +1,6 @@
 """What an estimated eye leaves of its measurement: on the axis nothing is lost."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from estimator.optics.zernike import (
     nm_from_index,
     remove_central_tilt,
     rescale_pupil,
+    summed_terms,
     zernike_values,
 )
 from estimator.profiles.measured_wavefront import MeasuredWavefront
@@ -26,11 +28,13 @@ from estimator.profiles.parse import parse_profile, preset_names
 from estimator.wavefront.aberrations import wavefront_grid
 from estimator.wavefront.field_wavefronts import (
     polynomial_in_mm,
+    rim_from_ellipse,
     zernike_from_polynomial,
 )
 from estimator.wavefront.moved_plane import moved_polynomial, moved_wavefront
 from filter_service.planning.grid import pupil_nodes_mm
 from tests.numerical.eye_cases import population_profiles, random_eye_profiles
+from tests.numerical.test_field_wavefronts import points_of
 from tests.numerical.test_moved_plane import exact_wave
 
 ABERROMETER_FILE = Path(__file__).parents[2] / "examples" / "data" / "aberrometer.csv"
@@ -72,7 +76,8 @@ def axis_error_um(profile):
         depth_mm=estimated.accommodating.entrance_pupil_mm,
         radius_mm=radius_mm,
     )
-    error_um = ours_um - zernike_from_polynomial(in_pupil_um, radius_mm)
+    expected_um = zernike_from_polynomial(in_pupil_um, radius_mm)
+    error_um = summed_terms(ours_um, -expected_um)
     return float(np.sqrt(np.sum(error_um[1:] ** 2)))
 
 
@@ -143,12 +148,72 @@ def test_a_measured_wavefront_follows_the_rays_into_the_pupil(name):
     ],
 )
 def test_a_traced_eye_follows_the_rays_on_its_axis(name):
-    profile, n_terms = MEASURED[name]
+    profile, _ = MEASURED[name]
     estimated = estimate_eye(profile)
     zernike_um = on_axis_um(estimated)
-    assert zernike_um.size == n_terms
     depth_mm = estimated.accommodating.entrance_pupil_mm
     assert ray_error_um(profile, zernike_um, depth_mm) <= 0.005
+
+
+@pytest.mark.parametrize(
+    ("name", "n_terms"),
+    [
+        ("keratoconus 6 mm", 36),
+        *(
+            pytest.param(name, n_terms, marks=pytest.mark.slow)
+            for name, n_terms in (
+                ("keratoconus 5 mm", 28),
+                ("severe keratoconus 5 mm", 36),
+                ("severe keratoconus 6 mm", 45),
+                ("aberrometer file", 36),
+                ("tenth order", 36),
+            )
+        ),
+    ],
+)
+def test_traced_wavefronts_follow_their_rays_off_the_axis(name, n_terms):
+    """Against fits of tenth order to eight times the rays, over the pupil."""
+    estimated = estimate_eye(replace(MEASURED[name][0], periphery="model"))
+    pupil_mm = estimated.profile.pupil_diameter_mm
+    h_deg = np.array([0.0, 10.0, 20.0, 30.0, 40.0])
+    eye = TracedEye.trace(
+        estimated,
+        pupil_diameters_mm=[pupil_mm],
+        focus_range_dpt=(-30.0, -30.0),
+        wavelengths_nm=[555.0],
+        field_range_deg=((0.0, 40.0), (0.0, 0.0)),
+        nodes_deg=(h_deg, np.zeros(1)),
+    )
+    state = {"h_deg": h_deg, "v_deg": 0.0, "pupil_diameter_mm": pupil_mm}
+    state |= {"accommodation_dpt": 0.0, "wavelength_nm": 555.0}
+    found = eye.wavefronts(**state, total_defocus_dpt=eye.total_defocus_dpt(**state))
+    dense = wavefront_grid(
+        estimated.relaxed,
+        fields_deg=np.stack([h_deg, np.zeros(5)], axis=-1),
+        wavelengths_nm=[555.0],
+        pupil_diameters_mm=[pupil_mm],
+        plane="pupil",
+        n_rings=14,
+        n_azimuths=40,
+        n_terms=66,
+    )
+    assert eye._field.grid.zernike_um.shape[-1] == n_terms
+    rest, share = estimated.rest([555.0], n_traced_terms=66), eye._residual.left_share
+    expected_um = summed_terms(
+        polynomial_in_mm(dense.zernike_um, dense.zernike_radius_mm)[:, 0, 0],
+        rest.residues_um(np.full(5, pupil_mm / 2.0), share(h_deg, 0.0 * h_deg)),
+        rest.color_um(np.full(5, 555.0)),
+    )
+    radius_mm = found.circle_diameter_mm / 2.0
+    expected_um = zernike_from_polynomial(expected_um, radius_mm)
+    for k, ellipse in enumerate(rim_from_ellipse(found.pupil_ellipse)):
+        x, y = points_of(ellipse).T / radius_mm[k]
+        error_um = zernike_values(x, y, n_terms=66) @ summed_terms(
+            expected_um[k], -found.zernike_um[k]
+        )
+        plane = np.stack([np.ones_like(x), x, y])
+        error_um -= plane.T @ np.linalg.lstsq(plane.T, error_um)[0]
+        assert error_um.std() <= 0.005
 
 
 def test_a_wavefront_that_no_eye_has_is_exact_too_and_said():

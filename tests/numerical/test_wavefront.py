@@ -17,6 +17,7 @@ from estimator.optics.units import ASTIGMATISM_PER_C22, SPHERE_PER_C20
 from estimator.optics.zernike import flip_horizontal, zernike_gradient
 from estimator.wavefront.aberrations import (
     wavefront_aberrations,
+    wavefront_grid,
 )
 from tests.numerical.schematic_eyes import (
     cartesian_eye,
@@ -283,3 +284,12 @@ def test_a_view_out_of_range_is_refused(change, message):
     view = {"wavelength_nm": 555.0, "stop_diameter_mm": 4.0, **change}
     with pytest.raises(ValueError, match=message):
         wavefront_aberrations(irregular_eye(), **view)
+
+
+def test_too_few_rays_for_the_terms_are_refused():
+    eye = irregular_eye()
+    view = {"fields_deg": [[0, 0]], "wavelengths_nm": [555], "pupil_diameters_mm": [4]}
+    found = wavefront_grid(eye, **view, n_rings=7, n_azimuths=22, n_terms=66)
+    assert found.zernike_um.shape == (1, 1, 1, 66)
+    with pytest.raises(ValueError, match="must be at least 7 and 22 for 66 terms"):
+        wavefront_grid(eye, **view, n_rings=7, n_azimuths=20, n_terms=66)
