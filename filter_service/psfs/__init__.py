@@ -10,7 +10,6 @@ store            the PSFs of an eye
 frame_layers     interpolation for a state, and the layers of a frame
 field_defocus    change of defocus over the field
 read_kernels     the cached kernels that a state reads, as plain arrays
-read_loops       compiled loops of light beyond kernels that read them
 store_cache      on-disk cache of eyes and nodes
 cache_folder     location of the on-disk cache
 cached_eyes      listing and erasing of cached eyes

@@ -167,7 +167,6 @@ HOME = {
         "estimator/optics/gradients/*",  # indices at a point
         "estimator/wavefront/*",  # aiming and fitting
         "filter_service/rendering/reference*.py",  # twins of the passes
-        "filter_service/psfs/read_loops.py",  # planning a frame
         "clients/commands/doctor_probes.py",  # asks which threads it runs on
         "filter_service/threads.py",
     ),
