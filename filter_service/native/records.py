@@ -260,6 +260,7 @@ class LightJob(c.Structure):
         ("seen", POINTER),
         ("radius_px", POINTER),
         ("omitted", POINTER),
+        ("omitted_index", POINTER),
         ("kernels", POINTER),
         ("n_phi", c.c_int64),
         ("n_fine", c.c_int64),

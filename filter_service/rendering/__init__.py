@@ -41,6 +41,7 @@ bright_pixels    pixels much brighter than white
 pupil_edges      edges of the pupils of a store's nodes
 edge_kinds       kinds of bright pixels, and the edges that send their light
 edge_light       light of bright pixels beyond their kernels
+light_kernels    kernels of their light
 light_planes     addition of their light to images
 visibility       which points of the pupil's edge see a source
 haze             straylight of the ocular media

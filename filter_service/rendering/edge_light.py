@@ -15,16 +15,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.native import shared_threads
 from estimator.psf.tables import N_EDGE
 from filter_service.constants import RGB
-from filter_service.native import loops, records
-from filter_service.native.records import pointers
+from filter_service.native import loops
 from filter_service.rendering.bright_pixels import BrightPixels
 from filter_service.rendering.edge_kinds import EdgeElements, EyeAtFrame, SourceKinds
 from filter_service.rendering.engine import FrameEngine, ViewRequest
@@ -33,25 +32,21 @@ from filter_service.rendering.frame_kernels import (
     frame_kernels,
     interval_count,
 )
+from filter_service.rendering.light_kernels import (
+    FADE_RATIO,
+    FINE,
+    RHO_PX,
+    distant_tables,
+    light_kernels,
+    omitted_shares,
+    places_around,
+)
 from filter_service.rendering.light_planes import add_plane, add_sources
 from filter_service.rendering.visibility import seen_by_edges
 from filter_service.rgbd_view import RgbdView
 
-N_PHI = 32
-"""Directions from a source, of the tables of distant light."""
-
-RHO_PX = 8.0 * 1.45 ** np.arange(10)
-"""Distances from a source, of the tables of distant light.  Beyond the last, 227 px,
-the light falls as the third power."""
-
-FINE = 8
-"""Steps between two distances in the tables."""
-
 RADII_PX = (16, 24, 36, 54, 81, 122, 182, 273, 410)
 """Distances up to which light may be added pixel by pixel."""
-
-FADE_RATIO = 1.5
-"""Ratio of the distances between which one grid replaces another."""
 
 COARSE_RATIO = 8.0
 """Least distance from the source, in coarse pixels, at which they are used.  The error
@@ -77,49 +72,6 @@ treated as seen by the entire pupil, with less light."""
 MAX_NEAR_PRODUCTS = 6_000_000
 """Products per channel that pixel-by-pixel light may take; if there are more, sources
 are merged in squares of 3, 9 or 27 pixels."""
-
-
-@lru_cache(maxsize=1)
-def _directions() -> NDArray[np.float32]:
-    """Return the directions (N_PHI, 2) of the tables of distant light."""
-    angle = 2.0 * np.pi * np.arange(N_PHI) / N_PHI
-    return np.stack([np.cos(angle), np.sin(angle)], axis=-1).astype(np.float32)
-
-
-@lru_cache(maxsize=64)
-def _places(
-    inner_px: float, outer_px: float, pitch_px: int
-) -> tuple[NDArray[np.float32], ...]:
-    """Return factor, and position in the tables, of offsets (side, side).
-
-    The factors fade in and out from two distances on.
-    """
-    half = math.ceil(FADE_RATIO * outer_px / pitch_px)
-    y, x = np.mgrid[-half : half + 1, -half : half + 1] * float(pitch_px)
-    rho_px = np.hypot(x, y)
-    share = 1.0 - _faded(rho_px, outer_px)
-    if inner_px:
-        share -= 1.0 - _faded(rho_px, inner_px)
-    rho_px = np.maximum(rho_px, RHO_PX[0])
-    factor = share / rho_px**3
-    if pitch_px > 1:
-        # Distribution to coarse pixels and interpolation between them add this much to
-        # the third power.
-        factor /= 1.0 + 1.5 * (pitch_px / rho_px) ** 2
-    # Between two distances, the tables are linear in the reciprocal.
-    whole = np.minimum(np.searchsorted(RHO_PX, rho_px, side="right"), RHO_PX.size - 1)
-    low, high = 1.0 / RHO_PX[whole - 1], 1.0 / RHO_PX[whole]
-    part = np.clip((1.0 / rho_px - low) / (high - low), 0.0, 0.9999)
-    phi_index = np.arctan2(y, x) / (2.0 * np.pi) * N_PHI % N_PHI
-    return tuple(
-        a.astype(np.float32) for a in (factor, FINE * (whole - 1 + part), phi_index)
-    )
-
-
-def _faded(rho_px: NDArray[np.float64], edge_px: float) -> NDArray[np.float64]:
-    """Return a smooth step from 0 to 1 at a distance."""
-    part = np.clip((rho_px / edge_px - 1.0) / (FADE_RATIO - 1.0), 0.0, 1.0)
-    return part * part * (3.0 - 2.0 * part)
 
 
 class EdgeLight:
@@ -157,7 +109,9 @@ class EdgeLight:
         self._edges = EdgeElements.of(state, self._kinds)
         self._find_ends(fill)
         self._sources, self._kernel, self._light = self._visible(view)
-        self._polar = self._tables()
+        self._polar = distant_tables(
+            self._edges.elements, self._kernel_kind, self._seen
+        )
         at_end = self._polar[:, :, -1].max(axis=(1, 2))
         self._per_light = at_end[self._kernel].astype(np.float64)  # times rho³
         self._reach_px = self._needed_reach_px(view)
@@ -247,25 +201,6 @@ class EdgeLight:
         order = sources[np.argsort(kernel[sources], kind="stable")]
         return order, kernel[order], light[order]
 
-    def _tables(self) -> NDArray[np.float32]:
-        """Return the distant light (n, N_PHI, n_fine, 3) of all kernels."""
-        n = self._kernel_kind.size
-        fine = FINE * (RHO_PX.size - 1) + 1
-        found = np.empty((n, N_PHI, fine, RGB), np.float32)
-        loops().call(
-            "fill_polar",
-            *(shared_threads(), self._edges.elements, self._kernel_kind, self._seen, n),
-            *(
-                RHO_PX.astype(np.float32),
-                RHO_PX.size,
-                _directions(),
-                N_PHI,
-                FINE,
-                found,
-            ),
-        )
-        return found
-
     def _needed_reach_px(self, view: RgbdView) -> float:
         """Return the distance at which the light has become invisible."""
         diagonal_px = math.hypot(view.width_px, view.height_px)
@@ -284,79 +219,29 @@ class EdgeLight:
 
     def _near_kernels(self, radius_px: int) -> NDArray[np.float32]:
         """Return the kernels (n, side, side, 3) of light near a source."""
-        state, kinds = self._state, self._kinds
-        layers, image = state.layers, state.image
-        places = _places(0.0, radius_px, 1)
+        places = places_around(0.0, radius_px, 1)
         own = np.flatnonzero(self._radius_px == radius_px)
-        omitted = np.empty((own.size, RGB, *places[0].shape), np.float32)
-        cells, lower = kinds.cell[own], kinds.interval[own]
-        upper = np.minimum(lower + 1, layers.layer_dpt.size - 1)
-        part = kinds.part_ratio[own]
-        arrays = {
-            "nodes": image.nodes[cells].astype(np.int64),
-            "weight_ratio": image.weight_ratio[cells],
-            "layer_dpt": layers.layer_dpt[np.stack([lower, upper], axis=-1)],
-            "layer_ratio": np.stack([1.0 - part, part], axis=-1),
-            "zero_dpt": np.ascontiguousarray(layers.layer_zero_dpt),
-            "maps": self._maps[own],
-            "reach_px": self._end_px[own],
-            "omitted": omitted,
-        }
-        tables = state.handle.store.tables
-        job = records.OmittedJob(
-            threads=shared_threads(),
-            tables=records.StoreTables(**pointers(**tables._asdict())),
-            reads=records.StateReads(
-                **pointers(**layers.reads._asdict()), count=layers.reads.groups.size
-            ),
+        omitted = omitted_shares(
+            *(self._state, self._kinds, own, self._maps[own], self._end_px[own]),
             side=len(places[0]),
-            count=own.size,
-            **pointers(**arrays),
         )
-        loops().call("fill_omitted", job)
         kernels = self._kernels_with(radius_px)
         index = np.searchsorted(own, self._kernel_kind[kernels])
-        return self._filled(kernels, places, omitted[index])
+        return self._filled(kernels, places, omitted, index)
 
     def _filled(
         self,
         own: NDArray[np.int64],
         places: tuple[NDArray[np.float32], ...],
-        omitted: NDArray[np.float32] | None = None,
+        *omitted: NDArray[Any],
     ) -> NDArray[np.float32]:
-        """Return kernels (n, side, side, 3) of light for some of the kernels (n,).
-
-        Parameters
-        ----------
-        own : (n,)
-            Which kernels.
-        places : 3 of (side, side)
-            See `_places`.
-        omitted : (n, 3, side, side), optional
-            Share of kernels that ends before each pixel; none for distant light.
-        """
-        side, kind = len(places[0]), self._kernel_kind[own]
-        found = np.empty((own.size, side, side, RGB), np.float32)
-        arrays = {
-            **dict(zip(("share_ratio", "rho_index", "phi_index"), places, strict=True)),
-            "polar": self._polar[own],
-            "edges": self._edges.elements,
-            "kernel_kind": kind,
-            "seen": self._seen[own],
-            "radius_px": self._exact_px[kind],
-            **({} if omitted is None else {"omitted": omitted}),
-            "kernels": found,
-        }
-        job = records.LightJob(
-            threads=shared_threads(),
-            n_phi=N_PHI,
-            n_fine=self._polar.shape[2],
-            side=side,
-            count=own.size,
-            **pointers(**arrays),
+        """Return kernels (n, side, side, 3) of light for some of the kernels (n,)."""
+        kind = self._kernel_kind[own]
+        return light_kernels(
+            self._edges.elements,
+            *(kind, self._seen[own], self._polar[own], places),
+            *(self._exact_px[kind], *omitted),
         )
-        loops().call("fill_light", job)
-        return found
 
     def _dimmed(self, view: RgbdView) -> RgbdView:
         """Return the view without the share of light that is beyond the kernels."""
@@ -416,7 +301,7 @@ class EdgeLight:
                     if pitch_px not in planes:
                         shape = tuple(-(-n // pitch_px) for n in color.shape[:2])
                         planes[pitch_px] = np.zeros((*shape, RGB), np.float32)
-                    places = _places(inner_px, 2.0 * inner_px, pitch_px)
+                    places = places_around(inner_px, 2.0 * inner_px, pitch_px)
                     kernels = self._filled(own, places)
                     number = np.searchsorted(own, self._far_kernel[self._kernel])
                     self._add_grid(planes[pitch_px], here, number, kernels, pitch_px)

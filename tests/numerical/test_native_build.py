@@ -34,6 +34,7 @@ FRAMES = (
     "tests/numerical/test_renderer_wide.py",
     "tests/numerical/test_native_random.py",
     "tests/numerical/test_native_light.py",
+    "tests/numerical/test_edge_light.py",
     "tests/numerical/test_field_layers.py",
     "tests/numerical/test_native_psfs.py",
     "tests/numerical/test_native_tracer.py",

@@ -47,7 +47,8 @@ typedef struct {
     const int64_t *kernel_kind;                 /* (count,) */
     const float *seen;        /* (count, N_EDGE) */
     const float *radius_px;   /* up to this, light is computed from the edges */
-    const float *omitted;     /* (count, 3, side, side), see omitted_job; NULL: distant light */
+    const float *omitted;     /* (n, 3, side, side), see omitted_job; NULL: distant light */
+    const int64_t *omitted_index;               /* (count,) */
     float *kernels;           /* (count, side, side, 3) */
     int64_t n_phi, n_fine, side, count;
 } light_job;

@@ -117,7 +117,7 @@ static void fill_polar(pool *threads, const float *edges, const int64_t *kernel_
 INLINE void near_pixel(const light_job *job, int64_t n, int64_t row, int64_t column, float x,
                        float y, float *light) {
     const float *edges = job->edges + RGB * EDGE_ROWS * N_EDGE * job->kernel_kind[n];
-    const float *omitted = job->omitted + RGB * job->side * job->side * n;
+    const float *omitted = job->omitted + RGB * job->side * job->side * job->omitted_index[n];
     for (int c = 0; c < RGB; ++c) {
         float ratio = omitted[(c * job->side + row) * job->side + column];
         if (ratio <= MIN_OMITTED) continue;
