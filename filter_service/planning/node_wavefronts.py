@@ -51,9 +51,9 @@ class NodeWavefronts:
 
     Attributes
     ----------
-    zernike_um : (n_groups, 3, n_primaries, 28)
+    zernike_um : (n_groups, 3, n_primaries, n_terms)
         Coefficients at a total defocus of 0 dpt in the middle of the channel.
-    per_dpt_um : (n_groups, 3, n_primaries, 28)
+    per_dpt_um : (n_groups, 3, n_primaries, n_terms)
         Change per diopter.
     circle_diameter_mm : (n_groups, 3, n_primaries)
     pupil_ellipse : (n_groups, 3, n_primaries, 5)

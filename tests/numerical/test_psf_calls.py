@@ -5,6 +5,7 @@ import pickle
 import numpy as np
 import pytest
 
+from estimator.optics.zernike import padded_terms
 from estimator.psf.compute import PsfTooLarge, compute_psfs
 from tests.numerical.psf_cases import case_zernike_um
 
@@ -34,6 +35,22 @@ def test_batches_equal_single_calls_in_order():
         np.testing.assert_array_equal(psf.kernel, single.kernel)
 
 
+@pytest.mark.parametrize(
+    "method", ["fourier", "geometric", pytest.param("enz", marks=pytest.mark.slow)]
+)
+def test_terms_of_zero_change_nothing(method):
+    zernike_um = case_zernike_um("emmetropia", 2.0)[None]
+    options = {"pupil_diameter_mm": 2.0, "wavelength_nm": 549.0, "radius_px": 6}
+    options |= {"pixel_pitch_mrad": PITCH_MRAD, "method": method}
+    (given,) = compute_psfs(zernike_um, **options)
+    (longer,) = compute_psfs(padded_terms(zernike_um, 66), **options)
+    assert longer.kernel == pytest.approx(given.kernel, abs=1e-6)
+    other_um = padded_terms(zernike_um, 66).copy()
+    other_um[0, 60] = 0.03
+    (other,) = compute_psfs(other_um, **options)
+    assert np.abs(other.kernel - given.kernel).sum() > 0.01
+
+
 def test_a_psf_beyond_the_allowed_radius_is_refused_with_the_numbers():
     zernike_um = np.stack([np.zeros(28), case_zernike_um("periph40", 7.0)])
     with pytest.raises(
@@ -54,7 +71,11 @@ def test_a_psf_beyond_the_allowed_radius_is_refused_with_the_numbers():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"zernike_um": np.zeros((2, 27))}, "zernike_um has shape"),
+        (
+            {"zernike_um": np.zeros((2, 27))},
+            r"zernike_um has shape \(2, 27\): must be \(P, n\), n one of 28, 36, 4",
+        ),
+        ({"zernike_um": np.zeros((2, 78))}, r"zernike_um has shape \(2, 78\)"),
         ({"zernike_um": np.full((1, 28), np.nan)}, "NaN"),
         ({"pupil_diameter_mm": 0.0}, "pupil_diameter_mm 0.0"),
         ({"wavelength_nm": [550.0, 450.0, 650.0]}, "wavelength_nm has shape"),
