@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.native import Core, core
+from estimator.native import Core, core, shared_threads
 from estimator.native.records import (
     PSF_DONE,
     PSF_NO_MEMORY,
@@ -18,7 +18,6 @@ from estimator.native.records import (
     pointer_to,
 )
 from estimator.psf.tables import psf_tables
-from estimator.threads import thread_count
 
 SIDES = 4
 
@@ -171,5 +170,4 @@ def compiled_psfs() -> CompiledPsfs:
     LibraryUnavailable
         If the core was not built.
     """
-    library = core()
-    return CompiledPsfs(library, library.new_threads(thread_count()))
+    return CompiledPsfs(core(), shared_threads())
