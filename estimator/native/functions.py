@@ -26,4 +26,6 @@ FUNCTIONS = {
     "magnifications": "f8[] i8 i8 f8[] i8 f8[]",
     "gradient_indices": "f8[] i8 f8[] i8 f8[]",
     "add_moved_rays": "f8[] f8[] f8[] f8[] f8[] i8 i8 i8 i8",
+    "hankel_table": f"{5 * 'f8[] '} i8 i8 i8 i8",
+    "image_light": f"{5 * 'f8[] '} i8 i8 i8 i8 f8",
 }

@@ -13,9 +13,9 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from estimator.native import core
 from estimator.optics.zernike import monomial_matrix, zernike_values
 from estimator.psf.enz_series import (
     LogAmplitude,
@@ -47,6 +47,9 @@ DEGREE_PER_WAVE = 2.0 * math.pi
 
 _RADIAL_STEPS = 32
 """Samples of V per lambda / pupil radius; cubic interpolation has an error of 4e-5."""
+
+_LANES = 4
+"""Orders that the loop in C processes at once."""
 
 _INTEGRATED_STEPS, _TAPS, _KAISER_BETA = 4, 8, 11.7
 """Samples per lambda / pupil radius that are integrated, and the filter by which the
@@ -80,64 +83,22 @@ class EnzOutsideDomain(ValueError):
         self.needed_degree_count = needed
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
-def _intensities(
-    qx: NDArray[np.float64],
-    qy: NDArray[np.float64],
-    step_x: NDArray[np.float64],
-    step_y: NDArray[np.float64],
-    table: NDArray[np.complex128],
-    per_r: int,
-    out: NDArray[np.float64],
-) -> None:
-    """Compute |U|² on a grid, by cubic interpolation of the table.
+def _refine(samples: NDArray[np.float64], table: NDArray[np.float64]) -> None:
+    """Fill a table with `_RADIAL_STEPS` samples for `_INTEGRATED_STEPS`.
 
-    U = sum_m table_m(r) exp(i m phi) at q = qx (2,) x + qy (2,) y.
-    """
-    top = table.shape[1] // 2
-    for j in range(step_y.size):
-        for i in range(step_x.size):
-            ax = qx[0] * step_x[i] + qy[0] * step_y[j]
-            ay = qx[1] * step_x[i] + qy[1] * step_y[j]
-            r = math.sqrt(ax * ax + ay * ay)
-            turn = complex(1.0, 0.0)
-            if r > 1e-12:
-                turn = complex(ax / r, ay / r)
-            place = r * per_r + 1.0
-            k = min(int(place), table.shape[0] - 3)
-            t = place - k
-            w0 = -t * (t - 1.0) * (t - 2.0) / 6.0
-            w1 = (t + 1.0) * (t - 1.0) * (t - 2.0) / 2.0
-            w2 = -(t + 1.0) * t * (t - 2.0) / 2.0
-            w3 = (t + 1.0) * t * (t - 1.0) / 6.0
-            total = complex(0.0, 0.0)
-            phase = complex(1.0, 0.0)
-            for m in range(top + 1):
-                c = top + m
-                plus = w0 * table[k - 1, c] + w1 * table[k, c]
-                plus += w2 * table[k + 1, c] + w3 * table[k + 2, c]
-                total += plus * phase
-                if m > 0:
-                    c = top - m
-                    minus = w0 * table[k - 1, c] + w1 * table[k, c]
-                    minus += w2 * table[k + 1, c] + w3 * table[k + 2, c]
-                    total += minus * phase.conjugate()
-                phase *= turn
-            out[j, i] = total.real * total.real + total.imag * total.imag
-
-
-def _refined(samples: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return `_RADIAL_STEPS` samples of a table for `_INTEGRATED_STEPS`.
-
-    The first and last `_TAPS` - 1 samples (n, m) only serve the filter.
+    Parameters
+    ----------
+    samples : (n + 2 `_TAPS` - 1, k)
+        The first and last `_TAPS` - 1 samples only serve the filter.
+    table : (8 n, k) out
     """
     ratio = _RADIAL_STEPS // _INTEGRATED_STEPS
-    at = np.arange(1 - _TAPS, _TAPS + 1)[:, None] - np.arange(ratio) / ratio
+    at = np.arange(1 - _TAPS, _TAPS + 1) - np.arange(ratio)[:, None] / ratio
     window = np.i0(_KAISER_BETA * np.sqrt(np.maximum(1.0 - (at / _TAPS) ** 2, 0.0)))
     weights = np.sinc(at) * window / np.i0(_KAISER_BETA)
     near = np.lib.stride_tricks.sliding_window_view(samples, 2 * _TAPS, axis=0)
-    found = np.moveaxis(near @ weights, 2, 1)
-    return found.reshape(-1, samples.shape[1])
+    rows = table.reshape(-1, ratio, samples.shape[1])
+    np.matmul(weights, near.swapaxes(1, 2), out=rows)
 
 
 @cache
@@ -203,23 +164,35 @@ class _Series:
             raise EnzOutsideDomain(**domain, captured=captured)
         return betas
 
-    def _radial_table(self, reach: float) -> NDArray[np.complex128]:
-        """Return 2 (-i)^|m| sum_n beta sqrt(n+1) V_n^m at radii -1, 0, 1 ... steps."""
+    def _radial_table(self, reach: float) -> NDArray[np.float64]:
+        """Return the image (n, 4, n_orders) by order, at radii of -1, 0, 1 ... steps.
+
+        With the sums v_m = 2 (-i)^|m| sum_n beta sqrt(n+1) V_n^m, the image is the sum
+        over m = 0, 1 ... of a_m cos(m phi) + i b_m sin(m phi), where a_m and b_m are
+        v_m + v_-m and v_m - v_-m.  Rows are the real and imaginary parts of a and b.
+        """
         rho, weight = radial_nodes(self.degree, abs(self.defocus_rad), reach)
         weight = weight * rho * np.exp(1j * self.defocus_rad * rho**2)
         _, _, radial = radial_basis(self.degree, rho.size)
-        weighted = np.empty((rho.size, 2 * self.degree + 1), np.complex128)
-        for m in range(-self.degree, self.degree + 1):
-            ring = self.betas[m] @ radial[abs(m)]
-            weighted[:, m + self.degree] = 2.0 * (-1j) ** abs(m) * weight * ring
+        n_orders = _LANES * math.ceil((self.degree + 1) / _LANES)
+        weighted = np.zeros((4, n_orders, rho.size))
+        for m in range(self.degree + 1):
+            scale = 2.0 * (-1j) ** m * weight
+            plus = scale * (self.betas[m] @ radial[m])
+            minus = scale * (self.betas[-m] @ radial[m]) if m else 0.0
+            even, odd = plus + minus, plus - minus
+            weighted[:, m] = even.real, even.imag, odd.real, odd.imag
         count = math.ceil(reach * _INTEGRATED_STEPS) + 2 + _TAPS
-        known = np.empty((count, weighted.shape[1]), np.complex128)
-        hankel_table(np.arange(count) / _INTEGRATED_STEPS, rho, weighted, known)
+        known = hankel_table(np.arange(count) / _INTEGRATED_STEPS, rho, weighted)
         # J_m has the parity of m.
-        signs = (-1.0) ** np.abs(np.arange(-self.degree, self.degree + 1))
-        table = _refined(np.concatenate([signs * known[_TAPS - 1 : 0 : -1], known]))
-        # The sample before 0 permits cubic interpolation at 0.
-        return np.concatenate([signs * table[1:2], table])
+        signs = np.tile((-1.0) ** np.arange(n_orders), 4)
+        known = known.reshape(count, -1)
+        samples = np.concatenate([signs * known[_TAPS - 1 : 0 : -1], known])
+        ratio = _RADIAL_STEPS // _INTEGRATED_STEPS
+        table = np.empty((1 + ratio * (count - _TAPS), signs.size))
+        _refine(samples, table[1:])
+        table[0] = signs * table[2]  # permits cubic interpolation at 0
+        return table.reshape(-1, 4, n_orders)
 
     def kernel(self, radius: int, accuracy: FourierAccuracy) -> NDArray[np.float32]:
         """Return the kernel (2R+1, 2R+1), in shares of the light.
@@ -269,8 +242,12 @@ class _Series:
         shift_x = (self.shift[0] - qy[0] * shift_y) / qx[0]
         x, y = x_px - shift_x, y_px - shift_y
         far = np.abs(x).max() * np.hypot(*qx) + np.abs(y).max() * np.hypot(*qy)
-        out = np.empty((y.size, x.size))
-        _intensities(qx, qy, x, y, self._radial_table(float(far)), _RADIAL_STEPS, out)
+        table, out = self._radial_table(float(far)), np.empty((y.size, x.size))
+        core().call(
+            "image_light",
+            *(np.stack([qx, qy], axis=-1), x, y, table, out),
+            *(x.size, y.size, len(table), table.shape[2], _RADIAL_STEPS),
+        )
         area = math.pi * self.half[0] * self.half[1] * s
         passed = float(self.survey.passed_ratio[self.index])
         light: NDArray[np.float64] = out * area / self.wavelength_um**2 / passed

@@ -16,10 +16,10 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import eval_jacobi
 
+from estimator.native import core
 from estimator.optics.zernike import zernike_values
 
 LogAmplitude = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -35,79 +35,31 @@ def radial_polynomial(n: int, m: int, rho: ArrayLike) -> NDArray[np.float64]:
     return values
 
 
-_UPWARD_FROM = 50.0
-"""Argument above which J_0 and J_1 are computed by Hankel's expansion, to 1e-15."""
+NODE_COUNT = 8
+"""Nodes that the loop in C processes at once."""
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
-def _hankel_asymptotic(order: int, x: float) -> float:
-    """Return J_order(x) for an order of 0 or 1 and large x."""
-    term, even, odd = 1.0, 1.0, 0.0
-    for k in range(1, 13):
-        term *= (4.0 * order * order - (2.0 * k - 1.0) ** 2) / (8.0 * k * x)
-        if k % 2 == 0:
-            even += -term if k % 4 == 2 else term
-        else:
-            odd += term if k % 4 == 1 else -term
-    phase = x - (0.5 * order + 0.25) * math.pi
-    return math.sqrt(2.0 / (math.pi * x)) * (
-        even * math.cos(phase) - odd * math.sin(phase)
-    )
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
-def _bessel_orders(x: float, count: int, out: NDArray[np.float64]) -> None:
-    """Compute J_0 .. J_(count-1) at x >= 0 by a stable recurrence.
-
-    It is the upward one for orders below the argument, and Miller's downward one
-    otherwise.
-    """
-    out[:count] = 0.0
-    if x > max(_UPWARD_FROM, count + 1.0):
-        below, here = _hankel_asymptotic(0, x), _hankel_asymptotic(1, x)
-        for order in range(count):
-            out[order] = below
-            below, here = here, 2.0 * (order + 1.0) / x * here - below
-        return
-    if x < 1e-12:
-        out[0] = 1.0
-        return
-    start = 2 * ((int(max(float(count), x)) + 30 + int(6.0 * x ** (1.0 / 3.0))) // 2)
-    above, here, norm = 0.0, 1e-300, 0.0
-    for order in range(start, 0, -1):
-        below = 2.0 * order / x * here - above
-        above, here = here, below
-        if order - 1 < count:
-            out[order - 1] = here
-        if (order - 1) % 2 == 0:
-            norm += here if order == 1 else 2.0 * here
-        if abs(here) > 1e200:
-            here, above, norm = here * 1e-200, above * 1e-200, norm * 1e-200
-            for k in range(order - 1, count):
-                out[k] *= 1e-200
-    for k in range(count):
-        out[k] /= norm
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
 def hankel_table(
-    r: NDArray[np.float64],
-    rho: NDArray[np.float64],
-    weighted: NDArray[np.complex128],
-    out: NDArray[np.complex128],
-) -> None:
-    """Compute out[q, m] = sum_g weighted[g, |m|] J_|m|(2 pi r_q rho_g).
+    r: NDArray[np.float64], rho: NDArray[np.float64], weighted: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return sums over nodes (n_r, n_rows, n_orders) of weighted J_m(2 pi r rho).
 
-    ``weighted`` is (nodes, 2 M + 1) for m = -M .. M.
+    Parameters
+    ----------
+    r : (n_r,)
+    rho : (n_nodes,)
+        A multiple of `NODE_COUNT`.
+    weighted : (n_rows, n_orders, n_nodes)
+        Weights of the orders m = 0, 1 ...
     """
-    top = weighted.shape[1] // 2
-    bessel = np.empty(top + 1)
-    for q in range(r.size):
-        out[q] = 0.0
-        for g in range(rho.size):
-            _bessel_orders(2.0 * math.pi * r[q] * rho[g], top + 1, bessel)
-            for m in range(-top, top + 1):
-                out[q, m + top] += weighted[g, m + top] * bessel[abs(m)]
+    n_rows, n_orders, n_nodes = weighted.shape
+    blocks = weighted.reshape(n_rows, n_orders, -1, NODE_COUNT)
+    blocks = np.ascontiguousarray(np.moveaxis(blocks, 2, 0))
+    found = np.empty((r.size, n_rows, n_orders))
+    scratch = np.empty((n_rows + 1, n_orders, NODE_COUNT))
+    sizes = r.size, n_nodes, n_rows, n_orders
+    core().call("hankel_table", r, rho, blocks, found, scratch, *sizes)
+    return found
 
 
 def radial_nodes(

@@ -8,6 +8,7 @@ from scipy.special import eval_legendre, jv, roots_legendre, spherical_jn
 
 from estimator.psf.compute import EnzOutsideDomain, compute_psf_batch, compute_psfs
 from estimator.psf.enz_series import (
+    NODE_COUNT,
     hankel_table,
     radial_nodes,
     radial_polynomial,
@@ -46,13 +47,30 @@ def enz_function(n, m, r, defocus_rad):
     """V_n^|m|(r, f) (k,) by the quadrature of the series, r in lambda / radius."""
     r = np.atleast_1d(np.asarray(r, np.float64))
     rho, weight = radial_nodes(n, abs(defocus_rad), float(r.max(initial=0.0)))
-    weighted = np.zeros((rho.size, 2 * abs(m) + 1), np.complex128)
-    weighted[:, -1] = (
+    field = (
         weight * rho * np.exp(1j * defocus_rad * rho**2) * radial_polynomial(n, m, rho)
     )
-    out = np.empty((r.size, weighted.shape[1]), np.complex128)
-    hankel_table(r, rho, weighted, out)
-    return out[:, -1]
+    weighted = np.zeros((2, abs(m) + 1, rho.size))
+    weighted[:, -1] = field.real, field.imag
+    found = hankel_table(r, rho, weighted)
+    return found[:, 0, -1] + 1j * found[:, 1, -1]
+
+
+@pytest.mark.parametrize("n_orders", [1, 31, 124])
+@pytest.mark.parametrize("largest", [0.0, 1e-10, 1e-3, 1.0, 60.0, 124.0, 130.0, 2e3])
+def test_bessel_functions_are_those_of_scipy(rng, largest, n_orders):
+    """Below, at and above the argument from which the recurrence goes upward."""
+    r = np.append(rng.uniform(0.0, 1.0, 3), 1.0) * largest / (2.0 * math.pi)
+    rho = np.append(np.sort(rng.uniform(1e-4, 1.0, NODE_COUNT - 1)), 1.0)
+    each = np.broadcast_to(
+        np.eye(NODE_COUNT)[:, None], (NODE_COUNT, n_orders, NODE_COUNT)
+    )
+    x = 2.0 * math.pi * r[:, None] * rho
+    np.testing.assert_allclose(
+        hankel_table(r, rho, each),
+        jv(np.arange(n_orders), x[..., None]),
+        atol=3e-13,
+    )
 
 
 @pytest.mark.parametrize(("n", "m"), TERMS)

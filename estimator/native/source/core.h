@@ -15,6 +15,7 @@
 
 #include "moved_plane.h"
 #include "wavefronts.h"
+#include "enz.h"
 
 static const named_function functions[] = {
     FUNCTION(psfs),
@@ -32,6 +33,8 @@ static const named_function functions[] = {
     FUNCTION(magnifications),
     FUNCTION(gradient_indices),
     FUNCTION(add_moved_rays),
+    FUNCTION(hankel_table),
+    FUNCTION(image_light),
     {NULL, NULL},
 };
 
