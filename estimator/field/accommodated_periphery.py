@@ -26,7 +26,7 @@ from estimator.optics.prescription import C2M2, C20, C22
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import N_TERMS, summed_terms
 from estimator.periphery.meridian import CIRCLE_MM
-from estimator.wavefront.aberrations import wavefront_grid
+from estimator.wavefront.aberrations import wavefront_grids
 from estimator.wavefront.field_wavefronts import (
     polynomial_in_mm,
     zernike_from_polynomial,
@@ -99,18 +99,15 @@ def _traced_um(
     directions_deg: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Return traced monomials (n_directions, n_accommodations, 28) on `CIRCLE_MM`."""
-    found_um = []
-    for state in eye.accommodating.states_at(accommodations_dpt):
-        traced = wavefront_grid(
-            state.surfaces,
-            fields_deg=directions_deg,
-            wavelengths_nm=[REFERENCE_WAVELENGTH_NM],
-            pupil_diameters_mm=[2.0 * CIRCLE_MM],
-            plane="pupil",
-            n_rings=FIELD_RINGS,
-            n_azimuths=FIELD_AZIMUTHS,
-        )
-        found_um.append(
-            polynomial_in_mm(traced.zernike_um, traced.zernike_radius_mm)[:, 0, 0]
-        )
-    return np.stack(found_um, axis=1)
+    states = eye.accommodating.states_at(accommodations_dpt)
+    traced = wavefront_grids(
+        [state.surfaces for state in states],
+        fields_deg=directions_deg,
+        wavelengths_nm=[REFERENCE_WAVELENGTH_NM],
+        pupil_diameters_mm=[2.0 * CIRCLE_MM],
+        plane="pupil",
+        n_rings=FIELD_RINGS,
+        n_azimuths=FIELD_AZIMUTHS,
+    )
+    found_um = polynomial_in_mm(traced.zernike_um, traced.zernike_radius_mm)
+    return np.swapaxes(found_um[:, :, 0, 0], 0, 1)

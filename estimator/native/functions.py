@@ -25,7 +25,7 @@ FUNCTIONS = {
     "trace_shifts": "record -> int",
     "magnifications": "f8[] i8 i8 f8[] i8 f8[]",
     "gradient_indices": "f8[] i8 f8[] i8 f8[]",
-    "add_moved_rays": "f8[] f8[] f8[] f8[] f8[] i8 i8 i8 i8",
     "hankel_table": f"{5 * 'f8[] '} i8 i8 i8 i8",
     "image_light": f"{5 * 'f8[] '} i8 i8 i8 i8 f8",
+    "moved_fits": "pool f8[] f8[] f8[] f8[] i8 i8 i8 i8 f8[] -> int",
 }

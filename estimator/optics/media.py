@@ -1,6 +1,7 @@
 """Refractive indices of the ocular media by Herzberger's formula, 365 to 1014 nm."""
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,18 @@ OCULAR_MEDIA = {
 }
 
 MEDIA = (AIR, *OCULAR_MEDIA)
+
+N_CACHED = 256
+"""Number of pairs of medium and wavelengths whose indices are kept: preparing an eye
+asks for the same ones hundreds of times."""
+
+
+@lru_cache(N_CACHED)
+def _ocular_index(
+    medium: str, wavelengths_nm: bytes, shape: tuple[int, ...]
+) -> NDArray[np.float64]:
+    known_nm = np.frombuffer(wavelengths_nm).reshape(shape)
+    return OCULAR_MEDIA[medium].refractive_index(known_nm)
 
 
 def refractive_index(
@@ -66,10 +79,12 @@ def refractive_index(
     if medium == AIR:
         return np.ones(wavelength_nm.shape)
     dispersion: Dispersion | None = media.get(medium) if media else None
-    dispersion = dispersion or OCULAR_MEDIA.get(medium)
-    if dispersion is not None:
+    if dispersion is not None or medium in OCULAR_MEDIA:
         try:
-            return dispersion.refractive_index(wavelength_nm)
+            if dispersion is not None:
+                return dispersion.refractive_index(wavelength_nm)
+            key = medium, wavelength_nm.tobytes(), wavelength_nm.shape
+            return _ocular_index(*key).copy()
         except ValueError as error:
             raise ValueError(f"medium '{medium}': {error}") from None
     given = [m for m in (*(indices or {}), *(media or {})) if m not in MEDIA]

@@ -12,12 +12,13 @@ from functools import cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.native import core
+from estimator.native import core, shared_threads
 from estimator.optics.units import UM_PER_MM
 from estimator.optics.zernike import (
     MAX_TERMS,
     exponents,
     monomial_degrees,
+    monomial_matrix,
     radial_order,
 )
 from estimator.wavefront.field_wavefronts import zernike_from_polynomial
@@ -72,7 +73,8 @@ def moved_polynomial(
     """
     shape, count = polynomial_um.shape[:-1], polynomial_um[..., 0].size
     given = polynomial_um.shape[-1]
-    order, fitted = radial_order(given), radial_order(n_terms or given)
+    n_terms = n_terms or given
+    order = radial_order(given)
     depth_mm, radius_mm = (
         np.broadcast_to(np.asarray(values, np.float64), shape).reshape(count, 1)
         for values in (depth_mm, radius_mm)
@@ -82,17 +84,14 @@ def moved_polynomial(
     # tilt is an artifact of the fit: the chief ray has no slope
     start_um[:, TILT] = 0.0
     tables_um[:, *exponents(given).T] = start_um
-    moments = np.zeros((count, 2 * fitted + 1, 2 * fitted + 1))
-    products_um = np.zeros((count, fitted + 1, fitted + 1))
     reach = depth_mm[:, 0] / (UM_PER_MM * radius_mm[:, 0] ** 2)
-    rays = _rays(n_terms or given)
-    sizes = (count, len(rays), order, fitted)
-    core().call("add_moved_rays", tables_um, reach, rays, moments, products_um, *sizes)
-    powers = exponents(n_terms or given)
-    pairs = powers[:, None] + powers
-    normal = moments[:, pairs[..., 0], pairs[..., 1]]
-    fitted_um = np.linalg.solve(normal, products_um[:, *powers.T, None])[..., 0]
-    moved_um: NDArray[np.float64] = fitted_um / radius_mm ** powers.sum(axis=1)
+    rays, matrix = _rays(n_terms), monomial_matrix(n_terms)
+    moved_um = np.zeros((count, n_terms))
+    sizes = (count, len(rays), order, n_terms)
+    arrays = (tables_um, reach, rays, matrix)
+    if core().call("moved_fits", shared_threads(), *arrays, *sizes, moved_um):
+        raise MemoryError("no memory for moved wavefronts")
+    moved_um /= radius_mm ** monomial_degrees(n_terms)
     moved_um = moved_um.reshape(*shape, -1)
     moved_um[..., 0] = polynomial_um[..., 0]
     moved_um[..., TILT] += polynomial_um[..., TILT]

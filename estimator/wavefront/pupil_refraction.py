@@ -46,8 +46,12 @@ def pupil_refraction_dpt(
     cosine, sine = points.T
     x, y, xx, xy, yy = np.moveaxis(rim_mm, -1, 0)[..., None]
     px, py = x + xx * cosine + xy * sine, y + xy * cosine + yy * sine
+    powers = [np.ones_like(px)], [np.ones_like(py)]
+    for of, position in zip(powers, (px, py), strict=True):
+        for _ in range(radial_order(n_terms)):
+            of.append(of[-1] * position)
     wave_um = sum(
-        polynomial_um[..., k, None] * px**a * py**b
+        polynomial_um[..., k, None] * powers[0][a] * powers[1][b]
         for k, (a, b) in enumerate(exponents(n_terms).tolist())
     )
     # 1, x and y are orthogonal over the unit disc: project out piston and tilt.

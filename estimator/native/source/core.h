@@ -32,9 +32,9 @@ static const named_function functions[] = {
     FUNCTION(trace_shifts),
     FUNCTION(magnifications),
     FUNCTION(gradient_indices),
-    FUNCTION(add_moved_rays),
     FUNCTION(hankel_table),
     FUNCTION(image_light),
+    FUNCTION(moved_fits),
     {NULL, NULL},
 };
 

@@ -2,50 +2,90 @@
 #ifndef OCU_MOVED_PLANE_H
 #define OCU_MOVED_PLANE_H
 
-#include "lanes.h"
+#include "pool.h"
+#include "pupil_fit.h"
 
-/* Adds moved rays to moments of their positions, and to those of W, for each wavefront.
- *
- * Lengths are relative to the radius of the circle.  tables_um (count, order + 1, order + 1) holds
- * the coefficients of x^a y^b, a first; rays (n_rays, 3) are x, y and weight, and move by reach
- * (count,) times the gradient.  moments is (count, 2 fitted + 1, 2 fitted + 1), products_um
- * (count, fitted + 1, fitted + 1). */
-static void add_moved_rays(const double *tables_um, const double *reach, const double *rays,
-                           double *moments, double *products_um, int64_t count, int64_t n_rays,
-                           int64_t order, int64_t fitted) {
-    int64_t n = order + 1, n_fitted = fitted + 1, n_moments = 2 * fitted + 1;
-    for (int64_t i = 0; i < count; ++i) {
-        const double *table = tables_um + i * n * n;
-        double *moment = moments + i * n_moments * n_moments;
-        double *product = products_um + i * n_fitted * n_fitted;
-        for (int64_t k = 0; k < n_rays; ++k) {
-            double x = rays[3 * k], y = rays[3 * k + 1], weight = rays[3 * k + 2];
-            double value = 0.0, slope_x = 0.0, slope_y = 0.0;
-            for (int64_t a = order; a >= 0; --a) {
-                double row = 0.0, row_y = 0.0;
-                for (int64_t b = order - a; b >= 0; --b) {
-                    row_y = row_y * y + row;
-                    row = row * y + table[a * n + b];
-                }
-                slope_x = slope_x * x + value;
-                value = value * x + row;
-                slope_y = slope_y * x + row_y;
+/* Lengths are relative to the radius of the circle. */
+typedef struct {
+    const double *tables_um; /* (count, order + 1, order + 1): coefficients of x^a y^b, a first */
+    const double *reach;     /* (count,): rays move by it times the gradient of W */
+    const double *rays;      /* (n_rays, 3): x, y and weight */
+    int n_rays, n_padded, order;
+    zernike_terms terms;
+    double *moved_um;        /* (count, n_terms): monomials */
+    double *memory;          /* of the threads */
+    size_t work_size;
+} moved_run;
+
+/* Moves the rays of a wavefront; x, y and weight (n_padded,) come from `rays`. */
+static void move_rays(const moved_run *run, const double *table, double reach,
+                      const sample_table *s) {
+    int n = run->order + 1;
+    for (int k = 0; k < run->n_padded; k += N_LANES) {
+        lanes x = load_lanes(s->x + k), y = load_lanes(s->y + k);
+        lanes value = {0.0}, slope_x = {0.0}, slope_y = {0.0};
+        for (int a = run->order; a >= 0; --a) {
+            lanes row = {0.0}, row_y = {0.0};
+            for (int b = run->order - a; b >= 0; --b) {
+                row_y = row_y * y + row;
+                row = row * y + table[a * n + b];
             }
-            x += reach[i] * slope_x;
-            y += reach[i] * slope_y;
-            value += 0.5 * reach[i] * (slope_x * slope_x + slope_y * slope_y);
-            double power_x = weight;
-            for (int64_t a = 0; a < n_moments; ++a) {
-                double power = power_x;
-                for (int64_t b = 0; b < n_moments - a; ++b) {
-                    moment[a * n_moments + b] += power;
-                    if (a + b <= fitted) product[a * n_fitted + b] += power * value;
-                    power *= y;
-                }
-                power_x *= x;
-            }
+            slope_x = slope_x * x + value;
+            value = value * x + row;
+            slope_y = slope_y * x + row_y;
         }
+        store_lanes(s->x + k, x + reach * slope_x);
+        store_lanes(s->y + k, y + reach * slope_y);
+        store_lanes(s->w + k,
+                    value + 0.5 * reach * (slope_x * slope_x + slope_y * slope_y));
     }
+}
+
+/* Moves one wavefront and fits it; an item of a pool's loop. */
+static void move_wavefront(void *argument, int item, int thread) {
+    const moved_run *run = argument;
+    int count = run->n_padded, n_terms = run->terms.n_terms, n = run->order + 1;
+    double *at = run->memory + run->work_size * (size_t)thread;
+    sample_table s = {.x = at, .y = at + count, .w = at + 2 * count, .weight = at + 3 * count,
+                      .count = count};
+    fit_work fit = {.row = at + 4 * count, .basis = at + 5 * count,
+                    .matrix = at + (5 + n_terms) * count};
+    memset(at, 0, sizeof(double) * 4 * (size_t)count);
+    for (int k = 0; k < run->n_rays; ++k) {
+        s.x[k] = run->rays[3 * k];
+        s.y[k] = run->rays[3 * k + 1];
+        s.weight[k] = run->rays[3 * k + 2];
+    }
+    move_rays(run, run->tables_um + (ptrdiff_t)item * n * n, run->reach[item], &s);
+    double zernike_um[MOST_TERMS], *moved_um = run->moved_um + (ptrdiff_t)item * n_terms;
+    fit_zernike(&run->terms, &s, 1.0, 0, &fit, zernike_um);
+    add_monomials(&run->terms, zernike_um, moved_um);
+}
+
+/* Moves wavefronts and adds the monomials (count, n_terms) of fits to their rays; NaN if a fit is
+ * singular.  `monomials` is (n_terms, n_terms), row j those of Zernike term j.  Returns 1 if out
+ * of memory. */
+static int moved_fits(pool *threads, const double *tables_um, const double *reach,
+                      const double *rays, const double *monomials, int64_t count,
+                      int64_t n_rays, int64_t order, int64_t n_terms, double *moved_um) {
+    moved_run *run = calloc(1, sizeof *run);
+    if (run == NULL) return 1;
+    run->tables_um = tables_um;
+    run->reach = reach;
+    run->rays = rays;
+    run->n_rays = (int)n_rays;
+    run->n_padded = row_length((int)n_rays);
+    run->order = (int)order;
+    run->moved_um = moved_um;
+    read_terms(&run->terms, monomials, (int)n_terms);
+    size_t columns = (size_t)(5 + n_terms) * (size_t)run->n_padded;
+    run->work_size = columns + (size_t)n_terms * (size_t)row_length((int)n_terms);
+    run->memory = calloc(run->work_size * (size_t)pool_size(threads), sizeof(double));
+    int is_done = run->memory != NULL;
+    if (is_done) pool_run(threads, (int)count, move_wavefront, run);
+    free(run->memory);
+    free(run);
+    return !is_done;
 }
 
 #endif

@@ -55,6 +55,13 @@ static void read_terms(zernike_terms *z, const double *monomials, int n_terms) {
     z->start[n_terms] = count;
 }
 
+/* Adds the monomials (n_terms,) of coefficients. */
+static void add_monomials(const zernike_terms *z, const double *zernike_um, double *monomials) {
+    for (int j = 0; j < z->n_terms; ++j)
+        for (int k = z->start[j]; k < z->start[j + 1]; ++k)
+            monomials[z->entries[k].monomial] += z->entries[k].factor * zernike_um[j];
+}
+
 /* Writes the polynomials (n_terms, count) at points of the unit circle, or their derivatives of
  * order d_x, d_y, which is 0 or 1. */
 static void write_basis(const zernike_terms *z, const sample_table *s, double radius_mm, int d_x,
