@@ -65,8 +65,22 @@ MEASURED = {
         for h_deg in (0.0, 20.0, -20.0)
     ],
 }
+TENTH_ORDER = {
+    "kind": "zernike",
+    "pupil_diameter_mm": 6.0,
+    "wavelength_nm": 555.0,
+    "zernike_um": {
+        **{"2,0": 1.6, "2,2": -0.2, "3,-1": -0.9, "3,3": 0.2, "4,0": 0.3, "5,1": 0.1},
+        **{"7,3": 0.05, "8,0": -0.04, "9,-5": 0.02, "10,2": 0.03},
+    },
+}
+"""Wavefronts are traced with 36 terms, and the residual has 66."""
+
 SCHEMATIC = "escudero_sanz_navarro_1999"
-PEOPLE = {name: name for name in preset_names()} | {"measured": json.dumps(MEASURED)}
+PEOPLE = {name: name for name in preset_names()} | {
+    "measured": json.dumps(MEASURED),
+    "tenth order": json.dumps(TENTH_ORDER),
+}
 
 
 def nodes_near(nodes_deg, wanted_deg):
