@@ -20,8 +20,8 @@ from estimator.eye.parameters import OFFSET_RADIUS_MM, OFFSET_SLICE, column
 from estimator.optics.media import refractive_index
 from estimator.optics.surfaces import horner_order, offset_monomials
 from estimator.optics.zernike import (
+    DEFAULT_ORDER,
     EXPONENTS,
-    MAX_RADIAL_ORDER,
     N_TERMS,
     index_from_nm,
     inverse_monomial_matrix,
@@ -90,7 +90,7 @@ class Shift(nn.Module):
     polynomial of degree 6 in (u, v) of the pupil, with coefficients (N, 27).
     """
 
-    DEGREE = MAX_RADIAL_ORDER
+    DEGREE = DEFAULT_ORDER
 
     def __init__(self) -> None:
         super().__init__()
@@ -128,7 +128,7 @@ class Shift(nn.Module):
 def _powers(x: Tensor) -> Tensor:
     """Return the powers 0 to 6 (N, 7)."""
     powers = [torch.ones_like(x)]
-    for _ in range(MAX_RADIAL_ORDER):
+    for _ in range(DEFAULT_ORDER):
         powers.append(powers[-1] * x)
     return torch.stack(powers, dim=1)
 

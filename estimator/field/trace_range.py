@@ -16,7 +16,7 @@ from estimator.field.interpolation import (
 )
 from estimator.field.peripheral_residual import PeripheralResidual
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
-from estimator.optics.zernike import HIGHEST_ORDER, MAX_RADIAL_ORDER, N_TERMS
+from estimator.optics.zernike import DEFAULT_ORDER, HIGHEST_ORDER, N_TERMS
 from estimator.periphery.change import peripheral_change
 from estimator.wavefront.aberrations import TRACED_FIELD_LIMIT_DEG, wavefront_grid
 from estimator.wavefront.nodes import fewest_nodes
@@ -77,7 +77,7 @@ def traced_terms(eye: EyeModel) -> int:
     profile = eye.profile
     if profile.is_given or profile.kind == "prescription":
         return N_TERMS
-    for order in range(MAX_RADIAL_ORDER, HIGHEST_ORDER + 1):
+    for order in range(DEFAULT_ORDER, HIGHEST_ORDER + 1):
         n_terms = (order + 1) * (order + 2) // 2
         n_rings, n_azimuths = fewest_nodes(n_terms)
         found = wavefront_grid(

@@ -48,8 +48,8 @@ from estimator.optics.packed import (
     WITH_OFFSET,
 )
 from estimator.optics.zernike import (
+    DEFAULT_ORDER,
     EXPONENTS,
-    MAX_RADIAL_ORDER,
     N_TERMS,
     monomial_matrix,
     nm_from_index,
@@ -173,8 +173,8 @@ def horner_order() -> NDArray[np.int64]:
     return np.array(
         [
             position[a, b]
-            for b in range(MAX_RADIAL_ORDER, -1, -1)
-            for a in range(MAX_RADIAL_ORDER - b, -1, -1)
+            for b in range(DEFAULT_ORDER, -1, -1)
+            for a in range(DEFAULT_ORDER - b, -1, -1)
         ]
     )
 

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-MAX_RADIAL_ORDER = 6
-N_TERMS = (MAX_RADIAL_ORDER + 1) * (MAX_RADIAL_ORDER + 2) // 2
+DEFAULT_ORDER = 6
+N_TERMS = (DEFAULT_ORDER + 1) * (DEFAULT_ORDER + 2) // 2
 """Radial order and number of terms by default."""
 
 HIGHEST_ORDER = 10

@@ -17,7 +17,7 @@ from msgspec import UNSET, Meta, UnsetType
 
 from estimator.eye.parameters import PARAMETERS, Parameter
 from estimator.media.straylight import BROWN
-from estimator.optics.zernike import HIGHEST_ORDER, MAX_RADIAL_ORDER
+from estimator.optics.zernike import DEFAULT_ORDER, HIGHEST_ORDER
 from estimator.profiles.correction_bodies import (
     AxisDeg,
     Body,
@@ -71,7 +71,7 @@ def _coefficients_meta(order: int) -> Meta:
 _CoefficientUm = Annotated[float, Meta(ge=-MAX_COEFFICIENT_UM, le=MAX_COEFFICIENT_UM)]
 CoefficientsUm = Annotated[dict[str, _CoefficientUm], _coefficients_meta(HIGHEST_ORDER)]
 CorneaCoefficientsUm = Annotated[
-    dict[str, _CoefficientUm], _coefficients_meta(MAX_RADIAL_ORDER)
+    dict[str, _CoefficientUm], _coefficients_meta(DEFAULT_ORDER)
 ]
 WavelengthNm = Annotated[float, Meta(ge=365.0, le=1014.0)]
 PupilDiameterMm = Annotated[

@@ -13,8 +13,8 @@ from estimator.eye.parameters import RetinaShape
 from estimator.media.straylight import CATARACTS, DEFAULT_AGE_YEARS, Straylight
 from estimator.note import note_of
 from estimator.optics.zernike import (
+    DEFAULT_ORDER,
     HIGHEST_ORDER,
-    MAX_RADIAL_ORDER,
     flip_horizontal,
     index_from_nm,
 )
@@ -150,7 +150,7 @@ def coefficients_um(
         A key is not a term, or two keys name the same one.
     """
     named: dict[int, tuple[str, float]] = {}
-    order = MAX_RADIAL_ORDER
+    order = DEFAULT_ORDER
     for key, value_um in entries.items():
         field = f"{path}{name}.{key}"
         n, j = _term_index(key, field, value_um, highest_order)

@@ -10,7 +10,7 @@ from estimator.eye.checked_fields import ProfileError
 from estimator.eye.surface_model import SurfaceModel
 from estimator.note import Note
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
-from estimator.optics.zernike import MAX_RADIAL_ORDER
+from estimator.optics.zernike import DEFAULT_ORDER
 from estimator.profiles import bodies, given_bodies
 from estimator.profiles.common_fields import coefficients_um, common_fields
 from estimator.profiles.correction_bodies import IntraocularBody
@@ -60,7 +60,7 @@ def _pseudophakic(body: given_bodies.PseudophakicBody) -> EyeProfile:
             body.frame,
             path="",
             name="cornea_zernike_um",
-            highest_order=MAX_RADIAL_ORDER,
+            highest_order=DEFAULT_ORDER,
         )
     worn = body.correction
     if isinstance(worn, IntraocularBody) and (

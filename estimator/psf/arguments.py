@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.optics.arrays import broadcast_copy
-from estimator.optics.zernike import HIGHEST_ORDER, MAX_RADIAL_ORDER
+from estimator.optics.zernike import DEFAULT_ORDER, HIGHEST_ORDER
 from estimator.psf.pupil import ELLIPSE_COLUMNS
 
 TERM_COUNTS = tuple(
-    (order + 1) * (order + 2) // 2
-    for order in range(MAX_RADIAL_ORDER, HIGHEST_ORDER + 1)
+    (order + 1) * (order + 2) // 2 for order in range(DEFAULT_ORDER, HIGHEST_ORDER + 1)
 )
 
 

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.optics.zernike import MAX_RADIAL_ORDER, exponents, radial_order
+from estimator.optics.zernike import DEFAULT_ORDER, exponents, radial_order
 
 
 @cache
@@ -19,7 +19,7 @@ def _disc(order: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
     They are exact for products of this order and the second.
     """
-    order = max(order, MAX_RADIAL_ORDER)
+    order = max(order, DEFAULT_ORDER)
     n_rings, n_azimuths = order // 2 + 2, order + 8
     unit, weights = np.polynomial.legendre.leggauss(n_rings)
     radius = np.sqrt(0.5 + 0.5 * unit)

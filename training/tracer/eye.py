@@ -16,11 +16,11 @@ from torch import Tensor
 from estimator.eye import lens_shape as rule
 from estimator.eye import parameters
 from estimator.optics.surfaces import horner_order, offset_monomials
-from estimator.optics.zernike import EXPONENTS, MAX_RADIAL_ORDER, N_TERMS
+from estimator.optics.zernike import DEFAULT_ORDER, EXPONENTS, N_TERMS
 from training.tracer.batches import constant
 from training.tracer.media import refractive_indices
 
-_N_POWERS = MAX_RADIAL_ORDER + 1
+_N_POWERS = DEFAULT_ORDER + 1
 
 
 class Shape(NamedTuple):

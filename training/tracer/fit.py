@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from estimator.optics.zernike import (
+    DEFAULT_ORDER,
     EXPONENTS,
-    MAX_RADIAL_ORDER,
     N_TERMS,
     monomial_matrix,
 )
@@ -28,7 +28,7 @@ def zernike_basis(x: Tensor, y: Tensor) -> Tensor:
     powers = []
     for coordinate in (x, y):
         row = [torch.ones_like(coordinate)]
-        for _ in range(MAX_RADIAL_ORDER):
+        for _ in range(DEFAULT_ORDER):
             row.append(row[-1] * coordinate)
         powers.append(row)
     monomials = [powers[0][a] * powers[1][b] for a, b in EXPONENTS.tolist()]
