@@ -13,6 +13,7 @@ import numpy as np
 
 from estimator.native import records
 from estimator.native.functions import FUNCTIONS
+from estimator.native.records import pointer_to
 from estimator.threads import thread_count
 
 PATH = Path(__file__).parent / "_core.so"
@@ -164,7 +165,7 @@ def _address(array: Any, dtype: np.dtype) -> int | None:
             f"expected a contiguous array of {dtype}, got {array.dtype} "
             f"of shape {array.shape}, strides {array.strides}"
         )
-    return array.ctypes.data
+    return pointer_to(array)
 
 
 class Core(Library):

@@ -129,9 +129,9 @@ class _Job:
         dtype: type = np.float64,
     ) -> None:
         """Point to values, broadcast to a shape."""
-        array: NDArray[Any] = np.ascontiguousarray(
-            np.broadcast_to(values, shape), dtype=dtype
-        )
+        array: NDArray[Any] = np.ascontiguousarray(values, dtype=dtype)
+        if array.shape != shape:  # the check takes a tenth of the time
+            array = np.ascontiguousarray(np.broadcast_to(array, shape))
         self._kept.append(array)
         setattr(self.record, name, pointer_to(array))
 
