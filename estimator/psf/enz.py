@@ -25,7 +25,7 @@ from estimator.psf.enz_series import (
     zernike_betas,
 )
 from estimator.psf.fourier import FourierAccuracy, plan_grids
-from estimator.psf.kernel_types import KernelBuffer, finish_kernel
+from estimator.psf.kernel_types import KernelBuffer, disc_mask
 from estimator.psf.survey import PupilSurvey
 from estimator.psf.tables import pixel_filter
 from estimator.psf.tail import add_tail
@@ -226,7 +226,7 @@ class _Series:
         half, shear = self.half, self.shear
         edge = survey.edge_slope_px[self.index]
         edge_um = float(survey.edge_light_um[self.index])
-        add_tail(kernel, window, 0.0, edge, half, shear, edge_um)
+        add_tail(kernel, window, edge, half, shear, edge_um)
         return kernel
 
     def _intensity(
@@ -319,7 +319,11 @@ def enz_kernels(
     def work(p: int) -> None:
         radius, start = int(output.radius_px[p]), int(output.offset_count[p])
         kernel = _Series(survey, p, degree, is_checked).kernel(radius, accuracy)
-        part = output.flat_kernels[start : start + kernel.size]
-        output.total_ratio[p] = finish_kernel(kernel, 1.0, part)
+        kernel[~disc_mask(radius)] = 0.0
+        total = float(kernel.sum(dtype=np.float64))
+        output.total_ratio[p] = total
+        if total > 0.0:
+            part = output.flat_kernels[start : start + kernel.size]
+            part[:] = kernel.ravel() * np.float32(1.0 / total)
 
     list(pool.map(work, members.tolist()))

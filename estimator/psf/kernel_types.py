@@ -1,12 +1,10 @@
 """Result, size error, buffer and kernel disc of the PSF engines."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 
@@ -122,29 +120,3 @@ def empty_buffer(
         geometric_ratio=geometric_ratio,
         total_ratio=np.zeros(radius_px.size),
     )
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]  # numba
-def finish_kernel(
-    kernel: NDArray[np.float32], share: float, flat: NDArray[np.float32]
-) -> float:
-    """Crop a kernel to its disc, scale it to a sum of ``share`` and add it to ``flat``.
-
-    Return ``share`` times the light in the disc.  Without light, nothing is added.
-    """
-    radius = kernel.shape[0] // 2
-    side = 2 * radius + 1
-    total = 0.0
-    for dy in range(-radius, radius + 1):
-        reach = math.floor(math.sqrt((radius + 0.5) ** 2 - dy * dy))
-        for dx in range(-reach, reach + 1):
-            total += kernel[dy + radius, dx + radius]
-    if not total > 0.0:
-        return 0.0
-    scale = np.float32(share / total)
-    for dy in range(-radius, radius + 1):
-        reach = math.floor(math.sqrt((radius + 0.5) ** 2 - dy * dy))
-        start = (dy + radius) * side + radius
-        for dx in range(-reach, reach + 1):
-            flat[start + dx] += scale * kernel[dy + radius, dx + radius]
-    return share * total

@@ -14,6 +14,7 @@ from estimator.psf.enz_series import (
     radial_polynomial,
     zernike_betas,
 )
+from estimator.psf.tail import add_tail
 from tests.numerical.psf_cases import (
     CASE_NAMES,
     case_zernike_um,
@@ -233,3 +234,30 @@ def test_a_higher_degree_widens_the_domain():
     radius = compared_radius_px(psf.blur_radius_px)
     reference = truth("keratoconus", 4.0, 550.0, PITCH_MRAD, radius)
     assert kernel_errors(physical_kernel(psf, radius), reference)[0] <= 2e-2
+
+
+@pytest.mark.parametrize("window", [(-9, 8, -5, 7), (5, -40, -3, 3)])
+def test_beyond_a_window_the_light_is_that_of_the_edge(window):
+    """On a circle's axes, where samples of the edge are nearest and farthest."""
+    radius, g_px, half_um, wavelength_um = 30, 6.0, 1.9, 0.55
+    angle = 2.0 * math.pi * np.arange(48) / 48
+    edge_px = g_px * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    kernel = np.full((2 * radius + 1,) * 2, -1.0, np.float32)
+    add_tail(
+        *(kernel, np.array(window), edge_px),
+        *(np.full(2, half_um), 0.0, wavelength_um),
+    )
+    rho = np.arange(12, radius + 1)
+    density = 1.0 / (rho - g_px) ** 2 + 1.0 / (rho + g_px) ** 2
+    density *= wavelength_um / (4.0 * math.pi**3 * half_um * rho)
+    for found in (
+        kernel[radius, radius + 12 :],
+        kernel[radius, radius - 12 :: -1],
+        kernel[radius - 12 :: -1, radius],
+        kernel[radius + 12 :, radius],
+    ):
+        np.testing.assert_allclose(found, density, rtol=1e-5)
+    left, right, down, up = window
+    y, x = np.mgrid[radius : -radius - 1 : -1, -radius : radius + 1]
+    is_known = (x >= left) & (x <= right) & (y >= down) & (y <= up)
+    np.testing.assert_array_equal(kernel >= 0.0, disc_mask(radius) & ~is_known)

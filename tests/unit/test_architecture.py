@@ -161,7 +161,6 @@ HOME = {
     "weasyprint": ("clients/report/make.py",),  # loads the system library Pango
     "lazy_loader": ("*/__init__.py",),  # names without what they load
     "numba": (
-        "estimator/psf/*",  # kernels of the PSF engines
         "estimator/optics/*_kernels.py",
         "estimator/optics/forms/*",  # sags
         "estimator/optics/gradients/*",  # indices at a point
