@@ -6,16 +6,11 @@ and caches them on disk; reading them takes 0.5 s.  The worker does this while i
 
 from dataclasses import replace
 
-import numpy as np
-
-from estimator.optics.units import REFERENCE_WAVELENGTH_NM
-from estimator.optics.zernike import N_TERMS
 from estimator.profiles.parse import parse_profile
 from filter_service.building.from_profile import build
 from filter_service.building.helper_process import HelperProcess
 from filter_service.building.jobs import BuildJob
 from filter_service.camera import Camera
-from filter_service.psfs.psf_engine import psf_engine
 from filter_service.psfs.store import PsfStore
 from filter_service.settings import FilterSettings
 
@@ -41,20 +36,6 @@ HELP_AFTER_S = 1.0
 def build_sample() -> None:
     """Estimate an eye and compute about 200 PSFs, with every compiled loop; 0.3 s."""
     _built(SAMPLE_JOB).fill()
-    compile_series()
-
-
-def compile_series() -> None:
-    """Compute one PSF of the published pipeline, which compiles its loops.
-
-    The render process computes its PSFs, and must not compile during a stream.
-    """
-    psf_engine("published").compute(
-        np.zeros((1, N_TERMS)),
-        pupil_diameter_mm=3.0,
-        wavelength_nm=REFERENCE_WAVELENGTH_NM,
-        pixel_pitch_mrad=1.0,
-    )
 
 
 def _built(job: BuildJob) -> PsfStore:
@@ -82,4 +63,3 @@ def compile_psfs() -> None:
     settings = replace(SAMPLE_JOB.settings, eye_model="wavefront", mode="on-axis")
     job = replace(SAMPLE_JOB, settings=settings)
     _built(job).fill()
-    compile_series()

@@ -9,10 +9,7 @@ import numpy as np
 from estimator.media.straylight import Straylight
 from filter_service.camera import Camera
 from filter_service.constants import RGB
-from filter_service.planning.nodes import PlanAxes
-from filter_service.planning.plan import NodePlanner
 from filter_service.psfs.frame_layers import frame_layers
-from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame import fill_missing_depth
 from filter_service.rendering.frame_kernels import (
     frame_kernels,
@@ -41,20 +38,6 @@ def plan_once() -> None:
     depth_m = np.ones((2, 2), np.float32)
     depth_m[0, 0] = np.nan
     fill_missing_depth(depth_m)
-    _plan_nodes_once(store)
     light = np.ones((SIDE_PX, SIDE_PX, RGB), np.float32)
     view = RgbdView(light, light[..., 0].copy(), store.spec.camera.tangents)
     MediaEffects(Straylight()).apply(light, view)
-
-
-def _plan_nodes_once(store: PsfStore) -> None:
-    """Plan the nodes of one state over the field."""
-    spec, plan = store.spec.with_settings(mode="dynamic"), store.plan
-    axes = PlanAxes(
-        h_deg=np.arange(2.0),
-        v_deg=plan.v_deg,
-        pupils_mm=plan.pupils_mm,
-        accommodations_dpt=plan.accommodations_dpt,
-        defocus_error=1e-3,
-    )
-    NodePlanner(store.eye, spec, axes).nodes(0, 0)

@@ -161,11 +161,6 @@ HOME = {
     "weasyprint": ("clients/report/make.py",),  # loads the system library Pango
     "lazy_loader": ("*/__init__.py",),  # names without what they load
     "numba": (
-        "estimator/optics/*_kernels.py",
-        "estimator/optics/forms/*",  # sags
-        "estimator/optics/gradients/*",  # indices at a point
-        "estimator/wavefront/*",  # aiming and fitting
-        "filter_service/rendering/reference*.py",  # twins of the passes
         "clients/commands/doctor_probes.py",  # asks which threads it runs on
         "filter_service/threads.py",
     ),

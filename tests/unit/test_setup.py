@@ -61,7 +61,7 @@ def test_loops_are_compiled_with_no_more_than_the_packages_that_come_first():
         check=True,
     )
     found = {name for name in ran.stdout.split() if not name.startswith("_")}
-    assert {"numba", "scipy"} <= found
+    assert "scipy" in found
     assert found - brought_along <= {name.replace("-", "_") for name in first}
 
 
