@@ -7,9 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 def broadcast_copy(values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """Return values broadcast to ``shape`` as a writable array in C order.
 
-    `numpy.broadcast_to` returns a read-only view, which `numpy.ascontiguousarray` does
-    not copy if it is contiguous.  To numba, read-only arrays are another type, for
-    which it recompiles everything: 7 s for the ray tracer.
+    `numpy.broadcast_to` returns a view that is read-only and may repeat its elements.
 
     Raises
     ------

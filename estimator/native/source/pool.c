@@ -152,15 +152,15 @@ void pool_free(pool *p) {
     if (p == NULL) return;
     pthread_mutex_lock(&life);
     pthread_mutex_lock(&lock);
-    stops = --n_handles == 0;
-    int count = stops ? n_helpers : 0;
-    if (stops) {
+    int is_last = --n_handles == 0, count = is_last ? n_helpers : 0;
+    if (is_last) {
+        stops = 1;
         n_helpers = 0;
         pthread_cond_broadcast(&begin);
     }
     pthread_mutex_unlock(&lock);
     for (int k = 0; k < count; ++k) pthread_join(threads[k], NULL);
-    stops = 0;
+    if (is_last) stops = 0; /* otherwise, threads may read it */
     pthread_mutex_unlock(&life);
     free(p);
 }
