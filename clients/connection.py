@@ -16,6 +16,7 @@ from zmq.utils.monitor import recv_monitor_message
 
 from filter_service.errors import ServiceTimeout
 from filter_service.keys import ClientKey
+from filter_service.waiting import Wait
 
 COPY_BELOW_BYTES = 65536  # pyzmq always copies smaller parts
 MAX_BUFFERS_PER_SIZE = 8
@@ -91,7 +92,8 @@ class SendBufferPool:
         for buffer in buffers:
             if not buffer.is_held and buffer.tracker is not None:
                 try:
-                    buffer.tracker.wait(self._timeout_s)
+                    with Wait("Waiting for the service"):
+                        buffer.tracker.wait(self._timeout_s)
                 except zmq.NotDone:
                     raise ServiceTimeout(
                         f"{len(buffers)} images of {buffer.memory.nbytes} bytes were "

@@ -54,7 +54,7 @@ DETAIL_CORNERS = {"courtyard": (0.32, 0.19), "primitives": (0.42, 0.30)}
 image's width and height."""
 
 LOG_TAIL_LINES = 12
-START_TIMEOUT_S = 180.0  # the first start compiles, which is slow on some machines
+START_TIMEOUT_S = 180.0  # scenes are rendered meanwhile, on all cores
 
 
 class DemoFailed(Exception):

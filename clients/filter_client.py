@@ -10,7 +10,8 @@ keeps only the newest.  `poll` returns each submitted frame once, as a `Filtered
 a `Dropped` or an `ErrorReply`.
 
 After a restart of the service, the client reconnects and sends its profile again.
-Every wait has a timeout, whose error says what the client waited for.
+Every wait has a timeout, whose error says what the client waited for.  Progress of a
+profile's preparation restarts it.
 """
 
 from __future__ import annotations
@@ -63,6 +64,7 @@ from filter_service.messages import (
     tangents_from_fov,
 )
 from filter_service.settings import DepthKind, RenderOptionValues, as_settings
+from filter_service.waiting import Wait
 
 __all__ = [
     "Event",
@@ -94,12 +96,17 @@ EXTENDING_S = 0.03
 class FilterClient:
     """A session with the filter service, for use by one thread at a time.
 
+    If a wait takes more than 2 s, a bar on stderr shows its progress.  There is none
+    without a terminal, with ``on_progress``, while the program shows a `Progress`, or
+    if the environment variable ``OCUFILTER_PROGRESS`` is 0.
+
     Parameters
     ----------
     endpoint : str
         Address that the service listens on.
     timeout_s : float
-        Default timeout of a reply.
+        Default timeout of a reply: longest time in which the service neither replies
+        nor reports progress.
     max_in_flight : int
         Maximum number of frames in flight.  With 1, frames of a live stream are the
         most recent (an age of 1.2 filter periods instead of 2.2).  The highest frame
@@ -231,7 +238,7 @@ class FilterClient:
         on_progress : callable, optional
             Called with each Progress while waiting.
         timeout_s : float
-            Timeout of the wait.
+            Longest time without progress of the preparation.
 
         Raises
         ------
@@ -313,8 +320,18 @@ class FilterClient:
         on_progress: Callable[[Progress], None] | None,
         timeout_s: float,
     ) -> Ready | Accepted:
-        profile_id = request.profile_id
-        deadline_s = time.monotonic() + timeout_s
+        with Wait(
+            "Preparing the eye", timeout_s, is_shown=on_progress is None
+        ) as waiting:
+            return self._awaited(request.profile_id, wait, on_progress, waiting)
+
+    def _awaited(
+        self,
+        profile_id: int,
+        wait: bool | str,
+        on_progress: Callable[[Progress], None] | None,
+        waiting: Wait,
+    ) -> Ready | Accepted:
         n_awaited = n_ready = 0
         while True:
             # One at a time, because later events are left for the caller.
@@ -322,9 +339,7 @@ class FilterClient:
                 lambda e: getattr(e, "profile_id", None) == profile_id
             )
             if event is None:
-                self._link.pump_before(
-                    deadline_s, f"profile {profile_id} to become ready"
-                )
+                self._link.pump_during(waiting, f"profile {profile_id} to become ready")
             if isinstance(event, ErrorReply):
                 raise event.exception()
             if isinstance(event, Progress) and on_progress is not None:
@@ -358,8 +373,9 @@ class FilterClient:
     ) -> FilteredFrame:
         """Send one frame and return it filtered; see `submit` for the parameters.
 
-        The frame is sent again, until the timeout, while the service prepares the eye
-        for its camera or state, and after a restart of the service.
+        The frame is sent again while the service prepares the eye for its camera or
+        state, and after a restart of the service, until this has not advanced for
+        ``timeout_s``.
 
         Raises
         ------
@@ -387,22 +403,32 @@ class FilterClient:
     ) -> FilteredFrame:
         """Submit a frame until it is filtered, and return it."""
         limit_s = self.timeout_s if timeout_s is None else timeout_s
-        deadline_s = time.monotonic() + limit_s
-        while True:
-            answer = self._await_frame(submit(), deadline_s)
-            if isinstance(answer, FilteredFrame):
-                return answer
-            if isinstance(answer, ErrorReply):
-                raise answer.exception()
-            if answer.reason == "preparing":
-                self._await_ready(deadline_s)
-            elif answer.reason == "extending":
-                if time.monotonic() > deadline_s:
-                    raise ServiceTimeout("timed out waiting for PSFs of this state")
-                self._link.pump(EXTENDING_S)
+        n_extended = n_most_extended = 0
+        with Wait("Filtering", limit_s) as wait:
+            while True:
+                answer = self._await_frame(submit(), wait)
+                if isinstance(answer, FilteredFrame):
+                    return answer
+                if isinstance(answer, ErrorReply):
+                    raise answer.exception()
+                if answer.reason == "preparing":
+                    self._await_ready(wait)
+                elif answer.reason == "extending":
+                    n_extended += 1
+                    if n_extended > n_most_extended:  # the service has computed PSFs
+                        n_most_extended = n_extended
+                        wait.advance()
+                    self._link.pump(EXTENDING_S)
+                elif answer.reason == "connection_lost":
+                    n_extended = 0  # their PSFs are lost, too
+                if wait.remaining_s <= 0.0:
+                    raise ServiceTimeout(
+                        "timed out waiting for a frame; the service dropped it "
+                        f"({answer.reason})"
+                    )
 
     def _await_frame(
-        self, frame_id: int, deadline_s: float
+        self, frame_id: int, wait: Wait
     ) -> FilteredFrame | Dropped | ErrorReply:
         while True:
             answer = self._link.take_event(
@@ -410,9 +436,9 @@ class FilterClient:
             )
             if isinstance(answer, FilteredFrame | Dropped | ErrorReply):
                 return answer
-            self._link.pump_before(deadline_s, f"a reply to frame {frame_id}")
+            self._link.pump_during(wait, f"a reply to frame {frame_id}")
 
-    def _await_ready(self, deadline_s: float) -> None:
+    def _await_ready(self, wait: Wait) -> None:
         """Wait for an eye that is being prepared; raise if its preparation fails.
 
         Return also after a lost connection, with which `Ready` may be lost.
@@ -429,7 +455,7 @@ class FilterClient:
                 raise event.exception()
             if event is not None:
                 return
-            self._link.pump_before(deadline_s, "the eye to be prepared for this camera")
+            self._link.pump_during(wait, "the eye to be prepared for this camera")
 
     def submit(
         self,
@@ -731,15 +757,15 @@ class FilterClient:
     def ping(self, timeout_s: float | None = None) -> tuple[float, Pong]:
         """Return the round trip in ms, and the state of the service's render worker."""
         limit_s = self.timeout_s if timeout_s is None else timeout_s
-        deadline_s = time.monotonic() + limit_s
         self._link.pongs.clear()
         start_s, asked = time.monotonic(), None
-        while not self._link.pongs:
-            if self.welcome is not asked and self.welcome is not None:
-                # Also after a lost connection, with which the reply was lost.
-                asked, start_s = self.welcome, time.monotonic()
-                self._link.queue_message(encode(Ping(start_s)))
-                self._link.pump(0.0)
-            else:
-                self._link.pump_before(deadline_s, "a reply to ping")
+        with Wait("Waiting for the service", limit_s) as wait:
+            while not self._link.pongs:
+                if self.welcome is not asked and self.welcome is not None:
+                    # Also after a lost connection, with which the reply was lost.
+                    asked, start_s = self.welcome, time.monotonic()
+                    self._link.queue_message(encode(Ping(start_s)))
+                    self._link.pump(0.0)
+                else:
+                    self._link.pump_during(wait, "a reply to ping")
         return 1000 * (time.monotonic() - start_s), self._link.pongs[-1]

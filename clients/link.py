@@ -45,6 +45,7 @@ from filter_service.messages import (
     decode_reply,
     encode,
 )
+from filter_service.waiting import Wait
 
 MAX_KEPT_PROGRESS = 1000
 RETRY_SEND_S = 0.002  # the socket accepts messages only shortly after the connect event
@@ -145,6 +146,9 @@ class ServiceLink:
         self.in_flight: dict[int, Outgoing] = {}
         self.pongs: list[Pong] = []
         self.n_superseded = 0
+        self.n_advances = 0  # of profiles' preparation: it changes as they advance
+        self._progress: tuple[float | None, str] = None, ""
+        self._furthest: dict[tuple[int, int, str], float] = {}
         self._max_in_flight = max_in_flight
         self._client_name = client_name
         self._connection = Connection(endpoint, key)
@@ -203,24 +207,26 @@ class ServiceLink:
         Raises
         ------
         ServiceTimeout
-            After ``timeout_s``; the message includes ``what``.
+            After ``timeout_s`` without progress; the message includes ``what``.
         """
-        deadline_s = time.monotonic() + timeout_s
         self.pump(0.0)
-        while not (found := find()):
-            self.pump_before(deadline_s, what)
+        with Wait("Waiting for the service", timeout_s) as wait:
+            while not (found := find()):
+                self.pump_during(wait, what)
         return found
 
-    def pump_before(self, deadline_s: float, what: str) -> None:
-        """Pump once; raise after the deadline or if the service rejected hello."""
-        remaining_s = deadline_s - time.monotonic()
-        if remaining_s <= 0:
+    def pump_during(self, wait: Wait, what: str) -> None:
+        """Pump once; raise at the time limit or if the service rejected hello."""
+        remaining_s, n_received = wait.remaining_s, self._connection.n_bytes_received
+        self.pump(min(max(remaining_s, 0.0), 0.5))
+        wait.update(self.n_advances, *self._progress)
+        has_received = self._connection.n_bytes_received > n_received
+        if remaining_s <= 0 and not has_received:
             raise ServiceTimeout(
                 f"timed out waiting for {what}: {self._connection.endpoint} is "
                 f"{self._connection.describe()}. Is the service running there? Start "
                 f"it with `ocufilter serve --bind {self._connection.endpoint}`"
             )
-        self.pump(min(remaining_s, 0.5))
         if self._connection.has_failed_handshake:
             raise AuthenticationFailed(
                 f"key exchange with {self._connection.endpoint} failed; expected a "
@@ -309,12 +315,28 @@ class ServiceLink:
                     for number, count in self._n_ready_missing.items()
                     if number in current
                 } | {reply.profile_id: reply.n_cameras}
+                self._furthest = {
+                    key: f for key, f in self._furthest.items() if key[0] in current
+                }
+            elif isinstance(reply, Progress):
+                self._note_progress(reply)
             elif isinstance(reply, Ready):
+                self._progress = None, ""
+                self.n_advances += 1
                 missing = self._n_ready_missing.get(reply.profile_id, 0)
                 if missing:
                     self._n_ready_missing[reply.profile_id] = missing - 1
             self._events.append(reply)
             self._bound_progress()
+
+    def _note_progress(self, reply: Progress) -> None:
+        """Count progress as an advance, but not what a restarted service repeats."""
+        self._progress = reply.fraction, reply.stage
+        n_missing = self._n_ready_missing.get(reply.profile_id, 0)
+        key = reply.profile_id, n_missing, reply.stage
+        if reply.fraction > self._furthest.get(key, -1.0):
+            self._furthest[key] = reply.fraction
+            self.n_advances += 1
 
     def _begin(self, welcome: Welcome) -> None:
         """Start or resume a session, and send the profiles that it lacks."""

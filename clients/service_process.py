@@ -12,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from filter_service.waiting import Wait
+
 SERVE_COMMAND = (sys.executable, "-m", "filter_service", "serve")
 CHECKOUT = Path(__file__).resolve().parents[1]
 # `-m` finds our packages in a checkout, and installed packages from any folder.
@@ -30,7 +32,7 @@ class ServiceProcess:
     command : sequence of str
         Command to start; ``--config FILE`` is appended.
     start_timeout_s : float
-        Timeout for the service to become ready.
+        Longest time without output of the service before it is ready.
     wait : bool
         Whether to wait until the service is ready; otherwise call `await_ready`.
 
@@ -141,20 +143,25 @@ class ServiceProcess:
     def await_ready(self, timeout_s: float = 60.0) -> None:
         """Wait until the service accepts frames; kill it if it does not start.
 
+        Parameters
+        ----------
+        timeout_s : float
+            Longest time without output of the service.
+
         Raises
         ------
         RuntimeError
-            If the service has ended or takes too long.  The message includes its
-            output.
+            If the service has ended, or wrote nothing for ``timeout_s``.  The message
+            includes its output.
         """
         try:
-            self._await_ready(timeout_s)
+            with Wait("Starting the service", timeout_s) as wait:
+                self._await_ready(wait, timeout_s)
         except BaseException:
             self.kill()
             raise
 
-    def _await_ready(self, timeout_s: float) -> None:
-        deadline_s = time.monotonic() + timeout_s
+    def _await_ready(self, wait: Wait, timeout_s: float) -> None:
         while not self._ready_file.exists():
             code = self.process.poll()
             if code is not None:
@@ -162,9 +169,10 @@ class ServiceProcess:
                     f"the service ended with code {code} before it was ready: "
                     f"{self.log[-LOG_TAIL_CHARACTERS:].strip()}"
                 )
-            if time.monotonic() > deadline_s:
+            wait.update(self._log_file.stat().st_size)
+            if wait.remaining_s <= 0.0:
                 raise RuntimeError(
-                    f"the service was not ready within {timeout_s:g} s: "
+                    f"the service was not ready and wrote nothing for {timeout_s:g} s: "
                     f"{self.log[-LOG_TAIL_CHARACTERS:].strip()}"
                 )
             time.sleep(POLL_S)

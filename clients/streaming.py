@@ -24,6 +24,8 @@ _BUILDING_HZ = 4.0
 and low enough to leave the processor to the preparation."""
 
 _BUILD_LIMIT_S = 180.0
+"""Longest time without progress of an eye's preparation."""
+
 _POLL_S = 0.05
 
 
@@ -105,7 +107,7 @@ def change_eye(
     Raises
     ------
     FilterError
-        If the profile is rejected, or its preparation fails or takes too long.
+        If the profile is rejected, or its preparation fails or no longer advances.
     """
     views = [frames[0].view]
     accepted = client.set_profile(
@@ -115,11 +117,13 @@ def change_eye(
     ready: Ready | None = None
     previous_generation, n_through_previous = None, 0
     next_send_s, index = time.monotonic(), 0
-    deadline_s = next_send_s + _BUILD_LIMIT_S
+    deadline_s, reached = next_send_s + _BUILD_LIMIT_S, (0.0, "")
     while ready is None or client.n_unanswered:
         now_s = time.monotonic()
         if now_s > deadline_s:
-            raise ServiceTimeout(f"the eye was not ready within {_BUILD_LIMIT_S:g} s")
+            raise ServiceTimeout(
+                f"the preparation of the eye has not advanced for {_BUILD_LIMIT_S:g} s"
+            )
         is_due = has_eye and ready is None and now_s >= next_send_s
         if is_due and not client.n_unanswered:
             submit(client, frames[index % len(frames)])
@@ -133,6 +137,9 @@ def change_eye(
                 continue
             elif isinstance(event, Progress):
                 on_progress(event.fraction, event.stage)
+                if (event.fraction, event.stage) != reached:
+                    reached = event.fraction, event.stage
+                    deadline_s = time.monotonic() + _BUILD_LIMIT_S
             elif isinstance(event, Ready):
                 ready = event
     return {

@@ -17,6 +17,7 @@ Importing this package loads no submodules, which keeps clients light.
     log_lines        log of the service
     validation       validation of values against annotated types
     progress         progress of long tasks on stderr
+    waiting          waits that report progress, with a limit of the time without it
     constants        constants shared by Python and GLSL
     image_files      color and depth files
     atomic_files     atomic file writes

@@ -37,6 +37,14 @@ MAX_SAMPLES = 512
 """Updates that a task remembers; of more, every other one is dropped."""
 
 
+_open: set[Progress] = set()
+
+
+def is_progress_open() -> bool:
+    """Return whether the program reports progress now, or has been told to be quiet."""
+    return bool(_open)
+
+
 class Task:
     """A task with a count; created by `Progress.task`."""
 
@@ -124,6 +132,8 @@ class Progress:
         Whether to write nothing.
     as_lines : bool
         Whether to write lines on a terminal, too.
+    is_removed : bool
+        Whether bars are removed at the end.
     stream : file, optional
         Stream in place of stderr.
     interval_s : float
@@ -138,6 +148,7 @@ class Progress:
         *,
         quiet: bool = False,
         as_lines: bool = False,
+        is_removed: bool = False,
         stream: TextIO | None = None,
         interval_s: float = INTERVAL_S,
         clock: Callable[[], float] = time.monotonic,
@@ -145,7 +156,7 @@ class Progress:
         self.clock = clock
         self._name, self._interval_s = name, interval_s
         self._stream = sys.stderr if stream is None else stream
-        self._is_quiet = quiet
+        self._is_quiet, self._is_removed = quiet, is_removed
         self._has_bars = not (quiet or as_lines) and self._stream.isatty()
         self._bars: _Bars | None = None
         self._task: Task | None = None
@@ -156,8 +167,9 @@ class Progress:
 
     def __enter__(self) -> Self:
         """Start the output."""
+        _open.add(self)
         if self._has_bars:
-            self._bars = _Bars(self._stream)
+            self._bars = _Bars(self._stream, is_removed=self._is_removed)
         elif not self._is_quiet:
             threading.Thread(target=self._repeat, daemon=True).start()
         return self
@@ -169,6 +181,7 @@ class Progress:
         trace: TracebackType | None,
     ) -> None:
         """Stop the output; write the final count."""
+        _open.discard(self)
         self._ended.set()
         if self._bars is not None:
             self._bars.close()
@@ -222,7 +235,7 @@ class Progress:
 class _Bars:
     """Bars by rich, imported only on terminals because that takes 0.1 s."""
 
-    def __init__(self, stream: TextIO) -> None:
+    def __init__(self, stream: TextIO, *, is_removed: bool) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
         from rich.progress import Progress as RichProgress
@@ -233,6 +246,10 @@ class _Bars:
             TextColumn("{task.fields[count]}"),
             TimeElapsedColumn(),
             console=Console(file=stream),
+            transient=is_removed,
+            # The caller of a wait may replace the streams meanwhile.
+            redirect_stdout=not is_removed,
+            redirect_stderr=not is_removed,
         )
         self._numbers: dict[Task, Any] = {}
         self._bars.start()
@@ -247,11 +264,12 @@ class _Bars:
         """Update a bar."""
         self._bars.update(
             self._numbers[task],
+            total=task.total or None,
             completed=task.done,
             description=task.name,
             count=task.count,
         )
 
     def close(self) -> None:
-        """Stop the bars; they stay on the screen."""
+        """Stop the bars."""
         self._bars.stop()

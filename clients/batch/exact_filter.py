@@ -10,7 +10,6 @@ from filter_service import Camera, EyeFilter, Filtered, FilterError, RgbdView
 from filter_service.errors import WorkerCrashed
 
 ATTEMPTS = 2
-BUILD_LIMIT_S = 600.0
 
 
 class EngineUnusable(RuntimeError):
@@ -79,7 +78,7 @@ class ExactFilter:
             settings, engine = self._job.settings, self._job.engine
             self._filter = EyeFilter(body, camera, settings, engine=engine)
             try:
-                ready = self._filter.wait(BUILD_LIMIT_S)
+                ready = self._filter.wait()
                 self.build_s += ready.build_ms / 1e3
                 return
             except WorkerCrashed as error:  # possibly for lack of memory

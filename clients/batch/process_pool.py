@@ -26,6 +26,7 @@ from typing import cast
 from clients.batch.exact_filter import EngineUnusable
 from clients.batch.job import Job
 from clients.batch.work import Record, Unit, UnitRunner, failed_records
+from filter_service.waiting import PROGRESS_VARIABLE
 
 THREADS_VARIABLE = "OCUFILTER_THREADS"
 MAX_DEATHS = 2
@@ -135,6 +136,7 @@ class ProcessPool:
             env={
                 **os.environ,
                 THREADS_VARIABLE: str(self._n_threads),
+                PROGRESS_VARIABLE: "0",  # this process reports it
                 "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path),
             },
         )

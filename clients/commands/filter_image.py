@@ -47,7 +47,6 @@ FOCUS_LIMITS_DPT = (0.0, MAX_VERGENCE_DPT)
 FOV_LIMITS_DEG = (1.0, 150.0)
 FOCAL_LIMITS_PX = (1.0, 1e6)
 DISTANCE_LIMITS_M = (1.0 / MAX_VERGENCE_DPT, float("inf"))
-TIMEOUT_S = 600.0
 
 
 @with_setting_options()
@@ -321,7 +320,7 @@ def _filtered(
     eye_filter = closing.enter_context(
         EyeFilter(eye, view.camera, settings, on_event=report, builder=builder)
     )
-    seen = eye_filter.filter(view, whole=True, timeout_s=TIMEOUT_S, **options)
+    seen = eye_filter.filter(view, whole=True, **options)
     store = eye_filter.prepared_stores[-1].store
     return _Filtered(
         seen,

@@ -111,7 +111,7 @@ class WorkerHandle:
         Time after which a canceled build that is still running is killed with its
         process.
     build_limit_s : float
-        Time after which a build is killed with its process.
+        Time without progress after which a build is killed with its process.
     warm_up : str
         ``module:function`` that the process runs while it waits for the first job.
     niceness : int
@@ -136,7 +136,8 @@ class WorkerHandle:
     _start_at_s: float = 0.0
     _is_ready: bool = False
     _worker: _Worker | None = None
-    _began_s: float = 0.0
+    _advanced_s: float = 0.0
+    _progress: BuildProgress | None = None
     _next_watch_s: float = 0.0
     _stopped_since_s: float | None = None
 
@@ -235,9 +236,10 @@ class WorkerHandle:
         if now_s < self._next_watch_s:
             return
         self._next_watch_s = now_s + WATCH_INTERVAL_S
-        if self._running is not None and now_s - self._began_s > self.build_limit_s:
+        if self._running is not None and now_s - self._advanced_s > self.build_limit_s:
             log.error(
-                "a build took longer than %g s; killing its process", self.build_limit_s
+                "a build has not advanced for %g s; killing its process",
+                self.build_limit_s,
             )
             worker.kill()
         if not is_stopped(worker.process.pid):
@@ -254,7 +256,10 @@ class WorkerHandle:
         if kind == "ready":
             self._is_ready = True
         elif kind == "progress":
-            events.append(BuildProgress(*message[1:]))
+            progress = BuildProgress(*message[1:])
+            if progress != self._progress:
+                self._progress, self._advanced_s = progress, time.monotonic()
+            events.append(progress)
         elif kind == "failed":
             ticket, code, text, at_field, allowed = message[1:]
             error = error_from_code(code, text, field=at_field, allowed=allowed)
@@ -278,7 +283,7 @@ class WorkerHandle:
         if self._running is None and self._is_ready and self._queue:
             ticket, job = self._queue.popleft()
             self._running = ticket
-            self._began_s = time.monotonic()
+            self._advanced_s = time.monotonic()
             self._send(("build", ticket, job))
 
     def _send(self, message: tuple[Any, ...]) -> None:

@@ -39,6 +39,8 @@ class PreparedStore:
         Earliest time of the next progress event.
     n_checks : int
         Number of completed checks for missing PSFs of a first frame.
+    n_most_computed : int
+        Largest number of PSFs that have been computed at a time.
     ticket : int
         Ticket of its build.
     """
@@ -52,6 +54,7 @@ class PreparedStore:
     pending: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     next_progress_s: float = 0.0
     n_checks: int = 0
+    n_most_computed: int = 0
     ticket: int = 0
 
 

@@ -101,6 +101,8 @@ class Builder:
         self.engine_name = engine_name
         self.streams: list[StreamEyes] = []
         self.frame_s = 0.0  # duration of the last frame
+        self.n_advances = 0  # of builds and of first PSFs: it changes as they advance
+        self._last_progress: BuildProgress | None = None
         self._limits = limits
         self._released: list[Any] = []
         self._dropping: list[Any] = []
@@ -206,6 +208,7 @@ class Builder:
         """
         self._drop_released()
         for event in self.worker.poll():
+            self._count_advance(event)
             if isinstance(event, BuildPart):
                 self._add_part(event)
                 continue
@@ -230,6 +233,14 @@ class Builder:
         if ahead:
             self._warm_ahead_of_streams()
         self._limit_memory()
+
+    def _count_advance(self, event: BuildEvent) -> None:
+        """Count an event, unless a build reports the same progress again."""
+        if isinstance(event, BuildProgress):
+            if event == self._last_progress:
+                return
+            self._last_progress = event
+        self.n_advances += 1
 
     def _handle(self, stream: StreamEyes, event: BuildEvent) -> None:
         if stream.building is None:
@@ -274,6 +285,12 @@ class Builder:
         for stream in list(self.streams):
             while (found := stream.store_to_warm()) is not None:
                 is_over = self._warm_first(stream, *found, until_s)
+                _, prepared = found
+                n_computed = prepared.store.computed_count
+                # Not those that were evicted and are computed again, without end.
+                if n_computed > prepared.n_most_computed:
+                    prepared.n_most_computed = n_computed
+                    self.n_advances += 1
                 if time.monotonic() > until_s:
                     self._is_warming |= not is_over
                     break

@@ -9,6 +9,7 @@ The service uses one filter for each eye of a session.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 import warnings
@@ -31,6 +32,7 @@ from filter_service.errors import (
 from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
 from filter_service.filtering.builder import Builder
 from filter_service.filtering.filtered import (
+    BuildingEye,
     EyeEvent,
     EyeFailed,
     EyeReady,
@@ -60,6 +62,7 @@ from filter_service.settings import (
 )
 from filter_service.texture_view import GlTexture, TextureView
 from filter_service.validation import checked
+from filter_service.waiting import Wait
 
 WAIT_SLICE_S = 0.02
 
@@ -123,6 +126,11 @@ class EyeFilter:
     By default all filters of a process share a build worker and an engine, which only
     one thread at a time may use.
 
+    If it takes more than 2 s to open the filter, to `wait` or to `filter`, a bar on
+    stderr shows the progress.  There is none without a terminal, with ``on_event``,
+    while the program shows a `Progress`, or if the environment variable
+    ``OCUFILTER_PROGRESS`` is 0.
+
     Parameters
     ----------
     profile : EyeProfile, mapping, str or Path, optional
@@ -175,7 +183,8 @@ class EyeFilter:
         self._shared: SharedBuilder | None = None
         self._takes_textures = builder is not None or gl_context == "current"
         if builder is None:
-            builder, self._shared = _acquired(engine, gl_context)
+            with self._new_wait("Opening the filter"):
+                builder, self._shared = _acquired(engine, gl_context)
         self._builder: Builder | None = builder
         self._eyes = StreamEyes(
             self._handle_event,
@@ -186,6 +195,7 @@ class EyeFilter:
         self._builder.streams.append(self._eyes)
         self._newest: AcceptedProfile | None = None
         self._failure: EyeFailed | None = None
+        self._progress: tuple[float | None, str] = None, ""
         self.is_extending = False  # whether the last frame only lacked PSFs
         self.ready: EyeReady | None = None
         if first is not None:
@@ -297,6 +307,12 @@ class EyeFilter:
     def wait(self, timeout_s: float = 120.0) -> EyeReady:
         """Wait until the newest eye is ready for all requested cameras.
 
+        Parameters
+        ----------
+        timeout_s : float
+            Longest time in which neither the build of an eye nor the computation of its
+            PSFs advances.
+
         Raises
         ------
         FilterError
@@ -305,17 +321,17 @@ class EyeFilter:
         BadMessage
             If there is no profile, or no camera to prepare for.
         """
-        deadline_s = time.monotonic() + timeout_s
         if self._newest is None:
             raise BadMessage("there is no profile", field="profile")
-        while True:
-            self.builder.advance()
-            failure, self._failure = self._failure, None
-            if failure is not None and failure.eye is self._newest:
-                raise failure.error
-            if not self._newest.requested:
-                return self._outcome(self._newest)
-            self._wait_for_worker(deadline_s, "the eye to be ready")
+        with self._new_wait("Preparing the eye", timeout_s) as waiting:
+            while True:
+                self.builder.advance()
+                failure, self._failure = self._failure, None
+                if failure is not None and failure.eye is self._newest:
+                    raise failure.error
+                if not self._newest.requested:
+                    return self._outcome(self._newest)
+                self._wait_for_worker(waiting, "the eye to be ready")
 
     def _outcome(self, eye: AcceptedProfile) -> EyeReady:
         """Return or raise the outcome of an eye whose builds have finished."""
@@ -332,11 +348,19 @@ class EyeFilter:
             self._failure = event
         elif isinstance(event, EyeReady):
             self.ready = event
+            self._progress = 1.0, "frame"
+        elif isinstance(event, BuildingEye):
+            self._progress = event.fraction, event.stage
         if self._on_event is not None:
             self._on_event(event)
 
-    def _wait_for_worker(self, deadline_s: float, what: str) -> None:
-        remaining_s = deadline_s - time.monotonic()
+    def _new_wait(self, title: str, timeout_s: float = math.inf) -> Wait:
+        self._progress = None, ""
+        return Wait(title, timeout_s, is_shown=self._on_event is None)
+
+    def _wait_for_worker(self, waiting: Wait, what: str) -> None:
+        waiting.update(self.builder.n_advances, *self._progress)
+        remaining_s = waiting.remaining_s
         if remaining_s <= 0.0:
             raise ServiceTimeout(f"timed out while waiting for {what}")
         descriptor = self.builder.worker.file_descriptor
@@ -381,7 +405,8 @@ class EyeFilter:
             Whether to wait until the newest eye is ready, instead of using the previous
             one meanwhile.
         timeout_s : float
-            Timeout for estimating the eye and computing its PSFs.
+            Longest time in which neither the build of an eye nor the computation of its
+            PSFs advances.
         **options
             Fields of `RenderOptions`: ``accumulation="coverage"`` or ``"paper"``
             (nearer surfaces occlude farther ones, or the published sum), ``merge=True``
@@ -405,22 +430,21 @@ class EyeFilter:
         ServiceTimeout
         """
         views = as_views(color, depth_m, next(iter(self.cameras), None))
-        deadline_s = time.monotonic() + timeout_s
-        while True:
-            seen = self.try_filter(
-                views,
-                pupil_diameter_mm=pupil_diameter_mm,
-                focus_dpt=focus_dpt,
-                gaze_deg=gaze_deg,
-                output=output,
-                newest_only=whole,
-                until_s=deadline_s,
-                **options,
-            )
-            self.builder.advance(ahead=False)  # after this frame's request
-            if seen is not None:
-                return seen
-            self._wait_for_worker(deadline_s, "the eye to be prepared for this camera")
+        with self._new_wait("Filtering", timeout_s) as waiting:
+            while True:
+                seen = self.try_filter(  # without a limit: its PSFs advance
+                    views,
+                    pupil_diameter_mm=pupil_diameter_mm,
+                    focus_dpt=focus_dpt,
+                    gaze_deg=gaze_deg,
+                    output=output,
+                    newest_only=whole,
+                    **options,
+                )
+                self.builder.advance(ahead=False)  # after this frame's request
+                if seen is not None:
+                    return seen
+                self._wait_for_worker(waiting, "the eye to be prepared for this camera")
 
     def try_filter(
         self,

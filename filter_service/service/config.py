@@ -75,7 +75,7 @@ class ServiceConfig:
     cancel_grace_s : float
         Time after which a canceled build that is still running is killed.
     build_limit_s : float
-        Maximum duration of a profile's build.
+        Longest time without progress of a profile's build.
     alive_interval_s : float
         Interval between ``alive`` messages, which detect vanished clients.
     session_keep_s : float

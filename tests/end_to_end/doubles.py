@@ -140,7 +140,7 @@ def read_profile(body):
 
 
 def build(job, *, progress, cancelled):
-    """Take ``build_s``; ``crash``, ``deaf``, ``fail`` in the body do what they say."""
+    """Take ``build_s``; ``crash``, ``deaf``, ``fail``, ``hang`` do what they say."""
     body = job.profile.body
     if body.get("crash"):
         os.kill(os.getpid(), signal.SIGKILL)
@@ -156,7 +156,7 @@ def build(job, *, progress, cancelled):
 def _work(build_s, body, progress, cancelled):
     start_s = time.monotonic()
     while (elapsed_s := time.monotonic() - start_s) < build_s:
-        progress(elapsed_s / build_s, "waiting")
+        progress(0.0 if body.get("hang") else elapsed_s / build_s, "waiting")
         if cancelled() and not body.get("deaf"):
             raise BuildCancelled("cancelled")
         time.sleep(0.005)

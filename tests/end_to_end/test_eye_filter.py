@@ -227,7 +227,7 @@ def test_what_is_missing_or_wrong_is_named(eye_filter, builder):
             blind.filter(COLOR, DEPTH_M, **SEE)
     with pytest.raises(ValueError, match="is closed"):
         blind.set_profile(eye(1))
-    eye_filter.set_profile(eye(1, build_s=5.0))
+    eye_filter.set_profile(eye(1, build_s=5.0, hang=True))
     with pytest.raises(ServiceTimeout, match="the eye to be ready"):
         eye_filter.wait(0.05)
 

@@ -33,6 +33,7 @@ MAY_IMPORT = {
         "filter_service.messages",
         "filter_service.errors",
         "filter_service.progress",  # of long programs
+        "filter_service.waiting",  # and of waits
         "filter_service.atomic_files",  # files that people keep
         "filter_service.log_lines",  # logs that stop no one
         "filter_service.keys",  # a client's own

@@ -1,0 +1,130 @@
+"""Waits of the Python API: a limit of the time without progress, and a bar meanwhile.
+
+    with Wait("Preparing the eye", timeout_s) as wait:
+        while not is_ready():
+            wait.update(n_steps_done, fraction, stage)
+            if wait.remaining_s <= 0.0:
+                raise ServiceTimeout("timed out while waiting for the eye")
+
+A wait that takes longer than `SHOWN_AFTER_S` shows a bar on stderr if that is a
+terminal, and removes it at the end.  There is none while the program shows a `Progress`
+of its own, or if the environment variable ``OCUFILTER_PROGRESS`` is 0.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+import threading
+import time
+from typing import Any, Self
+
+from filter_service.progress import Progress, Task, is_progress_open
+
+SHOWN_AFTER_S = 2.0
+PROGRESS_VARIABLE = "OCUFILTER_PROGRESS"
+
+_opening = threading.Lock()
+
+
+class Wait:
+    """A wait for work that advances.
+
+    Parameters
+    ----------
+    title : str
+        Name of the work, for the bar.
+    timeout_s : float
+        Longest time without an advance; unlimited by default.
+    is_shown : bool
+        Whether to show a bar; not if the caller reports the progress itself.
+    """
+
+    def __init__(
+        self, title: str, timeout_s: float = math.inf, *, is_shown: bool = True
+    ) -> None:
+        self._title, self._timeout_s = title, timeout_s
+        self._is_shown = is_shown
+        self._mark: Any = None
+        self._fraction: float | None = None
+        self._stage = ""
+        self._end_s = time.monotonic() + timeout_s
+        self._timer: threading.Timer | None = None
+        self._lock = threading.Lock()
+        self._has_ended = False
+        self._bar: tuple[Progress, Task] | None = None
+
+    def __enter__(self) -> Self:
+        """Start the time after which the bar appears."""
+        if self._is_shown and _has_terminal():
+            # A thread, because the caller may compute instead of calling `update`.
+            self._timer = threading.Timer(SHOWN_AFTER_S, self._open)
+            self._timer.daemon = True
+            self._timer.start()
+        return self
+
+    def __exit__(self, *exc_info: Any) -> None:
+        """Remove the bar."""
+        if self._timer is None:
+            return
+        self._timer.cancel()
+        with self._lock:
+            self._has_ended = True
+            if self._bar is not None:
+                self._bar[0].__exit__(None, None, None)
+
+    @property
+    def remaining_s(self) -> float:
+        """Return the time that remains for the next advance."""
+        return self._end_s - time.monotonic()
+
+    def advance(self) -> None:
+        """Restart the time limit: the work has advanced."""
+        self._end_s = time.monotonic() + self._timeout_s
+
+    def update(self, mark: Any, fraction: float | None = None, stage: str = "") -> None:
+        """Restart the time limit if the work has advanced, and update the bar.
+
+        Parameters
+        ----------
+        mark : object
+            Value that differs from the last one once the work has advanced.
+        fraction : float, optional
+            Completed fraction, 0 to 1, if it is known.
+        stage : str
+        """
+        if mark != self._mark:
+            self._mark = mark
+            self.advance()
+        if self._timer is None or (fraction, stage) == (self._fraction, self._stage):
+            return
+        with self._lock:
+            self._fraction, self._stage = fraction, stage
+            self._show()
+
+    def _open(self) -> None:
+        """Open the bar, unless the wait has ended or another bar is open."""
+        with _opening, self._lock:
+            if self._has_ended or is_progress_open():
+                return
+            progress = Progress(is_removed=True).__enter__()
+            self._bar = progress, progress.task(self._title, unit="%")
+            self._show()
+
+    def _show(self) -> None:
+        if self._bar is None:
+            return
+        task = self._bar[1]
+        task.total = 0.0 if self._fraction is None else 1.0
+        task.update(self._fraction or 0.0, self._stage)
+
+
+def _has_terminal() -> bool:
+    """Return whether stderr is a terminal on which bars are allowed."""
+    if os.environ.get(PROGRESS_VARIABLE) == "0" or sys.stderr is None:
+        return False
+    try:
+        return sys.stderr.isatty()
+    except ValueError:  # it is closed
+        return False
