@@ -10,6 +10,7 @@ files, pytest also runs these with the emulated library in place of the native o
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import sys
 import zipfile
@@ -19,9 +20,13 @@ from unittest import mock
 
 import numpy as np
 
-from filter_service.native import library as native
-from filter_service.native.library import Library
-from filter_service.psfs.native_psfs import NativePsfs
+from estimator.native import core
+from estimator.native import library as native
+from estimator.psf.compiled import compiled_psfs
+from estimator.threads import THREADS_VARIABLE, thread_count
+from filter_service.native import loops
+from filter_service.psfs.native_psfs import native_psfs
+from filter_service.psfs.psf_engine import psf_engine
 from filter_service.rendering.native import NativeRenderer
 from tests.conftest import Engine
 from tests.numerical import test_native_psfs as psf_cases
@@ -29,10 +34,15 @@ from tests.numerical import test_native_random as frame_cases
 from tests.numerical.one_kernel import OneKernelBench
 from tests.release.build import COMPILERS
 from tests.release.commands import BUILD, Failed, run, say
-from tests.release.emulated import EmulatedLibrary
+from tests.release.emulated import Emulator
 
 EMULATOR = "qemu-aarch64-static"
-LIBRARY = "filter_service/native/_loops.so"
+LIBRARIES = ("estimator/native/_core.so", "filter_service/native/_loops.so")
+CACHED = (
+    *(core, loops, native.shared_threads, compiled_psfs, native_psfs, psf_engine),
+)
+"""Functions that keep what they loaded."""
+
 SYSTEM = Path("/usr/aarch64-linux-gnu")  # glibc for aarch64, of libc6-dev-arm64-cross
 
 FRAMES = [
@@ -57,29 +67,53 @@ MAX_KERNEL_DIFFERENCE = 0.01  # as between the variants of x86-64, see the tests
 
 
 def unpack(wheel: Path, name: str) -> Path:
-    """Extract the library from a wheel."""
-    path = BUILD / "aarch64" / f"loops-{name}.so"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Extract the libraries from a wheel; return their folder."""
+    folder = BUILD / "aarch64" / f"libraries-{name}"
+    folder.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(wheel) as archive:
-        path.write_bytes(archive.read(LIBRARY))
-    return path
+        for library in LIBRARIES:
+            (folder / Path(library).name).write_bytes(archive.read(library))
+    return folder
 
 
 @contextlib.contextmanager
-def emulated(wheel: Path) -> Iterator[EmulatedLibrary]:
-    """Make every new `Library` call the functions of a wheel for aarch64."""
+def using(folder: Path) -> Iterator[None]:
+    """Use the portable variant of the libraries in a folder."""
+    variables = {
+        native.FOLDER_VARIABLE: str(folder),
+        native.VARIANT_VARIABLE: "portable",
+        THREADS_VARIABLE: "1",
+    }
+    thread_count.cache_clear()
+    with mock.patch.dict(os.environ, variables):
+        for function in CACHED:
+            function.cache_clear()
+        yield
+    thread_count.cache_clear()
+    for function in CACHED:
+        function.cache_clear()
+
+
+@contextlib.contextmanager
+def emulated(wheel: Path) -> Iterator[Emulator]:
+    """Use the libraries of a wheel for aarch64, under emulation."""
     driver = BUILD / "aarch64" / "driver"
-    path = unpack(wheel, "aarch64")
+    folder = unpack(wheel, "aarch64")
     source = Path(__file__).with_name("emulated.c")
     flags = ("-std=gnu11", "-O2", "-Wall", "-Wextra", "-Werror")
     run(COMPILERS["aarch64"], *flags, source, "-o", driver, "-ldl")
-    process = EmulatedLibrary(EMULATOR, "-L", SYSTEM, driver, path)
-    with mock.patch.object(native.ctypes, "CDLL", return_value=process):
+    paths = [folder / Path(library).name for library in LIBRARIES]
+    process = Emulator(EMULATOR, "-L", SYSTEM, driver, libraries=paths)
+    with (
+        mock.patch.object(native.ctypes, "CDLL", process.library),
+        mock.patch.object(native, "function_at", process.function_at),
+        using(folder),
+    ):
         yield process
     process.close()
 
 
-def render(library: Library, case: dict) -> np.ndarray:
+def render(case: dict) -> np.ndarray:
     """Filter a random frame; return the light."""
     rng = np.random.default_rng(case["seed"])
     height_px, width_px = case["size"]
@@ -93,7 +127,7 @@ def render(library: Library, case: dict) -> np.ndarray:
     )
     parts = {"distances_m": frame_cases.DISTANCES_M, "patch_px": 5}
     view = frame_cases.random_view(rng, bench, parts)
-    renderer = NativeRenderer(library, n_threads=1)
+    renderer = NativeRenderer(n_threads=1)
     seen = renderer.render(
         view,
         renderer.load(bench.store),
@@ -104,16 +138,14 @@ def render(library: Library, case: dict) -> np.ndarray:
     return np.asarray(seen.color, float)
 
 
-def kernels(library: Library) -> list[np.ndarray]:
+def kernels() -> list[np.ndarray]:
     """Compute PSFs of random wavefronts, by rays and by waves."""
-    engine = NativePsfs(library, library.new_threads(1))
     rng = np.random.default_rng(6)
     found = []
     for rms_um in (0.05, 0.5, 2.0, 4.0):
         wavefronts = psf_cases.wavefronts_of(psf_cases.random_zernike(rng, 4, rms_um))
-        packed, *_ = psf_cases.computed(wavefronts, engine=engine)
+        packed, *_ = psf_cases.computed(wavefronts)
         found += [psf_cases.kernel(packed, k) for k in range(12)]
-    library.end_threads(engine.threads)
     return found
 
 
@@ -125,25 +157,26 @@ def compare(wheel: Path, x86_64: Path) -> dict[str, float]:
     Failed
         If they exceed the limits.
     """
-    native.compiled_library()  # of this machine, for what the tests prepare
-    plain = Library(unpack(x86_64, "x86_64"), portable=True)
+    with using(unpack(x86_64, "x86_64")):
+        expected = [render(case) for case in FRAMES], kernels()
     with emulated(wheel) as process:
-        other = Library(unpack(wheel, "aarch64"))
-        light = 0.0
-        for case in FRAMES:
-            expected, seen = render(plain, case), render(other, case)
-            if not np.isfinite(seen).all():
-                raise Failed(f"aarch64: non-finite light: {case}")
-            light = max(light, float(np.abs(seen - expected).max()))
-        pairs = list(zip(kernels(other), kernels(plain), strict=True))
-        errors = [psf_cases.error_ratio(theirs, ours) for theirs, ours in pairs]
-        result = {
-            "frames": len(FRAMES),
-            "light": light,
-            "psfs": len(errors),
-            "psf": float(max(errors)),
-            "calls": process.call_count,
-        }
+        seen = [render(case) for case in FRAMES], kernels()
+    if not all(np.isfinite(light).all() for light in seen[0]):
+        raise Failed("aarch64: non-finite light")
+    light = max(
+        float(np.abs(a - b).max()) for a, b in zip(expected[0], seen[0], strict=True)
+    )
+    errors = [
+        psf_cases.error_ratio(theirs, ours)
+        for ours, theirs in zip(expected[1], seen[1], strict=True)
+    ]
+    result = {
+        "frames": len(FRAMES),
+        "light": light,
+        "psfs": len(errors),
+        "psf": float(max(errors)),
+        "calls": process.call_count,
+    }
     if light > MAX_LIGHT_DIFFERENCE or result["psf"] > MAX_KERNEL_DIFFERENCE:
         raise Failed(f"aarch64 differs from x86-64: {result}")
     return result
@@ -159,7 +192,6 @@ def main() -> None:
         import pytest
 
         say(f"running {' '.join(tests)} with the emulated library")
-        native.compiled_library.cache_clear()
         with emulated(Path(aarch64)):
             raise SystemExit(pytest.main([*tests, "-q", "-p", "no:cacheprovider"]))
 

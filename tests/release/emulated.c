@@ -5,9 +5,13 @@
  * not mapped here fetches the page from the other process; after each call, changed
  * words are sent back and the pages are dropped.
  *
- * In:  a call {function, n_arguments, arguments[6]}, or the answer to a fetch
+ * In:  a call {function, library, address, integers, doubles}: a name is looked up in the
+ *      library, otherwise the address is called; or the answer to a fetch
  * Out: {'F', address} fetch a page, {'S', address, length} and bytes store,
  *      {'R', result} the call has returned
+ *
+ * Integers and doubles are passed in registers of their own.  Of up to 16 integers, those
+ * beyond the first eight are on the stack, in order, as there are at most eight doubles.
  */
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -92,20 +96,35 @@ static void send_changes(void) {
     page_count = 0;
 }
 
+#define MOST_LIBRARIES 4
+typedef uint64_t word;
+typedef word (*any_function)(word, word, word, word, word, word, word, word, double, double,
+                             double, double, double, double, double, double, word, word,
+                             word, word, word, word, word, word);
+
 int main(int count, char **arguments) {
-    void *library = count == 2 ? dlopen(arguments[1], RTLD_NOW) : NULL;
-    if (library == NULL) fail(count == 2 ? dlerror() : "expected a library");
+    void *libraries[MOST_LIBRARIES];
+    if (count < 2 || count > MOST_LIBRARIES + 1) fail("expected libraries");
+    for (int i = 1; i < count; ++i) {
+        libraries[i - 1] = dlopen(arguments[i], RTLD_NOW);
+        if (libraries[i - 1] == NULL) fail(dlerror());
+    }
     pages = malloc(MAX_PAGES * sizeof *pages);
     struct sigaction action = {.sa_sigaction = fetch, .sa_flags = SA_SIGINFO | SA_NODEFER};
     sigaction(SIGSEGV, &action, NULL);
     for (;;) {
-        struct { char name[32]; uint64_t values[4]; } call;
+        struct { char name[32]; word library, address, v[16]; double d[8]; } call;
         get(&call, sizeof call);
-        uint64_t *v = call.values;
-        uint64_t (*function)(uint64_t, uint64_t, uint64_t, uint64_t);
-        *(void **)&function = dlsym(library, call.name);
-        if (function == NULL) fail(call.name);
-        uint64_t result = function(v[0], v[1], v[2], v[3]);
+        const word *v = call.v;
+        const double *d = call.d;
+        any_function function;
+        void *at = (void *)call.address;
+        if (call.name[0] != 0) at = dlsym(libraries[call.library], call.name);
+        if (at == NULL) fail(call.name);
+        *(void **)&function = at;
+        word result = function(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], d[0], d[1], d[2],
+                               d[3], d[4], d[5], d[6], d[7], v[8], v[9], v[10], v[11], v[12],
+                               v[13], v[14], v[15]);
         if (!strcmp(call.name, "ocu_name")) memcpy(&result, (char *)result, sizeof result);
         send_changes();
         put_words('R', result);
