@@ -4,8 +4,10 @@
 wheel of a platform therefore serves every Python version.
 """
 
+import importlib.util
 import os
 import shlex
+import shutil
 import sys
 from glob import glob
 
@@ -17,24 +19,31 @@ CORE = "estimator/native/source"
 FRAMES = "filter_service/native/source"
 LAYER = "clients/openxr_layer/source"
 FLAGS = ["-std=gnu11", "-g0", "-fvisibility=hidden"]
+COMPILER = "a C compiler (Debian: apt install gcc libc6-dev; or pip install ziglang)"
 WITHOUT = {
-    "estimator.native._core": (
-        "PSFs will be computed in Python, ten times as slow, and frames filtered with "
-        "OpenGL.  Install a C compiler (Debian: apt install gcc libc6-dev)"
-    ),
-    "filter_service.native._loops": (
-        "the native engine is missing: frames will be filtered with OpenGL, which is "
-        "slow without a GPU.  Install a C compiler (Debian: apt install gcc libc6-dev)"
-    ),
+    "estimator.native._core": f"install {COMPILER}",
+    "filter_service.native._loops": f"install {COMPILER}",
     "filter_service.service._drop_parts": (
         "the service will take ten times as long to drop messages with millions of "
-        "parts.  Install a C compiler (Debian: apt install gcc libc6-dev)"
+        f"parts; install {COMPILER}"
     ),
     "clients.openxr_layer._layer": (
-        "`ocufilter layer` will not work.  Install a C compiler and headers (Debian: "
+        "`ocufilter layer` will not work; install a C compiler and headers (Debian: "
         "apt install gcc libc6-dev libopenxr-dev libgl-dev libegl-dev libx11-dev)"
     ),
 }
+"""Libraries, and what to do where one cannot be compiled."""
+
+
+REQUIRED = ("estimator.native._core", "filter_service.native._loops")
+
+
+def compiler():
+    """Return the command of the C compiler: ``CC``, `cc`, or that of `ziglang`."""
+    cc = shlex.split(os.environ.get("CC", "cc"))
+    if shutil.which(cc[0]) is None and importlib.util.find_spec("ziglang") is not None:
+        return [sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline"]
+    return cc
 
 
 class BuildLibraries(build_ext):
@@ -50,7 +59,7 @@ class BuildLibraries(build_ext):
         Those differ between installations of Python, and so would the libraries.
         """
         if sys.platform == "linux":
-            cc = shlex.split(os.environ.get("CC", "cc"))
+            cc = compiler()
             link = shlex.split(os.environ.get("LDSHARED", "")) or [*cc, "-shared"]
             flags = shlex.split(os.environ.get("CFLAGS", ""))
             self.compiler.set_executables(
@@ -61,11 +70,12 @@ class BuildLibraries(build_ext):
             self.compiler.library_dirs = []
         super().build_extensions()
         for extension in self.extensions:
-            path = self.get_ext_fullpath(extension.name)
-            if not os.path.exists(path):
+            if not os.path.exists(self.get_ext_fullpath(extension.name)):
                 name = extension.name.rpartition(".")[2]
-                remedy = f"{WITHOUT[extension.name]}, and install ocufilter again."
-                print(f"ocufilter: {name} was not built; {remedy}", file=sys.stderr)
+                said = f"ocufilter: {name} was not built: {WITHOUT[extension.name]}"
+                if extension.name in REQUIRED:
+                    raise SystemExit(f"{said}, and install ocufilter again")
+                print(said, file=sys.stderr)
 
 
 def loops(name, folder, include_dirs=()):
@@ -110,9 +120,8 @@ setup(
         "filter_service.shaders.passes",
     ],
     package_dir={"filter_service.shaders": "shaders"},
-    # All libraries are optional and loaded by path.  Without a C compiler, the engine
-    # is gl, and dropping messages with millions of parts takes ten times as long.
-    # Without the headers of OpenXR, OpenGL and X11, `ocufilter layer` says what to do.
+    # Libraries are loaded by path.  All are marked as optional so that the build goes
+    # on to the end, where `BuildLibraries` says what is missing.
     ext_modules=[
         loops("estimator.native._core", CORE),
         loops("filter_service.native._loops", FRAMES, [CORE]),

@@ -36,14 +36,12 @@ for argument in "$@"; do
     esac
 done
 
-SYSTEM_PACKAGES="libegl1 libgl1 libgl1-mesa-dri libgomp1"
+SYSTEM_PACKAGES="libegl1 libgl1 libgl1-mesa-dri"
 # for reports as PDF; the service does not need them
 REPORT_PACKAGES="libpango-1.0-0 libpangoft2-1.0-0 libharfbuzz-subset0"
 C_PACKAGES="gcc libc6-dev"
 TEST_PACKAGES="xvfb"
 NODE_PACKAGES="nodejs npm"
-# imported by the modules with compiled loops
-COMPILER_PACKAGES="numpy scipy numba msgspec lazy-loader moderngl"
 # for `make witness`; the project itself does not import them
 WITNESS_PACKAGES="mitsuba==3.9.1 numpy"
 WITNESS_LLVM_PACKAGES="libllvm19 libllvm18 libllvm17 libllvm16"
@@ -104,7 +102,7 @@ apt_install() {
 
 install_system_libraries() {
     if ! command -v dpkg-query >/dev/null; then
-        say "not a Debian system: EGL, OpenGL (Mesa) and libgomp must be installed"
+        say "not a Debian system: EGL and OpenGL (Mesa) must be installed"
         return
     fi
     missing=$(missing_packages $SYSTEM_PACKAGES $REPORT_PACKAGES)
@@ -117,11 +115,11 @@ install_system_libraries() {
 
 can_compile() { echo 'int main(void) { return 0; }' | cc -x c -o /dev/null - 2>/dev/null; }
 
-install_c_compiler() { # for the native engine; Mesa is 20 times slower
+install_c_compiler() {
     if can_compile; then return; fi
     if command -v dpkg-query >/dev/null && apt_install $C_PACKAGES; then return; fi
-    say "no C compiler: frames will be filtered with OpenGL, which is slow without a" \
-        "GPU; to install one:  $(install_command "$C_PACKAGES")"
+    say "no C compiler: that of the package ziglang compiles, which takes longer and" \
+        "makes frames a quarter slower; to install gcc:  $(install_command "$C_PACKAGES")"
 }
 
 install_test_packages() { # optional: the tests also run without them
@@ -181,21 +179,10 @@ install_packages() {
     rm -f $STAMP $TRAINING_STAMP $PAGE_STAMP
     say "installing the pinned Python packages into $VENV (a minute or two)"
     pip="$VENV/bin/python -m pip -qq --disable-pip-version-check"
-    $pip install -c constraints.txt $COMPILER_PACKAGES
-    start_compiling
-    say "installing the other packages while the loops compile"
     $pip install -c constraints.txt setuptools
+    can_compile || $pip install -c constraints.txt ziglang
     $pip install -c constraints.txt --no-build-isolation -e '.[clients,batch,pyrender,report,dev]'
-    say "the packages are installed"
-    trap - EXIT
-    wait "$compiling" || say "compiling failed; the service will compile when it starts"
     echo "$wanted" >$STAMP
-}
-
-start_compiling() { # numba's loops take a minute on two cores; run in parallel
-    $VENV/bin/python -m filter_service.filtering.compile_loops &
-    compiling=$!
-    trap 'kill "$compiling" 2>/dev/null || true' EXIT
 }
 
 install_training_packages() { # only for training; the service does not need them

@@ -5,8 +5,7 @@
 #   python -m tests.audit.faults run FOLDER
 #
 # Without arguments for pytest, the tests are those of `make test`.  FOLDER/combined is a
-# file for `coverage`; the table of packages is printed at the end.  Functions that numba
-# compiles are not traced and left out.
+# file for `coverage`; the table of packages is printed at the end.
 set -eu
 cd "$(dirname "$0")/../.."
 export OCUFILTER_COVERAGE="$1"

@@ -14,7 +14,6 @@ from tests.native_build import COMPILER, LIBRARIES, build_libraries
 EXPECTED = {
     "numpy": "numpy",
     "scipy": "scipy",
-    "numba": "numba llvmlite",
     "matplotlib": "matplotlib contourpy cycler fonttools kiwisolver pyparsing "
     "python-dateutil",
     "PIL": "pillow",

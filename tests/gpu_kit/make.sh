@@ -24,7 +24,7 @@ CARRIED="moderngl glcontext pyzmq msgpack msgspec lz4 lazy-loader packaging Open
     trimesh networkx glfw
     pytest pluggy iniconfig hypothesis sortedcontainers"
 # packages that the GPU machine is expected to have: large, with many dependencies
-EXPECTED="numpy scipy numba matplotlib pillow onnxruntime"
+EXPECTED="numpy scipy matplotlib pillow onnxruntime"
 # and optionally torch; without it, the training step is skipped
 PLATFORMS="manylinux_2_28_x86_64 manylinux_2_27_x86_64 manylinux_2_17_x86_64
     manylinux2014_x86_64 manylinux1_x86_64"

@@ -29,7 +29,7 @@ def report_text(
 
 
 def _machine_line(hardware: dict) -> str:
-    names = ("device", "cpu", "n_cores", "python", "numpy", "numba", "torch", "date")
+    names = ("device", "cpu", "n_cores", "python", "numpy", "torch", "date")
     names += ("shares",)
     told = [f"{name} {hardware[name]}" for name in names if hardware.get(name)]
     return ", ".join(told)

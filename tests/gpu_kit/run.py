@@ -76,7 +76,7 @@ class Run:
         missing = environment.missing_modules(python)
         if missing:
             notes.append(f"not here, nor carried: {', '.join(missing)}")
-        if {"numpy", "scipy", "numba"} & set(missing):
+        if {"numpy", "scipy"} & set(missing):
             names = " ".join(environment.EXPECTED[module] for module in missing)
             raise environment.SetUpFailed(
                 f"{notes[-1]}; make the kit with WITH='{names}'"

@@ -58,13 +58,6 @@ def all_steps(tree: Path) -> tuple[Step, ...]:
     return (
         Step("machine", "what is here", KIT + "machine", limit_s=15.0),
         Step(
-            "compile",
-            "numba's loops, once on a machine",
-            "filter_service.filtering.compile_loops",
-            limit_s=55.0,
-            is_json=False,
-        ),
-        Step(
             "gpu",
             "frames at 720p, in textures and arrays",
             BENCHES + "bench_gpu",

@@ -63,7 +63,6 @@ fi
 chroot "$root" /usr/sbin/ip link set lo up
 exec chroot "$root" env -i PATH=$path HOME=/root LC_ALL=C.UTF-8 TERM="${TERM:-dumb}" \
     PYTHONPYCACHEPREFIX=/var/cache/ocufilter/python \
-    NUMBA_CACHE_DIR=/var/cache/ocufilter/numba \
     OCUFILTER_LIBRARY_DIR=/opt/ocufilter \
     OCUFILTER_DURATIONS=/var/cache/ocufilter/durations.json \
     PYTEST_ADDOPTS="-o cache_dir=/var/cache/ocufilter/pytest" \

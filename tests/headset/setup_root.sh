@@ -45,7 +45,7 @@ case $root in /*) ;; *) root=$(pwd)/$root ;; esac
 RELEASE=trixie
 SYSTEM_PACKAGES="monado-service monado-cli libopenxr1-monado libopenxr-loader1
     mesa-vulkan-drivers libegl1 libgl1 libglx-mesa0 libgl1-mesa-dri libgles2
-    libopengl0 xvfb xauth python3 python3-venv gcc libc6-dev libgomp1 iproute2
+    libopengl0 xvfb xauth python3 python3-venv gcc libc6-dev iproute2
     libopenxr-dev libopenxr-utils libgl-dev libegl-dev libx11-dev
     openxr-layer-apidump openxr-layer-corevalidation
     xserver-xorg-core xserver-xorg-video-dummy"
@@ -212,8 +212,6 @@ install_project() {
     step "installing the pinned Python packages (half a minute)" install_packages
     follow_checkout
     step "compiling the C code" build_loops
-    step "compiling numba's loops (a minute on two cores)" \
-        sh "$here/run_in_root.sh" python -m filter_service.filtering.compile_loops
     echo "$wanted" >"$PYTHON_STAMP"
     say "the chroot is ready"
 }

@@ -5,7 +5,7 @@
 GCC compiles, because its loops take 78 % of the time of clang's (116 and 149 ms for a
 frame of the myopia preset, 1280x720, one thread).  `zig cc` links, because it carries
 the symbols of every glibc: the libraries then load with glibc 2.28, which the wheels of
-NumPy and numba need, on whatever system they were built.
+NumPy need, on whatever system they were built.
 """
 
 from __future__ import annotations

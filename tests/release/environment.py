@@ -11,7 +11,7 @@ from pathlib import Path
 from tests.release.commands import TOOLS, Failed
 
 INDEX_SETTINGS = ("PIP_", "UV_", "SSL_CERT", "HTTP_PROXY", "HTTPS_PROXY", "NO_PROXY")
-LEADS = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "NUMBA_CACHE_DIR")
+LEADS = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
 ENTER = """
 mount --rbind /dev "$1/dev" && mount -t proc proc "$1/proc" || exit
 root=$1 folder=$2

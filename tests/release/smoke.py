@@ -82,10 +82,7 @@ def doctor(environment: Environment, *, needs_native: bool = True) -> None:
 
 
 def filter_picture(environment: Environment) -> float:
-    """Filter a picture through a preset; return the time it took, s.
-
-    The first time includes the compilation of numba's loops.
-    """
+    """Filter a picture through a preset; return the time it took, s."""
     if not (environment.work / "squares.png").exists():
         environment.run("python", "-c", PICTURE)
     started = time.perf_counter()

@@ -1,5 +1,6 @@
 """What installs the project agrees with itself."""
 
+import importlib
 import re
 import subprocess
 import sys
@@ -37,32 +38,14 @@ def test_every_requirement_has_a_pin():
     assert [name for name in _required() if _normal(name) not in pinned] == []
 
 
-IMPORTED_TO_COMPILE = """
-import sys
-from filter_service.building import compile_builds
-from filter_service.filtering import compile_loops
-from filter_service.rendering import plan_once
-for name, module in sys.modules.items():
-    if "." not in name and "site-packages" in (getattr(module, "__file__", "") or ""):
-        print(name)
-"""
-
-
-def test_loops_are_compiled_with_no_more_than_the_packages_that_come_first():
-    setup = (ROOT / "setup.sh").read_text(encoding="utf-8")
-    first = re.search(r'^COMPILER_PACKAGES="(.*)"$', setup, re.MULTILINE)[1].split()
-    brought_along = {"llvmlite", "glcontext", "typing_extensions"}  # by the others
-    brought_along |= {"yaml", "coverage"}  # optional to numba, of `web` and `dev`
-    ran = subprocess.run(
-        [sys.executable, "-c", IMPORTED_TO_COMPILE],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    found = {name for name in ran.stdout.split() if not name.startswith("_")}
-    assert "scipy" in found
-    assert found - brought_along <= {name.replace("-", "_") for name in first}
+def test_without_a_compiler_the_build_asks_for_that_of_pypi(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT)
+    backend = importlib.import_module("build_backend")
+    monkeypatch.setenv("CC", sys.executable)
+    assert backend.compiler_requirements() == []
+    monkeypatch.setenv("CC", "/nonexistent/cc -m64")
+    assert backend.compiler_requirements() == [backend.ZIG]
+    assert backend.ZIG in backend.get_requires_for_build_editable()
 
 
 @pytest.mark.parametrize("name", ["constraints.txt", "setup.sh", "Makefile", ".ci/run"])
