@@ -29,7 +29,6 @@ Importing this package loads no submodules, which keeps clients light.
     color_encoding   color profiles and codes, and conversion to sRGB
     gl_device        selection of the OpenGL device
     version          version of the installed package
-    threads          numba's threading layer
     one_blas_thread  NumPy's BLAS on one thread
     gl/              OpenGL context and shaders
     native/          compiled loops in C

@@ -7,9 +7,6 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
-# two cores are what the project plans for; must be set before numba is imported
-os.environ.setdefault("NUMBA_NUM_THREADS", str(min(2, os.cpu_count() or 1)))
-
 # a service that a test starts leaves the user's folder of stores alone
 os.environ["OCUFILTER_CACHE_DIR"] = ""
 
@@ -62,12 +59,9 @@ def loaded(request):
         return
     from clients.figures.style import new_figure
     from estimator.psf.compute import compute_psfs
-    from filter_service.filtering.compile_loops import PARTS, compile_part
     from tests.reference import render_passes
     from tests.reference.psf_integral import reference_kernel
 
-    for part in PARTS:
-        compile_part(part)
     for method in PSF_METHODS:
         compute_psfs(np.zeros((1, 28)), method=method, **SMALL_PSF)
     reference_kernel(np.zeros(28), radius_px=2, **SMALL_PSF)

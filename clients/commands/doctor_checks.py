@@ -19,13 +19,11 @@ from filter_service.gl_device import (
     is_device_selected,
     is_software_renderer,
 )
-from filter_service.threads import UNSAFE_THREADING_LAYER
 from filter_service.version import __version__
 
 SERVICE_PACKAGES = (
     "numpy",
     "scipy",
-    "numba",
     "moderngl",
     "glcontext",
     "pyzmq",
@@ -44,12 +42,12 @@ PYRENDER_PACKAGES = ("pyrender", "trimesh", "PyOpenGL")
 FORMER_PACKAGES = ("imageio", "imageio-ffmpeg")
 """Packages that are no longer required; version 0.3 removes them from ``packages``."""
 
-SYSTEM_LIBRARIES = {"EGL": "libegl1", "GL": "libgl1", "gomp": "libgomp1"}
+SYSTEM_LIBRARIES = {"EGL": "libegl1", "GL": "libgl1"}
 """Libraries that are loaded by name, and Debian packages that contain them."""
 
 PROBE_TIMEOUT_S = 60.0
 SHADERS_TIMEOUT_S = 180.0
-"""The first run compiles loops, which takes half a minute on two idle cores."""
+"""A software renderer compiles the shaders on the CPU."""
 
 FRAME_ERROR_MAX = 2e-3
 """Largest change of a pixel by a perfect eye; the step of a half float is 1e-3."""
@@ -87,14 +85,13 @@ def examine() -> dict[str, Any]:
     report : dict
         JSON-compatible, with the keys ``ok`` (whether the service can run), ``works``
         (by purpose), ``checks``, ``install`` (commands), ``machine``, ``gl`` (with the
-        EGL ``devices``), ``native`` (the compiled loops), ``threading_layer``,
-        ``networks`` (each with the size of its weights and its expected error),
-        ``packages`` (versions) and ``version`` (of ocufilter).
+        EGL ``devices``), ``native`` (the compiled loops), ``networks`` (each with the
+        size of its weights and its expected error), ``packages`` (versions) and
+        ``version`` (of ocufilter).
     """
     gl = run_probe("gl")
     shaders = {} if "error" in gl else run_probe("shaders", SHADERS_TIMEOUT_S)
     native = run_probe("native")
-    threads = run_probe("threads")
     networks = run_probe("networks")
     packages = package_versions()
     checks = [
@@ -106,7 +103,6 @@ def examine() -> dict[str, Any]:
         check_shaders(gl, shaders),
         check_native(native),
         check_engine(gl, native),
-        check_threads(threads),
         check_networks(networks),
         check_packages("client packages", CLIENT_PACKAGES, packages),
         check_packages("window packages", WINDOW_PACKAGES, packages),
@@ -123,7 +119,6 @@ def examine() -> dict[str, Any]:
         "gl": gl.get("info", {})
         | {"limits": gl.get("limits", {}), "devices": gl_devices()},
         "native": native.get("name"),
-        "threading_layer": threads.get("layer"),
         "networks": networks.get("cards", {}),
         "packages": packages,
         "version": __version__,
@@ -290,31 +285,9 @@ def check_engine(gl: dict[str, Any], native: dict[str, Any]) -> Check:
     if renderer and not is_software_renderer(renderer):
         return Check("engine", True, f"gl: {renderer} is a hardware GPU")
     reason = f"{renderer} is a software renderer" if renderer else "no OpenGL"
-    if "error" not in native:
-        return Check("engine", True, f"native: {reason}")
-    if renderer:
-        return Check(
-            "engine", True, f"gl, slow: {reason}, and there are no compiled loops"
-        )
-    return Check(
-        "engine", False, "none: neither OpenGL nor compiled loops", FIX_COMPILER
-    )
-
-
-def check_threads(threads: dict[str, Any]) -> Check:
-    """Check that two threads may call Numba at the same time."""
-    if "error" in threads:
-        return Check("threads", False, threads["error"], install_command(["numba"]))
-    layer = threads["layer"]
-    if layer == UNSAFE_THREADING_LAYER:
-        fix = f"{APT_INSTALL} libgomp1"
-        return Check(
-            "threads",
-            False,
-            f"{layer} is not thread-safe, which the service requires",
-            fix,
-        )
-    return Check("threads", threads["sum_correct"], layer)
+    if "error" in native:
+        return Check("engine", False, "none: no compiled libraries", FIX_COMPILER)
+    return Check("engine", True, f"native: {reason}")
 
 
 def check_networks(networks: dict[str, Any]) -> Check:
@@ -342,17 +315,14 @@ def check_display() -> Check:
 
 def what_works(ok: dict[str, bool]) -> dict[str, bool]:
     """Return for each purpose whether it works, from the checks that it requires."""
-    psf = ok["python"] and ok["service packages"]
-    shaders = ok["gl"] and ok["compute"] and ok["shaders"]
-    filters = psf and (ok["native"] or shaders)
-    serve = filters and ok["threads"]
-    demo = serve and ok["gl"]  # which renders its scenes
+    filters = ok["python"] and ok["service packages"] and ok["native"]
+    demo = filters and ok["gl"]  # which renders its scenes
     return {
-        "psf": psf,
+        "psf": filters,
         "filter": filters,
-        "serve": serve,
+        "serve": filters,
         "demo": demo,
-        "pyrender": serve and ok["pyrender packages"] and ok["gl"],
+        "pyrender": filters and ok["pyrender packages"] and ok["gl"],
         "window": demo and ok["window packages"] and ok["display"],
     }
 

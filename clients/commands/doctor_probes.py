@@ -13,7 +13,6 @@ import sys
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from numba import njit, prange, threading_layer
 
 from filter_service.errors import FilterError
 
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from filter_service.rendering.engine import FrameEngine
 
 PROBE_COUNT = 1000
-"""Number of values that the compute shader and the parallel loop process."""
+"""Number of values that the compute shader processes."""
 
 LIMITS = (
     "GL_MAX_SHADER_STORAGE_BLOCK_SIZE",
@@ -115,21 +114,6 @@ def probe_native() -> dict[str, Any]:
     }
 
 
-@njit(parallel=True)
-def _sum_of_squares(count: int) -> float:
-    total = 0.0
-    for i in prange(count):
-        total += float(i) * i
-    return total
-
-
-def probe_threads() -> dict[str, Any]:
-    """Run a parallel loop and return the threading layer that ran it."""
-    total = _sum_of_squares(PROBE_COUNT)
-    expected = (PROBE_COUNT - 1) * PROBE_COUNT * (2 * PROBE_COUNT - 1) / 6
-    return {"layer": threading_layer(), "sum_correct": bool(total == expected)}
-
-
 def probe_networks() -> dict[str, Any]:
     """Load every trained network and evaluate it once."""
     from estimator.networks.card import NETWORK_NAMES, NetworkUnavailable
@@ -160,7 +144,6 @@ PROBES = {
     "devices": probe_devices,
     "shaders": probe_shaders,
     "native": probe_native,
-    "threads": probe_threads,
     "networks": probe_networks,
 }
 

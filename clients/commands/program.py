@@ -24,7 +24,7 @@ from clients.commands.programs import (
     web,
 )
 from clients.commands.psf import psf
-from clients.commands.serve import prepare, serve
+from clients.commands.serve import serve
 from clients.commands.status import status
 from clients.commands.wavefront import wavefront
 from clients.option_values import given_value, likely_number
@@ -69,7 +69,6 @@ for program in (headset, layer, web, batch, report):
         }
     )(program)
 app.command()(paper)
-app.command()(prepare)
 app.command()(doctor)
 
 

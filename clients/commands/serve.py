@@ -1,4 +1,4 @@
-"""`ocufilter serve`: run the service; `prepare`: compile its loops ahead of time."""
+"""`ocufilter serve`: run the service."""
 
 from functools import partial
 from pathlib import Path
@@ -6,7 +6,6 @@ from typing import Annotated
 
 import typer
 
-from clients.commands.console import Json, print_json, print_line
 from filter_service.settings import Engine
 
 
@@ -81,26 +80,3 @@ def serve(
         store_cache_dir=None if keep_eyes is None else str(keep_eyes.absolute()),
     )
     service_launch.run(load(), reload_config=load)
-
-
-def prepare(json_output: Json = False) -> None:
-    """Compile the loops that trace eyes and plan frames, once per machine.
-
-    This takes a minute on two cores; later runs only check.  Otherwise the service
-    compiles while idle after its first start, and the first eye waits for that.
-
-    ocufilter prepare
-    """
-    import time
-
-    from filter_service.filtering.compile_loops import compile_loops
-    from filter_service.progress import Progress
-
-    started_s = time.monotonic()
-    with Progress(quiet=json_output) as progress:
-        compile_loops(progress)
-    spent_s = time.monotonic() - started_s
-    if json_output:
-        print_json({"ok": True, "seconds": round(spent_s, 1)})
-    else:
-        print_line(f"prepared in {spent_s:.0f} s")

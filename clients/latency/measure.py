@@ -224,7 +224,7 @@ def compare(target: Target, results: Sequence[Measured]) -> None:
     FilterError
         If this machine cannot filter.
     """
-    from filter_service import EyeFilter  # with numba, which takes a second
+    from filter_service import EyeFilter
 
     settings = target.profile_settings | {"tolerance": "fine"}
     with EyeFilter(target.profile, settings=settings) as exact:

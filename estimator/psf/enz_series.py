@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import eval_jacobi
 
 from estimator.native import core
 from estimator.optics.zernike import zernike_values
@@ -28,6 +27,8 @@ LogAmplitude = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.f
 
 def radial_polynomial(n: int, m: int, rho: ArrayLike) -> NDArray[np.float64]:
     """Return R_n^|m| by the recurrence of Jacobi polynomials, stable at any n."""
+    from scipy.special import eval_jacobi
+
     m, rho = abs(m), np.asarray(rho, np.float64)
     values: NDArray[np.float64] = rho**m * eval_jacobi(
         (n - m) // 2, 0, m, 2.0 * rho**2 - 1.0

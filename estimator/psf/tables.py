@@ -1,4 +1,7 @@
-"""Tables and constants of the PSF engine in C, each defined once."""
+"""Tables and constants of the PSF engine in C, each defined once.
+
+SciPy is imported where it is used: the service is ready before it loads SciPy.
+"""
 
 import math
 from collections.abc import Callable
@@ -7,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fresnel, i0, sici
 
 from estimator.native.records import PsfTables, pointer_to
 from estimator.optics.zernike import (
@@ -81,6 +83,8 @@ def edge_response() -> NDArray[np.float32]:
     to 0.43 of the window and is attenuated by 40 dB from 0.57 on, so little of it
     aliases.  Measurements with wider or less tapered windows were no better.
     """
+    from scipy.special import i0
+
     t: NDArray[Any] = np.arange(
         -EDGE_HALF_WIDTH * EDGE_STEPS, EDGE_HALF_WIDTH * EDGE_STEPS + 1
     )
@@ -105,6 +109,8 @@ def pixel_filter(samples_per_px: int, half_width: int) -> NDArray[np.float32]:
     interpolation, (Si(pi b) - Si(pi a)) / pi for distances a and b to the edges of the
     pixel, tapered outside the pixel.  Their sum is k.
     """
+    from scipy.special import sici
+
     reach = (samples_per_px + 1) // 2 + half_width
     t = np.arange(-reach, reach + 1)
     half = samples_per_px / 2.0
@@ -163,6 +169,8 @@ def fresnel_table() -> NDArray[np.float64]:
 
     The irradiance is (1/2)[(1/2+C)² + (1/2+S)²]; the integral starts in the shadow.
     """
+    from scipy.special import fresnel
+
     fine = 16
     v = np.linspace(-FRESNEL_LIMIT, FRESNEL_LIMIT, fine * _FRESNEL_STEPS + 1)
     s, c = fresnel(v)

@@ -11,9 +11,7 @@ from_profile        the build itself
 worker              main program of the worker process
 worker_handle       starts the process, queues builds, recovers from crashes
 inline_worker       the same interface, without a process
-background_warm_up  warm-up before the first build
-compile_builds      compilation of numba loops before the first build
-helper_process      subprocesses that end with their parent
+helper_process      import path and exit of subprocesses
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Python subprocesses that end with their parent."""
+"""What processes of the service have in common: import path, exit and stops."""
 
 from __future__ import annotations
 
@@ -6,55 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from pathlib import Path
-from typing import Self
-
-
-class HelperProcess:
-    """Context manager that runs ``python -m`` while its body takes long.
-
-    Parameters
-    ----------
-    *arguments : str
-        Module and its arguments.
-    after_s : float
-        Delay after which the process starts, unless the body has finished.
-    """
-
-    def __init__(self, *arguments: str, after_s: float) -> None:
-        self._arguments = arguments
-        self._process: subprocess.Popen[bytes] | None = None
-        self._timer = threading.Timer(after_s, self._start)
-        self._timer.daemon = True
-
-    def __enter__(self) -> Self:
-        """Start the timer of the process."""
-        self._timer.start()
-        return self
-
-    def __exit__(self, *exc_info: object) -> None:
-        """Kill the process, if it was started."""
-        self._timer.cancel()
-        self._timer.join()
-        if self._process is not None:
-            self._process.kill()
-            self._process.communicate()
-
-    def _start(self) -> None:
-        self._process = start_module(*self._arguments)
-
-
-def start_module(*arguments: str) -> subprocess.Popen[bytes]:
-    """Start ``python -m`` with the import path of this process.
-
-    Its standard input closes when this process ends; see `end_with_parent`.
-    """
-    return subprocess.Popen(
-        [sys.executable, "-P", "-m", *arguments],
-        stdin=subprocess.PIPE,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(import_path())},
-    )
 
 
 def import_path() -> list[str]:
@@ -88,14 +40,3 @@ def is_stopped(pid: int) -> bool:
     except (OSError, IndexError):
         return False
     return state == "T"
-
-
-def end_with_parent() -> None:
-    """Exit when the parent that ran `start_module` exits."""
-
-    def wait() -> None:
-        while os.read(sys.stdin.fileno(), 1):
-            pass
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()

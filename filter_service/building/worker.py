@@ -31,14 +31,11 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
-from filter_service.building.background_warm_up import BackgroundWarmUp
 from filter_service.building.jobs import Build, BuildJob
 from filter_service.errors import BuildCancelled, BuildFailed, FilterError
 from filter_service.log_lines import configure_logging
 
 PROGRESS_INTERVAL_S = 0.1
-IDLE_S = 3.0
-"""Time without a job after which the worker starts the warm-up."""
 
 log = logging.getLogger("ocufilter.worker")
 
@@ -48,30 +45,25 @@ class ParentExited(Exception):
 
 
 def main() -> None:
-    """Run the worker; arguments are DESCRIPTOR BUILD NICENESS WARM_UP."""
-    descriptor, build_name, niceness, warm_up_name = sys.argv[1:]
+    """Run the worker; arguments are DESCRIPTOR BUILD NICENESS."""
+    descriptor, build_name, niceness = sys.argv[1:]
     os.nice(int(niceness))
-    serve_builds(Connection(int(descriptor)), build_name, warm_up_name)
+    serve_builds(Connection(int(descriptor)), build_name)
 
 
-def serve_builds(pipe: Connection, build_name: str, warm_up_name: str = "") -> None:
+def serve_builds(pipe: Connection, build_name: str) -> None:
     """Serve build requests until the pipe closes."""
     # Ctrl-C signals the whole process group; the parent stops the worker itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     configure_logging("worker")
     try:
-        build, warm_up = _import_function(build_name), None
+        build = _import_function(build_name)
         pipe.send(("ready",))
-        # After a restart of the service, clients reconnect at once, often for a store
-        # in the on-disk cache; the warm-up must not compete with them for the
-        # processor.
-        if warm_up_name and not pipe.poll(IDLE_S):
-            warm_up = BackgroundWarmUp(_import_function(warm_up_name))
         while True:
             message = pipe.recv()
             if message[0] == "build":
                 ticket, job = message[1:]
-                _build_one(pipe, build, warm_up, ticket=ticket, job=job)
+                _build_one(pipe, build, ticket=ticket, job=job)
     except (EOFError, OSError, ParentExited):
         return
 
@@ -85,7 +77,6 @@ def _import_function(name: str) -> Callable[..., Any]:
 def _build_one(
     pipe: Connection,
     build: Build,
-    warm_up: BackgroundWarmUp | None,
     *,
     ticket: int,
     job: BuildJob,
@@ -95,8 +86,6 @@ def _build_one(
     def cancelled() -> bool:
         return _is_cancelled(pipe, ticket)
 
-    if warm_up is not None:
-        progress = warm_up.wrap_progress(progress, cancelled)
     try:
         built = build(job, progress=progress, cancelled=cancelled)
     except ParentExited:

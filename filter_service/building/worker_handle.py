@@ -41,7 +41,6 @@ STOPPED_LIMIT_S = 3.0
 """Time after which a worker stopped by a signal is killed."""
 
 BUILD = "filter_service.building.from_profile:build"
-WARM_UP = "filter_service.building.compile_builds:warm_up"
 NICENESS = 5
 
 log = logging.getLogger("ocufilter.worker")
@@ -112,8 +111,6 @@ class WorkerHandle:
         process.
     build_limit_s : float
         Time without progress after which a build is killed with its process.
-    warm_up : str
-        ``module:function`` that the process runs while it waits for the first job.
     niceness : int
         Niceness of the process.  While a new eye is estimated on two busy cores, 91 to
         96 % of a stream's frames are complete with 0, and 95 to 98 % with 5; with 10,
@@ -125,7 +122,6 @@ class WorkerHandle:
     build: str = BUILD
     cancel_grace_s: float = 3.0
     build_limit_s: float = 600.0
-    warm_up: str = WARM_UP
     niceness: int = NICENESS
     task: str = "computes PSFs"
     n_restarts: int = 0
@@ -154,7 +150,7 @@ class WorkerHandle:
         process = subprocess.Popen(
             [
                 *(sys.executable, "-P", "-m", "filter_service.building.worker"),
-                *(str(theirs.fileno()), self.build, str(self.niceness), self.warm_up),
+                *(str(theirs.fileno()), self.build, str(self.niceness)),
             ],
             pass_fds=[theirs.fileno()],
             stdin=subprocess.DEVNULL,

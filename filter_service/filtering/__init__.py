@@ -16,7 +16,6 @@ predicted_states  prediction of pupil and focus of the next frames
 builder           builder and engine shared by all streams
 shared_builder    builders shared within a process
 choose_engine     choice of the engine, with the reason
-compile_loops     compilation of all numba loops, on all cores
 """
 
 import lazy_loader

@@ -74,21 +74,14 @@ def open_engine(
 
 def _automatic(closing: ExitStack, *, warm_up: bool) -> ChosenEngine:
     if not may_have_gpu():
-        return _native_or_gl(closing, "no GPU on this machine", warm_up=warm_up)
+        return _native(closing, "no GPU on this machine")
     with ExitStack() as own:
         try:
             found = _gl(own, "a hardware GPU", warm_up=warm_up, hardware_only=True)
         except RenderFailed as error:
-            return _native_or_gl(closing, f"no GPU: {error}", warm_up=warm_up)
+            return _native(closing, f"no GPU: {error}")
         closing.push(own.pop_all())
     return found
-
-
-def _native_or_gl(closing: ExitStack, reason: str, *, warm_up: bool) -> ChosenEngine:
-    try:
-        return _native(closing, reason)
-    except RenderFailed as error:
-        return _gl(closing, f"{reason}, and {error}", warm_up=warm_up)
 
 
 def _native(closing: ExitStack, reason: str) -> ChosenEngine:

@@ -144,9 +144,7 @@ def preload() -> None:
 
     def load() -> None:
         try:
-            from filter_service.rendering.plan_once import plan_once
-
-            plan_once()
+            from filter_service.rendering import edge_light, frame_kernels  # noqa: F401
         except Exception:  # the first frame reports it to the client
             log.exception("could not preload")
 

@@ -31,7 +31,7 @@ from filter_service.psfs.boxes import pack_reach, unpack_reach
 from filter_service.psfs.field_defocus import EyeDefocus
 from filter_service.psfs.read_kernels import StoreTables
 
-if TYPE_CHECKING:  # these load numba, and the service is ready before that
+if TYPE_CHECKING:
     from estimator.profiles.parse import EyeProfile
     from filter_service.planning.plan import NodePlanner
     from filter_service.psfs.native_psfs import NodeRings

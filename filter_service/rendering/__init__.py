@@ -46,7 +46,6 @@ light_planes     addition of their light to images
 visibility       which points of the pupil's edge see a source
 haze             straylight of the ocular media
 spectacles       spectacle magnification
-plan_once        warm-up of frame planning
 gl/              engine of compute shaders
 native/          engine of compiled loops
 """

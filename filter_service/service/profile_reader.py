@@ -82,7 +82,6 @@ class ProfileReader:
         self._worker = WorkerHandle(
             f"{__name__}:read",
             build_limit_s=READ_LIMIT_S,
-            warm_up="",
             task="reads profiles",
         )
         self._reading: dict[int, tuple[str, ProfileRequest]] = {}  # by ticket

@@ -24,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.networks.inference import load_network
-from filter_service.building.compile_builds import build_sample
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.shared_builder import open_inline_builder
 from filter_service.rendering.srgb import linear_from_srgb, srgb_from_linear
@@ -161,9 +160,9 @@ def main() -> int:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     arguments = parser.parse_args()
     rows, pictures = [], {"published": [], "exact": []}
-    build_sample()  # loaded before the clock
     for network in ("eye", "focus", "aberration"):
         load_network(network)
+    run_method("emmetropia", "published", exact_picture("emmetropia"), repeats=1)
     for case in QUICK_CONDITIONS if arguments.quick else CONDITIONS:
         print(f"{case} ...", file=sys.stderr, flush=True)
         exact = exact_picture(case)

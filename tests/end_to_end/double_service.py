@@ -30,7 +30,6 @@ def open_builder(config, closing):
         "tests.end_to_end.doubles:build",
         config.cancel_grace_s,
         config.build_limit_s,
-        warm_up="",
     )
     closing.callback(worker.close)
     engine = EngineDouble(float(os.environ[FILTER_MS]))

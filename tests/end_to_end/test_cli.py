@@ -85,7 +85,6 @@ def test_doctor_reports_a_machine_that_can_serve():
     report = run_json("doctor")
     assert report["ok"]
     assert report["works"]["serve"]
-    assert report["threading_layer"] in ("omp", "tbb")
     assert report["gl"]["renderer"]
     assert report["gl"]["limits"]["GL_MAX_COMPUTE_WORK_GROUP_INVOCATIONS"] >= 64
     works = [d for d in report["gl"]["devices"] if d["error"] is None]

@@ -43,7 +43,7 @@ DEPTH_M = np.full((8, 16), 2.0, np.float32)
 
 @pytest.fixture(scope="module")
 def builder():
-    worker = WorkerHandle("tests.end_to_end.doubles:build", warm_up="")
+    worker = WorkerHandle("tests.end_to_end.doubles:build")
     builder = Builder(worker, EngineDouble(0.0), BuildLimits())
     yield builder
     builder.close()
@@ -139,7 +139,7 @@ def test_a_program_with_many_open_files_can_wait():
         closing.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
         for _ in range(1024):
             closing.callback(os.close, os.open(os.devnull, os.O_RDONLY))
-        worker = WorkerHandle("tests.end_to_end.doubles:build", warm_up="")
+        worker = WorkerHandle("tests.end_to_end.doubles:build")
         many = Builder(worker, EngineDouble(0.0), BuildLimits())
         closing.callback(many.close)
         with EyeFilter(eye(1), CAMERA, builder=many) as made:

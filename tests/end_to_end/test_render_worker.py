@@ -47,7 +47,7 @@ class FrontEnd:
     """The front end's end of a link, and what the loop has said."""
 
     def __init__(self, engine):
-        worker = WorkerHandle("tests.end_to_end.doubles:build", warm_up="")
+        worker = WorkerHandle("tests.end_to_end.doubles:build")
         builder = Builder(worker, engine, BuildLimits())
         loop = RenderWorker(builder, read_profile, max_cameras=4)
         self.link, theirs = Link.pair()

@@ -35,26 +35,6 @@ from filter_service.service import {module}
 print(json.dumps(sorted({{name.partition(".")[0] for name in sys.modules}})))
 """
 
-AFTER_READY = """
-import json, sys
-from filter_service.rendering.plan_once import plan_once
-
-def libraries():
-    return {m for m in sys.modules if m.startswith(("scipy.", "numba", "llvmlite"))}
-
-plan_once()
-before = libraries()
-assert {"scipy.interpolate", "scipy.ndimage"} <= before, before
-
-from contextlib import ExitStack
-from filter_service.filtering.choose_engine import open_engine
-from filter_service.rendering.perfect_eye import change_by_perfect_eye
-with ExitStack() as closing:
-    for engine in ("native", "gl"):
-        change_by_perfect_eye(open_engine(engine, closing).engine)
-print(json.dumps(sorted(libraries() - before)))
-"""
-
 STOPPED_DURING_THE_START = """
 import sys
 from filter_service.service import {module}
@@ -70,7 +50,7 @@ sys.argv[1:] = [str(end.detach()), double, "render"]
 print("true")
 """
 
-NOT_BEFORE_READY = {"numba", "llvmlite", "scipy", "matplotlib", "rich", "PIL"}
+NOT_BEFORE_READY = {"scipy", "matplotlib", "rich", "PIL"}
 """By the native engine; that of GL plans frames when it compiles its shaders."""
 
 
@@ -87,7 +67,7 @@ def _printed(script, *, timeout_s=120):
     return json.loads(ran.stdout)
 
 
-def test_a_service_is_ready_before_it_loads_numba_or_scipy():
+def test_a_service_is_ready_before_it_loads_scipy():
     loaded = set(_printed(UP_TO_READY))
     assert {"msgspec", "numpy"} <= loaded, "it has not come to the end"
     assert not loaded & (NOT_BEFORE_READY | {"zmq"})
@@ -102,11 +82,6 @@ def test_a_service_is_ready_before_it_loads_numba_or_scipy():
 )
 def test_what_stands_before_the_frames_is_light(module, heavy):
     assert not set(_printed(LIGHT.format(module=module))) & heavy
-
-
-@pytest.mark.long("a process loads both engines")
-def test_what_is_loaded_ahead_is_all_that_frames_need():
-    assert _printed(AFTER_READY) == []
 
 
 @pytest.mark.parametrize("module", ["front_end_process", "render_worker_process"])

@@ -23,7 +23,7 @@ from tests.source_tree import ROOT
 
 pytestmark = pytest.mark.tools
 
-TIMEOUT_S = 300  # where no kernel of numba's has been compiled yet
+TIMEOUT_S = 300
 WIDTH_PX, HEIGHT_PX = 24, 16
 PACKAGES = ("clients", "estimator", "filter_service")
 BRIEF_PAGES = ("docs/how-to/deploy.md", "docs/how-to/eye-models.md")
@@ -128,7 +128,6 @@ def installed(wheel, tmp_path_factory):
     # checkout's editable install.
     others = {sysconfig.get_path("purelib"), sysconfig.get_path("platlib")}
     (site / "others.pth").write_text("\n".join(others) + "\n", encoding="utf-8")
-    bring_compiled_kernels(site)
     empty = folder / "empty"
     empty.mkdir()
     return SimpleNamespace(
@@ -136,24 +135,9 @@ def installed(wheel, tmp_path_factory):
     )
 
 
-def bring_compiled_kernels(site):
-    """Copy numba's files from the checkout: compiling anew takes two minutes.
-
-    They belong to a source of the same time, so that comes along too.
-    """
-    for package in PACKAGES:
-        for compiled in (ROOT / package).rglob("__pycache__/*.nb[ci]"):
-            name = compiled.relative_to(ROOT)
-            (site / name).parent.mkdir(exist_ok=True)
-            shutil.copyfile(compiled, site / name)
-        for path in (site / package).rglob("*.py"):
-            source = ROOT / path.relative_to(site)
-            os.utime(path, ns=(source.stat().st_mtime_ns,) * 2)
-
-
 def start(installed, *command, cwd=None, **variables):
     """Run in an empty folder, with nothing that leads to the checkout."""
-    leads = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "NUMBA_CACHE_DIR")
+    leads = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
     environment = {k: v for k, v in os.environ.items() if k not in leads}
     return subprocess.run(
         [str(word) for word in command],

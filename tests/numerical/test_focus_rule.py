@@ -10,7 +10,7 @@ import pytest
 from estimator.estimate.given_surfaces import eye_model
 from estimator.eye.focusing import OUT_OF_REACH_DPT
 from estimator.field.prepare import prepare_eye
-from estimator.optics.zernike import EXPONENTS
+from estimator.optics.zernike import exponents
 from estimator.profiles.parse import parse_profile
 from estimator.wavefront.aberrations import wavefront_grid
 from estimator.wavefront.field_wavefronts import (
@@ -51,10 +51,13 @@ def defocus_dpt(model, residual, *, pupil_mm, accommodation_dpt):
     )
     assert found.open_ratio.min() > 0.999
     wave_um = polynomial_in_mm(found.zernike_um, found.zernike_radius_mm).ravel()
-    wave_um = wave_um + residual.on_axis_um(pupil_mm)[0]
+    own_um = residual.on_axis_um(pupil_mm)[0]
+    powers = exponents(max(wave_um.size, own_um.size))
+    wave_um = np.pad(wave_um, (0, len(powers) - wave_um.size))
+    wave_um += np.pad(own_um, (0, len(powers) - own_um.size))
     x, y = points_mm(found.ellipse_mm.ravel(), pupil_mm / 2.0)
-    of_x, of_y = (np.vander(v, EXPONENTS.max() + 1, increasing=True) for v in (x, y))
-    values_um = (of_x[:, EXPONENTS[:, 0]] * of_y[:, EXPONENTS[:, 1]]) @ wave_um
+    of_x, of_y = (np.vander(v, powers.max() + 1, increasing=True) for v in (x, y))
+    values_um = (of_x[:, powers[:, 0]] * of_y[:, powers[:, 1]]) @ wave_um
     columns = np.stack([np.ones_like(x), x, y, x**2 + y**2], axis=-1)
     return -2.0 * np.linalg.lstsq(columns, values_um)[0][3]
 

@@ -277,7 +277,7 @@ def test_hard_frames_pass_under_sanitizers(tmp_path, sanitizer):
         "OCUFILTER_LIBRARY_DIR": str(tmp_path),
         "OCUFILTER_THREADS": "4",
         "LD_PRELOAD": str(runtime),
-        # Python and numba keep memory to their end
+        # Python keeps memory to its end
         "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=0",
         "TSAN_OPTIONS": "halt_on_error=1:exitcode=66:ignore_noninstrumented_modules=1",
     }

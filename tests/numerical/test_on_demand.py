@@ -7,13 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from filter_service.building.compile_builds import SAMPLE_JOB
+from estimator.profiles.parse import parse_profile
+from filter_service.building.jobs import BuildJob
 from filter_service.building.worker_handle import (
     BuildDone,
     BuildError,
     BuildPart,
     WorkerHandle,
 )
+from filter_service.camera import Camera
 from filter_service.errors import BuildFailed, NotPrepared, OutOfMemory
 from filter_service.planning.cost import states_of
 from filter_service.planning.plan import plan_axes, unchecked_plan
@@ -153,11 +155,17 @@ def test_nodes_planned_ahead_serve_frames_as_they_would_plan_them(
 def test_the_worker_plans_ahead_until_it_is_asked_for_something_else(monkeypatch):
     from filter_service.planning.plan import NodePlanner
 
-    worker = WorkerHandle(warm_up="")
-    settings = replace(
-        SAMPLE_JOB.settings, pupil_range_mm=(2.0, 7.0), focus_range_dpt=(0, 4)
+    worker = WorkerHandle()
+    job = BuildJob(
+        profile=parse_profile({"kind": "prescription", "sphere_dpt": -2.0}),
+        settings=FilterSettings(
+            pupil_range_mm=(2.0, 7.0),
+            focus_range_dpt=(0, 4),
+            object_range_dpt=(0.0, 2.0),
+        ),
+        camera=Camera(32, 18, (-0.02, 0.02, 0.01, -0.01)),
+        near=(4.0, 2.0),
     )
-    job = replace(SAMPLE_JOB, settings=settings, near=(4.0, 2.0))
     try:
         worker.start()
         stores, parts, deadline_s = {}, [], time.monotonic() + 60.0

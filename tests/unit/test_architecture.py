@@ -161,10 +161,6 @@ HOME = {
     ),
     "weasyprint": ("clients/report/make.py",),  # loads the system library Pango
     "lazy_loader": ("*/__init__.py",),  # names without what they load
-    "numba": (
-        "clients/commands/doctor_probes.py",  # asks which threads it runs on
-        "filter_service/threads.py",
-    ),
     "av": ("clients/batch/video_*.py",),  # frames of videos, exactly
     "ray": ("clients/batch/ray_pool.py",),  # many machines
     "matplotlib": (
@@ -195,7 +191,6 @@ NEVER_LOADED_BY_CLIENT_LIBRARY = (
     "estimator",
     "filter_service.gl.gpu",
     "moderngl",
-    "numba",
     "scipy",
     "torch",
 )

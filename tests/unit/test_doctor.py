@@ -76,7 +76,7 @@ def test_without_opengl_shaders_are_not_tried():
 
 
 CHECKS = (
-    *("python", "service packages", "gl", "compute", "shaders", "native", "threads"),
+    *("python", "service packages", "gl", "compute", "shaders", "native"),
     *("client packages", "window packages", "pyrender packages", "display"),
 )
 
@@ -87,15 +87,14 @@ def test_the_demo_needs_no_package_of_the_extras():
 
 
 @pytest.mark.parametrize("lost", ["gl", "compute", "shaders"])
-def test_filter_and_serve_need_the_shaders_or_the_loops(lost):
+def test_filter_and_serve_need_the_compiled_libraries_and_no_opengl(lost):
     ok = dict.fromkeys(CHECKS, True)
     assert all(doctor_checks.what_works(ok).values())
     works = doctor_checks.what_works(ok | {lost: False})
     assert works["filter"]
     assert works["serve"]
     assert works["demo"] == (lost != "gl")  # its scenes are rendered with OpenGL
-    works = doctor_checks.what_works(ok | {lost: False, "native": False})
-    assert [name for name, it_works in works.items() if it_works] == ["psf"]
+    assert not any(doctor_checks.what_works(ok | {"native": False}).values())
 
 
 def test_the_native_engine_s_probe_filters_a_perfect_eye():
@@ -125,7 +124,7 @@ NATIVE = {"name": "native (avx2, 2 threads)", "frame_error": 0.0}
         ({"info": {"renderer": "NVIDIA H100"}}, NATIVE, "gl: NVIDIA H100"),
         (LLVMPIPE, NATIVE, "native: llvmpipe"),
         ({"error": "no libEGL"}, NATIVE, "native: no OpenGL"),
-        (LLVMPIPE, {"error": "not built"}, "gl, slow"),
+        (LLVMPIPE, {"error": "not built"}, "none"),
         ({"error": "no libEGL"}, {"error": "not built"}, "none"),
     ],
 )

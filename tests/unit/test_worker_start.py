@@ -34,7 +34,7 @@ def build(job, *, progress, cancelled):
 @contextmanager
 def started():
     """Start a worker whose builds report three stages."""
-    worker = WorkerHandle(f"{__name__}:build", warm_up="")
+    worker = WorkerHandle(f"{__name__}:build")
     worker.start()
     try:
         yield worker
