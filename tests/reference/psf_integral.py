@@ -12,7 +12,6 @@ from functools import cache
 
 import numpy as np
 import scipy.special
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.optics.zernike import (
@@ -26,6 +25,13 @@ from estimator.psf.stiles_crawford import StilesCrawford
 
 VALUES_AT_A_TIME = 1 << 24
 """Field values held at a time (256 MiB); pixel columns are processed in such parts."""
+
+ONE_THREAD_PRODUCT = 1 << 16
+"""Multiplications of a matrix product that OpenBLAS computes on the calling thread.
+
+Larger products on the threads of `_field` take 15 times the processor time:
+the threads of OpenBLAS wait for each other.
+"""
 
 
 @dataclass(frozen=True)
@@ -133,34 +139,22 @@ def _chord_nodes(n_chords: int, n_nodes: int):
     return half * node, np.sin(t), step * half**2 * weight
 
 
-@njit(cache=True, nogil=True, fastmath=True)
-def _chord_integrals(phase_rad, weight, x, start, step, offsets, out):
+def _chord_integrals(phase_rad, weight, x, start, step, offsets, n_steps):
     """Sum w exp(i phase) exp(-i x (start + o + q step)) over each chord's nodes.
 
-    ``out`` is (chords, offsets, steps).  One rotation per step replaces a sine and a
-    cosine; rounding grows to about 1e-16 times the number of steps.
+    Returns (chords, offsets, n_steps).  Powers of one rotation replace a sine and a
+    cosine for each step; rounding grows to about 1e-16 times the number of steps.
     """
-    n_nodes = x.shape[1]
-    re, im = np.empty(n_nodes), np.empty(n_nodes)
-    turn_re, turn_im = np.empty(n_nodes), np.empty(n_nodes)
-    for j in range(x.shape[0]):
-        for i in range(n_nodes):
-            turn_re[i] = math.cos(x[j, i] * step)
-            turn_im[i] = -math.sin(x[j, i] * step)
-        for g in range(offsets.shape[0]):
-            for i in range(n_nodes):
-                angle = phase_rad[j, i] - x[j, i] * (start + offsets[g])
-                re[i] = weight[j, i] * math.cos(angle)
-                im[i] = weight[j, i] * math.sin(angle)
-            for q in range(out.shape[2]):
-                total_re, total_im = 0.0, 0.0
-                for i in range(n_nodes):
-                    a, b = re[i], im[i]
-                    total_re += a
-                    total_im += b
-                    re[i] = a * turn_re[i] - b * turn_im[i]
-                    im[i] = a * turn_im[i] + b * turn_re[i]
-                out[j, g, q] = complex(total_re, total_im)
+    at = start + offsets[:, None]
+    field = weight[:, None] * np.exp(1j * (phase_rad[:, None] - x[:, None] * at))
+    turns = np.repeat(np.exp(-1j * step * x)[:, None], n_steps, axis=1)
+    turns[:, 0] = 1.0
+    np.cumprod(turns, axis=1, out=turns)
+    part = max(1, ONE_THREAD_PRODUCT // (offsets.size * n_steps))
+    return sum(
+        field[..., i : i + part] @ turns[..., i : i + part].swapaxes(1, 2)
+        for i in range(0, x.shape[1], part)
+    )
 
 
 def _polynomial_values(coefficients, x, y):
@@ -206,14 +200,14 @@ def _field(pupil: _Pupil, x_px, y_px, x_offset_px, refine, workers):
     chords = np.empty((y.size, x_offset_px.size, x_px.size), np.complex128)
 
     def integrate(part: slice) -> None:
-        _chord_integrals(
+        chords[part] = _chord_integrals(
             phase_rad[part],
             weight[part],
-            np.ascontiguousarray(x[part]),
+            x[part],
             x_px[0],
             step,
             x_offset_px,
-            chords[part],
+            x_px.size,
         )
 
     with ThreadPoolExecutor(max_workers=workers) as pool:
