@@ -59,13 +59,11 @@ def loaded(request):
         return
     from clients.figures.style import new_figure
     from estimator.psf.compute import compute_psfs
-    from tests.reference import render_passes
     from tests.reference.psf_integral import reference_kernel
 
     for method in PSF_METHODS:
         compute_psfs(np.zeros((1, 28)), method=method, **SMALL_PSF)
     reference_kernel(np.zeros(28), radius_px=2, **SMALL_PSF)
-    render_passes.gather_once()
     new_figure(9.0, 9.0).subplots()
     # A full collection of all that is loaded takes 0.3 s, in whichever case it falls.
     gc.collect()

@@ -15,6 +15,8 @@ from tests.reference import render_passes as reference
 
 SIZE = {"width_px": 320, "height_px": 180}
 STATE = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.5}
+ROW_STEP = 4
+"""The gather computes every fourth row, in 0.05 s."""
 OFTEN = ("keratoconus", "myopia")
 MERGING = [(eye, scene) for eye in ("myopia", "astigmatism") for scene in SCENES]
 """Cases in which at least half of the pixels merge."""
@@ -53,14 +55,18 @@ def test_passes_agree_with_the_sorted_gather(engine, often, eye, scene, accumula
     renderer = engine.new_renderer()
     handle = renderer.load(store)
     truth = reference.gather(
-        view, store, frame_layers(store, **STATE), accumulation=accumulation
+        view,
+        store,
+        frame_layers(store, **STATE),
+        accumulation=accumulation,
+        row_step=ROW_STEP,
     )
     single = renderer.render(
         view, handle, **STATE, accumulation=accumulation, merge=False
     )
     merged = renderer.render(view, handle, **STATE, accumulation=accumulation)
-    assert psnr_db(single.color, truth) >= 50.0
-    assert psnr_db(merged.color, truth) >= 45.0
+    assert psnr_db(single.color[::ROW_STEP], truth) >= 50.0
+    assert psnr_db(merged.color[::ROW_STEP], truth) >= 45.0
     if (eye, scene) in MERGING:
         assert merged.merged_count >= 0.5 * merged.color[..., 0].size
     handle.release()

@@ -6,13 +6,13 @@ planned layers.
 """
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
-from numba import njit, prange
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from filter_service.camera import Camera
 from filter_service.constants import (
     DISCONTINUITY_PX,
     MIN_BLUR_RANGE,
@@ -20,7 +20,7 @@ from filter_service.constants import (
     PAPER_FAR_M,
     PAPER_TIE_BREAK_M,
 )
-from filter_service.psfs.frame_layers import FrameLayers, frame_layers
+from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame import (
     border_px_of,
@@ -35,10 +35,12 @@ from filter_service.rendering.frame_kernels import (
     interval_count,
 )
 from filter_service.rendering.image_cells import ImageCells, image_cells
-from filter_service.rendering.perfect_eye import PUPIL_MM, TANGENTS, perfect_store
 from filter_service.rendering.srgb import linear_from_srgb
 from filter_service.rgbd_view import RgbdView
 from tests.reference.packed_kernels import square_kernel
+
+CANDIDATES_AT_A_TIME = 1 << 17
+"""Pairs of an output pixel and a source that `gather` holds at a time (20 MB)."""
 
 NOTHING = -1
 """Kernel index of an empty pixel."""
@@ -157,12 +159,18 @@ def gather(
     *,
     accumulation: str = "coverage",
     gaze_deg: tuple[float, float] | None = None,
+    row_step: int = 1,
 ) -> NDArray[np.float64]:
     """Filter a view by sorted per-pixel gathering.
 
+    Parameters
+    ----------
+    row_step : int
+        Compute every n-th output row only.
+
     Returns
     -------
-    linear_rgb : (height, width, 3)
+    linear_rgb : (ceil(height / row_step), width, 3)
     """
     filled_m, _ = fill_missing_depth(view.depth_m)
     image = image_cells(store.spec, store.plan, gaze_deg)
@@ -187,27 +195,18 @@ def gather(
     kernel_of = np.zeros(used.shape, np.int64)
     kernel_of[kernels.cells, kernels.intervals] = np.arange(kernels.count)
     kernel = kernel_of[cell, interval]
-    out = np.empty_like(linear[0])
-    _gather(
+    step_dpt = DISCONTINUITY_PX / max(layers.blur_px_per_dpt, MIN_BLUR_RANGE)
+    is_paper = accumulation == "paper"
+    out = _gather(
         linear,
         np.where(holds, kernel, NOTHING),
         position - interval,
         _sort_key(distances_dpt, accumulation),
         kernel_pairs(store, kernels),
-        accumulation == "paper",
-        DISCONTINUITY_PX / max(layers.blur_px_per_dpt, MIN_BLUR_RANGE),
-        out,
+        _over if is_paper else partial(_by_depths, depth_step=step_dpt),
+        range(border_px, view.height_px - border_px)[::row_step],
     )
-    rows, columns = (slice(border_px, n - border_px) for n in out.shape[:2])
-    return out[rows, columns]
-
-
-def gather_once() -> None:
-    """Gather one pixel, which compiles the loops or loads them."""
-    store = perfect_store(Camera(1, 1, TANGENTS))
-    layers = frame_layers(store, pupil_diameter_mm=PUPIL_MM, focus_dpt=0.0)
-    light = np.ones((1, 1, 3), np.float32)
-    gather(RgbdView(light, light[..., 0].copy(), TANGENTS), store, layers)
+    return out[:, border_px : view.width_px - border_px]
 
 
 def surface_vergences_dpt(view: RgbdView, layers: FrameLayers) -> NDArray[np.float64]:
@@ -242,78 +241,92 @@ def _sort_key(distances_dpt: NDArray, accumulation: str) -> NDArray[np.float64]:
     return distance_m + PAPER_TIE_BREAK_M * scan
 
 
-@njit(parallel=True, cache=True)
-def _gather(linear, kernel, fraction, key, kernels, paper_rule, depth_step, out):
-    n_surfaces, height, width = kernel.shape
+def _gather(linear, kernel, fraction, key, kernels, accumulate, rows):
+    """Return the light (rows, width, 3) of output rows, in blocks of rows."""
+    n_surfaces, _, width = kernel.shape
     size = kernels.shape[2]
     radius = size // 2
-    for y in prange(height):
-        found_key = np.empty(n_surfaces * size * size)
-        found_weight = np.empty((n_surfaces * size * size, 3))
-        found_color = np.empty((n_surfaces * size * size, 3))
-        for x in range(width):
-            count = 0
-            for s in range(n_surfaces):
-                for sy in range(max(0, y - radius), min(height, y + radius + 1)):
-                    for sx in range(max(0, x - radius), min(width, x + radius + 1)):
-                        k, share = kernel[s, sy, sx], fraction[s, sy, sx]
-                        if k < 0:
-                            continue
-                        any_light = False
-                        for c in range(3):
-                            weight = kernels[k, 0, y - sy + radius, x - sx + radius, c]
-                            if share > 0.0:
-                                far = kernels[k, 1, y - sy + radius, x - sx + radius, c]
-                                weight += share * (far - weight)
-                            found_weight[count, c] = weight
-                            any_light = any_light or weight > 0.0
-                        if any_light:
-                            found_key[count] = key[s, sy, sx]
-                            found_color[count] = linear[s, sy, sx]
-                            count += 1
-            order = np.argsort(found_key[:count], kind="mergesort")
-            for c in range(3):
-                args = (order, found_key, found_weight[:, c], found_color[:, c])
-                if paper_rule:
-                    light, coverage = _over(*args)
-                else:
-                    light, coverage = _by_depths(*args, depth_step)
-                if coverage >= MIN_COVERAGE:
-                    out[y, x, c] = light / coverage
-                else:
-                    out[y, x, c] = linear[0, y, x, c]
+    # The kernel of an empty pixel, at index NOTHING, has no light.
+    kernels = np.concatenate([kernels, np.zeros_like(kernels[:1])])
+    # A source to the left and above is lit by the kernel's right and lower part.
+    is_lit = (kernels[:, :, ::-1, ::-1] > 0.0).any(axis=-1)
+    order = np.argsort(key, axis=None, kind="stable")
+    rank = np.empty(order.size, np.int64)
+    rank[order] = np.arange(order.size)
+    border = (0, 0), (radius, radius), (radius, radius)
+    padded = (
+        np.pad(values, border, constant_values=fill)
+        for values, fill in (
+            (rank.reshape(kernel.shape), order.size),
+            (kernel, NOTHING),
+            (fraction, 0.0),
+        )
+    )
+    windows = [
+        np.moveaxis(sliding_window_view(values, (size, size), (1, 2)), 0, 2)
+        for values in padded
+    ]
+    offset_y, offset_x = np.indices((size, size), sparse=True)
+    out = np.empty((len(rows), width, 3))
+    block = max(1, CANDIDATES_AT_A_TIME // (width * n_surfaces * size**2))
+    for first in range(0, len(rows), block):
+        here = rows[first : first + block]
+        ranks, own, share = (window[here] for window in windows)
+        lit = (share < 1.0) & is_lit[own, 0, offset_y, offset_x]
+        lit |= (share > 0.0) & is_lit[own, 1, offset_y, offset_x]
+        ranks = np.where(lit, ranks, order.size).reshape(len(here), width, -1)
+        ranks = np.sort(ranks)[..., : lit.sum(axis=(2, 3, 4)).max()]
+        found = ranks < order.size
+        source = order[np.where(found, ranks, 0)]
+        _, y, x = np.unravel_index(source, kernel.shape)
+        y = np.asarray(here)[:, None, None] - y + radius
+        x = np.arange(width)[:, None] - x + radius
+        y, x = (np.where(found, offset, 0) for offset in (y, x))
+        own = np.where(found, kernel.ravel()[source], NOTHING)
+        near, far = kernels[own, 0, y, x], kernels[own, 1, y, x]
+        weight = near + fraction.ravel()[source][..., None] * (far - near)
+        light, coverage = accumulate(
+            np.where(found, key.ravel()[source], np.inf),
+            weight,
+            weight * linear.reshape(-1, 3)[source],
+        )
+        out[first : first + block] = np.where(
+            coverage >= MIN_COVERAGE,
+            light / np.maximum(coverage, MIN_COVERAGE),
+            linear[0, here],
+        )
+    return out
 
 
-@njit(cache=True)
-def _over(order, key, weight, color):
+def _over(key, weight, light):
     """Return light and coverage by the paper's rule: a weight is an opacity."""
-    light, coverage = 0.0, 0.0
-    for i in order:
-        share = weight[i] * (1.0 - coverage)
-        light += share * color[i]
-        coverage += share
-    return light, coverage
+    left = np.cumprod(1.0 - weight, axis=-2)
+    free = np.concatenate([np.ones_like(left[..., :1, :]), left[..., :-1, :]], axis=-2)
+    return (free * light).sum(axis=-2), (free * weight).sum(axis=-2)
 
 
-@njit(cache=True)
-def _by_depths(order, key, weight, color, depth_step):
+def _by_depths(key, weight, light, *, depth_step):
     """Return light and coverage, accumulated one depth after the other.
 
     The fragments of one depth share the free coverage in proportion to their weights.
     If the first took its full weight, a partly hidden surface would be lit by one side
     of the kernel only.
     """
-    light, coverage = 0.0, 0.0
-    first = 0
-    while first < order.size:
-        own_light, own_coverage = 0.0, 0.0
-        end = first
-        while end < order.size and key[order[end]] - key[order[first]] <= depth_step:
-            own_light += weight[order[end]] * color[order[end]]
-            own_coverage += weight[order[end]]
-            end += 1
-        share = min((1.0 - coverage) / max(own_coverage, MIN_COVERAGE), 1.0)
-        light += share * own_light
-        coverage += share * own_coverage
-        first = end
-    return light, coverage
+    n_columns = key.shape[-1]
+    key = key.reshape(-1, n_columns)
+    sums = np.zeros((2, len(key), n_columns + 1, 3))
+    np.cumsum(light.reshape(-1, n_columns, 3), axis=1, out=sums[0, :, 1:])
+    np.cumsum(weight.reshape(-1, n_columns, 3), axis=1, out=sums[1, :, 1:])
+    total = np.zeros((2, len(key), 3))
+    count = np.isfinite(key).sum(axis=1)
+    first = np.zeros(len(key), np.int64)
+    at = np.flatnonzero(count)
+    while at.size:
+        nearest = key[at, first[at]]
+        end = (key[at] - nearest[:, None] <= depth_step).sum(axis=1)
+        own = sums[:, at, end] - sums[:, at, first[at]]
+        room = 1.0 - total[1, at]
+        total[:, at] += np.minimum(room / np.maximum(own[1], MIN_COVERAGE), 1.0) * own
+        first[at] = end
+        at = at[end < count[at]]
+    return total.reshape(2, *weight.shape[:-2], 3)
