@@ -8,7 +8,6 @@ that the frame left; their entries must be as many as the renderer says.
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from filter_service.constants import (
@@ -79,65 +78,48 @@ def splat_work(gpu: Gpu, size_px: tuple[int, int], entry_count: int) -> SplatWor
 
 def work_of(blocks: NDArray, place: NDArray, tile_grid: tuple[int, int]) -> SplatWork:
     """Count the work of fragments in the words of BLOCKS and FRAGMENT_PLACE."""
-    counts = np.zeros((len(blocks), 3), np.int64)
-    _count(blocks[:, 0].astype(np.int64), place.astype(np.int64), *tile_grid, counts)
-    return SplatWork(*(int(count) for count in counts.sum(axis=0)))
+    is_alive = np.arange(THREADS) < blocks[:, :1]
+    fragments = place.reshape(-1, THREADS, 4)[is_alive].astype(np.int64)
+    return SplatWork(*(int(count) for count in _counts(fragments, tile_grid)))
 
 
-@njit(parallel=True, cache=True)
-def _count(alive, place, columns, rows, counts):
-    for block in prange(alive.size):
-        for slot in range(block * THREADS, block * THREADS + alive[block]):
-            _count_fragment(place[slot], columns, rows, counts[block])
-
-
-@njit(cache=True)
-def _count_fragment(words, columns, rows, counts):
-    """Add the entries, evaluations and lit evaluations of a fragment."""
-    x, y = words[0] & PLACE_MASK, words[0] >> PLACE_BITS
-    extent = (1 << ((words[1] >> LEVEL_SHIFT) & LEVEL_MASK)) - 1
-    reach_px = (words[2] >> PLACE_BITS) + 0.5
+def _counts(words: NDArray, tile_grid: tuple[int, int]) -> NDArray[np.int64]:
+    """Return the entries, evaluations and lit evaluations (3,) of fragments (n, 4)."""
+    place, level, reach, sides = words.T
+    start = np.stack([place & PLACE_MASK, place >> PLACE_BITS], axis=-1)
+    extent = (1 << ((level >> LEVEL_SHIFT) & LEVEL_MASK)) - 1
+    end = start + extent[:, None]
+    reach_px = (reach >> PLACE_BITS) + 0.5
     left, right, up, down = (
-        words[3] & BYTE_MASK,
-        (words[3] >> BYTE_BITS) & BYTE_MASK,
-        (words[3] >> 2 * BYTE_BITS) & BYTE_MASK,
-        words[3] >> 3 * BYTE_BITS,
+        (sides >> shift * BYTE_BITS) & BYTE_MASK for shift in range(4)
     )
+    first_px = start - np.stack([left, up], axis=-1)
+    last_px = end + np.stack([right, down], axis=-1)
     bin_px = BIN_TILES * TILE_SIZE_PX
-    last_column, last_row = (columns - 1) // BIN_TILES, (rows - 1) // BIN_TILES
-    for bin_y in range(
-        max(y - up, 0) // bin_px, min((y + extent + down) // bin_px, last_row) + 1
-    ):
-        for bin_x in range(
-            max(x - left, 0) // bin_px,
-            min((x + extent + right) // bin_px, last_column) + 1,
-        ):
-            is_entry = False
-            for tile_y in range(bin_y * BIN_TILES, (bin_y + 1) * BIN_TILES):
-                for tile_x in range(bin_x * BIN_TILES, (bin_x + 1) * BIN_TILES):
-                    across = _overlap(x - left, x + extent + right, tile_x)
-                    along = _overlap(y - up, y + extent + down, tile_y)
-                    gap_x = _gap(x, x + extent, tile_x)
-                    gap_y = _gap(y, y + extent, tile_y)
-                    is_near = gap_x * gap_x + gap_y * gap_y <= reach_px * reach_px
-                    if across <= 0 or along <= 0 or not is_near:
-                        continue
-                    is_entry = True
-                    if tile_x < columns and tile_y < rows:
-                        counts[1] += THREADS
-                        counts[2] += across * along
-            counts[0] += is_entry
-
-
-@njit(cache=True)
-def _overlap(first, last, tile):
-    """Pixels that a range shares with a tile, along one axis."""
-    start = tile * TILE_SIZE_PX
-    return min(last, start + TILE_SIZE_PX - 1) - max(first, start) + 1
-
-
-@njit(cache=True)
-def _gap(first, last, tile):
-    """Pixels from a range to a tile; 0 where they meet."""
-    start = tile * TILE_SIZE_PX
-    return max(start - last, first - start - TILE_SIZE_PX + 1, 0)
+    first_bin = np.maximum(first_px, 0) // bin_px
+    last_bin = np.minimum(last_px // bin_px, (np.array(tile_grid) - 1) // BIN_TILES)
+    counts = np.zeros(3, np.int64)
+    # One bin of every fragment at a time, by its place among the fragment's bins.
+    for step in np.ndindex(*np.max(last_bin - first_bin + 1, axis=0, initial=0)):
+        own = np.flatnonzero((first_bin + step <= last_bin).all(axis=1))
+        tile = (first_bin[own] + step)[..., None] * BIN_TILES + np.arange(BIN_TILES)
+        tile_px = tile * TILE_SIZE_PX
+        tile_end_px = tile_px + TILE_SIZE_PX - 1
+        shared_px = np.minimum(last_px[own][..., None], tile_end_px)
+        shared_px = shared_px - np.maximum(first_px[own][..., None], tile_px) + 1
+        before_px, after_px = (
+            tile_px - end[own][..., None],
+            start[own][..., None] - tile_end_px,
+        )
+        gap_px = np.maximum(np.maximum(before_px, after_px), 0)
+        # (fragments, tiles across, tiles along)
+        square = gap_px[:, 0, :, None] ** 2 + gap_px[:, 1, None, :] ** 2
+        is_lit = square <= reach_px[own, None, None] ** 2
+        is_lit &= (shared_px[:, 0, :, None] > 0) & (shared_px[:, 1, None, :] > 0)
+        counts[0] += is_lit.any(axis=(1, 2)).sum()
+        is_inside = tile < np.array(tile_grid)[:, None]
+        is_lit &= is_inside[:, 0, :, None] & is_inside[:, 1, None, :]
+        counts[1] += THREADS * is_lit.sum()
+        area = shared_px[:, 0, :, None] * shared_px[:, 1, None, :]
+        counts[2] += area[is_lit].sum()
+    return counts
