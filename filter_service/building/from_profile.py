@@ -22,6 +22,9 @@ from filter_service.psfs.store_cache import StoreCache, Stored, store_key
 
 Progress = Callable[[float, str], None]
 
+EYE_SHARE = 0.25
+"""Share of the eye in the duration of a build; the rest plans its nodes."""
+
 
 def grid_spec(job: BuildJob) -> GridSpec:
     """Return the grid specification of a job."""
@@ -76,16 +79,25 @@ def _built(
     if stored is not None:
         notes = (*stored.notes, Note("eye_from_cache", "eye from the disk cache"))
         return BuiltStore(PsfStore(**stored.parts), notes)
-    eye, notes = eye_for_spec(profile, spec, progress=progress, cancelled=cancelled)
-    check_cancelled()
-    progress(1.0, "plan")
+    eye, notes = eye_for_spec(
+        profile,
+        spec,
+        progress=lambda done, stage: progress(EYE_SHARE * done, stage),
+        cancelled=cancelled,
+    )
+
+    def report_plan(done: float) -> None:
+        check_cancelled()
+        progress(EYE_SHARE + (1.0 - EYE_SHARE) * done, "plan")
+
+    report_plan(0.0)
     # The total memory of the PSFs is known only if all ranges are prepared at once;
     # otherwise nodes are planned when frames first read them.
     plan: PlanAxes
     if job.settings.prepare == "ranges":
-        plan = plan_cache(eye, spec)
+        plan = plan_cache(eye, spec, progress=report_plan)
     else:
-        plan = plan_axes(eye, spec)
+        plan = plan_axes(eye, spec, progress=report_plan)
     check_cancelled()
     store = PsfStore(eye, spec, plan)
     cache.save_aside(key, Stored(store.parts, notes))

@@ -5,6 +5,7 @@ its objects, focus and channels.  Nodes cover only that range, and a stream plan
 nodes of a state when a frame first reads it.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, partial
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
+from estimator.field.trace_range import scaled_progress
 from filter_service.planning.axis_nodes import (
     axis_nodes,
     target_error,
@@ -79,6 +81,14 @@ __all__ = [
 STATE_SAMPLES = 96
 """Number of states for which errors are predicted."""
 
+AXES_SHARE = 0.4
+"""Share of the axes in the duration of a plan; the rest are the nodes of states."""
+
+OWN_SHARE = 0.9
+"""Progress of a finished plan; the rest are smaller plans if it is too large."""
+
+Progress = Callable[[float], None]
+
 
 class PlanTooLarge(ValueError):
     """A cache would need more memory than its budget.
@@ -98,8 +108,15 @@ class PlanTooLarge(ValueError):
         self.budget_mb = spec.memory_budget_mb
 
 
-def plan_cache(eye: EyeOptics, spec: GridSpec) -> CachePlan:
+def plan_cache(
+    eye: EyeOptics, spec: GridSpec, *, progress: Progress | None = None
+) -> CachePlan:
     """Plan the nodes of all axes for the frames of a spec, and predict their cost.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Callback with the completed fraction; may raise to cancel.
 
     Raises
     ------
@@ -110,10 +127,12 @@ def plan_cache(eye: EyeOptics, spec: GridSpec) -> CachePlan:
     PlanTooLarge
         If the kernels exceed ``spec.memory_budget_mb``; the message proposes a change.
     """
-    plan = unchecked_plan(eye, spec, predict=False)
+    own = scaled_progress(progress, 0.0, OWN_SHARE)
+    plan = unchecked_plan(eye, spec, predict=False, progress=own)
     prediction = _prediction(eye, spec, plan)
     if prediction.memory_mb > spec.memory_budget_mb:
-        raise PlanTooLarge(spec, prediction, _advice(eye, spec))
+        advice = _advice(eye, spec, scaled_progress(progress, OWN_SHARE, 1.0))
+        raise PlanTooLarge(spec, prediction, advice)
     return replace(plan, prediction=prediction)
 
 
@@ -123,6 +142,7 @@ def unchecked_plan(
     *,
     target_db: float | None = None,
     predict: bool = True,
+    progress: Progress | None = None,
 ) -> CachePlan:
     """Plan like `plan_cache`, without a limit on memory.
 
@@ -132,12 +152,16 @@ def unchecked_plan(
         Lowest PSNR after interpolation; by default that of the spec's tolerance.
     predict : bool
         Predict the cost of the plan.
+    progress : callable, optional
+        Callback with the completed fraction; may raise to cancel.
     """
-    axes = plan_axes(eye, spec, target_db=target_db)
+    of_axes = scaled_progress(progress, 0.0, AXES_SHARE)
+    axes = plan_axes(eye, spec, target_db=target_db, progress=of_axes)
+    of_nodes = scaled_progress(progress, AXES_SHARE, 1.0)
     plan = CachePlan(
         *(axes.h_deg, axes.v_deg, axes.pupils_mm, axes.accommodations_dpt),
         defocus_error=axes.defocus_error,
-        nodes=NodePlanner(eye, spec, axes).all_nodes(),
+        nodes=NodePlanner(eye, spec, axes).all_nodes(of_nodes),
     )
     if not predict:
         return plan
@@ -155,7 +179,11 @@ def _prediction(eye: EyeOptics, spec: GridSpec, plan: CachePlan) -> PlanPredicti
 
 
 def plan_axes(
-    eye: EyeOptics, spec: GridSpec, *, target_db: float | None = None
+    eye: EyeOptics,
+    spec: GridSpec,
+    *,
+    target_db: float | None = None,
+    progress: Progress | None = None,
 ) -> PlanAxes:
     """Plan the nodes of field, pupil and accommodation.
 
@@ -163,6 +191,8 @@ def plan_axes(
     ----------
     target_db : float, optional
         Lowest PSNR after interpolation; by default that of the spec's tolerance.
+    progress : callable, optional
+        Callback with the completed fraction; may raise to cancel.
 
     Raises
     ------
@@ -175,7 +205,8 @@ def plan_axes(
     if spec.settings.grid == "paper":
         axes = paper_axes(eye, spec)
     elif spec.follows_field:
-        axes = _field_axes(sample_states(eye, spec, STATE_SAMPLES), allowed_error)
+        sample = sample_states(eye, spec, STATE_SAMPLES)
+        axes = _field_axes(sample, allowed_error, progress)
     else:
         axes = _central_axes(eye, spec)
     check_plan_defocus(eye, spec, axes)
@@ -198,15 +229,21 @@ class NodePlanner:
         self.eye, self.spec, self.axes = eye, spec, axes
         self._cached_dpt: dict[tuple[float, float], NDArray[np.float64]] = {}
 
-    def all_nodes(self) -> PlanNodes:
-        """Return the nodes of all states, in C order [pupil, accommodation]."""
-        return PlanNodes.joined(
-            [
-                self.nodes(pupil, accommodation)
-                for pupil in range(len(self.axes.pupils_mm))
-                for accommodation in range(len(self.axes.accommodations_dpt))
-            ]
-        )
+    def all_nodes(self, progress: Progress | None = None) -> PlanNodes:
+        """Return the nodes of all states, in C order [pupil, accommodation].
+
+        Parameters
+        ----------
+        progress : callable, optional
+            Callback with the completed fraction; may raise to cancel.
+        """
+        counts = len(self.axes.pupils_mm), len(self.axes.accommodations_dpt)
+        found = []
+        for pupil, accommodation in np.ndindex(counts):
+            found.append(self.nodes(pupil, accommodation))
+            if progress is not None:
+                progress(len(found) / math.prod(counts))
+        return PlanNodes.joined(found)
 
     def nodes(self, pupil: int, accommodation: int) -> PlanNodes:
         """Return the nodes of one state.
@@ -327,7 +364,9 @@ def _central_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
     )
 
 
-def _field_axes(sample: StateSample, allowed_error: float) -> PlanAxes:
+def _field_axes(
+    sample: StateSample, allowed_error: float, progress: Progress | None
+) -> PlanAxes:
     """Return the nodes of all axes but defocus, and the error that is left to it.
 
     An axis with few nodes stays below its share; the other axes share the remainder.
@@ -351,6 +390,8 @@ def _field_axes(sample: StateSample, allowed_error: float) -> PlanAxes:
         )
         nodes[axis], error = axis_nodes(sample, axis, range_, allowed_error=share)
         spent.append(error)
+        if progress is not None:
+            progress(len(spent) / len(open_))
     left = equal_share(allowed_error, spent=spent, count=1)
     h_deg, v_deg, pupils_mm, accommodations_dpt = (nodes[axis] for axis in AXES[:-1])
     return PlanAxes(h_deg, v_deg, pupils_mm, accommodations_dpt, left)
@@ -390,10 +431,14 @@ def _nodes_by_blur(
     return np.unique(np.concatenate(pieces))
 
 
-def _advice(eye: EyeOptics, spec: GridSpec) -> str:
+def _advice(eye: EyeOptics, spec: GridSpec, progress: Progress | None) -> str:
     """Return a change of settings with which the plan fits, as text with its memory."""
-    for words, smaller in _smaller_specs(spec):
-        found = _prediction(eye, smaller, unchecked_plan(eye, smaller, predict=False))
+    steps = _smaller_specs(spec)
+    for number, (words, smaller) in enumerate(steps):
+        shares = number / len(steps), (number + 1) / len(steps)
+        own = scaled_progress(progress, *shares)
+        plan = unchecked_plan(eye, smaller, predict=False, progress=own)
+        found = _prediction(eye, smaller, plan)
         if found.memory_mb <= spec.memory_budget_mb:
             return f"{words} needs {_needs(found)}"
     return f"even {words} needs {_needs(found)}; use a smaller image"

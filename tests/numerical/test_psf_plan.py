@@ -415,9 +415,20 @@ def test_a_plan_beyond_its_budget_is_refused_with_one_that_fits():
 
 
 def test_where_nothing_fits_the_refusal_says_so():
-    spec = spec_for(memory_budget_mb=0.001)
+    spec, reported = spec_for(memory_budget_mb=0.001), []
     with pytest.raises(PlanTooLarge, match=r"even .* needs"):
-        plan_cache(measured_eye("myopia"), spec)
+        plan_cache(measured_eye("myopia"), spec, progress=reported.append)
+    assert reported == sorted(reported)
+    assert reported[-1] == pytest.approx(1.0)
+
+
+def test_a_plan_reports_each_axis_and_state():
+    spec, reported = spec_for(mode="on-axis", **SMALL), []
+    plan = unchecked_plan(measured_eye("myopia"), spec, progress=reported.append)
+    n_states = len(plan.pupils_mm) * len(plan.accommodations_dpt)
+    assert n_states > 3
+    assert len(set(reported)) >= n_states
+    assert reported == sorted(reported)
 
 
 DEGENERATE = {
