@@ -217,11 +217,9 @@ class ServiceLink:
 
     def pump_during(self, wait: Wait, what: str) -> None:
         """Pump once; raise at the time limit or if the service rejected hello."""
-        remaining_s, n_received = wait.remaining_s, self._connection.n_bytes_received
-        self.pump(min(max(remaining_s, 0.0), 0.5))
+        self.pump(min(max(wait.remaining_s, 0.0), 0.5))
         wait.update(self.n_advances, *self._progress)
-        has_received = self._connection.n_bytes_received > n_received
-        if remaining_s <= 0 and not has_received:
+        if wait.is_over():
             raise ServiceTimeout(
                 f"timed out waiting for {what}: {self._connection.endpoint} is "
                 f"{self._connection.describe()}. Is the service running there? Start "

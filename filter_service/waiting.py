@@ -50,6 +50,7 @@ class Wait:
         self._fraction: float | None = None
         self._stage = ""
         self._end_s = time.monotonic() + timeout_s
+        self._is_overdue = False
         self._timer: threading.Timer | None = None
         self._lock = threading.Lock()
         self._has_ended = False
@@ -78,6 +79,14 @@ class Wait:
     def remaining_s(self) -> float:
         """Return the time that remains for the next advance."""
         return self._end_s - time.monotonic()
+
+    def is_over(self) -> bool:
+        """Return whether the time limit has passed, at the last call as well.
+
+        If the program itself was suspended, it first reads what has arrived meanwhile.
+        """
+        was_overdue, self._is_overdue = self._is_overdue, self.remaining_s <= 0.0
+        return was_overdue and self._is_overdue
 
     def advance(self) -> None:
         """Restart the time limit: the work has advanced."""
