@@ -69,7 +69,7 @@ def machine_info() -> dict:
         "n_cores": len(os.sched_getaffinity(0)),
         "python": platform.python_version(),
         "system": f"{platform.system()} {platform.machine()}",
-        **{lib: version(lib) for lib in ("numpy", "scipy", "numba")},
+        **{lib: version(lib) for lib in ("numpy", "scipy")},
     }
 
 
