@@ -16,10 +16,10 @@ of whose rays meet anything keeps its own colour.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 STEP_PX = 0.25
@@ -69,86 +69,98 @@ def lens_picture(
     """
     slopes = pupil_points_mm(lens, ray_count) / np.asarray(lens.pitch_mrad)
     slopes[:, 1] *= -1.0  # rows grow downwards
-    held = [d[d >= 0.0] for d in distances_dpt]
-    nearest = max(float(d.max()) for d in held if d.size)
-    farthest = min(float(d.min()) for d in held if d.size)
-    out = np.empty(colors[0].shape)
-    _trace(
-        np.stack([np.asarray(c, np.float64) for c in colors]),
-        np.stack([np.asarray(d, np.float64) for d in distances_dpt]),
-        slopes,
-        lens.focus_dpt,
-        STEP_PX / (lens.pupil_diameter_mm / 2 / max(lens.pitch_mrad)),
-        nearest + 1e-9,
-        farthest - 1e-9,
-        out,
-    )
-    return out
+    distances = np.stack([np.asarray(d, np.float64) for d in distances_dpt])
+    distances[distances < 0.0] = np.nan
+    nearest, farthest = np.nanmax(distances) + 1e-9, np.nanmin(distances) - 1e-9
+    step_dpt = STEP_PX / (lens.pupil_diameter_mm / 2 / max(lens.pitch_mrad))
+    reach_dpt = max(abs(nearest - lens.focus_dpt), abs(farthest - lens.focus_dpt))
+    border = math.ceil(reach_dpt * np.abs(slopes).max()) + 1
+    shape = distances.shape[1:]
+    colors = _extended(np.stack([np.moveaxis(c, -1, 0) for c in colors]), border)
+    distances = _extended(distances, border)
+
+    def seen_at(values: NDArray, cell: tuple[int, int]) -> NDArray:
+        """Return what pixels see at so many columns and rows from themselves."""
+        column, row = (border + offset for offset in cell)
+        return values[..., row : row + shape[0], column : column + shape[1]]
+
+    light = np.zeros((3, *shape))
+    n_met = np.zeros(shape)
+    for slope in slopes:
+        is_open = np.ones(shape, bool)
+        before = None
+        for cell, near, far in _cells(*slope, lens.focus_dpt, nearest, farthest):
+            here = seen_at(distances, cell)
+            before = here if before is None else before
+            met = np.where(is_open, _met(here, before, near, far, step_dpt), -1)
+            for surface in range(len(distances)):
+                is_met = met == surface
+                light += is_met * seen_at(colors[surface], cell)
+            is_open &= met < 0
+            if not is_open.any():
+                break
+            before = here
+        n_met += ~is_open
+    own = seen_at(colors[0], (0, 0))
+    picture = np.where(n_met > 0, light / np.maximum(n_met, 1.0), own)
+    return np.moveaxis(picture, 0, -1)
 
 
-@njit(cache=True)
-def _met(distances, at, before, near, far, step_dpt):
-    """Surface that a ray meets in a pixel, between two distances, or -1.
+def _extended(values: NDArray, border: int) -> NDArray[np.float64]:
+    """Repeat the edges of images (..., height, width)."""
+    padding = [(0, 0)] * (values.ndim - 2) + [(border, border)] * 2
+    return np.pad(values.astype(np.float64), padding, mode="edge")
 
-    ``before`` is the pixel that it comes from, through their border at ``near``.
+
+def _cells(
+    slope_x: float, slope_y: float, focus: float, nearest: float, farthest: float
+) -> Iterator[tuple[tuple[int, int], float, float]]:
+    """Yield the pixels of a ray, and the distances at which it enters and leaves them.
+
+    Pixels are columns and rows from the one that the ray belongs to, and so are the
+    same for all pixels of an image.
     """
-    best, best_dpt = -1, NOTHING
-    for s in range(distances.shape[0]):
-        here = distances[s, at[0], at[1]]
-        if here < 0.0:
-            continue
-        if far <= here <= near and here > best_dpt:
-            best, best_dpt = s, here
-        if here <= near or near <= best_dpt:
-            continue
+    near = nearest
+    # Pixel coordinates grow from the centres of pixels.
+    column = math.floor((near - focus) * slope_x + 0.5)
+    row = math.floor((near - focus) * slope_y + 0.5)
+    while True:
+        # D falls, so the position moves against the slope.
+        leave_x, leave_y = (
+            focus + (at - math.copysign(0.5, slope)) / slope if slope else -math.inf
+            for at, slope in ((column, slope_x), (row, slope_y))
+        )
+        far = max(leave_x, leave_y)
+        yield (column, row), near, far
+        if far < farthest:
+            return
+        if leave_x >= leave_y:
+            column += -1 if slope_x > 0.0 else 1
+        else:
+            row += -1 if slope_y > 0.0 else 1
+        near = far
+
+
+def _met(
+    here: NDArray, before: NDArray, near: float, far: float, step_dpt: float
+) -> NDArray[np.int64]:
+    """Return the surface that rays meet in a pixel between two distances, or -1.
+
+    ``here`` and ``before`` are the distances (surfaces, height, width), NaN where a
+    layer holds nothing, in that pixel and in the one that the rays come from, through
+    their border at ``near``.
+    """
+    best = np.full(here.shape[1:], -1)
+    best_dpt = np.full(here.shape[1:], NOTHING)
+    for s, own in enumerate(here):
+        is_met = (far <= own) & (own <= near) & (own > best_dpt)
+        best[is_met] = s
+        best_dpt = np.where(is_met, own, best_dpt)
         # Behind this pixel already: through a slope, if it was before the last one.
-        for other in range(distances.shape[0]):
-            there = distances[other, before[0], before[1]]
-            if 0.0 <= there < near and here - there < step_dpt:
-                best, best_dpt = s, near
+        is_behind = (own > near) & (near > best_dpt)
+        if is_behind.any():
+            is_slope = (before < near) & (own - before < step_dpt)
+            is_behind &= is_slope.any(axis=0)
+            best[is_behind] = s
+            best_dpt[is_behind] = near
     return best
-
-
-@njit(parallel=True, cache=True)
-def _trace(colors, distances, slopes, focus, step_dpt, nearest, farthest, out):
-    height, width = distances.shape[1:]
-    for y in prange(height):
-        for x in range(width):
-            light = np.zeros(3)
-            n_met = 0
-            for r in range(slopes.shape[0]):
-                sx, sy = slopes[r, 0], slopes[r, 1]
-                near = nearest
-                # Pixel coordinates grow from the centres of pixels.
-                column = math.floor(x + (near - focus) * sx + 0.5)
-                row = math.floor(y + (near - focus) * sy + 0.5)
-                at = (min(max(row, 0), height - 1), min(max(column, 0), width - 1))
-                before = at
-                while True:
-                    # Distance at which the ray leaves this pixel: D falls, so the
-                    # position moves against the slope.
-                    leave_x = leave_y = -1e30
-                    if sx != 0.0:
-                        edge = column - 0.5 if sx > 0.0 else column + 0.5
-                        leave_x = focus + (edge - x) / sx
-                    if sy != 0.0:
-                        edge = row - 0.5 if sy > 0.0 else row + 0.5
-                        leave_y = focus + (edge - y) / sy
-                    far = max(leave_x, leave_y)
-                    s = _met(distances, at, before, near, far, step_dpt)
-                    if s >= 0:
-                        for c in range(3):
-                            light[c] += colors[s, at[0], at[1], c]
-                        n_met += 1
-                        break
-                    if far < farthest:
-                        break
-                    if leave_x >= leave_y:
-                        column += -1 if sx > 0.0 else 1
-                    else:
-                        row += -1 if sy > 0.0 else 1
-                    before = at
-                    at = (min(max(row, 0), height - 1), min(max(column, 0), width - 1))
-                    near = far
-            for c in range(3):
-                out[y, x, c] = light[c] / n_met if n_met else colors[0, y, x, c]
