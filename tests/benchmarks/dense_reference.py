@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from estimator.psf.compute import PsfBatch
 from filter_service.constants import DISCONTINUITY_PX
 from filter_service.rgbd_view import RgbdView
-from tests.benchmarks.depth_sums import RULES, add_sources, close_depths, normalised
+from tests.benchmarks.depth_sums import DepthSums
 from tests.benchmarks.view_sources import (
     EyeState,
     Window,
@@ -135,11 +135,7 @@ def _filtered(
     # A place is one PSF, however many pixels share it.
     places = np.stack([places.h_deg, places.v_deg, places.distance_dpt], axis=-1)
     places = places[order]
-    light = np.zeros((3, view.height_px, view.width_px))
-    coverage = np.zeros_like(light)
-    # Of the depth that is being added to each pixel: nearest distance, light, coverage.
-    depths = np.zeros((3, *light.shape))
-    step_dpt = depth_step_dpt(state)
+    sums = DepthSums(view.depth_m.shape, accumulation, depth_step_dpt(state))
     for part, found, place_of in _batches(places):
         psfs = state.exact_psfs(*found.T)
         if window is not None and psfs.radius_px.max() > WINDOW_REACH_PX:
@@ -147,23 +143,26 @@ def _filtered(
                 f"a PSF reaches {psfs.radius_px.max()} px; windows take in "
                 f"{WINDOW_REACH_PX} px about them"
             )
-        pixels = order[part]
-        add_sources(
-            *np.divmod(pixels, view.width_px),
-            sources.distance_dpt[pixels],
-            sources.color[pixels],
-            psfs.offset_count.reshape(-1, 3)[place_of],
-            psfs.radius_px.reshape(-1, 3)[place_of],
-            psfs.flat_kernels,
-            RULES.index(accumulation),
-            step_dpt,
-            depths,
-            light,
-            coverage,
-        )
-    close_depths(depths, light, coverage)
-    picture = normalised(light, coverage, linear_color(view))
+        for pixel, place in zip(order[part], place_of, strict=True):
+            sums.add(
+                *divmod(pixel, view.width_px),
+                sources.distance_dpt[pixel],
+                sources.color[pixel],
+                _of_three(psfs, place),
+            )
+    picture = sums.picture(linear_color(view))
     return picture if window is None else window.of(picture)
+
+
+def _of_three(psfs: PsfBatch, place: int) -> NDArray[np.float32]:
+    """Return the PSFs (3, 2R+1, 2R+1) of the channels at a place."""
+    three = [psfs[3 * place + channel] for channel in range(3)]
+    radius = max(psf.radius_px for psf in three)
+    kernels = np.zeros((3, 2 * radius + 1, 2 * radius + 1), np.float32)
+    for kernel, psf in zip(kernels, three, strict=True):
+        inner = slice(radius - psf.radius_px, radius + psf.radius_px + 1)
+        kernel[inner, inner] = psf.kernel
+    return kernels
 
 
 def depth_step_dpt(state: EyeState) -> float:

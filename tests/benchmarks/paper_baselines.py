@@ -11,19 +11,13 @@ layout reads.
 from dataclasses import replace
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from filter_service.planning.nodes import bracket_axis
 from filter_service.rgbd_view import RgbdView
 from tests.benchmarks.baseline_types import Filtered, Stopwatch
 from tests.benchmarks.dense_reference import depth_step_dpt
-from tests.benchmarks.depth_sums import (
-    BAND_ROWS,
-    add_to_depth,
-    close_depths,
-    normalised,
-)
+from tests.benchmarks.depth_sums import DepthSums
 from tests.benchmarks.paper_layout import (
     BYTES_PER_TEXEL,
     DYNAMIC,
@@ -250,30 +244,23 @@ def splat_sources(
     rule: str,
 ) -> tuple[NDArray, int]:
     """Splat sources near to far; image, and how many PSF values were made."""
-    order = sources.near_first()
-    light = np.zeros((3, view.height_px, view.width_px))
-    coverage = np.zeros_like(light)
-    radius_px = np.minimum(radius_px.astype(np.int64), texture.shape[2] // 2)
-    depths = np.zeros((3, *light.shape))
-    evaluations = np.zeros(-(-view.height_px // BAND_ROWS), np.int64)
-    _add_layers(
-        *np.divmod(order, view.width_px),
-        sources.distance_dpt[order],
-        sources.color[order],
-        layers[order],
-        weights[order].astype(np.float32),
-        radius_px[order],
-        texture,
-        RULES.index(rule),
-        depth_step_dpt(state),
-        depths,
-        light,
-        coverage,
-        evaluations,
-    )
-    close_depths(depths, light, coverage)
-    picture = normalised(light, coverage, linear_color(view))
-    return picture, int(evaluations.sum())
+    height, width, full = view.height_px, view.width_px, texture.shape[2] // 2
+    sums = DepthSums((height, width), rule, depth_step_dpt(state))
+    radius_px = np.minimum(radius_px.astype(np.int64), full)
+    weights = weights.astype(np.float32)
+    channels = np.arange(3)[:, None]
+    evaluations = 0
+    for n in sources.near_first():
+        row, column = divmod(n, width)
+        r = radius_px[n]
+        inner = slice(full - r, full + r + 1)
+        used = weights[n].any(axis=0)
+        psfs = texture[layers[n][:, used], channels, inner, inner]
+        kernel = np.einsum("ct,ctyx->cyx", weights[n][:, used], psfs)
+        sums.add(row, column, sources.distance_dpt[n], sources.color[n], kernel)
+        n_rows = min(height, row + r + 1) - max(0, row - r)
+        evaluations += n_rows * (min(width, column + r + 1) - max(0, column - r))
+    return sums.picture(linear_color(view)), int(evaluations)
 
 
 def _padded_stack(flat, starts, radius) -> NDArray[np.float32]:
@@ -290,57 +277,3 @@ def _padded_stack(flat, starts, radius) -> NDArray[np.float32]:
             ].reshape(side, side)
             start += side * side
     return stack
-
-
-@njit(parallel=True, cache=True)
-def _add_layers(
-    rows,
-    columns,
-    distance_dpt,
-    color,
-    layers,
-    shares,
-    radius_px,
-    texture,
-    rule,
-    step_dpt,
-    depths,
-    light,
-    coverage,
-    evaluations,
-):
-    height, width = light.shape[1:]
-    full = texture.shape[2] // 2
-    n_taps = layers.shape[2]
-    sums = (depths, light, coverage)
-    for band in prange(-(-height // BAND_ROWS)):
-        top = band * BAND_ROWS
-        bottom = min(height, top + BAND_ROWS)
-        line = np.empty(width, np.float32)
-        for n in range(rows.size):
-            y, x, r = rows[n], columns[n], radius_px[n]
-            left, right = max(0, x - r), min(width, x + r + 1)
-            for to_y in range(max(top, y - r), min(bottom, y + r + 1)):
-                evaluations[band] += right - left
-                for c in range(3):
-                    line[: right - left] = 0.0
-                    for tap in range(n_taps):
-                        share = shares[n, c, tap]
-                        if share == 0.0:
-                            continue
-                        psf = texture[layers[n, c, tap], c, to_y - y + full]
-                        for k in range(right - left):
-                            line[k] += share * psf[left + k - x + full]
-                    for k in range(right - left):
-                        weight = np.float64(line[k])
-                        if weight == 0.0:
-                            continue
-                        at = (c, to_y, left + k)
-                        if rule == 0:
-                            source = (color[n, c], distance_dpt[n])
-                            add_to_depth(at, weight, *source, step_dpt, sums)
-                            continue
-                        room = 1.0 - coverage[at]
-                        weight = weight * room if rule == 2 else min(weight, room)
-                        light[at] += weight * color[n, c]
-                        coverage[at] += weight
