@@ -41,7 +41,6 @@ from tests.benchmarks.field_methods import (
     EyeBench,
     Method,
     State,
-    warmed_up,
 )
 from tests.benchmarks.field_pictures import (
     pixels_of,
@@ -382,7 +381,6 @@ def run(renderer, arguments: argparse.Namespace, origin: str) -> list[FieldRow]:
     """Measure all parts; a row that two of them have counts once."""
     kept = KeptRows(KEPT, origin, resumes=arguments.resume)
     parts = _parts(arguments)
-    warmed_up(scene_view(SCENES[0], width_px=192, height_px=108))
     rows = {}
     for part in parts:
         methods = _methods(part, arguments.methods)

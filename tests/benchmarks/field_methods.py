@@ -286,23 +286,3 @@ METHODS = (
     *ON_AXIS_TEXTURES,
     *FIELD_TEXTURES,
 )
-
-
-def warmed_up(view: RgbdView) -> None:
-    """Run every baseline once on a corner of a view, so that all is compiled."""
-    left, right, up, down = view.tangents
-    share = (48 / view.width_px, 32 / view.height_px)
-    corner = replace(
-        view,
-        color=view.color[:32, :48].copy(),
-        depth_m=view.depth_m[:32, :48].copy(),
-        tangents=(
-            left,
-            left + (right - left) * share[0],
-            up,
-            up + (down - up) * share[1],
-        ),
-    )
-    bench = EyeBench(None, "emmetropia", [corner])
-    for method in (*CONVOLVED, *ON_AXIS_TEXTURES, FIELD_TEXTURES[0]):
-        method.run(bench, corner, State(3.0, 0.5), 1)

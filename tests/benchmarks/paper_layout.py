@@ -9,11 +9,9 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from tests.benchmarks.resized_psfs import (
-    ResizedPsfs,
     cut_psfs,
     full_radius_px,
     resized,
@@ -181,14 +179,48 @@ def paper_texture(state: EyeState, grid: PaperGrid) -> PaperTexture:
     psfs = resized(cut, first_px.ravel(), last_px.ravel())
     shape = tuple(axis.count for axis in axes)
     radius = full_radius_px(radii)
+    nodes, shares = _corners(axes, grid.shape)
+    first_px, starts = first_px.reshape(-1, 3), psfs.starts.reshape(-1, 3)
+    # (layers, channels): the interpolated radius
+    radius_px = np.einsum("lk,lkc->lc", shares, radii.reshape(-1, 3)[nodes])
     weights = np.zeros((math.prod(shape), 3, 2 * radius + 1, 2 * radius + 1), "f4")
-    layer_radius_px = np.empty(math.prod(shape))
-    bases = [axis.base for axis in axes]
-    fractions = [axis.fraction for axis in axes]
-    _fill_layers(
-        *bases, *fractions, radii, *_parts(psfs, radii.shape), weights, layer_radius_px
-    )
-    return PaperTexture(weights, layer_radius_px, *axes, psf_count=cut.sides.size)
+    for (layer, channel), own_px in np.ndenumerate(radius_px):
+        whole = int(own_px + 1e-9)
+        above = own_px - whole if own_px - whole > 1e-6 else 0.0
+        for node, share in zip(nodes[layer], shares[layer], strict=True):
+            for r, scale in (
+                (whole, share * (1.0 - above)),
+                (whole + 1, share * above),
+            ):
+                if scale == 0.0:
+                    continue
+                at = starts[node, channel] + squares_below(r)
+                at -= squares_below(first_px[node, channel])
+                kernel = psfs.flat_kernels[at : at + (2 * r + 1) ** 2]
+                inner = slice(radius - r, radius + r + 1)
+                weights[layer, channel, inner, inner] += scale * kernel.reshape(
+                    2 * r + 1, 2 * r + 1
+                )
+    return PaperTexture(weights, radius_px.max(axis=1), *axes, psf_count=cut.sides.size)
+
+
+def _corners(
+    axes: list[LayerAxis], shape: tuple[int, ...]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the nodes (layers, 8) around each layer, and their shares."""
+    nodes, shares = [], []
+    for corner in np.ndindex(2, 2, 2):
+        index = [
+            np.minimum(axis.base + step, count - 1)
+            for axis, step, count in zip(axes, corner, shape, strict=True)
+        ]
+        parts = [
+            axis.fraction if step else 1.0 - axis.fraction
+            for axis, step in zip(axes, corner, strict=True)
+        ]
+        nodes.append(np.ravel_multi_index(np.ix_(*index), shape).ravel())
+        shares.append(math.prod(np.ix_(*parts)).ravel())
+    return np.stack(nodes, axis=-1), np.stack(shares, axis=-1)
 
 
 _kept: dict[tuple, tuple[PaperTexture, EyeState, float]] = {}
@@ -216,10 +248,6 @@ def _kept_mb() -> float:
     return sum(texture.weights.nbytes for texture, *_ in _kept.values()) / 1e6
 
 
-def _parts(psfs: ResizedPsfs, shape: tuple) -> tuple[NDArray, NDArray, NDArray]:
-    return psfs.flat_kernels, psfs.starts.reshape(shape), psfs.first_px.reshape(shape)
-
-
 def _neighbour_radii(radii: NDArray) -> tuple[NDArray, NDArray]:
     """Whole radii that layers beside a node can need."""
     low, high = np.floor(radii + 1e-9), np.floor(radii + 1e-9) + 1
@@ -232,61 +260,3 @@ def _neighbour_radii(radii: NDArray) -> tuple[NDArray, NDArray]:
         low = np.min([low.take(r, axis) for r in around], axis=0)
         high = np.max([high.take(r, axis) for r in around], axis=0)
     return low.astype(np.int64), high.astype(np.int64)
-
-
-@njit(parallel=True, cache=True)
-def _fill_layers(
-    base_v,
-    base_h,
-    base_d,
-    part_v,
-    part_h,
-    part_d,
-    radii,
-    kernels,
-    starts,
-    first_px,
-    weights,
-    layer_radius_px,
-):
-    n_v, n_h, n_d = radii.shape[:3]
-    full = weights.shape[2] // 2
-    for block in prange(base_v.size * base_h.size):
-        iv, ih = block // base_h.size, block % base_h.size
-        for iz in range(base_d.size):
-            layer = block * base_d.size + iz
-            largest = 0.0
-            for c in range(3):
-                radius = 0.0
-                for corner in range(8):
-                    v = min(base_v[iv] + (corner >> 2), n_v - 1)
-                    h = min(base_h[ih] + (corner >> 1 & 1), n_h - 1)
-                    d = min(base_d[iz] + (corner & 1), n_d - 1)
-                    share = part_v[iv] if corner >> 2 else 1.0 - part_v[iv]
-                    share *= part_h[ih] if corner >> 1 & 1 else 1.0 - part_h[ih]
-                    share *= part_d[iz] if corner & 1 else 1.0 - part_d[iz]
-                    radius += share * radii[v, h, d, c]
-                largest = max(largest, radius)
-                whole = int(radius + 1e-9)
-                above = radius - whole if radius - whole > 1e-6 else 0.0
-                for corner in range(8):
-                    v = min(base_v[iv] + (corner >> 2), n_v - 1)
-                    h = min(base_h[ih] + (corner >> 1 & 1), n_h - 1)
-                    d = min(base_d[iz] + (corner & 1), n_d - 1)
-                    share = part_v[iv] if corner >> 2 else 1.0 - part_v[iv]
-                    share *= part_h[ih] if corner >> 1 & 1 else 1.0 - part_h[ih]
-                    share *= part_d[iz] if corner & 1 else 1.0 - part_d[iz]
-                    if share == 0.0:
-                        continue
-                    for step in range(2):
-                        scale = share * (above if step else 1.0 - above)
-                        if scale == 0.0:
-                            continue
-                        r = whole + step
-                        at = starts[v, h, d, c]
-                        at += squares_below(r) - squares_below(first_px[v, h, d, c])
-                        for y in range(full - r, full + r + 1):
-                            for x in range(full - r, full + r + 1):
-                                weights[layer, c, y, x] += scale * kernels[at]
-                                at += 1
-            layer_radius_px[layer] = largest

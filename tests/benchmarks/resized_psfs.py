@@ -10,7 +10,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from estimator.psf.compute import PsfBatch
@@ -115,44 +114,31 @@ def resized(cut: CutPsfs, first_px: NDArray, last_px: NDArray) -> ResizedPsfs:
     sizes = squares_below(last_px + 1) - squares_below(first_px)
     starts = np.cumsum(sizes) - sizes
     flat = np.empty(int(sizes.sum()), np.float32)
-    _resize(cut.sums, cut.starts, cut.sides, first_px, last_px, starts, flat)
+    for p, to in enumerate(starts):
+        start, corners = cut.starts[p], int(cut.sides[p]) + 1
+        sums = cut.sums[start : start + corners**2].reshape(corners, corners)
+        for radius in range(first_px[p], last_px[p] + 1):
+            width = 2 * radius + 1
+            kernel = flat[to : to + width**2].reshape(width, width)
+            kernel[:] = _light_in_cells(sums, width)
+            to += width**2
     return ResizedPsfs(flat, starts, first_px, last_px)
 
 
-@njit(cache=True)
 def squares_below(radius):
     """Weights of all kernels of radius 0 up to, but without, a radius."""
     return radius * (2 * radius - 1) * (2 * radius + 1) // 3
 
 
-@njit(cache=True)
-def _sum_at(sums, start, side, x, y):
-    """Light above and to the left of a point of the raster."""
-    column, row = min(int(x), side - 1), min(int(y), side - 1)
-    at = start + row * (side + 1) + column
-    right, down = x - column, y - row
-    above = sums[at] + right * (sums[at + 1] - sums[at])
-    at += side + 1
-    below = sums[at] + right * (sums[at + 1] - sums[at])
-    return above + down * (below - above)
-
-
-@njit(parallel=True, cache=True)
-def _resize(sums, sum_starts, sides, first_px, last_px, starts, flat):
-    for p in prange(starts.size):
-        to, side = starts[p], sides[p]
-        for radius in range(first_px[p], last_px[p] + 1):
-            width = 2 * radius + 1
-            scale = side / width
-            for row in range(width):
-                for column in range(width):
-                    x, y = column * scale, row * scale
-                    light = _sum_at(sums, sum_starts[p], side, x + scale, y + scale)
-                    light -= _sum_at(sums, sum_starts[p], side, x, y + scale)
-                    light -= _sum_at(sums, sum_starts[p], side, x + scale, y)
-                    light += _sum_at(sums, sum_starts[p], side, x, y)
-                    flat[to] = light
-                    to += 1
+def _light_in_cells(sums: NDArray, count: int) -> NDArray[np.float64]:
+    """Return the light in count² cells of a square; sums are bilinear in between."""
+    at = np.linspace(0.0, len(sums) - 1.0, count + 1)
+    lower = np.minimum(at.astype(np.int64), len(sums) - 2)
+    part = at - lower
+    rows = sums[lower] + part[:, None] * (sums[lower + 1] - sums[lower])
+    rows = np.diff(rows, axis=0)
+    inside = rows[:, lower] + part * (rows[:, lower + 1] - rows[:, lower])
+    return np.diff(inside, axis=1)
 
 
 def full_radius_px(radius_px: NDArray) -> int:
