@@ -161,6 +161,7 @@ def seen_refraction_dpt(
         indices,
         stop_diameters_mm=pupils_mm / magnifications(packed, indices),
         pupil_z_mm=pupil_z_mm,
+        only_whole=True,
     )
     polynomial_um = polynomial_in_mm(found.zernike_um, found.zernike_radius_mm)
     rim_mm = rim_from_ellipse(found.ellipse_mm)

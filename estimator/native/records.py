@@ -199,6 +199,7 @@ class WavefrontJob(c.Structure):
         ("n_terms", c.c_int64),
         ("at_pupil", c.c_int64),
         ("by_slopes", c.c_int64),
+        ("only_whole", c.c_int64),
     )
 
 

@@ -309,6 +309,7 @@ def eyes_aberrations(
     v_deg: ArrayLike = 0.0,
     pupil_z_mm: ArrayLike = math.nan,
     fit: str = "opd",
+    only_whole: bool = False,
     n_rings: int = N_RINGS,
     n_azimuths: int = N_AZIMUTHS,
     n_threads: int | None = None,
@@ -327,6 +328,9 @@ def eyes_aberrations(
         of the entrance pupil; nan for the cornea.
     fit : {"opd", "slope"}
         See `wavefront_grid`.
+    only_whole : bool
+        Leave the results of vignetted pupils nan, and their open ratio 0, which takes
+        less time.
     n_rings, n_azimuths : int
         Sampling of the stop, see `wavefront.nodes`.
     n_threads : int, optional
@@ -354,6 +358,7 @@ def eyes_aberrations(
         nodes=stop_nodes(n_rings, n_azimuths),
         at_pupil=True,
         by_slopes=fit == "slope",
+        only_whole=only_whole,
         n_threads=n_threads,
     )
     return FieldResults.from_rows(rows[:, 0])

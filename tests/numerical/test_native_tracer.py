@@ -182,6 +182,29 @@ def test_a_clear_radius_leaves_the_light_within_it(stop_mm):
     assert found[1] == pytest.approx((1.6 / stop_mm) ** 2, rel=0.03)
 
 
+def test_vignetted_pupils_are_left_if_only_whole_ones_are_wanted():
+    eye = navarro(reference())
+    lens = replace(eye.surfaces[2], clear_radius_mm=1.6)
+    clipped = replace(eye, surfaces=(*eye.surfaces[:2], lens, eye.surfaces[3]))
+    some, whole = (
+        compiled.stop_rows(
+            one_field(clipped),
+            stop_radii_mm=np.array([[1.5, 2.0, 1.2]]),
+            pupil_z_mm=np.nan,
+            nodes=stop_nodes(5, 14),
+            at_pupil=False,
+            by_slopes=False,
+            only_whole=only_whole,
+        )[0]
+        for only_whole in (False, True)
+    )
+    np.testing.assert_array_equal(some[[0, 2]], whole[[0, 2]])
+    assert np.isnan(whole[1, :28]).all()
+    assert whole[1, 28 + compiled.OPEN_SHARE] == 0.0
+    status = 28 + compiled.WORST_STATUS
+    assert whole[1, status] == some[1, status] == RayStatus.CLIPPED
+
+
 def test_unknown_forms_and_gradients_are_missed():
     """A packed eye of another version never calls beyond the tables."""
     packed, rays = pack_eye(irregular_eye()), np.array([[0.0, 0, -9, 0, 0, 1]])

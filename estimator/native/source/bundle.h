@@ -143,44 +143,55 @@ static void trace_spokes(const light *l, const pupil_nodes *nodes, int n_groups,
     }
 }
 
-/* Finds the largest radii of the stop without vignetting by bisection, in the lanes of
- * `active`, between those of the last ring that passes and of the next one. */
-static lanes open_radii(const light *l, const pupil_nodes *nodes, lanes radius, flags active,
-                        const spokes *s) {
-    lanes low = {0.0}, high = {0.0};
-    aims known = {{0.0}, {0.0}};
-    for (int lane = 0; lane < N_LANES; ++lane) {
-        if (!active[lane]) continue;
-        int done = (int)s->done[lane];
-        low[lane] = radius[lane] * ring_radius(nodes, done);
-        high[lane] = radius[lane] * ring_radius(nodes, done + 1);
-        known.a[lane] = s->known[done].a[lane];
-        known.b[lane] = s->known[done].b[lane];
+/* Finds the largest radii of the stop without vignetting (n_groups,) by bisection, in the lanes
+ * of `active`, between those of the last ring that passes and of the next one. */
+static void open_radii(const light *l, const pupil_nodes *nodes, int n_groups,
+                       const lanes *radius, const flags *active, const spokes *s, lanes *low) {
+    lanes high[N_GROUPS];
+    aims known[N_GROUPS];
+    for (int g = 0; g < n_groups; ++g) {
+        low[g] = high[g] = (lanes){0.0};
+        known[g] = (aims){{0.0}, {0.0}};
+        for (int lane = 0; lane < N_LANES; ++lane) {
+            if (!active[g][lane]) continue;
+            int done = (int)s[g].done[lane];
+            low[g][lane] = radius[g][lane] * ring_radius(nodes, done);
+            high[g][lane] = radius[g][lane] * ring_radius(nodes, done + 1);
+            known[g].a[lane] = s[g].known[done].a[lane];
+            known[g].b[lane] = s[g].known[done].b[lane];
+        }
     }
     for (int i = 0; i < EDGE_HALVINGS; ++i) {
-        lanes own = 0.5 * (low + high);
-        aims to = {own * known.a, own * known.b};
-        responses m = all_responses(l->response);
-        targets t = {own * s->cosine, own * s->sine, active};
-        rays r;
-        aim(l, 1, &t, AIM_TOLERANCE_MM, &to, &m, &r);
-        outward(&l->e, 0, l->e.n_before, 1, &r);
-        flags passes = r.status == TRACED;
-        low = chosen(passes, own, low);
-        high = chosen(passes, high, own);
-        known.a = chosen(passes, to.a / own, known.a);
-        known.b = chosen(passes, to.b / own, known.b);
+        responses m[N_GROUPS];
+        targets t[N_GROUPS];
+        aims to[N_GROUPS];
+        rays r[N_GROUPS];
+        lanes own[N_GROUPS];
+        for (int g = 0; g < n_groups; ++g) {
+            own[g] = 0.5 * (low[g] + high[g]);
+            to[g] = (aims){own[g] * known[g].a, own[g] * known[g].b};
+            m[g] = all_responses(l->response);
+            t[g] = (targets){own[g] * s[g].cosine, own[g] * s[g].sine, active[g]};
+        }
+        aim(l, n_groups, t, AIM_TOLERANCE_MM, to, m, r);
+        outward(&l->e, 0, l->e.n_before, n_groups, r);
+        for (int g = 0; g < n_groups; ++g) {
+            flags passes = r[g].status == TRACED;
+            low[g] = chosen(passes, own[g], low[g]);
+            high[g] = chosen(passes, high[g], own[g]);
+            known[g].a = chosen(passes, to[g].a / own[g], known[g].a);
+            known[g].b = chosen(passes, to[g].b / own[g], known[g].b);
+        }
     }
-    return low;
 }
 
 /* Samples the wavefront over the stop for some spokes (n_groups,); returns the worst status.
  *
  * On vignetted azimuths, the rings are compressed to the open part, whose fraction of the radius
- * is written to `edge`. */
+ * is written to `edge`; it is 0 with `only_whole`. */
 static int sample_spokes(const light *l, const pupil_nodes *nodes, double stop_radius_mm,
-                         int n_groups, double reuse, spokes *s, const sample_table *table,
-                         double *edge) {
+                         int n_groups, double reuse, int only_whole, spokes *s,
+                         const sample_table *table, double *edge) {
     lanes share[N_GROUPS], radius[N_GROUPS];
     flags active[N_GROUPS];
     int64_t worst = TRACED;
@@ -198,18 +209,18 @@ static int sample_spokes(const light *l, const pupil_nodes *nodes, double stop_r
         }
         if (!fails) break;
         if (reuse > 0.0) /* unlike the larger stop */
-            return sample_spokes(l, nodes, stop_radius_mm, n_groups, 0.0, s, table, edge);
+            return sample_spokes(l, nodes, stop_radius_mm, n_groups, 0.0, only_whole, s, table,
+                                 edge);
+        lanes open[N_GROUPS] = {{0.0}};
+        if (attempt == 0 && !only_whole)
+            open_radii(l, nodes, n_groups, radius, active, s, open);
         for (int g = 0; g < n_groups; ++g) {
-            if (!any_lane(active[g])) continue;
             for (int lane = 0; lane < N_LANES; ++lane)
                 if (active[g][lane] && s[g].status[lane] > worst) worst = s[g].status[lane];
-            lanes open = {0.0};
-            if (attempt == 0) {
-                open = open_radii(l, nodes, radius[g], active[g], s + g);
-                open = open / stop_radius_mm * (1.0 - EDGE_MARGIN);
-            }
-            share[g] = chosen(active[g], open, share[g]);
+            open[g] = open[g] / stop_radius_mm * (1.0 - EDGE_MARGIN);
+            share[g] = chosen(active[g], open[g], share[g]);
         }
+        if (only_whole) break;
     }
     for (int g = 0; g < n_groups; ++g) store_lanes(edge + s[g].first, share[g]);
     return (int)worst;
@@ -218,14 +229,15 @@ static int sample_spokes(const light *l, const pupil_nodes *nodes, double stop_r
 /* Samples the wavefront over the stop; returns the worst status of the rays.
  *
  * `s` are the spokes of the pupil, and `reuse` is that of `trace_spokes`.  The table starts with
- * zeros. */
+ * zeros.  With `only_whole`, a vignetted pupil is left where it is found to be one. */
 static int sample_pupil(const light *l, const pupil_nodes *nodes, double stop_radius_mm,
-                        double reuse, spokes *s, const sample_table *table, double *edge) {
+                        double reuse, int only_whole, spokes *s, const sample_table *table,
+                        double *edge) {
     int worst = TRACED, count = nodes->n_padded / N_LANES;
-    for (int first = 0; first < count; first += N_GROUPS) {
+    for (int first = 0; first < count && !(only_whole && worst); first += N_GROUPS) {
         int n_groups = count - first < N_GROUPS ? count - first : N_GROUPS;
-        int own = sample_spokes(l, nodes, stop_radius_mm, n_groups, reuse, s + first, table,
-                                edge);
+        int own = sample_spokes(l, nodes, stop_radius_mm, n_groups, reuse, only_whole, s + first,
+                                table, edge);
         if (own > worst) worst = own;
     }
     return worst;

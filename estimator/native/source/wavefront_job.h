@@ -29,6 +29,7 @@ typedef struct {
     int64_t count, n_rows, n_indices, n_radii, n_rings, n_azimuths, n_terms;
     int64_t at_pupil;              /* the plane is that of the entrance pupil if it is given */
     int64_t by_slopes;             /* fit the slopes instead of W */
+    int64_t only_whole;            /* leave vignetted pupils, which take 30 times as long */
 } wavefront_job;
 
 #endif

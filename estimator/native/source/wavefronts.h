@@ -158,13 +158,14 @@ static void analyze_field(void *argument, int item, int thread) {
         memset(work.samples.x, 0, sizeof(double) * 6 * (size_t)work.samples.count);
         if (known_mm < radius_mm) prepare_spokes(&run->nodes, l.response, work.known, work.spokes);
         double reuse = known_mm < radius_mm ? 0.0 : known_mm / radius_mm;
-        status = sample_pupil(&l, &run->nodes, radius_mm, reuse, work.spokes, &work.samples,
-                              work.edge);
+        int only_whole = job->only_whole != 0;
+        status = sample_pupil(&l, &run->nodes, radius_mm, reuse, only_whole, work.spokes,
+                              &work.samples, work.edge);
         if (reuse == 0.0) known_mm = status == TRACED ? radius_mm : 0.0;
         other[WORST_STATUS] = status;
         memcpy(other + RETINA_POINT, l.retina, sizeof l.retina);
         memcpy(other + PLANE_POINT, l.plane, sizeof l.plane);
-        analyze_pupil(run, &work, distance_mm, result);
+        if (status == TRACED || !only_whole) analyze_pupil(run, &work, distance_mm, result);
     }
 }
 
