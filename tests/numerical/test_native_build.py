@@ -210,6 +210,23 @@ def test_a_library_of_another_version_is_refused(monkeypatch):
         library.Loops(loops().path)
 
 
+def test_threads_start_again_after_the_last_handle():
+    """Also if its loops ran in the caller alone."""
+    code = (
+        "import os, time\n"
+        "from estimator.native import core\n"
+        "core().end_threads(core().new_threads(1))\n"
+        "before = len(os.listdir('/proc/self/task'))\n"
+        "core().new_threads(3)\n"
+        "time.sleep(0.05)\n"
+        "print(len(os.listdir('/proc/self/task')) - before)\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert ran.stdout == "2\n"
+
+
 def test_a_process_has_one_pool():
     """Frames, PSFs and a second engine share the threads of the largest handle."""
     code = (
