@@ -23,9 +23,10 @@ from typing import Any, Self
 from filter_service.progress import Progress, Task, is_progress_open
 
 SHOWN_AFTER_S = 2.0
-PROGRESS_VARIABLE = "OCUFILTER_PROGRESS"
+WATCH_S = 0.5
+"""Interval at which the watching thread looks for waits that take long."""
 
-_opening = threading.Lock()
+PROGRESS_VARIABLE = "OCUFILTER_PROGRESS"
 
 
 class Wait:
@@ -51,7 +52,8 @@ class Wait:
         self._stage = ""
         self._end_s = time.monotonic() + timeout_s
         self._is_overdue = False
-        self._timer: threading.Timer | None = None
+        self._began_s = time.monotonic()
+        self._is_watched = False
         self._lock = threading.Lock()
         self._has_ended = False
         self._bar: tuple[Progress, Task] | None = None
@@ -59,17 +61,15 @@ class Wait:
     def __enter__(self) -> Self:
         """Start the time after which the bar appears."""
         if self._is_shown and _has_terminal():
-            # A thread, because the caller may compute instead of calling `update`.
-            self._timer = threading.Timer(SHOWN_AFTER_S, self._open)
-            self._timer.daemon = True
-            self._timer.start()
+            self._is_watched = True
+            _watcher.watch(self)
         return self
 
     def __exit__(self, *exc_info: Any) -> None:
         """Remove the bar."""
-        if self._timer is None:
+        if not self._is_watched:
             return
-        self._timer.cancel()
+        _watcher.waits.discard(self)
         with self._lock:
             self._has_ended = True
             if self._bar is not None:
@@ -106,15 +106,20 @@ class Wait:
         if mark != self._mark:
             self._mark = mark
             self.advance()
-        if self._timer is None or (fraction, stage) == (self._fraction, self._stage):
+        if not self._is_watched or (fraction, stage) == (self._fraction, self._stage):
             return
         with self._lock:
             self._fraction, self._stage = fraction, stage
             self._show()
 
-    def _open(self) -> None:
+    @property
+    def is_long(self) -> bool:
+        """Return whether the wait has taken long enough for a bar."""
+        return time.monotonic() - self._began_s > SHOWN_AFTER_S
+
+    def open_bar(self) -> None:
         """Open the bar, unless the wait has ended or another bar is open."""
-        with _opening, self._lock:
+        with self._lock:
             if self._has_ended or is_progress_open():
                 return
             progress = Progress(is_removed=True).__enter__()
@@ -127,6 +132,36 @@ class Wait:
         task = self._bar[1]
         task.total = 0.0 if self._fraction is None else 1.0
         task.update(self._fraction or 0.0, self._stage)
+
+
+class _Watcher:
+    """Thread that opens the bars of long waits.
+
+    A thread, because who waits may compute for seconds; one for all, because a thread
+    for each frame took 0.2 ms.
+    """
+
+    def __init__(self) -> None:
+        self.waits: set[Wait] = set()
+        self._thread: threading.Thread | None = None
+
+    def watch(self, wait: Wait) -> None:
+        """Watch a wait; start the thread, which a forked process lacks."""
+        self.waits.add(wait)
+        if self._thread is None or not self._thread.is_alive():
+            self._thread = threading.Thread(target=self._run, daemon=True)
+            self._thread.start()
+
+    def _run(self) -> None:
+        never = threading.Event()
+        while not never.wait(WATCH_S):
+            for wait in list(self.waits):
+                if wait.is_long:
+                    wait.open_bar()
+                    self.waits.discard(wait)
+
+
+_watcher = _Watcher()
 
 
 def _has_terminal() -> bool:

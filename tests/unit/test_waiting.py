@@ -4,6 +4,7 @@ import io
 import os
 import sys
 import threading
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -381,7 +382,9 @@ def terminal(monkeypatch):
     terminal = Terminal()
     for module in (waiting_module, progress_module):
         monkeypatch.setattr(module, "sys", SimpleNamespace(stderr=terminal))
+    monkeypatch.setattr(waiting_module, "_watcher", waiting_module._Watcher())
     monkeypatch.setattr(waiting_module, "SHOWN_AFTER_S", 0.01)
+    monkeypatch.setattr(waiting_module, "WATCH_S", 0.01)
     monkeypatch.delenv(waiting_module.PROGRESS_VARIABLE, raising=False)
     monkeypatch.setenv("TERM", "xterm")
     return terminal
@@ -403,9 +406,9 @@ def test_a_long_wait_on_a_terminal_shows_a_bar_and_removes_it(terminal):
 def is_shown(**options):
     """Return whether a wait that takes long shows a bar."""
     with Wait("Digging", **options) as wait:
-        if wait._timer is not None:
-            wait._timer.join()
-    return wait._bar is not None
+        while wait in waiting_module._watcher.waits:
+            time.sleep(0.005)
+        return wait._bar is not None
 
 
 def test_only_a_wait_that_nobody_else_reports_shows_a_bar(terminal, monkeypatch):
@@ -414,7 +417,8 @@ def test_only_a_wait_that_nobody_else_reports_shows_a_bar(terminal, monkeypatch)
     with ProgressBars(quiet=True):
         assert not is_shown()
     with Wait("Outer") as outer:
-        outer._timer.join()
+        while outer._bar is None:
+            time.sleep(0.005)
         assert not is_shown()
     assert is_shown()
     with monkeypatch.context() as context:
@@ -433,7 +437,7 @@ def test_a_short_wait_writes_nothing(terminal, monkeypatch):
     monkeypatch.setattr(waiting_module, "SHOWN_AFTER_S", 60.0)
     with Wait("Digging") as wait:
         wait.update(1, 0.5, "psfs")
-    wait._timer.join()
+    assert not waiting_module._watcher.waits
     assert terminal.getvalue() == ""
 
 
@@ -457,5 +461,5 @@ def test_a_callback_of_the_caller_replaces_the_bar(terminal, clock, monkeypatch)
 
 def test_a_wait_without_a_terminal_starts_no_thread(terminal):
     terminal.isatty = lambda: False
-    with Wait("Digging") as wait:
-        assert wait._timer is None
+    with Wait("Digging"):
+        assert waiting_module._watcher._thread is None
