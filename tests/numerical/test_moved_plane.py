@@ -140,3 +140,14 @@ def test_a_field_without_the_axis_has_the_same_wavefronts(h_range_deg):
     part_dpt, part = seen(h_range_deg, (-3.0, 3.0) if h_range_deg[0] else (-3.0, 0.0))
     assert part_dpt == pytest.approx(whole_dpt, abs=1e-5)
     assert part.zernike_um == pytest.approx(whole.zernike_um, abs=2e-5)
+
+
+@pytest.mark.parametrize("power_dpt", [-20.0, 10.0, 250.0, 298.0])
+def test_a_sphere_ends_in_its_focus(power_dpt):
+    """Near the focus, 3.05 mm deep at 328 dpt, its rays fill a tenth of the circle."""
+    sphere_um = np.zeros(28)
+    sphere_um[[3, 5]] = -power_dpt / 2.0
+    (moved_um,) = moved_polynomial(sphere_um[None], depth_mm=3.05, radius_mm=1.0)
+    expected_dpt = power_dpt / (1.0 - 3.05e-3 * power_dpt)
+    np.testing.assert_allclose(-2.0 * moved_um[[3, 5]], expected_dpt, rtol=1e-9)
+    assert np.abs(np.delete(moved_um, [3, 5])).max() < 1e-6

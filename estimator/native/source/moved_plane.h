@@ -41,6 +41,13 @@ static void move_rays(const moved_run *run, const double *table, double reach,
     }
 }
 
+static double farthest_ray(const sample_table *s) {
+    double farthest2 = 0.0;
+    for (int k = 0; k < s->count; ++k)
+        farthest2 = fmax(farthest2, s->x[k] * s->x[k] + s->y[k] * s->y[k]);
+    return sqrt(farthest2);
+}
+
 /* Moves one wavefront and fits it; an item of a pool's loop. */
 static void move_wavefront(void *argument, int item, int thread) {
     const moved_run *run = argument;
@@ -58,8 +65,15 @@ static void move_wavefront(void *argument, int item, int thread) {
     }
     move_rays(run, run->tables_um + (ptrdiff_t)item * n * n, run->reach[item], &s);
     double zernike_um[MOST_TERMS], *moved_um = run->moved_um + (ptrdiff_t)item * n_terms;
-    fit_zernike(&run->terms, &s, 1.0, 0, &fit, zernike_um);
+    /* Near a focus, the rays fill a small part of the unit circle, where terms would be alike. */
+    double radius = farthest_ray(&s);
+    if (radius > 0.5 && radius < 2.0) radius = 1.0;
+    fit_zernike(&run->terms, &s, radius, 0, &fit, zernike_um);
     add_monomials(&run->terms, zernike_um, moved_um);
+    if (radius == 1.0) return;
+    double scale = 1.0;
+    for (int degree = 0, k = 0; k < n_terms; ++degree, scale /= radius)
+        for (int b = 0; b <= degree && k < n_terms; ++b, ++k) moved_um[k] *= scale;
 }
 
 /* Moves wavefronts and adds the monomials (count, n_terms) of fits to their rays; NaN if a fit is
