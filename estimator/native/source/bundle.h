@@ -11,7 +11,7 @@
 #include "aim.h"
 #include "pupil_fit.h"
 
-#define AIM_TOLERANCE_MM 1e-7 /* an error only moves the sample */
+#define AIM_TOLERANCE_MM 3e-8 /* an error only moves the sample */
 #define RIM_TOLERANCE_MM 1e-9 /* an error changes the radius of the circle */
 #define EDGE_MARGIN 1e-6      /* times the stop's radius: exceeds the aiming tolerance */
 
