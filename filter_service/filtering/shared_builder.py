@@ -101,6 +101,7 @@ class SharedBuilder:
                     current=current,
                 )
                 self._closing.push(closing.pop_all())
+            preload()  # while the worker estimates the first eye
         self._n_users += 1
         return self._builder
 
@@ -144,7 +145,11 @@ def preload() -> None:
 
     def load() -> None:
         try:
+            from estimator.field import traced_eye  # noqa: F401
+            from estimator.psf.tables import psf_tables
             from filter_service.rendering import edge_light, frame_kernels  # noqa: F401
+
+            psf_tables()
         except Exception:  # the first frame reports it to the client
             log.exception("could not preload")
 
