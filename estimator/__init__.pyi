@@ -27,13 +27,13 @@ from .field.eye_optics import EyeOptics as EyeOptics
 from .field.field_table import FieldTable as FieldTable
 from .field.field_table import field_table as field_table
 from .field.prepare import prepare_eye as prepare_eye
-from .optics.chromatic import chromatic_refraction_dpt as chromatic_refraction_dpt
 from .optics.prescription import Prescription as Prescription
 from .optics.prescription import power_vector as power_vector
 from .optics.prescription import power_vector_from_zernike as power_vector_from_zernike
 from .optics.prescription import (
     prescription_from_power_vector as prescription_from_power_vector,
 )
+from .optics.vergence import chromatic_refraction_dpt as chromatic_refraction_dpt
 from .optics.zernike import nm_from_index as nm_from_index
 from .optics.zernike import rescale_pupil as rescale_pupil
 from .optics.zernike import zernike_values as zernike_values

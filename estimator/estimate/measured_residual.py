@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from estimator.eye.assembly import eye_surfaces
 from estimator.eye.parameters import EyeParameters
 from estimator.eye.tracing import OPEN_RATIO
-from estimator.optics.chromatic import chromatic_refraction_dpt
 from estimator.optics.paraxial import entrance_pupil_mm
 from estimator.optics.surfaces import media_indices, pack_eye
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
+from estimator.optics.vergence import chromatic_refraction_dpt
 from estimator.optics.zernike import (
     EXPONENTS,
     N_TERMS,
@@ -67,7 +67,7 @@ class MeasuredResidual:
         `stretch_ratio`): polynomials diverge beyond the measured pupil.
     wavelengths_nm, color_dpt : (n,)
         Refraction that corrects the eye's longitudinal color, relative to the measured
-        wavelength, to that of measured eyes (`chromatic`).
+        wavelength, to that of measured eyes (`vergence`).
     """
 
     residue_um: NDArray[np.float64]

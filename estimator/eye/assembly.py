@@ -15,7 +15,7 @@ from estimator.eye.parameters import (
     RetinaShape,
     column,
 )
-from estimator.optics import packed as packing
+from estimator.optics import surfaces as packing
 from estimator.optics.surfaces import (
     EyeSurfaces,
     Retina,

@@ -3,17 +3,14 @@
 arrays            arrays in the form that compiled loops require
 units             unit conversions, reference wavelengths
 zernike           Zernike polynomials: indices, values, gradients, rescaling, mirroring
-media             refractive indices of the ocular media by wavelength
-dispersion/       refractive index of other media by formula, Abbe number or table
-gradients/        gradient-index media
-forms/            surface forms other than conics, biconics and offset terms
-packed            columns of the arrays that describe an eye to compiled code
-chromatic         chromatic difference of refraction of the mean eye
+media             refractive indices by wavelength: ocular media, formulas, tables
+gradients         gradient-index media
+forms             surface forms other than conics, biconics and offset terms
 prescription      spectacle prescriptions, power vectors, Zernike coefficients
 surfaces          surfaces of an eye, and their packing for compiled code
 raytrace          exact ray tracing, with a status per ray
 paraxial          power, cardinal points and entrance pupil
-vergence          object distances and vergences in the plane of the entrance pupil
+vergence          object distances and vergences, and refraction by wavelength
 pupil_screen      interface of a complex amplitude in the pupil, for wave optics
 pinhole           directions and local scale of a pinhole image
 

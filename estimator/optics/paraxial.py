@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.optics.gradients import index_values
-from estimator.optics.packed import (
+from estimator.optics.surfaces import (
     ADDED_CURVATURE,
     CURVATURE_X,
     CURVATURE_Y,
@@ -26,8 +26,6 @@ from estimator.optics.packed import (
     STOP_Z,
     VERTEX,
     WITH_OFFSET,
-)
-from estimator.optics.surfaces import (
     EyeSurfaces,
     check_eye,
     horner_order,

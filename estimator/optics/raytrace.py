@@ -7,14 +7,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from estimator.native import core, shared_threads
-from estimator.optics.packed import (
+from estimator.optics.surfaces import (
     CLEAR_SQUARED,
     GRADIENT,
     N_BEFORE_STOP,
     NEAR_GRADIENT,
     VERTEX,
-)
-from estimator.optics.surfaces import (
     EyeSurfaces,
     check_eye,
     media_indices,

@@ -3,6 +3,11 @@
 An eye consists of refracting surfaces, from the anterior cornea inward, a stop plane, a
 retina, and the media between them.  Its frame has its origin at the corneal apex, x to
 the person's right, y up and z into the eye.
+
+`pack_eye` returns the geometry for compiled code: one row per refracting surface, then
+one for the retina.  `media_indices` returns the *index row* of a wavelength: the
+refractive index in front of the first surface and behind each surface, followed by the
+parameters of each gradient-index medium.
 """
 
 import math
@@ -14,7 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.optics.dispersion import Dispersion
 from estimator.optics.forms import FORMS, Form
 from estimator.optics.gradients import (
     GRADIENTS,
@@ -22,31 +26,7 @@ from estimator.optics.gradients import (
     Gradient,
     index_values,
 )
-from estimator.optics.media import refractive_index
-from estimator.optics.packed import (
-    ADDED_CURVATURE,
-    BICONIC,
-    CLEAR_SQUARED,
-    CONIC,
-    CURVATURE_X,
-    CURVATURE_Y,
-    FIRST_FORM,
-    FORM,
-    FORM_NUMBERS,
-    GRADIENT,
-    HAS_OFFSET,
-    IS_TURNED,
-    N_BEFORE_STOP,
-    N_COLUMNS,
-    N_FORM_NUMBERS,
-    NEAR_GRADIENT,
-    OFFSET,
-    REVOLVED,
-    ROTATION,
-    STOP_Z,
-    VERTEX,
-    WITH_OFFSET,
-)
+from estimator.optics.media import Dispersion, refractive_index
 from estimator.optics.zernike import (
     DEFAULT_ORDER,
     EXPONENTS,
@@ -54,6 +34,33 @@ from estimator.optics.zernike import (
     monomial_matrix,
     nm_from_index,
 )
+
+# --- geometry: one row per refracting surface, the retina last ---------------------
+CURVATURE_X, CURVATURE_Y, CONIC = 0, 1, 2
+VERTEX = 3  # x, y, z of the vertex, mm
+ROTATION = 6  # 3 x 3, row-major: surface axes to eye axes
+FORM = 15  # REVOLVED, BICONIC, WITH_OFFSET, or a form of `forms`
+IS_TURNED = 16  # 1 where ROTATION is not the identity
+CLEAR_SQUARED = 17  # square of the clear radius, mm²
+NEAR_GRADIENT = 18  # 1 where the medium on either side has a gradient
+GRADIENT = 19  # column of the index row where the medium behind starts; 0: homogeneous
+OFFSET = 20  # 28 monomial coefficients, mm, in the order of `horner_order`
+STOP_Z = 48  # last row only: the stop plane, mm
+N_BEFORE_STOP = 49  # last row only: number of surfaces in front of the stop
+FORM_NUMBERS = 50  # parameters of a form of `forms`
+HAS_OFFSET = 62  # 1 where offset terms add to a form of `forms`
+ADDED_CURVATURE = 63  # mean curvature that a form of `forms` adds at the vertex, 1/mm
+N_COLUMNS = 64
+N_FORM_NUMBERS = HAS_OFFSET - FORM_NUMBERS
+
+REVOLVED, BICONIC, WITH_OFFSET = 0, 1, 2
+FIRST_FORM = 3  # of the table in `forms`
+
+# --- index row, from the column that GRADIENT names --------------------------------
+GRADIENT_FORM = 0  # position in `gradients.INDEX_FUNCTIONS`
+GRADIENT_STEPS = 1  # steps of the integration through the medium
+GRADIENT_NUMBERS = 2  # parameters of the gradient
+
 
 OFFSET_RADIUS_MM = 6.2
 """Radius of the circle of the corneal offset terms: half of the paper's 12.4 mm."""
@@ -278,7 +285,7 @@ def pack_eye(eye: EyeSurfaces) -> NDArray[np.float64]:
     Returns
     -------
     packed : (n_surfaces + 1, N_COLUMNS)
-        One row per refracting surface, then one for the retina; `packed` lists the
+        One row per refracting surface, then one for the retina; constants list the
         columns.  Refractive indices are separate (`media_indices`), because they change
         with wavelength.  Eyes with the same number of surfaces and the same gradients
         can be stacked to (n_eyes, n_surfaces + 1, N_COLUMNS).

@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from estimator.corrections.worn_lens import replaces_lens, rings_of, worn_polynomial
 from estimator.eye.focusing import FocusingEye
 from estimator.optics import prescription as rx
-from estimator.optics.chromatic import chromatic_refraction_dpt
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
 from estimator.optics.vergence import (
     TYPICAL_ENTRANCE_PUPIL_MM,
     ObjectVergence,
+    chromatic_refraction_dpt,
     refraction_at_cornea_dpt,
 )
 from estimator.optics.zernike import (

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import EyeParameters
 from estimator.eye.surface_model import SurfaceModel
-from estimator.optics.dispersion.values import AbbeNumber, Constant
+from estimator.optics.media import AbbeNumber, Constant
 from estimator.optics.surfaces import (
     EyeSurfaces,
     Retina,

@@ -7,7 +7,7 @@ import numpy as np
 from estimator.eye.checked_fields import ProfileError
 from estimator.note import Note
 from estimator.optics import prescription as rx
-from estimator.optics.chromatic import chromatic_refraction_dpt
+from estimator.optics.vergence import chromatic_refraction_dpt
 from estimator.optics.zernike import rescale_pupil, summed_terms
 from estimator.profiles.eye_profile import Measurement
 

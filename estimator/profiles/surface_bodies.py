@@ -1,7 +1,7 @@
 """Types of eyes that a profile gives by surfaces and media.
 
 The bodies of forms and media are made from the dataclasses of `estimator.optics.forms`,
-`dispersion` and `gradients`, whose fields they share.
+`media` and `gradients`, whose fields they share.
 """
 
 import dataclasses
@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
-from estimator.optics.dispersion import DISPERSIONS
 from estimator.optics.forms import FORMS
 from estimator.optics.gradients import GRADIENTS
+from estimator.optics.media import DISPERSIONS
 from estimator.optics.surfaces import MAX_SURFACES, OFFSET_RADIUS_MM
 from estimator.optics.zernike import N_TERMS
 from estimator.profiles.correction_bodies import Body

@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.native import core, shared_threads
 from estimator.native.records import WavefrontJob, pointer_to
-from estimator.optics.packed import N_COLUMNS
-from estimator.optics.surfaces import EyeSurfaces, check_eye, pack_eye
+from estimator.optics.surfaces import N_COLUMNS, EyeSurfaces, check_eye, pack_eye
 from estimator.optics.zernike import N_TERMS, monomial_matrix
 from estimator.threads import MAX_THREADS
 from estimator.wavefront.nodes import CircleNodes, Nodes

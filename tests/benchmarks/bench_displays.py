@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.optics.chromatic import chromatic_refraction_dpt
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.optics.vergence import chromatic_refraction_dpt
 from estimator.psf.compute import compute_psfs
 from filter_service.displays import (
     DISPLAYS,

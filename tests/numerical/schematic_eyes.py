@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from estimator.optics.dispersion import WavelengthPolynomial
 from estimator.optics.gradients import PolynomialGradient
+from estimator.optics.media import WavelengthPolynomial
 from estimator.optics.surfaces import EyeSurfaces, Retina, Surface, rotation_matrix
 from estimator.optics.zernike import (
     N_TERMS,

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from estimator.optics.dispersion import (
+from estimator.optics.media import (
     AbbeNumber,
     Cauchy,
     Conrady,

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimator.optics.dispersion import Constant
 from estimator.optics.forms import EvenAsphere, TwoConics
 from estimator.optics.gradients import (
     GoncharovDaintyGradient,
     PolynomialGradient,
     SquaredPolynomialGradient,
 )
+from estimator.optics.media import Constant
 from estimator.optics.paraxial import cardinal_points, entrance_pupil_mm
 from estimator.optics.raytrace import RayStatus, trace_rays
 from estimator.optics.surfaces import EyeSurfaces, Retina, Surface, media_indices

@@ -14,8 +14,10 @@ from estimator.estimate.measured_residual import (
     MeasuredResidual,
 )
 from estimator.field.traced_eye import TracedEye
-from estimator.optics.chromatic import chromatic_refraction_dpt
-from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
+from estimator.optics.vergence import (
+    TYPICAL_ENTRANCE_PUPIL_MM,
+    chromatic_refraction_dpt,
+)
 from estimator.optics.zernike import (
     nm_from_index,
     remove_central_tilt,

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from estimator import load_profile
-from estimator.optics.chromatic import chromatic_refraction_dpt
 from estimator.optics.prescription import (
     C2M2,
     C20,
@@ -19,7 +18,10 @@ from estimator.optics.prescription import (
     power_vector_from_zernike,
     prescription_from_power_vector,
 )
-from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
+from estimator.optics.vergence import (
+    TYPICAL_ENTRANCE_PUPIL_MM,
+    chromatic_refraction_dpt,
+)
 from estimator.optics.zernike import (
     nm_from_index,
     rescale_pupil,

@@ -11,8 +11,8 @@ from estimator.eye.parameters import random_vectors
 from estimator.eye.tracing import eye_indices
 from estimator.native import core
 from estimator.native.library import Core
-from estimator.optics import packed as columns
 from estimator.optics import raytrace
+from estimator.optics import surfaces as columns
 from estimator.optics.forms import (
     FORMS,
     EvenAsphere,

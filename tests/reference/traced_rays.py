@@ -12,9 +12,11 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from estimator.optics.forms import EvenAsphere, SeparateProfiles, Toroid, TwoConics
-from estimator.optics.gradients.goncharov_dainty import GoncharovDaintyGradient
-from estimator.optics.gradients.polynomial import PolynomialGradient
-from estimator.optics.gradients.squared_polynomial import SquaredPolynomialGradient
+from estimator.optics.gradients import (
+    GoncharovDaintyGradient,
+    PolynomialGradient,
+    SquaredPolynomialGradient,
+)
 from estimator.optics.media import refractive_index
 from estimator.optics.surfaces import Retina, Surface, rotation_matrix
 from estimator.optics.zernike import nm_from_index

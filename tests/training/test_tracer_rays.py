@@ -6,7 +6,8 @@ import pytest
 from estimator.eye import assembly
 from estimator.eye.parameters import random_vectors
 from estimator.eye.tracing import eye_indices
-from estimator.optics.packed import (
+from estimator.optics.raytrace import RayStatus, trace_packed
+from estimator.optics.surfaces import (
     BICONIC,
     FORM,
     IS_TURNED,
@@ -15,7 +16,6 @@ from estimator.optics.packed import (
     VERTEX,
     WITH_OFFSET,
 )
-from estimator.optics.raytrace import RayStatus, trace_packed
 
 torch = pytest.importorskip("torch")
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from estimator import ProfileError, parse_profile
-from estimator.optics.chromatic import chromatic_refraction_dpt
 from estimator.optics.units import SPHERE_PER_C20
+from estimator.optics.vergence import chromatic_refraction_dpt
 
 
 def measured(h_deg, zernike_um, pupil_diameter_mm=5.0, wavelength_nm=555.0):

@@ -1,4 +1,4 @@
-/* An eye as Python packs it: estimator/optics/packed.py describes the columns. */
+/* An eye as Python packs it: estimator/optics/surfaces.py describes the columns. */
 #ifndef OCU_PACKED_EYE_H
 #define OCU_PACKED_EYE_H
 
