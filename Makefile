@@ -19,10 +19,10 @@ BENCHES := $(filter-out gpu soak witness,$(patsubst tests/benchmarks/bench_%.py,
 .PHONY: demo docs web test test-gl test-clients test-tools test-timed test-training test-examples test-batch-ray test-headset test-layer test-layer-applications test-web test-workflows validate witness gl-witness gpu-kit check clean help setup setup-test setup-training setup-examples setup-batch-ray setup-page setup-docs setup-web setup-workflows setup-witness setup-peers peers release release-check setup-release setup-release-check
 
 demo: setup  ## filter two scenes through six eyes; writes out/demo/
-	$(PYTHON) -m filter_service demo $(ARGS)
+	$(PYTHON) -m ocufilter demo $(ARGS)
 
 web: setup-page  ## open a web page for your own prescription and photograph
-	$(PYTHON) -m filter_service web $(ARGS)
+	$(PYTHON) -m ocufilter web $(ARGS)
 
 docs: setup-docs  ## build the documentation in strict mode; writes out/docs/
 	NO_MKDOCS_2_WARNING=1 .docs/bin/python -m mkdocs build --quiet --strict $(ARGS)
@@ -75,13 +75,13 @@ validate: setup-test setup-web  ## run the slow tests and every benchmark; write
 	$(PYTHON) -m pytest -m "slow and not gpu" --ignore tests/training $(ARGS)
 	mkdir -p $(RESULTS) out
 	for bench in $(BENCHES); do \
-	    $(PYTHON) -m filter_service bench $$bench --json > out/$$bench.json && \
+	    $(PYTHON) -m ocufilter bench $$bench --json > out/$$bench.json && \
 	    $(PYTHON) -m json.tool --indent 1 out/$$bench.json $(RESULTS)/$$bench.json \
 	    || exit 1; \
 	done
 	for how in ipc shm curve tcp; do for eyes in mono stereo; do \
 	    case $$eyes in mono) many="--rate-hz 10";; stereo) many="--stereo --rate-hz 3";; esac; \
-	    $(PYTHON) -m filter_service bench roundtrip --transport $$how $$many \
+	    $(PYTHON) -m ocufilter bench roundtrip --transport $$how $$many \
 	        --json > out/roundtrip.json && $(PYTHON) -m json.tool --indent 1 \
 	        out/roundtrip.json $(RESULTS)/roundtrip_$${how}_$$eyes.json || exit 1; \
 	done; done

@@ -112,7 +112,9 @@ class AnyPythonWheel(bdist_wheel):
 setup(
     cmdclass={"bdist_wheel": AnyPythonWheel, "build_ext": BuildLibraries},
     packages=[
-        *find_packages(include=["clients*", "estimator*", "filter_service*"]),
+        *find_packages(
+            include=["clients*", "estimator*", "filter_service*", "ocufilter"]
+        ),
         # part of filter_service in a wheel, but a top-level folder in a checkout
         "filter_service.shaders",
         "filter_service.shaders.common",

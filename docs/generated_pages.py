@@ -1,8 +1,8 @@
 """MkDocs hook that generates reference pages from the code.
 
-``reference/api.md`` contains the docstrings and types of the public names of three
-packages.  ``reference/settings.md`` contains the fields of `FilterSettings` and
-`ServiceConfig`.  ``reference/command-line.md`` contains the help text of every command.
+``reference/api.md`` contains the docstrings and types of the names of `ocufilter`.
+``reference/settings.md`` contains the fields of `FilterSettings` and `ServiceConfig`.
+``reference/command-line.md`` contains the help text of every command.
 ``reference/benchmarks.md`` contains the benchmarks with their results and figures.
 """
 
@@ -29,9 +29,9 @@ from filter_service.validation import allowed_values
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {
-    "filter_service": "Filter frames in your own process.",
-    "clients": "Connect to a service.",
-    "estimator": "Estimate an eye from a profile and compute its wavefronts and PSFs.",
+    "filter_service": "Filter frames in your own process",
+    "clients": "Connect to a service",
+    "estimator": "Estimate an eye; compute its wavefronts and PSFs",
 }
 RESULTS = "tests/benchmarks/results"
 
@@ -60,19 +60,21 @@ def _api_page() -> str:
     lines = [
         "# Python API",
         "",
-        "The public API consists of the names below, from three packages. Everything "
-        "else may change without notice.",
+        "The public API consists of the names below, as in `from ocufilter import "
+        "Camera`. Everything else may change without notice. `ocufilter.errors` "
+        "contains the exceptions of the filter and the service. Importing `ocufilter` "
+        "is fast, because each name is loaded when it is first used.",
         "",
     ]
     for package, purpose in PACKAGES.items():
-        lines += [f"## `{package}`", "", purpose, ""]
+        lines += [f"## {purpose}", ""]
         module = importlib.import_module(package)
         for name in sorted(module.__all__, key=str.lower):
             found = getattr(module, name)
             is_code = inspect.isclass(found) or inspect.isroutine(found)
             if is_code and not inspect.getdoc(found):
                 raise PluginError(f"{package}.{name} has no docstring")
-            lines += [f"::: {package}.{name}", ""]
+            lines += [f"::: ocufilter.{name}", ""]
     return "\n".join(lines)
 
 
@@ -178,7 +180,7 @@ def _result_line(path: Path) -> str:
 
 def _help(*command: str) -> str:
     finished = subprocess.run(
-        [sys.executable, "-m", "filter_service", *command, "--help"],
+        [sys.executable, "-m", "ocufilter", *command, "--help"],
         cwd=ROOT,
         capture_output=True,
         text=True,

@@ -8,7 +8,7 @@ meters, pupils in millimeters and focus in diopters (1 / meters; 0 is infinity).
 
 from common import load_courtyard, save_pictures
 
-from filter_service import EyeFilter
+from ocufilter import EyeFilter
 
 color, depth_m, camera = load_courtyard()
 with EyeFilter("myopia", camera) as eye:

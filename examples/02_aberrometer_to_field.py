@@ -12,7 +12,7 @@ import numpy as np
 from common import DATA, OUT
 from matplotlib.figure import Figure
 
-from estimator import compute_psfs, estimate_eye, load_profile, prepare_eye
+from ocufilter import compute_psfs, estimate_eye, load_profile, prepare_eye
 
 PUPIL_MM, GREEN_NM = 4.0, 536.0  # the default green primary
 H_DEG = np.array([-30.0, -15.0, 0.0, 15.0, 30.0])  # to the person's right

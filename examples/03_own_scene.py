@@ -12,7 +12,7 @@ import numpy as np
 from common import font, save_pictures
 from PIL import Image, ImageDraw
 
-from filter_service import Camera, EyeFilter
+from ocufilter import Camera, EyeFilter
 
 WIDTH_PX, HEIGHT_PX = 480, 200
 CARDS = {  # text: (distance m, left edge px)

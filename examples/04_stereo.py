@@ -12,7 +12,7 @@ import numpy as np
 from common import font, save_pictures
 from PIL import Image, ImageDraw
 
-from filter_service import Camera, EyeFilter, RgbdView, ViewState, plan_views
+from ocufilter import Camera, EyeFilter, RgbdView, ViewState, plan_views
 
 WIDTH_PX, HEIGHT_PX = 360, 270
 EYES_APART_M = 0.063

@@ -10,7 +10,7 @@ import numpy as np
 from common import font, save_pictures
 from PIL import Image, ImageDraw
 
-from filter_service import Camera, EyeFilter, FilterSettings
+from ocufilter import Camera, EyeFilter, FilterSettings
 
 SIDE_PX = 150
 CARD_DPT = 2.0  # 50 cm

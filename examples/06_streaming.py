@@ -10,8 +10,7 @@ permanently.  Results arrive in order, and the client can do other work while it
 import numpy as np
 from common import load_courtyard, save_pictures
 
-from clients import FilterClient, FilteredFrame, ServiceProcess
-from filter_service import RgbdView
+from ocufilter import FilterClient, FilteredFrame, RgbdView, ServiceProcess
 
 FRAME_COUNT = 24
 SHOWN = (0, 6, 12, 18)

@@ -14,7 +14,7 @@ import numpy as np
 from common import OUT, font, save_pictures
 from PIL import Image, ImageDraw
 
-from filter_service import Camera, EyeFilter, FilterSettings
+from ocufilter import Camera, EyeFilter, FilterSettings
 
 SIDE_PX = 64
 FIELD_DEG = 1.1  # height of the image; the letter corresponds to 20/200

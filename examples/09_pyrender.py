@@ -14,11 +14,11 @@ import numpy as np
 import trimesh
 from common import save_pictures
 
-from clients import FilterClient, ServiceProcess
 from clients.frame_log import FrameLog
 from clients.pyrender_renderer import pyrender, pyrender_frames
 from clients.scenes.paths import Key, path_moments
 from clients.streaming import filter_in_order
+from ocufilter import FilterClient, ServiceProcess
 
 SIZE_PX = (360, 200)
 PERSON = {"kind": "preset", "name": "emmetropia", "age_years": 30}

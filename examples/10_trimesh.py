@@ -17,7 +17,7 @@ from common import save_pictures
 from clients.scene_renderer import SceneRenderer
 from clients.scenes.paths import look_at
 from clients.scenes.scene import Batch, Scene
-from filter_service import Camera, EyeFilter
+from ocufilter import Camera, EyeFilter
 
 SIZE_PX = (360, 270)
 TO_LAMP = np.array([0.5, 0.7, 0.5])

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from filter_service import Camera
+from ocufilter import Camera
 
 DATA = Path(__file__).parent / "data"
 OUT = Path("out/examples")

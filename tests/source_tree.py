@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("estimator", "filter_service", "training", "clients")
+PACKAGES = ("estimator", "filter_service", "training", "clients", "ocufilter")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import os
 
 import numpy as np
 
-from filter_service import Camera, EyeFilter
+from ocufilter import Camera, EyeFilter
 
 
 class SeenThrough:

@@ -31,7 +31,7 @@ class SeenImageStim(ImageStim):
     image : str, Path or (height, width, 3) uint8 sRGB
         Image to filter.
     profile : str, dict or Path
-        Profile, as for `filter_service.EyeFilter`.
+        Profile, as for `ocufilter.EyeFilter`.
     verticalFov : float
         Vertical field of view of the image, deg.
     distance : float, optional
@@ -61,8 +61,8 @@ class SeenImageStim(ImageStim):
         focus=0.0,
         **kwargs,
     ):
-        from filter_service import Camera, EyeFilter
         from filter_service.image_files import read_color, read_depth
+        from ocufilter import Camera, EyeFilter
 
         is_file = isinstance(image, str | Path)
         self._color = read_color(Path(image)) if is_file else np.asarray(image)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from filter_service import Camera, EyeFilter
+from ocufilter import Camera, EyeFilter
 
 try:
     import pyvirtualcam

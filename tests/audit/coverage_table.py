@@ -9,7 +9,7 @@ from coverage import Coverage
 
 from tests.source_tree import ROOT
 
-SOURCES = ("estimator", "filter_service", "clients")
+SOURCES = ("estimator", "filter_service", "clients", "ocufilter")
 
 
 def main(folder: Path) -> None:

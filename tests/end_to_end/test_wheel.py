@@ -25,7 +25,7 @@ pytestmark = pytest.mark.tools
 
 TIMEOUT_S = 300
 WIDTH_PX, HEIGHT_PX = 24, 16
-PACKAGES = ("clients", "estimator", "filter_service")
+PACKAGES = ("clients", "estimator", "filter_service", "ocufilter")
 BRIEF_PAGES = ("docs/how-to/deploy.md", "docs/how-to/eye-models.md")
 
 HELD = (
@@ -192,15 +192,25 @@ def test_the_wheel_holds_everything_of_its_packages_and_nothing_else(wheel_names
 
 def test_what_is_imported_is_the_wheel_s(installed):
     script = (
-        "import clients, estimator, filter_service as f, numpy\n"
+        "import clients, estimator, filter_service as f, ocufilter, numpy\n"
         "from filter_service.gl.shader_source import SHADER_ROOT\n"
-        "print(*(m.__file__ for m in (clients, estimator, f)), SHADER_ROOT, sep='\\n')"
+        "ours = clients, estimator, f, ocufilter\n"
+        "print(*(m.__file__ for m in ours), SHADER_ROOT, sep='\\n')"
     )
     finished = start(installed, installed.python, "-c", script)
     assert finished.returncode == 0, finished.stderr
     files = [Path(line) for line in finished.stdout.splitlines()]
-    assert len(files) == 4
+    assert len(files) == 5
     assert all(path.is_relative_to(installed.site) for path in files)
+
+
+def test_public_names_and_the_command_line_need_no_checkout(installed):
+    script = "import ocufilter; print(ocufilter.EyeFilter.__name__)"
+    shown = start(installed, installed.python, "-c", script)
+    assert shown.stdout == "EyeFilter\n", shown.stderr
+    module = start(installed, installed.python, "-m", "ocufilter", "--version")
+    command = start(installed, installed.ocufilter, "--version")
+    assert module.stdout == command.stdout != "", module.stderr
 
 
 def test_doctor_finds_a_machine_that_can_serve(run_json):

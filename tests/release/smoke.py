@@ -38,8 +38,7 @@ print(after.std() / before.std())
 REQUEST = """
 import sys
 import numpy as np
-from clients import FilterClient, ServiceProcess
-from filter_service import Camera
+from ocufilter import Camera, FilterClient, ServiceProcess
 
 color = np.full((36, 64, 3), 128, np.uint8)
 color[:, 32:] = 255
@@ -58,7 +57,7 @@ assert code == 0, code
 
 LATENCY = """
 import json, subprocess, sys
-from clients import ServiceProcess
+from ocufilter import ServiceProcess
 
 options = ["--mode", "on-axis", "--eye-model", "wavefront", "--size", "64x36"]
 options += ["--frames", "5", "--plot", "latency.png", "--json"]

@@ -6,7 +6,7 @@ import pytest
 
 from tests.source_tree import ROOT
 
-FOLDERS = ("clients", "estimator", "filter_service")
+FOLDERS = ("clients", "estimator", "filter_service", "ocufilter")
 WALL_CLOCK = {
     ("time", "time"),
     ("time", "time_ns"),

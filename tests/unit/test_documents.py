@@ -48,7 +48,7 @@ def test_links_lead_to_files(document):
 )
 def test_files_that_are_named_exist(document):
     named = re.findall(
-        r"`((?:clients|docs|estimator|examples|filter_service|shaders|tests|training)"
+        r"`((?:clients|docs|estimator|examples|filter_service|ocufilter|shaders|tests|training)"
         r"/[\w/.]+)`",
         text_of(document),
     )
