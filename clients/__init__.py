@@ -17,8 +17,7 @@ The package imports its modules only when their names are used.
     latency/         latency of frames through a running service
     arguments        parsers of profiles, settings and sizes on command lines
     pyrender_stream  streaming of a scene through a running service
-    pyrender_renderer  frames of pyrender scenes
-    pyrender_scenes  files that trimesh loads, and the built-in scenes, for pyrender
+    pyrender_renderer  frames of pyrender scenes, and of files that trimesh loads
     demo             `ocufilter demo`: two scenes through six eyes
     scenes/          two scenes, a letter chart, and their rendering
     report/          `ocufilter report`

@@ -39,9 +39,15 @@ from clients.natural_eye import (
     luminance_cd_m2,
 )
 from clients.option_values import a_number
-from clients.scene_renderer import SceneFrame, back_and_forth, scene_frames
+from clients.scene_renderer import (
+    PATHS,
+    Moment,
+    SceneFrame,
+    back_and_forth,
+    path_moments,
+    scene_frames,
+)
 from clients.scenes.catalog import SCENE_BUILDERS, build_scene
-from clients.scenes.paths import PATHS, Moment, path_moments
 from clients.streaming import submit
 from filter_service.errors import FilterError, ServiceTimeout
 from filter_service.messages import (
@@ -365,20 +371,22 @@ def _source(
             "--hidden requires the renderer own; pyrender renders one layer"
         )
     try:
-        from clients import pyrender_renderer, pyrender_scenes
+        from clients import pyrender_renderer
     except ModuleNotFoundError as error:
         raise CannotRun(what_to_install(error, PYRENDER_INSTALL)) from None
     flags, infinite_from_m = 0, np.inf
     if options.file is None:
         built = build_scene(options.scene or USUAL_SCENE)
-        scene, camera = pyrender_scenes.built_in(built)
+        scene, camera = pyrender_renderer.built_in(built)
         moments = path_moments(PATHS[built.name], options.frames)
-        flags, infinite_from_m = pyrender_scenes.BUILT_IN_FLAGS, built.infinite_from_m
+        flags, infinite_from_m = pyrender_renderer.BUILT_IN_FLAGS, built.infinite_from_m
         settings = path_settings(built.name)
     else:
-        loaded = pyrender_scenes.load_file(options.file, m_per_unit=options.m_per_unit)
+        loaded = pyrender_renderer.load_file(
+            options.file, m_per_unit=options.m_per_unit
+        )
         scene = loaded.scene
-        camera, moments = pyrender_scenes.orbit(
+        camera, moments = pyrender_renderer.orbit(
             loaded.bounds_m, options.frames, options.size
         )
         settings = moment_settings(moments)

@@ -16,7 +16,7 @@ from common import save_pictures
 
 from clients.frame_log import FrameLog
 from clients.pyrender_renderer import pyrender, pyrender_frames
-from clients.scenes.paths import Key, path_moments
+from clients.scene_renderer import Key, path_moments
 from clients.streaming import filter_in_order
 from ocufilter import FilterClient, ServiceProcess
 

@@ -14,9 +14,8 @@ import numpy as np
 import trimesh
 from common import save_pictures
 
-from clients.scene_renderer import SceneRenderer
-from clients.scenes.paths import look_at
-from clients.scenes.scene import Batch, Scene
+from clients.scene_renderer import SceneRenderer, look_at
+from clients.scenes.geometry import Batch, Scene
 from ocufilter import Camera, EyeFilter
 
 SIZE_PX = (360, 270)

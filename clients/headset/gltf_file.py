@@ -1,321 +1,298 @@
-"""Reader of glTF files: triangles and the appearance of each part.
+"""Header, buffers and arrays of a glTF file, within limits.
 
-The reader counts the contents of a file before it copies any, because a file may place
-one mesh a thousand times, or contain an image of a gigabyte.
+A file may reference other files. These must be in its folder or below, even after
+symbolic links are resolved, and count toward the same limit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import base64
+import binascii
+import struct
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clients.headset.gltf_arrays import accessor_array, accessor_count
-from clients.headset.gltf_container import Container
-from clients.headset.gltf_nodes import placed_meshes
-from clients.scenes.geometry import Array
-from filter_service.pictures import check_picture, read_texture
+from estimator.bounded_files import InvalidFile, loads_bounded, read_bytes
 
-MAX_TRIANGLES = 2_000_000
-MAX_VERTICES = 6_000_000
-"""Placed vertices, three for each triangle without normals. Each takes 32 bytes; two
-million triangles take 3 to 5 s."""
+MAX_FILE_MB = 256.0
+"""Total size of a file and the files that it references, which are all in memory during
+reading."""
 
-MAX_DRAWS = 15_000
-"""Parts placed by nodes; each takes 0.25 ms."""
+MAX_HEADER_BYTES = 64_000_000
+"""Size of the JSON, which may contain the buffers as text; parsing takes four times as
+much memory."""
 
-MAX_TEXTURE_PIXELS = 1 << 26
-"""Total pixels of all textures; each takes three bytes."""
+MAX_HEADER_ITEMS = 1_000_000
+"""Number of values in the JSON, which take a second to parse: enough for 50,000 nodes,
+meshes and accessors."""
 
-LEAST_VOLUME_RATIO = 1e-30
-"""A node that scales volumes by less is treated as not invertible."""
+MAX_HEADER_DEPTH = 64
+"""Nesting depth of the JSON, whose extras may contain anything."""
 
-LEAST_WEIGHT_RATIO = 0.5
-"""Parts that are blended with less opacity are left out."""
-
-_TRIANGLES, _STRIP = 4, 5
-_KNOWN_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")
-"""Prefixes of required extensions that this reader ignores."""
-
-_PICTURES = ("", "image/png", "image/jpeg", "image/webp")
+MAGIC = b"glTF"
+_JSON_CHUNK, _BINARY_CHUNK = b"JSON", b"BIN\0"
+_HEADER = struct.Struct("<4sII")
+_CHUNK = struct.Struct("<I4s")
 
 
-@dataclass(frozen=True)
-class Part:
-    """A primitive of a mesh, placed by a node of the file.
+class Container:
+    """A glTF file in memory.
 
     Attributes
     ----------
-    world_from_part : (4, 4) array
-        Transformation to the world frame.
-    vertices_m : (n, 3) array
-        Positions as stored.
-    faces : (m, 3) array
-        Vertex indices of the triangles.
-    normals : (n, 3) array or None
-        Normals as stored, if the file has any.
-    uv : (n, 2) array or None
-        Texture coordinates, v up.
-    reflectance_ratio : (n, 3) array
-        Linear color factor, without the texture.
-    texture : (h, w, 3) uint8 or None
-        sRGB; parts may share a texture.
-    is_unlit : bool
-        Whether the color is independent of the light.
+    path : Path
+        Path of the file.
+    header : dict
+        JSON of the file, of which nothing is checked but that it is an object.
     """
 
-    world_from_part: Array
-    vertices_m: NDArray[np.float32]
-    faces: NDArray[np.int64]
-    normals: NDArray[np.float32] | None
-    uv: NDArray[np.float32] | None
-    reflectance_ratio: Array
-    texture: NDArray[np.uint8] | None
-    is_unlit: bool
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._left = int(MAX_FILE_MB * 1e6)
+        content = self._read(path)
+        text, self._binary = _split(path, content)
+        self.header = _parsed(path, text)
+        self._buffers: dict[object, memoryview] = {}
+        self._lists: dict[str, list[dict[str, Any]]] = {}
+
+    def list_of(self, name: str) -> list[dict[str, Any]]:
+        """Return a list of objects of the header; empty if absent."""
+        if name not in self._lists:
+            found = self.header.get(name, [])
+            if not isinstance(found, list):
+                self.refuse(f"damaged: '{name}' is not a list", "a list of objects")
+            if not all(isinstance(entry, dict) for entry in found):
+                self.refuse(
+                    f"damaged: '{name}' has entries that are not objects", "objects"
+                )
+            self._lists[name] = found
+        return self._lists[name]
+
+    def entry(self, name: str, index: object) -> dict[str, Any]:
+        """Return an entry of a list of the header."""
+        entries = self.list_of(name)
+        if type(index) is not int or not 0 <= index < len(entries):
+            self.refuse(f"'{name}' {index!r:.20}", f"0 to {len(entries) - 1}")
+        return entries[index]
+
+    def view(self, index: object) -> memoryview:
+        """Return the bytes of a buffer view."""
+        view = self.entry("bufferViews", index)
+        where = f"bufferViews[{index}]"
+        start = self.whole(view, "byteOffset", where, default=0)
+        length = self.whole(view, "byteLength", where)
+        buffer = self._buffer(view.get("buffer"))
+        if start + length > len(buffer):
+            found = f"damaged: {where} ends at byte {start + length:,}"
+            self.refuse(found, f"the {len(buffer):,} bytes of its buffer")
+        return buffer[start : start + length]
+
+    def whole(
+        self, entry: dict[str, Any], field: str, where: str, *, default: int = -1
+    ) -> int:
+        """Return a field that must be an integer of at least 0."""
+        value = entry.get(field, default)
+        if type(value) is not int or not 0 <= value < 1 << 40:
+            self.refuse(f"damaged: {where}.{field} is {value!r:.30}", "0 or more")
+        return value
+
+    def uri_bytes(self, uri: object) -> bytes:
+        """Return the content of a data URI, or of the referenced file."""
+        if not isinstance(uri, str):
+            self.refuse(f"damaged: a URI is {uri!r:.30}", "text")
+        if uri.startswith("data:"):
+            head, comma, data = uri.partition(",")
+            if not comma or not head.endswith(";base64"):
+                self.refuse(f"the URI '{uri:.30}'", "data:...;base64,...")
+            try:
+                return base64.b64decode(data)
+            except (binascii.Error, ValueError):
+                self.refuse("damaged: a URI is not base64", "base64")
+        return self._read(self._beside(uri))
+
+    def refuse(self, found: str, allowed: str = "") -> NoReturn:
+        """Raise `InvalidFile` for this file."""
+        raise InvalidFile(self.path, found, allowed) from None
+
+    def _buffer(self, index: object) -> memoryview:
+        buffer = self.entry("buffers", index)
+        if index not in self._buffers:
+            is_inside = "uri" not in buffer
+            content = self._binary if is_inside else self.uri_bytes(buffer["uri"])
+            self._buffers[index] = memoryview(content)
+        return self._buffers[index]
+
+    def _beside(self, uri: str) -> Path:
+        allowed = "a file in its folder or below"
+        name = unquote(uri)
+        if not name or name.startswith("/") or ":" in name or "\\" in name:
+            self.refuse(f"the URI '{uri:.60}'", allowed)
+        folder = self.path.absolute().parent
+        try:
+            found = (folder / name).resolve()
+            is_below = found.is_relative_to(folder.resolve())
+        except (OSError, ValueError, RuntimeError):  # a null byte, a symlink loop
+            is_below = False
+        if not is_below:
+            self.refuse(f"the URI '{uri:.60}' leads out of its folder", allowed)
+        return found
+
+    def _read(self, path: Path) -> bytes:
+        try:
+            content = read_bytes(path, max_bytes=self._left)
+        except InvalidFile as error:
+            if path == self.path:
+                if not error.allowed.startswith("at most"):
+                    raise
+                self.refuse(error.found, f"at most {MAX_FILE_MB:g} MB")
+            self.refuse(f"it references '{path.name}': {error.found}")
+        self._left -= len(content)
+        return content
 
 
-def read_parts(path: Path) -> Iterator[Part]:
-    """Yield the triangles of a .glb or .gltf file, part by part.
+def _split(path: Path, content: bytes) -> tuple[bytes, memoryview]:
+    """Return the JSON and the binary chunk of a file."""
+    whole = memoryview(content)
+    if not content.startswith(MAGIC):
+        return content, whole[:0]
+    chunks: dict[bytes, memoryview] = {}
+    at = _HEADER.size
+    while at + _CHUNK.size <= len(content) and len(chunks) < 2:
+        length, name = _CHUNK.unpack_from(content, at)
+        at += _CHUNK.size
+        if at + length > len(content):
+            part = "not a glTF file" if not chunks else "damaged"
+            found = f"{part}: a chunk ends at byte {at + length:,}"
+            raise InvalidFile(path, found, f"{len(content):,} bytes")
+        if not chunks and name != _JSON_CHUNK:
+            break
+        chunks.setdefault(name, whole[at : at + length])
+        at += length
+    if _JSON_CHUNK not in chunks:
+        raise InvalidFile(path, "not a glTF file: it has no header", "glTF 2")
+    return bytes(chunks[_JSON_CHUNK]), chunks.get(_BINARY_CHUNK, whole[:0])
 
-    Raises
-    ------
-    InvalidFile
-        If the file does not exist, is not glTF 2, requires unknown extensions, is
-        damaged, has no triangles, or is too large.
 
-    Notes
-    -----
-    Transparency is not supported: parts that are blended with an opacity below
-    `LEAST_WEIGHT_RATIO` are left out, and all others are opaque. Skins, morph targets
-    and animations are ignored.
+def _parsed(path: Path, text: bytes) -> dict[str, Any]:
+    try:
+        header = loads_bounded(
+            text,
+            max_bytes=MAX_HEADER_BYTES,
+            max_depth=MAX_HEADER_DEPTH,
+            max_items=MAX_HEADER_ITEMS,
+            finite=True,
+        )
+    except ValueError as error:
+        raise InvalidFile(path, f"not a glTF file ({error})", "glTF 2") from None
+    asset = header.get("asset") if isinstance(header, dict) else None
+    version = asset.get("version") if isinstance(asset, dict) else None
+    if not isinstance(version, str | int | float):
+        raise InvalidFile(path, "not a glTF file: it has no version", "glTF 2")
+    if not str(version).startswith("2."):
+        raise InvalidFile(path, f"glTF {version!s:.20}", "glTF 2")
+    return header
+
+
+# Arrays of accessors
+
+_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+
+
+def accessor_count(file: Container, index: object) -> int:
+    """Return the number of elements of an accessor."""
+    accessor = file.entry("accessors", index)
+    return file.whole(accessor, "count", f"accessors[{index}]")
+
+
+def accessor_array(file: Container, index: object, *, kinds: str) -> NDArray[Any]:
+    """Return the elements (n, columns) of an accessor, as stored.
+
+    Parameters
+    ----------
+    kinds : str
+        Allowed kinds of numbers, any of ``u``, ``i`` and ``f``.
     """
-    file = Container(path)
-    required = file.header.get("extensionsRequired", [])
-    for name in required if isinstance(required, list) else [required]:
-        if not isinstance(name, str) or not name.startswith(_KNOWN_EXTENSIONS):
-            file.refuse(f"requires the extension {name!s:.60}, which is not supported")
-    placed = []
-    for matrix, mesh in placed_meshes(file):
-        if abs(np.linalg.det(matrix[:3, :3])) > LEAST_VOLUME_RATIO:
-            placed += [(matrix, primitive) for primitive in _primitives(file, mesh)]
-        if len(placed) > MAX_DRAWS:  # a million would take half a minute to count
-            file.refuse(f"more than {MAX_DRAWS:,} parts", f"at most {MAX_DRAWS:,}")
-    _check_counts(file, [primitive for _, primitive in placed])
-    textures = _Textures(file)
-    materials = [_material(file, primitive) for _, primitive in placed]
-    textures.check(materials)
-    n_parts = 0
-    for (matrix, primitive), material in zip(placed, materials, strict=True):
-        if not _is_shown(file, material):
-            continue
-        n_parts += 1
-        yield _part(file, matrix, primitive, material, textures)
-    if not n_parts:
-        file.refuse("no triangles to show")
-
-
-def _primitives(file: Container, mesh: int) -> list[dict[str, Any]]:
-    """Return the triangles among a mesh's primitives, without lines and points."""
-    primitives = file.entry("meshes", mesh).get("primitives")
-    if not isinstance(primitives, list):
-        file.refuse(f"damaged: meshes[{mesh}].primitives is not a list")
-    for primitive in primitives:
-        attributes = primitive.get("attributes") if isinstance(primitive, dict) else 0
-        if not isinstance(attributes, dict):
-            file.refuse(f"damaged: a primitive of meshes[{mesh}] has no attributes")
-    return [
-        primitive
-        for primitive in primitives
-        if primitive.get("mode", _TRIANGLES) in (_TRIANGLES, _STRIP)
-        and _triangle_count(file, primitive) > 0
-    ]
-
-
-def _triangle_count(file: Container, primitive: dict[str, Any]) -> int:
-    corners = primitive.get("indices", primitive["attributes"].get("POSITION"))
-    count = accessor_count(file, corners)
-    return count - 2 if primitive.get("mode", _TRIANGLES) == _STRIP else count // 3
-
-
-def _check_counts(file: Container, primitives: list[dict[str, Any]]) -> None:
-    """Reject counts above the limits; a primitive counts once per placement."""
-    counts = {id(p): _triangle_count(file, p) for p in primitives}
-    n_triangles = sum(counts[id(p)] for p in primitives)
-    if n_triangles > MAX_TRIANGLES:
-        file.refuse(f"{n_triangles:,} triangles", f"at most {MAX_TRIANGLES:,}")
-    counts = {
-        id(p): accessor_count(file, p["attributes"].get("POSITION"))
-        if "NORMAL" in p["attributes"]
-        else 3 * counts[id(p)]
-        for p in primitives
-    }
-    n_vertices = sum(counts[id(p)] for p in primitives)
-    if n_vertices > MAX_VERTICES:
-        file.refuse(f"{n_vertices:,} vertices", f"at most {MAX_VERTICES:,}")
-
-
-def _material(file: Container, primitive: dict[str, Any]) -> dict[str, Any]:
-    index = primitive.get("material")
-    return {} if index is None else file.entry("materials", index)
-
-
-def _object(file: Container, entry: dict[str, Any], field: str) -> dict[str, Any]:
-    found = entry.get(field, {})
-    if not isinstance(found, dict):
-        file.refuse(f"damaged: '{field}' is not an object")
-    return found
-
-
-def _factor(file: Container, material: dict[str, Any]) -> Array:
-    surface = _object(file, material, "pbrMetallicRoughness")
-    given = surface.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])
-    is_four = isinstance(given, list) and len(given) == 4
-    if not is_four or not all(type(v) in (int, float) for v in given):
-        file.refuse("damaged: a baseColorFactor", "four numbers")
-    return np.array(given, float)
-
-
-def _is_shown(file: Container, material: dict[str, Any]) -> bool:
-    weight = _factor(file, material)[3]
-    return material.get("alphaMode") != "BLEND" or weight >= LEAST_WEIGHT_RATIO
-
-
-def _part(
-    file: Container,
-    matrix: Array,
-    primitive: dict[str, Any],
-    material: dict[str, Any],
-    textures: _Textures,
-) -> Part:
-    attributes = primitive["attributes"]
-    vertices_m = _columns(file, attributes, "POSITION", 3, kinds="f")
-    n = len(vertices_m)
-    normals = uv = None
-    if "NORMAL" in attributes:
-        normals = _columns(file, attributes, "NORMAL", 3, kinds="f", count=n)
-        if not np.ptp(normals) > 0.0:
-            normals = None
-    if "TEXCOORD_0" in attributes:
-        uv = _columns(file, attributes, "TEXCOORD_0", 2, kinds="fu", count=n)
-        uv = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
-    return Part(
-        world_from_part=matrix,
-        vertices_m=vertices_m,
-        faces=_faces(file, primitive, n),
-        normals=normals,
-        uv=uv,
-        reflectance_ratio=_reflectance(file, material, attributes, n),
-        texture=None if uv is None else textures.of(material),
-        is_unlit="KHR_materials_unlit" in _object(file, material, "extensions"),
-    )
-
-
-def _columns(
-    file: Container,
-    attributes: dict[str, Any],
-    name: str,
-    columns: int,
-    *,
-    kinds: str,
-    count: int | None = None,
-) -> NDArray[Any]:
-    """Return a vertex attribute; integers become fractions of their largest value."""
-    array = accessor_array(file, attributes.get(name), kinds=kinds)
-    if array.shape[1] < columns or count not in (None, len(array)):
-        found = f"damaged: {name} has {len(array):,} entries of {array.shape[1]}"
-        file.refuse(found, f"{count or len(array):,} of {columns}")
-    if array.dtype.kind == "u":
-        return array / np.float32(np.iinfo(array.dtype).max)
+    accessor = file.entry("accessors", index)
+    where = f"accessors[{index}]"
+    count = accessor_count(file, index)
+    dtype, columns = _dtype(file, accessor, where)
+    if dtype.kind not in kinds:
+        file.refuse(f"damaged: {where} has elements of {dtype}")
+    if "bufferView" in accessor:
+        start = file.whole(accessor, "byteOffset", where, default=0)
+        stride = file.entry("bufferViews", accessor["bufferView"]).get("byteStride")
+        data = file.view(accessor["bufferView"])
+        array = _strided(file, data, where, start, stride, (count, columns), dtype)
+    else:
+        array = np.zeros((count, columns), dtype)
+    if "sparse" in accessor:
+        array = _with_sparse(file, accessor["sparse"], where, array)
     return array
 
 
-def _reflectance(
-    file: Container, material: dict[str, Any], attributes: dict[str, Any], n: int
-) -> Array:
-    """Return the linear color factor (n, 3) of each vertex."""
-    factor = _factor(file, material)[:3]
-    if "COLOR_0" not in attributes:
-        return np.broadcast_to(factor, (n, 3))
-    colors = accessor_array(file, attributes["COLOR_0"], kinds="fu")
-    if len(colors) != n or colors.shape[1] < 3:
-        return np.broadcast_to(factor, (n, 3))
-    top = np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1.0
-    return factor * (np.asarray(colors, float)[:, :3] / top)
+def _dtype(
+    file: Container, accessor: dict[str, Any], where: str
+) -> tuple[np.dtype, int]:
+    kind, shape = accessor.get("componentType"), accessor.get("type")
+    if type(kind) is not int or kind not in _TYPES:
+        file.refuse(f"damaged: {where}.componentType is {kind!r:.20}")
+    if not isinstance(shape, str) or shape not in _COLUMNS:
+        file.refuse(f"damaged: {where}.type is {shape!r:.20}")
+    return np.dtype(_TYPES[kind]), _COLUMNS[shape]
 
 
-def _faces(
-    file: Container, primitive: dict[str, Any], n_vertices: int
-) -> NDArray[np.int64]:
-    corners = np.arange(n_vertices)
-    if "indices" in primitive:
-        stored = accessor_array(file, primitive["indices"], kinds="u")
-        corners = stored[:, 0].astype(np.int64)
-        if len(corners) and int(corners.max()) >= n_vertices:
-            found = f"damaged: a triangle with vertex {int(corners.max()):,}"
-            file.refuse(found, f"0 to {n_vertices - 1:,}")
-    if primitive.get("mode", _TRIANGLES) == _STRIP:
-        faces = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
-        faces[1::2] = faces[1::2, ::-1]  # consistent winding
-        return faces
-    if len(corners) % 3:
-        file.refuse(
-            f"damaged: {len(corners):,} triangle corners", "a multiple of three"
-        )
-    return corners.reshape(-1, 3)
+def _strided(
+    file: Container,
+    data: memoryview,
+    where: str,
+    start: int,
+    stride: object,
+    shape: tuple[int, int],
+    dtype: np.dtype,
+) -> NDArray[Any]:
+    """Return the elements of a buffer view without copying them."""
+    count, columns = shape
+    element = columns * dtype.itemsize
+    step = element if stride is None else stride
+    if type(step) is not int or not element <= step <= 1 << 16:
+        file.refuse(f"damaged: {where} has elements {step!r:.20} bytes apart")
+    n_bytes = (count - 1) * step + element if count else 0
+    if start + n_bytes > len(data):
+        found = f"damaged: {where} ends at byte {start + n_bytes:,} of its view"
+        file.refuse(found, f"{len(data):,}")
+    if not count:
+        return np.zeros(shape, dtype)
+    return np.ndarray(shape, dtype, data, start, (step, dtype.itemsize))
 
 
-class _Textures:
-    """Images of a file: headers are checked at once, images are decoded when used."""
-
-    def __init__(self, file: Container) -> None:
-        self._file = file
-        self._decoded: dict[int, NDArray[np.uint8]] = {}
-
-    def check(self, materials: list[dict[str, Any]]) -> None:
-        """Reject images with too many pixels, from their headers alone."""
-        distinct = {id(m): m for m in materials}.values()
-        images = sorted({i for m in distinct if (i := self._image_of(m)) is not None})
-        n_pixels = 0
-        for index in images:
-            n_pixels += check_picture(self._content(index), name=self._name(index))
-            if n_pixels > MAX_TEXTURE_PIXELS:
-                found = f"textures of {n_pixels:,} pixels or more"
-                self._file.refuse(found, f"at most {MAX_TEXTURE_PIXELS:,}")
-
-    def of(self, material: dict[str, Any]) -> NDArray[np.uint8] | None:
-        """Return the texture of a material, or None."""
-        index = self._image_of(material)
-        if index is None:
-            return None
-        if index not in self._decoded:
-            content, name = self._content(index), self._name(index)
-            self._decoded[index] = read_texture(content, name=name)
-        return self._decoded[index]
-
-    def _image_of(self, material: dict[str, Any]) -> int | None:
-        """Return the index of a material's image; None without a supported one."""
-        surface = _object(self._file, material, "pbrMetallicRoughness")
-        if "baseColorTexture" not in surface:
-            return None
-        reference = _object(self._file, surface, "baseColorTexture")
-        texture = self._file.entry("textures", reference.get("index"))
-        extensions = _object(self._file, texture, "extensions")
-        webp = _object(self._file, extensions, "EXT_texture_webp")
-        index = webp.get("source", texture.get("source"))
-        if index is None:
-            return None
-        kind = self._file.entry("images", index).get("mimeType", "")
-        return index if kind in _PICTURES else None
-
-    def _content(self, index: int) -> bytes:
-        image = self._file.entry("images", index)
-        if "bufferView" in image:
-            return bytes(self._file.view(image["bufferView"]))
-        return self._file.uri_bytes(image.get("uri"))
-
-    def _name(self, index: int) -> str:
-        return f"{self._file.path}, image {index}"
+def _with_sparse(
+    file: Container, sparse: object, where: str, array: NDArray[Any]
+) -> NDArray[Any]:
+    """Return the array with some elements replaced."""
+    if not isinstance(sparse, dict):
+        file.refuse(f"damaged: {where}.sparse")
+    where = f"{where}.sparse"
+    count = file.whole(sparse, "count", where)
+    parts = []
+    for name, columns in (("indices", 1), ("values", array.shape[1])):
+        part = sparse.get(name)
+        if not isinstance(part, dict) or count > len(array):
+            file.refuse(f"damaged: {where}.{name}")
+        dtype = array.dtype
+        if name == "indices":
+            dtype, _ = _dtype(file, part | {"type": "SCALAR"}, f"{where}.indices")
+        start = file.whole(part, "byteOffset", where, default=0)
+        data = file.view(part.get("bufferView"))
+        shape = (count, columns)
+        parts.append(_strided(file, data, where, start, None, shape, dtype))
+    indices, values = parts
+    if indices.dtype.kind != "u" or (count and int(indices.max()) >= len(array)):
+        file.refuse(f"damaged: {where} has indices beyond {len(array):,}")
+    array = array.copy()
+    array[indices[:, 0].astype(np.int64)] = values
+    return array

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from clients.arguments import read_object, read_profile
-from clients.headset.controls import HELP
 from clients.headset.runtime import EYES, Eye
+from clients.headset.viewer import HELP
 from clients.natural_eye import USUAL_AGE_YEARS, USUAL_WHITE_CD_M2
 from clients.option_values import a_number
 from filter_service import FilterSettings

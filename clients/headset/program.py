@@ -29,8 +29,6 @@ import numpy as np
 
 from clients.arguments import profile_title, read_size_px
 from clients.extra import HEADSET_INSTALL
-from clients.headset.controls import HELP, Controls, TerminalKeys
-from clients.headset.local_filter import LocalFilter
 from clients.headset.options import (
     TRACKED_RANGE_DEG,
     arguments_of,
@@ -38,12 +36,10 @@ from clients.headset.options import (
     profiles_of,
     settings_of,
 )
-from clients.headset.poses import upright
-from clients.headset.runtime import Eye, NoRuntime, Runtime, ShownView
-from clients.headset.service_filter import ServiceFilter
-from clients.headset.stereo_filter import StereoFilter
+from clients.headset.runtime import Eye, NoRuntime, Runtime, ShownView, upright
+from clients.headset.stereo_filter import LocalFilter, ServiceFilter, StereoFilter
 from clients.headset.stereo_gaze import StereoGaze
-from clients.headset.viewer import Viewer, ViewerLog
+from clients.headset.viewer import HELP, Controls, TerminalKeys, Viewer, ViewerLog
 from estimator.bounded_files import printable
 from filter_service import FilterSettings, is_software_renderer
 from filter_service.atomic_files import replace_atomically
@@ -52,8 +48,7 @@ from filter_service.errors import FilterError
 if TYPE_CHECKING:
     import moderngl
 
-    from clients.scenes.geometry import Array
-    from clients.scenes.scene import Scene
+    from clients.scenes.geometry import Array, Scene
 
 WARM_UP_S = 60.0
 """Longest wait for the first filtered frame; `--seconds` counts from that frame."""
@@ -106,7 +101,7 @@ def scenery_of(options: argparse.Namespace, context: moderngl.Context) -> Any:
 def scene_of(name: str) -> tuple[Scene, Array]:
     """Return a built-in scene or the scene of a file, and the viewer's pose in it."""
     from clients.headset.gltf_scene import load_gltf
-    from clients.headset.viewpoint import viewpoint
+    from clients.headset.scenery import viewpoint
     from clients.scenes.catalog import build_scene
 
     is_file = Path(name).suffix.lower() in (".glb", ".gltf")
@@ -222,7 +217,7 @@ def _runtime(
     """Return the headset's runtime, or the simulated one."""
     if not options.simulated:
         return _open_xr(context, options)
-    from clients.headset.simulated_runtime import SimulatedRuntime
+    from clients.headset.runtime import SimulatedRuntime
 
     def finish() -> None:
         with context:

@@ -2,17 +2,49 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 
-from clients.headset.runtime import DueFrame, Eye, EyeView, Image
-from clients.headset.stereo_gaze import EyeAndGaze, Picture
-from filter_service import FilterSettings, RgbdView
-from filter_service.messages import ViewState
+from clients.filter_client import FilterClient, FilteredFrame
+from clients.headset.runtime import EYES, DueFrame, Eye, EyeView, Image
+from clients.headset.stereo_gaze import EyeAndGaze, Picture, RgbdPicture, TexturePicture
+from filter_service import (
+    BadMessage,
+    BuildingEye,
+    EyeFailed,
+    EyeFilter,
+    EyeReady,
+    FilteredTexture,
+    FilterSettings,
+    GlTexture,
+    RgbdView,
+    TextureView,
+    plan_views,
+)
+from filter_service.errors import BuildCancelled, FilterError
+from filter_service.messages import (
+    Dropped,
+    ErrorReply,
+    EyeName,
+    Ready,
+    Result,
+    ResultView,
+    ViewState,
+    body_of_eye,
+)
 from filter_service.settings import Output
+
+if TYPE_CHECKING:
+    import moderngl
+
 
 Say = Callable[[str], None]
 
@@ -120,3 +152,484 @@ def settings_for_gaze(settings: FilterSettings, eye: EyeAndGaze) -> FilterSettin
     if settings.gaze_deg != (0.0, 0.0):
         return settings
     return settings.changed(gaze_deg=eye.ahead_deg)
+
+
+# Filter in this process
+
+MS_PER_S = 1e3
+KEPT_VIEWS = 16
+"""Frames of an eye whose pose is kept until the GPU has finished them."""
+
+EyeEvent = BuildingEye | EyeFailed | EyeReady
+
+
+class LocalFilter:
+    """Filter of headset frames in this process, which returns each result at once.
+
+    Parameters
+    ----------
+    settings : FilterSettings
+        Settings of the filters.
+    say : callable
+        Called with each message about the eyes, one line.
+    context : moderngl.Context, optional
+        Context of the pictures.  Pictures in textures are then filtered to textures in
+        it, without copies and without waiting for the GPU, unless an eye has effects
+        that only frames of arrays have.
+    """
+
+    def __init__(
+        self,
+        settings: FilterSettings,
+        say: Say,
+        context: moderngl.Context | None = None,
+    ) -> None:
+        self._say = say
+        self.settings = settings
+        self._context = context
+        kind: Literal["own", "current"] = "own" if context is None else "current"
+        with self._entered():
+            self.filters: dict[EyeName, EyeFilter] = {
+                eye: EyeFilter(
+                    settings=settings,
+                    on_event=partial(self._tell, eye),
+                    gl_context=kind,
+                )
+                for eye in EYES
+            }
+        self._needs_arrays = False
+        self._wanted: dict[Eye, Mapping[str, Any]] = {}
+        self._generations: dict[Eye, int] = {}
+        self._targets: dict[Eye, moderngl.Texture] = {}
+        self._views: dict[int, EyeView] = {}  # of frames on the GPU, by number
+        self._known: dict[Eye, RgbdPicture] = {}
+
+    def _entered(self) -> AbstractContextManager[Any]:
+        return nullcontext() if self._context is None else self._context
+
+    def _tell(self, eye: Eye, event: EyeEvent) -> None:
+        if isinstance(event, EyeReady):
+            self._needs_arrays = False  # perhaps not of this eye
+            self._say(f"{eye} eye: ready after {event.build_ms:.0f} ms")
+        elif isinstance(event, EyeFailed) and not isinstance(
+            event.error, BuildCancelled
+        ):
+            self._say(f"{eye} eye: {event.error}")
+
+    def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
+        """Request another eye; frames use the previous one until it is ready."""
+        self._wanted[eye] = profile
+
+    def _set_profiles(self, frame: StereoFrame) -> None:
+        for picture, looking in zip(frame.pictures, frame.eyes, strict=True):
+            eye = picture.view.eye
+            profile = self._wanted.pop(eye, None)
+            if profile is None:
+                continue
+            try:
+                accepted = self.filters[eye].set_profile(
+                    body_of_eye(profile, eye),
+                    settings=settings_for_gaze(self.settings, looking),
+                    cameras=[picture.camera],
+                )
+                self._generations[eye] = accepted.generation
+            except ValueError as error:
+                self._say(f"{eye} eye: {error}")
+
+    def see(self, frame: StereoFrame) -> FilteredStereoFrame | None:
+        """Filter a frame; return None while an eye is being prepared for it.
+
+        Raises
+        ------
+        FilterError
+            If an eye cannot be prepared and there is no previous one.
+        """
+        begin_s = time.monotonic()
+        self._set_profiles(frame)
+        if self._takes_textures(frame):
+            try:
+                with self._entered():
+                    return self._see_textures(frame, begin_s)
+            except BadMessage as error:
+                if error.field != "profile":
+                    raise
+                self._needs_arrays = True
+                self._say(f"frames are copied for an eye that needs arrays: {error}")
+        # Textures are read in the context that the filter enters afterward: moderngl
+        # leaves none current.
+        views = frame.views
+        with self._entered():
+            return self._see_arrays(frame, views, begin_s)
+
+    def _takes_textures(self, frame: StereoFrame) -> bool:
+        return (
+            self._context is not None
+            and not self._needs_arrays
+            and all(isinstance(picture, TexturePicture) for picture in frame.pictures)
+        )
+
+    def _see_arrays(
+        self, frame: StereoFrame, views: list[RgbdView], begin_s: float
+    ) -> FilteredStereoFrame | None:
+        planned = plan_views(
+            self.filters.__getitem__,
+            views,
+            frame.states,
+            pupil_diameter_mm=frame.eyes[0].state.pupil_diameter_mm,
+            focus_dpt=frame.eyes[0].state.focus_dpt,
+        )
+        if planned is None:
+            return None
+        seen = planned.render(output=frame.output)
+        stages_ms = seen.stage_times_ms
+        whole_ms = MS_PER_S * (time.monotonic() - begin_s)
+        return FilteredStereoFrame(
+            frame,
+            tuple(picture.view for picture in frame.pictures),
+            tuple(view.color for view in seen.views),
+            tuple(
+                self._used_dpt(picture, view.generation, view.focus_dpt)
+                for view, picture in zip(seen.views, frame.pictures, strict=True)
+            ),
+            True,
+            seen.notes,
+            {
+                "filter_ms": sum(stages_ms.values()),
+                "around_ms": whole_ms - sum(stages_ms.values()),
+            },
+        )
+
+    def _used_dpt(
+        self, picture: Picture, generation: int, focus_dpt: float
+    ) -> float | None:
+        is_own = generation == self._generations.get(picture.view.eye)
+        return focus_dpt if is_own else None
+
+    def _see_textures(
+        self, frame: StereoFrame, begin_s: float
+    ) -> FilteredStereoFrame | None:
+        """Submit a frame in textures; the GPU filters it before it is shown."""
+        shown: list[FilteredTexture] = []
+        for picture, looking in zip(frame.pictures, frame.eyes, strict=True):
+            eye = picture.view.eye
+            assert isinstance(picture, TexturePicture)
+            found = self.filters[eye].filter_textures(
+                _texture_view(picture),
+                GlTexture(self._target(picture).glo, "rgba8"),
+                pupil_diameter_mm=looking.state.pupil_diameter_mm,
+                focus_dpt=looking.state.focus_dpt,
+                gaze_deg=looking.gaze_deg,
+            )
+            if found is not None:
+                self._note(picture, found)
+                shown.append(found)
+        if len(shown) < len(frame.pictures):
+            return None
+        whole_ms = MS_PER_S * (time.monotonic() - begin_s)
+        return FilteredStereoFrame(
+            frame,
+            tuple(picture.view for picture in frame.pictures),
+            tuple(self._target(picture) for picture in frame.pictures),
+            tuple(
+                self._used_dpt(picture, found.generation, found.focus_dpt)
+                for picture, found in zip(frame.pictures, shown, strict=True)
+            ),
+            all(found.earlier is None or found.earlier.is_complete for found in shown),
+            tuple(
+                f"{picture.view.eye} eye: {note}"
+                for picture, found in zip(frame.pictures, shown, strict=True)
+                for note in found.notes
+            ),
+            {"filter_ms": whole_ms, "around_ms": 0.0},
+        )
+
+    def _target(self, picture: Picture) -> moderngl.Texture:
+        """Return the texture for an eye's filtered image."""
+        assert self._context is not None
+        camera, eye = picture.camera, picture.view.eye
+        size_px = camera.width_px, camera.height_px
+        known = self._targets.get(eye)
+        if known is None or known.size != size_px:
+            if known is not None:
+                known.release()
+            known = self._targets[eye] = self._context.texture(size_px, 4)
+        return known
+
+    def _note(self, picture: Picture, found: FilteredTexture) -> None:
+        """Keep what is known of the newest frame that the GPU has finished."""
+        self._views[found.number] = picture.view
+        if found.earlier is None:
+            return
+        view = self._views.get(found.earlier.number)
+        for number in [n for n in self._views if n < found.number - KEPT_VIEWS]:
+            del self._views[number]
+        if view is not None:
+            sampled = found.earlier.sampled
+            self._known[view.eye] = RgbdPicture(view, sampled.color, sampled.depth_m)
+
+    def known(self, picture: Picture) -> Picture:
+        """Return what is known of an eye's last image, or the image itself."""
+        if not isinstance(picture, TexturePicture):
+            return picture
+        return self._known.get(picture.view.eye, picture)
+
+    def restart(self) -> None:
+        """Discard what is known of earlier frames."""
+        self._known = {}
+
+    def close(self) -> None:
+        """Close the filters."""
+        with self._entered():
+            for eye_filter in self.filters.values():
+                eye_filter.close()
+            for target in self._targets.values():
+                target.release()
+        self._targets = {}
+
+
+def _texture_view(picture: TexturePicture) -> TextureView:
+    image, camera = picture.image, picture.camera
+    return TextureView(
+        GlTexture(image.color.glo, "rgba8"),
+        GlTexture(image.depth_m.glo, "r32f"),
+        camera.width_px,
+        camera.height_px,
+        camera.tangents,
+        is_top_first=True,
+    )
+
+
+# Filter through a service
+
+RETRY_S = 1.0
+SAY_AGAIN_S = 10.0
+ASK_AGAIN = ("worker_crashed", "no_profile")
+"""Codes of errors after which a profile is sent again."""
+
+WAIT_SHARE = 0.6
+"""Fraction of a frame's period for which the viewer waits for the newest result, so
+that a fast filter's image is shown in the frame that it was rendered for."""
+
+PATIENCE_S = 0.4
+"""If the previous frame took no longer than this, the viewer always waits for the
+filter. Frames that are late in any case are then half as old. On two shared cores,
+frames of 896x1007 were 0.8 s old without this wait, and not more frequent."""
+
+_OWN_STAGES = ("decode_ms", "queue_ms", "copy_out_ms", "rests_ms", "other_ms")
+
+
+class ServiceFilter:
+    """Filter that sends frames to a service and returns the newest result.
+
+    Parameters
+    ----------
+    endpoint : str
+        Address of the service.
+    settings : FilterSettings
+        Settings of the filters.
+    say : callable
+        Called with each message for the user, one line.
+    key_file : Path, optional
+        Key file of the client, for a service that requires one.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        settings: FilterSettings,
+        say: Say,
+        *,
+        key_file: Path | None = None,
+    ) -> None:
+        self._say_once = LogOnce(say)
+        self._say = say
+        self.settings = settings
+        self._endpoint = endpoint
+        self._client = FilterClient(
+            endpoint, client_name="headset", key_file=key_file, timeout_s=5.0
+        )
+        self._wanted: dict[EyeName, dict[str, Any]] = {}
+        self._asked: dict[EyeName, tuple[int, dict[str, Any]]] = {}
+        self._retry_s = 0.0  # time before which no profile is sent
+        self._on_way: dict[int | None, StereoFrame] = {}
+        self._newest: FilteredStereoFrame | None = None
+        self._is_there = True
+        self._trip_s = math.inf  # round trip of the last result
+        self.n_dropped: dict[str, int] = {}
+
+    def wait_for_service(self) -> None:
+        """Wait until the service responds.
+
+        Raises
+        ------
+        FilterError
+            If the service does not respond or rejects this client.
+        """
+        self._client.hello()
+
+    def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
+        """Request another eye as soon as the service is connected."""
+        self._wanted[eye] = dict(profile)
+
+    def see(self, frame: StereoFrame) -> FilteredStereoFrame | None:
+        """Send a frame and return the newest result.
+
+        Returns
+        -------
+        FilteredStereoFrame or None
+            None until the connected service has returned a result.
+        """
+        client = self._client
+        self._take_events()
+        if client.welcome is None:
+            if self._is_there:
+                self._say(
+                    f"no filter service at {self._endpoint}: showing the scene "
+                    "unfiltered and trying again"
+                )
+            self._is_there, self._newest = False, None
+            return None
+        if not self._is_there:
+            self._say("connected to the filter service")
+            self._is_there = True
+        self._send_profiles(frame)
+        try:
+            frame_id = client.submit(
+                frame.views,
+                pupil_diameter_mm=frame.eyes[0].state.pupil_diameter_mm,
+                focus_dpt=frame.eyes[0].state.focus_dpt,
+                states=frame.states,
+                output=frame.output,
+                display_time_ns=frame.due.display_time_ns,
+            )
+            self._on_way[frame_id] = frame
+        except FilterError as error:
+            self._say(f"a frame could not be sent: {error}")
+        end_s = frame.begun_s + WAIT_SHARE * frame.due.period_s
+        if self._trip_s <= PATIENCE_S:
+            end_s = max(end_s, time.monotonic() + PATIENCE_S)
+        self._take_events()
+        while self._newest is None or self._newest.frame is not frame:
+            wait_s = end_s - time.monotonic()
+            if wait_s <= 0.0 or frame not in self._on_way.values():
+                break
+            self._take_events(wait_s)
+        return self._newest
+
+    def _send_profiles(self, frame: StereoFrame) -> None:
+        if time.monotonic() < self._retry_s:
+            return
+        for picture, looking in zip(frame.pictures, frame.eyes, strict=True):
+            eye = picture.view.eye
+            profile = self._wanted.pop(eye, None)
+            if profile is None:
+                continue
+            profile_id = self._client.request_profile(
+                profile,
+                eye=eye,
+                settings=settings_for_gaze(self.settings, looking),
+                views=[picture.camera],
+            )
+            self._asked[eye] = profile_id, profile
+
+    def _take_events(self, wait_s: float = 0.0) -> None:
+        for event in self._client.poll(wait_s):
+            if isinstance(event, FilteredFrame):
+                self._take(event)
+            elif isinstance(event, Dropped):
+                self._on_way.pop(event.frame_id, None)
+                reason = event.reason
+                self.n_dropped[reason] = self.n_dropped.get(reason, 0) + 1
+            elif isinstance(event, ErrorReply):
+                self._on_way.pop(event.frame_id, None)
+                self._take_error(event)
+            elif isinstance(event, Ready):
+                self._say(f"{event.eye} eye: ready after {event.build_ms:.0f} ms")
+
+    def _take_error(self, reply: ErrorReply) -> None:
+        """Report an error once; send profiles again that the service has lost."""
+        if reply.code == "build_cancelled":
+            return
+        self._say_once(str(reply.exception()))
+        if reply.code not in ASK_AGAIN:
+            return
+        for eye, (profile_id, profile) in self._asked.items():
+            # The service repeats the error of an eye for each frame.
+            if eye not in self._wanted and reply.profile_id in (None, profile_id):
+                self._wanted[eye] = profile
+                self._retry_s = time.monotonic() + RETRY_S
+
+    def _take(self, answer: FilteredFrame) -> None:
+        frame = self._on_way.pop(answer.frame_id, None)
+        if frame is None:
+            return
+        header = answer.header
+        self._trip_s = 1e-3 * answer.round_trip_ms
+        views = tuple(
+            EyeView(
+                picture.view.eye, view.pose or picture.view.pose, picture.view.tangents
+            )
+            for picture, view in zip(frame.pictures, header.views, strict=True)
+        )
+        filter_ms = header.total_ms
+        self._newest = FilteredStereoFrame(
+            frame,
+            views,
+            answer.colors,
+            tuple(self._used_focus_dpt(header, view) for view in header.views),
+            True,
+            header.notes,
+            {
+                "filter_ms": filter_ms - _added_ms(header.stage_times_ms),
+                "service_ms": _added_ms(header.stage_times_ms),
+                "wire_ms": answer.round_trip_ms - filter_ms,
+                "wait_ms": answer.age_ms - answer.round_trip_ms,
+            },
+        )
+
+    def _used_focus_dpt(self, header: Result, view: ResultView) -> float | None:
+        """Return the focus of a view; None if the requested eye was not used."""
+        if view.profile_id is None:  # a service that supports one eye only
+            return header.focus_dpt
+        asked = self._asked.get(view.eye)
+        if asked is None or asked[0] != view.profile_id:
+            return None
+        return view.focus_dpt
+
+    def known(self, picture: Picture) -> Picture:
+        """Return the image: the service needs arrays of it anyway."""
+        return picture
+
+    def restart(self) -> None:
+        """Discard the results and the frames in flight."""
+        self._newest = None
+        self._on_way = {}
+
+    def close(self) -> None:
+        """End the session."""
+        self._client.close()
+
+
+class LogOnce:
+    """Callable that suppresses lines repeated within `SAY_AGAIN_S`."""
+
+    def __init__(self, say: Say) -> None:
+        self._say = say
+        self._said_s: dict[str, float] = {}
+
+    def __call__(self, line: str) -> None:
+        """Report a line unless it was reported within `SAY_AGAIN_S`."""
+        now_s = time.monotonic()
+        self._said_s = {
+            said: at_s
+            for said, at_s in self._said_s.items()
+            if now_s - at_s <= SAY_AGAIN_S
+        }
+        if line not in self._said_s:
+            self._said_s[line] = now_s
+            self._say(line)
+
+
+def _added_ms(stages_ms: Mapping[str, float]) -> float:
+    """Return the time of the stages that the service adds to the filter."""
+    return sum(stages_ms.get(name, 0.0) for name in _OWN_STAGES)

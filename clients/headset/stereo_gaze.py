@@ -11,8 +11,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from clients.headset.poses import angles_of, direction_of, matrix_of
-from clients.headset.runtime import DueFrame, Eye, EyeView, Image
+from clients.headset.runtime import (
+    DueFrame,
+    Eye,
+    EyeView,
+    Image,
+    angles_of,
+    direction_of,
+    matrix_of,
+)
 from clients.natural_eye import (
     MAX_VERGENCE_DPT,
     USUAL_WHITE_CD_M2,

@@ -36,9 +36,8 @@ from clients.headset.options import (
 )
 from clients.headset.runtime import EYES
 from clients.openxr_layer import manifest
-from clients.openxr_layer.eyes import Eyes
-from clients.openxr_layer.helper import USUAL_AGE_MS, HelperOptions, LayerHelper
-from clients.openxr_layer.helper_socket import SOCKET_VARIABLE, ask, socket_path
+from clients.openxr_layer.helper import USUAL_AGE_MS, Eyes, HelperOptions, LayerHelper
+from clients.openxr_layer.wire import SOCKET_VARIABLE, ask, socket_path
 from clients.option_values import a_number
 from estimator import ProfileError, parse_profile
 from estimator.bounded_files import printable
@@ -169,9 +168,7 @@ def _checked(options: argparse.Namespace) -> tuple[HelperOptions, FilterSettings
 def _helper(options: argparse.Namespace) -> Iterator[tuple[LayerHelper, Eyes]]:
     """Return the helper, which listens, and its eyes."""
     helper_options, settings = _checked(options)
-    from clients.headset.local_filter import LocalFilter
-    from clients.headset.service_filter import ServiceFilter
-    from clients.headset.stereo_filter import StereoFilter
+    from clients.headset.stereo_filter import LocalFilter, ServiceFilter, StereoFilter
     from clients.headset.stereo_gaze import StereoGaze
 
     look = StereoGaze(

@@ -5,36 +5,48 @@ content: thin occluders, nearby foliage, furniture, text of several sizes, repea
 arches and small lamps.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
 
 from clients.scenes import architecture as build_
-from clients.scenes import foliage, furniture
-from clients.scenes.geometry import (
-    Array,
-    Look,
-    Mesh,
-    by_texture,
-    new_mesh,
-    patch,
-    placed,
-    rotation,
-    transformed,
-)
-from clients.scenes.lighting import Baker, Lights, baker
-from clients.scenes.scene import Batch, Scene, finished
-from clients.scenes.textures import (
+from clients.scenes.appearance import (
+    Baker,
+    Lights,
+    baker,
     board,
     evening_sky,
     framed,
     hills,
     plaster,
+    resized,
     stone_tiles,
     stripes,
     uint8_srgb,
     wood,
+)
+from clients.scenes.geometry import (
+    Array,
+    Batch,
+    Look,
+    Mesh,
+    Scene,
+    by_texture,
+    finished,
+    grid_faces,
+    lathe,
+    linear_from_hex,
+    merged,
+    new_mesh,
+    patch,
+    placed,
+    rotation,
+    sphere,
+    transformed,
+    tube,
 )
 
 _FLOOR_M = (-6.5, -15.0, 13.0, 17.0)  # left, far, width, length
@@ -136,9 +148,9 @@ def _furniture(rng: np.random.Generator) -> list[Mesh]:
     for (x, z, turn), frame in zip(spots, frames, strict=True):
         parts += _table_group(x, z, turn, frame, rng)
     parts += _near_table(rng)
-    menu = furniture.standing_board((0.62, 0.98), texture="chalk")
+    menu = build_.standing_board((0.62, 0.98), texture="chalk")
     parts += [placed(p, (1.42, 0, -2.6), turn_deg=-26) for p in menu]
-    parts += furniture.railing((2.0, 0, -3.3), (5.0, 0, -3.3))
+    parts += build_.railing((2.0, 0, -3.3), (5.0, 0, -3.3))
     return parts
 
 
@@ -146,37 +158,35 @@ def _table_group(
     x: float, z: float, turn: float, frame: str, rng: np.random.Generator
 ) -> list[Mesh]:
     """Return a table with two or three chairs, a lantern and cups."""
-    group = list(furniture.bistro_table(top="table"))
+    group = list(build_.bistro_table(top="table"))
     for angle in (15, 140, 255)[: 2 + int(rng.random() < 0.6)]:
         radians = np.deg2rad(angle)
         where = (0.62 * np.sin(radians), 0, 0.62 * np.cos(radians))
-        seat = furniture.chair(frame=frame)
+        seat = build_.chair(frame=frame)
         group += [placed(p, where, turn_deg=angle) for p in seat]
-    group += [placed(p, (0.05, 0.74, -0.06)) for p in furniture.lantern()]
+    group += [placed(p, (0.05, 0.74, -0.06)) for p in build_.lantern()]
     for dx, dz in ((-0.18, 0.08), (0.14, 0.15)):
-        group += [
-            placed(p, (dx, 0.74, dz), turn_deg=40) for p in furniture.cup(sides=12)
-        ]
+        group += [placed(p, (dx, 0.74, dz), turn_deg=40) for p in build_.cup(sides=12)]
     return [placed(p, (x, 0, z), turn_deg=turn) for p in group]
 
 
 def _near_table(rng: np.random.Generator) -> list[Mesh]:
     """Return the viewer's table, with objects at distances of 0.6 to 1.1 m."""
-    things = list(furniture.bistro_table(radius_m=0.46, top="table"))
+    things = list(build_.bistro_table(radius_m=0.46, top="table"))
     top = 0.74
-    cup = furniture.cup()
+    cup = build_.cup()
     things += [placed(p, (0.02, top, 0.0), turn_deg=-30) for p in cup]
-    card = furniture.table_card((0.15, 0.21), texture="card")
+    card = build_.table_card((0.15, 0.21), texture="card")
     things += [placed(p, (-0.23, top, -0.03), turn_deg=16) for p in card]
-    things += [placed(p, (0.24, top, -0.06)) for p in furniture.vase(rng=rng)]
-    things += [placed(p, (-0.03, top, -0.27)) for p in furniture.lantern()]
+    things += [placed(p, (0.24, top, -0.06)) for p in vase(rng=rng)]
+    things += [placed(p, (-0.03, top, -0.27)) for p in build_.lantern()]
     return [placed(p, (0.02, 0, -0.80)) for p in things]
 
 
 def _plants(rng: np.random.Generator) -> list[Mesh]:
     """Return the nearby branches, climbing plants and potted trees."""
     parts = [
-        foliage.branch(path, rng=rng, n_leaves=n, leaf_m=0.062)
+        branch(path, rng=rng, n_leaves=n, leaf_m=0.062)
         for path, n in (
             (((-0.62, 1.50, -0.62), (-0.42, 1.44, -0.50), (-0.28, 1.37, -0.45)), 26),
             (((-0.62, 1.46, -0.62), (-0.44, 1.36, -0.55), (-0.36, 1.27, -0.52)), 22),
@@ -193,13 +203,13 @@ def _plants(rng: np.random.Generator) -> list[Mesh]:
             [-5.02 + 0 * s, 0.2 + 2.6 * s, -3.0 - start - 0.4 * np.sin(4 * s)], axis=1
         )
         parts.append(
-            foliage.climber(
+            climber(
                 path, spread_m=(0.07, 0.25, 0.3), n_leaves=520, n_blossoms=290, rng=rng
             )
         )
     hedge = [(-6.2 + 0.25 * k, 3.95 + 0.15 * np.sin(k), -13.8) for k in range(14)]
     parts.append(
-        foliage.climber(
+        climber(
             hedge, spread_m=(0.2, 0.28, 0.12), n_leaves=760, n_blossoms=430, rng=rng,
             leaf_m=0.12,
         )
@@ -207,7 +217,7 @@ def _plants(rng: np.random.Generator) -> list[Mesh]:
     pots = ((-3.2, -9.6, ""), (3.9, -6.3, "#f2a03d"), (-4.0, -1.9, ""),
             (4.4, -10.6, "#f2c53d"), (-1.9, -12.6, "#f2c53d"))  # fmt: skip
     for x, z, fruit in pots:
-        tree = foliage.potted_tree(rng=rng, fruit=fruit)
+        tree = potted_tree(rng=rng, fruit=fruit)
         parts += [placed(p, (x, 0, z)) for p in tree]
     return parts
 
@@ -222,7 +232,7 @@ def _lamps() -> tuple[list[Mesh], np.ndarray]:
         ((5.2, 3.5, -6.2), (-5.2, 3.6, -11.6), 0.6, 14),
     )
     for start, end, sag_m, count in lines:
-        line, where = furniture.string_lights(start, end, sag_m=sag_m, count=count)
+        line, where = build_.string_lights(start, end, sag_m=sag_m, count=count)
         parts += line
         positions.append(where)
     return parts, np.concatenate(positions)
@@ -242,25 +252,12 @@ def _floor_batch(bake: Baker) -> Batch:
         (left, 0, far), (width, 0, 0), (0, 0, length), size=(columns, rows)
     )
     tile_px = round(4.0 / texel_m)  # the pattern repeats every four meters
-    tiles = _resized(stone_tiles(), tile_px, tile_px)
+    tiles = resized(stone_tiles(), (tile_px, tile_px), Image.Resampling.BOX)
     repeat = np.tile(tiles, (rows // tile_px + 1, columns // tile_px + 1, 1))
     texture = uint8_srgb(image * repeat[:rows, :columns])
     floor = replace(_floor(), texture="floor")
     ones = np.ones((len(floor.vertices_m), 3))
     return finished(floor, ones, {"floor": texture})
-
-
-def _resized(image: Array, width: int, height: int) -> NDArray[np.float32]:
-    """Reduce a linear image (h, w, 3) to a smaller size by averaging."""
-    from PIL import Image
-
-    channels = [
-        Image.fromarray(image[..., k].astype(np.float32)).resize(
-            (width, height), Image.Resampling.BOX
-        )
-        for k in range(3)
-    ]
-    return np.stack([np.asarray(channel) for channel in channels], axis=-1)
 
 
 def _backdrop() -> list[Mesh]:
@@ -276,7 +273,7 @@ def _backdrop() -> list[Mesh]:
         (-5.6, -19, 6.0), (-2.6, -23, 7.0), (2.2, -20.5, 6.2), (4.6, -25, 7.5),
         (6.2, -18.5, 5.2), (-7.6, -24, 7.0),
     ):  # fmt: skip
-        trees.append(placed(foliage.cypress(rng=rng, height_m=height), (x, 0, z)))
+        trees.append(placed(cypress(rng=rng, height_m=height), (x, 0, z)))
     # Cosine shading: leaves that face the sun are brighter.
     shaded = []
     for tree in trees:
@@ -288,21 +285,13 @@ def _backdrop() -> list[Mesh]:
 
 def _sky() -> Mesh:
     """Return a dome 100 m away, which the renderer treats as infinitely far."""
-    t = np.linspace(-0.05, np.pi / 2, 12)
-    a = np.linspace(0, 2 * np.pi, 25)
-    tt, aa = np.meshgrid(t, a, indexing="ij")
+    tt, aa = np.meshgrid(
+        np.linspace(-0.05, np.pi / 2, 12), np.linspace(0, 2 * np.pi, 25), indexing="ij"
+    )
     points = 100 * np.stack(
         [np.cos(tt) * np.sin(aa), np.sin(tt), np.cos(tt) * np.cos(aa)], axis=-1
     )
-    i, j = np.meshgrid(np.arange(11), np.arange(24), indexing="ij")
-    first = (i * 25 + j).ravel()
-    faces = np.concatenate(
-        [
-            np.stack([first, first + 1, first + 26], axis=1),
-            np.stack([first, first + 26, first + 25], axis=1),
-        ]
-    )
-    mesh = new_mesh(points, faces)
+    mesh = new_mesh(points, grid_faces(11, 24))
     return replace(mesh, albedo=evening_sky(np.sin(tt).ravel()))
 
 
@@ -354,3 +343,256 @@ def _menu_card() -> Array:
     ]
     image = board((480, 672), lines, paper="#f6ecd6", ink="#2b211a", grain=0.04)
     return framed(image, color="#8c2f24", border_px=6, inset_px=14)
+
+
+# Plants, made of many small triangles
+
+GREENS = ("#3f6b2a", "#5c8a35", "#7ba246", "#355c2c", "#94b04e")
+BLOSSOMS = ("#d63a7e", "#e85d9a", "#c22a6a", "#f08ab8")
+
+
+def leaves(
+    base_m: Array,
+    along: Array,
+    facing: Array,
+    *,
+    length_m: float,
+    width_m: float,
+    colors: Sequence[str],
+    rng: np.random.Generator,
+    segments: int = 0,
+) -> Mesh:
+    """Return folded, translucent leaves.
+
+    Parameters
+    ----------
+    base_m, along, facing : (n, 3) arrays
+        Foot, direction and upward normal of each leaf; the last two need not be unit
+        vectors.
+    length_m, width_m : float
+        Mean size.
+    colors : sequence of str
+        sRGB codes to choose from.
+    rng : numpy.random.Generator
+        Source of the variation.
+    segments : int
+        Rows of triangles per leaf; with 0, a leaf has two triangles and no midrib.
+    """
+    n = len(base_m)
+    along = _unit(along)
+    across = _unit(np.cross(along, facing))
+    up = np.cross(across, along)
+    size = rng.uniform(0.7, 1.3, (n, 1, 1))
+    s = np.linspace(0, 1, max(segments, 1) + 2)
+    half_width = 0.5 * width_m * np.sin(np.pi * s**0.8)
+    droop = -0.35 * length_m * s**2
+    fold = 0.45
+    rows = []
+    for side in (-1, 0, 1):
+        offset = (
+            (length_m * s)[None, :, None] * along[:, None]
+            + (side * half_width)[None, :, None] * across[:, None]
+            + (droop + fold * abs(side) * half_width)[None, :, None] * up[:, None]
+        )
+        rows.append(base_m[:, None] + size * offset)
+    vertices = np.stack(rows, axis=2)  # (n, rows, 3 across, xyz)
+    faces = _leaf_faces(segments)
+    per_leaf = vertices.shape[1] * 3
+    all_faces = faces[None] + per_leaf * np.arange(n)[:, None, None]
+    mesh = new_mesh(vertices, all_faces, normals=np.repeat(up, per_leaf, axis=0))
+    palette = np.array([linear_from_hex(color) for color in colors])
+    tint = palette[rng.integers(len(palette), size=n)] * rng.uniform(0.75, 1.2, (n, 1))
+    # A pale midrib and a darker foot make leaves recognizable at close range.
+    shade = np.ones((len(s), 3, 1)) * np.array([1.0, 1.25, 1.0])[None, :, None]
+    shade = shade * (0.75 + 0.35 * s)[:, None, None]
+    albedo = np.clip(tint[:, None, None] * shade, 0, 1).reshape(-1, 3)
+    return replace(mesh, albedo=albedo, translucency=np.full(len(albedo), 0.55))
+
+
+def _leaf_faces(segments: int) -> NDArray[np.int64]:
+    """Return the triangles of a leaf; rows have a left, midrib and right vertex."""
+    if segments == 0:
+        return np.array([(1, 5, 7), (1, 7, 3)])
+    faces = []
+    for row in range(segments + 1):
+        left, middle, right = 3 * row, 3 * row + 1, 3 * row + 2
+        # The first and the last row are points, so half of their triangles are empty.
+        if row > 0:
+            faces += [(left, middle, middle + 3), (middle, right, middle + 3)]
+        if row < segments:
+            faces += [(left, middle + 3, left + 3)]
+            faces += [(right, right + 3, middle + 3)]
+    return np.array(faces)
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
+
+
+def branch(
+    path_m: ArrayLike,
+    *,
+    radius_m: float = 0.006,
+    leaf_m: float = 0.07,
+    n_leaves: int = 40,
+    rng: np.random.Generator,
+    colors: Sequence[str] = GREENS,
+) -> Mesh:
+    """Return a twig with leaves on two sides, with details for a distance of 0.3 m."""
+    path_m = np.asarray(path_m, float)
+    taper = np.linspace(radius_m, 0.3 * radius_m, len(path_m))
+    bark = tube(path_m, taper, sides=6, color="#5b4632")
+    t = np.sort(rng.uniform(0.08, 1.0, n_leaves)) * (len(path_m) - 1)
+    index = np.minimum(t.astype(int), len(path_m) - 2)
+    along = path_m[index + 1] - path_m[index]
+    base = path_m[index] + (t - index)[:, None] * along
+    side = np.where(np.arange(n_leaves) % 2, 1.0, -1.0)[:, None]
+    out = side * np.cross(_unit(along), [0.0, 0.3, 1.0]) + 0.7 * _unit(along)
+    out = out + rng.normal(0, 0.35, (n_leaves, 3))
+    facing = np.array([0, 1.0, 0.5]) + rng.normal(0, 0.4, (n_leaves, 3))
+    crown = leaves(
+        base,
+        out,
+        facing,
+        length_m=leaf_m,
+        width_m=0.45 * leaf_m,
+        colors=colors,
+        rng=rng,
+        segments=4,
+    )
+    return merged([bark, crown])
+
+
+def cloud(
+    center_m: ArrayLike,
+    size_m: ArrayLike,
+    *,
+    n_leaves: int,
+    leaf_m: float,
+    rng: np.random.Generator,
+    colors: Sequence[str] = GREENS,
+    width_ratio: float = 0.55,
+) -> Mesh:
+    """Return leaves around a rough ball, such as a bush or the crown of a tree."""
+    direction = _unit(rng.normal(0, 1, (n_leaves, 3)))
+    depth = rng.uniform(0.55, 1.0, (n_leaves, 1)) ** 0.5
+    lumps = 1 + 0.18 * np.sin(direction @ rng.normal(0, 4, (3, 1)) + 1)
+    base = np.asarray(center_m) + direction * depth * lumps * np.asarray(size_m) / 2
+    along = direction + rng.normal(0, 0.6, (n_leaves, 3))
+    facing = direction + np.array([0, 0.8, 0]) + rng.normal(0, 0.4, (n_leaves, 3))
+    return leaves(
+        base,
+        along,
+        facing,
+        length_m=leaf_m,
+        width_m=width_ratio * leaf_m,
+        colors=colors,
+        rng=rng,
+    )
+
+
+def climber(
+    path_m: ArrayLike,
+    *,
+    spread_m: ArrayLike,
+    n_leaves: int,
+    n_blossoms: int,
+    rng: np.random.Generator,
+    leaf_m: float = 0.07,
+) -> Mesh:
+    """Return leaves and blossoms of a plant that climbs along a path."""
+    path_m = np.asarray(path_m, float)
+
+    def along_path(n: int, spread: Array) -> Array:
+        t = rng.uniform(0, len(path_m) - 1.001, n)
+        i = t.astype(int)
+        base = path_m[i] + (t - i)[:, None] * (path_m[i + 1] - path_m[i])
+        return base + rng.normal(0, 1, (n, 3)) * spread
+
+    def spray(
+        n: int, spread: float, length_m: float, colors: Sequence[str], ratio: float
+    ) -> Mesh:
+        base = along_path(n, np.asarray(spread_m) * spread)
+        direction = rng.normal(0, 1, (n, 3)) + np.array([0, -0.3, 0.5])
+        return leaves(
+            base,
+            direction,
+            rng.normal(0, 0.5, (n, 3)) + np.array([0, 0.7, 0.7]),
+            length_m=length_m,
+            width_m=ratio * length_m,
+            colors=colors,
+            rng=rng,
+        )
+
+    return merged(
+        [
+            spray(n_leaves, 1.0, leaf_m, GREENS, 0.6),
+            spray(n_blossoms, 1.1, 0.65 * leaf_m, BLOSSOMS, 0.95),
+        ]
+    )
+
+
+def potted_tree(
+    *,
+    rng: np.random.Generator,
+    height_m: float = 1.9,
+    crown_m: float = 0.95,
+    fruit: str = "",
+) -> list[Mesh]:
+    """Return a small tree in a clay pot, standing on the origin."""
+    pot = lathe(
+        [(0.0, 0.0), (0.17, 0.0), (0.25, 0.36), (0.28, 0.38), (0.28, 0.44),
+         (0.24, 0.44), (0.0, 0.40)],
+        sides=18,
+        color="#b5643c",
+    )  # fmt: skip
+    trunk = tube(
+        [(0, 0.4, 0), (0.02, 0.8, 0.01), (0, height_m - 0.6 * crown_m, 0)],
+        [0.03, 0.025, 0.02],
+        color="#6a4f38",
+    )
+    center = np.array([0, height_m - crown_m / 2, 0])
+    crown = cloud(center, [crown_m] * 3, n_leaves=520, leaf_m=0.11, rng=rng)
+    parts = [pot, trunk, crown]
+    if fruit:
+        for direction in _unit(rng.normal(0, 1, (16, 3))):
+            ball = sphere(0.045, sides=8, color=fruit)
+            move = np.eye(4)
+            move[:3, 3] = center + direction * crown_m * 0.47
+            parts.append(transformed(ball, move))
+    return parts
+
+
+def cypress(*, rng: np.random.Generator, height_m: float = 7.0) -> Mesh:
+    """Return a tall dark tree, standing on the origin."""
+    return cloud(
+        [0, height_m / 2, 0],
+        [1.5, height_m, 1.5],
+        n_leaves=680,
+        leaf_m=0.34,
+        rng=rng,
+        colors=("#2f4a2a", "#3b5a31", "#496a38"),
+    )
+
+
+def vase(*, rng: np.random.Generator, height_m: float = 0.13) -> list[Mesh]:
+    """Return a small blue vase with three flowering stems."""
+    body = lathe(
+        [(0.0, 0.0), (0.024, 0.0), (0.034, 0.03), (0.028, 0.065), (0.013, 0.1),
+         (0.018, height_m)],
+        sides=24,
+        color="#3f7fa3",
+    )  # fmt: skip
+    parts = [body]
+    for lean in ((-0.05, 0.02), (0.045, 0.0), (0.0, -0.03)):
+        tip = np.array([lean[0], height_m + 0.11, lean[1]])
+        middle = np.array([0.3 * lean[0], height_m + 0.03, 0.3 * lean[1]])
+        parts.append(tube([(0, 0.05, 0), middle, tip], 0.0025, color="#55803a"))
+        parts.append(
+            cloud(tip, [0.06] * 3, n_leaves=40, leaf_m=0.026, rng=rng,
+                  colors=BLOSSOMS, width_ratio=0.8)
+        )  # fmt: skip
+        parts.append(
+            cloud(middle, [0.04] * 3, n_leaves=8, leaf_m=0.035, rng=rng, colors=GREENS)
+        )
+    return parts

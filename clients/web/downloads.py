@@ -10,7 +10,7 @@ from typing import Any
 from nicegui import ui
 
 from clients.headset.runtime import Eye
-from clients.openxr_layer.helper_socket import ask, socket_path
+from clients.openxr_layer.wire import ask, socket_path
 from clients.report import report_html
 from clients.web.eye_form import SIDES, EyeSide
 from clients.web.figure_worker import FigureFailed, FigureWorker

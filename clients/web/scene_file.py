@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from clients.arguments import read_size_px
-from clients.headset.gltf_container import (
+from clients.headset.gltf_file import (
     MAX_HEADER_BYTES,
     MAX_HEADER_DEPTH,
     MAX_HEADER_ITEMS,
@@ -165,10 +165,9 @@ def _rendered(source: str, title: str, folder: Path) -> Picture:
 def main(source: str, file: str, size: str) -> int:
     """Render a scene and write it to a file, in the child process."""
     from clients.headset.gltf_scene import load_gltf
-    from clients.headset.viewpoint import viewpoint
-    from clients.scene_renderer import SceneRenderer
+    from clients.headset.scenery import viewpoint
+    from clients.scene_renderer import PATHS, SceneRenderer, path_moments
     from clients.scenes.catalog import build_scene
-    from clients.scenes.paths import PATHS, path_moments
 
     try:
         is_built_in = source in PATHS

@@ -31,17 +31,12 @@ from pathlib import Path
 import moderngl
 import numpy as np
 
-from clients.headset.controls import Controls
 from clients.headset.gltf_scene import load_gltf
-from clients.headset.local_filter import LocalFilter
-from clients.headset.poses import upright
-from clients.headset.scenery import SceneScenery
-from clients.headset.service_filter import ServiceFilter
-from clients.headset.simulated_runtime import SimulatedRuntime
-from clients.headset.stereo_filter import StereoFilter
+from clients.headset.runtime import SimulatedRuntime, upright
+from clients.headset.scenery import SceneScenery, viewpoint
+from clients.headset.stereo_filter import LocalFilter, ServiceFilter, StereoFilter
 from clients.headset.stereo_gaze import StereoGaze
-from clients.headset.viewer import Viewer
-from clients.headset.viewpoint import viewpoint
+from clients.headset.viewer import Controls, Viewer
 from clients.scenes.catalog import build_scene
 from clients.scenes.scene_view import read_texture
 from clients.service_process import ServiceProcess

@@ -30,8 +30,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clients.headset.local_filter import LocalFilter
-from clients.headset.stereo_filter import FilteredStereoFrame
+from clients.headset.stereo_filter import FilteredStereoFrame, LocalFilter
 from clients.headset.stereo_gaze import StereoGaze
 from tests.benchmarks.bench_headset import PROFILES, SETTINGS, error_db
 from tests.benchmarks.harness import Row, memory_mb, report

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.pyrender_stream import path_settings
-from clients.scenes.paths import PATHS, path_moments
+from clients.scene_renderer import PATHS, path_moments
 from tests.benchmarks.dense_reference import dense_reference, has_reference
 from tests.benchmarks.view_sources import EyeState, Window
 from tests.grid_specs import grid_spec

@@ -2,14 +2,13 @@
 
 import numpy as np
 
-from clients.headset.controls import Controls
-from clients.headset.poses import matrix_of
-from clients.headset.simulated_runtime import (
+from clients.headset.runtime import (
     eye_views,
+    matrix_of,
 )
 from clients.headset.stereo_filter import FilteredStereoFrame
 from clients.headset.stereo_gaze import RgbdPicture, StereoGaze
-from clients.headset.viewer import Viewer
+from clients.headset.viewer import Controls, Viewer
 
 SIZE_PX = (40, 36)
 WALL_M = 2.0

@@ -8,7 +8,7 @@ import threading
 
 import numpy as np
 
-from clients.headset.simulated_runtime import eye_views, still
+from clients.headset.runtime import eye_views, still
 from clients.openxr_layer import wire
 from clients.openxr_layer.helper import HelperOptions, LayerHelper
 from filter_service.shared_memory import Slot, aligned_starts

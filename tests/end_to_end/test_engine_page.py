@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from clients.headset.poses import angles_of, direction_of
+from clients.headset.runtime import angles_of, direction_of
 from clients.scenes.scene_view import projection
 from estimator.profiles import parse_profile
 from filter_service import Camera

@@ -11,7 +11,7 @@ import pytest
 
 from clients.headset import options as options_module
 from clients.headset import program
-from clients.headset.simulated_runtime import (
+from clients.headset.runtime import (
     Happening,
     SimulatedRuntime,
 )

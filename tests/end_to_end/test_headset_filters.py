@@ -6,20 +6,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clients.headset.local_filter import LocalFilter
 from clients.headset.runtime import (
     EYES,
     DueFrame,
-)
-from clients.headset.service_filter import SAY_AGAIN_S, LogOnce, ServiceFilter
-from clients.headset.simulated_runtime import (
     Happening,
     SimulatedRuntime,
     eye_views,
     still,
     swaying,
 )
-from clients.headset.stereo_filter import StereoFrame
+from clients.headset.stereo_filter import (
+    SAY_AGAIN_S,
+    LocalFilter,
+    LogOnce,
+    ServiceFilter,
+    StereoFrame,
+)
 from clients.headset.stereo_gaze import EyeAndGaze, EyeState, RgbdPicture
 from filter_service import FilterSettings
 from tests.end_to_end.conftest import TIMEOUT_S

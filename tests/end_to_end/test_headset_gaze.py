@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clients.headset.poses import angles_of, direction_of, turned
 from clients.headset.runtime import (
+    EYE_DISTANCE_M,
     DueFrame,
     GazeSample,
-)
-from clients.headset.simulated_runtime import (
-    EYE_DISTANCE_M,
     Happening,
     SimulatedRuntime,
+    angles_of,
+    direction_of,
     eye_views,
     still,
+    turned,
 )
 from clients.headset.stereo_gaze import StereoGaze
 from tests.end_to_end.headset_doubles import (

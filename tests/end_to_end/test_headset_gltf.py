@@ -8,10 +8,9 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from clients.headset.gltf_scene import BACKGROUND_SRGB, light_on, load_gltf
-from clients.headset.viewpoint import EYE_HEIGHT_M, viewpoint
-from clients.scenes.geometry import rotation, srgb_from_linear
-from clients.scenes.paths import PATHS, path_moments
-from clients.scenes.scene import Scene
+from clients.headset.scenery import EYE_HEIGHT_M, viewpoint
+from clients.scene_renderer import PATHS, path_moments
+from clients.scenes.geometry import Scene, rotation, srgb_from_linear
 
 ONE_TO_ONE = (-1.0, 1.0, 1.0, -1.0)
 
@@ -168,9 +167,9 @@ def test_a_file_that_cannot_be_shown_is_named_with_the_reason(tmp_path, monkeypa
     refused("extension KHR_x", "extension.gltf", need)
     write_gltf(tmp_path / "huge.glb", [(quad(), np.diag([9e3, 9e3, 1.0, 1.0]))])
     refused("m across", "huge.glb")
-    monkeypatch.setattr("clients.headset.gltf_file.MAX_TRIANGLES", 1)
+    monkeypatch.setattr("clients.headset.gltf_scene.MAX_TRIANGLES", 1)
     refused("2 triangles", "good.glb")
-    monkeypatch.setattr("clients.headset.gltf_container.MAX_FILE_MB", 1e-5)
+    monkeypatch.setattr("clients.headset.gltf_file.MAX_FILE_MB", 1e-5)
     refused("at most 1e-05 MB", "good.glb")
 
 

@@ -4,8 +4,11 @@ import moderngl
 import numpy as np
 import pytest
 
+from clients.scene_renderer import PATHS, look_at, path_moments
 from clients.scenes.catalog import build_scene
 from clients.scenes.geometry import (
+    Scene,
+    finished,
     linear_from_hex,
     patch,
     placed,
@@ -13,10 +16,7 @@ from clients.scenes.geometry import (
     srgb_from_linear,
     transformed,
 )
-from clients.scenes.paths import PATHS, look_at, path_moments
-from clients.scenes.scene import Scene, finished
-from clients.scenes.scene_buffers import LEAST_GAP_DPT
-from clients.scenes.scene_view import SceneView
+from clients.scenes.scene_view import LEAST_GAP_DPT, SceneView
 
 SIZE_PX = (320, 180)
 ONE_TO_ONE = (-1.0, 1.0, 1.0, -1.0)

@@ -10,20 +10,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clients.headset.local_filter import LocalFilter
-from clients.headset.poses import upright
-from clients.headset.presenter import Presenter
-from clients.headset.runtime import DueFrame, ShownView
-from clients.headset.scenery import SceneScenery
-from clients.headset.simulated_runtime import (
+from clients.headset.runtime import (
+    DueFrame,
+    ShownView,
     SimulatedRuntime,
     eye_views,
     still,
     swaying,
+    upright,
 )
-from clients.headset.stereo_filter import StereoFrame
+from clients.headset.scenery import Presenter, SceneScenery, viewpoint
+from clients.headset.stereo_filter import LocalFilter, StereoFrame
 from clients.headset.stereo_gaze import RgbdPicture, StereoGaze, images_of
-from clients.headset.viewpoint import viewpoint
 from clients.scenes.catalog import build_scene
 from clients.scenes.scene_view import open_context, read_texture
 from filter_service import FilterSettings

@@ -10,21 +10,23 @@ import numpy as np
 import pytest
 
 from clients.headset import program
-from clients.headset.poses import angles_of, direction_of, matrix_of, turned, upright
 from clients.headset.runtime import (
+    EYE_DISTANCE_M,
     EYES,
     DueFrame,
     GazeSample,
+    Happening,
     NoRuntime,
     SessionLost,
-)
-from clients.headset.simulated_runtime import (
-    EYE_DISTANCE_M,
-    Happening,
     SimulatedRuntime,
+    angles_of,
+    direction_of,
     eye_views,
+    matrix_of,
     still,
     swaying,
+    turned,
+    upright,
 )
 from clients.headset.stereo_gaze import StereoGaze
 from tests.end_to_end.headset_doubles import (

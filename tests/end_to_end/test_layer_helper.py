@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from clients.arguments import profile_title
-from clients.headset.local_filter import LocalFilter
+from clients.headset.stereo_filter import LocalFilter
 from clients.headset.stereo_gaze import StereoGaze
 from clients.openxr_layer import program, wire
 from clients.openxr_layer.helper import MAX_WAITING, HelperOptions, LayerHelper
-from clients.openxr_layer.helper_socket import ask
+from clients.openxr_layer.wire import ask
 from filter_service import Camera, EyeFilter, FilterSettings, RgbdView
 from filter_service.messages import body_of_eye
 from tests.end_to_end.layer_double import LayerDouble, RunningHelper

@@ -16,22 +16,19 @@ from trimesh.transformations import rotation_matrix, translation_matrix
 from clients.filter_client import FilterClient
 from clients.frame_log import FrameLog
 from clients.pyrender_renderer import (
+    BUILT_IN_FLAGS,
+    MAX_PARTS,
     PyrenderRenderer,
+    built_in,
     camera_tangents,
+    load_file,
+    orbit,
     pyrender,
     pyrender_frames,
 )
-from clients.pyrender_scenes import (
-    BUILT_IN_FLAGS,
-    MAX_PARTS,
-    built_in,
-    load_file,
-    orbit,
-)
-from clients.scene_renderer import SceneRenderer
+from clients.scene_renderer import Moment, SceneRenderer, look_at
 from clients.scenes.catalog import build_scene
-from clients.scenes.paths import Moment, look_at
-from clients.scenes.scene import Batch, Scene
+from clients.scenes.geometry import Batch, Scene
 from clients.streaming import filter_in_order
 from estimator import InvalidFile
 from tests.source_tree import ROOT

@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_erosion
 
-from clients.scene_renderer import SceneRenderer
+from clients.scene_renderer import PATHS, SceneRenderer, look_at, path_moments
+from clients.scenes.appearance import Lights, baker
 from clients.scenes.catalog import build_scene
 from clients.scenes.geometry import box, patch, placed, sphere
-from clients.scenes.lighting import Lights, baker
-from clients.scenes.paths import PATHS, look_at, path_moments
-from clients.scenes.scene_buffers import LEAST_GAP_DPT
-from clients.scenes.scene_view import open_context
+from clients.scenes.scene_view import LEAST_GAP_DPT, open_context
 from filter_service.errors import RenderFailed
 
 UNITS_PER_M = 180.0

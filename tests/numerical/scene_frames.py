@@ -19,11 +19,10 @@ import json
 import sys
 from dataclasses import replace
 import numpy as np
-from clients.scene_renderer import SceneRenderer
-from clients.scenes import courtyard, primitives
-from clients.scenes.paths import PATHS, Key, path_moments
+from clients.scene_renderer import PATHS, Key, SceneRenderer, path_moments
+from clients.scenes.catalog import build_scene
 name, width, height, count, first, end, keys, hidden, fov, out = sys.argv[1:]
-scene = {"courtyard": courtyard, "primitives": primitives}[name].build()
+scene = build_scene(name)
 if float(fov):
     scene = replace(scene, fov_deg=float(fov))
 path = [Key(*key) for key in json.loads(keys)] or PATHS[name]
@@ -76,7 +75,7 @@ def scene_views(
     Parameters
     ----------
     path : tuple
-        Arguments of `clients.scenes.paths.Key`.
+        Arguments of `clients.scene_renderer.Key`.
     count, first, end : int
         Frames of the whole path, and which of them.
     """

@@ -3,11 +3,10 @@
 import time
 from unittest import mock
 
-from clients.headset.local_filter import LocalFilter
-from clients.headset.stereo_filter import FilteredStereoFrame
+from clients.headset.stereo_filter import FilteredStereoFrame, LocalFilter
 from clients.headset.stereo_gaze import StereoGaze
 from clients.openxr_layer import manifest
-from clients.openxr_layer.helper_socket import SOCKET_VARIABLE
+from clients.openxr_layer.wire import SOCKET_VARIABLE
 
 LAYER_LINE = "ocufilter layer: "
 LONG_MS = 60_000

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from clients.openxr_layer import manifest, program
-from clients.openxr_layer.helper_socket import SOCKET_VARIABLE
+from clients.openxr_layer.wire import SOCKET_VARIABLE
 from tests.end_to_end.layer_double import RunningHelper
 from tests.native_build import runtime_of
 from tests.openxr_layer import build

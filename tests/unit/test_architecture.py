@@ -138,7 +138,7 @@ HOME = {
     "pyrender": ("clients/pyrender_renderer.py",),  # and not before its settings
     "OpenGL": ("clients/pyrender_renderer.py",),  # buffers and errors of pyrender
     "pyglet": ("clients/pyrender_renderer.py",),
-    "trimesh": ("clients/pyrender_scenes.py",),  # reads files
+    "trimesh": ("clients/pyrender_renderer.py",),  # reads files
     "xr": ("clients/headset/openxr_*",),  # makes PyOpenGL use GLX
     "zmq": (
         "filter_service/service/router.py",  # the server's socket and nothing else

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from clients.openxr_layer.submitted_depth import (
+from clients.openxr_layer.frame_images import (
     DepthRange,
     corrected_range,
     planar_depth,

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from clients.scenes.letter_chart import LOG_MAR_ROWS, letter_chart
-from clients.scenes.sloan_letters import SLOAN_LETTERS
+from clients.scenes.letter_chart import LOG_MAR_ROWS, SLOAN_LETTERS, letter_chart
 from filter_service import Camera
 
 HALF_LIGHT = 188

@@ -9,7 +9,7 @@ import sys
 import pytest
 from playwright.sync_api import sync_playwright
 
-from clients.openxr_layer.helper_socket import SOCKET_VARIABLE
+from clients.openxr_layer.wire import SOCKET_VARIABLE
 from tests.source_tree import ROOT
 from tests.web.browser import BROWSERS, PageUnderTest, open_browser
 

@@ -52,7 +52,7 @@ static void lose(link_state *link, const char *why) {
     link_close(link);
 }
 
-/* The address, as in clients/openxr_layer/helper_socket.py; false if it is too long. */
+/* The address, as in clients/openxr_layer/wire.py; false if it is too long. */
 static bool address_of(struct sockaddr_un *address) {
     *address = (struct sockaddr_un){.sun_family = AF_UNIX};
     const char *path = secure_getenv("OCUFILTER_LAYER_SOCKET");
