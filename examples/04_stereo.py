@@ -59,7 +59,7 @@ filters = {side: EyeFilter(PROFILES[side], camera) for side in sides}
 for eye_filter in filters.values():
     eye_filter.wait()
 planned = plan_views(filters.get, views, states, pupil_diameter_mm=4.5, focus_dpt=0.5)
-assert planned is not None  # both eyes are ready
+assert planned  # both eyes are ready
 seen = planned.render().views
 for eye_filter in filters.values():
     eye_filter.close()

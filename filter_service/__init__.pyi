@@ -8,6 +8,7 @@ from .filtering.filtered import EyeFailed as EyeFailed
 from .filtering.filtered import EyeReady as EyeReady
 from .filtering.filtered import Filtered as Filtered
 from .filtering.filtered import FilteredTexture as FilteredTexture
+from .filtering.filtered import Preparing as Preparing
 from .filtering.several_eyes import plan_views as plan_views
 from .gl_device import is_software_renderer as is_software_renderer
 from .rgbd_view import ColorImage as ColorImage

@@ -155,10 +155,6 @@ class WorkerCrashed(SessionError):
     code = "worker_crashed"
 
 
-class NotPrepared(Exception):
-    """PSFs that a frame needs were not computed before its deadline; never sent."""
-
-
 class RenderError(FilterError):
     """A frame could not be filtered."""
 

@@ -16,7 +16,14 @@ from clients.web.eye_form import EyeSide
 from clients.web.picture import coarser
 from clients.web.picture_files import jpeg_of, png_of
 from clients.web.picture_requests import Kind, PictureRequest, SentPicture
-from filter_service import EyeFilter, Filtered, FilterError, FilterSettings, RgbdView
+from filter_service import (
+    EyeFilter,
+    Filtered,
+    FilterError,
+    FilterSettings,
+    Preparing,
+    RgbdView,
+)
 
 MS_PER_S = 1e3
 PSF_SLICE_S = 0.05
@@ -46,8 +53,8 @@ class _ProfiledFilter:
 
     def filter_view(
         self, view: RgbdView, request: PictureRequest, *, gaze_deg: tuple[float, float]
-    ) -> Filtered | None:
-        """Return the picture through the newest eye; None while the eye is prepared."""
+    ) -> Filtered | Preparing:
+        """Return the picture through the newest eye, unless it is being prepared."""
         state: dict[str, Any] = {
             "pupil_diameter_mm": request.pupil_diameter_mm,
             "focus_dpt": request.focus_dpt,
@@ -134,7 +141,7 @@ class EyeView:
             return SentPicture(
                 "failed", self.side, request.number, b"", {"error": str(error)}
             )
-        if seen is None:
+        if not seen:
             return None
         self.seen[kind] = request.number
         encode = png_of if kind == "full" else jpeg_of

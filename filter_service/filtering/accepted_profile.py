@@ -80,6 +80,10 @@ class AcceptedProfile:
         Failed builds.
     accepted_s : float
         Time of acceptance.
+    fraction : float, optional
+        Completed fraction of its preparation.
+    stage : str
+        Current stage of its preparation.
     """
 
     generation: int
@@ -91,6 +95,8 @@ class AcceptedProfile:
     was_ready: bool = False
     failures: list[tuple[Camera, FilterError]] = field(default_factory=list)
     accepted_s: float = field(default_factory=time.monotonic)
+    fraction: float | None = None
+    stage: str = ""
 
     @property
     def media_effects(self) -> MediaEffects | None:

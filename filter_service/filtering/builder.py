@@ -28,7 +28,6 @@ from filter_service.camera import Camera
 from filter_service.errors import (
     BuildCancelled,
     FilterError,
-    NotPrepared,
     RenderFailed,
 )
 from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
@@ -248,7 +247,7 @@ class Builder:
         target = stream.building
         if isinstance(event, BuildProgress):
             fraction = EYE_PROGRESS * event.fraction
-            stream.on_event(BuildingEye(target.eye, fraction, event.stage))
+            self._report(stream, target.eye, fraction, event.stage)
         elif isinstance(event, BuildDone):
             stream.ticket = stream.building = None
             try:
@@ -322,15 +321,17 @@ class Builder:
                     self._report_progress(stream, eye, prepared)
             n_pending = prepared.pending.size
             if n_pending:
-                store.fill(prepared.pending, until_s=until_s, batch_count=WARM_BATCH)
-                prepared.pending = prepared.pending[:0]
+                left = store.fill(
+                    prepared.pending, until_s=until_s, batch_count=WARM_BATCH
+                )
+                if left.size:
+                    self._report_progress(stream, eye, prepared)
+                    return False
+                prepared.pending = left
                 # Pupil and focus may have changed meanwhile, so check again.
                 prepared.n_checks += 1
                 if n_pending > WARM_BATCH * CHECK_GROWTH ** (prepared.n_checks - 1):
                     return False
-        except NotPrepared:
-            self._report_progress(stream, eye, prepared)
-            return False
         except Exception as error:  # must not affect other streams
             target = BuildTarget(eye, prepared.camera)
             self._fail(stream, target, _to_filter_error(error))
@@ -348,7 +349,13 @@ class Builder:
         n_computed = prepared.store.computed_count
         share = n_computed / (n_computed + prepared.pending.size)
         fraction = EYE_PROGRESS + (1.0 - EYE_PROGRESS) * share
-        stream.on_event(BuildingEye(eye, fraction, "psfs"))
+        self._report(stream, eye, fraction, "psfs")
+
+    def _report(
+        self, stream: StreamEyes, eye: AcceptedProfile, fraction: float, stage: str
+    ) -> None:
+        eye.fraction, eye.stage = fraction, stage
+        stream.on_event(BuildingEye(eye, fraction, stage))
 
     def mark_rendered(self, stream: StreamEyes, plan: RenderPlan) -> None:
         """Mark the stores that a frame was rendered with as ready."""
@@ -383,10 +390,10 @@ class Builder:
             for state in stream.history.predicted_states():
                 left = store.missing_psfs(last, state=state)
                 if left.size:
-                    store.fill(left, until_s=until_s, batch_count=WARM_BATCH)
-        except NotPrepared:
-            self._is_warming = True
-            return
+                    left = store.fill(left, until_s=until_s, batch_count=WARM_BATCH)
+                if left.size:
+                    self._is_warming = True
+                    return
         except Exception as error:  # a frame that needs the PSFs reports it
             log.info(
                 "predicted PSFs could not be computed: %s", _to_filter_error(error)

@@ -25,7 +25,6 @@ from estimator.profiles.parse import EyeProfile, parse_profile
 from filter_service.camera import Camera
 from filter_service.errors import (
     BadMessage,
-    NotPrepared,
     RenderFailed,
     ServiceTimeout,
 )
@@ -38,6 +37,7 @@ from filter_service.filtering.filtered import (
     EyeReady,
     Filtered,
     FilteredTexture,
+    Preparing,
 )
 from filter_service.filtering.planned_frame import PlannedFrame
 from filter_service.filtering.planned_textures import (
@@ -196,7 +196,6 @@ class EyeFilter:
         self._newest: AcceptedProfile | None = None
         self._failure: EyeFailed | None = None
         self._progress: tuple[float | None, str] = None, ""
-        self.is_extending = False  # whether the last frame only lacked PSFs
         self.ready: EyeReady | None = None
         if first is not None:
             try:
@@ -442,7 +441,7 @@ class EyeFilter:
                     **options,
                 )
                 self.builder.advance(ahead=False)  # after this frame's request
-                if seen is not None:
+                if seen:
                     return seen
                 self._wait_for_worker(waiting, "the eye to be prepared for this camera")
 
@@ -458,20 +457,24 @@ class EyeFilter:
         until_s: float | None = None,
         out: Sequence[NDArray[Any] | None] | None = None,
         **options: Unpack[RenderOptionValues],
-    ) -> Filtered | None:
-        """Filter one frame like `filter`; return None while its eye is being prepared.
+    ) -> Filtered | Preparing:
+        """Filter one frame like `filter`, but do not wait until its eye is prepared.
 
         Parameters
         ----------
         newest_only : bool
-            Whether to return None, and set `is_extending`, while only an older eye is
-            ready.
+            Whether to return `Preparing` while only an older eye is ready.
         until_s : float, optional
             Time of `time.monotonic` after which no more PSFs are computed.  If some are
-            missing then, this returns None and sets `is_extending`; the computed ones
-            stay cached for the next frame.
+            missing then, this returns `Preparing`; the computed ones stay cached for
+            the next frame.
         out : sequence of arrays, optional
             Output arrays that may be used; only the returned arrays are valid.
+
+        Returns
+        -------
+        Filtered or Preparing
+            The latter is false: ``while not (seen := eye_filter.try_filter(...))``.
 
         Raises
         ------
@@ -482,22 +485,18 @@ class EyeFilter:
         RenderError
             If the engine failed.
         """
-        try:
-            finish = self.begin(
-                views,
-                pupil_diameter_mm=pupil_diameter_mm,
-                focus_dpt=focus_dpt,
-                gaze_deg=gaze_deg,
-                output=output,
-                newest_only=newest_only,
-                until_s=until_s,
-                out=out,
-                **options,
-            )
-            return None if finish is None else finish()
-        except NotPrepared:
-            self.is_extending = True
-            return None
+        finish = self.begin(
+            views,
+            pupil_diameter_mm=pupil_diameter_mm,
+            focus_dpt=focus_dpt,
+            gaze_deg=gaze_deg,
+            output=output,
+            newest_only=newest_only,
+            until_s=until_s,
+            out=out,
+            **options,
+        )
+        return finish() if finish else finish
 
     def begin(
         self,
@@ -511,7 +510,7 @@ class EyeFilter:
         until_s: float | None = None,
         out: Sequence[NDArray[Any] | None] | None = None,
         **options: Unpack[RenderOptionValues],
-    ) -> Callable[[], Filtered] | None:
+    ) -> Callable[[], Filtered | Preparing] | Preparing:
         """Start one frame; return a function that waits for it and returns the result.
 
         On a hardware GPU, the CPU is free until then: to render, to begin the frame of
@@ -522,14 +521,9 @@ class EyeFilter:
 
         Returns
         -------
-        callable or None
-            None while the eye is being prepared.
-
-        Raises
-        ------
-        NotPrepared
-            If PSFs were not computed by ``until_s``.  The returned function may also
-            raise it.
+        callable or Preparing
+            The latter, which is false, while the eye is being prepared.  The function
+            also returns one if PSFs were not computed by ``until_s``.
         """
         self.advance_builds()
         if gaze_deg is not None:
@@ -541,8 +535,8 @@ class EyeFilter:
             gaze_deg=gaze_deg,
             newest_only=newest_only,
         )
-        if planned is None:
-            return None
+        if isinstance(planned, Preparing):
+            return planned
         return planned.begin(
             gazes_deg=[gaze_deg] * len(views),
             output=output,
@@ -562,13 +556,14 @@ class EyeFilter:
         target_is_top_first: bool | None = None,
         newest_only: bool = False,
         **options: Unpack[RenderOptionValues],
-    ) -> FilteredTexture | None:
+    ) -> FilteredTexture | Preparing:
         """Filter a frame from textures to a texture, all in the caller's context.
 
         This submits the frame to the GPU and does not wait for it, except for the first
         frame of an eye.  Later commands of the context see the filtered image.  Counts,
         and samples of the input, are those of an earlier frame.  The caller's OpenGL
-        state is kept.  Returns None, and writes nothing, while the eye is prepared.
+        state is kept.  While the eye is prepared, this writes nothing and returns
+        `Preparing`, which is false.
 
         A frame that needs PSFs that are not computed yet uses others instead; the
         next frames have them.  To compute PSFs before frames need them, call `advance`
@@ -613,14 +608,15 @@ class EyeFilter:
             focus_dpt=focus_dpt,
             newest_only=newest_only,
         )
-        if planned is None:
-            return None
+        if isinstance(planned, Preparing):
+            return planned
         shown = planned.show(
             0,
             gaze_deg=gaze_deg,
             options=RenderOptions(**options),
             target_is_top_first=target_is_top_first,
         )
+        assert shown is not None  # as the frame does not wait
         return FilteredTexture(
             planned.plan.eye.profile_id,
             planned.plan.eye.generation,
@@ -640,8 +636,8 @@ class EyeFilter:
         focus_dpt: float,
         newest_only: bool = False,
         **_: Any,
-    ) -> PlannedTextures | None:
-        """Return views in textures that are ready to be rendered, or None.
+    ) -> PlannedTextures | Preparing:
+        """Return views in textures that are ready to be rendered.
 
         Parameters, errors and lifetime are those of `plan`.
         """
@@ -651,8 +647,8 @@ class EyeFilter:
         plan = self._planned(
             [view.camera for view, _ in views], newest_only=newest_only
         )
-        if plan is None:
-            return None
+        if isinstance(plan, Preparing):
+            return plan
         return PlannedTextures(
             self.builder, self._eyes, plan, tuple(views), pupil_diameter_mm, focus_dpt
         )
@@ -665,8 +661,8 @@ class EyeFilter:
         focus_dpt: float,
         gaze_deg: tuple[float, float] | None = None,
         newest_only: bool = False,
-    ) -> PlannedFrame | None:
-        """Return a frame that is ready to be rendered, or None.
+    ) -> PlannedFrame | Preparing:
+        """Return a frame that is ready to be rendered, or `Preparing`.
 
         The parameters and errors are those of `try_filter`.  To prepare two eyes at the
         same time, plan the frames of both before you render one.  Render a plan before
@@ -682,19 +678,16 @@ class EyeFilter:
             at_s=time.monotonic(),
         )
         plan = self._planned([view.camera for view in views], newest_only=newest_only)
-        if plan is None:
-            return None
+        if isinstance(plan, Preparing):
+            return plan
         return PlannedFrame(
             self.builder, self._eyes, plan, tuple(views), pupil_diameter_mm, focus_dpt
         )
 
     def _planned(
         self, cameras: Sequence[Camera], *, newest_only: bool
-    ) -> RenderPlan | None:
-        """Return the eye and the stores of a frame, or None while they are prepared."""
-        plan = self._eyes.plan(cameras)
+    ) -> RenderPlan | Preparing:
+        """Return the eye and the stores of a frame, unless they are being prepared."""
+        plan = self._eyes.plan(cameras, newest_only=newest_only)
         self.builder.free_retired(self._eyes)
-        self.is_extending = (
-            plan is not None and newest_only and not self._eyes.is_newest(plan)
-        )
-        return None if self.is_extending else plan
+        return plan

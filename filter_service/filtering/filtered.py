@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 from numpy.typing import NDArray
 
@@ -198,6 +198,30 @@ def summed_times(times_ms: Iterable[Mapping[str, float]]) -> dict[str, float]:
         for name, value_ms in stages_ms.items():
             found[name] = found.get(name, 0.0) + float(value_ms)
     return found
+
+
+@dataclass(frozen=True)
+class Preparing:
+    """Why a frame is not filtered yet, in place of its result; it is false.
+
+    Attributes
+    ----------
+    reason : "preparing" or "extending"
+        Whether no eye is ready for the frame, or only PSFs of its state or the newest
+        eye are missing.
+    fraction : float, optional
+        Completed fraction, 0 to 1, if it is known.
+    stage : str
+        What is computed now.
+    """
+
+    reason: Literal["preparing", "extending"]
+    fraction: float | None = None
+    stage: str = ""
+
+    def __bool__(self) -> Literal[False]:
+        """Return false, unlike results."""
+        return False
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,16 @@ from typing import Any
 from numpy.typing import NDArray
 
 from filter_service.filtering.builder import Builder
-from filter_service.filtering.filtered import Filtered, ViewResult, summed_times
+from filter_service.filtering.filtered import (
+    Filtered,
+    Preparing,
+    ViewResult,
+    summed_times,
+)
 from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
 from filter_service.rendering.engine import Pending, ViewRequest
 from filter_service.rendering.filtered_view import summed_counts
+from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rendering.media_effects import begin_through_media
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
@@ -40,7 +46,7 @@ class PlannedFrame:
         options: RenderOptions = DEFAULT_OPTIONS,
         out: Sequence[NDArray[Any] | None] | None = None,
         until_s: float | None = None,
-    ) -> Filtered:
+    ) -> Filtered | Preparing:
         """Filter the frame; `EyeFilter.filter` describes the other parameters.
 
         Parameters
@@ -51,10 +57,13 @@ class PlannedFrame:
         until_s : float, optional
             Time of `time.monotonic` after which no more PSFs are computed.
 
+        Returns
+        -------
+        Filtered or Preparing
+            The latter if PSFs were not computed by ``until_s``.
+
         Raises
         ------
-        NotPrepared
-            If PSFs that the frame needs were not computed by ``until_s``.
         RenderError
             If the engine failed.
         """
@@ -73,7 +82,7 @@ class PlannedFrame:
         options: RenderOptions = DEFAULT_OPTIONS,
         out: Sequence[NDArray[Any] | None] | None = None,
         **values: Any,
-    ) -> Callable[[], Filtered]:
+    ) -> Callable[[], Filtered | Preparing]:
         """Start rendering; return a function that waits for the result.
 
         The parameters are those of `render`.  Frames of other eyes may be started
@@ -105,9 +114,16 @@ class PlannedFrame:
         ]
         return _BegunFrame(self, begun, started_s)
 
-    def finish(self, begun: Sequence[Pending], started_s: float) -> Filtered:
+    def finish(
+        self, begun: Sequence[Pending], started_s: float
+    ) -> Filtered | Preparing:
         """Wait for the views and return the result."""
-        rendered = [finish() for finish in begun]
+        rendered = []
+        for finish in begun:
+            view = finish()
+            if isinstance(view, MissingPsfs):
+                return Preparing("extending", stage="psfs")
+            rendered.append(view)
         self.builder.frame_s = time.monotonic() - started_s
         self.builder.mark_rendered(self.stream, self.plan)
         eye = self.plan.eye
@@ -144,7 +160,7 @@ class _BegunFrame:
         self._planned, self._begun, self._started_s = planned, begun, started_s
         planned.stream.begun.add(self)
 
-    def __call__(self) -> Filtered:
+    def __call__(self) -> Filtered | Preparing:
         """Wait for the frame."""
         try:
             return self._planned.finish(self._begun, self._started_s)

@@ -12,7 +12,7 @@ import numpy as np
 
 from filter_service.errors import BadMessage, RenderFailed
 from filter_service.filtering.builder import Builder
-from filter_service.filtering.filtered import Filtered, ViewResult
+from filter_service.filtering.filtered import Filtered, Preparing, ViewResult
 from filter_service.filtering.planned_frame import GazeDegrees
 from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
 from filter_service.rendering.engine import (
@@ -72,7 +72,7 @@ class PlannedTextures:
         options: RenderOptions = DEFAULT_OPTIONS,
         until_s: float | None = None,
         **_: Any,
-    ) -> Callable[[], Filtered]:
+    ) -> Callable[[], Filtered | Preparing]:
         """Return a function that renders all views and waits for them.
 
         The result has no images, which are in the textures.  Other parameters and the
@@ -85,13 +85,15 @@ class PlannedTextures:
         gazes_deg: Sequence[GazeDegrees],
         options: RenderOptions,
         until_s: float | None,
-    ) -> Filtered:
-        shown = [
-            self.show(
+    ) -> Filtered | Preparing:
+        shown = []
+        for index, gaze_deg in enumerate(gazes_deg):
+            view = self.show(
                 index, gaze_deg=gaze_deg, options=options, waits=True, until_s=until_s
             )
-            for index, gaze_deg in enumerate(gazes_deg)
-        ]
+            if view is None:
+                return Preparing("extending", stage="psfs")
+            shown.append(view)
         eye = self.plan.eye
         counts = [view.earlier.counts for view in shown if view.earlier is not None]
         return Filtered(
@@ -124,15 +126,15 @@ class PlannedTextures:
         target_is_top_first: bool | None = None,
         waits: bool = False,
         until_s: float | None = None,
-    ) -> ShownTexture:
+    ) -> ShownTexture | None:
         """Render one view; the parameters are those of `TextureRequest`.
+
+        Returns None if the frame waits, and PSFs were not computed by ``until_s``.
 
         Raises
         ------
         BadMessage
             If textures do not fit, or the profile has effects that need arrays.
-        NotPrepared
-            If the frame waits, and PSFs were not computed by ``until_s``.
         RenderError
         """
         view, target = self.views[index]
@@ -163,6 +165,8 @@ class PlannedTextures:
                 until_s=until_s,
             )
         )
+        if shown is None:
+            return None
         self.builder.frame_s = time.monotonic() - started_s
         self.builder.mark_rendered(self.stream, self.plan)
         earlier = shown.earlier

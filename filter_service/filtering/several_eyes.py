@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from filter_service.errors import BadMessage, NoProfile, SessionError
 from filter_service.filtering.eye_filter import EyeFilter
-from filter_service.filtering.filtered import Filtered
+from filter_service.filtering.filtered import Filtered, Preparing
 from filter_service.filtering.planned_frame import GazeDegrees, PlannedFrame
 from filter_service.filtering.planned_textures import PlannedTextures, TargetedView
 from filter_service.rgbd_view import RgbdView
@@ -47,15 +47,10 @@ class PlannedViews:
         out: Sequence[NDArray[Any] | None] | None = None,
         until_s: float | None = None,
         **options: Unpack[RenderOptionValues],
-    ) -> Filtered:
+    ) -> Filtered | Preparing:
         """Filter the frame; start all eyes before waiting for one.
 
-        The parameters are those of `PlannedFrame.render`.
-
-        Raises
-        ------
-        NotPrepared
-            If PSFs that the frame needs were not computed by ``until_s``.
+        Parameters and results are those of `PlannedFrame.render`.
         """
         begun = {
             eye: planned.begin(
@@ -67,7 +62,12 @@ class PlannedViews:
             )
             for eye, planned in self.by_eye.items()
         }
-        found = {eye: finish() for eye, finish in begun.items()}
+        found: dict[EyeName, Filtered] = {}
+        for eye, finish in begun.items():
+            seen = finish()
+            if isinstance(seen, Preparing):
+                return seen
+            found[eye] = seen
         return Filtered.merged(found, self.indices)
 
 
@@ -79,9 +79,9 @@ def plan_views(
     pupil_diameter_mm: float,
     focus_dpt: float,
     gaze_deg: tuple[float, float] | None = None,
-    plan: Callable[..., PlannedFrame | PlannedTextures | None] = EyeFilter.plan,
-) -> PlannedViews | None:
-    """Plan a frame for the eyes of its views; return None while one is being prepared.
+    plan: Callable[..., PlannedFrame | PlannedTextures | Preparing] = EyeFilter.plan,
+) -> PlannedViews | Preparing:
+    """Plan a frame for the eyes of its views; all of them must be ready.
 
     All eyes are prepared at the same time.
 
@@ -96,6 +96,11 @@ def plan_views(
         Values of the frame, as for `EyeFilter.try_filter`.
     plan : callable
         `EyeFilter.plan`, or `EyeFilter.plan_textures` for views in textures.
+
+    Returns
+    -------
+    PlannedViews or Preparing
+        The latter, which is false, while an eye is being prepared.
 
     Raises
     ------
@@ -122,6 +127,7 @@ def plan_views(
     planned: dict[EyeName, PlannedFrame | PlannedTextures] = {}
     gazes_deg = tuple(_gaze(state.gaze_deg or gaze_deg) for state in states)
     failure: SessionError | None = None
+    preparing: Preparing | None = None
     for eye, own in indices.items():
         state = states[own[0]]
         eye_filter = filter_of(eye)
@@ -139,12 +145,14 @@ def plan_views(
         except SessionError as error:
             failure = failure or _with_eye_name(error, eye, own[0])
             continue
-        if frame is not None:
+        if isinstance(frame, Preparing):
+            preparing = frame
+        else:
             planned[eye] = frame
     if failure is not None:
         raise failure.with_traceback(None)
-    if len(planned) < len(indices):
-        return None
+    if preparing is not None:
+        return preparing
     return PlannedViews(planned, indices, gazes_deg)
 
 

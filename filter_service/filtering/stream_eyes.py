@@ -15,7 +15,7 @@ from estimator.profiles.parse import EyeProfile
 from filter_service.camera import Camera
 from filter_service.errors import FilterError, NoProfile
 from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
-from filter_service.filtering.filtered import EyeEvent
+from filter_service.filtering.filtered import EyeEvent, Preparing
 from filter_service.filtering.predicted_states import FrameHistory
 from filter_service.rendering.engine import LoadedStore
 from filter_service.settings import FilterSettings
@@ -78,11 +78,14 @@ class StreamEyes:
     _n_accepted: int = 0
     _last_cameras: tuple[Camera, ...] = ()
 
-    def plan(self, cameras: Sequence[Camera]) -> RenderPlan | None:
-        """Return how to render a frame; None while no eye can render it.
+    def plan(
+        self, cameras: Sequence[Camera], *, newest_only: bool = False
+    ) -> RenderPlan | Preparing:
+        """Return how to render a frame, or why no eye can render it yet.
 
         This requests stores of the newest eye for the frame's cameras.  Frames use the
-        previous eye until the newest is ready; then the previous one is retired.
+        previous eye until the newest is ready, unless ``newest_only`` is set; then the
+        previous one is retired.
 
         Raises
         ------
@@ -109,16 +112,14 @@ class StreamEyes:
                 eye.mark_used(camera)
             if eye is newest and eye in ready:
                 self._retire_older()
+            if newest_only and eye is not newest:
+                return Preparing("extending", newest.fraction, newest.stage)
             return RenderPlan(eye, tuple(s.store for s in found[eye.generation]))
         for camera in cameras:
             failure = newest.failure_for(camera)
             if failure is not None:
                 raise failure.with_traceback(None)  # raised again for every frame
-        return None
-
-    def is_newest(self, plan: RenderPlan) -> bool:
-        """Return whether a plan uses the newest eye."""
-        return plan.eye is self.eyes[0]
+        return Preparing("preparing", newest.fraction, newest.stage)
 
     def add_profile(
         self,

@@ -22,7 +22,6 @@ from filter_service.constants import RGB
 from filter_service.errors import (
     BuildFailed,
     GridTooLarge,
-    NotPrepared,
     OutOfMemory,
 )
 from filter_service.planning.grid import GridSpec
@@ -247,7 +246,7 @@ class PsfStore:
         batch_count: int | None = None,
         between: Callable[[], None] | None = None,
         progress: Callable[[float], None] | None = None,
-    ) -> None:
+    ) -> NDArray[np.int64]:
         """Compute missing kernels.
 
         Parameters
@@ -263,10 +262,13 @@ class PsfStore:
         progress : callable, optional
             Called with the completed share.
 
+        Returns
+        -------
+        (n,)
+            PSFs that are missing at ``until_s``; otherwise none.
+
         Raises
         ------
-        NotPrepared
-            If kernels are missing at ``until_s``.
         GridTooLarge
             If a kernel exceeds ``spec.max_blur_radius_px``.
         BuildFailed
@@ -286,6 +288,7 @@ class PsfStore:
         if not self.spec.settings.chromatic:  # channels share kernels
             psfs = RGB * np.unique(psfs // RGB)
         psfs = psfs[~self.tables.is_computed[psfs]]
+        left = psfs[:0]
         step = self.engine.batch_count
         step = min(batch_count or step, step)
         batches = np.array_split(psfs, -(-psfs.size // step) or 1)
@@ -310,8 +313,10 @@ class PsfStore:
             if between is not None:
                 between()
             if until_s is not None and time.monotonic() > until_s:
-                raise NotPrepared
+                left = psfs[~self.tables.is_computed[psfs]]
+                break
         self.build_ms += 1e3 * (time.perf_counter() - started_s)
+        return left
 
     def _node_rings(self) -> NodeRings | None:
         """Return the rings of the eye's lens, tabulated on first use, or None."""

@@ -28,7 +28,8 @@ from filter_service.rendering.bright_pixels import BrightPixels
 from filter_service.rendering.edge_kinds import EdgeElements, EyeAtFrame, SourceKinds
 from filter_service.rendering.engine import FrameEngine, ViewRequest
 from filter_service.rendering.frame_kernels import (
-    Fill,
+    FrameKernels,
+    MissingPsfs,
     frame_kernels,
     interval_count,
 )
@@ -86,8 +87,10 @@ class EdgeLight:
         Its bright pixels.
     white : float
         Its white level; 0 if nearly all of it is dark.
-    fill : callable
-        Function that computes missing PSFs (n,).
+    kinds : SourceKinds
+        Kinds of the bright pixels.
+    kernels : FrameKernels
+        Kernels of the kinds.
 
     Attributes
     ----------
@@ -102,12 +105,13 @@ class EdgeLight:
         view: RgbdView,
         pixels: BrightPixels,
         white: float,
-        fill: Fill,
+        kinds: SourceKinds,
+        kernels: FrameKernels,
     ):
         self._state, self._pixels, self._white = state, pixels, white
-        self._kinds = SourceKinds.of(state, pixels)
-        self._edges = EdgeElements.of(state, self._kinds)
-        self._find_ends(fill)
+        self._kinds = kinds
+        self._edges = EdgeElements.of(state, kinds)
+        self._find_ends(kernels)
         self._sources, self._kernel, self._light = self._visible(view)
         self._polar = distant_tables(
             self._edges.elements, self._kernel_kind, self._seen
@@ -122,13 +126,12 @@ class EdgeLight:
         self.view = self._dimmed(view)
 
     @classmethod
-    def of(cls, engine: FrameEngine, request: ViewRequest) -> EdgeLight | None:
+    def of(
+        cls, engine: FrameEngine, request: ViewRequest
+    ) -> EdgeLight | MissingPsfs | None:
         """Return the light of a request in linear light, or None if nothing is bright.
 
-        Raises
-        ------
-        NotPrepared
-            As `FrameEngine.begin`.
+        It returns missing PSFs like `FrameEngine.begin`.
         """
         white = request.white_level
         if white is None:
@@ -143,19 +146,22 @@ class EdgeLight:
             return None
         if settings.pipeline == "published":  # which ends at its kernels
             return None
-        fill = partial(store.fill, until_s=request.until_s)
-        return cls(EyeAtFrame.of(engine, request), request.view, pixels, white, fill)
-
-    def _find_ends(self, fill: Fill) -> None:
-        """Compute the kernels of the kinds, and find where they end."""
-        state, kinds = self._state, self._kinds
-        layers, image = state.layers, state.image
-        used = np.zeros((image.count, interval_count(layers)), bool)
+        state = EyeAtFrame.of(engine, request)
+        kinds = SourceKinds.of(state, pixels)
+        used = np.zeros((state.image.count, interval_count(state.layers)), bool)
         used[kinds.cell, kinds.interval] = True
-        kernels = frame_kernels(state.handle.store, layers, image, used, fill=fill)
+        fill = partial(store.fill, until_s=request.until_s)
+        kernels = frame_kernels(store, state.layers, state.image, used, fill=fill)
+        if isinstance(kernels, MissingPsfs):
+            return kernels
+        return cls(state, request.view, pixels, white, kinds, kernels)
+
+    def _find_ends(self, kernels: FrameKernels) -> None:
+        """Find where the kernels of the kinds end."""
+        kinds, n_intervals = self._kinds, interval_count(self._state.layers)
         pair = np.searchsorted(
-            kernels.cells * used.shape[1] + kernels.intervals,
-            kinds.cell * used.shape[1] + kinds.interval,
+            kernels.cells * n_intervals + kernels.intervals,
+            kinds.cell * n_intervals + kinds.interval,
         )
         self._maps = kernels.maps[pair]
         self._end_px = kernels.reach_px[pair].max(axis=1)

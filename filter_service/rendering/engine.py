@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.rendering.filtered_view import FilteredView
+from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rendering.frame_states import FrameStates
 from filter_service.rendering.sampled_frame import SampledFrame
 from filter_service.rgbd_view import RgbdView
@@ -40,7 +41,7 @@ class LoadedStore(Protocol):
 
     def fill(  # noqa: D102
         self, psfs: NDArray[np.int64], *, until_s: float, batch_count: int
-    ) -> None: ...
+    ) -> NDArray[np.int64]: ...
 
     def evict(self, max_mb: float) -> None: ...  # noqa: D102
 
@@ -141,8 +142,9 @@ class ShownTexture:
     earlier: EarlierFrame | None
 
 
-Pending = Callable[[], FilteredView]
-"""Wait for a view that `FrameEngine.begin` has started, and return it."""
+Pending = Callable[[], FilteredView | MissingPsfs]
+"""Wait for a view that `FrameEngine.begin` has started, and return it, or the PSFs that
+were not computed by ``until_s``."""
 
 
 class FrameEngine(Protocol):
@@ -181,9 +183,6 @@ class FrameEngine(Protocol):
             Arrays or options are invalid.
         CameraMismatch
             The store is for another camera, see `camera.is_same_camera`.
-        NotPrepared
-            The deadline ``until_s`` passed before all required PSFs were computed.
-            The returned function may also raise it.
         RenderError
         """
 
@@ -192,8 +191,10 @@ class FrameEngine(Protocol):
 class TextureEngine(Protocol):
     """An engine that filters frames in textures of the caller's context."""
 
-    def filter_textures(self, request: TextureRequest) -> ShownTexture:
+    def filter_textures(self, request: TextureRequest) -> ShownTexture | None:
         """Filter a view from textures to a texture, without waiting for the GPU.
+
+        Returns None if the request waits, and PSFs were not computed by ``until_s``.
 
         Raises
         ------
@@ -201,8 +202,6 @@ class TextureEngine(Protocol):
             Textures or options are invalid.
         CameraMismatch
             The store is for another camera, see `camera.is_same_camera`.
-        NotPrepared
-            As for `FrameEngine.begin`, if the request waits.
         RenderError
         """
 
@@ -236,7 +235,7 @@ class OneView:
 
     def render(
         self: FrameEngine, view: RgbdView, handle: Any, **values: Any
-    ) -> FilteredView:
+    ) -> FilteredView | MissingPsfs:
         """Filter one view; ``values`` are fields of the request or its options."""
         names = {option.name for option in fields(RenderOptions)}
         options = {name: values.pop(name) for name in names & set(values)}

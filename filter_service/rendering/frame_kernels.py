@@ -6,7 +6,6 @@ kernels of three field nodes, and each node kernel is a weighted sum of cached k
 """
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service.constants import RECIPE_WORDS, RGB
-from filter_service.errors import NotPrepared
 from filter_service.native import loops, records
 from filter_service.native.records import pointers
 from filter_service.psfs.frame_layers import FrameLayers
@@ -22,7 +20,15 @@ from filter_service.psfs.read_kernels import StoreTables
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.image_cells import ImageCells
 
-Fill = Callable[[NDArray[np.int64]], None]
+Fill = Callable[[NDArray[np.int64]], NDArray[np.int64]]
+"""Compute PSFs (n,); return those (m,) that are still missing at a deadline."""
+
+
+@dataclass(frozen=True)
+class MissingPsfs:
+    """PSFs (n,) that a frame needs and that were not computed before its deadline."""
+
+    psfs: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -110,7 +116,7 @@ def frame_kernels(
     *,
     tables: StoreTables | None = None,
     fill: Fill | None = None,
-) -> FrameKernels:
+) -> FrameKernels | MissingPsfs:
     """Plan the kernels of used (cell, interval) pairs, and compute missing PSFs.
 
     Parameters
@@ -120,18 +126,15 @@ def frame_kernels(
     tables : StoreTables, optional
         Tables to use instead of the store's; their offsets are written to the recipes.
     fill : callable, optional
-        Function that computes missing PSFs (n,); `PsfStore.fill` by default.
-
-    Raises
-    ------
-    NotPrepared
-        The deadline of ``fill`` has passed.
+        Function that computes missing PSFs; `PsfStore.fill` by default.
     """
     n_fields, maps = len(layers.layer_zero_dpt), image.maps.tables
     cells, intervals, parts, *pairs = _list_nodes(used, image, n_fields)
     nodes = _node_kernels(
         store, tables or store.tables, fill or store.fill, layers, *pairs
     )
+    if isinstance(nodes, MissingPsfs):
+        return nodes
     inputs = {
         "cell_weight_ratio": np.ascontiguousarray(image.weight_ratio),
         "cells": cells,
@@ -169,15 +172,10 @@ def missing_psfs(
 ) -> NDArray[np.int64]:
     """Return the indices (n,) of needed PSFs that have not been computed yet."""
     *_, fields, intervals = _list_nodes(used, image, len(layers.layer_zero_dpt))
-    found: list[NDArray[np.int64]] = []
-
-    def note(psfs: NDArray[np.int64]) -> None:
-        found.append(psfs)
-        raise NotPrepared
-
-    with suppress(NotPrepared):
-        _node_kernels(store, store.tables, note, layers, fields, intervals)
-    return found[0] if found else np.zeros(0, np.int64)
+    found = _node_kernels(
+        store, store.tables, lambda psfs: psfs, layers, fields, intervals
+    )
+    return found.psfs if isinstance(found, MissingPsfs) else np.zeros(0, np.int64)
 
 
 def _list_nodes(
@@ -227,7 +225,7 @@ def _node_kernels(
     layers: FrameLayers,
     fields: NDArray[Any],
     intervals: NDArray[Any],
-) -> NodeKernels:
+) -> NodeKernels | MissingPsfs:
     """Plan node kernels (n,), with a recipe for each field node and layer in use."""
     n_layers = len(layers.layer_dpt)
     ends = np.minimum(np.stack([intervals, intervals + 1]), n_layers - 1)
@@ -262,7 +260,9 @@ def _node_kernels(
         n_missing = loops().call("fill_recipes", job)
         if not n_missing:
             break
-        fill(missing[:n_missing].copy())
+        left = fill(missing[:n_missing].copy())
+        if left.size:
+            return MissingPsfs(left)
     return NodeKernels(
         near=near,
         far=far,

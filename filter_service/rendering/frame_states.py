@@ -101,9 +101,9 @@ class FrameStore:
 
     def fill(
         self, psfs: NDArray[np.int64], *, until_s: float, batch_count: int
-    ) -> None:
+    ) -> NDArray[np.int64]:
         """Compute PSFs, see `PsfStore.fill`."""
-        self.store.fill(psfs, until_s=until_s, batch_count=batch_count)
+        return self.store.fill(psfs, until_s=until_s, batch_count=batch_count)
 
     def add_part(self, part: Any) -> None:
         """Add a part of the plan that the worker has prepared."""

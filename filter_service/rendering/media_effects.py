@@ -22,6 +22,7 @@ from filter_service.native import loops
 from filter_service.rendering.edge_light import EdgeLight
 from filter_service.rendering.engine import FrameEngine, Pending, ViewRequest
 from filter_service.rendering.filtered_view import FilteredView
+from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rendering.haze import add_haze
 from filter_service.rendering.light_planes import add_plane
 from filter_service.rendering.spectacles import (
@@ -114,10 +115,13 @@ def begin_through_media(
         view = seen_through(view, effects.magnification_ratio)
         request = replace(request, view=view)
         stages.end("media_ms")
-    edge_light = None
+    edge_light: EdgeLight | MissingPsfs | None = None
     if view.color.dtype != np.uint8:
         request = replace(request, white_level=white_level(view.color))
         edge_light = EdgeLight.of(engine, request)
+    if isinstance(edge_light, MissingPsfs):
+        missing = edge_light
+        return lambda: missing
     if edge_light is not None:
         request = replace(request, view=edge_light.view)
         stages.end("edge_light_ms")
@@ -125,8 +129,10 @@ def begin_through_media(
         return engine.begin(request)
     begun = engine.begin(replace(request, output="linear", out=None))
 
-    def finish() -> FilteredView:
+    def finish() -> FilteredView | MissingPsfs:
         rendered = begun()
+        if isinstance(rendered, MissingPsfs):
+            return rendered
         stages.start()
         color = np.ascontiguousarray(rendered.color, dtype=np.float32)
         coarse = NOTHING

@@ -14,6 +14,7 @@ from filter_service.planning.nodes import CachePlan, PlanNodes, RaggedNodes
 from filter_service.psfs.pack import PackedKernels
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import FrameEngine, ViewRequest
+from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import Accumulation, FilterSettings, Output, RenderOptions
 
@@ -48,6 +49,7 @@ def change_by_perfect_eye(engine: FrameEngine) -> float:
             view, handle, PUPIL_MM, 0.0, output=output, options=options
         )
         rendered = engine.begin(request)()
+        assert not isinstance(rendered, MissingPsfs)  # it has no deadline
         changes.append(np.abs(rendered.color.astype(np.float32) - view.color))
     handle.release()
     return float(np.max(changes))

@@ -10,9 +10,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from filter_service.errors import FilterError, NotPrepared, RenderFailed
+from filter_service.errors import FilterError, RenderFailed
 from filter_service.filtering.eye_filter import EyeFilter
-from filter_service.filtering.filtered import Filtered
+from filter_service.filtering.filtered import Filtered, Preparing
 from filter_service.filtering.several_eyes import plan_views
 from filter_service.messages import (
     Dropped,
@@ -52,7 +52,7 @@ def frame_reply(
     """
     started_s = time.monotonic()
 
-    def filtered() -> Filtered | None:
+    def filtered() -> Filtered | Preparing:
         planned = plan_views(
             filter_of,
             [
@@ -64,8 +64,8 @@ def frame_reply(
             focus_dpt=frame.focus_dpt,
             gaze_deg=frame.gaze_deg,
         )
-        if planned is None:
-            return None
+        if isinstance(planned, Preparing):
+            return planned
         return planned.render(
             output=OUTPUT_OF_FORMAT[frame.output],
             out=out,
@@ -77,7 +77,7 @@ def frame_reply(
 
 
 def reply_to_frame(
-    frame: Frame, filter_frame: Callable[[], Filtered | None]
+    frame: Frame, filter_frame: Callable[[], Filtered | Preparing]
 ) -> Result | Dropped | ErrorReply:
     """Call a function that filters a frame, and return the reply; see `frame_reply`.
 
@@ -85,15 +85,13 @@ def reply_to_frame(
     ----------
     frame : Frame
     filter_frame : callable
-        Returns the filtered frame, or None while an eye is being prepared.
+        Returns the filtered frame, or why it cannot be filtered yet.
     """
     started_s = time.monotonic()
     try:
         filtered = filter_frame()
-        if filtered is None:
-            return Dropped(frame.frame_id, "preparing")
-    except NotPrepared:
-        return Dropped(frame.frame_id, "extending")
+        if isinstance(filtered, Preparing):
+            return Dropped(frame.frame_id, filtered.reason)
     except FilterError as error:
         return ErrorReply.from_exception(error, frame_id=frame.frame_id)
     except Exception as error:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from filter_service.errors import BadMessage
 from filter_service.filtering.eye_filter import EyeFilter
-from filter_service.filtering.filtered import Filtered
+from filter_service.filtering.filtered import Filtered, Preparing
 from filter_service.filtering.planned_textures import TargetedView
 from filter_service.filtering.several_eyes import plan_views
 from filter_service.messages import (
@@ -42,7 +42,7 @@ def filter_in_textures(
     """
     started_s = time.monotonic()
 
-    def filtered() -> Filtered | None:
+    def filtered() -> Filtered | Preparing:
         planned = plan_views(
             filter_of,
             [
@@ -55,8 +55,8 @@ def filter_in_textures(
             gaze_deg=frame.gaze_deg,
             plan=EyeFilter.plan_textures,
         )
-        if planned is None:
-            return None
+        if isinstance(planned, Preparing):
+            return planned
         return planned.render(
             until_s=started_s + PSF_BUDGET_S, **frame.options.render_values
         )

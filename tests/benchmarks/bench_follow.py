@@ -129,7 +129,7 @@ class Following:
             )
             seen.times_ms.append(1e3 * (time.perf_counter() - begin_s))
             end_s = time.monotonic()
-            is_whole = shown is not None
+            is_whole = bool(shown)
             seen.n_whole += is_whole and end_s - due_s <= 2.0 / rate_hz
             if is_whole and shown.generation > 1:
                 seen.new_eye_s = min(seen.new_eye_s, end_s - changed_s)

@@ -16,6 +16,7 @@ from filter_service import (
     EyeFilter,
     EyeReady,
     FilterSettings,
+    Preparing,
     RgbdView,
 )
 from filter_service.building.inline_worker import InlineWorker
@@ -174,7 +175,8 @@ def test_frames_that_never_wait_are_enough_to_prepare_an_eye():
     settings = FilterSettings(mode="on-axis", eye_model="wavefront")
     view, end_s = RgbdView(COLOR, DEPTH_M, camera.tangents), time.monotonic() + 60.0
     with EyeFilter("myopia", camera, settings, engine="native") as eye_filter:
-        while (seen := eye_filter.try_filter([view], **SEE)) is None:
+        while not (seen := eye_filter.try_filter([view], **SEE)):
+            assert seen.reason == "preparing"
             assert time.monotonic() < end_s, "the eye was never ready"
             time.sleep(0.01)
     assert seen.color.shape == COLOR.shape
@@ -352,14 +354,13 @@ def test_a_frame_stops_computing_psfs_when_its_time_is_over(rng):
         eye_filter.wait()
         state = {"pupil_diameter_mm": 6.0, "focus_dpt": 1.0}
         seen = eye_filter.try_filter([view], **state, until_s=time.monotonic())
-        assert seen is None
-        assert eye_filter.is_extending
+        assert isinstance(seen, Preparing)
+        assert seen.reason == "extending"
         n_tries, end_s = 0, time.monotonic() + 60.0
-        while seen is None and time.monotonic() < end_s:
+        while not seen and time.monotonic() < end_s:
             n_tries += 1
             seen = eye_filter.try_filter([view], **state, until_s=time.monotonic())
-        assert seen is not None
-        assert not eye_filter.is_extending
+        assert seen
         whole = eye_filter.filter(view, **state)
     np.testing.assert_array_equal(seen.color, whole.color)
 

@@ -50,7 +50,7 @@ def frame_of(eye, view, target, **state):
     until_s = time.monotonic() + 60.0
     while time.monotonic() < until_s:
         shown = eye.filter_textures(view, target, **(STATE | state))
-        if shown is not None:
+        if shown:
             return shown
         time.sleep(0.01)
     raise AssertionError("the eye is never ready")

@@ -16,13 +16,17 @@ from filter_service.building.worker_handle import (
     WorkerHandle,
 )
 from filter_service.camera import Camera
-from filter_service.errors import BuildFailed, NotPrepared, OutOfMemory
+from filter_service.errors import BuildFailed, OutOfMemory
 from filter_service.planning.cost import states_of
 from filter_service.planning.plan import plan_axes, unchecked_plan
 from filter_service.planning.slopes import state_survey
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import PsfStore, build_psf_store
-from filter_service.rendering.frame_kernels import frame_kernels, interval_count
+from filter_service.rendering.frame_kernels import (
+    MissingPsfs,
+    frame_kernels,
+    interval_count,
+)
 from filter_service.rendering.sampled_frame import (
     SampledFrame,
     SampledView,
@@ -293,14 +297,13 @@ def test_a_frame_without_time_says_so_and_the_next_goes_on(known, views, alone):
     view, state = frames(views)[0]
     counts = []
     for _ in range(1000):
-        try:
-            seen = renderer.render(
-                view, handle, **state, output="srgb8", until_s=time.monotonic()
-            )
-        except NotPrepared:
-            counts.append(store.computed_count)
-        else:
+        seen = renderer.render(
+            view, handle, **state, output="srgb8", until_s=time.monotonic()
+        )
+        if not isinstance(seen, MissingPsfs):
             break
+        assert not store.tables.is_computed[seen.psfs].any()
+        counts.append(store.computed_count)
     assert seen.color.tobytes() == alone[0]
     assert counts == sorted(set(counts))
 
@@ -394,7 +397,7 @@ def test_a_plan_without_time_asks_for_what_it_lacks(known):
 
     def fill(psfs):
         asked.append(psfs)
-        store.fill(psfs)
+        return store.fill(psfs)
 
     frame_kernels(store, layers, image, used, fill=fill)
     assert len(asked) == 1

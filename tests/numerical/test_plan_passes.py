@@ -47,7 +47,12 @@ class Planned:
             )
             self.run.make()
             self.gpu.read_into(*self.run.to_read(np.zeros(256, np.uint32)))
-        return self.run.is_complete(self.fields.append)
+        return self.run.is_complete(self._note)
+
+    def _note(self, psfs):
+        """Note missing PSFs, and compute none."""
+        self.fields.append(psfs)
+        return psfs
 
     def plan_until_complete(self, used):
         """Plan again with larger buffers, as frames do."""

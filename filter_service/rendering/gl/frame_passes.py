@@ -13,6 +13,7 @@ from filter_service.constants import (
     THREADS,
     TOTAL_WORDS,
 )
+from filter_service.rendering.frame_kernels import Fill
 from filter_service.rendering.gl.fragment_passes import ArrayFragments
 from filter_service.rendering.gl.kernel_passes import KernelRun
 from filter_service.rendering.gl.list_passes import ListPasses
@@ -91,9 +92,7 @@ class FramePasses:
                 *self.kernels.to_read(self.fragments.stats),
             )
 
-    def end_read(
-        self, fill: Callable[[NDArray[np.int64]], None]
-    ) -> NDArray[Any] | None:
+    def end_read(self, fill: Fill) -> NDArray[Any] | None:
         """Wait for the image; return it, or None if the strip must be filtered again.
 
         That is the case if kernels were missing, or if the fragment lists did not fit
@@ -102,11 +101,11 @@ class FramePasses:
         Parameters
         ----------
         fill : callable
-            Function that computes missing PSFs (n,).
+            Function that computes missing PSFs, or some of them.
 
         Raises
         ------
-        KernelsTooLarge, NotPrepared
+        KernelsTooLarge
             As `KernelRun.is_complete`.
         """
         with self.strip.timer.wall("readback_ms"):

@@ -23,6 +23,7 @@ from filter_service.rendering.frame import (
     fill_missing_depth,
     reach_px_of,
 )
+from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rendering.gl.eye_states import EyeState
 from filter_service.rendering.gl.fragment_passes import ArrayFragments
 from filter_service.rendering.gl.frame_passes import FramePasses
@@ -84,6 +85,7 @@ class FrameRun:
         self._out = out
         self._cell_px: int | None = None
         self._missing_count: int | None = None
+        self.missing: MissingPsfs | None = None  # at the deadline
         self.layers: FrameLayers = eye.states.layers(
             self.timer,
             eye.handle,
@@ -102,12 +104,14 @@ class FrameRun:
         """Depth of the view, with missing depth filled in."""
         return self._view.depth_m
 
-    def finish(self) -> tuple[NDArray[Any], Counts]:
-        """Return the image and the counts."""
+    def finish(self) -> tuple[NDArray[Any], Counts] | MissingPsfs:
+        """Return the image and the counts, or the PSFs that it lacks."""
         picture, counts = self._finish_begun()
         if self._missing_count is None and counts["missing_depth_count"]:
             self._fill_depth()
             picture, counts = self._whole()
+        if self.missing is not None:
+            return self.missing
         if self._missing_count is not None:
             counts = {**counts, "missing_depth_count": self._missing_count}
         return picture, counts
@@ -170,11 +174,14 @@ class FrameRun:
     def _joined(
         self, plan: _Plan, runs: "list[_StripRun]"
     ) -> tuple[NDArray[Any], Counts]:
-        """Finish the strips and join their images."""
+        """Finish the strips and join their images, unless PSFs are missing."""
         counts = Counter[str]()
         pictures = []
         for run in runs:
-            pictures.append(run.finish()[run.rows.output_rows])
+            picture = run.finish()
+            if picture is None:
+                return self._out, counts
+            pictures.append(picture[run.rows.output_rows])
             counts.update(run.passes.counts())
         kernels = runs[-1].passes.kernels.frame_counts()  # of all strips
         if self.out_of(plan) is None:
@@ -220,10 +227,13 @@ class FrameRun:
             lambda: eye.kernels.begin(eye.handle, plan.state, self.timer),
         )
 
-    def fill(self, psfs: NDArray[np.int64]) -> None:
+    def fill(self, psfs: NDArray[np.int64]) -> NDArray[np.int64]:
         """Compute the missing PSFs of a frame, timed as a stage of its own."""
         with self.timer.wall("psf_compute_ms"):
-            self._eye.handle.store.fill(psfs, until_s=self._request.until_s)
+            left = self._eye.handle.store.fill(psfs, until_s=self._request.until_s)
+        if left.size:
+            self.missing = MissingPsfs(left)
+        return left
 
     def out_of(self, plan: _Plan) -> NDArray[Any] | None:
         """Return the output array if the frame is one strip without a border."""
@@ -249,11 +259,13 @@ class _StripRun:
         self.passes.begin_read(self._frame.output, self._frame.out_of(self.plan))
         self._is_begun = True
 
-    def finish(self) -> NDArray[Any]:
-        """Return the image."""
+    def finish(self) -> NDArray[Any] | None:
+        """Return the image, or None if the frame lacks PSFs at its deadline."""
         if not self._is_begun:
             self.begin()
         while (picture := self.passes.end_read(self._frame.fill)) is None:
+            if self._frame.missing is not None:
+                return None
             self.passes = self._frame.passes_of(self.plan, self.rows)
             self.begin()
         return picture

@@ -4,7 +4,6 @@ The GPU itself finds which kernels a frame uses, so no frame waits for the CPU. 
 the state of the eye stays, kernels are kept, and frames add those that they lack.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -44,7 +43,7 @@ from filter_service.gl.gpu import Gpu
 from filter_service.gl.passes import Atlas, Buffer, BufferPart, Pages
 from filter_service.gl.stage_timer import Timer
 from filter_service.psfs.frame_layers import FrameLayers
-from filter_service.rendering.frame_kernels import interval_count
+from filter_service.rendering.frame_kernels import Fill, interval_count
 from filter_service.rendering.gl.gl_store import GlStore
 from filter_service.rendering.gl.strip import dispatch_grid, group_count
 from filter_service.rendering.image_cells import (
@@ -453,7 +452,7 @@ class KernelRun:
             found.append((buffer, 0, target))
         return found
 
-    def is_complete(self, fill: Callable[[NDArray[np.int64]], None]) -> bool:
+    def is_complete(self, fill: Fill) -> bool:
         """Return whether the frame had all its kernels, after the readback.
 
         Otherwise this computes missing PSFs or enlarges buffers, and the frame must be
@@ -462,14 +461,12 @@ class KernelRun:
         Parameters
         ----------
         fill : callable
-            Function that computes missing PSFs (n,).
+            Function that computes missing PSFs, or some of them.
 
         Raises
         ------
         KernelsTooLarge
             There are too many texels, and larger cells are possible.
-        NotPrepared
-            The deadline of ``fill`` has passed.
         """
         store, counts = self.handle.store, self.counts
         if counts[PLAN_NODES] > counts[PLAN_OLD_NODES]:

@@ -21,6 +21,7 @@ from filter_service.rendering.filtered_view import (
     input_notes,
     sampled_input_notes,
 )
+from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rendering.frame_states import FrameStates
 from filter_service.rendering.gl.eye_states import EyeStates
 from filter_service.rendering.gl.frame_run import FrameRun
@@ -95,7 +96,7 @@ class FilterRenderer(OneView):
             )
         return partial(self._finish, run, *gaze)
 
-    def filter_textures(self, request: TextureRequest) -> ShownTexture:
+    def filter_textures(self, request: TextureRequest) -> ShownTexture | None:
         """Filter a view from textures; see `TextureEngine.filter_textures`.
 
         Raises
@@ -111,9 +112,12 @@ class FilterRenderer(OneView):
             if self._textures is None:
                 self._textures = TextureFrames(self._gpu)
             self._textures.check(request)
-            layers, earlier = self._textures.filter(
+            found = self._textures.filter(
                 request, self._eyes.of(request.handle), gaze_deg
             )
+            if found is None:
+                return None
+            layers, earlier = found
             if request.waits:
                 self._gpu.check("render")
                 notes = (*notes, *_input_notes(request.view, earlier))
@@ -164,9 +168,12 @@ class FilterRenderer(OneView):
 
     def _finish(
         self, run: FrameRun, gaze_deg: tuple[float, float], gaze_notes: tuple[str, ...]
-    ) -> FilteredView:
+    ) -> FilteredView | MissingPsfs:
         with self._gpu.entered():
-            color, counts = run.finish()
+            found = run.finish()
+            if isinstance(found, MissingPsfs):
+                return found
+            color, counts = found
             self._gpu.check("render")
             stages_ms = run.timer.result_ms()
         self._had_missing_depth = counts["missing_depth_count"] > 0

@@ -11,7 +11,6 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,7 +27,7 @@ from filter_service.constants import (
     THREADS,
     TOTAL_WORDS,
 )
-from filter_service.errors import NotPrepared, OutOfGpuMemory
+from filter_service.errors import OutOfGpuMemory
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.passes import RecordedPass
 from filter_service.gl.stage_timer import Untimed
@@ -191,8 +190,11 @@ class TextureFrames:
 
     def filter(
         self, request: TextureRequest, eye: EyeState, gaze_deg: tuple[float, float]
-    ) -> tuple[FrameLayers, EarlierFrame | None]:
-        """Filter a frame; return its layers, and the counters of an earlier one."""
+    ) -> tuple[FrameLayers, EarlierFrame | None] | None:
+        """Filter a frame; return its layers, and the counters of an earlier one.
+
+        Returns None if a frame that waits lacks PSFs at its deadline.
+        """
         self._read_finished()
         view = self._io.in_textures(request.view)
         if view is not request.view:
@@ -225,10 +227,15 @@ class TextureFrames:
             if eye.is_settled:
                 break
             repeats += 1
-            if request.waits:
-                _check_repeats(repeats, request.until_s)
-            elif repeats == MAX_REPEATS:  # later frames go on where this one ended
-                break
+            until_s = request.until_s
+            if request.waits and until_s is not None and time.monotonic() > until_s:
+                return None
+            if repeats == MAX_REPEATS:
+                if request.waits:
+                    raise OutOfGpuMemory(
+                        "the lists of the frame exceed the buffers of this device"
+                    )
+                break  # later frames go on where this one ended
         if request.waits:
             self._gpu.wait()
         return layers, eye.earlier
@@ -400,15 +407,15 @@ class TextureFrames:
         """Read a frame's counters and act on them; return whether it was complete."""
         eye, kernels, lists = frame.eye, frame.kernels, frame.lists
 
-        def fill(psfs: NDArray[np.int64]) -> None:
-            eye.handle.store.fill(psfs, until_s=until_s, batch_count=FILL_BATCH)
+        def fill(psfs: NDArray[np.int64]) -> NDArray[np.int64]:
+            """Compute PSFs; the next frames compute those that are left."""
+            return eye.handle.store.fill(psfs, until_s=until_s, batch_count=FILL_BATCH)
 
         is_complete = False
-        with suppress(NotPrepared):  # the next frames compute the others
-            try:
-                is_complete = kernels.is_complete(fill)
-            except KernelsTooLarge:
-                eye.cell_px = 2 * kernels.state.image.cell_px
+        try:
+            is_complete = kernels.is_complete(fill)
+        except KernelsTooLarge:
+            eye.cell_px = 2 * kernels.state.image.cell_px
         fits = lists.record_totals(frame.totals)
         lists.reserve_more(HEADROOM)
         if is_complete:
@@ -423,11 +430,3 @@ class TextureFrames:
             sample=partial(SampledInput.of_words, frame.samples, SAMPLE_STEP_PX),
         )
         return is_complete and fits
-
-
-def _check_repeats(repeats: int, until_s: float | None) -> None:
-    """Raise if a frame that waits must not be repeated."""
-    if until_s is not None and time.monotonic() > until_s:
-        raise NotPrepared("PSFs of the frame are missing")
-    if repeats >= MAX_REPEATS:
-        raise OutOfGpuMemory("the lists of the frame exceed the buffers of this device")

@@ -13,6 +13,7 @@ from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.frame_kernels import (
     Fill,
     FrameKernels,
+    MissingPsfs,
     frame_kernels,
     pair_index,
 )
@@ -59,19 +60,19 @@ def plan_kernels(
     image: ImageCells,
     used: NDArray[np.bool_],
     fill: Fill,
-) -> KernelPlan:
+) -> KernelPlan | MissingPsfs:
     """Plan the kernels of used pairs, and compute missing PSFs.
 
     Raises
     ------
     KernelsTooLarge
         There are too many texels, and larger cells are possible.
-    NotPrepared
-        The deadline of ``fill`` has passed.
     """
     kernels = frame_kernels(
         handle.store, layers, image, used, tables=handle.tables, fill=fill
     )
+    if isinstance(kernels, MissingPsfs):
+        return kernels
     widths, heights = box_sizes(kernels.reach_px)
     check_texels(int((widths * heights).sum()), image, handle.store.spec)
     nodes = kernels.nodes

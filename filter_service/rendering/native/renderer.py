@@ -25,7 +25,7 @@ from filter_service.rendering.frame import (
     extended,
     fill_missing_depth,
 )
-from filter_service.rendering.frame_kernels import Fill
+from filter_service.rendering.frame_kernels import Fill, MissingPsfs
 from filter_service.rendering.frame_states import FrameStates
 from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
 from filter_service.rendering.native.arrays import Arrays
@@ -143,8 +143,9 @@ class NativeRenderer(OneView):
                 break
             except KernelsTooLarge:
                 cell_px = 2 * image.cell_px
-        notes = [*layers.notes, *gaze_notes, *rendered.notes]
-        rendered = replace(rendered, notes=notes)
+        if isinstance(rendered, FilteredView):
+            notes = [*layers.notes, *gaze_notes, *rendered.notes]
+            rendered = replace(rendered, notes=notes)
         return lambda: rendered
 
     def _render(
@@ -156,7 +157,7 @@ class NativeRenderer(OneView):
         layers: FrameLayers,
         image: ImageCells,
         fill: Fill,
-    ) -> FilteredView:
+    ) -> FilteredView | MissingPsfs:
         view, options = request.view, request.options
         frame = FrameRecord.new(
             self._threads, self._n_threads, self._arrays, eye.arrays
@@ -164,6 +165,8 @@ class NativeRenderer(OneView):
         missing_count, used = self._pixels(timer, frame, view, eye, layers, image)
         with timer.wall("psf_plan_ms"):
             plan = self._planned(eye, layers, image, used, fill)
+            if isinstance(plan, MissingPsfs):
+                return plan
             frame.set_kernels(plan)
             frame.set_store(eye.handle)
         with timer.wall("merge_ms"):
@@ -232,12 +235,15 @@ class NativeRenderer(OneView):
         image: ImageCells,
         used: NDArray[np.bool_],
         fill: Fill,
-    ) -> KernelPlan:
+    ) -> KernelPlan | MissingPsfs:
         """Return the last frame's plan if it serves this frame, else a new one."""
         state = (eye.handle, layers, image)
         if eye.plan is None or not eye.plan.serves(state, used):
             eye.plan = None  # remains None if the following fails
-            eye.plan = plan_kernels(eye.handle, layers, image, used, fill)
+            plan = plan_kernels(eye.handle, layers, image, used, fill)
+            if isinstance(plan, MissingPsfs):
+                return plan
+            eye.plan = plan
             self._is_syncing = True
             try:
                 eye.handle.sync(self._loops, self._threads)
@@ -251,10 +257,12 @@ class NativeRenderer(OneView):
         handle: NativeStore,
         until_s: float | None,
         psfs: NDArray[np.int64],
-    ) -> None:
+    ) -> NDArray[np.int64]:
         """Compute the missing PSFs of a frame, timed as a stage of its own."""
         with timer.inner("psf_compute_ms"):
-            handle.store.fill(psfs, until_s=until_s, between=self._pause_callback)
+            return handle.store.fill(
+                psfs, until_s=until_s, between=self._pause_callback
+            )
 
     def _blend(
         self, timer: "StageTimes", frame: FrameRecord, plan: KernelPlan, eye: EyeState
