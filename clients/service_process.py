@@ -100,7 +100,7 @@ class ServiceProcess:
             except FileNotFoundError:
                 continue
             name = ""
-            if b"filter_service.service.front_end_process" in words:
+            if b"filter_service.service.front_end" in words:
                 name = "front-end"
             elif b"filter_service.service.render_worker_process" in words:
                 name = words[-2].decode()  # the last argument; an empty word follows

@@ -13,8 +13,72 @@ from filter_service.building.limits import BuildLimits, default_cache_dir
 from filter_service.constants import ENGINES
 from filter_service.gl_device import checked_gl_device
 from filter_service.log_lines import LOG_FORMATS
-from filter_service.service.devices import check_devices, device_named
-from filter_service.wire.message import DEFAULT_ENDPOINT, Limits
+from filter_service.wire.message import DEFAULT_ENDPOINT, MAX_DEVICES, Limits
+
+DEVICES_ALLOWED = (
+    f"up to {MAX_DEVICES} of auto, native, native:THREADS (1 to {MAX_THREADS}), gl, "
+    "gl:INDEX"
+)
+
+
+@dataclass(frozen=True)
+class Device:
+    """Engine and resources of one render worker.
+
+    Attributes
+    ----------
+    engine, gl_device : str
+        See the settings of the same names.
+    threads : int, optional
+        Number of threads; None: a share of all threads.
+    """
+
+    engine: str
+    gl_device: str = "auto"
+    threads: int | None = None
+
+
+def device_named(text: str) -> Device:
+    """Parse the name of a device.
+
+    Raises
+    ------
+    ValueError
+        If the name is invalid.
+    """
+    engine, colon, number = text.partition(":")
+    is_number = number.isascii() and number.isdecimal()
+    if engine in ENGINES and not colon:
+        return Device(engine)
+    if engine == "gl" and is_number:
+        return Device(engine, gl_device=number)
+    if engine == "native" and is_number and 1 <= int(number) <= MAX_THREADS:
+        return Device(engine, threads=int(number))
+    raise ValueError(
+        f"unknown device {text!r:.100} in devices; allowed: {DEVICES_ALLOWED}"
+    )
+
+
+def check_devices(names: tuple[str, ...], *, engine: str, gl_device: str) -> None:
+    """Check the names of devices, and that no other setting selects an engine.
+
+    Raises
+    ------
+    ValueError
+        If there are too many names, one is invalid, or ``engine`` or ``gl_device`` is
+        set as well.
+    """
+    if len(names) > MAX_DEVICES:
+        raise ValueError(f"devices has {len(names)} items; allowed: {DEVICES_ALLOWED}")
+    for name in names:
+        device_named(name)
+    for setting, value in (("engine", engine), ("gl_device", gl_device)):
+        if names and value != "auto":
+            raise ValueError(
+                f"{setting} is {value!r:.100}, but devices select their own engines; "
+                "allowed with devices: auto"
+            )
+
 
 LOOPBACK_HOSTS = ("127.0.0.1", "[::1]", "localhost")
 MB = 10**6

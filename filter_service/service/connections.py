@@ -8,19 +8,210 @@ id, which a client chooses itself.
 
 from __future__ import annotations
 
+import enum
+import errno
 import logging
 import math
 import os
+import resource
 import socket
 import struct
 import sys
-from collections.abc import Collection
-from contextlib import suppress
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import chain
+from pathlib import Path
 
 from filter_service.log_lines import ONCE_A_SECOND
-from filter_service.service.rate_limit import RateLimit
+
+WINDOW_S = 1.0
+MAX_REFUSALS = 100
+"""Refused messages per window, beyond which the rest of the window is ignored."""
+
+MAX_REQUESTS = 200
+"""The same for messages other than frames; each takes the front end about 0.1 ms."""
+
+MAX_IGNORED = 400
+"""Ignored messages per window, beyond which the connection is closed.  Reading and
+discarding one takes about 0.01 ms."""
+
+
+class Verdict(enum.Enum):
+    """Decision about the next message of a connection."""
+
+    HANDLE = "handle"
+    IGNORE = "ignore"
+    CLOSE = "close"
+
+
+class RateLimit:
+    """Counts the messages of one connection in windows of a second."""
+
+    def __init__(self) -> None:
+        self._ends_s = 0.0
+        self._n_refusals = self._n_requests = self._n_ignored = 0
+
+    def verdict(self, now_s: float) -> Verdict:
+        """Return the decision about the next message."""
+        if now_s >= self._ends_s:
+            self._ends_s = now_s + WINDOW_S
+            self._n_refusals = self._n_requests = self._n_ignored = 0
+        if self._n_refusals < MAX_REFUSALS and self._n_requests < MAX_REQUESTS:
+            return Verdict.HANDLE
+        self._n_ignored += 1
+        return Verdict.IGNORE if self._n_ignored <= MAX_IGNORED else Verdict.CLOSE
+
+    def exhaust(self) -> None:
+        """Exhaust the limit: the next message in the window closes the connection."""
+        self._n_refusals, self._n_ignored = MAX_REFUSALS, MAX_IGNORED
+
+    def count_refusal(self) -> None:
+        """Count a refused message."""
+        self._n_refusals += 1
+
+    def count_request(self) -> None:
+        """Count a message other than a frame."""
+        self._n_requests += 1
+
+
+TARGET_COUNT = 4096
+"""Soft limit to request, up to the hard limit."""
+
+RESERVE = 32
+"""Descriptors that only the front end itself may open."""
+
+BASE_COUNT = 96
+"""The reserve, plus the descriptors that are open without clients (30), rounded up."""
+
+OUT_OF_RESOURCES = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+"""Errors of the system when descriptors or kernel memory are exhausted."""
+
+
+class DescriptorLimit:
+    """Limit of the descriptors of this process.
+
+    Parameters
+    ----------
+    max_sessions : int
+        Number of sessions that must fit.
+
+    Attributes
+    ----------
+    max_connections : int
+        Maximum number of simultaneous connections, with or without a session.
+    max_slots : int
+        Maximum number of open shared-memory slots.
+
+    Raises
+    ------
+    OSError
+        If the hard limit is too low for that many sessions.
+    """
+
+    def __init__(self, max_sessions: int) -> None:
+        soft, self._hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        most = max(soft, TARGET_COUNT) if soft >= 0 else TARGET_COUNT
+        self._most = most if self._hard < 0 else min(most, self._hard)
+        least = BASE_COUNT + 3 * max_sessions
+        if self._most < least:
+            raise OSError(
+                f"this process may open {self._most} files; expected at least {least} "
+                f"for {max_sessions} sessions: raise the limit (ulimit -n {least}, or "
+                f"LimitNOFILE={least} of a systemd unit), or lower max_sessions"
+            )
+        free = self._most - BASE_COUNT
+        self.max_slots = max(max_sessions, free // 4)
+        self.max_connections = free - self.max_slots
+        self._set(self._most - RESERVE)
+
+    def _set(self, soft: int) -> None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, self._hard))
+
+    @contextmanager
+    def reserve(self) -> Iterator[None]:
+        """Return a context in which the reserve may be used."""
+        self._set(self._most)
+        try:
+            yield
+        finally:
+            self._set(self._most - RESERVE)
+
+
+BACKLOG = 4096
+"""Larger than libzmq's 100: when many clients connect at once, a full backlog loses
+their first packets, which the system resends only after a second."""
+
+DEFER_ACCEPT_S = 5
+"""Minimum time for which the kernel holds back TCP connections that have sent no data;
+a ZeroMQ client sends first.  1,500 silent clients that keep reconnecting then cause at
+most 200 accepted connections per second instead of 5,000."""
+
+TCP_DEFER_ACCEPT: int | None = getattr(socket, "TCP_DEFER_ACCEPT", None)
+
+
+def check_path_is_free(bind: str) -> None:
+    """Check that an ``ipc://`` path is free or a stale socket, which binding replaces.
+
+    Raises
+    ------
+    FileExistsError
+        If it is another file, or a service listens on it.
+    """
+    if not bind.startswith("ipc://"):
+        return
+    path = Path(bind.removeprefix("ipc://"))
+    if not path.exists():
+        return
+    if not path.is_socket():
+        raise FileExistsError(f"{path} exists and is not a socket")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        try:
+            probe.connect(str(path))
+        except OSError:
+            return
+    raise FileExistsError(f"another service listens on {path}")
+
+
+def socket_family(bind: str) -> socket.AddressFamily:
+    """Return the address family of an endpoint's connections."""
+    if bind.startswith("ipc://"):
+        return socket.AF_UNIX
+    return socket.AF_INET6 if bind.startswith("tcp://[") else socket.AF_INET
+
+
+def deferring_listener(bind: str) -> socket.socket | None:
+    """Return a TCP socket that accepts connections once their clients have sent data.
+
+    Return None for other transports, and for interface names, which libzmq resolves.
+
+    Raises
+    ------
+    OSError
+        If the address is in use, or is not one of this machine.
+    """
+    if not bind.startswith("tcp://") or TCP_DEFER_ACCEPT is None:
+        return None
+    host, _, port = bind.removeprefix("tcp://").rpartition(":")
+    family = socket_family(bind)
+    wildcard = "::" if family == socket.AF_INET6 else "0.0.0.0"
+    name = wildcard if host == "*" else host.strip("[]")
+    number = 0 if port == "*" else int(port)
+    try:
+        found = socket.getaddrinfo(name, number, family, socket.SOCK_STREAM)
+    except socket.gaierror:
+        return None
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.setsockopt(socket.IPPROTO_TCP, TCP_DEFER_ACCEPT, DEFER_ACCEPT_S)
+        listener.bind(found[0][4])
+        listener.listen(BACKLOG)
+    except OSError:
+        listener.close()
+        raise
+    return listener
+
 
 MAX_UNREAD_BYTES = 262_144
 """Bytes of an incomplete message that a connection without a session may send in any

@@ -10,11 +10,13 @@ responds while a frame is rendered, however long that takes.
 from __future__ import annotations
 
 import logging
+import resource
 import time
 from collections.abc import Iterable
 from contextlib import suppress
 from typing import Any
 
+import estimator.bounded_files  # noqa: F401  (later, no descriptor may be free to read it)
 from filter_service.errors import (
     BadMessage,
     BuildCancelled,
@@ -43,17 +45,28 @@ from filter_service.messages import (
     is_bye,
     peek_ids,
 )
-from filter_service.service.client_memory import MAX_PARTS_PER_VIEW, ClientMemory
-from filter_service.service.client_textures import ClientTextures
+from filter_service.service.client_memory import (
+    MAX_PARTS_PER_VIEW,
+    ClientMemory,
+    ClientTextures,
+    TextureSocket,
+)
 from filter_service.service.config import ServiceConfig
-from filter_service.service.connections import Connections, Peer
-from filter_service.service.descriptors import DescriptorLimit
+from filter_service.service.connections import (
+    Connections,
+    DescriptorLimit,
+    Peer,
+    Verdict,
+    socket_family,
+)
 from filter_service.service.frame_queue import FrameQueue
-from filter_service.service.listening_socket import socket_family
-from filter_service.service.metrics import serve_metrics
-from filter_service.service.process_channel import Link, LinkClosed
-from filter_service.service.process_info import resident_memory_mb
-from filter_service.service.rate_limit import Verdict
+from filter_service.service.metrics import MetricsUnavailable, serve_metrics
+from filter_service.service.process_channel import (
+    Link,
+    LinkClosed,
+    resident_memory_mb,
+    start_process,
+)
 from filter_service.service.render_client import RenderClient
 from filter_service.service.router import (
     KeyRemoved,
@@ -63,10 +76,8 @@ from filter_service.service.router import (
     Tracker,
 )
 from filter_service.service.served_devices import ServedDevice, ServedDevices
-from filter_service.service.session import Session, SessionRecord
+from filter_service.service.session import Session, SessionRecord, SessionTable
 from filter_service.service.session_manager import SessionManager
-from filter_service.service.session_table import SessionTable
-from filter_service.service.texture_socket import TextureSocket
 from filter_service.texture_view import TextureSupport
 from filter_service.wire.message import Message
 
@@ -527,3 +538,26 @@ def _load_keys(folder: str) -> KeyRing | None:
     except ValueError as error:
         raise OSError(f"keys_dir: {error}") from None
     return keys
+
+
+def main() -> None:
+    """Serve clients until the supervisor sends stop."""
+    supervisor, config, others = start_process("front-end")
+    # libzmq does not report the size of incomplete messages.  Beyond the limit it
+    # aborts the process, which frees the memory; sessions survive.
+    limit = config.max_socket_mb * MB
+    try:
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    except (OSError, ValueError) as error:
+        log.warning("max_socket_mb has no effect on this system: %s", error)
+    try:
+        front_end = FrontEnd(config, supervisor)
+    except (OSError, MetricsUnavailable) as error:
+        supervisor.send(("failed", str(error)))
+        raise SystemExit(1) from None
+    supervisor.send(("ready", front_end.endpoint))
+    front_end.run(others)
+
+
+if __name__ == "__main__":
+    main()

@@ -6,14 +6,40 @@ Messages are pickled, which is safe because both processes belong to the service
 
 from __future__ import annotations
 
+import ctypes
 import os
 import pickle
+import resource
 import select
+import signal
 import socket
 import struct
+import sys
 from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, Self
+
+from filter_service.log_lines import configure_logging
+from filter_service.service.config import ServiceConfig
+
+
+def resident_memory_mb() -> float:
+    """Return the resident memory of this process (Linux; 0 elsewhere)."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except (OSError, IndexError, ValueError):
+        return 0.0
+
+    return pages * resource.getpagesize() / 1e6
+
+
+def trim_heap() -> None:
+    """Return freed memory to the system (glibc; does nothing elsewhere)."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
 
 HEAD = struct.Struct("<QB")  # length of what follows, number of descriptors
 MAX_DESCRIPTORS = 8
@@ -173,3 +199,46 @@ class Link:
         self._unsent.clear()
         self._descriptors.clear()
         self._socket.close()
+
+
+PR_SET_PDEATHSIG = 1
+
+
+def start_process(name: str) -> tuple[Link, ServiceConfig, list[tuple[Any, list[int]]]]:
+    """Set up signals and the log, and wait for the settings.
+
+    The first argument of the program is the descriptor of the link to the supervisor.
+
+    Parameters
+    ----------
+    name : str
+        Name of the process in the log.
+
+    Returns
+    -------
+    supervisor : Link
+    config : ServiceConfig
+    others : list of (message, descriptors)
+        Messages that arrived after the settings.
+    """
+    _end_with_parent()
+    # Ctrl-C signals the whole process group; the supervisor stops its processes itself.
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    configure_logging(name)
+    supervisor = Link.from_descriptor(int(sys.argv[1]))
+    (first, _), *others = supervisor.wait()
+    kind, config = first
+    assert kind == "config"
+    return supervisor, config, others
+
+
+def _end_with_parent() -> None:
+    """Make the kernel kill this process when its parent dies (Linux)."""
+    parent = os.getppid()
+    try:
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    except (OSError, AttributeError):
+        return  # then the closed link ends this process
+    if os.getppid() != parent:
+        sys.exit(1)

@@ -51,8 +51,9 @@ from filter_service.messages import (
     SharedPlaces,
     ShareTexture,
 )
-from filter_service.service.process_channel import Link, LinkClosed
-from filter_service.service.process_info import (
+from filter_service.service.process_channel import (
+    Link,
+    LinkClosed,
     resident_memory_mb,
     trim_heap,
 )

@@ -21,8 +21,7 @@ from filter_service.building.worker_handle import WorkerHandle
 from filter_service.errors import FilterError
 from filter_service.gl_device import AUTO, GL_DEVICE_VARIABLE
 from filter_service.service.config import ServiceConfig
-from filter_service.service.process_channel import Link
-from filter_service.service.process_startup import start_process
+from filter_service.service.process_channel import Link, start_process
 
 if TYPE_CHECKING:
     from estimator.profiles.parse import EyeProfile

@@ -4,27 +4,191 @@ from __future__ import annotations
 
 import ctypes
 import enum
+import logging
 import math
 import os
 import secrets
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import zmq
+from zmq.utils import z85
 
 from filter_service.keys import KeyRing
-from filter_service.service.authenticator import Authenticator, parse_user_id
-from filter_service.service.connections import Connection, Connections, Peer
-from filter_service.service.dropped_parts import drop_parts
-from filter_service.service.listening_socket import (
+from filter_service.service.connections import (
     BACKLOG,
+    Connection,
+    Connections,
+    Peer,
     check_path_is_free,
     deferring_listener,
 )
+
+ZAP_ENDPOINT = "inproc://zeromq.zap.01"
+ZAP_VERSION = b"1.0"
+ZAP_DOMAIN = b"ocufilter"
+MAX_REQUESTS_PER_TURN = 64
+
+log = logging.getLogger("ocufilter")
+
+
+class Authenticator:
+    """ZAP handler that numbers connections and admits only those with an allowed key.
+
+    Parameters
+    ----------
+    context : zmq.Context
+        Context of the secured socket, which must be bound after this handler exists.
+    keys : KeyRing, optional
+        Allowed keys; if None, every connection is admitted.
+    on_request : callable
+        Called when a connection requests admission, before it is numbered; by then the
+        socket's monitor has reported that the connection was accepted.
+
+    Attributes
+    ----------
+    next_number : int
+        Number of the next connection that is admitted.
+    """
+
+    def __init__(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        keys: KeyRing | None,
+        on_request: Callable[[], None],
+    ) -> None:
+        self._keys, self._on_request = keys, on_request
+        self.next_number = 1
+        self.socket = context.socket(zmq.REP)
+        self.socket.linger = 0
+        self.socket.bind(ZAP_ENDPOINT)
+
+    def secure(self, socket: zmq.Socket[bytes]) -> None:
+        """Enable authentication on a socket that is not bound yet."""
+        socket.zap_domain = ZAP_DOMAIN
+        if self._keys is not None:
+            pair = self._keys.server
+            socket.curve_server = True
+            socket.curve_secretkey = pair.secret.encode()
+            socket.curve_publickey = pair.public.encode()
+
+    def handle_requests(self) -> None:
+        """Reply to pending ZAP requests."""
+        for _ in range(MAX_REQUESTS_PER_TURN):
+            try:
+                request = self.socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            self._on_request()
+            self.socket.send_multipart(self._reply(request))
+
+    def accepts(self, key: str) -> bool:
+        """Return whether a client's public key is currently allowed."""
+        return self._keys is None or key in self._keys.allowed()
+
+    def _reply(self, request: list[bytes]) -> list[bytes]:
+        _, request_id, _, address, _, mechanism, *credentials = request
+        key = ""
+        if self._keys is not None:
+            key = z85.encode(credentials[0]).decode() if credentials else ""
+            if mechanism != b"CURVE" or not self.accepts(key):
+                log.warning(
+                    "rejected a client at %s: its key is not allowed", address.decode()
+                )
+                return [
+                    *(ZAP_VERSION, request_id, b"400", b"key is not allowed", b"", b"")
+                ]
+        user_id = f"{self.next_number} {key}".strip()
+        self.next_number += 1
+        return [ZAP_VERSION, request_id, b"200", b"OK", user_id.encode(), b""]
+
+    def close(self) -> None:
+        """Close the socket."""
+        self.socket.close(linger=0)
+
+
+def parse_user_id(user_id: str) -> tuple[int, str]:
+    """Return a connection's number and key, parsed from its ``User-Id``."""
+    number, _, key = user_id.partition(" ")
+    return int(number), key
+
+
+FILE = "_drop_parts.so"
+CALLS = ("init", "recv", "more", "close")
+
+
+class _ZmqCalls(ctypes.Structure):
+    """Addresses of the libzmq functions that `drop_parts.c` calls."""
+
+    _fields_ = tuple((name, ctypes.c_void_p) for name in CALLS)
+
+
+def drop_parts(socket: zmq.Socket[Any], max_count: int) -> tuple[int, bool]:
+    """Drop the next parts of the message that is being received.
+
+    Parameters
+    ----------
+    socket : zmq.Socket
+        Socket of which a message was read in part: its last part had `more` set.
+    max_count : int
+        Maximum number of parts to drop.
+
+    Returns
+    -------
+    count : int
+        Number of dropped parts.
+    has_more : bool
+        Whether the message has further parts.
+    """
+    loop = _compiled()
+    if loop is None:
+        return drop_parts_in_python(socket, max_count)
+    library, calls = loop
+    has_more = ctypes.c_int32(1)
+    count = library.ocu_drop_parts(
+        *(ctypes.c_void_p(socket.underlying), ctypes.byref(calls)),
+        *(ctypes.c_int64(max_count), ctypes.byref(has_more)),
+    )
+    return int(count), bool(has_more.value)
+
+
+def drop_parts_in_python(socket: zmq.Socket[Any], max_count: int) -> tuple[int, bool]:
+    """Implement `drop_parts` without the compiled loop."""
+    receive = socket.recv
+    for count in range(1, max_count + 1):
+        if not receive(copy=False).more:
+            return count, False
+    return max_count, True
+
+
+@cache
+def _compiled() -> tuple[ctypes.CDLL, _ZmqCalls] | None:
+    """Return the compiled loop and libzmq's functions; None if either is missing."""
+    path = Path(__file__).with_name(FILE)
+    try:
+        from zmq.backend.cython import _zmq
+
+        # The libzmq that pyzmq's extension is linked with.
+        libzmq = ctypes.CDLL(_zmq.__file__)
+        calls = _ZmqCalls(
+            *(
+                ctypes.cast(getattr(libzmq, f"zmq_msg_{name}"), ctypes.c_void_p)
+                for name in CALLS
+            )
+        )
+        library = ctypes.CDLL(str(path)) if path.is_file() else None
+    except (ImportError, OSError, AttributeError):
+        return None
+    if library is None:
+        return None
+    library.ocu_drop_parts.restype = ctypes.c_int64
+    return library, calls
+
 
 COPY_BELOW_BYTES = 65536  # pyzmq copies smaller parts in any case
 

@@ -11,13 +11,11 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 from filter_service.messages import DeviceState, Reply
-from filter_service.service.connections import Peer
-from filter_service.service.descriptors import DescriptorLimit
+from filter_service.service.connections import DescriptorLimit, Peer
 from filter_service.service.frame_queue import FrameQueue
 from filter_service.service.render_client import RenderClient
 from filter_service.service.router import Tracker
-from filter_service.service.session import Session
-from filter_service.service.session_table import SessionTable
+from filter_service.service.session import Session, SessionTable
 from filter_service.texture_view import TextureSupport
 
 

@@ -24,14 +24,17 @@ from filter_service.messages import (
     Reply,
     Welcome,
 )
-from filter_service.service.client_memory import ClientMemory
-from filter_service.service.client_textures import ClientTextures
+from filter_service.service.client_memory import ClientMemory, ClientTextures
 from filter_service.service.config import ServiceConfig
 from filter_service.service.connections import Peer
 from filter_service.service.router import Outcome, Tracker
 from filter_service.service.served_devices import ServedDevice, ServedDevices
-from filter_service.service.session import EyeProfiles, Session, SessionRecord
-from filter_service.service.session_table import SessionTable
+from filter_service.service.session import (
+    EyeProfiles,
+    Session,
+    SessionRecord,
+    SessionTable,
+)
 
 MAX_PENDING_HELLOS = 256
 """Maximum number of clients whose hello is answered once all devices have started."""

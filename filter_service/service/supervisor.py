@@ -29,7 +29,7 @@ from filter_service.building.helper_process import (
 from filter_service.service.config import ServiceConfig, changed_while_running
 from filter_service.service.process_channel import Link, LinkClosed
 
-FRONT_END_MODULE = "filter_service.service.front_end_process"
+FRONT_END_MODULE = "filter_service.service.front_end"
 RENDER_MODULE = "filter_service.service.render_worker_process"
 FRONT_END, RENDER = "front-end", "render"
 OPEN_BUILDER = "filter_service.service.render_worker_process:open_configured_builder"

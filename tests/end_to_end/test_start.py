@@ -84,7 +84,7 @@ def test_what_stands_before_the_frames_is_light(module, heavy):
     assert not set(_printed(LIGHT.format(module=module))) & heavy
 
 
-@pytest.mark.parametrize("module", ["front_end_process", "render_worker_process"])
+@pytest.mark.parametrize("module", ["front_end", "render_worker_process"])
 def test_a_process_that_is_stopped_during_its_start_ends(module, monkeypatch):
     monkeypatch.setenv("OCUFILTER_TEST_FILTER_MS", "0")
     assert _printed(STOPPED_DURING_THE_START.format(module=module), timeout_s=20)

@@ -142,8 +142,8 @@ HOME = {
     "xr": ("clients/headset/openxr_*",),  # makes PyOpenGL use GLX
     "zmq": (
         "filter_service/service/router.py",  # the server's socket and nothing else
-        "filter_service/service/authenticator.py",  # who may connect to it
-        "filter_service/service/dropped_parts.py",  # messages of too many parts
+        "filter_service/service/router.py",  # who may connect to it
+        "filter_service/service/router.py",  # messages of too many parts
         "filter_service/service/status_query.py",  # one ping
         "filter_service/keys.py",  # makes pairs of them
         "clients/connection.py",  # the client's socket and nothing else

@@ -23,19 +23,24 @@ from filter_service.log_lines import (
     LineWriter,
     RepeatFilter,
 )
-from filter_service.service.connections import Connections
-from filter_service.service.descriptors import BASE_COUNT, DescriptorLimit
-from filter_service.service.dropped_parts import drop_parts, drop_parts_in_python
-from filter_service.service.fair_queue import MAX_CATCH_UP_S, MAX_CHARGE_S, FairQueue
-from filter_service.service.rate_limit import (
+from filter_service.service.connections import (
+    BASE_COUNT,
     MAX_IGNORED,
     MAX_REFUSALS,
     MAX_REQUESTS,
     WINDOW_S,
+    Connections,
+    DescriptorLimit,
     RateLimit,
     Verdict,
 )
-from filter_service.service.router import Outcome, Router
+from filter_service.service.frame_queue import MAX_CATCH_UP_S, MAX_CHARGE_S, FairQueue
+from filter_service.service.router import (
+    Outcome,
+    Router,
+    drop_parts,
+    drop_parts_in_python,
+)
 from filter_service.service.supervisor import _Restarts
 from filter_service.shared_memory import SlotPool
 from filter_service.wire.unpacking import MAX_ITEMS, MAX_TEXT, unpack_profile

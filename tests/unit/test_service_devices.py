@@ -5,7 +5,7 @@ import pytest
 from estimator.threads import thread_count
 from filter_service.messages import DeviceState, Pong, encode
 from filter_service.service.config import ServiceConfig, load_config
-from filter_service.service.load import WINDOW_S, Load
+from filter_service.service.frame_queue import LOAD_WINDOW_S, Load
 from filter_service.wire.message import MAX_DEVICES
 from filter_service.wire.unpacking import MAX_HEADER_BYTES
 
@@ -81,7 +81,7 @@ def test_load_is_of_the_last_seconds():
         load.add(0.5, 100.0 + second)
     busy = load.busy_ratio(1099.0)
     assert busy == pytest.approx(0.5, abs=0.03)
-    later = load.busy_ratio(1099.0 + WINDOW_S)
+    later = load.busy_ratio(1099.0 + LOAD_WINDOW_S)
     assert later == pytest.approx(busy / 2.718, rel=1e-3)
     load.add(1000.0, 1100.0)
     assert load.busy_ratio(1100.0) == 1.0
