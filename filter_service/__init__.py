@@ -19,13 +19,11 @@ Importing this package loads no submodules, which keeps clients light.
     progress         progress of long tasks on stderr
     waiting          waits that report progress, with a limit of the time without it
     constants        constants shared by Python and GLSL
-    image_files      color and depth files
+    image_files      color and depth files; .npy files within limits
     atomic_files     atomic file writes
-    pictures         colors and depth of pictures, upright and in sRGB
-    pnm_files        PGM and PPM files
+    pictures         colors and depth of pictures, PGM and PPM, upright and in sRGB
     exr_files        OpenEXR files
     bounded_images   image decoders with memory limits
-    bounded_npy      .npy files within limits
     color_encoding   color profiles and codes, and conversion to sRGB
     gl_device        selection of the OpenGL device
     version          version of the installed package

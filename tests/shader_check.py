@@ -18,7 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from filter_service.gl.shader_source import load_shader
+from filter_service.gl.passes import load_shader
 from tests.shader_variants import Variant, all_variants
 from tests.source_tree import ROOT
 

@@ -67,7 +67,7 @@ def probe_gl() -> dict[str, Any]:
 
 def probe_devices() -> dict[str, Any]:
     """List the EGL devices; `probe_gl` checks whether they work."""
-    from filter_service.gl.egl_devices import egl_devices
+    from filter_service.gl.choose_device import egl_devices
 
     return {
         "devices": [

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from filter_service.constants import ENGINES
 from filter_service.errors import RenderFailed
-from filter_service.gl.hardware import may_have_gpu
-from filter_service.gl_device import is_device_selected
+from filter_service.gl_device import is_device_selected, may_have_gpu
 
 if TYPE_CHECKING:
     from filter_service.gl.current_context import CurrentContext

@@ -1,2 +1,2 @@
 from .gpu import Gpu as Gpu
-from .shader_source import load_shader as load_shader
+from .passes import load_shader as load_shader

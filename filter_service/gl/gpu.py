@@ -12,24 +12,24 @@ from numpy.typing import DTypeLike, NDArray
 from filter_service import constants
 from filter_service.errors import OutOfGpuMemory, RenderFailed
 from filter_service.gl.choose_device import open_on_device
-from filter_service.gl.copying import copy_bytes
 from filter_service.gl.current_context import (
     CurrentContext,
     EglCurrent,
+    KeptState,
     current_moderngl_context,
+    gl_functions,
 )
-from filter_service.gl.functions import gl_functions
-from filter_service.gl.kept_state import KeptState
 from filter_service.gl.passes import Atlas, Buffer, BufferPart, Pages, Passes
 from filter_service.gl.staging import (
     ALIGNMENT,
     Group,
     Staging,
+    TimerQuery,
+    copy_bytes,
     has_buffer_storage,
     wait_for_fence,
 )
 from filter_service.gl.texture_io import TextureIo
-from filter_service.gl.timer_query import TimerQuery
 from filter_service.gl_device import (
     checked_gl_device,
     is_software_renderer,

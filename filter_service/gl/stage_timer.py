@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from filter_service.gl.gpu import Gpu
-from filter_service.gl.timer_query import TimerQuery
+from filter_service.gl.staging import TimerQuery
 
 
 class StageTimer:

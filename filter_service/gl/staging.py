@@ -7,18 +7,93 @@ ARB_buffer_storage).
 """
 
 import ctypes
+import os
 from collections import deque
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.threads import thread_count
 from filter_service.errors import OutOfGpuMemory, RenderFailed
 
 if TYPE_CHECKING:
     import moderngl
+
+MIN_PART_BYTES = 2 << 20
+"""Smallest part per thread.  For frames of 1280x720 on the host of an H100, parts of
+half the size took longer than a single thread."""
+
+MAX_THREADS = 4
+"""Two frames of 1832x1920, state unchanged, on a 16-core Xeon host of an H100: 16.0 ms
+with one thread, 13.8 with two, 12.4 with four, 12.8 with six, 13.7 with eight."""
+
+
+def copy_bytes(target: NDArray[np.uint8], source: NDArray[np.uint8]) -> None:
+    """Copy bytes (n,), in several threads if there are many; wait for completion."""
+    # Half of the cores; the others are for other streams.
+    count = min(source.size // MIN_PART_BYTES, thread_count() // 2, MAX_THREADS)
+    if count < 2:
+        target[:] = source
+        return
+    first, *others = pairwise(source.size * k // count for k in range(count + 1))
+    waiting = [
+        _pool().submit(np.copyto, target[start:end], source[start:end])
+        for start, end in others
+    ]
+    np.copyto(target[: first[1]], source[: first[1]])
+    for part in waiting:
+        part.result()
+
+
+@lru_cache(maxsize=1)
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(MAX_THREADS - 1, thread_name_prefix="copy")
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
+
+
+GL_TIME_ELAPSED, GL_QUERY_RESULT = 0x88BF, 0x8866
+
+
+class TimerQuery:
+    """Measures the time that the GPU takes for the commands within.
+
+    Parameters
+    ----------
+    functions : SimpleNamespace
+        From `gl_functions`.
+    """
+
+    def __init__(self, functions: SimpleNamespace) -> None:
+        self._gl, self._name = functions, ctypes.c_uint(0)
+        functions.glGenQueries(1, ctypes.byref(self._name))
+
+    def __enter__(self) -> None:
+        """Begin the query."""
+        self._gl.glBeginQuery(GL_TIME_ELAPSED, self._name)
+
+    def __exit__(self, *raised: object) -> None:
+        """End the query."""
+        self._gl.glEndQuery(GL_TIME_ELAPSED)
+
+    @property
+    def elapsed_ns(self) -> int:
+        """Wait for the GPU, and return the time in nanoseconds."""
+        found = ctypes.c_uint64(0)
+        self._gl.glGetQueryObjectui64v(self._name, GL_QUERY_RESULT, ctypes.byref(found))
+        return found.value
+
+    def release(self) -> None:
+        """Delete the query."""
+        self._gl.glDeleteQueries(1, ctypes.byref(self._name))
+
 
 GL_COPY_READ_BUFFER, GL_COPY_WRITE_BUFFER = 0x8F36, 0x8F37
 GL_MAP_READ_BIT, GL_MAP_WRITE_BIT = 0x1, 0x2

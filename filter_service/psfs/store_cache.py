@@ -29,7 +29,7 @@ from estimator import native as core
 from estimator.native import in_use
 from estimator.profiles.parse import EyeProfile
 from filter_service import native as loops
-from filter_service.gl.shader_source import SHADER_ROOT
+from filter_service.gl.passes import SHADER_ROOT
 from filter_service.planning.grid import GridSpec
 from filter_service.psfs.cache_folder import check_is_private
 from filter_service.psfs.store_codec import NotStorable, pack

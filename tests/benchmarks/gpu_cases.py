@@ -12,8 +12,8 @@ from estimator.profiles.parse import parse_profile
 from filter_service.gl.current_context import CurrentContext
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.stage_timer import StageTimer
+from filter_service.gl.staging import TimerQuery
 from filter_service.gl.texture_io import TextureIo
-from filter_service.gl.timer_query import TimerQuery
 from filter_service.planning.grid import GridSpec
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import PsfStore, build_psf_store

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import moderngl
 import numpy as np
 
-from filter_service.gl.imported_textures import TextureImporter
+from filter_service.gl.texture_io import TextureImporter
 from filter_service.texture_view import BYTES_PER_PIXEL, TextureMemory
 from tests.numerical.gl_textures import FORMATS, TEXTURE_2D, Textures
 

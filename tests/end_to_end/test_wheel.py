@@ -193,7 +193,7 @@ def test_the_wheel_holds_everything_of_its_packages_and_nothing_else(wheel_names
 def test_what_is_imported_is_the_wheel_s(installed):
     script = (
         "import clients, estimator, filter_service as f, ocufilter, numpy\n"
-        "from filter_service.gl.shader_source import SHADER_ROOT\n"
+        "from filter_service.gl.passes import SHADER_ROOT\n"
         "ours = clients, estimator, f, ocufilter\n"
         "print(*(m.__file__ for m in ours), SHADER_ROOT, sep='\\n')"
     )

@@ -5,8 +5,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from filter_service.gl import copying
-from filter_service.gl.staging import INITIAL_BYTES, has_buffer_storage
+from filter_service.gl import staging
+from filter_service.gl.staging import INITIAL_BYTES, copy_bytes, has_buffer_storage
 from tests.numerical.synthetic import Bench, depth_scene, texture
 
 SIZE = {"width_px": 150, "height_px": 101, "vertical_fov_deg": 8.0}
@@ -48,22 +48,22 @@ def test_arrays_come_back_as_they_went(staged, rng, count):
 @pytest.mark.parametrize("size", [0, 1, 1999, 2000, 4001, 12_345])
 @pytest.mark.parametrize("cores", [1, 4, 16])
 def test_threads_copy_every_byte_once(monkeypatch, rng, size, cores):
-    monkeypatch.setattr(copying, "MIN_PART_BYTES", 1000)
-    monkeypatch.setattr(copying, "thread_count", lambda: cores)
+    monkeypatch.setattr(staging, "MIN_PART_BYTES", 1000)
+    monkeypatch.setattr(staging, "thread_count", lambda: cores)
     sent = rng.integers(0, 256, size, np.uint8)
     room = np.full(size + 2, 77, np.uint8)
-    copying.copy_bytes(room[1:-1], sent)
+    copy_bytes(room[1:-1], sent)
     assert np.array_equal(room[1:-1], sent)
     assert room[0] == room[-1] == 77
 
 
 def test_a_copy_that_fails_says_so(monkeypatch):
-    monkeypatch.setattr(copying, "MIN_PART_BYTES", 10)
-    monkeypatch.setattr(copying, "thread_count", lambda: 4)
+    monkeypatch.setattr(staging, "MIN_PART_BYTES", 10)
+    monkeypatch.setattr(staging, "thread_count", lambda: 4)
     locked = np.zeros(100, np.uint8)
     locked.setflags(write=False)
     with pytest.raises(ValueError, match="read-only"):
-        copying.copy_bytes(locked, np.ones(100, np.uint8))
+        copy_bytes(locked, np.ones(100, np.uint8))
 
 
 def test_a_full_block_starts_anew_without_losing_what_was_sent(staged, rng):

@@ -8,7 +8,7 @@ import pytest
 
 from filter_service.errors import BadMessage, OutOfGpuMemory, RenderFailed
 from filter_service.gl.gpu import GROWTH, Gpu
-from filter_service.gl.imported_textures import TextureImporter
+from filter_service.gl.texture_io import TextureImporter
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import TextureRequest
 from filter_service.rendering.gl import texture_frames

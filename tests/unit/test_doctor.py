@@ -12,7 +12,7 @@ from clients.commands.doctor_checks import (
     check_shaders,
 )
 from clients.commands.doctor_probes import probe_native, probe_shaders
-from filter_service.gl import shader_source
+from filter_service.gl import passes as gl_passes
 from filter_service.gl.passes import Passes
 from filter_service.native import library
 
@@ -32,13 +32,13 @@ def test_the_probe_runs_every_pass_and_all_is_well(monkeypatch):
     check = check_shaders({}, found)
     assert check.ok and not check.fix, check
     assert f"{found['program_count']} programs" in check.detail
-    passes = shader_source.SHADER_ROOT / "passes"
+    passes = gl_passes.SHADER_ROOT / "passes"
     of_textures = {"sample_input.comp.glsl"}  # of a caller's context
     assert compiled == {path.name for path in passes.glob("*.glsl")} - of_textures
 
 
 def test_a_missing_shader_is_named_with_what_brings_it_back(monkeypatch, tmp_path):
-    monkeypatch.setattr(shader_source, "SHADER_ROOT", tmp_path)
+    monkeypatch.setattr(gl_passes, "SHADER_ROOT", tmp_path)
     check = check_shaders({}, probe_shaders())
     assert not check.ok
     assert "'passes/begin_plan.comp.glsl' does not exist" in check.detail
@@ -48,7 +48,7 @@ def test_a_missing_shader_is_named_with_what_brings_it_back(monkeypatch, tmp_pat
 def test_a_shader_that_does_not_compile_is_named_in_one_line(monkeypatch, tmp_path):
     (tmp_path / "passes").mkdir()
     (tmp_path / "passes" / "begin_plan.comp.glsl").write_text("nonsense\n")
-    monkeypatch.setattr(shader_source, "SHADER_ROOT", tmp_path)
+    monkeypatch.setattr(gl_passes, "SHADER_ROOT", tmp_path)
     check = check_shaders({}, probe_shaders())
     assert not check.ok
     assert "begin_plan.comp.glsl" in check.detail

@@ -10,13 +10,14 @@ from clients.commands.doctor_checks import gl_devices
 from filter_service.errors import RenderFailed
 from filter_service.filtering.choose_engine import open_engine
 from filter_service.gl import choose_device
-from filter_service.gl.choose_device import by_preference, open_on_device
-from filter_service.gl.egl_devices import (
+from filter_service.gl.choose_device import (
     NAME_EXTENSION,
     SOFTWARE_EXTENSION,
     EglDevice,
     _described,
+    by_preference,
     egl_devices,
+    open_on_device,
 )
 from filter_service.gl.gpu import Gpu
 from filter_service.gl_device import (

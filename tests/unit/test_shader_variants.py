@@ -5,7 +5,7 @@ import re
 import pytest
 
 from filter_service.constants import SORT_CAPACITIES
-from filter_service.gl.shader_source import (
+from filter_service.gl.passes import (
     SHADER_ROOT,
     load_shader,
     shared_defines,

@@ -7,7 +7,7 @@ from functools import partial
 
 from filter_service.errors import RenderFailed
 from filter_service.gl.gpu import Gpu
-from filter_service.gl.imported_textures import ImportedTexture, TextureImporter
+from filter_service.gl.texture_io import ImportedTexture, TextureImporter
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import (
     OneView,
