@@ -54,6 +54,7 @@ from filter_service.messages import (
     Progress,
     Ready,
     ShareTexture,
+    State,
     UnshareTexture,
     ViewHeader,
     ViewState,
@@ -524,7 +525,7 @@ class FilterClient:
             raise ValueError(
                 f"{len(states)} states; allowed: {len(items)}, one per view"
             )
-        check_states(states, pupil_diameter_mm, focus_dpt)
+        check_states(states, State(pupil_diameter_mm, focus_dpt))
         if self.welcome is not None:
             check_limits(items, self.welcome)
         frame = Frame(
@@ -706,7 +707,7 @@ class FilterClient:
             raise ValueError(
                 f"{len(states)} states; allowed: {len(views)}, one per view"
             )
-        check_states(states, pupil_diameter_mm, focus_dpt)
+        check_states(states, State(pupil_diameter_mm, focus_dpt))
         frame = Frame(
             frame_id=self._next_frame_id,
             views=tuple(

@@ -10,6 +10,7 @@ from estimator.profiles.parse import EyeProfile
 from filter_service.building.limits import BuildLimits
 from filter_service.camera import Camera
 from filter_service.settings import FilterSettings
+from filter_service.view_state import State
 
 DEFAULT_LIMITS = BuildLimits()
 
@@ -24,7 +25,7 @@ class BuildJob:
     settings : FilterSettings
     camera : Camera
     limits : BuildLimits
-    near : (pupil_diameter_mm, focus_dpt), optional
+    near : State, optional
         State around which nodes are planned once the store is sent; by default none.
     """
 
@@ -32,7 +33,7 @@ class BuildJob:
     settings: FilterSettings
     camera: Camera
     limits: BuildLimits = DEFAULT_LIMITS
-    near: tuple[float, float] | None = None
+    near: State | None = None
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class BuiltStore:
         """Yield parts that frames will need, for ``take`` of the loaded store."""
         planned = getattr(self.store, "planned_ahead", None)
         if planned is not None and job.near is not None:
-            yield from planned(*job.near)
+            yield from planned(job.near)
 
 
 Build = Callable[..., BuiltStore]

@@ -36,6 +36,7 @@ from filter_service.filtering.stream_eyes import BuildTarget, RenderPlan, Stream
 from filter_service.rendering.engine import FrameEngine
 from filter_service.rendering.sampled_frame import first_frame
 from filter_service.settings import FilterSettings
+from filter_service.view_state import State
 
 MS_PER_S = 1e3
 
@@ -422,10 +423,10 @@ class Builder:
         stream.on_event(EyeFailed(target.eye, error))
 
 
-def _likely_state(stream: StreamEyes, target: BuildTarget) -> tuple[float, float]:
+def _likely_state(stream: StreamEyes, target: BuildTarget) -> State:
     """Return the likely pupil and focus of the next frame."""
     use = stream.history.last or first_frame(target.camera, target.eye.settings)
-    return use.pupil_diameter_mm, use.focus_dpt
+    return use.state
 
 
 def _to_filter_error(error: Exception) -> FilterError:

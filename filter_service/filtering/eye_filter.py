@@ -52,16 +52,13 @@ from filter_service.settings import (
     DEFAULTS,
     Engine,
     FilterSettings,
-    GazeDeg,
     Output,
-    PupilMm,
     RenderOptions,
     RenderOptionValues,
-    VergenceDpt,
     as_settings,
 )
 from filter_service.texture_view import GlTexture, TextureView
-from filter_service.validation import checked
+from filter_service.view_state import State
 from filter_service.waiting import Wait
 
 WAIT_SLICE_S = 0.02
@@ -526,19 +523,11 @@ class EyeFilter:
             also returns one if PSFs were not computed by ``until_s``.
         """
         self.advance_builds()
-        if gaze_deg is not None:
-            gaze_deg = checked(gaze_deg, tuple[GazeDeg, GazeDeg], "gaze_deg")
-        planned = self.plan(
-            views,
-            pupil_diameter_mm=pupil_diameter_mm,
-            focus_dpt=focus_dpt,
-            gaze_deg=gaze_deg,
-            newest_only=newest_only,
-        )
+        state = State.checked(pupil_diameter_mm, focus_dpt, gaze_deg)
+        planned = self.plan(views, [state] * len(views), newest_only=newest_only)
         if isinstance(planned, Preparing):
             return planned
         return planned.begin(
-            gazes_deg=[gaze_deg] * len(views),
             output=output,
             options=RenderOptions(**options),
             out=out,
@@ -599,20 +588,13 @@ class EyeFilter:
             raise RenderFailed(
                 "frames in textures need EyeFilter(..., gl_context='current')"
             )
-        if gaze_deg is not None:
-            gaze_deg = checked(gaze_deg, tuple[GazeDeg, GazeDeg], "gaze_deg")
+        state = State.checked(pupil_diameter_mm, focus_dpt, gaze_deg)
         self.advance_builds()
-        planned = self.plan_textures(
-            [(view, target)],
-            pupil_diameter_mm=pupil_diameter_mm,
-            focus_dpt=focus_dpt,
-            newest_only=newest_only,
-        )
+        planned = self.plan_textures([(view, target)], [state], newest_only=newest_only)
         if isinstance(planned, Preparing):
             return planned
         shown = planned.show(
             0,
-            gaze_deg=gaze_deg,
             options=RenderOptions(**options),
             target_is_top_first=target_is_top_first,
         )
@@ -620,9 +602,7 @@ class EyeFilter:
         return FilteredTexture(
             planned.plan.eye.profile_id,
             planned.plan.eye.generation,
-            shown.pupil_diameter_mm,
-            shown.focus_dpt,
-            shown.gaze_deg,
+            shown.state,
             shown.number,
             shown.notes,
             shown.earlier,
@@ -631,58 +611,43 @@ class EyeFilter:
     def plan_textures(
         self,
         views: Sequence[TargetedView],
+        states: Sequence[State],
         *,
-        pupil_diameter_mm: float,
-        focus_dpt: float,
         newest_only: bool = False,
-        **_: Any,
     ) -> PlannedTextures | Preparing:
         """Return views in textures that are ready to be rendered.
 
         Parameters, errors and lifetime are those of `plan`.
         """
         texture_engine(self.builder)
-        pupil_diameter_mm = checked(pupil_diameter_mm, PupilMm, "pupil_diameter_mm")
-        focus_dpt = checked(focus_dpt, VergenceDpt, "focus_dpt")
         plan = self._planned(
             [view.camera for view, _ in views], newest_only=newest_only
         )
         if isinstance(plan, Preparing):
             return plan
         return PlannedTextures(
-            self.builder, self._eyes, plan, tuple(views), pupil_diameter_mm, focus_dpt
+            self.builder, self._eyes, plan, tuple(views), tuple(states)
         )
 
     def plan(
         self,
         views: Sequence[RgbdView],
+        states: Sequence[State],
         *,
-        pupil_diameter_mm: float,
-        focus_dpt: float,
-        gaze_deg: tuple[float, float] | None = None,
         newest_only: bool = False,
     ) -> PlannedFrame | Preparing:
         """Return a frame that is ready to be rendered, or `Preparing`.
 
-        The parameters and errors are those of `try_filter`.  To prepare two eyes at the
-        same time, plan the frames of both before you render one.  Render a plan before
-        the next call of this filter, which may free the plan's stores.
+        All states have the same pupil and focus.  The errors are those of `try_filter`.
+        To prepare two eyes at the same time, plan the frames of both before you render
+        one.  Render a plan before the next call of this filter, which may free the
+        plan's stores.
         """
-        pupil_diameter_mm = checked(pupil_diameter_mm, PupilMm, "pupil_diameter_mm")
-        focus_dpt = checked(focus_dpt, VergenceDpt, "focus_dpt")
-        self._eyes.history.record(
-            views,
-            pupil_diameter_mm=pupil_diameter_mm,
-            focus_dpt=focus_dpt,
-            gaze_deg=gaze_deg,
-            at_s=time.monotonic(),
-        )
+        self._eyes.history.record(views, states[0], at_s=time.monotonic())
         plan = self._planned([view.camera for view in views], newest_only=newest_only)
         if isinstance(plan, Preparing):
             return plan
-        return PlannedFrame(
-            self.builder, self._eyes, plan, tuple(views), pupil_diameter_mm, focus_dpt
-        )
+        return PlannedFrame(self.builder, self._eyes, plan, tuple(views), tuple(states))
 
     def _planned(
         self, cameras: Sequence[Camera], *, newest_only: bool

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -15,20 +14,11 @@ from filter_service.errors import FilterError
 from filter_service.filtering.accepted_profile import AcceptedProfile
 from filter_service.rendering.filtered_view import FrameCounts, summed_counts
 from filter_service.texture_view import EarlierFrame
-from filter_service.view_state import EyeName
-
-
-def _is_complete() -> bool:
-    warnings.warn(
-        "is_complete is always true; it will be removed in version 0.3",
-        DeprecationWarning,
-        stacklevel=3,  # the reader of the property
-    )
-    return True
+from filter_service.view_state import EyeName, State, WithState
 
 
 @dataclass(frozen=True)
-class ViewResult:
+class ViewResult(WithState):
     """One output image, and the eye and state that it was filtered with.
 
     Attributes
@@ -40,24 +30,16 @@ class ViewResult:
         The caller's identifier of the profile; by default the generation.
     generation : int
         Number of the profile in its stream.
-    pupil_diameter_mm, focus_dpt
-        Values used.  A profile may limit the pupil, and an eye can only add power.
-    gaze_deg : (h, v)
-        Gaze used.
+    state : State
+        Pupil, focus and gaze used.  A profile may limit the pupil, and an eye can only
+        add power.
     """
 
     color: NDArray[Any]
     eye: EyeName
     profile_id: int
     generation: int
-    pupil_diameter_mm: float
-    focus_dpt: float
-    gaze_deg: tuple[float, float]
-
-    @property
-    def is_complete(self) -> bool:
-        """Return true; deprecated, will be removed in version 0.3."""
-        return _is_complete()
+    state: State
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,22 +136,17 @@ class Filtered(FrameCounts):
         """Return the focus used for the first view."""
         return self.views[0].focus_dpt
 
-    @property
-    def is_complete(self) -> bool:
-        """Return true; deprecated, will be removed in version 0.3."""
-        return _is_complete()
-
 
 @dataclass(frozen=True)
-class FilteredTexture:
+class FilteredTexture(WithState):
     """A frame in textures that was submitted to the GPU, and the eye that it is for.
 
     Attributes
     ----------
     profile_id, generation : int
         As in `ViewResult`.
-    pupil_diameter_mm, focus_dpt, gaze_deg
-        Values used.
+    state : State
+        Pupil, focus and gaze used.
     number : int
         Number of the frame among those of the context; see `EarlierFrame`.
     notes : tuple of str
@@ -179,9 +156,7 @@ class FilteredTexture:
 
     profile_id: int
     generation: int
-    pupil_diameter_mm: float
-    focus_dpt: float
-    gaze_deg: tuple[float, float]
+    state: State
     number: int
     notes: tuple[str, ...]
     earlier: EarlierFrame | None
@@ -255,11 +230,6 @@ class EyeReady:
     psf_count: int
     memory_mb: float
     notes: tuple[str, ...]
-
-    @property
-    def is_complete(self) -> bool:
-        """Return true; deprecated, will be removed in version 0.3."""
-        return _is_complete()
 
 
 @dataclass(frozen=True)

@@ -23,25 +23,22 @@ from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rendering.media_effects import begin_through_media
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
-
-GazeDegrees = tuple[float, float] | None
+from filter_service.view_state import State
 
 
 @dataclass(frozen=True)
 class PlannedFrame:
-    """Views of one eye in one state, and the stores that render them."""
+    """Views of one eye, their states, and the stores that render them."""
 
     builder: Builder  # the filter may be closed during the frame
     stream: StreamEyes
     plan: RenderPlan
     views: tuple[RgbdView, ...]
-    pupil_diameter_mm: float
-    focus_dpt: float
+    states: tuple[State, ...]
 
     def render(
         self,
         *,
-        gazes_deg: Sequence[GazeDegrees],
         output: Output = "srgb8",
         options: RenderOptions = DEFAULT_OPTIONS,
         out: Sequence[NDArray[Any] | None] | None = None,
@@ -51,7 +48,6 @@ class PlannedFrame:
 
         Parameters
         ----------
-        gazes_deg : sequence of (h, v) or None, one for each view
         out : sequence of arrays, optional
             Output arrays that may be used; only the returned arrays are valid.
         until_s : float, optional
@@ -68,7 +64,6 @@ class PlannedFrame:
             If the engine failed.
         """
         return self.begin(
-            gazes_deg=gazes_deg,
             output=output,
             options=options,
             out=out,
@@ -78,7 +73,6 @@ class PlannedFrame:
     def begin(
         self,
         *,
-        gazes_deg: Sequence[GazeDegrees],
         options: RenderOptions = DEFAULT_OPTIONS,
         out: Sequence[NDArray[Any] | None] | None = None,
         **values: Any,
@@ -99,17 +93,15 @@ class PlannedFrame:
                 ViewRequest(
                     view,
                     store,
-                    self.pupil_diameter_mm,
-                    self.focus_dpt,
-                    gaze_deg,
+                    state,
                     options=options,
                     out=array,
                     **values,
                 ),
                 effects,
             )
-            for view, store, gaze_deg, array in zip(
-                self.views, plan.stores, gazes_deg, arrays, strict=True
+            for view, store, state, array in zip(
+                self.views, plan.stores, self.states, arrays, strict=True
             )
         ]
         return _BegunFrame(self, begun, started_s)
@@ -130,13 +122,7 @@ class PlannedFrame:
         return Filtered(
             views=tuple(
                 ViewResult(
-                    view.color,
-                    "both",
-                    eye.profile_id,
-                    eye.generation,
-                    float(view.pupil_diameter_mm),
-                    float(view.focus_dpt),
-                    (float(view.gaze_deg[0]), float(view.gaze_deg[1])),
+                    view.color, "both", eye.profile_id, eye.generation, view.state
                 )
                 for view in rendered
             ),

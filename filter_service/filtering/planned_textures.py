@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any
@@ -13,7 +13,6 @@ import numpy as np
 from filter_service.errors import BadMessage, RenderFailed
 from filter_service.filtering.builder import Builder
 from filter_service.filtering.filtered import Filtered, Preparing, ViewResult
-from filter_service.filtering.planned_frame import GazeDegrees
 from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
 from filter_service.rendering.engine import (
     ShownTexture,
@@ -26,6 +25,7 @@ from filter_service.rendering.media_effects import UNCHANGED
 from filter_service.rendering.sampled_frame import SampledView
 from filter_service.settings import DEFAULT_OPTIONS, RenderOptions
 from filter_service.texture_view import GlTexture, TextureView
+from filter_service.view_state import State
 
 TargetedView = tuple[TextureView, GlTexture]
 """A view and the texture for its filtered image."""
@@ -56,19 +56,17 @@ def texture_importer(builder: Builder) -> TextureImporter | None:
 
 @dataclass(frozen=True)
 class PlannedTextures:
-    """Views of one eye in one state, and the stores that render them."""
+    """Views of one eye, their states, and the stores that render them."""
 
     builder: Builder
     stream: StreamEyes
     plan: RenderPlan
     views: tuple[TargetedView, ...]
-    pupil_diameter_mm: float
-    focus_dpt: float
+    states: tuple[State, ...]
 
     def begin(
         self,
         *,
-        gazes_deg: Sequence[GazeDegrees],
         options: RenderOptions = DEFAULT_OPTIONS,
         until_s: float | None = None,
         **_: Any,
@@ -78,19 +76,16 @@ class PlannedTextures:
         The result has no images, which are in the textures.  Other parameters and the
         errors are those of `PlannedFrame.begin`.
         """
-        return partial(self._render, gazes_deg, options, until_s)
+        return partial(self._render, options, until_s)
 
     def _render(
         self,
-        gazes_deg: Sequence[GazeDegrees],
         options: RenderOptions,
         until_s: float | None,
     ) -> Filtered | Preparing:
         shown = []
-        for index, gaze_deg in enumerate(gazes_deg):
-            view = self.show(
-                index, gaze_deg=gaze_deg, options=options, waits=True, until_s=until_s
-            )
+        for index in range(len(self.views)):
+            view = self.show(index, options=options, waits=True, until_s=until_s)
             if view is None:
                 return Preparing("extending", stage="psfs")
             shown.append(view)
@@ -98,15 +93,7 @@ class PlannedTextures:
         counts = [view.earlier.counts for view in shown if view.earlier is not None]
         return Filtered(
             views=tuple(
-                ViewResult(
-                    NO_IMAGE,
-                    "both",
-                    eye.profile_id,
-                    eye.generation,
-                    view.pupil_diameter_mm,
-                    view.focus_dpt,
-                    view.gaze_deg,
-                )
+                ViewResult(NO_IMAGE, "both", eye.profile_id, eye.generation, view.state)
                 for view in shown
             ),
             notes=tuple(dict.fromkeys(note for view in shown for note in view.notes)),
@@ -121,7 +108,6 @@ class PlannedTextures:
         self,
         index: int,
         *,
-        gaze_deg: GazeDegrees,
         options: RenderOptions,
         target_is_top_first: bool | None = None,
         waits: bool = False,
@@ -151,9 +137,7 @@ class PlannedTextures:
                 view,
                 target,
                 self.plan.stores[index],
-                self.pupil_diameter_mm,
-                self.focus_dpt,
-                gaze_deg,
+                self.states[index],
                 target_is_top_first=(
                     view.is_top_first
                     if target_is_top_first is None
@@ -173,9 +157,7 @@ class PlannedTextures:
         if earlier is not None:
             self.stream.history.record_sampled(
                 lambda: (SampledView.of_samples(view.camera, earlier.sampled),),
-                pupil_diameter_mm=self.pupil_diameter_mm,
-                focus_dpt=self.focus_dpt,
-                gaze_deg=gaze_deg,
+                self.states[index],
                 at_s=started_s,
             )
         return shown

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 
 from filter_service.rendering.sampled_frame import SampledFrame, SampledView
 from filter_service.rgbd_view import RgbdView
+from filter_service.view_state import State
 
 SPEED_S = 0.25
 """Interval over which the speed of pupil and focus is measured."""
@@ -23,41 +24,31 @@ class FrameHistory:
     """The last frames of a stream."""
 
     def __init__(self) -> None:
-        self._states: deque[tuple[float, float, float]] = deque()
+        self._states: deque[tuple[float, State]] = deque()
         self.last: SampledFrame | None = None
         self.last_warmed: SampledFrame | None = None  # last with computed predictions
 
     def record(
         self,
         views: Sequence[RgbdView],
+        state: State,
         *,
-        pupil_diameter_mm: float,
-        focus_dpt: float,
-        gaze_deg: tuple[float, float] | None,
         at_s: float,
     ) -> None:
         """Add a frame that arrived at ``at_s``."""
         seen = tuple(SampledView.of(view) for view in views)
-        self.record_sampled(
-            lambda: seen,
-            pupil_diameter_mm=pupil_diameter_mm,
-            focus_dpt=focus_dpt,
-            gaze_deg=gaze_deg,
-            at_s=at_s,
-        )
+        self.record_sampled(lambda: seen, state, at_s=at_s)
 
     def record_sampled(
         self,
         sample: Callable[[], tuple[SampledView, ...]],
+        state: State,
         *,
-        pupil_diameter_mm: float,
-        focus_dpt: float,
-        gaze_deg: tuple[float, float] | None,
         at_s: float,
     ) -> None:
         """Add a frame, whose views are sampled only if PSFs are computed for them."""
-        self.last = SampledFrame(at_s, pupil_diameter_mm, focus_dpt, gaze_deg, sample)
-        self._states.append((at_s, pupil_diameter_mm, focus_dpt))
+        self.last = SampledFrame(at_s, state, sample)
+        self._states.append((at_s, state))
         while self._states[0][0] < at_s - SPEED_S and len(self._states) > 2:
             self._states.popleft()
 
@@ -68,18 +59,20 @@ class FrameHistory:
             return 0.0
         return (self._states[-1][0] - self._states[0][0]) / (len(self._states) - 1)
 
-    def predicted_states(self) -> list[tuple[float, float]]:
+    def predicted_states(self) -> list[State]:
         """Return the linearly extrapolated pupil and focus at each horizon."""
         if len(self._states) < 2:
             return []
-        (first_s, *first), (last_s, *last) = self._states[0], self._states[-1]
+        (first_s, first), (last_s, last) = self._states[0], self._states[-1]
         if last_s - first_s < 1e-3:
             return []
         found = []
         for lead_s in LEAD_S:
             steps = lead_s / (last_s - first_s)
             pupil_mm, focus_dpt = (
-                b + steps * (b - a) for a, b in zip(first, last, strict=True)
+                getattr(last, name)
+                + steps * (getattr(last, name) - getattr(first, name))
+                for name in ("pupil_diameter_mm", "focus_dpt")
             )
-            found.append((pupil_mm, focus_dpt))
+            found.append(State(pupil_mm, focus_dpt))
         return found

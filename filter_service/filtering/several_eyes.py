@@ -19,17 +19,15 @@ from numpy.typing import NDArray
 from filter_service.errors import BadMessage, NoProfile, SessionError
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.filtered import Filtered, Preparing
-from filter_service.filtering.planned_frame import GazeDegrees, PlannedFrame
+from filter_service.filtering.planned_frame import PlannedFrame
 from filter_service.filtering.planned_textures import PlannedTextures, TargetedView
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import (
-    GazeDeg,
     Output,
     RenderOptions,
     RenderOptionValues,
 )
-from filter_service.validation import checked
-from filter_service.view_state import EyeName, ViewState, check_states
+from filter_service.view_state import EyeName, State, ViewState, check_states
 
 
 @dataclass(frozen=True)
@@ -38,7 +36,6 @@ class PlannedViews:
 
     by_eye: Mapping[EyeName, PlannedFrame | PlannedTextures]
     indices: Mapping[EyeName, tuple[int, ...]]  # indices of their views
-    gazes_deg: tuple[GazeDegrees, ...]
 
     def render(
         self,
@@ -54,7 +51,6 @@ class PlannedViews:
         """
         begun = {
             eye: planned.begin(
-                gazes_deg=[self.gazes_deg[i] for i in self.indices[eye]],
                 output=output,
                 options=RenderOptions(**options),
                 out=None if out is None else [out[i] for i in self.indices[eye]],
@@ -115,7 +111,8 @@ def plan_views(
             field="states",
             allowed=f"{len(views)}, as views",
         )
-    check_states(states, pupil_diameter_mm, focus_dpt)
+    of_frame = State(pupil_diameter_mm, focus_dpt, gaze_deg)
+    check_states(states, of_frame)
     indices: dict[EyeName, tuple[int, ...]] = {}
     for i, state in enumerate(states):
         indices[state.eye] = (*indices.get(state.eye, ()), i)
@@ -125,22 +122,18 @@ def plan_views(
             raise _with_eye_name(NoProfile("there is no filter"), eye, own[0])
         found.advance_builds()
     planned: dict[EyeName, PlannedFrame | PlannedTextures] = {}
-    gazes_deg = tuple(_gaze(state.gaze_deg or gaze_deg) for state in states)
+    found_states = [vars(state.state(of_frame)) for state in states]
+    own_states = [State.checked(**state) for state in found_states]
     failure: SessionError | None = None
     preparing: Preparing | None = None
     for eye, own in indices.items():
-        state = states[own[0]]
         eye_filter = filter_of(eye)
         assert eye_filter is not None
         try:
             frame = plan(
                 eye_filter,
                 [views[i] for i in own],
-                pupil_diameter_mm=_or_default(
-                    state.pupil_diameter_mm, pupil_diameter_mm
-                ),
-                focus_dpt=_or_default(state.focus_dpt, focus_dpt),
-                gaze_deg=gazes_deg[own[0]],
+                [own_states[i] for i in own],
             )
         except SessionError as error:
             failure = failure or _with_eye_name(error, eye, own[0])
@@ -153,7 +146,7 @@ def plan_views(
         raise failure.with_traceback(None)
     if preparing is not None:
         return preparing
-    return PlannedViews(planned, indices, gazes_deg)
+    return PlannedViews(planned, indices)
 
 
 def _with_eye_name(error: SessionError, eye: EyeName, view: int) -> SessionError:
@@ -165,13 +158,3 @@ def _with_eye_name(error: SessionError, eye: EyeName, view: int) -> SessionError
         field=f"views[{view}].eye",
         allowed=error.allowed,
     )
-
-
-def _or_default(value: float | None, default: float) -> float:
-    return default if value is None else value
-
-
-def _gaze(gaze_deg: tuple[float, float] | None) -> GazeDegrees:
-    if gaze_deg is None:
-        return None
-    return checked(gaze_deg, tuple[GazeDeg, GazeDeg], "gaze_deg")

@@ -28,6 +28,7 @@ from filter_service.planning.readable import usable_pupils_mm
 from filter_service.psfs.field_defocus import FieldDefocus
 from filter_service.psfs.read_kernels import StateReads, StoreTables, layer_blur_px
 from filter_service.psfs.store import PsfStore
+from filter_service.view_state import State
 
 CURVE_MARGIN_DPT = 1.0
 """Range of a step curve beyond the layers of its node, for states between nodes."""
@@ -58,6 +59,8 @@ class FrameLayers:
     edge_reach_px : float
         Distance to which kernels extend beyond the rays: diffraction at the pupil's
         edge that ``spec.kept_energy_ratio`` keeps.
+    state : State
+        Pupil and focus that are reached; the gaze is not theirs.
     merge_spread_px : float
         Smallest spread of kernels that merged squares may use.
     """
@@ -70,8 +73,7 @@ class FrameLayers:
     reads: StateReads
     tables: StoreTables
     edge_reach_px: float
-    pupil_diameter_mm: float
-    focus_dpt: float
+    state: State
     blur_px_per_dpt: float
     notes: tuple[str, ...]
     merge_spread_px: float = MERGE_MIN_SPREAD_PX
@@ -99,14 +101,13 @@ class FrameLayers:
 
 def frame_layers(
     store: PsfStore,
+    state: State,
     *,
-    pupil_diameter_mm: float,
-    focus_dpt: float,
     object_range_dpt: tuple[float, float] | None = None,
     step_ratio: float = 1.0,
     merge_spread_px: float = MERGE_MIN_SPREAD_PX,
 ) -> FrameLayers:
-    """Plan the layers of a frame for a pupil and focus.
+    """Plan the layers of a frame for the pupil and focus of a state.
 
     The pupil is clamped to the cache's range and the measured pupil, with a note.
 
@@ -124,12 +125,16 @@ def frame_layers(
     Csoba & Kunkli 2023, section 6.4 (cached neighbors of pupil and focus) and 6.2.
     """
     plan, eye = store.plan, store.eye
-    pupil_mm, notes = _usable_pupil(store, pupil_diameter_mm)
-    accommodation_dpt = eye.accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
+    pupil_mm, notes = _usable_pupil(store, state.pupil_diameter_mm)
+    accommodation_dpt = eye.accommodation_dpt(
+        state.focus_dpt, pupil_diameter_mm=pupil_mm
+    )
     reached_dpt = eye.sharpest_dpt(accommodation_dpt, pupil_diameter_mm=pupil_mm)
-    is_met = abs(reached_dpt - focus_dpt) <= OUT_OF_REACH_DPT
-    if not is_met or pupil_mm != pupil_diameter_mm:
-        notes += eye.notes(pupil_diameter_mm=pupil_diameter_mm, focus_dpt=focus_dpt)
+    is_met = abs(reached_dpt - state.focus_dpt) <= OUT_OF_REACH_DPT
+    if not is_met or pupil_mm != state.pupil_diameter_mm:
+        notes += eye.notes(
+            pupil_diameter_mm=state.pupil_diameter_mm, focus_dpt=state.focus_dpt
+        )
     layer_zero_dpt, change = _layer_zero_dpt(store, pupil_mm, accommodation_dpt)
     corners = _corners(plan, pupil_mm, accommodation_dpt)
     reads = _state_reads(store, pupil_mm, corners)
@@ -157,8 +162,7 @@ def frame_layers(
         reads=reads,
         tables=store.tables,
         edge_reach_px=_edge_reach_px(store.spec, pupil_mm),
-        pupil_diameter_mm=pupil_mm,
-        focus_dpt=reached_dpt,
+        state=State(pupil_mm, float(reached_dpt)),
         blur_px_per_dpt=store.spec.blur_px_per_dpt(pupil_mm),
         notes=notes,
         merge_spread_px=merge_spread_px,

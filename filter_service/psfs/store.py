@@ -29,6 +29,7 @@ from filter_service.planning.nodes import CachePlan, PlanAxes, PlanNodes
 from filter_service.psfs.boxes import pack_reach, unpack_reach
 from filter_service.psfs.field_defocus import EyeDefocus
 from filter_service.psfs.read_kernels import StoreTables
+from filter_service.view_state import State
 
 if TYPE_CHECKING:
     from estimator.profiles.parse import EyeProfile
@@ -45,7 +46,7 @@ KEPT_AFTER_EVICTION = 0.7
 """Share of the memory limit that an eviction keeps.  Kernels are evicted together,
 because moving the others costs about 0.1 ms per megabyte."""
 
-State = tuple[int, int]
+StateNode = tuple[int, int]
 """Indices of a plan's nodes of pupil and accommodation."""
 
 
@@ -102,8 +103,8 @@ class PsfStore:
     ) -> None:
         self.eye, self.spec, self.plan, self.engine = eye, spec, plan, engine
         self.tables = StoreTables.empty()
-        self._first_groups: dict[State, int] = {}
-        self._ahead: dict[State, PlanNodes] = {}
+        self._first_groups: dict[StateNode, int] = {}
+        self._ahead: dict[StateNode, PlanNodes] = {}
         self.methods: Counter[str] = Counter()
         self.max_lost_energy_ratio = 0.0
         self.build_ms = 0.0
@@ -112,7 +113,7 @@ class PsfStore:
         self._words = np.empty(0, np.uint16)
         self._n_words = 0
         self._added: list[NDArray[np.int64]] = []
-        self.step_curves: dict[State, NDArray[np.float64]] = {}
+        self.step_curves: dict[StateNode, NDArray[np.float64]] = {}
         self._rings: NodeRings | None = None
         if isinstance(plan, CachePlan):
             self._add_nodes(self._states, plan.nodes)
@@ -142,7 +143,7 @@ class PsfStore:
     # Nodes
 
     @property
-    def _states(self) -> list[State]:
+    def _states(self) -> list[StateNode]:
         """All states of the plan, in the order of its groups."""
         n_pupils, n_accommodations = self.plan.group_shape[:2]
         return list(product(range(n_pupils), range(n_accommodations)))
@@ -152,7 +153,7 @@ class PsfStore:
         """Number of field nodes, and of groups per state."""
         return len(self.plan.v_deg) * len(self.plan.h_deg)
 
-    def groups_of(self, states: Sequence[State]) -> NDArray[np.int64]:
+    def groups_of(self, states: Sequence[StateNode]) -> NDArray[np.int64]:
         """Return the group (n,) of each state's first field node.
 
         Parameters
@@ -174,14 +175,12 @@ class PsfStore:
             self._add_nodes(new, PlanNodes.joined(planned))
         return np.array([self._first_groups[state] for state in states])
 
-    def _nodes_of(self, state: State) -> PlanNodes:
+    def _nodes_of(self, state: StateNode) -> PlanNodes:
         """Return the nodes of a state that were planned ahead, or plan them."""
         planned = self._ahead.pop(state, None)
         return self._planner.nodes(*state) if planned is None else planned
 
-    def planned_ahead(
-        self, pupil_diameter_mm: float, focus_dpt: float
-    ) -> Iterator[tuple[State, PlanNodes]]:
+    def planned_ahead(self, near: State) -> Iterator[tuple[StateNode, PlanNodes]]:
         """Plan states that no frame has read yet, for `take` of an equal store.
 
         The worker process calls this.  In the rendering process, planning a state would
@@ -189,12 +188,12 @@ class PsfStore:
 
         Parameters
         ----------
-        pupil_diameter_mm, focus_dpt : float
+        near : State
             State whose neighbors are planned first.
         """
-        pupil_mm = pupil_diameter_mm
+        pupil_mm = near.pupil_diameter_mm
         accommodation_dpt = self.eye.accommodation_dpt(
-            focus_dpt, pupil_diameter_mm=self.eye.usable_pupil_mm(pupil_mm)
+            near.focus_dpt, pupil_diameter_mm=self.eye.usable_pupil_mm(pupil_mm)
         )
         plan = self.plan
         at = (
@@ -209,7 +208,7 @@ class PsfStore:
         for state in sorted(left, key=lambda s: np.hypot(s[0] - at[0], s[1] - at[1])):
             yield state, self._planner.nodes(*state)
 
-    def take(self, planned: tuple[State, PlanNodes]) -> None:
+    def take(self, planned: tuple[StateNode, PlanNodes]) -> None:
         """Keep the nodes of a state that was planned ahead until a frame reads it."""
         state, nodes = planned
         if state not in self._first_groups:
@@ -225,7 +224,7 @@ class PsfStore:
 
         return NodePlanner(self.eye, self.spec, self.plan)
 
-    def _add_nodes(self, states: list[State], new: PlanNodes) -> None:
+    def _add_nodes(self, states: list[StateNode], new: PlanNodes) -> None:
         if self._first_groups:
             new = PlanNodes.joined([self.nodes, new])
         first = len(self._first_groups) * self.fields_count

@@ -67,11 +67,10 @@ class EyeAtFrame:
         layers = states.layers(
             timer,
             handle,
-            request.pupil_diameter_mm,
-            request.focus_dpt,
+            request.state,
             request.options,
         )
-        gaze_deg, _ = clamped_gaze(handle.store.spec, request.gaze_deg)
+        gaze_deg, _ = clamped_gaze(handle.store.spec, request.state.gaze_deg)
         image = states.cells(timer, handle, gaze_deg)
         return cls(
             handle, layers, image, states.corner_change_dpt(timer, layers, image)

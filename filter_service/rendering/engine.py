@@ -22,6 +22,7 @@ from filter_service.texture_view import (
     TextureSupport,
     TextureView,
 )
+from filter_service.view_state import State
 
 
 class LoadedStore(Protocol):
@@ -36,7 +37,7 @@ class LoadedStore(Protocol):
         self,
         frame: SampledFrame | None = None,
         *,
-        state: tuple[float, float] | None = None,
+        state: State | None = None,
     ) -> NDArray[np.int64]: ...
 
     def fill(  # noqa: D102
@@ -59,9 +60,8 @@ class ViewRequest:
     ----------
     handle : LoadedStore
         PSFs of the eye, loaded by the engine.
-    gaze_deg : (h, v), optional
-        Gaze; by default that of the store.  A gaze outside the prepared range is
-        clamped, and the result has a note.
+    state : State
+        A gaze outside the prepared range is clamped, and the result has a note.
     out : array, optional
         Array of the shape and type of the output, which the engine may fill.
     until_s : float, optional
@@ -72,9 +72,7 @@ class ViewRequest:
 
     view: RgbdView
     handle: Any
-    pupil_diameter_mm: float
-    focus_dpt: float
-    gaze_deg: tuple[float, float] | None = None
+    state: State
     output: Output = "linear"
     options: RenderOptions = DEFAULT_OPTIONS
     out: NDArray[Any] | None = None
@@ -108,9 +106,7 @@ class TextureRequest:
     view: TextureView
     target: GlTexture
     handle: Any
-    pupil_diameter_mm: float
-    focus_dpt: float
-    gaze_deg: tuple[float, float] | None = None
+    state: State
     target_is_top_first: bool = False
     gain_ratio: tuple[float, float, float] = (1.0, 1.0, 1.0)
     options: RenderOptions = DEFAULT_OPTIONS
@@ -124,7 +120,7 @@ class ShownTexture:
 
     Attributes
     ----------
-    pupil_diameter_mm, focus_dpt, gaze_deg
+    state : State
         After clamping to the prepared ranges.
     number : int
         Number of the frame among those of the context, from 1 on.
@@ -134,9 +130,7 @@ class ShownTexture:
         request waits.
     """
 
-    pupil_diameter_mm: float
-    focus_dpt: float
-    gaze_deg: tuple[float, float]
+    state: State
     number: int
     notes: tuple[str, ...]
     earlier: EarlierFrame | None
@@ -236,8 +230,15 @@ class OneView:
     def render(
         self: FrameEngine, view: RgbdView, handle: Any, **values: Any
     ) -> FilteredView | MissingPsfs:
-        """Filter one view; ``values`` are fields of the request or its options."""
+        """Filter one view; ``values`` are a state, options or fields of the request."""
+        state = State(
+            values.pop("pupil_diameter_mm"),
+            values.pop("focus_dpt"),
+            values.pop("gaze_deg", None),
+        )
         names = {option.name for option in fields(RenderOptions)}
         options = {name: values.pop(name) for name in names & set(values)}
-        request = ViewRequest(view, handle, options=RenderOptions(**options), **values)
+        request = ViewRequest(
+            view, handle, state, options=RenderOptions(**options), **values
+        )
         return self.begin(request)()

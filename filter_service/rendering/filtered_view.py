@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.note import Note
+from filter_service.view_state import State, WithState
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +46,7 @@ def summed_counts(counts: Sequence[FrameCounts]) -> dict[str, int]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FilteredView(FrameCounts):
+class FilteredView(FrameCounts, WithState):
     """A filtered view, with the parameters and statistics of its rendering.
 
     Attributes
@@ -54,10 +55,8 @@ class FilteredView(FrameCounts):
         float32 or float16 linear light, or uint8 sRGB.
     stage_times_ms : dict
         Time by stage; their sum is the time spent in the engine.
-    pupil_diameter_mm, focus_dpt : float
+    state : State
         After clamping to the prepared ranges.
-    gaze_deg : (h, v)
-        After clamping to the prepared range.
     fragment_count, merged_count, entry_count : int
         Fragments, pixels merged into fragments, and entries of the bins' fragment
         lists.  Rows shared by two strips of a very large frame count twice.  With a
@@ -68,9 +67,7 @@ class FilteredView(FrameCounts):
 
     color: NDArray[Any]
     stage_times_ms: dict[str, float]
-    pupil_diameter_mm: float
-    focus_dpt: float
-    gaze_deg: tuple[float, float]
+    state: State
     fragment_count: int
     merged_count: int
     entry_count: int

@@ -20,6 +20,7 @@ from filter_service.rendering.image_cells import ImageCells, image_cells, stored
 from filter_service.rendering.pupil_edges import PupilEdges
 from filter_service.rendering.sampled_frame import SampledFrame, missing_psfs_of
 from filter_service.settings import DEFAULT_OPTIONS, RenderOptions
+from filter_service.view_state import State
 
 LAYER_STEP_RATIOS = (0.2, 2.0)
 """Smallest and largest layer step relative to the default.  With the smallest, layers
@@ -73,7 +74,7 @@ class FrameStore:
         self,
         frame: SampledFrame | None = None,
         *,
-        state: tuple[float, float] | None = None,
+        state: State | None = None,
     ) -> NDArray[np.int64]:
         """Return the PSFs (n,) that a frame needs and that are not computed yet.
 
@@ -81,8 +82,8 @@ class FrameStore:
         ----------
         frame : SampledFrame, optional
             By default, PSFs that any frame may need are returned.
-        state : (pupil_diameter_mm, focus_dpt), optional
-            State to use instead of the frame's.
+        state : State, optional
+            Pupil and focus to use instead of the frame's.
 
         Raises
         ------
@@ -145,22 +146,20 @@ class FrameStates:
         self,
         timer: Timer,
         handle: FrameStore,
-        pupil_diameter_mm: float,
-        focus_dpt: float,
+        state: State,
         options: RenderOptions = DEFAULT_OPTIONS,
     ) -> FrameLayers:
         """Return the layers for a pupil, a focus and the options of a frame."""
         self._reset_if_other(handle)
         tolerance, spread_px = options.render_tolerance, merge_spread_px(options)
-        state = (pupil_diameter_mm, focus_dpt, tolerance, spread_px)
-        if self._layers is None or self._layers[0] != state:
+        key = (state.pupil_diameter_mm, state.focus_dpt, tolerance, spread_px)
+        if self._layers is None or self._layers[0] != key:
             with timer.wall("psf_plan_ms"):
                 self._layers = (
-                    state,
+                    key,
                     frame_layers(
                         handle.store,
-                        pupil_diameter_mm=pupil_diameter_mm,
-                        focus_dpt=focus_dpt,
+                        state,
                         step_ratio=layer_step_ratio(tolerance),
                         merge_spread_px=spread_px,
                     ),

@@ -17,8 +17,10 @@ from filter_service.rendering.engine import FrameEngine, ViewRequest
 from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import Accumulation, FilterSettings, Output, RenderOptions
+from filter_service.view_state import State
 
 PUPIL_MM = 3.0
+STATE = State(PUPIL_MM, 0.0)
 SIDE_PX = 16
 TANGENTS = (-0.01, 0.01, 0.01, -0.01)
 
@@ -45,9 +47,7 @@ def change_by_perfect_eye(engine: FrameEngine) -> float:
     for dtype, output, accumulation in VARIANTS:
         view = RgbdView(np.ones((SIDE_PX, SIDE_PX, RGB), dtype), depth_m, TANGENTS)
         options = RenderOptions(accumulation=accumulation)
-        request = ViewRequest(
-            view, handle, PUPIL_MM, 0.0, output=output, options=options
-        )
+        request = ViewRequest(view, handle, STATE, output=output, options=options)
         rendered = engine.begin(request)()
         assert not isinstance(rendered, MissingPsfs)  # it has no deadline
         changes.append(np.abs(rendered.color.astype(np.float32) - view.color))

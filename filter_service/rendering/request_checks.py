@@ -5,10 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.camera import Camera
 from filter_service.errors import BadMessage, CameraMismatch
 from filter_service.psfs.store import PsfStore
-from filter_service.rendering.engine import ViewRequest
+from filter_service.rendering.engine import TextureRequest, ViewRequest
 from filter_service.rendering.gaze import clamped_gaze
 from filter_service.settings import Output, RenderOptions
 from filter_service.validation import checked
@@ -30,23 +29,21 @@ def check_request(
     """
     output: Any = Output  # mypy takes only classes for types as arguments
     checked(request.output, output, "output")
-    return check_options(request.options, request.view.camera, store, request.gaze_deg)
+    return check_options(request, store)
 
 
 def check_options(
-    options: RenderOptions,
-    camera: Camera,
-    store: PsfStore,
-    gaze_deg: tuple[float, float] | None,
+    request: ViewRequest | TextureRequest, store: PsfStore
 ) -> tuple[tuple[float, float], tuple[str, ...]]:
     """Check the options and the camera of a view; return as `check_request`."""
-    checked(options.fields(), RenderOptions)
+    camera = request.view.camera
+    checked(request.options.fields(), RenderOptions)
     if not store.spec.serves(camera):
         raise CameraMismatch(
             f"the PSFs are for {store.spec.camera}, the view has {camera}",
             field="tangents",
         )
-    return clamped_gaze(store.spec, gaze_deg)
+    return clamped_gaze(store.spec, request.state.gaze_deg)
 
 
 def output_array(request: ViewRequest) -> NDArray[Any]:

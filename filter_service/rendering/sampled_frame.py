@@ -18,12 +18,13 @@ from filter_service.rendering.image_cells import ImageCells
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
 from filter_service.texture_view import SampledInput
+from filter_service.view_state import State
 
 STEP_PX = 4
 """Stride at which depth is sampled.  PSFs that only other pixels need are computed
 while the frame is filtered."""
 
-FIRST_PUPIL_MM, FIRST_FOCUS_DPT, FIRST_OBJECT_DPT = 4.0, 0.0, (0.0, 2.0)
+FIRST_STATE, FIRST_OBJECT_DPT = State(4.0, 0.0), (0.0, 2.0)
 """State and object distances that are assumed before the first frame."""
 
 FIRST_DISTANCE_COUNT = 9
@@ -86,9 +87,7 @@ class SampledFrame:
     """
 
     at_s: float
-    pupil_diameter_mm: float
-    focus_dpt: float
-    gaze_deg: tuple[float, float] | None
+    state: State
     sample: Callable[[], tuple[SampledView, ...]]
 
     @cached_property
@@ -102,8 +101,6 @@ def first_frame(camera: Camera, settings: FilterSettings) -> SampledFrame:
 
     The service computes PSFs for it.
     """
-    pupil_mm = float(np.clip(FIRST_PUPIL_MM, *settings.pupil_range_mm))
-    focus_dpt = float(np.clip(FIRST_FOCUS_DPT, *settings.focus_range_dpt))
     low_dpt, high_dpt = np.clip(FIRST_OBJECT_DPT, *settings.object_range_dpt)
     if settings.object_planes_dpt:
         low_dpt, high_dpt = (
@@ -115,7 +112,7 @@ def first_frame(camera: Camera, settings: FilterSettings) -> SampledFrame:
     column = np.linspace(low_dpt, high_dpt, FIRST_DISTANCE_COUNT)
     distances_dpt = np.resize(column, (rows, columns))
     views = (SampledView(camera, distances_dpt),)
-    return SampledFrame(0.0, pupil_mm, focus_dpt, None, lambda: views)
+    return SampledFrame(0.0, FIRST_STATE.clamped(settings), lambda: views)
 
 
 def missing_psfs_of(
@@ -123,7 +120,7 @@ def missing_psfs_of(
     frame: SampledFrame,
     image_of: ImageCellsOf,
     *,
-    state: tuple[float, float] | None = None,
+    state: State | None = None,
 ) -> NDArray[np.int64]:
     """Return the indices (n,) of needed PSFs that have not been computed yet.
 
@@ -131,17 +128,12 @@ def missing_psfs_of(
     ----------
     image_of : callable
         Function that returns the cells of the image at a gaze.
-    state : (pupil_diameter_mm, focus_dpt), optional
-        State to use instead of the frame's.
+    state : State, optional
+        Pupil and focus to use instead of the frame's.
     """
-    pupil_mm, focus_dpt = state or (frame.pupil_diameter_mm, frame.focus_dpt)
     settings = store.spec.settings
-    layers = frame_layers(
-        store,
-        pupil_diameter_mm=float(np.clip(pupil_mm, *settings.pupil_range_mm)),
-        focus_dpt=float(np.clip(focus_dpt, *settings.focus_range_dpt)),
-    )
-    gaze_deg = frame.gaze_deg or settings.gaze_deg
+    layers = frame_layers(store, (state or frame.state).clamped(settings))
+    gaze_deg = frame.state.gaze_deg or settings.gaze_deg
     image = image_of(gaze_deg)
     used = np.zeros((image.count, interval_count(layers)), bool)
     for view in frame.views:

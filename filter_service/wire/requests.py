@@ -21,7 +21,7 @@ from filter_service.settings import (
 )
 from filter_service.shared_memory import ALIGNMENT_BYTES
 from filter_service.validation import Record, show
-from filter_service.view_state import EyeName, check_states
+from filter_service.view_state import EyeName, State, check_states
 from filter_service.wire.compression import Compression
 from filter_service.wire.images import (
     SRGB8,
@@ -155,6 +155,11 @@ class Frame(Message):
     payload: ClassVar[str] = "images"
 
     @property
+    def state(self) -> State:
+        """Return the state of views that have none of their own."""
+        return State(self.pupil_diameter_mm, self.focus_dpt, self.gaze_deg)
+
+    @property
     def pixel_count(self) -> int:
         """Return the number of pixels of all views."""
         return sum(view.camera.pixel_count for view in self.views)
@@ -194,7 +199,7 @@ class Frame(Message):
             check_camera(view.camera, f"views[{i}]", limits)
             check_part_size(view.camera, self.output, f"views[{i}]", limits)
         states = [view.state for view in self.views]
-        check_states(states, self.pupil_diameter_mm, self.focus_dpt)
+        check_states(states, self.state)
         if self.textures:
             expect_parts(parts, 0)
             self._check_textures()

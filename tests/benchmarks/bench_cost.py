@@ -31,6 +31,7 @@ from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.srgb import srgb_from_linear
 from filter_service.rgbd_view import RgbdView
+from filter_service.view_state import State
 from tests.benchmarks.cost_law import AGAINST, CostRow, bounds, laws
 from tests.benchmarks.dense_reference import dense_reference
 from tests.benchmarks.engines import counted_work, open_renderer, working_memory_mb
@@ -180,7 +181,9 @@ class FieldBench(CostBench):
     def truth(self) -> NDArray[np.float64]:
         """Sorted gather with the same layers and cells."""
         store = self.handle.store
-        return reference.gather(self.view, store, frame_layers(store, **self.state))
+        return reference.gather(
+            self.view, store, frame_layers(store, State(**self.state))
+        )
 
     reference_name = "float64 sorted gather, same layers"
 

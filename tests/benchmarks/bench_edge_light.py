@@ -28,6 +28,7 @@ from filter_service.rendering.gl import FilterRenderer
 from filter_service.rendering.media_effects import begin_through_media
 from filter_service.rendering.native import NativeRenderer
 from filter_service.rgbd_view import RgbdView
+from filter_service.view_state import State
 from tests.benchmarks.frame_runs import states_towards
 from tests.benchmarks.harness import Row, memory_mb, publish
 from tests.grid_specs import grid_spec
@@ -75,7 +76,7 @@ def lamp_rows(quick: bool):
             color[y, x] = LAMP
             depth_m = np.full((height, width), 1e6, np.float32)
             view = RgbdView(color, depth_m, spec.camera.tangents, "radial")
-            request = ViewRequest(view, engine.load(store), pupil_mm, focus_dpt)
+            request = ViewRequest(view, engine.load(store), State(pupil_mm, focus_dpt))
             plain = engine.begin(request)().color
             started_s = time.perf_counter()
             seen = begin_through_media(engine, request, None)()
@@ -172,7 +173,7 @@ def frame_rows(size: tuple[int, int], count: int):
 
         def frame(color, state, output="srgb8", engine=engine, handle=handle):
             shown = RgbdView(color, view.depth_m, view.tangents, view.depth_kind)
-            request = ViewRequest(shown, handle, output=output, **state)
+            request = ViewRequest(shown, handle, State(**state), output=output)
             return begin_through_media(engine, request, None)()
 
         for name, color in colors.items():

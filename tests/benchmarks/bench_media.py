@@ -26,6 +26,7 @@ from filter_service.rendering.media_effects import (
     begin_through_media,
 )
 from filter_service.rendering.native import NativeRenderer
+from filter_service.view_state import State
 from tests.benchmarks.frame_runs import states_towards
 from tests.benchmarks.harness import Row, memory_mb, publish
 from tests.grid_specs import grid_spec
@@ -98,14 +99,14 @@ def rows_of(size: tuple[int, int], count: int):
     for k, state in enumerate([states[0], states[0], *states]):
         for name in EYES:
             start_s = time.perf_counter()
-            request = ViewRequest(view, handle, output="srgb8", **state)
+            request = ViewRequest(view, handle, State(**state), output="srgb8")
             seen = begin_through_media(engine, request, effects[name])()
             elapsed_ms = 1e3 * (time.perf_counter() - start_s)
             if k >= 2:
                 times_ms[name].append(elapsed_ms)
                 alone_ms[name].append(seen.stage_times_ms.get("media_ms", 0.0))
     for name in EYES:
-        request = ViewRequest(view, handle, output="linear", **states[0])
+        request = ViewRequest(view, handle, State(**states[0]), output="linear")
         seen = begin_through_media(engine, request, effects[name])()
         colors[name] = seen.color.astype(np.float64)
     engine.close()

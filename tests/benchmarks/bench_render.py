@@ -16,6 +16,7 @@ import numpy as np
 from estimator.profiles.parse import parse_profile
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import build_psf_store
+from filter_service.view_state import State
 from tests.benchmarks.engines import ENGINES, open_renderer, working_memory_mb
 from tests.benchmarks.frame_runs import timed_frames
 from tests.benchmarks.harness import (
@@ -58,7 +59,7 @@ def bench_case(renderer, scene, size, eye, body, repeats) -> list[Row]:
         pupil_range_mm=(PUPIL_MM, PUPIL_MM),
     )
     store = build_psf_store(parse_profile(body), spec)
-    layers = frame_layers(store, **STATE)
+    layers = frame_layers(store, State(**STATE))
     handle = renderer.load(store)
     setting = f"{scene} {size[0]}x{size[1]}"
 

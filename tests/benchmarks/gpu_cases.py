@@ -22,6 +22,7 @@ from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.native import NativeRenderer
 from filter_service.rgbd_view import RgbdView
 from filter_service.texture_view import GlTexture, TextureView
+from filter_service.view_state import State
 from tests.benchmarks.pass_work import FrameWork, counted_work
 from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import scene_view
@@ -86,7 +87,7 @@ class Case:
         start_s = time.perf_counter()
         begun = [
             self.renderer.begin(
-                ViewRequest(self.view, handle, output="srgb8", out=room, **state)
+                ViewRequest(self.view, handle, State(**state), output="srgb8", out=room)
             )
             for handle, room in zip(self.handles, self.rooms, strict=True)
         ]
@@ -149,7 +150,7 @@ class TextureCase:
     def _submit(self, handle, target: GlTexture, state: dict) -> None:
         shown = self._renderer.filter_textures(
             TextureRequest(
-                self._view, target, handle, **state, target_is_top_first=True
+                self._view, target, handle, State(**state), target_is_top_first=True
             )
         )
         earlier = shown.earlier

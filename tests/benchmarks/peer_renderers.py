@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import build_psf_store
+from filter_service.view_state import State
 from tests.benchmarks.peer_problem import KeptForState, Problem
 from tests.benchmarks.view_sources import EyeState
 from tests.reference import render_passes as reference
@@ -84,9 +85,7 @@ def sorted_gather(problem: Problem):
     store = build_psf_store(problem.eye, problem.spec)
     layers = KeptForState(
         lambda state: frame_layers(
-            store,
-            pupil_diameter_mm=state.pupil_diameter_mm,
-            focus_dpt=state.focus_dpt,
+            store, State(state.pupil_diameter_mm, state.focus_dpt)
         )
     )
     return lambda state: reference.gather(problem.view, store, layers.get(state))

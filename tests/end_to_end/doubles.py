@@ -16,6 +16,7 @@ from filter_service.camera import is_same_camera
 from filter_service.errors import BuildCancelled, CameraMismatch, UnknownProfile
 from filter_service.messages import Camera
 from filter_service.rendering.filtered_view import FrameCounts
+from filter_service.view_state import State
 
 
 @dataclass
@@ -46,9 +47,7 @@ class StoreDouble:
 class RenderedDouble(FrameCounts):
     color: np.ndarray
     stage_times_ms: dict
-    pupil_diameter_mm: float
-    focus_dpt: float
-    gaze_deg: tuple[float, float]
+    state: State
     bad_color_count: int = 0
     notes: list = field(default_factory=list)
 
@@ -75,7 +74,7 @@ class EngineDouble:
 
     def begin(self, request):
         view, handle = request.view, request.handle
-        pupil_diameter_mm, output = request.pupil_diameter_mm, request.output
+        state, output = request.state, request.output
         accumulation = request.options.accumulation
         assert handle.n_released == 0, "rendered with a store that was freed"
         height_px, width_px = view.depth_m.shape
@@ -84,7 +83,7 @@ class EngineDouble:
             handle.camera, camera, follows_field=handle.follows_field
         ):
             raise CameraMismatch(f"{camera}", field="tangents")
-        if pupil_diameter_mm == 8.75:
+        if state.pupil_diameter_mm == 8.75:
             raise ArithmeticError("the double breaks at 8.75 mm")
         start_s = time.perf_counter()
         filter_ms = self.filter_ms if handle.filter_ms is None else handle.filter_ms
@@ -101,9 +100,11 @@ class EngineDouble:
             stage_times_ms={"filter_ms": 1000 * (time.perf_counter() - start_s)},
             missing_depth_count=int(np.count_nonzero(~(view.depth_m > 0))),
             clamped_depth_count=0,
-            pupil_diameter_mm=min(pupil_diameter_mm, 7.0),
-            focus_dpt=request.focus_dpt,
-            gaze_deg=request.gaze_deg or (0.0, 0.0),
+            state=State(
+                min(state.pupil_diameter_mm, 7.0),
+                state.focus_dpt,
+                state.gaze_deg or (0.0, 0.0),
+            ),
             notes=[accumulation] if accumulation != "coverage" else [],
         )
         return lambda: found

@@ -9,6 +9,7 @@ from estimator.profiles.parse import parse_profile
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import build_psf_store
 from filter_service.rgbd_view import RgbdView
+from filter_service.view_state import State
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_twin import layer_blur_px
 
@@ -69,7 +70,7 @@ class Bench:
 
     def layers(self, **options):
         options = {"pupil_diameter_mm": 5.0, "focus_dpt": 0.0, **options}
-        return frame_layers(self.store, **options)
+        return frame_layers(self.store, State(**options))
 
     def blur_px(self, **options):
         """Blur radius (n_layers, 3) of a frame's layers, on axis."""

@@ -18,6 +18,7 @@ from filter_service.rendering.edge_light import EdgeLight
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.media_effects import begin_through_media, encoded
 from filter_service.rgbd_view import RgbdView
+from filter_service.view_state import State
 from tests.grid_specs import grid_spec
 from tests.numerical.synthetic import Bench, assert_same_frame, tangents
 from tests.reference.edge_light import lamp_light, ring_ratios
@@ -83,8 +84,7 @@ def request_of(bench, color, depth_m=1e6, focus_dpt=0.0, hidden=None, **more):
     if hidden is not None:
         hidden_color, hidden_m = hidden
         view = replace(view, hidden_color=hidden_color, hidden_depth_m=hidden_m)
-    state = {"pupil_diameter_mm": PUPIL_MM, "focus_dpt": focus_dpt}
-    return ViewRequest(view, bench.handle, **state, **more)
+    return ViewRequest(view, bench.handle, State(PUPIL_MM, focus_dpt), **more)
 
 
 def seen(bench, *given, **more):
@@ -354,7 +354,9 @@ def test_eyes_without_light_from_the_edge_alone_keep_their_kernels(diffraction, 
     view = RgbdView(
         lamp_at(), np.ones((HEIGHT, WIDTH), np.float32), (-0.1, 0.1, 0.1, -0.1)
     )
-    request = ViewRequest(view, SimpleNamespace(store=store), 4.0, 0.0, white_level=1.0)
+    request = ViewRequest(
+        view, SimpleNamespace(store=store), State(4.0, 0.0), white_level=1.0
+    )
     assert EdgeLight.of(None, request) is None
 
 

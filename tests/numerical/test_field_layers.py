@@ -13,6 +13,7 @@ from filter_service.psfs.field_defocus import EyeDefocus
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import build_psf_store
 from filter_service.rgbd_view import RgbdView
+from filter_service.view_state import State
 from tests.grid_specs import grid_spec
 from tests.numerical.plan_cases import spec_for, traced_eye
 from tests.numerical.synthetic import assert_same_frame, psnr_db, tangents, texture
@@ -220,5 +221,7 @@ def test_a_frame_says_where_its_blur_is_limited():
     object.__setattr__(spec.settings, "object_range_dpt", (0.0, 40.0))
     eye = traced_eye("emmetropia", spec)
     store = build_psf_store(eye, spec)
-    assert "limited to a radius of 6 px" in " ".join(frame_layers(store, **STATE).notes)
+    assert "limited to a radius of 6 px" in " ".join(
+        frame_layers(store, State(**STATE)).notes
+    )
     assert store.reach_px.max() <= 6

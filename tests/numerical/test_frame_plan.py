@@ -17,6 +17,7 @@ from filter_service.psfs.store import PsfStore
 from filter_service.rendering import frame_kernels
 from filter_service.rendering.cell_maps import CellMaps
 from filter_service.rendering.image_cells import image_cells
+from filter_service.view_state import State
 from tests.numerical import plan_twin
 from tests.numerical.plan_cases import spec_for, traced_eye
 
@@ -99,7 +100,7 @@ def case(request, rng, stores):
     (name, settings), pupil_mm, focus_dpt, share, gaze_deg = CASES[request.param]
     store = store_for(name, **settings)
     state = {"pupil_diameter_mm": pupil_mm, "focus_dpt": focus_dpt}
-    layers = frame_layers(store, **state)
+    layers = frame_layers(store, State(**state))
     image = image_cells(store.spec, store.plan, gaze_deg)
     used = rng.random((image.count, frame_kernels.interval_count(layers))) < share
     used[image.count // 2, used.shape[1] // 2] = True
@@ -111,7 +112,7 @@ def test_the_cases_read_one_two_and_three_neighbors(stores):
     for (name, settings), pupil_mm, focus_dpt, *_ in CASES.values():
         store = store_for(name, **settings)
         state = {"pupil_diameter_mm": pupil_mm, "focus_dpt": focus_dpt}
-        found.add(frame_layers(store, **state).reads.weights.size)
+        found.add(frame_layers(store, State(**state)).reads.weights.size)
     assert found == {1, 2, 3}
 
 
@@ -165,10 +166,10 @@ def test_defocus_is_the_eyes(case, request):
     eye, spec = store.eye, store.spec
     h_deg, v_deg = store.plan.field_nodes_deg
     state = {
-        "pupil_diameter_mm": layers.pupil_diameter_mm,
+        "pupil_diameter_mm": layers.state.pupil_diameter_mm,
         "accommodation_dpt": eye.accommodation_dpt(
             CASES[request.node.callspec.params["case"]][2],  # the focus asked for
-            pupil_diameter_mm=layers.pupil_diameter_mm,
+            pupil_diameter_mm=layers.state.pupil_diameter_mm,
         ),
     }
     own_dpt = eye.total_defocus_dpt(
@@ -204,7 +205,7 @@ def test_kernels_equal_the_plain_statement(case):
 
 def test_a_measured_wavefront_has_one_defocus_over_the_field():
     store = store_for("myopia", model="measured", **FIELD, **MOVING)
-    layers = frame_layers(store, pupil_diameter_mm=3.3, focus_dpt=1.0)
+    layers = frame_layers(store, State(pupil_diameter_mm=3.3, focus_dpt=1.0))
     own_dpt = store.eye.total_defocus_dpt(
         pupil_diameter_mm=3.3,
         accommodation_dpt=store.eye.accommodation_dpt(1.0, pupil_diameter_mm=3.3),

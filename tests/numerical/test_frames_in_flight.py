@@ -12,6 +12,7 @@ from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.gl import list_bands
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rgbd_view import RgbdView
+from filter_service.view_state import State
 from tests.numerical.plan_cases import spec_for, traced_eye
 from tests.numerical.scene_frames import scene_view
 
@@ -88,7 +89,7 @@ def test_eyes_in_flight_are_as_if_alone(hardware, stores, eye_count):
     handles = [loaded[id(store)] for store in used]
     for state, pair, expected in zip(STATES, pairs, wanted, strict=True):
         begun = [
-            renderer.begin(ViewRequest(view, handle, **state))
+            renderer.begin(ViewRequest(view, handle, State(**state)))
             for handle, view in zip(handles, itertools.cycle(pair), strict=False)
         ]
         for finish, one in zip(begun, expected, strict=True):
@@ -104,7 +105,7 @@ def test_finished_in_any_order(hardware, stores):
     handles = [renderer.load(store) for store in stores[:2]]
     for _ in range(2):
         begun = [
-            renderer.begin(ViewRequest(view, handle, **STATES[0]))
+            renderer.begin(ViewRequest(view, handle, State(**STATES[0])))
             for handle, view in zip(handles, views, strict=True)
         ]
         for k in (1, 0):
@@ -121,7 +122,7 @@ def test_missing_depth_beside_a_whole_view(hardware, stores):
     handle = renderer.load(stores[0])
     for _ in range(2):
         begun = [
-            renderer.begin(ViewRequest(view, handle, **STATES[0]))
+            renderer.begin(ViewRequest(view, handle, State(**STATES[0])))
             for view in (torn, whole)
         ]
         for finish, one in zip(begun, wanted, strict=True):
@@ -136,7 +137,9 @@ def test_lists_that_do_not_fit_are_made_again(hardware, stores, monkeypatch):
     monkeypatch.setattr(list_bands, "MAX_BAND_ENTRIES", wanted[0].entry_count // 3)
     renderer = FilterRenderer(hardware)
     handle = renderer.load(stores[0])
-    begun = [renderer.begin(ViewRequest(view, handle, **STATES[0])) for view in views]
+    begun = [
+        renderer.begin(ViewRequest(view, handle, State(**STATES[0]))) for view in views
+    ]
     for finish, one in zip(begun, wanted, strict=True):
         assert_same(finish(), one)
 

@@ -17,6 +17,7 @@ from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.engine import TextureRequest
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rgbd_view import RgbdView
+from filter_service.view_state import State
 from tests.numerical.gl_textures import SETS, ViewTextures, callers_context
 from tests.numerical.plan_cases import spec_for, traced_eye
 from tests.numerical.scene_frames import scene_view
@@ -186,7 +187,7 @@ def texture_stream(gpu, stores, *, round_count, frames_per_set):
                 textures = ViewTextures(arrays, formats)
                 for _ in range(frames_per_set):
                     request = TextureRequest(
-                        *(textures.view, textures.target, handle), **next(states)
+                        *(textures.view, textures.target, handle), State(**next(states))
                     )
                     renderer.filter_textures(request)
                 assert textures.image().any()

@@ -17,6 +17,7 @@ from filter_service.rendering.media_effects import (
     encoded,
 )
 from filter_service.rgbd_view import RgbdView
+from filter_service.view_state import State
 
 WIDE = Camera.from_fov(50.0, width_px=640, height_px=360)
 
@@ -228,9 +229,7 @@ class Glass:
         return lambda: FilteredView(
             color=request.view.color.astype(np.float32),
             stage_times_ms={"splat_ms": 1.0},
-            pupil_diameter_mm=request.pupil_diameter_mm,
-            focus_dpt=request.focus_dpt,
-            gaze_deg=(0.0, 0.0),
+            state=request.state,
             notes=[],
             **none,
         )
@@ -251,7 +250,7 @@ def test_the_filter_adds_what_the_profile_asks_for_and_tells_its_time():
     )
     settings = SimpleNamespace(diffraction=False)
     store = SimpleNamespace(spec=SimpleNamespace(settings=settings), eye=None)
-    request = ViewRequest(view, SimpleNamespace(store=store), 4.0, 0.0)
+    request = ViewRequest(view, SimpleNamespace(store=store), State(4.0, 0.0))
     effects = MediaEffects.of(profile, "common")
     found = begin_through_media(Glass(), request, effects)()
     red, _, blue = found.color[100, 110]

@@ -9,6 +9,7 @@ from filter_service.psfs.frame_layers import frame_layers
 from filter_service.rendering.native import frame_record
 from filter_service.rendering.perfect_eye import PUPIL_MM
 from filter_service.rgbd_view import RgbdView
+from filter_service.view_state import State
 from tests.conftest import Engine
 from tests.numerical.one_kernel import OneKernelBench, disc
 from tests.numerical.synthetic import psnr_db, texture
@@ -74,7 +75,7 @@ def assert_twin_makes_the_same(case):
     view = random_view(rng, bench, case)
     rule = {"accumulation": case["accumulation"]}
     result = bench.renderer.render(view, bench.handle, **STATE, merge=False, **rule)
-    layers = frame_layers(bench.store, **STATE)
+    layers = frame_layers(bench.store, State(**STATE))
     truth = reference.gather(view, bench.store, layers, **rule)
     assert np.isfinite(result.color).all()
     assert psnr_db(result.color, truth) >= ROUNDING_DB

@@ -34,6 +34,7 @@ from filter_service.rendering.sampled_frame import (
 )
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
+from filter_service.view_state import State
 from tests.numerical.plan_cases import spec_for, traced_eye
 from tests.numerical.synthetic import depth_scene, psnr_db, tangents, texture
 
@@ -140,11 +141,11 @@ def test_nodes_planned_ahead_serve_frames_as_they_would_plan_them(
     from filter_service.rendering.native import NativeRenderer
 
     pupil_mm, focus_dpt = STATES[0]["pupil_diameter_mm"], STATES[0]["focus_dpt"]
-    ahead = list(PsfStore(*streamed).planned_ahead(pupil_mm, focus_dpt))
+    ahead = list(PsfStore(*streamed).planned_ahead(State(pupil_mm, focus_dpt)))
     store = PsfStore(*streamed)
     n_pupils, n_used = store.plan.group_shape[:2]
     assert len(ahead) == len({state for state, _ in ahead}) == n_pupils * n_used
-    frame_layers(store, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt)
+    frame_layers(store, State(pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt))
     for part in ahead:
         store.take(pickle.loads(pickle.dumps(part)))
     monkeypatch.setattr(NodePlanner, "nodes", None)  # nothing is left to plan
@@ -152,7 +153,7 @@ def test_nodes_planned_ahead_serve_frames_as_they_would_plan_them(
     near = PsfStore(*streamed)
     for part in ahead[:4]:  # those around the state come first
         near.take(part)
-    frame_layers(near, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt)
+    frame_layers(near, State(pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt))
 
 
 @pytest.mark.long("a process plans two eyes")
@@ -168,7 +169,7 @@ def test_the_worker_plans_ahead_until_it_is_asked_for_something_else(monkeypatch
             object_range_dpt=(0.0, 2.0),
         ),
         camera=Camera(32, 18, (-0.02, 0.02, 0.01, -0.01)),
-        near=(4.0, 2.0),
+        near=State(4.0, 2.0),
     )
     try:
         worker.start()
@@ -332,7 +333,7 @@ def test_layers_do_not_depend_on_computed_psfs(known):
     empty, whole = PsfStore(eye, spec, plan), build_psf_store(eye, spec, plan=plan)
     for state in STATES:
         state = {k: state[k] for k in ("pupil_diameter_mm", "focus_dpt")}
-        one, other = (frame_layers(store, **state) for store in (empty, whole))
+        one, other = (frame_layers(store, State(**state)) for store in (empty, whole))
         np.testing.assert_array_equal(one.layer_dpt, other.layer_dpt)
 
 
@@ -366,7 +367,7 @@ def test_what_is_computed_ahead_is_what_the_frame_needs(streamed, views):
         store, renderer = PsfStore(*streamed), NativeRenderer()
         handle = renderer.load(store)
         seen = (SampledView.of(view),)
-        use = SampledFrame(0.0, *state.values(), None, lambda seen=seen: seen)
+        use = SampledFrame(0.0, State(**state), lambda seen=seen: seen)
         ahead = handle.missing_psfs(use)
         handle.fill(ahead, until_s=time.monotonic() + 60.0, batch_count=512)
         assert store.computed_count == ahead.size
@@ -380,14 +381,14 @@ def test_a_first_frame_is_guessed(known):
 
     handle = NativeRenderer().load(PsfStore(eye, spec, plan))
     use = first_frame(spec.camera, FilterSettings(pupil_range_mm=(5.0, 6.0)))
-    assert use.pupil_diameter_mm == 5.0
+    assert use.state.pupil_diameter_mm == 5.0
     assert 0 < handle.missing_psfs(use).size < handle.missing_psfs().size
 
 
 def test_a_plan_without_time_asks_for_what_it_lacks(known):
     eye, spec, plan = known
     store = PsfStore(eye, spec, plan)
-    layers = frame_layers(store, pupil_diameter_mm=4.0, focus_dpt=0.0)
+    layers = frame_layers(store, State(pupil_diameter_mm=4.0, focus_dpt=0.0))
     from filter_service.rendering.image_cells import image_cells
 
     image = image_cells(spec, plan)

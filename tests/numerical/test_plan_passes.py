@@ -11,6 +11,7 @@ from filter_service.rendering.frame_kernels import frame_kernels, interval_count
 from filter_service.rendering.gl import kernel_passes
 from filter_service.rendering.gl.gl_store import GlStore
 from filter_service.rendering.gl.kernel_passes import FrameState, KernelPasses, marked
+from filter_service.view_state import State
 from tests.numerical import plan_twin
 from tests.numerical.test_frame_plan import CASES, store_for
 
@@ -96,7 +97,7 @@ def case(request, rng, gpu):
     """A plan, and used pairs."""
     (name, settings), pupil_mm, focus_dpt, share, gaze_deg = CASES[request.param]
     store = store_for(name, **settings)
-    layers = frame_layers(store, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt)
+    layers = frame_layers(store, State(pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt))
     image = image_cells.image_cells(store.spec, store.plan, gaze_deg)
     shape = image.count, interval_count(layers)
     used = rng.random(shape) < min(share, MOST_PAIRS / np.prod(shape))
@@ -245,7 +246,7 @@ def planned_case(gpu):
     """A state between the nodes of pupil and accommodation."""
     (name, settings), pupil_mm, focus_dpt, *_ = CASES["between all nodes"]
     store = store_for(name, **settings)
-    layers = frame_layers(store, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt)
+    layers = frame_layers(store, State(pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt))
     image = image_cells.image_cells(store.spec, store.plan)
     return Planned(gpu, store, layers, image)
 

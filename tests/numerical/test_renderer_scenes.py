@@ -8,6 +8,7 @@ from estimator.profiles.parse import parse_profile, preset_names
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.native import NativeRenderer
+from filter_service.view_state import State
 from tests.grid_specs import grid_spec
 from tests.numerical.scene_frames import SCENES, scene_view
 from tests.numerical.synthetic import psnr_db
@@ -57,7 +58,7 @@ def test_passes_agree_with_the_sorted_gather(engine, often, eye, scene, accumula
     truth = reference.gather(
         view,
         store,
-        frame_layers(store, **STATE),
+        frame_layers(store, State(**STATE)),
         accumulation=accumulation,
         row_step=ROW_STEP,
     )

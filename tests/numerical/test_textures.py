@@ -16,6 +16,7 @@ from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.srgb import linear_from_srgb
 from filter_service.settings import RenderOptions
 from filter_service.texture_view import DepthProjection, GlTexture, TextureView
+from filter_service.view_state import State
 from tests.conftest import Engine
 from tests.numerical.gl_calls import CountedContext
 from tests.numerical.gl_textures import FORMATS, Textures, callers_context
@@ -68,7 +69,12 @@ class Caller:
     def filter(self, view, target, *, handle=None, **values):
         """Submit a frame."""
         values = {**STATE, "target_is_top_first": True, **values}
-        request = TextureRequest(view, target, handle or self.handle, **values)
+        state = State(
+            values.pop("pupil_diameter_mm"),
+            values.pop("focus_dpt"),
+            values.pop("gaze_deg", None),
+        )
+        request = TextureRequest(view, target, handle or self.handle, state, **values)
         return self.renderer.filter_textures(request)
 
     def close(self):

@@ -23,6 +23,7 @@ from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.frame_kernels import frame_kernels, interval_count
 from filter_service.rendering.image_cells import image_cells
+from filter_service.view_state import State
 from tests.grid_specs import grid_spec
 from tests.reference import render_passes as reference
 
@@ -182,7 +183,7 @@ def test_blended_kernels_equal_traced_ones_between_nodes():
     assert "estimated" in notes[0]
     store = build_psf_store(eye, spec)
     pupil_mm, focus_dpt, object_dpt = 4.5, 3.37, 4.2
-    layers = frame_layers(store, pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt)
+    layers = frame_layers(store, State(pupil_diameter_mm=pupil_mm, focus_dpt=focus_dpt))
     k = int(np.argmin(np.abs(layers.layer_dpt - object_dpt)))
     used = np.zeros((1, interval_count(layers)), bool)
     used[0, k] = True

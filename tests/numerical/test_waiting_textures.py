@@ -16,6 +16,7 @@ from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.gl.texture_frames import HEADROOM
 from filter_service.settings import RenderOptions
 from filter_service.texture_view import TextureMemory, TextureView
+from filter_service.view_state import State
 from tests.numerical.gl_textures import Textures
 from tests.numerical.synthetic import Bench, assert_same_frame, depth_scene, texture
 from tests.numerical.test_textures import FIELD, HEIGHT, MYOPIA, SIZE_PX, STATES, WIDTH
@@ -57,7 +58,12 @@ class Waiting:
 
     def filter(self, **values):
         values = {"target_is_top_first": True, "waits": True, **values}
-        request = TextureRequest(self.view, self.target, self.handle, **values)
+        state = State(
+            values.pop("pupil_diameter_mm"),
+            values.pop("focus_dpt"),
+            values.pop("gaze_deg", None),
+        )
+        request = TextureRequest(self.view, self.target, self.handle, state, **values)
         return self.renderer.filter_textures(request)
 
     def image(self):

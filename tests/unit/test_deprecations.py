@@ -13,17 +13,13 @@ from estimator import parse_profile, prepare_eye
 from filter_service import (
     Camera,
     EyeFilter,
-    EyeReady,
-    Filtered,
     FilterSettings,
     RgbdView,
 )
-from filter_service.filtering.filtered import ViewResult
 from filter_service.messages import PROTOCOL_VERSION
 from tests.source_tree import PACKAGES, ROOT, python_files
 
 CAMERA = Camera(32, 16, (-0.1, 0.1, 0.05, -0.05))
-COUNTS = ("missing_depth", "clamped_depth", "bad_color")
 PROFILE = {"kind": "prescription", "sphere_dpt": -1.0}
 
 
@@ -108,14 +104,3 @@ def test_prepared_only(tmp_path):
                 prepared_only=True,
             )
     assert [warning.filename for warning in caught] == [__file__]
-
-
-def test_is_complete():
-    view = ViewResult(np.zeros((1, 1, 3)), "both", 1, 1, 4.0, 0.0, (0.0, 0.0))
-    counts = dict.fromkeys((f"{name}_count" for name in COUNTS), 0)
-    whole = Filtered(views=(view,), notes=(), stage_times_ms={}, **counts)
-    ready = EyeReady(None, CAMERA, 1.0, 1, 1.0, ())
-    for result in (view, whole, ready):
-        with pytest.warns(DeprecationWarning, match="version 0.3") as caught:
-            assert result.is_complete is True
-        assert [warning.filename for warning in caught] == [__file__]

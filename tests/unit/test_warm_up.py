@@ -8,6 +8,7 @@ from filter_service.filtering.predicted_states import LEAD_S, SPEED_S, FrameHist
 from filter_service.rendering.sampled_frame import STEP_PX, SampledView, first_frame
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
+from filter_service.view_state import State
 
 TANGENTS = (-0.4, 0.4, 0.3, -0.3)
 
@@ -21,26 +22,25 @@ def noted(states, interval_s=0.05):
     history = FrameHistory()
     view = view_of(np.ones((12, 16)))
     for number, (pupil_mm, focus_dpt) in enumerate(states):
-        history.record(
-            [view],
-            pupil_diameter_mm=pupil_mm,
-            focus_dpt=focus_dpt,
-            gaze_deg=None,
-            at_s=10.0 + number * interval_s,
-        )
+        at_s = 10.0 + number * interval_s
+        history.record([view], State(pupil_mm, focus_dpt), at_s=at_s)
     return history
+
+
+def predicted(history):
+    return [(s.pupil_diameter_mm, s.focus_dpt) for s in history.predicted_states()]
 
 
 def test_states_go_on_at_their_speed():
     history = noted([(4.0 + 0.1 * k, 2.0 - 0.05 * k) for k in range(20)])
     expected = [(5.9 + 2.0 * lead_s, 1.05 - 1.0 * lead_s) for lead_s in LEAD_S]
-    np.testing.assert_allclose(history.predicted_states(), expected, rtol=1e-9)
+    np.testing.assert_allclose(predicted(history), expected, rtol=1e-9)
 
 
 def test_only_the_last_frames_tell_the_speed():
     n_last = int(SPEED_S / 0.05) + 2
     history = noted([(2.0, 0.0), (7.0, 5.0)] * 10 + [(4.0, 1.0)] * n_last)
-    np.testing.assert_allclose(history.predicted_states(), [(4.0, 1.0)] * len(LEAD_S))
+    np.testing.assert_allclose(predicted(history), [(4.0, 1.0)] * len(LEAD_S))
 
 
 def test_the_interval_is_that_of_the_last_frames():
@@ -95,6 +95,6 @@ def test_a_first_frame_keeps_to_the_settings():
         object_range_dpt=(0.5, 1.0),
     )
     use = first_frame(camera, settings)
-    assert (use.pupil_diameter_mm, use.focus_dpt) == (5.0, 1.0)
+    assert use.state == State(5.0, 1.0)
     (seen,) = use.views
     assert (seen.object_dpt.min(), seen.object_dpt.max()) == (0.5, 1.0)

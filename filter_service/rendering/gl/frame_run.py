@@ -89,8 +89,7 @@ class FrameRun:
         self.layers: FrameLayers = eye.states.layers(
             self.timer,
             eye.handle,
-            request.pupil_diameter_mm,
-            request.focus_dpt,
+            request.state,
             request.options,
         )
         with self.timer.wall("prepare_ms"):
@@ -210,7 +209,7 @@ class FrameRun:
             rows.view,
             image=image,
             tolerance=options.render_tolerance if options.merge else 0.0,
-            gaze=merge_gaze(options, self._request.gaze_deg),
+            gaze=merge_gaze(options, self._request.state.gaze_deg),
             first_row=rows.first_row,
             frame_pixel_count=plan.whole.width_px * plan.whole.height_px,
             image_size_px=(self._view.width_px, self._view.height_px),

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 
 from filter_service.errors import RenderFailed
@@ -105,9 +106,7 @@ class FilterRenderer(OneView):
             In addition to its errors: the context is not current, or OpenGL cannot
             draw to the target.
         """
-        gaze_deg, notes = check_options(
-            request.options, request.view.camera, request.handle.store, request.gaze_deg
-        )
+        gaze_deg, notes = check_options(request, request.handle.store)
         with self._gpu.entered():
             if self._textures is None:
                 self._textures = TextureFrames(self._gpu)
@@ -122,9 +121,7 @@ class FilterRenderer(OneView):
                 self._gpu.check("render")
                 notes = (*notes, *_input_notes(request.view, earlier))
         return ShownTexture(
-            pupil_diameter_mm=layers.pupil_diameter_mm,
-            focus_dpt=layers.focus_dpt,
-            gaze_deg=gaze_deg,
+            state=replace(layers.state, gaze_deg=gaze_deg),
             number=self._textures.number,
             notes=(*layers.notes, *notes),
             earlier=earlier,
@@ -182,9 +179,7 @@ class FilterRenderer(OneView):
         return FilteredView(
             color=color,
             stage_times_ms=stages_ms,
-            pupil_diameter_mm=layers.pupil_diameter_mm,
-            focus_dpt=layers.focus_dpt,
-            gaze_deg=gaze_deg,
+            state=replace(layers.state, gaze_deg=gaze_deg),
             **counts,
             layer_count=len(layers.layer_dpt),
             notes=[

@@ -203,8 +203,7 @@ class TextureFrames:
         layers = eye.states.layers(
             timer,
             eye.handle,
-            request.pupil_diameter_mm,
-            request.focus_dpt,
+            request.state,
             request.options,
         )
         repeats = 0
@@ -305,7 +304,7 @@ class TextureFrames:
             *(view.width_px, view.height_px, view.tangents, view.projection),
             *(view.is_top_first, view.white_ratio),
             *(request.target.format == "rgba16f", request.options),
-            merge_gaze(request.options, request.gaze_deg),
+            merge_gaze(request.options, request.state.gaze_deg),
             *(image.cell_px, image.grid, kernels.capacity, kernels.group_counts),
             *(gpu.buffers[name].size for name in LISTS if name in gpu.buffers),
             is_counted,
@@ -336,7 +335,7 @@ class TextureFrames:
             self._io,
             image=state.image,
             tolerance=options.render_tolerance if options.merge else 0.0,
-            gaze=merge_gaze(options, request.gaze_deg),
+            gaze=merge_gaze(options, request.state.gaze_deg),
             first_row=0,
             frame_pixel_count=strip.pixel_count,
             image_size_px=size_px,

@@ -128,8 +128,7 @@ class NativeRenderer(OneView):
         layers = eye.states.layers(
             timer,
             handle,
-            request.pupil_diameter_mm,
-            request.focus_dpt,
+            request.state,
             request.options,
         )
         fill = partial(self._fill, timer, handle, request.until_s)
@@ -175,7 +174,7 @@ class NativeRenderer(OneView):
                 white = white_level(view.color)
             frame.set_merging(
                 tolerance=options.render_tolerance if options.merge else 0.0,
-                gaze=merge_gaze(options, request.gaze_deg),
+                gaze=merge_gaze(options, request.state.gaze_deg),
                 paper_rule=options.accumulation == "paper",
                 white_level=white,
                 is_encoded=request.output == "srgb8",
@@ -194,9 +193,7 @@ class NativeRenderer(OneView):
             missing_depth_count=missing_count,
             clamped_depth_count=frame.c.clamped_count,
             bad_color_count=frame.c.bad_color_count,
-            pupil_diameter_mm=layers.pupil_diameter_mm,
-            focus_dpt=layers.focus_dpt,
-            gaze_deg=gaze_deg,
+            state=replace(layers.state, gaze_deg=gaze_deg),
             fragment_count=frame.c.fragment_count,
             merged_count=frame.c.merged_count,
             entry_count=frame.c.entry_count,
