@@ -278,9 +278,9 @@ class LocalFilter:
             pupil_diameter_mm=frame.eyes[0].state.pupil_diameter_mm,
             focus_dpt=frame.eyes[0].state.focus_dpt,
         )
-        if planned is None:
+        seen = planned and planned.render(output=frame.output)
+        if not seen:
             return None
-        seen = planned.render(output=frame.output)
         stages_ms = seen.stage_times_ms
         whole_ms = MS_PER_S * (time.monotonic() - begin_s)
         return FilteredStereoFrame(
@@ -320,7 +320,7 @@ class LocalFilter:
                 focus_dpt=looking.state.focus_dpt,
                 gaze_deg=looking.gaze_deg,
             )
-            if found is not None:
+            if found:
                 self._note(picture, found)
                 shown.append(found)
         if len(shown) < len(frame.pictures):
