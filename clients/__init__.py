@@ -15,7 +15,6 @@ The package imports its modules only when their names are used.
     natural_eye      eye whose pupil and focus follow light and distance
     frame_log        statistics of streams
     latency/         latency of frames through a running service
-    arguments        parsers of profiles, settings and sizes on command lines
     pyrender_stream  streaming of a scene through a running service
     pyrender_renderer  frames of pyrender scenes, and of files that trimesh loads
     demo             `ocufilter demo`: two scenes through six eyes

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import platform
@@ -16,12 +15,13 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
-from clients.arguments import size_px_argument
+from clients.commands.options import read_size_px
 from clients.demo_eyes import EYES
 from clients.filter_client import FilterClient, FilteredFrame
 from clients.frame_log import FrameLog
@@ -42,6 +42,7 @@ from clients.sheet import (
 from clients.streaming import change_eye, filter_in_order
 from clients.video import write_video
 from filter_service.atomic_files import replace_atomically
+from filter_service.command_line import CommandFailed, Json, print_json, print_line
 from filter_service.errors import FilterError, RenderFailed
 from filter_service.progress import Progress
 
@@ -55,10 +56,6 @@ image's width and height."""
 
 LOG_TAIL_LINES = 12
 START_TIMEOUT_S = 180.0  # scenes are rendered meanwhile, on all cores
-
-
-class DemoFailed(Exception):
-    """The demo could not run; the message gives the reason."""
 
 
 @dataclass(frozen=True)
@@ -98,80 +95,67 @@ class EyeFilm:
     change: dict[str, Any]
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the demo; return its exit code."""
-    options = _arguments(argv)
-    options.out.mkdir(parents=True, exist_ok=True)
-    try:
-        report = run(options)
-    except (DemoFailed, FilterError) as error:
-        sys.stderr.write(f"demo: {error}\n")
-        return 1
-    sys.stdout.write(json.dumps(report) + "\n" if options.json else _summary(report))
-    return 0
+def demo(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Output folder.")] = Path(
+        "out/demo"
+    ),
+    frames: Annotated[int, typer.Option(min=1, help="Number of frames per eye.")] = 60,
+    size: Annotated[
+        str, typer.Option(metavar="WxH", help="Frame size in px.")
+    ] = "480x270",
+    json_output: Json = False,
+) -> None:
+    """Stream two scenes through six eyes and write a video and a contact sheet.
+
+    Starts a service of its own and a client that connects to it.  Writes a video (a GIF
+    without the package av), contact_sheet.png and latency.json.
+
+    ocufilter demo --out out/demo --frames 24 --size 480x270
+    """
+    size_px = read_size_px(size)
+    out.mkdir(parents=True, exist_ok=True)
+    report = run(out, frames, size_px, quiet=json_output)
+    if json_output:
+        print_json(report)
+    else:
+        print_line(_summary(report))
 
 
-def _arguments(argv: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m clients.demo", description=__doc__.split("\n")[0]
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("out/demo"),
-        metavar="DIR",
-        help="output folder",
-    )
-    parser.add_argument("--frames", type=int, default=60, help="frames for each eye")
-    parser.add_argument(
-        "--size",
-        type=size_px_argument,
-        default="480x270",
-        metavar="WxH",
-        help="frame size in px",
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    options = parser.parse_args(argv)
-    if options.frames < 1:
-        parser.error(f"--frames {options.frames}; allowed: 1 or more")
-    return options
-
-
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(
+    out: Path, n_frames: int, size_px: tuple[int, int], *, quiet: bool
+) -> dict[str, Any]:
     """Render, stream through every eye and write the files; return the report.
 
     Raises
     ------
-    DemoFailed
+    CommandFailed
         If the service does not start, fails during the run or does not reply.
     FilterError
         If the scenes cannot be rendered.
     """
     start_s = time.monotonic()
-    with Progress("demo", quiet=options.json) as progress:
+    with Progress("demo", quiet=quiet) as progress:
         with ServiceProcess(wait=False) as service:  # starts while scenes are rendered
-            frames = _rendered(options, progress)
+            frames = _rendered(n_frames, size_px, progress)
             progress.task("Waiting for the service")
-            server, films = _through(service, frames, options.size, progress)
-        video = _written(options, frames, films, progress)
+            server, films = _through(service, frames, size_px, progress)
+        video = _written(out, size_px, frames, films, progress)
     report = {
         "machine": {"cpu_count": os.cpu_count(), "platform": platform.platform()},
         "server": server,
-        "size_px": list(options.size),
-        "frames_per_eye": options.frames,
+        "size_px": list(size_px),
+        "frames_per_eye": n_frames,
         "scenes": Counter(frame.scene for frame in frames),
         "eyes": {
             eye.preset: film.log.summary() | {"eye_change": film.change}
             for eye, film in zip(EYES, films, strict=True)
         },
         "video": str(video),
-        "contact_sheet": str(options.out / "contact_sheet.png"),
+        "contact_sheet": str(out / "contact_sheet.png"),
         "total_s": round(time.monotonic() - start_s, 1),
     }
     text = json.dumps(report, indent=1, allow_nan=False)
-    replace_atomically(
-        options.out / "latency.json", lambda part: part.write_text(text + "\n")
-    )
+    replace_atomically(out / "latency.json", lambda part: part.write_text(text + "\n"))
     return report
 
 
@@ -189,26 +173,29 @@ def _through(
             server = dict(client.welcome.server)
             return server, _filmed(client, frames, size_px, progress)
     except FilterError as error:
-        tail = "\n".join(service.log.splitlines()[-LOG_TAIL_LINES:])
+        for line in service.log.splitlines()[-LOG_TAIL_LINES:]:
+            sys.stderr.write(f"service: {line}\n")
         text = textwrap.shorten(str(error), 300, placeholder=" ...")
-        raise DemoFailed(f"{text}\nThe last lines of the service:\n{tail}") from None
+        raise CommandFailed(text) from None
     except RuntimeError as error:  # it did not start; the message ends with its output
-        raise DemoFailed(str(error)) from None
+        raise CommandFailed(str(error)) from None
 
 
-def _rendered(options: argparse.Namespace, progress: Progress) -> list[DemoFrame]:
+def _rendered(
+    n_frames: int, size_px: tuple[int, int], progress: Progress
+) -> list[DemoFrame]:
     """Render both scenes: two thirds of the frames Courtyard, one third Primitives."""
-    n_courtyard = max(1, round(options.frames * 2 / 3))
-    task = progress.task("Rendering the scenes", total=options.frames)
+    n_courtyard = max(1, round(n_frames * 2 / 3))
+    task = progress.task("Rendering the scenes", total=n_frames)
     frames = []
     # The sheet shows Courtyard with a wide pupil and far focus (the middle of the path)
     # and Primitives focused on the letter (its beginning).
     for name, count, sheet_index in (
         ("courtyard", n_courtyard, (n_courtyard - 1) // 2),
-        ("primitives", options.frames - n_courtyard, 0),
+        ("primitives", n_frames - n_courtyard, 0),
     ):
         if count:
-            rendered = scene_frames(build_scene(name), None, count, options.size)
+            rendered = scene_frames(build_scene(name), None, count, size_px)
             for index, frame in enumerate(rendered):
                 frames.append(DemoFrame(name, frame, index == sheet_index))
                 task.advance()
@@ -252,16 +239,17 @@ def _filmed(
 
 
 def _written(
-    options: argparse.Namespace,
+    out: Path,
+    size_px: tuple[int, int],
     frames: list[DemoFrame],
     films: list[EyeFilm],
     progress: Progress,
 ) -> Path:
     """Write the contact sheet and the video; return the video's path."""
     progress.task("Writing the contact sheet")
-    cell_px = cell_size_px(options.size)
+    cell_px = cell_size_px(size_px)
     sheet = _contact_sheet(frames, films, cell_px)
-    replace_atomically(options.out / "contact_sheet.png", sheet.save)
+    replace_atomically(out / "contact_sheet.png", sheet.save)
     task = progress.task("Writing the video", total=len(frames))
 
     def pages() -> Iterator[NDArray[np.uint8]]:
@@ -272,7 +260,7 @@ def _written(
             yield video_frame(cells, frame.state, frame.rendered.depth_m)
             task.advance()
 
-    return write_video(options.out / "demo", pages, FRAMES_PER_SECOND)
+    return write_video(out / "demo", pages, FRAMES_PER_SECOND)
 
 
 def _contact_sheet(
@@ -326,9 +314,5 @@ def _summary(report: dict[str, Any]) -> str:
         f"{report['frames_per_eye']} frames through {len(report['eyes'])} eyes in "
         f"{report['total_s']:.0f} s (frame age {min(ages):.0f} to {max(ages):.0f} ms, "
         f"{dropped} dropped): {Path(report['video']).name}, contact_sheet.png and "
-        f"latency.json in {folder}\n"
+        f"latency.json in {folder}"
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from clients.option_values import likely_unit
 from clients.scenes.geometry import linear_from_srgb
 from estimator.dynamics import AccommodationResponse, PupilReflex
+from filter_service.command_line import likely_unit
 from filter_service.messages import Camera
 
 MAX_VERGENCE_DPT = 20.0

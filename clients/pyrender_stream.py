@@ -14,20 +14,18 @@ replaces one that waits to be sent.
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
-from clients.arguments import read_profile, size_px_argument
+from clients.commands.options import read_profile, read_size_px, with_options
 from clients.extra import PYRENDER_INSTALL, what_to_install
 from clients.filter_client import FilterClient, FilteredFrame
 from clients.frame_log import FrameLog
@@ -38,7 +36,6 @@ from clients.natural_eye import (
     distance_at,
     luminance_cd_m2,
 )
-from clients.option_values import a_number
 from clients.scene_renderer import (
     PATHS,
     Moment,
@@ -47,9 +44,17 @@ from clients.scene_renderer import (
     path_moments,
     scene_frames,
 )
-from clients.scenes.catalog import SCENE_BUILDERS, build_scene
+from clients.scenes.catalog import build_scene
 from clients.streaming import submit
-from filter_service.errors import FilterError, ServiceTimeout
+from filter_service.command_line import (
+    CommandFailed,
+    Json,
+    app_of,
+    print_json,
+    print_line,
+)
+from filter_service.command_line import run as run_program
+from filter_service.errors import ServiceTimeout
 from filter_service.messages import (
     DEFAULT_ENDPOINT,
     Camera,
@@ -63,14 +68,104 @@ MAX_LOOK_AROUND_DEG = 30.0
 STRAIGHT_AHEAD = (0.0, 0.0)
 NATURAL_RANGES = {"pupil_range_mm": (2.0, 8.0), "focus_range_dpt": (0.0, 8.5)}
 USUAL_SCENE = "courtyard"
-USUAL_IPD_MM = 63.0
+
+SceneName = Literal["courtyard", "primitives"]
 
 Show = Callable[[NDArray[np.uint8], NDArray[np.uint8], str], bool]
 Learn = Callable[[float, float], None]
 
 
-class CannotRun(Exception):
-    """A package or a display is missing."""
+@dataclass(frozen=True, kw_only=True)
+class StreamOptions:
+    """Options of the command line."""
+
+    endpoint: Annotated[
+        str, typer.Option(metavar="ENDPOINT", help="Endpoint of the service.")
+    ] = DEFAULT_ENDPOINT
+    scene: Annotated[
+        SceneName | None,
+        typer.Option(help=f"Built-in scene; by default {USUAL_SCENE}."),
+    ] = None
+    file: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE",
+            help="File that trimesh loads, instead of --scene: .glb, .gltf, .obj, "
+            ".stl, .ply ...",
+        ),
+    ] = None
+    m_per_unit: Annotated[
+        float,
+        typer.Option(metavar="M", help="Meters per unit of the file, such as 0.001."),
+    ] = 1.0
+    renderer: Annotated[
+        Literal["own", "pyrender"] | None,
+        typer.Option(
+            help="Renderer of a built-in scene; by default own.  Files require "
+            "pyrender."
+        ),
+    ] = None
+    stereo: Annotated[
+        bool, typer.Option("--stereo", help="Render one view for each eye.")
+    ] = False
+    ipd_mm: Annotated[
+        float, typer.Option(metavar="MM", help="Interpupillary distance for --stereo.")
+    ] = 63.0
+    profile: Annotated[
+        str,
+        typer.Option(help="Preset name, JSON, or a .json, .abp, .csv or .zmx file."),
+    ] = "myopia"
+    right_profile: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PROFILE",
+            help="Profile of the right eye for --stereo; by default that of --profile.",
+        ),
+    ] = None
+    size: Annotated[str, typer.Option(metavar="WxH", help="Size of a view in px.")] = (
+        "480x270"
+    )
+    frames: Annotated[
+        int, typer.Option(help="Number of frames along the path of the camera.")
+    ] = 96
+    hidden: Annotated[
+        bool,
+        typer.Option(
+            "--hidden",
+            help="Also send the hidden layer, the surface behind the visible one; own "
+            "renderer only.",
+        ),
+    ] = False
+    window: Annotated[
+        bool,
+        typer.Option(
+            "--window", help="Show a live window; the path repeats until Esc."
+        ),
+    ] = False
+    look_around: Annotated[
+        float,
+        typer.Option(
+            metavar="DEG",
+            help="Radius of a circular gaze movement, deg, 0 to "
+            f"{MAX_LOOK_AROUND_DEG:g}.",
+        ),
+    ] = 0.0
+    natural: Annotated[
+        bool,
+        typer.Option(
+            "--natural",
+            help="Let the focus follow the fixated object, and the pupil the light; "
+            "otherwise both follow the path.",
+        ),
+    ] = False
+    age: Annotated[
+        float, typer.Option(metavar="YEARS", help="Age of the person for --natural.")
+    ] = USUAL_AGE_YEARS
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Return the width and height of a view in px."""
+        return read_size_px(self.size)
 
 
 def path_settings(*scene_names: str) -> dict[str, tuple[float, float]]:
@@ -211,94 +306,7 @@ def _title(answer: FilteredFrame) -> str:
     )
 
 
-def _arguments(argv: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        prog="python -m clients.pyrender_stream", description=__doc__.split("\n")[0]
-    )
-    parser.add_argument("--endpoint", default=DEFAULT_ENDPOINT)
-    source = parser.add_mutually_exclusive_group()
-    source.add_argument(
-        "--scene",
-        choices=sorted(SCENE_BUILDERS),
-        help=f"built-in scene (default: {USUAL_SCENE})",
-    )
-    source.add_argument(
-        "--file", help="file that trimesh loads: .glb, .gltf, .obj, .stl, .ply ..."
-    )
-    parser.add_argument(
-        "--m-per-unit",
-        default=1.0,
-        type=a_number,
-        metavar="M",
-        help="meters per unit of the file, such as 0.001 (default: 1)",
-    )
-    parser.add_argument(
-        "--renderer",
-        choices=("own", "pyrender"),
-        help="renderer of a built-in scene (default: own); files require pyrender",
-    )
-    parser.add_argument(
-        "--stereo", action="store_true", help="render one view for each eye"
-    )
-    parser.add_argument(
-        "--ipd-mm",
-        default=USUAL_IPD_MM,
-        type=a_number,
-        metavar="MM",
-        help=f"interpupillary distance, for --stereo (default: {USUAL_IPD_MM:g})",
-    )
-    parser.add_argument(
-        "--profile",
-        default="myopia",
-        help="preset name, JSON, or a .json, .abp, .csv or .zmx file",
-    )
-    parser.add_argument(
-        "--right-profile",
-        metavar="PROFILE",
-        help="profile of the right eye, for --stereo (default: that of --profile)",
-    )
-    parser.add_argument(
-        "--size", default="480x270", type=size_px_argument, metavar="WxH"
-    )
-    parser.add_argument(
-        "--frames", default=96, type=int, help="number of frames along the path"
-    )
-    parser.add_argument(
-        "--hidden",
-        action="store_true",
-        help="also send the hidden layer, the surface behind the visible one "
-        "(own renderer only)",
-    )
-    parser.add_argument(
-        "--window",
-        action="store_true",
-        help="show a live window; the path repeats until Esc",
-    )
-    parser.add_argument(
-        "--look-around",
-        default=0.0,
-        type=a_number,
-        metavar="DEG",
-        help=f"radius of a circular gaze movement, 0 to {MAX_LOOK_AROUND_DEG:g}",
-    )
-    parser.add_argument(
-        "--natural",
-        action="store_true",
-        help="make the focus follow the fixated object and the pupil the light "
-        "(default: both follow the path)",
-    )
-    parser.add_argument(
-        "--age",
-        default=USUAL_AGE_YEARS,
-        type=a_number,
-        metavar="YEARS",
-        help=f"age of the person, for --natural (default: {USUAL_AGE_YEARS:g})",
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    return parser.parse_args(argv)
-
-
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: StreamOptions) -> dict[str, Any]:
     """Connect and stream; return a summary of the frames."""
     reach_deg = options.look_around
     if not 0.0 <= reach_deg <= MAX_LOOK_AROUND_DEG:
@@ -310,7 +318,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     rendered, settings = _source(options)
     log = FrameLog()
     with ExitStack() as stack:
-        show = _opened_window(options.size, stack) if options.window else None
+        show = _opened_window(options.size_px, stack) if options.window else None
         client = stack.enter_context(
             FilterClient(options.endpoint, client_name="pyrender_stream")
         )
@@ -332,7 +340,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
     return {"sent": n_sent, **log.summary()}
 
 
-def _profiles(options: argparse.Namespace) -> dict[EyeName, dict[str, Any]]:
+def _profiles(options: StreamOptions) -> dict[EyeName, dict[str, Any]]:
     """Return the profile of each eye."""
     profile = read_profile(options.profile)
     if not options.stereo:
@@ -346,12 +354,14 @@ def _profiles(options: argparse.Namespace) -> dict[EyeName, dict[str, Any]]:
 
 
 def _source(
-    options: argparse.Namespace,
+    options: StreamOptions,
 ) -> tuple[Generator[SceneFrame, None, None], dict[str, tuple[float, float]]]:
     """Return the frames to stream, and settings that cover their states."""
     ipd_mm = options.ipd_mm if options.stereo else None
     if not 0.0 < options.ipd_mm < np.inf:
         raise ValueError(f"--ipd-mm is {options.ipd_mm:g}; allowed: above 0")
+    if options.scene is not None and options.file is not None:
+        raise ValueError("--scene and --file: given together; allowed: one of them")
     if options.file is not None and options.renderer == "own":
         raise ValueError("--renderer is own; allowed with --file: pyrender")
     if options.file is None and options.renderer != "pyrender":
@@ -360,7 +370,7 @@ def _source(
             build_scene(name),
             None,
             options.frames,
-            options.size,
+            options.size_px,
             with_hidden=options.hidden,
             repeats=options.window,
             ipd_mm=ipd_mm,
@@ -373,7 +383,7 @@ def _source(
     try:
         from clients import pyrender_renderer
     except ModuleNotFoundError as error:
-        raise CannotRun(what_to_install(error, PYRENDER_INSTALL)) from None
+        raise CommandFailed(what_to_install(error, PYRENDER_INSTALL)) from None
     flags, infinite_from_m = 0, np.inf
     if options.file is None:
         built = build_scene(options.scene or USUAL_SCENE)
@@ -387,12 +397,12 @@ def _source(
         )
         scene = loaded.scene
         camera, moments = pyrender_renderer.orbit(
-            loaded.bounds_m, options.frames, options.size
+            loaded.bounds_m, options.frames, options.size_px
         )
         settings = moment_settings(moments)
     frames = pyrender_renderer.pyrender_frames(
         scene,
-        options.size,
+        options.size_px,
         camera=camera,
         path=back_and_forth(moments) if options.window else moments,
         ipd_mm=ipd_mm,
@@ -407,27 +417,26 @@ def _opened_window(size_px: tuple[int, int], stack: ExitStack) -> Show:
     try:
         from clients import window  # which requires glfw
     except ModuleNotFoundError as error:
-        raise CannotRun(what_to_install(error)) from error
+        raise CommandFailed(what_to_install(error)) from error
     try:
         return stack.enter_context(window.LiveWindow(size_px, "ocufilter")).show
     except window.NoDisplay as error:
-        raise CannotRun(str(error)) from error
+        raise CommandFailed(str(error)) from error
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the program; return its exit code."""
-    options = _arguments(argv)
-    try:
-        report = run(options)
-    except ValueError as error:
-        sys.stderr.write(f"pyrender_stream: {error}\n")
-        return 2
-    except (FilterError, CannotRun) as error:
-        sys.stderr.write(f"pyrender_stream: {error}\n")
-        return 1
-    text = json.dumps(report) + "\n" if options.json else _report_line(report)
-    sys.stdout.write(text)
-    return 0
+@with_options
+def pyrender_stream(options: StreamOptions, json_output: Json = False) -> None:
+    """Stream a scene through a running service, as the client of another program.
+
+    python -m clients.pyrender_stream --scene courtyard --profile keratoconus --window
+
+    python -m clients.pyrender_stream --file chair.glb --stereo
+    """
+    report = run(options)
+    if json_output:
+        print_json(report)
+    else:
+        print_line(_report_line(report))
 
 
 def _report_line(report: dict[str, Any]) -> str:
@@ -435,9 +444,14 @@ def _report_line(report: dict[str, Any]) -> str:
     dropped = sum(report["drops"].values())
     return (
         f"{report['frames']} of {report['sent']} frames filtered, {dropped} dropped; "
-        f"frame age p50 {age['p50']} ms, p99 {age['p99']} ms\n"
+        f"frame age p50 {age['p50']} ms, p99 {age['p99']} ms"
     )
 
 
+def main() -> None:
+    """Run the program."""
+    run_program(app_of(pyrender_stream), "pyrender_stream")
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -26,6 +26,8 @@ Importing this package loads no submodules, which keeps clients light.
     bounded_images   image decoders with memory limits
     color_encoding   color profiles and codes, and conversion to sRGB
     gl_device        selection of the OpenGL device
+    command_line     what commands share: start, output, errors, numbers
+    serve            `ocufilter serve`
     version          version of the installed package
     one_blas_thread  NumPy's BLAS on one thread
     gl/              OpenGL context and shaders

@@ -1,7 +1,6 @@
-"""``python -m filter_service``: the `ocufilter` program."""
+"""``python -m filter_service``: start the service."""
 
-import importlib
+from filter_service.serve import main
 
 if __name__ == "__main__":
-    # By name, because this package must not import the clients.
-    importlib.import_module("clients.commands.program").main()
+    main()

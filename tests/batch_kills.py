@@ -9,7 +9,7 @@ from contextlib import suppress
 
 from tests.source_tree import ROOT
 
-COMMAND = (sys.executable, "-m", "filter_service", "batch")
+COMMAND = (sys.executable, "-m", "ocufilter", "batch")
 MARK = "OCUFILTER_TEST_OUT"
 
 

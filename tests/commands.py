@@ -59,11 +59,17 @@ def run_command(*arguments, cwd: Path = ROOT, **environment: str):
     """
     from clients.commands.program import main
 
-    def with_arguments(words):
+    return run_main(with_arguments(main), *arguments, cwd=cwd, **environment)
+
+
+def with_arguments(main):
+    """Return a function of the arguments that `main` takes from ``sys.argv``."""
+
+    def run(words):
         with mock.patch.object(sys, "argv", ["ocufilter", *words]):
             main()
 
-    return run_main(with_arguments, *arguments, cwd=cwd, **environment)
+    return run
 
 
 def run_main(main, *arguments, cwd: Path = ROOT, **environment: str):

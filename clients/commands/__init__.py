@@ -1,22 +1,15 @@
-"""The command line, one module per command.
+"""The command line: its program, and the commands that have no package of their own.
 
-console          output, errors, progress
-setting_options  command-line options generated from `FilterSettings`
-display_file     measured spectra of a display
-program          the `ocufilter` program: dispatch and errors
-programs         demo, headset, layer, report, batch, web, doctor
-checkout         bench and paper
-serve            the service, and ahead-of-time compilation of its loops
-status           state of a running service
-latency          latency and error of frames through a running service
-keys             client keys of the service
-eyes             on-disk cache of eyes
-filter_image     filtering of one image
-plan_text        a PSF plan as text
-estimate         an eye from a profile
-wavefront        aberrations of an eye in one direction of the visual field
-field            aberrations over the visual field
-psf              PSFs of an eye
-doctor_checks    checks of this machine
-doctor_probes    probes that run in processes of their own
+program        the `ocufilter` program and the table of its commands
+options        options that commands share: settings, profiles, sizes
+service        status, latency, keys and eyes: a running service and its folders
+filter_image   filter: one image
+eye            estimate and field: an eye and its visual field
+optics         wavefront and psf: an eye in one direction
+checkout       bench and paper, which need a checkout
+doctor         doctor: checks of this machine
+doctor_probes  probes that run in processes of their own
+pending        programs that parse their own options
+
+`filter_service.command_line` runs every command, and prints its errors.
 """

@@ -7,13 +7,19 @@ from typing import Annotated
 
 import typer
 
-from clients.commands.console import CommandFailed, Json
+from filter_service.command_line import CommandFailed, Json, typer_app
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 BENCHMARKS = CHECKOUT / "tests" / "benchmarks"
 
 
-def bench(
+bench = typer_app()
+
+
+@bench.command(
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
+)
+def run_benchmark(
     context: typer.Context,
     name: Annotated[
         str,

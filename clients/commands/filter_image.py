@@ -10,16 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from clients.commands.console import (
+from clients.commands.options import with_setting_options
+from filter_service.camera import read_intrinsics
+from filter_service.command_line import (
     Json,
+    check_range,
     print_json,
     print_line,
     progress_bar,
 )
-from clients.commands.plan_text import print_plan
-from clients.commands.setting_options import with_setting_options
-from clients.option_values import check_range
-from filter_service.camera import read_intrinsics
 from filter_service.settings import (
     MAX_PUPIL_MM,
     MAX_RENDER_TOLERANCE,
@@ -507,3 +506,56 @@ def _report(summary: dict[str, Any]) -> None:
         f"eye {summary['build_ms']:.0f} ms, frame with {summary['psf_count']} PSFs "
         f"{summary['render_ms']:.0f} ms on {summary['renderer']}"
     )
+
+
+AXIS_NAMES = {"h": "azimuth", "v": "elevation"}
+
+
+def plan_summary(plan: "CachePlan") -> dict[str, Any]:
+    """Return a plan's nodes and prediction in JSON-compatible types."""
+    predicted, defocus = plan.prediction, plan.nodes.defocus
+    return {
+        "h_deg": plan.h_deg.tolist(),
+        "v_deg": plan.v_deg.tolist(),
+        "pupils_mm": plan.pupils_mm.tolist(),
+        "accommodations_dpt": plan.accommodations_dpt.tolist(),
+        "defocus_range_dpt": [
+            float(defocus.values_dpt.min()),
+            float(defocus.values_dpt.max()),
+        ],
+        "defocus_counts": [
+            int(defocus.counts.min()),
+            int(defocus.counts.max()),
+        ],
+        **vars(predicted),
+    }
+
+
+def print_plan(plan: "CachePlan", *, json_output: bool) -> None:
+    """Print a plan as text or as JSON."""
+    summary = plan_summary(plan)
+    if json_output:
+        print_json(summary)
+        return
+    low_dpt, high_dpt = summary["defocus_range_dpt"]
+    fewest, most = summary["defocus_counts"]
+    count_text = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+    print_line(_axis("azimuths", summary["h_deg"], "deg"))
+    print_line(_axis("elevations", summary["v_deg"], "deg"))
+    print_line(_axis("pupils", summary["pupils_mm"], "mm"))
+    print_line(_axis("accommodations", summary["accommodations_dpt"], "dpt"))
+    print_line(f"{count_text} defoci from {low_dpt:.2f} to {high_dpt:.2f} dpt at each")
+    parts = ", ".join(
+        f"{AXIS_NAMES.get(axis, axis)} {db:.0f}"
+        for axis, db in summary["error_db_by_axis"].items()
+    )
+    print_line(
+        f"{summary['psf_count']} PSFs, {summary['memory_mb']:.1f} MB, "
+        f"{summary['build_s']:.1f} s on {summary['core_count']} cores; "
+        f"interpolation at {summary['interpolation_db']:.0f} dB ({parts})"
+    )
+
+
+def _axis(name: str, values: list[float], unit: str) -> str:
+    shown = ", ".join(f"{round(value, 2) + 0.0:g}" for value in values)
+    return f"{len(values)} {name}: {shown} {unit}"

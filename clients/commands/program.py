@@ -1,75 +1,128 @@
-"""The `ocufilter` program: dispatch of commands, and one line for each error."""
+"""The `ocufilter` program: its commands, each of which is imported when it runs."""
 
-import io
 import sys
+from importlib import import_module
+from typing import Any
 
 import typer
-from typer.exceptions import Abort, TyperException
+from typer.core import TyperGroup
+from typer.main import get_command
 
-from clients.commands.checkout import bench, paper
-from clients.commands.console import CommandFailed, print_line
-from clients.commands.estimate import estimate
-from clients.commands.eyes import eyes
-from clients.commands.field import field
-from clients.commands.filter_image import filter_image
-from clients.commands.keys import keys
-from clients.commands.latency import latency
-from clients.commands.programs import (
-    batch,
-    demo,
-    doctor,
-    headset,
-    layer,
-    report,
-    web,
-)
-from clients.commands.psf import psf
-from clients.commands.serve import serve
-from clients.commands.status import status
-from clients.commands.wavefront import wavefront
-from clients.option_values import given_value, likely_number
 from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
+from filter_service.command_line import app_of, print_line, run, typer_app
 
-EXIT_FAILURE = 1
-EXIT_BAD_INPUT = 2
-EXIT_INTERRUPTED = 130
+COMMANDS = {
+    # name: where its function or typer application is, and what `--help` says
+    "demo": (
+        "clients.demo:demo",
+        "Stream two scenes through six eyes; write a video.",
+    ),
+    "serve": (
+        "filter_service.serve:serve",
+        "Filter frames for clients until interrupted.",
+    ),
+    "status": (
+        "clients.commands.service:status",
+        "Print the state of a running service.",
+    ),
+    "latency": (
+        "clients.commands.service:latency",
+        "Time frames through a running service; compute their error.",
+    ),
+    "keys": (
+        "clients.commands.service:keys",
+        "Create and revoke client keys of a service.",
+    ),
+    "eyes": (
+        "clients.commands.service:eyes",
+        "List and erase the eyes that a service cached on disk.",
+    ),
+    "filter": (
+        "clients.commands.filter_image:filter_image",
+        "Filter one image with depth through one eye.",
+    ),
+    "batch": (
+        "clients.commands.pending:batch",
+        "Filter folders and videos of color and depth, on all cores.",
+    ),
+    "estimate": (
+        "clients.commands.eye:estimate",
+        "Estimate the eye that reproduces a measured wavefront.",
+    ),
+    "wavefront": (
+        "clients.commands.optics:wavefront",
+        "Print the Zernike coefficients of an eye in one direction.",
+    ),
+    "field": (
+        "clients.commands.eye:field",
+        "Print refraction and aberrations over the visual field.",
+    ),
+    "psf": (
+        "clients.commands.optics:psf",
+        "Compute one PSF as an array or an image.",
+    ),
+    "report": (
+        "clients.commands.pending:report",
+        "Write a report on one eye, or a comparison of two.",
+    ),
+    "headset": (
+        "clients.commands.pending:headset",
+        "Show a scene in an OpenXR headset, through two eyes.",
+    ),
+    "layer": (
+        "clients.commands.pending:layer",
+        "See another OpenXR program through simulated eyes.",
+    ),
+    "web": (
+        "clients.commands.pending:web",
+        "Serve a web page with an eye's data and filtered views.",
+    ),
+    "bench": (
+        "clients.commands.checkout:bench",
+        "Time one part of the program, with its error.",
+    ),
+    "paper": (
+        "clients.commands.checkout:paper",
+        "Compare the paper's tables and figures with ours.",
+    ),
+    "doctor": (
+        "clients.commands.doctor:doctor",
+        "Check what works on this machine, and what is missing.",
+    ),
+}
 
-app = typer.Typer(
+
+class _Commands(TyperGroup):
+    """The commands of the table, without the modules of those that do not run."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands: dict[str, Any] = dict.fromkeys(COMMANDS)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, attribute = COMMANDS[cmd_name][0].partition(":")
+        found = getattr(import_module(module), attribute)
+        app = found if isinstance(found, typer.Typer) else app_of(found)
+        command = get_command(app)
+        command.name = cmd_name
+        return command
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+
+app = typer_app(
     name="ocufilter",
+    cls=_Commands,
     help="See through another person's eyes.  Start with `ocufilter demo`; "
     "`ocufilter doctor` reports what is missing on this machine.",
     epilog="Option names end in their unit: mm, nm, deg, dpt (diopters; 0 is "
     "infinity).  "
     "Exit codes: 0 success, 1 failure, 2 invalid input.",
-    add_completion=False,
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command()(demo)
-app.command()(serve)
-app.command()(status)
-app.command()(latency)
-app.add_typer(keys, name="keys")
-app.add_typer(eyes, name="eyes")
-app.command(name="filter")(filter_image)
-app.command()(estimate)
-app.command()(wavefront)
-app.command()(field)
-app.command()(psf)
-app.command(
-    context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
-)(bench)
-for program in (headset, layer, web, batch, report):
-    app.command(
-        context_settings={
-            "allow_extra_args": True,
-            "ignore_unknown_options": True,
-            "help_option_names": [],  # the program prints its own help
-        }
-    )(program)
-app.command()(paper)
-app.command()(doctor)
 
 
 def _print_version(is_asked: bool) -> None:
@@ -90,7 +143,7 @@ def _root(
         is_eager=True,
         help="Print the version and exit.",
     ),
-    traceback: bool = typer.Option(  # noqa: ARG001  (`_exit_code` reads it)
+    traceback: bool = typer.Option(  # noqa: ARG001  (`exit_code` reads it)
         False, help="Show the traceback of an error."
     ),
 ) -> None:
@@ -100,52 +153,7 @@ def _root(
 
 def main() -> None:
     """Run the program; errors become one line on stderr and an exit code."""
-    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-        # otherwise a file whose name is not UTF-8 ends a finished command with an error
-        sys.stdout.reconfigure(errors="backslashreplace")
-    sys.exit(_exit_code(sys.argv[1:]))
-
-
-def _exit_code(arguments: list[str]) -> int:
-    try:
-        return app(arguments, prog_name="ocufilter", standalone_mode=False) or 0
-    except (Abort, KeyboardInterrupt):
-        return EXIT_INTERRUPTED
-    except Exception as error:
-        if "--traceback" in arguments[:1]:
-            raise
-        code, text = _code_and_text(error, arguments)
-        sys.stderr.write(f"ocufilter: {' '.join(text.split())}\n")
-        return code
-
-
-def _code_and_text(error: Exception, arguments: list[str]) -> tuple[int, str]:
-    from filter_service.errors import FilterError
-
-    if isinstance(error, TyperException):
-        return error.exit_code, _with_value(error, arguments)
-    if isinstance(error, FilterError):
-        return EXIT_BAD_INPUT if error.field else EXIT_FAILURE, str(error)
-    if isinstance(error, CommandFailed):
-        return EXIT_FAILURE, str(error)
-    if isinstance(error, ValueError):  # invalid input, by convention
-        return EXIT_BAD_INPUT, str(error)
-    if isinstance(error, OSError):
-        return EXIT_FAILURE, str(error)
-    kind = type(error).__name__
-    return EXIT_FAILURE, f"{kind}: {error} (see ocufilter --traceback ...)"
-
-
-def _with_value(error: TyperException, arguments: list[str]) -> str:
-    """Return the message of an error; Typer's does not name a wrong number."""
-    text = error.format_message()
-    options: list[str] = getattr(getattr(error, "param", None), "opts", [])
-    value = given_value(options, arguments)
-    if value is None or not ("valid number" in text or "valid integer" in text):
-        return text
-    is_whole = "valid integer" in text
-    allowed = "; allowed: an integer" if is_whole else likely_number(value)
-    return f"{options[0]} is '{value:.60}'{allowed}"
+    run(app, "ocufilter")
 
 
 if __name__ == "__main__":

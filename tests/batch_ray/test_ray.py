@@ -22,7 +22,7 @@ TIMEOUT_S = 300
 
 
 def run(room, out, *arguments):
-    command = [sys.executable, "-m", "filter_service", "batch", room, "-o", out]
+    command = [sys.executable, "-m", "ocufilter", "batch", room, "-o", out]
     command += ["-p", "myopia", "-p", "cataract", "--fov-deg", 20, *MODE, *arguments]
     finished = subprocess.run(
         [*map(str, command), "--json"],

@@ -38,7 +38,6 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from clients.arguments import size_px_argument
 from clients.batch.exact_filter import ExactFilter
 from clients.batch.job import Job, batch_settings
 from clients.batch.manifest import Manifest
@@ -46,6 +45,7 @@ from clients.batch.process_pool import ProcessPool
 from clients.batch.run import Batch, run_batch
 from clients.batch.source import FieldOfView, Scaled, SourceFrame
 from clients.batch.states import States
+from clients.commands.options import read_size_px
 from filter_service import RgbdView
 from filter_service.image_files import read_color, read_depth
 from tests.batch_kills import kill, pictures, start, wait_for_orphans
@@ -291,7 +291,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--quick", action="store_true", help="one eye, 96x54, 2 kills")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--eyes", nargs="+", choices=CONDITIONS)
-    parser.add_argument("--sizes", nargs="+", type=size_px_argument, metavar="WxH")
+    parser.add_argument("--sizes", nargs="+", type=read_size_px, metavar="WxH")
     parser.add_argument("--frames", type=int, metavar="N", help="96, of 720p 48")
     parser.add_argument("--no-kills", action="store_true")
     options = parser.parse_args(argv)

@@ -221,7 +221,7 @@ def _run_command(label: str, arguments: list[str]) -> tuple[float, float, str]:
     """Return s, MB and the exit code, or what is wrong with it."""
     start_s = time.perf_counter()
     process = subprocess.Popen(
-        [sys.executable, "-m", "filter_service", *arguments],
+        [sys.executable, "-m", "ocufilter", *arguments],
         cwd=ROOT,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,

@@ -69,7 +69,7 @@ class Clients:
         key_option = [] if key is None else ["--key", key]
         if method == "ocufilter latency":
             told = output_of(
-                *(self.options.program or (sys.executable, "-m", "filter_service")),
+                *(self.options.program or (sys.executable, "-m", "ocufilter")),
                 *("latency", endpoint, "--still", "--transport", "tcp", "--json"),
                 *("--size", SIZE, "--rate-hz", RATE_HZ, "--frames", n_frames),
                 *key_option,

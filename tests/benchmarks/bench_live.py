@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from clients.arguments import size_px_argument
+from clients.commands.options import read_size_px
 from clients.pyrender_stream import path_settings
 from filter_service.gl_device import is_software_renderer
 from filter_service.psfs.store import build_psf_store
@@ -143,7 +143,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--quick", action="store_true", help="one eye, 192x108")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--eyes", nargs="+", default=CONDITIONS, choices=CONDITIONS)
-    parser.add_argument("--sizes", nargs="+", type=size_px_argument, metavar="WxH")
+    parser.add_argument("--sizes", nargs="+", type=read_size_px, metavar="WxH")
     parser.add_argument("--threads", nargs="+", type=int, default=[1, 2], metavar="N")
     parser.add_argument(
         "--frames", type=int, metavar="N", help="24, of large frames 12"

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from clients.arguments import read_object, read_profile, read_size_px
+from clients.commands.options import read_object, read_profile, read_size_px
 from clients.filter_client import FilterClient
 from clients.latency.stream import LatencyRun, StreamSettings, measure_stream
 from clients.service_process import ServiceProcess

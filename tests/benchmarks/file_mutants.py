@@ -122,7 +122,7 @@ def kinds(folder: Path) -> list[Kind]:
     from clients.batch.manifest import Manifest, ManifestDiffers
     from clients.batch.states import read_states
     from clients.batch.video_reading import VideoReader
-    from clients.commands.display_file import display_of_file
+    from clients.commands.options import display_of_file
     from clients.headset.gltf_scene import load_gltf
     from clients.web.eye_form import read_profile_file
     from clients.web.page_state import PageState

@@ -27,7 +27,7 @@ WIDTH_PX, HEIGHT_PX = 48, 32
 def run_process(*arguments, cwd=ROOT, **environment):
     """Run the program in a process of its own, for what is read at its start."""
     return subprocess.run(
-        [sys.executable, "-m", "filter_service", *map(str, arguments)],
+        [sys.executable, "-m", "ocufilter", *map(str, arguments)],
         cwd=cwd,
         env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
         capture_output=True,
@@ -587,7 +587,7 @@ def test_benchmarks_say_that_they_need_a_checkout(tmp_path):
             ignore=shutil.ignore_patterns("__pycache__", "node_modules"),
         )
     finished = subprocess.run(
-        [sys.executable, "-m", "filter_service", "bench", "psf"],
+        [sys.executable, "-m", "ocufilter", "bench", "psf"],
         cwd=tmp_path,
         env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
         capture_output=True,

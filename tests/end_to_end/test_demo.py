@@ -15,16 +15,18 @@ from PIL import Image
 
 import clients.batch
 from clients import demo, pyrender_stream, sheet, video
-from clients.arguments import read_profile, read_size_px
 from clients.batch import video_writing
 from clients.batch.video_reading import VideoReader
+from clients.commands.options import read_profile, read_size_px
 from clients.demo_eyes import EYES
 from clients.frame_log import FrameLog, percentiles
 from clients.pyrender_stream import path_settings
 from clients.scenes.catalog import build_scene
 from clients.service_process import CHECKOUT, ServiceProcess
 from estimator.profiles.files import profile_body
+from filter_service.command_line import app_of, exit_code
 from filter_service.progress import INTERVAL_S
+from tests.commands import run_command
 
 pytestmark = pytest.mark.clients
 
@@ -36,7 +38,7 @@ SIZE_PX = (160, 90)
 def demo_run(tmp_path_factory):
     """One small demo in a process of its own: its folder and what it printed."""
     folder = tmp_path_factory.mktemp("demo")
-    command = [sys.executable, "-m", "clients.demo", "--out", str(folder)]
+    command = [sys.executable, "-m", "ocufilter", "demo", "--out", str(folder)]
     command += ["--frames", str(N_FRAMES), "--size", "160x90"]
     output = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(command, cwd=CHECKOUT, **output) as process:
@@ -121,19 +123,20 @@ def primitives_only(name):
     return build_scene("primitives")
 
 
-def test_demo_reports_a_service_that_does_not_start(monkeypatch, capsys, tmp_path):
+def test_demo_reports_a_service_that_does_not_start(monkeypatch, tmp_path):
     command = (sys.executable, "-c", "print('no GL here'); raise SystemExit(3)")
     broken = functools.partial(ServiceProcess, command=command)
     monkeypatch.setattr(demo, "ServiceProcess", broken)
     monkeypatch.setattr(demo, "build_scene", primitives_only)
     arguments = ["--out", str(tmp_path), "--frames", "1", "--size", "64x36"]
-    assert demo.main(arguments) == 1
-    error = capsys.readouterr().err
-    assert "code 3" in error
-    assert "no GL here" in error
+    ended = run_command("demo", *arguments)
+    assert ended.returncode == 1
+    (line,) = [x for x in ended.stderr.splitlines() if x.startswith("ocufilter: ")]
+    assert "code 3" in line
+    assert "no GL here" in line
 
 
-def test_demo_reports_a_service_that_dies_on_the_way(monkeypatch, capsys, tmp_path):
+def test_demo_reports_a_service_that_dies_on_the_way(monkeypatch, tmp_path):
     change_eye, services = demo.change_eye, []
 
     def recorded(**options):
@@ -150,11 +153,13 @@ def test_demo_reports_a_service_that_dies_on_the_way(monkeypatch, capsys, tmp_pa
     monkeypatch.setattr(demo, "ServiceProcess", recorded)
     monkeypatch.setattr(demo, "change_eye", change_then_kill)
     arguments = ["--out", str(tmp_path), "--frames", "1", "--size", "64x36"]
-    assert demo.main([*arguments, "--json"]) == 1
-    output = capsys.readouterr()
-    assert output.out == ""
-    assert "connection" in output.err
-    assert f"serving on {services[0].endpoint}" in output.err
+    ended = run_command("demo", *arguments, "--json")
+    assert ended.returncode == 1
+    assert ended.stdout == ""
+    *told, line = ended.stderr.splitlines()
+    assert "connection" in line
+    assert any(f"serving on {services[0].endpoint}" in x for x in told)
+    assert all(x.startswith("service: ") for x in told)
 
 
 @pytest.mark.parametrize(
@@ -239,8 +244,9 @@ def test_the_gaze_goes_round_the_image_as_far_as_was_asked(
     endpoint = shared_service.endpoint
     arguments = ["--endpoint", endpoint, "--size", "64x36", "--frames", "4"]
     arguments += ["--scene", "primitives"]
-    assert pyrender_stream.main([*arguments, "--look-around", "20"]) == 0
-    assert pyrender_stream.main([*arguments, "--look-around", "31"]) == 2
+    app = app_of(pyrender_stream.pyrender_stream)
+    assert exit_code(app, [*arguments, "--look-around", "20"], "stream") == 0
+    assert exit_code(app, [*arguments, "--look-around", "31"], "stream") == 2
     assert asked[0] == (0.0, 10.0)
     assert len(asked) == 4
     assert all(np.hypot(h, 2 * v) == pytest.approx(20) for h, v in asked)

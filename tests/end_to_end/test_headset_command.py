@@ -71,7 +71,7 @@ def make(context):
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
 def test_a_signal_ends_it_with_its_report_and_its_pictures(tmp_path, name):
     command = (
-        *(sys.executable, "-m", "filter_service", "headset", "--simulated", "--json"),
+        *(sys.executable, "-m", "ocufilter", "headset", "--simulated", "--json"),
         *("--size", "48x54", "--scene", "own_scenery:make", "--out", "pictures"),
         *("--settings", json.dumps({"tolerance": "loose", "mode": "on-axis"})),
     )

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clients.arguments import profile_title
+from clients.commands.options import profile_title
 from clients.headset.stereo_filter import LocalFilter
 from clients.headset.stereo_gaze import StereoGaze
 from clients.openxr_layer import program, wire

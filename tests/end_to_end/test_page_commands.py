@@ -16,7 +16,7 @@ from typer.core import TyperCommand
 from clients import pyrender_stream
 from filter_service.service.config import load_config
 from filter_service.version import __version__
-from tests.commands import run_command, run_main
+from tests.commands import run_command, run_main, with_arguments
 from tests.end_to_end.printed_script import printed_by
 from tests.page_commands import (
     ENDPOINT,
@@ -94,7 +94,9 @@ def test_the_program_reads_the_arguments(read, command):
     ids=str,
 )
 def test_the_streaming_program_reads_the_arguments(read, command, tmp_path):
-    finished = run_main(pyrender_stream.main, *command.words[3:], cwd=tmp_path)
+    finished = run_main(
+        with_arguments(pyrender_stream.main), *command.words[3:], cwd=tmp_path
+    )
     assert finished.returncode == 0, (command.text, finished.stderr)
 
 

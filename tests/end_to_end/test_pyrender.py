@@ -506,11 +506,10 @@ def test_another_opengl_platform_is_refused_in_one_line(platform, before, says):
     environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"}
     if platform is not None:
         environment["PYOPENGL_PLATFORM"] = platform
-    code = f"{before}\nimport sys; from clients.pyrender_stream import main; " + (
-        "sys.exit(main(['--renderer', 'pyrender', '--endpoint', 'tcp://127.0.0.1:9']))"
-    )
+    code = f"{before}\nfrom clients.pyrender_stream import main; main()"
+    words = ("--renderer", "pyrender", "--endpoint", "tcp://127.0.0.1:9")
     finished = subprocess.run(
-        [sys.executable, "-c", code],
+        [sys.executable, "-c", code, *words],
         cwd=ROOT,
         env=environment,
         capture_output=True,

@@ -288,7 +288,7 @@ def test_psf_is_written(run_json, installed):
 
 
 def test_a_benchmark_of_the_tests_needs_a_checkout(installed):
-    module = (installed.python, "-m", "filter_service")
+    module = (installed.python, "-m", "ocufilter")
     assert "checkout" in one_line(start(installed, *module, "bench", "psf"), 1)
 
 
@@ -337,8 +337,8 @@ def first_command(bare):
 
 
 def test_the_first_command_needs_no_extra(bare):
-    module = (bare.python, "-m", f"clients.{first_command(bare)}", "--frames", 0)
-    assert "allowed: 1 or more" in start(bare, *module).stderr
+    command = (bare.ocufilter, first_command(bare), "--frames", 0)
+    assert "allowed: 1 or more" in start(bare, *command).stderr
 
 
 @pytest.mark.slow

@@ -5,11 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from clients.commands.program import _exit_code
+from clients.commands.program import app
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
 from estimator.psf.compute import compute_psfs
 from filter_service import Camera, EyeFilter, FilterSettings
+from filter_service.command_line import exit_code
 from filter_service.image_files import write_image
 
 PUPIL_MM = 3.4
@@ -97,7 +98,7 @@ def test_far_and_near_are_both_sharp(tmp_path, capsys):
             words = ["psf", str(file), "--pupil-mm", "3", "--wavelength-nm", "550"]
             words += ["--pixel-arcmin", "1", "--object-dpt", object_dpt]
             words += ["-o", str(tmp_path / "psf.npy"), "--json"]
-            assert _exit_code(words) == 0
+            assert exit_code(app, words, "ocufilter") == 0
             facts = json.loads(capsys.readouterr().out)
             peaks[design, object_dpt] = facts["peak_ratio"]
     assert peaks["monofocal", "2.18"] < 0.1 * peaks["monofocal", "0"]
@@ -112,18 +113,18 @@ def test_the_program_takes_worn_lenses(tmp_path, capsys):
     """`estimate` and `filter` of one profile, and a clear error of a wrong one."""
     file = tmp_path / "eye.json"
     file.write_text(json.dumps(BIFOCAL))
-    assert _exit_code(["estimate", str(file), "--json"]) == 0
+    assert exit_code(app, ["estimate", str(file), "--json"], "ocufilter") == 0
     assert json.loads(capsys.readouterr().out)
     image, depth = tmp_path / "in.png", tmp_path / "depth.npy"
     write_image(image, np.full((32, 32, 3), 128, np.uint8))
     np.save(depth, np.full((32, 32), 0.5, np.float32))
     words = ["filter", "--color", str(image), "--depth", str(depth), "--fov-deg", "5"]
     words += ["--profile", str(file), "-o", str(tmp_path / "out.png"), "--json"]
-    assert _exit_code(words) == 0
+    assert exit_code(app, words, "ocufilter") == 0
     assert json.loads(capsys.readouterr().out)
     wrong = BIFOCAL | {"correction": {"kind": "iol", "design": "bifocal"}}
     file.write_text(json.dumps(wrong))
-    assert _exit_code(words) == 2
+    assert exit_code(app, words, "ocufilter") == 2
     assert "correction.add_dpt" in capsys.readouterr().err
 
 

@@ -42,7 +42,7 @@ class Run:
     def __init__(self, folder, environment, *arguments):
         self._said = folder / "said.txt"
         socket = ("--socket", str(folder / "layer.sock"))
-        command = (sys.executable, "-m", "clients.commands.program", "layer", "run")
+        command = (sys.executable, "-m", "ocufilter", "layer", "run")
         with self._said.open("wb") as said:
             self.process = subprocess.Popen(
                 [*command, *socket, "--json", *map(str, arguments)],
@@ -146,7 +146,7 @@ def test_profiles_change_while_frames_are_filtered(run, display, tmp_path):
     profile = tmp_path / "eye.json"
     profile.write_text(json.dumps({"kind": "prescription", "sphere_dpt": -1.0}))
     socket = ("--socket", str(tmp_path / "layer.sock"))
-    command = (sys.executable, "-m", "clients.commands.program", "layer")
+    command = (sys.executable, "-m", "ocufilter", "layer")
     with Monado(tmp_path, variables=HALF_SIZE) as monado:
         options = ("--profile", profile, *PATIENT)
         with run(monado, *options, "--", *HELLO, DISPLAY=display) as program:

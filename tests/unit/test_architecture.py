@@ -33,6 +33,7 @@ MAY_IMPORT = {
         "clients",
         "filter_service.messages",
         "filter_service.errors",
+        "filter_service.command_line",  # of all commands
         "filter_service.progress",  # of long programs
         "filter_service.waiting",  # and of waits
         "filter_service.atomic_files",  # files that people keep
@@ -183,7 +184,11 @@ HOME = {
         "filter_service/psfs/picture.py",
         "clients/*",  # captions, textures, contact sheet
     ),
-    "typer": ("clients/commands/*",),
+    "typer": (
+        "filter_service/command_line.py",  # what all commands share
+        "filter_service/serve.py",
+        "clients/*",
+    ),
     "rich": ("filter_service/progress.py", "clients/*", "training/*"),  # bars, tables
     "hypothesis": ("tests/*",),
     "pytest": ("tests/*",),

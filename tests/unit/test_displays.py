@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clients.commands.display_file import display_of_file
+from clients.commands.options import display_of_file
 from estimator.optics.units import RGB_WAVELENGTHS_NM
 from filter_service.displays import (
     DISPLAYS,

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from clients.commands import doctor_checks
-from clients.commands.doctor_checks import (
+from clients.commands import doctor
+from clients.commands.doctor import (
     check_engine,
     check_native,
     check_packages,
@@ -83,18 +83,18 @@ CHECKS = (
 
 def test_the_demo_needs_no_package_of_the_extras():
     ok = dict.fromkeys(CHECKS, True) | {"client packages": False}
-    assert doctor_checks.what_works(ok)["demo"]
+    assert doctor.what_works(ok)["demo"]
 
 
 @pytest.mark.parametrize("lost", ["gl", "compute", "shaders"])
 def test_filter_and_serve_need_the_compiled_libraries_and_no_opengl(lost):
     ok = dict.fromkeys(CHECKS, True)
-    assert all(doctor_checks.what_works(ok).values())
-    works = doctor_checks.what_works(ok | {lost: False})
+    assert all(doctor.what_works(ok).values())
+    works = doctor.what_works(ok | {lost: False})
     assert works["filter"]
     assert works["serve"]
     assert works["demo"] == (lost != "gl")  # its scenes are rendered with OpenGL
-    assert not any(doctor_checks.what_works(ok | {"native": False}).values())
+    assert not any(doctor.what_works(ok | {"native": False}).values())
 
 
 def test_the_native_engine_s_probe_filters_a_perfect_eye():
@@ -145,7 +145,7 @@ def test_a_named_device_asks_for_gl(monkeypatch):
 
 
 def test_a_wheel_s_missing_packages_are_installed_with_pip(monkeypatch):
-    monkeypatch.setattr(doctor_checks, "IN_CHECKOUT", False)
+    monkeypatch.setattr(doctor, "IN_CHECKOUT", False)
     versions = {"av": None, "numpy": "1", "lz4": None, "glfw": None}
     check = check_packages("client packages", ("av", "lz4"), versions)
     assert check.fix == "pip install av lz4"

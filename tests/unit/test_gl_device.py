@@ -6,7 +6,7 @@ from contextlib import ExitStack
 
 import pytest
 
-from clients.commands.doctor_checks import gl_devices
+from clients.commands.doctor import gl_devices
 from filter_service.errors import RenderFailed
 from filter_service.filtering.choose_engine import open_engine
 from filter_service.gl import choose_device

@@ -294,7 +294,7 @@ def test_numbers_as_people_read_them(value, unit, text):
 
 def test_the_command_writes_the_page(tmp_path):
     out = tmp_path / "paper.html"
-    command = [sys.executable, "-m", "filter_service", "paper", "--json", "-o"]
+    command = [sys.executable, "-m", "ocufilter", "paper", "--json", "-o"]
     finished = subprocess.run(
         [*command, str(out)], cwd=ROOT, capture_output=True, text=True
     )
@@ -308,7 +308,7 @@ def test_the_command_writes_the_page(tmp_path):
 
 
 def test_quick_alone_is_refused(tmp_path):
-    command = [sys.executable, "-m", "filter_service", "paper", "--quick"]
+    command = [sys.executable, "-m", "ocufilter", "paper", "--quick"]
     finished = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert finished.returncode == 2
     assert finished.stderr.count("\n") == 1

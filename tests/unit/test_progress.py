@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from clients.commands.console import print_line
+from filter_service.command_line import print_line
 from filter_service.progress import Progress
 from tests.source_tree import ROOT
 

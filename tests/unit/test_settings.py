@@ -9,8 +9,8 @@ import pytest
 from msgspec import Meta
 from typer.testing import CliRunner
 
+from clients.commands.options import with_setting_options
 from clients.commands.program import app
-from clients.commands.setting_options import with_setting_options
 from filter_service.camera import Camera
 from filter_service.errors import BadMessage
 from filter_service.settings import (

@@ -24,7 +24,7 @@ from tests.openxr_layer.applications.applications import (
 )
 from tests.openxr_layer.layered import layer_environment
 
-LAYER = (sys.executable, "-m", "clients.commands.program", "layer")
+LAYER = (sys.executable, "-m", "ocufilter", "layer")
 EYES = (
     *("--left", json.dumps({"kind": "prescription", "sphere_dpt": -4.0})),
     *("--right", "emmetropia", "--focus-dpt", "0", "--pupil-mm", "6"),

@@ -1,11 +1,14 @@
-"""`ocufilter serve`: run the service."""
+"""`ocufilter serve`, or ``python -m filter_service``: run the service."""
 
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
+from filter_service.command_line import app_of, run
 from filter_service.settings import Engine
 
 
@@ -80,3 +83,13 @@ def serve(
         store_cache_dir=None if keep_eyes is None else str(keep_eyes.absolute()),
     )
     service_launch.run(load(), reload_config=load)
+
+
+def main() -> None:
+    """Run the service with the options of `ocufilter serve`, which need no client.
+
+    python -m filter_service serve --bind tcp://127.0.0.1:5577
+    """
+    if sys.argv[1:2] == ["serve"]:  # the only command
+        del sys.argv[1]
+    run(app_of(serve), "python -m filter_service")

@@ -1,4 +1,4 @@
-"""Checks of this machine: what works, what is missing, and how to install it."""
+"""`ocufilter doctor`: what works on this machine, and what is missing."""
 
 import ctypes.util
 import json
@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from estimator.threads import thread_count
+from filter_service.command_line import CommandFailed, Json, print_json, print_line
 from filter_service.gl_device import (
     GL_DEVICE_VARIABLE,
     is_device_selected,
@@ -330,3 +331,45 @@ def what_works(ok: dict[str, bool]) -> dict[str, bool]:
 def install_commands(checks: list[Check]) -> list[str]:
     """Return the fixes of the checks that failed, each once."""
     return list(dict.fromkeys(c.fix for c in checks if not c.ok and c.fix))
+
+
+def doctor(json_output: Json = False) -> None:
+    """Check whether this machine has everything that ocufilter requires.
+
+    Prints how to install what is missing.  The exit code is 0 if the service can run
+    here and 1 if it cannot.
+
+    ocufilter doctor --json
+    """
+    report = examine()
+    if json_output:
+        print_json(report)
+    else:
+        _print_diagnosis(report)
+    if not report["ok"]:
+        fails = ", ".join(name for name, ok in report["works"].items() if not ok)
+        raise CommandFailed(f"the service cannot run here; failed: {fails}")
+
+
+def _print_diagnosis(report: dict[str, Any]) -> None:
+    machine = report["machine"]
+    print_line(
+        f"ocufilter {report['version']}, {machine['system']}, "
+        f"{machine['processor']}, {machine['n_cores']} cores"
+    )
+    for check in report["checks"]:
+        print_line(
+            f"  {'ok ' if check['ok'] else 'NO '} {check['name']}: {check['detail']}"
+        )
+    for name, value in report["gl"]["limits"].items():
+        print_line(f"      {name}: {value}")
+    for device in report["gl"]["devices"]:
+        found = device["renderer"] or f"no context: {device['error']}"
+        print_line(f"      EGL device {device['index']} ({device['name']}): {found}")
+    works = [name for name, ok in report["works"].items() if ok]
+    fails = [name for name, ok in report["works"].items() if not ok]
+    print_line("works here: " + (", ".join(works) or "nothing"))
+    if fails:
+        print_line("does not work here: " + ", ".join(fails))
+    for command in report["install"]:
+        print_line(f"install: {command}")

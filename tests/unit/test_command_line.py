@@ -1,0 +1,185 @@
+"""The table of commands, and errors that name the value and the likely mistake."""
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from clients.batch.options import arguments_of, batch_of
+from clients.commands.program import COMMANDS, app
+from clients.natural_eye import NaturalEye
+from filter_service import command_line
+from filter_service.command_line import (
+    check_range,
+    exit_code,
+    given_value,
+    likely_unit,
+)
+from tests.commands import run_command
+from tests.source_tree import ROOT
+
+
+def refused(capsys, *arguments):
+    """Run the command line; return its one line on stderr."""
+    assert exit_code(app, list(arguments), "ocufilter") == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
+FILTER = ("filter", "--color", "a.png", "--fov-deg", "50", "--profile", "myopia")
+FILTER += ("-o", "b.png", "--distance-m", "2")
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("--focus-dpt 2,5", "is '2,5'; allowed: a decimal point, as in 2.5"),
+        ("--distance-m 2m", "is '2m'; allowed: a number without 'm', as in 2"),
+        ("--pupil-mm wide", "is 'wide'; allowed: a number"),
+        ("--pupil-mm 0.004", "is 0.004; allowed: 0.5 to 9 mm (0.004 m is 4 mm)"),
+        ("--distance-m 0.01", "is 0.01; allowed: 0.05 to inf m"),
+        ("--gaze-h-deg 5deg", "is '5deg'; allowed: a number without 'deg', as in 5"),
+        ("--render-tolerance 9", "is 9; allowed: 0 to 8"),
+    ],
+)
+def test_a_command_names_the_value_and_the_likely_mistake(capsys, given, said):
+    option, value = given.split()
+    for arguments in ((option, value), (f"{option}={value}",)):
+        line = refused(capsys, *FILTER, *arguments)
+        assert line == f"ocufilter: {option} {said}"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("wavefront",), ("field",), ("psf", "--pixel-arcmin", "1", "-o", "a.npy")],
+)
+def test_a_wavelength_in_micrometers_is_recognized(capsys, command):
+    given = ("navarro", "--pupil-mm", "4", "--wavelength-nm", "0.555")
+    line = refused(capsys, *command, *given)
+    assert line.endswith(" nm (0.555 um is 555 nm)")
+
+
+@pytest.mark.parametrize("text", ["1,000,000", "2 5", "0x10", "4" * 99 + "q"])
+def test_what_is_no_number_is_named(capsys, text):
+    line = refused(capsys, *FILTER, f"--fov-deg={text}")
+    assert line.startswith(f"ocufilter: --fov-deg is '{text[:60]}'; allowed: a number")
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("demo --frames 2.5", "--frames is '2.5'; allowed: an integer"),
+        ("demo --frames 0", "--frames is '0'; allowed: 1 or more"),
+        ("latency --frames=200000", "--frames is '200000'; allowed: 100000 or less"),
+        ("serve --engine cuda", "--engine is 'cuda'; allowed: auto, gl, native"),
+        ("psf navarro --method=dct", "--method is 'dct'; allowed: auto, fourier, "),
+        ("fliter", "No such command 'fliter'. Did you mean 'filter'?"),
+        ("psf", "Missing argument 'eye'."),
+    ],
+)
+def test_a_refusal_names_the_value_and_what_is_allowed(capsys, given, said):
+    assert refused(capsys, *given.split()).startswith(f"ocufilter: {said}")
+
+
+@pytest.fixture(scope="module")
+def help_text():
+    return run_command("--help").stdout
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_and_a_summary_that_is_not_cut(help_text, name):
+    assert f"  {name:<9}  {COMMANDS[name][1]}\n" in help_text
+    shown = run_command(name, "--help")
+    assert shown.returncode == 0, shown.stderr
+    assert shown.stdout.lower().startswith(f"usage: ocufilter {name} ")
+
+
+def modules_loaded(script, *words):
+    """Run a script; return the modules that it has loaded at its end."""
+    finished = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            f"{script}\nprint(*sys.modules, file=sys.stderr)",
+            *words,
+        ],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert finished.returncode == 0, finished.stderr
+    return set(finished.stderr.split()), finished.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "home"),
+    [("--version", None), ("--help", None), ("status -h", "clients.commands.service")],
+)
+def test_a_command_loads_no_other(words, home):
+    script = (
+        "import sys\n"
+        "from filter_service.command_line import exit_code\n"
+        "from clients.commands.program import app\n"
+        "assert exit_code(app, sys.argv[1:], 'ocufilter') == 0"
+    )
+    loaded, _ = modules_loaded(script, *words.split())
+    homes = {target.partition(":")[0] for target, _ in COMMANDS.values()}
+    assert loaded & homes == {home} - {None}
+    assert home or "numpy" not in loaded
+
+
+def test_the_service_starts_without_the_clients():
+    script = (
+        "import sys, runpy\n"
+        "try:\n    runpy.run_module('filter_service', run_name='__main__')\n"
+        "except SystemExit as ended:\n    assert ended.code == 0"
+    )
+    for words in (["serve", "--help"], ["--help"]):
+        loaded, shown = modules_loaded(script, *words)
+        assert "--bind ENDPOINT" in shown
+        assert "filter_service.serve" in loaded
+        assert not [name for name in loaded if name.split(".")[0] == "clients"]
+
+
+def test_a_program_of_its_own_says_the_same(capsys):
+    given = ["room", "-p", "myopia", "-o", "out"]
+    with pytest.raises(SystemExit):
+        arguments_of([*given, "--pupil-mm", "4,5"])
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert "--pupil-mm: '4,5' is not a number; allowed: a decimal point" in last
+    with pytest.raises(ValueError, match=r"allowed: 0\.5 to 9 mm \(0\.004 m is 4 mm\)"):
+        batch_of(arguments_of([*given, "--pupil-mm", "0.004"]))
+    with pytest.raises(ValueError, match=r"0\.004; allowed: .* \(0\.004 m is 4 mm\)"):
+        NaturalEye(pupil_diameter_mm=0.004)
+
+
+@pytest.mark.parametrize("focus", ["2,5", "2.5dpt"])
+def test_a_focus_of_a_batch_is_a_number_or_the_center(tmp_path, focus):
+    from PIL import Image
+
+    for name in ("a_color.png", "a_depth.png"):
+        Image.new("I;16" if "depth" in name else "RGB", (4, 4)).save(tmp_path / name)
+    given = [str(tmp_path), "-p", "myopia", "-o", str(tmp_path / "out")]
+    options = arguments_of([*given, "--fov-deg", "40", "--focus-dpt", focus])
+    with pytest.raises(
+        ValueError, match=rf"--focus-dpt is '{focus}'; .*2\.5, or center"
+    ):
+        batch_of(options)
+
+
+def test_a_number_outside_its_range_is_named():
+    check_range("--pupil-mm", 0.5, (0.5, 9.0))
+    with pytest.raises(ValueError, match="--pupil-mm is nan"):
+        check_range("--pupil-mm", float("nan"), (0.5, 9.0))
+    assert likely_unit("--count", 5.0, (1.0, 2.0)) == ""
+    assert likely_unit("--focus-dpt", 25.0, (0.0, 20.0)) == " dpt"
+
+
+def test_the_last_value_of_an_option_counts():
+    given = ["--pupil-mm", "1", "-x", "--pupil-mm=2", "--pupil"]
+    assert given_value(["--pupil-mm"], given) == "2"
+    assert given_value(["--pupil"], given) is None
+    assert given_value(["--focus"], given) is None
+    error = SimpleNamespace(format_message=lambda: "Missing option.")
+    assert command_line._with_value(error, given) == "Missing option."
