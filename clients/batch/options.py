@@ -1,29 +1,30 @@
-"""Command line of `ocufilter batch`, parsed and checked."""
+"""Options of `ocufilter batch`, and the batch that they describe."""
 
 from __future__ import annotations
 
-import argparse
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from clients.arguments import read_object
+import typer
+
 from clients.batch.job import (
-    FORMATS,
     LINEAR_FORMATS,
     VIDEO_FORMATS,
+    Format,
     Job,
     batch_settings,
 )
-from clients.batch.layouts import LAYOUTS, LayoutOptions, list_frames, optics_of
+from clients.batch.layouts import LayoutOptions, list_frames, optics_of
 from clients.batch.run import Batch
 from clients.batch.source import SourceFrame
 from clients.batch.states import CENTER, States, read_states
-from clients.option_values import a_number, check_range, likely_number
+from clients.commands.options import read_object
 from estimator import InvalidFile, load_profile, profile_body, thread_count
+from filter_service.command_line import check_range, likely_number
 from filter_service.settings import (
     MAX_PUPIL_MM,
     MAX_RENDER_TOLERANCE,
@@ -31,170 +32,134 @@ from filter_service.settings import (
     MIN_PUPIL_MM,
 )
 
-DESCRIPTION = """\
-Filter folders and videos of color and depth on all cores, each frame through each
-profile.  Run the same command again to continue an interrupted batch.
-
-  ocufilter batch rgbd_dataset_freiburg1_desk -p myopia -p keratoconus -o seen
-  ocufilter batch room/ -p me.json --fov-deg 50 --focus-dpt center -o room_seen
-  ocufilter batch walk.mp4 --depth walk_depth.mkv --fov-deg 60 -p myopia \\
-      --format h264 -o walk_seen
-"""
-
-LAYOUT_HELP = """\
-layouts, detected from the content of the folder:
-  tum         TUM RGB-D: rgb/, depth/ and their lists; depth / 5000, driver's camera
-  nyu         NYU depth v2: N_colors.png with N_depth.png, rgb_N.jpg with
-              sync_depth_N.png (mm), or raw dumps r-*.ppm with d-*.pgm
-  middlebury  im0.png, disp0.pfm, calib.txt of one scene or of a folder of scenes
-  pairs       color/ and depth/, or NAME_color with NAME_depth; depth as 16-bit PNG,
-              float TIFF, NPY, EXR or PFM; requires --fov-deg or --intrinsics
-  video       a color video, with depth as a 16-bit gray video or a folder of images
-
-results: OUT/PROFILE/FRAME.png or OUT/PROFILE.mkv; a line for each frame in
-OUT/manifest.jsonl, and a summary in OUT/manifest.json.  Exit codes: 0 success, 1 some
-frames failed, 2 invalid input.
-"""
-
+Layout = Literal["auto", "tum", "nyu", "middlebury", "pairs", "video"]
 FPS_LIMITS_HZ = (0.1, 1000.0)
 _NAME = re.compile(r"[^\w.+-]+")
 
 
-def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Return the parsed command line."""
-    parser = argparse.ArgumentParser(
-        prog="ocufilter batch",
-        description=DESCRIPTION,
-        epilog=LAYOUT_HELP,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("input", type=Path, metavar="INPUT", help="folder or video")
-    parser.add_argument(
-        *("-o", "--out"), type=Path, required=True, metavar="DIR", help="output folder"
-    )
-    parser.add_argument(
-        *("-p", "--profile"),
-        action="append",
-        required=True,
-        metavar="P",
-        help="preset name, a .json, .abp, .csv or .zmx file, or JSON; repeatable; "
-        "NAME=P sets the name of its folder",
-    )
-    _add_source(parser.add_argument_group("input"))
-    _add_eye(parser.add_argument_group("eye and filter"))
-    _add_results(parser.add_argument_group("output"))
-    _add_machines(parser.add_argument_group("workers"))
-    return parser.parse_args(argv)
+@dataclass(frozen=True, kw_only=True)
+class BatchOptions:
+    """Options of the command line."""
+
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="INPUT", help="Folder or video."),
+    ]
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="DIR", help="Output folder.")
+    ]
+    profile: Annotated[
+        list[str],
+        typer.Option(
+            "--profile",
+            "-p",
+            metavar="P",
+            help="Preset name, a .json, .abp, .csv or .zmx file, or JSON; repeatable.  "
+            "NAME=P sets the name of its folder.",
+        ),
+    ]
+    layout: Annotated[
+        Layout,
+        typer.Option(help="Layout of a folder; auto detects it from the content."),
+    ] = "auto"
+    depth: Annotated[
+        Path | None,
+        typer.Option(metavar="PATH", help="Folder or video of depth."),
+    ] = None
+    depth_scale: Annotated[
+        float | None,
+        typer.Option(metavar="M", help="Meters per unit of depth."),
+    ] = None
+    fov_deg: Annotated[
+        float | None, typer.Option(help="Vertical field of view, deg.")
+    ] = None
+    intrinsics: Annotated[
+        str | None,
+        typer.Option(metavar="FX,FY,CX,CY", help="Camera matrix in px."),
+    ] = None
+    limit: Annotated[
+        int | None, typer.Option(metavar="N", help="Use the first N frames only.")
+    ] = None
+    pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")] = 4.0
+    focus_dpt: Annotated[
+        str,
+        typer.Option(
+            metavar="DPT|center",
+            help="Focus distance, dpt, or the depth at the center of each frame; 0 is "
+            "infinity.",
+        ),
+    ] = "0"
+    states: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CSV",
+            help="A line for each frame, with the columns frame, pupil_mm and "
+            "focus_dpt.",
+        ),
+    ] = None
+    settings: Annotated[
+        str,
+        typer.Option(
+            metavar="JSON",
+            help='Settings such as {"mode": "quality", "object_range_dpt": [0, 5]}.',
+        ),
+    ] = "{}"
+    render_tolerance: Annotated[
+        float,
+        typer.Option(help="Rendering error relative to the default; 0 is exact."),
+    ] = 1.0
+    format: Annotated[
+        Format,
+        typer.Option(
+            help="png: sRGB; npy, exr: linear light; ffv1: lossless video; h264: video."
+        ),
+    ] = "png"
+    half: Annotated[
+        bool, typer.Option("--half", help="Write half floats to npy or exr.")
+    ] = False
+    fps: Annotated[
+        float | None,
+        typer.Option(
+            help="Frame rate of videos; by default the times of the input video, or 30."
+        ),
+    ] = None
+    overwrite: Annotated[
+        bool,
+        typer.Option(
+            "--overwrite", help="Delete the output of another job in the folder."
+        ),
+    ] = False
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Estimate time and cost, then stop.")
+    ] = False
+    price_per_core_hour: Annotated[
+        float | None, typer.Option(metavar="X", help="Price for --dry-run.")
+    ] = None
+    workers: Annotated[
+        int | None, typer.Option(help="Number of processes; by default one per core.")
+    ] = None
+    threads: Annotated[
+        int | None,
+        typer.Option(help="Threads per worker; by default cores / workers."),
+    ] = None
+    engine: Annotated[
+        Literal["native", "gl"],
+        typer.Option(
+            help="native: CPU, with the same results on all machines; gl: GPU, with "
+            "one worker by default."
+        ),
+    ] = "native"
+    ray: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Ray cluster that shares INPUT and OUT: auto, an address, or local; "
+            "requires the extra batch-ray.",
+        ),
+    ] = None
 
 
-def _add_source(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--layout", default="auto", choices=LAYOUTS, help="default: detected"
-    )
-    group.add_argument(
-        "--depth", type=Path, metavar="PATH", help="folder or video of depth"
-    )
-    group.add_argument(
-        "--depth-scale", type=a_number, metavar="M", help="meters per unit of depth"
-    )
-    group.add_argument("--fov-deg", type=a_number, help="vertical field of view, deg")
-    group.add_argument("--intrinsics", metavar="FX,FY,CX,CY", help="camera in px")
-    group.add_argument(
-        "--limit", type=int, metavar="N", help="use the first N frames only"
-    )
-
-
-def _add_eye(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--pupil-mm",
-        type=a_number,
-        default=4.0,
-        help="entrance pupil, mm (default: 4)",
-    )
-    group.add_argument(
-        "--focus-dpt",
-        default="0",
-        metavar="DPT|center",
-        help="focus distance, or the depth at the center of each frame (default: 0, "
-        "infinity)",
-    )
-    group.add_argument(
-        "--states",
-        type=Path,
-        metavar="CSV",
-        help="a line for each frame, with the columns frame, pupil_mm and focus_dpt",
-    )
-    group.add_argument(
-        "--settings",
-        default="{}",
-        metavar="JSON",
-        help='settings such as {"mode": "quality", "object_range_dpt": [0, 5]}',
-    )
-    group.add_argument(
-        "--render-tolerance",
-        type=a_number,
-        default=1.0,
-        help="rendering error relative to the default; 0 is exact (default: 1)",
-    )
-
-
-def _add_results(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--format",
-        default="png",
-        choices=FORMATS,
-        help="png: sRGB; npy, exr: linear light; ffv1: lossless video; h264: video",
-    )
-    group.add_argument(
-        "--half", action="store_true", help="write half floats to npy or exr"
-    )
-    group.add_argument(
-        "--fps",
-        type=a_number,
-        help="frame rate of videos (default: the times of the input video, or 30)",
-    )
-    group.add_argument(
-        "--overwrite",
-        action="store_true",
-        help="delete the output of another job in the folder",
-    )
-    group.add_argument(
-        "--dry-run",
-        action="store_true",
-        help="estimate time and cost, and stop",
-    )
-    group.add_argument(
-        "--price-per-core-hour",
-        type=a_number,
-        metavar="X",
-        help="price for --dry-run",
-    )
-    group.add_argument("--json", action="store_true", help="print one JSON object")
-
-
-def _add_machines(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--workers", type=int, help="number of processes (default: one per core)"
-    )
-    group.add_argument(
-        "--threads", type=int, help="threads per worker (default: cores / workers)"
-    )
-    group.add_argument(
-        "--engine",
-        default="native",
-        choices=("native", "gl"),
-        help="native: CPU, with the same results on all machines; gl: GPU, with one "
-        "worker by default",
-    )
-    group.add_argument(
-        "--ray",
-        metavar="ADDRESS",
-        help="use a Ray cluster that shares INPUT and OUT: auto, an address, or local "
-        "(requires the extra batch-ray)",
-    )
-
-
-def batch_of(options: argparse.Namespace) -> Batch:
+def batch_of(options: BatchOptions) -> Batch:
     """Return the batch that the command line describes.
 
     Raises
@@ -208,7 +173,7 @@ def batch_of(options: argparse.Namespace) -> Batch:
         optics_of(options.fov_deg, options.intrinsics),
         options.depth_scale,
     )
-    layout, frames = list_frames(options.input, options.layout, layout_options)
+    layout, frames = list_frames(options.source, options.layout, layout_options)
     frames = frames[: options.limit]
     if options.fps is not None:
         frames = [replace(frame, time_s=None) for frame in frames]
@@ -223,10 +188,10 @@ def batch_of(options: argparse.Namespace) -> Batch:
         render_tolerance=options.render_tolerance,
         rate_hz=_rate_hz(options, frames),
     )
-    return Batch(job, layout, options.input, frames, options.out)
+    return Batch(job, layout, options.source, frames, options.out)
 
 
-def workers_and_threads(options: argparse.Namespace) -> tuple[int, int]:
+def workers_and_threads(options: BatchOptions) -> tuple[int, int]:
     """Return the number of processes, and of threads in each.
 
     One process per core filters more frames than one process with as many threads
@@ -238,7 +203,7 @@ def workers_and_threads(options: argparse.Namespace) -> tuple[int, int]:
     return n_workers, options.threads or max(1, n_cores // n_workers)
 
 
-def _check(options: argparse.Namespace) -> None:
+def _check(options: BatchOptions) -> None:
     limits: Mapping[str, tuple[float, float]] = {
         "pupil_mm": (MIN_PUPIL_MM, MAX_PUPIL_MM),
         "render_tolerance": (0.0, MAX_RENDER_TOLERANCE),
@@ -261,7 +226,7 @@ def _check(options: argparse.Namespace) -> None:
         raise ValueError(f"--out '{options.out}' is a file; allowed: a folder")
 
 
-def _states(options: argparse.Namespace, names: Sequence[str]) -> States:
+def _states(options: BatchOptions, names: Sequence[str]) -> States:
     focus_dpt: float | None = None
     if options.focus_dpt != CENTER:
         try:
@@ -313,7 +278,7 @@ def read_profiles(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _rate_hz(options: argparse.Namespace, frames: Sequence[SourceFrame]) -> float:
+def _rate_hz(options: BatchOptions, frames: Sequence[SourceFrame]) -> float:
     if options.fps is not None:
         return float(options.fps)
     if frames[0].color_index is None:

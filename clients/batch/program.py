@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import signal
 import sys
 from collections.abc import Sequence
 from typing import Any
 
+import typer
+
 from clients.batch.dry_run import dry_run, lines_of
 from clients.batch.exact_filter import EngineUnusable
 from clients.batch.manifest import Manifest, note_line
-from clients.batch.options import arguments_of, batch_of, workers_and_threads
+from clients.batch.options import BatchOptions, batch_of, workers_and_threads
 from clients.batch.process_pool import THREADS_VARIABLE, ProcessPool
 from clients.batch.run import (
     Batch,
@@ -24,15 +24,22 @@ from clients.batch.run import (
     only_one,
     run_batch,
 )
+from clients.commands.options import with_options
 from estimator.bounded_files import printable
-from filter_service.errors import FilterError
+from filter_service.command_line import (
+    EXIT_FAILURE,
+    EXIT_INTERRUPTED,
+    CommandFailed,
+    Json,
+    print_json,
+)
 from filter_service.progress import Progress
 
 SHOWN_FAILURES = 10
 INSTALL = f"{sys.executable} -m pip install"
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: BatchOptions, *, quiet: bool) -> dict[str, Any]:
     """Run the batch; return its summary.
 
     Raises
@@ -56,7 +63,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
             begin_anew(batch)
         with (
             Manifest(batch.out, batch.described()) as manifest,
-            Progress("batch", quiet=options.json) as progress,
+            Progress("batch", quiet=quiet) as progress,
         ):
             task = progress.task(
                 ", ".join(batch.job.profiles),
@@ -68,7 +75,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _pool(
-    options: argparse.Namespace,
+    options: BatchOptions,
     batch: Batch,
     n_workers: int,
     n_threads: int,
@@ -89,7 +96,7 @@ def _pool(
     )
 
 
-def report_lines(summary: dict[str, Any], options: argparse.Namespace) -> list[str]:
+def report_lines(summary: dict[str, Any], options: BatchOptions) -> list[str]:
     """Format the summary as lines of text."""
     this_run = summary["this_run"]
     n_all, n_failed = summary["frames"], len(summary["failures"])
@@ -116,43 +123,63 @@ def failure_lines(summary: dict[str, Any]) -> list[str]:
     return lines
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the program; return its exit code."""
-    options = arguments_of(argv)
+@with_options
+def batch(options: BatchOptions, json_output: Json = False) -> None:
+    """Filter folders and videos of color and depth on all cores, through each profile.
+
+    Run the same command again to continue an interrupted batch.
+
+    ocufilter batch rgbd_dataset_freiburg1_desk -p myopia -p keratoconus -o seen
+
+    ocufilter batch room/ -p me.json --fov-deg 50 --focus-dpt center -o room_seen
+
+    ocufilter batch walk.mp4 --depth walk_depth.mkv --fov-deg 60 -p myopia
+    --format h264 -o walk_seen
+
+    \b
+    Layouts, detected from the content of the folder:
+      tum         TUM RGB-D: rgb/, depth/ and their lists; depth / 5000,
+                  camera of the driver
+      nyu         NYU depth v2: N_colors.png with N_depth.png, rgb_N.jpg with
+                  sync_depth_N.png (mm), or raw dumps r-*.ppm with d-*.pgm
+      middlebury  im0.png, disp0.pfm, calib.txt of one scene or of a folder
+                  of scenes
+      pairs       color/ and depth/, or NAME_color with NAME_depth; depth as
+                  16-bit PNG, float TIFF, NPY, EXR or PFM; requires --fov-deg
+                  or --intrinsics
+      video       a color video, with depth as a 16-bit gray video or a folder
+                  of images
+
+    Results are OUT/PROFILE/FRAME.png or OUT/PROFILE.mkv, with a line for each frame in
+    OUT/manifest.jsonl and a summary in OUT/manifest.json.  The exit code is 1 if some
+    frames failed.
+    """  # noqa: D301  (\b keeps the lines of the list)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        summary = run(options)
+        summary = run(options, quiet=json_output)
     except KeyboardInterrupt:
-        print("batch: stopped; run the same command again to continue", file=sys.stderr)
-        return 130
+        sys.stderr.write("batch: stopped; run the same command again to continue\n")
+        raise typer.Exit(EXIT_INTERRUPTED) from None
     except ModuleNotFoundError as error:
         if error.name not in ("av", "ray"):
             raise
         extra = "batch" if error.name == "av" else "batch-ray"
-        print(
-            f"batch: {error.name} is not installed: {INSTALL} 'ocufilter[{extra}]'",
-            file=sys.stderr,
-        )
-        return 1
-    except ValueError as error:
-        print(f"batch: {printable(' '.join(str(error).split()))}", file=sys.stderr)
-        return 2
-    except (EngineUnusable, FilterError, OSError) as error:
-        print(f"batch: {printable(str(error))}", file=sys.stderr)
-        return 1
-    if options.json:
-        lines = [json.dumps(summary, allow_nan=False)]  # ASCII of any length
+        raise CommandFailed(
+            f"{error.name} is not installed: {INSTALL} 'ocufilter[{extra}]'"
+        ) from None
+    except EngineUnusable as error:
+        raise CommandFailed(str(error)) from error
+    if json_output:
+        print_json(summary)
     elif options.dry_run:
-        lines = [*map(printable, lines_of(summary, options.price_per_core_hour))]
+        _print(lines_of(summary, options.price_per_core_hour))
     else:
-        lines = [*map(printable, report_lines(summary, options))]
-    sys.stdout.write("\n".join(lines) + "\n")
-    if options.dry_run and all(p["errors"] for p in summary["profiles"]):
-        return 1
+        _print(report_lines(summary, options))
     failures = failure_lines(summary)
     sys.stderr.writelines(f"{printable(line)}\n" for line in failures)
-    return 1 if failures else 0
+    if failures or (options.dry_run and all(p["errors"] for p in summary["profiles"])):
+        raise typer.Exit(EXIT_FAILURE)
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def _print(lines: Sequence[str]) -> None:
+    sys.stdout.writelines(f"{printable(line)}\n" for line in lines)

@@ -42,7 +42,7 @@ COMMANDS = {
         "Filter one image with depth through one eye.",
     ),
     "batch": (
-        "clients.commands.pending:batch",
+        "clients.batch.program:batch",
         "Filter folders and videos of color and depth, on all cores.",
     ),
     "estimate": (

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clients.batch import program
 from clients.batch.exact_filter import ExactFilter
 from clients.batch.job import Job, batch_settings
 from clients.batch.layouts import LayoutOptions, list_frames
@@ -24,7 +23,9 @@ from clients.batch.manifest import Manifest
 from clients.batch.source import FieldOfView
 from clients.batch.states import States
 from clients.batch.work import Unit, UnitRunner
+from clients.commands.program import app
 from filter_service import Camera, RgbdView
+from filter_service.command_line import exit_code
 from filter_service.image_files import read_color
 from tests.batch_kills import (
     MARK,
@@ -246,7 +247,8 @@ def test_a_rerun_does_only_what_is_missing(room, usual, tmp_path):
 
 def refusal(capsys, *arguments):
     """Return the one line that the program, run here, refuses its arguments with."""
-    assert program.main(list(map(str, arguments))) == 2
+    words = ["batch", *map(str, arguments)]
+    assert exit_code(app, words, "ocufilter") == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     return error

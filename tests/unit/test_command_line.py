@@ -3,10 +3,12 @@
 import subprocess
 import sys
 from types import SimpleNamespace
+from typing import get_args
 
 import pytest
 
-from clients.batch.options import arguments_of, batch_of
+from clients.batch.layouts import LAYOUTS
+from clients.batch.options import Layout
 from clients.commands.program import COMMANDS, app
 from clients.natural_eye import NaturalEye
 from filter_service import command_line
@@ -92,7 +94,7 @@ def test_every_command_has_help_and_a_summary_that_is_not_cut(help_text, name):
     assert f"  {name:<9}  {COMMANDS[name][1]}\n" in help_text
     shown = run_command(name, "--help")
     assert shown.returncode == 0, shown.stderr
-    assert shown.stdout.lower().startswith(f"usage: ocufilter {name} ")
+    assert shown.stdout.startswith(f"Usage: ocufilter {name} ")
 
 
 def modules_loaded(script, *words):
@@ -142,30 +144,29 @@ def test_the_service_starts_without_the_clients():
         assert not [name for name in loaded if name.split(".")[0] == "clients"]
 
 
-def test_a_program_of_its_own_says_the_same(capsys):
-    given = ["room", "-p", "myopia", "-o", "out"]
-    with pytest.raises(SystemExit):
-        arguments_of([*given, "--pupil-mm", "4,5"])
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert "--pupil-mm: '4,5' is not a number; allowed: a decimal point" in last
-    with pytest.raises(ValueError, match=r"allowed: 0\.5 to 9 mm \(0\.004 m is 4 mm\)"):
-        batch_of(arguments_of([*given, "--pupil-mm", "0.004"]))
+def test_a_pupil_in_meters_is_recognized(capsys):
+    line = refused(
+        capsys, *["batch", "room", "-p", "myopia", "-o", "out", "--pupil-mm", "0.004"]
+    )
+    assert line.endswith("--pupil-mm is 0.004; allowed: 0.5 to 9 mm (0.004 m is 4 mm)")
     with pytest.raises(ValueError, match=r"0\.004; allowed: .* \(0\.004 m is 4 mm\)"):
         NaturalEye(pupil_diameter_mm=0.004)
 
 
 @pytest.mark.parametrize("focus", ["2,5", "2.5dpt"])
-def test_a_focus_of_a_batch_is_a_number_or_the_center(tmp_path, focus):
+def test_a_focus_of_a_batch_is_a_number_or_the_center(tmp_path, capsys, focus):
     from PIL import Image
 
     for name in ("a_color.png", "a_depth.png"):
         Image.new("I;16" if "depth" in name else "RGB", (4, 4)).save(tmp_path / name)
     given = [str(tmp_path), "-p", "myopia", "-o", str(tmp_path / "out")]
-    options = arguments_of([*given, "--fov-deg", "40", "--focus-dpt", focus])
-    with pytest.raises(
-        ValueError, match=rf"--focus-dpt is '{focus}'; .*2\.5, or center"
-    ):
-        batch_of(options)
+    line = refused(capsys, "batch", *given, "--fov-deg", "40", "--focus-dpt", focus)
+    assert line.startswith(f"ocufilter: --focus-dpt is '{focus}'; ")
+    assert line.endswith("2.5, or center")
+
+
+def test_the_layouts_of_a_batch_are_those_that_it_reads():
+    assert get_args(Layout) == LAYOUTS
 
 
 def test_a_number_outside_its_range_is_named():
