@@ -28,5 +28,4 @@ def _program(module: str) -> typer.Typer:
 
 headset = _program("clients.headset.program")
 layer = _program("clients.openxr_layer.program")
-report = _program("clients.report.program")
 web = _program("clients.web.program")

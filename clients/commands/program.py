@@ -62,7 +62,7 @@ COMMANDS = {
         "Compute one PSF as an array or an image.",
     ),
     "report": (
-        "clients.commands.pending:report",
+        "clients.report.program:report",
         "Write a report on one eye, or a comparison of two.",
     ),
     "headset": (

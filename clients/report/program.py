@@ -1,31 +1,11 @@
-"""Write a report on one eye, or a comparison of two.
+"""`ocufilter report`: write a report on one eye, or a comparison of two."""
 
-    ocufilter report keratoconus -o eye.html
-    ocufilter report eye.json -o eye.pdf
-    ocufilter report before.json after.json -o surgery.pdf
-    ocufilter report myopia -o eye.html --people 20
-
-A profile is a preset name, a .json, .abp, .csv or .zmx file, or a JSON object.  The
-report begins with a summary: refraction, acuity, wavefront, point images, contrast, a
-letter chart near and far.  Then it shows the visual field, acuity by distance, the
-estimated eye, which data were measured or assumed, and the literature references.  The
-HTML file is self-contained and prints on A4.  The PDF is tagged for screen readers; it
-needs the packages of ocufilter[report].
-
-With --people, the report of one eye shows how people with this prescription, or with
-this wavefront on the axis, differ: bands around curves from the 5th to the 95th
-percentile of persons drawn from the population.
-"""
-
-from __future__ import annotations
-
-import argparse
-import json
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Annotated
+
+import typer
 
 from clients.figures.study import profile_of
 from clients.report.labels import check_text, shortened
@@ -38,131 +18,122 @@ from clients.report.make import (
     write_report,
 )
 from clients.report.origin import Record
-from filter_service.errors import FilterError
+from filter_service.command_line import CommandFailed, Json, print_json, print_line
 from filter_service.image_files import check_output
 from filter_service.progress import Progress
 
 
-class _Parser(argparse.ArgumentParser):
-    """Argument parser that reports errors in one line, like other errors."""
+def report(
+    profile: Annotated[
+        str,
+        typer.Argument(
+            metavar="PROFILE",
+            help="Preset name, .json, .abp, .csv or .zmx file, or JSON object.",
+        ),
+    ],
+    after: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="AFTER",
+            help="Profile to compare with, such as after surgery or with spectacles.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", metavar="OUT", help="File to write: .html or .pdf."
+        ),
+    ] = None,
+    name: Annotated[
+        str, typer.Option(help="Name of the first eye in the report.")
+    ] = "",
+    after_name: Annotated[
+        str, typer.Option(help="Name of the second eye in the report.")
+    ] = "",
+    reference: Annotated[
+        str,
+        typer.Option(
+            metavar="TEXT", help="Record or order number, shown on each page."
+        ),
+    ] = "",
+    patient: Annotated[
+        str, typer.Option(metavar="TEXT", help="Patient name, shown on each page.")
+    ] = "",
+    examiner: Annotated[
+        str, typer.Option(metavar="TEXT", help="Examiner name, shown in the header.")
+    ] = "",
+    no_charts: Annotated[
+        bool, typer.Option("--no-charts", help="Omit the letter charts; faster.")
+    ] = False,
+    people: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Persons to draw for bands around the curves, 2 to 1000; takes 0.3 s "
+            "per person on two cores, 0.1 s with a wavefront measured on the axis.",
+        ),
+    ] = None,
+    json_output: Json = False,
+) -> None:
+    """Write a report on one eye, or a comparison of two, as HTML or PDF.
 
-    def error(self, message: str) -> NoReturn:
-        raise ValueError(f"{message}; see --help")
+    ocufilter report keratoconus -o eye.html
 
+    ocufilter report eye.json -o eye.pdf
 
-def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Parse the command line."""
-    parser = _Parser(
-        prog="ocufilter report",
-        allow_abbrev=False,
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "profile", help="preset name, .json, .abp, .csv or .zmx file, or JSON object"
-    )
-    parser.add_argument(
-        "after",
-        nargs="?",
-        help="profile to compare with, such as after surgery or with spectacles",
-    )
-    parser.add_argument(
-        "-o", "--out", type=Path, metavar="OUT", help="file to write: .html or .pdf"
-    )
-    parser.add_argument(
-        "--name", default="", help="name of the first eye in the report"
-    )
-    parser.add_argument(
-        "--after-name", default="", help="name of the second eye in the report"
-    )
-    parser.add_argument(
-        "--reference",
-        default="",
-        metavar="TEXT",
-        help="record or order number, shown on each page",
-    )
-    parser.add_argument(
-        "--patient", default="", metavar="TEXT", help="patient name, shown on each page"
-    )
-    parser.add_argument(
-        "--examiner",
-        default="",
-        metavar="TEXT",
-        help="examiner name, shown in the header",
-    )
-    parser.add_argument(
-        "--no-charts", action="store_true", help="omit the letter charts (faster)"
-    )
-    parser.add_argument(
-        "--people",
-        type=int,
-        metavar="N",
-        help="persons to draw for bands around the curves, 2 to 1000; takes 0.3 s per "
-        "person on two cores, 0.1 s with a wavefront measured on the axis",
-    )
-    parser.add_argument(
-        "--json", action="store_true", help="print the numbers as one JSON object"
-    )
-    return parser.parse_args(argv)
+    ocufilter report before.json after.json -o surgery.pdf
 
+    ocufilter report myopia -o eye.html --people 20
 
-def run(options: argparse.Namespace) -> str:
-    """Write the requested report; return the text to print.
+    The report begins with a summary: refraction, acuity, wavefront, point images,
+    contrast, and a letter chart near and far.  Then it shows the visual field, acuity
+    by distance, the estimated eye, which data were measured or assumed, and the
+    literature references.  The HTML file is self-contained and prints on A4.  The PDF
+    is tagged for screen readers; it needs the packages of ocufilter[report].
 
-    Raises
-    ------
-    ValueError
-        If a profile, a text or a file name is invalid.
-    ReportError
-        If PDF output is unavailable (missing dependency).
+    With --people, the report of one eye shows how people with this prescription, or
+    with this wavefront on the axis, differ: bands around curves from the 5th to the
+    95th percentile of persons drawn from the population.
     """
-    _check_out(options)
-    record = Record(
-        patient=options.patient,
-        examiner=options.examiner,
-        reference=options.reference,
-    )
-    if options.out is not None and options.out.suffix.lower() == ".pdf":
-        check_pdf()
-    check_text("--name", options.name)
-    check_text("--after-name", options.after_name)
-    sources = [options.profile] + ([options.after] if options.after else [])
+    if out is not None:
+        check_output(out, SUFFIXES)
+    elif not json_output:
+        raise ValueError("--out is missing; expected a .html or .pdf file")
+    record = Record(patient=patient, examiner=examiner, reference=reference)
+    try:
+        if out is not None and out.suffix.lower() == ".pdf":
+            check_pdf()
+    except ReportError as error:
+        raise CommandFailed(str(error)) from None
+    check_text("--name", name)
+    check_text("--after-name", after_name)
+    sources = [profile] + ([after] if after else [])
     profiles = [profile_of(source) for source in sources]  # fail early
     labels = tuple(
-        name or _default_name(source)
-        for name, source in zip(
-            (options.name, options.after_name), sources, strict=False
-        )
+        given or _default_name(source)
+        for given, source in zip((name, after_name), sources, strict=False)
     )
     started_s = time.monotonic()
-    with Progress(quiet=options.json) as progress:
+    with Progress(quiet=json_output) as progress:
         task = progress.task("Report", total=1.0, unit="%")
         eyes = compute_eye_facts(
             list(profiles),
             labels=labels,
-            has_charts=not options.no_charts and options.out is not None,
-            people=options.people,
+            has_charts=not no_charts and out is not None,
+            people=people,
             progress=task.update,
         )
-        if options.out is not None:
-            write_report(eyes, options.out, record)
+        if out is not None:
+            write_report(eyes, out, record)
         task.update(1.0, "written")
-    if options.json:
-        return json.dumps(report_numbers(eyes), allow_nan=False)
-    for eye in eyes:
-        if eye.chart_problem and not options.no_charts:
-            print(f"note: no letter charts: {eye.chart_problem}", file=sys.stderr)
-    names = "".join(f"{eye.label}, " for eye in eyes if eye.label)
-    return f"{options.out}: {names}{time.monotonic() - started_s:.1f} s"
-
-
-def _check_out(options: argparse.Namespace) -> None:
-    out = options.out
-    if out is None:
-        if not options.json:
-            raise ValueError("--out is missing; expected a .html or .pdf file")
+    if json_output:
+        print_json(report_numbers(eyes))
         return
-    check_output(out, SUFFIXES)
+    for eye in eyes:
+        if eye.chart_problem and not no_charts:
+            sys.stderr.write(f"note: no letter charts: {eye.chart_problem}\n")
+    names = "".join(f"{eye.label}, " for eye in eyes if eye.label)
+    print_line(f"{out}: {names}{time.monotonic() - started_s:.1f} s")
 
 
 def _default_name(source: str) -> str:
@@ -170,23 +141,3 @@ def _default_name(source: str) -> str:
     if source.lstrip().startswith("{"):
         return ""
     return shortened(Path(source).stem if Path(source).suffix else source)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the program; return its exit code."""
-    try:
-        sys.stdout.write(run(arguments_of(argv)) + "\n")
-    except KeyboardInterrupt:
-        return 130
-    except (FilterError, ValueError) as error:
-        bad_input = isinstance(error, ValueError)
-        print(f"report: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2 if bad_input else 1
-    except (OSError, ReportError) as error:
-        print(f"report: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -45,7 +45,6 @@ from clients.report.make import document_of, write_report
 from clients.report.method_text import entered_text, method_text
 from clients.report.numbers import Refraction, measured_numbers, spectacles_for
 from clients.report.origin import Record
-from clients.report.program import main
 from clients.report.provenance import provenance_table
 from clients.report.sources import SOURCES, Citations
 from clients.report.tables import change_text, refraction_table, vision_table
@@ -384,11 +383,12 @@ def test_two_eyes_have_distinct_labels(labels, sides, expected):
 
 
 @pytest.mark.slow
-def test_a_report_of_two_inline_profiles_needs_no_names(capsys, tmp_path):
+def test_a_report_of_two_inline_profiles_needs_no_names(tmp_path):
     out = tmp_path / "eyes.html"
     eye = {"kind": "prescription", "sphere_dpt": -1.0}
     profiles = [json.dumps(eye), json.dumps(eye | {"sphere_dpt": -2.0})]
-    assert main([*profiles, "-o", str(out), "--no-charts"]) == 0
+    words = ("report", *profiles, "-o", out, "--no-charts")
+    assert run_command(*words).returncode == 0
     assert "<h1>Eye report: first eye → second eye</h1>" in out.read_text()
 
 
@@ -480,10 +480,11 @@ def test_every_page_says_whose_report_it_is(pdf):
     assert "Examiner E. Roe" in pages[0]
 
 
-def test_a_text_that_is_too_long_is_refused(capsys, tmp_path):
-    out = str(tmp_path / "eye.pdf")
-    assert main(["myopia", "-o", out, "--patient", "x" * 61]) == 2
-    assert "patient has 61 characters; allowed: at most 60" in capsys.readouterr().err
+def test_a_text_that_is_too_long_is_refused(tmp_path):
+    words = ("report", "myopia", "-o", tmp_path / "eye.pdf", "--patient", "x" * 61)
+    ended = run_command(*words)
+    assert ended.returncode == 2
+    assert "patient has 61 characters; allowed: at most 60" in ended.stderr
 
 
 NAMES = (r"$\nope$", "_worn: $5 & $6")
@@ -663,10 +664,11 @@ def test_psfs_before_and_after_have_one_scale(myope, corrected):
     assert extents[0] == extents[1]
 
 
-def test_a_missing_pdf_library_is_named_before_any_work(monkeypatch, capsys, tmp_path):
+def test_a_missing_pdf_library_is_named_before_any_work(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "weasyprint", None)
-    assert main(["myopia", "-o", str(tmp_path / "eye.pdf")]) == 1
-    assert "pip install 'ocufilter[report]'" in capsys.readouterr().err
+    ended = run_command("report", "myopia", "-o", tmp_path / "eye.pdf")
+    assert ended.returncode == 1
+    assert "pip install 'ocufilter[report]'" in ended.stderr
     assert not list(tmp_path.iterdir())
 
 
@@ -675,11 +677,11 @@ def test_a_missing_pdf_library_is_named_before_any_work(monkeypatch, capsys, tmp
     [
         (
             ["nobody", "-o", "eye.html"],
-            "report: profile: 'nobody' is not known",
+            "ocufilter: profile: 'nobody' is not known",
         ),
-        ([], "report: the following arguments are required: profile"),
-        (["myopia", "-o", "a.pdf", "--fast"], "unrecognized arguments: --fast"),
-        (["myopia"], "report: --out is missing; expected a .html or .pdf file"),
+        ([], "ocufilter: Missing argument 'PROFILE'"),
+        (["myopia", "-o", "a.pdf", "--fast"], "No such option: --fast"),
+        (["myopia"], "ocufilter: --out is missing; expected a .html or .pdf file"),
         (["myopia", "-o", "eye.docx"], "allowed: a name that ends in .html, .pdf"),
         (["myopia", "-o", "nowhere/eye.pdf"], "its folder does not exist"),
         (["myopia", "-o", "eye.html", "--name", "a\nb"], "--name contains '\\n'"),
@@ -689,15 +691,12 @@ def test_a_missing_pdf_library_is_named_before_any_work(monkeypatch, capsys, tmp
         (["myopia", "gone.json", "-o", "eye.pdf"], "file 'gone.json' does not exist"),
     ],
 )
-def test_bad_input_is_one_line_and_no_file(
-    arguments, said, capsys, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
-    written = capsys.readouterr()
-    assert written.out == ""
-    assert said in written.err
-    assert written.err.count("\n") == 1
+def test_bad_input_is_one_line_and_no_file(arguments, said, tmp_path):
+    ended = run_command("report", *arguments, cwd=tmp_path)
+    assert ended.returncode == 2
+    assert ended.stdout == ""
+    assert said in ended.stderr
+    assert ended.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 

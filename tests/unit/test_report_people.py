@@ -21,8 +21,8 @@ from clients.figures.transfer_curves import FREQUENCY_CPD
 from clients.report.facts import EyeFacts, facts_of
 from clients.report.html_page import html_of
 from clients.report.make import compute_eye_facts, document_of
-from clients.report.program import main
 from estimator import field_table
+from tests.commands import run_command
 
 YOUNG = {"kind": "prescription", "sphere_dpt": -1.0, "age_years": 25}
 MEASURED = {
@@ -194,7 +194,7 @@ def test_lenslets_leave_the_axis_without_bands():
     ("arguments", "said"),
     [
         (["myopia", "--people", "1"], "people is 1; allowed: 2 to 1000"),
-        (["myopia", "--people", "x"], "argument --people: invalid int value: 'x'"),
+        (["myopia", "--people", "x"], "--people is 'x'; allowed: an integer"),
         (
             ["myopia", "emmetropia", "--people", "20"],
             "people is 20, but a comparison of two eyes draws no persons",
@@ -202,12 +202,12 @@ def test_lenslets_leave_the_axis_without_bands():
         (["le_grand_relaxed", "--people", "20"], "the profile gives the eye itself"),
     ],
 )
-def test_bad_people_are_one_line_and_no_file(arguments, said, capsys, tmp_path):
-    assert main([*arguments, "-o", str(tmp_path / "eye.html"), "--json"]) == 2
-    written = capsys.readouterr()
-    assert written.out == ""
-    assert said in written.err
-    assert written.err.count("\n") == 1
+def test_bad_people_are_one_line_and_no_file(arguments, said, tmp_path):
+    ended = run_command("report", *arguments, "-o", tmp_path / "eye.html", "--json")
+    assert ended.returncode == 2
+    assert ended.stdout == ""
+    assert said in ended.stderr
+    assert ended.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 
