@@ -26,6 +26,4 @@ def _program(module: str) -> typer.Typer:
     return app
 
 
-headset = _program("clients.headset.program")
-layer = _program("clients.openxr_layer.program")
 web = _program("clients.web.program")

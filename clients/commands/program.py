@@ -66,11 +66,11 @@ COMMANDS = {
         "Write a report on one eye, or a comparison of two.",
     ),
     "headset": (
-        "clients.commands.pending:headset",
+        "clients.headset.program:headset",
         "Show a scene in an OpenXR headset, through two eyes.",
     ),
     "layer": (
-        "clients.commands.pending:layer",
+        "clients.openxr_layer.program:layer",
         "See another OpenXR program through simulated eyes.",
     ),
     "web": (

@@ -1,20 +1,10 @@
-"""View a scene through other people's eyes in an OpenXR headset.
-
-    ocufilter headset --left myopia --right keratoconus
-    ocufilter headset --scene kitchen.glb --service tcp://127.0.0.1:5577
-    ocufilter headset --simulated --seconds 10 --out out/headset
-
-Each eye is filtered through its own profile, pupil, focus and gaze, in this process or
-by a running service. The headset's eye tracker, if it has one, provides the gaze. Focus
-follows the point of fixation, and pupils adapt to the light of the scene.
-"""
+"""`ocufilter headset`: view a scene through other people's eyes."""
 
 from __future__ import annotations
 
-import argparse
 import importlib
-import json
 import logging
+import math
 import os
 import signal
 import sys
@@ -23,16 +13,16 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+import typer
 
-from clients.arguments import profile_title, read_size_px
+from clients.commands.options import profile_title, read_size_px, with_options
 from clients.extra import HEADSET_INSTALL
 from clients.headset.options import (
     TRACKED_RANGE_DEG,
-    arguments_of,
-    check_limits,
+    EyeOptions,
     profiles_of,
     settings_of,
 )
@@ -43,7 +33,13 @@ from clients.headset.viewer import HELP, Controls, TerminalKeys, Viewer, ViewerL
 from estimator.bounded_files import printable
 from filter_service import FilterSettings, is_software_renderer
 from filter_service.atomic_files import replace_atomically
-from filter_service.errors import FilterError
+from filter_service.command_line import (
+    CommandFailed,
+    Json,
+    check_range,
+    print_json,
+    print_line,
+)
 
 if TYPE_CHECKING:
     import moderngl
@@ -54,6 +50,92 @@ WARM_UP_S = 60.0
 """Longest wait for the first filtered frame; `--seconds` counts from that frame."""
 
 CORE_VALIDATION = "XR_APILAYER_LUNARG_core_validation"
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeadsetOptions(EyeOptions):
+    """Options of the command line."""
+
+    scene: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME|FILE|MODULE:FUNCTION",
+            help="courtyard, primitives, or a .glb or .gltf file; or a function that "
+            "receives the OpenGL context and returns a renderer, an object whose "
+            "method pictures(views, size_px) returns an RgbdPicture for each view (see "
+            "clients/headset/scenery.py).",
+        ),
+    ] = "courtyard"
+    supersampling: Annotated[
+        int, typer.Option(help="Samples per pixel along each axis.")
+    ] = 2
+    textures: Annotated[
+        Literal["auto", "yes", "no"],
+        typer.Option(
+            help="Filter in textures of the viewer's OpenGL context, without copies; "
+            "auto: on a hardware GPU."
+        ),
+    ] = "auto"
+    simulated: Annotated[
+        bool,
+        typer.Option(
+            "--simulated",
+            help="Simulate a headset and a person who looks around; see --out.",
+        ),
+    ] = False
+    size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WxH",
+            help="With --simulated: image size of each eye in px; by default 448x504.",
+        ),
+    ] = None
+    rate_hz: Annotated[
+        float | None,
+        typer.Option(help="With --simulated: frame rate; by default 72."),
+    ] = None
+    scale: Annotated[
+        float | None,
+        typer.Option(
+            help="Image size relative to the headset's, 0.1 to 2; by default 1."
+        ),
+    ] = None
+    validate: Annotated[
+        bool,
+        typer.Option("--validate", help="Load OpenXR's core validation layer."),
+    ] = False
+    frames: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Stop after N filtered frames."),
+    ] = None
+    seconds: Annotated[
+        float | None,
+        typer.Option(help="Stop this long after the first filtered frame."),
+    ] = None
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder for the last filtered images."),
+    ] = None
+
+    def check(self) -> None:
+        """Check the limits, and that the options apply to the runtime.
+
+        Raises
+        ------
+        ValueError
+            If a value is invalid.  The message names the option.
+        """
+        elsewhere = ("scale", "validate") if self.simulated else ("size", "rate_hz")
+        for name in elsewhere:
+            if getattr(self, name) not in (None, False):
+                where = "a headset" if self.simulated else "--simulated"
+                raise ValueError(f"--{name.replace('_', '-')} requires {where}")
+        if self.scale is not None:
+            check_range("--scale", self.scale, (0.1, 2.0))
+        for name in ("frames", "seconds"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise ValueError(f"--{name} is {value}; allowed: above 0")
 
 
 def say(line: str) -> None:
@@ -70,7 +152,7 @@ def gaze_range_of(
     return settings.gaze_range_deg
 
 
-def scenery_of(options: argparse.Namespace, context: moderngl.Context) -> Any:
+def scenery_of(options: HeadsetOptions, context: moderngl.Context) -> Any:
     """Return the renderer of both eyes' images: the built-in one or the user's.
 
     Raises
@@ -138,10 +220,11 @@ class _Eyes:
             self.change(eye, profile)
 
 
-def run(options: argparse.Namespace) -> dict[str, Any]:
+def run(options: HeadsetOptions) -> dict[str, Any]:
     """Show the scene until the user or a limit ends it; return a report."""
+    options.check()
     settings, profiles = settings_of(options), profiles_of(options)
-    size_px = read_size_px(options.size)
+    size_px = read_size_px(options.size or "448x504")
     look = StereoGaze(
         age_years=options.age,
         pupil_diameter_mm=options.pupil_mm,
@@ -149,7 +232,8 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         gaze_range_deg=settings.gaze_range_deg,
         focus_dpt=options.focus_dpt,
     )
-    check_limits(options)
+    if options.out is not None:
+        options.out.mkdir(parents=True, exist_ok=True)
     pictures = _Pictures()
     with ExitStack() as stack:
         context = _context(options, stack)
@@ -175,7 +259,7 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         return _report(options, viewer.log, took_s, seeing)
 
 
-def _view(viewer: Viewer, controls: Controls, options: argparse.Namespace) -> float:
+def _view(viewer: Viewer, controls: Controls, options: HeadsetOptions) -> float:
     """Show frames until a limit, the user or a signal ends the viewer.
 
     Returns
@@ -209,7 +293,7 @@ def _view(viewer: Viewer, controls: Controls, options: argparse.Namespace) -> fl
 
 
 def _runtime(
-    options: argparse.Namespace,
+    options: HeadsetOptions,
     context: Any,
     size_px: tuple[int, int],
     pictures: _Pictures,
@@ -224,7 +308,7 @@ def _runtime(
             context.finish()
 
     return SimulatedRuntime(
-        size_px, rate_hz=options.rate_hz, on_shown=pictures.keep, finish=finish
+        size_px, rate_hz=options.rate_hz or 72.0, on_shown=pictures.keep, finish=finish
     )
 
 
@@ -241,7 +325,7 @@ def _openxr(name: str) -> Any:
         ) from None
 
 
-def _context(options: argparse.Namespace, stack: ExitStack) -> Any:
+def _context(options: HeadsetOptions, stack: ExitStack) -> Any:
     """Return the OpenGL context for all drawing."""
     if not options.simulated:
         return stack.enter_context(_openxr("openxr_gl").open_context())
@@ -252,10 +336,10 @@ def _context(options: argparse.Namespace, stack: ExitStack) -> Any:
     return context
 
 
-def _open_xr(context: moderngl.Context, options: argparse.Namespace) -> Runtime:
+def _open_xr(context: moderngl.Context, options: HeadsetOptions) -> Runtime:
     layers = [CORE_VALIDATION] if options.validate else []
     runtime = _openxr("openxr_runtime").OpenXrRuntime(
-        context, layers=layers, scale=options.scale
+        context, layers=layers, scale=options.scale or 1.0
     )
     for note in runtime.notes:
         say(note)
@@ -263,7 +347,7 @@ def _open_xr(context: moderngl.Context, options: argparse.Namespace) -> Runtime:
 
 
 def _seeing(
-    options: argparse.Namespace,
+    options: HeadsetOptions,
     settings: FilterSettings,
     context: moderngl.Context,
     stack: ExitStack,
@@ -316,7 +400,7 @@ class _Pictures:
 
 
 def _report(
-    options: argparse.Namespace, log: ViewerLog, took_s: float, seeing: StereoFilter
+    options: HeadsetOptions, log: ViewerLog, took_s: float, seeing: StereoFilter
 ) -> dict[str, Any]:
     report = {
         "where": options.service or "in this process",
@@ -343,27 +427,34 @@ def _lines(report: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the program; return its exit code."""
-    options = arguments_of(argv, __doc__)
+@with_options
+def headset(options: HeadsetOptions, json_output: Json = False) -> None:
+    """Show a scene in an OpenXR headset, each eye through its own profile.
+
+    ocufilter headset --left myopia --right keratoconus
+
+    ocufilter headset --scene kitchen.glb --service tcp://127.0.0.1:5577
+
+    ocufilter headset --simulated --seconds 10 --out out/headset
+
+    Each eye is filtered through its own profile, pupil, focus and gaze, in this process
+    or by a running service.  The headset's eye tracker, if it has one, provides the
+    gaze.  Focus follows the point of fixation, and pupils adapt to the light of the
+    scene.
+
+    Keys in the terminal: 1 to 6 give both eyes a preset, l and r the next preset to the
+    left or right eye; f turns the filter on or off, s shows the left half unfiltered,
+    and q quits.
+    """
     logging.basicConfig(format="headset: %(message)s", level=logging.INFO)
     logging.getLogger("OpenGL").setLevel(logging.WARNING)  # pyopenxr imports it
     try:
         report = run(options)
-    except KeyboardInterrupt:  # before the first frame
-        return 130
-    except ValueError as error:
-        print(f"headset: {error}", file=sys.stderr)
-        return 2
-    except (FilterError, NoRuntime, OSError, RuntimeError) as error:
-        print(f"headset: {error}", file=sys.stderr)
-        return 1
-    sys.stdout.write((json.dumps(report) if options.json else _lines(report)) + "\n")
+    except (NoRuntime, RuntimeError) as error:
+        raise CommandFailed(str(error)) from error
+    if json_output:
+        print_json(report)
+    else:
+        print_line(_lines(report))
     if not report["filtered"]:
-        print("headset: no frame was filtered", file=sys.stderr)
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        raise CommandFailed("no frame was filtered")

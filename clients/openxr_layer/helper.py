@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import ctypes
 import json
@@ -18,9 +17,9 @@ from typing import Any, cast
 
 from numpy.typing import NDArray
 
-from clients.arguments import profile_title, read_profile
+from clients.commands.options import profile_title, read_profile
 from clients.frame_log import percentiles, without_numbers
-from clients.headset.options import TRACKED_RANGE_DEG, profiles_of
+from clients.headset.options import TRACKED_RANGE_DEG, EyeOptions, profiles_of
 from clients.headset.runtime import (
     EYES,
     DueFrame,
@@ -444,7 +443,7 @@ def _gaze_of(frame: wire.Frame) -> GazeSample | None:
 class _ProfileFiles:
     """Profiles that come from files, which are read again when they change."""
 
-    def __init__(self, options: argparse.Namespace) -> None:
+    def __init__(self, options: EyeOptions) -> None:
         self._paths: dict[Eye, Path] = {}
         self._seen: dict[Eye, tuple[int, int] | None] = {}
         for eye in EYES:
@@ -481,8 +480,7 @@ class Eyes:
 
     Parameters
     ----------
-    options : argparse.Namespace
-        Options of `add_eye_arguments`.
+    options : EyeOptions
     seeing : StereoFilter
         Filter that is told of each change.
     look : StereoGaze
@@ -498,7 +496,7 @@ class Eyes:
 
     def __init__(
         self,
-        options: argparse.Namespace,
+        options: EyeOptions,
         seeing: StereoFilter,
         look: StereoGaze,
         say: Say,

@@ -1,49 +1,38 @@
-"""See another OpenXR program, unmodified, through simulated eyes.
-
-    ocufilter layer run --left myopia --right keratoconus -- hello_xr -g OpenGL
-    ocufilter layer set --left emmetropia
-    ocufilter layer status
-
-`run` starts the program with an OpenXR API layer, which copies each frame, has it
-filtered by this process, and shows the result in place of the program's own frame. When
-there is no result, the program's own frames are shown.
-
-`install` makes the layer known to all programs of this user, such as those that a game
-launcher starts. XR_ENABLE_API_LAYERS=XR_APILAYER_ocufilter_eye enables it for one of
-them, --implicit for all. Frames are filtered while `ocufilter layer serve` runs.
-"""
+"""`ocufilter layer`: see another OpenXR program, unmodified, through simulated eyes."""
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import json
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from clients.arguments import read_profile
-from clients.headset.options import (
-    add_eye_arguments,
-    add_service_arguments,
-    profiles_of,
-    settings_of,
-)
-from clients.headset.runtime import EYES
+import typer
+
+from clients.commands.options import read_profile, with_options
+from clients.headset.options import EyeOptions, profiles_of, settings_of
 from clients.openxr_layer import manifest
 from clients.openxr_layer.helper import USUAL_AGE_MS, Eyes, HelperOptions, LayerHelper
 from clients.openxr_layer.wire import SOCKET_VARIABLE, ask, socket_path
-from clients.option_values import a_number
 from estimator import ProfileError, parse_profile
 from estimator.bounded_files import printable
 from filter_service import FilterSettings
 from filter_service.atomic_files import replace_atomically
-from filter_service.errors import FilterError
+from filter_service.command_line import (
+    EXIT_FAILURE,
+    CommandFailed,
+    Json,
+    check_range,
+    print_json,
+    print_line,
+    typer_app,
+)
 
 CHECK_S = 0.25
 """Period at which profile files and the program are looked at."""
@@ -57,101 +46,76 @@ def say(line: str) -> None:
     print(f"layer: {printable(line)}", file=sys.stderr, flush=True)
 
 
-# Command line
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="ocufilter layer",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    run = actions.add_parser("run", help="run a program with the layer")
-    serve = actions.add_parser(
-        "serve", help="filter the frames of programs with the layer"
-    )
-    for each in (run, serve):
-        add_eye_arguments(each)
-        _add_helper_arguments(each)
-    run.add_argument(
-        "program", nargs=argparse.REMAINDER, metavar="-- PROGRAM ...", help="after --"
-    )
-    change = actions.add_parser("set", help="change the eyes of a running helper")
-    for eye in ("profile", *EYES):
-        which = "both eyes" if eye == "profile" else f"the {eye} eye"
-        change.add_argument(f"--{eye}", metavar="PROFILE", help=f"profile of {which}")
-    _add_socket(change)
-    install = actions.add_parser("install", help="make the layer known to the loader")
-    install.add_argument(
-        "--implicit",
-        action="store_true",
-        help="load it into all OpenXR programs of this user, unless the variable "
-        f"{manifest.OFF_VARIABLE} is set",
-    )
-    actions.add_parser("remove", help="undo install")
-    status = actions.add_parser("status", help="report what is installed and running")
-    status.add_argument("--json", action="store_true", help="print one JSON object")
-    _add_socket(status)
-    return parser
-
-
-def _add_helper_arguments(parser: argparse.ArgumentParser) -> None:
-    where = parser.add_argument_group("where and how frames are filtered")
-    add_service_arguments(where)
-    where.add_argument(
-        "--flat-dpt",
-        type=a_number,
-        default=1.0,
-        metavar="D",
-        help="distance of everything in programs that submit no depth, 1/m; 0 is "
-        "infinity (default: 1)",
-    )
-    where.add_argument(
-        "--wait-ms",
-        type=int,
-        default=0,
-        metavar="MS",
-        help="longest wait of the program for the result of each frame (default: 0, "
-        "which shows the newest result)",
-    )
-    where.add_argument(
-        "--max-age-ms",
-        type=int,
-        default=USUAL_AGE_MS,
-        metavar="MS",
-        help="age up to which a filtered frame is shown; then the program's own is "
-        f"(default: {USUAL_AGE_MS})",
-    )
-    where.add_argument(
-        "--split", action="store_true", help="leave the left half unfiltered"
-    )
-    _add_socket(where)
-    where.add_argument(
-        "--json", action="store_true", help="print one JSON object at the end"
-    )
-
-
-def _add_socket(parser: Any) -> None:
-    parser.add_argument(
-        "--socket",
-        type=Path,
-        default=socket_path(),
+Socket = Annotated[
+    Path | None,
+    typer.Option(
         metavar="PATH",
-        help=f"socket of the helper (default: ${SOCKET_VARIABLE}, or %(default)s)",
-    )
+        help=f"Socket of the helper; by default ${SOCKET_VARIABLE}, or a file of this "
+        "user.",
+    ),
+]
+
+layer = typer_app(
+    help="""See another OpenXR program, unmodified, through simulated eyes.
+
+    `run` starts the program with an OpenXR API layer, which copies each frame, has it
+    filtered by this process, and shows the result in place of the program's own frame.
+    When there is no result, the program's own frames are shown.
+
+    ocufilter layer run --left myopia --right keratoconus -- hello_xr -g OpenGL
+
+    `install` makes the layer known to all programs of this user, such as those that a
+    game launcher starts.  XR_ENABLE_API_LAYERS=XR_APILAYER_ocufilter_eye enables it for
+    one of them, --implicit for all.  Frames are filtered while `ocufilter layer serve`
+    runs.""",
+    no_args_is_help=True,
+)
 
 
-def _checked(options: argparse.Namespace) -> tuple[HelperOptions, FilterSettings]:
+@dataclass(frozen=True, kw_only=True)
+class LayerOptions(EyeOptions):
+    """Options of `run` and `serve`."""
+
+    flat_dpt: Annotated[
+        float,
+        typer.Option(
+            metavar="D",
+            help="Distance of everything in programs that submit no depth, dpt; 0 is "
+            "infinity.",
+        ),
+    ] = 1.0
+    wait_ms: Annotated[
+        int,
+        typer.Option(
+            metavar="MS",
+            help="Longest wait of the program for the result of each frame; 0 shows "
+            "the newest result.",
+        ),
+    ] = 0
+    max_age_ms: Annotated[
+        int,
+        typer.Option(
+            metavar="MS",
+            help="Age up to which a filtered frame is shown; then the program's own is "
+            "shown.",
+        ),
+    ] = USUAL_AGE_MS
+    split: Annotated[
+        bool, typer.Option("--split", help="Leave the left half unfiltered.")
+    ] = False
+    socket: Socket = None
+
+    @property
+    def socket_file(self) -> Path:
+        """Return the socket of the helper."""
+        return self.socket or socket_path()
+
+
+def _checked(options: LayerOptions) -> tuple[HelperOptions, FilterSettings]:
     """Check the options before the engine is loaded."""
-    if not 0.0 <= options.flat_dpt <= 20.0:
-        raise ValueError(f"--flat-dpt is {options.flat_dpt}; allowed: 0 to 20")
-    if not 0 <= options.wait_ms <= MAX_WAIT_MS:
-        raise ValueError(f"--wait-ms is {options.wait_ms}; allowed: 0 to {MAX_WAIT_MS}")
-    if not 1 <= options.max_age_ms <= MAX_WAIT_MS:
-        raise ValueError(
-            f"--max-age-ms is {options.max_age_ms}; allowed: 1 to {MAX_WAIT_MS}"
-        )
+    check_range("--flat-dpt", options.flat_dpt, (0.0, 20.0))
+    check_range("--wait-ms", options.wait_ms, (0, MAX_WAIT_MS))
+    check_range("--max-age-ms", options.max_age_ms, (1, MAX_WAIT_MS))
     profiles_of(options)
     return (
         HelperOptions(
@@ -161,11 +125,8 @@ def _checked(options: argparse.Namespace) -> tuple[HelperOptions, FilterSettings
     )
 
 
-# The helper
-
-
 @contextlib.contextmanager
-def _helper(options: argparse.Namespace) -> Iterator[tuple[LayerHelper, Eyes]]:
+def _helper(options: LayerOptions) -> Iterator[tuple[LayerHelper, Eyes]]:
     """Return the helper, which listens, and its eyes."""
     helper_options, settings = _checked(options)
     from clients.headset.stereo_filter import LocalFilter, ServiceFilter, StereoFilter
@@ -186,7 +147,7 @@ def _helper(options: argparse.Namespace) -> Iterator[tuple[LayerHelper, Eyes]]:
     with contextlib.closing(seeing):
         eyes = Eyes(options, seeing, look, say)
         helper = LayerHelper(
-            seeing, look, say, helper_options, eyes.change, options.socket
+            seeing, look, say, helper_options, eyes.change, options.socket_file
         )
         helper.on_gaze = eyes.prepare_for_gaze
         with contextlib.closing(helper):
@@ -205,55 +166,74 @@ class _Ending:
         self.signal = number
 
 
-def _serve(options: argparse.Namespace) -> int:
+@layer.command()
+@with_options
+def serve(options: LayerOptions, json_output: Json = False) -> None:
+    """Filter the frames of programs with the layer.
+
+    Ends when it is interrupted.
+
+    ocufilter layer serve --left myopia
+    """
     ending = _Ending()
     with _helper(options) as (helper, eyes):
-        say(f"listening at {options.socket}")
+        say(f"listening at {options.socket_file}")
         while not ending.signal:
             helper.run_once(CHECK_S)
             eyes.reread()
-        _print_report(helper, options)
-    return 0
+        _print_report(helper, json_output)
 
 
-def _run(options: argparse.Namespace) -> int:
-    command = options.program[1:] if options.program[:1] == ["--"] else options.program
-    if not command:
+@layer.command(context_settings={"allow_interspersed_args": False})
+@with_options
+def run(
+    options: LayerOptions,
+    program: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="PROGRAM", help="Program and its arguments, after --."),
+    ] = None,
+    json_output: Json = False,
+) -> None:
+    """Run a program with the layer, and end with its exit code.
+
+    ocufilter layer run --left myopia --right keratoconus -- hello_xr -g OpenGL
+    """
+    if not program:
         raise ValueError("there is no program; put it after --")
     _checked(options)
-    library = manifest.library()
+    library = _library()
     ending = _Ending()
     with _helper(options) as (helper, eyes), tempfile.TemporaryDirectory() as folder:
         (Path(folder) / f"{manifest.NAME}.json").write_text(
             manifest.manifest("explicit")
         )
         environment = manifest.layered_environment(Path(folder)) | {
-            SOCKET_VARIABLE: str(options.socket.resolve())
+            SOCKET_VARIABLE: str(options.socket_file.resolve())
         }
-        program = subprocess.Popen(command, env=environment)
+        process = subprocess.Popen(program, env=environment)
         asked_s = 0.0
-        while program.poll() is None:
+        while process.poll() is None:
             helper.run_once(CHECK_S)
             eyes.reread()
             if ending.signal and not asked_s:
-                program.send_signal(ending.signal)
+                process.send_signal(ending.signal)
                 asked_s = time.monotonic()
             elif asked_s and time.monotonic() - asked_s > STOP_S:
-                program.kill()
-        _print_report(helper, options)
+                process.kill()
+        _print_report(helper, json_output)
     if helper.n_frames == 0 and not ending.signal:
         say(
-            f"no frame arrived: {command[0]} did not load the layer {library}, or has "
+            f"no frame arrived: {program[0]} did not load the layer {library}, or has "
             "not submitted frames that can be filtered"
         )
-    code = program.returncode
-    return 128 - code if code < 0 else code
+    code = process.returncode
+    raise typer.Exit(128 - code if code < 0 else code)
 
 
-def _print_report(helper: LayerHelper, options: argparse.Namespace) -> None:
+def _print_report(helper: LayerHelper, json_output: bool) -> None:
     report = helper.report()
-    if options.json:
-        sys.stdout.write(json.dumps(report) + "\n")
+    if json_output:
+        print_json(report)
         return
     say(
         f"{report['filtered']} frames filtered; {report['shown_filtered']} of "
@@ -265,14 +245,40 @@ def _print_report(helper: LayerHelper, options: argparse.Namespace) -> None:
         say(f"  {name.removesuffix('_ms'):10s} {words} ms")
 
 
-# Other actions
+def _library() -> Path:
+    """Return the layer's library.
+
+    Raises
+    ------
+    CommandFailed
+        If it was not built.  The message says what is missing.
+    """
+    try:
+        return manifest.library()
+    except manifest.NoLayer as error:
+        raise CommandFailed(str(error)) from None
 
 
-def _set(options: argparse.Namespace) -> int:
+@layer.command(name="set")
+def set_eyes(
+    profile: Annotated[
+        str | None, typer.Option(metavar="PROFILE", help="Profile of both eyes.")
+    ] = None,
+    left: Annotated[
+        str | None, typer.Option(metavar="PROFILE", help="Profile of the left eye.")
+    ] = None,
+    right: Annotated[
+        str | None, typer.Option(metavar="PROFILE", help="Profile of the right eye.")
+    ] = None,
+    socket: Socket = None,
+) -> None:
+    """Change the eyes of a running helper.
+
+    ocufilter layer set --left emmetropia
+    """
     wanted: dict[str, str] = {}
-    for eye in EYES:
-        text = getattr(options, eye)
-        text = options.profile if text is None else text
+    for eye, own in (("left", left), ("right", right)):
+        text = profile if own is None else own
         if text is not None:
             is_path = Path(text).exists() and not text.lstrip().startswith("{")
             try:
@@ -282,24 +288,85 @@ def _set(options: argparse.Namespace) -> int:
             wanted[eye] = str(Path(text).resolve()) if is_path else text
     if not wanted:
         raise ValueError("there is no profile; use --profile, --left or --right")
-    ask(options.socket, wanted)
-    return 0
+    ask(socket or socket_path(), wanted)
 
 
-def _install(options: argparse.Namespace) -> int:
-    kind: manifest.Kind = "implicit" if options.implicit else "explicit"
+@layer.command()
+def install(
+    implicit: Annotated[
+        bool,
+        typer.Option(
+            "--implicit",
+            help="Load it into all OpenXR programs of this user, unless the variable "
+            f"{manifest.OFF_VARIABLE} is set.",
+        ),
+    ] = False,
+) -> None:
+    """Make the layer known to the OpenXR loader.
+
+    ocufilter layer install --implicit
+    """
+    _library()
+    kind: manifest.Kind = "implicit" if implicit else "explicit"
     text = manifest.manifest(kind)
     _remove_all()
     path = manifest.manifest_path(kind)
     path.parent.mkdir(parents=True, exist_ok=True)
     replace_atomically(path, lambda part: part.write_text(text))
     say(f"wrote {path}")
-    if options.implicit:
+    if implicit:
         say(f"all OpenXR programs load it, except with {manifest.OFF_VARIABLE}=1")
     else:
         say(f"to enable it for a program: XR_ENABLE_API_LAYERS={manifest.NAME}")
     say("frames are filtered while `ocufilter layer serve` runs")
-    return 0
+
+
+@layer.command()
+def remove() -> None:
+    """Undo `install`.
+
+    ocufilter layer remove
+    """
+    paths = _remove_all()
+    for path in paths:
+        say(f"removed {path}")
+    if not paths:
+        say("the layer was not installed")
+
+
+@layer.command()
+def status(socket: Socket = None, json_output: Json = False) -> None:
+    """Print what is installed and running.
+
+    The exit code is 0 if the layer was built.
+
+    ocufilter layer status
+    """
+    socket = socket or socket_path()
+    found: dict[str, Any] = {
+        "layer": None,
+        "error": None,
+        "installed": [str(path) for path in _installed()],
+        "helper": None,
+    }
+    try:
+        found["layer"] = str(manifest.library())
+    except manifest.NoLayer as error:
+        found["error"] = str(error)
+    with contextlib.suppress(OSError):
+        found["helper"] = ask(socket, {})
+    if json_output:
+        print_json(found)
+    else:
+        helper = found["helper"]
+        print_line(f"layer: {found['layer'] or found['error']}")
+        print_line(f"installed: {', '.join(found['installed']) or 'no'}")
+        print_line(f"helper: {'none' if helper is None else 'running'} at {socket}")
+        if helper is not None:
+            print_line(f"program: {helper['program'] or 'none'}")
+            print_line(f"frames filtered: {helper['filtered']}")
+    if not found["layer"]:
+        raise typer.Exit(EXIT_FAILURE)
 
 
 def _installed() -> list[Path]:
@@ -312,69 +379,3 @@ def _remove_all() -> list[Path]:
     for path in found:
         path.unlink()
     return found
-
-
-def _remove() -> int:
-    paths = _remove_all()
-    for path in paths:
-        say(f"removed {path}")
-    if not paths:
-        say("the layer was not installed")
-    return 0
-
-
-def _status(options: argparse.Namespace) -> int:
-    found: dict[str, Any] = {
-        "layer": None,
-        "error": None,
-        "installed": [],
-        "helper": None,
-    }
-    try:
-        found["layer"] = str(manifest.library())
-    except manifest.NoLayer as error:
-        found["error"] = str(error)
-    found["installed"] = [str(path) for path in _installed()]
-    with contextlib.suppress(OSError):
-        found["helper"] = ask(options.socket, {})
-    if options.json:
-        sys.stdout.write(json.dumps(found) + "\n")
-    else:
-        helper = found["helper"]
-        lines = [
-            f"layer: {found['layer'] or found['error']}",
-            f"installed: {', '.join(found['installed']) or 'no'}",
-            f"helper: {'none' if helper is None else 'running'} at {options.socket}",
-        ]
-        if helper is not None:
-            lines.append(f"program: {helper['program'] or 'none'}")
-            lines.append(f"frames filtered: {helper['filtered']}")
-        sys.stdout.write("\n".join(lines) + "\n")
-    return 0 if found["layer"] else 1
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    options = _parser().parse_args(argv)
-    try:
-        if options.action == "run":
-            return _run(options)
-        if options.action == "serve":
-            return _serve(options)
-        if options.action == "set":
-            return _set(options)
-        if options.action == "install":
-            return _install(options)
-        if options.action == "remove":
-            return _remove()
-        return _status(options)
-    except ValueError as error:
-        say(str(error))
-        return 2
-    except (FilterError, manifest.NoLayer, OSError) as error:
-        say(str(error))
-        return 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -9,8 +9,8 @@ import time
 import numpy as np
 import pytest
 
-from clients.headset import options as options_module
 from clients.headset import program
+from clients.headset.options import EyeOptions, settings_of
 from clients.headset.runtime import (
     Happening,
     SimulatedRuntime,
@@ -151,22 +151,22 @@ def test_a_wrong_argument_is_named(arguments, words):
 def test_the_help_teaches():
     finished = run_program("--help")
     assert finished.returncode == 0
-    for words in ("--left", "--service", "keys:", "ocufilter headset --simulated"):
+    for words in ("--left", "--service", "Keys ", "ocufilter headset --simulated"):
         assert words in finished.stdout
 
 
 def test_how_far_eyes_turn_follows_from_the_tracker_unless_it_is_told():
     with_tracker = SimulatedRuntime(happening=Happening(gaze_deg=(0.0, 0.0)))
     without = SimulatedRuntime()
-    for arguments, runtime, expected in (
-        ((), with_tracker, (15.0, 10.0)),
-        ((), without, (0.0, 0.0)),
-        (("--gaze-range", "3,2"), with_tracker, (3.0, 2.0)),
-        (("--gaze-range", "0,0"), with_tracker, (0.0, 0.0)),
-        (("--settings", '{"gaze_range_deg": [5, 4]}'), without, (5.0, 4.0)),
+    for given, runtime, expected in (
+        ({}, with_tracker, (15.0, 10.0)),
+        ({}, without, (0.0, 0.0)),
+        ({"gaze_range": "3,2"}, with_tracker, (3.0, 2.0)),
+        ({"gaze_range": "0,0"}, with_tracker, (0.0, 0.0)),
+        ({"settings": '{"gaze_range_deg": [5, 4]}'}, without, (5.0, 4.0)),
     ):
-        options = options_module.arguments_of(arguments, "")
-        settings = options_module.settings_of(options)
+        options = EyeOptions(**given)
+        settings = settings_of(options)
         is_told = options.gaze_range is not None
         found = program.gaze_range_of(settings, runtime, is_given=is_told)
         assert found == expected

@@ -17,6 +17,7 @@ from clients.openxr_layer.helper import MAX_WAITING, HelperOptions, LayerHelper
 from clients.openxr_layer.wire import ask
 from filter_service import Camera, EyeFilter, FilterSettings, RgbdView
 from filter_service.messages import body_of_eye
+from tests.commands import run_command
 from tests.end_to_end.layer_double import LayerDouble, RunningHelper
 
 SIZE_PX = (96, 72)
@@ -445,10 +446,10 @@ def test_a_profile_is_not_sent_to_another_user_s_process():
     [
         (
             ["run", "--flat-dpt", "-1", "--", "x"],
-            "--flat-dpt is -1.0; allowed: 0 to 20",
+            "--flat-dpt is -1; allowed: 0 to 20 dpt",
         ),
-        (["serve", "--wait-ms", "-5"], "--wait-ms is -5; allowed: 0 to 600000"),
-        (["serve", "--max-age-ms", "0"], "--max-age-ms is 0; allowed: 1 to 600000"),
+        (["serve", "--wait-ms", "-5"], "--wait-ms is -5; allowed: 0 to 600000 ms"),
+        (["serve", "--max-age-ms", "0"], "--max-age-ms is 0; allowed: 1 to 600000 ms"),
         (["serve", "--focus-dpt", "99"], "focus_dpt is 99.0; allowed: 0 to 20"),
         (["serve", "--left", "{}x"], "--left {}x: profile: not JSON"),
         (["run"], "there is no program; put it after --"),
@@ -461,18 +462,23 @@ def test_a_profile_is_not_sent_to_another_user_s_process():
         ),
     ],
 )
-def test_options_are_checked(arguments, message, capsys, tmp_path):
+def test_options_are_checked(arguments, message, tmp_path):
     socket_option = ["--socket", str(tmp_path / "s")]
     at = arguments.index("--") if "--" in arguments else len(arguments)
-    assert program.main([*arguments[:at], *socket_option, *arguments[at:]]) == 2
-    assert message in capsys.readouterr().err
+    words = ("layer", *arguments[:at], *socket_option, *arguments[at:])
+    ended = run_command(*words)
+    assert ended.returncode == 2
+    assert message in ended.stderr
+    assert ended.stderr.count("\n") == 1
 
 
-def test_status_and_install_without_the_library(capsys, monkeypatch, tmp_path):
+def test_status_and_install_without_the_library(monkeypatch, tmp_path):
     monkeypatch.setenv("OCUFILTER_LAYER_LIBRARY", str(tmp_path / "none.so"))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    assert program.main(["status", "--socket", str(tmp_path / "s")]) == 1
-    assert "the layer was not built" in capsys.readouterr().out
-    assert program.main(["install"]) == 1
-    assert "libopenxr-dev" in capsys.readouterr().err
-    assert program.main(["remove"]) == 0
+    ended = run_command("layer", "status", "--socket", tmp_path / "s")
+    assert ended.returncode == 1
+    assert "the layer was not built" in ended.stdout
+    ended = run_command("layer", "install")
+    assert ended.returncode == 1
+    assert "libopenxr-dev" in ended.stderr
+    assert run_command("layer", "remove").returncode == 0

@@ -13,7 +13,8 @@ import sys
 
 import moderngl
 
-from clients.headset import openxr_runtime, program
+from clients.commands import program
+from clients.headset import openxr_runtime
 from clients.scenes.scene_view import read_texture
 
 
@@ -52,10 +53,11 @@ def as_json(view):
     return {"eye": view.eye, "pose": view.pose, "tangents": view.tangents}
 
 
-def main() -> int:
+def main() -> None:
     openxr_runtime.OpenXrRuntime = WatchedRuntime
-    return program.main([*sys.argv[1:], "--json"])
+    sys.argv[1:] = ["headset", *sys.argv[1:], "--json"]
+    program.main()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

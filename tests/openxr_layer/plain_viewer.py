@@ -7,6 +7,7 @@ Its arguments are the command's.
 
 import sys
 
+from clients.commands.program import main
 from clients.headset import program
 from clients.headset.stereo_filter import FilteredStereoFrame
 from clients.headset.stereo_gaze import images_of
@@ -43,4 +44,5 @@ class Unfiltered:
 
 if __name__ == "__main__":
     program.LocalFilter = Unfiltered
-    sys.exit(program.main())
+    sys.argv.insert(1, "headset")
+    main()

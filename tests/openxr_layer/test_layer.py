@@ -12,8 +12,9 @@ import time
 import numpy as np
 import pytest
 
-from clients.openxr_layer import manifest, program
+from clients.openxr_layer import manifest
 from clients.openxr_layer.wire import SOCKET_VARIABLE
+from tests.commands import run_command
 from tests.end_to_end.layer_double import RunningHelper
 from tests.native_build import runtime_of
 from tests.openxr_layer import build
@@ -480,7 +481,7 @@ def test_the_loader_finds_the_installed_layer(
     monkeypatch.setenv(manifest.LIBRARY_VARIABLE, str(layer))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     options = ["--implicit"] if kind == "implicit" else []
-    assert program.main(["install", *options]) == 0
+    assert run_command("layer", "install", *options).returncode == 0
     enabled = {"XR_ENABLE_API_LAYERS": manifest.NAME}
     variables = enabled if kind == "explicit" else {}
     socket = {SOCKET_VARIABLE: str(tmp_path / "layer.sock")}
@@ -495,6 +496,6 @@ def test_the_loader_finds_the_installed_layer(
     assert lines() == ["no helper is connected; trying again every second"]
     if kind == "implicit":
         assert lines(**{manifest.OFF_VARIABLE: "1"}) == []
-    assert program.main(["remove"]) == 0
+    assert run_command("layer", "remove").returncode == 0
     variables = {}
     assert lines() == []

@@ -131,7 +131,7 @@ def run_headset(module, room, runtime, folder, environment):
     eyes = []
     for eye, body in PROFILES.items():
         eyes += [f"--{eye}", json.dumps(body)]
-    command = (sys.executable, "-m", module, "--scene", room, *HEADSET, *eyes)
+    command = (sys.executable, "-m", *module, "--scene", room, *HEADSET, *eyes)
     ran = Run(runtime, folder, *command, **environment)
     assert ran.exit_code == 0, ran.said
     assert ran.violations == []
@@ -144,11 +144,11 @@ def test_the_headset_client_is_filtered_as_it_filters_itself(
     room = str(stripes(tmp_path / "room.glb"))
     own = environment | {"MOCK_XR_HEAD": moving_head}
     make_eyes = frozen_eyes(PROFILES, FilterSettings(**SETTINGS))
-    plain_viewer = "tests.openxr_layer.plain_viewer"
+    plain_viewer = ("tests.openxr_layer.plain_viewer",)
     with RunningHelper(tmp_path / "layer.sock", make_eyes, wait_ms=LONG_MS):
         through = run_headset(plain_viewer, room, runtime, tmp_path / "through", own)
     del own["XR_ENABLE_API_LAYERS"]
-    viewer = "clients.headset.program"
+    viewer = ("ocufilter", "headset")
     itself = run_headset(viewer, room, runtime, tmp_path / "itself", own)
     expected = {poses_of(frame): frame for frame in itself.frames[-N_FRAMES:]}
     n_compared = 0
