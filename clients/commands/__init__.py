@@ -9,7 +9,6 @@ optics         wavefront and psf: an eye in one direction
 checkout       bench and paper, which need a checkout
 doctor         doctor: checks of this machine
 doctor_probes  probes that run in processes of their own
-pending        programs that parse their own options
 
 `filter_service.command_line` runs every command, and prints its errors.
 """

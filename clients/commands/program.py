@@ -74,7 +74,7 @@ COMMANDS = {
         "See another OpenXR program through simulated eyes.",
     ),
     "web": (
-        "clients.commands.pending:web",
+        "clients.web.program:web",
         "Serve a web page with an eye's data and filtered views.",
     ),
     "bench": (

@@ -1,17 +1,6 @@
-"""Interactive page in the browser: `ocufilter web`.
+"""`ocufilter web`: an interactive page in the browser."""
 
-    ocufilter web
-    ocufilter web --profile myopia --port 8080 --no-browser
-
-Prints an address that contains an access token.  Only this machine can connect, unless
-`--host` is given.
-"""
-
-from __future__ import annotations
-
-import argparse
 import ipaddress
-import json
 import logging
 import secrets
 import signal
@@ -21,9 +10,12 @@ import threading
 import webbrowser
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any
+
+import typer
 
 from clients.extra import WEB_INSTALL
+from filter_service.command_line import CommandFailed, Json, print_json, print_line
 from filter_service.log_lines import configure_logging
 
 DEFAULT_PORT = 8765
@@ -32,51 +24,6 @@ EXPOSED = (
     "web: other machines can reach this page over unencrypted HTTP; anyone who can "
     "read the traffic can use the token"
 )
-
-
-def arguments_of(argv: Sequence[str] | None) -> argparse.Namespace:
-    """Return the parsed command line."""
-    parser = argparse.ArgumentParser(
-        prog="ocufilter web",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
-        "--port",
-        type=int,
-        default=DEFAULT_PORT,
-        help=f"port; 0 selects a free one (default: {DEFAULT_PORT})",
-    )
-    parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        help="address to listen on; with 0.0.0.0 or a network address, other machines "
-        "can connect with the token, unencrypted (default: 127.0.0.1)",
-    )
-    parser.add_argument(
-        "--proxy-host",
-        action="append",
-        default=[],
-        metavar="HOST",
-        help="host name in requests from a proxy on this machine; may be repeated.  "
-        "Without --host, only requests for localhost and these names are accepted.  "
-        "The cookie is Secure if the proxy sends X-Forwarded-Proto: https",
-    )
-    parser.add_argument(
-        "--no-browser",
-        action="store_true",
-        help="print the address without opening a browser",
-    )
-    parser.add_argument(
-        "--profile",
-        metavar="P",
-        help="initial profile of both eyes: preset name, or a .json, .abp, .csv or "
-        ".zmx file",
-    )
-    parser.add_argument(
-        "--json", action="store_true", help="print the address as a JSON object"
-    )
-    return parser.parse_args(argv)
 
 
 def read_profile(source: str | None) -> tuple[Mapping[str, Any], str] | None:
@@ -143,62 +90,88 @@ def hosts_of(listening: socket.socket, names: Sequence[str]) -> set[str] | None:
     return {"localhost", "127.0.0.1", "::1", address, *map(str.lower, names)}
 
 
-def serve(options: argparse.Namespace) -> int:
-    """Serve until interrupted; return the exit code."""
-    profile = read_profile(options.profile)
-    listening = open_socket(options.host, options.port)
+def web(
+    port: Annotated[
+        int, typer.Option(help="Port; 0 selects a free one.")
+    ] = DEFAULT_PORT,
+    host: Annotated[
+        str,
+        typer.Option(
+            help="Address to listen on; with 0.0.0.0 or a network address, other "
+            "machines can connect with the token, unencrypted."
+        ),
+    ] = "127.0.0.1",
+    proxy_host: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="HOST",
+            help="Host name in requests from a proxy on this machine; repeatable.  "
+            "Without --host, only requests for localhost and these names are "
+            "accepted.  The cookie is Secure if the proxy sends X-Forwarded-Proto: "
+            "https.",
+        ),
+    ] = None,
+    no_browser: Annotated[
+        bool,
+        typer.Option(
+            "--no-browser", help="Print the address without opening a browser."
+        ),
+    ] = False,
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            metavar="P",
+            help="Initial profile of both eyes: preset name, or a .json, .abp, .csv or "
+            ".zmx file.",
+        ),
+    ] = None,
+    json_output: Json = False,
+) -> None:
+    """Serve a web page with an eye's data, sliders, and before-and-after views.
+
+    Prints an address that contains an access token.  Only this machine can connect,
+    unless --host is given.
+
+    ocufilter web --profile myopia
+
+    ocufilter web --port 8080 --no-browser
+    """
+    shown = read_profile(profile)
+    proxy_hosts = proxy_host or []
+    listening = open_socket(host, port)
     port = listening.getsockname()[1]
-    hosts = hosts_of(listening, options.proxy_host)
+    hosts = hosts_of(listening, proxy_hosts)
     if hosts is None:
-        print(EXPOSED, file=sys.stderr, flush=True)
+        sys.stderr.write(f"{EXPOSED}\n")
     token, one_time_token = (secrets.token_urlsafe(TOKEN_BYTES) for _ in range(2))
-    from clients.web.server import make_server
+    try:
+        from clients.web.server import make_server
+    except ModuleNotFoundError as error:
+        raise CommandFailed(f"{error.name} is not installed: {WEB_INSTALL}") from None
+
+    def announce() -> None:
+        address = address_of(host, port, token)
+        if json_output:
+            print_json({"address": address})
+        else:
+            print_line(f"Open {address}\nPress Ctrl-C to stop.")
+        sys.stdout.flush()
+        if not no_browser:  # may wait for the browser
+            one_time = address_of(host, port, one_time_token)
+            threading.Thread(
+                target=webbrowser.open, args=[one_time], daemon=True
+            ).start()
 
     configure_logging("web", level=logging.WARNING)
-    addresses = [address_of(options.host, port, t) for t in (token, one_time_token)]
     server = make_server(
         token,
         port,
-        profile,
-        one_time_token=None if options.no_browser else one_time_token,
+        shown,
+        one_time_token=None if no_browser else one_time_token,
         hosts=hosts,
-        is_behind_proxy=bool(options.proxy_host),
-        on_ready=lambda: _announce(*cast(tuple[str, str], addresses), options),
+        is_behind_proxy=bool(proxy_hosts),
+        on_ready=announce,
     )
     # the server shuts down by itself and raises the signal again: exit cleanly
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     server.run(sockets=[listening])
-    return 0
-
-
-def _announce(address: str, one_time_address: str, options: argparse.Namespace) -> None:
-    if options.json:
-        print(json.dumps({"address": address}), flush=True)
-    else:
-        print(f"Open {address}\nPress Ctrl-C to stop.", flush=True)
-    if not options.no_browser:  # may wait for the browser
-        threading.Thread(
-            target=webbrowser.open, args=[one_time_address], daemon=True
-        ).start()
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the program; return its exit code."""
-    options = arguments_of(argv)
-    try:
-        return serve(options)
-    except ModuleNotFoundError as error:
-        print(f"web: {error.name} is not installed: {WEB_INSTALL}", file=sys.stderr)
-        return 1
-    except ValueError as error:
-        print(f"web: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"web: {error}", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        return 130
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from clients.arguments import read_size_px
+from clients.commands.options import read_size_px
 from clients.headset.gltf_file import (
     MAX_HEADER_BYTES,
     MAX_HEADER_DEPTH,

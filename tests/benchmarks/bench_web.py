@@ -93,7 +93,7 @@ def program_mb(process_id: int) -> float:
 
 def times(count: int) -> tuple[dict[tuple[str, str], list[float]], float]:
     """Return the times in ms of each slider and kind, and the program's memory."""
-    command = [sys.executable, "-m", "clients.web.program"]
+    command = [sys.executable, "-m", "ocufilter", "web"]
     command += ["--no-browser", "--port", "0", "--json"]
     found: dict[tuple[str, str], list[float]] = {}
     with (

@@ -23,7 +23,7 @@ def layer_socket(tmp_path_factory):
 @pytest.fixture(scope="session")
 def address(layer_socket):
     """Start `ocufilter web`; return the address that it prints."""
-    command = [sys.executable, "-m", "clients.web.program"]
+    command = [sys.executable, "-m", "ocufilter", "web"]
     command += ["--no-browser", "--port", "0", "--json"]
     with subprocess.Popen(
         command,

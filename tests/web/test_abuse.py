@@ -72,7 +72,7 @@ class Target:
 @contextmanager
 def attacked(*options):
     """Start the program; in the end it still answers, and has told of no fault."""
-    command = [sys.executable, "-m", "clients.web.program"]
+    command = [sys.executable, "-m", "ocufilter", "web"]
     command += ["--no-browser", "--port", "0", "--json", *options]
     with subprocess.Popen(
         command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -157,7 +157,7 @@ def test_a_log_that_nobody_reads_stops_no_visitor():
         while True:
             os.write(writing, 65536 * b"x")
     os.set_blocking(writing, True)
-    command = [sys.executable, "-m", "clients.web.program"]
+    command = [sys.executable, "-m", "ocufilter", "web"]
     command += ["--no-browser", "--port", "0", "--json"]
     with subprocess.Popen(
         command, cwd=ROOT, stdout=subprocess.PIPE, stderr=writing, text=True
