@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 Notes = dict[str, dict[str, Any]]
 """Number of frames and one example of each kind of note."""
 
+PERCENTS = {"p50": 50, "p95": 95, "p99": 99}
 _NUMBER = re.compile(r"\d+(\.\d+)?(e-?\d+)?")
 
 
@@ -63,12 +64,11 @@ class FrameLog:
         }
 
 
-def percentiles(values_ms: Sequence[float]) -> dict[str, float | None]:
-    """Return p50, p95 and p99, rounded to microseconds; None without values."""
-    names = {"p50": 50, "p95": 95, "p99": 99}
+def percentiles(
+    values_ms: Sequence[float], percents: Mapping[str, float] = PERCENTS
+) -> dict[str, float | None]:
+    """Return named percentiles, rounded to microseconds; None without values."""
     if not values_ms:
-        return dict.fromkeys(names)
-    return {
-        name: round(float(np.percentile(values_ms, percent)), 3)
-        for name, percent in names.items()
-    }
+        return dict.fromkeys(percents)
+    found = np.percentile(values_ms, [*percents.values()]).tolist()
+    return {name: round(value, 3) for name, value in zip(percents, found, strict=True)}

@@ -61,7 +61,7 @@ def workers_of(out):
                 ours = os.fsencode(f"{MARK}={out}") in file.read().split(b"\0")
         except OSError:
             continue
-        if ours and b"clients.batch.process_pool" in words:
+        if ours and b"clients.batch.pools" in words:
             found.append(int(folder))
     return found
 

@@ -14,8 +14,16 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
-from clients.batch import layout_middlebury, layout_nyu, layout_pairs, layout_tum
-from clients.batch.layout_pairs import images_in
+from clients.batch.datasets import (
+    images_in,
+    is_middlebury,
+    is_nyu,
+    is_tum,
+    middlebury_frames,
+    nyu_frames,
+    pair_frames,
+    tum_frames,
+)
 from clients.batch.source import (
     FieldOfView,
     Optics,
@@ -58,11 +66,11 @@ class LayoutOptions:
 Listing = Callable[[Path], list[SourceFrame]]
 
 DETECTED: dict[str, tuple[Callable[[Path], bool], Listing]] = {
-    "tum": (layout_tum.is_tum, layout_tum.tum_frames),
-    "nyu": (layout_nyu.is_nyu, layout_nyu.nyu_frames),
+    "tum": (is_tum, tum_frames),
+    "nyu": (is_nyu, nyu_frames),
     "middlebury": (
-        layout_middlebury.is_middlebury,
-        layout_middlebury.middlebury_frames,
+        is_middlebury,
+        middlebury_frames,
     ),
 }
 LAYOUTS = ("auto", *DETECTED, "pairs", "video")
@@ -85,14 +93,15 @@ def list_frames(
         if options.depth is not None:
             raise ValueError(f"--depth: the layout {layout} has its own depth")
         frames = DETECTED[layout][1](source)
-    elif layout == "video":
-        frames = _video_frames(
-            source, options.depth, _optics(options), _scaled(options)
+    elif options.optics is None:
+        raise ValueError(
+            "--fov-deg is not given, and the data set has no calibration; allowed: the "
+            "vertical field of view in deg, or --intrinsics FX,FY,CX,CY in px"
         )
     else:
-        frames = layout_pairs.pair_frames(
-            source, options.depth, _optics(options), _scaled(options)
-        )
+        listed = _video_frames if layout == "video" else pair_frames
+        scaled = Scaled(options.depth_scale_m)
+        frames = listed(source, options.depth, options.optics, scaled)
     if not frames:
         raise ValueError(_nothing_found(source, layout, options.depth))
     _check_names(frames)
@@ -175,19 +184,6 @@ def _video_frames(
         )
         for k, (path, depth_index) in enumerate(depths)
     ]
-
-
-def _optics(options: LayoutOptions) -> Optics:
-    if options.optics is None:
-        raise ValueError(
-            "--fov-deg is not given, and the data set has no calibration; allowed: the "
-            "vertical field of view in deg, or --intrinsics FX,FY,CX,CY in px"
-        )
-    return options.optics
-
-
-def _scaled(options: LayoutOptions) -> Scaled:
-    return Scaled(options.depth_scale_m)
 
 
 def _with_options(frame: SourceFrame, options: LayoutOptions) -> SourceFrame:

@@ -6,11 +6,13 @@
 
 One process appends complete lines; a partial line after a power failure is removed. A
 frame without a line is processed again even if its files exist.  File names that are
-not UTF-8 are written with escapes (`text_of`).
+not UTF-8 are written with escapes (`text_of`).  Results are written atomically, and
+recorded with their size and hash.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -20,14 +22,76 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
-from clients.batch.atomic_files import below
-from clients.batch.job import fingerprint
+from msgspec import ValidationError, convert, defstruct
+
 from clients.batch.source import SourceFrame
-from clients.batch.work import Record
 from clients.frame_log import Notes, add_notes
 from estimator import InvalidFile
 from estimator.bounded_files import loads_bounded
-from filter_service.atomic_files import write_atomically
+from filter_service.atomic_files import PART_NAME, replace_atomically, write_atomically
+
+
+def write_whole(path: Path, write: Callable[[Path], object]) -> dict[str, Any]:
+    """Write a file atomically, and its folder if that is missing.
+
+    A killed process leaves at most one temporary file, which `remove_parts` removes.
+
+    Parameters
+    ----------
+    path : Path
+        File to write.
+    write : callable
+        Function that writes the content to a path.
+
+    Returns
+    -------
+    dict
+        Size in ``bytes`` and ``sha256`` of the file.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content: dict[str, Any] = {}
+
+    def write_and_hash(part: Path) -> None:
+        write(part)
+        content.update(content_of(part))
+
+    replace_atomically(path, write_and_hash)
+    return content
+
+
+def content_of(path: Path) -> dict[str, Any]:
+    """Return the size of a file in bytes and its SHA-256."""
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        return {"bytes": file.tell(), "sha256": digest}
+
+
+def remove_parts(folder: Path) -> int:
+    """Remove temporary files of killed processes; return their number."""
+    parts = [
+        path
+        for path in folder.rglob(".ocufilter-*")
+        if PART_NAME.fullmatch(path.name) and path.is_file() and not path.is_symlink()
+    ]
+    for path in parts:
+        path.unlink(missing_ok=True)
+    return len(parts)
+
+
+def below(folder: Path, name: object) -> Path | None:
+    """Return the path of a file below a folder; None if the name leads outside.
+
+    Links in the folder are followed: a folder that is a link leads outside.
+    """
+    if not isinstance(name, str) or not name or "\0" in name:
+        return None
+    inner = Path(name)
+    if inner.is_absolute() or ".." in inner.parts:
+        return None
+    path = folder / inner
+    is_inside = path.parent.resolve().is_relative_to(folder.resolve())
+    return path if is_inside else None
+
 
 LINES, SUMMARY = "manifest.jsonl", "manifest.json"
 RESTART = "the same value, another folder, or --overwrite"
@@ -37,6 +101,9 @@ MAX_LINE_BYTES, MAX_LINE_ITEMS = 16_000_000, 2_000_000
 SYNC_S = 2.0
 """Interval of writes to disk: a power failure loses at most this much work."""
 
+
+Record = dict[str, Any]
+"""A line of the manifest."""
 
 ContentOf = Callable[[Path], Mapping[str, Any]]
 """Function that returns the size and the hash of a file, as `content_of`."""
@@ -62,6 +129,22 @@ def name_of(text: str) -> str:
         return "\\" if escape == r"\\" else chr(0xDC00 + int(escape[2:], 16))
 
     return _ESCAPE.sub(unescaped, text)
+
+
+_AS_TEXT: dict[str, Callable[[Any], Any]] = {
+    "frame": text_of,
+    "file": text_of,
+    "files": lambda names: [*map(text_of, names)],
+    "inputs": lambda files: [{**one, "name": text_of(one["name"])} for one in files],
+    "error": lambda error: error.encode("utf-8", "backslashreplace").decode(),
+}
+"""Functions that make the values of a record text that JSON can hold."""
+
+
+def fingerprint(plain: Mapping[str, Any]) -> str:
+    """Return a hash of JSON-compatible values."""
+    text = json.dumps(plain, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 class ManifestDiffers(InvalidFile):
@@ -130,10 +213,10 @@ class Manifest:
                 if end == 0:
                     _check_same(record, job, self._path)
                 elif record.get("kind") == "frame":
-                    _check_frame(record, self._path)
+                    _check(record, self._path)
                     self._places[record["profile"], record["frame"]] = end
                 elif record.get("kind") == "video":
-                    _check_video(record, self._path)
+                    _check(record, self._path)
                     self._videos[record["profile"]] = record
                 end += len(line)
         if len(line) > MAX_LINE_BYTES:
@@ -147,7 +230,10 @@ class Manifest:
 
     def append(self, record: Record) -> None:
         """Append a line for a frame, or for the video of a profile."""
-        written = _with_text(record)
+        written = {
+            key: _AS_TEXT[key](value) if key in _AS_TEXT else value
+            for key, value in record.items()
+        }
         place = self._write(_line(written))
         if record["kind"] == "video":
             self._videos[record["profile"]] = written
@@ -218,10 +304,12 @@ class Manifest:
         # Records of earlier versions have no camera.
         source = json.loads(json.dumps(frame.described()))
         files, inputs = frame.files, record["inputs"]
+        path = below(self._out, name_of(record["file"]))
         return (
             record.get("source", source) == source
             and len(files) == len(inputs)
-            and self._is_intact(record, content_of)
+            and path is not None
+            and _has_content(path, record, content_of)
             and all(map(_has_content, files, inputs, [content_of] * len(files)))
         )
 
@@ -229,10 +317,6 @@ class Manifest:
         """Return whether a file is the last video of a profile, unchanged."""
         record = self._videos.get(profile)
         return record is not None and _has_content(path, record, content_of)
-
-    def _is_intact(self, record: Record, content_of: ContentOf) -> bool:
-        path = below(self._out, name_of(record["file"]))
-        return path is not None and _has_content(path, record, content_of)
 
 
 def begin_manifest(out: Path, job: Mapping[str, Any]) -> None:
@@ -246,24 +330,6 @@ def _job_line(job: Mapping[str, Any]) -> bytes:
 
 def _line(record: Mapping[str, Any]) -> bytes:
     return json.dumps(record, allow_nan=False).encode() + b"\n"
-
-
-def _with_text(record: Record) -> Record:
-    """Return a record whose file names JSON can hold."""
-    written = dict(record)
-    for key in ("frame", "file"):
-        if key in record:
-            written[key] = text_of(record[key])
-    if "files" in record:
-        written["files"] = [text_of(name) for name in record["files"]]
-    if "inputs" in record:
-        written["inputs"] = [
-            {**one, "name": text_of(one["name"])} for one in record["inputs"]
-        ]
-    if "error" in record:
-        error = record["error"].encode("utf-8", "backslashreplace")
-        written["error"] = error.decode()
-    return written
 
 
 def _has_content(
@@ -299,52 +365,34 @@ def _parsed(line: bytes, path: Path) -> Record:
     return record
 
 
-_FRAME_FIELDS: dict[str, type | tuple[type, ...]] = {
-    "profile": str,
-    "frame": str,
-    "ok": bool,
-}
-_DONE_FIELDS: dict[str, type | tuple[type, ...]] = {
-    "file": str,
-    "bytes": int,
-    "sha256": str,
-    "inputs": list,
-    "notes": list,
-    "missing_depth_count": int,
-    "clamped_depth_count": int,
-    "overflow_count": int,
-}
-_INPUT_FIELDS = {"bytes": int, "sha256": str}
-_VIDEO_FIELDS = {"profile": str, "file": str, "bytes": int, "sha256": str}
+_FRAME = [("profile", str), ("frame", str), ("ok", bool)]
+_CONTENT = [("bytes", int), ("sha256", str)]
+_COUNTS = ("missing_depth_count", "clamped_depth_count", "overflow_count")
+_Failed = defstruct("_Failed", [*_FRAME, ("error", str)])
+_Video = defstruct("_Video", [("profile", str), ("file", str), *_CONTENT])
+_Input = defstruct("_Input", _CONTENT)
+_Done = defstruct(
+    "_Done",
+    [
+        *_FRAME,
+        ("file", str),
+        *_CONTENT,
+        ("inputs", list[_Input]),  # type: ignore[valid-type]
+        ("notes", list[str]),
+        *((name, int) for name in _COUNTS),
+    ],
+)
 
 
-def _check_frame(record: Record, path: Path) -> None:
-    """Check that a frame's record has all required fields."""
-    wanted = _FRAME_FIELDS | (_DONE_FIELDS if record.get("ok") else {"error": str})
-    wrong = [k for k, kind in wanted.items() if not isinstance(record.get(k), kind)]
-    if not wrong and record["ok"]:
-        if not all(isinstance(note, str) for note in record["notes"]):
-            wrong.append("notes")
-        for recorded in record["inputs"]:
-            if not isinstance(recorded, dict) or not all(
-                isinstance(recorded.get(k), kind) for k, kind in _INPUT_FIELDS.items()
-            ):
-                wrong.append("inputs")
-    _refuse("frame", wrong, path)
-
-
-def _check_video(record: Record, path: Path) -> None:
-    """Check that a video's record has all required fields."""
-    wrong = [
-        k for k, kind in _VIDEO_FIELDS.items() if not isinstance(record.get(k), kind)
-    ]
-    _refuse("video", wrong, path)
-
-
-def _refuse(kind: str, wrong: list[str], path: Path) -> None:
-    if wrong:
-        found = f"the record of a {kind} has an invalid '{wrong[0]}'"
-        raise InvalidFile(path, found, "the manifest of a batch, or --overwrite")
+def _check(record: Record, path: Path) -> None:
+    """Check that the record of a frame or a video has all required fields."""
+    kind = _Done if record.get("ok") else _Failed
+    try:
+        convert(record, _Video if record["kind"] == "video" else kind)
+    except ValidationError as error:
+        found = f"the record of a {record['kind']} is invalid: {error}"
+        allowed = "the manifest of a batch, or --overwrite"
+        raise InvalidFile(path, found, allowed) from None
 
 
 def _check_same(found: Record, job: Mapping[str, Any], path: Path) -> None:
@@ -401,7 +449,7 @@ def summary_of(manifest: Manifest, wanted: set[tuple[str, str]]) -> dict[str, An
             continue
         n_done[record["profile"]] += 1
         add_notes(notes, record["notes"])
-        for name in ("missing_depth_count", "clamped_depth_count", "overflow_count"):
+        for name in _COUNTS:
             pixels[name] += record[name]
     return {
         "frames_done": dict(n_done),

@@ -11,17 +11,16 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from clients.batch.job import (
+from clients.batch.layouts import LayoutOptions, list_frames, optics_of
+from clients.batch.run import Batch
+from clients.batch.source import CENTER, SourceFrame, States, read_states
+from clients.batch.work import (
     LINEAR_FORMATS,
     VIDEO_FORMATS,
     Format,
     Job,
     batch_settings,
 )
-from clients.batch.layouts import LayoutOptions, list_frames, optics_of
-from clients.batch.run import Batch
-from clients.batch.source import SourceFrame
-from clients.batch.states import CENTER, States, read_states
 from clients.commands.options import read_object
 from estimator import InvalidFile, load_profile, profile_body, thread_count
 from filter_service.command_line import check_range, likely_number

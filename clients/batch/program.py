@@ -10,20 +10,24 @@ from typing import Any
 
 import typer
 
-from clients.batch.dry_run import dry_run, lines_of
-from clients.batch.exact_filter import EngineUnusable
 from clients.batch.manifest import Manifest, note_line
-from clients.batch.options import BatchOptions, batch_of, workers_and_threads
-from clients.batch.process_pool import THREADS_VARIABLE, ProcessPool
+from clients.batch.options import (
+    BatchOptions,
+    batch_of,
+    workers_and_threads,
+)
+from clients.batch.pools import THREADS_VARIABLE, ProcessPool, RayPool
 from clients.batch.run import (
     Batch,
-    Pool,
     begin_anew,
     check_folder,
     check_links,
+    dry_run,
+    lines_of,
     only_one,
     run_batch,
 )
+from clients.batch.work import EngineUnusable
 from clients.commands.options import with_options
 from estimator.bounded_files import printable
 from filter_service.command_line import (
@@ -80,13 +84,11 @@ def _pool(
     n_workers: int,
     n_threads: int,
     lock: int,
-) -> Pool:
+) -> ProcessPool | RayPool:
     if options.ray is None:
         return ProcessPool(
             batch.job, batch.out, n_workers=n_workers, n_threads=n_threads, lock=lock
         )
-    from clients.batch.ray_pool import RayPool
-
     return RayPool(
         batch.job,
         batch.out.absolute(),

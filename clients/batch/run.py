@@ -1,35 +1,52 @@
-"""Run of a batch: processes the missing frames and returns a summary."""
+"""Run of a batch: processes the missing frames and returns a summary.
+
+`dry_run` estimates the time, and the cost of a million images: it filters the first
+frames on one core and discards the images.
+"""
 
 from __future__ import annotations
 
 import fcntl
+import math
 import os
 import re
+import shutil
+import subprocess
+import tempfile
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
-from clients.batch.atomic_files import below, content_of, remove_parts, write_whole
-from clients.batch.job import Job, code_version
+import numpy as np
+
 from clients.batch.manifest import (
     LINES,
     SUMMARY,
     Manifest,
     begin_manifest,
+    below,
+    content_of,
     name_of,
+    note_line,
     records_of,
+    remove_parts,
     summary_of,
     text_of,
     write_summary,
+    write_whole,
 )
+from clients.batch.pools import ProcessPool, RayPool
 from clients.batch.source import SourceFrame
-from clients.batch.work import Record, Unit
+from clients.batch.work import Job, Unit, UnitRunner
+from clients.frame_log import Notes, add_notes
 from estimator import InvalidFile, thread_count
+from filter_service import __version__
 
 UNIT_FRAMES = 16
 """Frames per unit of work: few enough that all workers finish at about the same time,
@@ -39,6 +56,7 @@ SEGMENT_FRAMES = 48
 """Frames per video segment. The number does not depend on the workers, because it
 determines the bytes of the video."""
 
+CHECKOUT = Path(__file__).resolve().parents[2]
 SEGMENTS = ".segments"
 VIDEO_SUFFIXES = (".mkv", ".mp4")
 LOCK = ".lock"
@@ -47,13 +65,6 @@ LOCK_WAIT_S = 3.0
 
 _CHECKED_AT_ONCE = 1000
 _SEGMENT_NAME = re.compile(r"\d{8}\.mkv")
-
-
-class Pool(Protocol):
-    """Interface of pools that run units."""
-
-    def run(self, units: Sequence[Unit]) -> Generator[Record, None, None]:
-        """Yield the records of units as frames are finished, in any order."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +138,24 @@ class Batch:
                 raise OSError(
                     f"'{path}' changed during the run; start again with --overwrite"
                 )
+
+
+def code_version() -> dict[str, str | None]:
+    """Return the version of the package and, in a checkout, its commit."""
+    return {"version": __version__, "commit": _commit()}
+
+
+def _commit() -> str | None:
+    if shutil.which("git") is None or not (CHECKOUT / ".git").exists():
+        return None
+    answer = subprocess.run(
+        ["git", "describe", "--always", "--dirty", "--abbrev=12"],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return answer.stdout.strip() or None
 
 
 def _identity(path: Path) -> tuple[int, ...]:
@@ -224,20 +253,16 @@ def only_one(out: Path) -> Iterator[int]:
         raise InvalidFile(out / LOCK, found, "a plain file or none") from None
     with os.fdopen(descriptor, "w") as file:
         deadline_s = time.monotonic() + LOCK_WAIT_S
-        while not _is_locked(file.fileno()):
-            if time.monotonic() > deadline_s:
-                raise ValueError(f"--out '{out}': another batch is running there")
+        while True:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > deadline_s:
+                    found = f"--out '{out}': another batch is running there"
+                    raise ValueError(found) from None
             time.sleep(0.02)
         yield file.fileno()
-
-
-def _is_locked(descriptor: int) -> bool:
-    """Lock a file; return whether this succeeded."""
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 def missing_units(batch: Batch, manifest: Manifest) -> list[Unit]:
@@ -296,7 +321,7 @@ def _parts(
 def run_batch(
     batch: Batch,
     manifest: Manifest,
-    pool: Pool,
+    pool: ProcessPool | RayPool,
     *,
     on_done: Callable[[int, int], None] = lambda n_done, n_all: None,
 ) -> dict[str, Any]:
@@ -385,9 +410,13 @@ def _join_videos(batch: Batch, manifest: Manifest) -> None:
         if not segments:
             continue
 
-        def join(path: Path, segments: list[tuple[int, Path]] = segments) -> None:
-            join_segments(path, segments, kind=kind, rate_hz=rate_hz, times_s=times_s)
-
+        join = partial(
+            join_segments,
+            segments=segments,
+            kind=kind,
+            rate_hz=rate_hz,
+            times_s=times_s,
+        )
         content = write_whole(target, join)
         manifest.append(
             {"kind": "video", "profile": profile, "file": target.name, **content}
@@ -397,3 +426,126 @@ def _join_videos(batch: Batch, manifest: Manifest) -> None:
 def _is_ok(manifest: Manifest, profile: str, frame: SourceFrame) -> bool:
     record = manifest.record(profile, frame.name)
     return record is not None and record["ok"]
+
+
+MEASURED_FRAMES = 6
+"""Frames per profile, of which the first one is a warm-up."""
+
+SECONDS_PER_HOUR = 3600.0
+MILLION = 1_000_000
+
+
+def dry_run(
+    batch: Batch, *, n_cores: int, price_per_core_hour: float | None
+) -> dict[str, Any]:
+    """Return the report of `ocufilter batch --dry-run`."""
+    n_all = len(batch.frames) * len(batch.job.profiles)
+    n_missing = n_all
+    if (batch.out / LINES).is_file():
+        job = batch.described()
+        with Manifest(batch.out, job, read_only=True) as manifest:
+            units = missing_units(batch, manifest)
+        n_missing = sum(len(unit.frames) for unit in units)
+    measured = [_measured(batch, profile) for profile in batch.job.profiles]
+    ms = [one["ms_per_frame"] for one in measured if one["ms_per_frame"] is not None]
+    mean_ms = float(np.mean(ms)) if ms else math.nan
+    sizes = [one["bytes_per_frame"] for one in measured if one["bytes_per_frame"]]
+    # A helper process of each worker computes the PSFs, once per profile.
+    builds_s = sum(one["build_s"] for one in measured) if n_missing else 0.0
+    core_hours = mean_ms * MILLION / 1e3 / SECONDS_PER_HOUR
+    report = {
+        "layout": batch.layout,
+        "frames": len(batch.frames),
+        "profiles": measured,
+        "pictures": n_all,
+        "pictures_missing": n_missing,
+        "cores": n_cores,
+        "ms_per_picture_and_core": _known(mean_ms, 2),
+        "seconds": _known(n_missing * mean_ms / 1e3 / n_cores + builds_s, 1),
+        "output_mb": _known(n_missing * float(np.mean(sizes)) / 1e6, 1)
+        if sizes
+        else None,
+        "core_hours_per_million": _known(core_hours, 2),
+    }
+    if price_per_core_hour is not None:
+        report["price_per_million"] = _known(core_hours * price_per_core_hour, 2)
+    return report
+
+
+def _known(value: float, digits: int) -> float | None:
+    return round(value, digits) if math.isfinite(value) else None
+
+
+def _measured(batch: Batch, profile: str) -> dict[str, Any]:
+    """Filter the first frames through a profile, on one thread."""
+    frames = batch.frames[:MEASURED_FRAMES]
+    times_ms, sizes, errors = [], [], []
+    notes: Notes = {}
+    build_s = 0.0
+    with tempfile.TemporaryDirectory(prefix="ocufilter-dry-run-") as folder:
+        runner = UnitRunner(batch.job, Path(folder))
+        try:
+            for number, frame in enumerate(frames):
+                segment = Path(f"{number}.mkv") if batch.job.is_video else None
+                unit = Unit(number, profile, (frame,), segment)
+                started_s = time.perf_counter()
+                (record,) = runner.run(unit)
+                took_ms = 1e3 * (time.perf_counter() - started_s)
+                if not record["ok"]:
+                    errors.append(record["error"])
+                    continue
+                add_notes(notes, record["notes"])
+                sizes.append(record["bytes"])
+                if "build" not in record["ms"]:
+                    times_ms.append(took_ms)
+            build_s = runner.build_s
+        finally:
+            runner.close()
+    return {
+        "profile": profile,
+        "measured_frames": len(times_ms),
+        "build_s": round(build_s, 2),
+        "ms_per_frame": round(float(np.median(times_ms)), 2) if times_ms else None,
+        "bytes_per_frame": round(float(np.mean(sizes))) if sizes else None,
+        "errors": errors,
+        "notes": list(notes.values()),
+    }
+
+
+def lines_of(report: dict[str, Any], price_per_core_hour: float | None) -> list[str]:
+    """Format the report as lines of text."""
+    lines = [
+        f"{report['frames']} frames of the layout {report['layout']}, "
+        f"{len(report['profiles'])} profiles: {report['pictures']} images, "
+        f"{report['pictures_missing']} of them missing"
+    ]
+    for one in report["profiles"]:
+        took = one["ms_per_frame"]
+        measured = (
+            "no frame was measured"
+            if took is None
+            else f"{took:.1f} ms per frame on one core ({one['measured_frames']} "
+            f"measured), {one['bytes_per_frame'] / 1e6:.2f} MB"
+        )
+        lines.append(f"  {one['profile']}: {measured}; PSFs {one['build_s']:.1f} s")
+        for text, count in Counter(one["errors"]).items():
+            times = f" ({count} of {MEASURED_FRAMES} frames)" if count > 1 else ""
+            lines.append(f"    error: {text}{times}")
+        lines += [f"    note: {note_line(note)}" for note in one["notes"]]
+    if report["seconds"] is not None:
+        lines.append(
+            f"about {_duration(report['seconds'])} on {report['cores']} cores, "
+            f"{report['output_mb']:g} MB"
+        )
+        cost = f"a million images: {report['core_hours_per_million']:g} core-hours"
+        if price_per_core_hour is not None:
+            cost += f", {report['price_per_million']:g} at {price_per_core_hour:g} each"
+        lines.append(cost)
+    return lines
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    minutes = seconds / 60.0
+    return f"{minutes:.0f} min" if minutes < 120.0 else f"{minutes / 60.0:.1f} h"

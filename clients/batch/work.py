@@ -1,25 +1,31 @@
-"""Work of a worker: reads and filters frames, writes files and returns records."""
+"""Work of a worker: reads and filters the frames of a job, writes files and records."""
 
 from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clients.batch.atomic_files import below, write_whole
-from clients.batch.exact_filter import ExactFilter
-from clients.batch.job import Job
-from clients.batch.source import BadFrame, SourceFrame, check_sizes
+from clients.batch.manifest import Record, below, write_whole
+from clients.batch.source import BadFrame, SourceFrame, States, check_sizes
 from estimator.bounded_files import read_bytes
-from filter_service import Filtered, FilterError, RgbdView
+from filter_service import (
+    Camera,
+    EyeFilter,
+    FilterError,
+    FilterSettings,
+    Output,
+    RgbdView,
+)
 from filter_service.bounded_images import MAX_FILE_BYTES
 from filter_service.camera import PixelGrid
+from filter_service.errors import WorkerCrashed
 from filter_service.image_files import (
     ImageFile,
     named_note,
@@ -30,8 +36,105 @@ from filter_service.image_files import (
 if TYPE_CHECKING:
     from clients.batch.video_reading import VideoReader
 
-Record = dict[str, Any]
-"""A line of the manifest."""
+
+FORMATS = ("png", "npy", "exr", "ffv1", "h264")
+LINEAR_FORMATS = ("npy", "exr")
+VIDEO_FORMATS = ("ffv1", "h264")
+
+Format = Literal["png", "npy", "exr", "ffv1", "h264"]
+
+
+@dataclass(frozen=True)
+class Job:
+    """Parameters that determine the images, whatever the workers and the order.
+
+    Attributes
+    ----------
+    profiles : mapping
+        Profiles, as JSON objects, by name.
+    settings : FilterSettings
+        Settings of the filter.
+    states : States
+        Pupil and focus of each frame.
+    format : str
+        Output format, one of `FORMATS`.
+    half : bool
+        Whether to write half floats instead of floats.
+    engine : "native" or "gl"
+        Engine that filters.
+    render_tolerance : float
+        Rendering error relative to the default.
+    rate_hz : float
+        Frame rate of output videos.
+    """
+
+    profiles: Mapping[str, Mapping[str, Any]]
+    settings: FilterSettings
+    states: States
+    format: Format = "png"
+    half: bool = False
+    engine: Literal["native", "gl"] = "native"
+    render_tolerance: float = 1.0
+    rate_hz: float = 30.0
+
+    @property
+    def output(self) -> Output:
+        """Return the output kind of the filter for this format."""
+        if self.format not in LINEAR_FORMATS:
+            return "srgb8"
+        return "linear16" if self.half else "linear"
+
+    @property
+    def is_video(self) -> bool:
+        """Return whether the output is one video per profile."""
+        return self.format in VIDEO_FORMATS
+
+    def described(self) -> dict[str, Any]:
+        """Return the parameters as plain values."""
+        return {
+            "profiles": {name: dict(body) for name, body in self.profiles.items()},
+            "settings": self.settings.fields(),
+            "states": self.states.described(),
+            "format": self.format,
+            "half": self.half,
+            "engine": self.engine,
+            "render_tolerance": self.render_tolerance,
+            "rate_hz": self.rate_hz if self.is_video else None,
+        }
+
+
+def batch_settings(given: Mapping[str, Any], states: States) -> FilterSettings:
+    """Return the settings of a batch.
+
+    Parameters
+    ----------
+    given : mapping
+        Fields of `FilterSettings`.  Ranges that are not given are the defaults, widened
+        to include the states.
+    states : States
+        Pupil and focus of each frame.
+
+    Raises
+    ------
+    ValueError
+        If a setting is unknown or out of range.
+    """
+    try:
+        settings = FilterSettings(**given)
+    except TypeError as error:
+        raise ValueError(f"--settings: {error}") from None
+    return settings.covering(
+        pupils_mm=() if "pupil_range_mm" in given else states.pupil_range_mm,
+        foci_dpt=() if "focus_range_dpt" in given else states.focus_range_dpt,
+    )
+
+
+ATTEMPTS = 2
+
+
+class EngineUnusable(RuntimeError):
+    """The engine does not work on this machine; the message says what to install."""
+
 
 PNG_LEVEL = 1
 """Files are a fifth larger than by default and take a quarter of the time."""
@@ -62,34 +165,23 @@ class Unit:
     segment: Path | None = None
 
 
-@dataclass
-class FilteredPicture:
-    """A filtered frame, the place of its pixels, and its record without the file."""
-
-    filtered: Filtered
-    grid: PixelGrid
-    record: Record
-
-
 class UnitRunner:
     """Runner of units, which reads, filters and writes the frames of one job."""
 
     def __init__(self, job: Job, out: Path) -> None:
         self._job, self._out = job, out
-        self._filter = ExactFilter(job)
+        self._open: EyeFilter | None = None
+        self._key: tuple[str, Camera] | None = None
+        self._failure: FilterError | None = None
         self._readers: dict[Path, VideoReader] = {}
+        self.build_s = 0.0
 
     def close(self) -> None:
         """Release the filter and the video readers."""
-        self._filter.close()
+        if self._open is not None:
+            self._open.close()
         for reader in self._readers.values():
             reader.close()
-        self._readers = {}
-
-    @property
-    def build_s(self) -> float:
-        """Return the total preparation time of eyes so far."""
-        return self._filter.build_s
 
     def run(
         self, unit: Unit, is_wanted: Callable[[], bool] = lambda: True
@@ -104,7 +196,7 @@ class UnitRunner:
             Called before each frame; the unit stops if it returns False.
         """
         if unit.segment is not None:
-            yield from self._segment(unit, is_wanted)
+            yield from self._segment(unit, unit.segment, is_wanted)
             return
         for frame in unit.frames:
             if not is_wanted():
@@ -114,28 +206,25 @@ class UnitRunner:
             yield record | {"cpu_ms": _cpu_ms_since(cpu_s)}
 
     def _picture(self, profile: str, frame: SourceFrame) -> Record:
-        seen = self._attempt(profile, frame)
-        if not isinstance(seen, FilteredPicture):
-            return seen
-        start_s = time.perf_counter()
         file = Path(profile) / f"{frame.name}.{self._job.format}"
-        color = seen.filtered.color
-
-        def write(path: Path) -> None:
-            write_image(path, color, png_level=PNG_LEVEL, grid=seen.grid)
-
         try:
-            written = write_whole(self._place(file), write)
+            color, grid, record = self._filtered(profile, frame)
+            start_s = time.perf_counter()
+            written = write_whole(
+                self._place(file),
+                lambda path: write_image(path, color, png_level=PNG_LEVEL, grid=grid),
+            )
         except FAILURES as error:
             return _failed(profile, frame, error)
-        seen.record["ms"]["write"] = _ms_since(start_s)
-        return {**seen.record, "file": file.as_posix(), **written}
+        record["ms"]["write"] = _ms_since(start_s)
+        return {**record, "file": file.as_posix(), **written}
 
-    def _segment(self, unit: Unit, is_wanted: Callable[[], bool]) -> Iterator[Record]:
+    def _segment(
+        self, unit: Unit, segment: Path, is_wanted: Callable[[], bool]
+    ) -> Iterator[Record]:
         """Write a video segment; yield its records when it is complete."""
         from clients.batch.video_writing import VIDEO_KINDS, write_segment
 
-        assert unit.segment is not None
         records: list[Record] = []
         ratio = 1.0
 
@@ -146,31 +235,30 @@ class UnitRunner:
                 if not is_wanted():
                     raise Cancelled
                 cpu_s = time.process_time()
-                seen = self._attempt(unit.profile, frame)
-                if isinstance(seen, FilteredPicture):
-                    image = seen.filtered.color
+                try:
+                    image, grid, record = self._filtered(unit.profile, frame)
                     shape = shape or image.shape
-                    if image.shape == shape:
-                        ratio = seen.grid.pixel_aspect_ratio
-                        yield number, image  # encoded before the next line runs
-                        records.append(seen.record | {"cpu_ms": _cpu_ms_since(cpu_s)})
-                        continue
-                    seen = _failed(unit.profile, frame, BadFrame("its size differs"))
-                records.append(seen | {"cpu_ms": _cpu_ms_since(cpu_s)})
+                    if image.shape != shape:
+                        raise BadFrame("its size differs")
+                except FAILURES as error:
+                    record = _failed(unit.profile, frame, error)
+                else:
+                    ratio = grid.pixel_aspect_ratio
+                    yield number, image  # encoded before the next line runs
+                records.append(record | {"cpu_ms": _cpu_ms_since(cpu_s)})
 
         def write(path: Path) -> None:
-            kind, rate_hz = VIDEO_KINDS[self._job.format], self._job.rate_hz
             write_segment(
                 path,
                 images(),
-                kind=kind,
-                rate_hz=rate_hz,
+                kind=VIDEO_KINDS[self._job.format],
+                rate_hz=self._job.rate_hz,
                 pixel_aspect_ratio=lambda: ratio,
             )
             path.touch()  # exists even without frames
 
         try:
-            place = self._place(unit.segment)
+            place = self._place(segment)
             written = write_whole(place, write)
         except Cancelled:
             return
@@ -182,7 +270,7 @@ class UnitRunner:
             place.unlink()
         for record in records:
             if record["ok"]:
-                record = {**record, "file": unit.segment.as_posix(), **written}
+                record = {**record, "file": segment.as_posix(), **written}
             yield record
 
     def _place(self, file: Path) -> Path:
@@ -195,26 +283,26 @@ class UnitRunner:
             )
         return path
 
-    def _attempt(self, profile: str, frame: SourceFrame) -> FilteredPicture | Record:
-        try:
-            return self._filtered(profile, frame)
-        except FAILURES as error:
-            return _failed(profile, frame, error)
-
-    def _filtered(self, profile: str, frame: SourceFrame) -> FilteredPicture:
+    def _filtered(
+        self, profile: str, frame: SourceFrame
+    ) -> tuple[NDArray[Any], PixelGrid, Record]:
+        """Return a filtered frame, the place of its pixels, and its record."""
         if frame.fault is not None:
             raise BadFrame(frame.fault)
         start_s = time.perf_counter()
         color, depth, inputs = self._read(frame)
         check_sizes(frame, color, depth)
-        depth_m = depth.pixels
-        tangents = frame.optics.tangents(color.grid)
-        view = RgbdView(color.pixels, depth_m, tangents)
-        pupil_mm, focus_dpt = self._job.states.of(frame.name, depth_m)
+        view = RgbdView(color.pixels, depth.pixels, frame.optics.tangents(color.grid))
+        pupil_mm, focus_dpt = self._job.states.of(frame.name, depth.pixels)
         read_ms, start_s = _ms_since(start_s), time.perf_counter()
-        built_s = self._filter.build_s
-        seen = self._filter.see(profile, view, pupil_mm=pupil_mm, focus_dpt=focus_dpt)
-        built_now = self._filter.build_s > built_s
+        built_s = self.build_s
+        seen = self._prepared(profile, view.camera).filter(
+            view,
+            pupil_diameter_mm=pupil_mm,
+            focus_dpt=focus_dpt,
+            output=self._job.output,
+            render_tolerance=self._job.render_tolerance,
+        )
         record: Record = {
             "kind": "frame",
             "profile": profile,
@@ -230,9 +318,36 @@ class UnitRunner:
             "source": frame.described(),
             "ms": {"read": read_ms, "filter": _ms_since(start_s)},
         }
-        if built_now:
-            record["ms"]["build"] = 1e3 * (self._filter.build_s - built_s)
-        return FilteredPicture(seen, color.grid, record)
+        if self.build_s > built_s:
+            record["ms"]["build"] = 1e3 * (self.build_s - built_s)
+        return seen.color, color.grid, record
+
+    def _prepared(self, profile: str, camera: Camera) -> EyeFilter:
+        """Return the filter, prepared for a profile and for exactly a camera.
+
+        With an eye prepared for similar cameras, images would depend on which camera
+        came first.
+        """
+        try:
+            self._open = found = self._open or EyeFilter(engine=self._job.engine)
+        except FilterError as error:
+            raise EngineUnusable(str(error)) from None
+        if self._key != (profile, camera):
+            self._key = None
+            for _ in range(ATTEMPTS):
+                self._failure = None
+                body, settings = self._job.profiles[profile], self._job.settings
+                found.set_profile(body, settings=settings, cameras=[camera])
+                try:
+                    self.build_s += found.wait().build_ms / 1e3
+                except FilterError as error:
+                    self._failure = error
+                if not isinstance(self._failure, WorkerCrashed):  # for lack of memory
+                    break
+            self._key = profile, camera
+        if self._failure is not None:
+            raise self._failure
+        return found
 
     def _read(self, frame: SourceFrame) -> tuple[ImageFile, ImageFile, list[Record]]:
         """Return color, depth and the records of the image files.

@@ -153,8 +153,15 @@ def latency(
     from itertools import product
 
     from clients.commands.options import read_profile, read_size_px
-    from clients.latency import report
-    from clients.latency.measure import Case, Target, compare, measure
+    from clients.latency.measure import (
+        Case,
+        Target,
+        as_json,
+        as_text,
+        compare,
+        measure,
+        save_plot,
+    )
     from filter_service.atomic_files import replace_atomically
     from filter_service.errors import FilterError
     from filter_service.image_files import check_output
@@ -201,11 +208,11 @@ def latency(
     except FilterError as failure:  # the times remain
         sys.stderr.write(f"ocufilter: the error is missing: {failure}\n")
     if plot is not None:
-        replace_atomically(plot, lambda path: report.save_plot(results, path))
+        replace_atomically(plot, lambda path: save_plot(results, path))
     if json_output:
-        print_json(report.as_json(target, results))
+        print_json(as_json(target, results))
         return
-    for line in report.as_text(target, results):
+    for line in as_text(target, results):
         print_line(line)
 
 

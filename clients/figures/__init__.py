@@ -6,19 +6,11 @@
 `NAME_figure` returns a new figure.  `draw_NAME` draws into axes, or into a figure or
 subfigure if it needs several axes.
 
-study           `EyeStudy`: one eye, estimated and traced once
-pupil_wavefront  one wavefront in the pupil, and its transfer function
-style           sizes, colors, fonts
-wavefront       maps of a wavefront
-orders          RMS by radial order, coefficients
-psfs            images of point-spread functions
-transfer_curves  contrast by spatial frequency
-field_maps      refraction and blur over the visual field
-drawn_curves    curves of persons drawn from the population
-field_lines     their refraction along the horizontal meridian
-acuity          visual acuity by distance
-acuity_curves   curves of visual acuity
-section         cross-section of the eye, with rays
+study      `EyeStudy`: one eye, estimated and traced once; its wavefronts and acuity
+style      sizes, colors, fonts
+wavefront  maps of a wavefront, orders, coefficients, point images, section of the eye
+curves     contrast, acuity and refraction by frequency, distance and direction, and
+           curves of persons drawn from the population
 """
 
 import lazy_loader

@@ -1,32 +1,287 @@
-"""One eye prepared for its figures: estimated and traced once, evaluated often."""
+"""One eye prepared for its figures: estimated and traced once, evaluated often.
+
+`PupilWavefront` is one wavefront in the pupil, with its optical transfer function and
+the acuity that it allows; `AcuityByDistance` is that acuity at all distances.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clients.figures.acuity import AcuityByDistance, acuity_by_distance
-from clients.figures.pupil_wavefront import PupilWavefront
 from estimator import (
+    Acuity,
     EyeModel,
     EyeOptics,
     EyeProfile,
     FieldTable,
     Lenslets,
     Rings,
+    Transfer,
+    best_correction_um,
     eye_model,
     field_table,
     load_profile,
+    log_mar_of,
+    optical_transfer,
     parse_profile,
+    predict_acuity,
     prepare_eye,
     preset_names,
 )
+
+SECOND_ORDER = slice(3, 6)
+TILTS = slice(1, 3)
+
+
+@dataclass(frozen=True)
+class PupilWavefront:
+    """The wavefront of a point source and its pupil.
+
+    Attributes
+    ----------
+    zernike_um : (28,)
+        Coefficients on the circle of ``circle_diameter_mm``, in the plane of the
+        entrance pupil.
+    pupil_ellipse : (5,)
+        Pupil within the circle: center x, y and semi-axes, mm, and angle, rad.
+    rings : Rings or None
+        Rings that produce several foci, or lenslets in front of the pupil.
+    """
+
+    zernike_um: NDArray[np.float64]
+    circle_diameter_mm: float
+    pupil_ellipse: NDArray[np.float64]
+    wavelength_nm: float
+    rings: Rings | None = None
+
+    @property
+    def is_readable(self) -> bool:
+        """Return whether acuity and contrast are known; not through lenslets."""
+        return self.rings is None or self.rings.lattice_mm is None
+
+    @cached_property
+    def predicted(self) -> Acuity | None:
+        """Return acuity and visual Strehl ratio.
+
+        None if the wavefront is too steep to be resolved, and through lenslets.
+        """
+        try:
+            return predict_acuity(self.zernike_um, **self._pupil)
+        except ValueError:
+            return None
+
+    @cached_property
+    def best_corrected(self) -> PupilWavefront:
+        """Return the wavefront with the best sphere and cylinder for this pupil.
+
+        These have the highest visual Strehl ratio at which neither that ratio nor the
+        acuity is worse than without them.  Through lenslets, they are those of least
+        squares.
+        """
+        if not self.is_readable:
+            return self._least_squares
+        return next(
+            tried
+            for tried in self._corrections()
+            if tried is self or tried.is_as_good_as(self)
+        )
+
+    def near_best_corrected(self, *, n_samples: int) -> PupilWavefront:
+        """Return the wavefront with the best sphere and cylinder near least squares.
+
+        Without large higher orders it is that of `best_corrected`, in less time.
+
+        Parameters
+        ----------
+        n_samples : int
+            Samples across the pupil.
+        """
+        start_um = self._least_squares.zernike_um
+        zernike_um = best_correction_um(start_um, n_samples=n_samples, **self._pupil)
+        return replace(self, zernike_um=zernike_um)
+
+    def _corrections(self) -> Iterator[PupilWavefront]:
+        """Yield the states to choose the best correction from, the best first."""
+        zernike_um = best_correction_um(self.zernike_um, **self._pupil)
+        yield replace(self, zernike_um=zernike_um)
+        yield self._least_squares
+        yield self
+
+    def is_as_good_as(self, other: PupilWavefront) -> bool:
+        """Return whether acuity and visual Strehl ratio are not worse than another's.
+
+        A wavefront that is too steep to be resolved is worse than all others.
+        """
+        mine, its = self.predicted, other.predicted
+        if mine is None or its is None:
+            return its is None
+        has_ratio = mine.visual_strehl_ratio >= its.visual_strehl_ratio
+        return has_ratio and mine.log_mar <= its.log_mar
+
+    @property
+    def _least_squares(self) -> PupilWavefront:
+        zernike_um = self.zernike_um.copy()
+        zernike_um[SECOND_ORDER] = 0.0
+        return replace(self, zernike_um=zernike_um)
+
+    @property
+    def _pupil(self) -> dict[str, Any]:
+        return {
+            "zernike_radius_mm": self.circle_diameter_mm / 2.0,
+            "wavelength_nm": self.wavelength_nm,
+            "pupil_ellipse": self.pupil_ellipse,
+            "pupil_screen": self.rings,
+        }
+
+    def transfer(self, **options: Any) -> Transfer:
+        """Return the optical transfer function.
+
+        Parameters
+        ----------
+        **options
+            ``frequency_step_cpd``; see `optical_transfer`.
+
+        Raises
+        ------
+        ValueError
+            If the wavefront is too steep to be resolved, or through lenslets.
+        """
+        zernike_um = self.zernike_um.copy()
+        zernike_um[TILTS] = 0.0  # the image's position is irrelevant
+        return optical_transfer(zernike_um, **self._pupil, **options)
+
+
+STEP_COUNT, ACCOMMODATED_COUNT = 11, 3
+"""Number of distances of a curve, and of its part within the accommodation range."""
+
+FINE_STEP_DPT = 0.25
+"""Step of the curve of a lens with several foci, which lie 1 dpt apart."""
+
+PAST_LAST_FOCUS_DPT = 1.0
+
+NEAREST_DPT = 5.0
+PAST_FAR_POINT_DPT = 2.0
+HIGHEST_DPT = 20.0
+MIN_ACCOMMODATION_DPT = 1e-6
+"""Smallest accommodation range; an eye with less is treated as fixed-focus."""
+
+
+@dataclass(frozen=True)
+class AcuityByDistance:
+    """Acuity through one pupil, logMAR; infinite where the blur is too wide.
+
+    Attributes
+    ----------
+    object_dpt : (n,)
+        Distances, far to near.
+    far_log_mar, near_log_mar : (n,)
+        Acuity of the eye focused far, and accommodating for each distance.
+    """
+
+    object_dpt: NDArray[np.float64]
+    far_log_mar: NDArray[np.float64]
+    near_log_mar: NDArray[np.float64]
+
+
+def acuity_by_distance(study: EyeStudy, pupil_diameter_mm: float) -> AcuityByDistance:
+    """Return the acuity of an eye from far to 20 cm, or past its far point."""
+    object_dpt = distances_dpt(study, pupil_diameter_mm)
+    far = through_focus_log_mar(study, pupil_diameter_mm, object_dpt)
+    near = accommodated_log_mar(study, pupil_diameter_mm, object_dpt, far)
+    return AcuityByDistance(object_dpt, far, near)
+
+
+def acuity_log_mar(wavefront: PupilWavefront) -> float:
+    """Return the acuity of a wavefront; infinite if it is too steep to be resolved.
+
+    NaN through lenslets: how people read through them is not known.
+    """
+    if not wavefront.is_readable:
+        return np.nan
+    try:
+        return log_mar_of(wavefront.transfer())
+    except ValueError:
+        return np.inf
+
+
+def distances_dpt(study: EyeStudy, pupil_diameter_mm: float) -> NDArray[np.float64]:
+    """Return the distances (n,) of a curve: far to 20 cm, and past the far point."""
+    pupil_mm = study.optics.usable_pupil_mm(pupil_diameter_mm)
+    far_dpt, _ = study.optics.focus_limits_dpt(pupil_mm)
+    nearest = min(max(NEAREST_DPT, far_dpt + PAST_FAR_POINT_DPT), HIGHEST_DPT)
+    even = np.linspace(0.0, np.ceil(nearest), STEP_COUNT)
+    peaks_dpt = np.array([far_dpt])
+    seen = study.wavefront(pupil_mm)
+    if seen.rings is not None and seen.is_readable:
+        peaks_dpt = far_dpt + seen.rings.main_dpt(seen.wavelength_nm)
+        last_dpt = float(peaks_dpt.max()) + PAST_LAST_FOCUS_DPT
+        nearest = max(nearest, last_dpt)
+        first_dpt = max(far_dpt - PAST_LAST_FOCUS_DPT, 0.0)
+        fine = np.arange(first_dpt, last_dpt, FINE_STEP_DPT)
+        even = np.union1d(np.linspace(0.0, np.ceil(nearest), STEP_COUNT), fine)
+    return np.union1d(even, peaks_dpt[(peaks_dpt > 0.0) & (peaks_dpt < nearest)])
+
+
+def through_focus_log_mar(
+    study: EyeStudy,
+    pupil_diameter_mm: float,
+    object_dpt: NDArray[np.float64],
+    *,
+    is_accommodating: bool = False,
+) -> NDArray[np.float64]:
+    """Return the acuity (n,) of an eye focused far, logMAR, at distances (n,).
+
+    If ``is_accommodating`` is set, the eye accommodates for each distance.
+    """
+    wavefronts = (
+        study.wavefront(
+            pupil_diameter_mm, object_dpt=d, focus_dpt=d if is_accommodating else 0.0
+        )
+        for d in object_dpt.tolist()
+    )
+    return np.array([*map(acuity_log_mar, wavefronts)])
+
+
+def accommodated_log_mar(
+    study: EyeStudy,
+    pupil_diameter_mm: float,
+    object_dpt: NDArray[np.float64],
+    far_log_mar: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the acuity (n,) of an eye that accommodates for each distance, logMAR.
+
+    Within the accommodation range acuity changes slowly: it is computed at three
+    distances and interpolated.
+
+    Parameters
+    ----------
+    far_log_mar : (n,)
+        Acuity of the same eye focused far, which applies beyond its far point.
+    """
+    pupil_mm = study.optics.usable_pupil_mm(pupil_diameter_mm)
+    far_dpt, near_dpt = study.optics.focus_limits_dpt(pupil_mm)
+    if near_dpt - far_dpt < MIN_ACCOMMODATION_DPT:
+        return far_log_mar.copy()
+
+    predict = partial(through_focus_log_mar, study, pupil_mm, is_accommodating=True)
+    found = far_log_mar.copy()
+    is_near = object_dpt > near_dpt
+    found[is_near] = predict(object_dpt[is_near])
+    within = object_dpt[(object_dpt >= max(far_dpt, 0.0)) & ~is_near]
+    if within.size:
+        sampled_dpt = np.unique(np.linspace(within[0], within[-1], ACCOMMODATED_COUNT))
+        found[np.isin(object_dpt, within)] = np.interp(
+            within, sampled_dpt, predict(sampled_dpt)
+        )
+    return found
+
 
 PUPILS_MM = (3.0, 5.0)
 """Pupils in daylight and at dusk."""

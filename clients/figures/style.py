@@ -5,7 +5,7 @@ Figures are made without pyplot, which is not thread-safe.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,6 +39,19 @@ def new_figure(width_mm: float, height_mm: float) -> Figure:
     """Return an empty figure of a given size on paper."""
     size = (width_mm / MM_PER_INCH, height_mm / MM_PER_INCH)
     return Figure(figsize=size, layout="constrained", facecolor="white")
+
+
+def figure_of(
+    width_mm: float,
+    height_mm: float,
+    draw: Callable[..., None],
+    *subjects: Any,
+    **options: Any,
+) -> Figure:
+    """Return a figure with one pair of axes, into which a function draws."""
+    figure = new_figure(width_mm, height_mm)
+    draw(figure.subplots(), *subjects, **options)
+    return figure
 
 
 def style_axes(axes: Axes, *, title: str = "", x: str = "", y: str = "") -> None:

@@ -130,37 +130,10 @@ class StreamSettings:
             "states": self.states,
         }
 
-    @property
-    def case(self) -> str:
-        """Return a description of the content."""
-        views = "" if self.n_views == 1 else f"{self.n_views} x "
-        eye = _name_of(self.profile)
-        if self.right_profile is not None:
-            eye = f"left {eye}, right {_name_of(self.right_profile)}"
-        state = f"{self.pupil_diameter_mm:g} mm, {self.focus_dpt:g} dpt"
-        if self.is_moving:
-            state = "moving pupil and focus"
-        return f"{views}{self.width_px}x{self.height_px} {self.output}, {eye}, {state}"
-
-    @property
-    def setting(self) -> str:
-        """Return a description of schedule and transport."""
-        schedule = f"{self.rate_hz:g} Hz for {self.duration_s:g} s"
-        how = [self.transport]
-        if self.compression != "none":
-            how.append(self.compression)
-        if self.depth_encoding != "float32":
-            how.append(f"depth {self.depth_encoding}")
-        return f"{schedule}, {self.max_in_flight} in flight, {', '.join(how)}"
-
 
 def _between(span: tuple[float, float], n_periods: float) -> float:
     low, high = span
     return low + (high - low) * (0.5 + 0.5 * math.sin(2.0 * math.pi * n_periods))
-
-
-def _name_of(profile: Mapping[str, Any]) -> str:
-    return str(profile.get("name", profile.get("kind", "profile")))
 
 
 @dataclass(frozen=True)
@@ -187,8 +160,8 @@ class LatencyRun:
 
     Attributes
     ----------
-    case, setting : str
-        Descriptions of the content and of schedule and transport.
+    settings : StreamSettings
+    renderer : str
     stages_ms : dict of lists
         ``client_wait_ms`` from the schedule to the send; ``wire_and_queue_ms``, the
         round trip minus the service's own total; the service's stages;
@@ -214,8 +187,7 @@ class LatencyRun:
         Replies whose images were kept.
     """
 
-    case: str
-    setting: str
+    settings: StreamSettings
     renderer: str
     stages_ms: dict[str, list[float]] = field(default_factory=dict)
     due_s: list[float] = field(default_factory=list)
@@ -311,7 +283,7 @@ def measure_stream(
         for k, frame in enumerate(frames)
     ]
     welcome = client.hello()
-    run = LatencyRun(settings.case, settings.setting, welcome.server["renderer"])
+    run = LatencyRun(settings, welcome.server["renderer"])
     run.n_scheduled = settings.n_scheduled
     run.memory_start_mb = read_memory_mb()
     before = client.n_bytes

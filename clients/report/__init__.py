@@ -1,21 +1,13 @@
 """Reports of simulated eyes: `ocufilter report` and `report_html`.
 
-program          the command
-make             reports from profiles
-facts            computed content of a report on one eye
-numbers          numbers of a report
-correction_text  descriptions of corrections
-charts           filtered letter charts, near and far
-method_text      how the eye was computed
-provenance       measured, entered and assumed data
-sources          literature references
-labels           names of the eyes
-origin           reference, date, version and digest of the profile
-blocks           sections, rows, tables and figures
-tables           tables of a report
-content          the report of one eye
-comparison       the report of two eyes
-html_page        HTML output, which a PDF is printed from
+program    the command
+make       reports from profiles, and what identifies them
+facts      computed content of a report on one eye: numbers, letter charts, names
+text       sentences: corrections, method, provenance, literature references
+tables     tables of a report
+content    the reports of one eye and of two eyes
+html_page  sections, rows, tables and figures, and their HTML, from which a PDF is
+           printed
 """
 
 import lazy_loader

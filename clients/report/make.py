@@ -2,20 +2,65 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from clients.figures.study import Profile, ProgressCallback, profile_of
-from clients.report.blocks import Document
-from clients.report.comparison import comparison_document
-from clients.report.content import eye_document
-from clients.report.facts import EyeFacts, facts_of
-from clients.report.html_page import html_of
-from clients.report.labels import check_text, distinct_labels
-from clients.report.origin import Record, origin_of, running_footer
+from clients.report.content import comparison_document, eye_document
+from clients.report.facts import EyeFacts, check_text, distinct_labels, facts_of
+from clients.report.html_page import Document, html_of
 from estimator import drawn_profiles
+from filter_service import __version__
 from filter_service.atomic_files import write_atomically
+
+SHOWN_DIGITS = 16
+"""Digits of a profile's digest that are shown: 64 bits."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """Identification of a report entered by the user; empty texts are omitted.
+
+    Raises
+    ------
+    ValueError
+        If a text is too long or cannot be printed.
+    """
+
+    patient: str = ""
+    examiner: str = ""
+    reference: str = ""
+
+    def __post_init__(self) -> None:
+        for name in (field.name for field in fields(self)):
+            check_text(name, getattr(self, name))
+
+
+def origin_of(eyes: list[EyeFacts], record: Record) -> tuple[tuple[str, str], ...]:
+    """Return names and values that identify a report."""
+    digests = " → ".join(facts.study.profile.digest[:SHOWN_DIGITS] for facts in eyes)
+    entries = (
+        ("Patient", record.patient),
+        ("Examiner", record.examiner),
+        ("Reference", record.reference),
+        ("Date", f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}"),
+        ("Version", f"ocufilter {__version__}"),
+        ("Profile", digests),
+    )
+    return tuple((name, value) for name, value in entries if value)
+
+
+def running_footer(title: str, origin: tuple[tuple[str, str], ...]) -> str:
+    """Return the text in the footer of every page, which identifies the report."""
+    shown = [
+        value if name == "Date" else f"{name} {value}"
+        for name, value in origin
+        if name in ("Patient", "Reference", "Date")
+    ]
+    return " · ".join([title, *shown])
+
 
 SUFFIXES = (".html", ".pdf")
 PANGO_PACKAGES = ("libpango-1.0-0", "libpangoft2-1.0-0", "libharfbuzz-subset0")
@@ -110,11 +155,10 @@ def compute_eye_facts(
             )
         drawn_profiles(profile_of(profiles[0]), people)  # fail early
     share = WRITING_START_FRACTION / len(profiles)
+    report = progress or (lambda fraction, stage: None)
 
-    def share_of_progress(k: int) -> ProgressCallback | None:
-        if progress is None:
-            return None
-        return lambda fraction, stage: progress((k + fraction) * share, stage)
+    def part_of_progress(k: int) -> ProgressCallback:
+        return lambda done, stage: report((k + done) * share, stage)
 
     eyes = [
         facts_of(
@@ -122,12 +166,11 @@ def compute_eye_facts(
             label=label,
             has_charts=has_charts,
             people=people,
-            progress=share_of_progress(k),
+            progress=part_of_progress(k),
         )
         for k, (profile, label) in enumerate(zip(profiles, labels, strict=False))
     ]
-    if progress is not None:
-        progress(WRITING_START_FRACTION, "writing")
+    report(WRITING_START_FRACTION, "writing")
     if len(eyes) == 1:
         return eyes
     before, after = eyes

@@ -8,16 +8,16 @@ from typing import Annotated
 import typer
 
 from clients.figures.study import profile_of
-from clients.report.labels import check_text, shortened
+from clients.report.facts import check_text, shortened
 from clients.report.make import (
     SUFFIXES,
+    Record,
     ReportError,
     check_pdf,
     compute_eye_facts,
     report_numbers,
     write_report,
 )
-from clients.report.origin import Record
 from filter_service.command_line import CommandFailed, Json, print_json, print_line
 from filter_service.image_files import check_output
 from filter_service.progress import Progress

@@ -6,14 +6,15 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from clients.figures.study import WAVELENGTH_NM
-from clients.report.blocks import Table
-from clients.report.facts import EyeFacts
-from clients.report.method_text import entered_text, um_text
-from clients.report.numbers import (
+from clients.report.facts import (
     SPECTACLE_VERTEX_MM,
+    EyeFacts,
     format_prescription,
+    signed,
     spectacles_for,
 )
+from clients.report.html_page import Table
+from clients.report.text import entered_text, um_text
 
 N_COLUMNS, N_JOINT_COLUMNS = 4, 3
 """Columns of the coefficients of one eye, and of two."""
@@ -91,13 +92,6 @@ def spectacles_text(facts: EyeFacts) -> str:
 def change_text(before: float, after: float) -> str:
     """Return the difference of two numbers as they are shown."""
     return signed(round(after, 2) - round(before, 2))
-
-
-def signed(value: float) -> str:
-    """Return a number with its sign, rounded to a hundredth."""
-    if abs(value) < 0.005:
-        return "0.00"
-    return f"{value:+.2f}".replace("-", "−")
 
 
 def vision_table(facts: EyeFacts) -> Table:
@@ -189,53 +183,35 @@ def acuity_range_text(log_mar: float | None) -> str:
     return f"{text} ({10.0**-log_mar:.2f})"
 
 
-def coefficient_table(facts: EyeFacts) -> Table:
-    """Return all coefficients in four columns."""
-    measured = facts.numbers["measured"]
-    cells = [
-        (_term_text(name), _coefficient_text(value))
-        for name, value in measured["zernike_um"].items()
-    ]
-    return Table(
-        COEFFICIENTS_TITLE,
-        _side_by_side(cells, N_COLUMNS),
-        head=("n, m", "µm") * N_COLUMNS,
-        note=_circle_text(measured),
-    )
-
-
-def joint_coefficient_table(
-    before: EyeFacts, after: EyeFacts, names: tuple[str, str]
+def coefficient_table(
+    eyes: Sequence[EyeFacts], names: Sequence[str] = ("µm",)
 ) -> Table:
-    """Return all coefficients of two eyes in three columns."""
-    first, second = (facts.numbers["measured"] for facts in (before, after))
+    """Return all coefficients of one eye in four columns, or of two in three."""
+    measured = [facts.numbers["measured"] for facts in eyes]
+    n_columns = N_COLUMNS if len(eyes) == 1 else N_JOINT_COLUMNS
     cells = [
         (
             _term_text(term),
             *(
-                _coefficient_text(m["zernike_um"].get(term, 0.0))
-                for m in (first, second)
+                f"{m['zernike_um'].get(term, 0.0):+.4f}".replace("-", "−")
+                for m in measured
             ),
         )
-        for term in first["zernike_um"] | second["zernike_um"]
+        for term in dict.fromkeys(term for m in measured for term in m["zernike_um"])
     ]
-    notes = [_circle_text(measured) for measured in (first, second)]
-    if notes[0] != notes[1]:
+    notes = [*dict.fromkeys(map(_circle_text, measured))]
+    if len(notes) > 1:
         notes = [f"{name}: {note}" for name, note in zip(names, notes, strict=True)]
     return Table(
         COEFFICIENTS_TITLE,
-        _side_by_side(cells, N_JOINT_COLUMNS),
-        head=("n, m", *names) * N_JOINT_COLUMNS,
-        note=" ".join(dict.fromkeys(notes)),
+        _side_by_side(cells, n_columns),
+        head=("n, m", *names) * n_columns,
+        note=" ".join(notes),
     )
 
 
 def _term_text(name: str) -> str:
     return f"({name.replace(',', ', ')})".replace("-", "−")
-
-
-def _coefficient_text(value_um: float) -> str:
-    return f"{value_um:+.4f}".replace("-", "−")
 
 
 def _side_by_side(

@@ -15,7 +15,7 @@ from clients.figures import (
     draw_through_focus_acuity,
     draw_wavefront_map,
 )
-from clients.figures.field_maps import blur_arcmin, draw_field_map
+from clients.figures.curves import blur_arcmin, draw_field_map
 
 DOTS_PER_INCH = 220
 FIGURE_TITLES = {

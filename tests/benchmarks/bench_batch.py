@@ -38,15 +38,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from clients.batch.exact_filter import ExactFilter
-from clients.batch.job import Job, batch_settings
 from clients.batch.manifest import Manifest
-from clients.batch.process_pool import ProcessPool
+from clients.batch.pools import ProcessPool
 from clients.batch.run import Batch, run_batch
-from clients.batch.source import FieldOfView, Scaled, SourceFrame
-from clients.batch.states import States
+from clients.batch.source import FieldOfView, Scaled, SourceFrame, States
+from clients.batch.work import Job, batch_settings
 from clients.commands.options import read_size_px
-from filter_service import RgbdView
+from filter_service import EyeFilter, RgbdView
 from filter_service.image_files import read_color, read_depth
 from tests.batch_kills import kill, pictures, start, wait_for_orphans
 from tests.benchmarks.harness import (
@@ -139,15 +137,24 @@ class _Exact:
     """A job's filter as the judge asks for it."""
 
     def __init__(self, job: Job, eye: str, frame: SourceFrame) -> None:
-        self._filter, self._eye, self._frame = ExactFilter(job), eye, frame
+        self._job, self._profile, self._frame = job, job.profiles[eye], frame
+        self._filter = EyeFilter(engine=job.engine)
 
     def render(self, view, handle, *, pupil_diameter_mm, focus_dpt, render_tolerance):
         """Return the picture in linear light, from the files of the frame."""
         own = RgbdView(
             read_color(self._frame.color), read_depth(self._frame.depth), view.tangents
         )
-        return self._filter.see(
-            self._eye, own, pupil_mm=pupil_diameter_mm, focus_dpt=focus_dpt
+        self._filter.set_profile(
+            self._profile, settings=self._job.settings, cameras=[view.camera]
+        )
+        self._filter.wait()
+        return self._filter.filter(
+            own,
+            pupil_diameter_mm=pupil_diameter_mm,
+            focus_dpt=focus_dpt,
+            output=self._job.output,
+            render_tolerance=self._job.render_tolerance,
         )
 
     def close(self) -> None:

@@ -117,10 +117,9 @@ class Kind:
 
 def kinds(folder: Path) -> list[Kind]:
     """Return all kinds; valid files are written to a folder, and read from there."""
-    from clients.batch.layout_middlebury import read_calibration
-    from clients.batch.layout_tum import tum_frames
+    from clients.batch.datasets import read_calibration, tum_frames
     from clients.batch.manifest import Manifest, ManifestDiffers
-    from clients.batch.states import read_states
+    from clients.batch.source import read_states
     from clients.batch.video_reading import VideoReader
     from clients.commands.options import display_of_file
     from clients.headset.gltf_scene import load_gltf

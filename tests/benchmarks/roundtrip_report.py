@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,36 @@ from rich.table import Table
 from clients.latency.stream import SUMS, LatencyRun
 
 PERCENTILES = (50, 95, 99, 99.9)
+
+
+def case_of(run: LatencyRun) -> str:
+    """Return a description of the content."""
+    settings = run.settings
+    views = "" if settings.n_views == 1 else f"{settings.n_views} x "
+    eye = _name_of(settings.profile)
+    if settings.right_profile is not None:
+        eye = f"left {eye}, right {_name_of(settings.right_profile)}"
+    state = f"{settings.pupil_diameter_mm:g} mm, {settings.focus_dpt:g} dpt"
+    if settings.is_moving:
+        state = "moving pupil and focus"
+    size = f"{settings.width_px}x{settings.height_px}"
+    return f"{views}{size} {settings.output}, {eye}, {state}"
+
+
+def setting_of(run: LatencyRun) -> str:
+    """Return a description of schedule and transport."""
+    settings = run.settings
+    schedule = f"{settings.rate_hz:g} Hz for {settings.duration_s:g} s"
+    how = [settings.transport]
+    if settings.compression != "none":
+        how.append(settings.compression)
+    if settings.depth_encoding != "float32":
+        how.append(f"depth {settings.depth_encoding}")
+    return f"{schedule}, {settings.max_in_flight} in flight, {', '.join(how)}"
+
+
+def _name_of(profile: Mapping[str, Any]) -> str:
+    return str(profile.get("name", profile.get("kind", "profile")))
 
 
 def percentiles_ms(run: LatencyRun, stage: str) -> dict[float, float]:
@@ -30,8 +61,8 @@ def as_json(run: LatencyRun) -> dict[str, Any]:
             {
                 "bench": "roundtrip",
                 "method": name,
-                "case": run.case,
-                "setting": run.setting,
+                "case": case_of(run),
+                "setting": setting_of(run),
                 "n": run.n_filtered,
                 "median_ms": p[50],
                 "p95_ms": p[95],
@@ -62,7 +93,7 @@ def as_json(run: LatencyRun) -> dict[str, Any]:
 
 def as_table(run: LatencyRun) -> Table:
     """Return the run as a terminal table."""
-    table = Table(title=f"{run.case}, {run.setting}", title_justify="left")
+    table = Table(title=f"{case_of(run)}, {setting_of(run)}", title_justify="left")
     table.add_column("stage")
     for percentile in PERCENTILES:
         table.add_column(f"p{percentile:g} [ms]", justify="right")
@@ -100,7 +131,7 @@ def save_plot(run: LatencyRun, path: Path) -> None:
     over_time.plot(
         run.due_s, run.stages_ms["service_total_ms"], ".", label="time in the service"
     )
-    over_time.set(xlabel="scheduled at [s]", ylabel="[ms]", title=run.case)
+    over_time.set(xlabel="scheduled at [s]", ylabel="[ms]", title=case_of(run))
     over_time.set_ylim(bottom=0)
     over_time.legend()
     names = [name for name in run.stage_names() if name not in SUMS][::-1]
@@ -109,7 +140,7 @@ def save_plot(run: LatencyRun, path: Path) -> None:
         values = [percentiles_ms(run, name)[percentile] for name in names]
         by_stage.barh(places + offset, values, height=0.2, label=f"p{percentile:g}")
     by_stage.set_yticks(places, [name.removesuffix("_ms") for name in names])
-    by_stage.set(xlabel="[ms]", title=run.setting)
+    by_stage.set(xlabel="[ms]", title=setting_of(run))
     by_stage.legend()
     figure.tight_layout()
     path.parent.mkdir(parents=True, exist_ok=True)

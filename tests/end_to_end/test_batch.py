@@ -16,15 +16,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clients.batch.exact_filter import ExactFilter
-from clients.batch.job import Job, batch_settings
 from clients.batch.layouts import LayoutOptions, list_frames
 from clients.batch.manifest import Manifest
-from clients.batch.source import FieldOfView
-from clients.batch.states import States
-from clients.batch.work import Unit, UnitRunner
+from clients.batch.source import FieldOfView, States
+from clients.batch.work import Job, Unit, UnitRunner, batch_settings
 from clients.commands.program import app
-from filter_service import Camera, RgbdView
+from filter_service import Camera, EyeFilter, RgbdView
 from filter_service.command_line import exit_code
 from filter_service.image_files import read_color
 from tests.batch_kills import (
@@ -107,9 +104,9 @@ def test_one_worker_makes_what_the_filter_makes(room, usual):
     color = read_color(room / "color/007.png")
     depth_m = 0.001 * np.asarray(Image.open(room / "depth/007.png")).astype(np.float64)
     view = RgbdView(color, depth_m.astype(np.float32), camera.tangents)
-    exact = ExactFilter(job)
-    seen = exact.see("myopia", view, pupil_mm=4.0, focus_dpt=0.0)
-    exact.close()
+    with EyeFilter("myopia", camera, job.settings, engine="native") as eye_filter:
+        eye_filter.wait()
+        seen = eye_filter.filter(view, pupil_diameter_mm=4.0, focus_dpt=0.0)
     np.testing.assert_array_equal(read_color(usual / "myopia/007.png"), seen.color)
     assert not np.array_equal(seen.color, color)
 

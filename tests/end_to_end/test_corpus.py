@@ -9,7 +9,8 @@ from dataclasses import asdict
 import msgpack
 import pytest
 
-from clients.batch.job import code_version, fingerprint
+from clients.batch.manifest import fingerprint
+from clients.batch.run import code_version
 from estimator.profiles.files import load_profile
 from filter_service import messages
 from filter_service.protocol_schema import protocol_schema

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clients.figures import EyeStudy
-from clients.report.charts import FIELD_DEG, LOG_MAR, charts_of
+from clients.report.facts import FIELD_DEG, LOG_MAR, charts_of
 from clients.scenes.letter_chart import letter_chart
 from filter_service import Camera
 

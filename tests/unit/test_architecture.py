@@ -164,11 +164,12 @@ HOME = {
         "filter_service/view_state.py",
         "filter_service/protocol_schema.py",
         "filter_service/wire/*",
+        "clients/batch/manifest.py",  # records of earlier runs
     ),
     "weasyprint": ("clients/report/make.py",),  # loads the system library Pango
     "lazy_loader": ("*/__init__.py",),  # names without what they load
     "av": ("clients/batch/video_*.py",),  # frames of videos, exactly
-    "ray": ("clients/batch/ray_pool.py",),  # many machines
+    "ray": ("clients/batch/pools.py",),  # many machines
     "matplotlib": (
         "clients/*",
         "tests/*",  # plots of measurements

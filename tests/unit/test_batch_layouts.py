@@ -8,12 +8,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clients.batch.job import Job
-from clients.batch.layout_nyu import counted_depth_m, registered_m
+from clients.batch.datasets import counted_depth_m, registered_m
 from clients.batch.layouts import LayoutOptions, list_frames, optics_of
-from clients.batch.source import FieldOfView, Pinhole, Scaled, center_depth_m
-from clients.batch.states import States, read_states
-from clients.batch.work import Unit, UnitRunner
+from clients.batch.source import (
+    FieldOfView,
+    Pinhole,
+    Scaled,
+    States,
+    center_depth_m,
+    read_states,
+)
+from clients.batch.work import Job, Unit, UnitRunner
 from filter_service.camera import PixelGrid
 from filter_service.settings import FilterSettings
 

@@ -6,18 +6,18 @@ import stat
 
 import pytest
 
-from clients.batch.atomic_files import remove_parts, write_whole
-from clients.batch.job import Job, batch_settings
 from clients.batch.manifest import (
     Manifest,
     begin_manifest,
     name_of,
+    remove_parts,
     text_of,
     write_summary,
+    write_whole,
 )
 from clients.batch.run import Batch
-from clients.batch.source import FieldOfView, Scaled, SourceFrame
-from clients.batch.states import States
+from clients.batch.source import FieldOfView, Scaled, SourceFrame, States
+from clients.batch.work import Job, batch_settings
 
 
 def test_any_name_becomes_text_and_no_two_the_same():

@@ -5,10 +5,9 @@ import unicodedata
 import numpy as np
 import pytest
 
-from clients.batch.layout_pairs import in_order
+from clients.batch.datasets import in_order
 from clients.batch.layouts import LayoutOptions, list_frames
-from clients.batch.source import FieldOfView
-from clients.batch.states import read_states
+from clients.batch.source import FieldOfView, read_states
 from tests.unit.test_batch_layouts import (
     FOV,
     write_color,

@@ -17,7 +17,7 @@ WALL_CLOCK = {
 MAY_READ_IT = {
     # file: why
     "filter_service/psfs/store_cache.py": "compares with the times of files",
-    "clients/report/origin.py": "dates a report",
+    "clients/report/make.py": "dates a report",
 }
 
 

@@ -22,10 +22,14 @@ from clients.figures import (
     through_focus_log_mar,
     wavefront_map_figure,
 )
-from clients.figures.acuity import acuity_log_mar, distances_dpt
-from clients.figures.field_maps import blur_arcmin
-from clients.figures.psfs import centered, psf_picture, ray_directions_mrad
-from clients.figures.study import FIELD_H_DEG, FIELD_V_DEG
+from clients.figures.curves import blur_arcmin
+from clients.figures.study import (
+    FIELD_H_DEG,
+    FIELD_V_DEG,
+    acuity_log_mar,
+    distances_dpt,
+)
+from clients.figures.wavefront import centered, psf_picture, ray_directions_mrad
 from estimator import load_profile
 from estimator.estimate.plot import surface_line_mm
 from estimator.optics.surfaces import Surface

@@ -10,12 +10,9 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from clients.batch.atomic_files import below, write_whole
-from clients.batch.layout_middlebury import read_calibration
-from clients.batch.layout_nyu import KinectCounts
-from clients.batch.layout_tum import tum_frames
-from clients.batch.manifest import Manifest, records_of
-from clients.batch.states import read_states
+from clients.batch.datasets import KinectCounts, read_calibration, tum_frames
+from clients.batch.manifest import Manifest, below, records_of, write_whole
+from clients.batch.source import read_states
 from clients.commands.options import display_of_file, read_object
 from clients.headset.gltf_scene import load_gltf
 from estimator.bounded_files import (

@@ -25,30 +25,41 @@ from clients.figures import (
     field_maps_figure,
     wavefront_map_figure,
 )
-from clients.figures.psfs import psf_sides_arcmin
 from clients.figures.style import new_figure
+from clients.figures.wavefront import psf_sides_arcmin
 from clients.report import report_numbers
-from clients.report.blocks import (
+from clients.report.facts import (
+    EyeFacts,
+    distinct_labels,
+    facts_of,
+    format_prescription,
+    measured_numbers,
+    own_name,
+    picture_side_px,
+    spectacles_for,
+)
+from clients.report.html_page import (
+    STYLE,
     Document,
     Picture,
     Row,
     Section,
     Table,
     Text,
+    html_of,
 )
-from clients.report.charts import picture_side_px
-from clients.report.correction_text import correction_text, near_text
-from clients.report.facts import EyeFacts, facts_of
-from clients.report.html_page import STYLE, html_of
-from clients.report.labels import distinct_labels, own_name
-from clients.report.make import document_of, write_report
-from clients.report.method_text import entered_text, method_text
-from clients.report.numbers import Refraction, measured_numbers, spectacles_for
-from clients.report.origin import Record
-from clients.report.provenance import provenance_table
-from clients.report.sources import SOURCES, Citations
+from clients.report.make import Record, document_of, write_report
 from clients.report.tables import change_text, refraction_table, vision_table
-from estimator import load_profile, parse_profile
+from clients.report.text import (
+    SOURCES,
+    Citations,
+    correction_text,
+    entered_text,
+    method_text,
+    near_text,
+    provenance_table,
+)
+from estimator import load_profile, parse_profile, prescription_from_power_vector
 from tests.commands import full_disk, run_command
 
 SPECTACLES = {"sphere_dpt": -4.0, "cylinder_dpt": -1.0, "axis_deg": 20.0}
@@ -168,15 +179,16 @@ def test_rms_by_order_and_coefficients_are_the_profiles():
 
 
 def test_an_axis_is_written_as_the_examiner_does():
-    text = Refraction(
+    lens = prescription_from_power_vector(
         -2.25, 0.25 * math.cos(2.0), 0.25 * math.sin(2.0)
-    ).format_prescription()
-    assert text == "−2.00 dpt sph −0.50 cyl x 123°"
-    assert Refraction(1.0, 0.0, 0.0).format_prescription() == "+1.00 dpt sph"
+    )
+    assert format_prescription(lens) == "−2.00 dpt sph −0.50 cyl x 123°"
+    sphere = prescription_from_power_vector(1.0, 0.0, 0.0)
+    assert format_prescription(sphere) == "+1.00 dpt sph"
 
 
 def _rows(profile) -> dict[str, tuple[str, str]]:
-    table = provenance_table(EyeStudy.of(profile), Citations())
+    table = provenance_table([EyeStudy.of(profile)], Citations())
     return {row[0]: row[1:] for row in table.rows}
 
 

@@ -13,11 +13,10 @@ from clients.figures import (
     drawn_people,
     modulation,
 )
-from clients.figures.acuity import acuity_log_mar
-from clients.figures.orders import rms_um
-from clients.figures.study import FIELD_H_DEG
+from clients.figures.curves import FREQUENCY_CPD
+from clients.figures.study import FIELD_H_DEG, acuity_log_mar
 from clients.figures.style import new_figure
-from clients.figures.transfer_curves import FREQUENCY_CPD
+from clients.figures.wavefront import rms_um
 from clients.report.facts import EyeFacts, facts_of
 from clients.report.html_page import html_of
 from clients.report.make import compute_eye_facts, document_of

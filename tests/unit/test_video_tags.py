@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clients.batch.job import Job, batch_settings
 from clients.batch.layouts import LayoutOptions, list_frames
-from clients.batch.source import FieldOfView
-from clients.batch.states import States
-from clients.batch.work import Unit, UnitRunner
+from clients.batch.source import FieldOfView, States
+from clients.batch.work import Job, Unit, UnitRunner, batch_settings
 from filter_service.image_files import read_color_file
 
 av = pytest.importorskip("av")
@@ -262,11 +260,11 @@ def test_matrix_and_range_are_those_of_the_tags(tmp_path, matrix, full, bits):
 def test_a_large_video_without_tags_is_bt709_and_a_small_one_bt601(
     tmp_path, monkeypatch
 ):
-    from clients.batch import video_color
+    from clients.batch import video_reading
 
     for bits, layout in ((8, "yuv420p"), (10, "yuv420p10le")):
         for matrix, height_px in ((BT601, 720), (BT709, HEIGHT_PX)):
-            monkeypatch.setattr(video_color, "HD_HEIGHT_PX", height_px)
+            monkeypatch.setattr(video_reading, "HD_HEIGHT_PX", height_px)
             planes = yuv420(ORANGE, matrix, bits=bits)
             write(tmp_path / "a.mkv", [planes], source=layout, pixels=layout)
             pixels = first_frame(tmp_path / "a.mkv").pixels[8, 8]

@@ -1,6 +1,6 @@
-"""Worker processes on this machine; one that dies is replaced.
+"""Workers on this machine, of which those that die are replaced, or on many with Ray.
 
-    python -m clients.batch.process_pool DESCRIPTOR
+    python -m clients.batch.pools DESCRIPTOR
 
 runs a worker, which receives units through a pipe and returns records.  It exits when
 the pipe closes: between two frames, or after `GRACE_S` in the midst of one.
@@ -18,14 +18,20 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Generator, Iterator, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
-from clients.batch.exact_filter import EngineUnusable
-from clients.batch.job import Job
-from clients.batch.work import Record, Unit, UnitRunner, failed_records
+from clients.batch.manifest import Record
+from clients.batch.work import (
+    EngineUnusable,
+    Job,
+    Unit,
+    UnitRunner,
+    failed_records,
+)
 from filter_service.waiting import PROGRESS_VARIABLE
 
 THREADS_VARIABLE = "OCUFILTER_THREADS"
@@ -129,7 +135,7 @@ class ProcessPool:
         ours, theirs = socket.socketpair()
         descriptor = str(theirs.fileno())
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "clients.batch.process_pool", descriptor],
+            [sys.executable, "-P", "-m", "clients.batch.pools", descriptor],
             pass_fds=[theirs.fileno(), *self._locks],
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # Ctrl-C reaches only this process, which stops it
@@ -215,6 +221,106 @@ def _exit_after(descriptor: int) -> None:
     closed.poll()
     time.sleep(GRACE_S)
     os._exit(1)
+
+
+LOCAL = "local"
+
+
+class _RayWorker(UnitRunner):
+    """Ray actor that runs units."""
+
+    def run_whole(self, unit: Unit) -> list[Record]:
+        """Run a unit, which writes its files, and return its records."""
+        return list(self.run(unit))
+
+
+class RayPool:
+    """Pool of Ray actors on many machines, which share the input and output folders.
+
+    Parameters
+    ----------
+    job : Job
+        Parameters of the batch.
+    out : Path
+        Output folder.
+    address : str
+        Address of the cluster; ``auto`` for Ray's default, or ``local`` for a new
+        cluster on this machine.
+    n_workers : int, optional
+        Number of actors; by default, as many as the cluster has cores for.
+    n_threads : int
+        Threads of each actor, and cores that it requests.
+    """
+
+    def __init__(
+        self,
+        job: Job,
+        out: Path,
+        *,
+        address: str,
+        n_workers: int | None,
+        n_threads: int,
+    ) -> None:
+        import ray
+
+        self._ray: Any = ray
+        self._setup = job, out
+        self._address, self._n_workers = address, n_workers
+        self._n_threads = n_threads
+
+    def run(self, units: Sequence[Unit]) -> Generator[Record, None, None]:
+        """Yield the records of units as units are finished, in any order."""
+        if not units:
+            return
+        is_local = self._address == LOCAL
+        own_cores = None
+        if is_local and self._n_workers is not None:
+            own_cores = self._n_workers * self._n_threads
+        started = not self._ray.is_initialized()
+        if started:
+            self._ray.init(
+                address=None if is_local else self._address,
+                num_cpus=own_cores,
+                include_dashboard=False if is_local else None,
+                log_to_driver=False,
+            )
+        try:
+            with redirect_stdout(sys.stderr):  # Ray prints messages about dead workers
+                yield from self._run(deque((unit, 0) for unit in units))
+        finally:
+            if started:
+                self._ray.shutdown()
+
+    def _run(self, waiting: deque[tuple[Unit, int]]) -> Iterator[Record]:
+        cores = int(self._ray.cluster_resources().get("CPU", 1))
+        wanted = self._n_workers or max(1, cores // self._n_threads)
+        actor = self._ray.remote(_RayWorker).options(
+            num_cpus=self._n_threads,
+            runtime_env={"env_vars": {THREADS_VARIABLE: str(self._n_threads)}},
+        )
+        running: dict[Any, tuple[Any, Unit, int]] = {}
+
+        def begin(worker: Any) -> None:
+            unit, n_deaths = waiting.popleft()
+            running[worker.run_whole.remote(unit)] = worker, unit, n_deaths
+
+        for _ in range(min(wanted, len(waiting))):
+            begin(actor.remote(*self._setup))
+        while running:
+            (ended,), _ = self._ray.wait(list(running))
+            worker, unit, n_deaths = running.pop(ended)
+            try:
+                yield from self._ray.get(ended)
+            except self._ray.exceptions.RayActorError as error:
+                if n_deaths + 1 < MAX_DEATHS:
+                    waiting.appendleft((unit, n_deaths + 1))
+                else:
+                    names = [frame.name for frame in unit.frames]
+                    reason = f"its worker process died {MAX_DEATHS} times: {error}"
+                    yield from failed_records(unit, names, reason)
+                worker = actor.remote(*self._setup) if waiting else None
+            if waiting:
+                begin(worker)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,536 @@
+"""Sentences of a report: corrections, how an eye was computed, provenance of its data.
+
+Each datum is measured, entered or typical of a population; `SOURCES` are the cited
+papers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from clients.figures import DrawnPeople, EyeStudy
+from clients.figures.curves import ACUITY_PUPIL_MM
+from clients.figures.study import PUPILS_MM
+from clients.report.facts import EyeFacts, format_prescription, is_beyond_measured
+from clients.report.html_page import Table
+from estimator import (
+    DiffractiveRings,
+    EyeProfile,
+    GivenSurfaces,
+    Lenslets,
+    Prescription,
+    ProgressiveLens,
+    RefractiveZones,
+    WornLens,
+    drawn_text,
+    draws_axis,
+    draws_periphery,
+)
+
+SOURCES = {
+    "csoba": "Csoba & Kunkli 2023, Fast rendering of central and peripheral human "
+    "visual aberrations across the entire visual field with interactive "
+    "personalization: the eye model, and the measured conditions among the presets",
+    "osa": "Thibos, Applegate, Schwiegerling & Webb 2002 (J Refract Surg 18:S652): "
+    "Zernike terms, their order and normalization",
+    "vectors": "Thibos, Wheeler & Horner 1997 (Optom Vis Sci 74:367): M, J0, J45",
+    "typical": "Thibos, Hong, Bradley & Cheng 2002 (JOSA A 19:2329): typical "
+    "higher-order aberrations of 200 eyes",
+    "growth": "Berrio, Tabernero & Artal 2010 (J Vis 10(14):34): their growth with age",
+    "amplitude": "Anderson, Hentz, Glasser et al. 2008 (IOVS 49:2919): objective "
+    "amplitude of accommodation by age",
+    "color": "Thibos, Ye, Zhang & Bradley 1992 (Appl Opt 31:3594): the chromatic eye",
+    "periphery": "Jaeken & Artal 2012 (IOVS 53:3405): wavefronts of 65 people over the "
+    "horizontal meridian",
+    "length": "Atchison 2006 (Vision Res 46:2236): eye length and corneal radius by "
+    "refraction",
+    "acuity": "Watson & Ahumada 2008 (J Vis 8(4):17): acuity from a wavefront",
+    "nerves": "Watson & Ahumada 2005 (J Vis 5(9):6), Watson 2013 (J Vis 13(6):18): "
+    "contrast sensitivity of people and their mean optics",
+    "strehl": "Thibos, Hong, Bradley & Applegate 2004 (J Vis 4(4):9): visual Strehl "
+    "ratio (VSOTF)",
+    "chart": "Ferris, Kassoff, Bresnick & Bailey 1982 (Am J Ophthalmol 94:91): the "
+    "letter chart",
+    "straylight": "Vos & van den Berg 1999 (CIE Research Note 135/1): light scattered "
+    "in the eye",
+    "cataract": "J Ophthalmol 2017:5649532: straylight of cataracts before surgery",
+}
+
+
+class Citations:
+    """Numbers the sources in the order of citation."""
+
+    def __init__(self) -> None:
+        self._names: list[str] = []
+
+    def __call__(self, *names: str) -> str:
+        """Return citation marks such as ``[1, 4]`` for sources."""
+        for name in names:
+            if name not in self._names:
+                self._names.append(name)
+        numbers = (str(self._names.index(name) + 1) for name in names)
+        return f"[{', '.join(numbers)}]"
+
+    def listed(self) -> tuple[str, ...]:
+        """Return the cited sources, numbered."""
+        return tuple(
+            f"[{k + 1}] {SOURCES[name]}." for k, name in enumerate(self._names)
+        )
+
+
+DESIGNS = {
+    "monofocal": "monofocal",
+    "bifocal": "bifocal",
+    "trifocal": "trifocal",
+    "edof": "extended depth of focus",
+    "zones": "zones of several powers",
+}
+STRAIGHT_DEG = 0.5
+
+IMPLANT_LIMITS = (
+    "Intraocular lens: it acts as a phase in the pupil. Wavefront maps and "
+    "coefficients exclude it and the cornea's spherical aberration, and the section "
+    "shows the eye model with its natural lens; point images, contrast, acuity and "
+    "charts include both."
+)
+
+
+def short_text(lens: Prescription) -> str:
+    """Return the type of a correction as a short phrase."""
+    if isinstance(lens, ProgressiveLens):
+        return "progressive spectacles"
+    if not isinstance(lens, WornLens):
+        return "spectacles"
+    if lens.kind == "lenslets":
+        return "spectacles with lenslets"
+    if lens.kind == "contact_lens":
+        return "contact lens"
+    return f"intraocular lens, {DESIGNS[lens.design]}"
+
+
+def correction_text(lens: Prescription) -> str:
+    """Return the type of a correction, its powers and its alignment to the eye."""
+    if isinstance(lens, ProgressiveLens):
+        own, more = lens.distance, _progressive(lens)
+    elif isinstance(lens, WornLens):
+        own, more = lens, _alignment(lens)
+    else:
+        own, more = lens, ()
+    if isinstance(lens, WornLens) and lens.replaces_lens:
+        return ", ".join([short_text(lens), *_own_power(lens), *more])
+    return ", ".join(
+        [f"{short_text(lens)} {format_prescription(own)}{_where(own)}", *more]
+    )
+
+
+def _own_power(lens: WornLens) -> tuple[str, ...]:
+    """Return an intraocular lens's power beyond the eye's need."""
+    own = Prescription(
+        lens.at_lens_dpt(lens.sphere_dpt),
+        lens.at_lens_dpt(lens.cylinder_dpt),
+        lens.axis_deg,
+    )
+    has_power = abs(own.sphere_dpt) + abs(own.cylinder_dpt) >= 0.005
+    return (f"{format_prescription(own)} beyond the eye's need",) if has_power else ()
+
+
+def _where(lens: Prescription) -> str:
+    if isinstance(lens, WornLens) and lens.kind == "contact_lens":
+        return ""
+    return f" at {lens.vertex_mm:g} mm" if lens.vertex_mm else " at the cornea"
+
+
+def _alignment(lens: WornLens) -> tuple[str, ...]:
+    parts = []
+    rings = lens.rings
+    if isinstance(rings, Lenslets):
+        parts.append(f"lenslets of {_power(rings.power_dpt)} dpt")
+        parts.append(gaze_text(rings.gaze_deg))
+    elif isinstance(rings, DiffractiveRings):
+        adds = [_power(lens.at_lens_dpt(d)) for d in design_adds_dpt(rings)]
+        many = "adds" if len(adds) > 1 else "add"
+        parts.append(f"{many} {' and '.join(adds)} dpt at the lens")
+    elif isinstance(rings, RefractiveZones):
+        adds = [_power(lens.at_lens_dpt(d)) for d in rings.powers_dpt]
+        parts.append(f"from the middle {', '.join(adds)} dpt at the lens")
+    if any(lens.centre_mm):
+        aside_mm = math.hypot(*lens.centre_mm)
+        parts.append(f"{aside_mm:.2g} mm off the middle of the pupil")
+    return tuple(parts)
+
+
+def design_adds_dpt(rings: DiffractiveRings) -> list[float]:
+    """Return the design additions of a lens, dpt in the pupil, ascending."""
+    lowest, highest = rings.orders
+    orders = np.arange(lowest + 1, highest + 1)
+    middle = orders[:-1]
+    if middle.size > 1:  # the intermediate order with the most light
+        light = np.abs(rings.kinoform.amplitudes(middle))
+        middle = middle[[int(light.argmax())]]
+    return [float(k - lowest) * rings.spacing_dpt for k in (*middle, highest)]
+
+
+def _progressive(lens: ProgressiveLens) -> tuple[str, ...]:
+    parts = (
+        f"add {_power(lens.add_dpt)} dpt",
+        f"corridor {lens.corridor_mm:g} mm",
+        gaze_text(lens.gaze_deg),
+    )
+    return (*parts[:2], f"{parts[2]} through {format_prescription(lens)}")
+
+
+def gaze_text(gaze_deg: tuple[float, float]) -> str:
+    """Return the gaze direction of an eye as text."""
+    parts = [
+        f"{abs(angle):.0f}° {names[angle < 0.0]}"
+        for angle, names in zip(
+            gaze_deg, (("right", "left"), ("up", "down")), strict=True
+        )
+        if abs(angle) >= STRAIGHT_DEG
+    ]
+    return f"looking {', '.join(parts) or 'straight ahead'}"
+
+
+def _power(power_dpt: float) -> str:
+    """Return an addition with one decimal, or two if needed."""
+    text = f"{power_dpt:+.2f}".replace("-", "\N{MINUS SIGN}")
+    return text[:-1] if text.endswith("0") else text
+
+
+def near_text(lens: Prescription | None) -> str:
+    """Return the end of a near chart's caption, for a progressive lens."""
+    if not isinstance(lens, ProgressiveLens):
+        return ""
+    gaze = gaze_text(lens.gaze_deg).removeprefix("looking ")
+    return f"; {gaze}"
+
+
+def limits_text(profile: EyeProfile) -> tuple[str, ...]:
+    """Return the limitations that a correction imposes on a report."""
+    lens = profile.correction
+    if isinstance(lens, ProgressiveLens):
+        return (
+            "Progressive lens: this report applies to "
+            f"{_eye_at_gaze(lens.gaze_deg)}; elsewhere "
+            "the lens has another power.",
+        )
+    if isinstance(lens, WornLens) and lens.replaces_lens:
+        # the implant of a pseudophakic eye is traced by its surfaces
+        limits = () if profile.surfaces is not None else (IMPLANT_LIMITS,)
+        return (*limits, *_rings_limits(lens))
+    return _rings_limits(lens)
+
+
+def _rings_limits(lens: Prescription | None) -> tuple[str, ...]:
+    if not isinstance(lens, WornLens) or lens.rings is None:
+        return ()
+    if isinstance(lens.rings, Lenslets):
+        return (
+            f"Lenslets: this report applies to {_eye_at_gaze(lens.rings.gaze_deg)}. "
+            "Where they lie before the pupil, acuity and contrast are not "
+            "reported: no model of reading through them is known; wavefronts and field "
+            "maps are those of the spectacles without them.",
+        )
+    return (
+        "Several foci: no Zernike term holds the rings of the lens. Refraction, "
+        "wavefront and field maps are those of its focus for far; point images, "
+        "contrast, acuity and charts go through all of it.",
+    )
+
+
+def _eye_at_gaze(gaze_deg: tuple[float, float]) -> str:
+    return f"an eye that is {gaze_text(gaze_deg)}"
+
+
+COMPUTED_BY = ("eye estimated", "eye as given", "focus traced", "aberrations traced")
+"""Prefixes of notes on the computation, which `_model_text` replaces."""
+POOR_FIT = "eye estimated poorly"
+
+REPLACEMENTS = {
+    "+-": "±",
+    " um": " µm",
+    " deg ": "° ",
+    "vertex_mm is missing: the powers of spectacles need it, usually 12 to 14 mm": (
+        "no vertex distance was given; powers of spectacles usually refer to a lens "
+        "12 to 14 mm in front of it"
+    ),
+}
+OPTION_HINT = '; "higher_order"'
+"""Start of the part of a note that names an option of the profile."""
+
+
+def method_text(study: EyeStudy) -> tuple[str, ...]:
+    """Return sentences on how the eye was computed and what its powers refer to."""
+    notes = (n for n in study.field.notes if not n.startswith(COMPUTED_BY))
+    return (_model_text(study), *map(_plain_text, notes))
+
+
+def people_text(facts: EyeFacts) -> tuple[str, ...]:
+    """Return a sentence on the bands of drawn persons; empty without them."""
+    people, profile = facts.people, facts.study.profile
+    if people is None:
+        return ()
+    text = (
+        f"bands are from the 5th to the 95th percentile of {people.count} persons: "
+        f"{drawn_text(profile)}"
+    )
+    if people.modulation:
+        return (
+            f"{text}; the bands of contrast are best corrected, that of acuity is "
+            f"accommodating through {ACUITY_PUPIL_MM:g} mm",
+        )
+    reason = "the axis is not drawn"
+    if draws_axis(profile):
+        reason = "they are not known through lenslets"
+    return (f"{text}; contrast and acuity have no bands, because {reason}",)
+
+
+def entered_text(profile: EyeProfile) -> str:
+    """Return a prescription's powers as entered and where they refer to, or ""."""
+    for note in profile.notes:
+        name, _, text = note.partition(": ")
+        if name == "prescription":
+            powers, _, missing = text.partition("; ")
+            hint = ", no vertex distance given" if missing else ""
+            return f"Entered: {powers}{hint}.".replace("-", "−")
+    return ""
+
+
+def um_text(value_um: float) -> str:
+    """Return a small error in µm."""
+    return "less than 0.001 µm" if value_um < 0.001 else f"{value_um:.3f} µm"
+
+
+def _model_text(study: EyeStudy) -> str:
+    found = study.found
+    if study.profile.is_given:
+        return "the eye model comes from the profile"
+    is_poor = any(note.startswith(POOR_FIT) for note in study.notes)
+    poor = "poor fit: " if is_poor else ""
+    return (
+        f"{poor}the eye model reproduces the coefficients of the wavefront to "
+        f"{um_text(found.mean_abs_error_um)} on average"
+    )
+
+
+def _plain_text(note: str) -> str:
+    text = note.partition(OPTION_HINT)[0]
+    for technical, plain in REPLACEMENTS.items():
+        text = text.replace(technical, plain)
+    return text.replace(" -", " −")
+
+
+WELL_DETERMINED = 0.5
+"""Fraction of the prior's variance that a measurement must remove."""
+
+MEASURED, TYPICAL, STATED, EXAMPLE = "measured", "assumed", "entered", "example"
+
+
+def provenance_table(
+    studies: Sequence[EyeStudy],
+    cite: Citations,
+    *,
+    labels: Sequence[str] = ("",),
+    people: DrawnPeople | None = None,
+) -> Table:
+    """Return the source of each part of one or two eyes: once where they agree.
+
+    Parameters
+    ----------
+    labels : sequence of str
+        Names of the eyes.
+    people : DrawnPeople, optional
+        Persons drawn with the profile of the only eye.
+    """
+    of_each = [{row[0]: row for row in _rows(study, cite)} for study in studies]
+    rows: list[tuple[str, ...]] = []
+    for part in dict.fromkeys(part for found in of_each for part in found):
+        same = [found.get(part) for found in of_each]
+        if all(row == same[0] for row in same):
+            rows += [row for row in same[:1] if row]
+        else:
+            rows += [
+                (part, row[1], f"{label}: {row[2]}")
+                for row, label in zip(same, labels, strict=True)
+                if row
+            ]
+    if people is not None:
+        rows.append(_drawn(studies[0], cite, people))
+    return Table(
+        "What is known, and what is assumed",
+        tuple(rows),
+        head=("part", "", "where it comes from"),
+        has_prose=True,
+    )
+
+
+def _rows(study: EyeStudy, cite: Citations) -> tuple[tuple[str, ...], ...]:
+    rows = (
+        _refraction(study),
+        _higher_orders(study, cite),
+        _pupils(study),
+        _periphery(study, cite),
+        _accommodation(study, cite),
+        _shape(study, cite),
+        _color(study, cite),
+        _media(study, cite),
+        _nerves(cite),
+        _worn(study),
+    )
+    return tuple(row for row in rows if row)
+
+
+def _refraction(study: EyeStudy) -> tuple[str, ...]:
+    profile = study.profile
+    if profile.kind == "prescription":
+        return ("Refraction", STATED, "the prescription, as powers at the cornea")
+    if profile.is_given:
+        return ("Refraction", STATED, "traced through the eye that the profile gives")
+    return ("Refraction", _origin(study), f"second order of {_measurement(study)}")
+
+
+def _origin(study: EyeStudy) -> str:
+    return EXAMPLE if study.is_example else MEASURED
+
+
+def _measurement(study: EyeStudy) -> str:
+    profile = study.profile
+    whose = "an example eye's" if study.is_example else "the measured"
+    text = (
+        f"{whose} wavefront ({profile.pupil_diameter_mm:g} mm, "
+        f"{profile.wavelength_nm:g} nm)"
+    )
+    others = len(profile.measurements) - 1
+    return f"{text} and {others} more" if others > 0 else text
+
+
+def _higher_orders(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
+    profile = study.profile
+    if profile.is_given:
+        return ("Higher orders", STATED, "of the eye that the profile gives")
+    if profile.kind != "prescription":
+        text = f"orders 3 to 6 of {_measurement(study)}"
+        return ("Higher orders", _origin(study), text)
+    if _replaces_lens(profile.correction):
+        text = "the cornea's and the lens's spherical aberration; no others are known"
+        return ("Higher orders", TYPICAL, text)
+    if profile.higher_order == "none":
+        return ("Higher orders", STATED, "none, as the profile asks for")
+    whose = "a young adult"
+    if profile.age_years is not None:
+        whose = f"people of {profile.age_years:g} years"
+    text = f"mean size in {whose}; this eye's own differ {cite('typical', 'growth')}"
+    return ("Higher orders", TYPICAL, text)
+
+
+def _drawn(study: EyeStudy, cite: Citations, people: DrawnPeople) -> tuple[str, ...]:
+    names = [
+        name
+        for name, is_drawn in (
+            ("typical", draws_axis(study.profile)),
+            ("periphery", draws_periphery(study.profile)),
+        )
+        if is_drawn
+    ]
+    text = f"{people.count} persons: {drawn_text(study.profile)} {cite(*names)}"
+    return ("Bands and ranges", "drawn", text)
+
+
+def _pupils(study: EyeStudy) -> tuple[str, ...]:
+    beyond = [p for p in PUPILS_MM if is_beyond_measured(study, p)]
+    if not beyond:
+        return ()
+    pupils = " and ".join(f"{p:g}" for p in beyond)
+    text = (
+        f"wider than the {study.profile.max_pupil_diameter_mm:g} mm measured: the eye "
+        "model's rim, with the measured remainder stretched"
+    )
+    return (f"Pupil of {pupils} mm", TYPICAL, text)
+
+
+def _periphery(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
+    if study.profile.periphery == "model":
+        return ("Visual field", TYPICAL, "the periphery of the eye model")
+    count = sum(not m.is_on_axis for m in study.profile.measurements)
+    people = f"people with such an axis {cite('periphery')}"
+    known = [note for note in study.field.notes if "known to" in note]
+    spread = known[0].partition("; ")[2] if known else ""
+    tail = f"; {spread.replace('+-', '±')}" if spread else ""
+    if count:
+        text = f"{count} directions of the profile; between them {people}{tail}"
+        return ("Visual field", MEASURED, text)
+    return ("Visual field", TYPICAL, f"most probable in {people}{tail}")
+
+
+def _accommodation(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
+    profile, amplitude_dpt = study.profile, study.found.amplitude_dpt
+    if _replaces_lens(profile.correction):
+        return ("Accommodation", STATED, "none: the eye's own lens is gone")
+    if profile.surfaces is not None and profile.age_years is None:
+        text = f"{amplitude_dpt:.1f} dpt, by the states that the profile gives"
+        return ("Accommodation", STATED, text)
+    through = ""
+    if profile.kind.startswith("zernike"):
+        through = f" through {profile.pupil_diameter_mm:g} mm"
+    if profile.age_years is None and not profile.add_dpt:
+        text = f"age not given: a young eye's {amplitude_dpt:.1f} dpt{through}"
+        return ("Accommodation", TYPICAL, text)
+    known = []
+    if profile.age_years is not None:
+        known.append(f"age of {profile.age_years:g} years {cite('amplitude')}")
+    if profile.add_dpt:
+        known.append(f"addition of {profile.add_dpt:g} dpt")
+    text = f"{amplitude_dpt:.1f} dpt{through}, by {' and '.join(known)}"
+    return ("Accommodation", TYPICAL, text)
+
+
+def _replaces_lens(lens: Prescription | None) -> bool:
+    return isinstance(lens, WornLens) and lens.replaces_lens
+
+
+def _shape(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
+    found = study.found
+    if isinstance(found, GivenSurfaces):
+        return ("Shape of the eye", STATED, "the surfaces of the profile")
+    if study.profile.is_given:
+        return ("Shape of the eye", STATED, "the 45 parameters of the profile")
+    ratios = found.determined_ratio.values()
+    count = sum(ratio > WELL_DETERMINED for ratio in ratios)
+    text = (
+        f"{count} of 45 parameters follow from the wavefront for the most part; the "
+        f"others are those of a mean eye of this refraction {cite('csoba', 'length')}"
+    )
+    return ("Shape of the eye", TYPICAL, text)
+
+
+def _color(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
+    if isinstance(study.found, GivenSurfaces):
+        return ("Color", STATED, "dispersion of the media that the profile gives")
+    return ("Color", TYPICAL, f"longitudinal color of measured eyes {cite('color')}")
+
+
+def _media(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
+    haze = study.profile.straylight
+    if haze is None:
+        return ("Straylight", "left out", "the profile asks for none")
+    if haze.log_s is None:
+        return ("Straylight", TYPICAL, f"by age and pigment {cite('straylight')}")
+    text = f"log s {haze.log_s:g} at 7° {cite('straylight', 'cataract')}"
+    return ("Straylight", STATED, text + "; in the letter charts alone")
+
+
+def _nerves(cite: Citations) -> tuple[str, ...]:
+    text = (
+        "a template observer with a young adult's retina and nerves reads what the "
+        f"optics leave {cite('acuity', 'nerves')}; amblyopia or disease is not in it; "
+        f"visual Strehl ratio {cite('strehl')}, charts {cite('chart')}"
+    )
+    return ("Acuity", "predicted", text)
+
+
+def _worn(study: EyeStudy) -> tuple[str, ...]:
+    lens = study.profile.correction
+    return () if lens is None else ("Correction worn", STATED, correction_text(lens))
