@@ -1,23 +1,29 @@
-"""Frames before and after filtering, and the interface of filters."""
+"""Filters of both eyes' frames, in this process or in a service."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from clients.filter_client import FilterClient, FilteredFrame
 from clients.headset.runtime import EYES, DueFrame, Eye, EyeView, Image
-from clients.headset.stereo_gaze import EyeAndGaze, Picture, RgbdPicture, TexturePicture
+from clients.headset.stereo_gaze import (
+    EyeAndGaze,
+    Picture,
+    RgbdPicture,
+    TexturePicture,
+)
 from filter_service import (
-    BadMessage,
     BuildingEye,
     EyeFailed,
     EyeFilter,
@@ -29,14 +35,13 @@ from filter_service import (
     TextureView,
     plan_views,
 )
-from filter_service.errors import BuildCancelled, FilterError
+from filter_service.errors import BadMessage, BuildCancelled, FilterError
 from filter_service.messages import (
+    Camera,
     Dropped,
     ErrorReply,
     EyeName,
     Ready,
-    Result,
-    ResultView,
     ViewState,
     body_of_eye,
 )
@@ -45,8 +50,29 @@ from filter_service.settings import Output
 if TYPE_CHECKING:
     import moderngl
 
-
+EyeEvent = BuildingEye | EyeFailed | EyeReady
 Say = Callable[[str], None]
+
+MS_PER_S = 1e3
+KEPT_VIEWS = 16
+"""Frames of an eye whose pose is kept until the GPU has finished them."""
+
+RETRY_S = 1.0
+SAY_AGAIN_S = 10.0
+ASK_AGAIN = ("worker_crashed", "no_profile")
+"""Codes of errors after which a profile is sent again."""
+
+WAIT_SHARE = 0.6
+"""Fraction of a frame's period for which the viewer waits for the newest result, so
+that a fast filter's image is shown in the frame that it was rendered for."""
+
+PATIENCE_S = 0.4
+"""If the previous frame took no longer than this, the viewer always waits for the
+filter. Frames that are late in any case are then half as old. On two shared cores,
+frames of 896x1007 were 0.8 s old without this wait, and not more frequent."""
+
+_OWN_STAGES = ("decode_ms", "queue_ms", "copy_out_ms", "rests_ms", "other_ms")
+"""Stages that a service adds to the filter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,14 +112,12 @@ class StereoFrame:
 
 @dataclass(frozen=True)
 class FilteredStereoFrame:
-    """Filtered frame, with the views that it was rendered for.
+    """Filtered frame.
 
     Attributes
     ----------
     frame : StereoFrame
-        Input frame.
-    views : tuple of EyeView
-        View of each image, with the pose that was returned with it.
+        Input frame, whose views are those of the images.
     colors : tuple of (h, w, 3) uint8 or float16, or of moderngl.Texture
         Filtered image of each eye, sRGB or linear light as the input.
     used_focus_dpt : tuple of float or None
@@ -108,16 +132,24 @@ class FilteredStereoFrame:
     """
 
     frame: StereoFrame
-    views: tuple[EyeView, ...]
     colors: tuple[Image, ...]
     used_focus_dpt: tuple[float | None, ...]
-    is_complete: bool
-    notes: tuple[str, ...]
+    is_complete: bool = True
+    notes: tuple[str, ...] = ()
     stages_ms: Mapping[str, float] = field(default_factory=dict)
 
 
-class StereoFilter(Protocol):
-    """Interface of filters, which filter each eye through its own profile.
+class StereoFilter(ABC):
+    """Filter of both eyes' frames, each eye through its own profile.
+
+    `LocalFilter` filters in this process, `ServiceFilter` in a service.
+
+    Parameters
+    ----------
+    settings : FilterSettings
+        Settings of the eyes.
+    say : callable
+        Called with each message for the user, one line.
 
     Attributes
     ----------
@@ -125,11 +157,16 @@ class StereoFilter(Protocol):
         Settings of the eyes, from the next change on.
     """
 
-    settings: FilterSettings
+    def __init__(self, settings: FilterSettings, say: Say) -> None:
+        self.settings, self._say = settings, say
+        self._wanted: dict[EyeName, dict[str, Any]] = {}
+        self._asked: dict[EyeName, tuple[int, dict[str, Any]]] = {}
 
     def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
         """Request another eye; frames use the previous one until it is ready."""
+        self._wanted[eye] = dict(profile)
 
+    @abstractmethod
     def see(self, frame: StereoFrame) -> FilteredStereoFrame | None:
         """Submit a frame; return the newest result, or None before the first one."""
 
@@ -139,39 +176,59 @@ class StereoFilter(Protocol):
         It is the image itself if that is in arrays, otherwise a smaller one of an
         earlier frame.
         """
+        return picture
 
+    @abstractmethod
     def restart(self) -> None:
         """Discard results, whose poses refer to the previous session."""
 
+    @abstractmethod
     def close(self) -> None:
         """Release all resources."""
 
+    def _set_profiles(self, frame: StereoFrame) -> None:
+        for picture, looking in zip(frame.pictures, frame.eyes, strict=True):
+            eye = picture.view.eye
+            profile = self._wanted.pop(eye, None)
+            if profile is None:
+                continue
+            settings = self.settings
+            if settings.gaze_deg == (0.0, 0.0):  # straight ahead of the head
+                settings = settings.changed(gaze_deg=looking.ahead_deg)
+            try:
+                number = self._set_profile(eye, profile, settings, picture.camera)
+                self._asked[eye] = number, profile
+            except ValueError as error:
+                self._say(f"{eye} eye: {error}")
 
-def settings_for_gaze(settings: FilterSettings, eye: EyeAndGaze) -> FilterSettings:
-    """Return settings with the gaze straight ahead of the head, for canted views."""
-    if settings.gaze_deg != (0.0, 0.0):
-        return settings
-    return settings.changed(gaze_deg=eye.ahead_deg)
+    @abstractmethod
+    def _set_profile(
+        self,
+        eye: Eye,
+        profile: dict[str, Any],
+        settings: FilterSettings,
+        camera: Camera,
+    ) -> int:
+        """Prepare an eye; return a number of the request, which results contain."""
+
+    def _own_focus_dpt(
+        self, eye: EyeName, number: int | None, focus_dpt: float | None
+    ) -> float | None:
+        """Return the focus of a result; None if it is not of the requested eye."""
+        asked = self._asked.get(eye)
+        return None if asked is None or asked[0] != number else focus_dpt
+
+    def _say_ready(self, eye: EyeName, build_ms: float) -> None:
+        self._say(f"{eye} eye: ready after {build_ms:.0f} ms")
 
 
-# Filter in this process
-
-MS_PER_S = 1e3
-KEPT_VIEWS = 16
-"""Frames of an eye whose pose is kept until the GPU has finished them."""
-
-EyeEvent = BuildingEye | EyeFailed | EyeReady
-
-
-class LocalFilter:
+class LocalFilter(StereoFilter):
     """Filter of headset frames in this process, which returns each result at once.
 
     Parameters
     ----------
-    settings : FilterSettings
-        Settings of the filters.
-    say : callable
-        Called with each message about the eyes, one line.
+    settings, say
+        As for `StereoFilter`.
     context : moderngl.Context, optional
         Context of the pictures.  Pictures in textures are then filtered to textures in
         it, without copies and without waiting for the GPU, unless an eye has effects
@@ -184,8 +241,7 @@ class LocalFilter:
         say: Say,
         context: moderngl.Context | None = None,
     ) -> None:
-        self._say = say
-        self.settings = settings
+        super().__init__(settings, say)
         self._context = context
         kind: Literal["own", "current"] = "own" if context is None else "current"
         with self._entered():
@@ -198,8 +254,6 @@ class LocalFilter:
                 for eye in EYES
             }
         self._needs_arrays = False
-        self._wanted: dict[Eye, Mapping[str, Any]] = {}
-        self._generations: dict[Eye, int] = {}
         self._targets: dict[Eye, moderngl.Texture] = {}
         self._views: dict[int, EyeView] = {}  # of frames on the GPU, by number
         self._known: dict[Eye, RgbdPicture] = {}
@@ -210,31 +264,24 @@ class LocalFilter:
     def _tell(self, eye: Eye, event: EyeEvent) -> None:
         if isinstance(event, EyeReady):
             self._needs_arrays = False  # perhaps not of this eye
-            self._say(f"{eye} eye: ready after {event.build_ms:.0f} ms")
+            self._say_ready(eye, event.build_ms)
         elif isinstance(event, EyeFailed) and not isinstance(
             event.error, BuildCancelled
         ):
             self._say(f"{eye} eye: {event.error}")
 
-    def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
-        """Request another eye; frames use the previous one until it is ready."""
-        self._wanted[eye] = profile
-
-    def _set_profiles(self, frame: StereoFrame) -> None:
-        for picture, looking in zip(frame.pictures, frame.eyes, strict=True):
-            eye = picture.view.eye
-            profile = self._wanted.pop(eye, None)
-            if profile is None:
-                continue
-            try:
-                accepted = self.filters[eye].set_profile(
-                    body_of_eye(profile, eye),
-                    settings=settings_for_gaze(self.settings, looking),
-                    cameras=[picture.camera],
-                )
-                self._generations[eye] = accepted.generation
-            except ValueError as error:
-                self._say(f"{eye} eye: {error}")
+    def _set_profile(
+        self,
+        eye: Eye,
+        profile: dict[str, Any],
+        settings: FilterSettings,
+        camera: Camera,
+    ) -> int:
+        body = body_of_eye(profile, eye)
+        accepted = self.filters[eye].set_profile(
+            body, settings=settings, cameras=[camera]
+        )
+        return accepted.generation
 
     def see(self, frame: StereoFrame) -> FilteredStereoFrame | None:
         """Filter a frame; return None while an eye is being prepared for it.
@@ -259,7 +306,25 @@ class LocalFilter:
         # leaves none current.
         views = frame.views
         with self._entered():
-            return self._see_arrays(frame, views, begin_s)
+            planned = plan_views(
+                self.filters.__getitem__,
+                views,
+                frame.states,
+                pupil_diameter_mm=frame.eyes[0].state.pupil_diameter_mm,
+                focus_dpt=frame.eyes[0].state.focus_dpt,
+            )
+            seen = planned and planned.render(output=frame.output)
+        if not seen:
+            return None
+        filter_ms = sum(seen.stage_times_ms.values())
+        whole_ms = MS_PER_S * (time.monotonic() - begin_s)
+        return FilteredStereoFrame(
+            frame,
+            tuple(view.color for view in seen.views),
+            self._used_dpt(frame, seen.views),
+            notes=seen.notes,
+            stages_ms={"filter_ms": filter_ms, "around_ms": whole_ms - filter_ms},
+        )
 
     def _takes_textures(self, frame: StereoFrame) -> bool:
         return (
@@ -268,54 +333,18 @@ class LocalFilter:
             and all(isinstance(picture, TexturePicture) for picture in frame.pictures)
         )
 
-    def _see_arrays(
-        self, frame: StereoFrame, views: list[RgbdView], begin_s: float
-    ) -> FilteredStereoFrame | None:
-        planned = plan_views(
-            self.filters.__getitem__,
-            views,
-            frame.states,
-            pupil_diameter_mm=frame.eyes[0].state.pupil_diameter_mm,
-            focus_dpt=frame.eyes[0].state.focus_dpt,
-        )
-        seen = planned and planned.render(output=frame.output)
-        if not seen:
-            return None
-        stages_ms = seen.stage_times_ms
-        whole_ms = MS_PER_S * (time.monotonic() - begin_s)
-        return FilteredStereoFrame(
-            frame,
-            tuple(picture.view for picture in frame.pictures),
-            tuple(view.color for view in seen.views),
-            tuple(
-                self._used_dpt(picture, view.generation, view.focus_dpt)
-                for view, picture in zip(seen.views, frame.pictures, strict=True)
-            ),
-            True,
-            seen.notes,
-            {
-                "filter_ms": sum(stages_ms.values()),
-                "around_ms": whole_ms - sum(stages_ms.values()),
-            },
-        )
-
-    def _used_dpt(
-        self, picture: Picture, generation: int, focus_dpt: float
-    ) -> float | None:
-        is_own = generation == self._generations.get(picture.view.eye)
-        return focus_dpt if is_own else None
-
     def _see_textures(
         self, frame: StereoFrame, begin_s: float
     ) -> FilteredStereoFrame | None:
         """Submit a frame in textures; the GPU filters it before it is shown."""
         shown: list[FilteredTexture] = []
+        targets = []
         for picture, looking in zip(frame.pictures, frame.eyes, strict=True):
-            eye = picture.view.eye
             assert isinstance(picture, TexturePicture)
-            found = self.filters[eye].filter_textures(
+            targets.append(self._target(picture))
+            found = self.filters[picture.view.eye].filter_textures(
                 _texture_view(picture),
-                GlTexture(self._target(picture).glo, "rgba8"),
+                GlTexture(targets[-1].glo, "rgba8"),
                 pupil_diameter_mm=looking.state.pupil_diameter_mm,
                 focus_dpt=looking.state.focus_dpt,
                 gaze_deg=looking.gaze_deg,
@@ -328,12 +357,8 @@ class LocalFilter:
         whole_ms = MS_PER_S * (time.monotonic() - begin_s)
         return FilteredStereoFrame(
             frame,
-            tuple(picture.view for picture in frame.pictures),
-            tuple(self._target(picture) for picture in frame.pictures),
-            tuple(
-                self._used_dpt(picture, found.generation, found.focus_dpt)
-                for picture, found in zip(frame.pictures, shown, strict=True)
-            ),
+            tuple(targets),
+            self._used_dpt(frame, shown),
             all(found.earlier is None or found.earlier.is_complete for found in shown),
             tuple(
                 f"{picture.view.eye} eye: {note}"
@@ -341,6 +366,14 @@ class LocalFilter:
                 for note in found.notes
             ),
             {"filter_ms": whole_ms, "around_ms": 0.0},
+        )
+
+    def _used_dpt(
+        self, frame: StereoFrame, found: Sequence[Any]
+    ) -> tuple[float | None, ...]:
+        return tuple(
+            self._own_focus_dpt(picture.view.eye, view.generation, view.focus_dpt)
+            for picture, view in zip(frame.pictures, found, strict=True)
         )
 
     def _target(self, picture: Picture) -> moderngl.Texture:
@@ -399,36 +432,15 @@ def _texture_view(picture: TexturePicture) -> TextureView:
     )
 
 
-# Filter through a service
-
-RETRY_S = 1.0
-SAY_AGAIN_S = 10.0
-ASK_AGAIN = ("worker_crashed", "no_profile")
-"""Codes of errors after which a profile is sent again."""
-
-WAIT_SHARE = 0.6
-"""Fraction of a frame's period for which the viewer waits for the newest result, so
-that a fast filter's image is shown in the frame that it was rendered for."""
-
-PATIENCE_S = 0.4
-"""If the previous frame took no longer than this, the viewer always waits for the
-filter. Frames that are late in any case are then half as old. On two shared cores,
-frames of 896x1007 were 0.8 s old without this wait, and not more frequent."""
-
-_OWN_STAGES = ("decode_ms", "queue_ms", "copy_out_ms", "rests_ms", "other_ms")
-
-
-class ServiceFilter:
+class ServiceFilter(StereoFilter):
     """Filter that sends frames to a service and returns the newest result.
 
     Parameters
     ----------
     endpoint : str
         Address of the service.
-    settings : FilterSettings
-        Settings of the filters.
-    say : callable
-        Called with each message for the user, one line.
+    settings, say
+        As for `StereoFilter`.
     key_file : Path, optional
         Key file of the client, for a service that requires one.
     """
@@ -441,21 +453,18 @@ class ServiceFilter:
         *,
         key_file: Path | None = None,
     ) -> None:
+        super().__init__(settings, say)
         self._say_once = LogOnce(say)
-        self._say = say
-        self.settings = settings
         self._endpoint = endpoint
         self._client = FilterClient(
             endpoint, client_name="headset", key_file=key_file, timeout_s=5.0
         )
-        self._wanted: dict[EyeName, dict[str, Any]] = {}
-        self._asked: dict[EyeName, tuple[int, dict[str, Any]]] = {}
         self._retry_s = 0.0  # time before which no profile is sent
         self._on_way: dict[int | None, StereoFrame] = {}
         self._newest: FilteredStereoFrame | None = None
         self._is_there = True
         self._trip_s = math.inf  # round trip of the last result
-        self.n_dropped: dict[str, int] = {}
+        self.n_dropped: Counter[str] = Counter()
 
     def wait_for_service(self) -> None:
         """Wait until the service responds.
@@ -467,9 +476,16 @@ class ServiceFilter:
         """
         self._client.hello()
 
-    def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
-        """Request another eye as soon as the service is connected."""
-        self._wanted[eye] = dict(profile)
+    def _set_profile(
+        self,
+        eye: Eye,
+        profile: dict[str, Any],
+        settings: FilterSettings,
+        camera: Camera,
+    ) -> int:
+        return self._client.request_profile(
+            profile, eye=eye, settings=settings, views=[camera]
+        )
 
     def see(self, frame: StereoFrame) -> FilteredStereoFrame | None:
         """Send a frame and return the newest result.
@@ -492,7 +508,8 @@ class ServiceFilter:
         if not self._is_there:
             self._say("connected to the filter service")
             self._is_there = True
-        self._send_profiles(frame)
+        if time.monotonic() >= self._retry_s:
+            self._set_profiles(frame)
         try:
             frame_id = client.submit(
                 frame.views,
@@ -516,35 +533,18 @@ class ServiceFilter:
             self._take_events(wait_s)
         return self._newest
 
-    def _send_profiles(self, frame: StereoFrame) -> None:
-        if time.monotonic() < self._retry_s:
-            return
-        for picture, looking in zip(frame.pictures, frame.eyes, strict=True):
-            eye = picture.view.eye
-            profile = self._wanted.pop(eye, None)
-            if profile is None:
-                continue
-            profile_id = self._client.request_profile(
-                profile,
-                eye=eye,
-                settings=settings_for_gaze(self.settings, looking),
-                views=[picture.camera],
-            )
-            self._asked[eye] = profile_id, profile
-
     def _take_events(self, wait_s: float = 0.0) -> None:
         for event in self._client.poll(wait_s):
             if isinstance(event, FilteredFrame):
                 self._take(event)
             elif isinstance(event, Dropped):
                 self._on_way.pop(event.frame_id, None)
-                reason = event.reason
-                self.n_dropped[reason] = self.n_dropped.get(reason, 0) + 1
+                self.n_dropped[event.reason] += 1
             elif isinstance(event, ErrorReply):
                 self._on_way.pop(event.frame_id, None)
                 self._take_error(event)
             elif isinstance(event, Ready):
-                self._say(f"{event.eye} eye: ready after {event.build_ms:.0f} ms")
+                self._say_ready(event.eye, event.build_ms)
 
     def _take_error(self, reply: ErrorReply) -> None:
         """Report an error once; send profiles again that the service has lost."""
@@ -564,41 +564,25 @@ class ServiceFilter:
         if frame is None:
             return
         header = answer.header
-        self._trip_s = 1e-3 * answer.round_trip_ms
-        views = tuple(
-            EyeView(
-                picture.view.eye, view.pose or picture.view.pose, picture.view.tangents
-            )
-            for picture, view in zip(frame.pictures, header.views, strict=True)
-        )
-        filter_ms = header.total_ms
+        self._trip_s = answer.round_trip_ms / MS_PER_S
+        own_ms = sum(header.stage_times_ms.get(name, 0.0) for name in _OWN_STAGES)
         self._newest = FilteredStereoFrame(
             frame,
-            views,
             answer.colors,
-            tuple(self._used_focus_dpt(header, view) for view in header.views),
-            True,
-            header.notes,
-            {
-                "filter_ms": filter_ms - _added_ms(header.stage_times_ms),
-                "service_ms": _added_ms(header.stage_times_ms),
-                "wire_ms": answer.round_trip_ms - filter_ms,
+            tuple(
+                header.focus_dpt  # of a service that supports one eye only
+                if view.profile_id is None
+                else self._own_focus_dpt(view.eye, view.profile_id, view.focus_dpt)
+                for view in header.views
+            ),
+            notes=header.notes,
+            stages_ms={
+                "filter_ms": header.total_ms - own_ms,
+                "service_ms": own_ms,
+                "wire_ms": answer.round_trip_ms - header.total_ms,
                 "wait_ms": answer.age_ms - answer.round_trip_ms,
             },
         )
-
-    def _used_focus_dpt(self, header: Result, view: ResultView) -> float | None:
-        """Return the focus of a view; None if the requested eye was not used."""
-        if view.profile_id is None:  # a service that supports one eye only
-            return header.focus_dpt
-        asked = self._asked.get(view.eye)
-        if asked is None or asked[0] != view.profile_id:
-            return None
-        return view.focus_dpt
-
-    def known(self, picture: Picture) -> Picture:
-        """Return the image: the service needs arrays of it anyway."""
-        return picture
 
     def restart(self) -> None:
         """Discard the results and the frames in flight."""
@@ -628,8 +612,3 @@ class LogOnce:
         if line not in self._said_s:
             self._said_s[line] = now_s
             self._say(line)
-
-
-def _added_ms(stages_ms: Mapping[str, float]) -> float:
-    """Return the time of the stages that the service adds to the filter."""
-    return sum(stages_ms.get(name, 0.0) for name in _OWN_STAGES)

@@ -242,10 +242,26 @@ class StereoGaze:
         self._distance_m = None
         self.is_tracked = False
 
-    def learn(self, eye: Eye, asked_dpt: float, used_dpt: float) -> None:
-        """Learn an eye's far and near point from the focus that the filter used."""
-        if eye in self._eyes:
-            self._eyes[eye].learn(asked_dpt, used_dpt)
+    def learn(
+        self,
+        pictures: Sequence[Picture],
+        asked: Sequence[EyeAndGaze],
+        used_dpt: Sequence[float | None],
+    ) -> None:
+        """Learn the far and near points from the foci that the filter used.
+
+        Parameters
+        ----------
+        pictures : sequence of RgbdPicture or TexturePicture
+            Images of a frame.
+        asked : sequence of EyeAndGaze
+            Requested state of each eye.
+        used_dpt : sequence of float or None
+            Focus of each eye; None teaches nothing.
+        """
+        for picture, eye, found_dpt in zip(pictures, asked, used_dpt, strict=True):
+            if found_dpt is not None and picture.view.eye in self._eyes:
+                self._eyes[picture.view.eye].learn(eye.state.focus_dpt, found_dpt)
 
     def change(self, eye: Eye) -> None:
         """Forget the far and near point of an eye that is replaced."""

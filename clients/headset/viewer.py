@@ -166,18 +166,16 @@ class Viewer:
         warm_up_s : float
             Longest wait for the first filtered frame, before the time limit starts.
         """
-        started_s = time.monotonic()
-
-        def end_s(limit_s: float) -> float:
-            latest_s = started_s + warm_up_s
-            return min(self.log.first_filtered_s or latest_s, latest_s) + limit_s
+        latest_s = time.monotonic() + warm_up_s
+        controls, log = self._controls, self.log
 
         def is_done() -> bool:
-            if max_frames is not None and self.log.n_filtered >= max_frames:
-                return True
-            if limit_s is not None and time.monotonic() >= end_s(limit_s):
-                return True
-            return self._controls.is_over
+            begun_s = min(log.first_filtered_s or latest_s, latest_s)
+            return (
+                controls.is_over
+                or (max_frames is not None and log.n_filtered >= max_frames)
+                or (limit_s is not None and time.monotonic() >= begun_s + limit_s)
+            )
 
         said = ""
         while not is_done():
@@ -210,18 +208,17 @@ class Viewer:
         return self.log
 
     def _run_session(self, runtime: Runtime, is_done: Callable[[], bool]) -> None:
-        seen: FilteredStereoFrame | None
-        shown: tuple[ShownView, ...]
-        times_ms: dict[str, float]
         while not is_done():
             due = runtime.begin_frame()
             begun_s = time.monotonic()
             if due is None:
                 self._controls.press(self._read_keys())
                 continue
+            seen: FilteredStereoFrame | None = None
+            shown: tuple[ShownView, ...] = ()
+            times_ms: dict[str, float] = {}
             try:
                 self._controls.press(self._read_keys(), due.pressed)
-                seen, shown, times_ms = None, (), {}
                 if due.should_render:
                     seen, shown, times_ms = self._frame(due, begun_s, runtime.size_px)
             except BaseException:
@@ -270,11 +267,9 @@ class Viewer:
             )
         ratio = SPLIT_RATIO if self._controls.is_split else 0.0
         found = []
-        for view, color, picture in zip(
-            seen.views, seen.colors, seen.frame.pictures, strict=True
-        ):
+        for color, picture in zip(seen.colors, seen.frame.pictures, strict=True):
             plain, depth_m = images_of(picture)
-            found.append(ShownView(view, color, depth_m, plain, ratio))
+            found.append(ShownView(picture.view, color, depth_m, plain, ratio))
         return tuple(found)
 
     def _note(
@@ -287,14 +282,11 @@ class Viewer:
             self.log.n_repeated += 1
             return
         self._last = seen
-        for picture, eye, used_dpt in zip(
-            seen.frame.pictures, seen.frame.eyes, seen.used_focus_dpt, strict=True
-        ):
-            if used_dpt is not None:
-                self._look.learn(picture.view.eye, eye.state.focus_dpt, used_dpt)
+        frame = seen.frame
+        self._look.learn(frame.pictures, frame.eyes, seen.used_focus_dpt)
         add_notes(self.log.notes, seen.notes)
         self.log.n_incomplete += not seen.is_complete
-        age_s = time.monotonic() - seen.frame.begun_s
+        age_s = time.monotonic() - frame.begun_s
         scene_ms, look_ms, show_ms = times_ms.values()
         self.log.add(
             scene_ms=scene_ms,
@@ -330,6 +322,12 @@ PRESETS = (
     "cataract",
     "post_lasik",
 )
+_PRESET_KEYS = ("1", "2", "3", "4", "5", "6")
+_NEXT_KEYS: dict[str, tuple[Eye, ...]] = {
+    "l": ("left",),
+    "r": ("right",),
+    "next_eye": EYES,  # a button
+}
 HELP = (
     "keys: both eyes: "
     + ", ".join(f"{n} {name}" for n, name in enumerate(PRESETS, 1))
@@ -368,30 +366,21 @@ class Controls:
 
     def press(self, keys: str, buttons: Sequence[str] = ()) -> None:
         """Handle pressed keys and controller buttons."""
-        for key in keys:
-            if key in "123456":
+        for key in (*keys, *buttons):
+            if key in _PRESET_KEYS:
                 for eye in EYES:
-                    self._set(eye, int(key) - 1)
-            elif key in ("l", "r"):
-                eye = "left" if key == "l" else "right"
+                    self._set(eye, _PRESET_KEYS.index(key))
+            for eye in _NEXT_KEYS.get(key, ()):
                 self._set(eye, (self._numbers[eye] + 1) % len(PRESETS))
-            elif key == "f":
-                self._switch()
+            if key in ("f", "on_off"):
+                self.is_on = not self.is_on
+                state = "on" if self.is_on else "off: the scene is unfiltered"
+                self.say(f"filter {state}")
             elif key == "s":
                 self.is_split = not self.is_split
                 self.say(f"split {'on' if self.is_split else 'off'}")
             elif key == "q":
                 self.is_over = True
-        for button in buttons:
-            if button == "on_off":
-                self._switch()
-            elif button == "next_eye":
-                for eye in EYES:
-                    self._set(eye, (self._numbers[eye] + 1) % len(PRESETS))
-
-    def _switch(self) -> None:
-        self.is_on = not self.is_on
-        self.say(f"filter {'on' if self.is_on else 'off: the scene is unfiltered'}")
 
     def _set(self, eye: Eye, number: int) -> None:
         self._numbers[eye] = number
@@ -403,8 +392,8 @@ class TerminalKeys:
     """Reader of single key presses from the terminal; reads none from other stdin."""
 
     def __init__(self) -> None:
-        self._before: list[Any] | None = None
-        self._descriptor: int | None = None
+        self._before: list[Any] = []
+        self._descriptor = -1
 
     def __enter__(self) -> TerminalKeys:
         """Switch the terminal to unbuffered input."""
@@ -416,16 +405,13 @@ class TerminalKeys:
 
     def __exit__(self, *exc_info: object) -> None:
         """Restore the terminal's settings."""
-        if self._before is not None and termios is not None:
-            assert self._descriptor is not None
+        if self._before:
             termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
 
     def pressed(self) -> str:
         """Return the keys pressed since the last call, without waiting."""
-        if self._descriptor is None:
-            return ""
         keys = b""
-        while select.select([self._descriptor], [], [], 0.0)[0]:
+        while self._before and select.select([self._descriptor], [], [], 0.0)[0]:
             got = os.read(self._descriptor, 64)
             if not got:
                 break

@@ -10,7 +10,7 @@ import selectors
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -43,6 +43,7 @@ WAIT_S = 1.0
 """Period that is told to a service's filter, which waits for a result accordingly."""
 
 MS_PER_S, US_PER_MS, NS_PER_S = 1e3, 1e3, 1e9
+_COUNTS = ("filtered", "not_filtered", "submitted", "shown_filtered", "fallback")
 N_LATE = 10
 """Successive late results after which the user is told."""
 
@@ -145,8 +146,8 @@ class LayerHelper:
         self.on_gaze: Callable[[], None] = lambda: None  # an eye tracker was found
         self._stages_ms: dict[str, deque[float]] = {}
         self._n_late = 0
-        self.n_frames = self.n_unready = 0
-        self.n_submitted = self.n_shown = self.n_fallback = 0
+        self.n_frames = 0
+        self._counts = dict.fromkeys(_COUNTS, 0)
 
     def close(self) -> None:
         """Close all connections and remove the socket."""
@@ -213,21 +214,19 @@ class LayerHelper:
                 connection.send(reply)
             self._forget(connection)
             return
-        try:
+        hello = None
+        with contextlib.suppress(ValueError):
             hello = wire.parsed(data)
-        except ValueError:
-            hello = None
         if not isinstance(hello, wire.Hello) or hello.magic != wire.MAGIC:
             self._forget(connection)
             return
         name = _printable(hello.application) or f"process {hello.process_id}"
         if hello.version != wire.VERSION:
             self._say(f"{name}: its layer is of another version of ocufilter")
-            self._forget(connection)
-        elif self._program is not None:
-            self._forget(connection)  # it tries again every second
-        else:
+        elif self._program is None:
             self._begin(connection, name, _printable(hello.engine))
+            return
+        self._forget(connection)  # it tries again every second
 
     def _begin(self, connection: socket.socket, name: str, engine: str) -> None:
         self._waiting.pop(connection, None)
@@ -363,13 +362,10 @@ class LayerHelper:
             self.on_frame(frame, seen)
         if seen is None or seen.frame is not frame:
             return False
-        for index, (picture, eye, used_dpt) in enumerate(
-            zip(pictures, frame.eyes, seen.used_focus_dpt, strict=True)
-        ):
-            color = cast("NDArray[Any]", seen.colors[index])  # as the input
-            images.put(index, color, SPLIT_RATIO if self._options.is_split else 0.0)
-            if used_dpt is not None:
-                self._look.learn(picture.view.eye, eye.state.focus_dpt, used_dpt)
+        for index, color in enumerate(seen.colors):
+            ratio = SPLIT_RATIO if self._options.is_split else 0.0
+            images.put(index, cast("NDArray[Any]", color), ratio)  # as the input
+        self._look.learn(pictures, eyes, seen.used_focus_dpt)
         took_ms = MS_PER_S * (time.monotonic() - begun_s)
         self._note(
             look_ms=MS_PER_S * (looked_s - begun_s), **seen.stages_ms, helper_ms=took_ms
@@ -394,10 +390,12 @@ class LayerHelper:
 
     def _count(self, frame: wire.Frame, is_filtered: bool) -> None:
         self.n_frames += 1
-        self.n_unready += not is_filtered
-        self.n_submitted += frame.frames
-        self.n_shown += frame.frames_filtered
-        self.n_fallback += frame.frames_fallback
+        counted = (
+            *(is_filtered, not is_filtered),
+            *(frame.frames, frame.frames_filtered, frame.frames_fallback),
+        )
+        for name, count in zip(_COUNTS, counted, strict=True):
+            self._counts[name] += count
         if frame.frames:
             self._note(
                 **{
@@ -411,11 +409,7 @@ class LayerHelper:
     def report(self) -> dict[str, Any]:
         """Return counts of frames, and times in ms."""
         return {
-            "filtered": self.n_frames - self.n_unready,
-            "not_filtered": self.n_unready,
-            "submitted": self.n_submitted,
-            "shown_filtered": self.n_shown,
-            "fallback": self.n_fallback,
+            **self._counts,
             "stages_ms": {
                 name: percentiles(list(times))
                 for name, times in self._stages_ms.items()
@@ -438,33 +432,6 @@ def _gaze_of(frame: wire.Frame) -> GazeSample | None:
 
 
 # Profiles of both eyes, from options, files that change, and commands
-
-
-class _ProfileFiles:
-    """Profiles that come from files, which are read again when they change."""
-
-    def __init__(self, options: EyeOptions) -> None:
-        self._paths: dict[Eye, Path] = {}
-        self._seen: dict[Eye, tuple[int, int] | None] = {}
-        for eye in EYES:
-            text = getattr(options, eye)
-            self.watch(eye, options.profile if text is None else text)
-
-    def watch(self, eye: Eye, text: str) -> None:
-        """Watch the file of an eye's profile if it is one."""
-        path = Path(text)
-        self._paths.pop(eye, None)
-        if not text.lstrip().startswith("{") and path.is_file():
-            self._paths[eye] = path
-            self._seen[eye] = _stamp(path)
-
-    def changed(self) -> Iterator[tuple[Eye, str]]:
-        """Yield the eyes whose file has changed, and its path."""
-        for eye, path in self._paths.items():
-            stamp = _stamp(path)
-            if stamp is not None and stamp != self._seen[eye]:
-                self._seen[eye] = stamp
-                yield eye, str(path)
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
@@ -502,10 +469,20 @@ class Eyes:
         say: Say,
     ) -> None:
         self._seeing, self._look, self._say = seeing, look, say
-        self._files = _ProfileFiles(options)
+        self._files: dict[Eye, tuple[Path, tuple[int, int] | None]] = {}
+        for eye in EYES:
+            text = getattr(options, eye)
+            self._watch(eye, options.profile if text is None else text)
         self._profiles = profiles_of(options)
         self._is_range_given = options.gaze_range is not None
         self._request()
+
+    def _watch(self, eye: Eye, text: str) -> None:
+        """Watch the file of an eye's profile if it is one."""
+        path = Path(text)
+        self._files.pop(eye, None)
+        if not text.lstrip().startswith("{") and path.is_file():
+            self._files[eye] = path, _stamp(path)
 
     def _request(self) -> None:
         for eye, profile in self._profiles.items():
@@ -529,7 +506,7 @@ class Eyes:
             If the profile cannot be read.
         """
         profile = read_profile(text, f"--{eye}")
-        self._files.watch(eye, text)
+        self._watch(eye, text)
         self._profiles[eye] = profile
         self._look.change(eye)
         self._seeing.change(eye, profile)
@@ -537,8 +514,12 @@ class Eyes:
 
     def reread(self) -> None:
         """Read the files that have changed."""
-        for eye, text in list(self._files.changed()):
+        for eye, (path, seen) in list(self._files.items()):
+            stamp = _stamp(path)
+            if stamp is None or stamp == seen:
+                continue
+            self._files[eye] = path, stamp
             try:
-                self.change(eye, text)
+                self.change(eye, str(path))
             except ValueError as error:
                 self._say(f"{eye} eye is unchanged: {error}")

@@ -1,7 +1,7 @@
 """Parts of buildings, furniture and small objects."""
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Unpack
 
 import numpy as np
@@ -12,7 +12,7 @@ from clients.scenes.geometry import (
     Line,
     Look,
     Mesh,
-    box,
+    block,
     lathe,
     merged,
     new_mesh,
@@ -80,51 +80,38 @@ def arch_wall(
 
 def _arch_edge(center: float, radius: float, springing_m: float) -> Array:
     """Return the outline (n, 3) of an opening, from foot to foot."""
-    angle = np.linspace(np.pi, 0, 17)
-    curve = np.stack(
-        [center + radius * np.cos(angle), springing_m + radius * np.sin(angle)], axis=1
-    )
-    rise = np.linspace(0, springing_m, 9)[:-1]
-    left = np.stack([np.full(8, center - radius), rise], axis=1)
-    right = np.stack([np.full(8, center + radius), rise[::-1]], axis=1)
-    flat = np.concatenate([left, curve, right])
-    return np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
+    angle, rise = np.linspace(np.pi, 0, 17), np.linspace(0, springing_m, 9)[:-1]
+    x = [np.full(8, -radius), radius * np.cos(angle), np.full(8, radius)]
+    y = [rise, springing_m + radius * np.sin(angle), rise[::-1]]
+    x_m, y_m = center + np.concatenate(x), np.concatenate(y)
+    return np.column_stack([x_m, y_m, np.zeros(len(x_m))])
 
 
 def _face_over_arch(
     edge: Array, start_m: float, bay_m: float, height_m: float, look: Look
 ) -> list[Mesh]:
     """Return the front of a bay: two piers and the surface above the arch."""
-    left_pier = edge[:9]
-    right_pier = edge[-9:]
-    curve = edge[8:-8]
-    start, end = np.full(9, start_m), np.full(9, start_m + bay_m)
-    rows = [
-        np.stack([np.column_stack([start, left_pier[:, 1:]]), left_pier]),
-        np.stack(
-            [right_pier, np.column_stack([end, right_pier[:, 1:]])]
-        ),
-    ]  # fmt: skip
+    left_pier, curve, right_pier = edge[:9], edge[8:-8], edge[-9:]
+    ends_m = start_m, start_m + bay_m
     top = np.linspace(0, 1, 13)[:, None, None]
-    above = np.linspace(start_m, start_m + bay_m, len(curve))
+    above = np.linspace(*ends_m, len(curve))
     crown = np.column_stack([above, np.full(len(curve), height_m), 0 * above])
     sheet = (1 - top) * curve[None] + top * crown[None]
-    # The sides of that surface run from the springing to the corners, which leaves
-    # gaps.
-    corner_l = _corner_fill(sheet[:, 0], start_m)
-    corner_r = _corner_fill(sheet[:, -1], start_m + bay_m)
-    front = np.array([0, 0, 1e3])
-    return [
-        _sheet(block.swapaxes(0, 1), inward=front, **look)
-        for block in (*rows, sheet.swapaxes(0, 1), corner_l, corner_r)
+    blocks = [
+        np.stack([_at_x(left_pier, ends_m[0]), left_pier], axis=1),
+        np.stack([right_pier, _at_x(right_pier, ends_m[1])], axis=1),
+        sheet,
+        # The sides of that surface run from the springing to the corners, which leaves
+        # gaps.
+        np.stack([sheet[:, 0], _at_x(sheet[:, 0], ends_m[0])], axis=1),
+        np.stack([sheet[:, -1], _at_x(sheet[:, -1], ends_m[1])], axis=1),
     ]
+    return [_sheet(block, inward=np.array([0, 0, 1e3]), **look) for block in blocks]
 
 
-def _corner_fill(side: Array, x: float) -> Array:
-    """Return the surface between a slanted side and the vertical at x."""
-    straight = side.copy()
-    straight[:, 0] = x
-    return np.stack([side, straight], axis=0)
+def _at_x(points: Array, x: float) -> Array:
+    """Move points (n, 3) to one x."""
+    return np.column_stack([np.full(len(points), x), points[:, 1:]])
 
 
 def _sheet(points: Array, *, inward: Array, **look: Unpack[Look]) -> Mesh:
@@ -175,25 +162,22 @@ def tiled_roof(
 ) -> Mesh:
     """Return a roof of clay tiles that slopes toward +z from a ridge on the x axis."""
     rng = np.random.default_rng(12)
-    tiles = []
-    step = slope_m / rows
-    count = round(width_m / 0.26)
+    step, count = slope_m / rows, round(width_m / 0.26)
     angle = np.linspace(0, np.pi, 5)
-    arc = np.stack([-np.cos(angle) * 0.135, np.sin(angle) * 0.07], axis=1)
     palette = ("#b4552f", "#c4683c", "#a34a2a", "#cf7d4e", "#b86142")
-    for row in range(rows):
-        for i in range(count):
-            x = (i + 0.5) * width_m / count
-            near = np.column_stack([x + arc[:, 0], arc[:, 1] + 0.03, 0 * arc[:, 0]])
-            far = near - [0, 0.03, 0]
-            near[:, 2], far[:, 2] = (row + 1.1) * step, row * step
-            tiles.append(
-                _sheet(
-                    np.stack([far, near]),
-                    inward=np.array([x, 1e3, row * step]),
-                    color=str(rng.choice(palette)),
-                )
+    tiles = []
+    for row, i in np.ndindex(rows, count):
+        x = (i + 0.5) * width_m / count
+        arc_x, arc_y = x - np.cos(angle) * 0.135, np.sin(angle) * 0.07
+        far = np.column_stack([arc_x, arc_y + 0.03 - 0.03, np.full(5, row * step)])
+        near = np.column_stack([arc_x, arc_y + 0.03, np.full(5, (row + 1.1) * step)])
+        tiles.append(
+            _sheet(
+                np.stack([far, near]),
+                inward=np.array([x, 1e3, row * step]),
+                color=str(rng.choice(palette)),
             )
+        )
     return transformed(merged(tiles), rotation("x", pitch_deg))
 
 
@@ -202,20 +186,17 @@ def window(
 ) -> list[Mesh]:
     """Return a window with shutters for a wall facing +z, standing on the origin."""
     w, h = width_m, height_m
-    glass = patch((-w / 2, 0, 0.02), (w, 0, 0), (0, h, 0), color="#28343d")
-    parts = [glass]
+    parts = [patch((-w / 2, 0, 0.02), (w, 0, 0), (0, h, 0), color="#28343d")]
     for x in (-w / 2, 0.0, w / 2):
-        parts.append(placed(box((0.05, h, 0.06), color="#efe6d2"), (x, h / 2, 0.04)))
+        parts.append(block((0.05, h, 0.06), (x, h / 2, 0.04), color="#efe6d2"))
     for y in (0.0, 0.5 * h, h):
-        parts.append(placed(box((w, 0.05, 0.06), color="#efe6d2"), (0, y, 0.04)))
-    parts.append(placed(box((w + 0.3, 0.07, 0.16), color="#d8c6a0"), (0, -0.07, 0.08)))
-    for side in (-1, 1):
-        x = side * 0.78 * w
-        parts.append(placed(box((0.5 * w, h, 0.03), color=shutter), (x, h / 2, 0.04)))
+        parts.append(block((w, 0.05, 0.06), (0, y, 0.04), color="#efe6d2"))
+    parts.append(block((w + 0.3, 0.07, 0.16), (0, -0.07, 0.08), color="#d8c6a0"))
+    for x in (-0.78 * w, 0.78 * w):
+        parts.append(block((0.5 * w, h, 0.03), (x, h / 2, 0.04), color=shutter))
         for k in range(7):
             foot = (x - 0.21 * w, (k + 0.5) * h / 7.2, 0.058)
-            slat = patch(foot, (0.42 * w, 0, 0), (0, 0.03, 0), color="#5aa3a7")
-            parts.append(slat)
+            parts.append(patch(foot, (0.42 * w, 0, 0), (0, 0.03, 0), color="#5aa3a7"))
     return parts
 
 
@@ -223,23 +204,20 @@ def awning(
     width_m: float, reach_m: float, drop_m: float, *, texture: str
 ) -> list[Mesh]:
     """Return an awning that extends toward +z from the line (0..width, 0, 0)."""
-    cloth = patch(
-        (0, -drop_m, reach_m),
-        (width_m, 0, 0),
-        (0, drop_m, -reach_m),
-        cells=(24, 8),
-        uv_scale=(width_m / 2, 1),
-        texture=texture,
-    )
-    fringe = patch(
-        (0, -drop_m - 0.22, reach_m),
-        (width_m, 0, 0),
-        (0, 0.22, 0),
-        cells=(24, 1),
-        uv_scale=(width_m / 2, 1),
-        texture=texture,
-    )
-    return [cloth, fringe]
+    return [
+        patch(
+            (0, low_m, reach_m),
+            (width_m, 0, 0),
+            up_m,
+            cells=(24, rows),
+            uv_scale=(width_m / 2, 1),
+            texture=texture,
+        )
+        for low_m, up_m, rows in (
+            (-drop_m, (0, drop_m, -reach_m), 8),
+            (-drop_m - 0.22, (0, 0.22, 0), 1),  # the fringe
+        )
+    ]
 
 
 def fountain() -> list[Mesh]:
@@ -252,24 +230,24 @@ def fountain() -> list[Mesh]:
         color=stone,
     )  # fmt: skip
     water = lathe([(1.02, 0.36), (0.6, 0.36), (0.3, 0.36), (0.0, 0.36)], sides=36)
-    up = np.tile([0.0, 1.0, 0.0], (len(water.vertices_m), 1))
-    water = new_mesh(water.vertices_m, water.faces, normals=up, color="#5b9aa8")
+    water = _upward(new_mesh(water.vertices_m, water.faces, color="#5b9aa8"))
     stem = lathe(
         [(0.22, 0.3), (0.14, 0.5), (0.11, 0.8), (0.16, 1.0), (0.5, 1.12), (0.56, 1.2),
          (0.5, 1.2), (0.1, 1.12), (0.07, 1.4), (0.24, 1.52), (0.28, 1.58), (0.0, 1.56)],
         sides=28,
         color=stone,
     )  # fmt: skip
-    jets = []
-    for angle in np.linspace(0, 2 * np.pi, 10, endpoint=False):
-        t = np.linspace(0, 1, 8)
-        reach = 0.5 + 0.4 * t
-        height = 1.22 + 0.25 * t - 1.1 * t**2
-        path = np.stack(
-            [reach * np.cos(angle), height, reach * np.sin(angle)],
-            axis=1,
-        )  # fmt: skip
-        jets.append(tube(path, 0.008, sides=4, color="#e4f3f6"))
+    t = np.linspace(0, 1, 8)
+    reach, height = 0.5 + 0.4 * t, 1.22 + 0.25 * t - 1.1 * t**2
+    jets = [
+        tube(
+            np.stack([reach * np.cos(angle), height, reach * np.sin(angle)], axis=1),
+            0.008,
+            sides=4,
+            color="#e4f3f6",
+        )
+        for angle in np.linspace(0, 2 * np.pi, 10, endpoint=False)
+    ]
     top = placed(sphere(0.09, sides=14, color=stone), (0, 1.66, 0))
     return [basin, water, stem, top, *jets]
 
@@ -281,16 +259,13 @@ def lattice(
     parts = []
     for sign in (-1, 1):
         for c in np.arange(-height_m, width_m + height_m, spacing_m):
-            x = np.array([c, c + height_m]) if sign > 0 else np.array([c + height_m, c])
-            t = np.clip((np.array([0, width_m]) - x[0]) / (x[1] - x[0]), 0, 1)
-            low, high = sorted(t)
-            if high - low < 0.02:
-                continue
-            ends = np.array([low, high])
-            path = np.column_stack(
-                [x[0] + ends * (x[1] - x[0]), ends * height_m, [0.01 * sign] * 2]
-            )
-            parts.append(tube(path, 0.013, sides=4, color=color))
+            x = (c, c + height_m)[::sign]
+            t = np.sort(np.clip((np.array([0, width_m]) - x[0]) / (x[1] - x[0]), 0, 1))
+            if t[1] - t[0] >= 0.02:
+                path = np.column_stack(
+                    [x[0] + t * (x[1] - x[0]), t * height_m, [0.01 * sign] * 2]
+                )
+                parts.append(tube(path, 0.013, sides=4, color=color))
     rails = [(0, 0), (width_m, 0), (width_m, height_m), (0, height_m), (0, 0)]
     for (xa, ya), (xb, yb) in pairwise(rails):
         parts.append(tube([(xa, ya, 0), (xb, yb, 0)], 0.03, sides=4, color=color))
@@ -312,14 +287,13 @@ def bistro_table(
         sides=12,
         color=_IRON,
     )  # fmt: skip
-    plate = _disc(radius_m, height_m, texture=top)
     rim = lathe(
         [(radius_m, height_m - 0.025), (radius_m + 0.004, height_m - 0.012),
          (radius_m, height_m)],
         sides=36,
         color="#6b4a2c" if top else "#8b8f90",
     )  # fmt: skip
-    return [leg, plate, rim]
+    return [leg, _disc(radius_m, height_m, texture=top), rim]
 
 
 def _disc(
@@ -328,42 +302,35 @@ def _disc(
     *,
     rings: int = 8,
     sides: int = 36,
-    texture: str = "",
-    color: str = "#ffffff",
+    **look: Unpack[Look],
 ) -> Mesh:
     """Return a horizontal disc, finely divided for small shadows."""
     r = np.linspace(0, radius_m, rings + 1)
     mesh = lathe(np.stack([r, np.full_like(r, height_m)], axis=1)[::-1], sides=sides)
     uv = mesh.vertices_m[:, [0, 2]] / (2 * radius_m) * [1, -1] + 0.5
-    normals = np.tile([0.0, 1.0, 0.0], (len(uv), 1))
-    return new_mesh(
-        mesh.vertices_m, mesh.faces, normals=normals, uv=uv, texture=texture,
-        color=color,
-    )  # fmt: skip
+    return _upward(new_mesh(mesh.vertices_m, mesh.faces, uv=uv, **look))
 
 
 def chair(*, frame: str = _IRON, seat: str = "#b0703c") -> list[Mesh]:
     """Return a bent-wire chair that faces -z, with thin legs and bars in its back."""
-    parts = [painted(_disc(0.20, 0.46, rings=4, sides=20), seat)]
-    parts.append(lathe([(0.20, 0.44), (0.205, 0.45), (0.20, 0.46)], color=frame))
+    parts = [
+        painted(_disc(0.20, 0.46, rings=4, sides=20), seat),
+        lathe([(0.20, 0.44), (0.205, 0.45), (0.20, 0.46)], color=frame),
+    ]
     bars: list[Line] = []
     for x in (-0.16, 0.16):
         bars.append([(0.75 * x, 0.45, -0.12), (1.15 * x, 0.0, -0.19)])
-        back = [(0.75 * x, 0.0, 0.22), (x, 0.45, 0.17), (1.05 * x, 0.85, 0.24)]
-        bars.append(back)
+        bars.append([(0.75 * x, 0.0, 0.22), (x, 0.45, 0.17), (1.05 * x, 0.85, 0.24)])
     angle = np.linspace(0, np.pi, 9)
-    arch = np.stack(
-        [0.168 * np.cos(angle), 0.85 + 0.10 * np.sin(angle), np.full(9, 0.24)], axis=1
-    )
-    bars.append(arch)
+    arch = [0.168 * np.cos(angle), 0.85 + 0.10 * np.sin(angle), np.full(9, 0.24)]
+    bars.append(np.stack(arch, axis=1))
     for x in (-0.09, 0.0, 0.09):
         bars.append([(x, 0.46, 0.18), (x, 0.68, 0.205), (x, 0.93 - abs(x), 0.24)])
     ring = np.linspace(0, 2 * np.pi, 13)
     bars.append(
         np.stack([0.15 * np.cos(ring), 0 * ring + 0.18, 0.17 * np.sin(ring)], axis=1)
     )
-    parts += [tube(bar, 0.010, sides=5, color=frame) for bar in bars]
-    return parts
+    return parts + [tube(bar, 0.010, sides=5, color=frame) for bar in bars]
 
 
 def cup(
@@ -407,23 +374,28 @@ def _upward(mesh: Mesh) -> Mesh:
 
 def lantern(*, glow: float = 1.6) -> list[Mesh]:
     """Return a candle lantern, 0.24 m high, with thin bars around a flame."""
-    parts = [placed(box((0.10, 0.012, 0.10), color=_IRON), (0, 0.006, 0))]
-    parts.append(placed(box((0.10, 0.010, 0.10), color=_IRON), (0, 0.170, 0)))
     roof = lathe([(0.068, 0.175), (0.02, 0.215), (0.008, 0.222)], sides=4, color=_IRON)
-    parts.append(placed(roof, turn_deg=45))
     ring = np.linspace(0, 2 * np.pi, 11)
     loop = np.stack([0.02 * np.cos(ring), 0.24 + 0.02 * np.sin(ring), 0 * ring], axis=1)
-    parts.append(tube(loop, 0.0025, sides=5, color=_IRON))
-    for x in (-0.046, 0.046):
-        for z in (-0.046, 0.046):
-            parts.append(tube([(x, 0.01, z), (x, 0.17, z)], 0.004, color=_IRON))
+    bars = [
+        tube([(x, 0.01, z), (x, 0.17, z)], 0.004, color=_IRON)
+        for x, z in product((-0.046, 0.046), repeat=2)
+    ]
     candle = lathe([(0.025, 0.012), (0.025, 0.085), (0.0, 0.085)], color="#f3e3bd")
     flame = lathe(
         [(0.0, 0.088), (0.010, 0.102), (0.008, 0.115), (0.0, 0.138)],
         sides=10,
         color="#ffb347",
     )
-    return [*parts, candle, painted(flame, "#ffd27a", emission=glow)]
+    return [
+        block((0.10, 0.012, 0.10), (0, 0.006, 0), color=_IRON),
+        block((0.10, 0.010, 0.10), (0, 0.170, 0), color=_IRON),
+        placed(roof, turn_deg=45),
+        tube(loop, 0.0025, sides=5, color=_IRON),
+        *bars,
+        candle,
+        painted(flame, "#ffd27a", emission=glow),
+    ]
 
 
 def railing(
@@ -471,7 +443,6 @@ def string_lights(
         drop = np.array([0.0, 4 * sag_m, 0.0])
         return (1 - s) * start_m + s * end_m - s * (1 - s) * drop
 
-    parts = [tube(point(t), 0.006, sides=5, color="#1d1d1f")]
     where = point(((np.arange(count) + 0.5) / count)[:, None])
     bulb = merged(
         [
@@ -480,8 +451,8 @@ def string_lights(
         ]
     )
     below = where - [0.0, 0.08, 0.0]
-    parts += [placed(bulb, position) for position in below]
-    return parts, below
+    cable = tube(point(t), 0.006, sides=5, color="#1d1d1f")
+    return [cable, *(placed(bulb, position) for position in below)], below
 
 
 def standing_board(
@@ -497,11 +468,11 @@ def standing_board(
         texture=texture,
     )
     frame = [
-        placed(box((0.05, height + 0.14, 0.03), color="#7a4f2a"), (x, height / 2, 0.0))
+        block((0.05, height + 0.14, 0.03), (x, height / 2, 0.0), color="#7a4f2a")
         for x in (-width / 2 - 0.01, width / 2 + 0.01)
     ]
     frame += [
-        placed(box((width + 0.06, 0.05, 0.03), color="#7a4f2a"), (0, y, 0.0))
+        block((width + 0.06, 0.05, 0.03), (0, y, 0.0), color="#7a4f2a")
         for y in (0.07, height + 0.09)
     ]
     tilt = rotation("x", -lean_deg)
@@ -515,13 +486,9 @@ def standing_board(
 def table_card(size_m: tuple[float, float], *, texture: str) -> list[Mesh]:
     """Return a folded menu card that stands on a table and faces +z."""
     width, height = size_m
-    tilt = rotation("x", -14)
-    front = patch(
-        (-width / 2, 0, 0), (width, 0, 0), (0, height, 0), cells=(4, 6), texture=texture
-    )
-    back = patch(
-        (-width / 2, 0, 0), (width, 0, 0), (0, height, 0), color="#efe4cd", cells=(4, 6)
-    )
+    corner_m, sides_m = (-width / 2, 0, 0), ((width, 0, 0), (0, height, 0))
+    front = patch(corner_m, *sides_m, cells=(4, 6), texture=texture)
+    back = patch(corner_m, *sides_m, cells=(4, 6), color="#efe4cd")
     away = rotation("x", 14)
     away[:3, 3] = (0, 0, -2 * height * np.sin(np.deg2rad(14)))
-    return [transformed(front, tilt), transformed(back, away)]
+    return [transformed(front, rotation("x", -14)), transformed(back, away)]

@@ -230,6 +230,11 @@ def box(size_m: ArrayLike, *, cells: int = 1, **look: Unpack[Look]) -> Mesh:
     return merged(sides)
 
 
+def block(size_m: ArrayLike, center_m: ArrayLike, **look: Unpack[Look]) -> Mesh:
+    """Return a box about a point."""
+    return placed(box(size_m, **look), center_m)
+
+
 def lathe(profile_m: ArrayLike, *, sides: int = 20, **look: Unpack[Look]) -> Mesh:
     """Revolve a profile of (radius, height) points, bottom first, about the y axis."""
     profile_m = np.asarray(profile_m, float)

@@ -58,11 +58,8 @@ class Inverting:
         frame = self.frames[-1 - self.late]
         return FilteredStereoFrame(
             frame,
-            tuple(picture.view for picture in frame.pictures),
             tuple(255 - picture.color for picture in frame.pictures),
             tuple(eye.state.focus_dpt for eye in frame.eyes),
-            True,
-            (),
         )
 
     def known(self, picture):

@@ -123,11 +123,10 @@ def test_the_far_point_is_learnt_from_what_the_filter_says():
 
     def at(at_s, seen):
         due = DueFrame(int(1e9 * at_s), True, eye_views(head), head)
-        return look.follow(due, seen)[0].state.focus_dpt
+        return look.follow(due, seen)
 
-    asked = at(0.0, pictures)
-    look.learn("left", asked, 4.0)
-    begun = [at(0.02 * step, near) for step in range(1, 300)]
+    look.learn(pictures, at(0.0, pictures), (4.0, None))
+    begun = [at(0.02 * step, near)[0].state.focus_dpt for step in range(1, 300)]
     assert begun[0] == pytest.approx(4.0, abs=1e-6)
     assert begun[-1] == pytest.approx(5.0, abs=0.05)
 

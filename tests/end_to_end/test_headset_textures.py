@@ -155,11 +155,10 @@ def stereo_frames(headset, presenter, target, count):
     """Filter frames of a moving head and draw them, as a session does."""
     for k in range(count):
         seen = headset.frame(k / 90.0, swaying)
-        for view, color, picture in zip(
-            seen.views, seen.colors, seen.frame.pictures, strict=True
-        ):
+        for color, picture in zip(seen.colors, seen.frame.pictures, strict=True):
             plain, depth_m = images_of(picture)
-            presenter.draw(ShownView(view, color, depth_m, plain, 0.5), target)
+            shown = ShownView(picture.view, color, depth_m, plain, 0.5)
+            presenter.draw(shown, target)
 
 
 def test_a_frame_transfers_no_image_and_waits_for_nothing(monkeypatch):

@@ -53,11 +53,8 @@ class Inverting:
         time.sleep(self.takes_s)
         return FilteredStereoFrame(
             frame,
-            tuple(picture.view for picture in frame.pictures),
             tuple(inverted(picture.color) for picture in frame.pictures),
             tuple(eye.state.focus_dpt for eye in frame.eyes),
-            True,
-            (),
         )
 
     def restart(self):

@@ -25,11 +25,8 @@ class Unfiltered:
     def see(self, frame):
         return FilteredStereoFrame(
             frame,
-            tuple(picture.view for picture in frame.pictures),
             tuple(images_of(picture)[0] for picture in frame.pictures),
             (None, None),
-            True,
-            (),
         )
 
     def known(self, picture):
