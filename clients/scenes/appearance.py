@@ -4,9 +4,9 @@ Shadows come from depth maps along parallel rays: one fine map for the sun, and 
 coarse ones for the sky (ambient occlusion).
 """
 
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,54 +54,6 @@ class Lights:
     lamp: Array
 
 
-class DepthMaps:
-    """Depth maps of fixed occluders along parallel rays.
-
-    Back faces cast no shadows, so that walls around a scene do not hide the sky behind
-    them.
-    """
-
-    def __init__(self, occluders: list[Mesh], *, center_m: ArrayLike, radius_m: float):
-        whole = merged([replace(mesh, texture="") for mesh in occluders])
-        far_m = _NEAR_M + 2 * radius_m
-        batch = Batch(
-            vertices_m=whole.vertices_m.astype(np.float32),
-            faces=whole.faces.astype(np.uint32),
-            uv=whole.uv.astype(np.float32),
-            srgb=np.zeros_like(whole.vertices_m, np.float32),
-            texture=None,
-        )
-        self._scene = Scene(
-            name="occluders",
-            batches=(batch,),
-            background_srgb=(0.0, 0.0, 0.0),
-            near_m=_NEAR_M,
-            far_m=far_m,
-            infinite_from_m=far_m,
-        )
-        self._center_m = np.asarray(center_m, float)
-        self._radius_m = radius_m
-        self._context = open_context()
-
-    def close(self) -> None:
-        """Release the OpenGL context."""
-        self._context.release()
-
-    def toward(self, directions: Iterable[Array], size_px: int) -> list["ParallelMap"]:
-        """Render the depth map (size_px, size_px) of each distant source."""
-        found = []
-        size = (size_px, size_px)
-        with SceneView(self._context, self._scene, size, supersampling=1) as view:
-            for direction in directions:
-                axes = _axes_along(direction)
-                pose = np.eye(4)
-                pose[:3, :3] = axes.T
-                pose[:3, 3] = self._center_m + axes[2] * (self._radius_m + _NEAR_M)
-                depth_m = view.parallel_depth_m(pose, self._radius_m).astype(float)
-                found.append(ParallelMap(depth_m, pose[:3, 3], axes, self._radius_m))
-        return found
-
-
 @dataclass(frozen=True)
 class ParallelMap:
     """Depth map along parallel rays, in which points are looked up."""
@@ -117,22 +69,28 @@ class ParallelMap:
         size = len(self.depth_m)
         column = (local[:, 0] / self.radius_m + 1) * size / 2
         row = (1 - local[:, 1] / self.radius_m) * size / 2
-        shifts = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
+        shifts = list(product((-1, 0, 1), repeat=2)) if soft else [(0, 0)]
         total = np.zeros(len(points_m))
-        for dx, dy in shifts if soft else [(0, 0)]:
+        for dx, dy in shifts:
             i = np.clip(np.floor(row + dy), 0, size - 1).astype(int)
             j = np.clip(np.floor(column + dx), 0, size - 1).astype(int)
             total += self.depth_m[i, j] > -local[:, 2] - bias_m
-        return total / (len(shifts) if soft else 1)
+        return total / len(shifts)
 
 
-def _axes_along(direction: Array) -> Array:
-    """Return the axes right, up and back (rows) of a camera facing `-direction`."""
+def _seen_from(
+    view: SceneView, direction: Array, center_m: ArrayLike, radius_m: float
+) -> ParallelMap:
+    """Render the depth map toward a distant source in a direction (3,)."""
     back = np.asarray(direction, float) / np.linalg.norm(direction)
     helper = np.eye(3)[2 if abs(back[1]) > 0.9 else 1]
     right = np.cross(helper, back)
     right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(back, right), back])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+    pose[:3, 3] = np.asarray(center_m, float) + back * (radius_m + _NEAR_M)
+    depth_m = view.parallel_depth_m(pose, radius_m).astype(float)
+    return ParallelMap(depth_m, pose[:3, 3], pose[:3, :3].T, radius_m)
 
 
 def hemisphere(count: int) -> Array:
@@ -145,13 +103,48 @@ def hemisphere(count: int) -> Array:
 
 
 class Baker:
-    """Light that arrives at the points of a scene."""
+    """Light that arrives at the points of a scene.
 
-    def __init__(self, lights: Lights, maps: DepthMaps, *, sky_directions: int = 40):
+    Shadows come from depth maps of fixed occluders within a sphere.  Back faces cast no
+    shadows, so that walls around a scene do not hide the sky behind them.
+    """
+
+    def __init__(
+        self,
+        lights: Lights,
+        occluders: list[Mesh],
+        *,
+        center_m: ArrayLike,
+        radius_m: float,
+        sky_directions: int = 40,
+    ) -> None:
         self._lights = lights
-        (self._sun_map,) = maps.toward([lights.sun_direction], 2048)
-        sky = hemisphere(sky_directions)
-        self._sky = list(zip(sky, maps.toward(sky, 384), strict=True))
+        whole = merged([replace(mesh, texture="") for mesh in occluders])
+        batch = Batch(
+            vertices_m=whole.vertices_m.astype(np.float32),
+            faces=whole.faces.astype(np.uint32),
+            uv=whole.uv.astype(np.float32),
+            srgb=np.zeros_like(whole.vertices_m, np.float32),
+            texture=None,
+        )
+        far_m = _NEAR_M + 2 * radius_m
+        scene = Scene("occluders", (batch,), (0.0, 0.0, 0.0), _NEAR_M, far_m, far_m)
+        maps: list[ParallelMap] = []
+        context = open_context()
+        try:
+            for directions, size_px in (
+                ([lights.sun_direction], 2048),
+                (hemisphere(sky_directions), 384),
+            ):
+                size = (size_px, size_px)
+                with SceneView(context, scene, size, supersampling=1) as view:
+                    maps += [
+                        _seen_from(view, d, center_m, radius_m) for d in directions
+                    ]
+        finally:
+            context.release()
+        self._sun_map, *sky_maps = maps
+        self._sky = list(zip(hemisphere(sky_directions), sky_maps, strict=True))
 
     def light(
         self, points_m: Array, normals: Array, translucency: ArrayLike = 0.0
@@ -180,17 +173,13 @@ class Baker:
         """
         width, height = size
         coarse = (max(2, width // 8), max(2, height // 8))
+        up, none = np.array([[0.0, 1.0, 0.0]]), np.zeros(1)
         points = _grid_points(origin_m, side_u_m, side_v_m, coarse)
-        up = np.tile([0.0, 1.0, 0.0], (len(points), 1))
-        none = np.zeros(len(points))
         slow = self._sky_light(points + 0.02 * up, up, none)
         slow = (slow + self._lamp_light(points, up, none)).reshape(*coarse[::-1], 3)
         points = _grid_points(origin_m, side_u_m, side_v_m, size)
-        up = np.tile([0.0, 1.0, 0.0], (len(points), 1))
-        sun = self._sun_light(points, up, np.zeros(len(points)))
-        return resized(slow, size, Image.Resampling.BILINEAR) + sun.reshape(
-            height, width, 3
-        )
+        sun = self._sun_light(points, up, none).reshape(height, width, 3)
+        return resized(slow, size, Image.Resampling.BILINEAR) + sun
 
     def _sun_light(self, points_m: Array, normals: Array, through: Array) -> Array:
         sun = self._lights.sun_direction / np.linalg.norm(self._lights.sun_direction)
@@ -198,21 +187,19 @@ class Baker:
         return (seen * _facing(normals @ sun, through))[:, None] * self._lights.sun
 
     def _sky_light(self, points_m: Array, normals: Array, through: Array) -> Array:
+        lights, openness = self._lights, np.zeros(len(points_m))
         total = np.zeros((len(points_m), 3))
-        openness = np.zeros(len(points_m))
         for direction, depth_map in self._sky:
             seen = depth_map.seen(points_m, bias_m=0.04)
             blend = direction[1] ** 0.6
-            radiance = blend * self._lights.sky_zenith
-            radiance = radiance + (1 - blend) * self._lights.sky_horizon
-            facing = _facing(normals @ direction, through)
-            total += (seen * facing)[:, None] * radiance
+            radiance = blend * lights.sky_zenith + (1 - blend) * lights.sky_horizon
+            total += (seen * _facing(normals @ direction, through))[:, None] * radiance
             openness += seen
         # Uniform directions: the mean of 2 cos over a hemisphere is 1.
         total *= 2 / len(self._sky)
         openness = 0.35 + 0.65 * openness / len(self._sky)
         from_below = 0.55 - 0.45 * normals[:, 1]
-        return total + (openness * from_below)[:, None] * self._lights.bounce
+        return total + (openness * from_below)[:, None] * lights.bounce
 
     def _lamp_light(self, points_m: Array, normals: Array, through: Array) -> Array:
         total = np.zeros(len(points_m))
@@ -230,10 +217,9 @@ def _grid_points(
 ) -> Array:
     """Return the texel centers (h·w, 3) of a parallelogram, row by row."""
     width, height = size
-    u, v = np.meshgrid(
-        (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
-    )
-    sides = np.outer(u.ravel(), side_u_m) + np.outer(v.ravel(), side_v_m)
+    rows, columns = np.arange(height) + 0.5, np.arange(width) + 0.5
+    u, v = (grid.ravel() for grid in np.meshgrid(columns / width, rows / height))
+    sides = np.outer(u, side_u_m) + np.outer(v, side_v_m)
     return np.asarray(origin_m, float) + sides
 
 
@@ -253,18 +239,6 @@ def _facing(cosine: Array, through: Array) -> Array:
     return np.maximum(cosine, 0.0) + through * np.maximum(-cosine, 0.0)
 
 
-@contextmanager
-def baker(
-    lights: Lights, occluders: list[Mesh], *, center_m: ArrayLike, radius_m: float
-) -> Iterator[Baker]:
-    """Open a `Baker` for a scene, with an OpenGL context that the block closes."""
-    maps = DepthMaps(occluders, center_m=center_m, radius_m=radius_m)
-    try:
-        yield Baker(lights, maps)
-    finally:
-        maps.close()
-
-
 # Textures, as linear images (h, w, 3) from 0 to 1
 
 
@@ -275,10 +249,10 @@ def noise(height: int, width: int, *, cells: int, seed: int, octaves: int = 4) -
     for octave in range(octaves):
         n = cells * 2**octave
         grid = np.pad(rng.uniform(-1, 1, (n, n)), 2, mode="wrap")
-        image = Image.fromarray(grid.astype(np.float32))
         # The padding makes the cubic filter wrap around, and is cropped afterward.
         step_x, step_y = width / n, height / n
         size = (round(width + 4 * step_x), round(height + 4 * step_y))
+        image = Image.fromarray(grid.astype(np.float32))
         big = np.asarray(image.resize(size, Image.Resampling.BICUBIC))
         top, left = round(2 * step_y), round(2 * step_x)
         total += big[top : top + height, left : left + width] / 1.8**octave
@@ -293,9 +267,9 @@ def tinted(value: Array, dark: str, light: str) -> Array:
 
 def plaster(dark: str, light: str, *, size: int = 512, seed: int = 1) -> Array:
     """Return weathered plaster (size, size, 3)."""
-    value = noise(size, size, cells=4, seed=seed)
+    value = 0.8 * noise(size, size, cells=4, seed=seed)
     fine = noise(size, size, cells=64, seed=seed + 1, octaves=2)
-    return tinted(0.8 * value + 0.25 * fine, dark, light)
+    return tinted(value + 0.25 * fine, dark, light)
 
 
 def wood(dark: str, light: str, *, size: int = 512, planks: int = 5) -> Array:
@@ -331,10 +305,8 @@ def stripes(first: str, second: str, *, count: int, size: int = 256) -> Array:
     x = np.arange(size) / size * 2 * count
     edge = np.clip((np.abs((x + 0.5) % 2 - 1) - 0.5) * size / count, -1, 1)
     cloth = noise(size, size, cells=32, seed=9, octaves=2)
-    return (
-        tinted(edge[None, :] + 0 * cloth, first, second)
-        * (0.94 + 0.06 * cloth)[..., None]
-    )
+    color = tinted(edge[None, :] + 0 * cloth, first, second)
+    return color * (0.94 + 0.06 * cloth)[..., None]
 
 
 def board(
@@ -371,15 +343,16 @@ def board(
             anchor="mm",
         )
     linear = linear_from_srgb(np.asarray(image) / 255.0)
-    value = noise(height, width, cells=8, seed=11)
-    return np.clip(linear * (1 + grain * value[..., None]), 0, 1)
+    return np.clip(
+        linear * (1 + grain * noise(height, width, cells=8, seed=11)[..., None]), 0, 1
+    )
 
 
 def framed(image: Array, *, color: str, border_px: int, inset_px: int = 0) -> Array:
     """Draw a frame of `color` around an image, inset from its edge."""
     result = image.copy()
-    h, w = image.shape[:2]
     a, b = inset_px, inset_px + border_px
+    h, w = image.shape[:2]
     mask = np.zeros((h, w), bool)
     mask[a : h - a, a : w - a] = True
     mask[b : h - b, b : w - b] = False
@@ -393,8 +366,7 @@ def optotype_e(*, size: int = 640) -> Array:
     image = np.full((size, size, 3), 0.9)
     low, high = round(1.5 * unit), round(6.5 * unit)
     image[low:high, low : low + unit] = 0.008
-    for bar in range(3):
-        top = low + 2 * bar * unit
+    for top in range(low, high, 2 * unit):
         image[top : top + unit, low:high] = 0.008
     return image
 

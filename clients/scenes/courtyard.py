@@ -16,7 +16,6 @@ from clients.scenes import architecture as build_
 from clients.scenes.appearance import (
     Baker,
     Lights,
-    baker,
     board,
     evening_sky,
     framed,
@@ -47,6 +46,7 @@ from clients.scenes.geometry import (
     sphere,
     transformed,
     tube,
+    unit,
 )
 
 _FLOOR_M = (-6.5, -15.0, 13.0, 17.0)  # left, far, width, length
@@ -57,8 +57,6 @@ def build() -> Scene:
     """Build the scene and bake its light (a few seconds on two cores)."""
     lamps, lamps_m = _lamps()
     rng = np.random.default_rng(2023)
-    solid = [*_architecture(), *_furniture(rng), *_plants(rng), *lamps]
-    backdrop = _backdrop()
     lights = Lights(
         sun_direction=_SUN,
         sun=np.array([1.0, 0.80, 0.55]) * 1.25,
@@ -69,17 +67,16 @@ def build() -> Scene:
         lamp=np.array([1.0, 0.62, 0.28]) * 0.05,
     )
     textures = _textures()
-    solids = by_texture(solid)
+    solids = by_texture([*_architecture(), *_furniture(rng), *_plants(rng), *lamps])
     occluders = [*solids, _floor()]
-    with baker(lights, occluders, center_m=(0, 2.0, -6.5), radius_m=11.5) as bake:
-        batches = [
-            finished(m, bake.light(m.vertices_m, m.normals, m.translucency), textures)
-            for m in solids
-        ]
-        batches.append(_floor_batch(bake))
-    for mesh in by_texture(backdrop):
-        light = np.ones((len(mesh.vertices_m), 3))
-        batches.append(finished(mesh, light, textures))
+    bake = Baker(lights, occluders, center_m=(0, 2.0, -6.5), radius_m=11.5)
+    batches = [
+        finished(m, bake.light(m.vertices_m, m.normals, m.translucency), textures)
+        for m in solids
+    ]
+    batches.append(_floor_batch(bake))
+    for mesh in by_texture(_backdrop()):
+        batches.append(finished(mesh, np.ones((len(mesh.vertices_m), 3)), textures))
     return Scene(
         name="courtyard",
         batches=tuple(batches),
@@ -90,97 +87,102 @@ def build() -> Scene:
     )
 
 
+def _put(parts: list[Mesh], position_m: ArrayLike, turn_deg: float = 0.0) -> list[Mesh]:
+    """Return the parts of a thing, rotated about the vertical axis and moved."""
+    return [placed(part, position_m, turn_deg=turn_deg) for part in parts]
+
+
 def _architecture() -> list[Mesh]:
     """Return the walls, the arcades and the fountain."""
-    wall_look: Look = {"texture": "plaster_warm"}
-    back = build_.arch_wall(
-        bay_m=2.6, bays=5, springing_m=1.7, height_m=3.75, **wall_look
-    )
-    parts = [placed(back, (-6.5, 0, -14.0))]
-    parts.append(
-        build_.wall((-6.5, 3.75, -14.0), (13, 0, 0), 1.95, texture="plaster_warm")
-    )
+    warm: Look = {"texture": "plaster_warm"}
+    back = build_.arch_wall(bay_m=2.6, bays=5, springing_m=1.7, height_m=3.75, **warm)
+    windows: list[Mesh] = []
     for x in np.arange(5) * 2.6 - 5.2:
-        parts += [placed(p, (x, 4.15, -14.0)) for p in build_.window(height_m=1.15)]
-    roof = build_.tiled_roof(13.4, 1.5)
-    parts.append(placed(roof, (-6.7, 6.1, -14.9)))
-    parts += _side(-6.5, 5.2, "plaster_rose", turn_deg=90)
-    # The wall on this side is low and lets in the evening sun.
-    parts += _side(6.5, 2.3, "plaster_warm", turn_deg=-90)
-    parts += [placed(p, (0.4, 0, -7.6)) for p in build_.fountain()]
-    awning = build_.awning(4.6, 1.3, 0.7, texture="stripes")
-    parts += [placed(p, (-5.9, 3.45, -12.2), turn_deg=38) for p in awning]
-    sign = patch(
-        (-2.2, 3.1, -13.97), (4.4, 0, 0), (0, 0.62, 0), cells=(16, 4), texture="sign"
-    )
-    return [*parts, sign]
+        windows += _put(build_.window(height_m=1.15), (x, 4.15, -14.0))
+    return [
+        placed(back, (-6.5, 0, -14.0)),
+        build_.wall((-6.5, 3.75, -14.0), (13, 0, 0), 1.95, **warm),
+        *windows,
+        placed(build_.tiled_roof(13.4, 1.5), (-6.7, 6.1, -14.9)),
+        *_side(-6.5, 5.2, "plaster_rose", turn_deg=90),
+        # The wall on this side is low and lets in the evening sun.
+        *_side(6.5, 2.3, "plaster_warm", turn_deg=-90),
+        *_put(build_.fountain(), (0.4, 0, -7.6)),
+        *_put(build_.awning(4.6, 1.3, 0.7, texture="stripes"), (-5.9, 3.45, -12.2), 38),
+        patch(
+            (-2.2, 3.1, -13.97),
+            (4.4, 0, 0),
+            (0, 0.62, 0),
+            cells=(16, 4),
+            texture="sign",
+        ),
+    ]
 
 
 def _side(x_m: float, height_m: float, texture: str, *, turn_deg: float) -> list[Mesh]:
     """Return a side of the courtyard: a wall, and an arcade in front of it."""
     inward = -np.sign(x_m)
-    parts = []
-    for z in np.arange(-13.2, -1.0, 2.4):
-        parts.append(placed(build_.column(3.0), (x_m + 1.3 * inward, 0, z)))
+    start_z, foot_z = (-1.2, 1.5) if inward > 0 else (-13.2, -14.5)
     arcade = build_.arch_wall(
         bay_m=2.4, bays=5, springing_m=3.0 - 0.02, height_m=4.3, opening_ratio=0.86,
         depth_m=0.3, texture=texture,
     )  # fmt: skip
     # Raise the feet of the piers to keep only the part above the columns.
-    lifted = arcade.vertices_m.copy()
-    lifted[:, 1] = np.maximum(lifted[:, 1], 2.98)
-    arcade = replace(arcade, vertices_m=lifted)
-    start_z = -1.2 if inward > 0 else -13.2
+    lifted = np.maximum(arcade.vertices_m, [-np.inf, 2.98, -np.inf])
     move = rotation("y", turn_deg)
     move[:3, 3] = (x_m + 1.15 * inward, 0, start_z)
-    parts.append(transformed(arcade, move))
-    along = (0, 0, -16.0) if inward > 0 else (0, 0, 16.0)
-    foot = (x_m, 0.0, 1.5 if inward > 0 else -14.5)
-    parts.append(build_.wall(foot, along, height_m, texture=texture))
-    return parts
+    return [
+        *(
+            placed(build_.column(3.0), (x_m + 1.3 * inward, 0, z))
+            for z in np.arange(-13.2, -1.0, 2.4)
+        ),
+        transformed(replace(arcade, vertices_m=lifted), move),
+        build_.wall(
+            (x_m, 0.0, foot_z), (0, 0, -16.0 * inward), height_m, texture=texture
+        ),
+    ]
 
 
 def _furniture(rng: np.random.Generator) -> list[Mesh]:
     """Return tables, chairs, a board, a railing and the objects on the near table."""
-    parts = []
-    spots = ((-1.75, -3.4, 20), (1.9, -4.9, -35), (-2.9, -6.6, 60), (2.7, -8.6, 10))
-    frames = ("#1f6f78", "#2b2f33", "#a23b2a", "#1f6f78")
-    for (x, z, turn), frame in zip(spots, frames, strict=True):
-        parts += _table_group(x, z, turn, frame, rng)
-    parts += _near_table(rng)
     menu = build_.standing_board((0.62, 0.98), texture="chalk")
-    parts += [placed(p, (1.42, 0, -2.6), turn_deg=-26) for p in menu]
-    parts += build_.railing((2.0, 0, -3.3), (5.0, 0, -3.3))
-    return parts
+    return [
+        *_table_group(-1.75, -3.4, 20, "#1f6f78", rng),
+        *_table_group(1.9, -4.9, -35, "#2b2f33", rng),
+        *_table_group(-2.9, -6.6, 60, "#a23b2a", rng),
+        *_table_group(2.7, -8.6, 10, "#1f6f78", rng),
+        *_near_table(rng),
+        *_put(menu, (1.42, 0, -2.6), -26),
+        *build_.railing((2.0, 0, -3.3), (5.0, 0, -3.3)),
+    ]
 
 
 def _table_group(
     x: float, z: float, turn: float, frame: str, rng: np.random.Generator
 ) -> list[Mesh]:
     """Return a table with two or three chairs, a lantern and cups."""
-    group = list(build_.bistro_table(top="table"))
+    group = build_.bistro_table(top="table")
     for angle in (15, 140, 255)[: 2 + int(rng.random() < 0.6)]:
         radians = np.deg2rad(angle)
         where = (0.62 * np.sin(radians), 0, 0.62 * np.cos(radians))
-        seat = build_.chair(frame=frame)
-        group += [placed(p, where, turn_deg=angle) for p in seat]
-    group += [placed(p, (0.05, 0.74, -0.06)) for p in build_.lantern()]
-    for dx, dz in ((-0.18, 0.08), (0.14, 0.15)):
-        group += [placed(p, (dx, 0.74, dz), turn_deg=40) for p in build_.cup(sides=12)]
-    return [placed(p, (x, 0, z), turn_deg=turn) for p in group]
+        group += _put(build_.chair(frame=frame), where, angle)
+    group += _put(build_.lantern(), (0.05, 0.74, -0.06))
+    group += _put(build_.cup(sides=12), (-0.18, 0.74, 0.08), 40)
+    group += _put(build_.cup(sides=12), (0.14, 0.74, 0.15), 40)
+    return _put(group, (x, 0, z), turn)
 
 
 def _near_table(rng: np.random.Generator) -> list[Mesh]:
     """Return the viewer's table, with objects at distances of 0.6 to 1.1 m."""
-    things = list(build_.bistro_table(radius_m=0.46, top="table"))
     top = 0.74
-    cup = build_.cup()
-    things += [placed(p, (0.02, top, 0.0), turn_deg=-30) for p in cup]
-    card = build_.table_card((0.15, 0.21), texture="card")
-    things += [placed(p, (-0.23, top, -0.03), turn_deg=16) for p in card]
-    things += [placed(p, (0.24, top, -0.06)) for p in vase(rng=rng)]
-    things += [placed(p, (-0.03, top, -0.27)) for p in build_.lantern()]
-    return [placed(p, (0.02, 0, -0.80)) for p in things]
+    things = [
+        *build_.bistro_table(radius_m=0.46, top="table"),
+        *_put(build_.cup(), (0.02, top, 0.0), -30),
+        *_put(build_.table_card((0.15, 0.21), texture="card"), (-0.23, top, -0.03), 16),
+        *_put(vase(rng=rng), (0.24, top, -0.06)),
+        *_put(build_.lantern(), (-0.03, top, -0.27)),
+    ]
+    return _put(things, (0.02, 0, -0.80))
 
 
 def _plants(rng: np.random.Generator) -> list[Mesh]:
@@ -193,10 +195,7 @@ def _plants(rng: np.random.Generator) -> list[Mesh]:
             (((-0.50, 1.47, -0.50), (-0.30, 1.42, -0.43), (-0.13, 1.40, -0.40)), 22),
         )
     ]
-    frame = [
-        placed(p, (-5.1, 0.2, -3.0), turn_deg=90) for p in build_.lattice(3.4, 2.6)
-    ]
-    parts += frame
+    parts += _put(build_.lattice(3.4, 2.6), (-5.1, 0.2, -3.0), 90)
     for start in (0.2, 1.5, 2.9):
         s = np.linspace(0, 1, 10)
         path = np.stack(
@@ -217,8 +216,7 @@ def _plants(rng: np.random.Generator) -> list[Mesh]:
     pots = ((-3.2, -9.6, ""), (3.9, -6.3, "#f2a03d"), (-4.0, -1.9, ""),
             (4.4, -10.6, "#f2c53d"), (-1.9, -12.6, "#f2c53d"))  # fmt: skip
     for x, z, fruit in pots:
-        tree = potted_tree(rng=rng, fruit=fruit)
-        parts += [placed(p, (x, 0, z)) for p in tree]
+        parts += _put(potted_tree(rng=rng, fruit=fruit), (x, 0, z))
     return parts
 
 
@@ -273,14 +271,12 @@ def _backdrop() -> list[Mesh]:
         (-5.6, -19, 6.0), (-2.6, -23, 7.0), (2.2, -20.5, 6.2), (4.6, -25, 7.5),
         (6.2, -18.5, 5.2), (-7.6, -24, 7.0),
     ):  # fmt: skip
-        trees.append(placed(cypress(rng=rng, height_m=height), (x, 0, z)))
-    # Cosine shading: leaves that face the sun are brighter.
-    shaded = []
-    for tree in trees:
+        tree = placed(cypress(rng=rng, height_m=height), (x, 0, z))
+        # Cosine shading: leaves that face the sun are brighter.
         facing = np.maximum(tree.normals @ _SUN / np.linalg.norm(_SUN), 0)
-        light = 0.55 + 0.75 * facing
-        shaded.append(replace(tree, albedo=tree.albedo * light[:, None]))
-    return [lawn, view, path, *shaded, _sky()]
+        light = (0.55 + 0.75 * facing)[:, None]
+        trees.append(replace(tree, albedo=tree.albedo * light))
+    return [lawn, view, path, *trees, _sky()]
 
 
 def _sky() -> Mesh:
@@ -379,27 +375,24 @@ def leaves(
         Rows of triangles per leaf; with 0, a leaf has two triangles and no midrib.
     """
     n = len(base_m)
-    along = _unit(along)
-    across = _unit(np.cross(along, facing))
+    along = unit(along)
+    across = unit(np.cross(along, facing))
     up = np.cross(across, along)
     size = rng.uniform(0.7, 1.3, (n, 1, 1))
     s = np.linspace(0, 1, max(segments, 1) + 2)
     half_width = 0.5 * width_m * np.sin(np.pi * s**0.8)
-    droop = -0.35 * length_m * s**2
-    fold = 0.45
-    rows = []
-    for side in (-1, 0, 1):
-        offset = (
-            (length_m * s)[None, :, None] * along[:, None]
-            + (side * half_width)[None, :, None] * across[:, None]
-            + (droop + fold * abs(side) * half_width)[None, :, None] * up[:, None]
-        )
-        rows.append(base_m[:, None] + size * offset)
-    vertices = np.stack(rows, axis=2)  # (n, rows, 3 across, xyz)
-    faces = _leaf_faces(segments)
+    droop, fold = -0.35 * length_m * s**2, 0.45
+    rows = [
+        (length_m * s)[None, :, None] * along[:, None]
+        + (side * half_width)[None, :, None] * across[:, None]
+        + (droop + fold * abs(side) * half_width)[None, :, None] * up[:, None]
+        for side in (-1, 0, 1)
+    ]
+    # (n, rows, 3 across, xyz)
+    vertices = np.stack([base_m[:, None] + size * row for row in rows], axis=2)
     per_leaf = vertices.shape[1] * 3
-    all_faces = faces[None] + per_leaf * np.arange(n)[:, None, None]
-    mesh = new_mesh(vertices, all_faces, normals=np.repeat(up, per_leaf, axis=0))
+    faces = _leaf_faces(segments)[None] + per_leaf * np.arange(n)[:, None, None]
+    mesh = new_mesh(vertices, faces, normals=np.repeat(up, per_leaf, axis=0))
     palette = np.array([linear_from_hex(color) for color in colors])
     tint = palette[rng.integers(len(palette), size=n)] * rng.uniform(0.75, 1.2, (n, 1))
     # A pale midrib and a darker foot make leaves recognizable at close range.
@@ -420,13 +413,8 @@ def _leaf_faces(segments: int) -> NDArray[np.int64]:
         if row > 0:
             faces += [(left, middle, middle + 3), (middle, right, middle + 3)]
         if row < segments:
-            faces += [(left, middle + 3, left + 3)]
-            faces += [(right, right + 3, middle + 3)]
+            faces += [(left, middle + 3, left + 3), (right, right + 3, middle + 3)]
     return np.array(faces)
-
-
-def _unit(vectors: Array) -> Array:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
 
 
 def branch(
@@ -447,7 +435,7 @@ def branch(
     along = path_m[index + 1] - path_m[index]
     base = path_m[index] + (t - index)[:, None] * along
     side = np.where(np.arange(n_leaves) % 2, 1.0, -1.0)[:, None]
-    out = side * np.cross(_unit(along), [0.0, 0.3, 1.0]) + 0.7 * _unit(along)
+    out = side * np.cross(unit(along), [0.0, 0.3, 1.0]) + 0.7 * unit(along)
     out = out + rng.normal(0, 0.35, (n_leaves, 3))
     facing = np.array([0, 1.0, 0.5]) + rng.normal(0, 0.4, (n_leaves, 3))
     crown = leaves(
@@ -474,7 +462,7 @@ def cloud(
     width_ratio: float = 0.55,
 ) -> Mesh:
     """Return leaves around a rough ball, such as a bush or the crown of a tree."""
-    direction = _unit(rng.normal(0, 1, (n_leaves, 3)))
+    direction = unit(rng.normal(0, 1, (n_leaves, 3)))
     depth = rng.uniform(0.55, 1.0, (n_leaves, 1)) ** 0.5
     lumps = 1 + 0.18 * np.sin(direction @ rng.normal(0, 4, (3, 1)) + 1)
     base = np.asarray(center_m) + direction * depth * lumps * np.asarray(size_m) / 2
@@ -503,19 +491,16 @@ def climber(
     """Return leaves and blossoms of a plant that climbs along a path."""
     path_m = np.asarray(path_m, float)
 
-    def along_path(n: int, spread: Array) -> Array:
-        t = rng.uniform(0, len(path_m) - 1.001, n)
-        i = t.astype(int)
-        base = path_m[i] + (t - i)[:, None] * (path_m[i + 1] - path_m[i])
-        return base + rng.normal(0, 1, (n, 3)) * spread
-
     def spray(
         n: int, spread: float, length_m: float, colors: Sequence[str], ratio: float
     ) -> Mesh:
-        base = along_path(n, np.asarray(spread_m) * spread)
+        t = rng.uniform(0, len(path_m) - 1.001, n)
+        i = t.astype(int)
+        base = path_m[i] + (t - i)[:, None] * (path_m[i + 1] - path_m[i])
+        scatter = rng.normal(0, 1, (n, 3)) * (np.asarray(spread_m) * spread)
         direction = rng.normal(0, 1, (n, 3)) + np.array([0, -0.3, 0.5])
         return leaves(
-            base,
+            base + scatter,
             direction,
             rng.normal(0, 0.5, (n, 3)) + np.array([0, 0.7, 0.7]),
             length_m=length_m,
@@ -553,14 +538,12 @@ def potted_tree(
     )
     center = np.array([0, height_m - crown_m / 2, 0])
     crown = cloud(center, [crown_m] * 3, n_leaves=520, leaf_m=0.11, rng=rng)
-    parts = [pot, trunk, crown]
+    balls = []
     if fruit:
-        for direction in _unit(rng.normal(0, 1, (16, 3))):
-            ball = sphere(0.045, sides=8, color=fruit)
-            move = np.eye(4)
-            move[:3, 3] = center + direction * crown_m * 0.47
-            parts.append(transformed(ball, move))
-    return parts
+        ball = sphere(0.045, sides=8, color=fruit)
+        places = center + unit(rng.normal(0, 1, (16, 3))) * crown_m * 0.47
+        balls = [placed(ball, place) for place in places]
+    return [pot, trunk, crown, *balls]
 
 
 def cypress(*, rng: np.random.Generator, height_m: float = 7.0) -> Mesh:
@@ -587,12 +570,10 @@ def vase(*, rng: np.random.Generator, height_m: float = 0.13) -> list[Mesh]:
     for lean in ((-0.05, 0.02), (0.045, 0.0), (0.0, -0.03)):
         tip = np.array([lean[0], height_m + 0.11, lean[1]])
         middle = np.array([0.3 * lean[0], height_m + 0.03, 0.3 * lean[1]])
-        parts.append(tube([(0, 0.05, 0), middle, tip], 0.0025, color="#55803a"))
-        parts.append(
+        parts += [
+            tube([(0, 0.05, 0), middle, tip], 0.0025, color="#55803a"),
             cloud(tip, [0.06] * 3, n_leaves=40, leaf_m=0.026, rng=rng,
-                  colors=BLOSSOMS, width_ratio=0.8)
-        )  # fmt: skip
-        parts.append(
-            cloud(middle, [0.04] * 3, n_leaves=8, leaf_m=0.035, rng=rng, colors=GREENS)
-        )
+                  colors=BLOSSOMS, width_ratio=0.8),
+            cloud(middle, [0.04] * 3, n_leaves=8, leaf_m=0.035, rng=rng, colors=GREENS),
+        ]  # fmt: skip
     return parts

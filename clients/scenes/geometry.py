@@ -3,8 +3,9 @@
 The frame of every scene is that of OpenGL: meters, x right, y up, z toward the viewer.
 """
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TypedDict, Unpack
 
 import numpy as np
@@ -109,8 +110,12 @@ def vertex_normals(vertices_m: Array, faces: NDArray[np.int64]) -> Array:
     normals = np.zeros_like(vertices_m)
     for k in range(3):
         np.add.at(normals, faces[:, k], face_normals)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals / np.maximum(length, 1e-12)
+    return unit(normals)
+
+
+def unit(vectors: Array) -> Array:
+    """Return vectors (..., 3) with length 1; those without a length stay 0."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
 def painted(mesh: Mesh, color: str, *, emission: float = 0.0) -> Mesh:
@@ -122,10 +127,10 @@ def painted(mesh: Mesh, color: str, *, emission: float = 0.0) -> Mesh:
 def transformed(mesh: Mesh, matrix: Array) -> Mesh:
     """Apply a (4, 4) matrix to a mesh, which may scale its axes differently."""
     linear = matrix[:3, :3]
-    normals = mesh.normals @ np.linalg.inv(linear)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return replace(
-        mesh, vertices_m=mesh.vertices_m @ linear.T + matrix[:3, 3], normals=normals
+        mesh,
+        vertices_m=mesh.vertices_m @ linear.T + matrix[:3, 3],
+        normals=unit(mesh.normals @ np.linalg.inv(linear)),
     )
 
 
@@ -155,23 +160,18 @@ def rotation(axis: str, angle_deg: float) -> Array:
 
 def merged(meshes: Sequence[Mesh]) -> Mesh:
     """Join meshes with one texture into one mesh."""
-    names = {mesh.texture for mesh in meshes}
-    if len(names) != 1:
+    textures = {mesh.texture for mesh in meshes}
+    if len(textures) != 1:
         raise ValueError(
-            f"meshes have the textures {sorted(names)}; expected exactly one"
+            f"meshes have the textures {sorted(textures)}; expected exactly one"
         )
     offsets = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes[:-1])])
-    joined = {
-        name: np.concatenate([getattr(mesh, name) for mesh in meshes])
-        for name in ("vertices_m", "normals", "albedo", "emission", "uv")
-    }
+    faces = [mesh.faces + start for mesh, start in zip(meshes, offsets, strict=True)]
+    names = [f.name for f in fields(Mesh) if f.name not in ("faces", "texture")]
     return Mesh(
-        faces=np.concatenate(
-            [mesh.faces + start for mesh, start in zip(meshes, offsets, strict=True)]
-        ),
-        translucency=np.concatenate([mesh.translucency for mesh in meshes]),
+        faces=np.concatenate(faces),
         texture=meshes[0].texture,
-        **joined,
+        **{k: np.concatenate([getattr(m, k) for m in meshes]) for k in names},
     )
 
 
@@ -192,10 +192,8 @@ def patch(
 ) -> Mesh:
     """Return a flat parallelogram whose front faces side_u × side_v."""
     nu, nv = cells
-    u: Array
-    v: Array
-    u, v = np.meshgrid(np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1))
-    u, v = u.ravel(), v.ravel()
+    grid = np.meshgrid(np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1))
+    u, v = (values.ravel() for values in grid)
     side_u_m, side_v_m = np.asarray(side_u_m, float), np.asarray(side_v_m, float)
     vertices = np.asarray(origin_m, float) + np.outer(u, side_u_m)
     vertices = vertices + np.outer(v, side_v_m)
@@ -218,15 +216,12 @@ def box(size_m: ArrayLike, *, cells: int = 1, **look: Unpack[Look]) -> Mesh:
     """Return a box centered on the origin, with cells × cells squares per face."""
     sides = []
     half = np.asarray(size_m, float) / 2
-    for axis in range(3):
-        for sign in (-1.0, 1.0):
-            u, v, origin = np.zeros(3), np.zeros(3), -half.copy()
-            u[(axis + 1) % 3] = 2 * half[(axis + 1) % 3]
-            v[(axis + 2) % 3] = 2 * half[(axis + 2) % 3]
-            origin[axis] = sign * half[axis]
-            if sign < 0:
-                u, v = v, u
-            sides.append(patch(origin, u, v, cells=(cells, cells), **look))
+    for axis, sign in itertools.product(range(3), (-1.0, 1.0)):
+        u, v = (
+            2 * half * np.eye(3)[(axis + shift) % 3] for shift in (1, 2)[:: int(sign)]
+        )
+        origin = np.where(np.arange(3) == axis, sign * half, -half)
+        sides.append(patch(origin, u, v, cells=(cells, cells), **look))
     return merged(sides)
 
 
@@ -242,8 +237,7 @@ def lathe(profile_m: ArrayLike, *, sides: int = 20, **look: Unpack[Look]) -> Mes
     ring = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=1)
     up = np.array([0.0, 1.0, 0.0])
     vertices = profile_m[:, None, :1] * ring + profile_m[:, None, 1:] * up
-    slope = np.gradient(profile_m, axis=0)
-    slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
+    slope = unit(np.asarray(np.gradient(profile_m, axis=0)))
     normals = slope[:, None, 1:] * ring - slope[:, None, :1] * up
     v = np.linspace(0, 1, len(profile_m))
     uv = np.stack(np.broadcast_arrays(angle / (2 * np.pi), v[:, None]), axis=-1)
@@ -264,12 +258,10 @@ def tube(
     """Return a round bar along a path (n, 3); its radius is one number or (n,)."""
     path_m = np.asarray(path_m, float)
     radius_m = np.broadcast_to(np.asarray(radius_m, float), len(path_m))
-    along = np.gradient(path_m, axis=0)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    along = unit(np.asarray(np.gradient(path_m, axis=0)))
     # A single helper direction keeps the rings of the bar from twisting.
     helper = np.eye(3)[np.argmin(np.abs(along).mean(axis=0))]
-    across = np.cross(along, helper)
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    across = unit(np.cross(along, helper))
     third = np.cross(along, across)
     angle = np.linspace(0, 2 * np.pi, sides + 1)[None, :, None]
     normals = np.cos(angle) * across[:, None] + np.sin(angle) * third[:, None]

@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import binary_erosion
 
 from clients.scene_renderer import PATHS, SceneRenderer, look_at, path_moments
-from clients.scenes.appearance import Lights, baker
+from clients.scenes.appearance import Baker, Lights
 from clients.scenes.catalog import build_scene
 from clients.scenes.geometry import box, patch, placed, sphere
 from clients.scenes.scene_view import LEAST_GAP_DPT, open_context
@@ -181,8 +181,8 @@ def test_baked_sun_and_sky_are_shadowed_by_what_is_above():
     )
     points = np.array([[0.0, 0, 0], [1.5, 0, 1.5]])
     up = np.tile([0.0, 1.0, 0.0], (2, 1))
-    with baker(lights, [floor, plate], center_m=(0, 0.4, 0), radius_m=3.0) as bake:
-        below, beside = bake.light(points, up)
+    bake = Baker(lights, [floor, plate], center_m=(0, 0.4, 0), radius_m=3.0)
+    below, beside = bake.light(points, up)
     # The plate hides the sun wholly; of the sky, the cosine-weighted part of a square
     # straight above: 4 x its corner's form factor, for a half side of h = 0.5 / 0.8.
     h = 0.5 / 0.8
