@@ -4,14 +4,10 @@ A *build* turns a profile, settings and a camera into a *store*: the estimated e
 the nodes (states of pupil and focus, field directions, defocus) of its PSFs.  A
 *ticket* identifies a build.
 
-jobs                requests and results of the worker
-limits              limits of every build
-read_profile        validation of a profile's body
+jobs                requests, limits and results of the worker
 from_profile        the build itself
 worker              main program of the worker process
 worker_handle       starts the process, queues builds, recovers from crashes
-inline_worker       the same interface, without a process
-helper_process      import path and exit of subprocesses
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
 from .jobs import BuildJob as BuildJob
+from .jobs import BuildLimits as BuildLimits
 from .jobs import BuiltStore as BuiltStore
-from .limits import BuildLimits as BuildLimits
 from .worker_handle import WorkerHandle as WorkerHandle

@@ -1,4 +1,4 @@
-"""Build of an eye and the nodes of its PSFs from a profile, in the worker process."""
+"""Build of an eye and the nodes of its PSFs from a profile."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 from estimator.eye.checked_fields import ProfileError
 from estimator.note import Note
-from filter_service.building.jobs import BuildJob, BuiltStore
-from filter_service.building.read_profile import unknown_profile
+from filter_service.building.jobs import BuildJob, BuiltStore, unknown_profile
 from filter_service.errors import (
     BuildCancelled,
     BuildFailed,

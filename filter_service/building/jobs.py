@@ -1,16 +1,47 @@
-"""Requests and results of the build worker."""
+"""Requests, limits and results of the build worker."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from estimator.profiles.parse import EyeProfile
-from filter_service.building.limits import BuildLimits
-from filter_service.camera import Camera
-from filter_service.settings import FilterSettings
-from filter_service.view_state import State
+from filter_service.errors import BuildFailed, FilterError, UnknownProfile
+from filter_service.psfs.cache_folder import default_cache_dir as default_cache_dir
+
+if TYPE_CHECKING:
+    from estimator.eye.checked_fields import ProfileError
+    from estimator.profiles.parse import EyeProfile
+    from filter_service.camera import Camera
+    from filter_service.settings import FilterSettings
+    from filter_service.view_state import State
+
+log = logging.getLogger("ocufilter.worker")
+
+
+@dataclass(frozen=True)
+class BuildLimits:
+    """Limits of builds, from the service's settings.
+
+    Attributes
+    ----------
+    max_blur_radius_px : int
+        Largest kernel radius.
+    max_store_mb, max_stores_mb : int
+        Memory of one loaded store, and of all of them, 10^6 bytes.
+    store_cache_dir : str
+        Folder of the on-disk cache; empty without one.
+    store_cache_max_mb : int
+        Maximum size of that folder, 10^6 bytes.
+    """
+
+    max_blur_radius_px: int = 255
+    max_store_mb: int = 2000
+    max_stores_mb: int = 4000
+    store_cache_dir: str = ""
+    store_cache_max_mb: int = 2000
+
 
 DEFAULT_LIMITS = BuildLimits()
 
@@ -51,3 +82,52 @@ class BuiltStore:
 
 
 Build = Callable[..., BuiltStore]
+
+
+@dataclass(frozen=True)
+class BuildProgress:
+    """Progress of a build."""
+
+    ticket: int
+    fraction: float
+    stage: str
+
+
+@dataclass(frozen=True)
+class BuildDone:
+    """Result of a build."""
+
+    ticket: int
+    built: BuiltStore
+
+
+@dataclass(frozen=True)
+class BuildPart:
+    """Part of a built store that frames will need."""
+
+    ticket: int
+    part: Any
+
+
+@dataclass(frozen=True)
+class BuildError:
+    """Failure of a build."""
+
+    ticket: int
+    error: FilterError
+
+
+BuildEvent = BuildProgress | BuildDone | BuildPart | BuildError
+
+
+def to_build_error(error: Exception) -> FilterError:
+    """Return the error of a build for clients; log an unexpected one."""
+    if isinstance(error, FilterError):
+        return error
+    log.error("a build failed unexpectedly", exc_info=error)
+    return BuildFailed(f"{type(error).__name__}: {error}")
+
+
+def unknown_profile(error: ProfileError) -> UnknownProfile:
+    """Convert an exception of the parser."""
+    return UnknownProfile(error.problem, field=error.field, allowed=error.allowed)

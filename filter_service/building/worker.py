@@ -31,8 +31,8 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
-from filter_service.building.jobs import Build, BuildJob
-from filter_service.errors import BuildCancelled, BuildFailed, FilterError
+from filter_service.building.jobs import Build, BuildJob, to_build_error
+from filter_service.errors import BuildCancelled
 from filter_service.log_lines import configure_logging
 
 PROGRESS_INTERVAL_S = 0.1
@@ -132,9 +132,7 @@ def _is_cancelled(pipe: Connection, ticket: int) -> bool:
 
 
 def _send_failure(pipe: Connection, ticket: int, error: Exception) -> None:
-    if not isinstance(error, FilterError):
-        log.exception("a build failed unexpectedly")
-        error = BuildFailed(f"{type(error).__name__}: {error}")
+    error = to_build_error(error)
     if not isinstance(error, BuildCancelled):
         log.info("build %d failed: %s", ticket, error)
     pipe.send(("failed", ticket, error.code, error.message, error.field, error.allowed))

@@ -1,10 +1,14 @@
-"""Interface to the build worker: queues builds and recovers from crashes."""
+"""Interface to the build worker: queues builds and recovers from crashes.
+
+`InlineWorker` has the same interface, without a process.
+"""
 
 from __future__ import annotations
 
 import logging
 import os
 import pickle
+import signal
 import socket
 import subprocess
 import sys
@@ -12,16 +16,19 @@ import time
 from collections import deque
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 from estimator.threads import THREADS_VARIABLE
-from filter_service.building.helper_process import (
-    describe_exit,
-    import_path,
-    is_stopped,
-    wait_or_kill,
+from filter_service.building.jobs import (
+    BuildDone,
+    BuildError,
+    BuildEvent,
+    BuildJob,
+    BuildPart,
+    BuildProgress,
+    to_build_error,
 )
-from filter_service.building.jobs import BuiltStore
 from filter_service.errors import (
     BuildCancelled,
     FilterError,
@@ -44,42 +51,6 @@ BUILD = "filter_service.building.from_profile:build"
 NICENESS = 5
 
 log = logging.getLogger("ocufilter.worker")
-
-
-@dataclass(frozen=True)
-class BuildProgress:
-    """Progress of a build."""
-
-    ticket: int
-    fraction: float
-    stage: str
-
-
-@dataclass(frozen=True)
-class BuildDone:
-    """Result of a build."""
-
-    ticket: int
-    built: BuiltStore
-
-
-@dataclass(frozen=True)
-class BuildPart:
-    """Part of a built store that frames will need."""
-
-    ticket: int
-    part: Any
-
-
-@dataclass(frozen=True)
-class BuildError:
-    """Failure of a build."""
-
-    ticket: int
-    error: FilterError
-
-
-BuildEvent = BuildProgress | BuildDone | BuildPart | BuildError
 
 
 @dataclass
@@ -315,3 +286,88 @@ class WorkerHandle:
         # After the start: under the same number, selectors would miss the new pipe.
         worker.pipe.close()
         return [BuildError(ticket, error) for ticket in tickets]
+
+
+class InlineWorker:
+    """`WorkerHandle`'s interface in the calling thread, which builds when polled.
+
+    For programs that filter one image: starting a process takes longer than a build.
+    """
+
+    file_descriptor = None
+    is_busy = False
+    needs_poll = False
+    n_restarts = 0
+
+    def __init__(self) -> None:
+        self._queue: deque[tuple[int, BuildJob]] = deque()
+        self._next_ticket = 1
+
+    def start(self) -> None:
+        """Do nothing: there is no process."""
+
+    def close(self) -> None:
+        """Discard queued jobs."""
+        self._queue.clear()
+
+    def submit(self, job: BuildJob) -> int:
+        """Queue a job; return its ticket."""
+        ticket = self._next_ticket
+        self._next_ticket += 1
+        self._queue.append((ticket, job))
+        return ticket
+
+    def cancel(self, ticket: int) -> None:
+        """Remove a queued job."""
+        self._queue = deque(item for item in self._queue if item[0] != ticket)
+
+    def poll(self) -> list[BuildEvent]:
+        """Run the first queued job and return its events."""
+        from filter_service.building.from_profile import build
+
+        if not self._queue:
+            return []
+        ticket, job = self._queue.popleft()
+        events: list[BuildEvent] = []
+
+        def progress(fraction: float, stage: str) -> None:
+            events.append(BuildProgress(ticket, fraction, stage))
+
+        try:
+            built = build(job, progress=progress, cancelled=lambda: False)
+        except Exception as error:
+            return [*events, BuildError(ticket, to_build_error(error))]
+        return [*events, BuildDone(ticket, built)]
+
+
+def import_path() -> list[str]:
+    """Return the import path of this process, for PYTHONPATH."""
+    return [entry or os.getcwd() for entry in sys.path if isinstance(entry, str)]
+
+
+def wait_or_kill(process: subprocess.Popen[bytes], timeout_s: float) -> int:
+    """Wait for a process to end, and kill it after a timeout; return its exit code."""
+    try:
+        return process.wait(timeout_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+def describe_exit(exit_code: int) -> str:
+    """Describe an exit code, as in "exited with code 1"."""
+    if exit_code >= 0:
+        return f"exited with code {exit_code}"
+    try:
+        return f"was killed by {signal.Signals(-exit_code).name}"
+    except ValueError:
+        return f"was killed by signal {-exit_code}"
+
+
+def is_stopped(pid: int) -> bool:
+    """Return whether a process is stopped by a signal (Linux only; otherwise False)."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
+    except (OSError, IndexError):
+        return False
+    return state == "T"

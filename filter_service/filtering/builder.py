@@ -13,17 +13,16 @@ from collections.abc import Sequence
 from typing import Any
 
 from estimator.profiles.parse import EyeProfile
-from filter_service.building.inline_worker import InlineWorker
-from filter_service.building.jobs import BuildJob
-from filter_service.building.limits import BuildLimits
-from filter_service.building.worker_handle import (
+from filter_service.building.jobs import (
     BuildDone,
     BuildError,
     BuildEvent,
+    BuildJob,
+    BuildLimits,
     BuildPart,
     BuildProgress,
-    WorkerHandle,
 )
+from filter_service.building.worker_handle import InlineWorker, WorkerHandle
 from filter_service.camera import Camera
 from filter_service.errors import (
     BuildCancelled,

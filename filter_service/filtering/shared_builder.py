@@ -10,9 +10,8 @@ from contextlib import ExitStack
 from functools import cache
 from typing import TYPE_CHECKING
 
-from filter_service.building.inline_worker import InlineWorker
-from filter_service.building.limits import BuildLimits
-from filter_service.building.worker_handle import WorkerHandle
+from filter_service.building.jobs import BuildLimits
+from filter_service.building.worker_handle import InlineWorker, WorkerHandle
 from filter_service.filtering.builder import Builder
 from filter_service.psfs.cache_folder import default_cache_dir
 

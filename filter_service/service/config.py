@@ -9,7 +9,7 @@ from typing import Any
 
 from estimator.bounded_files import MAX_BITS, read_toml
 from estimator.threads import MAX_THREADS, thread_count
-from filter_service.building.limits import BuildLimits, default_cache_dir
+from filter_service.building.jobs import BuildLimits, default_cache_dir
 from filter_service.constants import ENGINES
 from filter_service.gl_device import checked_gl_device
 from filter_service.log_lines import LOG_FORMATS

@@ -13,9 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from estimator.eye.checked_fields import ProfileError
 from estimator.profiles.bodies import TRACED_KINDS
-from estimator.profiles.parse import EyeProfile
-from filter_service.building.worker_handle import BuildDone, BuildError, WorkerHandle
+from estimator.profiles.parse import EyeProfile, parse_profile
+from filter_service.building.jobs import BuildDone, BuildError, unknown_profile
+from filter_service.building.worker_handle import WorkerHandle
 from filter_service.errors import FilterError
 from filter_service.messages import ProfileRequest
 from filter_service.view_state import body_of_eye
@@ -48,6 +50,20 @@ class ReadProfile:
     def parts_ahead(self, job: ReadJob) -> tuple[()]:
         """Return no parts, unlike a build."""
         return ()
+
+
+def read_profile(body: dict[str, Any]) -> EyeProfile:
+    """Parse the body of a profile.
+
+    Raises
+    ------
+    UnknownProfile
+        If the body is invalid; the error names the field and the allowed values.
+    """
+    try:
+        return parse_profile(body)
+    except ProfileError as error:
+        raise unknown_profile(error) from error
 
 
 def read(job: ReadJob, **_build: Any) -> ReadProfile:

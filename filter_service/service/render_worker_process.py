@@ -49,8 +49,8 @@ def open_configured_builder(config: ServiceConfig, closing: ExitStack) -> Opened
     )
     closing.callback(worker.close)
     worker.start()  # imports take long; both processes run them at the same time
-    from filter_service.building.read_profile import read_profile
     from filter_service.filtering.shared_builder import open_builder, preload
+    from filter_service.service.profile_reader import read_profile
 
     builder = open_builder(worker, config.build_limits, closing, engine=config.engine)
     return builder, read_profile, preload

@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
-from filter_service.building.helper_process import (
+from filter_service.building.worker_handle import (
     describe_exit,
     import_path,
     is_stopped,

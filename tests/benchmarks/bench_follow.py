@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from filter_service import Camera, EyeFilter
-from filter_service.building.limits import BuildLimits
+from filter_service.building.jobs import BuildLimits
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.filtering.builder import Builder
 from filter_service.filtering.filtered import EyeReady

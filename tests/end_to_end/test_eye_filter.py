@@ -19,9 +19,8 @@ from filter_service import (
     Preparing,
     RgbdView,
 )
-from filter_service.building.inline_worker import InlineWorker
-from filter_service.building.limits import BuildLimits
-from filter_service.building.worker_handle import WorkerHandle
+from filter_service.building.jobs import BuildLimits
+from filter_service.building.worker_handle import InlineWorker, WorkerHandle
 from filter_service.errors import (
     BadMessage,
     BuildCancelled,

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from filter_service.building.limits import BuildLimits
+from filter_service.building.jobs import BuildLimits
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.filtering.builder import Builder
 from filter_service.messages import ProfileRequest, SharedPlaces

@@ -8,13 +8,8 @@ import numpy as np
 import pytest
 
 from estimator.profiles.parse import parse_profile
-from filter_service.building.jobs import BuildJob
-from filter_service.building.worker_handle import (
-    BuildDone,
-    BuildError,
-    BuildPart,
-    WorkerHandle,
-)
+from filter_service.building.jobs import BuildDone, BuildError, BuildJob, BuildPart
+from filter_service.building.worker_handle import WorkerHandle
 from filter_service.camera import Camera
 from filter_service.errors import BuildFailed, OutOfMemory
 from filter_service.planning.cost import states_of

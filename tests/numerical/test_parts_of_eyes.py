@@ -5,8 +5,7 @@ import pytest
 
 from estimator.profiles.parse import parse_profile
 from filter_service.building.from_profile import build
-from filter_service.building.jobs import BuildJob
-from filter_service.building.limits import BuildLimits
+from filter_service.building.jobs import BuildJob, BuildLimits
 from filter_service.camera import Camera
 from filter_service.rendering.native.renderer import NativeRenderer
 from filter_service.rgbd_view import RgbdView

@@ -19,8 +19,7 @@ from estimator.profiles.parse import parse_profile
 from estimator.profiles.published import published_eye
 from estimator.wavefront.aberrations import wavefront_aberrations
 from filter_service.building.from_profile import build
-from filter_service.building.jobs import BuildJob
-from filter_service.building.limits import BuildLimits
+from filter_service.building.jobs import BuildJob, BuildLimits
 from filter_service.camera import Camera
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings

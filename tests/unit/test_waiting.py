@@ -18,14 +18,14 @@ from filter_service import Camera, EyeFilter
 from filter_service import progress as progress_module
 from filter_service import waiting as waiting_module
 from filter_service.building import worker_handle
-from filter_service.building.jobs import BuiltStore
-from filter_service.building.limits import BuildLimits
-from filter_service.building.worker_handle import (
+from filter_service.building.jobs import (
     BuildDone,
     BuildError,
+    BuildLimits,
     BuildProgress,
-    WorkerHandle,
+    BuiltStore,
 )
+from filter_service.building.worker_handle import WorkerHandle
 from filter_service.errors import BuildFailed, ServiceTimeout
 from filter_service.filtering import eye_filter as eye_filter_module
 from filter_service.filtering.builder import Builder

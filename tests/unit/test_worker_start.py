@@ -9,13 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from filter_service.building.jobs import BuildJob, BuiltStore
-from filter_service.building.worker_handle import (
+from filter_service.building.jobs import (
     BuildDone,
     BuildError,
+    BuildJob,
     BuildProgress,
-    WorkerHandle,
+    BuiltStore,
 )
+from filter_service.building.worker_handle import WorkerHandle
 from filter_service.camera import Camera
 from filter_service.settings import FilterSettings
 from tests.source_tree import ROOT
