@@ -3,13 +3,13 @@ from .camera import tangents_from_fov as tangents_from_fov
 from .errors import BadMessage as BadMessage
 from .errors import FilterError as FilterError
 from .filtering.eye_filter import EyeFilter as EyeFilter
-from .filtering.filtered import BuildingEye as BuildingEye
-from .filtering.filtered import EyeFailed as EyeFailed
-from .filtering.filtered import EyeReady as EyeReady
 from .filtering.filtered import Filtered as Filtered
 from .filtering.filtered import FilteredTexture as FilteredTexture
-from .filtering.filtered import Preparing as Preparing
 from .filtering.several_eyes import plan_views as plan_views
+from .filtering.stream_eyes import BuildingEye as BuildingEye
+from .filtering.stream_eyes import EyeFailed as EyeFailed
+from .filtering.stream_eyes import EyeReady as EyeReady
+from .filtering.stream_eyes import Preparing as Preparing
 from .gl_device import is_software_renderer as is_software_renderer
 from .rgbd_view import ColorImage as ColorImage
 from .rgbd_view import RgbdView as RgbdView

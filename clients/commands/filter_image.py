@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 
     from estimator.profiles.parse import EyeProfile
     from filter_service.camera import PixelGrid, Tangents
-    from filter_service.filtering.filtered import EyeEvent, Filtered
+    from filter_service.filtering.filtered import Filtered
+    from filter_service.filtering.stream_eyes import EyeEvent
     from filter_service.image_files import ImageFile
     from filter_service.planning.nodes import CachePlan
     from filter_service.rgbd_view import RgbdView
@@ -304,8 +305,8 @@ def _filtered(
 ) -> _Filtered:
     """Filter a view as one frame of a stream; the eye is estimated in this process."""
     from filter_service.filtering.eye_filter import EyeFilter
-    from filter_service.filtering.filtered import BuildingEye, EyeReady
     from filter_service.filtering.shared_builder import open_inline_builder
+    from filter_service.filtering.stream_eyes import BuildingEye, EyeReady
 
     def report(event: "EyeEvent") -> None:
         if isinstance(event, BuildingEye):

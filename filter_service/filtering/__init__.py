@@ -9,13 +9,10 @@ eye_filter        `EyeFilter`: one stream
 planned_frame     a frame whose eye is prepared
 planned_textures  the same, with its images in textures
 several_eyes      `plan_views`: a frame whose views use different eyes
-filtered          `Filtered` frames, and events of a profile
-accepted_profile  a profile and its stores
-stream_eyes       the profiles of a stream and their states
-predicted_states  prediction of pupil and focus of the next frames
+filtered          `Filtered` frames
+stream_eyes       the profiles of a stream, their stores and events, and its frames
 builder           builder and engine shared by all streams
-shared_builder    builders shared within a process
-choose_engine     choice of the engine, with the reason
+shared_builder    builders shared within a process, and the choice of their engine
 """
 
 import lazy_loader

@@ -29,9 +29,16 @@ from filter_service.errors import (
     FilterError,
     RenderFailed,
 )
-from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
-from filter_service.filtering.filtered import BuildingEye, EyeFailed, EyeReady
-from filter_service.filtering.stream_eyes import BuildTarget, RenderPlan, StreamEyes
+from filter_service.filtering.stream_eyes import (
+    AcceptedProfile,
+    BuildingEye,
+    BuildTarget,
+    EyeFailed,
+    EyeReady,
+    PreparedStore,
+    RenderPlan,
+    StreamEyes,
+)
 from filter_service.rendering.engine import FrameEngine
 from filter_service.rendering.sampled_frame import first_frame
 from filter_service.settings import FilterSettings

@@ -28,17 +28,8 @@ from filter_service.errors import (
     RenderFailed,
     ServiceTimeout,
 )
-from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
 from filter_service.filtering.builder import Builder
-from filter_service.filtering.filtered import (
-    BuildingEye,
-    EyeEvent,
-    EyeFailed,
-    EyeReady,
-    Filtered,
-    FilteredTexture,
-    Preparing,
-)
+from filter_service.filtering.filtered import Filtered, FilteredTexture
 from filter_service.filtering.planned_frame import PlannedFrame
 from filter_service.filtering.planned_textures import (
     PlannedTextures,
@@ -46,7 +37,17 @@ from filter_service.filtering.planned_textures import (
     texture_engine,
 )
 from filter_service.filtering.shared_builder import SharedBuilder, shared
-from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
+from filter_service.filtering.stream_eyes import (
+    AcceptedProfile,
+    BuildingEye,
+    EyeEvent,
+    EyeFailed,
+    EyeReady,
+    PreparedStore,
+    Preparing,
+    RenderPlan,
+    StreamEyes,
+)
 from filter_service.rgbd_view import ColorImage, RgbdView, as_views
 from filter_service.settings import (
     DEFAULTS,

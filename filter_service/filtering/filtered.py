@@ -1,17 +1,14 @@
-"""A filtered frame, and events of a profile."""
+"""A filtered frame."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 from numpy.typing import NDArray
 
 from estimator.note import Note
-from filter_service.camera import Camera
-from filter_service.errors import FilterError
-from filter_service.filtering.accepted_profile import AcceptedProfile
 from filter_service.rendering.filtered_view import FrameCounts, summed_counts
 from filter_service.texture_view import EarlierFrame
 from filter_service.view_state import EyeName, State, WithState
@@ -173,71 +170,3 @@ def summed_times(times_ms: Iterable[Mapping[str, float]]) -> dict[str, float]:
         for name, value_ms in stages_ms.items():
             found[name] = found.get(name, 0.0) + float(value_ms)
     return found
-
-
-@dataclass(frozen=True)
-class Preparing:
-    """Why a frame is not filtered yet, in place of its result; it is false.
-
-    Attributes
-    ----------
-    reason : "preparing" or "extending"
-        Whether no eye is ready for the frame, or only PSFs of its state or the newest
-        eye are missing.
-    fraction : float, optional
-        Completed fraction, 0 to 1, if it is known.
-    stage : str
-        What is computed now.
-    """
-
-    reason: Literal["preparing", "extending"]
-    fraction: float | None = None
-    stage: str = ""
-
-    def __bool__(self) -> Literal[False]:
-        """Return false, unlike results."""
-        return False
-
-
-@dataclass(frozen=True)
-class BuildingEye:
-    """Progress of a profile: the completed fraction, 0 to 1, and the stage."""
-
-    eye: AcceptedProfile
-    fraction: float
-    stage: str
-
-
-@dataclass(frozen=True)
-class EyeReady:
-    """The PSFs for a first frame of a camera are computed.
-
-    Attributes
-    ----------
-    build_ms : float
-        Time since the profile was accepted.
-    psf_count : int
-        Number of computed PSFs.
-    memory_mb : float
-        Memory of the PSFs, 10^6 bytes.
-    notes : tuple of str
-        Notes for the user.
-    """
-
-    eye: AcceptedProfile
-    camera: Camera
-    build_ms: float
-    psf_count: int
-    memory_mb: float
-    notes: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class EyeFailed:
-    """A profile, or its PSFs for a camera, could not be prepared."""
-
-    eye: AcceptedProfile
-    error: FilterError
-
-
-EyeEvent = BuildingEye | EyeReady | EyeFailed

@@ -10,13 +10,8 @@ from typing import Any
 from numpy.typing import NDArray
 
 from filter_service.filtering.builder import Builder
-from filter_service.filtering.filtered import (
-    Filtered,
-    Preparing,
-    ViewResult,
-    summed_times,
-)
-from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
+from filter_service.filtering.filtered import Filtered, ViewResult, summed_times
+from filter_service.filtering.stream_eyes import Preparing, RenderPlan, StreamEyes
 from filter_service.rendering.engine import Pending, ViewRequest
 from filter_service.rendering.filtered_view import summed_counts
 from filter_service.rendering.frame_kernels import MissingPsfs

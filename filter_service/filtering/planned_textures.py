@@ -12,8 +12,8 @@ import numpy as np
 
 from filter_service.errors import BadMessage, RenderFailed
 from filter_service.filtering.builder import Builder
-from filter_service.filtering.filtered import Filtered, Preparing, ViewResult
-from filter_service.filtering.stream_eyes import RenderPlan, StreamEyes
+from filter_service.filtering.filtered import Filtered, ViewResult
+from filter_service.filtering.stream_eyes import Preparing, RenderPlan, StreamEyes
 from filter_service.rendering.engine import (
     ShownTexture,
     TextureEngine,

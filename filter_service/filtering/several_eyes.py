@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from filter_service.errors import BadMessage, NoProfile, SessionError
 from filter_service.filtering.eye_filter import EyeFilter
-from filter_service.filtering.filtered import Filtered, Preparing
+from filter_service.filtering.filtered import Filtered
 from filter_service.filtering.planned_frame import PlannedFrame
 from filter_service.filtering.planned_textures import PlannedTextures, TargetedView
+from filter_service.filtering.stream_eyes import Preparing
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import (
     Output,

@@ -1,4 +1,4 @@
-"""Builders that the filters of a process share, one for each engine setting."""
+"""Engines, and builders that the filters of a process share, one for each setting."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ import logging
 import os
 import threading
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from filter_service.building.jobs import BuildLimits
 from filter_service.building.worker_handle import InlineWorker, WorkerHandle
+from filter_service.constants import ENGINES
+from filter_service.errors import RenderFailed
 from filter_service.filtering.builder import Builder
+from filter_service.gl_device import is_device_selected, may_have_gpu
 from filter_service.psfs.cache_folder import default_cache_dir
 
 if TYPE_CHECKING:
@@ -49,9 +53,6 @@ def open_builder(
     """
     closing.callback(worker.close)
     worker.start()
-    # Imports take long; this process and the worker run them at the same time.
-    from filter_service.filtering.choose_engine import open_engine
-
     chosen = open_engine(engine, closing, warm_up=True, current=current)
     # mypy checks here that the engine implements `FrameEngine`.
     builder = Builder(worker, chosen.engine, limits, engine_name=chosen.name)
@@ -70,6 +71,105 @@ def open_inline_builder(closing: ExitStack, *, engine: str = "auto") -> Builder:
         If no engine works on this machine; the message names what to install.
     """
     return open_builder(InlineWorker(), BuildLimits(), closing, engine=engine)
+
+
+@dataclass(frozen=True)
+class ChosenEngine:
+    """An open frame engine.
+
+    Attributes
+    ----------
+    name : "gl" or "native"
+    engine : FrameEngine
+    reason : str
+        Reason for the choice, a phrase.
+    """
+
+    name: str
+    engine: Any
+    reason: str
+
+
+def open_engine(
+    choice: str,
+    closing: ExitStack,
+    *,
+    warm_up: bool = False,
+    current: CurrentContext | None = None,
+) -> ChosenEngine:
+    """Open a frame engine.
+
+    Parameters
+    ----------
+    choice : "auto", "gl" or "native"
+        "auto" selects gl on a hardware GPU or for a selected device, otherwise native.
+    closing : ExitStack
+        Closes the engine.
+    warm_up : bool
+        Whether to compile shaders now instead of in the first frames.
+    current : CurrentContext, optional
+        Context of the caller for the engine gl, which is then chosen.
+
+    Raises
+    ------
+    ValueError
+        For an unknown choice.
+    RenderFailed
+        If the engine does not work on this machine; the message says what to install.
+    """
+    if choice not in ENGINES:
+        raise ValueError(f"unknown engine {choice!r}; allowed: {', '.join(ENGINES)}")
+    if current is not None:
+        return _gl(closing, "in the caller's context", warm_up=warm_up, current=current)
+    if choice == "native":
+        return _native(closing, "as requested")
+    if choice == "gl":
+        return _gl(closing, "as requested", warm_up=warm_up)
+    if is_device_selected():
+        return _gl(closing, "a device is selected", warm_up=warm_up)
+    return _automatic(closing, warm_up=warm_up)
+
+
+def _automatic(closing: ExitStack, *, warm_up: bool) -> ChosenEngine:
+    if not may_have_gpu():
+        return _native(closing, "no GPU on this machine")
+    with ExitStack() as own:
+        try:
+            found = _gl(own, "a hardware GPU", warm_up=warm_up, hardware_only=True)
+        except RenderFailed as error:
+            return _native(closing, f"no GPU: {error}")
+        closing.push(own.pop_all())
+    return found
+
+
+def _native(closing: ExitStack, reason: str) -> ChosenEngine:
+    from filter_service.rendering.native.lanes import NativeLanes
+
+    lanes = NativeLanes()
+    closing.callback(lanes.close)
+    return ChosenEngine("native", lanes, reason)
+
+
+def _gl(
+    closing: ExitStack,
+    reason: str,
+    *,
+    warm_up: bool,
+    hardware_only: bool = False,
+    current: CurrentContext | None = None,
+) -> ChosenEngine:
+    from filter_service.gl.gpu import Gpu
+    from filter_service.rendering.gl.compile_passes import compile_passes
+    from filter_service.rendering.gl.renderer import FilterRenderer
+
+    gpu = Gpu(current=current)
+    closing.callback(gpu.close)
+    if hardware_only and gpu.is_software:
+        raise RenderFailed(f"{gpu.info['renderer']} is a software renderer")
+    renderer = FilterRenderer(gpu)
+    if warm_up:
+        compile_passes(renderer)
+    return ChosenEngine("gl", renderer, reason)
 
 
 class SharedBuilder:

@@ -1,24 +1,295 @@
 """The eyes of one stream: the newest one, and the previous one until it is ready.
 
-A profile is requested, then building, then ready.  This module only holds the state;
-`builder` acts on it.
+A profile is requested, then building, then ready.  This module only holds the state,
+with the last frames of the stream; `builder` acts on it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 from weakref import WeakSet
 
+import numpy as np
+from numpy.typing import NDArray
+
 from estimator.profiles.parse import EyeProfile
-from filter_service.camera import Camera
+from filter_service.camera import Camera, distinct_cameras, is_same_camera
 from filter_service.errors import FilterError, NoProfile
-from filter_service.filtering.accepted_profile import AcceptedProfile, PreparedStore
-from filter_service.filtering.filtered import EyeEvent, Preparing
-from filter_service.filtering.predicted_states import FrameHistory
 from filter_service.rendering.engine import LoadedStore
+from filter_service.rendering.media_effects import MediaEffects
+from filter_service.rendering.sampled_frame import SampledFrame, SampledView
+from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
+from filter_service.view_state import State
+
+SPEED_S = 0.25
+"""Interval over which the speed of pupil and focus is measured."""
+
+LEAD_S = (0.1, 0.3)
+"""Prediction horizons: the next frame, and later ones."""
+
+
+@dataclass(eq=False)
+class PreparedStore:
+    """A store that an engine has loaded, and the camera that it was built for.
+
+    Attributes
+    ----------
+    camera : Camera
+    store : LoadedStore
+    started_s : float
+        Time when its profile was accepted, or when a frame first used the camera.
+    notes : tuple of str
+        Notes about the eye, in sentences.
+    is_ready : bool
+        Whether the PSFs of a first frame are computed, so that frames use the store.
+    last_used_s : float
+        Time when a frame last used it, or when it was loaded.
+    pending : (n,)
+        Indices of the PSFs of a first frame that are being computed.
+    next_progress_s : float
+        Earliest time of the next progress event.
+    n_checks : int
+        Number of completed checks for missing PSFs of a first frame.
+    n_most_computed : int
+        Largest number of PSFs that have been computed at a time.
+    ticket : int
+        Ticket of its build.
+    """
+
+    camera: Camera
+    store: LoadedStore
+    started_s: float
+    notes: tuple[str, ...] = ()
+    is_ready: bool = False
+    last_used_s: float = field(default_factory=time.monotonic)
+    pending: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    next_progress_s: float = 0.0
+    n_checks: int = 0
+    n_most_computed: int = 0
+    ticket: int = 0
+
+
+@dataclass(eq=False)
+class AcceptedProfile:
+    """An accepted profile and its stores.
+
+    Attributes
+    ----------
+    generation : int
+        Number of the profile in its stream; results return it.
+    profile_id : int
+        The caller's identifier of the profile.
+    profile : EyeProfile
+    settings : FilterSettings
+    requested : tuple of Camera
+        Cameras for which no store is ready yet.
+    stores : list of PreparedStore
+        Stores in order of last use, at most one for each camera.
+    was_ready : bool
+        Whether a store has been ready at any time.
+    failures : list of (Camera, FilterError)
+        Failed builds.
+    accepted_s : float
+        Time of acceptance.
+    fraction : float, optional
+        Completed fraction of its preparation.
+    stage : str
+        Current stage of its preparation.
+    """
+
+    generation: int
+    profile_id: int
+    profile: EyeProfile
+    settings: FilterSettings
+    requested: tuple[Camera, ...] = ()
+    stores: list[PreparedStore] = field(default_factory=list)
+    was_ready: bool = False
+    failures: list[tuple[Camera, FilterError]] = field(default_factory=list)
+    accepted_s: float = field(default_factory=time.monotonic)
+    fraction: float | None = None
+    stage: str = ""
+
+    @property
+    def media_effects(self) -> MediaEffects | None:
+        """Return the effects of the media, which the published pipeline lacks."""
+        if self.settings.pipeline == "published":
+            return None
+        return MediaEffects.of(self.profile, self.settings.display)
+
+    def shares_store(self, first: Camera, second: Camera) -> bool:
+        """Return whether both cameras can share a store of this eye."""
+        return is_same_camera(first, second, follows_field=self.settings.follows_field)
+
+    def store_for(self, camera: Camera) -> PreparedStore | None:
+        """Return the store for a camera, if there is one."""
+        return next(
+            (s for s in self.stores if self.shares_store(s.camera, camera)), None
+        )
+
+    def mark_used(self, camera: Camera) -> None:
+        """Mark a camera's store as the last one used."""
+        found = self.store_for(camera)
+        if found is not None:
+            found.last_used_s = time.monotonic()
+        self.stores.sort(
+            key=lambda prepared: self.shares_store(prepared.camera, camera)
+        )
+
+    def failure_for(self, camera: Camera) -> FilterError | None:
+        """Return the error of the failed build for a camera, if there is one."""
+        return next((e for c, e in self.failures if self.shares_store(c, camera)), None)
+
+    def request(self, cameras: Iterable[Camera]) -> None:
+        """Request stores for cameras that have neither a store nor a failed build."""
+        new = [
+            camera
+            for camera in cameras
+            if self.store_for(camera) is None and self.failure_for(camera) is None
+        ]
+        self.requested = distinct_cameras(
+            [*self.requested, *new], follows_field=self.settings.follows_field
+        )
+
+    def withdraw(self, camera: Camera) -> None:
+        """Withdraw the request for a camera."""
+        self.requested = tuple(
+            c for c in self.requested if not self.shares_store(c, camera)
+        )
+
+
+@dataclass(frozen=True)
+class Preparing:
+    """Why a frame is not filtered yet, in place of its result; it is false.
+
+    Attributes
+    ----------
+    reason : "preparing" or "extending"
+        Whether no eye is ready for the frame, or only PSFs of its state or the newest
+        eye are missing.
+    fraction : float, optional
+        Completed fraction, 0 to 1, if it is known.
+    stage : str
+        What is computed now.
+    """
+
+    reason: Literal["preparing", "extending"]
+    fraction: float | None = None
+    stage: str = ""
+
+    def __bool__(self) -> Literal[False]:
+        """Return false, unlike results."""
+        return False
+
+
+@dataclass(frozen=True)
+class BuildingEye:
+    """Progress of a profile: the completed fraction, 0 to 1, and the stage."""
+
+    eye: AcceptedProfile
+    fraction: float
+    stage: str
+
+
+@dataclass(frozen=True)
+class EyeReady:
+    """The PSFs for a first frame of a camera are computed.
+
+    Attributes
+    ----------
+    build_ms : float
+        Time since the profile was accepted.
+    psf_count : int
+        Number of computed PSFs.
+    memory_mb : float
+        Memory of the PSFs, 10^6 bytes.
+    notes : tuple of str
+        Notes for the user.
+    """
+
+    eye: AcceptedProfile
+    camera: Camera
+    build_ms: float
+    psf_count: int
+    memory_mb: float
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class EyeFailed:
+    """A profile, or its PSFs for a camera, could not be prepared."""
+
+    eye: AcceptedProfile
+    error: FilterError
+
+
+EyeEvent = BuildingEye | EyeReady | EyeFailed
+
+
+class FrameHistory:
+    """The last frames of a stream, which predict pupil and focus of the next ones.
+
+    PSFs of predicted states are computed between frames, which saves time in the next
+    one.  A wrong prediction cannot change an image.
+    """
+
+    def __init__(self) -> None:
+        self._states: deque[tuple[float, State]] = deque()
+        self.last: SampledFrame | None = None
+        self.last_warmed: SampledFrame | None = None  # last with computed predictions
+
+    def record(
+        self,
+        views: Sequence[RgbdView],
+        state: State,
+        *,
+        at_s: float,
+    ) -> None:
+        """Add a frame that arrived at ``at_s``."""
+        seen = tuple(SampledView.of(view) for view in views)
+        self.record_sampled(lambda: seen, state, at_s=at_s)
+
+    def record_sampled(
+        self,
+        sample: Callable[[], tuple[SampledView, ...]],
+        state: State,
+        *,
+        at_s: float,
+    ) -> None:
+        """Add a frame, whose views are sampled only if PSFs are computed for them."""
+        self.last = SampledFrame(at_s, state, sample)
+        self._states.append((at_s, state))
+        while self._states[0][0] < at_s - SPEED_S and len(self._states) > 2:
+            self._states.popleft()
+
+    @property
+    def interval_s(self) -> float:
+        """Return the mean interval of the last frames; 0 before the second."""
+        if len(self._states) < 2:
+            return 0.0
+        return (self._states[-1][0] - self._states[0][0]) / (len(self._states) - 1)
+
+    def predicted_states(self) -> list[State]:
+        """Return the linearly extrapolated pupil and focus at each horizon."""
+        if len(self._states) < 2:
+            return []
+        (first_s, first), (last_s, last) = self._states[0], self._states[-1]
+        if last_s - first_s < 1e-3:
+            return []
+        found = []
+        for lead_s in LEAD_S:
+            steps = lead_s / (last_s - first_s)
+            pupil_mm, focus_dpt = (
+                getattr(last, name)
+                + steps * (getattr(last, name) - getattr(first, name))
+                for name in ("pupil_diameter_mm", "focus_dpt")
+            )
+            found.append(State(pupil_mm, focus_dpt))
+        return found
 
 
 @dataclass(frozen=True)

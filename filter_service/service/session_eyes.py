@@ -11,7 +11,7 @@ from estimator.profiles.parse import EyeProfile
 from filter_service.errors import FilterError, NoSession
 from filter_service.filtering.builder import Builder
 from filter_service.filtering.eye_filter import EyeFilter
-from filter_service.filtering.filtered import BuildingEye, EyeEvent, EyeReady
+from filter_service.filtering.stream_eyes import BuildingEye, EyeEvent, EyeReady
 from filter_service.messages import (
     Accepted,
     ErrorReply,

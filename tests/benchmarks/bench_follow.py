@@ -25,7 +25,7 @@ from filter_service import Camera, EyeFilter
 from filter_service.building.jobs import BuildLimits
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.filtering.builder import Builder
-from filter_service.filtering.filtered import EyeReady
+from filter_service.filtering.stream_eyes import EyeReady
 from filter_service.rendering.native.lanes import NativeLanes
 from tests.benchmarks.harness import Row, memory_mb, publish
 from tests.benchmarks.published_figures import CONDITIONS

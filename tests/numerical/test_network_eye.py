@@ -16,7 +16,7 @@ from estimator.profiles.parse import parse_profile
 from estimator.wavefront.aberrations import wavefront_grid
 from estimator.wavefront.field_wavefronts import polynomial_in_mm, rim_from_ellipse
 from estimator.wavefront.moved_plane import moved_polynomial, moved_rim
-from filter_service.filtering.accepted_profile import AcceptedProfile
+from filter_service.filtering.stream_eyes import AcceptedProfile
 from filter_service.planning.cost import predicted_cost
 from filter_service.planning.plan import plan_cache
 from filter_service.psfs.psf_engine import psf_engine

@@ -8,7 +8,7 @@ import pytest
 
 from clients.commands.doctor import gl_devices
 from filter_service.errors import RenderFailed
-from filter_service.filtering.choose_engine import open_engine
+from filter_service.filtering.shared_builder import open_engine
 from filter_service.gl import choose_device
 from filter_service.gl.choose_device import (
     NAME_EXTENSION,

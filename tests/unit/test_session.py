@@ -2,10 +2,10 @@
 
 import pytest
 
+from filter_service import Preparing
 from filter_service.camera import Camera
 from filter_service.errors import BuildFailed, CreditExceeded, NoProfile
-from filter_service.filtering.accepted_profile import PreparedStore
-from filter_service.filtering.stream_eyes import StreamEyes
+from filter_service.filtering.stream_eyes import PreparedStore, StreamEyes
 from filter_service.messages import Frame, ViewHeader
 from filter_service.service.session import Session, WaitingFrame
 from filter_service.settings import DEFAULTS, FilterSettings
@@ -83,7 +83,7 @@ def test_a_new_camera_is_wanted_while_the_old_eye_serves_the_old_one():
     stream = make_stream()
     add(stream, 1, SMALL)
     build_all(stream)
-    assert planned(stream, LARGE) is None
+    assert planned(stream, LARGE) == Preparing("preparing")
     assert stream.next_build()[1] == LARGE
     assert planned(stream, SMALL) is not None
     build_all(stream)
@@ -166,7 +166,7 @@ def test_the_old_eye_serves_until_a_first_frame_through_the_new_one_is_prepared(
 def test_without_an_old_eye_frames_go_through_the_one_that_is_being_prepared():
     stream = make_stream()
     add(stream, 1, SMALL)
-    assert planned(stream, SMALL) is None
+    assert planned(stream, SMALL) == Preparing("preparing")
     _, prepared = load_one(stream)
     assert planned(stream, SMALL).stores == (prepared.store,)
     assert stream.store_in_use() is None
