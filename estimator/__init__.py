@@ -18,8 +18,7 @@ From a profile to PSFs: `load_profile`, `estimate_eye` or `prepare_eye`, `comput
     native/        the compiled core: threads, PSFs
     note           notes for the user, with codes and numbers
     bounded_files  size-limited reading of untrusted text and JSON
-    threads        number of threads to use
-    machine_speed  relative speed of one core
+    threads        number of threads to use, and the speed of one core
     version        version of the installed package
 """
 

@@ -202,8 +202,9 @@ def read_toml(
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        found = f"not TOML ({reason_of(error)})"
-        raise InvalidFile(path, found, "TOML", option) from None
+        raise InvalidFile(
+            path, f"not TOML ({reason_of(error)})", "TOML", option
+        ) from None
 
 
 def loads_bounded(

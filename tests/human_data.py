@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.acuity.sensitivity import perfect_transfer
+from estimator.acuity.transfer import perfect_transfer
 
 NAVARRO_PUPIL_MM, NAVARRO_NM, NAVARRO_FOCUS_DPT = 4.0, 632.8, 3.0
 """Conditions of Navarro, Artal & Williams 1993."""

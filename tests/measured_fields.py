@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.periphery.meridian import TERMS
+from estimator.periphery.population import TERMS
 
 
 def load_measured_fields(file: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -4,8 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from estimator.acuity.curves import acuity_through_focus
-from estimator.acuity.predict import log_mar_of
+from estimator.acuity.predict import acuity_through_focus, log_mar_of
 from estimator.acuity.transfer import Transfer
 from estimator.corrections.progressive import ProgressiveLens
 from estimator.optics import prescription as rx

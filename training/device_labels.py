@@ -5,7 +5,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from estimator.eye.lens_change import AQUEOUS, DIAMETER
+from estimator.eye.assembly import AQUEOUS, DIAMETER
 from training.tasks import LENS_DIAMETER_MARGINS, N_EYE, Domain
 from training.tracer.accommodation import (
     accommodated_eyes,

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
-from estimator.networks.card import WEIGHTS_FOLDER
+from estimator.networks.inference import WEIGHTS_FOLDER
 from training.batches import task_rows
 from training.checkpoint import load_finished
 from training.command import make_parser, run_command

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from estimator.eye.lens_shape import (
+from estimator.eye.assembly import (
     CAP_VOLUME_RATIO,
     HEIGHT_RATIO,
     RIM_THICKNESS_MM,
@@ -276,7 +276,7 @@ def _lens(eye: Tensor, cosine: Tensor, sine: Tensor) -> dict[str, Tensor]:
 
 
 def lens_thickness_mm(diameter_mm: Tensor, volume_mm3: Tensor) -> Tensor:
-    """Return the lens thickness (N,), as in `estimator.eye.lens_shape.lens_shape`."""
+    """Return the lens thickness (N,), as in `estimator.eye.assembly.lens_shape`."""
     caps_mm3 = CAP_VOLUME_RATIO * volume_mm3
     return RIM_THICKNESS_MM + 8.0 * caps_mm3 / (math.pi * diameter_mm**2)
 

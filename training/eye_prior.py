@@ -1,7 +1,7 @@
 """Prior of the estimation in torch: distribution of eyes with a given refraction.
 
-See `estimator.estimate.prior`. 25 coefficients do not determine 45 parameters; without
-a prior, an estimator rotates corneas and tilts lenses at random.
+See `estimator.estimate.problem`. 25 coefficients do not determine 45 parameters;
+without a prior, an estimator rotates corneas and tilts lenses at random.
 """
 
 from functools import cache
@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from estimator.estimate import prior as estimation_prior
-from estimator.networks.card import FIRST_TERM
+from estimator.estimate import problem as estimation_prior
+from estimator.networks.inference import FIRST_TERM
 from estimator.optics.prescription import C20
 from estimator.optics.units import SPHERE_PER_C20
 

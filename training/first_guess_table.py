@@ -9,8 +9,7 @@ refractions and aberrations.
 import json
 from typing import Any
 
-from estimator.estimate.estimation import estimate_eye
-from estimator.estimate.table import TABLE_FILE
+from estimator.estimate.estimation import TABLE_FILE, estimate_eye
 from estimator.eye.parameters import mean_vector
 from estimator.optics.prescription import zernike_from_power_vector
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM

@@ -8,8 +8,7 @@ decentrations and offset terms: a few hundredths of a diopter, smooth in all inp
 import torch
 from torch import Tensor, nn
 
-from estimator.eye.lens_change import AQUEOUS, DIAMETER
-from estimator.eye.lens_shape import ANTERIOR_THICKNESS_RATIO
+from estimator.eye.assembly import ANTERIOR_THICKNESS_RATIO, AQUEOUS, DIAMETER
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from training.eye_features import EyeFeatures, lens_thickness_mm, named
 from training.tracer.accommodation import smallest_diameters_mm

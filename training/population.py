@@ -1,4 +1,4 @@
-"""Eyes drawn from the prior of the estimation (`estimator.estimate.prior`).
+"""Eyes drawn from the prior of the estimation (`estimator.estimate.problem`).
 
 The ranges of Table 2 contain improbable eyes and exclude long, myopic ones. The service
 estimates eyes with this prior, so these are the eyes for which it uses the networks.
@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from estimator.estimate.prior import REFRACTION_LIMITS_DPT, deviations, mean_eyes
-from estimator.eye.lens_change import (
+from estimator.estimate.problem import REFRACTION_LIMITS_DPT, deviations, mean_eyes
+from estimator.eye.assembly import (
     AQUEOUS,
     DIAMETER,
     SMALLEST_AQUEOUS_MM,

@@ -9,8 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from estimator.periphery.measured_eyes import load_measured_eyes
-from estimator.periphery.population import POPULATION_FILE, Population
+from estimator.periphery.population import (
+    POPULATION_FILE,
+    Population,
+    load_measured_eyes,
+)
 
 SOURCE = (
     "Jaeken & Artal, IOVS 53(7), 2012: half of 65 people's eyes along the horizontal "

@@ -1,6 +1,6 @@
 """Labels computed as in the published data sets, for a comparison of statistics.
 
-The authors' framework (see its published sources and `lens_shape.compat_lens_shape`)
+The authors' framework (see its published sources and `compat_lens_shape`)
 differs from this one: circles have the size of the stop, the lens has another shape
 rule, two offset terms receive the values of others, one conic constant has a narrower
 range, and off axis, a stretch multiplies slopes that it should divide. Training does
@@ -17,7 +17,7 @@ from estimator.eye.parameters import OFFSET_SLICE, EyeParameters, column
 from estimator.optics.surfaces import pack_eye
 from estimator.optics.zernike import N_TERMS, zernike_gradient
 from estimator.wavefront.aberrations import eyes_aberrations
-from estimator.wavefront.results import FieldResults
+from estimator.wavefront.compiled import FieldResults
 from training.tasks import N_EYE, media_indices_of
 
 CIRCLE, LENS, SLIP, STRETCH = (

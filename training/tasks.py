@@ -13,17 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.eye.accommodation import AccommodatingEye
-from estimator.eye.assembly import pack_eyes
-from estimator.eye.lens_change import (
+from estimator.eye.assembly import (
     AQUEOUS,
     DIAMETER,
     accommodated_eyes,
+    pack_eyes,
     smallest_diameter_mm,
 )
 from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters, sampled_ranges
 from estimator.eye.tracing import MEDIA_INWARDS, TraceFailed, eye_indices
-from estimator.networks.card import INPUTS, OUTPUTS
-from estimator.networks.card import ZERNIKE_NAMES as ZERNIKE_NAMES
+from estimator.networks.inference import INPUTS, OUTPUTS
+from estimator.networks.inference import ZERNIKE_NAMES as ZERNIKE_NAMES
 from estimator.optics.media import refractive_index
 from estimator.optics.prescription import C20
 from estimator.optics.raytrace import RayStatus

@@ -116,8 +116,11 @@ def probe_native() -> dict[str, Any]:
 
 def probe_networks() -> dict[str, Any]:
     """Load every trained network and evaluate it once."""
-    from estimator.networks.card import NETWORK_NAMES, NetworkUnavailable
-    from estimator.networks.inference import load_network
+    from estimator.networks.inference import (
+        NETWORK_NAMES,
+        NetworkUnavailable,
+        load_network,
+    )
 
     cards, missing = {}, {}
     for name in NETWORK_NAMES:

@@ -24,8 +24,7 @@ from filter_service.command_line import (
 
 if TYPE_CHECKING:
     from estimator.estimate.estimation import EstimatedEye
-    from estimator.field.drawn_fields import DrawnFields
-    from estimator.field.field_table import FieldTable
+    from estimator.field.field_table import DrawnFields, FieldTable
     from estimator.profiles.eye_profile import EyeProfile
 
 TIME_LIMITS_S = (0.1, 86400.0)
@@ -66,7 +65,7 @@ def estimate(
     check_range("--max-time-s", max_time_s, TIME_LIMITS_S)
 
     from estimator.estimate.estimation import estimate_eye
-    from estimator.networks.card import DamagedWeights, WeightsMissing
+    from estimator.networks.inference import DamagedWeights, WeightsMissing
     from estimator.profiles.files import load_profile
     from filter_service.atomic_files import replace_atomically
     from filter_service.image_files import check_output
@@ -200,7 +199,7 @@ def field(
             f"allowed: at most {MAX_DIRECTIONS}"
         )
 
-    from estimator.profiles.drawn_people import (
+    from estimator.profiles.typical_aberrations import (
         PEOPLE_LIMITS,
         drawn_profiles,
         drawn_text,
@@ -276,7 +275,7 @@ def _drawn(
     eye: "EyeProfile", people: int, states: dict[str, Any], *, quiet: bool
 ) -> "DrawnFields":
     """Return the fields of drawn persons; show progress on a terminal."""
-    from estimator.field.drawn_fields import drawn_fields
+    from estimator.field.field_table import drawn_fields
     from filter_service.progress import Progress
 
     with Progress(quiet=quiet or not sys.stderr.isatty()) as progress:
@@ -308,7 +307,7 @@ def _angles(option: str, text: str) -> list[float]:
 
 
 def _directions(found: "FieldTable") -> list[dict[str, Any]]:
-    from estimator.wavefront.results import PupilEllipse
+    from estimator.wavefront.compiled import PupilEllipse
 
     return [
         {

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from estimator.profiles.parse import EyeProfile
     from estimator.psf.kernel_types import Psf
     from estimator.psf.stiles_crawford import StilesCrawford
-    from estimator.wavefront.results import Aberrations, PupilEllipse
+    from estimator.wavefront.compiled import Aberrations, PupilEllipse
 
 STOP_LIMITS_MM = (0.05, 12.0)
 PUPIL_LIMITS_MM = (0.1, 12.0)
@@ -157,7 +157,7 @@ def _of_frames(
 ) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Return the facts of the wavefront that frames use, and the notes on it."""
     from estimator.field.field_table import field_table
-    from estimator.wavefront.results import PupilEllipse
+    from estimator.wavefront.compiled import PupilEllipse
 
     found = field_table(
         profile, focus_dpt=focus_dpt, pupil_diameter_mm=pupil_mm, **view
@@ -450,7 +450,7 @@ def _compute(
 
 
 def _psf_facts(computed: "Psf", state: _State) -> dict[str, Any]:
-    from estimator.wavefront.results import PupilEllipse
+    from estimator.wavefront.compiled import PupilEllipse
     from filter_service.psfs.picture import half_light_radius_px
 
     return {

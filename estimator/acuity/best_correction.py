@@ -14,12 +14,12 @@ from scipy import fft
 from scipy.optimize import minimize
 
 from estimator.acuity.predict import HIGHEST_CPD, TILTS
-from estimator.acuity.sensitivity import neural_sensitivity
 from estimator.acuity.transfer import (
     NM_PER_MM,
     UM_PER_MM,
     clear_pupil,
     grid_wavefront_um,
+    neural_sensitivity,
 )
 from estimator.optics.pupil_screen import PupilScreen
 
@@ -95,8 +95,7 @@ def _peak(
             "fatol": 1e-4,
         },
     )
-    peak_um: NDArray[np.float64] = peak.x * um_per_dpt
-    return peak_um
+    return peak.x * um_per_dpt
 
 
 def _visual_strehl(

@@ -1,4 +1,10 @@
-"""Optical transfer functions: autocorrelations of the pupil function, by FFT."""
+"""Optical transfer functions: autocorrelations of the pupil function, by FFT.
+
+Contrast sensitivity of the visual system, and its optical and neural parts.
+
+The contrast sensitivity of the Standard Spatial Observer, measured with natural optics,
+divided by the modulation transfer of the mean eye is the neural contrast sensitivity.
+"""
 
 import math
 from dataclasses import dataclass
@@ -15,6 +21,61 @@ from estimator.optics.zernike import (
     wavefront_polynomial,
     zernike_gradient,
 )
+
+OBSERVER_PUPIL_MM = 4.0
+"""Natural pupil diameter of the ModelFest observers (displays of 30 cd/m²)."""
+
+MEAN_EYE_NM = 555.0
+
+
+def contrast_sensitivity(frequency_cpd: ArrayLike) -> NDArray[np.float64]:
+    """Return the contrast sensitivity (...) with natural optics.
+
+    References
+    ----------
+    Watson & Ahumada, J. Vision 5(9), 2005: the "HPmH" function of ModelFest.
+    """
+    cpd = np.abs(np.asarray(frequency_cpd, dtype=np.float64))
+    high = 1.0 / np.cosh(np.minimum((cpd / 4.1726) ** 0.7786, 700.0))
+    low = 1.0 / np.cosh(np.minimum(cpd / 1.3625, 700.0))
+    return 373.08 * (high - 0.8493 * low)
+
+
+def perfect_transfer(
+    frequency_cpd: ArrayLike, *, pupil_diameter_mm: float, wavelength_nm: float
+) -> NDArray[np.float64]:
+    """Return the diffraction-limited modulation transfer (...) of a circular pupil."""
+    cutoff_cpd = math.radians(1.0) * pupil_diameter_mm * 1e6 / wavelength_nm
+    ratio = np.clip(np.abs(np.asarray(frequency_cpd)) / cutoff_cpd, 0.0, 1.0)
+    return 2.0 / np.pi * (np.arccos(ratio) - ratio * np.sqrt(1.0 - ratio**2))
+
+
+def mean_eye_transfer(
+    frequency_cpd: ArrayLike, *, pupil_diameter_mm: float
+) -> NDArray[np.float64]:
+    """Return the mean modulation transfer (...) of 200 best-corrected eyes at 555 nm.
+
+    The formula is valid for pupils of 2 to 6 mm.
+
+    References
+    ----------
+    Watson, J. Vision 13(6):18, 2013.
+    """
+    d = pupil_diameter_mm
+    knee_cpd = 21.95 - 5.512 * d + 0.3922 * d**2
+    perfect = perfect_transfer(
+        frequency_cpd, pupil_diameter_mm=d, wavelength_nm=MEAN_EYE_NM
+    )
+    falloff = 1.0 + np.square(np.asarray(frequency_cpd) / knee_cpd)
+    return np.sqrt(perfect) * falloff**-0.62
+
+
+def neural_sensitivity(frequency_cpd: ArrayLike) -> NDArray[np.float64]:
+    """Return the neural contrast sensitivity (...), without the optics."""
+    cpd = np.asarray(frequency_cpd, dtype=np.float64)
+    optics = mean_eye_transfer(cpd, pupil_diameter_mm=OBSERVER_PUPIL_MM)
+    return contrast_sensitivity(cpd) / np.maximum(optics, 1e-3)
+
 
 MIN_SAMPLES, MAX_SAMPLES = 128, 1024
 """Number of samples across the circle of the coefficients."""
@@ -82,8 +143,7 @@ class Transfer:
             * np.stack([np.sin(angles), np.cos(angles)])[:, None]
         )
         around = map_coordinates(values, positions, order=1)
-        mean: NDArray[np.float64] = around.mean(axis=-1)
-        return mean
+        return around.mean(axis=-1)
 
 
 def optical_transfer(
@@ -217,8 +277,7 @@ def _samples(
             "expected at most "
             f"{MAX_SAMPLES * STEP_WAVES * wavelength_nm / 2.0 / UM_PER_MM:.0f}"
         )
-    count: int = fft.next_fast_len(needed)
-    return count
+    return fft.next_fast_len(needed)
 
 
 def _inside(
@@ -239,7 +298,4 @@ def _inside(
     along = (x_mm - cx) * np.cos(angle) + (y_mm - cy) * np.sin(angle)
     across = (y_mm - cy) * np.cos(angle) - (x_mm - cx) * np.sin(angle)
     from_rim = 1.0 - np.hypot(along / major_mm, across / minor_mm)
-    within: NDArray[np.float64] = np.minimum(
-        circle, np.clip(0.5 + from_rim * minor_mm / step_mm, 0.0, 1.0)
-    )
-    return within
+    return np.minimum(circle, np.clip(0.5 + from_rim * minor_mm / step_mm, 0.0, 1.0))

@@ -2,11 +2,8 @@
 
 worn_lens         contact and intraocular lenses, and the wavefront of any correction
 rings             multifocal lenses: diffractive rings, refractive zones
-kinoform          diffraction efficiency of the orders of a phase profile
-lens_plane        point of a spectacle lens that the line of sight crosses
 lenslets          spectacles with lenslets around a clear center
-progressive       progressive spectacles
-intraocular       conversion from the plane of an intraocular lens to the pupil
+progressive       progressive spectacles, and where the line of sight crosses a lens
 
 A *correction* is a `Prescription` or one of its subclasses here, given in the plane of
 the device: spectacles at the *vertex distance* ``vertex_mm`` in front of the cornea, a

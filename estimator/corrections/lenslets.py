@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.corrections.lens_plane import lens_point_mm
+from estimator.corrections.progressive import lens_point_mm
 from estimator.optics.units import NM_PER_UM
 
 EDGE_ORDERS = 4.0

@@ -12,6 +12,8 @@ cumulative normal distribution with a quarter of the corridor as its standard de
   through 4 mm in the middle of a 14 mm corridor with an addition of 2 dpt.  The third
   derivatives of the surface describe all but 0.005 um of them there, and all but
   0.02 um at the ends of the corridor.
+
+Point of a spectacle lens that the line of sight crosses, by gaze and by field.
 """
 
 from dataclasses import dataclass, field, replace
@@ -20,11 +22,47 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.corrections.lens_plane import lens_point_mm
 from estimator.optics import prescription as rx
 from estimator.optics.units import MM_PER_M
+from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
 from estimator.optics.zernike import EXPONENTS, N_TERMS
 from estimator.wavefront.field_wavefronts import polynomial_in_mm
+
+ROTATION_CENTER_MM = 13.5
+"""Depth of the eye's center of rotation behind the cornea."""
+
+
+def lens_point_mm(
+    h_deg: ArrayLike,
+    v_deg: ArrayLike,
+    *,
+    vertex_mm: float,
+    gaze_deg: tuple[float, float],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the points x and y (...), mm, where field directions cross a lens.
+
+    The origin is in front of the pupil in primary gaze.  Gaze rotates about the eye's
+    center of rotation, field directions about the entrance pupil.
+
+    Parameters
+    ----------
+    h_deg, v_deg : (...)
+        Field directions relative to the line of sight.
+    vertex_mm : float
+        Distance from lens to cornea.
+    gaze_deg : (h, v)
+        Gaze relative to the head.
+    """
+    by_gaze_mm = vertex_mm + ROTATION_CENTER_MM
+    by_field_mm = vertex_mm + TYPICAL_ENTRANCE_PUPIL_MM
+    x, y = (
+        by_gaze_mm * np.tan(np.radians(gaze)) + by_field_mm * np.tan(direction)
+        for gaze, direction in zip(
+            gaze_deg, (np.radians(h_deg), np.radians(v_deg)), strict=True
+        )
+    )
+    return x, y
+
 
 CUBES = [EXPONENTS.tolist().index([a, 3 - a]) for a in (3, 2, 1, 0)]
 """Indices of the monomials x³, x²y, xy² and y³."""
@@ -180,12 +218,10 @@ def progressive_polynomial(
         ]
     )
     parts = np.stack([m, j0, at_pupil[..., 0, 1]], axis=-1)
-    found: NDArray[np.float64] = parts @ polynomial_in_mm(
-        unit, 1.0
-    ) + lens.power_gradient_polynomial(*point_mm)
-    return found
+    return parts @ polynomial_in_mm(unit, 1.0) + lens.power_gradient_polynomial(
+        *point_mm
+    )
 
 
 def _bell(along: NDArray[np.float64]) -> NDArray[np.float64]:
-    bell: NDArray[np.float64] = np.exp(-along * along / 2.0) / np.sqrt(2.0 * np.pi)
-    return bell
+    return np.exp(-along * along / 2.0) / np.sqrt(2.0 * np.pi)

@@ -2,6 +2,13 @@
 
 The light of the foci interferes.  Through pupils of 2 to 3 mm, interference extends the
 depth of focus of low additions, which an incoherent sum would miss.
+
+Diffraction efficiency of the orders of a diffractive lens, by scalar theory.
+
+The zones have equal areas, so the profile is periodic in r².  The amplitude of order k
+is the k-th Fourier coefficient of the transmission over a period.  A sawtooth of h
+waves has an efficiency of sinc²(h - k) in order k: 40.5 % in each of two orders for
+half a wave.  Shading by the steps and the dispersion of their material are not modeled.
 """
 
 from dataclasses import dataclass
@@ -10,9 +17,94 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from estimator.corrections.kinoform import Kinoform
 from estimator.corrections.lenslets import Lenslets
 from estimator.optics.units import NM_PER_UM
+
+N_SAMPLES = 1024
+"""Samples per period; efficiencies are accurate to 1e-5."""
+
+N_ITERATIONS = 400
+"""Iterations of the profile search: efficiencies within 0.01 of the attainable ones."""
+
+
+@dataclass(frozen=True)
+class Kinoform:
+    """One period of a diffractive phase profile.
+
+    Attributes
+    ----------
+    path_ratio : tuple of float
+        Optical path difference in design wavelengths, at `N_SAMPLES` points evenly
+        spaced in r² over a period.
+    """
+
+    path_ratio: tuple[float, ...]
+
+    @classmethod
+    def sawtooth(cls, step_waves: float) -> "Kinoform":
+        """Return a ramp of ``step_waves`` wavelengths: half a wave has two foci."""
+        return cls(tuple((step_waves * _period_positions()).tolist()))
+
+    @classmethod
+    def two_combs(cls, coarse_waves: float, fine_waves: float) -> "Kinoform":
+        """Return the sum of a sawtooth and one of half its period: three foci.
+
+        The first order of the fine sawtooth coincides with the second order of the
+        coarse one.
+
+        References
+        ----------
+        Gatinel et al., J. Refract. Surg. 27, 2011.
+        """
+        x = _period_positions()
+        waves = coarse_waves * x + fine_waves * (2.0 * x % 1.0)
+        return cls(tuple(waves.tolist()))
+
+    @classmethod
+    def with_light(cls, light: dict[int, float]) -> "Kinoform":
+        """Return a profile with the given efficiency of each order.
+
+        Manufacturers publish efficiencies but not profiles.  The search alternately
+        imposes the requested amplitudes on the orders and unit modulus on the profile.
+
+        References
+        ----------
+        Gerchberg and Saxton, Optik 35, 1972.
+        """
+        orders = np.array(list(light))
+        target = np.sqrt(np.array(list(light.values())))
+        spectrum = np.zeros(N_SAMPLES, complex)
+        # Quadratic phases keep the modulus nearly uniform over the period.
+        spectrum[orders] = target * np.exp(1j * np.pi * orders**2 / (orders.max() + 1))
+        for _ in range(N_ITERATIONS):
+            phase = np.angle(np.fft.ifft(spectrum))
+            current = np.fft.fft(np.exp(1j * phase)) / N_SAMPLES
+            spectrum = current.copy()
+            spectrum[orders] = target * np.exp(1j * np.angle(current[orders]))
+        waves = np.unwrap(phase) / (2.0 * np.pi)
+        return cls(tuple((waves - waves.min()).tolist()))
+
+    def amplitudes(
+        self, orders: NDArray[np.int64], *, color_ratio: float = 1.0
+    ) -> NDArray[np.complex128]:
+        """Return amplitudes (K,) of orders (K,); their squares are the efficiencies.
+
+        Parameters
+        ----------
+        orders : (K,) int
+        color_ratio : float
+            Design wavelength over that of the light.
+        """
+        field = np.exp(2j * np.pi * color_ratio * np.array(self.path_ratio))
+        # Samples are at the centers of their intervals.
+        half_sample = np.exp(-1j * np.pi * orders / N_SAMPLES)
+        spectrum = np.fft.fft(field) / N_SAMPLES
+        return spectrum[orders % N_SAMPLES] * half_sample
+
+
+def _period_positions() -> NDArray[np.float64]:
+    return (np.arange(N_SAMPLES) + 0.5) / N_SAMPLES
+
 
 LOWEST_ORDER, HIGHEST_ORDER = -3, 3
 """Orders included below the lowest and above the highest design order.  The light of
@@ -104,10 +196,9 @@ class DiffractiveRings:
         light = np.abs(self.amplitudes(wavelength_nm)[is_main]) ** 2
         is_far = self.followed_orders[is_main] == self.far_order
         by_rings = np.minimum(self.diameter_mm / 2.0 / np.asarray(radius_mm), 1.0) ** 2
-        shares: NDArray[np.float64] = np.multiply.outer(
-            light, by_rings
-        ) + np.multiply.outer(is_far, 1.0 - by_rings)
-        return shares
+        return np.multiply.outer(light, by_rings) + np.multiply.outer(
+            is_far, 1.0 - by_rings
+        )
 
     def _is_main(self, wavelength_nm: float) -> NDArray[np.bool_]:
         return np.abs(self.amplitudes(wavelength_nm)) ** 2 >= MAIN_SHARE
@@ -116,10 +207,7 @@ class DiffractiveRings:
         self, radius_mm: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.float64]:
         """Return the largest deflection of light at distances from the center."""
-        reach_mrad: NDArray[np.float64] = np.abs(
-            self.added_dpt(wavelength_nm)
-        ).max() * np.asarray(radius_mm)
-        return reach_mrad
+        return np.abs(self.added_dpt(wavelength_nm)).max() * np.asarray(radius_mm)
 
     def transmission(
         self, square_mm2: ArrayLike, wavelength_nm: float
@@ -180,10 +268,7 @@ class RefractiveZones:
         self, radius_mm: ArrayLike, wavelength_nm: float
     ) -> NDArray[np.float64]:
         """Return the largest deflection of light at distances from the center."""
-        reach_mrad: NDArray[np.float64] = np.abs(self.powers_dpt).max() * np.asarray(
-            radius_mm
-        )
-        return reach_mrad
+        return np.abs(self.powers_dpt).max() * np.asarray(radius_mm)
 
     def transmission(
         self, square_mm2: ArrayLike, wavelength_nm: float
@@ -196,10 +281,7 @@ class RefractiveZones:
             path_um += power_dpt / 2.0 * np.clip(square - before, 0.0, end - before)
             before = end
         path_um += self.powers_dpt[-1] / 2.0 * np.maximum(square - before, 0.0)
-        field: NDArray[np.complex128] = np.exp(
-            2j * np.pi * NM_PER_UM / wavelength_nm * path_um
-        )
-        return field
+        return np.exp(2j * np.pi * NM_PER_UM / wavelength_nm * path_um)
 
 
 Rings = DiffractiveRings | RefractiveZones | Lenslets

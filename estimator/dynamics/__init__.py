@@ -1,10 +1,7 @@
 """Dynamics of the eye: pupil, accommodation and gaze over time.
 
-accommodation_response  accommodation that follows the fixation distance
-pupil_size              steady-state pupil diameter
-pupil_reflex            pupillary light reflex
-gaze                    smoothed gaze of an eye tracker
-delayed_approach        exponential approach to a target after a latency
+responses  pupillary light reflex, and accommodation that follows the fixation distance
+gaze       smoothed gaze of an eye tracker
 
 Times are in seconds on any clock; each model is independent of the sampling rate.
 """

@@ -2,15 +2,10 @@
 
 estimation         entry point: refined, by network, or by pattern search
 given_surfaces     an eye that a profile gives by its surfaces
-problem            compared coefficients and the model of them
-prior              prior distribution of eyes, by refraction
+problem            prior, compared coefficients, and the pattern search of earlier work
 bounded_fit        least squares with bounds
-plausible          properties of an eye that are unusual in people
 measured_residual  residual of the estimate, kept as a phase
-table              start eyes of a fit
-eye_table.json  the table
-network_guess      start eye from the eye network
-pattern_search     pattern search of the earlier work
+eye_table.json     start eyes of a fit
 plot               plot of an estimated eye
 """
 

@@ -3,7 +3,9 @@
 This is Gauss-Newton in a trust region: the Jacobian's finite differences are one batch,
 and each linear step is solved exactly within the bounds.  SciPy's `least_squares` calls
 its model once per parameter and stays off the bounds; here a parameter can reach its
-bound, and is reported as being on it.
+bound, and is reported as being on it.  With this Jacobian, `least_squares` took five to
+ten times as long and 414 instead of 49 evaluations (medians of 50 drawn persons), ended
+at a higher cost, and its eyes differed by up to 3 prior deviations in a parameter.
 """
 
 from collections.abc import Callable
@@ -116,8 +118,7 @@ class _Descent:
 
     @property
     def is_met(self) -> bool:
-        met: bool = np.max(np.abs(self.state.value_um - self.target_um)) < MET_UM
-        return met
+        return np.max(np.abs(self.state.value_um - self.target_um)) < MET_UM
 
     def differentiate(self) -> None:
         self.jacobian_um = difference_jacobian_um(

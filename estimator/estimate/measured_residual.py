@@ -192,8 +192,7 @@ def stretch_ratio(pupil_ratio: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     beyond = np.minimum(np.maximum(pupil_ratio - 1.0, 0.0), 2.0 * OVERSHOOT)
     rim = np.minimum(pupil_ratio, 1.0) + beyond - beyond**2 / (4.0 * OVERSHOOT)
-    ratio: NDArray[np.float64] = rim / pupil_ratio
-    return ratio
+    return rim / pupil_ratio
 
 
 def _traced_um(

@@ -13,6 +13,7 @@ from estimator.optics import prescription as rx
 from estimator.optics.raytrace import RayStatus, trace_rays
 from estimator.optics.surfaces import EyeSurfaces, Surface, rotation_matrix
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
+from estimator.optics.zernike import nm_from_index, norms, zernike_values
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,18 +55,12 @@ def surface_line_mm(
 def _offset_mm(surface: Surface, y_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     if surface.offset_mm is None:
         return np.zeros_like(y_mm)
-    from estimator.optics.zernike import N_TERMS, nm_from_index, zernike_values
-
-    norms = [
-        math.sqrt((2 - (m == 0)) * (n + 1))
-        for n, m in (nm_from_index(j) for j in range(N_TERMS))
-    ]
     angle_rad = math.radians(surface.rotation_deg)
     heights = y_mm / surface.offset_radius_mm
     values = zernike_values(
         heights * math.sin(angle_rad), heights * math.cos(angle_rad)
     )
-    return values @ (np.asarray(surface.offset_mm) / norms)
+    return values @ (np.asarray(surface.offset_mm) / norms())
 
 
 def plot_eye(found: EstimatedEye, path: Path, *, focus_dpt: float = 0.0) -> None:
@@ -159,8 +154,6 @@ def _draw_retina(axes: "Axes", eye: EyeSurfaces) -> None:
 
 
 def _draw_coefficients(axes: "Axes", found: EstimatedEye) -> None:
-    from estimator.optics.zernike import nm_from_index
-
     index = np.arange(3, found.zernike_um.size)
     measured_um = found.zernike_um - found.residual_um
     axes.bar(index - 0.2, measured_um[3:], 0.4, label="measured", color="0.6")

@@ -3,13 +3,26 @@
 Coefficients are compared on the measured circle, with the model's entrance pupil equal
 to the measured pupil, without piston and tilt: the chief ray's zero slope ties tilt to
 coma, so a measured tilt contains no information about the eye.
+
+Prior of the estimation.
+
+27 coefficients do not determine 45 parameters; among the eyes that fit, the prior
+selects the one nearest to the mean eye of that refraction.
+
+Pattern search over the 45 parameters: the baseline of the earlier work.
+
+This is the published generalized pattern search (Csoba & Kunkli 2023): squared error
+with weights by radial order and a penalty on wrong signs, parameters scaled to their
+ranges, mesh factors 1/2 and 2.  It needs no derivatives, at the cost of time; the
+recommended method is in `estimation.py`.
 """
 
+import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from estimator.estimate.bounded_fit import (
     BoundedFit,
@@ -17,12 +30,72 @@ from estimator.estimate.bounded_fit import (
     difference_jacobian_um,
     fit_bounded,
 )
-from estimator.estimate.prior import Prior, prior_for_refraction
-from estimator.eye.parameters import PARAMETER_NAMES
+from estimator.eye.parameters import (
+    N_PARAMETERS,
+    PARAMETER_NAMES,
+    PARAMETERS,
+    EyeParameters,
+    allowed_ranges,
+    column,
+    mean_vector,
+    offset_name,
+)
 from estimator.eye.tracing import zernike_of_vectors
 from estimator.optics import prescription as rx
-from estimator.optics.zernike import N_TERMS
+from estimator.optics.zernike import N_TERMS, nm_from_index
 from estimator.profiles.parse import EyeProfile, Measurement
+
+LENGTH_PER_DPT_MM = -0.299
+RADIUS_PER_DPT_MM = 0.022
+"""Myopia is mostly a long eye: axial length and anterior corneal radius against the
+spherical refraction (Atchison 2006)."""
+
+REFRACTION_LIMITS_DPT = (-12.0, 6.0)
+"""Range of refractions in which the two slopes above apply."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Independent normal prior in table order, in the units of the parameters."""
+
+    _mean: NDArray[np.float64]
+    _deviation: NDArray[np.float64]
+
+    def to_unit(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return parameters (..., 45) in deviations from the mean."""
+        return (vectors - self._mean) / self._deviation
+
+    def from_unit(self, unit: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return parameters from deviations, the inverse of `to_unit`."""
+        return self._mean + unit * self._deviation
+
+    def unit_bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the allowed ranges in deviations from the mean."""
+        low, high = allowed_ranges().T
+        return self.to_unit(low), self.to_unit(high)
+
+
+def mean_eyes(refraction_dpt: ArrayLike) -> NDArray[np.float64]:
+    """Return vectors (..., 45) of the mean eyes of spherical refractions (...), dpt.
+
+    Refractions are clamped to `REFRACTION_LIMITS_DPT`.
+    """
+    clipped_dpt = np.clip(refraction_dpt, *REFRACTION_LIMITS_DPT)
+    eyes = np.broadcast_to(mean_vector(), (*np.shape(clipped_dpt), N_PARAMETERS)).copy()
+    eyes[..., column("eye_length_mm")] += LENGTH_PER_DPT_MM * clipped_dpt
+    eyes[..., column("cornea_anterior_radius_mm")] += RADIUS_PER_DPT_MM * clipped_dpt
+    return eyes
+
+
+def deviations() -> NDArray[np.float64]:
+    """Return standard deviations (45,) about a mean eye, each in its own unit."""
+    return np.array([row.deviation for row in PARAMETERS])
+
+
+def prior_for_refraction(refraction_dpt: float) -> Prior:
+    """Return the prior around the mean eye of a spherical refraction M, dpt."""
+    return Prior(mean_eyes(refraction_dpt), deviations())
+
 
 FIRST_COMPARED = 3
 """Index of the first compared coefficient, after piston and tilt."""
@@ -141,3 +214,139 @@ class EstimationProblem:
             for name, left in zip(PARAMETER_NAMES, room, strict=True)
             if left < ON_BOUND_RATIO
         )
+
+
+WEIGHT_BY_ORDER = {1: 0.5, 2: 1.0, 3: 1.0, 4: 2.0, 5: 4.0, 6: 4.0}
+ERROR_WEIGHT = 200.0
+WRONG_SIGN_WEIGHT = 10.0
+RIGHT_SIGN_UM = 1e-6
+
+FIRST_MESH = 0.005
+SMALLEST_MESH = 1e-6
+LARGEST_MESH = 1.0
+
+POPULATION = {
+    # parameter: (mean, half width without a penalty, half range), in its own unit
+    "eye_length_mm": (23.82, 0.81, 2.0),
+    "cornea_thickness_mm": (0.55, 0.03, 0.16),
+    "cornea_anterior_radius_mm": (7.81, 0.25, 2.0),
+    "cornea_posterior_astigmatism_ratio": (1.0, 0.03, 0.2),
+    "cornea_posterior_radius_ratio": (0.825, 0.03, 0.09),
+    "cornea_anterior_conic_constant": (-0.29, 0.09, 3.0),
+    "cornea_posterior_conic_constant": (-0.34, 0.24, 3.0),
+    "cornea_anterior_rotation_deg": (0.0, 0.0, 45.0),
+    "cornea_posterior_rotation_deg": (0.0, 0.0, 45.0),
+    "aqueous_thickness_mm": (2.90, 0.39, 1.0),
+    "lens_diameter_mm": (9.5, 0.3, 0.5),
+    "lens_volume_mm3": (160.1, 2.5, 7.0),
+    "lens_anterior_conic_constant": (-4.4, 1.6, 6.0),
+    "lens_posterior_conic_constant": (-4.0, 2.0, 6.0),
+    "lens_decentration_x_mm": (0.0, 0.0, 0.8),
+    "lens_decentration_y_mm": (0.0, 0.0, 0.8),
+    "lens_tilt_about_y_deg": (0.0, 0.0, 7.0),
+    "lens_tilt_about_x_deg": (0.0, 0.0, 7.0),
+}
+"""Table of the published search; where our cornea has another parameter (ratios instead
+of radii), the widths are converted."""
+
+OFFSET_HALF_RANGE_MM = {1: 0.10, 2: 0.10, 3: 0.06, 4: 0.06, 5: 0.03, 6: 0.03}
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """Best eye found, and the cost of the search."""
+
+    parameters: EyeParameters
+    loss_ratio: float
+    n_iterations: int
+    n_evaluations: int
+    mesh_ratio: float
+    stopped_by: str
+
+
+def _table() -> NDArray[np.float64]:
+    rows = [POPULATION.get(name, (0.0, 0.0, 0.0)) for name in PARAMETER_NAMES]
+    for index in range(1, N_TERMS):
+        half_range_mm = OFFSET_HALF_RANGE_MM[nm_from_index(index)[0]]
+        rows[PARAMETER_NAMES.index(offset_name(index))] = (0.0, 0.0, half_range_mm)
+    return np.array(rows)
+
+
+def search_weights() -> NDArray[np.float64]:
+    """Return the weights (28,) of the coefficients; piston has none."""
+    orders = [nm_from_index(j)[0] for j in range(N_TERMS)]
+    return np.array([WEIGHT_BY_ORDER.get(n, 0.0) for n in orders])
+
+
+def search_loss(
+    zernike_um: NDArray[np.float64], target_um: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the weighted squared error (P,) of sets (P, 28); infinite where NaN."""
+    # A zero up to rounding, as in the symmetric start, counts as the wrong sign:
+    # otherwise rounding would decide between losses a factor of ten apart.
+    wrong_sign = zernike_um * np.sign(target_um) < RIGHT_SIGN_UM
+    wrong_sign &= target_um != 0.0
+    weight = search_weights() * np.where(wrong_sign, WRONG_SIGN_WEIGHT, 1.0)
+    error = weight * ERROR_WEIGHT * (zernike_um - target_um) ** 2
+    error[..., 0] = 0.0
+    loss = error.sum(axis=-1)
+    return np.where(np.isnan(loss), np.inf, loss)
+
+
+def pattern_search(
+    zernike_of: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    *,
+    target_um: NDArray[np.float64],
+    max_time_s: float,
+    max_evaluations: int | None = None,
+) -> SearchResult:
+    """Search from the mean eye.
+
+    Parameters
+    ----------
+    zernike_of : callable
+        Function from (P, 45) parameter vectors to (P, 28) um, with NaN rows where
+        light does not pass.
+    target_um : (28,)
+    max_time_s : float
+        Time limit; the published runs took one to three hours.
+
+    Notes
+    -----
+    Every iteration polls both directions of every parameter in one batch and moves to
+    the best of them: mesh x 2 after a success, x 1/2 otherwise.
+    """
+    mean, dead_zone, half_range = _table().T
+    allowed = (allowed_ranges() - mean[:, None]) / half_range[:, None]
+    low, high = np.clip(allowed, -1.0, 1.0).T
+    directions = np.concatenate([np.eye(N_PARAMETERS), -np.eye(N_PARAMETERS)])
+
+    def losses(units: NDArray[np.float64]) -> NDArray[np.float64]:
+        outside = np.maximum(np.abs(units) - dead_zone / half_range, 0.0)
+        zernike_um = zernike_of(mean + units * half_range)
+        penalty: NDArray[np.float64] = np.sum(outside**2, axis=-1)
+        return search_loss(zernike_um, target_um) + penalty
+
+    start_s = time.perf_counter()
+    position, mesh = np.zeros(N_PARAMETERS), FIRST_MESH
+    best = float(losses(position[None])[0])
+    n_iterations, n_evaluations, stopped_by = 0, 1, "mesh"
+    while mesh >= SMALLEST_MESH:
+        if time.perf_counter() - start_s > max_time_s:
+            stopped_by = "time"
+            break
+        if max_evaluations is not None and n_evaluations >= max_evaluations:
+            stopped_by = "evaluations"
+            break
+        polled = np.clip(position + mesh * directions, low, high)
+        polled_losses = losses(polled)
+        n_iterations += 1
+        n_evaluations += len(polled)
+        winner = int(np.argmin(polled_losses))
+        if polled_losses[winner] < best:
+            position, best = polled[winner], float(polled_losses[winner])
+            mesh = min(2.0 * mesh, LARGEST_MESH)
+        else:
+            mesh *= 0.5
+    parameters = EyeParameters.from_vector(mean + position * half_range)
+    return SearchResult(parameters, best, n_iterations, n_evaluations, mesh, stopped_by)

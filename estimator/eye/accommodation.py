@@ -1,27 +1,37 @@
 """Accommodation: the lens diameter and chamber depth that focus an eye at a distance.
 
-`lens_change` describes the change of the lens.  The eye is focused at f dpt when its
+`assembly` describes the change of the lens.  The eye is focused at f dpt when its
 ray-traced least-squares refraction M at 555 nm, over the given pupil, is -f.
+
+Refraction over pupil and accommodation is interpolated: over accommodation by a
+polynomial through traced states of the lens; over the pupil by a polynomial in its
+square, in which a wavefront's spherical terms are a short series.
 """
 
 import math
-from dataclasses import dataclass
-from typing import Protocol
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import BarycentricInterpolator
 
 from estimator.corrections.worn_lens import worn_refraction
-from estimator.eye.assembly import eye_surfaces
-from estimator.eye.focus_table import FocusTable, table_pupils_mm
-from estimator.eye.focusing import FocusedSurfaces, TabulatedFocusing
-from estimator.eye.lens_change import (
+from estimator.eye.assembly import (
     AQUEOUS,
     DIAMETER,
     accommodated,
     accommodated_vectors,
+    eye_surfaces,
     smallest_diameter_mm,
+)
+from estimator.eye.focusing import (
+    FocusedSurfaces,
+    Focusing,
+    FocusTable,
+    table_pupils_mm,
 )
 from estimator.eye.parameters import EyeParameters, RetinaShape
 from estimator.eye.tracing import (
@@ -49,25 +59,6 @@ REFRACTION_TOLERANCE_DPT = 1e-6
 MAX_REFINEMENTS = 6
 
 
-@dataclass(frozen=True)
-class FocusedEye(FocusedSurfaces):
-    """An eye of 45 parameters at one focus."""
-
-    parameters: EyeParameters
-    lens_diameter_change_mm: float
-    aqueous_thickness_change_mm: float
-
-
-class ResidualPhase(Protocol):
-    """Phase added to that of the traced eye, see `estimate.measured_residual`."""
-
-    def on_axis_um(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
-        """Return monomials (n, n_terms) at 555 nm in the plane of pupils (n,)."""
-
-    def on_axis_dpt(self, pupil_diameter_mm: float) -> float:
-        """Return their least-squares M in a pupil."""
-
-
 def falling_count(refractions_dpt: NDArray[np.float64]) -> int:
     """Return how many leading refractions are finite and decreasing."""
     usable = np.isfinite(refractions_dpt)
@@ -88,11 +79,19 @@ def polynomial_through(
     return BarycentricInterpolator(x, y, rng=np.random.default_rng(0))
 
 
-class AccommodatingEye(TabulatedFocusing[FocusedEye]):
-    """An eye of 45 parameters that can focus, at any pupil.
+State = TypeVar("State", bound=FocusedSurfaces)
+
+
+class TabulatedFocusing(Focusing, Generic[State]):
+    """A `Focusing` eye that is traced, with a table of its refraction.
+
+    *Accommodation* identifies a state of the lens by the change of refraction at
+    ``pupil_diameter_mm``.  Through another pupil the change differs.
 
     Attributes
     ----------
+    pupil_diameter_mm : float
+        The eye's own pupil, at which accommodation is measured.
     refraction_dpt : float
         M of the relaxed eye at the cornea, 555 nm and ``pupil_diameter_mm``, through
         the correction.
@@ -100,11 +99,227 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
         M without the correction.
     entrance_pupil_mm : float
         Depth of the relaxed eye's entrance pupil behind the corneal apex.
+    amplitude_dpt : float
+        The smaller of the accommodation of the last state of the lens and the given
+        amplitude (by age), at that pupil.
+    """
+
+    pupil_diameter_mm: float
+    entrance_pupil_mm: float
+    bare_refraction_dpt: float
+
+    _table: FocusTable | None = None
+
+    def _tabulate(
+        self,
+        nodes: NDArray[np.float64],
+        *,
+        correction: rx.Prescription | None,
+        amplitude_dpt: float,
+        rest_dpt: float = 0.0,
+    ) -> None:
+        """Trace the refraction at states of the lens, from the relaxed one on.
+
+        The table ends where the refraction no longer falls.
+
+        Parameters
+        ----------
+        nodes : (n,)
+            Numbers that place the states.
+        rest_dpt : float
+            M of the residual through the eye's own pupil.
+
+        Raises
+        ------
+        TraceFailed
+            Light does not pass the relaxed eye.
+        """
+        refractions_dpt = self._refractions_dpt(nodes)
+        if not np.isfinite(refractions_dpt[0]):
+            raise TraceFailed(
+                f"light does not pass the relaxed eye at {self.pupil_diameter_mm:g} mm"
+                + self._obstruction(self.pupil_diameter_mm)
+            )
+        count = falling_count(refractions_dpt)
+        self._nodes, self._bare_dpt = nodes[:count], float(refractions_dpt[0])
+        self._accommodations_dpt = self._bare_dpt - refractions_dpt[:count]
+        self._age_amplitude_dpt = amplitude_dpt
+        self.amplitude_dpt = min(amplitude_dpt, float(self._accommodations_dpt[-1]))
+        self.vergence = ObjectVergence.seen_through(
+            correction, entrance_pupil_mm=self.entrance_pupil_mm
+        )
+        self._correction_dpt = worn_refraction(
+            correction, entrance_pupil_mm=self.entrance_pupil_mm
+        )
+        self.bare_refraction_dpt = refraction_at_cornea_dpt(
+            self._bare_dpt + rest_dpt, entrance_pupil_mm=self.entrance_pupil_mm
+        )
+        at_cornea_dpt = 0.0
+        if correction is not None:
+            at_cornea_dpt, *_ = rx.power_vector(correction)
+        self.refraction_dpt = self.bare_refraction_dpt - at_cornea_dpt
+
+    @abstractmethod
+    def _refractions_dpt(self, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Trace M (n,) at the eye's own pupil, in states of the lens (n,)."""
+
+    def _obstruction(self, pupil_diameter_mm: float) -> str:
+        """Return the reason why light does not pass, in parentheses, if it is known."""
+        return ""
+
+    def _nodes_at(self, accommodations_dpt: ArrayLike) -> NDArray[np.float64]:
+        """Return states of the lens (P,) at accommodations (P,) within the amplitude.
+
+        One polynomial inverts the table; secant steps, all in batches, then refine the
+        result until the traced refraction is met to `REFRACTION_TOLERANCE_DPT`.
+        """
+        wanted_dpt = np.atleast_1d(np.asarray(accommodations_dpt, dtype=np.float64))
+        known_dpt, nodes = self._accommodations_dpt, self._nodes
+        if nodes.size == 1:
+            return np.full(wanted_dpt.shape, nodes[0])
+        low, high = sorted(nodes[[0, -1]].tolist())
+        # The table is smooth and short: linear interpolation would be 1e-2 dpt off,
+        # and every further step costs a trace for each focus.
+        found = np.clip(polynomial_through(known_dpt, nodes)(wanted_dpt), low, high)
+        slope = np.interp(wanted_dpt, known_dpt, np.gradient(nodes, known_dpt))
+        for _ in range(MAX_REFINEMENTS):
+            error_dpt = wanted_dpt - (self._bare_dpt - self._refractions_dpt(found))
+            if np.max(np.abs(error_dpt)) < REFRACTION_TOLERANCE_DPT:
+                break
+            found = np.clip(found + slope * error_dpt, low, high)
+        return found
+
+    @abstractmethod
+    def _new_focus_table(self) -> FocusTable:
+        """Trace the refraction without correction over pupil and accommodation."""
+
+    @abstractmethod
+    def states_at(self, accommodations_dpt: ArrayLike) -> Sequence[State]:
+        """Return states (P,) at accommodations within the amplitude.
+
+        Their ``focus_dpt`` is that of the eye's own pupil.
+        """
+
+    @property
+    def _focus_table(self) -> FocusTable:
+        """Refraction without correction over pupil and accommodation, traced lazily.
+
+        It is not a cached property, so that storing an eye stores the table too.
+        """
+        if self._table is None:
+            self._table = self._new_focus_table()
+        return self._table
+
+    def accommodation_dpt(
+        self, focus_dpt: float, *, pupil_diameter_mm: float | None = None
+    ) -> float:
+        """Return the accommodation for a focus, by default at the eye's own pupil."""
+        pupil_mm = pupil_diameter_mm or self.pupil_diameter_mm
+        return super().accommodation_dpt(focus_dpt, pupil_diameter_mm=pupil_mm)
+
+    def refraction_at_dpt(
+        self, *, pupil_diameter_mm: float, accommodation_dpt: float
+    ) -> float:
+        """Return least-squares M at 555 nm through a pupil, at an accommodation."""
+        bare_dpt = self._focus_table.refraction_dpt(
+            pupil_mm=pupil_diameter_mm, accommodation_dpt=accommodation_dpt
+        )
+        return bare_dpt - self._taken_off_dpt(pupil_diameter_mm)
+
+    def _taken_off_dpt(self, pupil_diameter_mm: float) -> float:
+        """Return M of the correction through a pupil."""
+        at_center_dpt, per_mm2 = self._correction_dpt
+        return at_center_dpt + per_mm2 * (pupil_diameter_mm / 2.0) ** 2
+
+    def accommodation_for_dpt(
+        self, refraction_dpt: float, *, pupil_diameter_mm: float
+    ) -> float:
+        """Return the accommodation in reach whose M at a pupil is nearest to this."""
+        relaxed_dpt = self.refraction_at_dpt(
+            pupil_diameter_mm=pupil_diameter_mm, accommodation_dpt=0.0
+        )
+        least_dpt = relaxed_dpt - self._age_amplitude_dpt
+        return self._focus_table.accommodation_dpt(
+            pupil_mm=pupil_diameter_mm,
+            refraction_dpt=max(refraction_dpt, least_dpt)
+            + self._taken_off_dpt(pupil_diameter_mm),
+        )
+
+    def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
+        """Return the accommodation for the near point through a pupil."""
+        return self.accommodation_for_dpt(
+            -math.inf, pupil_diameter_mm=pupil_diameter_mm
+        )
+
+    def focused(
+        self, focus_dpt: float, *, pupil_diameter_mm: float | None = None
+    ) -> State:
+        """Return the eye focused as near to ``focus_dpt`` as possible."""
+        return self.focused_at([focus_dpt], pupil_diameter_mm=pupil_diameter_mm)[0]
+
+    def focused_at(
+        self, focuses_dpt: ArrayLike, *, pupil_diameter_mm: float | None = None
+    ) -> list[State]:
+        """Focus at many distances in one batch of traces.
+
+        Parameters
+        ----------
+        pupil_diameter_mm : float, optional
+            Pupil through which they are sharpest; the eye's own if None.
+
+        Raises
+        ------
+        ValueError
+            A distance is not finite.
+        """
+        focuses_dpt = np.atleast_1d(np.asarray(focuses_dpt, dtype=np.float64))
+        if not np.all(np.isfinite(focuses_dpt)):
+            raise ValueError(f"focus {focuses_dpt} dpt: must be finite; infinity is 0")
+        pupil_mm = pupil_diameter_mm or self.pupil_diameter_mm
+        accommodations_dpt = [
+            self.accommodation_dpt(f, pupil_diameter_mm=pupil_mm)
+            for f in focuses_dpt.tolist()
+        ]
+        return [
+            replace(
+                state,
+                focus_dpt=self.sharpest_dpt(
+                    state.accommodation_dpt, pupil_diameter_mm=pupil_mm
+                ),
+                notes=self.focus_notes(focus_dpt, pupil_diameter_mm=pupil_mm),
+            )
+            for focus_dpt, state in zip(
+                focuses_dpt.tolist(), self.states_at(accommodations_dpt), strict=True
+            )
+        ]
+
+
+@dataclass(frozen=True)
+class FocusedEye(FocusedSurfaces):
+    """An eye of 45 parameters at one focus."""
+
+    parameters: EyeParameters
+    lens_diameter_change_mm: float
+    aqueous_thickness_change_mm: float
+
+
+class ResidualPhase(Protocol):
+    """Phase added to that of the traced eye, see `estimate.measured_residual`."""
+
+    def on_axis_um(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
+        """Return monomials (n, n_terms) at 555 nm in the plane of pupils (n,)."""
+
+    def on_axis_dpt(self, pupil_diameter_mm: float) -> float:
+        """Return their least-squares M in a pupil."""
+
+
+class AccommodatingEye(TabulatedFocusing[FocusedEye]):
+    """An eye of 45 parameters that can focus, at any pupil.
+
+    Attributes
+    ----------
     lens_range_dpt : float
         Largest accommodation of the lens model.
-    amplitude_dpt : float
-        The smaller of ``lens_range_dpt`` and the given amplitude (by age), at that
-        pupil.
 
     Parameters
     ----------
@@ -130,29 +345,17 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
             eye_surfaces(parameters, retina=retina),
             wavelength_nm=REFERENCE_WAVELENGTH_NM,
         )
-        self.vergence = ObjectVergence.seen_through(
-            correction, entrance_pupil_mm=self.entrance_pupil_mm
-        )
-        diameters_mm, refractions_dpt = self._refraction_table()
-        self._bare_dpt = float(refractions_dpt[0])
         self._rest = rest
         self._last_taken_off = (0.0, 0.0)
-        at_cornea_dpt = 0.0
-        if correction is not None:
-            at_cornea_dpt, *_ = rx.power_vector(correction)
-        self._correction_dpt = worn_refraction(
-            correction, entrance_pupil_mm=self.entrance_pupil_mm
+        relaxed_mm = self._vector[DIAMETER]
+        smallest_mm = smallest_diameter_mm(self._vector)
+        self._tabulate(
+            np.linspace(relaxed_mm, smallest_mm, N_TABLE),
+            correction=correction,
+            amplitude_dpt=amplitude_dpt,
+            rest_dpt=float(self._rest_dpt(pupil_diameter_mm)[0]),
         )
-        self.bare_refraction_dpt = refraction_at_cornea_dpt(
-            self._bare_dpt + float(self._rest_dpt(pupil_diameter_mm)[0]),
-            entrance_pupil_mm=self.entrance_pupil_mm,
-        )
-        self.refraction_dpt = self.bare_refraction_dpt - at_cornea_dpt
-        self._diameters_mm = diameters_mm
-        self._accommodations_dpt = self._bare_dpt - refractions_dpt
         self.lens_range_dpt = float(self._accommodations_dpt[-1])
-        self._age_amplitude_dpt = amplitude_dpt
-        self.amplitude_dpt = min(amplitude_dpt, self.lens_range_dpt)
 
     def _rest_dpt(self, pupil_diameter_mm: ArrayLike) -> NDArray[np.float64]:
         """Return M (n,) of the residual on round pupils (n,)."""
@@ -183,12 +386,8 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
         pupil.  The table holds only its difference between the pupil and a round one.
         """
         pupils_mm = np.array(table_pupils_mm(self.pupil_diameter_mm))
-        some = np.unique(
-            np.linspace(0, self._diameters_mm.size - 1, N_FOCUS).astype(int)
-        )
-        states = accommodated_vectors(
-            self._vector, lens_diameter_mm=self._diameters_mm[some]
-        )
+        some = np.unique(np.linspace(0, self._nodes.size - 1, N_FOCUS).astype(int))
+        states = accommodated_vectors(self._vector, lens_diameter_mm=self._nodes[some])
         rest_um = np.zeros((pupils_mm.size, N_TERMS))
         if self._rest is not None:
             rest_um = self._rest.on_axis_um(pupils_mm)
@@ -210,7 +409,7 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
         it.
         """
         refractions_dpt = refraction_of_vectors(
-            accommodated_vectors(self._vector, lens_diameter_mm=self._diameters_mm),
+            accommodated_vectors(self._vector, lens_diameter_mm=self._nodes),
             retina=self.retina,
             pupil_diameter_mm=self.pupil_diameter_mm,
         )
@@ -230,10 +429,9 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
         """
         used_dpt = np.atleast_1d(np.asarray(accommodations_dpt, dtype=np.float64))
         known_dpt, refractions_dpt = self._cornea_table()
-        found_dpt: NDArray[np.float64] = polynomial_through(known_dpt, refractions_dpt)(
+        return polynomial_through(known_dpt, refractions_dpt)(
             np.minimum(used_dpt, known_dpt[-1])
         )
-        return found_dpt
 
     def accommodations_at_cornea_dpt(
         self, refractions_dpt: NDArray[np.float64]
@@ -244,26 +442,11 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
             return np.zeros(np.shape(refractions_dpt))
         wanted_dpt = np.clip(refractions_dpt, at_cornea_dpt[-1], at_cornea_dpt[0])
         used_dpt = polynomial_through(at_cornea_dpt, known_dpt)(wanted_dpt)
-        within_dpt: NDArray[np.float64] = np.clip(used_dpt, 0.0, self.amplitude_dpt)
-        return within_dpt
+        return np.clip(used_dpt, 0.0, self.amplitude_dpt)
 
-    def _refraction_table(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return falling lens diameters and refractions, as far as those fall."""
-        relaxed_mm = self._vector[DIAMETER]
-        smallest_mm = smallest_diameter_mm(self._vector)
-        diameters_mm = np.linspace(relaxed_mm, smallest_mm, N_TABLE)
-        vectors = accommodated_vectors(self._vector, lens_diameter_mm=diameters_mm)
-        refractions_dpt = self._refractions_dpt(vectors)
-        if not np.isfinite(refractions_dpt[0]):
-            raise TraceFailed(
-                f"light does not pass the relaxed eye at {self.pupil_diameter_mm:g} mm"
-            )
-        count = falling_count(refractions_dpt)
-        return diameters_mm[:count], refractions_dpt[:count]
-
-    def _refractions_dpt(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _refractions_dpt(self, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
         return refraction_of_vectors(
-            vectors,
+            accommodated_vectors(self._vector, lens_diameter_mm=nodes),
             retina=self.retina,
             pupil_diameter_mm=self.pupil_diameter_mm,
             wavelength_nm=REFERENCE_WAVELENGTH_NM,
@@ -271,32 +454,8 @@ class AccommodatingEye(TabulatedFocusing[FocusedEye]):
         )
 
     def lens_diameters_mm(self, accommodations_dpt: ArrayLike) -> NDArray[np.float64]:
-        """Return lens diameters (P,) for accommodations (P,) within the amplitude.
-
-        One polynomial inverts the table; secant steps, all in batches, then refine the
-        result until the traced refraction is met to `REFRACTION_TOLERANCE_DPT`.
-        """
-        wanted_dpt = np.atleast_1d(np.asarray(accommodations_dpt, dtype=np.float64))
-        known_dpt, known_mm = self._accommodations_dpt, self._diameters_mm
-        if known_mm.size == 1:
-            return np.full(wanted_dpt.shape, known_mm[0])
-        # The table is smooth and short: linear interpolation would be 1e-2 dpt off,
-        # and every further step costs a trace for each focus.
-        curve = polynomial_through(known_dpt, known_mm)
-        diameters_mm: NDArray[np.float64] = np.clip(
-            curve(wanted_dpt), known_mm[-1], known_mm[0]
-        )
-        slopes = np.gradient(known_mm, known_dpt)
-        slope_mm_dpt = np.interp(wanted_dpt, known_dpt, slopes)
-        for _ in range(MAX_REFINEMENTS):
-            vectors = accommodated_vectors(self._vector, lens_diameter_mm=diameters_mm)
-            reached_dpt = self._bare_dpt - self._refractions_dpt(vectors)
-            error_dpt = wanted_dpt - reached_dpt
-            if np.max(np.abs(error_dpt)) < REFRACTION_TOLERANCE_DPT:
-                break
-            step_mm = slope_mm_dpt * error_dpt
-            diameters_mm = np.clip(diameters_mm + step_mm, known_mm[-1], known_mm[0])
-        return diameters_mm
+        """Return lens diameters (P,) for accommodations (P,) within the amplitude."""
+        return self._nodes_at(accommodations_dpt)
 
     def changes_mm(self, accommodations_dpt: ArrayLike) -> NDArray[np.float64]:
         """Return changes (P, 2) of lens diameter and aqueous thickness."""

@@ -163,8 +163,7 @@ def _numbers(
         return [first] * len(weights)
     if not np.isfinite(values).all():
         raise StatesDiffer(f"{name}: is given in some states only")
-    blended: list[float] = (weights @ np.array(values)).tolist()
-    return blended
+    return (weights @ np.array(values)).tolist()
 
 
 def _check_equal(values: Sequence[Any], name: str) -> None:

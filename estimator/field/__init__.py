@@ -2,20 +2,16 @@
 
 eye_optics              interface between the PSF cache and an eye
 aberration_grid         wavefronts traced at the nodes of a grid
-few_colors              grid with one wavelength at all nodes, the others at fewer
 interpolation           interpolation between the nodes
-peripheral_residual     difference between the population's periphery and the model's
-accommodated_periphery  refraction off the axis at every accommodation
+peripheral_residual     difference between the population's periphery and the model's,
+                        at every accommodation
 trace_range             traced part of the field
 traced_fields           wavefronts at fixed fields, as pupil and accommodation change
-fixed_defocus           total defocus at fixed fields
 traced_eye              an estimated eye, ray-traced over the field
-prepare                 entry point: from a profile to such an eye
+prepare                 entry point: from a profile to such an eye, with notes
 network_eye             the same by network: the eye of the published pipeline
-field_table             wavefronts in many directions, at the cornea
-drawn_fields            these of drawn persons
+field_table             wavefronts in many directions, at the cornea; of drawn persons
 plot                    maps of a field table
-notes                   notes on how an eye was computed
 
 A *field* is a direction in the visual field, azimuth h and elevation v.  A *grid* has
 axes of h, v, pupil, accommodation and wavelength.  The *state* of an eye is its pupil

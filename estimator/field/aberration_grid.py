@@ -11,7 +11,7 @@ from estimator.estimate.given_surfaces import EyeModel
 from estimator.eye.focusing import FocusedSurfaces
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.aberrations import wavefront_grids
-from estimator.wavefront.chief_rays import chief_shifts_mrad
+from estimator.wavefront.compiled import chief_shifts_mrad
 from estimator.wavefront.nodes import N_AZIMUTHS, N_RINGS
 
 FIELD_RINGS, FIELD_AZIMUTHS = 5, 14
@@ -37,7 +37,7 @@ class AberrationGrid:
     ellipse_mm : with 5 as the last axis
         See `wavefront.FieldResults`.
     chief_shift_mrad : (n_h, n_v, n_accommodations, n_wavelengths, 2)
-        Lateral color, see `chief_rays`.
+        Lateral color, see `chief_shift_mrad`.
     """
 
     h_deg: NDArray[np.float64]

@@ -1,5 +1,6 @@
 """Wavefronts of an eye in many directions, at the cornea as instruments report them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -11,6 +12,7 @@ from estimator.field.traced_eye import TracedEye
 from estimator.note import Note
 from estimator.optics import prescription as rx
 from estimator.profiles.parse import EyeProfile
+from estimator.profiles.typical_aberrations import drawn_profiles
 from estimator.wavefront.field_wavefronts import (
     FieldWavefronts,
     polynomial_in_mm,
@@ -63,16 +65,12 @@ class FieldTable:
     @property
     def coma_um(self) -> NDArray[np.float64]:
         """Return the magnitude (n,) of C(3,-1) and C(3,1)."""
-        coma_um: NDArray[np.float64] = np.hypot(*self.zernike_um[:, COMA].T)
-        return coma_um
+        return np.hypot(*self.zernike_um[:, COMA].T)
 
     @property
     def higher_order_rms_um(self) -> NDArray[np.float64]:
         """Return the root mean square (n,) of orders 3 to 6."""
-        rms_um: NDArray[np.float64] = np.linalg.norm(
-            self.zernike_um[:, FIRST_HIGHER:], axis=1
-        )
-        return rms_um
+        return np.linalg.norm(self.zernike_um[:, FIRST_HIGHER:], axis=1)
 
 
 def field_table(
@@ -170,3 +168,92 @@ def _edge_notes(
         direction_count=count,
     )
     return (note,)
+
+
+PERCENTILES = (5, 50, 95)
+
+
+@dataclass(frozen=True)
+class DrawnFields:
+    """Quantities of a `FieldTable` of each of N persons, in the same n directions.
+
+    Attributes
+    ----------
+    power_dpt : (N, n, 3)
+        M, J0 and J45.
+    coma_um, higher_order_rms_um : (N, n)
+    zernike_radius_mm : (N, n)
+    """
+
+    power_dpt: NDArray[np.float64]
+    coma_um: NDArray[np.float64]
+    higher_order_rms_um: NDArray[np.float64]
+    zernike_radius_mm: NDArray[np.float64]
+
+    def percentiles(self) -> list[dict[str, dict[str, float]]]:
+        """Return the percentiles of each quantity in each direction, for JSON."""
+        quantities = {
+            "M_dpt": self.power_dpt[..., 0],
+            "J0_dpt": self.power_dpt[..., 1],
+            "J45_dpt": self.power_dpt[..., 2],
+            "coma_um": self.coma_um,
+            "higher_order_rms_um": self.higher_order_rms_um,
+        }
+        found = {name: percentiles_of(values) for name, values in quantities.items()}
+        return [
+            {name: numbers[k] for name, numbers in found.items()}
+            for k in range(self.coma_um.shape[1])
+        ]
+
+
+def percentiles_of(values: NDArray[np.float64]) -> list[dict[str, float]]:
+    """Return `PERCENTILES` of each of n values (N, n) of N persons, by name."""
+    names = [str(percentile) for percentile in PERCENTILES]
+    return [
+        dict(zip(names, numbers, strict=True))
+        for numbers in np.percentile(values, PERCENTILES, axis=0).T.tolist()
+    ]
+
+
+def drawn_fields(
+    profile: EyeProfile,
+    count: int,
+    *,
+    progress: Callable[[], None] | None = None,
+    **states: Any,
+) -> DrawnFields:
+    """Return the fields of persons drawn from the population.
+
+    A person takes 0.05 to 0.1 s on two cores.
+
+    Parameters
+    ----------
+    profile : EyeProfile
+    count : int
+        Number of persons; see `drawn_profiles`.
+    progress : callable, optional
+        Called after each person.
+    **states
+        Directions, pupil, wavelength and focus; see `field_table`.
+
+    Raises
+    ------
+    ValueError
+        Persons with this profile do not differ, or the eye of one cannot be traced.
+    """
+    tables = []
+    for person in drawn_profiles(profile, count):
+        tables.append(_without_coefficients(field_table(person, **states)))
+        if progress is not None:
+            progress()
+    return DrawnFields(*map(np.stack, zip(*tables, strict=True)))
+
+
+def _without_coefficients(table: FieldTable) -> tuple[NDArray[np.float64], ...]:
+    """Return the attributes of `DrawnFields`, a fifth of the memory of a table."""
+    return (
+        table.power_dpt,
+        table.coma_um,
+        table.higher_order_rms_um,
+        table.zernike_radius_mm,
+    )

@@ -160,10 +160,7 @@ def pupil_weights(
         def rises(ratios: NDArray[Any]) -> NDArray[np.float64]:
             """Return powers (n, 2, m) of ratios (n,), minus those of the first."""
             powers = np.stack([power, power + 2.0])
-            found: NDArray[np.float64] = (
-                ratios[:, None, None] ** powers - ratio[0] ** powers
-            )
-            return found
+            return ratios[:, None, None] ** powers - ratio[0] ** powers
 
         known = np.moveaxis(rises(ratio[1:]), 2, 0)
         found = np.moveaxis(rises(pupil_mm / nodes_mm[-1]), 2, 0)
@@ -298,13 +295,12 @@ class FieldInterpolation:
         """Return the unvignetted pupils (n,) at fields, or None if all are open."""
         if self.all_open:
             return None
-        open_mm: NDArray[np.float64] = np.einsum(
+        return np.einsum(
             "nh,nv,hv->n",
             _linear(self.grid.h_deg, h_deg),
             _linear(self.grid.v_deg, v_deg),
             self.open_pupil_mm,
         )
-        return open_mm
 
     def at(
         self,
@@ -404,7 +400,7 @@ class FieldInterpolation:
         accommodation_dpt: NDArray[np.float64],
         wavelength_nm: NDArray[np.float64],
     ) -> NDArray[np.float64]:
-        """Return the lateral color (n, 2) of states (n,), mrad, see `chief_rays`."""
+        """Return lateral color (n, 2) of states (n,), mrad; see `chief_shift_mrad`."""
         over_h = lagrange_weights(stretched(self.grid.h_deg), stretched(h_deg))
         over_v = lagrange_weights(stretched(self.grid.v_deg), stretched(v_deg))
         weights = lagrange_weights(self.grid.accommodations_dpt, accommodation_dpt)

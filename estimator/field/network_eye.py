@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.estimate.estimation import EstimatedEye, estimate_eye
 from estimator.eye.accommodation import FocusedEye
-from estimator.eye.lens_change import accommodated_vectors
+from estimator.eye.assembly import accommodated_vectors
 from estimator.eye.tracing import OPEN_RATIO
 from estimator.field.aberration_grid import (
     FIELD_AZIMUTHS,
@@ -33,8 +33,9 @@ from estimator.field.interpolation import (
 )
 from estimator.field.trace_range import FieldRange, check_field_range
 from estimator.field.traced_eye import TracedEye
-from estimator.networks.card import INPUTS, NetworkUnfit
 from estimator.networks.inference import (
+    INPUTS,
+    NetworkUnfit,
     load_network,
     network_aberrations,
     network_focus,
@@ -122,10 +123,7 @@ def network_eye(
     check_field_range(field_range_deg)
     _check_profile(profile)
 
-    def report(fraction: float, stage: str) -> None:
-        if progress is not None:
-            progress(fraction, stage)
-
+    report = progress or (lambda fraction, stage: None)
     report(0.0, "eye")
     found = estimate_eye(profile, method="network")
     if found.network_reason:
@@ -204,7 +202,7 @@ def network_focused(
     """Return the eye at accommodations (n,) within its amplitude, by focus network.
 
     The relaxed eye is known.  Of the network's two outputs, only the lens diameter is
-    used; the chamber depth follows from it by the rule of `lens_change`.
+    used; the chamber depth follows from it by the rule of `accommodated_eyes`.
 
     Raises
     ------

@@ -10,8 +10,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from estimator.field.drawn_fields import DrawnFields
-    from estimator.field.field_table import FieldTable
+    from estimator.field.field_table import DrawnFields, FieldTable
 
 ARCMIN_PER_MRAD = 3.4377
 
@@ -64,10 +63,7 @@ def blur_arcmin(table: "FieldTable | DrawnFields") -> NDArray[np.float64]:
     """Return the RMS blur (..., n) of the second order, in minutes of arc."""
     # Light at r mm is deflected by r times the power, in mrad; mean r² is R² / 2.
     power_dpt = np.linalg.norm(table.power_dpt, axis=-1)
-    blur: NDArray[np.float64] = (
-        ARCMIN_PER_MRAD * power_dpt * table.zernike_radius_mm / np.sqrt(2.0)
-    )
-    return blur
+    return ARCMIN_PER_MRAD * power_dpt * table.zernike_radius_mm / np.sqrt(2.0)
 
 
 def _maps(table: "FieldTable | DrawnFields") -> dict[str, NDArray[np.float64]]:

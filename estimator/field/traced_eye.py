@@ -20,14 +20,12 @@ from estimator.corrections.worn_lens import rings_of, worn_polynomial
 from estimator.estimate.given_surfaces import EyeModel
 from estimator.eye.focusing import FocusingEye
 from estimator.field.aberration_grid import AberrationGrid, aberration_grid
-from estimator.field.accommodated_periphery import held_refraction_um
-from estimator.field.fixed_defocus import FixedDefocus
 from estimator.field.interpolation import (
     FieldInterpolation,
     FieldNodes,
     accommodation_nodes_dpt,
 )
-from estimator.field.peripheral_residual import PeripheralResidual
+from estimator.field.peripheral_residual import PeripheralResidual, held_refraction_um
 from estimator.field.trace_range import (
     ON_AXIS_DEG,
     FieldRange,
@@ -39,7 +37,7 @@ from estimator.field.trace_range import (
     trace_field,
     traced_terms,
 )
-from estimator.field.traced_fields import TracedFields, check_limits
+from estimator.field.traced_fields import FixedDefocus, TracedFields, check_limits
 from estimator.note import Note
 from estimator.wavefront.field_wavefronts import (
     FieldWavefronts,
@@ -237,8 +235,7 @@ class TracedEye(FocusingEye):
             refraction_dpt, pupil_diameter_mm=pupil_diameter_mm
         )
         low_dpt, high_dpt = self.grid.accommodations_dpt[[0, -1]].tolist()
-        traced_dpt: float = min(max(accommodation_dpt, low_dpt), high_dpt)
-        return traced_dpt
+        return min(max(accommodation_dpt, low_dpt), high_dpt)
 
     def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
         """Return the accommodation for the near point through a pupil."""
@@ -410,7 +407,7 @@ class TracedEye(FocusingEye):
         """Return the lateral color relative to 555 nm, mrad, along the pupil axes.
 
         All arguments broadcast; the result has their shape and a last axis of 2.
-        Corrections are not included.  See `chief_rays`.
+        Corrections are not included.  See `chief_shift_mrad`.
         """
         states = np.broadcast_arrays(h_deg, v_deg, accommodation_dpt, wavelength_nm)
         columns = [np.asarray(state, dtype=np.float64).ravel() for state in states]

@@ -1,7 +1,6 @@
 """Scattering and absorption in the ocular media.
 
-straylight  wide-angle scattering, by age, pigmentation and cataract
-absorption  spectral absorption, by age
+straylight  wide-angle scattering by age, pigmentation and cataract; absorption by age
 """
 
 import lazy_loader

@@ -1,7 +1,6 @@
 """Inference with the trained networks; only `training` requires PyTorch.
 
-card       cards of the networks: columns, training ranges, expected error
-inference  loading and evaluation, by ONNX Runtime
+inference  cards of the networks, loading and evaluation, by ONNX Runtime
 weights/   cards and ONNX files, written by `python -m training.export`
 """
 

@@ -1,7 +1,7 @@
-from .card import Card as Card
-from .card import NetworkUnavailable as NetworkUnavailable
-from .card import OutOfDomain as OutOfDomain
+from .inference import Card as Card
 from .inference import Network as Network
+from .inference import NetworkUnavailable as NetworkUnavailable
+from .inference import OutOfDomain as OutOfDomain
 from .inference import load_network as load_network
 from .inference import network_aberrations as network_aberrations
 from .inference import network_eye as network_eye

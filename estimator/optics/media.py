@@ -90,8 +90,7 @@ class OcularHerzberger:
         squared = (bounded_nm(wavelength_nm, self.limits_nm) / NM_PER_UM) ** 2
         inverse = 1.0 / (squared - _POLE_UM2)
         terms = np.stack([np.ones_like(squared), squared, inverse, inverse**2], axis=-1)
-        found: NDArray[np.float64] = terms @ (_KNOT_WEIGHTS.T @ np.array(self.indices))
-        return found
+        return terms @ (_KNOT_WEIGHTS.T @ np.array(self.indices))
 
 
 @dataclass(frozen=True)
@@ -222,10 +221,7 @@ class AbbeNumber:
         """Return the index (...) at wavelengths (...)."""
         inverse = bounded_nm(wavelength_nm, self.limits_nm) ** -2.0
         share = (inverse - D_LINE_NM**-2.0) / (F_LINE_NM**-2.0 - C_LINE_NM**-2.0)
-        found: NDArray[np.float64] = (
-            self.d_line_index + (self.d_line_index - 1.0) / self.abbe_number * share
-        )
-        return found
+        return self.d_line_index + (self.d_line_index - 1.0) / self.abbe_number * share
 
 
 @dataclass(frozen=True)
@@ -259,10 +255,9 @@ class IndexTable:
         """Return the index (...) at wavelengths (...)."""
         limits_nm = (self.wavelengths_nm[0], self.wavelengths_nm[-1])
         wavelength_nm = bounded_nm(wavelength_nm, limits_nm)
-        found: NDArray[np.float64] = np.interp(
+        return np.interp(
             -(wavelength_nm**-2.0), -(np.array(self.wavelengths_nm) ** -2), self.indices
         )
-        return found
 
 
 class Dispersion(Protocol):

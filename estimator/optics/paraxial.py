@@ -209,8 +209,7 @@ def entrance_pupils_mm(
         z_mm = vertex_mm[:, i]
         power = (indices[i + 1] - indices[i]) * curvature[:, i]
         slope = (indices[i + 1] * slope + power * height) / indices[i]
-    pupil_mm: NDArray[np.float64] = z_mm - height / slope
-    return pupil_mm
+    return z_mm - height / slope
 
 
 def cardinal_points(eye: EyeSurfaces, *, wavelength_nm: float) -> CardinalPoints:

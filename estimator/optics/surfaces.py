@@ -32,7 +32,7 @@ from estimator.optics.zernike import (
     EXPONENTS,
     N_TERMS,
     monomial_matrix,
-    nm_from_index,
+    norms,
 )
 
 # --- geometry: one row per refracting surface, the retina last ---------------------
@@ -188,12 +188,7 @@ def horner_order() -> NDArray[np.int64]:
 
 @cache
 def _unnormalized_monomials() -> NDArray[np.float64]:
-    norms = [
-        math.sqrt((2 - (m == 0)) * (n + 1))
-        for n, m in (nm_from_index(j) for j in range(N_TERMS))
-    ]
-    matrix: NDArray[np.float64] = monomial_matrix() / np.array(norms)[:, None]
-    return matrix
+    return monomial_matrix() / norms()[:, None]
 
 
 def offset_monomials(

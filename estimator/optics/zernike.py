@@ -159,6 +159,15 @@ def _radial_coefficients(n: int, m: int) -> list[tuple[int, float]]:
 
 
 @cache
+def norms(n_terms: int = N_TERMS) -> NDArray[np.float64]:
+    """Return the factors (n_terms,) of polynomials that make their RMS 1."""
+    terms = map(nm_from_index, range(n_terms))
+    found = np.array([math.sqrt((2 - (m == 0)) * (n + 1)) for n, m in terms])
+    found.setflags(write=False)
+    return found
+
+
+@cache
 def monomial_matrix(n_terms: int = N_TERMS) -> NDArray[np.float64]:
     """Return the coefficients of every Zernike polynomial in the monomial basis.
 
@@ -173,7 +182,7 @@ def monomial_matrix(n_terms: int = N_TERMS) -> NDArray[np.float64]:
     matrix = np.zeros((n_terms, n_terms))
     for j in range(n_terms):
         n, m = nm_from_index(j)
-        norm = math.sqrt((2 - (m == 0)) * (n + 1))
+        norm = norms(n_terms)[j]
         harmonic = _solid_harmonic(abs(m))[0 if m >= 0 else 1]
         for power, radial in _radial_coefficients(n, abs(m)):
             for i in range(power + 1):
@@ -224,10 +233,7 @@ def zernike_values(
     x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
     a, b = exponents(n_terms).T
     px, py = _powers(x, radial_order(n_terms)), _powers(y, radial_order(n_terms))
-    values: NDArray[np.float64] = (
-        np.moveaxis(px[a] * py[b], 0, -1) @ monomial_matrix(n_terms).T
-    )
-    return values
+    return np.moveaxis(px[a] * py[b], 0, -1) @ monomial_matrix(n_terms).T
 
 
 def zernike_gradient(

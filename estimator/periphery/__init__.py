@@ -1,9 +1,7 @@
 """Change of wavefronts from the axis to the periphery in measured eyes.
 
-meridian         extension from the horizontal meridian to the visual field
-measured_eyes    data of measured eyes, all as right eyes
-population       mean and covariance of these data
-change           change of one eye, conditioned on its axis and other measurements
+population  data of measured eyes, their mean and covariance, over the field
+change      change of one eye, conditioned on its axis and other measurements
 
 The *change* is the wavefront in a direction minus that on the axis: terms 3 to 14 on a
 circle of 4 mm about the chief ray, at the cornea.  It is stored at *knots*, azimuths of

@@ -3,7 +3,7 @@
 The normal distribution of measured eyes (`population`) is conditioned on the axis of
 this eye and on all other measured directions; the result is the most probable change,
 or one drawn from the conditional distribution.  Off the horizontal meridian,
-eyes deviate from the model of `meridian`; a Gaussian process that is zero on the
+eyes deviate from the model of `population`; a Gaussian process that is zero on the
 meridian represents the deviation.  It follows measurements, and draws.  Its deviations
 are those of the five eyes of Polans 2015, because the population was measured on the
 meridian alone.  Orders above the fourth, which the population does not contain, are
@@ -25,17 +25,18 @@ from estimator.optics.zernike import (
     nm_from_index,
     rescale_pupil,
 )
-from estimator.periphery.meridian import (
+from estimator.periphery.population import (
     CIRCLE_MM,
     TERMS,
+    Population,
     field_matrix,
     field_terms,
+    measured_population,
 )
-from estimator.periphery.population import Population, measured_population
 from estimator.profiles.parse import EyeProfile, Measurement
 
 NOISE_UM = 0.02
-"""Standard deviation of a measured coefficient on the circle of `meridian`: the
+"""Standard deviation of a measured coefficient on the circle of `population`: the
 repeatability of instruments, and the residual of the spline between knots."""
 
 PRESCRIPTION_TERMS = (3, 4, 5)
@@ -56,7 +57,7 @@ OFF_MERIDIAN_UM = dict(
         strict=True,
     )
 )
-"""RMS deviation of five eyes (Polans 2015) from the model of `meridian`, at 25 deg up
+"""RMS deviation of five eyes (Polans 2015) from the model of `population`, at 25 deg up
 and down and within 30 deg to the sides."""
 
 OFF_MERIDIAN_AT_DEG, CORRELATION_LENGTH_DEG = 25.0, 20.0
@@ -117,10 +118,7 @@ class OffMeridianDraw(NamedTuple):
         """Return the deviation (n, 12) in directions (n,)."""
         directions_deg = np.stack([h_deg, v_deg], axis=-1)
         cosines = np.cos(directions_deg @ self.frequencies.T + self.phases_rad)
-        found_um: NDArray[np.float64] = (
-            v_deg[:, None] / OFF_MERIDIAN_AT_DEG * (cosines @ self.amplitudes_um)
-        )
-        return found_um
+        return v_deg[:, None] / OFF_MERIDIAN_AT_DEG * (cosines @ self.amplitudes_um)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +132,7 @@ class PeripheralChange:
     eye_side : str
         OD or OS.
     axis_um : (12,)
-        Wavefront on the axis, on the circle of `meridian`.
+        Wavefront on the axis, on the circle of `population`.
     is_in_population : bool
         Whether it is that of the eye, and not clamped to the range of the population.
     knots_um : (96,)
@@ -231,8 +229,7 @@ def clamped_axis_um(
     distance = math.sqrt(float(away @ np.linalg.solve(spread, away)))
     if distance <= MAX_DISTANCE:
         return axis_um
-    clamped_um: NDArray[np.float64] = mean_um + MAX_DISTANCE / distance * away
-    return clamped_um
+    return mean_um + MAX_DISTANCE / distance * away
 
 
 def _axis_distribution(population: Population) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -260,7 +257,7 @@ def _axis(profile: EyeProfile) -> tuple[NDArray[np.float64], NDArray[np.float64]
 def _as_right_eye(
     measurement: Measurement, eye_side: str
 ) -> tuple[float, float, NDArray[np.float64], NDArray[np.float64]]:
-    """Return direction, terms (12,) and noise (12,) on the circle of `meridian`."""
+    """Return direction, terms (12,) and noise (12,) on the circle of `population`."""
     zernike_um, h_deg = measurement.zernike_um, measurement.h_deg
     if eye_side == "OS":
         zernike_um, h_deg = flip_horizontal(zernike_um), -h_deg
@@ -344,10 +341,7 @@ def _conditioned(
 def _sphere_deviation_dpt(variances_um2: NDArray[Any]) -> NDArray[np.float64]:
     """Return the standard deviation (8,) of M from variances (96,) at the knots."""
     sphere_um2 = variances_um2.reshape(len(TERMS), -1)[TERMS.index(4)]
-    deviation_dpt: NDArray[np.float64] = (
-        SPHERE_PER_C20 * np.sqrt(np.maximum(sphere_um2, 0.0)) / CIRCLE_MM**2
-    )
-    return deviation_dpt
+    return SPHERE_PER_C20 * np.sqrt(np.maximum(sphere_um2, 0.0)) / CIRCLE_MM**2
 
 
 def _off_meridian_variances() -> NDArray[np.float64]:
@@ -363,5 +357,4 @@ def _off_meridian_covariance(
     (h, v), (h0, v0) = at_deg, measured_deg
     square = (h[:, None] - h0) ** 2 + (v[:, None] - v0) ** 2
     near = np.exp(-0.5 * square / CORRELATION_LENGTH_DEG**2)
-    products: NDArray[np.float64] = near * v[:, None] * v0 / OFF_MERIDIAN_AT_DEG**2
-    return products
+    return near * v[:, None] * v0 / OFF_MERIDIAN_AT_DEG**2

@@ -6,19 +6,259 @@ prediction is shrunk by the fraction that chance explains (James and Stein), and
 the covariance of the residuals.  Penalties and shrinkage factors are those with the
 smallest cross-validation error that, at every angle, do not predict worse than the
 sphere alone.
+
+Extension of wavefronts from the horizontal meridian to the whole visual field.
+
+Eyes were measured along the horizontal meridian.  About the symmetry axis of a nearly
+rotationally symmetric eye (angle alpha), nodal aberration theory (Thompson, JOSA A 22,
+2005) gives the dependence on direction H = h + iv: defocus is proportional to |H|²,
+astigmatism to H² and coma to H.  A shift of the axis adds terms in H to the first two.
+Terms that are even along the meridian therefore rotate with one multiple of the
+azimuth, and odd terms with another.
+
+For five eyes measured over +-40 x 25 deg (Polans 2015), this is as accurate as the mean
+of the other four.  Separate vertical terms, fitted to those four, are no improvement.
+
+Wavefronts of measured eyes, all as right eyes in the project's frame.
+
+The data are those of Jaeken & Artal, IOVS 53(7), 2012, as distributed with ISETBio (MIT
+license): both eyes of 65 people along the horizontal meridian, 4 mm.  Angles in the
+file are positive in the temporal retina of a right eye, whose visual field is to the
+left: h = -angle.  Coefficients are in the project's frame, as the sign of coma shows.
+Left eyes are mirrored.
 """
 
+import io
 import json
+import zipfile
+import zlib
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
 
-from estimator.periphery.measured_eyes import MeasuredEyes, knots_um
-from estimator.periphery.meridian import KNOTS_DEG, TERMS
+from estimator.bounded_files import InvalidFile, read_bytes, reason_of
+from estimator.optics.zernike import N_TERMS, flip_horizontal
+
+SMOOTHING_RATIO = 0.15
+"""Standard deviation of the Gaussian weights, over the angle of a knot, of the fit of a
+parabola about it.  The change is small near the axis, and no window extends past it."""
+
+LEAST_POINTS = 2
+MAX_FILE_BYTES = 10_000_000
+"""Size limit of a file and of each of its arrays; that of 130 eyes has 0.4 MB."""
+
+_DAMAGED = (
+    *(ValueError, KeyError, TypeError, OSError, EOFError, OverflowError),
+    *(NotImplementedError, RuntimeError, MemoryError, SyntaxError, zlib.error),
+)
+"""What NumPy and zipfile raise for damaged files."""
+
+
+class MeasuredEyes(NamedTuple):
+    """Wavefronts of measured eyes along the horizontal meridian.
+
+    Attributes
+    ----------
+    person : (n,)
+        Index of the person.
+    h_deg : (n_directions,)
+        Azimuths, ascending.
+    zernike_um : (n, n_directions, 12)
+        Coefficients of `TERMS`; NaN where an eye was not measured.
+    """
+
+    person: NDArray[np.int64]
+    h_deg: NDArray[np.float64]
+    zernike_um: NDArray[np.float64]
+
+    @property
+    def axis_um(self) -> NDArray[np.float64]:
+        """Coefficients on the axis, (n, 12)."""
+        return self.zernike_um[:, np.flatnonzero(self.h_deg == 0.0)[0]]
+
+    @property
+    def change_um(self) -> NDArray[np.float64]:
+        """Coefficients minus those on the axis, (n, n_directions, 12)."""
+        return self.zernike_um - self.axis_um[:, None]
+
+    def select(self, is_selected: NDArray[np.bool_]) -> "MeasuredEyes":
+        """Return the eyes for which a mask (n,) is True."""
+        return MeasuredEyes(
+            self.person[is_selected], self.h_deg, self.zernike_um[is_selected]
+        )
+
+
+def load_measured_eyes(file: Path) -> MeasuredEyes:
+    """Read the eyes of Jaeken & Artal from ``peripheral_wavefronts.npz``.
+
+    Raises
+    ------
+    InvalidFile
+        The file is damaged, too large, or does not contain these arrays.
+    """
+    found = _arrays(file)
+    measured_um, angle_deg = (
+        found["jaeken_zernike_um"],
+        found["jaeken_eccentricity_deg"],
+    )
+    person = found["jaeken_subject"].astype(np.int64)
+    shape = (2, len(person), len(angle_deg))
+    if measured_um.shape[:3] != shape or not 15 <= measured_um.shape[3] <= N_TERMS:
+        problem = f"jaeken_zernike_um has the shape {measured_um.shape}"
+        raise InvalidFile(file, problem, f"{shape} and 15 to {N_TERMS} terms")
+    if not (np.all(np.diff(angle_deg) > 0.0) and np.all(angle_deg == -angle_deg[::-1])):
+        problem = "jaeken_eccentricity_deg is not ascending and symmetrical"
+        raise InvalidFile(file, problem, "angles from -h to h, 0 in the middle")
+    zernike_um = np.zeros((*measured_um.shape[:3], N_TERMS))
+    zernike_um[..., : measured_um.shape[3]] = measured_um
+    right, left = zernike_um
+    left = flip_horizontal(left)[:, ::-1]  # angles are symmetrical about 0
+    eyes_um = np.concatenate([right, left])[:, ::-1, list(TERMS)]
+    return MeasuredEyes(np.tile(person, 2), -angle_deg[::-1], eyes_um)
+
+
+_DIMENSIONS = {
+    "jaeken_zernike_um": 4,
+    "jaeken_eccentricity_deg": 1,
+    "jaeken_subject": 1,
+}
+
+
+def _arrays(file: Path) -> dict[str, NDArray[np.float64]]:
+    """Return the arrays of `_DIMENSIONS`; check sizes before unpacking."""
+    content = read_bytes(file, max_bytes=MAX_FILE_BYTES)
+    found = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as packed:
+            for name, n_dimensions in _DIMENSIONS.items():
+                entry = packed.getinfo(f"{name}.npy")
+                if entry.file_size > MAX_FILE_BYTES:
+                    problem = f"{name} has {entry.file_size:,} bytes"
+                    raise InvalidFile(file, problem, f"at most {MAX_FILE_BYTES:,}")
+                array = np.load(io.BytesIO(packed.read(entry)), allow_pickle=False)
+                if array.ndim != n_dimensions or array.dtype.kind not in "fiu":
+                    problem = f"{name} is {array.dtype} of shape {array.shape}"
+                    raise InvalidFile(file, problem, f"{n_dimensions} axes of numbers")
+                found[name] = array.astype(np.float64)
+    except InvalidFile:
+        raise
+    except (*_DAMAGED, zipfile.BadZipFile) as error:
+        problem = f"cannot be read ({reason_of(error)})"
+        raise InvalidFile(file, problem, "an .npz file of measured eyes") from None
+    return found
+
+
+def knots_um(eyes: MeasuredEyes) -> NDArray[np.float64]:
+    """Return smoothed changes (n, 12, 8) at the knots; NaN where not measured."""
+    change_um, h_deg = eyes.change_um, eyes.h_deg
+    found = np.full((len(change_um), len(TERMS), len(KNOTS_DEG)), np.nan)
+    for eye, rows_um in enumerate(change_um):
+        is_known = np.isfinite(rows_um).all(axis=1)
+        for knot, at_deg in enumerate(KNOTS_DEG):
+            away, width_deg = h_deg - at_deg, SMOOTHING_RATIO * abs(at_deg)
+            if (is_known & (np.abs(away) <= width_deg)).sum() < LEAST_POINTS:
+                continue
+            near = is_known & (np.abs(away) <= 2.5 * width_deg)
+            root = np.exp(-0.25 * np.square(away[near] / width_deg))[:, None]
+            parabola = np.stack([away[near] ** k for k in range(3)], axis=-1)
+            fitted = np.linalg.lstsq(root * parabola, root * rows_um[near], rcond=None)
+            found[eye, :, knot] = fitted[0][0]
+    return found
+
+
+TERMS = tuple(range(3, 15))
+"""OSA indices of the measured terms: orders 2 to 4."""
+
+CIRCLE_MM = 2.0
+"""Radius of the circle of the coefficients."""
+
+KNOTS_DEG = (-40.0, -30.0, -20.0, -10.0, 10.0, 20.0, 30.0, 40.0)
+"""Azimuths h of the knots, in a right eye."""
+
+MEASURED_DEG = 40.0
+"""Largest measured angle; beyond it, the slope decays exponentially."""
+
+FADE_DEG = 15.0
+
+_AZIMUTHAL_ORDERS = (
+    # cosine term, sine term, azimuthal order of the even part and of the odd part
+    (4, None, 0, 1),
+    (5, 3, 2, 1),
+    (8, 7, 0, 1),
+    (9, 6, 2, 1),
+    (12, None, 0, 1),
+    (13, 11, 2, 1),
+    (14, 10, 2, 1),
+)
+
+
+def meridian_weights(h_deg: ArrayLike) -> NDArray[np.float64]:
+    """Return spline weights (..., 8) of the knots at azimuths (...), 0 on the axis."""
+    h_deg = np.asarray(h_deg, dtype=np.float64)
+    spline = _spline()
+    inside = np.clip(h_deg, -MEASURED_DEG, MEASURED_DEG)
+    beyond = h_deg - inside
+    faded = np.sign(beyond) * FADE_DEG * -np.expm1(-np.abs(beyond) / FADE_DEG)
+    return spline(inside) + faded[..., None] * spline(inside, 1)
+
+
+@cache
+def _spline() -> CubicSpline:
+    nodes = np.array(sorted((*KNOTS_DEG, 0.0)))
+    values = np.delete(np.eye(nodes.size), KNOTS_DEG.index(10.0), axis=1)
+    return CubicSpline(nodes, values)
+
+
+def field_terms(
+    h_deg: ArrayLike, v_deg: ArrayLike, knots: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return terms (n, 12) at directions (n,) from those at the knots (12, 8).
+
+    The result is the product of `field_matrix` and the knots, in a tenth of the time,
+    because most of the matrix is zero.
+    """
+    h_deg, v_deg = np.broadcast_arrays(np.atleast_1d(h_deg), np.atleast_1d(v_deg))
+    angle_deg, azimuth = np.hypot(h_deg, v_deg), np.arctan2(v_deg, h_deg)
+    right, left = (meridian_weights(a) @ knots.T for a in (angle_deg, -angle_deg))
+    parts = 0.5 * (right + left), 0.5 * (right - left)
+    found = np.zeros((h_deg.size, len(TERMS)))
+    rotations = [(np.cos(k * azimuth), np.sin(k * azimuth)) for k in range(3)]
+    for cosine, sine, *orders in _AZIMUTHAL_ORDERS:
+        c, s = TERMS.index(cosine), None if sine is None else TERMS.index(sine)
+        for part, order in zip(parts, orders, strict=True):
+            cos, sin = rotations[order]
+            found[:, c] += cos * part[:, c]
+            if s is not None:
+                found[:, c] -= sin * part[:, s]
+                found[:, s] += cos * part[:, s] + sin * part[:, c]
+    return found
+
+
+def field_matrix(h_deg: ArrayLike, v_deg: ArrayLike) -> NDArray[np.float64]:
+    """Return the matrix (n, 12, 12, 8) from terms at the knots to directions (n,)."""
+    h_deg, v_deg = np.broadcast_arrays(np.atleast_1d(h_deg), np.atleast_1d(v_deg))
+    angle_deg, azimuth = np.hypot(h_deg, v_deg), np.arctan2(v_deg, h_deg)
+    right, left = meridian_weights(angle_deg), meridian_weights(-angle_deg)
+    matrix = np.zeros((h_deg.size, len(TERMS), len(TERMS), len(KNOTS_DEG)))
+    for cosine, sine, *orders in _AZIMUTHAL_ORDERS:
+        parts = (0.5 * (right + left), 0.5 * (right - left))
+        for part, order in zip(parts, orders, strict=True):
+            along = np.cos(order * azimuth)[:, None] * part
+            across = np.sin(order * azimuth)[:, None] * part
+            c = TERMS.index(cosine)
+            matrix[:, c, c] += along
+            if sine is not None:
+                s = TERMS.index(sine)
+                matrix[:, s, s] += along
+                matrix[:, c, s] -= across
+                matrix[:, s, c] += across
+    return matrix
+
 
 POPULATION_FILE = Path(__file__).parent / "population.json"
 
@@ -115,8 +355,7 @@ def measured_population() -> Population:
 
 
 def _rounded(values: NDArray[np.float64]) -> list[Any]:
-    rounded: list[Any] = np.vectorize(lambda v: float(f"{v:.5g}"))(values).tolist()
-    return rounded
+    return np.vectorize(lambda v: float(f"{v:.5g}"))(values).tolist()
 
 
 def _by_terms() -> NDArray[np.int64]:

@@ -1,17 +1,35 @@
-"""Fields that several kinds of profiles share, from their types."""
+"""Fields that several kinds of profiles share, and the correction, from their types."""
 
-from collections.abc import Mapping
-from typing import Any
+import math
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from estimator.bounded_files import printable
+from estimator.corrections.lenslets import Lenslets
+from estimator.corrections.progressive import ProgressiveLens
+from estimator.corrections.rings import (
+    DiffractiveRings,
+    Kinoform,
+    RefractiveZones,
+    Rings,
+)
+from estimator.corrections.worn_lens import (
+    WornLens,
+    diameter_at_pupil_mm,
+    power_at_pupil_dpt,
+)
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import RetinaShape
 from estimator.media.straylight import CATARACTS, DEFAULT_AGE_YEARS, Straylight
-from estimator.note import note_of
+from estimator.note import Note, note_of
+from estimator.optics import prescription as rx
+from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
 from estimator.optics.zernike import (
     DEFAULT_ORDER,
     HIGHEST_ORDER,
@@ -19,7 +37,327 @@ from estimator.optics.zernike import (
     index_from_nm,
 )
 from estimator.profiles import bodies
-from estimator.profiles.correction import parse_correction, vertex_notes
+from estimator.profiles.bodies import (
+    CORNEA_SPHERICAL_ABERRATION_UM,
+    OPTIC_MM,
+    BifocalBody,
+    ContactLensBody,
+    CorrectionBody,
+    IntraocularLensBody,
+    LensletsBody,
+    MonofocalBody,
+    ProgressiveBody,
+    SpectaclesBody,
+    TrifocalBody,
+    ZonesBody,
+)
+
+if TYPE_CHECKING:
+    from estimator.profiles.bodies import PrescriptionBody
+
+if TYPE_CHECKING:
+    VertexBody = PrescriptionBody | SpectaclesBody | ProgressiveBody | LensletsBody
+
+SPECTACLES = (SpectaclesBody, ProgressiveBody, LensletsBody)
+"""Corrections whose powers count at a distance from the cornea."""
+
+ASKS_FROM_DPT = 4.0
+"""Power above which 12 mm change it by 0.2 dpt or more, which a refraction resolves."""
+
+LEAST_VERTEX_MM = 5.0
+"""Spectacles are farther away; less may be in meters or centimeters."""
+
+SHOWN_DPT = 0.005
+
+MAX_DENOMINATOR, RATIO_TOLERANCE = 4, 0.03
+PATH = "correction."
+
+
+def parse_correction(
+    body: CorrectionBody | None, *, has_cornea: bool
+) -> rx.Prescription | None:
+    """Return the lens that a profile's correction describes, or None.
+
+    Parameters
+    ----------
+    body : CorrectionBody or None
+    has_cornea : bool
+        Whether the profile's wavefront or surfaces include the cornea.
+
+    Raises
+    ------
+    ProfileError
+        Fields contradict each other, or describe a lens that cannot be made.
+    """
+    if body is None:
+        return None
+    if isinstance(body, SpectaclesBody):
+        return prescription(body, path=PATH)
+    if isinstance(body, ProgressiveBody):
+        return ProgressiveLens.of(
+            prescription(body, path=PATH),
+            add_dpt=body.add_dpt,
+            corridor_mm=body.corridor_mm,
+            gaze_deg=body.gaze_deg,
+        )
+    if isinstance(body, LensletsBody):
+        return _lenslets(body)
+    if isinstance(body, ContactLensBody):
+        return WornLens(**_lens_at_the_eye(body, "contact_lens"))
+    return _intraocular(body, has_cornea=has_cornea)
+
+
+def _lenslets(body: LensletsBody) -> WornLens:
+    spectacles = prescription(body, path=PATH)
+    diameter_mm, count = body.lenslet_diameter_mm, body.lenslet_count
+    inner_mm = (body.clear_diameter_mm + diameter_mm) / 2.0
+    outer_mm = (body.lenslets_diameter_mm - diameter_mm) / 2.0
+    area_mm2 = math.pi * (outer_mm**2 - inner_mm**2) / count
+    pitch_mm = math.sqrt(max(area_mm2, 0.0) * 2.0 / math.sqrt(3.0))
+    if pitch_mm < diameter_mm:
+        raise ProfileError(
+            PATH + "lenslet_count",
+            f"{count:g} lenslets of {diameter_mm:g} mm do not fit into the honeycomb",
+            "fewer or smaller lenslets, or a larger honeycomb",
+        )
+    lenslets = Lenslets(
+        power_dpt=body.lenslet_add_dpt,
+        diameter_mm=diameter_mm,
+        pitch_mm=pitch_mm,
+        inner_mm=inner_mm,
+        outer_mm=outer_mm,
+        vertex_mm=spectacles.vertex_mm,
+        gaze_deg=body.gaze_deg,
+    )
+    return WornLens(**vars(spectacles), kind="lenslets", rings=lenslets)
+
+
+def vertex_notes(
+    eye: "PrescriptionBody | None", correction: CorrectionBody | None
+) -> tuple[str, ...]:
+    """Return notes on the plane of a profile's powers, and on the powers at the cornea.
+
+    Spectacle powers mistaken for powers at the cornea describe another eye: -8 dpt at
+    12 mm are -7.30 dpt there.
+    """
+    notes = []
+    if eye is not None:
+        notes.append(_vertex_note("prescription", eye))
+    if isinstance(correction, SPECTACLES):
+        notes.append(_vertex_note("worn spectacles", correction))
+    return tuple(note for note in notes if note)
+
+
+def _vertex_note(name: str, body: "VertexBody") -> str:
+    lens = prescription(body, path="")
+    meridians_dpt = lens.sphere_dpt, lens.sphere_dpt + lens.cylinder_dpt
+    strongest_dpt = max(map(abs, meridians_dpt))
+    if strongest_dpt < SHOWN_DPT:
+        return ""
+    if lens.vertex_mm:
+        at_cornea = rx.format_prescription(rx.at_cornea(lens))
+        place = f"at {lens.vertex_mm:g} mm, {at_cornea} at the cornea"
+    else:
+        place = "at the cornea"
+    note = f"{name}: {rx.format_prescription(lens)} {place}"
+    if 0.0 < lens.vertex_mm < LEAST_VERTEX_MM:
+        note += "; is vertex_mm in mm? Spectacles usually have 12 to 14 mm"
+    if body.vertex_mm is UNSET and strongest_dpt >= ASKS_FROM_DPT:
+        note += (
+            "; vertex_mm is missing: the powers of spectacles need it, usually "
+            "12 to 14 mm"
+        )
+    return Note(
+        "plane_of_powers",
+        note,
+        sphere_dpt=lens.sphere_dpt,
+        cylinder_dpt=lens.cylinder_dpt,
+        vertex_mm=lens.vertex_mm,
+    )
+
+
+def prescription(body: "VertexBody", *, path: str) -> rx.Prescription:
+    """Return sphere, cylinder, axis and the distance in front of the cornea."""
+    return rx.Prescription(
+        sphere_dpt=body.sphere_dpt,
+        cylinder_dpt=body.cylinder_dpt,
+        axis_deg=_axis_deg(body, path=path),
+        vertex_mm=0.0 if body.vertex_mm is UNSET else body.vertex_mm,
+    )
+
+
+def _axis_deg(
+    body: "VertexBody | ContactLensBody | IntraocularLensBody", *, path: str
+) -> float:
+    if body.axis_deg is not UNSET:
+        return body.axis_deg
+    if body.cylinder_dpt:
+        raise ProfileError(
+            f"{path}axis_deg", "is required with a cylinder", "a number from 0 to 180"
+        )
+    return 0.0
+
+
+def _lens_at_the_eye(
+    body: ContactLensBody | IntraocularLensBody, kind: str
+) -> dict[str, Any]:
+    """Return powers, decentration and aberration of a lens on or in the eye."""
+    return {
+        "sphere_dpt": body.sphere_dpt,
+        "cylinder_dpt": body.cylinder_dpt,
+        "axis_deg": (_axis_deg(body, path=PATH) + body.rotation_deg) % 180.0,
+        "kind": kind,
+        "spherical_aberration_um": body.spherical_aberration_um,
+        "centre_mm": body.decentration_mm,
+    }
+
+
+def _intraocular(body: IntraocularLensBody, *, has_cornea: bool) -> WornLens:
+    """Return an intraocular lens, its powers converted to the entrance pupil."""
+    depth_mm = body.depth_mm
+    lens = _lens_at_the_eye(body, "iol")
+    for name in ("sphere_dpt", "cylinder_dpt"):
+        lens[name] = power_at_pupil_dpt(lens[name], depth_mm=depth_mm)
+    lens["spherical_aberration_um"] += _cornea_um(body, has_cornea=has_cornea)
+    return WornLens(
+        **lens,
+        vertex_mm=-TYPICAL_ENTRANCE_PUPIL_MM,
+        rings=_rings(body),
+        replaces_lens=True,
+        design=str(body.__struct_config__.tag).partition("/")[2],
+        depth_mm=depth_mm,
+    )
+
+
+def _cornea_um(body: IntraocularLensBody, *, has_cornea: bool) -> float:
+    """Return the cornea's own C(4,0), or 0 if the profile includes the cornea."""
+    given = body.cornea_spherical_aberration_um
+    if not has_cornea:
+        return CORNEA_SPHERICAL_ABERRATION_UM if given is UNSET else given
+    if given is not UNSET:
+        raise ProfileError(
+            PATH + "cornea_spherical_aberration_um",
+            "applies to kind 'prescription' only: other profiles include the cornea",
+            "no value",
+        )
+    return 0.0
+
+
+def _rings(body: IntraocularLensBody) -> Rings | None:
+    if isinstance(body, MonofocalBody):
+        return None
+    if isinstance(body, ZonesBody):
+        return _zones(body)
+    if isinstance(body, BifocalBody):
+        spacing_dpt, kinoform, orders, far_order = _bifocal(body)
+    elif isinstance(body, TrifocalBody):
+        spacing_dpt, kinoform, orders, far_order = _trifocal(body)
+    else:
+        # orders 1 and 2 partly correct the eye's color (Millán 2017)
+        spacing_dpt, orders, far_order = body.add_dpt, (1, 2), 1
+        kinoform = Kinoform.sawtooth(body.step_waves)
+    return DiffractiveRings(
+        spacing_dpt=power_at_pupil_dpt(spacing_dpt, depth_mm=body.depth_mm),
+        kinoform=kinoform,
+        orders=orders,
+        far_order=far_order,
+        design_nm=body.design_wavelength_nm,
+        diameter_mm=diameter_at_pupil_mm(
+            body.rings_diameter_mm, depth_mm=body.depth_mm
+        ),
+        centre_mm=body.decentration_mm,
+    )
+
+
+Diffraction = tuple[float, Kinoform, tuple[int, int], int]
+"""Spacing of the orders, dpt; profile of the steps; orders of the first and last focus;
+order of the far focus."""
+
+
+def _bifocal(body: BifocalBody) -> Diffraction:
+    light = _light(body, "step_waves")
+    if light is not None:
+        return body.add_dpt, Kinoform.with_light(dict(enumerate(light))), (0, 1), 0
+    step = 0.5 if body.step_waves is UNSET else body.step_waves
+    return body.add_dpt, Kinoform.sawtooth(step), (0, 1), 0
+
+
+def _trifocal(body: TrifocalBody) -> Diffraction:
+    middle_dpt, near_dpt = body.adds_dpt
+    shown = _written(body.adds_dpt)
+    if middle_dpt >= near_dpt:
+        raise ProfileError(PATH + "adds_dpt", f"{shown} is not ascending", "ascending")
+    light = _light(body, "steps_waves")
+    ratio = Fraction(middle_dpt / near_dpt).limit_denominator(MAX_DENOMINATOR)
+    if abs(float(ratio) - middle_dpt / near_dpt) > RATIO_TOLERANCE:
+        raise ProfileError(
+            PATH + "adds_dpt",
+            f"{shown} are not orders of one diffractive lens",
+            f"a ratio of whole numbers up to {MAX_DENOMINATOR}, such as 1:2 or 2:3",
+        )
+    orders = (0, ratio.numerator, ratio.denominator)
+    spacing_dpt = near_dpt / ratio.denominator
+    if light is not None:
+        kinoform = Kinoform.with_light(dict(zip(orders, light, strict=True)))
+        return spacing_dpt, kinoform, (0, ratio.denominator), 0
+    if ratio != Fraction(1, 2):
+        raise ProfileError(
+            PATH + "light_ratio",
+            "is missing",
+            "three shares, for additions other than 1:2",
+        )
+    if body.steps_waves is UNSET:
+        raise ProfileError(
+            PATH + "steps_waves", "is missing", "a list of 2 numbers from 0 to 0.95"
+        )
+    return spacing_dpt, Kinoform.two_combs(*body.steps_waves), (0, 2), 0
+
+
+def _light(body: BifocalBody | TrifocalBody, steps: str) -> tuple[float, ...] | None:
+    if body.light_ratio is UNSET:
+        return None
+    if getattr(body, steps) is not UNSET:
+        raise ProfileError(
+            PATH + steps, "cannot be combined with light_ratio", "one of the two"
+        )
+    if sum(body.light_ratio) > 1.0 + 1e-9:
+        raise ProfileError(
+            PATH + "light_ratio",
+            f"{_written(body.light_ratio)} sums to more than 1",
+            "a sum of at most 1",
+        )
+    return body.light_ratio
+
+
+def _zones(body: ZonesBody) -> RefractiveZones:
+    diameters_mm = list(body.zone_diameters_mm)
+    if len(diameters_mm) != len(body.zone_adds_dpt):
+        raise ProfileError(
+            PATH + "zone_diameters_mm",
+            f"{_written(diameters_mm)} has another length than zone_adds_dpt",
+            f"a list of {len(body.zone_adds_dpt)} numbers from 0.5 to {OPTIC_MM:g}",
+        )
+    if diameters_mm != sorted(set(diameters_mm)):
+        raise ProfileError(
+            PATH + "zone_diameters_mm",
+            f"{_written(diameters_mm)} is not ascending",
+            "outer diameters, ascending",
+        )
+    depth_mm = body.depth_mm
+    return RefractiveZones(
+        outer_mm=tuple(
+            diameter_at_pupil_mm(d, depth_mm=depth_mm) / 2.0 for d in diameters_mm
+        ),
+        powers_dpt=tuple(
+            power_at_pupil_dpt(p, depth_mm=depth_mm) for p in body.zone_adds_dpt
+        ),
+        centre_mm=body.decentration_mm,
+    )
+
+
+def _written(values: Sequence[float]) -> str:
+    return "[" + ", ".join(f"{value:g}" for value in values) + "]"
+
 
 MAX_NAME_CHARACTERS = 200
 
@@ -155,8 +493,9 @@ def coefficients_um(
         field = f"{path}{name}.{key}"
         n, j = _term_index(key, field, value_um, highest_order)
         if j in named:
-            problem = f"names the same term as {named[j][0]!r}"
-            raise ProfileError(field, problem, "each term once")
+            raise ProfileError(
+                field, f"names the same term as {named[j][0]!r}", "each term once"
+            )
         named[j] = key, value_um
         order = max(order, n if value_um else 0)
     zernike_um = np.zeros((order + 1) * (order + 2) // 2)
@@ -180,6 +519,9 @@ def _term_index(
     except ValueError as error:
         raise ProfileError(name, str(error), allowed) from None
     if n > highest_order and value_um != 0.0:
-        problem = f"radial order {n}, {value_um:g} um"
-        raise ProfileError(name, problem, f"{allowed}; higher orders are 0")
+        raise ProfileError(
+            name,
+            f"radial order {n}, {value_um:g} um",
+            f"{allowed}; higher orders are 0",
+        )
     return n, j

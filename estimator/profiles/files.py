@@ -9,7 +9,7 @@ from estimator.bounded_files import InvalidFile, loads_bounded, read_bytes, reas
 from estimator.eye.checked_fields import did_you_mean
 from estimator.profiles.bodies import PUBLISHED_NAMES
 from estimator.profiles.coefficient_files import abp_body, csv_body
-from estimator.profiles.optiland_files import is_optiland, optiland_body
+from estimator.profiles.lens_files import is_optiland, optiland_body
 from estimator.profiles.parse import (
     EyeProfile,
     ProfileError,
@@ -140,14 +140,15 @@ def profile_body(
     if not is_file:
         raise ProfileError("profile", f"file '{source}' does not exist", allowed)
     try:
-        body = reader(_text(path), path)
+        is_table = reader in (abp_body, csv_body)
+        body = reader(_text(path), path.name if is_table else path.stem)
     except InvalidFile as error:
         raise InvalidProfileFile(path, "", error.found, error.allowed) from None
     except ProfileError as error:
         raise InvalidProfileFile(
             path, error.field, error.problem, error.allowed
         ) from None
-    if reader is _read_csv:
+    if reader is csv_body:
         given = {"pupil_diameter_mm": pupil_diameter_mm, "wavelength_nm": wavelength_nm}
         body.update({k: v for k, v in given.items() if v is not None})
     return body
@@ -164,8 +165,9 @@ def _inline(text: str) -> dict[str, Any]:
     try:
         return _json_body(text, "profile")
     except ProfileError as error:
-        field = error.field or "profile"
-        raise ProfileError(field, error.problem, error.allowed) from None
+        raise ProfileError(
+            error.field or "profile", error.problem, error.allowed
+        ) from None
 
 
 def _text(path: Path) -> str:
@@ -199,8 +201,9 @@ def _json_body(text: str, name: str) -> dict[str, Any]:
     try:
         body = loads_bounded(data, max_bytes=2 * MAX_PROFILE_BYTES)
     except ValueError as error:
-        problem = f"not JSON ({reason_of(error)})"
-        raise ProfileError("", problem, "one JSON object") from None
+        raise ProfileError(
+            "", f"not JSON ({reason_of(error)})", "one JSON object"
+        ) from None
     if not isinstance(body, dict):
         raise ProfileError("", f"{body!r:.60} is not an object", "one JSON object")
     if is_optiland(body):
@@ -210,22 +213,7 @@ def _json_body(text: str, name: str) -> dict[str, Any]:
     return body
 
 
-def _read_json(text: str, path: Path) -> dict[str, Any]:
-    return _json_body(text, path.stem)
-
-
-def _read_abp(text: str, path: Path) -> dict[str, Any]:
-    return abp_body(text, path.name)
-
-
-def _read_csv(text: str, path: Path) -> dict[str, Any]:
-    return csv_body(text, path.name)
-
-
-def _read_zmx(text: str, path: Path) -> dict[str, Any]:
-    return zmx_body(text, path.stem)
-
-
-READERS: dict[str, Callable[[str, Path], dict[str, Any]]] = dict(
-    zip(PROFILE_SUFFIXES, (_read_json, _read_abp, _read_csv, _read_zmx), strict=True)
+READERS: dict[str, Callable[[str, str], dict[str, Any]]] = dict(
+    zip(PROFILE_SUFFIXES, (_json_body, abp_body, csv_body, zmx_body), strict=True)
 )
+"""Functions of the text of a file, and the name of an eye without a name in it."""

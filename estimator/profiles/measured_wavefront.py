@@ -226,10 +226,7 @@ class MeasuredWavefront(FocusingEye):
             self.wavelength_nm
         )
         relaxed_dpt = total_defocus_dpt(self._on_circles(radius_mm), radius_mm)
-        found_dpt: NDArray[np.float64] = (
-            relaxed_dpt.reshape(pupil_mm.shape) + shift_dpt - used_dpt
-        )
-        return found_dpt
+        return relaxed_dpt.reshape(pupil_mm.shape) + shift_dpt - used_dpt
 
     def defocus_at(
         self, *, h_deg: ArrayLike, v_deg: ArrayLike, wavelength_nm: ArrayLike

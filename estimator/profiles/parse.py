@@ -7,24 +7,134 @@ person's right, y up).
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, cast
 
 import msgspec
+import numpy as np
 
 from estimator.corrections.worn_lens import replaces_lens
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters
+from estimator.note import Note
 from estimator.optics import prescription as rx
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
-from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM
-from estimator.optics.zernike import remove_central_tilt
+from estimator.optics.vergence import (
+    TYPICAL_ENTRANCE_PUPIL_MM,
+    chromatic_refraction_dpt,
+)
+from estimator.optics.zernike import remove_central_tilt, rescale_pupil, summed_terms
 from estimator.profiles import bodies
-from estimator.profiles.common_fields import coefficients_um, common_fields
-from estimator.profiles.correction import prescription
+from estimator.profiles.common_fields import (
+    coefficients_um,
+    common_fields,
+    prescription,
+)
 from estimator.profiles.eye_profile import EYE_PUPIL_MM, EyeProfile, Measurement
-from estimator.profiles.repeats import merged_repeats
 from estimator.profiles.validation import KIND, convert
 from estimator.wavefront.field_wavefronts import polynomial_in_mm, rays_cross
+
+SAME_DEG = 0.5
+"""Largest distance, along each axis, of two measurements of one direction."""
+
+NOISE_DPT, NOISE_UM = 0.75, 0.3
+"""Largest differences of two measurements of an eye: of M, J0 and J45, and RMS of the
+higher orders.  95 % of repeats by one instrument differ by less than 0.5 dpt."""
+
+FIRST_HIGHER = 6
+
+
+def merged_repeats(
+    measurements: list[Measurement],
+) -> tuple[list[Measurement], tuple[Note, ...]]:
+    """Return measurements without repeats, in their order, and a note on them.
+
+    Repeats have the same direction, pupil and wavelength; their coefficients are
+    averaged.  Measurements of one direction through other pupils or at other
+    wavelengths are compared as well, but kept.
+
+    Raises
+    ------
+    ProfileError
+        Two measurements of one direction differ by more than `NOISE_DPT` or
+        `NOISE_UM`.
+    """
+    groups: list[list[Measurement]] = []
+    for number, measurement in enumerate(measurements):
+        for other, earlier in enumerate(measurements[:number]):
+            if _is_same_direction(measurement, earlier):
+                _check_agreement(number, measurement, other, earlier)
+        group = next((g for g in groups if _is_repeat(measurement, g[0])), None)
+        if group is None:
+            groups.append([measurement])
+        else:
+            group.append(measurement)
+    repeated = [group for group in groups if len(group) > 1]
+    merged = [
+        replace(
+            group[0],
+            zernike_um=summed_terms(*(m.zernike_um for m in group)) / len(group),
+        )
+        if len(group) > 1
+        else group[0]
+        for group in groups
+    ]
+    if not repeated:
+        return merged, ()
+    count = sum(map(len, repeated))
+    places = "one direction" if len(repeated) == 1 else f"{len(repeated)} directions"
+    note = Note(
+        "repeated_measurements",
+        f"{count} measurements repeat {places}: their average is used",
+        measurement_count=count,
+        direction_count=len(repeated),
+    )
+    return merged, (note,)
+
+
+def _is_same_direction(one: Measurement, other: Measurement) -> bool:
+    distances_deg = abs(one.h_deg - other.h_deg), abs(one.v_deg - other.v_deg)
+    return max(distances_deg) <= SAME_DEG
+
+
+def _is_repeat(one: Measurement, other: Measurement) -> bool:
+    return (
+        _is_same_direction(one, other)
+        and one.pupil_diameter_mm == other.pupil_diameter_mm
+        and one.wavelength_nm == other.wavelength_nm
+    )
+
+
+def _check_agreement(
+    number: int, one: Measurement, other_number: int, other: Measurement
+) -> None:
+    pupil_mm = min(one.pupil_diameter_mm, other.pupil_diameter_mm)
+    waves_um = [
+        rescale_pupil(m.zernike_um, radius_ratio=pupil_mm / m.pupil_diameter_mm)
+        for m in (one, other)
+    ]
+    powers_dpt = np.stack(
+        [rx.power_vectors_dpt(wave_um, pupil_mm / 2.0) for wave_um in waves_um]
+    )
+    wavelengths_nm = np.array([one.wavelength_nm, other.wavelength_nm])
+    powers_dpt[:, 0] -= chromatic_refraction_dpt(wavelengths_nm)
+    differences_dpt = np.abs(powers_dpt[0] - powers_dpt[1])
+    difference_um = summed_terms(waves_um[0], -waves_um[1])
+    higher_um = float(np.linalg.norm(difference_um[FIRST_HIGHER:]))
+    if differences_dpt.max() <= NOISE_DPT and higher_um <= NOISE_UM:
+        return
+    name = ("M", "J0", "J45")[int(differences_dpt.argmax())]
+    found = f"{name} differs by {differences_dpt.max():.3g} dpt"
+    if differences_dpt.max() <= NOISE_DPT:
+        found = f"its higher orders differ by {higher_um:.3g} um RMS"
+    raise ProfileError(
+        f"measurements.{number}.zernike_um",
+        f"contradicts measurement {other_number} of the same direction, h "
+        f"{other.h_deg:g} v {other.v_deg:g} deg: {found}",
+        f"repeats that agree to {NOISE_DPT:g} dpt and {NOISE_UM:g} um RMS of higher "
+        "orders, or another direction",
+    )
+
 
 __all__ = [
     "EyeProfile",

@@ -11,10 +11,7 @@ from msgspec import inspect
 
 from estimator.profiles import (
     bodies,
-    correction_bodies,
     given_bodies,
-    implant_bodies,
-    surface_bodies,
     validation,
 )
 from estimator.profiles.validation import KIND, allowed_values
@@ -31,28 +28,28 @@ INTRODUCTIONS: dict[type[msgspec.Struct], str] = {
     bodies.MeasurementBody: "Each entry of `measurements`.",
     bodies.RetinaBody: "`retina`.",
     bodies.StraylightBody: "`straylight`; an empty object uses the defaults.",
-    correction_bodies.PowersBody: "`correction`: fields of every kind.",
-    correction_bodies.SpectaclesBody: "`correction` of kind `spectacles` (default).",
-    correction_bodies.ProgressiveBody: "`correction` of kind `progressive`.",
-    correction_bodies.LensletsBody: "`correction` of kind `lenslets`.",
-    correction_bodies.ContactLensBody: "`correction` of kind `contact_lens`.",
-    correction_bodies.IntraocularBody: "`correction` of kind `iol`: every design.",
-    correction_bodies.DiffractiveBody: "`correction` of kind `iol`: designs `bifocal`, "
+    bodies.PowersBody: "`correction`: fields of every kind.",
+    bodies.SpectaclesBody: "`correction` of kind `spectacles` (default).",
+    bodies.ProgressiveBody: "`correction` of kind `progressive`.",
+    bodies.LensletsBody: "`correction` of kind `lenslets`.",
+    bodies.ContactLensBody: "`correction` of kind `contact_lens`.",
+    bodies.IntraocularBody: "`correction` of kind `iol`: every design.",
+    bodies.DiffractiveBody: "`correction` of kind `iol`: designs `bifocal`, "
     "`trifocal` and `edof`.",
-    correction_bodies.BifocalBody: "Design `bifocal`.",
-    correction_bodies.TrifocalBody: "Design `trifocal`.",
-    correction_bodies.ExtendedDepthBody: "Design `edof`.",
-    correction_bodies.ZonesBody: "Design `zones`.",
+    bodies.BifocalBody: "Design `bifocal`.",
+    bodies.TrifocalBody: "Design `trifocal`.",
+    bodies.ExtendedDepthBody: "Design `edof`.",
+    bodies.ZonesBody: "Design `zones`.",
     bodies.EyeBody: "Kind `eye`: the eye model by its parameters.",
     bodies.ParametersBody: "`parameters`.",
     given_bodies.SurfacesBody: "Kind `surfaces`: an eye by its surfaces and media.",
-    surface_bodies.RetinalSurfaceBody: "`retina` of kind `surfaces`, and fields of "
+    given_bodies.RetinalSurfaceBody: "`retina` of kind `surfaces`, and fields of "
     "every surface.",
-    surface_bodies.SurfaceBody: "Each entry of `surfaces`.",
-    surface_bodies.StateBody: "Each entry of `states`.",
+    given_bodies.SurfaceBody: "Each entry of `surfaces`.",
+    given_bodies.StateBody: "Each entry of `states`.",
     given_bodies.PseudophakicBody: "Kind `pseudophakic`: an eye with an intraocular "
     "lens by its geometry.",
-    implant_bodies.ImplantBody: "`implant`.",
+    given_bodies.ImplantBody: "`implant`.",
     given_bodies.PublishedBody: "Kind `published`: a schematic eye by its name.",
 }
 """Tables of the reference in their order, with the line above each."""
@@ -105,7 +102,7 @@ def profile_tables() -> str:
         rows = ["| field | default | allowed | meaning |", "|---|---|---|---|"]
         rows += [_row(field) for field in _own_fields(body)]
         blocks.append("\n".join([introduction, "", *rows]))
-    for introduction, kinds in surface_bodies.TABLES.items():
+    for introduction, kinds in given_bodies.TABLES.items():
         rows = ["| kind | fields (default) | definition |", "|---|---|---|"]
         rows += [_kind_row(kind) for kind in kinds]
         blocks.append("\n".join([introduction, "", *rows]))

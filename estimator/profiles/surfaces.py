@@ -1,7 +1,16 @@
-"""Eyes by their surfaces: from the types of `surface_bodies` to a `SurfaceModel`."""
+"""Eyes by their surfaces: from the types of `given_bodies` to a `SurfaceModel`.
 
+`published` has schematic eyes from the literature, one JSON file each.  A file names
+the eye (``title``), its publication (``reference``), the places from which the numbers
+were taken (``sources``), the wavelength of its figures, the eye in the format of kind
+``surfaces``, and published figures of the eye, each with its own source.
+"""
+
+import json
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from typing import Any, cast
 
@@ -21,9 +30,15 @@ from estimator.optics.surfaces import (
 )
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import N_TERMS
-from estimator.profiles import surface_bodies
-from estimator.profiles.given_bodies import SurfacesBody
-from estimator.profiles.surface_bodies import RetinalSurfaceBody, StateBody, SurfaceBody
+from estimator.profiles import given_bodies
+from estimator.profiles.bodies import PUBLISHED, PUBLISHED_NAMES
+from estimator.profiles.given_bodies import (
+    RetinalSurfaceBody,
+    StateBody,
+    SurfaceBody,
+    SurfacesBody,
+)
+from estimator.profiles.validation import convert
 
 N_CHECKED_BETWEEN = 4
 """Eyes between neighboring states that are checked as well."""
@@ -106,8 +121,7 @@ def _eye(
     try:
         _check_traceable(eye)
     except ValueError as error:
-        allowed = "surfaces in order"
-        raise ProfileError(f"{path}surfaces", str(error), allowed) from None
+        raise ProfileError(f"{path}surfaces", str(error), "surfaces in order") from None
     return eye
 
 
@@ -120,10 +134,10 @@ def _check_traceable(eye: EyeSurfaces) -> None:
         media_indices(eye, REFERENCE_WAVELENGTH_NM)
         behind = [eye.media.get(surface.medium_after) for surface in eye.surfaces]
         steps = sum(getattr(medium, "steps", 0) for medium in behind)
-        if steps > surface_bodies.MAX_STEPS:
+        if steps > given_bodies.MAX_STEPS:
             raise ValueError(
                 f"{steps} steps of the integration through gradients: allowed are up "
-                f"to {surface_bodies.MAX_STEPS} in total"
+                f"to {given_bodies.MAX_STEPS} in total"
             )
 
 
@@ -171,12 +185,12 @@ def radii_mm(
         A radius is too small; ``name`` is the path of the field.
     """
     radii = value if isinstance(value, list) else [value, value]
-    low, high = surface_bodies.SMALLEST_RADIUS_MM, surface_bodies.NUMBER_LIMIT
+    low, high = given_bodies.SMALLEST_RADIUS_MM, given_bodies.NUMBER_LIMIT
     if not all(r is None or low <= abs(r) <= high for r in radii):
         raise ProfileError(
             name,
             f"{value!r:.60} is out of range",
-            surface_bodies.RADIUS_ALLOWED,
+            given_bodies.RADIUS_ALLOWED,
         )
     first, second = (math.inf if r is None else float(r) for r in radii)
     return first, second
@@ -189,7 +203,7 @@ def _offsets(value: list[float] | None, path: str) -> NDArray[np.float64] | None
         raise ProfileError(
             f"{path}offset_mm",
             f"has {len(value)} entries",
-            surface_bodies.OFFSETS_ALLOWED,
+            given_bodies.OFFSETS_ALLOWED,
         )
     return np.array([0.0] * (N_TERMS - len(value)) + value)
 
@@ -202,7 +216,7 @@ def _built(body: msgspec.Struct, path: str) -> Any:
     ProfileError
         Fields contradict each other; ``path`` is that of the body.
     """
-    kind = surface_bodies.KINDS[cast(str, body.__struct_config__.tag)]
+    kind = given_bodies.DATACLASSES[cast(str, body.__struct_config__.tag)]
     values: Mapping[str, Any] = {
         name: _built(value, f"{path}.{name}")
         if isinstance(value, msgspec.Struct)
@@ -213,3 +227,79 @@ def _built(body: msgspec.Struct, path: str) -> Any:
         return kind(**values)
     except ValueError as error:
         raise ProfileError(path, str(error), "see the other fields") from None
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A published figure of an eye.
+
+    Attributes
+    ----------
+    quantity : str
+        Attribute of `estimator.optics.paraxial.CardinalPoints`.
+    value : float
+        In the unit that ends ``quantity``.
+    digits : int
+        Decimal places given.
+    source : str
+    """
+
+    quantity: str
+    value: float
+    digits: int
+    source: str
+
+
+@dataclass(frozen=True)
+class PublishedEye:
+    """A schematic eye with its sources.
+
+    Attributes
+    ----------
+    title, reference : str
+    sources : tuple of str
+        Addresses, or repositories with commit and path.
+    notes : str
+        What the sources leave open.
+    wavelength_nm : float
+        Wavelength of the figures.
+    model : SurfaceModel
+    figures : tuple of Figure
+    """
+
+    title: str
+    reference: str
+    sources: tuple[str, ...]
+    notes: str
+    wavelength_nm: float
+    model: SurfaceModel
+    figures: tuple[Figure, ...]
+
+    @property
+    def surfaces(self) -> EyeSurfaces:
+        """Return the relaxed eye."""
+        return self.model.relaxed
+
+
+@cache
+def published_eye(name: str) -> PublishedEye:
+    """Read a schematic eye.
+
+    Raises
+    ------
+    ValueError
+        The name is none of `bodies.PUBLISHED_NAMES`.
+    """
+    if name not in PUBLISHED_NAMES:
+        known = ", ".join(PUBLISHED_NAMES)
+        raise ValueError(f"published eye '{name}': allowed are {known}")
+    data = json.loads((PUBLISHED / f"{name}.json").read_text(encoding="utf-8"))
+    return PublishedEye(
+        title=data["title"],
+        reference=data["reference"],
+        sources=tuple(data["sources"]),
+        notes=data.get("notes", ""),
+        wavelength_nm=data["wavelength_nm"],
+        model=surface_model(convert(data["eye"], SurfacesBody)),
+        figures=tuple(Figure(**figure) for figure in data["figures"]),
+    )

@@ -146,8 +146,11 @@ def _check_object(value: object, kind: inspect.StructType, path: str) -> None:
             names = [*names, DESIGN]
     for name in data:
         if name not in names:
-            problem = "is not a field of this kind" + did_you_mean(name, names)
-            raise ProfileError(prefix + name, problem, "the fields " + ", ".join(names))
+            raise ProfileError(
+                prefix + name,
+                "is not a field of this kind" + did_you_mean(name, names),
+                "the fields " + ", ".join(names),
+            )
     for field in kind.fields:
         if field.encode_name in data:
             _check(data[field.encode_name], field.type, prefix + field.encode_name)
@@ -179,8 +182,11 @@ def _check_number(
 
 def _check_choice(value: object, options: list[str], path: str) -> None:
     if not isinstance(value, str) or value not in options:
-        problem = f"{_shown(value)} is unknown{did_you_mean(value, options)}"
-        raise ProfileError(path, problem, "one of " + ", ".join(options))
+        raise ProfileError(
+            path,
+            f"{_shown(value)} is unknown{did_you_mean(value, options)}",
+            "one of " + ", ".join(options),
+        )
 
 
 def _check_list(
@@ -238,8 +244,9 @@ def _lengths(kind: inspect.Type) -> tuple[int, int]:
 
 def _object(value: object, path: str) -> dict[str, Any]:
     if not isinstance(value, dict) or not all(isinstance(k, str) for k in value):
-        problem = f"{_shown(value)} is not an object"
-        raise ProfileError(path or "profile", problem, "a JSON object")
+        raise ProfileError(
+            path or "profile", f"{_shown(value)} is not an object", "a JSON object"
+        )
     return value
 
 

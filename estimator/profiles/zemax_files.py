@@ -295,8 +295,11 @@ def _clear_radius_mm(number: int, block: Mapping[str, list[str]]) -> float | Non
         if operand == "FLAP" and block.get("DIAM"):
             outer_mm = _number(block["DIAM"][0], number, "DIAM")
         if inner_mm != 0.0 or outer_mm <= 0.0:
-            problem = f"{operand} with an inner radius, or without a radius"
-            raise refused(number, problem, f"{operand} 0 and a radius")
+            raise refused(
+                number,
+                f"{operand} with an inner radius, or without a radius",
+                f"{operand} 0 and a radius",
+            )
         return outer_mm
     return None
 

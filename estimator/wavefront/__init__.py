@@ -1,13 +1,10 @@
 """Wavefronts of an eye, from rays traced from the retina outward.
 
 aberrations       Zernike coefficients by field, pupil and wavelength; of many eyes
-results           result types
-compiled          calls of the compiled tracer for fields of many packed eyes
+compiled          calls of the compiled tracer for many packed eyes, and its results
 nodes             quadrature nodes over the stop or a circle
-chief_rays        chief rays by wavelength: lateral color
 field_wavefronts  wavefronts over the field with their pupils, input of the PSF engines
 moved_plane       transfer of a wavefront to another plane along the chief ray
-pupil_refraction  least-squares refraction over the area of the pupil
 
 Wavefronts are given in a plane normal to the chief ray, outside the eye: where the
 chief ray meets the cornea, or where it crosses the plane of the paraxial *entrance

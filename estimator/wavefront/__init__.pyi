@@ -2,8 +2,8 @@ from .aberrations import eyes_aberrations as eyes_aberrations
 from .aberrations import on_axis_zernike as on_axis_zernike
 from .aberrations import wavefront_aberrations as wavefront_aberrations
 from .aberrations import wavefront_grid as wavefront_grid
-from .chief_rays import chief_shift_mrad as chief_shift_mrad
+from .compiled import Aberrations as Aberrations
+from .compiled import FieldResults as FieldResults
+from .compiled import PupilEllipse as PupilEllipse
+from .compiled import chief_shift_mrad as chief_shift_mrad
 from .field_wavefronts import FieldWavefronts as FieldWavefronts
-from .results import Aberrations as Aberrations
-from .results import FieldResults as FieldResults
-from .results import PupilEllipse as PupilEllipse

@@ -20,6 +20,7 @@ from estimator.optics.surfaces import EyeSurfaces, media_indices, pack_eye
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront import compiled
+from estimator.wavefront.compiled import Aberrations, FieldResults, PupilEllipse
 from estimator.wavefront.nodes import (
     N_AZIMUTHS,
     N_RINGS,
@@ -28,7 +29,6 @@ from estimator.wavefront.nodes import (
     fewest_nodes,
     stop_nodes,
 )
-from estimator.wavefront.results import Aberrations, FieldResults, PupilEllipse
 
 FITS = ("opd", "slope")
 PLANES = ("cornea", "pupil")

@@ -3,13 +3,21 @@
 A field has an eye, an index row and a direction.  Its chief ray is traced from air
 through the center of the stop to the retina.  From its retinal point, rays are traced
 out of the eye (Algorithm 1 of the paper), through nodes of the stop or of a circle.
+
+Lateral color: shift of the apparent direction of chief rays with wavelength.
+
+The chief ray of a wavelength from direction u meets the retina at a point.  The
+apparent direction is the one whose 555 nm chief ray meets the same point; it is found
+by tracing from that point back through the center of the stop.  The shift is the angle
+from u to the apparent direction.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +25,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from estimator.native import core, shared_threads
 from estimator.native.records import WavefrontJob, pointer_to
-from estimator.optics.surfaces import N_COLUMNS, EyeSurfaces, check_eye, pack_eye
+from estimator.optics.raytrace import STATUS_WORDS, RayStatus
+from estimator.optics.surfaces import (
+    N_COLUMNS,
+    EyeSurfaces,
+    check_eye,
+    media_indices,
+    pack_eye,
+)
+from estimator.optics.units import MRAD_PER_RAD, REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import N_TERMS, monomial_matrix
 from estimator.threads import MAX_THREADS
 from estimator.wavefront.nodes import CircleNodes, Nodes
@@ -297,3 +313,167 @@ def magnifications(
         step = indices.shape[1]
     core().call("magnifications", packed, *packed.shape[:2], indices, step, found)
     return found
+
+
+def chief_shift_mrad(
+    eye: EyeSurfaces, *, fields_deg: ArrayLike, wavelengths_nm: ArrayLike
+) -> NDArray[np.float64]:
+    """Return the lateral color of an eye relative to 555 nm.
+
+    Parameters
+    ----------
+    eye : EyeSurfaces
+    fields_deg : (n_fields, 2)
+        Azimuth h and elevation v of the source.
+    wavelengths_nm : (n_wavelengths,)
+
+    Returns
+    -------
+    shift_mrad : (n_fields, n_wavelengths, 2)
+        Direction cosines of the apparent direction along ex and ey of the field, times
+        1000; nan if a chief ray fails.
+
+    Raises
+    ------
+    ValueError
+        The eye cannot be traced, or a wavelength is out of range.
+    """
+    return chief_shifts_mrad(
+        [eye], fields_deg=fields_deg, wavelengths_nm=wavelengths_nm
+    )[0]
+
+
+def chief_shifts_mrad(
+    eyes: Sequence[EyeSurfaces], *, fields_deg: ArrayLike, wavelengths_nm: ArrayLike
+) -> NDArray[np.float64]:
+    """Return `chief_shift_mrad` (n_eyes, ...) of eyes with the same parts.
+
+    Raises
+    ------
+    ValueError
+        As `chief_shift_mrad`, or the eyes have different numbers of surfaces.
+    """
+    packed = packed_eyes(eyes)
+    directions_rad = np.radians(np.atleast_2d(np.asarray(fields_deg, np.float64)))
+    indices = np.stack([media_indices(e, np.atleast_1d(wavelengths_nm)) for e in eyes])
+    reference = np.stack([media_indices(e, REFERENCE_WAVELENGTH_NM) for e in eyes])
+    fields = Fields.of_grid(packed, indices, directions_rad)
+    both = replace(fields, indices=np.concatenate([fields.indices, reference]))
+    shifts = chief_shifts(both, len(fields.indices) + fields.eyes)
+    shape = (len(eyes), len(directions_rad), indices.shape[1], 2)
+    return MRAD_PER_RAD * shifts.reshape(shape)
+
+
+@dataclass(frozen=True)
+class PupilEllipse:
+    """Least-squares ellipse of the rim of the projected pupil.
+
+    Attributes
+    ----------
+    centre_x_mm, centre_y_mm : float
+        Center relative to the chief ray.
+    semi_major_mm, semi_minor_mm : float
+    major_axis_deg : float
+        Angle of the major axis from +x toward +y, 0 to 180.
+    """
+
+    centre_x_mm: float
+    centre_y_mm: float
+    semi_major_mm: float
+    semi_minor_mm: float
+    major_axis_deg: float
+
+    @classmethod
+    def of(cls, columns: NDArray[np.float64]) -> PupilEllipse:
+        """Return the ellipse of center, semi-axes, mm, and angle, rad, (5,)."""
+        x_mm, y_mm, major_mm, minor_mm, angle_rad = columns.tolist()
+        return cls(x_mm, y_mm, major_mm, minor_mm, math.degrees(angle_rad))
+
+    @property
+    def axis_ratio(self) -> float:
+        """Ratio of the minor to the major semi-axis."""
+        return self.semi_minor_mm / self.semi_major_mm
+
+
+@dataclass(frozen=True)
+class FieldResults:
+    """Wavefronts and pupils of several fields, wavelengths, stops or eyes.
+
+    Attributes
+    ----------
+    zernike_um : (..., n_terms)
+        Coefficients; piston is zero; nan where the chief ray fails.
+    zernike_radius_mm : (...)
+        Radius of their circle: the largest distance of the rim from the chief ray.
+    ellipse_mm : (..., 5)
+        Center x, y, semi-axes major, minor (mm) and angle of the major axis (rad).
+    rms_residual_um : (...)
+        RMS residual of the fit of W.
+    open_ratio : (...)
+        Unvignetted fraction of the stop's area.
+    chief_status_index, worst_status_index : (...) int
+        `RayStatus` of the chief ray, and the worst of all rays.
+    retinal_point_mm : (..., 3)
+        Intersection of the chief ray with the retina.
+    pupil_point_mm : (..., 3)
+        Intersection of the chief ray with the cornea or with the plane of the entrance
+        pupil: the origin of the plane of the wavefront.
+    """
+
+    zernike_um: NDArray[np.float64]
+    zernike_radius_mm: NDArray[np.float64]
+    ellipse_mm: NDArray[np.float64]
+    rms_residual_um: NDArray[np.float64]
+    open_ratio: NDArray[np.float64]
+    chief_status_index: NDArray[np.int64]
+    worst_status_index: NDArray[np.int64]
+    retinal_point_mm: NDArray[np.float64]
+    pupil_point_mm: NDArray[np.float64]
+
+    def at(self, index: int) -> FieldResults:
+        """Return the results at an index of the first axis."""
+        return FieldResults(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    @classmethod
+    def from_rows(cls, rows: NDArray[Any]) -> FieldResults:
+        """Unpack rows (..., n_terms + N_OTHER); see `stop_rows`."""
+        n_terms = rows.shape[-1] - N_OTHER
+        other = rows[..., n_terms:]
+        retina, plane = RETINA_POINT, PLANE_POINT
+        return cls(
+            zernike_um=rows[..., :n_terms],
+            zernike_radius_mm=other[..., RADIUS],
+            ellipse_mm=other[..., ELLIPSE:RMS],
+            rms_residual_um=other[..., RMS],
+            open_ratio=other[..., OPEN_SHARE],
+            chief_status_index=other[..., CHIEF_STATUS].astype(np.int64),
+            worst_status_index=other[..., WORST_STATUS].astype(np.int64),
+            retinal_point_mm=other[..., retina : retina + 3],
+            pupil_point_mm=other[..., plane : plane + 3],
+        )
+
+
+@dataclass(frozen=True)
+class Aberrations:
+    """Aberrations for one field, wavelength and stop; fields as in `FieldResults`."""
+
+    zernike_um: NDArray[np.float64]
+    zernike_radius_mm: float
+    pupil_ellipse: PupilEllipse
+    rms_residual_um: float
+    stop_diameter_mm: float
+    open_ratio: float
+    chief_status: RayStatus
+    worst_status: RayStatus
+    retinal_point_mm: NDArray[np.float64]
+    pupil_point_mm: NDArray[np.float64]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Notes on vignetting; empty for an unvignetted pupil."""
+        if self.chief_status != RayStatus.TRACED:
+            return (f"no chief ray: {STATUS_WORDS[self.chief_status]}",)
+        if self.worst_status != RayStatus.TRACED:
+            reason = STATUS_WORDS[self.worst_status]
+            return (f"vignetted to {self.open_ratio:.1%} of the stop ({reason})",)
+        return ()

@@ -111,8 +111,7 @@ def circumscribed_radius_mm(rim_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         step = np.where(is_concave, -first / np.where(is_concave, second, 1.0), 0.0)
         angle = angle + np.clip(step, -NEWTON_STEP_RAD, NEWTON_STEP_RAD)
     highest = np.maximum(half_square(angle)[..., 0], sampled.max(axis=-1))
-    radius_mm: NDArray[np.float64] = np.sqrt(2.0 * highest)
-    return radius_mm
+    return np.sqrt(2.0 * highest)
 
 
 def polynomial_in_mm(

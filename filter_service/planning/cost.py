@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
-from estimator.machine_speed import relative_core_time
 from estimator.psf.compute import ACCURACY
 from estimator.psf.fourier import plan_grids
 from estimator.psf.survey import (
@@ -15,7 +14,7 @@ from estimator.psf.survey import (
     needed_radius_px,
 )
 from estimator.psf.switch import geometric_shares
-from estimator.threads import thread_count
+from estimator.threads import relative_core_time, thread_count
 from filter_service.constants import RGB
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.node_wavefronts import PupilStates
@@ -142,8 +141,8 @@ LARGEST_RADIUS_PX = 1e9
 
 TERM_US = {"psf": 56.5, "wave": 2.24e-4, "texels": 0.0134}
 """Processor time per unit of each term of `cost_terms` on an AMD EPYC, in us.
-`machine_speed` scales it for other machines.  36 batches of 768 PSFs of three eyes and
-three image sizes, 56 to 465 us per PSF, took 0.77 to 1.19 of the prediction
+`relative_core_time` scales it for other machines.  36 batches of 768 PSFs of three eyes
+and three image sizes, 56 to 465 us per PSF, took 0.77 to 1.19 of the prediction
 (`python -m tests.benchmarks.bench_plan --calibrate` repeats the fit)."""
 
 

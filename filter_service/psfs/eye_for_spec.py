@@ -11,7 +11,7 @@ from estimator.field.eye_optics import EyeOptics
 from estimator.field.network_eye import network_eye
 from estimator.field.prepare import prepare_eye
 from estimator.field.trace_range import FieldRange
-from estimator.networks.card import NetworkUnavailable
+from estimator.networks.inference import NetworkUnavailable
 from estimator.note import Note
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import EyeProfile

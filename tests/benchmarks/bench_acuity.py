@@ -32,7 +32,7 @@ from estimator.acuity import (
 )
 from estimator.optics.prescription import zernike_from_power_vector
 from estimator.optics.zernike import rescale_pupil
-from estimator.periphery.measured_eyes import load_measured_eyes
+from estimator.periphery.population import load_measured_eyes
 from estimator.profiles.typical_aberrations import (
     TYPICAL_PUPIL_MM,
     typical_zernike_um,

@@ -14,8 +14,7 @@ import time
 from collections.abc import Sequence
 from importlib.metadata import version
 
-from estimator.networks.card import DamagedWeights, WeightsMissing
-from estimator.networks.inference import load_network
+from estimator.networks.inference import DamagedWeights, WeightsMissing, load_network
 from tests.benchmarks.first_guess import GuessRow, guess_rows
 from tests.benchmarks.harness import (
     OUT,

@@ -38,9 +38,14 @@ from estimator.optics.prescription import power_vectors_dpt
 from estimator.optics.units import SPHERE_PER_C20
 from estimator.optics.zernike import N_TERMS, nm_from_index, rescale_pupil
 from estimator.periphery.change import peripheral_change
-from estimator.periphery.measured_eyes import MeasuredEyes, load_measured_eyes
-from estimator.periphery.meridian import CIRCLE_MM, TERMS
-from estimator.periphery.population import Population, measured_population
+from estimator.periphery.population import (
+    CIRCLE_MM,
+    TERMS,
+    MeasuredEyes,
+    Population,
+    load_measured_eyes,
+    measured_population,
+)
 from estimator.profiles.parse import parse_profile, preset_names
 from filter_service.progress import Progress
 from tests.benchmarks.harness import OUT, RESULTS, Row, memory_mb, publish

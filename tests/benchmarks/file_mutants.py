@@ -127,7 +127,7 @@ def kinds(folder: Path) -> list[Kind]:
     from clients.web.page_state import PageState
     from clients.web.picture import photo_picture
     from clients.web.shared_entries import fragment_of, restore
-    from estimator.periphery.measured_eyes import load_measured_eyes
+    from estimator.periphery.population import load_measured_eyes
     from estimator.profiles.files import load_profile
     from estimator.profiles.parse import parse_profile
     from filter_service.image_files import read_color_file, read_depth_file

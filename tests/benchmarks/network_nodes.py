@@ -11,16 +11,14 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from estimator.eye.accommodation import AccommodatingEye
-from estimator.eye.assembly import pack_eyes
-from estimator.eye.lens_change import AQUEOUS, DIAMETER, accommodated_vectors
+from estimator.eye.assembly import AQUEOUS, DIAMETER, accommodated_vectors, pack_eyes
 from estimator.eye.parameters import N_PARAMETERS, EyeParameters
 from estimator.eye.tracing import eye_indices, refraction_of_vectors
 from estimator.networks import inference as networks
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM, RGB_WAVELENGTHS_NM
 from estimator.wavefront.aberrations import eyes_aberrations
-from estimator.wavefront.compiled import magnifications
+from estimator.wavefront.compiled import FieldResults, magnifications
 from estimator.wavefront.nodes import N_AZIMUTHS, N_RINGS
-from estimator.wavefront.results import FieldResults
 from tests.numerical.spot_focus import focus_by_spot
 
 PUPILS_MM = np.linspace(2.0, 7.0, 6)

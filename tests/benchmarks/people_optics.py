@@ -12,12 +12,11 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.acuity.sensitivity import MEAN_EYE_NM, mean_eye_transfer
+from estimator.acuity.transfer import MEAN_EYE_NM, mean_eye_transfer
 from estimator.field.field_table import field_table
 from estimator.optics.prescription import power_vectors_dpt
 from estimator.optics.zernike import N_TERMS, index_from_nm, rescale_pupil
-from estimator.periphery.measured_eyes import MeasuredEyes
-from estimator.periphery.meridian import CIRCLE_MM, TERMS
+from estimator.periphery.population import CIRCLE_MM, TERMS, MeasuredEyes
 from estimator.profiles.parse import EyeProfile, parse_profile
 from tests import human_data
 from tests.benchmarks.people_findings import Finding, band_of

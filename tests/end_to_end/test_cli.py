@@ -15,7 +15,7 @@ from PIL import Image
 import clients
 import estimator
 import filter_service
-from estimator.networks.card import NETWORK_NAMES
+from estimator.networks.inference import NETWORK_NAMES
 from tests.commands import full_disk
 from tests.commands import run_command as run
 from tests.source_tree import ROOT

@@ -5,9 +5,11 @@ import json
 import numpy as np
 from scipy.optimize import brentq
 
-from estimator.dynamics.accommodation_response import AccommodationResponse
-from estimator.dynamics.pupil_reflex import PupilReflex
-from estimator.dynamics.pupil_size import steady_pupil_mm
+from estimator.dynamics.responses import (
+    AccommodationResponse,
+    PupilReflex,
+    steady_pupil_mm,
+)
 from tests.source_tree import ROOT
 
 PUPIL_CURVES = json.loads((ROOT / "tests/data/pupil_curves.json").read_text("utf-8"))

@@ -10,8 +10,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.eye.assembly import eye_surfaces
-from estimator.eye.lens_change import accommodated
+from estimator.eye.assembly import accommodated, eye_surfaces
 from estimator.eye.parameters import EyeParameters, RetinaShape
 from estimator.optics.raytrace import RayStatus, trace_rays
 from estimator.optics.surfaces import EyeSurfaces

@@ -8,9 +8,12 @@ import pytest
 
 from estimator.estimate.estimation import estimate_eye
 from estimator.eye.accommodation import AccommodatingEye
-from estimator.eye.assembly import eye_surfaces
-from estimator.eye.lens_change import SMALLEST_DIAMETER_RATIO, accommodated
-from estimator.eye.lens_shape import lens_shape
+from estimator.eye.assembly import (
+    SMALLEST_DIAMETER_RATIO,
+    accommodated,
+    eye_surfaces,
+    lens_shape,
+)
 from estimator.eye.parameters import EyeParameters, RetinaShape
 from estimator.eye.tracing import (
     refraction_of_vectors,

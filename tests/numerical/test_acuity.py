@@ -15,11 +15,11 @@ from estimator.acuity import (
     predict_acuity,
     retina_nyquist_cpd,
 )
-from estimator.acuity.sensitivity import contrast_sensitivity, perfect_transfer
+from estimator.acuity.transfer import contrast_sensitivity, perfect_transfer
 from estimator.field.field_table import field_table
 from estimator.optics.prescription import zernike_from_power_vector
 from estimator.optics.zernike import rescale_pupil, zernike_values
-from estimator.periphery.measured_eyes import load_measured_eyes
+from estimator.periphery.population import load_measured_eyes
 from estimator.profiles.parse import parse_profile
 from estimator.profiles.typical_aberrations import (
     TYPICAL_PUPIL_MM,

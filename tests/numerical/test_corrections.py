@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 from estimator.acuity import acuity_through_focus, optical_transfer
-from estimator.corrections.kinoform import Kinoform
 from estimator.corrections.progressive import (
     CUBES,
     ProgressiveLens,
     progressive_polynomial,
 )
-from estimator.corrections.rings import DiffractiveRings, RefractiveZones
+from estimator.corrections.rings import DiffractiveRings, Kinoform, RefractiveZones
 from estimator.corrections.worn_lens import (
     WornLens,
     aberration_polynomial,

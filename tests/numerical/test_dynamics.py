@@ -6,14 +6,14 @@ import math
 import numpy as np
 import pytest
 
-from estimator.dynamics.accommodation_response import AccommodationResponse
-from estimator.dynamics.delayed_approach import DelayedApproach
 from estimator.dynamics.gaze import GazeFollower
-from estimator.dynamics.pupil_reflex import (
+from estimator.dynamics.responses import (
     LATENCY_RANGE_S,
+    AccommodationResponse,
+    DelayedApproach,
     reflex_latency_s,
+    steady_pupil_mm,
 )
-from estimator.dynamics.pupil_size import steady_pupil_mm
 from tests.numerical.moving_eyes import (
     recorded_pulses,
     steps_response,

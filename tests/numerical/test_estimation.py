@@ -5,11 +5,13 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from estimator.estimate.bounded_fit import FitFailed, box_minimum, fit_bounded
-from estimator.estimate.estimation import POOR_FIT_UM, estimate_eye
-from estimator.estimate.pattern_search import search_loss, search_weights
-from estimator.estimate.prior import prior_for_refraction
-from estimator.estimate.problem import compared_terms
-from estimator.estimate.table import table_vectors
+from estimator.estimate.estimation import POOR_FIT_UM, estimate_eye, table_vectors
+from estimator.estimate.problem import (
+    compared_terms,
+    prior_for_refraction,
+    search_loss,
+    search_weights,
+)
 from estimator.eye.parameters import (
     PARAMETER_NAMES,
     PARAMETERS,

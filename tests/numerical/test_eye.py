@@ -7,8 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from estimator.eye.assembly import eye_surfaces, pack_eyes
-from estimator.eye.lens_shape import compat_lens_shape, lens_shape
+from estimator.eye.assembly import (
+    compat_lens_shape,
+    eye_surfaces,
+    lens_shape,
+    pack_eyes,
+)
 from estimator.eye.parameters import (
     N_PARAMETERS,
     PARAMETER_NAMES,

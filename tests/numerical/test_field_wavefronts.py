@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from estimator.estimate.estimation import estimate_eye
+from estimator.eye.tracing import pupil_refraction_dpt
 from estimator.field.aberration_grid import aberration_grid
-from estimator.field.few_colors import few_colors_grid
 from estimator.field.field_table import field_table
 from estimator.field.interpolation import FieldInterpolation, field_nodes_deg
+from estimator.field.prepare import few_colors_grid
 from estimator.field.traced_eye import TracedEye
 from estimator.optics.prescription import power_vector, zernike_from_power_vector
 from estimator.optics.zernike import flip_horizontal, zernike_values
@@ -28,7 +29,6 @@ from estimator.wavefront.field_wavefronts import (
     total_defocus_dpt,
     zernike_from_polynomial,
 )
-from estimator.wavefront.pupil_refraction import pupil_refraction_dpt
 
 WIDE_DEG = ((-45.0, 45.0), (-25.0, 25.0))
 BLUE_NM = 464.0

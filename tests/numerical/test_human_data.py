@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from estimator.acuity import mean_eye_transfer, optical_transfer
-from estimator.acuity.sensitivity import perfect_transfer
+from estimator.acuity.transfer import perfect_transfer
 from estimator.media.straylight import CATARACTS, Straylight
 from estimator.optics.prescription import power_vectors_dpt
 from estimator.optics.zernike import N_TERMS
-from estimator.periphery.measured_eyes import load_measured_eyes
+from estimator.periphery.population import load_measured_eyes
 from tests import human_data
 from tests.benchmarks.bench_people import FILE
 from tests.benchmarks.people_findings import Finding, print_findings

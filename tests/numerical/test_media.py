@@ -5,8 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from estimator.media.absorption import channel_gains, media_density
-from estimator.media.straylight import CATARACTS, Straylight, cie_glare_per_sr
+from estimator.media.straylight import (
+    CATARACTS,
+    Straylight,
+    channel_gains,
+    cie_glare_per_sr,
+    media_density,
+)
 from estimator.profiles.parse import ProfileError, parse_profile
 from filter_service.camera import Camera
 from filter_service.rendering.engine import ViewRequest

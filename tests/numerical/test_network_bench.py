@@ -14,7 +14,7 @@ from PIL import Image
 from estimator.estimate.estimation import estimate_eye
 from estimator.eye.assembly import eye_surfaces
 from estimator.eye.parameters import EyeParameters, mean_vector
-from estimator.networks.card import WeightsMissing
+from estimator.networks.inference import WeightsMissing
 from estimator.profiles.parse import parse_profile
 from estimator.wavefront.aberrations import wavefront_grid
 from tests.benchmarks import bench_networks, network_nodes, network_steps

@@ -7,8 +7,7 @@ import pytest
 
 from estimator.estimate.estimation import estimate_eye
 from estimator.field.network_eye import NetworkEye, network_eye, trained_range
-from estimator.networks.card import NetworkUnavailable
-from estimator.networks.inference import network_aberrations
+from estimator.networks.inference import NetworkUnavailable, network_aberrations
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.profiles.files import load_profile
 from estimator.profiles.measured_wavefront import MeasuredWavefront

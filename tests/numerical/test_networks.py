@@ -9,21 +9,17 @@ import sys
 import numpy as np
 import pytest
 
-from estimator.estimate.estimation import GOOD_FIT_UM, estimate_eye
-from estimator.estimate.network_guess import network_guess
+from estimator.estimate.estimation import GOOD_FIT_UM, estimate_eye, network_guess
 from estimator.eye.accommodation import AccommodatingEye
-from estimator.eye.assembly import eye_surfaces
-from estimator.eye.lens_change import accommodated_vectors
+from estimator.eye.assembly import accommodated_vectors, eye_surfaces
 from estimator.eye.parameters import EyeParameters, column, random_vectors
 from estimator.eye.tracing import TraceFailed, zernike_of_vectors
 from estimator.networks import inference as networks
-from estimator.networks.card import (
+from estimator.networks.inference import (
     INPUTS,
     NETWORK_NAMES,
     OutOfDomain,
     WeightsMissing,
-)
-from estimator.networks.inference import (
     load_network,
     network_aberrations,
     network_eye,

@@ -15,17 +15,18 @@ from estimator.optics.zernike import (
     rescale_pupil,
 )
 from estimator.periphery.change import OFF_MERIDIAN_UM, peripheral_change
-from estimator.periphery.measured_eyes import load_measured_eyes
-from estimator.periphery.meridian import (
+from estimator.periphery.population import (
     CIRCLE_MM,
     KNOTS_DEG,
     MEASURED_DEG,
     TERMS,
+    Population,
     field_matrix,
     field_terms,
+    load_measured_eyes,
+    measured_population,
     meridian_weights,
 )
-from estimator.periphery.population import Population, measured_population
 from estimator.profiles.parse import ProfileError, parse_profile
 from tests.benchmarks.bench_people import (
     ANGLES_DEG,

@@ -8,7 +8,7 @@ import pytest
 from estimator.optics.gradients import GRADIENTS
 from estimator.optics.paraxial import cardinal_points
 from estimator.profiles.bodies import PUBLISHED_NAMES
-from estimator.profiles.published import published_eye
+from estimator.profiles.surfaces import published_eye
 from estimator.wavefront.aberrations import wavefront_grid
 
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from estimator.estimate.given_surfaces import eye_model
-from estimator.eye.assembly import eye_surfaces
-from estimator.eye.lens_change import accommodated
+from estimator.eye.assembly import accommodated, eye_surfaces
 from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters
 from estimator.eye.surface_model import StatesDiffer, SurfaceModel
 from estimator.eye.tracing import TraceFailed
@@ -16,7 +15,7 @@ from estimator.field.prepare import prepare_eye
 from estimator.optics.forms import SeparateProfiles, TwoConics
 from estimator.profiles.files import load_profile
 from estimator.profiles.parse import parse_profile
-from estimator.profiles.published import published_eye
+from estimator.profiles.surfaces import published_eye
 from estimator.wavefront.aberrations import wavefront_aberrations
 from filter_service.building.from_profile import build
 from filter_service.building.jobs import BuildJob, BuildLimits

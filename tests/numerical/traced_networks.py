@@ -6,7 +6,7 @@ from estimator.eye.accommodation import AccommodatingEye
 from estimator.eye.assembly import eye_surfaces
 from estimator.eye.parameters import EyeParameters
 from estimator.networks import inference as networks
-from estimator.networks.card import INPUTS, OUTPUTS, Card, ExpectedError
+from estimator.networks.inference import INPUTS, OUTPUTS, Card, ExpectedError
 from estimator.wavefront.aberrations import wavefront_grid
 from estimator.wavefront.field_wavefronts import rim_from_ellipse
 

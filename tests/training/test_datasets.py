@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from estimator.estimate.prior import prior_for_refraction
+from estimator.estimate.problem import prior_for_refraction
 from estimator.eye.accommodation import AccommodatingEye
-from estimator.eye.assembly import eye_surfaces
-from estimator.eye.lens_change import smallest_diameter_mm
+from estimator.eye.assembly import eye_surfaces, smallest_diameter_mm
 from estimator.eye.parameters import EyeParameters, column
 from estimator.wavefront.aberrations import wavefront_aberrations
 from training.datasets import (

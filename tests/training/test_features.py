@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from estimator.estimate.prior import deviations, mean_eyes
+from estimator.estimate.problem import deviations, mean_eyes
 from estimator.eye.parameters import column, mean_vector
 from estimator.eye.tracing import refraction_of_vectors
-from estimator.networks.card import FIRST_TERM
+from estimator.networks.inference import FIRST_TERM
 from estimator.optics.prescription import C20
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20
 from estimator.optics.zernike import nm_from_index, zernike_values

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from estimator.eye.accommodation import AccommodatingEye
-from estimator.eye.lens_change import accommodated_vectors
+from estimator.eye.assembly import accommodated_vectors
 from estimator.eye.parameters import EyeParameters, column, mean_vector, random_vectors
 
 torch = pytest.importorskip("torch")

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from estimator import drawn_profiles, load_profile, parse_profile
-from estimator.field.drawn_fields import DrawnFields, drawn_fields
-from estimator.field.field_table import field_table
+from estimator.field.field_table import DrawnFields, drawn_fields, field_table
 from estimator.field.plot import field_figure
 from tests.commands import run_command
 

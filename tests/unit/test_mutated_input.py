@@ -14,8 +14,8 @@ import pytest
 
 from estimator.bounded_files import printable
 from estimator.eye.checked_fields import ProfileError
+from estimator.profiles.given_eyes import biconvex_radius_mm
 from estimator.profiles.parse import parse_profile
-from estimator.profiles.pseudophakic import biconvex_radius_mm
 from tests.benchmarks.bench_files import (
     MAX_MEMORY_MB,
     MAX_READ_S,

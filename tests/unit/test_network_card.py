@@ -7,9 +7,9 @@ import pytest
 
 from estimator.estimate.problem import FIRST_COMPARED
 from estimator.eye.parameters import PARAMETER_NAMES
-from estimator.networks import card as network_card
+from estimator.networks import inference as network_card
 from estimator.networks import inference as networks
-from estimator.networks.card import (
+from estimator.networks.inference import (
     INPUTS,
     NETWORK_NAMES,
     OUTPUTS,

@@ -12,8 +12,7 @@ import pytest
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import PARAMETERS, EyeParameters
 from estimator.profiles import bodies, reference
-from estimator.profiles.bodies import MEASURED_KINDS, TRACED_KINDS
-from estimator.profiles.correction_bodies import CorrectionBody
+from estimator.profiles.bodies import MEASURED_KINDS, TRACED_KINDS, CorrectionBody
 from estimator.profiles.given_bodies import KINDS, ProfileBody
 from estimator.profiles.parse import parse_profile, preset_names
 from filter_service import errors, messages

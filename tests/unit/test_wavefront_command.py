@@ -10,7 +10,7 @@ from estimator.field.field_table import field_table
 from estimator.optics.zernike import rescale_pupil
 from estimator.profiles.files import load_profile
 from estimator.wavefront.aberrations import pupil_magnification
-from estimator.wavefront.results import PupilEllipse
+from estimator.wavefront.compiled import PupilEllipse
 from tests.commands import run_command
 from tests.numerical.schematic_eyes import reference
 

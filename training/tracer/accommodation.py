@@ -13,14 +13,15 @@ import torch
 from torch import Tensor
 
 from estimator.eye.accommodation import MAX_REFINEMENTS, N_TABLE
-from estimator.eye.lens_change import (
+from estimator.eye.assembly import (
+    ANTERIOR_THICKNESS_RATIO,
     AQUEOUS,
+    CAP_VOLUME_RATIO,
     DIAMETER,
     SMALLEST_AQUEOUS_MM,
     SMALLEST_DIAMETER_RATIO,
     VOLUME,
 )
-from estimator.eye.lens_shape import ANTERIOR_THICKNESS_RATIO, CAP_VOLUME_RATIO
 from training.tracer.circle import refraction_of_eyes
 from training.tracer.eye import lens_shape
 
@@ -61,7 +62,7 @@ def accommodated_eyes(vectors: Tensor, lens_diameter_mm: Tensor) -> Tensor:
 
 
 def smallest_diameters_mm(vectors: Tensor) -> Tensor:
-    """Compute `estimator.eye.lens_change.smallest_diameter_mm` for a batch."""
+    """Compute `estimator.eye.assembly.smallest_diameter_mm` for a batch."""
     relaxed_mm, volume_mm3 = vectors[..., DIAMETER], vectors[..., VOLUME]
     room_mm = torch.clamp(vectors[..., AQUEOUS] - SMALLEST_AQUEOUS_MM, min=0.0)
     c_mm3 = 8.0 / math.pi * CAP_VOLUME_RATIO * ANTERIOR_THICKNESS_RATIO * volume_mm3

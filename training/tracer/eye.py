@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from estimator.eye import lens_shape as rule
+from estimator.eye import assembly as rule
 from estimator.eye import parameters
 from estimator.optics.surfaces import horner_order, offset_monomials
 from estimator.optics.zernike import DEFAULT_ORDER, EXPONENTS, N_TERMS
