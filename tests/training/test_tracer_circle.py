@@ -10,7 +10,7 @@ from estimator.optics.media import refractive_index
 torch = pytest.importorskip("torch")
 
 from training.tracer.circle import refraction_of_eyes, zernike_of_eyes  # noqa: E402
-from training.tracer.media import refractive_indices  # noqa: E402
+from training.tracer.eye import refractive_indices  # noqa: E402
 
 N_EYES = 500
 

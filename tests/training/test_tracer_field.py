@@ -13,8 +13,8 @@ from estimator.wavefront.compiled import magnifications
 
 torch = pytest.importorskip("torch")
 
-from training.tracer.field import field_aberrations_of_eyes  # noqa: E402
-from training.tracer.fit import (  # noqa: E402
+from training.tracer.field import (  # noqa: E402
+    field_aberrations_of_eyes,
     fit_zernike,
     rim_ellipse,
     rim_radius,

@@ -20,7 +20,7 @@ from estimator.optics.surfaces import (
 torch = pytest.importorskip("torch")
 
 from training.tracer import eye as eyes  # noqa: E402
-from training.tracer.surfaces import cross_conic, cross_iterated  # noqa: E402
+from training.tracer.rays import cross_conic, cross_iterated  # noqa: E402
 
 N_EYES, N_RAYS = 40, 30
 WAVELENGTH_NM = 530.0

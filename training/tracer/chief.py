@@ -10,15 +10,15 @@ import torch
 from torch import Tensor
 
 from training.tracer import eye as eyes
-from training.tracer.bundle import (
+from training.tracer.eye import Eye
+from training.tracer.rays import (
     ORDER_TOLERANCE_MM,
+    cross_conic,
     into_cornea,
     into_lens,
     inverse_2x2,
     to_stop,
 )
-from training.tracer.eye import Eye
-from training.tracer.surfaces import cross_conic
 
 _START_MM = 30.0
 _DIFFERENCE_MM = 1e-6

@@ -3,7 +3,7 @@
 The counterpart of `estimator.eye.tracing.zernike_of_vectors` on axis: the wavefront of
 the chief ray's retinal point on the filled circle of half the pupil diameter, whatever
 the stop. Here rays start at the nodes of that circle and are aimed at the retinal
-point; their miss has little effect (see `paths`).
+point; their miss has little effect (see `extra_path`).
 """
 
 from typing import Any, cast
@@ -16,17 +16,17 @@ from estimator.optics.zernike import N_TERMS, index_from_nm
 from estimator.wavefront.nodes import circle_nodes
 from training.tracer import chief as chiefs
 from training.tracer import eye as eyes
-from training.tracer.aim import broyden
 from training.tracer.batches import constant, in_chunks
-from training.tracer.bundle import (
+from training.tracer.eye import Eye
+from training.tracer.rays import (
     ORDER_TOLERANCE_MM,
     across,
+    broyden,
+    extra_path,
     into_cornea,
     into_lens,
     inverse_2x2,
 )
-from training.tracer.eye import Eye
-from training.tracer.paths import extra_path
 
 _ACCEPTED_MM = 1e-4
 """Miss at the retina: its square leaves 4e-7 um, but gradients depend on it
