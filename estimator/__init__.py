@@ -5,8 +5,8 @@ From a profile to PSFs: `load_profile`, `estimate_eye` or `prepare_eye`, `comput
     optics/        light and surfaces
     wavefront/     ray-traced wavefronts of surfaces
     acuity/        image quality metrics and visual acuity
-    dynamics/      pupil, accommodation and gaze over time
-    media/         scattering and absorption in the ocular media
+    dynamics       pupil, accommodation and gaze over time
+    media          scattering and absorption in the ocular media
     psf/           point-spread functions of wavefronts
     corrections/   spectacles, contact lenses and intraocular lenses
     eye/           the 45-parameter eye model

@@ -23,7 +23,9 @@ class Import:
 
 
 def python_files(package: str) -> list[Path]:
-    return sorted((ROOT / package).rglob("*.py"))
+    """Return the files of a folder, or of a module without one."""
+    module = ROOT / f"{package}.py"
+    return [module] if module.is_file() else sorted((ROOT / package).rglob("*.py"))
 
 
 def imports_of(path: Path) -> list[Import]:

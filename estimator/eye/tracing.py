@@ -113,14 +113,11 @@ def zernike_of_vectors(
     retina: RetinaShape | None = None,
     h_deg: float = 0.0,
     v_deg: float = 0.0,
-    at_pupil: bool = False,
 ) -> NDArray[np.float64]:
     """Return coefficients (P, 28), um, of relaxed or accommodated eyes (P, 45).
 
-    They are on the circle of ``pupil_diameter_mm``, one or (P,), about the chief ray,
-    for an object at infinity; a row is NaN where light does not pass.  The circle lies
-    at the cornea or, on axis with ``at_pupil``, in the plane of each eye's own entrance
-    pupil.
+    They are on the circle of ``pupil_diameter_mm``, one or (P,), about the chief ray at
+    the cornea, for an object at infinity; a row is NaN where light does not pass.
     """
     packed = pack_eyes(vectors, retina=retina)
     indices = eye_indices(wavelength_nm)
@@ -129,10 +126,7 @@ def zernike_of_vectors(
     )
     radius_mm, reference = pupils_mm / 2.0, eye_indices(REFERENCE_WAVELENGTH_NM)
     if h_deg == 0.0 and v_deg == 0.0:
-        pupil_z_mm = entrance_pupils_mm(packed, reference) if at_pupil else np.nan
-        return on_axis_zernike(
-            packed, indices, zernike_radius_mm=radius_mm, pupil_z_mm=pupil_z_mm
-        )[0]
+        return on_axis_zernike(packed, indices, zernike_radius_mm=radius_mm)[0]
     ratios = magnifications(packed, reference)
     zernike_um = np.full((len(vectors), N_TERMS), np.nan)
     usable = ratios > 0.0
@@ -163,17 +157,17 @@ def refraction_of_vectors(
 ) -> NDArray[np.float64]:
     """Return least-squares M (P,), dpt, from C(2,0) on the pupil's circle.
 
-    It is NaN where light does not pass.
+    The circle lies at the cornea, or in the plane of each eye's own entrance pupil.  M
+    is NaN where light does not pass.
     """
-    zernike_um = zernike_of_vectors(
-        vectors,
+    packed = pack_eyes(vectors, retina=retina)
+    reference = eye_indices(REFERENCE_WAVELENGTH_NM)
+    return refraction_of_packed(
+        packed,
+        eye_indices(wavelength_nm),
+        pupil_z_mm=entrance_pupils_mm(packed, reference) if at_pupil else np.nan,
         pupil_diameter_mm=pupil_diameter_mm,
-        wavelength_nm=wavelength_nm,
-        retina=retina,
-        at_pupil=at_pupil,
     )
-    radius_mm = np.asarray(pupil_diameter_mm, dtype=np.float64) / 2.0
-    return -SPHERE_PER_C20 * zernike_um[:, C20] / radius_mm**2
 
 
 def seen_refraction_of_vectors(
@@ -241,20 +235,20 @@ def refraction_of_packed(
     indices: NDArray[np.float64],
     *,
     pupil_z_mm: ArrayLike,
-    pupil_diameter_mm: float,
+    pupil_diameter_mm: ArrayLike,
 ) -> NDArray[np.float64]:
-    """Return least-squares M (P,), dpt, of packed eyes (P, ...) on axis at 555 nm.
+    """Return least-squares M (P,), dpt, of packed eyes (P, ...) on axis.
 
     Parameters
     ----------
-    indices : (P, n)
-        Index row of each eye.
-    pupil_z_mm : (P,)
-        Plane of the circle, such as the entrance pupil.
-    pupil_diameter_mm : float
+    indices : (n,) or (P, n)
+        Index row of all eyes, or of each.
+    pupil_z_mm : scalar or (P,)
+        Plane of the circle, such as the entrance pupil; nan for the cornea.
+    pupil_diameter_mm : scalar or (P,)
         Circle of the fit, filled regardless of the stop.
     """
-    radius_mm = pupil_diameter_mm / 2.0
+    radius_mm = np.asarray(pupil_diameter_mm, dtype=np.float64) / 2.0
     zernike_um, _ = on_axis_zernike(
         packed, indices, zernike_radius_mm=radius_mm, pupil_z_mm=pupil_z_mm
     )

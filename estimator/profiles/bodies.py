@@ -20,7 +20,7 @@ from msgspec import UNSET, Meta, UnsetType
 
 from estimator.corrections.worn_lens import TYPICAL_DEPTH_MM
 from estimator.eye.parameters import PARAMETERS, Parameter
-from estimator.media.straylight import BROWN
+from estimator.media import BROWN
 from estimator.optics.zernike import DEFAULT_ORDER, HIGHEST_ORDER
 from estimator.profiles.validation import ALLOWED
 

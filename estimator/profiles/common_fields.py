@@ -26,7 +26,7 @@ from estimator.corrections.worn_lens import (
 )
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import RetinaShape
-from estimator.media.straylight import CATARACTS, DEFAULT_AGE_YEARS, Straylight
+from estimator.media import CATARACTS, DEFAULT_AGE_YEARS, Straylight
 from estimator.note import Note, note_of
 from estimator.optics import prescription as rx
 from estimator.optics.vergence import TYPICAL_ENTRANCE_PUPIL_MM

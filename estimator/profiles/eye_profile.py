@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import EyeParameters, RetinaShape
-from estimator.media.straylight import Straylight
+from estimator.media import Straylight
 from estimator.optics import prescription as rx
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 

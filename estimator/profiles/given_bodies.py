@@ -267,73 +267,6 @@ class ImplantBody(Body, kw_only=True):
     tilt_deg: Tilt = (0.0, 0.0)
 
 
-AxialLengthMm = Annotated[
-    float, Meta(ge=17.0, le=36.0, description="corneal apex to the photoreceptors")
-]
-Keratometry = Annotated[
-    tuple[
-        Annotated[float, Meta(ge=30.0, le=60.0)],
-        Annotated[float, Meta(ge=30.0, le=60.0)],
-    ],
-    Meta(description="power in the meridian of `keratometry_axis_deg`, and across it"),
-]
-KeratometryAxisDeg = Annotated[
-    float,
-    Meta(
-        ge=0.0,
-        le=180.0,
-        description="as the examiner writes it; required if the powers differ",
-    ),
-]
-KeratometricIndex = Annotated[
-    float,
-    Meta(ge=1.32, le=1.35, description="index of the keratometer: K = (index - 1) / R"),
-]
-PosteriorRatio = Annotated[
-    float,
-    Meta(ge=0.6, le=1.0, description="posterior over anterior radius of the cornea"),
-]
-ChamberDepthMm = Annotated[
-    float,
-    Meta(
-        ge=1.5,
-        le=5.5,
-        description="before surgery, corneal apex to natural lens; with "
-        "`lens_thickness_mm`, places the implant",
-    ),
-]
-LensThicknessMm = Annotated[
-    float, Meta(ge=2.0, le=7.0, description="of the natural lens, before surgery")
-]
-OlsenC = Annotated[
-    float,
-    Meta(
-        ge=0.2,
-        le=0.6,
-        description="center of the implant = `acd_mm` + C x `lens_thickness_mm` "
-        "(Olsen & Hoffmann 2014)",
-    ),
-]
-LensCenterMm = Annotated[
-    float,
-    Meta(
-        ge=2.5,
-        le=8.0,
-        description="corneal apex to the center of the implant; instead of `acd_mm`, "
-        "`lens_thickness_mm` and `olsen_c`",
-    ),
-]
-IrisDepthMm = Annotated[
-    float,
-    Meta(
-        ge=1.5,
-        le=7.0,
-        description="corneal apex to the iris; by default `acd_mm`, at most 0.1 mm in "
-        "front of the implant",
-    ),
-]
-
-
 class SurfacesBody(CommonBody, kw_only=True, tag_field="kind", tag="surfaces"):
     """An eye by its surfaces and media."""
 
@@ -362,11 +295,43 @@ class SurfacesBody(CommonBody, kw_only=True, tag_field="kind", tag="surfaces"):
 class PseudophakicBody(CommonBody, kw_only=True, tag_field="kind", tag="pseudophakic"):
     """An eye with an intraocular lens, by biometry and the lens's geometry."""
 
-    axial_length_mm: AxialLengthMm
-    keratometry_dpt: Keratometry
-    keratometry_axis_deg: KeratometryAxisDeg | UnsetType = UNSET
-    keratometric_index: KeratometricIndex = 1.3375
-    posterior_ratio: PosteriorRatio = 0.825
+    axial_length_mm: Annotated[
+        float, Meta(ge=17.0, le=36.0, description="corneal apex to the photoreceptors")
+    ]
+    keratometry_dpt: Annotated[
+        tuple[
+            Annotated[float, Meta(ge=30.0, le=60.0)],
+            Annotated[float, Meta(ge=30.0, le=60.0)],
+        ],
+        Meta(
+            description="power in the meridian of `keratometry_axis_deg`, and across it"
+        ),
+    ]
+    keratometry_axis_deg: (
+        Annotated[
+            float,
+            Meta(
+                ge=0.0,
+                le=180.0,
+                description="as the examiner writes it; required if the powers differ",
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
+    keratometric_index: Annotated[
+        float,
+        Meta(
+            ge=1.32,
+            le=1.35,
+            description="index of the keratometer: K = (index - 1) / R",
+        ),
+    ] = 1.3375
+    posterior_ratio: Annotated[
+        float,
+        Meta(
+            ge=0.6, le=1.0, description="posterior over anterior radius of the cornea"
+        ),
+    ] = 0.825
     cornea_conic_constant: (
         Annotated[
             float,
@@ -381,11 +346,58 @@ class PseudophakicBody(CommonBody, kw_only=True, tag_field="kind", tag="pseudoph
     cornea_zernike_um: CorneaCoefficientsUm | UnsetType = UNSET
     cornea_pupil_diameter_mm: PupilDiameterMm = 6.0
     frame: Frame = "eye"
-    acd_mm: ChamberDepthMm | UnsetType = UNSET
-    lens_thickness_mm: LensThicknessMm | UnsetType = UNSET
-    olsen_c: OlsenC = 0.39
-    lens_center_mm: LensCenterMm | UnsetType = UNSET
-    iris_depth_mm: IrisDepthMm | UnsetType = UNSET
+    acd_mm: (
+        Annotated[
+            float,
+            Meta(
+                ge=1.5,
+                le=5.5,
+                description="before surgery, corneal apex to natural lens; with "
+                "`lens_thickness_mm`, places the implant",
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
+    lens_thickness_mm: (
+        Annotated[
+            float,
+            Meta(ge=2.0, le=7.0, description="of the natural lens, before surgery"),
+        ]
+        | UnsetType
+    ) = UNSET
+    olsen_c: Annotated[
+        float,
+        Meta(
+            ge=0.2,
+            le=0.6,
+            description="center of the implant = `acd_mm` + C x `lens_thickness_mm` "
+            "(Olsen & Hoffmann 2014)",
+        ),
+    ] = 0.39
+    lens_center_mm: (
+        Annotated[
+            float,
+            Meta(
+                ge=2.5,
+                le=8.0,
+                description="corneal apex to the center of the implant; instead of "
+                "`acd_mm`, `lens_thickness_mm` and `olsen_c`",
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
+    iris_depth_mm: (
+        Annotated[
+            float,
+            Meta(
+                ge=1.5,
+                le=7.0,
+                description="corneal apex to the iris; by default `acd_mm`, at most "
+                "0.1 mm in front of the implant",
+            ),
+        ]
+        | UnsetType
+    ) = UNSET
     implant: Annotated[ImplantBody, Meta(description="the intraocular lens")]
 
 

@@ -162,7 +162,7 @@ def _row(field: inspect.Field) -> str:
         f"`{field.encode_name}`",
         _default(field),
         _allowed(field),
-        _meaning(field),
+        _meaning(field.type),
     ]
     return "| " + " | ".join(cells) + " |"
 
@@ -196,22 +196,15 @@ def _allowed(field: inspect.Field) -> str:
     return allowed_values(kind).removeprefix("a number from ")
 
 
-def _meaning(field: inspect.Field) -> str:
-    kind, found = field.type, ""
+def _meaning(kind: inspect.Type) -> str:
+    """Return the description of a type, or of the first member that has one."""
+    found = ""
     while isinstance(kind, inspect.Metadata):
         found = found or str((kind.extra_json_schema or {}).get("description", ""))
         kind = kind.type
     if isinstance(kind, inspect.UnionType):
-        return found or next(
-            (_meaning_of(member) for member in kind.types if _meaning_of(member)), ""
-        )
+        return found or next(filter(None, map(_meaning, kind.types)), "")
     return found
-
-
-def _meaning_of(kind: inspect.Type) -> str:
-    if isinstance(kind, inspect.Metadata):
-        return str((kind.extra_json_schema or {}).get("description", ""))
-    return ""
 
 
 def _bare(kind: inspect.Type) -> inspect.Type:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.media.straylight import Straylight
+from estimator.media import Straylight
 from estimator.native import shared_threads
 from estimator.threads import thread_count
 from filter_service.camera import Camera

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.media.straylight import Straylight, channel_gains
+from estimator.media import Straylight, channel_gains
 from estimator.native import shared_threads
 from estimator.profiles.parse import EyeProfile
 from filter_service.constants import RGB

@@ -14,7 +14,7 @@ import time
 
 import numpy as np
 
-from estimator.media.straylight import Straylight, cie_glare_per_sr
+from estimator.media import Straylight, cie_glare_per_sr
 from estimator.profiles.parse import parse_profile
 from filter_service.camera import Camera
 from filter_service.psfs.eye_for_spec import eye_for_spec

@@ -14,7 +14,7 @@ from estimator.acuity.transfer import (
     clear_pupil,
     grid_wavefront_um,
 )
-from estimator.media.straylight import LARGEST_DEG, SMALLEST_DEG, Straylight
+from estimator.media import LARGEST_DEG, SMALLEST_DEG, Straylight
 from estimator.optics.prescription import C2M2, C20, C22, zernike_from_power_vector
 from estimator.optics.zernike import N_TERMS
 from tests.benchmarks.bench_acuity import ASTIGMATISM_RATIO, RESIDUALS_DPT

@@ -5,7 +5,7 @@ import json
 import numpy as np
 from scipy.optimize import brentq
 
-from estimator.dynamics.responses import (
+from estimator.dynamics import (
     AccommodationResponse,
     PupilReflex,
     steady_pupil_mm,

@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from estimator.dynamics.gaze import GazeFollower
-from estimator.dynamics.responses import (
+from estimator.dynamics import (
     LATENCY_RANGE_S,
     AccommodationResponse,
     DelayedApproach,
+    GazeFollower,
     reflex_latency_s,
     steady_pupil_mm,
 )

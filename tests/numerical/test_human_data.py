@@ -9,7 +9,7 @@ import pytest
 
 from estimator.acuity import mean_eye_transfer, optical_transfer
 from estimator.acuity.transfer import perfect_transfer
-from estimator.media.straylight import CATARACTS, Straylight
+from estimator.media import CATARACTS, Straylight
 from estimator.optics.prescription import power_vectors_dpt
 from estimator.optics.zernike import N_TERMS
 from estimator.periphery.population import load_measured_eyes

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from estimator.media.straylight import (
+from estimator.media import (
     CATARACTS,
     Straylight,
     channel_gains,

@@ -1,4 +1,6 @@
-"""Straylight: wide-angle scattering in the eye, which causes glare and lowers contrast.
+"""Scattering and absorption in the ocular media.
+
+Straylight is wide-angle scattering, which causes glare and lowers contrast.
 
 The CIE total glare function is the point-spread function of an eye from 0 to 100 deg,
 by age and pigmentation (Vos & van den Berg, CIE Research Note 135/1, 1999).  Its core
