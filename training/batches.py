@@ -2,7 +2,6 @@
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,6 @@ from training.datasets import (
     recipe_of,
     split,
 )
-from training.device_labels import label_on_device
 from training.models import Network
 from training.run_file import Run
 from training.tasks import N_EYE, TASKS
@@ -34,9 +32,7 @@ FRESH_SEED = 7919
 """Added to the seed of the run, so that fresh rows differ from those of the shards."""
 
 FRESH_STEPS = 8
-"""Steps whose rows are traced in one call: the number of operations of a call, some ten
-thousand, does not depend on the number of rows. On a GPU, launching them should
-dominate the time; this has not been measured."""
+"""Steps whose rows are traced in one call."""
 
 
 @dataclass(frozen=True)
@@ -178,10 +174,7 @@ class Batches:
         domain = TASKS[self._run.task].domain
         recipe = self._fresh_recipe(domain.n_repeats)
         inputs = draw(recipe, block * self._n_ranks + self._rank)
-        labels = None
-        if self._device.type == "cuda":
-            labels = partial(label_on_device, domain, device=self._device)
-        return task_rows(self._run.task, label(domain, inputs, labels=labels))
+        return task_rows(self._run.task, label(domain, inputs))
 
     def _fresh_recipe(self, n_repeats: int) -> Recipe:
         per_shard = -(-self._size * FRESH_STEPS // n_repeats) * n_repeats

@@ -24,7 +24,7 @@ from training.population import (
     population_eyes,
     population_ranges,
 )
-from training.tasks import DOMAINS, MAX_COEFFICIENT_UM, N_EYE, Domain, Labels
+from training.tasks import DOMAINS, MAX_COEFFICIENT_UM, N_EYE, Domain
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -181,14 +181,9 @@ def _unit_points(recipe: Recipe, first: int, n: int, n_axes: int) -> NDArray[Any
         return sequence.random(n)
 
 
-def label(
-    domain: Domain, inputs: NDArray[np.float64], *, labels: Labels | None = None
-) -> Shard:
-    """Trace inputs (n, n_inputs), and omit vignetted rows.
-
-    ``labels`` replaces the tracer of the domain.
-    """
-    targets = (labels or domain.label)(inputs)
+def label(domain: Domain, inputs: NDArray[np.float64]) -> Shard:
+    """Trace inputs (n, n_inputs), and omit vignetted rows."""
+    targets = domain.label(inputs)
     with np.errstate(invalid="ignore"):
         good = np.all(np.abs(targets) <= MAX_COEFFICIENT_UM, axis=1)
     return Shard(

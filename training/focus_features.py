@@ -5,13 +5,22 @@ aberration of the centered eye. The network learns the residual, the effect of t
 decentrations and offset terms: a few hundredths of a diopter, smooth in all inputs.
 """
 
+import math
+
 import torch
 from torch import Tensor, nn
 
-from estimator.eye.assembly import ANTERIOR_THICKNESS_RATIO, AQUEOUS, DIAMETER
+from estimator.eye.assembly import (
+    ANTERIOR_THICKNESS_RATIO,
+    AQUEOUS,
+    CAP_VOLUME_RATIO,
+    DIAMETER,
+    SMALLEST_AQUEOUS_MM,
+    SMALLEST_DIAMETER_RATIO,
+    VOLUME,
+)
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from training.eye_features import EyeFeatures, lens_thickness_mm, named
-from training.tracer.accommodation import smallest_diameters_mm
 
 BOUND_MARGIN_MM = 1e-4
 """Distance from a bound within which a change of the lens counts as bounded."""
@@ -122,3 +131,12 @@ def _aqueous_change_mm(eye: Tensor, change_mm: Tensor) -> Tensor:
         diameter_mm + change_mm, volume_mm3
     ) - lens_thickness_mm(diameter_mm, volume_mm3)
     return -ANTERIOR_THICKNESS_RATIO * growth_mm
+
+
+def smallest_diameters_mm(vectors: Tensor) -> Tensor:
+    """Compute `estimator.eye.assembly.smallest_diameter_mm` for a batch."""
+    relaxed_mm, volume_mm3 = vectors[..., DIAMETER], vectors[..., VOLUME]
+    room_mm = torch.clamp(vectors[..., AQUEOUS] - SMALLEST_AQUEOUS_MM, min=0.0)
+    c_mm3 = 8.0 / math.pi * CAP_VOLUME_RATIO * ANTERIOR_THICKNESS_RATIO * volume_mm3
+    fitting_mm = (relaxed_mm**-2 + room_mm / c_mm3) ** -0.5
+    return torch.maximum(fitting_mm, SMALLEST_DIAMETER_RATIO * relaxed_mm)

@@ -1,4 +1,4 @@
-"""A data set, its labels by the device, and a short training: rows a second.
+"""A data set and a short training: rows a second.
 
     python -m tests.gpu_kit.short_training RUN.toml
 
@@ -13,18 +13,13 @@ import tempfile
 import time
 from contextlib import redirect_stdout
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from tests.benchmarks.harness import commit_id, machine_info
-from training.datasets import draw, label
-from training.device_labels import label_on_device
 from training.generate import generate
 from training.run_file import Run, read_run
-from training.tasks import DOMAINS
 from training.train import train
 
 
@@ -34,23 +29,6 @@ def data_set_row(run: Run) -> dict:
     with redirect_stdout(sys.stderr):  # it prints its statistics
         generate(run.recipe, run.data_folder)
     return _row("data set", run.recipe.n_rows, time.perf_counter() - start_s)
-
-
-def device_row(run: Run, device: torch.device) -> dict:
-    """Trace a shard by the device, and compare its labels."""
-    domain = DOMAINS[run.recipe.domain]
-    inputs = draw(run.recipe, 0)
-    labels = partial(label_on_device, domain, device=device)
-    label(domain, inputs[:64], labels=labels)  # starts the device
-    start_s = time.perf_counter()
-    found = label(domain, inputs, labels=labels)
-    seconds = time.perf_counter() - start_s
-    expected = label(domain, inputs)
-    row = _row("labels on the device", len(inputs), seconds)
-    row |= {"device": device.type, "worst_um": None}
-    if found.inputs.shape == expected.inputs.shape:  # light passes the same rows
-        row["worst_um"] = float(np.abs(found.targets - expected.targets).max())
-    return row
 
 
 def training_row(run: Run) -> dict:
@@ -70,7 +48,7 @@ def _row(method: str, count: int, seconds: float) -> dict:
 
 
 def main() -> None:
-    """Run all three, print."""
+    """Run both, print."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("run", type=Path, metavar="RUN.toml")
     file = parser.parse_args().run
@@ -81,7 +59,7 @@ def main() -> None:
             data_folder=Path(folder) / "data",
             output_folder=Path(folder) / "run",
         )
-        rows = [data_set_row(run), device_row(run, device), training_row(run)]
+        rows = [data_set_row(run), training_row(run)]
     machine = {**machine_info(), "torch": torch.__version__, "device": str(device)}
     print(json.dumps({"machine": machine, "commit": commit_id(), "rows": rows}))
 

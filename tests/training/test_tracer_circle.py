@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from estimator.eye.parameters import column, mean_vector, random_vectors, sampled_ranges
-from estimator.eye.tracing import refraction_of_vectors, zernike_of_vectors
+from estimator.eye.tracing import zernike_of_vectors
 from estimator.optics.media import refractive_index
 
 torch = pytest.importorskip("torch")
 
-from training.tracer.circle import refraction_of_eyes, zernike_of_eyes  # noqa: E402
+from training.tracer.circle import zernike_of_eyes  # noqa: E402
 from training.tracer.eye import refractive_indices  # noqa: E402
 
 N_EYES = 500
@@ -67,14 +67,6 @@ def test_parts_of_a_batch_give_what_the_whole_gives(rng):
     np.testing.assert_allclose(parts_um.numpy(), whole_um.numpy(), atol=1e-9)
     with pytest.raises(ValueError, match="must be equal"):
         zernike_of_eyes(eyes[0], eyes[1][:5], eyes[2])
-
-
-def test_refraction_is_that_of_the_compiled_tracer(rng):
-    vectors = random_vectors(20, rng)
-    truth_dpt = refraction_of_vectors(vectors, pupil_diameter_mm=4.0)
-    found_dpt, ok = refraction_of_eyes(*tensors(vectors, np.full(20, 4.0)))
-    assert bool(ok.all())
-    np.testing.assert_allclose(found_dpt.numpy(), truth_dpt, atol=1e-7)
 
 
 def test_gradients_are_central_differences_of_the_compiled_tracer(rng):

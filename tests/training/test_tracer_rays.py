@@ -74,7 +74,7 @@ def _batched(vectors, rays):
             else eye.indices[:, i : i + 1] / eye.indices[:, i + 1 :][:, :1]
         )
         cross = cross_iterated if i < 2 else cross_conic
-        point, direction, _ = cross(eye.shapes[i], point, direction, ratio, 1.0)
+        point, direction, _ = cross(eye.shapes[i], point, direction, ratio)
         found.append(point)
     return torch.stack(found, -1).permute(0, 2, 3, 1).numpy()
 

@@ -1,8 +1,7 @@
 """The ray tracer of `estimator` over batches of eyes, differentiable, on any device.
 
-- `circle.zernike_of_eyes`, `circle.refraction_of_eyes`: on axis, on a given circle
-- `field.field_aberrations_of_eyes`: any field, through the stop
-- `accommodation.focus_of_eyes`: the accommodated state for a distance
+`circle.zernike_of_eyes` is what losses need: the coefficients on the axis, on a given
+circle.
 
 The eye and its chief ray are always float64; ``ray_dtype`` is that of the bundle.
 Rays are solved without a graph. Gradients come from Fermat's principle on axis, and

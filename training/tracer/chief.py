@@ -25,7 +25,6 @@ _DIFFERENCE_MM = 1e-6
 _STEPS = 25
 _TOLERANCE_MM = 1e-12
 _ACCEPTED_MM = 1e-9
-_MAGNIFICATION_DIFFERENCE_MM = 1e-3
 
 
 class Axes(NamedTuple):
@@ -152,24 +151,8 @@ def trace_chief(eye: Eye, axes: Axes, solved: Solved) -> Chief:
     )
     third, fourth, direction, reach, depth = into_lens(eye, stop, direction)
     point, onwards = eyes.inward(eye.to_retina, fourth, direction)
-    _, _, rest = cross_conic(eye.shapes[4], point, onwards, None, 1.0)
+    _, _, rest = cross_conic(eye.shapes[4], point, onwards, None)
     origin = fourth + rest[:, None] * direction
     legs = torch.stack([gap, deep + reach, depth, rest])
     ok = solved.ok & (legs >= -ORDER_TOLERANCE_MM).all(0)[:, 0]
     return Chief((first, second, third, fourth), origin, direction, ok)
-
-
-def magnification(eye: Eye) -> Tensor:
-    """Return entrance pupil over stop (B,), about the axial chief ray; nan where none.
-
-    As `estimator.wavefront.compiled.magnifications`, with the same differences.
-    """
-    zero = torch.zeros_like(eye.indices[:, 0])
-    axes = field_axes(zero, zero)
-    solved = solve_chief(eye, axes)
-    start, h = _attached(eye, axes, solved), _MAGNIFICATION_DIFFERENCE_MM
-    around = start.new_tensor([[h, -h, 0.0, 0.0], [0.0, 0.0, h, -h]])
-    stop = _shoot(eye, axes, solved.base_z, start + around)[2][:, :2]
-    da, db = stop[..., 0] - stop[..., 1], stop[..., 2] - stop[..., 3]
-    area = (da[:, 0] * db[:, 1] - da[:, 1] * db[:, 0]).abs()
-    return torch.where(solved.ok, 2.0 * h * area.rsqrt(), torch.nan)

@@ -11,8 +11,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from estimator.optics.units import REFERENCE_WAVELENGTH_NM, SPHERE_PER_C20, UM_PER_MM
-from estimator.optics.zernike import N_TERMS, index_from_nm
+from estimator.optics.units import UM_PER_MM
+from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.nodes import circle_nodes
 from training.tracer import chief as chiefs
 from training.tracer import eye as eyes
@@ -39,7 +39,6 @@ _TOLERANCE_WITHOUT_GRADIENT_MM = 2e-5
 _STEPS = 10
 _FIRST_STEPS, _WARM_STEPS = 5, 2
 _DIFFERENCE_COSINE = 1e-3
-_C20 = index_from_nm(2, 0)
 
 _Rows = tuple[Tensor, Tensor, Tensor]
 _Starts = tuple[Tensor | None, Tensor | None]
@@ -229,22 +228,3 @@ def _wavefront(
     there_mm = nodes[:, :1] * x_axis + nodes[:, 1:] * y_axis
     last_mm = ((there_mm - away_mm) * outward).sum(1)
     return -UM_PER_MM * (path_mm + eye.indices[:, :1] * last_mm)
-
-
-def refraction_of_eyes(
-    vectors: Tensor,
-    pupil_diameter_mm: Tensor,
-    wavelength_nm: Tensor | None = None,
-    **options: Any,
-) -> tuple[Tensor, Tensor]:
-    """Return least-squares M (B,), dpt, from C(2,0) on the pupil's circle, and ok (B,).
-
-    ``wavelength_nm`` defaults to 555 nm; ``options`` are those of `zernike_of_eyes`.
-    """
-    if wavelength_nm is None:
-        wavelength_nm = torch.full_like(pupil_diameter_mm, REFERENCE_WAVELENGTH_NM)
-    zernike_um, ok = zernike_of_eyes(
-        vectors, pupil_diameter_mm, wavelength_nm, **options
-    )
-    radius_mm = (pupil_diameter_mm / 2.0).to(zernike_um.dtype)
-    return -SPHERE_PER_C20 * zernike_um[:, _C20] / radius_mm**2, ok

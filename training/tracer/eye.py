@@ -252,14 +252,3 @@ def inward(step: Step, *vectors: Tensor) -> tuple[Tensor, ...]:
     if step.shift is not None:
         point = point + step.shift
     return point, *directions
-
-
-def outward(step: Step, *vectors: Tensor) -> tuple[Tensor, ...]:
-    """Transform a point, and then directions, (B, 3, R) back from the next frame."""
-    point, *directions = vectors
-    if step.shift is not None:
-        point = point - step.shift
-    if step.turn is not None:
-        point = turned(step.turn.mT, point)
-        directions = [turned(step.turn.mT, d) for d in directions]
-    return point, *directions
