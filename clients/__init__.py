@@ -7,7 +7,6 @@ The package imports its modules only when their names are used.
     link             client side of the protocol
     connection       socket of the client
     shared_memory    images in memory shared with a service on the same machine
-    shared_textures  textures shared with a service on the same GPU
     service_process  service in a child process
     hello            minimal client
     batch/           `ocufilter batch`: offline filtering of data sets

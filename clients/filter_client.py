@@ -17,18 +17,17 @@ profile's preparation restarts it.
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Unpack, cast
+from typing import Any, Required, Unpack, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clients.frame_packer import FramePacker, check_limits
-from clients.link import Event, FilteredFrame, Outgoing, ServiceLink
-from clients.shared_textures import REPLY_LIMIT_S
+from clients.link import Event, FilteredFrame, ServiceLink
+from clients.shared_memory import REPLY_LIMIT_S
 from filter_service import ColorImage, Output, RgbdView, as_views
 from filter_service.errors import BadMessage, FilterError, ServiceTimeout
 from filter_service.keys import load_client_key
@@ -42,8 +41,6 @@ from filter_service.messages import (
     Camera,
     Compression,
     DepthEncoding,
-    Dropped,
-    ErrorReply,
     EyeName,
     FilterSettings,
     Frame,
@@ -62,22 +59,29 @@ from filter_service.messages import (
     Welcome,
     check_states,
     encode,
-    tangents_from_fov,
 )
 from filter_service.settings import DepthKind, RenderOptionValues, as_settings
 from filter_service.waiting import Wait
 
-__all__ = [
-    "Event",
-    "FilterClient",
-    "FilteredFrame",
-    "RgbdView",
-    "ViewState",
-    "tangents_from_fov",
-]
+__all__ = ["Event", "FilterClient", "FilteredFrame", "RgbdView", "ViewState"]
 
 
 DEFAULT_SETTINGS = FilterSettings()
+
+SharedViews = Sequence[tuple[Camera, ViewTextures]]
+"""Views of a frame in shared textures."""
+
+
+class FrameValues(RenderOptionValues, total=False):
+    """Keyword arguments of `FilterClient.submit`."""
+
+    pupil_diameter_mm: Required[float]
+    focus_dpt: Required[float]
+    gaze_deg: tuple[float, float] | None
+    output: Output
+    depth_encoding: DepthEncoding
+    states: Sequence[ViewState]
+    display_time_ns: int | None
 
 
 def _floats(pair: tuple[float, float]) -> tuple[float, float]:
@@ -90,8 +94,11 @@ def _floats(pair: tuple[float, float]) -> tuple[float, float]:
         ) from None
 
 
-EXTENDING_S = 0.03
-"""Delay before a frame is sent again whose state is being prepared."""
+def _shared_views(color: object) -> SharedViews:
+    """Return the views of a frame in shared textures; none for other frames."""
+    if isinstance(color, Sequence) and color and isinstance(color[0], tuple):
+        return cast("SharedViews", color)
+    return ()
 
 
 class FilterClient:
@@ -254,7 +261,9 @@ class FilterClient:
         self.hello()
         self._ask(request, parts)
         try:
-            return self._await_profile(request, wait, on_progress, timeout_s)
+            return self._link.await_profile(
+                request.profile_id, wait, on_progress, timeout_s
+            )
         except FilterError:
             # After a restart of the service, the last accepted profile is sent again.
             if previous is None:
@@ -314,63 +323,15 @@ class FilterClient:
         if self.welcome is not None:  # otherwise `_begin` sends it after hello
             self._link.queue_message(parts)
 
-    def _await_profile(
-        self,
-        request: ProfileRequest,
-        wait: bool | str,
-        on_progress: Callable[[Progress], None] | None,
-        timeout_s: float,
-    ) -> Ready | Accepted:
-        with Wait(
-            "Preparing the eye", timeout_s, is_shown=on_progress is None
-        ) as waiting:
-            return self._awaited(request.profile_id, wait, on_progress, waiting)
-
-    def _awaited(
-        self,
-        profile_id: int,
-        wait: bool | str,
-        on_progress: Callable[[Progress], None] | None,
-        waiting: Wait,
-    ) -> Ready | Accepted:
-        n_awaited = n_ready = 0
-        while True:
-            # One at a time, because later events are left for the caller.
-            event = self._link.take_event(
-                lambda e: getattr(e, "profile_id", None) == profile_id
-            )
-            if event is None:
-                self._link.pump_during(waiting, f"profile {profile_id} to become ready")
-            if isinstance(event, ErrorReply):
-                raise event.exception()
-            if isinstance(event, Progress) and on_progress is not None:
-                on_progress(event)
-            if isinstance(event, Accepted):
-                # Again after a lost connection: the profile was sent again.
-                n_awaited, n_ready = event.n_cameras, 0
-                if not (wait and event.is_building):
-                    return event
-            if isinstance(event, Ready):
-                n_ready += 1
-                if n_ready >= n_awaited or wait == "first":
-                    return event
-
     # Frames
 
     def filter(
         self,
-        color: ColorImage | RgbdView | Sequence[RgbdView],
+        color: ColorImage | RgbdView | Sequence[RgbdView] | SharedViews,
         depth_m: NDArray[np.float32] | None = None,
         *,
-        pupil_diameter_mm: float,
-        focus_dpt: float,
-        gaze_deg: tuple[float, float] | None = None,
-        output: Output = "srgb8",
-        depth_encoding: DepthEncoding = "float32",
-        states: Sequence[ViewState] = (),
-        display_time_ns: int | None = None,
         timeout_s: float | None = None,
-        **options: Unpack[RenderOptionValues],
+        **frame: Unpack[FrameValues],
     ) -> FilteredFrame:
         """Send one frame and return it filtered; see `submit` for the parameters.
 
@@ -380,94 +341,35 @@ class FilterClient:
 
         Raises
         ------
+        BadMessage
+            Among others, if the service has lost a texture with a render worker.
         ProtocolError, SessionError, RenderError, ServiceTimeout
         """
-        return self._until_filtered(
-            partial(
-                self.submit,
-                color,
-                depth_m,
-                pupil_diameter_mm=pupil_diameter_mm,
-                focus_dpt=focus_dpt,
-                gaze_deg=gaze_deg,
-                output=output,
-                depth_encoding=depth_encoding,
-                states=states,
-                display_time_ns=display_time_ns,
-                **options,
-            ),
-            timeout_s,
-        )
+        return self.begin(color, depth_m, timeout_s=timeout_s, **frame)()
 
-    def _until_filtered(
-        self, submit: Callable[[], int], timeout_s: float | None
-    ) -> FilteredFrame:
-        """Submit a frame until it is filtered, and return it."""
+    def begin(
+        self,
+        color: ColorImage | RgbdView | Sequence[RgbdView] | SharedViews,
+        depth_m: NDArray[np.float32] | None = None,
+        *,
+        timeout_s: float | None = None,
+        **frame: Unpack[FrameValues],
+    ) -> Callable[[], FilteredFrame]:
+        """Send one frame; return a function that waits for it like `filter`."""
         limit_s = self.timeout_s if timeout_s is None else timeout_s
-        n_extended = n_most_extended = 0
-        with Wait("Filtering", limit_s) as wait:
-            while True:
-                answer = self._await_frame(submit(), wait)
-                if isinstance(answer, FilteredFrame):
-                    return answer
-                if isinstance(answer, ErrorReply):
-                    raise answer.exception()
-                if answer.reason == "preparing":
-                    self._await_ready(wait)
-                elif answer.reason == "extending":
-                    n_extended += 1
-                    if n_extended > n_most_extended:  # the service has computed PSFs
-                        n_most_extended = n_extended
-                        wait.advance()
-                    self._link.pump(EXTENDING_S)
-                elif answer.reason == "connection_lost":
-                    n_extended = 0  # their PSFs are lost, too
-                if wait.remaining_s <= 0.0:
-                    raise ServiceTimeout(
-                        "timed out waiting for a frame; the service dropped it "
-                        f"({answer.reason})"
-                    )
-
-    def _await_frame(
-        self, frame_id: int, wait: Wait
-    ) -> FilteredFrame | Dropped | ErrorReply:
-        while True:
-            answer = self._link.take_event(
-                lambda e: getattr(e, "frame_id", None) == frame_id
-            )
-            if isinstance(answer, FilteredFrame | Dropped | ErrorReply):
-                return answer
-            self._link.pump_during(wait, f"a reply to frame {frame_id}")
-
-    def _await_ready(self, wait: Wait) -> None:
-        """Wait for an eye that is being prepared; raise if its preparation fails.
-
-        Return also after a lost connection, with which `Ready` may be lost.
-        """
-        profile_ids = {p.profile_id for p in self._link.profiles.values()}
-        welcome = self.welcome
-        while self.welcome is welcome:
-            event = self._link.take_event(
-                lambda e: (
-                    isinstance(e, Ready | ErrorReply) and e.profile_id in profile_ids
-                )
-            )
-            if isinstance(event, ErrorReply):
-                raise event.exception()
-            if event is not None:
-                return
-            self._link.pump_during(wait, "the eye to be prepared for this camera")
+        submit = partial(self.submit, color, depth_m, **frame)
+        first_id = submit()
+        return lambda: self._link.await_filtered(first_id, submit, limit_s)
 
     def submit(
         self,
-        color: ColorImage | RgbdView | Sequence[RgbdView],
+        color: ColorImage | RgbdView | Sequence[RgbdView] | SharedViews,
         depth_m: NDArray[np.float32] | None = None,
         *,
         pupil_diameter_mm: float,
         focus_dpt: float,
         gaze_deg: tuple[float, float] | None = None,
         output: Output = "srgb8",
-        prepared_only: bool = False,
         depth_encoding: DepthEncoding = "float32",
         states: Sequence[ViewState] = (),
         display_time_ns: int | None = None,
@@ -476,13 +378,16 @@ class FilterClient:
         """Submit a frame without waiting; return its frame_id.
 
         The images are copied, so the caller may reuse its arrays at once, except those
-        of `lend_view`.  If the service is busy, the client queues the frame in place of
-        one that is already queued, which is dropped with the reason ``superseded``.
+        of `lend_view`.  The GPU must have finished rendering shared textures, which the
+        service uses until its reply; then the results are finished.  If the service is
+        busy, the client queues the frame in place of one that is already queued, which
+        is dropped with the reason ``superseded``.
 
         Parameters
         ----------
         color : (height, width, 3) array, RgbdView, or several views
-            uint8 sRGB, or float32 or float16 linear light.
+            uint8 sRGB, or float32 or float16 linear light.  Or a sequence of (Camera,
+            ViewTextures): numbers from `share_texture`, and the meaning of the depth.
         depth_m : (height, width) float32, optional
             View-space z in meters, required if ``color`` is an array.  The camera is
             then the first one of the profile.
@@ -493,8 +398,6 @@ class FilterClient:
             None selects the profile's setting.
         output : {"srgb8", "linear", "linear16"}
             8-bit sRGB, or linear light in float32 or float16.
-        prepared_only : bool
-            Deprecated and without effect; it will be removed in version 0.3.
         depth_encoding : {"float32", "float16", "dpt16", "mm16"}
             Encoding of depth on the wire: meters as float32; or, in half the bytes for
             slow networks, meters or diopters as float16, or integer millimeters.
@@ -506,12 +409,6 @@ class FilterClient:
         **options
             Fields of `RenderOptions`; see `EyeFilter.filter`.
         """
-        if prepared_only:
-            warnings.warn(
-                "prepared_only has no effect; it will be removed in version 0.3",
-                DeprecationWarning,
-                stacklevel=2,
-            )
         if depth_encoding not in DEPTH_ENCODINGS:
             raise ValueError(
                 f"depth_encoding is {depth_encoding!r}; allowed: "
@@ -519,26 +416,34 @@ class FilterClient:
             )
         if output not in FORMATS:
             raise ValueError(f"output is {output!r}; allowed: {', '.join(FORMATS)}")
-        items = as_views(color, depth_m, self._camera)
-        states = tuple(states) or (ViewState(),) * len(items)
-        if len(states) != len(items):
-            raise ValueError(
-                f"{len(states)} states; allowed: {len(items)}, one per view"
-            )
+        shared = _shared_views(color)
+        items = () if shared else as_views(cast("Any", color), depth_m, self._camera)
+        n_views = len(shared or items)
+        states = tuple(states) or (ViewState(),) * n_views
+        if len(states) != n_views:
+            raise ValueError(f"{len(states)} states; allowed: {n_views}, one per view")
         check_states(states, State(pupil_diameter_mm, focus_dpt))
-        if self.welcome is not None:
+        if self.welcome is not None and items:
             check_limits(items, self.welcome)
-        frame = Frame(
-            frame_id=self._next_frame_id,
-            views=tuple(
+        if shared:
+            headers = [
+                ViewHeader.of(camera, state=state)
+                for (camera, _), state in zip(shared, states, strict=True)
+            ]
+        else:
+            headers = [
                 ViewHeader.describing(item, depth_encoding, state)
                 for item, state in zip(items, states, strict=True)
-            ),
+            ]
+        frame = Frame(
+            frame_id=self._next_frame_id,
+            views=tuple(headers),
             pupil_diameter_mm=float(pupil_diameter_mm),
             focus_dpt=float(focus_dpt),
             gaze_deg=None if gaze_deg is None else _floats(gaze_deg),
             output=FORMATS[output],
             options=FrameOptions(**options),
+            textures=tuple(textures for _, textures in shared),
             display_time_ns=display_time_ns,
         )
         self._next_frame_id += 1
@@ -644,87 +549,6 @@ class FilterClient:
         """Take a texture back; the service frees it."""
         self._link.queue_message(encode(UnshareTexture(texture)))
         self._link.pump(0.0)
-
-    def filter_textures(
-        self,
-        views: Sequence[tuple[Camera, ViewTextures]],
-        *,
-        pupil_diameter_mm: float,
-        focus_dpt: float,
-        gaze_deg: tuple[float, float] | None = None,
-        states: Sequence[ViewState] = (),
-        display_time_ns: int | None = None,
-        timeout_s: float | None = None,
-        **options: Unpack[RenderOptionValues],
-    ) -> FilteredFrame:
-        """Filter a frame in shared textures; see `submit_textures` and `filter`.
-
-        Raises
-        ------
-        BadMessage
-            Among others, if the service has lost a texture with a render worker.
-        ProtocolError, SessionError, RenderError, ServiceTimeout
-        """
-        return self._until_filtered(
-            partial(
-                self.submit_textures,
-                views,
-                pupil_diameter_mm=pupil_diameter_mm,
-                focus_dpt=focus_dpt,
-                gaze_deg=gaze_deg,
-                states=states,
-                display_time_ns=display_time_ns,
-                **options,
-            ),
-            timeout_s,
-        )
-
-    def submit_textures(
-        self,
-        views: Sequence[tuple[Camera, ViewTextures]],
-        *,
-        pupil_diameter_mm: float,
-        focus_dpt: float,
-        gaze_deg: tuple[float, float] | None = None,
-        states: Sequence[ViewState] = (),
-        display_time_ns: int | None = None,
-        **options: Unpack[RenderOptionValues],
-    ) -> int:
-        """Submit a frame in shared textures without waiting; return its frame_id.
-
-        The GPU must have finished rendering the textures.  The service uses them until
-        its reply, when the results are finished.
-
-        Parameters
-        ----------
-        views : sequence of (Camera, ViewTextures)
-            Numbers from `share_texture`, and the meaning of the depth.
-        pupil_diameter_mm, focus_dpt, gaze_deg, states, display_time_ns, options
-            As for `submit`.
-        """
-        states = tuple(states) or (ViewState(),) * len(views)
-        if len(states) != len(views):
-            raise ValueError(
-                f"{len(states)} states; allowed: {len(views)}, one per view"
-            )
-        check_states(states, State(pupil_diameter_mm, focus_dpt))
-        frame = Frame(
-            frame_id=self._next_frame_id,
-            views=tuple(
-                ViewHeader.of(camera, state=state)
-                for (camera, _), state in zip(views, states, strict=True)
-            ),
-            pupil_diameter_mm=float(pupil_diameter_mm),
-            focus_dpt=float(focus_dpt),
-            gaze_deg=None if gaze_deg is None else _floats(gaze_deg),
-            options=FrameOptions(**options),
-            textures=tuple(textures for _, textures in views),
-            display_time_ns=display_time_ns,
-        )
-        self._next_frame_id += 1
-        now_s = time.monotonic()
-        self._link.submit(Outgoing(frame.frame_id, encode(frame), [], now_s, frame, []))
-        return frame.frame_id
 
     def poll(self, timeout_s: float = 0.0) -> list[Event]:
         """Return the new events; wait up to ``timeout_s`` if there are none.

@@ -51,8 +51,13 @@ class FramePacker:
         self._pool = SendBufferPool(timeout_s)
 
     def packed(self, frame: Frame, items: Sequence[RgbdView]) -> Outgoing:
-        """Copy images to shared memory or send buffers; return the message."""
+        """Copy images to shared memory or send buffers; return the message.
+
+        Frames in shared textures have no images to copy.
+        """
         now_s = time.monotonic()
+        if frame.textures:
+            return Outgoing(frame.frame_id, encode(frame), [], now_s, frame)
         per_view = [
             _as_sent(item, header.depth.encoding)
             for item, header in zip(items, frame.views, strict=True)

@@ -14,8 +14,7 @@ from typing import Any, TypeVar
 from numpy.typing import NDArray
 
 from clients.connection import Connection, SendBuffer
-from clients.shared_memory import ClientSlot, SharedMemory
-from clients.shared_textures import SharedTextures
+from clients.shared_memory import ClientSlot, SharedMemory, SharedTextures
 from filter_service.errors import (
     AuthenticationFailed,
     FilterError,
@@ -48,6 +47,9 @@ from filter_service.messages import (
 from filter_service.waiting import Wait
 
 MAX_KEPT_PROGRESS = 1000
+EXTENDING_S = 0.03
+"""Delay before a frame is sent again whose state is being prepared."""
+
 RETRY_SEND_S = 0.002  # the socket accepts messages only shortly after the connect event
 
 _Found = TypeVar("_Found")
@@ -214,6 +216,107 @@ class ServiceLink:
             while not (found := find()):
                 self.pump_during(wait, what)
         return found
+
+    def await_profile(
+        self,
+        profile_id: int,
+        wait: bool | str,
+        on_progress: Callable[[Progress], None] | None,
+        timeout_s: float,
+    ) -> Ready | Accepted:
+        """Wait for a profile as the parameters of `FilterClient.set_profile` say.
+
+        Raises
+        ------
+        FilterError
+            The reply to the profile, or `ServiceTimeout`.
+        """
+        n_awaited = n_ready = 0
+        is_shown = on_progress is None
+        with Wait("Preparing the eye", timeout_s, is_shown=is_shown) as waiting:
+            while True:
+                # One at a time, because later events are left for the caller.
+                event = self.take_event(
+                    lambda e: getattr(e, "profile_id", None) == profile_id
+                )
+                if event is None:
+                    self.pump_during(waiting, f"profile {profile_id} to become ready")
+                if isinstance(event, ErrorReply):
+                    raise event.exception()
+                if isinstance(event, Progress) and on_progress is not None:
+                    on_progress(event)
+                if isinstance(event, Accepted):
+                    # Again after a lost connection: the profile was sent again.
+                    n_awaited, n_ready = event.n_cameras, 0
+                    if not (wait and event.is_building):
+                        return event
+                if isinstance(event, Ready):
+                    n_ready += 1
+                    if n_ready >= n_awaited or wait == "first":
+                        return event
+
+    def await_filtered(
+        self, frame_id: int, submit: Callable[[], int], timeout_s: float
+    ) -> FilteredFrame:
+        """Wait for a frame, submit it again until it is filtered, and return it.
+
+        Raises
+        ------
+        FilterError
+            The reply to the frame, or `ServiceTimeout`.
+        """
+        n_extended = n_most_extended = 0
+        with Wait("Filtering", timeout_s) as wait:
+            while True:
+                answer = self._await_frame(frame_id, wait)
+                if isinstance(answer, FilteredFrame):
+                    return answer
+                if isinstance(answer, ErrorReply):
+                    raise answer.exception()
+                if answer.reason == "preparing":
+                    self._await_ready(wait)
+                elif answer.reason == "extending":
+                    n_extended += 1
+                    if n_extended > n_most_extended:  # the service has computed PSFs
+                        n_most_extended = n_extended
+                        wait.advance()
+                    self.pump(EXTENDING_S)
+                elif answer.reason == "connection_lost":
+                    n_extended = 0  # their PSFs are lost, too
+                if wait.remaining_s <= 0.0:
+                    raise ServiceTimeout(
+                        "timed out waiting for a frame; the service dropped it "
+                        f"({answer.reason})"
+                    )
+                frame_id = submit()
+
+    def _await_frame(
+        self, frame_id: int, wait: Wait
+    ) -> FilteredFrame | Dropped | ErrorReply:
+        while True:
+            answer = self.take_event(lambda e: getattr(e, "frame_id", None) == frame_id)
+            if isinstance(answer, FilteredFrame | Dropped | ErrorReply):
+                return answer
+            self.pump_during(wait, f"a reply to frame {frame_id}")
+
+    def _await_ready(self, wait: Wait) -> None:
+        """Wait for an eye that is being prepared; raise if its preparation fails.
+
+        Return also after a lost connection, with which `Ready` may be lost.
+        """
+        profile_ids = {p.profile_id for p in self.profiles.values()}
+        welcome = self.welcome
+        while self.welcome is welcome:
+            event = self.take_event(
+                lambda e: (
+                    isinstance(e, Ready | ErrorReply) and e.profile_id in profile_ids
+                )
+            )
+            if isinstance(event, ErrorReply):
+                raise event.exception()
+            if event is not None:
+                return
+            self.pump_during(wait, "the eye to be prepared for this camera")
 
     def pump_during(self, wait: Wait, what: str) -> None:
         """Pump once; raise at the time limit or if the service rejected hello."""

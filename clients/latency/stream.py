@@ -21,7 +21,6 @@ from clients.filter_client import (
     FilterClient,
     FilteredFrame,
     RgbdView,
-    tangents_from_fov,
 )
 from clients.streaming import events_of
 from filter_service import Output
@@ -32,6 +31,7 @@ from filter_service.messages import (
     Dropped,
     EyeName,
     ViewState,
+    tangents_from_fov,
 )
 
 N_FRAMES = 8

@@ -17,8 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from clients.filter_client import Dropped, FilterClient, FilteredFrame
+from clients.filter_client import FilterClient, FilteredFrame
 from clients.service_process import ServiceProcess
+from filter_service.wire.replies import Dropped
 from tests.benchmarks.harness import Row, publish
 from tests.benchmarks.mutated_messages import view_of
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import zmq
 
-from clients.filter_client import FilterClient, RgbdView, tangents_from_fov
+from clients.filter_client import FilterClient, RgbdView
 from clients.scenes.scene_view import SceneView
 from clients.service_process import SERVE_COMMAND, ServiceProcess
 from filter_service.messages import (
@@ -22,6 +22,7 @@ from filter_service.messages import (
     ViewImages,
     decode_reply,
     encode,
+    tangents_from_fov,
 )
 from tests.end_to_end.service_pool import ServicePool
 

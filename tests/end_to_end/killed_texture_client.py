@@ -14,6 +14,6 @@ if __name__ == "__main__":
         numbers = [gl.new(kind, SIZE_PX).share(client) for kind in kinds]
         print("shared", flush=True)
         sys.stdin.readline()
-        client.submit_textures([(CAMERA, ViewTextures(*numbers))], **SEE)
+        client.submit([(CAMERA, ViewTextures(*numbers))], **SEE)
         print("sent", flush=True)
         sys.stdin.readline()

@@ -7,9 +7,10 @@ from contextlib import nullcontext
 
 import numpy as np
 
-from clients.filter_client import FilterClient, RgbdView, tangents_from_fov
+from clients.filter_client import FilterClient, RgbdView
 from clients.service_process import SERVE_COMMAND, ServiceProcess
 from filter_service.errors import ServiceTimeout
+from filter_service.messages import tangents_from_fov
 from filter_service.service.status_query import query_status
 
 MAX_IDLE = 4

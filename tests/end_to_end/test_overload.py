@@ -7,9 +7,10 @@ import time
 import numpy as np
 import pytest
 
-from clients.filter_client import Dropped, FilterClient, FilteredFrame
+from clients.filter_client import FilterClient, FilteredFrame
 from clients.service_process import CHECKOUT
 from filter_service.messages import Ping, encode
+from filter_service.wire.replies import Dropped
 from tests.benchmarks.bench_abuse import ATTACK, Guest
 from tests.end_to_end.conftest import make_view, small_frame
 from tests.end_to_end.test_lifecycle import wait_until

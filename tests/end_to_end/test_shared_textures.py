@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clients.filter_client import FilterClient, RgbdView, ViewState, tangents_from_fov
+from clients.filter_client import FilterClient, RgbdView, ViewState
 from clients.service_process import CHECKOUT, ServiceProcess
 from filter_service.errors import BadMessage, RenderFailed
 from filter_service.messages import (
@@ -22,6 +22,7 @@ from filter_service.messages import (
     UnshareTexture,
     ViewTextures,
     encode,
+    tangents_from_fov,
 )
 from filter_service.rendering.srgb import linear_from_srgb
 from filter_service.rendering.white_level import white_level
@@ -111,7 +112,7 @@ def of_arrays(client, seed=0, **values):
 def is_usable(gl, client):
     """Whether frames in textures still have the pixels of arrays."""
     exported, used = shared_frame(gl, client, seed=7)
-    client.filter_textures([(CAMERA, used)], **SEE)
+    client.filter([(CAMERA, used)], **SEE)
     for number in used.numbers:
         client.unshare_texture(number)
     found = gl.read(exported[2])[..., :3]
@@ -164,7 +165,7 @@ def test_images_and_counts_are_those_of_arrays(client, gl, kind, is_top_first):
         is_top_first=is_top_first,
         white_ratio=white_level(color),  # of arrays, the service finds it
     )
-    found = client.filter_textures([(CAMERA, used)], **SEE)
+    found = client.filter([(CAMERA, used)], **SEE)
     image = gl.read(exported[2])[flip][..., :3]
     assert_same_frame(image, expected.color)
     ours, theirs = found.header, expected.header
@@ -189,7 +190,7 @@ def test_a_depth_buffer_means_the_distances_of_its_projection(client, gl, kind):
     ]
     numbers = [texture.share(client) for texture in exported]
     used = ViewTextures(*numbers, near_m=near_m, is_reversed=True, is_top_first=True)
-    client.filter_textures([(CAMERA, used)], **SEE)
+    client.filter([(CAMERA, used)], **SEE)
     off = gl.read(exported[2])[..., :3].astype(int) - of_arrays(client).color
     assert np.abs(off).max() <= 1
 
@@ -197,7 +198,7 @@ def test_a_depth_buffer_means_the_distances_of_its_projection(client, gl, kind):
 def test_missing_depth_is_counted_and_noted(client, gl):
     exported, used = shared_frame(gl, client)
     gl.write(exported[1], np.zeros((HEIGHT, WIDTH), np.float32))
-    found = client.filter_textures([(CAMERA, used)], **SEE)
+    found = client.filter([(CAMERA, used)], **SEE)
     assert found.header.missing_depth_count == WIDTH * HEIGHT
     assert "no pixel has depth; infinity is assumed" in found.header.notes
 
@@ -207,7 +208,7 @@ def test_each_view_has_its_eye(client, gl):
     left, left_used = shared_frame(gl, client, seed=1)
     right, right_used = shared_frame(gl, client, seed=2)
     states = [ViewState("left", focus_dpt=0.5), ViewState()]
-    found = client.filter_textures(
+    found = client.filter(
         [(CAMERA, left_used), (CAMERA, right_used)], states=states, **SEE
     )
     assert [view.eye for view in found.header.views] == ["left", "both"]
@@ -222,11 +223,11 @@ def test_two_clients_have_only_their_own_textures(service, client, gl):
     with connect(service) as other:
         other.set_profile("myopia", views=[CAMERA])
         with pytest.raises(BadMessage, match="a texture of this session"):
-            other.filter_textures([(CAMERA, used)], **SEE)
+            other.filter([(CAMERA, used)], **SEE)
         others, others_used = shared_frame(gl, other, seed=2)
         assert others_used.numbers == used.numbers, "each client counts its own"
         for one, own in ((client, used), (other, others_used)):
-            one.submit_textures([(CAMERA, own)], **SEE)
+            one.submit([(CAMERA, own)], **SEE)
         for one in (client, other):
             wait_until(lambda one=one: one.poll(0.1))
         for one, textures, seed in ((client, exported, 1), (other, others, 2)):
@@ -282,11 +283,11 @@ def test_textures_outlive_the_descriptor_and_end_when_taken_back(service, client
         os.close(descriptor)
         _, used = shared_frame(gl, client)
         used = ViewTextures(used.color, used.depth, number)
-        client.filter_textures([(CAMERA, used)], **SEE)
+        client.filter([(CAMERA, used)], **SEE)
         for texture in range(number, number + 4):
             client.unshare_texture(texture)
         with pytest.raises(BadMessage, match="a texture of this session"):
-            client.filter_textures([(CAMERA, used)], **SEE)
+            client.filter([(CAMERA, used)], **SEE)
     wait_until(lambda: has_no_more(service, before))
 
 
@@ -302,7 +303,7 @@ def test_textures_are_shared_again_after_a_process_was_killed(
     if name == "render":
         assert client._link.textures.reply_about(used.color).reason == LOST
     with pytest.raises(BadMessage, match="a texture of this session"):
-        client.filter_textures([(CAMERA, used)], **SEE)
+        client.filter([(CAMERA, used)], **SEE)
     assert is_usable(gl, client)
     assert has_few_maps(service)
 
@@ -381,7 +382,7 @@ def test_frames_that_do_not_fit_their_textures_are_refused(client, gl):
     }
     for field, textures in cases.items():
         with pytest.raises(BadMessage) as raised:
-            client.filter_textures([(CAMERA, textures[0])], **SEE)
+            client.filter([(CAMERA, textures[0])], **SEE)
         assert raised.value.field == field
     assert is_usable(gl, client)
 
@@ -390,7 +391,7 @@ def test_effects_that_need_arrays_are_refused(client, gl):
     client.set_profile("cataract", views=[CAMERA])
     _, used = shared_frame(gl, client)
     with pytest.raises(BadMessage, match="straylight") as raised:
-        client.filter_textures([(CAMERA, used)], **SEE)
+        client.filter([(CAMERA, used)], **SEE)
     assert raised.value.field == "profile"
 
 

@@ -220,7 +220,7 @@ class Connected:
 
     def filter(self):
         self.link.profiles["both"] = SimpleNamespace(profile_id=0)
-        return self.client._until_filtered(lambda: 7, TIMEOUT_S)
+        return self.client._link.await_filtered(7, lambda: 7, TIMEOUT_S)
 
 
 @pytest.fixture
@@ -270,7 +270,7 @@ def test_a_frame_waits_for_its_eye_while_that_advances(connected):
         return 7
 
     service.link.profiles["both"] = SimpleNamespace(profile_id=0)
-    assert service.client._until_filtered(submit, TIMEOUT_S) is FRAME
+    assert service.client._link.await_filtered(submit(), submit, TIMEOUT_S) is FRAME
 
 
 @pytest.mark.parametrize(
@@ -293,7 +293,7 @@ def test_a_frame_does_not_wait_for_a_service(connected, clock, drops):
         return 7
 
     with pytest.raises(ServiceTimeout, match="the service dropped it"):
-        service.client._until_filtered(submit, TIMEOUT_S)
+        service.client._link.await_filtered(submit(), submit, TIMEOUT_S)
     assert clock.n_steps < 6
 
 
@@ -306,7 +306,7 @@ def test_a_message_that_came_while_the_program_slept_is_read(connected, clock):
         clock.now_s += 10.0 * TIMEOUT_S
         return 7
 
-    assert service.client._until_filtered(submit, TIMEOUT_S) is FRAME
+    assert service.client._link.await_filtered(submit(), submit, TIMEOUT_S) is FRAME
 
 
 @pytest.mark.parametrize("hangs", [False, True])
