@@ -17,6 +17,7 @@ import os
 import sys
 import warnings
 from collections.abc import Generator, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from clients.scene_renderer import Moment, SceneFrame, eye_poses, joined, look_at
+from clients.scene_renderer import Moment, SceneFrame, frame_at, look_at
 from clients.scenes.geometry import (
     Array,
     Batch,
@@ -347,20 +348,7 @@ def pyrender_frames(
         infinite_from_m=infinite_from_m,
     ) as renderer:
         for moment in path:
-            eyes = []
-            for pose in eye_poses(moment.pose, ipd_mm):
-                color, depth_m = renderer.render(camera, pose)
-                eyes.append(
-                    SceneFrame(
-                        color=color,
-                        depth_m=depth_m,
-                        tangents=tangents,
-                        pose=pose,
-                        pupil_diameter_mm=moment.pupil_diameter_mm,
-                        focus_dpt=moment.focus_dpt,
-                    )
-                )
-            yield joined(eyes)
+            yield frame_at(moment, partial(renderer.render, camera), tangents, ipd_mm)
 
 
 def camera_tangents(camera: pyrender.Camera, size_px: tuple[int, int]) -> Tangents:
@@ -461,12 +449,12 @@ def built_in(scene: Scene) -> tuple[pyrender.Scene, pyrender.PerspectiveCamera]:
 
 
 def _primitive(batch: Batch) -> pyrender.Primitive:
-    alpha = np.ones((len(batch.srgb), 1), np.float32)
+    color = np.concatenate([batch.srgb, np.ones((len(batch.srgb), 1), np.float32)], 1)
     return pyrender.Primitive(
         positions=batch.vertices_m,
         indices=batch.faces,
         texcoord_0=None if batch.texture is None else batch.uv,
-        color_0=np.concatenate([batch.srgb, alpha], axis=1),
+        color_0=color,
         material=pyrender.MetallicRoughnessMaterial(
             baseColorTexture=batch.texture, doubleSided=True
         ),
@@ -496,9 +484,9 @@ def load_file(path: str | Path, *, m_per_unit: float = 1.0) -> LoadedFile:
         raise ValueError(f"m_per_unit is {m_per_unit:g}; allowed: above 0")
     if not path.is_file():
         raise InvalidFile(path, "does not exist", "a file that trimesh loads")
-    if path.stat().st_size > MAX_FILE_BYTES:
-        found = f"{path.stat().st_size:,} bytes"
-        raise InvalidFile(path, found, f"at most {MAX_FILE_BYTES:,}")
+    n_bytes = path.stat().st_size
+    if n_bytes > MAX_FILE_BYTES:
+        raise InvalidFile(path, f"{n_bytes:,} bytes", f"at most {MAX_FILE_BYTES:,}")
     try:
         # Textures and materials of OBJ and glTF may be in other files beside it.
         content = trimesh.load_scene(path)
@@ -510,7 +498,6 @@ def load_file(path: str | Path, *, m_per_unit: float = 1.0) -> LoadedFile:
     found = pyrender.Scene(bg_color=[*BACKGROUND_SRGB, 1.0], ambient_light=_AMBIENT)
     corners_m: list[Array] = []
     meshes: dict[str, pyrender.Mesh] = {}
-    scale = np.diag([m_per_unit] * 3 + [1.0])
     n_parts = len(content.graph.nodes_geometry)
     if n_parts > MAX_PARTS:
         raise InvalidFile(path, f"{n_parts:,} parts", f"at most {MAX_PARTS:,}")
@@ -519,8 +506,9 @@ def load_file(path: str | Path, *, m_per_unit: float = 1.0) -> LoadedFile:
         shape = content.geometry[name]
         if not isinstance(shape, trimesh.Trimesh) or not len(shape.faces):
             continue  # points and curves
-        pose = scale @ world_from_node
-        corners_m.append(trimesh.transform_points(_corners(shape.bounds), pose))
+        pose = np.diag([m_per_unit] * 3 + [1.0]) @ world_from_node
+        corners = trimesh.bounds.corners(shape.bounds)
+        corners_m.append(trimesh.transform_points(corners, pose))
         if name not in meshes:
             meshes[name] = _mesh(shape, is_smooth=path.suffix.lower() in _WITH_NORMALS)
         found.add(meshes[name], pose=pose)
@@ -536,12 +524,6 @@ def load_file(path: str | Path, *, m_per_unit: float = 1.0) -> LoadedFile:
         lamp = pyrender.DirectionalLight(color=np.ones(3), intensity=intensity)
         found.add(lamp, pose=look_at(from_m, (0.0, 0.0, 0.0)))
     return LoadedFile(found, bounds_m)
-
-
-def _corners(bounds: Array) -> Array:
-    """Return the eight corners of a box (2, 3)."""
-    picked = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T
-    return np.take_along_axis(bounds, picked, axis=0)
 
 
 def _mesh(shape: trimesh.Trimesh, *, is_smooth: bool) -> pyrender.Mesh:
@@ -595,9 +577,7 @@ def orbit(
         toward = np.array([np.sin(turn), _HEIGHT_RATIO, np.cos(turn)])
         position_m = center_m + distance_m * toward / np.linalg.norm(toward)
         ratio = (1.0 + np.cos(turn)) / 2.0
-        focus_dpt = ratio / near_m + (1.0 - ratio) / far_m
-        pupil_mm = _PUPILS_MM[0] + (_PUPILS_MM[1] - _PUPILS_MM[0]) * ratio
-        moments.append(
-            Moment(look_at(position_m, center_m), float(pupil_mm), float(focus_dpt))
-        )
+        focus_dpt = float(ratio / near_m + (1.0 - ratio) / far_m)
+        pupil_mm = float(_PUPILS_MM[0] + (_PUPILS_MM[1] - _PUPILS_MM[0]) * ratio)
+        moments.append(Moment(look_at(position_m, center_m), pupil_mm, focus_dpt))
     return camera, moments

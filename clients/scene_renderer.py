@@ -5,15 +5,16 @@ A path gives position, target, focus and pupil of an eye over time.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
 from itertools import cycle
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clients.scenes.geometry import Array, Scene
-from clients.scenes.scene_view import Picture, SceneView, open_context
+from clients.scenes.scene_view import Picture, SceneView, Tangents, open_context
 from filter_service import RgbdView
 
 
@@ -89,11 +90,9 @@ def eye_poses(pose: Array, ipd_mm: float | None) -> list[Array]:
         return [pose]
     if not 0.0 < ipd_mm < np.inf:
         raise ValueError(f"ipd_mm is {ipd_mm:g}; allowed: above 0")
-    poses = []
-    for side in (-1.0, 1.0):
-        eye = np.array(pose, float)
+    poses = [np.array(pose, float), np.array(pose, float)]
+    for side, eye in zip((-1.0, 1.0), poses, strict=True):
         eye[:3, 3] += side * ipd_mm / 2000.0 * eye[:3, 0]
-        poses.append(eye)
     return poses
 
 
@@ -189,37 +188,46 @@ def scene_frames(
     """
     moments = path_moments(path or PATHS[scene.name], n_frames)
     with SceneRenderer(scene, size_px) as renderer:
+
+        def render(pose: Array) -> tuple[NDArray[Any], ...]:
+            if not with_hidden:
+                return renderer.render(pose)
+            visible, hidden = renderer.render_layers(pose)
+            return *visible, *hidden
+
         for moment in back_and_forth(moments) if repeats else moments:
-            eyes = []
-            for pose in eye_poses(moment.pose, ipd_mm):
-                hidden: Picture | tuple[None, None] = (None, None)
-                if with_hidden:
-                    seen, hidden = renderer.render_layers(pose)
-                else:
-                    seen = renderer.render(pose)
-                eyes.append(
-                    SceneFrame(
-                        color=seen[0],
-                        depth_m=seen[1],
-                        tangents=renderer.tangents,
-                        pose=pose,
-                        pupil_diameter_mm=moment.pupil_diameter_mm,
-                        focus_dpt=moment.focus_dpt,
-                        hidden_color=hidden[0],
-                        hidden_depth_m=hidden[1],
-                    )
-                )
-            yield joined(eyes)
+            yield frame_at(moment, render, renderer.tangents, ipd_mm)
+
+
+def frame_at(
+    moment: Moment,
+    render: Callable[[Array], tuple[Any, ...]],
+    tangents: Tangents,
+    ipd_mm: float | None,
+) -> SceneFrame:
+    """Render the frame of one eye, or the stereo frame of the left and right eye.
+
+    Parameters
+    ----------
+    moment : Moment
+        Pose of the point between the eyes, pupil and focus.
+    render : callable
+        Returns color and depth seen from a pose (4, 4), followed by those of the hidden
+        layer if there is one.
+    tangents, ipd_mm
+        As for `SceneFrame` and `scene_frames`.
+    """
+    eyes = []
+    for pose in eye_poses(moment.pose, ipd_mm):
+        color, depth_m, *hidden = render(pose)
+        state = moment.pupil_diameter_mm, moment.focus_dpt, None
+        eyes.append(SceneFrame(color, depth_m, tangents, pose, *state, *hidden))
+    return replace(eyes[0], right_view=eyes[1].view) if len(eyes) > 1 else eyes[0]
 
 
 def back_and_forth(moments: list[Moment]) -> Iterator[Moment]:
     """Follow a path to its end, back to its beginning, and so on."""
     return cycle(moments + moments[-2:0:-1])
-
-
-def joined(eyes: list[SceneFrame]) -> SceneFrame:
-    """Return the frame of one eye, or the stereo frame of the left and right eye."""
-    return replace(eyes[0], right_view=eyes[1].view) if len(eyes) > 1 else eyes[0]
 
 
 # Camera paths

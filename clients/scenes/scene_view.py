@@ -16,7 +16,7 @@ import moderngl
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from clients.scenes.geometry import Array, Batch, Scene
+from clients.scenes.geometry import Array, Scene
 from filter_service.errors import RenderFailed
 
 Tangents = tuple[float, float, float, float]
@@ -24,6 +24,24 @@ Picture = tuple[NDArray[np.uint8], NDArray[np.float32]]
 
 _FRAMEBUFFER_SRGB = 0x8DB9  # GL_FRAMEBUFFER_SRGB
 _WRITE, _KEEP = (True,) * 4, (False,) * 4
+LEAST_GAP_DPT = 0.05
+"""Smallest distance of the hidden layer behind the visible surface; closer surfaces
+have nearly the same blur."""
+
+_Made = TypeVar("_Made")
+
+_ASSETS = Path(__file__).resolve().parents[1] / "assets"
+_SRGB8_ALPHA8 = 0x8C43  # GL_SRGB8_ALPHA8
+
+_RESOLVE_CONSTANTS = {
+    # Bits of the float: a division by zero need not give infinity.
+    "INFINITY_BITS": "0x7F800000u",
+    # IEC 61966-2-1, as in `clients.scenes.geometry`.
+    "SRGB_GAIN": 1.055,
+    "SRGB_POWER": 2.4,
+    "SRGB_SLOPE": 12.92,
+    "SRGB_KNEE": 0.0031308,
+}
 
 
 def open_context(version: int = 330) -> moderngl.Context:
@@ -88,6 +106,28 @@ def read_texture(texture: moderngl.Texture) -> NDArray[Any]:
     return found
 
 
+class Layer(NamedTuple):
+    """OpenGL objects that render one layer, visible or hidden.
+
+    Attributes
+    ----------
+    samples : moderngl.Framebuffer
+        Target of the samples: color, and the inverse of planar depth as a float, 1/m.
+        A depth buffer is too coarse at large distances.
+    program : moderngl.Program
+        Draws the scene.
+    draw_calls : list of (moderngl.VertexArray, moderngl.Texture)
+        Triangles of the program, each with its texture.
+    resolving : moderngl.VertexArray
+        One triangle that resolves samples to pixels.
+    """
+
+    samples: moderngl.Framebuffer
+    program: moderngl.Program
+    draw_calls: list[tuple[moderngl.VertexArray, moderngl.Texture]]
+    resolving: moderngl.VertexArray
+
+
 class SceneView:
     """Renderer of one scene, in an OpenGL context that may be shared.
 
@@ -131,14 +171,26 @@ class SceneView:
         image_count: int = 1,
     ):
         self.scene, self.size_px = scene, size_px
-        self._context = context
-        with context:
-            info = context.info
-            largest = min(info["GL_MAX_TEXTURE_SIZE"], *info["GL_MAX_VIEWPORT_DIMS"])
-            check_size(size_px, supersampling, largest)
-            self._buffers = SceneBuffers(
-                context, scene, size_px, supersampling, image_count
-            )
+        self._context, self._supersampling = context, supersampling
+        self._owned: list[Any] = []
+        try:
+            with context:
+                info = context.info
+                check_size(
+                    size_px,
+                    supersampling,
+                    min(info["GL_MAX_TEXTURE_SIZE"], *info["GL_MAX_VIEWPORT_DIMS"]),
+                )
+                # Color, and planar depth in meters, with the top row first.
+                self._images = [
+                    self._target(size_px, None, with_depth=False)
+                    for _ in range(image_count)
+                ]
+                self._content = self._uploaded(scene)
+                self._visible = self._layer({})
+        except BaseException:
+            self.close()
+            raise
 
     def __enter__(self) -> SceneView:
         return self
@@ -149,11 +201,10 @@ class SceneView:
     def close(self) -> None:
         """Free the OpenGL objects; closing twice is allowed."""
         with self._context:
-            self._buffers.release()
+            while self._owned:
+                self._owned.pop().release()
 
-    def render(
-        self, pose: Array, tangents: Tangents, *, out: Picture | None = None
-    ) -> Picture:
+    def render(self, pose: Array, tangents: Tangents) -> Picture:
         """Render the scene from a pose.
 
         Parameters
@@ -162,8 +213,6 @@ class SceneView:
             Camera to world; x right, y up, looking along -z.
         tangents : (left, right, up, down)
             Tangents of the angles to the image edges.
-        out : (color, depth_m), optional
-            Output arrays, contiguous, of the shapes and types below.
 
         Returns
         -------
@@ -175,15 +224,12 @@ class SceneView:
         Raises
         ------
         ValueError
-            If the pose or the tangents do not describe a camera, or an output array
-            does not fit.
+            If the pose or the tangents do not describe a camera.
         """
-        uniforms = _uniforms(pose, self._projection(tangents))
-        picture = self._output(out)
+        uniforms = self._uniforms(pose, tangents)
         with self._context:
-            self._draw(self._buffers.visible, uniforms)
-            self._resolve(self._buffers.visible, picture)
-        return picture
+            self._draw(self._visible, uniforms)
+            return self._resolved(self._visible)
 
     def draw(self, pose: Array, tangents: Tangents, *, image: int = 0) -> SceneImage:
         """Render the scene from a pose to textures, without waiting for the GPU.
@@ -195,11 +241,11 @@ class SceneView:
         image : int
             Number of the image, whose previous content is lost.
         """
-        uniforms = _uniforms(pose, self._projection(tangents))
-        target = self._buffers.images[image]
+        uniforms = self._uniforms(pose, tangents)
+        target = self._images[image]
         with self._context:
-            self._draw(self._buffers.visible, uniforms)
-            self._resolve_to(target, self._buffers.visible)
+            self._draw(self._visible, uniforms)
+            self._resolve_to(target, self._visible)
         color, depth_m = target.color_attachments
         return SceneImage(
             self._context,
@@ -224,15 +270,13 @@ class SceneView:
         visible, hidden : (color, depth_m)
             As for `render`; the hidden depth is 0 where nothing is hidden.
         """
-        uniforms = _uniforms(pose, self._projection(tangents))
-        visible, hidden = self._output(None), self._output(None)
+        uniforms = self._uniforms(pose, tangents)
         with self._context:
-            self._draw(self._buffers.visible, uniforms)
-            self._resolve(self._buffers.visible, visible)
-            seen = self._buffers.visible.samples.color_attachments[1]
-            self._draw(self._buffers.hidden, uniforms, seen)
-            self._resolve(self._buffers.hidden, hidden, seen)
-        return visible, hidden
+            self._draw(self._visible, uniforms)
+            visible = self._resolved(self._visible)
+            seen = self._visible.samples.color_attachments[1]
+            self._draw(self._hidden, uniforms, seen)
+            return visible, self._resolved(self._hidden, seen)
 
     def parallel_depth_m(self, pose: Array, half_width_m: float) -> NDArray[np.float32]:
         """Return the depth (h, w) of front faces along parallel rays.
@@ -249,15 +293,17 @@ class SceneView:
         near_m, far_m = self.scene.near_m, self.scene.far_m
         clip_from_view = np.diag([1.0 / half_width_m] * 2 + [2 / (near_m - far_m), 1.0])
         clip_from_view[2, 3] = (near_m + far_m) / (near_m - far_m)
-        picture = self._output(None)
+        uniforms = _uniforms(pose, clip_from_view)
         with self._context:
-            uniforms = _uniforms(pose, clip_from_view)
-            self._draw(self._buffers.visible, uniforms, culls=True)
-            self._resolve(self._buffers.visible, picture)
-        return picture[1]
+            self._draw(self._visible, uniforms, culls=True)
+            return self._resolved(self._visible)[1]
 
-    def _projection(self, tangents: Tangents) -> Array:
-        return projection(tangents, self.scene.near_m, self.scene.far_m)
+    def _uniforms(
+        self, pose: Array, tangents: Tangents
+    ) -> dict[str, tuple[float, ...]]:
+        return _uniforms(
+            pose, projection(tangents, self.scene.near_m, self.scene.far_m)
+        )
 
     def _draw(
         self,
@@ -295,13 +341,16 @@ class SceneView:
                 texture.use(0)
                 triangles.render(moderngl.TRIANGLES)
 
-    def _resolve(self, layer: Layer, out: Picture, seen: Any = None) -> None:
-        """Resolve samples to pixels and copy these; waits for the GPU."""
-        pixels = self._buffers.images[0]
+    def _resolved(self, layer: Layer, seen: Any = None) -> Picture:
+        """Resolve samples to pixels and return these; waits for the GPU."""
+        pixels, (width, height) = self._images[0], self.size_px
         self._resolve_to(pixels, layer, seen)
+        color = np.empty((height, width, 3), np.uint8)
+        depth_m = np.empty((height, width), np.float32)
         # The size of a row of three-byte pixels need not be a multiple of four.
-        pixels.read_into(out[0], components=3, attachment=0, alignment=1)
-        pixels.read_into(out[1], components=1, attachment=1, dtype="f4")
+        pixels.read_into(color, components=3, attachment=0, alignment=1)
+        pixels.read_into(depth_m, components=1, attachment=1, dtype="f4")
+        return color, depth_m
 
     def _resolve_to(
         self, pixels: moderngl.Framebuffer, layer: Layer, seen: Any = None
@@ -313,23 +362,96 @@ class SceneView:
                     cast("moderngl.Texture", texture).use(unit)
             layer.resolving.render(moderngl.TRIANGLES, vertices=3)
 
-    def _output(self, out: Picture | None) -> Picture:
-        """Return the caller's output arrays after a check, or new ones."""
-        width, height = self.size_px
-        wanted = (((height, width, 3), np.uint8), ((height, width), np.float32))
-        if out is None:
-            return cast(
-                "Picture", tuple(np.empty(shape, dtype) for shape, dtype in wanted)
-            )
-        arrays: tuple[NDArray[Any], ...] = out
-        for array, (shape, dtype) in zip(arrays, wanted, strict=True):
-            fits = array.shape == shape and array.dtype == dtype
-            if not (fits and array.flags.c_contiguous and array.flags.writeable):
-                raise ValueError(
-                    f"output array of {array.dtype} {array.shape}; expected "
-                    f"{np.dtype(dtype)} {shape}, contiguous and writable"
-                )
-        return out
+    @cached_property
+    def _hidden(self) -> Layer:
+        """Objects that render the hidden layer, created at first use."""
+        return self._layer({"LEAST_GAP_DPT": LEAST_GAP_DPT})
+
+    def _own(self, made: _Made) -> _Made:
+        """Register an object for release and return it."""
+        self._owned.append(made)
+        return made
+
+    def _layer(self, defines: Mapping[str, object]) -> Layer:
+        width_px, height_px = self.size_px
+        samples_px = (self._supersampling * width_px, self._supersampling * height_px)
+        # Samples hold sRGB values, which OpenGL decodes to linear light on reading:
+        # faster than a power law in the shader.
+        samples = self._target(samples_px, _SRGB8_ALPHA8, with_depth=True)
+        program: Any = self._program("scene.vert", "scene.frag", defines)
+        program["surface"].value = 0
+        calls = [
+            (self._own(self._context.vertex_array(program, *content)), texture)
+            for content, texture in self._content
+        ]
+        constants = {"SAMPLES": self._supersampling, **_RESOLVE_CONSTANTS, **defines}
+        resolving: Any = self._program("resolve.vert", "resolve.frag", constants)
+        resolving["samples_light"].value, resolving["samples_per_m"].value = 0, 1
+        resolving["infinite_to_per_m"].value = 1.0 / self.scene.infinite_from_m
+        resolving["last_row"].value = height_px - 1
+        if defines:
+            program["seen_per_m"].value, resolving["seen_per_m"].value = 1, 2
+        triangle = self._own(self._context.vertex_array(resolving, []))
+        return Layer(samples, program, calls, triangle)
+
+    def _target(
+        self, size_px: tuple[int, int], color_format: int | None, *, with_depth: bool
+    ) -> moderngl.Framebuffer:
+        """Return a framebuffer for a color and a float."""
+        context, own = self._context, self._own
+        color = own(context.texture(size_px, 4, internal_format=color_format))
+        values = own(context.texture(size_px, 1, dtype="f4"))
+        for texture in (color, values):
+            texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        depth = own(context.depth_renderbuffer(size_px)) if with_depth else None
+        return own(context.framebuffer([color, values], depth))
+
+    def _program(
+        self, vertex: str, fragment: str, defines: Mapping[str, object]
+    ) -> moderngl.Program:
+        """Build the program of two files in assets/."""
+        texts = [(_ASSETS / name).read_text("utf-8") for name in (vertex, fragment)]
+        version, _, rest = texts[1].partition("\n")
+        lines = [f"#define {key} {value}" for key, value in defines.items()]
+        # Compiler messages then refer to the lines of the file.
+        texts[1] = "\n".join([version, *lines, "#line 2", rest])
+        return self._own(
+            self._context.program(vertex_shader=texts[0], fragment_shader=texts[1])
+        )
+
+    def _uploaded(self, scene: Scene) -> list[tuple[tuple[Any, ...], moderngl.Texture]]:
+        """Return each batch's vertices, indices and texture.
+
+        Batches may share a texture.
+        """
+        # A surface without a texture is its color times white.
+        textures: dict[int | None, moderngl.Texture] = {
+            None: self._own(self._context.texture((1, 1), 3, b"\xff" * 3))
+        }
+        found = []
+        for batch in scene.batches:
+            key = None if batch.texture is None else id(batch.texture)
+            if batch.texture is not None and key not in textures:
+                textures[key] = self._surface(batch.texture)
+            vertices = [
+                (self._buffer(batch.vertices_m, np.float32), "3f", "vertex_m"),
+                (self._buffer(batch.srgb, np.float32), "3f", "srgb"),
+                (self._buffer(batch.uv, np.float32), "2f", "uv"),
+            ]
+            content = vertices, self._buffer(batch.faces, np.uint32)
+            found.append((content, textures[key]))
+        return found
+
+    def _buffer(self, values: NDArray[Any], dtype: DTypeLike) -> moderngl.Buffer:
+        return self._own(self._context.buffer(np.ascontiguousarray(values, dtype)))
+
+    def _surface(self, texels: NDArray[np.uint8]) -> moderngl.Texture:
+        """Return a repeating texture with mipmaps and linear filtering."""
+        upright = np.ascontiguousarray(texels[::-1])
+        texture = self._own(self._context.texture(texels.shape[1::-1], 3, upright))
+        texture.build_mipmaps()
+        texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+        return texture
 
 
 def check_size(size_px: tuple[int, int], supersampling: int, largest: int) -> None:
@@ -410,207 +532,12 @@ def projection(tangents: Tangents, near_m: float, far_m: float) -> Array:
         raise ValueError(
             f"tangents are {tangents}; allowed: finite, left < right and down < up"
         )
-    matrix = np.zeros((4, 4))
-    matrix[0, 0], matrix[0, 2] = 2 / (right - left), (right + left) / (right - left)
-    matrix[1, 1], matrix[1, 2] = 2 / (up - down), (up + down) / (up - down)
-    matrix[2, 2] = (near_m + far_m) / (near_m - far_m)
-    matrix[2, 3] = 2 * near_m * far_m / (near_m - far_m)
-    matrix[3, 2] = -1.0
-    return matrix
-
-
-# OpenGL objects: render targets, programs and triangles
-
-LEAST_GAP_DPT = 0.05
-"""Smallest distance of the hidden layer behind the visible surface; closer surfaces
-have nearly the same blur."""
-
-_Made = TypeVar("_Made")
-
-_ASSETS = Path(__file__).resolve().parents[1] / "assets"
-_SRGB8_ALPHA8 = 0x8C43  # GL_SRGB8_ALPHA8
-
-_RESOLVE_CONSTANTS = {
-    # Bits of the float: a division by zero need not give infinity.
-    "INFINITY_BITS": "0x7F800000u",
-    # IEC 61966-2-1, as in `clients.scenes.geometry`.
-    "SRGB_GAIN": 1.055,
-    "SRGB_POWER": 2.4,
-    "SRGB_SLOPE": 12.92,
-    "SRGB_KNEE": 0.0031308,
-}
-
-
-class Layer(NamedTuple):
-    """OpenGL objects that render one layer, visible or hidden.
-
-    Attributes
-    ----------
-    samples : moderngl.Framebuffer
-        Target of the samples: color, and the inverse of planar depth as a float, 1/m.
-        A depth buffer is too coarse at large distances.
-    program : moderngl.Program
-        Draws the scene.
-    draw_calls : list of (moderngl.VertexArray, moderngl.Texture)
-        Triangles of the program, each with its texture.
-    resolving : moderngl.VertexArray
-        One triangle that resolves samples to pixels.
-    """
-
-    samples: moderngl.Framebuffer
-    program: moderngl.Program
-    draw_calls: list[tuple[moderngl.VertexArray, moderngl.Texture]]
-    resolving: moderngl.VertexArray
-
-
-class SceneBuffers:
-    """OpenGL objects of one view; their context must be current for every call.
-
-    Parameters
-    ----------
-    context : moderngl.Context
-        Context that owns the objects.
-    scene : Scene
-        Scene to upload.
-    size_px : (int, int)
-        Width and height of an image.
-    supersampling : int
-        Samples per pixel along each axis.
-    image_count : int
-        Number of targets of the pixels.
-
-    Attributes
-    ----------
-    images : list of moderngl.Framebuffer
-        Targets of the pixels resolved from samples: color, and planar depth in meters,
-        with the top row first.
-    visible, hidden : Layer
-        Objects of each layer; those of the hidden layer are created at first use.
-    """
-
-    def __init__(
-        self,
-        context: moderngl.Context,
-        scene: Scene,
-        size_px: tuple[int, int],
-        supersampling: int,
-        image_count: int,
-    ):
-        self._context, self._scene = context, scene
-        self._size_px, self._supersampling = size_px, supersampling
-        self._owned: list[Any] = []
-        try:
-            self.images = [
-                self._target(size_px, None, with_depth=False)
-                for _ in range(image_count)
-            ]
-            self._content = self._uploaded(scene)
-            self.visible = self._layer({})
-        except BaseException:
-            self.release()
-            raise
-
-    @cached_property
-    def hidden(self) -> Layer:
-        """Objects that render the hidden layer."""
-        return self._layer({"LEAST_GAP_DPT": LEAST_GAP_DPT})
-
-    def release(self) -> None:
-        """Free all objects."""
-        while self._owned:
-            self._owned.pop().release()
-
-    def _own(self, made: _Made) -> _Made:
-        """Register an object for release and return it."""
-        self._owned.append(made)
-        return made
-
-    def _layer(self, defines: Mapping[str, object]) -> Layer:
-        width_px, height_px = self._size_px
-        samples_px = (self._supersampling * width_px, self._supersampling * height_px)
-        # Samples hold sRGB values, which OpenGL decodes to linear light on reading:
-        # faster than a power law in the shader.
-        samples = self._target(samples_px, _SRGB8_ALPHA8, with_depth=True)
-        program: Any = self._program("scene.vert", "scene.frag", defines)
-        program["surface"].value = 0
-        calls = [
-            (self._own(self._context.vertex_array(program, *content)), texture)
-            for content, texture in self._content
+    width, height, depth_m = right - left, up - down, near_m - far_m
+    return np.array(
+        [
+            [2 / width, 0.0, (right + left) / width, 0.0],
+            [0.0, 2 / height, (up + down) / height, 0.0],
+            [0.0, 0.0, (near_m + far_m) / depth_m, 2 * near_m * far_m / depth_m],
+            [0.0, 0.0, -1.0, 0.0],
         ]
-        constants = {"SAMPLES": self._supersampling, **_RESOLVE_CONSTANTS, **defines}
-        resolving: Any = self._program("resolve.vert", "resolve.frag", constants)
-        resolving["samples_light"].value, resolving["samples_per_m"].value = 0, 1
-        resolving["infinite_to_per_m"].value = 1.0 / self._scene.infinite_from_m
-        resolving["last_row"].value = height_px - 1
-        if defines:
-            program["seen_per_m"].value, resolving["seen_per_m"].value = 1, 2
-        triangle = self._own(self._context.vertex_array(resolving, []))
-        return Layer(samples, program, calls, triangle)
-
-    def _target(
-        self, size_px: tuple[int, int], color_format: int | None, *, with_depth: bool
-    ) -> moderngl.Framebuffer:
-        """Return a framebuffer for a color and a float."""
-        context, own = self._context, self._own
-        color = own(context.texture(size_px, 4, internal_format=color_format))
-        values = own(context.texture(size_px, 1, dtype="f4"))
-        for texture in (color, values):
-            texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
-        depth = own(context.depth_renderbuffer(size_px)) if with_depth else None
-        return own(context.framebuffer([color, values], depth))
-
-    def _program(
-        self, vertex: str, fragment: str, defines: Mapping[str, object]
-    ) -> moderngl.Program:
-        """Build the program of two files in assets/."""
-        texts = [(_ASSETS / name).read_text("utf-8") for name in (vertex, fragment)]
-        version, _, rest = texts[1].partition("\n")
-        lines = [f"#define {key} {value}" for key, value in defines.items()]
-        # Compiler messages then refer to the lines of the file.
-        texts[1] = "\n".join([version, *lines, "#line 2", rest])
-        return self._own(
-            self._context.program(vertex_shader=texts[0], fragment_shader=texts[1])
-        )
-
-    def _uploaded(self, scene: Scene) -> list[tuple[tuple[Any, ...], moderngl.Texture]]:
-        """Return each batch's vertices, indices and texture.
-
-        Batches may share a texture.
-        """
-        # A surface without a texture is its color times white.
-        textures: dict[int | None, moderngl.Texture] = {
-            None: self._own(self._context.texture((1, 1), 3, b"\xff" * 3))
-        }
-        found = []
-        for batch in scene.batches:
-            key = None if batch.texture is None else id(batch.texture)
-            if key not in textures:
-                assert batch.texture is not None
-                textures[key] = self._surface(batch.texture)
-            found.append((self._triangles(batch), textures[key]))
-        return found
-
-    def _triangles(self, batch: Batch) -> tuple[list[tuple[Any, str, str]], Any]:
-        """Return a batch's vertices and indices in the layout of the scene shader."""
-        columns = (
-            (batch.vertices_m, "3f", "vertex_m"),
-            (batch.srgb, "3f", "srgb"),
-            (batch.uv, "2f", "uv"),
-        )
-        content = [
-            (self._buffer(values, np.float32), kind, name)
-            for values, kind, name in columns
-        ]
-        return content, self._buffer(batch.faces, np.uint32)
-
-    def _buffer(self, values: NDArray[Any], dtype: DTypeLike) -> moderngl.Buffer:
-        return self._own(self._context.buffer(np.ascontiguousarray(values, dtype)))
-
-    def _surface(self, texels: NDArray[np.uint8]) -> moderngl.Texture:
-        """Return a repeating texture with mipmaps and linear filtering."""
-        height, width = texels.shape[:2]
-        upright = np.ascontiguousarray(texels[::-1])
-        texture = self._own(self._context.texture((width, height), 3, upright))
-        texture.build_mipmaps()
-        texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
-        return texture
+    )

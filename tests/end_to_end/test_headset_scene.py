@@ -198,24 +198,6 @@ def linear_from_srgb8(values):
 # ----- the view as an object
 
 
-def test_a_picture_goes_to_the_callers_memory(context):
-    scene = scene_of(square((0, 0, -2), 1))
-    with SceneView(context, scene, (7, 5)) as view:
-        new = view.render(np.eye(4), ONE_TO_ONE)
-        memory = np.zeros((5, 7, 3), np.uint8), np.zeros((5, 7), np.float32)
-        returned = view.render(np.eye(4), ONE_TO_ONE, out=memory)
-        for k in range(2):
-            assert returned[k] is memory[k]
-            assert np.array_equal(new[k], memory[k])
-        for wrong in (
-            (memory[0], memory[1].astype(float)),
-            (memory[0][:4], memory[1]),
-            (np.zeros((5, 14, 3), np.uint8)[:, ::2], memory[1]),
-        ):
-            with pytest.raises(ValueError, match="output array of"):
-                view.render(np.eye(4), ONE_TO_ONE, out=wrong)
-
-
 def test_other_contexts_of_the_thread_go_on(context):
     other = moderngl.create_context(standalone=True, require=330, backend="egl")
     scene = scene_of(square((0, 0, -2), 4))
@@ -249,7 +231,7 @@ def test_what_the_context_was_set_to_does_not_show(context):
 
 def test_a_closed_view_holds_nothing(context):
     view = SceneView(context, scene_of(square((0, 0, -2), 1)), (8, 8))
-    held = list(view._buffers._owned)
+    held = list(view._owned)
     assert held
     view.close()
     view.close()
