@@ -58,10 +58,10 @@ def typer_app(**settings: Any) -> typer.Typer:
     )
 
 
-def app_of(command: Callable[..., None], **settings: Any) -> typer.Typer:
-    """Return an application with one command; `settings` are those of the command."""
+def app_of(command: Callable[..., None]) -> typer.Typer:
+    """Return an application with one command."""
     app = typer_app()
-    app.command(**settings)(command)
+    app.command()(command)
     return app
 
 

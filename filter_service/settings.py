@@ -182,39 +182,43 @@ class FilterSettings(Record):
     display: Annotated[
         str,
         _doc(
-            "Display: common, lcd, oled, crt, paper, or wavelengths of "
-            "red, green and blue in nm as 620,530,455, with standard deviations as "
-            "620:13,530:19,455:13.  A command also takes a .csv of spectra: nm, red, "
-            "green, blue."
+            "Type of display (common, lcd, oled, crt, paper), or the wavelengths of "
+            "red, green and blue in nm, as 620,530,455 or with standard deviations as "
+            "620:13,530:19,455:13.  Commands also read a .csv file of spectra with the "
+            "columns nm, red, green, blue."
         ),
     ] = "common"
     wide_primaries: Annotated[
         bool,
         _doc(
-            "Two wavelengths for each primary of the display instead of one; takes "
-            "twice as long to prepare, and no longer for a frame."
+            "Represent each primary of the display by two wavelengths instead of one; "
+            "preparing takes twice as long, a frame does not."
         ),
     ] = False
-    diffraction: Annotated[bool, _doc("Off: geometrical optics only.")] = True
-    chromatic: Annotated[bool, _doc("Off: all colors are focused alike.")] = True
+    diffraction: Annotated[
+        bool, _doc("Diffraction at the pupil; off: geometrical optics only.")
+    ] = True
+    chromatic: Annotated[
+        bool, _doc("Chromatic aberration; off: all colors are focused alike.")
+    ] = True
     lateral_color: Annotated[
         bool,
         _doc(
-            "Lateral color: displace red and blue against green off the axis; traced "
-            "eyes only."
+            "Displace red and blue against green off the axis, as lateral color does; "
+            "traced eyes only."
         ),
     ] = False
     stiles_crawford: Annotated[
         bool,
         _doc(
-            "Dim light toward the pupil's rim as cones see it, about the center usual "
-            "for the eye's side."
+            "Dim light toward the rim of the pupil, as cones perceive it, about the "
+            "center usual for the eye's side."
         ),
     ] = False
     eye_model: Annotated[
         EyeModel,
         _doc(
-            "wavefront: the measurement by formula, up to its own pupil; traced: an "
+            "wavefront: the measured wavefront, up to the measured pupil; traced: an "
             "estimated eye, ray-traced at any pupil and focus."
         ),
     ] = "traced"
@@ -228,8 +232,8 @@ class FilterSettings(Record):
     age_years: Annotated[
         Years | None,
         _doc(
-            "Instead of the profile's; limits accommodation, and typical aberrations "
-            "grow with it."
+            "Age instead of the profile's; it limits accommodation, and typical "
+            "aberrations grow with it."
         ),
     ] = None
 

@@ -36,7 +36,10 @@ Method = Literal["network", "refined", "search"]
 def estimate(
     profile: Annotated[
         str,
-        typer.Argument(help="A preset name, or a .json, .abp, .csv or .zmx profile."),
+        typer.Argument(
+            metavar="PROFILE",
+            help="Preset name, or a .json, .abp, .csv or .zmx profile.",
+        ),
     ],
     method: Annotated[
         Method,
@@ -57,8 +60,8 @@ def estimate(
 ) -> None:
     """Estimate the 45-parameter eye that reproduces a measured wavefront.
 
-    Coefficients are compared on the measured circle, without tilt: the chief ray makes
-    tilt a function of coma.
+    Coefficients are compared on the measured circle, without tilt, because the chief
+    ray makes tilt a function of coma.
 
     ocufilter estimate keratoconus --plot eye.png
     """
@@ -143,7 +146,10 @@ HORIZONTAL, VERTICAL = "-40,-30,-20,-10,0,10,20,30,40", "0"
 def field(
     profile: Annotated[
         str,
-        typer.Argument(help="Preset name, or a .json, .abp, .csv or .zmx profile."),
+        typer.Argument(
+            metavar="PROFILE",
+            help="Preset name, or a .json, .abp, .csv or .zmx profile.",
+        ),
     ],
     pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength, nm.")],
@@ -179,7 +185,7 @@ def field(
     the cornea, on the circle about the chief ray that encloses the pupil; the table has
     its radius.  M, J0 and J45 are the least-squares refraction.  Off-axis values are
     those of a measured population with the same on-axis values.  They follow the
-    off-axis measurements in the profile, within about 0.05 dpt if these are like those
+    off-axis measurements in the profile, within about 0.05 dpt if these are typical
     of people.  With "periphery": "model" in the profile, they are those of the eye
     model.
 

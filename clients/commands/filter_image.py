@@ -130,7 +130,9 @@ def filter_image(
     ] = "planar",
     depth_scale: Annotated[
         float | None,
-        typer.Option(help="Meters per unit of the depth file [integers: 0.001]."),
+        typer.Option(
+            help="Meters per unit of the depth file; by default 0.001 for integers."
+        ),
     ] = None,
     no_merge: Annotated[
         bool, typer.Option("--no-merge", help="Do not merge similar pixels.")

@@ -51,8 +51,9 @@ def wavefront(
     eye: Annotated[
         str,
         typer.Argument(
+            metavar="EYE",
             help="Name of a preset or schematic eye, or a .json, .abp, .csv or .zmx "
-            "profile."
+            "profile.",
         ),
     ],
     wavelength_nm: Annotated[float, typer.Option(help="Wavelength, nm.")],
@@ -88,11 +89,11 @@ def wavefront(
     """Print the Zernike coefficients of an eye's wavefront in one direction.
 
     Coefficients are OSA, um, at the cornea.  A measurement, prescription or preset has
-    the wavefront of frames and of the commands field and psf, on the circle of the
-    entrance pupil: the measured one on the axis and the periphery of people with such
-    an axis, through the correction.  An eye that is given by its surfaces or parameters
-    is traced as it is, to where the chief ray meets the cornea, on the circle there
-    that encloses the projected pupil.
+    the wavefront that frames and the commands `field` and `psf` use, through the
+    correction, on the circle of the entrance pupil: on the axis the measured wavefront,
+    and off the axis that of people with the same wavefront on the axis.  An eye that is
+    given by its surfaces or parameters is traced as it is, to where the chief ray meets
+    the cornea, on the circle there that encloses the projected pupil.
 
     ocufilter wavefront eye.json --stop-mm 4 --wavelength-nm 555 --h-deg 20
     """
@@ -304,8 +305,9 @@ def psf(
     eye: Annotated[
         str,
         typer.Argument(
+            metavar="EYE",
             help="Name of a preset or schematic eye, or a .json, .abp, .csv or .zmx "
-            "profile."
+            "profile.",
         ),
     ],
     pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")],
@@ -344,9 +346,9 @@ def psf(
     """Compute one PSF, integrated over pixels that are square in visual angle.
 
     The kernel is an array [y, x] in image orientation (rows grow downward), with the
-    chief ray at its center and unit sum.  It is the PSF of the filter: that of the
-    traced eye with its elliptical pupil, which has the measured wavefront on the axis
-    and the periphery of people with such an axis.
+    chief ray at its center and unit sum.  It is the PSF that the filter uses, of the
+    traced eye with its elliptical pupil: on the axis it has the measured wavefront, and
+    off the axis that of people with the same wavefront on the axis.
 
     ocufilter psf keratoconus --pupil-mm 5 --wavelength-nm 549
     --pixel-arcmin 1 --h-deg 20 -o psf.png

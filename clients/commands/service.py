@@ -22,7 +22,9 @@ from filter_service.psfs.cache_folder import CACHE_VARIABLE
 if TYPE_CHECKING:
     from filter_service.keys import KeyRing
 
-Seconds = Annotated[float, typer.Option("--timeout", metavar="S", help="Timeout, s.")]
+Seconds = Annotated[
+    float, typer.Option("--timeout", metavar="S", help="Longest wait for a reply, s.")
+]
 
 
 def status(
@@ -140,7 +142,7 @@ def latency(
     *,
     settings: dict[str, Any],
 ) -> None:
-    """Time frames through a running service, and compute the error of what returns.
+    """Time frames through a running service, and compute the error of the images.
 
     Frames are sent at a fixed rate, each with another pupil and focus, and their ages
     count from that schedule.  Prints the median, the 90th and 99th percentile and the

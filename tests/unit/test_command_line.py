@@ -77,7 +77,7 @@ def test_what_is_no_number_is_named(capsys, text):
         ("serve --engine cuda", "--engine is 'cuda'; allowed: auto, gl, native"),
         ("psf navarro --method=dct", "--method is 'dct'; allowed: auto, fourier, "),
         ("fliter", "No such command 'fliter'. Did you mean 'filter'?"),
-        ("psf", "Missing argument 'eye'."),
+        ("psf", "Missing argument 'EYE'."),
     ],
 )
 def test_a_refusal_names_the_value_and_what_is_allowed(capsys, given, said):
