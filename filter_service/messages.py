@@ -29,23 +29,28 @@ from filter_service.view_state import (
     body_of_eye,
     check_states,
 )
-from filter_service.wire.compression import COMPRESSIONS, Compression
-from filter_service.wire.depths import DEPTH_ENCODINGS, DepthEncoding, encoded_depth
 from filter_service.wire.images import (
+    COMPRESSIONS,
+    DEPTH_ENCODINGS,
     FORMATS,
     LINEAR,
     LINEAR16,
     SRGB8,
+    Compression,
+    DepthEncoding,
     ImageFormat,
     ViewHeader,
     ViewImages,
+    encoded_depth,
 )
 from filter_service.wire.message import (
     DEFAULT_ENDPOINT,
+    MAX_HEADER_BYTES,
     MAX_ID,
     Limits,
     Message,
     Part,
+    unpack_header,
 )
 from filter_service.wire.replies import (
     DROP_REASONS,
@@ -82,7 +87,6 @@ from filter_service.wire.textures import (
     ViewTextures,
     used_textures,
 )
-from filter_service.wire.unpacking import MAX_HEADER_BYTES, unpack_header
 
 __all__ = [
     "COMPRESSIONS",

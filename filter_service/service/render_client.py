@@ -30,7 +30,7 @@ from filter_service.service.router import Tracker
 from filter_service.service.session import Session, WaitingFrame
 from filter_service.shared_memory import Slot, SlotPool, aligned_starts
 from filter_service.texture_view import COLOR_FORMATS, DEPTH_FORMATS
-from filter_service.wire.compression import largest_block_bytes
+from filter_service.wire.images import largest_block_bytes
 
 
 def check_positions(session: Session, frame: Frame) -> None:

@@ -14,8 +14,7 @@ from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.messages import EyeName, Frame, Reply, Result, SharedPlaces
 from filter_service.service.frame_reply import frame_reply
 from filter_service.shared_memory import Slot
-from filter_service.wire.compression import packed
-from filter_service.wire.images import ViewImages
+from filter_service.wire.images import ViewImages, packed
 
 MS_PER_S = 1e3
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +15,132 @@ from filter_service.rgbd_view import ColorImage, RgbdView
 from filter_service.settings import DepthKind, GazeDeg, Output, PupilMm, VergenceDpt
 from filter_service.validation import Record
 from filter_service.view_state import EyeName, Pose, ViewState
-from filter_service.wire.compression import (
-    Compression,
-    block_from_part,
-    packed,
-    unpacked,
-)
-from filter_service.wire.depths import WIRE_DTYPES, DepthEncoding, decoded_depth
 from filter_service.wire.message import Limits, Part, expect_parts
+
+Compression = Literal["none", "lz4"]
+
+COMPRESSIONS: tuple[str, ...] = get_args(Compression)
+
+
+def largest_block_bytes(size_bytes: int) -> int:
+    """Return the maximum block size for this many bytes (LZ4's own bound)."""
+    return size_bytes + size_bytes // 255 + 16
+
+
+def packed(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Compress an image of any shape and type to a block (n_bytes,)."""
+    from lz4 import block
+
+    contiguous = np.ascontiguousarray(image)
+    data = contiguous.reshape(-1).view(np.uint8).data
+    return np.frombuffer(block.compress(data, store_size=False), np.uint8)
+
+
+def unpacked(
+    part: NDArray[np.uint8], shape: Sequence[int], dtype: str, path: str
+) -> NDArray[Any]:
+    """Decompress a block (n_bytes,) to an image of the given shape and type.
+
+    Raises
+    ------
+    BadMessage
+        If it is not an LZ4 block, or has another decompressed size.
+    """
+    from lz4 import block
+
+    wanted = np.dtype(dtype).newbyteorder("<")
+    size_bytes = int(np.prod(shape, dtype=np.int64)) * wanted.itemsize
+    try:
+        data = block.decompress(part.data, uncompressed_size=size_bytes)
+    except block.LZ4BlockError as error:
+        raise BadMessage(
+            f"it is not an LZ4 block ({error})",
+            field=path,
+            allowed=f"{size_bytes} bytes",
+        ) from None
+    if len(data) != size_bytes:
+        raise BadMessage(
+            f"the block decompresses to {len(data)} bytes",
+            field=path,
+            allowed=f"{size_bytes} bytes, shape {tuple(shape)} of {dtype}",
+        )
+    return np.frombuffer(data, wanted).reshape(shape)
+
+
+def block_from_part(part: Any, size_bytes: int, path: str) -> NDArray[np.uint8]:
+    """Return an array over a part that is a block, without decompressing it.
+
+    Parameters
+    ----------
+    size_bytes : int
+        Decompressed size.
+    path : str
+        Path of the image in error messages.
+
+    Raises
+    ------
+    BadMessage
+        If the part is empty, or too large for that size.
+    """
+    most = largest_block_bytes(size_bytes)
+    n_bytes = memoryview(part).nbytes
+    if not 0 < n_bytes <= most:
+        raise BadMessage(
+            f"the part has {n_bytes} bytes", field=path, allowed=f"1 to {most} bytes"
+        )
+    return np.frombuffer(part, np.uint8)
+
+
+DepthEncoding = Literal["float32", "float16", "dpt16", "mm16"]
+"""Meters; meters in half precision; diopters in half precision; whole millimeters."""
+
+DEPTH_ENCODINGS: tuple[str, ...] = get_args(DepthEncoding)
+
+WIRE_DTYPES = {
+    "float32": "float32",
+    "float16": "float16",
+    "dpt16": "float16",
+    "mm16": "uint16",
+}
+
+MM_PER_M = 1000.0
+MISSING_MM, INFINITE_MM = 0, 65535
+"""Special values of mm16; 1 to 65534 are millimeters."""
+
+
+def encoded_depth(depth_m: NDArray[np.float32], encoding: str) -> NDArray[Any]:
+    """Encode depth for the wire.
+
+    Errors are 0.05 % of the distance for float16 and dpt16, and half a millimeter for
+    mm16.  dpt16 cannot distinguish distances beyond 16 km or nearer than 0.1 mm; mm16
+    represents distances beyond 65.5 m as infinity.
+    """
+    if encoding == "float32":
+        return np.ascontiguousarray(depth_m, dtype=np.float32)
+    is_missing = ~(depth_m > 0.0)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        if encoding == "float16":
+            return np.where(is_missing, 0.0, depth_m).astype(np.float16)
+        if encoding == "dpt16":
+            return np.where(is_missing, np.nan, 1.0 / depth_m).astype(np.float16)
+        near_mm = np.clip(np.rint(MM_PER_M * depth_m), 1, INFINITE_MM)
+    return np.where(is_missing, MISSING_MM, near_mm).astype(np.uint16)
+
+
+def decoded_depth(encoded: NDArray[Any], encoding: str) -> NDArray[np.float32]:
+    """Decode depth to meters; 0 is missing."""
+    if encoding == "float32":
+        return encoded
+    if encoding == "float16":
+        return encoded.astype(np.float32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if encoding == "dpt16":
+            near_m = 1.0 / np.abs(encoded.astype(np.float32))  # -0 is infinity, too
+            return np.where(encoded >= 0.0, near_m, np.float32(0.0)).astype(np.float32)
+    found = encoded.astype(np.float32) / np.float32(MM_PER_M)
+    found[encoded == INFINITE_MM] = np.inf
+    return found
+
 
 DEFAULT_STATE = ViewState()
 

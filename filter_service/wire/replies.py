@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from filter_service.errors import FilterError, error_from_code
 from filter_service.validation import Record
 from filter_service.view_state import EyeName, Pose
-from filter_service.wire.compression import Compression, unpacked
 from filter_service.wire.images import (
     SRGB8,
+    Compression,
     ImageFormat,
     Pictures,
     image_from_part,
     to_wire_image,
+    unpacked,
 )
 from filter_service.wire.message import (
     MAX_DEVICES,

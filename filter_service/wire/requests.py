@@ -22,9 +22,9 @@ from filter_service.settings import (
 from filter_service.shared_memory import ALIGNMENT_BYTES
 from filter_service.validation import Record, show
 from filter_service.view_state import EyeName, State, check_states
-from filter_service.wire.compression import Compression
 from filter_service.wire.images import (
     SRGB8,
+    Compression,
     ImageFormat,
     Images,
     ViewHeader,
@@ -43,10 +43,11 @@ from filter_service.wire.message import (
     ShortText,
     Size,
     Timestamp,
+    check_profile_size,
     expect_parts,
+    unpack_profile,
 )
 from filter_service.wire.textures import ViewTextures
-from filter_service.wire.unpacking import check_profile_size, unpack_profile
 
 MAX_VIEWS = 8
 

@@ -11,7 +11,7 @@ import zmq
 from clients.filter_client import FilterClient, FilteredFrame, RgbdView
 from filter_service import errors
 from filter_service.messages import Bye, Hello, Ping, encode
-from filter_service.wire.compression import packed
+from filter_service.wire.images import packed
 from tests.end_to_end.conftest import make_view, small_frame
 
 SEE = {"pupil_diameter_mm": 4.0, "focus_dpt": 0.5}

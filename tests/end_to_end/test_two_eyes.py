@@ -26,8 +26,7 @@ from filter_service.messages import (
     decode_request,
     encode,
 )
-from filter_service.wire.message import Limits
-from filter_service.wire.unpacking import MAX_HEADER_BYTES
+from filter_service.wire.message import MAX_HEADER_BYTES, Limits
 from tests.end_to_end.conftest import TIMEOUT_S, make_view, small_frame
 from tests.end_to_end.test_lifecycle import wait_until
 

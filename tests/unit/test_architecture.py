@@ -154,8 +154,8 @@ HOME = {
     "uvicorn": ("clients/web/server.py", "clients/web/connections.py"),
     "playwright": ("tests/web/*", "tests/benchmarks/bench_web.py"),
     "prometheus_client": ("filter_service/service/metrics.py",),
-    "lz4": ("filter_service/wire/compression.py",),
-    "msgpack": ("filter_service/messages.py", "filter_service/wire/unpacking.py"),
+    "lz4": ("filter_service/wire/images.py",),
+    "msgpack": ("filter_service/messages.py", "filter_service/wire/message.py"),
     "msgspec": (
         "estimator/profiles/*",  # types of profiles
         "filter_service/validation.py",  # values against annotated types

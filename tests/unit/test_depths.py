@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filter_service.messages import DEPTH_ENCODINGS, encoded_depth
-from filter_service.wire.depths import WIRE_DTYPES, decoded_depth
+from filter_service.wire.images import WIRE_DTYPES, decoded_depth
 
 DEPTH_M = np.geomspace(0.05, 60.0, 5000, dtype=np.float32).reshape(50, 100)
 STRANGE_M = np.array([[0.0, -1.0, np.nan, np.inf, 1e-6, 100.0, 1e9]], np.float32)

@@ -43,7 +43,7 @@ from filter_service.service.router import (
 )
 from filter_service.service.supervisor import _Restarts
 from filter_service.shared_memory import SlotPool
-from filter_service.wire.unpacking import MAX_ITEMS, MAX_TEXT, unpack_profile
+from filter_service.wire.message import MAX_ITEMS, MAX_TEXT, unpack_profile
 
 # Connections
 

@@ -6,8 +6,7 @@ from estimator.threads import thread_count
 from filter_service.messages import DeviceState, Pong, encode
 from filter_service.service.config import ServiceConfig, load_config
 from filter_service.service.frame_queue import LOAD_WINDOW_S, Load
-from filter_service.wire.message import MAX_DEVICES
-from filter_service.wire.unpacking import MAX_HEADER_BYTES
+from filter_service.wire.message import MAX_DEVICES, MAX_HEADER_BYTES
 
 
 def test_without_devices_the_one_process_has_the_settings_as_they_are():
