@@ -6,9 +6,9 @@ from .acuity.transfer import Transfer as Transfer
 from .acuity.transfer import optical_transfer as optical_transfer
 from .acuity.transfer import perfect_transfer as perfect_transfer
 from .bounded_files import InvalidFile as InvalidFile
-from .corrections.lenslets import Lenslets as Lenslets
 from .corrections.progressive import ProgressiveLens as ProgressiveLens
 from .corrections.rings import DiffractiveRings as DiffractiveRings
+from .corrections.rings import Lenslets as Lenslets
 from .corrections.rings import RefractiveZones as RefractiveZones
 from .corrections.rings import Rings as Rings
 from .corrections.worn_lens import WornLens as WornLens

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.corrections.lenslets import Lenslets
 from estimator.corrections.progressive import ProgressiveLens
-from estimator.corrections.rings import DiffractiveRings, Rings
+from estimator.corrections.rings import DiffractiveRings, Lenslets, Rings
 from estimator.optics.units import NM_PER_UM
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile

@@ -246,7 +246,7 @@ def field(
         drawn = _drawn(eye, people, states, quiet=json_output)
         notes.append(f"{people} persons: {drawn_text(eye)}")
     if plot is not None:
-        from estimator.field.plot import plot_field
+        from estimator.field.field_table import plot_field
 
         title = f"{eye.name}, {pupil_mm:g} mm"
         write = partial(plot_field, found, title=title, drawn=drawn)

@@ -1,8 +1,7 @@
 """Corrections of the eye, by their effect on light in the entrance pupil.
 
 worn_lens         contact and intraocular lenses, and the wavefront of any correction
-rings             multifocal lenses: diffractive rings, refractive zones
-lenslets          spectacles with lenslets around a clear center
+rings             multifocal lenses: diffractive rings, refractive zones, lenslets
 progressive       progressive spectacles, and where the line of sight crosses a lens
 
 A *correction* is a `Prescription` or one of its subclasses here, given in the plane of

@@ -13,9 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.corrections.lenslets import Lenslets
 from estimator.corrections.progressive import ProgressiveLens
-from estimator.corrections.rings import Rings
+from estimator.corrections.rings import Lenslets, Rings
 from estimator.optics import prescription as rx
 from estimator.optics.units import MM_PER_M
 from estimator.optics.zernike import EXPONENTS, N_TERMS, index_from_nm

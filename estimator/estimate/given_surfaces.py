@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from estimator.estimate.estimation import EstimatedEye, estimate_eye
 from estimator.estimate.measured_residual import MeasuredResidual
 from estimator.eye.focusing import FocusedSurfaces
-from estimator.eye.surface_eye import SurfaceEye
-from estimator.eye.surface_model import SurfaceModel
+from estimator.eye.surface_eye import SurfaceEye, SurfaceModel
 from estimator.optics.surfaces import EyeSurfaces
 from estimator.optics.zernike import N_TERMS
 from estimator.profiles.measured_wavefront import profile_amplitude_dpt

@@ -6,8 +6,7 @@ assembly        conversion of parameters to surfaces, and the shape of the lens
 tracing         coefficients and refractions of many eyes
 focusing        far point, near point, and notes on unreachable focus
 accommodation   the lens state that focuses an eye at a distance
-surface_model   an eye given by surfaces, in states of accommodation
-surface_eye     its focus
+surface_eye     an eye given by surfaces, in states of accommodation, and its focus
 """
 
 import lazy_loader

@@ -6,6 +6,6 @@ from .focusing import FocusingEye as FocusingEye
 from .parameters import EyeParameters as EyeParameters
 from .parameters import RetinaShape as RetinaShape
 from .surface_eye import SurfaceEye as SurfaceEye
-from .surface_model import SurfaceModel as SurfaceModel
+from .surface_eye import SurfaceModel as SurfaceModel
 from .tracing import TraceFailed as TraceFailed
 from .tracing import zernike_of_vectors as zernike_of_vectors

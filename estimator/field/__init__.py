@@ -1,17 +1,16 @@
 """Wavefronts of an eye over its visual field, the input of the PSF cache.
 
 eye_optics              interface between the PSF cache and an eye
-aberration_grid         wavefronts traced at the nodes of a grid
-interpolation           interpolation between the nodes
+interpolation           wavefronts at the nodes of a grid, and between the nodes
 peripheral_residual     difference between the population's periphery and the model's,
                         at every accommodation
-trace_range             traced part of the field
-traced_fields           wavefronts at fixed fields, as pupil and accommodation change
+traced_fields           traced part of the field; wavefronts at fixed fields, as pupil
+                        and accommodation change
 traced_eye              an estimated eye, ray-traced over the field
 prepare                 entry point: from a profile to such an eye, with notes
 network_eye             the same by network: the eye of the published pipeline
-field_table             wavefronts in many directions, at the cornea; of drawn persons
-plot                    maps of a field table
+field_table             wavefronts in many directions, at the cornea; of drawn persons;
+                        maps of them
 
 A *field* is a direction in the visual field, azimuth h and elevation v.  A *grid* has
 axes of h, v, pupil, accommodation and wavelength.  The *state* of an eye is its pupil

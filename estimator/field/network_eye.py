@@ -21,18 +21,16 @@ from estimator.estimate.estimation import EstimatedEye, estimate_eye
 from estimator.eye.accommodation import FocusedEye
 from estimator.eye.assembly import accommodated_vectors
 from estimator.eye.tracing import OPEN_RATIO
-from estimator.field.aberration_grid import (
+from estimator.field.interpolation import (
     FIELD_AZIMUTHS,
     FIELD_RINGS,
     AberrationGrid,
-)
-from estimator.field.interpolation import (
     FieldInterpolation,
     accommodation_nodes_dpt,
     field_nodes_deg,
 )
-from estimator.field.trace_range import FieldRange, check_field_range
 from estimator.field.traced_eye import TracedEye
+from estimator.field.traced_fields import FieldRange, check_field_range
 from estimator.networks.inference import (
     INPUTS,
     NetworkUnfit,

@@ -35,13 +35,14 @@ from numpy.typing import NDArray
 from estimator.estimate.estimation import EstimatedEye, estimate_eye
 from estimator.estimate.given_surfaces import EyeModel
 from estimator.eye.tracing import on_axis_zernike_um
-from estimator.field.aberration_grid import (
+from estimator.field.interpolation import (
     FIELD_AZIMUTHS,
     FIELD_RINGS,
     AberrationGrid,
+    FieldInterpolation,
+    FieldNodes,
     aberration_grid,
 )
-from estimator.field.interpolation import FieldInterpolation, FieldNodes
 from estimator.optics.prescription import C2M2, C20, C22
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import (

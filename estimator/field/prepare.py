@@ -21,17 +21,18 @@ from estimator.estimate.given_surfaces import EyeModel, GivenSurfaces
 from estimator.estimate.given_surfaces import eye_model as model_of
 from estimator.eye.accommodation import REFRACTION_TOLERANCE_DPT
 from estimator.eye.focusing import FocusedSurfaces
-from estimator.field.aberration_grid import AberrationGrid, aberration_grid
 from estimator.field.eye_optics import EyeOptics
 from estimator.field.interpolation import (
+    AberrationGrid,
     FieldInterpolation,
     FieldNodes,
+    aberration_grid,
     fewer_field_nodes_deg,
     lagrange_weights,
     stretched,
 )
-from estimator.field.trace_range import ON_AXIS_DEG, FieldRange, scaled_progress
 from estimator.field.traced_eye import TRACED_ERROR_UM, TracedEye
+from estimator.field.traced_fields import ON_AXIS_DEG, FieldRange, scaled_progress
 from estimator.note import Note
 from estimator.optics.units import RGB_WAVELENGTHS_NM
 from estimator.periphery.change import MAX_MISFIT_UM

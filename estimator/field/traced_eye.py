@@ -19,17 +19,21 @@ from estimator.corrections.progressive import (
 from estimator.corrections.worn_lens import rings_of, worn_polynomial
 from estimator.estimate.given_surfaces import EyeModel
 from estimator.eye.focusing import FocusingEye
-from estimator.field.aberration_grid import AberrationGrid, aberration_grid
 from estimator.field.interpolation import (
+    AberrationGrid,
     FieldInterpolation,
     FieldNodes,
+    aberration_grid,
     accommodation_nodes_dpt,
 )
 from estimator.field.peripheral_residual import PeripheralResidual, held_refraction_um
-from estimator.field.trace_range import (
+from estimator.field.traced_fields import (
     ON_AXIS_DEG,
     FieldRange,
+    FixedDefocus,
+    TracedFields,
     check_field_range,
+    check_limits,
     field_pupils_mm,
     largest_open_pupil_mm,
     peripheral_residual,
@@ -37,7 +41,6 @@ from estimator.field.trace_range import (
     trace_field,
     traced_terms,
 )
-from estimator.field.traced_fields import FixedDefocus, TracedFields, check_limits
 from estimator.note import Note
 from estimator.wavefront.field_wavefronts import (
     FieldWavefronts,

@@ -11,11 +11,11 @@ from msgspec import UNSET
 from numpy.typing import NDArray
 
 from estimator.bounded_files import printable
-from estimator.corrections.lenslets import Lenslets
 from estimator.corrections.progressive import ProgressiveLens
 from estimator.corrections.rings import (
     DiffractiveRings,
     Kinoform,
+    Lenslets,
     RefractiveZones,
     Rings,
 )

@@ -16,7 +16,7 @@ from estimator.optics import prescription as rx
 from estimator.optics.units import REFERENCE_WAVELENGTH_NM
 
 if TYPE_CHECKING:
-    from estimator.eye.surface_model import SurfaceModel
+    from estimator.eye.surface_eye import SurfaceModel
 
 EYE_PUPIL_MM = 6.0
 """Entrance pupil at which the wavefront of a given eye is represented."""

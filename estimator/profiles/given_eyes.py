@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from estimator.corrections.worn_lens import replaces_lens
 from estimator.eye.checked_fields import ProfileError
 from estimator.eye.parameters import EyeParameters
-from estimator.eye.surface_model import SurfaceModel
+from estimator.eye.surface_eye import SurfaceModel
 from estimator.note import Note
 from estimator.optics.media import AbbeNumber, Constant
 from estimator.optics.surfaces import (

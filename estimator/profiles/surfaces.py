@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.eye.checked_fields import ProfileError
-from estimator.eye.surface_model import StatesDiffer, SurfaceModel
+from estimator.eye.surface_eye import StatesDiffer, SurfaceModel
 from estimator.optics.media import MEDIA
 from estimator.optics.surfaces import (
     EyeSurfaces,

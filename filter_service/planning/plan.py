@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
-from estimator.field.trace_range import scaled_progress
+from estimator.field.traced_fields import scaled_progress
 from filter_service.planning.axis_nodes import (
     axis_nodes,
     target_error,

@@ -10,7 +10,7 @@ from estimator.corrections.worn_lens import WornLens, depends_on_gaze
 from estimator.field.eye_optics import EyeOptics
 from estimator.field.network_eye import network_eye
 from estimator.field.prepare import prepare_eye
-from estimator.field.trace_range import FieldRange
+from estimator.field.traced_fields import FieldRange
 from estimator.networks.inference import NetworkUnavailable
 from estimator.note import Note
 from estimator.profiles.measured_wavefront import MeasuredWavefront

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.estimate.estimation import estimate_eye
-from estimator.field.aberration_grid import FIELD_AZIMUTHS, FIELD_RINGS
-from estimator.field.interpolation import OPEN_RATIO
+from estimator.field.interpolation import FIELD_AZIMUTHS, FIELD_RINGS, OPEN_RATIO
 from estimator.wavefront.nodes import N_AZIMUTHS, N_RINGS
 from tests.benchmarks import eye_ways, network_nodes
 from tests.benchmarks.harness import Row, memory_mb, time_calls

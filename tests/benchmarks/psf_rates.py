@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from estimator.estimate.estimation import estimate_eye
-from estimator.field.aberration_grid import aberration_grid
+from estimator.field.interpolation import aberration_grid
 from estimator.optics.pinhole import pixel_from_mrad
 from estimator.optics.units import RGB_WAVELENGTHS_NM, SPHERE_PER_C20
 from estimator.profiles.files import load_profile

@@ -7,9 +7,12 @@ import pytest
 
 from estimator.estimate.estimation import estimate_eye
 from estimator.eye.tracing import pupil_refraction_dpt
-from estimator.field.aberration_grid import aberration_grid
 from estimator.field.field_table import field_table
-from estimator.field.interpolation import FieldInterpolation, field_nodes_deg
+from estimator.field.interpolation import (
+    FieldInterpolation,
+    aberration_grid,
+    field_nodes_deg,
+)
 from estimator.field.prepare import few_colors_grid
 from estimator.field.traced_eye import TracedEye
 from estimator.optics.prescription import power_vector, zernike_from_power_vector

@@ -5,8 +5,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from estimator.corrections.lenslets import Lenslets
-from estimator.corrections.rings import DiffractiveRings, Kinoform, RefractiveZones
+from estimator.corrections.rings import (
+    DiffractiveRings,
+    Kinoform,
+    Lenslets,
+    RefractiveZones,
+)
 from estimator.native import Core, core
 from estimator.optics.zernike import padded_terms, zernike_gradient
 from estimator.psf.compiled import CompiledPsfs

@@ -9,7 +9,7 @@ import pytest
 from estimator.estimate.given_surfaces import eye_model
 from estimator.eye.assembly import accommodated, eye_surfaces
 from estimator.eye.parameters import PARAMETER_NAMES, EyeParameters
-from estimator.eye.surface_model import StatesDiffer, SurfaceModel
+from estimator.eye.surface_eye import StatesDiffer, SurfaceModel
 from estimator.eye.tracing import TraceFailed
 from estimator.field.prepare import prepare_eye
 from estimator.optics.forms import SeparateProfiles, TwoConics

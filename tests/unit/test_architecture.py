@@ -174,7 +174,7 @@ HOME = {
         "clients/*",
         "tests/*",  # plots of measurements
         "estimator/estimate/plot.py",  # `ocufilter estimate --plot`
-        "estimator/field/plot.py",  # `ocufilter field --plot`
+        "estimator/field/field_table.py",  # `ocufilter field --plot`
         "training/learning_curve.py",
     ),
     "OpenEXR": ("filter_service/exr_files.py",),

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from estimator import drawn_profiles, load_profile, parse_profile
-from estimator.field.field_table import DrawnFields, drawn_fields, field_table
-from estimator.field.plot import field_figure
+from estimator.field.field_table import (
+    DrawnFields,
+    drawn_fields,
+    field_figure,
+    field_table,
+)
 from tests.commands import run_command
 
 MYOPE = {"kind": "prescription", "sphere_dpt": -2.0, "age_years": 30}

@@ -14,18 +14,21 @@ from torch import Tensor
 from estimator.optics.units import UM_PER_MM
 from estimator.optics.zernike import N_TERMS
 from estimator.wavefront.nodes import circle_nodes
-from training.tracer import chief as chiefs
 from training.tracer import eye as eyes
-from training.tracer.batches import constant, in_chunks
-from training.tracer.eye import Eye
+from training.tracer.eye import Eye, constant, in_chunks
 from training.tracer.rays import (
     ORDER_TOLERANCE_MM,
+    Axes,
+    Chief,
     across,
     broyden,
     extra_path,
+    field_axes,
     into_cornea,
     into_lens,
     inverse_2x2,
+    solve_chief,
+    trace_chief,
 )
 
 _ACCEPTED_MM = 1e-4
@@ -105,9 +108,9 @@ def _zernike(
     with torch.no_grad():
         eye = eyes.pack_eyes(vectors, wavelength_nm)
         zero = torch.zeros_like(eye.indices[:, 0])
-        axes = chiefs.field_axes(zero, zero)
-        solved = chiefs.solve_chief(eye, axes)
-        chief = chiefs.trace_chief(eye, axes, solved)
+        axes = field_axes(zero, zero)
+        solved = solve_chief(eye, axes)
+        chief = trace_chief(eye, axes, solved)
         points, outward, ok = _aim(
             eye, axes, chief, pupil_mm / 2.0, dtype, with_gradient
         )
@@ -117,22 +120,22 @@ def _zernike(
         lambda t: t[rows], (axes, solved, points, outward)
     )
     eye = eyes.pack_eyes(vectors[rows], wavelength_nm[rows])
-    chief = chiefs.trace_chief(eye, axes, solved)
+    chief = trace_chief(eye, axes, solved)
     wave_um = _wavefront(eye, axes, chief, points, outward, pupil_mm[rows] / 2.0)
     zernike_um = wave_um.new_full((len(ok), N_TERMS), torch.nan)
     projection = _nodes(vectors.device, dtype)[1]
     return zernike_um.index_copy(0, rows, wave_um @ projection), ok
 
 
-def _plane(eye: Eye, axes: chiefs.Axes, dtype: torch.dtype) -> tuple[Tensor, ...]:
+def _plane(eye: Eye, axes: Axes, dtype: torch.dtype) -> tuple[Tensor, ...]:
     """Return the pupil plane's axes in those of the anterior cornea, (B, 3, 1) each."""
     return tuple(torch.bmm(eye.to_cornea.turn, axis).to(dtype) for axis in axes)
 
 
 def _aim(
     eye: Eye,
-    axes: chiefs.Axes,
-    chief: chiefs.Chief,
+    axes: Axes,
+    chief: Chief,
     radius_mm: Tensor,
     dtype: torch.dtype,
     with_gradient: bool,
@@ -211,8 +214,8 @@ def _to_origin(
 
 def _wavefront(
     eye: Eye,
-    axes: chiefs.Axes,
-    chief: chiefs.Chief,
+    axes: Axes,
+    chief: Chief,
     points: tuple[Tensor, ...],
     outward: Tensor,
     radius_mm: Tensor,
