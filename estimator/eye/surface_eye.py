@@ -105,16 +105,18 @@ class SurfaceModel:
 
 def _plain(value: Any) -> Any:
     """Return a value as lists and dicts that name the classes of its parts."""
-    if dataclasses.is_dataclass(value):
-        parts = {
-            f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)
-        }
-        return {"class": type(value).__name__, **parts}
-    if isinstance(value, Mapping):
-        return {key: _plain(value[key]) for key in sorted(value)}
-    if isinstance(value, tuple):
-        return [_plain(entry) for entry in value]
-    return value.tolist() if isinstance(value, np.ndarray) else value
+    match value:
+        case Mapping():
+            return {key: _plain(value[key]) for key in sorted(value)}
+        case tuple():
+            return [_plain(entry) for entry in value]
+        case np.ndarray():
+            return value.tolist()
+        case _ if dataclasses.is_dataclass(value):
+            names = [part.name for part in dataclasses.fields(value)]
+            parts = {name: _plain(getattr(value, name)) for name in names}
+            return {"class": type(value).__name__, **parts}
+    return value
 
 
 def _blended(
@@ -125,33 +127,34 @@ def _blended(
     if any(type(value) is not type(first) for value in values):
         kinds = ", ".join(type(value).__name__ for value in values)
         raise StatesDiffer(f"{name}: differs in kind between the states ({kinds})")
-    if isinstance(first, float):
-        return _numbers(values, weights, name)
-    if isinstance(first, np.ndarray):
-        return list(np.tensordot(weights, np.stack(values), axes=1))
-    if dataclasses.is_dataclass(first) and not isinstance(first, type):
-        parts = {
-            part.name: _part(values, weights, part.name, name)
-            for part in dataclasses.fields(first)
-        }
-        return [
-            dataclasses.replace(first, **{key: part[k] for key, part in parts.items()})
-            for k in range(count)
-        ]
-    if isinstance(first, Mapping):
-        _check_equal([sorted(value) for value in values], name)
-        parts = {
-            key: _blended([v[key] for v in values], weights, f"{name}.{key}")
-            for key in first
-        }
-        return [{key: part[k] for key, part in parts.items()} for k in range(count)]
-    if isinstance(first, tuple):
-        _check_equal([len(value) for value in values], name)
-        entries = [
-            _blended(entries, weights, f"{name}[{i}]")
-            for i, entries in enumerate(zip(*values, strict=True))
-        ]
-        return [tuple(entry[k] for entry in entries) for k in range(count)]
+    match first:
+        case float():
+            return _numbers(values, weights, name)
+        case np.ndarray():
+            return list(np.tensordot(weights, np.stack(values), axes=1))
+        case Mapping():
+            _check_equal([sorted(value) for value in values], name)
+            parts = {
+                key: _blended([v[key] for v in values], weights, f"{name}.{key}")
+                for key in first
+            }
+            return [{key: part[k] for key, part in parts.items()} for k in range(count)]
+        case tuple():
+            _check_equal([len(value) for value in values], name)
+            entries = [
+                _blended(entries, weights, f"{name}[{i}]")
+                for i, entries in enumerate(zip(*values, strict=True))
+            ]
+            return [tuple(entry[k] for entry in entries) for k in range(count)]
+        case _ if dataclasses.is_dataclass(first) and not isinstance(first, type):
+            parts = {
+                part.name: _part(values, weights, part.name, name)
+                for part in dataclasses.fields(first)
+            }
+            return [
+                dataclasses.replace(first, **{n: part[k] for n, part in parts.items()})
+                for k in range(count)
+            ]
     _check_equal(values, name)
     return [first] * count
 

@@ -89,21 +89,22 @@ def parse_correction(
     ProfileError
         Fields contradict each other, or describe a lens that cannot be made.
     """
-    if body is None:
-        return None
-    if isinstance(body, SpectaclesBody):
-        return prescription(body, path=PATH)
-    if isinstance(body, ProgressiveBody):
-        return ProgressiveLens.of(
-            prescription(body, path=PATH),
-            add_dpt=body.add_dpt,
-            corridor_mm=body.corridor_mm,
-            gaze_deg=body.gaze_deg,
-        )
-    if isinstance(body, LensletsBody):
-        return _lenslets(body)
-    if isinstance(body, ContactLensBody):
-        return WornLens(**_lens_at_the_eye(body, "contact_lens"))
+    match body:
+        case None:
+            return None
+        case SpectaclesBody():
+            return prescription(body, path=PATH)
+        case ProgressiveBody():
+            return ProgressiveLens.of(
+                prescription(body, path=PATH),
+                add_dpt=body.add_dpt,
+                corridor_mm=body.corridor_mm,
+                gaze_deg=body.gaze_deg,
+            )
+        case LensletsBody():
+            return _lenslets(body)
+        case ContactLensBody():
+            return WornLens(**_lens_at_the_eye(body, "contact_lens"))
     return _intraocular(body, has_cornea=has_cornea)
 
 
@@ -244,18 +245,19 @@ def _cornea_um(body: IntraocularLensBody, *, has_cornea: bool) -> float:
 
 
 def _rings(body: IntraocularLensBody) -> Rings | None:
-    if isinstance(body, MonofocalBody):
-        return None
-    if isinstance(body, ZonesBody):
-        return _zones(body)
-    if isinstance(body, BifocalBody):
-        spacing_dpt, kinoform, orders, far_order = _bifocal(body)
-    elif isinstance(body, TrifocalBody):
-        spacing_dpt, kinoform, orders, far_order = _trifocal(body)
-    else:
-        # orders 1 and 2 partly correct the eye's color (Millán 2017)
-        spacing_dpt, orders, far_order = body.add_dpt, (1, 2), 1
-        kinoform = Kinoform.sawtooth(body.step_waves)
+    match body:
+        case MonofocalBody():
+            return None
+        case ZonesBody():
+            return _zones(body)
+        case BifocalBody():
+            spacing_dpt, kinoform, orders, far_order = _bifocal(body)
+        case TrifocalBody():
+            spacing_dpt, kinoform, orders, far_order = _trifocal(body)
+        case _:
+            # orders 1 and 2 partly correct the eye's color (Millán 2017)
+            spacing_dpt, orders, far_order = body.add_dpt, (1, 2), 1
+            kinoform = Kinoform.sawtooth(body.step_waves)
     return DiffractiveRings(
         spacing_dpt=power_at_pupil_dpt(spacing_dpt, depth_mm=body.depth_mm),
         kinoform=kinoform,

@@ -309,10 +309,11 @@ def parse_given_eye(data: object) -> EyeProfile:
         A field is invalid, or the kind is unknown.
     """
     body = convert(data, given_bodies.ProfileBody)
-    if isinstance(body, given_bodies.PseudophakicBody):
-        return _pseudophakic(body)
-    if isinstance(body, given_bodies.PublishedBody):
-        return _published(body)
+    match body:
+        case given_bodies.PseudophakicBody():
+            return _pseudophakic(body)
+        case given_bodies.PublishedBody():
+            return _published(body)
     assert isinstance(body, given_bodies.SurfacesBody)
     return _with_surfaces(body, "surfaces", surface_model(body))
 

@@ -162,14 +162,15 @@ def parse_profile(data: object) -> EyeProfile:
 
         return parse_given_eye(data)
     body = convert(data, bodies.MeasuredBody)
-    if isinstance(body, bodies.PresetBody):
-        return _preset(body, cast(Mapping[str, Any], data))
-    if isinstance(body, bodies.PrescriptionBody):
-        return _prescription(body)
-    if isinstance(body, bodies.ZernikeSetBody):
-        return _zernike_set(body)
-    if isinstance(body, bodies.EyeBody):
-        return _eye(body)
+    match body:
+        case bodies.PresetBody():
+            return _preset(body, cast(Mapping[str, Any], data))
+        case bodies.PrescriptionBody():
+            return _prescription(body)
+        case bodies.ZernikeSetBody():
+            return _zernike_set(body)
+        case bodies.EyeBody():
+            return _eye(body)
     return _zernike(body)
 
 

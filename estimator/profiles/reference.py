@@ -12,9 +12,8 @@ from msgspec import inspect
 from estimator.profiles import (
     bodies,
     given_bodies,
-    validation,
 )
-from estimator.profiles.validation import KIND, allowed_values
+from estimator.profiles.validation import ALLOWED, KIND, allowed_values
 
 SCHEMA_DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -171,28 +170,30 @@ def _default(field: inspect.Field) -> str:
     if field.required:
         return "required"
     value = field.default
-    if value is msgspec.NODEFAULT or value is msgspec.UNSET or value is None:
-        return ""
-    if isinstance(value, bool):
-        return "`true`" if value else "`false`"
-    if isinstance(value, tuple):
-        return "[" + ", ".join(f"{v:g}" for v in value) + "]"
+    match value:
+        case msgspec.NODEFAULT | msgspec.UNSET | None:
+            return ""
+        case bool():
+            return "`true`" if value else "`false`"
+        case tuple():
+            return "[" + ", ".join(f"{v:g}" for v in value) + "]"
     return f"`{value}`" if isinstance(value, str) else f"{value:g}"
 
 
 def _allowed(field: inspect.Field) -> str:
     kind = field.type
-    bare = _bare(kind)
-    if isinstance(bare, inspect.LiteralType):
-        return ", ".join(f"`{value}`" for value in sorted(map(str, bare.values)))
-    if isinstance(bare, inspect.AnyType):
-        return "text"
-    if isinstance(kind, inspect.Metadata) and validation.ALLOWED in (kind.extra or {}):
-        return allowed_values(kind)
-    if isinstance(bare, inspect.StructType | inspect.UnionType | inspect.DictType):
-        return "an object"
-    if isinstance(bare, inspect.BoolType):
-        return "`true`, `false`"
+    is_stated = isinstance(kind, inspect.Metadata) and ALLOWED in (kind.extra or {})
+    match _bare(kind):
+        case inspect.LiteralType(values=values):
+            return ", ".join(f"`{value}`" for value in sorted(map(str, values)))
+        case inspect.AnyType():
+            return "text"
+        case _ if is_stated:
+            return allowed_values(kind)
+        case inspect.StructType() | inspect.UnionType() | inspect.DictType():
+            return "an object"
+        case inspect.BoolType():
+            return "`true`, `false`"
     return allowed_values(kind).removeprefix("a number from ")
 
 

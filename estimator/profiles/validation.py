@@ -64,52 +64,53 @@ _type_info = cache(inspect.type_info)
 
 def _tagged(data: object, field: str) -> object:
     """Return ``data`` as dict, list and plain numbers, objects with complete tags."""
-    if isinstance(data, np.generic):
-        return data.item()
-    if isinstance(data, Mapping):
-        found = {key: _tagged(value, str(key)) for key, value in data.items()}
-        if field not in DEFAULT_KINDS:
-            return found
-        kind = found.get(KIND, DEFAULT_KINDS[field])
-        if isinstance(kind, str) and kind in DEFAULT_DESIGNS:
-            design = found.get(DESIGN, DEFAULT_DESIGNS[kind])
-            if isinstance(design, str):  # anything else is reported as it is
-                kind = f"{kind}/{design}"
-                found.pop(DESIGN, None)
-        return {**found, KIND: kind}
-    if isinstance(data, list | tuple):
-        return [_tagged(value, "") for value in data]
-    return data
+    match data:
+        case np.generic():
+            return data.item()
+        case list() | tuple():
+            return [_tagged(value, "") for value in data]
+        case Mapping():
+            found = {key: _tagged(value, str(key)) for key, value in data.items()}
+        case _:
+            return data
+    if field not in DEFAULT_KINDS:
+        return found
+    kind = found.get(KIND, DEFAULT_KINDS[field])
+    if isinstance(kind, str) and kind in DEFAULT_DESIGNS:
+        design = found.get(DESIGN, DEFAULT_DESIGNS[kind])
+        if isinstance(design, str):  # anything else is reported as it is
+            kind = f"{kind}/{design}"
+            found.pop(DESIGN, None)
+    return {**found, KIND: kind}
 
 
 def _check(value: object, kind: inspect.Type, path: str) -> None:
     """Raise an error at the first field of ``value`` that is not of type ``kind``."""
-    if isinstance(kind, inspect.Metadata):
-        allowed = (kind.extra or {}).get(ALLOWED)
-        if allowed is not None and not _accepts(value, kind.type):
-            raise ProfileError(path, _mismatch(value, kind.type), allowed)
-        _check(value, kind.type, path)
-    elif isinstance(kind, inspect.UnionType):
-        _check_union(value, kind, path)
-    elif isinstance(kind, inspect.StructType):
-        _check_object(value, kind, path)
-    elif isinstance(kind, inspect.FloatType | inspect.IntType):
-        _check_number(value, kind, path)
-    elif isinstance(kind, inspect.BoolType):
-        if not isinstance(value, bool):
+    match kind:
+        case inspect.Metadata():
+            allowed = (kind.extra or {}).get(ALLOWED)
+            if allowed is not None and not _accepts(value, kind.type):
+                raise ProfileError(path, _mismatch(value, kind.type), allowed)
+            _check(value, kind.type, path)
+        case inspect.UnionType():
+            _check_union(value, kind, path)
+        case inspect.StructType():
+            _check_object(value, kind, path)
+        case inspect.FloatType() | inspect.IntType():
+            _check_number(value, kind, path)
+        case inspect.BoolType() if not isinstance(value, bool):
             raise ProfileError(
                 path, f"{_shown(value)} is not a boolean", "true or false"
             )
-    elif isinstance(kind, inspect.LiteralType):
-        _check_choice(value, sorted(map(str, kind.values)), path)
-    elif isinstance(kind, inspect.StrType):
-        if not isinstance(value, str):
+        case inspect.LiteralType():
+            _check_choice(value, sorted(map(str, kind.values)), path)
+        case inspect.StrType() if not isinstance(value, str):
             raise ProfileError(path, f"{_shown(value)} is not text", "text")
-    elif isinstance(kind, inspect.DictType):
-        for key, item in _object(value, path).items():
-            _check(item, kind.value_type, f"{path}.{key}")
-    elif isinstance(kind, inspect.ListType | inspect.TupleType | inspect.VarTupleType):
-        _check_list(value, kind, path)
+        case inspect.DictType():
+            for key, item in _object(value, path).items():
+                _check(item, kind.value_type, f"{path}.{key}")
+        case inspect.ListType() | inspect.TupleType() | inspect.VarTupleType():
+            _check_list(value, kind, path)
 
 
 def _check_union(value: object, kind: inspect.UnionType, path: str) -> None:
@@ -198,32 +199,26 @@ def _check_list(
         raise ProfileError(path, _mismatch(value, kind), allowed_values(kind))
     assert isinstance(value, list)
     for index, item in enumerate(value):
-        item_type = (
-            kind.item_types[index]
-            if isinstance(kind, inspect.TupleType)
-            else kind.item_type
-        )
-        _check(item, item_type, f"{path}.{index}")
+        _check(item, _item_type(kind, index), f"{path}.{index}")
 
 
 def _accepts(value: object, kind: inspect.Type) -> bool:
     """Return whether ``value`` is of the JSON type of ``kind``, lists of its length."""
-    if isinstance(kind, inspect.Metadata):
-        return _accepts(value, kind.type)
-    if isinstance(kind, inspect.UnionType):
-        return any(_accepts(value, member) for member in kind.types)
-    if isinstance(kind, inspect.NoneType):
-        return value is None
-    if isinstance(kind, inspect.FloatType):
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    if isinstance(kind, inspect.StructType | inspect.DictType):
-        return isinstance(value, dict)
-    if not isinstance(
-        kind, inspect.ListType | inspect.TupleType | inspect.VarTupleType
-    ):
-        return True
-    low, high = _lengths(kind)
-    return isinstance(value, list) and low <= len(value) <= high
+    match kind:
+        case inspect.Metadata():
+            return _accepts(value, kind.type)
+        case inspect.UnionType():
+            return any(_accepts(value, member) for member in kind.types)
+        case inspect.NoneType():
+            return value is None
+        case inspect.FloatType():
+            return isinstance(value, int | float) and not isinstance(value, bool)
+        case inspect.StructType() | inspect.DictType():
+            return isinstance(value, dict)
+        case inspect.ListType() | inspect.TupleType() | inspect.VarTupleType():
+            low, high = _lengths(kind)
+            return isinstance(value, list) and low <= len(value) <= high
+    return True
 
 
 def _mismatch(value: object, kind: inspect.Type) -> str:
@@ -252,36 +247,40 @@ def _object(value: object, path: str) -> dict[str, Any]:
 
 def allowed_values(kind: inspect.Type) -> str:
     """Return the allowed values of a type in words."""
-    if isinstance(kind, inspect.Metadata):
-        return (kind.extra or {}).get(ALLOWED) or allowed_values(kind.type)
-    if isinstance(kind, inspect.FloatType | inspect.IntType):
-        noun = "a number" if isinstance(kind, inspect.FloatType) else "an integer"
-        if kind.ge is None or kind.le is None:  # an outer rule has the limits
-            return noun
-        return f"{noun} from {kind.ge:g} to {kind.le:g}"
-    if isinstance(kind, inspect.UnionType):
-        return " or ".join(
-            "null" if isinstance(member, inspect.NoneType) else allowed_values(member)
-            for member in kind.types
-        )
-    if isinstance(kind, inspect.LiteralType):
-        return "one of " + ", ".join(sorted(map(str, kind.values)))
-    if isinstance(kind, inspect.TupleType | inspect.VarTupleType):
-        low, high = _lengths(kind)
-        count = f"{low}" if low == high else f"{low} to {high}"
-        item = (
-            kind.item_types[0]
-            if isinstance(kind, inspect.TupleType)
-            else kind.item_type
-        )
-        bare = item.type if isinstance(item, inspect.Metadata) else item
-        if isinstance(bare, inspect.TupleType | inspect.VarTupleType):
-            return f"a list of {count} lists"
-        return (
-            f"a list of {count} numbers{allowed_values(item).removeprefix('a number')}"
-        )
-    is_object = isinstance(kind, inspect.StructType | inspect.DictType)
-    return "a JSON object" if is_object else "text"
+    match kind:
+        case inspect.Metadata():
+            return (kind.extra or {}).get(ALLOWED) or allowed_values(kind.type)
+        case inspect.FloatType() | inspect.IntType():
+            noun = "a number" if isinstance(kind, inspect.FloatType) else "an integer"
+            if kind.ge is None or kind.le is None:  # an outer rule has the limits
+                return noun
+            return f"{noun} from {kind.ge:g} to {kind.le:g}"
+        case inspect.NoneType():
+            return "null"
+        case inspect.UnionType():
+            return " or ".join(map(allowed_values, kind.types))
+        case inspect.LiteralType():
+            return "one of " + ", ".join(sorted(map(str, kind.values)))
+        case inspect.TupleType() | inspect.VarTupleType():
+            low, high = _lengths(kind)
+            count = f"{low}" if low == high else f"{low} to {high}"
+            item = _item_type(kind, 0)
+            bare = item.type if isinstance(item, inspect.Metadata) else item
+            if isinstance(bare, inspect.TupleType | inspect.VarTupleType):
+                return f"a list of {count} lists"
+            limits = allowed_values(item).removeprefix("a number")
+            return f"a list of {count} numbers{limits}"
+        case inspect.StructType() | inspect.DictType():
+            return "a JSON object"
+    return "text"
+
+
+def _item_type(
+    kind: inspect.ListType | inspect.TupleType | inspect.VarTupleType, index: int
+) -> inspect.Type:
+    if isinstance(kind, inspect.TupleType):
+        return kind.item_types[index]
+    return kind.item_type
 
 
 def _shown(value: object) -> str:
