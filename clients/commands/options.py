@@ -18,8 +18,7 @@ from typing import Annotated, Any, NoReturn, cast, get_args, get_type_hints
 import numpy as np
 import typer
 
-from estimator import InvalidFile, profile_body
-from estimator.bounded_files import loads_bounded, printable, read_text
+from estimator.bounded_files import InvalidFile, loads_bounded, printable, read_text
 from filter_service.displays import primaries_of_spectra
 from filter_service.errors import BadMessage
 from filter_service.settings import DEFAULTS, setting_help, setting_types
@@ -208,6 +207,8 @@ def read_profile(text: str, option: str = "--profile") -> dict[str, Any]:
     ValueError
         If the profile cannot be read.  The message names the option and the file.
     """
+    from estimator import profile_body  # the reader of profiles takes 40 ms
+
     try:
         return profile_body(text)
     except InvalidFile as error:
