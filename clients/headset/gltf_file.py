@@ -53,9 +53,7 @@ class Container:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._left = int(MAX_FILE_MB * 1e6)
-        content = self._read(path)
-        text, self._binary = _split(path, content)
-        self.header = _parsed(path, text)
+        self.header, self._binary = read_header(path, self._read(path))
         self._buffers: dict[object, memoryview] = {}
         self._lists: dict[str, list[dict[str, Any]]] = {}
 
@@ -152,6 +150,18 @@ class Container:
             self.refuse(f"it references '{path.name}': {error.found}")
         self._left -= len(content)
         return content
+
+
+def read_header(path: Path, content: bytes) -> tuple[dict[str, Any], memoryview]:
+    """Return the JSON of a file, and its binary chunk.
+
+    Raises
+    ------
+    InvalidFile
+        If the content is not a glTF 2 file, or beyond the limits.
+    """
+    text, binary = _split(path, content)
+    return _parsed(path, text), binary
 
 
 def _split(path: Path, content: bytes) -> tuple[bytes, memoryview]:

@@ -4,39 +4,37 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from dataclasses import replace
+from functools import partial
+from typing import Any
 
 from nicegui import events, ui
 
-from clients.web.correction_form import (
+from clients.web.controls import (
     AXIS,
     CYLINDER,
+    PRESCRIPTION,
+    SPHERE,
+    SPHERE_SLIDER,
+    NumberField,
+    prescription_texts,
+)
+from clients.web.eye_form import (
     DESIGNS,
     DISTANCE_KINDS,
     HINTS,
-    PRESCRIPTION,
-    SPHERE,
-)
-from clients.web.eye_form import (
     EyeForm,
     EyeSide,
     preset_titles,
 )
-from clients.web.numbers import NumberField, prescription_texts
-from clients.web.slider_row import SliderRow
-from clients.web.upload_entry import upload_entry
+from clients.web.widgets import SliderRow, select, toggle, upload_entry
 from estimator import MAX_PROFILE_BYTES, PROFILE_SUFFIXES
 
 SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
-SLIDER_REACH_DPT = 10.0
-"""Range of the sphere slider; typed values may exceed it."""
-
-SPHERE_SLIDER = replace(
-    SPHERE, name="sphere_slider_dpt", low=-SLIDER_REACH_DPT, high=SLIDER_REACH_DPT
-)
 
 TYPING_MS = 400
 """Pause after which a typed number is used; an incomplete one would be another eye."""
+
+ChangeHandler = Callable[[events.ValueChangeEventArguments], None]
 
 
 class EyePanel:
@@ -57,26 +55,31 @@ class EyePanel:
         self.form = form
         self._on_change, self._on_file = on_change, on_file
         self._entries: dict[tuple[str, bool], ui.input] = {}
-        with ui.element("div").classes("oc-eye") as self.box:
-            self.box.props["data-eye-panel"] = form.side
-            self._build()
+        with ui.element("div").classes("oc-eye") as box:
+            box.props["data-eye-panel"] = form.side
+            self.build()
 
     @ui.refreshable_method
-    def _build(self) -> None:
+    def build(self) -> None:
+        """Show the entries of the form."""
         form = self.form
         self._entries.clear()
-        ui.toggle(SOURCES, value=form.source, on_change=self._choose_source).props(
-            'no-caps unelevated spread dense role=group aria-label="Kind of entries"'
-        ).classes("oc-toggle")
+        toggle(
+            SOURCES,
+            form.source,
+            self._takes(partial(setattr, form, "source")),
+            label="Kind of entries",
+            props="spread",
+        )
         if form.source == "prescription":
             self._prescription()
         elif form.source == "preset":
-            ui.select(
+            select(
                 preset_titles(),
-                value=form.preset,
-                on_change=self._choose_preset,
+                form.preset,
+                self._takes(partial(setattr, form, "preset"), rebuilds=False),
                 label="Preset",
-            ).props("outlined dense options-dense").classes("oc-wide").mark("preset")
+            ).classes("oc-wide").mark("preset")
         else:
             self._file()
         if form.loaded_name and form.source != "file":
@@ -88,24 +91,19 @@ class EyePanel:
         form = self.form
         with ui.element("div").classes("oc-fields"):
             sphere = self._entry(SPHERE, form.texts)
-            self._sphere_slider(sphere)
+            # linked with the entry in both directions
+            slider = SliderRow(
+                SPHERE_SLIDER,
+                _position(sphere.value),
+                lambda _, value: sphere.set_value(SPHERE.show(value)),
+                is_titled=False,
+            ).classes("oc-sphere")
+            sphere.on_value_change(lambda event: slider.show(_position(event.value)))
             for number in PRESCRIPTION[1:]:
                 self._entry(number, form.texts)
-        ui.switch(
-            "Higher-order aberrations of this age",
-            value=form.has_higher_order,
-            on_change=self._switch_higher_order,
-        ).props("dense").classes("oc-switch")
-
-    def _sphere_slider(self, entry: ui.input) -> None:
-        """Show a slider that is linked with an entry in both directions."""
-        slider = SliderRow(
-            SPHERE_SLIDER,
-            _within(entry.value),
-            lambda value: entry.set_value(SPHERE.show(value)),
-            is_titled=False,
-        ).classes("oc-sphere")
-        entry.on_value_change(lambda event: slider.show(_within(event.value)))
+        self._switch(
+            "Higher-order aberrations of this age", "has_higher_order", rebuilds=False
+        )
 
     def _entry(
         self, number: NumberField, texts: dict[str, str], *, is_worn: bool = False
@@ -124,9 +122,14 @@ class EyePanel:
             is_pasted = False
 
         def normalize() -> None:
+            """Show the text as usual; a whole prescription fills its three entries."""
             text = entry.value or ""
-            if not self._split_prescription(number, text, is_worn):
+            found = prescription_texts(text) if number is SPHERE else None
+            if found is None:
                 entry.set_value(number.normalized(text))
+                return
+            for each, part in zip((SPHERE, CYLINDER, AXIS), found, strict=True):
+                self._entries[each.name, is_worn].set_value(each.normalized(part))
 
         def paste() -> None:
             nonlocal is_pasted
@@ -150,61 +153,41 @@ class EyePanel:
             entry.on(
                 f"keydown.{key}.prevent",
                 lambda _, steps=steps: entry.set_value(
-                    number.stepped(entry.value or "", steps)
+                    number.normalized(entry.value or "", steps)
                 ),
             )
         return entry
 
-    def _split_prescription(
-        self, number: NumberField, text: str, is_worn: bool
-    ) -> bool:
-        """Set sphere, cylinder and axis from a whole prescription in the sphere."""
-        found = prescription_texts(text) if number is SPHERE else None
-        if found is None:
-            return False
-        for each, part in zip((SPHERE, CYLINDER, AXIS), found, strict=True):
-            self._entries[each.name, is_worn].set_value(each.normalized(part))
-        return True
-
     def _file(self) -> None:
+        form, suffixes = self.form, ", ".join(PROFILE_SUFFIXES)
         upload_entry(
-            "Profile", ",".join(PROFILE_SUFFIXES), MAX_PROFILE_BYTES, self._take_file
+            *("Profile", ",".join(PROFILE_SUFFIXES), MAX_PROFILE_BYTES),
+            lambda name, content: self._on_file(form.side, name, content),
         ).classes("oc-wide").mark("profile-file")
-        text = (
-            f"In use: {self.form.file_name}"
-            if self.form.file_name
-            else (f"A profile: {', '.join(PROFILE_SUFFIXES)}")
-        )
-        ui.label(text).classes("oc-hint")
+        text = f"In use: {form.file_name}" if form.file_name else ""
+        ui.label(text or f"A profile: {suffixes}").classes("oc-hint")
 
     def _correction(self) -> None:
-        form = self.form
+        form, worn = self.form, self.form.worn
         with ui.element("div").classes("oc-line"):
-            ui.switch(
-                "Wears a correction",
-                value=form.wears_correction,
-                on_change=self._switch_correction,
-            ).props("dense").classes("oc-switch")
-            can_correct = not form.wears_correction or form.worn.kind in DISTANCE_KINDS
+            self._switch("Wears a correction", "wears_correction")
+            can_correct = not form.wears_correction or worn.kind in DISTANCE_KINDS
             if form.source == "prescription" and can_correct:
                 ui.button("Correct fully", on_click=self._correct_fully).props(
                     "flat dense no-caps size=sm"
                 ).tooltip("Wear the prescription above; keep kind of lens and addition")
-        if form.wears_correction:
-            self._worn()
-
-    def _worn(self) -> None:
-        worn = self.form.worn
-        ui.select(
-            worn.kinds, value=worn.kind, on_change=self._choose_worn, label="Correction"
-        ).props("outlined dense options-dense").classes("oc-wide oc-worn-kind")
+        if not form.wears_correction:
+            return
+        select(
+            worn.kinds, worn.kind, self._takes(form.choose_worn), label="Correction"
+        ).classes("oc-wide oc-worn-kind")
         if worn.kind == "iol":
-            ui.select(
+            select(
                 DESIGNS,
-                value=worn.design,
-                on_change=self._choose_design,
+                worn.design,
+                self._takes(partial(setattr, worn, "design")),
                 label="Design",
-            ).props("outlined dense options-dense").classes("oc-wide oc-worn-design")
+            ).classes("oc-wide oc-worn-design")
         with ui.element("div").classes("oc-fields oc-worn"):
             for number in worn.entries:
                 entry = self._entry(number, worn.texts, is_worn=True)
@@ -212,64 +195,45 @@ class EyePanel:
         if worn.kind in HINTS:
             ui.label(HINTS[worn.kind]).classes("oc-hint")
 
-    def copy(self, other: EyeForm) -> None:
-        """Copy the entries of the other eye."""
-        form = self.form
-        form.source, form.preset = other.source, other.preset
-        form.texts, form.worn = dict(other.texts), other.worn.copied()
-        form.has_higher_order = other.has_higher_order
-        form.file_body, form.file_name = other.file_body, other.file_name
-        form.loaded_name = other.loaded_name
-        form.wears_correction = other.wears_correction
-        self._changed()
+    def _switch(self, label: str, name: str, *, rebuilds: bool = True) -> None:
+        ui.switch(
+            label,
+            value=getattr(self.form, name),
+            on_change=self._takes(partial(setattr, self.form, name), rebuilds=rebuilds),
+        ).props("dense").classes("oc-switch")
 
     # Event handlers
 
-    def _choose_source(self, event: events.ValueChangeEventArguments) -> None:
-        self.form.source = event.value
-        self._changed()
+    def _takes(
+        self, take: Callable[[Any], None], *, rebuilds: bool = True
+    ) -> ChangeHandler:
+        """Return a handler that passes a new value to a function.
 
-    def _choose_preset(self, event: events.ValueChangeEventArguments) -> None:
-        self.form.preset = event.value
-        self._on_change()
+        Parameters
+        ----------
+        rebuilds : bool
+            Whether other entries are visible with the new value.
+        """
 
-    def _switch_higher_order(self, event: events.ValueChangeEventArguments) -> None:
-        self.form.has_higher_order = event.value
-        self._on_change()
+        def handle(event: events.ValueChangeEventArguments) -> None:
+            take(event.value)
+            self.changed() if rebuilds else self._on_change()
 
-    def _switch_correction(self, event: events.ValueChangeEventArguments) -> None:
-        self.form.wears_correction = event.value
-        self._changed()
-
-    def _choose_worn(self, event: events.ValueChangeEventArguments) -> None:
-        self.form.choose_worn(event.value)
-        self._changed()
-
-    def _choose_design(self, event: events.ValueChangeEventArguments) -> None:
-        self.form.worn.design = event.value
-        self._changed()
+        return handle
 
     def _correct_fully(self) -> None:
         self.form.correct_fully()
-        self._changed()
+        self.changed()
 
-    async def _take_file(self, name: str, content: bytes) -> None:
-        await self._on_file(self.form.side, name, content)
-
-    def show(self) -> None:
-        """Show the entries of the form again."""
-        self._build.refresh()
-
-    def _changed(self) -> None:
+    def changed(self) -> None:
         """Rebuild the panel after a change of the visible entries."""
-        self._build.refresh()
+        self.build.refresh()
         self._on_change()
 
 
-def _within(text: str | None) -> float:
-    """Return the slider's position for a text."""
+def _position(text: str | None) -> float:
+    """Return the position of the sphere's slider for a text."""
     try:
-        value = SPHERE.read(text or "")
+        return SPHERE_SLIDER.clamped(SPHERE.read(text or ""))
     except ValueError:
         return 0.0
-    return min(max(value, -SLIDER_REACH_DPT), SLIDER_REACH_DPT)

@@ -11,12 +11,18 @@ from typing import Any
 from nicegui import events, ui
 
 from clients.scenes.letter_chart import smallest_row
-from clients.web.eye_figures import FIGURE_TITLES, eye_figure, predicted_log_mar
+from clients.web.controls import DISTANCE, distance_text
 from clients.web.eye_form import SIDES, EyeSide
-from clients.web.figure_worker import FigureFailed, FigureWorker
-from clients.web.numbers import distance_text
-from clients.web.page_state import DISTANCE, FOCUS, PUPIL, PageState
-from clients.web.point_spread import PointState, point_spread
+from clients.web.figure_worker import (
+    FIGURE_TITLES,
+    Ask,
+    FigureFailed,
+    eye_figure,
+    point_spread,
+    predicted_log_mar,
+)
+from clients.web.page_state import PageState
+from clients.web.widgets import card, title, toggle
 
 WIDTHS_ARCMIN = {
     "a stroke of the 1.0 (20/20) line": 1.0,
@@ -31,24 +37,16 @@ WIDTHS_ARCMIN = {
 """Visual angles of familiar objects."""
 
 
-def data_url(png: bytes) -> str:
-    """Return a picture as a data URL."""
-    return "data:image/png;base64," + base64.b64encode(png).decode()
-
-
 class FigurePanel:
     """Point-spread function and figures of one eye.
 
     Parameters
     ----------
-    page : str
-        Page that owns the requests.
+    ask : runs a function in the worker process, for this page
     """
 
-    def __init__(
-        self, page: str, state: PageState, figure_worker: FigureWorker
-    ) -> None:
-        self._page, self._state, self._worker = page, state, figure_worker
+    def __init__(self, state: PageState, ask: Ask) -> None:
+        self._state, self._ask = state, ask
         self._side: EyeSide = "OD"
         self._at = (0.5, 0.5)
         self._figure = next(iter(FIGURE_TITLES))
@@ -60,28 +58,24 @@ class FigurePanel:
 
     def build_point(self) -> None:
         """Build the point-spread function card."""
-        with (
-            ui.element("section")
-            .classes("oc-card oc-point")
-            .props("aria-label='Point of light'")
-        ):
-            ui.html(
-                "How a point of light looks here", tag="h2", sanitize=False
-            ).classes("oc-title")
+        with card("Point of light", "oc-point"):
+            title("How a point of light looks here")
             self._psf = self._picture_button("oc-psf", "the point of light")
-            self._message_label = ui.label(
-                "Move the pointer over the picture."
-            ).classes("oc-hint")
+            self._message = ui.label("Move the pointer over the picture.")
+            self._message.classes("oc-hint")
 
     def build_figure(self) -> None:
         """Build the figure card."""
-        with ui.element("section").classes("oc-card").props("aria-label=Figures"):
-            self._title = ui.html("Figures", tag="h2", sanitize=False).classes(
-                "oc-title"
+        with card("Figures"):
+            self._title = title("Figures")
+            toggle(
+                FIGURE_TITLES,
+                self._figure,
+                self._choose,
+                label="Figure",
+                props="spread",
+                kind="oc-figures",
             )
-            ui.toggle(FIGURE_TITLES, value=self._figure, on_change=self._choose).props(
-                "no-caps unelevated spread dense role=group aria-label=Figure"
-            ).classes("oc-toggle oc-figures")
             self._image = self._picture_button("oc-figure", "the figure")
 
     def _picture_button(self, kind: str, what: str) -> ui.html:
@@ -115,7 +109,7 @@ class FigurePanel:
         self._figure = event.value
         await self._show_figure()
 
-    async def _ask(
+    async def _answer(
         self, kind: str, function: Callable[..., Any], *args: Any, **options: Any
     ) -> Any:
         """Run a function in the worker.
@@ -123,35 +117,33 @@ class FigurePanel:
         Return None if it fails or a newer request supersedes it.
         """
         try:
-            return await self._worker.ask(self._page, kind, function, *args, **options)
+            return await self._ask(kind, function, *args, **options)
         except FigureFailed as error:
-            self._message_label.text = str(error)
+            self._message.text = str(error)
             return None
 
-    def _body(self) -> str | None:
-        body = self._state.profile_at_gaze(self._side)
+    def _body(self, side: EyeSide) -> str | None:
+        """Return an eye's profile as JSON, the cache key of the worker."""
+        body = self._state.profile_at_gaze(side)
         return None if body is None else json.dumps(body, sort_keys=True)
 
     async def _show_point(self) -> None:
-        body = self._body()
-        scene_point = self._state.scene_point(*self._at)
-        if body is None or scene_point is None:
+        body, picture = self._body(self._side), self._state.picture
+        if body is None or picture is None:
             return
-        values = self._state.values
-        point = PointState(
+        scene_point = picture.scene_point(*self._at)
+        answer = await self._answer(
+            "point",
+            point_spread,
+            body,
             direction_deg=scene_point.direction_deg(self._state.picture_gaze_deg),
             object_dpt=scene_point.distance_dpt,
-            pupil_diameter_mm=values[PUPIL.name],
-            focus_dpt=values[FOCUS.name],
+            **self._state.eye_state,
         )
-        answer = await self._ask("point", point_spread, body, point)
-        if answer is None:
-            return
-        png, facts = answer
-        self._psf.content = (
-            f'<img src="{data_url(png)}" alt="Image of the point of light">'
-        )
-        self._message_label.text = describe_point(facts)
+        if answer is not None:
+            png, facts = answer
+            self._psf.content = _image(png, "Image of the point of light")
+            self._message.text = describe_point(facts)
 
     async def smallest_rows(self) -> dict[EyeSide, int | None] | None:
         """Return the smallest chart row that each eye can read; None if it reads none.
@@ -159,20 +151,19 @@ class FigurePanel:
         Return None if a request failed or was superseded.  An eye whose acuity is
         unknown is omitted.
         """
-        picture, values = self._state.picture, self._state.values
+        picture = self._state.picture
         rows = [row.log_mar for row in picture.chart_rows] if picture else []
         found: dict[EyeSide, int | None] = {}
         for side in self._state.sides if rows else ():
-            body = self._state.profile_at_gaze(side)
+            body = self._body(side)
             if body is None:
                 continue
-            log_mar = await self._ask(
+            log_mar = await self._answer(
                 f"acuity {side}",
                 predicted_log_mar,
-                json.dumps(body, sort_keys=True),
-                pupil_diameter_mm=values[PUPIL.name],
-                focus_dpt=values[FOCUS.name],
-                object_dpt=values[DISTANCE.name],
+                body,
+                object_dpt=self._state.values[DISTANCE.name],
+                **self._state.eye_state,
             )
             if log_mar is None:
                 return None
@@ -182,24 +173,21 @@ class FigurePanel:
 
     async def _show_figure(self) -> None:
         self._title.content = f"Figures: {SIDES[self._side].lower()}"
-        body, values = self._body(), self._state.values
-        state = {name: values[name] for name in (PUPIL.name, FOCUS.name)}
-        request = (
-            self._figure,
-            body,
-            *(state.values() if self._depends_on_eye_state else ()),
-        )
+        body, state = self._body(self._side), self._state.eye_state
+        depends_on_state = self._figure in ("wavefront", "acuity")
+        request = self._figure, body, state if depends_on_state else None
         if body is None or request == self._drawn_request:
             return
-        png = await self._ask("figure", eye_figure, self._figure, body, **state)
+        png = await self._answer("figure", eye_figure, self._figure, body, **state)
         if png is not None:
             self._drawn_request = request
-            title = FIGURE_TITLES[self._figure]
-            self._image.content = f'<img src="{data_url(png)}" alt="{title}">'
+            self._image.content = _image(png, FIGURE_TITLES[self._figure])
 
-    @property
-    def _depends_on_eye_state(self) -> bool:
-        return self._figure in ("wavefront", "acuity")
+
+def _image(png: bytes, text: str) -> str:
+    """Return the HTML of a picture with its text alternative."""
+    data = base64.b64encode(png).decode()
+    return f'<img src="data:image/png;base64,{data}" alt="{text}">'
 
 
 def describe_point(facts: dict[str, float]) -> str:
@@ -217,8 +205,7 @@ def describe_point(facts: dict[str, float]) -> str:
 
 def nearest_familiar_object(radius_arcmin: float) -> str:
     """Return the familiar object closest in angular size to the spot (by ratio)."""
-    diameter_arcmin = 2.0 * radius_arcmin
+    diameter_arcmin = max(2.0 * radius_arcmin, 1e-3)
     return min(
-        WIDTHS_ARCMIN.items(),
-        key=lambda item: abs(math.log(item[1] / max(diameter_arcmin, 1e-3))),
-    )[0]
+        WIDTHS_ARCMIN, key=lambda k: abs(math.log(WIDTHS_ARCMIN[k] / diameter_arcmin))
+    )

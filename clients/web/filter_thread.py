@@ -3,19 +3,26 @@
 The page's event loop never filters; it submits a request here and continues. A newer
 request replaces one that has not been started. The preview follows at once, and the
 full picture after a pause without input; new input cancels it.
+
+The preview uses the on-axis wavefront from a formula and takes some hundredths of a
+second; the full picture uses the eye ray-traced over its field.
 """
 
 from __future__ import annotations
 
+import json
 import logging
+import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any, Literal
 
-from clients.web.eye_form import EyeSide
-from clients.web.eye_view import EyeView
-from clients.web.picture_requests import PictureRequest, SentPicture
+from clients.web.eye_form import EyeSide, depends_on_gaze
+from clients.web.picture import Picture, coarser, jpeg_of, png_of
+from filter_service import EyeFilter, FilterError, FilterSettings
+from filter_service.settings import Pipeline
 
 PAUSE_S = 0.12
 """Time without a newer request after which the full picture is computed."""
@@ -26,15 +33,163 @@ POLL_S = 0.002
 STALE_S = 0.5
 """Maximum wait for a preview once a newer request has arrived."""
 
+PSF_SLICE_S = 0.05
+"""Time limit for computing PSFs between checks for newer requests."""
+
+MS_PER_S = 1e3
+FULL = FilterSettings()
+QUICK = FULL.changed(mode="on-axis", eye_model="wavefront")
+MIN_WIDTH_PX = 200
+"""If the blur is too wide for the filter, pictures are reduced, down to this width."""
+
+Kind = Literal["scene", "preview", "full", "failed"]
 
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class PictureRequest:
+    """One requested state of the page.
+
+    Attributes
+    ----------
+    number : increases with each request
+    bodies : profile of each eye shown
+    """
+
+    number: int
+    picture: Picture
+    bodies: Mapping[EyeSide, Mapping[str, Any]]
+    pupil_diameter_mm: float
+    focus_dpt: float
+    gaze_deg: tuple[float, float]
+    pipeline: Pipeline = "exact"
+
+
+@dataclass(frozen=True)
+class SentPicture:
+    """A picture to be sent to the browser.
+
+    Attributes
+    ----------
+    kind : "scene" without the eye; "preview" or "full" through it; or "failed"
+    number : of the request
+    data : the encoded picture, empty on failure
+    facts : further values for the page, plain types
+    """
+
+    kind: Kind
+    eye: EyeSide | None
+    number: int
+    data: bytes
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    def packed(self) -> bytes:
+        """Return the message: length of a JSON header, the header, the picture."""
+        header = {"kind": self.kind, "eye": self.eye, "number": self.number}
+        text = json.dumps({**header, **self.facts}).encode()
+        return struct.pack("<I", len(text)) + text + self.data
+
+
+class EyeView:
+    """Pictures of one eye of one page; must be used from a single thread.
+
+    Attributes
+    ----------
+    side : "OD" or "OS"
+    seen : number of the last request that each kind of picture was returned for
+    """
+
+    def __init__(self, side: EyeSide) -> None:
+        self.side = side
+        self.seen: dict[Kind, int] = {"preview": 0, "full": 0}
+        self._filters: dict[Kind, EyeFilter] = {}
+        self._profiles: dict[Kind, Any] = {}  # set last: body, settings and camera
+        self._merge_factor = 1
+
+    def picture(self, kind: Kind, request: PictureRequest) -> SentPicture | None:
+        """Return a preview or a full picture; None while its eye is being prepared."""
+        start_s = time.monotonic()
+        body = request.bodies[self.side]
+        if kind == "preview":
+            self._stop_full(request)
+            settings, view = QUICK, request.picture.small
+            if depends_on_gaze(body):
+                settings = settings.changed(gaze_deg=request.gaze_deg)
+        else:
+            view = request.picture.view
+            settings = FULL.changed(
+                gaze_deg=request.gaze_deg, pipeline=request.pipeline
+            )
+            if self._merge_factor > 1:
+                view = coarser(view, self._merge_factor)
+        settings = settings.covering(foci_dpt=(request.focus_dpt,))
+        if kind not in self._filters:
+            self._filters[kind] = EyeFilter()
+        eye_filter, profile = self._filters[kind], (body, settings, view.camera)
+        try:
+            if profile != self._profiles.get(kind):
+                self._profiles[kind] = profile
+                eye_filter.set_profile(body, settings=settings, cameras=[view.camera])
+            seen = eye_filter.try_filter(
+                [view],
+                pupil_diameter_mm=request.pupil_diameter_mm,
+                focus_dpt=request.focus_dpt,
+                gaze_deg=settings.gaze_deg,
+                newest_only=True,
+                until_s=time.monotonic() + PSF_SLICE_S,
+            )
+            eye_filter.advance()  # this frame has requested its PSFs
+        except FilterError as error:
+            self._profiles.pop(kind, None)
+            if kind == "full" and view.width_px >= 2 * MIN_WIDTH_PX:
+                self._merge_factor *= 2
+                return None
+            self.seen[kind] = request.number
+            return failed(self.side, request, str(error))
+        if not seen:
+            return None
+        self.seen[kind] = request.number
+        data = png_of(seen.color) if kind == "full" else jpeg_of(seen.color)
+        facts = {
+            "width_px": seen.color.shape[1],
+            "height_px": seen.color.shape[0],
+            "pupil_diameter_mm": round(seen.pupil_diameter_mm, 3),
+            "focus_dpt": round(seen.focus_dpt, 3),
+            "wanted_focus_dpt": request.focus_dpt,
+            "frame_ms": round(sum(seen.stage_times_ms.values()), 2),
+            "took_ms": round(MS_PER_S * (time.monotonic() - start_s), 2),
+            "notes": list(seen.notes),
+        }
+        return SentPicture(kind, self.side, request.number, data, facts)
+
+    def _stop_full(self, request: PictureRequest) -> None:
+        """Cancel the full eye if it is outdated, to free the worker."""
+        if "full" not in self._profiles:
+            return
+        body, settings, _ = self._profiles["full"]
+        wanted = (request.bodies[self.side], request.gaze_deg, request.pipeline)
+        if (body, settings.gaze_deg, settings.pipeline) != wanted:
+            self._filters.pop("full").close()
+            del self._profiles["full"]
+            self._merge_factor = 1
+
+    def close(self) -> None:
+        """Close the filters."""
+        for eye_filter in self._filters.values():
+            eye_filter.close()
+
+
+def failed(side: EyeSide, request: PictureRequest, reason: str) -> SentPicture:
+    """Return a message that a picture failed, and why."""
+    return SentPicture("failed", side, request.number, b"", {"error": reason})
 
 
 @dataclass
 class _Page:
     """One page: its newest request, the current one, and its eyes."""
 
-    show: Callable[[SentPicture], None]
+    show: Callable[[SentPicture], Any]
     newest: PictureRequest | None = None
     arrived_s: float = 0.0
     current: PictureRequest | None = None
@@ -44,59 +199,53 @@ class _Page:
     def step(self) -> float | None:
         """Do a piece of work; return the time until the next step, in s, or None."""
         now_s = time.monotonic()
-        request = self._next_request(now_s)
+        if self.current is not self.newest and (
+            self._has_all("preview") or now_s > self.begun_s + STALE_S
+        ):
+            self.current, self.begun_s = self.newest, now_s
+        request = self.current
         if request is None:
             return None
-        for side in request.bodies:
-            self.eyes.setdefault(side, EyeView(side))
-        wanted = [self.eyes[side] for side in request.bodies]
-        is_waiting = False
-        for eye in wanted:
-            if eye.seen["preview"] < request.number:
-                is_waiting |= not self._show_if_ready(eye.preview(request))
-        if is_waiting:
+        self._show("preview", request)
+        if not self._has_all("preview"):
             return POLL_S
         if request is not self.newest:
             return 0.0
-        if all(eye.seen["full"] >= request.number for eye in wanted):
+        if self._has_all("full"):
             return None
         pause_s = self.arrived_s + PAUSE_S - now_s
         if pause_s > 0.0:
             return pause_s
-        for eye in wanted:
-            if eye.seen["full"] < request.number:
-                is_waiting |= not self._show_if_ready(eye.full(request))
-            if request is not self.newest:
-                return 0.0
-        return POLL_S if is_waiting else None
+        self._show("full", request)
+        if request is not self.newest:
+            return 0.0
+        return None if self._has_all("full") else POLL_S
 
-    def _next_request(self, now_s: float) -> PictureRequest | None:
-        """Return the current request until its previews are shown, then the newest."""
-        is_new = self.current is not self.newest
-        if is_new and (self._has_all_previews() or now_s > self.begun_s + STALE_S):
-            self.current, self.begun_s = self.newest, now_s
-        return self.current
-
-    def _has_all_previews(self) -> bool:
+    def _has_all(self, kind: Kind) -> bool:
+        """Return whether the current request has all pictures of a kind."""
         request = self.current
         return request is None or all(
-            side in self.eyes and self.eyes[side].seen["preview"] >= request.number
+            side in self.eyes and self.eyes[side].seen[kind] >= request.number
             for side in request.bodies
         )
 
-    def _show_if_ready(self, seen: SentPicture | None) -> bool:
-        if seen is not None:
-            self.show(seen)
-        return seen is not None
+    def _show(self, kind: Kind, request: PictureRequest) -> None:
+        """Show the missing pictures of a kind that are ready."""
+        for side in request.bodies:
+            eye = self.eyes.setdefault(side, EyeView(side))
+            if kind == "full" and request is not self.newest:
+                return
+            if eye.seen[kind] < request.number:
+                seen = eye.picture(kind, request)
+                if seen is not None:
+                    self.show(seen)
 
     def fail_request(self, reason: str) -> None:
         """Drop the current request and report why."""
         request, self.newest, self.current = self.current, None, None
-        for side in request.bodies if request else ():
-            assert request is not None
-            self.show(
-                SentPicture("failed", side, request.number, b"", {"error": reason})
-            )
+        if request is not None:
+            for side in request.bodies:
+                self.show(failed(side, request, reason))
 
     def close(self) -> None:
         for eye in self.eyes.values():
@@ -114,7 +263,7 @@ class FilterThread:
         self._thread = threading.Thread(target=self._run, name="filter", daemon=True)
         self._thread.start()
 
-    def open(self, page: str, show: Callable[[SentPicture], None]) -> None:
+    def open(self, page: str, show: Callable[[SentPicture], Any]) -> None:
         """Register a page; ``show`` gets its pictures, in the filter thread."""
         self._pages[page] = _Page(show)
 

@@ -1,45 +1,60 @@
-"""State of a page: both eyes' entries, viewing conditions, and the picture."""
+"""State of a page, independent of its layout; and its entries as text, for links.
+
+The text is the fragment of the page's address, which browsers do not send.  It contains
+the entries that differ from a new page, and never the content of a file.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import base64
+import json
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, get_args
 
-from clients.web.correction_form import profile_for_gaze, reading_gaze_deg
-from clients.web.eye_form import SIDES, EyeForm, EyeSide, NoFile, read_profile_file
-from clients.web.numbers import NumberField
-from clients.web.picture import Picture, ScenePoint
-from clients.web.picture_requests import PictureRequest
+from clients.web.controls import (
+    AGE,
+    CONDITIONS,
+    DISTANCE,
+    FOCUS,
+    GAZE_H,
+    GAZE_V,
+    PUPIL,
+    initial_values,
+)
+from clients.web.eye_form import (
+    DESIGNS,
+    KINDS,
+    SIDES,
+    CorrectionForm,
+    EyeForm,
+    EyeSide,
+    NoFile,
+    Source,
+    preset_titles,
+    profile_for_gaze,
+    read_profile_file,
+    reading_gaze_deg,
+)
+from clients.web.filter_thread import PictureRequest
+from clients.web.picture import Picture
+from estimator.bounded_files import loads_bounded
 from filter_service.settings import Pipeline
 
 Shown = Literal["OD", "OS", "both"]
-
-PUPIL = NumberField("pupil_diameter_mm", "Pupil", "mm", 2.0, 7.0, 0.1, digits=1)
-FOCUS = NumberField("focus_dpt", "Focus", "dpt", 0.0, 8.0, 0.05)
-DISTANCE = NumberField("distance_dpt", "Distance", "dpt", 0.0, 6.0, 0.05)
-GAZE_H = NumberField("gaze_h_deg", "Gaze, right", "°", -20.0, 20.0, 1.0, digits=0)
-GAZE_V = NumberField("gaze_v_deg", "Gaze, up", "°", -45.0, 30.0, 1.0, digits=0)
-AGE = NumberField("age_years", "Age", "years", 5.0, 90.0, 1.0, digits=0)
-CONDITIONS = (PUPIL, FOCUS, DISTANCE, AGE, GAZE_H, GAZE_V)
-"""Viewing conditions, in the order of the page."""
 
 READING_DPT = 2.5
 READING_GAZE_DEG = -30.0
 """Vertical gaze for reading without a progressive lens."""
 
+VERSION = 1
+MAX_CHARACTERS = 8000
+"""Length limit of a fragment; every entry of both eyes takes 1,600 characters."""
 
-def first_values() -> dict[str, float]:
-    """Return the initial viewing conditions."""
-    return {
-        PUPIL.name: 4.0,
-        FOCUS.name: 0.0,
-        DISTANCE.name: 0.25,
-        GAZE_H.name: 0.0,
-        GAZE_V.name: 0.0,
-        AGE.name: 30.0,
-    }
+MAX_ENTRY_CHARACTERS = 40
+SCENES = ("courtyard", "primitives", "chart")
+"""Scenes that need no file; the first one is that of a new page."""
 
 
 @dataclass
@@ -48,19 +63,23 @@ class PageState:
 
     Attributes
     ----------
-    picture : the scene; None until one is ready
-    valid_profiles : the last valid profile of each eye
-    shown : which eye, or both
+    values : viewing conditions by field name
     is_focus_set : whether the user set the focus, so that it ignores the distance
+    picture : the scene; None until one is ready
+    empty_reason : text in place of the picture, or an empty string
+    shown : which eye, or both
     pipeline : that of full pictures; previews are exact
+    number : of the last request
+    valid_profiles : the last valid profile of each eye
     """
 
     eyes: dict[EyeSide, EyeForm] = field(
         default_factory=lambda: {side: EyeForm(side) for side in SIDES}
     )
-    values: dict[str, float] = field(default_factory=first_values)
+    values: dict[str, float] = field(default_factory=initial_values)
     is_focus_set: bool = False
     picture: Picture | None = None
+    empty_reason: str = ""
     shown: Shown = "OD"
     pipeline: Pipeline = "exact"
     number: int = 0
@@ -70,6 +89,11 @@ class PageState:
     def sides(self) -> tuple[EyeSide, ...]:
         """Return the eyes that are shown."""
         return tuple(SIDES) if self.shown == "both" else (self.shown,)
+
+    @property
+    def titles(self) -> str:
+        """Return the names of the eyes that are shown, in lower case."""
+        return " and ".join(SIDES[side].lower() for side in self.sides)
 
     def body(self, side: EyeSide) -> dict[str, Any]:
         """Return an eye's profile.
@@ -94,6 +118,11 @@ class PageState:
         return found
 
     @property
+    def eye_state(self) -> dict[str, float]:
+        """Return pupil and focus, as arguments of filters and figures."""
+        return {number.name: self.values[number.name] for number in (PUPIL, FOCUS)}
+
+    @property
     def gaze_deg(self) -> tuple[float, float]:
         """Return the gaze relative to straight ahead of the head."""
         return self.values[GAZE_H.name], self.values[GAZE_V.name]
@@ -112,10 +141,8 @@ class PageState:
     def set_picture(self, picture: Picture) -> None:
         """Set the picture; the first one also sets its initial focus and pupil."""
         if self.picture is None:
-            for number, value in (
-                (FOCUS, picture.focus_dpt),
-                (PUPIL, picture.pupil_diameter_mm),
-            ):
+            for number in (FOCUS, PUPIL):
+                value = getattr(picture, number.name)
                 if value is not None:
                     shown = round(value, number.digits)
                     self.values[number.name] = min(shown, number.high)
@@ -154,6 +181,11 @@ class PageState:
         }
         self.is_focus_set = False
 
+    def load_body(self, side: EyeSide, body: Mapping[str, Any], name: str) -> None:
+        """Load a profile into an eye, with the age of the person."""
+        self.eyes[side].load_body(body, name)
+        self.values[AGE.name] = body.get(AGE.name, self.values[AGE.name])
+
     def load_file(self, side: EyeSide, name: str, content: bytes) -> EyeSide:
         """Load a profile file into the eye that it names, by default into `side`.
 
@@ -168,17 +200,16 @@ class PageState:
         """
         body = read_profile_file(name, content)
         loaded_side: EyeSide = body.get("eye_side", side)
-        self.eyes[loaded_side].load_body(body, Path(name).name)
+        self.load_body(loaded_side, body, Path(name).name)
         if loaded_side != side and self.eyes[side].file_body is None:
             self.eyes[side].source = "prescription"
-        self.values[AGE.name] = body.get(AGE.name, self.values[AGE.name])
         return loaded_side
 
     def reset(self) -> None:
         """Set the initial entries; picture and uploaded files stay available."""
         for form in self.eyes.values():
             form.reset()
-        self.values.update(first_values())
+        self.values.update(initial_values())
         self.shown, self.is_focus_set, self.pipeline = "OD", False, "exact"
 
     def read_profiles(self) -> bool:
@@ -197,36 +228,185 @@ class PageState:
     def request(self) -> PictureRequest | None:
         """Return the request for the current state; None without a picture or eye."""
         self.read_profiles()
-        bodies = {
-            side: self.valid_profiles[side]
-            for side in self.sides
-            if side in self.valid_profiles
-        }
-        if self.picture is None or not bodies:
+        shown = [side for side in self.sides if side in self.valid_profiles]
+        if self.picture is None or not shown:
             return None
         self.picture = self.picture.at(self.values[DISTANCE.name])
+        bodies = {side: self.valid_profiles[side] for side in shown}
         if self.picture.follows_gaze:
-            bodies = {
-                s: profile_for_gaze(body, self.gaze_deg) for s, body in bodies.items()
-            }
+            bodies = {s: profile_for_gaze(bodies[s], self.gaze_deg) for s in shown}
         self.number += 1
         return PictureRequest(
             number=self.number,
             picture=self.picture,
             bodies=bodies,
-            pupil_diameter_mm=self.values[PUPIL.name],
-            focus_dpt=self.values[FOCUS.name],
             gaze_deg=self.picture_gaze_deg,
             pipeline=self.pipeline,
+            **self.eye_state,
         )
-
-    def scene_point(self, x: float, y: float) -> ScenePoint | None:
-        """Return the scene point at a position in the picture."""
-        return None if self.picture is None else self.picture.scene_point(x, y)
 
     def look_at(self, x: float, y: float) -> None:
         """Focus on the scene point at a position in the picture."""
-        point = self.scene_point(x, y)
-        if point is not None:
-            focus_dpt = round(point.distance_dpt, FOCUS.digits)
+        if self.picture is not None:
+            distance_dpt = self.picture.scene_point(x, y).distance_dpt
+            focus_dpt = round(distance_dpt, FOCUS.digits)
             self.move(FOCUS.name, min(focus_dpt, FOCUS.high))
+
+
+def fragment_of(state: PageState, scene: str) -> str:
+    """Return the entries as the fragment of an address, without ``#``."""
+    changes = _changes(_entries(state, scene), _entries(PageState(), SCENES[0]))
+    text = json.dumps({"v": VERSION, **changes}, separators=(",", ":"))
+    return base64.urlsafe_b64encode(text.encode()).decode().rstrip("=")
+
+
+def _entries(state: PageState, scene: str) -> dict[str, Any]:
+    return {
+        "shown": state.shown,
+        "pipeline": state.pipeline,
+        "scene": scene if scene in SCENES else SCENES[0],
+        "focus_set": state.is_focus_set,
+        "values": {name: round(value, 4) for name, value in state.values.items()},
+        "eyes": {side: _eye_entries(form) for side, form in state.eyes.items()},
+    }
+
+
+def _eye_entries(form: EyeForm) -> dict[str, Any]:
+    worn = form.worn
+    entries = {"kind": worn.kind, "design": worn.design, "texts": worn.texts}
+    is_file = form.source == "file"
+    return {
+        "source": form.source,
+        "file": form.file_name[:MAX_ENTRY_CHARACTERS] if is_file else None,
+        "preset": form.preset,
+        "higher_order": form.has_higher_order,
+        "texts": form.texts,
+        "correction": entries if form.wears_correction else {},
+    }
+
+
+def _changes(entries: Mapping[str, Any], initial: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries that differ from the initial ones, at any depth."""
+    return {
+        name: _changes(value, initial[name])
+        if isinstance(value, dict) and name in initial
+        else value
+        for name, value in entries.items()
+        if value != initial.get(name)
+    }
+
+
+class Restored(NamedTuple):
+    """Result of reading a link.
+
+    Attributes
+    ----------
+    scene : str or None
+        Scene to show; None if the fragment contains no entries for a page.
+    problems : list of str
+        Sentences about rejected entries of the link.
+    """
+
+    scene: str | None
+    problems: list[str]
+
+
+def restore(state: PageState, fragment: str) -> Restored:
+    """Set a page's entries from a fragment; report rejected entries.
+
+    Entries are validated like typed ones.  Invalid and missing ones get their initial
+    values.
+    """
+    entries = _read(fragment)
+    if entries is None:
+        text = "The link contains no entries for this page; it may be incomplete."
+        return Restored(None, [text])
+    state.reset()
+    state.is_focus_set = entries.get("focus_set") is True
+    state.shown = _choice(entries, "shown", get_args(Shown)) or state.shown
+    state.pipeline = _choice(entries, "pipeline", get_args(Pipeline)) or state.pipeline
+    problems = []
+    values = state.values | _mapping(entries, "values")
+    for number in CONDITIONS:
+        value = values[number.name]
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            problem: str | None = f"{_short(value)} is not a number"
+        else:
+            problem = number.problem(f"{value:g}")
+        if problem:
+            problems.append(f"{number.label}: {problem}.")
+        else:
+            state.values[number.name] = float(value)
+    eyes = _mapping(entries, "eyes")
+    for side, title in SIDES.items():
+        found = _restore_eye(state.eyes[side], _mapping(eyes, side))
+        problems += [f"{title}: {problem}." for problem in found]
+    return Restored(_choice(entries, "scene", SCENES) or SCENES[0], problems)
+
+
+def _read(fragment: str) -> dict[str, Any] | None:
+    if len(fragment) > MAX_CHARACTERS:
+        return None
+    try:
+        padded = fragment + "=" * (-len(fragment) % 4)
+        text = base64.urlsafe_b64decode(padded)
+        entries = loads_bounded(text, max_bytes=MAX_CHARACTERS, finite=True)
+    except ValueError:
+        return None
+    if not isinstance(entries, dict) or entries.get("v") != VERSION:
+        return None
+    return entries
+
+
+def _mapping(entries: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return an entry that is a mapping; an empty one if it is missing or another."""
+    value = entries.get(name)
+    return value if isinstance(value, dict) else {}
+
+
+def _choice(entries: Mapping[str, Any], name: str, options: Collection[str]) -> Any:
+    """Return an entry that is one of some texts; None if it is missing or another."""
+    value = entries.get(name)
+    return value if isinstance(value, str) and value in options else None
+
+
+def _short(value: object) -> str:
+    return f"{value!r:.30}"
+
+
+def _restore_eye(form: EyeForm, entries: dict[str, Any]) -> list[str]:
+    problems = []
+    source = _choice(entries, "source", get_args(Source))
+    if source == "file":
+        name = str(entries.get("file", ""))[:MAX_ENTRY_CHARACTERS]
+        if form.file_body is None or form.file_name[:MAX_ENTRY_CHARACTERS] != name:
+            source = None
+            problems.append(
+                f"the profile file {name!r} is not part of a link; upload it"
+            )
+    form.source = source or form.source
+    form.preset = _choice(entries, "preset", preset_titles()) or form.preset
+    if entries.get("preset", form.preset) != form.preset:
+        problems.append(f"preset {_short(entries['preset'])} is unknown")
+    form.has_higher_order = entries.get("higher_order") is not False
+    problems += _restore_texts(form.texts, _mapping(entries, "texts"))
+    correction = _mapping(entries, "correction")
+    if correction:
+        form.wears_correction, form.worn = True, CorrectionForm()
+        form.worn.kind = _choice(correction, "kind", KINDS) or form.worn.kind
+        if correction.get("kind") != form.worn.kind:
+            problems.append(f"correction {_short(correction.get('kind'))} is unknown")
+        form.worn.design = _choice(correction, "design", DESIGNS) or form.worn.design
+        problems += _restore_texts(form.worn.texts, _mapping(correction, "texts"))
+    return problems
+
+
+def _restore_texts(texts: dict[str, str], entries: dict[str, Any]) -> list[str]:
+    """Set known entries; the form reports invalid texts, as it does typed ones."""
+    problems = []
+    for name in texts.keys() & entries.keys():
+        if isinstance(entries[name], str):
+            texts[name] = entries[name][:MAX_ENTRY_CHARACTERS]
+        else:
+            problems.append(f"{name} {_short(entries[name])} is not text")
+    return problems

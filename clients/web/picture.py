@@ -1,26 +1,58 @@
-"""A picture with depth, at full and preview size."""
+"""Pictures with depth: built-in scenes, glTF files, photos and a letter chart.
+
+    python -m clients.web.picture courtyard out.npz
+
+renders a scene, in a child process: building it takes seconds, during which the page
+must stay responsive.
+"""
 
 from __future__ import annotations
 
+import io
 import math
+import subprocess
+import sys
+import tempfile
+import threading
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from clients.headset.gltf_file import read_header
+from clients.scenes.geometry import linear_from_srgb, srgb_from_linear
+from clients.scenes.letter_chart import ChartRow, letter_chart
 from estimator import InvalidFile
 from filter_service import Camera, RgbdView
+from filter_service.atomic_files import replace_atomically
 from filter_service.image_files import named_note, read_depth_file
 from filter_service.pictures import read_picture_srgb8
 
-MAX_WIDTH_PX, MAX_HEIGHT_PX = 960, 720
-"""Size limit of the full picture; larger pictures are reduced."""
-
 SMALL_WIDTH_PX = 480
 """Maximum width of a preview."""
+
+FAR_DPT = 0.0
+PREVIEW_QUALITY = 92
+PNG_LEVEL = 1
+"""Fastest compression level; the file usually stays on this machine."""
+
+TIMEOUT_S = 300.0
+SIZE_PX = (960, 540)
+"""Size of rendered scenes."""
+
+GLTF_SUFFIXES = (".glb", ".gltf")
+MAX_GLTF_BYTES = 200_000_000
+TITLES = {"courtyard": "Courtyard", "primitives": "Primitives"}
+_CHECKOUT = Path(__file__).resolve().parents[2]
+# In a checkout, `-m` requires this folder; installed packages need none.
+_FOLDER = _CHECKOUT if (_CHECKOUT / "pyproject.toml").is_file() else None
+
+MAX_WIDTH_PX, MAX_HEIGHT_PX = 960, 720
+"""Size limit of the full picture; larger pictures are reduced."""
 
 MIN_SIDE_PX = 16
 MAX_SIDE_RATIO = 100
@@ -32,16 +64,17 @@ PHOTO_FORMATS = ("JPEG", "PNG", "WEBP", "TIFF")
 used decoders."""
 
 DEPTH_SUFFIXES = (".npy", ".png", ".tif", ".tiff", ".exr")
-FAR_DPT = 0.0
 DEPTH_HELP = "floats in meters (.npy, .exr, .tif), integers in millimeters (.png, .npy)"
 
+CHART_ROWS = tuple(round(1.0 - 0.1 * k, 1) for k in range(12))
+"""LogMAR, from 1.0 to -0.1."""
 
-class ChartRow(NamedTuple):
-    """One row of a letter chart: its size, and its center and right end, 0 to 1."""
+CHART_WIDTH_DEG = 13.6
+"""The largest row takes 7.5 deg, which leaves space for the labels beside it."""
 
-    log_mar: float
-    y_ratio: float
-    end_ratio: float
+CHART_SIZE_PX = (1200, 675)
+
+_LOCKS = {name: threading.Lock() for name in TITLES}
 
 
 @dataclass(frozen=True)
@@ -70,19 +103,14 @@ class Picture:
     follows_gaze: bool = False
     notes: tuple[str, ...] = ()
 
-    @property
-    def aspect_ratio(self) -> float:
-        """Return width over height."""
-        return self.view.width_px / self.view.height_px
-
     def at(self, distance_dpt: float) -> Picture:
         """Return a flat picture at another distance; one with depth unchanged."""
         if self.distance_dpt is None or distance_dpt == self.distance_dpt:
             return self
         return replace(
             self,
-            view=_flat(self.view, distance_dpt),
-            small=_flat(self.small, distance_dpt),
+            view=flat_view(self.view, distance_dpt),
+            small=flat_view(self.small, distance_dpt),
             distance_dpt=distance_dpt,
         )
 
@@ -121,19 +149,10 @@ class ScenePoint:
         return math.degrees(math.atan2(x, -z)), math.degrees(math.asin(y / length))
 
 
-def picture_of(
-    title: str,
-    view: RgbdView,
-    *,
-    distance_dpt: float | None = None,
-    focus_dpt: float | None = None,
-    pupil_diameter_mm: float | None = None,
-) -> Picture:
-    """Return a picture with its preview."""
-    n = math.ceil(view.width_px / SMALL_WIDTH_PX)
-    return Picture(
-        title, view, coarser(view, n), distance_dpt, focus_dpt, pupil_diameter_mm
-    )
+def picture_of(title: str, view: RgbdView, **known: Any) -> Picture:
+    """Return a picture with its preview; ``known`` are further attributes."""
+    small = coarser(view, math.ceil(view.width_px / SMALL_WIDTH_PX))
+    return Picture(title, view, small, **known)
 
 
 def coarser(view: RgbdView, n: int) -> RgbdView:
@@ -164,21 +183,148 @@ def coarser(view: RgbdView, n: int) -> RgbdView:
 
 def linear_from_srgb8(color: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return linear light, 0 to 1."""
-    v = np.arange(256) / 255.0
-    table = np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
-    return table.astype(np.float32)[color]
+    return linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)[color]
 
 
 def srgb8_from_linear(light: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return 8-bit sRGB."""
-    v = np.clip(light, 0.0, 1.0)
-    srgb = np.where(v <= 0.0031308, 12.92 * v, 1.055 * v ** (1 / 2.4) - 0.055)
-    return np.round(255.0 * srgb).astype(np.uint8)
+    return np.round(255.0 * srgb_from_linear(cast("Any", light))).astype(np.uint8)
 
 
-def _flat(view: RgbdView, distance_dpt: float) -> RgbdView:
+def png_of(color: NDArray[Any], *, level: int = PNG_LEVEL) -> bytes:
+    """Return a picture (h, w, 3) as a PNG, lossless."""
+    file = io.BytesIO()
+    Image.fromarray(color).save(file, "png", compress_level=level)
+    return file.getvalue()
+
+
+def jpeg_of(color: NDArray[Any]) -> bytes:
+    """Return a picture (h, w, 3) as a JPEG without color subsampling."""
+    file = io.BytesIO()
+    Image.fromarray(color).save(file, "jpeg", quality=PREVIEW_QUALITY, subsampling=0)
+    return file.getvalue()
+
+
+def flat_view(view: RgbdView, distance_dpt: float) -> RgbdView:
+    """Return a view whose depth is a distance everywhere."""
     distance_m = np.inf if distance_dpt <= 0.0 else 1.0 / distance_dpt
     return replace(view, depth_m=np.full(view.color.shape[:2], distance_m, np.float32))
+
+
+class SceneNotRendered(ValueError):
+    """Raised when a scene cannot be rendered; the message gives the reason."""
+
+
+def scene_picture(name: str) -> Picture:
+    """Return a built-in scene as a picture; only the first call takes seconds.
+
+    Raises
+    ------
+    SceneNotRendered
+    """
+    with _LOCKS[name]:  # others wait for the first one
+        return _built_in(name)
+
+
+@cache
+def _built_in(name: str) -> Picture:
+    with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
+        return _rendered(name, TITLES[name], Path(folder))
+
+
+def gltf_picture(name: str, content: bytes) -> Picture:
+    """Return a glTF file as a picture.
+
+    Raises
+    ------
+    InvalidFile
+        If the file is of another kind, or refers to other files.
+    SceneNotRendered
+        If the file is damaged or cannot be rendered here.
+    """
+    suffix = Path(name).suffix.lower()
+    if suffix not in GLTF_SUFFIXES:
+        allowed = f"{', '.join(GLTF_SUFFIXES)} with embedded textures and meshes"
+        raise InvalidFile(name[:60], "not a scene", allowed)
+    header, _ = read_header(Path(name[:60]), content)
+    for uri in _uris(header):
+        if not uri.startswith("data:"):  # other files would be on the server
+            found = f"refers to another file, '{uri:.60}'"
+            allowed = ".glb, or .gltf with embedded textures and meshes"
+            raise InvalidFile(name[:60], found, allowed)
+    with tempfile.TemporaryDirectory(prefix="ocufilter-") as folder:
+        path = Path(folder) / f"scene{suffix}"
+        path.write_bytes(content)
+        try:
+            return _rendered(str(path), Path(name).name[:60], Path(folder))
+        except SceneNotRendered as error:
+            raise SceneNotRendered(
+                str(error).replace(str(path), Path(name).name)
+            ) from None
+
+
+def _uris(part: object) -> list[str]:
+    """Return all URIs in the header of a glTF file, at any depth."""
+    if isinstance(part, list):
+        return [uri for each in part for uri in _uris(each)]
+    if not isinstance(part, dict):
+        return []
+    own = part.get("uri")
+    return [str(own)] * (own is not None) + _uris(list(part.values()))
+
+
+def _rendered(source: str, title: str, folder: Path) -> Picture:
+    file = folder / "rendered.npz"
+    command = [sys.executable, "-m", "clients.web.picture", source, str(file)]
+    try:
+        done = subprocess.run(
+            command,
+            cwd=_FOLDER,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_S,
+        )
+    except subprocess.TimeoutExpired:
+        raise SceneNotRendered(
+            f"{title}: rendering timed out after {TIMEOUT_S:.0f} s"
+        ) from None
+    if not file.is_file():
+        lines = done.stderr.strip().splitlines() or [f"ended with {done.returncode}"]
+        raise SceneNotRendered(lines[-1])
+    with np.load(file) as arrays:
+        names = "pupil_diameter_mm", "focus_dpt"  # of built-in scenes
+        known = dict(zip(names, arrays["state"].tolist(), strict=False))
+        view = RgbdView(
+            arrays["color"],
+            arrays["depth_m"],
+            tuple(arrays["tangents"].tolist()),
+            hidden_color=arrays["hidden_color"],
+            hidden_depth_m=arrays["hidden_depth_m"],
+        )
+    return picture_of(title, view, **known)
+
+
+def chart_picture(distance_dpt: float) -> Picture:
+    """Return a chart that has the same visual angle at every distance."""
+    camera = Camera(*CHART_SIZE_PX, _tangents(CHART_WIDTH_DEG, *CHART_SIZE_PX))
+    chart = letter_chart(camera, distance_m=math.inf, log_mar=CHART_ROWS)
+    # the camera turns with the eye, so that the rows stay on the fovea
+    return picture_of(
+        *("Letter chart", chart.view),
+        distance_dpt=0.0,
+        chart_rows=chart.rows,
+        follows_gaze=True,
+    ).at(distance_dpt)
+
+
+def _tangents(
+    width_deg: float, width_px: int, height_px: int
+) -> tuple[float, float, float, float]:
+    """Return the edges of a symmetric camera with a horizontal field of view."""
+    right = math.tan(math.radians(width_deg) / 2.0)
+    up = right * height_px / width_px
+    return -right, right, up, -up
 
 
 def photo_picture(
@@ -207,21 +353,16 @@ def photo_picture(
     """
     color, notes = _photo_color(name, content)
     height_px, width_px = color.shape[:2]
-    depth_m = None
+    tangents, title = _tangents(width_deg, width_px, height_px), Path(name).name[:60]
+    factor = max(1.0, width_px / MAX_WIDTH_PX, height_px / MAX_HEIGHT_PX)
     if depth is not None:
         depth_m, depth_notes = _photo_depth(*depth, shape=(height_px, width_px))
-        notes += depth_notes
-    factor = max(1.0, width_px / MAX_WIDTH_PX, height_px / MAX_HEIGHT_PX)
-    right = math.tan(math.radians(width_deg) / 2.0)
-    up = right * height_px / width_px
-    tangents, title = (-right, right, up, -up), Path(name).name[:60]
-    if depth_m is not None:
         view = coarser(RgbdView(color, depth_m, tangents), math.ceil(factor))
-        return replace(picture_of(title, view), notes=notes)
+        return picture_of(title, view, notes=notes + depth_notes)
     color = _resized(color, round(width_px / factor), round(height_px / factor))
     view = RgbdView(color, np.ones(color.shape[:2], np.float32), tangents)
-    flat = picture_of(title, view, distance_dpt=math.nan)
-    return replace(flat.at(distance_dpt), notes=notes)
+    view = flat_view(view, distance_dpt)
+    return picture_of(title, view, distance_dpt=distance_dpt, notes=notes)
 
 
 def _resized(
@@ -287,8 +428,36 @@ def _check_size(name: str, content: bytes) -> None:
         raise InvalidFile(name[:60], found, f"{MAX_PHOTO_BYTES / 1e6:.0f} MB")
 
 
-def camera_of(width_deg: float, *, width_px: int, height_px: int) -> Camera:
-    """Return a symmetric camera with the given horizontal field of view."""
-    right = math.tan(math.radians(width_deg) / 2.0)
-    up = right * height_px / width_px
-    return Camera(width_px, height_px, (-right, right, up, -up))
+def main(source: str, file: str) -> int:
+    """Render a scene and write it to a file, in the child process."""
+    from clients.headset.gltf_scene import load_gltf
+    from clients.headset.scenery import viewpoint
+    from clients.scene_renderer import PATHS, SceneRenderer, path_moments
+    from clients.scenes.catalog import build_scene
+
+    try:
+        is_built_in = source in PATHS
+        scene = build_scene(source) if is_built_in else load_gltf(source)
+    except ValueError as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    state: tuple[float, ...] = ()
+    if is_built_in:
+        (moment,) = path_moments(PATHS[source], 1)
+        state = (moment.pupil_diameter_mm, moment.focus_dpt)
+    with SceneRenderer(scene, SIZE_PX) as renderer:
+        seen, hidden = renderer.render_layers(viewpoint(scene))
+        arrays: dict[str, Any] = {
+            "color": seen[0],
+            "depth_m": seen[1],
+            "hidden_color": hidden[0],
+            "hidden_depth_m": hidden[1],
+            "tangents": renderer.tangents,
+            "state": state,
+        }
+    replace_atomically(Path(file), lambda part: np.savez(part, **arrays))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -26,10 +26,8 @@ import numpy as np
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-from clients.web.eye_view import FULL, EyeView
-from clients.web.picture import linear_from_srgb8
-from clients.web.picture_requests import PictureRequest
-from clients.web.scene_file import scene_picture
+from clients.web.filter_thread import FULL, EyeView, PictureRequest
+from clients.web.picture import linear_from_srgb8, scene_picture
 from filter_service import EyeFilter
 from tests.benchmarks.harness import ROOT, Row, publish
 from tests.web.browser import PageUnderTest, open_browser
@@ -142,10 +140,10 @@ def errors(states) -> dict[str, float]:
             }
             exact.wait()
             reference = exact.filter([picture.view], **state, render_tolerance=0.0)
-            for kind, make in (("preview", eye.preview), ("full", eye.full)):
-                while (seen := make(wish)) is None:
+            for kind, values in found.items():
+                while (seen := eye.picture(kind, wish)) is None:
                     time.sleep(0.002)
-                found[kind].append(_psnr_db(seen.data, reference.color))
+                values.append(_psnr_db(seen.data, reference.color))
     eye.close()
     return {kind: min(values) for kind, values in found.items()}
 

@@ -5,9 +5,12 @@ import json
 
 import pytest
 
-from clients.web.eye_figures import eye_figure
-from clients.web.figure_worker import FigureFailed, FigureWorker
-from clients.web.point_spread import PointState, point_spread
+from clients.web.figure_worker import (
+    FigureFailed,
+    FigureWorker,
+    eye_figure,
+    point_spread,
+)
 
 MYOPE = json.dumps({"kind": "prescription", "sphere_dpt": -3.0, "eye_side": "OD"})
 PNG = b"\x89PNG"
@@ -27,7 +30,7 @@ def _of_a_study(questions):
 
 
 def _seen(state, body=MYOPE):
-    return point_spread(body, state)[1]["half_light_arcmin"]
+    return point_spread(body, **state)[1]["half_light_arcmin"]
 
 
 @pytest.mark.clients
@@ -40,7 +43,7 @@ def test_answers_failures_and_newer_questions():
         ]
         with pytest.raises(FigureFailed, match="'cat' is unknown"):
             await figure_worker.ask(
-                "a", "figure", point_spread, '{"kind": "cat"}', None
+                "a", "figure", eye_figure, "field", '{"kind": "cat"}', **state
             )
         waiting = [
             asyncio.create_task(figure_worker.ask("a", "n", divmod, 7 + k, 2))
@@ -61,8 +64,8 @@ def test_answers_failures_and_newer_questions():
 @pytest.mark.clients
 def test_light_of_a_point_spreads_as_rays_have_it():
     """A disc of pupil times defocus: half of its light within 1 / sqrt(2) of it."""
-    sharp = PointState((0.0, 0.0), 3.0, 4.0, 0.0)
-    blurred = PointState((0.0, 0.0), 1.0, 4.0, 0.0)
+    state = {"direction_deg": (0.0, 0.0), "pupil_diameter_mm": 4.0, "focus_dpt": 0.0}
+    sharp, blurred = state | {"object_dpt": 3.0}, state | {"object_dpt": 1.0}
     body = {"kind": "prescription", "sphere_dpt": -3, "higher_order": "none"}
     plain = json.dumps(body)
     expected_arcmin = 2.0 * 4.0 / 2.0 / 2.0**0.5 * 3.43775

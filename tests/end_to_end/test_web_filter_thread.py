@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clients.web.filter_thread import FilterThread
+from clients.web.filter_thread import FilterThread, PictureRequest
 from clients.web.picture import linear_from_srgb8
-from clients.web.picture_requests import PictureRequest
 from filter_service import EyeFilter, FilterSettings
 from tests.unit.web_parts import a_picture
 

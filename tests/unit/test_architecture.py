@@ -151,7 +151,7 @@ HOME = {
     ),
     "nicegui": ("clients/web/*",),
     "fastapi": ("clients/web/*",),
-    "uvicorn": ("clients/web/server.py", "clients/web/connections.py"),
+    "uvicorn": ("clients/web/server.py",),
     "playwright": ("tests/web/*", "tests/benchmarks/bench_web.py"),
     "prometheus_client": ("filter_service/service/metrics.py",),
     "lz4": ("filter_service/wire/images.py",),

@@ -50,6 +50,7 @@ DIMENSIONLESS = {
     "low": "in the unit of a network's input column, or of an entry of the page",
     "high": "in the unit of a network's input column, or of an entry of the page",
     "step": "in the unit of an entry of the page",
+    "initial": "in the unit of an entry of the page",
     "value": "in the unit of a network's input column",
     "mean_abs": "in the unit that a network's card names",
     "p95_abs": "in the unit that a network's card names",

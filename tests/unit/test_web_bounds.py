@@ -4,8 +4,7 @@ import asyncio
 
 import pytest
 
-from clients.web.bounds import Bounds, Limits
-from clients.web.file_names import plain_name
+from clients.web.guard import Bounds, Limits, plain_name
 
 LIMITS = Limits(message_bytes=100, upload_bytes=1000, body_s=0.2, uploads=2)
 UPLOAD = "/_nicegui/client/an-id/upload/7"

@@ -5,19 +5,25 @@ import json
 
 import pytest
 
-from clients.web.chart import chart_picture
-from clients.web.correction_form import (
+from clients.web.controls import (
+    AGE,
     AXIS,
+    DISTANCE,
+    FOCUS,
+    GAZE_V,
+    SPHERE,
+    distance_text,
+    prescription_texts,
+)
+from clients.web.eye_form import (
     DESIGNS,
     KINDS,
-    SPHERE,
     CorrectionForm,
-    default_texts,
+    EyeForm,
+    preset_titles,
 )
-from clients.web.eye_form import EyeForm, preset_titles
-from clients.web.numbers import distance_text, prescription_texts
-from clients.web.page_state import AGE, DISTANCE, FOCUS, GAZE_V, PageState
-from clients.web.shared_entries import fragment_of, restore
+from clients.web.page_state import PageState, fragment_of, restore
+from clients.web.picture import chart_picture
 from estimator import parse_profile, preset_names
 from tests.unit.web_parts import a_picture
 
@@ -44,10 +50,10 @@ def test_a_wrong_entry_is_told_with_what_is_allowed(field, text, said):
 
 
 def test_arrow_keys_step_within_what_is_allowed():
-    assert SPHERE.stepped("-2.5", 1) == "-2.25"
-    assert SPHERE.stepped("0", 1) == "+0.25"
-    assert SPHERE.stepped("30", 1) == "+30.00"
-    assert SPHERE.stepped("abc", 1) == "abc"
+    assert SPHERE.normalized("-2.5", 1) == "-2.25"
+    assert SPHERE.normalized("0", 1) == "+0.25"
+    assert SPHERE.normalized("30", 1) == "+30.00"
+    assert SPHERE.normalized("abc", 1) == "abc"
 
 
 def test_a_distance_is_told_as_people_say_it():
@@ -108,7 +114,7 @@ def test_a_lens_that_the_page_has_no_entries_for_stays_as_it_is():
     assert form.body() == zones
     assert "file" in form.kinds
     assert form.entries == ()
-    assert "file" not in CorrectionForm(texts=default_texts()).kinds
+    assert "file" not in CorrectionForm().kinds
 
 
 def test_additions_that_no_lens_can_have_are_told():

@@ -102,6 +102,18 @@ def test_everything_else_is_refused(query, headers):
     assert closed == {"type": "websocket.close", "code": POLICY_VIOLATION}
 
 
+def test_events_of_the_server_need_no_token():
+    """They have no headers: the server starts only if they are passed on."""
+    scopes = []
+
+    async def inside(scope, _receive, _send):
+        scopes.append(scope)
+
+    guard = Guard(inside, token=TOKEN, cookie="ocufilter-8765", hosts=LOCAL)
+    asyncio.run(guard({"type": "lifespan"}, None, None))
+    assert scopes == [{"type": "lifespan"}]
+
+
 def test_our_own_page_may_open_its_websocket():
     (first,) = _asked(
         "websocket", b"", _cookie(), (b"origin", b"http://127.0.0.1:8765")

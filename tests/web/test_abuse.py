@@ -22,8 +22,8 @@ import pytest
 import uvicorn
 from PIL import Image
 
-from clients.web.bounds import MAX_MESSAGE_BYTES, MAX_PAGES, MAX_UPLOAD_BYTES
-from clients.web.connections import MAX_HEAD_BYTES, BoundedConnection
+from clients.web.guard import MAX_MESSAGE_BYTES, MAX_PAGES, MAX_UPLOAD_BYTES
+from clients.web.server import MAX_HEAD_BYTES, BoundedConnection
 from tests.source_tree import ROOT
 
 TIMEOUT_S = 20.0

@@ -1,0 +1,196 @@
+"""The numbers that can be entered on the page: limits, steps and initial values.
+
+A control is one line of a table here, and its use in `page_state` or `eye_form`: the
+page, links and new pages take everything else from the line.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+DEGREE = "°"
+MINUS_SIGNS = str.maketrans({"\N{MINUS SIGN}": "-", "\N{EN DASH}": "-", ",": "."})
+
+_POWER = r"([+-]?\d+(?:\.\d+)?)"
+_PRESCRIPTION = re.compile(
+    rf"{_POWER}\s*(?:[/;]\s*|\s+|(?=[+-])){_POWER}\s*"
+    r"(?:[x×*@/;]|ax(?:is|e)?\.?|\s)\s*(\d{1,3})\s*°?",
+    re.IGNORECASE | re.ASCII,
+)
+
+
+@dataclass(frozen=True)
+class NumberField:
+    """One number of a form.
+
+    Attributes
+    ----------
+    name : str
+        Profile field, with its unit.
+    label, unit : str
+        As displayed.
+    low, high : float
+        Allowed range.
+    step : float
+        Step of arrow keys and sliders.
+    initial : float
+        Value on a new page.
+    digits : int
+        Decimals shown.
+    is_signed : bool
+        Whether a plus sign is shown, as on a prescription.
+    is_distance : bool
+        Whether a slider shows the distance in meters, too.
+    """
+
+    name: str
+    label: str
+    unit: str
+    low: float
+    high: float
+    step: float
+    initial: float = 0.0
+    digits: int = 2
+    is_signed: bool = False
+    is_distance: bool = False
+
+    @property
+    def allowed(self) -> str:
+        """Return the range as text."""
+        limits = f"{self.low:g} to {self._with_unit(f'{self.high:g}')}"
+        return limits.replace("-", "\N{MINUS SIGN}")
+
+    def read(self, text: str) -> float:
+        """Return the number in a text; a comma may be the decimal point.
+
+        Raises
+        ------
+        ValueError
+            If it is not a number or out of range; the message contains the text and the
+            allowed range.
+        """
+        shown = text.strip()
+        if not shown:
+            raise ValueError(f"{self.label} is empty; allowed: {self.allowed}")
+        try:
+            value = float(shown.translate(MINUS_SIGNS))
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise ValueError(f"“{shown:.20}” is not a number; allowed: {self.allowed}")
+        if not self.low <= value <= self.high:
+            raise ValueError(f"{shown:.20} is out of range; allowed: {self.allowed}")
+        return value
+
+    def problem(self, text: str) -> str | None:
+        """Return the error message for a text, or None."""
+        try:
+            self.read(text)
+        except ValueError as error:
+            return str(error)
+        return None
+
+    def clamped(self, value: float) -> float:
+        """Return a value clamped to the range."""
+        return float(min(max(value, self.low), self.high))
+
+    def show(self, value: float) -> str:
+        """Return a value as displayed in an entry."""
+        sign = "+" if self.is_signed and value > 0 else ""
+        return f"{sign}{value:.{self.digits}f}"
+
+    def normalized(self, text: str, steps: int = 0) -> str:
+        """Return a valid text as displayed, "-4" as "-4.00"; others unchanged.
+
+        Parameters
+        ----------
+        steps : int
+            Number of steps by which to change the value, within the range.
+        """
+        try:
+            value = self.read(text)
+        except ValueError:
+            return text
+        if steps:
+            value = self.clamped((round(value / self.step) + steps) * self.step)
+        return self.show(value)
+
+    def describe(self, value: float) -> str:
+        """Return a value as displayed beside a slider."""
+        if self.is_distance:
+            return distance_text(value)
+        return self._with_unit(self.show(value))
+
+    def _with_unit(self, text: str) -> str:
+        return f"{text}{'' if self.unit == DEGREE else ' '}{self.unit}"
+
+
+PUPIL = NumberField("pupil_diameter_mm", "Pupil", "mm", 2.0, 7.0, 0.1, 4.0, digits=1)
+FOCUS = NumberField("focus_dpt", "Focus", "dpt", 0.0, 8.0, 0.05, is_distance=True)
+DISTANCE = NumberField(
+    "distance_dpt", "Distance", "dpt", 0.0, 6.0, 0.05, 0.25, is_distance=True
+)
+GAZE_H = NumberField("gaze_h_deg", "Gaze, right", "°", -20.0, 20.0, 1.0, digits=0)
+GAZE_V = NumberField("gaze_v_deg", "Gaze, up", "°", -45.0, 30.0, 1.0, digits=0)
+AGE = NumberField("age_years", "Age", "years", 5.0, 90.0, 1.0, 30.0, digits=0)
+CONDITIONS = (PUPIL, FOCUS, DISTANCE, GAZE_H, GAZE_V, AGE)
+"""Viewing conditions, in the order of the page."""
+
+SPHERE = NumberField("sphere_dpt", "Sphere", "dpt", -30.0, 30.0, 0.25, is_signed=True)
+CYLINDER = replace(SPHERE, name="cylinder_dpt", label="Cylinder", low=-15.0, high=15.0)
+AXIS = NumberField("axis_deg", "Axis", "°", 0.0, 180.0, 1.0, digits=0)
+VERTEX = NumberField("vertex_mm", "Vertex", "mm", 0.0, 25.0, 1.0, 12.0, digits=0)
+PRESCRIPTION = (SPHERE, CYLINDER, AXIS, VERTEX)
+SPHERE_SLIDER = replace(SPHERE, name="sphere_slider_dpt", low=-10.0, high=10.0)
+"""Typed values may exceed the range of the slider."""
+
+PROGRESSIVE_ADD = NumberField(
+    "add_dpt", "Addition", "dpt", 0.25, 4.0, 0.25, 2.0, is_signed=True
+)
+CORRIDOR = NumberField("corridor_mm", "Corridor", "mm", 8.0, 24.0, 1.0, 14.0, digits=0)
+BIFOCAL_ADD = replace(PROGRESSIVE_ADD, low=0.5, high=6.0)
+EDOF_ADD = replace(PROGRESSIVE_ADD, high=3.0)
+MIDDLE_ADD = NumberField(
+    "middle_add_dpt", "Middle add", "dpt", 0.5, 6.0, 0.01, 1.66, is_signed=True
+)
+NEAR_ADD = replace(MIDDLE_ADD, name="near_add_dpt", label="Near add", initial=3.32)
+ABERRATION = NumberField(
+    *("spherical_aberration_um", "C(4,0), 6 mm", "µm", -2.0, 2.0, 0.01),
+    is_signed=True,
+)
+CORRECTION = (
+    *PRESCRIPTION,
+    *(PROGRESSIVE_ADD, CORRIDOR, MIDDLE_ADD, NEAR_ADD, ABERRATION),
+)
+"""All entries of corrections."""
+
+
+def initial_values() -> dict[str, float]:
+    """Return the initial viewing conditions."""
+    return {field.name: field.initial for field in CONDITIONS}
+
+
+def initial_texts(fields: Iterable[NumberField]) -> dict[str, str]:
+    """Return the initial texts of entries."""
+    return {field.name: field.show(field.initial) for field in fields}
+
+
+def distance_text(vergence_dpt: float) -> str:
+    """Return a distance in dpt and in meters or centimeters."""
+    if vergence_dpt < 0.005:
+        return "0 dpt · far away"
+    meters = 1.0 / vergence_dpt
+    distance = f"{100 * meters:.0f} cm" if meters < 1.0 else f"{meters:.1f} m"
+    return f"{vergence_dpt:.2f} dpt · {distance}"
+
+
+def prescription_texts(text: str) -> tuple[str, str, str] | None:
+    """Return sphere, cylinder and axis of a text as "-3.5 -1.25 x 80".
+
+    None if the text has another form.
+    """
+    found = _PRESCRIPTION.fullmatch(text.strip().translate(MINUS_SIGNS))
+    return None if found is None else (found[1], found[2], found[3])

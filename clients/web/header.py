@@ -1,0 +1,216 @@
+"""Header of the page: downloads, the headset, and the link to the page's entries."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any
+
+from nicegui import events, ui
+
+from clients.headset.runtime import Eye
+from clients.openxr_layer.wire import ask as ask_helper
+from clients.openxr_layer.wire import socket_path
+from clients.report import report_html
+from clients.web.eye_form import SIDES, EyeSide
+from clients.web.figure_worker import Ask, FigureFailed
+from clients.web.page_state import PageState, fragment_of
+from clients.web.picture_panel import PictureSender
+from clients.web.widgets import Delayed, title, warn
+
+EYE_OF_SIDE: Mapping[EyeSide, Eye] = {"OD": "right", "OS": "left"}
+
+READY_S = 120.0
+"""Maximum time that a download waits for the full picture."""
+
+POLL_S = 0.05
+UPDATE_DELAY_S = 0.5
+"""Delay after the last change before the address in the browser is updated."""
+
+READ = """
+window.addEventListener("hashchange",
+  () => emitEvent("oc-fragment", location.hash.slice(1)));
+return location.hash.slice(1);
+"""
+COPY = """
+const link = location.origin + "/?token=" + TOKEN + location.hash;
+if (navigator.clipboard) navigator.clipboard.writeText(link);
+else {  // no clipboard API over HTTP from another machine
+  const text = document.body.appendChild(document.createElement("textarea"));
+  text.value = link;
+  text.select();
+  document.execCommand("copy");
+  text.remove();
+}
+"""
+
+
+Action = Callable[[], Awaitable[None]]
+
+
+def _reported(act: Action) -> Action:
+    """Return a handler that shows why its action failed."""
+
+    async def handle() -> None:
+        try:
+            await act()
+        except (OSError, ValueError, FigureFailed) as error:
+            warn(str(error), "negative")
+
+    return handle
+
+
+class Header:
+    """Buttons for downloads and the link, and the fragment of the browser's address.
+
+    A button shows the eyes in the program of a running `ocufilter layer`.
+
+    Parameters
+    ----------
+    ask : runs a function in the worker process, for this page
+    token : the access token, part of a copied link
+    scene : returns the selected scene
+    on_fragment : called with the new fragment when the address of the open page changes
+    """
+
+    def __init__(
+        self,
+        state: PageState,
+        sender: PictureSender,
+        ask: Ask,
+        token: str,
+        *,
+        scene: Callable[[], str],
+        on_fragment: Callable[[str], None],
+    ) -> None:
+        self._state, self._sender, self._ask = state, sender, ask
+        self._token, self._scene, self._on_fragment = token, scene, on_fragment
+        self._fragment: str | None = None  # not read yet
+        self._update = Delayed(UPDATE_DELAY_S)
+        with ui.element("header").classes("oc-header"):
+            title("ocufilter", "h1", "oc-brand")
+            ui.label("See through another person’s eyes").classes("oc-motto")
+            ui.element("span").classes("oc-grow")
+            self._nav = ui.element("nav").classes("oc-downloads")
+            self._nav.props("aria-label=Downloads")
+        buttons: list[tuple[str, str, str, Action]] = [
+            ("Picture", "download", "The image that the eye sees, PNG", self._picture),
+            ("Profile", "download", "The eye's profile, JSON", self._profile),
+            ("Report", "download", "Report on this eye, HTML", self._report),
+            (
+                *("Copy link", "link"),
+                "Link to these entries, including the access token",
+                self._copy_link,
+            ),
+        ]
+        if socket_path().is_socket():
+            tip = "Show this eye in the program that runs with `ocufilter layer`"
+            buttons.append(("Headset", "view_in_ar", tip, self._headset))
+        with self._nav:
+            for label, icon, tip, act in buttons:
+                ui.button(label, icon=icon, on_click=_reported(act)).props(
+                    "outline dense no-caps size=sm"
+                ).classes("oc-download").tooltip(tip)
+        ui.on("oc-fragment", self._change_fragment)
+
+    # Downloads
+
+    async def _picture(self) -> None:
+        state = self._state
+        if state.empty_reason:
+            warn(state.empty_reason)
+            return
+        sides = state.sides
+        try:
+            async with asyncio.timeout(READY_S):
+                for side in sides:  # wait for an eye that is still being prepared
+                    while not self._sender.is_final(side, state.number):
+                        await asyncio.sleep(POLL_S)
+        except TimeoutError:
+            warn("The full picture is not ready yet")
+            return
+        for side in sides:
+            seen = self._sender.last[side]
+            if seen.kind == "full":
+                ui.download(seen.data, f"ocufilter_{side}.png")
+
+    async def _report(self) -> None:
+        for side in self._state.sides:
+            body = self._state.profile_at_gaze(side)
+            if body is None:
+                continue
+            label = SIDES[side]
+            waiting = ui.notification(
+                f"Writing the report on the {label.lower()}…",
+                spinner=True,
+                timeout=None,
+                position="top",
+            )
+            try:
+                text = await self._ask(f"report {side}", report_html, body, label=label)
+            finally:
+                waiting.dismiss()
+            if text is not None:
+                ui.download(text.encode(), f"ocufilter_{side}.html")
+
+    async def _profile(self) -> None:
+        for side in self._state.sides:
+            text = json.dumps(self._state.body(side), indent=1)
+            ui.download(text.encode(), f"ocufilter_{side}.json")
+
+    async def _headset(self) -> None:
+        eyes: dict[str, str] = {
+            EYE_OF_SIDE[side]: json.dumps(self._state.body(side))
+            for side in self._state.sides
+        }
+        answer = await asyncio.to_thread(ask_helper, socket_path(), eyes)
+        warn(f"Sent to {answer['program'] or 'the next program'}", "positive")
+
+    # Link
+
+    async def read_fragment(self) -> str | None:
+        """Return the fragment that the page was opened with; None if the browser left.
+
+        The address is not written before that, as it would replace the fragment.
+        """
+        try:
+            self._fragment = str(await ui.run_javascript(READ, timeout=10.0))
+        except TimeoutError:
+            return None
+        return self._fragment
+
+    def _change_fragment(self, event: events.GenericEventArguments) -> None:
+        fragment: Any = event.args
+        if isinstance(fragment, str) and fragment not in ("", self._fragment):
+            self._fragment = fragment
+            self._on_fragment(fragment)
+
+    def schedule_update(self) -> None:
+        """Write the entries to the browser's address after a delay without changes."""
+        self._update.call(self._write)
+
+    def _write(self) -> None:
+        # an upload may end after its page was closed
+        if self._fragment is None or self._nav.is_deleted:
+            return
+        fragment = fragment_of(self._state, self._scene())
+        if fragment != self._fragment:
+            self._fragment = fragment
+            with self._nav:
+                ui.run_javascript(f'history.replaceState(null, "", "#{fragment}")')
+
+    async def _copy_link(self) -> None:
+        """Copy a link to the entries that contains the token."""
+        self._write()
+        ui.run_javascript(COPY.replace("TOKEN", json.dumps(self._token)))
+        ui.notify(
+            "Link copied. Anyone who has it can use this page; it does not contain "
+            "uploaded files.",
+            position="top",
+            timeout=6000,
+        )
+
+    def cancel(self) -> None:
+        """Cancel the pending update."""
+        self._update.cancel()
