@@ -98,6 +98,15 @@ class Container:
             self.refuse(f"damaged: {where}.{field} is {value!r:.30}", "0 or more")
         return value
 
+    @staticmethod
+    def are_numbers(given: object, count: int) -> bool:
+        """Return whether a value of the header is a list of so many numbers."""
+        return (
+            isinstance(given, list)
+            and len(given) == count
+            and all(type(value) in (int, float) for value in given)
+        )
+
     def uri_bytes(self, uri: object) -> bytes:
         """Return the content of a data URI, or of the referenced file."""
         if not isinstance(uri, str):
@@ -119,8 +128,7 @@ class Container:
     def _buffer(self, index: object) -> memoryview:
         buffer = self.entry("buffers", index)
         if index not in self._buffers:
-            is_inside = "uri" not in buffer
-            content = self._binary if is_inside else self.uri_bytes(buffer["uri"])
+            content = self.uri_bytes(buffer["uri"]) if "uri" in buffer else self._binary
             self._buffers[index] = memoryview(content)
         return self._buffers[index]
 
@@ -298,8 +306,7 @@ def _with_sparse(
             dtype, _ = _dtype(file, part | {"type": "SCALAR"}, f"{where}.indices")
         start = file.whole(part, "byteOffset", where, default=0)
         data = file.view(part.get("bufferView"))
-        shape = (count, columns)
-        parts.append(_strided(file, data, where, start, None, shape, dtype))
+        parts.append(_strided(file, data, where, start, None, (count, columns), dtype))
     indices, values = parts
     if indices.dtype.kind != "u" or (count and int(indices.max()) >= len(array)):
         file.refuse(f"damaged: {where} has indices beyond {len(array):,}")

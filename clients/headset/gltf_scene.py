@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,15 @@ from numpy.typing import NDArray
 
 from clients.headset.gltf_file import Container, accessor_array, accessor_count
 from clients.headset.runtime import rotation_of
-from clients.scenes.geometry import Array, Batch, Mesh, Scene, finished, transformed
+from clients.scenes.geometry import (
+    Array,
+    Batch,
+    Mesh,
+    Scene,
+    finished,
+    transformed,
+    unit,
+)
 from estimator import InvalidFile
 from filter_service.pictures import check_picture, read_texture
 
@@ -32,6 +39,29 @@ _SUN = np.array([0.55, 0.53, 0.48])
 _TO_SUN = np.array([0.40, 0.80, 0.45]) / np.linalg.norm([0.40, 0.80, 0.45])
 """Linear light on a white surface; the total is at most 1."""
 
+MAX_TRIANGLES = 2_000_000
+MAX_VERTICES = 6_000_000
+"""Placed vertices, three for each triangle without normals. Each takes 32 bytes; two
+million triangles take 3 to 5 s."""
+
+MAX_DRAWS = 15_000
+"""Parts placed by nodes; each takes 0.25 ms."""
+
+MAX_TEXTURE_PIXELS = 1 << 26
+"""Total pixels of all textures; each takes three bytes."""
+
+LEAST_VOLUME_RATIO = 1e-30
+"""A node that scales volumes by less is treated as not invertible."""
+
+LEAST_WEIGHT_RATIO = 0.5
+"""Parts that are blended with less opacity are left out."""
+
+_TRIANGLES, _STRIP = 4, 5
+_KNOWN_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")
+"""Prefixes of required extensions that this reader ignores."""
+
+_PICTURES = ("", "image/png", "image/jpeg", "image/webp")
+
 
 def load_gltf(path: str | Path) -> Scene:
     """Return the scene of a .glb or .gltf file, in meters, y up.
@@ -39,20 +69,23 @@ def load_gltf(path: str | Path) -> Scene:
     Raises
     ------
     InvalidFile
-        If the file is invalid (see `read_parts`), has positions that are not finite, or
-        is larger than `MAX_EXTENT_M`.
+        If the file does not exist, is not glTF 2, requires unknown extensions, is
+        damaged, has no triangles, has positions that are not finite, or is too large.
+
+    Notes
+    -----
+    Transparency is not supported: parts that are blended with an opacity below
+    `LEAST_WEIGHT_RATIO` are left out, and all others are opaque. Skins, morph targets
+    and animations are ignored.
     """
     path = Path(path)
     batches, corners_m = [], []
     with np.errstate(over="ignore", invalid="ignore"):  # positions that are not finite
-        for part in read_parts(
-            path
-        ):  # one at a time: a batch takes a sixth of a part's memory
-            for mesh in _meshes(part):
-                low_m, high_m = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
-                corners_m += [low_m, high_m]
-                textures = {} if part.texture is None else {mesh.texture: part.texture}
-                batches.append(finished(mesh, light_on(mesh.normals), textures))
+        # One mesh at a time: a batch takes a sixth of its memory.
+        for mesh, texture in _meshes(Container(path)):
+            corners_m += [mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)]
+            textures = {} if texture is None else {mesh.texture: texture}
+            batches.append(finished(mesh, light_on(mesh.normals), textures))
         extent_m = float(np.linalg.norm(np.ptp(corners_m, axis=0)))
     if not extent_m <= MAX_EXTENT_M:
         allowed = f"at most {MAX_EXTENT_M:g} m"
@@ -106,125 +139,13 @@ def _merged(batches: list[Batch]) -> Batch:
     )
 
 
-def _meshes(part: Part) -> Iterator[Mesh]:
-    """Yield a part as meshes in the world frame, with normals as glTF specifies."""
-    for start in range(0, len(part.faces), PIECE_TRIANGLES):
-        faces = part.faces[start : start + PIECE_TRIANGLES]
-        is_whole = len(faces) == len(part.faces)
-        used = np.arange(len(part.vertices_m))
-        if part.normals is None:  # flat faces share no vertices
-            used, faces = faces.ravel(), np.arange(faces.size).reshape(-1, 3)
-        elif not is_whole:
-            is_used = np.zeros(len(used), bool)
-            is_used[faces] = True
-            used, faces = np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[faces]
-        yield _mesh(part, used, faces)
-
-
-def _mesh(part: Part, used: NDArray[np.int64], faces: NDArray[np.int64]) -> Mesh:
-    """Return a mesh of some triangles and the vertices that they use."""
-    vertices_m = part.vertices_m[used].astype(float)
-    albedo = part.reflectance_ratio[used]
-    uv = np.zeros((len(used), 2)) if part.uv is None else part.uv[used].astype(float)
-    if part.normals is None:
-        a, b, c = (vertices_m[k::3] for k in range(3))
-        normals = np.cross(b - a, c - a)
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        normals = np.repeat(normals / np.maximum(length, 1e-12), 3, axis=0)
-    else:
-        normals = part.normals[used].astype(float)
-    dark = np.zeros_like(albedo)
-    mesh = Mesh(
-        vertices_m=vertices_m,
-        normals=normals,
-        faces=faces,
-        albedo=dark if part.is_unlit else albedo,
-        emission=albedo if part.is_unlit else dark,
-        translucency=np.zeros(len(normals)),
-        uv=uv,
-        texture="" if part.texture is None else str(id(part.texture)),
-    )
-    return transformed(mesh, part.world_from_part)
-
-
 # Triangles and appearance of each part.  The contents of a file are counted before any
 # are copied: a file may place one mesh a thousand times, or contain an image of a
 # gigabyte.
 
-MAX_TRIANGLES = 2_000_000
-MAX_VERTICES = 6_000_000
-"""Placed vertices, three for each triangle without normals. Each takes 32 bytes; two
-million triangles take 3 to 5 s."""
 
-MAX_DRAWS = 15_000
-"""Parts placed by nodes; each takes 0.25 ms."""
-
-MAX_TEXTURE_PIXELS = 1 << 26
-"""Total pixels of all textures; each takes three bytes."""
-
-LEAST_VOLUME_RATIO = 1e-30
-"""A node that scales volumes by less is treated as not invertible."""
-
-LEAST_WEIGHT_RATIO = 0.5
-"""Parts that are blended with less opacity are left out."""
-
-_TRIANGLES, _STRIP = 4, 5
-_KNOWN_EXTENSIONS = ("KHR_materials_", "KHR_lights_", "EXT_texture_webp")
-"""Prefixes of required extensions that this reader ignores."""
-
-_PICTURES = ("", "image/png", "image/jpeg", "image/webp")
-
-
-@dataclass(frozen=True)
-class Part:
-    """A primitive of a mesh, placed by a node of the file.
-
-    Attributes
-    ----------
-    world_from_part : (4, 4) array
-        Transformation to the world frame.
-    vertices_m : (n, 3) array
-        Positions as stored.
-    faces : (m, 3) array
-        Vertex indices of the triangles.
-    normals : (n, 3) array or None
-        Normals as stored, if the file has any.
-    uv : (n, 2) array or None
-        Texture coordinates, v up.
-    reflectance_ratio : (n, 3) array
-        Linear color factor, without the texture.
-    texture : (h, w, 3) uint8 or None
-        sRGB; parts may share a texture.
-    is_unlit : bool
-        Whether the color is independent of the light.
-    """
-
-    world_from_part: Array
-    vertices_m: NDArray[np.float32]
-    faces: NDArray[np.int64]
-    normals: NDArray[np.float32] | None
-    uv: NDArray[np.float32] | None
-    reflectance_ratio: Array
-    texture: NDArray[np.uint8] | None
-    is_unlit: bool
-
-
-def read_parts(path: Path) -> Iterator[Part]:
-    """Yield the triangles of a .glb or .gltf file, part by part.
-
-    Raises
-    ------
-    InvalidFile
-        If the file does not exist, is not glTF 2, requires unknown extensions, is
-        damaged, has no triangles, or is too large.
-
-    Notes
-    -----
-    Transparency is not supported: parts that are blended with an opacity below
-    `LEAST_WEIGHT_RATIO` are left out, and all others are opaque. Skins, morph targets
-    and animations are ignored.
-    """
-    file = Container(path)
+def _meshes(file: Container) -> Iterator[tuple[Mesh, NDArray[np.uint8] | None]]:
+    """Yield the triangles of a file with their textures, piece by piece."""
     required = file.header.get("extensionsRequired", [])
     for name in required if isinstance(required, list) else [required]:
         if not isinstance(name, str) or not name.startswith(_KNOWN_EXTENSIONS):
@@ -237,14 +158,20 @@ def read_parts(path: Path) -> Iterator[Part]:
             file.refuse(f"more than {MAX_DRAWS:,} parts", f"at most {MAX_DRAWS:,}")
     _check_counts(file, [primitive for _, primitive in placed])
     textures = _Textures(file)
-    materials = [_material(file, primitive) for _, primitive in placed]
+    materials = [
+        {}
+        if primitive.get("material") is None
+        else file.entry("materials", primitive["material"])
+        for _, primitive in placed
+    ]
     textures.check(materials)
     n_parts = 0
     for (matrix, primitive), material in zip(placed, materials, strict=True):
-        if not _is_shown(file, material):
+        factor = _factor(file, material)
+        if material.get("alphaMode") == "BLEND" and factor[3] < LEAST_WEIGHT_RATIO:
             continue
         n_parts += 1
-        yield _part(file, matrix, primitive, material, textures)
+        yield from _pieces(file, matrix, primitive, material, textures)
     if not n_parts:
         file.refuse("no triangles to show")
 
@@ -274,24 +201,17 @@ def _triangle_count(file: Container, primitive: dict[str, Any]) -> int:
 
 def _check_counts(file: Container, primitives: list[dict[str, Any]]) -> None:
     """Reject counts above the limits; a primitive counts once per placement."""
-    counts = {id(p): _triangle_count(file, p) for p in primitives}
-    n_triangles = sum(counts[id(p)] for p in primitives)
+    n_triangles = sum(_triangle_count(file, p) for p in primitives)
     if n_triangles > MAX_TRIANGLES:
         file.refuse(f"{n_triangles:,} triangles", f"at most {MAX_TRIANGLES:,}")
-    counts = {
-        id(p): accessor_count(file, p["attributes"].get("POSITION"))
+    n_vertices = sum(
+        accessor_count(file, p["attributes"].get("POSITION"))
         if "NORMAL" in p["attributes"]
-        else 3 * counts[id(p)]
+        else 3 * _triangle_count(file, p)
         for p in primitives
-    }
-    n_vertices = sum(counts[id(p)] for p in primitives)
+    )
     if n_vertices > MAX_VERTICES:
         file.refuse(f"{n_vertices:,} vertices", f"at most {MAX_VERTICES:,}")
-
-
-def _material(file: Container, primitive: dict[str, Any]) -> dict[str, Any]:
-    index = primitive.get("material")
-    return {} if index is None else file.entry("materials", index)
 
 
 def _object(file: Container, entry: dict[str, Any], field: str) -> dict[str, Any]:
@@ -304,28 +224,23 @@ def _object(file: Container, entry: dict[str, Any], field: str) -> dict[str, Any
 def _factor(file: Container, material: dict[str, Any]) -> Array:
     surface = _object(file, material, "pbrMetallicRoughness")
     given = surface.get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])
-    is_four = isinstance(given, list) and len(given) == 4
-    if not is_four or not all(type(v) in (int, float) for v in given):
+    if not file.are_numbers(given, 4):
         file.refuse("damaged: a baseColorFactor", "four numbers")
     return np.array(given, float)
 
 
-def _is_shown(file: Container, material: dict[str, Any]) -> bool:
-    weight = _factor(file, material)[3]
-    return material.get("alphaMode") != "BLEND" or weight >= LEAST_WEIGHT_RATIO
-
-
-def _part(
+def _pieces(
     file: Container,
-    matrix: Array,
+    world_from_part: Array,
     primitive: dict[str, Any],
     material: dict[str, Any],
     textures: _Textures,
-) -> Part:
+) -> Iterator[tuple[Mesh, NDArray[np.uint8] | None]]:
+    """Yield a part in the world frame, with normals as glTF specifies."""
     attributes = primitive["attributes"]
     vertices_m = _columns(file, attributes, "POSITION", 3, kinds="f")
     n = len(vertices_m)
-    normals = uv = None
+    normals = uv = texture = None
     if "NORMAL" in attributes:
         normals = _columns(file, attributes, "NORMAL", 3, kinds="f", count=n)
         if not np.ptp(normals) > 0.0:
@@ -333,16 +248,40 @@ def _part(
     if "TEXCOORD_0" in attributes:
         uv = _columns(file, attributes, "TEXCOORD_0", 2, kinds="fu", count=n)
         uv = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
-    return Part(
-        world_from_part=matrix,
-        vertices_m=vertices_m,
-        faces=_faces(file, primitive, n),
-        normals=normals,
-        uv=uv,
-        reflectance_ratio=_reflectance(file, material, attributes, n),
-        texture=None if uv is None else textures.of(material),
-        is_unlit="KHR_materials_unlit" in _object(file, material, "extensions"),
-    )
+    corners = _faces(file, primitive, n)
+    reflectance_ratio = _reflectance(file, material, attributes, n)
+    if uv is not None:
+        texture = textures.of(material)
+    is_unlit = "KHR_materials_unlit" in _object(file, material, "extensions")
+    for start in range(0, len(corners), PIECE_TRIANGLES):
+        faces = corners[start : start + PIECE_TRIANGLES]
+        used = np.arange(n)
+        if normals is None:  # flat faces share no vertices
+            used, faces = faces.ravel(), np.arange(faces.size).reshape(-1, 3)
+        elif len(faces) < len(corners):
+            is_used = np.zeros(n, bool)
+            is_used[faces] = True
+            used, faces = np.flatnonzero(is_used), (np.cumsum(is_used) - 1)[faces]
+        points_m = vertices_m[used].astype(float)
+        color = reflectance_ratio[used]
+        dark = np.zeros_like(color)
+        mesh = Mesh(
+            vertices_m=points_m,
+            normals=_flat(points_m) if normals is None else normals[used].astype(float),
+            faces=faces,
+            albedo=dark if is_unlit else color,
+            emission=color if is_unlit else dark,
+            translucency=np.zeros(len(used)),
+            uv=np.zeros((len(used), 2)) if uv is None else uv[used].astype(float),
+            texture="" if texture is None else str(id(texture)),
+        )
+        yield transformed(mesh, world_from_part), texture
+
+
+def _flat(vertices_m: Array) -> Array:
+    """Return the normals of triangles that share no vertices."""
+    a, b, c = (vertices_m[k::3] for k in range(3))
+    return np.repeat(unit(np.cross(b - a, c - a)), 3, axis=0)
 
 
 def _columns(
@@ -369,13 +308,12 @@ def _reflectance(
 ) -> Array:
     """Return the linear color factor (n, 3) of each vertex."""
     factor = _factor(file, material)[:3]
-    if "COLOR_0" not in attributes:
-        return np.broadcast_to(factor, (n, 3))
-    colors = accessor_array(file, attributes["COLOR_0"], kinds="fu")
-    if len(colors) != n or colors.shape[1] < 3:
-        return np.broadcast_to(factor, (n, 3))
-    top = np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1.0
-    return factor * (np.asarray(colors, float)[:, :3] / top)
+    if "COLOR_0" in attributes:
+        colors = accessor_array(file, attributes["COLOR_0"], kinds="fu")
+        if len(colors) == n and colors.shape[1] >= 3:
+            top = np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1.0
+            return factor * (np.asarray(colors, float)[:, :3] / top)
+    return np.broadcast_to(factor, (n, 3))
 
 
 def _faces(
@@ -457,7 +395,13 @@ class _Textures:
 MAX_NODE_DEPTH = 1000
 """Nesting depth of nodes: a skeleton has about 20, and a chain of links about 100."""
 
-_SIZES = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
+_TRANSFORMATIONS = {
+    "matrix": np.eye(4).ravel(),
+    "translation": np.zeros(3),
+    "rotation": np.array([0.0, 0.0, 0.0, 1.0]),
+    "scale": np.ones(3),
+}
+"""Default of each part of a node's transformation."""
 
 
 def placed_meshes(file: Container) -> Iterator[tuple[Array, int]]:
@@ -476,8 +420,7 @@ def placed_meshes(file: Container) -> Iterator[tuple[Array, int]]:
     scene = file.entry("scenes", file.header.get("scene", 0))
     nodes = file.list_of("nodes")
     seen: set[int] = set()
-    origin = np.eye(4)
-    waiting = [(k, origin, 1) for k in reversed(_numbers(file, scene, "nodes"))]
+    waiting = [(k, np.eye(4), 1) for k in reversed(_numbers(file, scene, "nodes"))]
     while waiting:
         k, world_from_parent, depth = waiting.pop()
         if not 0 <= k < len(nodes):
@@ -485,8 +428,9 @@ def placed_meshes(file: Container) -> Iterator[tuple[Array, int]]:
         if k in seen:
             file.refuse(f"damaged: node {k} occurs twice in the tree", "once")
         if depth > MAX_NODE_DEPTH:
-            found_text = f"nodes more than {MAX_NODE_DEPTH} deep"
-            file.refuse(found_text, f"at most {MAX_NODE_DEPTH}")
+            file.refuse(
+                f"nodes more than {MAX_NODE_DEPTH} deep", f"at most {MAX_NODE_DEPTH}"
+            )
         seen.add(k)
         node = nodes[k]
         with np.errstate(all="ignore"):
@@ -512,25 +456,15 @@ def _numbers(file: Container, entry: dict[str, Any], field: str) -> list[int]:
 def _local(file: Container, node: dict[str, Any], k: int) -> Array:
     """Return the matrix (4, 4) from a node's frame to its parent's."""
     values: dict[str, Array] = {}
-    for name, size in _SIZES.items():
+    for name, usual in _TRANSFORMATIONS.items():
         given = node.get(name)
-        if given is None:
-            continue
-        is_list = isinstance(given, list) and len(given) == size
-        if not is_list or not all(type(v) in (int, float) for v in given):
-            file.refuse(f"damaged: nodes[{k}].{name}", f"{size} numbers")
-        values[name] = np.array(given, float)
-    matrix = np.eye(4)
-    if "matrix" in values:
-        matrix = values["matrix"].reshape(4, 4).T
-    if "translation" in values:
-        moved = np.eye(4)
-        moved[:3, 3] = values["translation"]
-        matrix = matrix @ moved
-    if "rotation" in values:
-        length = np.linalg.norm(values["rotation"])
-        if length > np.finfo(float).tiny:
-            matrix[:3, :3] = matrix[:3, :3] @ rotation_of(values["rotation"] / length)
-    if "scale" in values:
-        matrix = matrix @ np.diag([*values["scale"], 1.0])
-    return matrix
+        if given is not None and not file.are_numbers(given, usual.size):
+            file.refuse(f"damaged: nodes[{k}].{name}", f"{usual.size} numbers")
+        values[name] = usual if given is None else np.array(given, float)
+    moved = np.eye(4)
+    moved[:3, 3] = values["translation"]
+    matrix = values["matrix"].reshape(4, 4).T @ moved
+    length = np.linalg.norm(values["rotation"])
+    if length > np.finfo(float).tiny:
+        matrix[:3, :3] = matrix[:3, :3] @ rotation_of(values["rotation"] / length)
+    return matrix @ np.diag([*values["scale"], 1.0])

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import json
+import os
 import signal
 import subprocess
 import sys
@@ -11,13 +14,12 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from clients.commands.options import read_profile, with_options
 from clients.headset.options import EyeOptions, profiles_of, settings_of
-from clients.openxr_layer import manifest
 from clients.openxr_layer.helper import USUAL_AGE_MS, Eyes, HelperOptions, LayerHelper
 from clients.openxr_layer.wire import SOCKET_VARIABLE, ask, socket_path
 from estimator import ProfileError, parse_profile
@@ -39,6 +41,14 @@ CHECK_S = 0.25
 
 STOP_S = 5.0
 MAX_WAIT_MS = 600_000
+
+LAYER_NAME = "XR_APILAYER_ocufilter_eye"
+OFF_VARIABLE = "DISABLE_XR_APILAYER_OCUFILTER_EYE"
+LIBRARY_VARIABLE = "OCUFILTER_LAYER_LIBRARY"
+ENTRY_POINT = "xrNegotiateLoaderApiLayerInterface"
+HEADERS = "libopenxr-dev libgl-dev libegl-dev libx11-dev"
+
+Kind = Literal["explicit", "implicit"]
 
 
 def say(line: str) -> None:
@@ -201,13 +211,11 @@ def run(
     if not program:
         raise ValueError("there is no program; put it after --")
     _checked(options)
-    library = _library()
+    path = _library()
     ending = _Ending()
     with _helper(options) as (helper, eyes), tempfile.TemporaryDirectory() as folder:
-        (Path(folder) / f"{manifest.NAME}.json").write_text(
-            manifest.manifest("explicit")
-        )
-        environment = manifest.layered_environment(Path(folder)) | {
+        (Path(folder) / f"{LAYER_NAME}.json").write_text(manifest("explicit"))
+        environment = layered_environment(Path(folder)) | {
             SOCKET_VARIABLE: str(options.socket_file.resolve())
         }
         process = subprocess.Popen(program, env=environment)
@@ -223,7 +231,7 @@ def run(
         _print_report(helper, json_output)
     if helper.n_frames == 0 and not ending.signal:
         say(
-            f"no frame arrived: {program[0]} did not load the layer {library}, or has "
+            f"no frame arrived: {program[0]} did not load the layer {path}, or has "
             "not submitted frames that can be filtered"
         )
     code = process.returncode
@@ -254,8 +262,8 @@ def _library() -> Path:
         If it was not built.  The message says what is missing.
     """
     try:
-        return manifest.library()
-    except manifest.NoLayer as error:
+        return library()
+    except NoLayer as error:
         raise CommandFailed(str(error)) from None
 
 
@@ -298,7 +306,7 @@ def install(
         typer.Option(
             "--implicit",
             help="Load it into all OpenXR programs of this user, unless the variable "
-            f"{manifest.OFF_VARIABLE} is set.",
+            f"{OFF_VARIABLE} is set.",
         ),
     ] = False,
 ) -> None:
@@ -307,17 +315,17 @@ def install(
     ocufilter layer install --implicit
     """
     _library()
-    kind: manifest.Kind = "implicit" if implicit else "explicit"
-    text = manifest.manifest(kind)
+    kind: Kind = "implicit" if implicit else "explicit"
+    text = manifest(kind)
     _remove_all()
-    path = manifest.manifest_path(kind)
+    path = manifest_path(kind)
     path.parent.mkdir(parents=True, exist_ok=True)
     replace_atomically(path, lambda part: part.write_text(text))
     say(f"wrote {path}")
     if implicit:
-        say(f"all OpenXR programs load it, except with {manifest.OFF_VARIABLE}=1")
+        say(f"all OpenXR programs load it, except with {OFF_VARIABLE}=1")
     else:
-        say(f"to enable it for a program: XR_ENABLE_API_LAYERS={manifest.NAME}")
+        say(f"to enable it for a program: XR_ENABLE_API_LAYERS={LAYER_NAME}")
     say("frames are filtered while `ocufilter layer serve` runs")
 
 
@@ -350,8 +358,8 @@ def status(socket: Socket = None, json_output: Json = False) -> None:
         "helper": None,
     }
     try:
-        found["layer"] = str(manifest.library())
-    except manifest.NoLayer as error:
+        found["layer"] = str(library())
+    except NoLayer as error:
         found["error"] = str(error)
     with contextlib.suppress(OSError):
         found["helper"] = ask(socket, {})
@@ -370,8 +378,8 @@ def status(socket: Socket = None, json_output: Json = False) -> None:
 
 
 def _installed() -> list[Path]:
-    kinds: tuple[manifest.Kind, ...] = ("explicit", "implicit")
-    return [path for path in map(manifest.manifest_path, kinds) if path.exists()]
+    kinds: tuple[Kind, ...] = ("explicit", "implicit")
+    return [path for path in map(manifest_path, kinds) if path.exists()]
 
 
 def _remove_all() -> list[Path]:
@@ -379,3 +387,101 @@ def _remove_all() -> list[Path]:
     for path in found:
         path.unlink()
     return found
+
+
+# Library and manifest, by which the loader of OpenXR finds the layer.  It reads
+# explicit layers, which a program's environment names, and implicit ones, which it
+# loads into all programs unless their environment forbids it.
+
+
+class NoLayer(Exception):
+    """The layer's library is missing or cannot be loaded."""
+
+
+def library() -> Path:
+    """Return the path of the layer's library.
+
+    Raises
+    ------
+    NoLayer
+        If it was not built, or cannot be loaded.
+    """
+    given = os.environ.get(LIBRARY_VARIABLE)
+    path = Path(given) if given else Path(__file__).with_name("_layer.so")
+    if not path.is_file():
+        raise NoLayer(
+            "the layer was not built; it requires Linux, a C compiler and the headers "
+            f"of OpenXR, OpenGL and X11 (Debian: apt install gcc {HEADERS}); then "
+            "install ocufilter again"
+        )
+    try:
+        getattr(ctypes.CDLL(str(path)), ENTRY_POINT)
+    except (OSError, AttributeError) as error:
+        raise NoLayer(f"{path} is not a layer for this machine: {error}") from None
+    return path.resolve()
+
+
+def manifest(kind: Kind) -> str:
+    """Return the manifest of the layer, JSON."""
+    found = {
+        "file_format_version": "1.0.0",
+        "api_layer": {
+            "name": LAYER_NAME,
+            "library_path": str(library()),
+            "api_version": "1.1",
+            "implementation_version": "1",
+            "description": "Shows each frame as a simulated eye would see it",
+            # For runtimes without depth, where the layer removes it.
+            "instance_extensions": [
+                {
+                    "name": "XR_KHR_composition_layer_depth",
+                    "extension_version": "6",
+                    "entrypoints": [],
+                }
+            ],
+            **({"disable_environment": OFF_VARIABLE} if kind == "implicit" else {}),
+        },
+    }
+    return json.dumps(found, indent=2) + "\n"
+
+
+def folder(kind: Kind) -> Path:
+    """Return the user's folder of manifests."""
+    data = os.environ.get("XDG_DATA_HOME") or str(Path.home() / ".local/share")
+    return Path(data) / "openxr/1/api_layers" / f"{kind}.d"
+
+
+def manifest_path(kind: Kind) -> Path:
+    """Return the path of the installed manifest."""
+    return folder(kind) / f"{LAYER_NAME}.json"
+
+
+def search_path(own: Path) -> str:
+    """Return a value of XR_API_LAYER_PATH with another folder.
+
+    The variable replaces the loader's own folders, which are therefore named as well.
+    """
+    given = os.environ.get("XR_API_LAYER_PATH")
+    if given:
+        return os.pathsep.join((str(own), given))
+    settings = os.environ.get("XDG_CONFIG_DIRS") or "/etc/xdg"
+    data = os.environ.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share"
+    system = [*settings.split(":"), "/etc", *data.split(":")]
+    folders = [Path(base) / "openxr/1/api_layers/explicit.d" for base in system]
+    return os.pathsep.join(map(str, (own, folder("explicit"), *folders)))
+
+
+def layered_environment(own: Path) -> dict[str, str]:
+    """Return the environment of a program with the layer, next to the program.
+
+    Parameters
+    ----------
+    own : Path
+        Folder that contains the manifest.
+    """
+    others = os.environ.get("XR_ENABLE_API_LAYERS")
+    return {
+        **os.environ,
+        "XR_API_LAYER_PATH": search_path(own),
+        "XR_ENABLE_API_LAYERS": os.pathsep.join(filter(None, (LAYER_NAME, others))),
+    }

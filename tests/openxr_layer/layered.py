@@ -5,7 +5,7 @@ from unittest import mock
 
 from clients.headset.stereo_filter import FilteredStereoFrame, LocalFilter
 from clients.headset.stereo_gaze import StereoGaze
-from clients.openxr_layer import manifest
+from clients.openxr_layer import program
 from clients.openxr_layer.wire import SOCKET_VARIABLE
 
 LAYER_LINE = "ocufilter layer: "
@@ -24,10 +24,10 @@ def layer_environment(library, folder, socket_path):
         The helper's socket.
     """
     # A library with a sanitizer loads only into programs with the sanitizer.
-    with mock.patch.object(manifest, "library", return_value=library):
-        text = manifest.manifest("explicit")
-    (folder / f"{manifest.NAME}.json").write_text(text)
-    return manifest.layered_environment(folder) | {SOCKET_VARIABLE: str(socket_path)}
+    with mock.patch.object(program, "library", return_value=library):
+        text = program.manifest("explicit")
+    (folder / f"{program.LAYER_NAME}.json").write_text(text)
+    return program.layered_environment(folder) | {SOCKET_VARIABLE: str(socket_path)}
 
 
 def layer_lines(run):

@@ -12,7 +12,7 @@ import time
 import numpy as np
 import pytest
 
-from clients.openxr_layer import manifest
+from clients.openxr_layer.program import LAYER_NAME, LIBRARY_VARIABLE, OFF_VARIABLE
 from clients.openxr_layer.wire import SOCKET_VARIABLE
 from tests.commands import run_command
 from tests.end_to_end.layer_double import RunningHelper
@@ -478,11 +478,11 @@ def test_handles_of_several_sessions(watched, tmp_path):
 def test_the_loader_finds_the_installed_layer(
     layer, runtime, driver, tmp_path, monkeypatch, kind
 ):
-    monkeypatch.setenv(manifest.LIBRARY_VARIABLE, str(layer))
+    monkeypatch.setenv(LIBRARY_VARIABLE, str(layer))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     options = ["--implicit"] if kind == "implicit" else []
     assert run_command("layer", "install", *options).returncode == 0
-    enabled = {"XR_ENABLE_API_LAYERS": manifest.NAME}
+    enabled = {"XR_ENABLE_API_LAYERS": LAYER_NAME}
     variables = enabled if kind == "explicit" else {}
     socket = {SOCKET_VARIABLE: str(tmp_path / "layer.sock")}
 
@@ -495,7 +495,7 @@ def test_the_loader_finds_the_installed_layer(
 
     assert lines() == ["no helper is connected; trying again every second"]
     if kind == "implicit":
-        assert lines(**{manifest.OFF_VARIABLE: "1"}) == []
+        assert lines(**{OFF_VARIABLE: "1"}) == []
     assert run_command("layer", "remove").returncode == 0
     variables = {}
     assert lines() == []

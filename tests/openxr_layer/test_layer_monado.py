@@ -12,7 +12,7 @@ import time
 import numpy as np
 import pytest
 
-from clients.openxr_layer import manifest
+from clients.openxr_layer.program import LIBRARY_VARIABLE
 from tests.headset.monado import Monado
 from tests.headset.rooms import stripes
 
@@ -87,7 +87,7 @@ def run(layer, tmp_path):
     """Return how to run a program with the layer."""
 
     def started(monado, *arguments, **variables):
-        own = {manifest.LIBRARY_VARIABLE: str(layer)}
+        own = {LIBRARY_VARIABLE: str(layer)}
         return Run(tmp_path, monado.environment | own | variables, *arguments)
 
     return started
@@ -153,7 +153,7 @@ def test_profiles_change_while_frames_are_filtered(run, display, tmp_path):
             program.wait_until(lambda said: said.count("eye: ready") >= 2)
             status = subprocess.run(
                 [*command, "status", *socket, "--json"],
-                env=os.environ | {manifest.LIBRARY_VARIABLE: "none"},
+                env=os.environ | {LIBRARY_VARIABLE: "none"},
                 capture_output=True,
                 text=True,
             )

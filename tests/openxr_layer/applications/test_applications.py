@@ -13,7 +13,7 @@ import time
 import numpy as np
 import pytest
 
-from clients.openxr_layer import manifest
+from clients.openxr_layer.program import LIBRARY_VARIABLE
 from tests.native_build import runtime_of
 from tests.openxr_layer import build
 from tests.openxr_layer.applications.applications import (
@@ -74,7 +74,7 @@ def report_of(output):
 def test_each_eye_sees_as_it_does(application, layer, run_command, tmp_path):
     with Running(application, tmp_path / "plain") as running:
         plain = running.screenshot()
-    library = {manifest.LIBRARY_VARIABLE: str(layer)}
+    library = {LIBRARY_VARIABLE: str(layer)}
     folder = tmp_path / "filtered"
     with Running(application, folder, *run_command, **library) as running:
         running.wait_until(lambda: READY in running.said)
@@ -111,7 +111,7 @@ VALIDATED = [given.name for given in APPLICATIONS if given.name != "qt-egl"]
 
 @each(*VALIDATED)
 def test_validation(application, layer, run_command, tmp_path):
-    library = {manifest.LIBRARY_VARIABLE: str(layer)}
+    library = {LIBRARY_VARIABLE: str(layer)}
     with Running(
         application, tmp_path / "seen", *run_command, is_validated=True, **library
     ) as running:
