@@ -4,7 +4,6 @@ from .errors import BadMessage as BadMessage
 from .errors import FilterError as FilterError
 from .filtering.eye_filter import EyeFilter as EyeFilter
 from .filtering.filtered import Filtered as Filtered
-from .filtering.filtered import FilteredTexture as FilteredTexture
 from .filtering.several_eyes import plan_views as plan_views
 from .filtering.stream_eyes import BuildingEye as BuildingEye
 from .filtering.stream_eyes import EyeFailed as EyeFailed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Protocol, Self, get_args
 
 from msgspec import Meta
 
@@ -74,23 +74,28 @@ class State:
         )
 
 
+class HasState(Protocol):
+    """A result with the state that was used for it."""
+
+    @property
+    def state(self) -> State: ...  # noqa: D102
+
+
 class WithState:
     """Mixin of results: the values of their attribute `state`."""
 
-    state: State
-
     @property
-    def pupil_diameter_mm(self) -> float:
+    def pupil_diameter_mm(self: HasState) -> float:
         """Return the pupil diameter used."""
         return self.state.pupil_diameter_mm
 
     @property
-    def focus_dpt(self) -> float:
+    def focus_dpt(self: HasState) -> float:
         """Return the focus used."""
         return self.state.focus_dpt
 
     @property
-    def gaze_deg(self) -> tuple[float, float]:
+    def gaze_deg(self: HasState) -> tuple[float, float]:
         """Return the gaze used, (h, v)."""
         return self.state.gaze_deg or (0.0, 0.0)
 

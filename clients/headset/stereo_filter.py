@@ -28,7 +28,7 @@ from filter_service import (
     EyeFailed,
     EyeFilter,
     EyeReady,
-    FilteredTexture,
+    Filtered,
     FilterSettings,
     GlTexture,
     RgbdView,
@@ -337,7 +337,7 @@ class LocalFilter(StereoFilter):
         self, frame: StereoFrame, begin_s: float
     ) -> FilteredStereoFrame | None:
         """Submit a frame in textures; the GPU filters it before it is shown."""
-        shown: list[FilteredTexture] = []
+        shown: list[Filtered] = []
         targets = []
         for picture, looking in zip(frame.pictures, frame.eyes, strict=True):
             assert isinstance(picture, TexturePicture)
@@ -388,7 +388,7 @@ class LocalFilter(StereoFilter):
             known = self._targets[eye] = self._context.texture(size_px, 4)
         return known
 
-    def _note(self, picture: Picture, found: FilteredTexture) -> None:
+    def _note(self, picture: Picture, found: Filtered) -> None:
         """Keep what is known of the newest frame that the GPU has finished."""
         self._views[found.number] = picture.view
         if found.earlier is None:

@@ -7,7 +7,6 @@ replaces the previous one.  A *store* is the PSF cache of one eye for one camera
 
 eye_filter        `EyeFilter`: one stream
 planned_frame     a frame whose eye is prepared
-planned_textures  the same, with its images in textures
 several_eyes      `plan_views`: a frame whose views use different eyes
 filtered          `Filtered` frames
 stream_eyes       the profiles of a stream, their stores and events, and its frames

@@ -36,10 +36,9 @@ from filter_service.filtering.stream_eyes import (
     EyeFailed,
     EyeReady,
     PreparedStore,
-    RenderPlan,
     StreamEyes,
 )
-from filter_service.rendering.engine import FrameEngine
+from filter_service.rendering.engine import FrameEngine, LoadedStore
 from filter_service.rendering.sampled_frame import first_frame
 from filter_service.settings import FilterSettings
 from filter_service.view_state import State
@@ -364,11 +363,13 @@ class Builder:
         eye.fraction, eye.stage = fraction, stage
         stream.on_event(BuildingEye(eye, fraction, stage))
 
-    def mark_rendered(self, stream: StreamEyes, plan: RenderPlan) -> None:
-        """Mark the stores that a frame was rendered with as ready."""
-        for prepared in list(plan.eye.stores):
-            if not prepared.is_ready and prepared.store in plan.stores:
-                self._set_ready(stream, plan.eye, prepared)
+    def mark_rendered(
+        self, stream: StreamEyes, eye: AcceptedProfile, store: LoadedStore
+    ) -> None:
+        """Mark the store that a view was rendered with as ready."""
+        for prepared in list(eye.stores):
+            if not prepared.is_ready and prepared.store is store:
+                self._set_ready(stream, eye, prepared)
 
     def _set_ready(
         self, stream: StreamEyes, eye: AcceptedProfile, prepared: PreparedStore

@@ -29,13 +29,8 @@ from filter_service.errors import (
     ServiceTimeout,
 )
 from filter_service.filtering.builder import Builder
-from filter_service.filtering.filtered import Filtered, FilteredTexture
-from filter_service.filtering.planned_frame import PlannedFrame
-from filter_service.filtering.planned_textures import (
-    PlannedTextures,
-    TargetedView,
-    texture_engine,
-)
+from filter_service.filtering.filtered import Filtered
+from filter_service.filtering.planned_frame import PlannedFrame, PlannedView
 from filter_service.filtering.shared_builder import SharedBuilder, shared
 from filter_service.filtering.stream_eyes import (
     AcceptedProfile,
@@ -45,7 +40,6 @@ from filter_service.filtering.stream_eyes import (
     EyeReady,
     PreparedStore,
     Preparing,
-    RenderPlan,
     StreamEyes,
 )
 from filter_service.rgbd_view import ColorImage, RgbdView, as_views
@@ -58,8 +52,9 @@ from filter_service.settings import (
     RenderOptionValues,
     as_settings,
 )
+from filter_service.stage_times import StageTimes
 from filter_service.texture_view import GlTexture, TextureView
-from filter_service.view_state import State
+from filter_service.view_state import EyeName, State
 from filter_service.waiting import Wait
 
 WAIT_SLICE_S = 0.02
@@ -533,6 +528,7 @@ class EyeFilter:
             options=RenderOptions(**options),
             out=out,
             until_s=until_s,
+            times=StageTimes(),
         )
 
     def filter_textures(
@@ -546,7 +542,7 @@ class EyeFilter:
         target_is_top_first: bool | None = None,
         newest_only: bool = False,
         **options: Unpack[RenderOptionValues],
-    ) -> FilteredTexture | Preparing:
+    ) -> Filtered | Preparing:
         """Filter a frame from textures to a texture, all in the caller's context.
 
         This submits the frame to the GPU and does not wait for it, except for the first
@@ -591,50 +587,24 @@ class EyeFilter:
             )
         state = State.checked(pupil_diameter_mm, focus_dpt, gaze_deg)
         self.advance_builds()
-        planned = self.plan_textures([(view, target)], [state], newest_only=newest_only)
+        planned = self.plan([view], [state], newest_only=newest_only)
         if isinstance(planned, Preparing):
             return planned
-        shown = planned.show(
-            0,
+        found = planned.begin(
             options=RenderOptions(**options),
+            out=[target],
             target_is_top_first=target_is_top_first,
-        )
-        assert shown is not None  # as the frame does not wait
-        return FilteredTexture(
-            planned.plan.eye.profile_id,
-            planned.plan.eye.generation,
-            shown.state,
-            shown.number,
-            shown.notes,
-            shown.earlier,
-        )
-
-    def plan_textures(
-        self,
-        views: Sequence[TargetedView],
-        states: Sequence[State],
-        *,
-        newest_only: bool = False,
-    ) -> PlannedTextures | Preparing:
-        """Return views in textures that are ready to be rendered.
-
-        Parameters, errors and lifetime are those of `plan`.
-        """
-        texture_engine(self.builder)
-        plan = self._planned(
-            [view.camera for view, _ in views], newest_only=newest_only
-        )
-        if isinstance(plan, Preparing):
-            return plan
-        return PlannedTextures(
-            self.builder, self._eyes, plan, tuple(views), tuple(states)
-        )
+            times=StageTimes(),
+        )()
+        assert isinstance(found, Filtered)  # as the frame does not wait
+        return found
 
     def plan(
         self,
-        views: Sequence[RgbdView],
+        views: Sequence[RgbdView | TextureView],
         states: Sequence[State],
         *,
+        name: EyeName = "both",
         newest_only: bool = False,
     ) -> PlannedFrame | Preparing:
         """Return a frame that is ready to be rendered, or `Preparing`.
@@ -644,16 +614,18 @@ class EyeFilter:
         one.  Render a plan before the next call of this filter, which may free the
         plan's stores.
         """
-        self._eyes.history.record(views, states[0], at_s=time.monotonic())
-        plan = self._planned([view.camera for view in views], newest_only=newest_only)
-        if isinstance(plan, Preparing):
-            return plan
-        return PlannedFrame(self.builder, self._eyes, plan, tuple(views), tuple(states))
-
-    def _planned(
-        self, cameras: Sequence[Camera], *, newest_only: bool
-    ) -> RenderPlan | Preparing:
-        """Return the eye and the stores of a frame, unless they are being prepared."""
-        plan = self._eyes.plan(cameras, newest_only=newest_only)
+        arrays = [view for view in views if isinstance(view, RgbdView)]
+        if arrays:
+            self._eyes.history.record(arrays, states[0], at_s=time.monotonic())
+        cameras = [view.camera for view in views]
+        found = self._eyes.plan(cameras, newest_only=newest_only)
         self.builder.free_retired(self._eyes)
-        return plan
+        if isinstance(found, Preparing):
+            return found
+        eye, stores = found
+        return PlannedFrame(
+            tuple(
+                PlannedView(self.builder, self._eyes, eye, store, view, state, name)
+                for store, view, state in zip(stores, views, states, strict=True)
+            )
+        )

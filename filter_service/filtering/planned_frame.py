@@ -1,57 +1,112 @@
-"""Rendering of a frame whose eye is ready."""
+"""Rendering of a frame whose eyes are ready."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from numpy.typing import NDArray
 
 from filter_service.filtering.builder import Builder
-from filter_service.filtering.filtered import Filtered, ViewResult, summed_times
-from filter_service.filtering.stream_eyes import Preparing, RenderPlan, StreamEyes
-from filter_service.rendering.engine import Pending, ViewRequest
-from filter_service.rendering.filtered_view import summed_counts
+from filter_service.filtering.filtered import Filtered
+from filter_service.filtering.stream_eyes import (
+    AcceptedProfile,
+    Preparing,
+    StreamEyes,
+)
+from filter_service.rendering.engine import (
+    LoadedStore,
+    Pending,
+    ViewRequest,
+    ViewResult,
+)
 from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rendering.media_effects import begin_through_media
+from filter_service.rendering.sampled_frame import SampledView
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
-from filter_service.view_state import State
+from filter_service.stage_times import StageTimes
+from filter_service.texture_view import GlTexture, TextureView
+from filter_service.view_state import EyeName, State
+
+
+@dataclass(frozen=True)
+class PlannedView:
+    """A view, and the eye, the state and the store that it is rendered with."""
+
+    builder: Builder  # the filter may be closed during the frame
+    stream: StreamEyes
+    eye: AcceptedProfile
+    store: LoadedStore
+    view: RgbdView | TextureView
+    state: State
+    name: EyeName
+
+    def begin(self, **values: Any) -> Pending:
+        """Start rendering; ``values`` are fields of `ViewRequest`."""
+        options = self.eye.settings.frame_options(values.pop("options"))
+        request = ViewRequest(
+            self.view, self.store, self.state, options=options, **values
+        )
+        engine, effects = self.builder.engine, self.eye.media_effects
+        return begin_through_media(engine, request, effects)
+
+    def finish(self, begun: Pending, started_s: float) -> ViewResult | None:
+        """Wait for the view; return None if PSFs are missing."""
+        found = begun()
+        if isinstance(found, MissingPsfs):
+            return None
+        self.builder.mark_rendered(self.stream, self.eye, self.store)
+        earlier, camera = found.earlier, self.view.camera
+        if earlier is not None:
+            self.stream.history.record_sampled(
+                lambda: (SampledView.of_samples(camera, earlier.sampled),),
+                self.state,
+                at_s=started_s,
+            )
+        return replace(
+            found,
+            eye=self.name,
+            profile_id=self.eye.profile_id,
+            generation=self.eye.generation,
+        )
 
 
 @dataclass(frozen=True)
 class PlannedFrame:
-    """Views of one eye, their states, and the stores that render them."""
+    """A frame whose eyes are ready: its views, in order."""
 
-    builder: Builder  # the filter may be closed during the frame
-    stream: StreamEyes
-    plan: RenderPlan
-    views: tuple[RgbdView, ...]
-    states: tuple[State, ...]
+    views: tuple[PlannedView, ...]
 
     def render(
         self,
         *,
         output: Output = "srgb8",
         options: RenderOptions = DEFAULT_OPTIONS,
-        out: Sequence[NDArray[Any] | None] | None = None,
+        out: Sequence[NDArray[Any] | GlTexture | None] | None = None,
         until_s: float | None = None,
+        times: StageTimes | None = None,
     ) -> Filtered | Preparing:
-        """Filter the frame; `EyeFilter.filter` describes the other parameters.
+        """Filter the frame; start all views before waiting for one.
 
         Parameters
         ----------
-        out : sequence of arrays, optional
-            Output arrays that may be used; only the returned arrays are valid.
+        output, options
+            As for `EyeFilter.filter`.
+        out : sequence of arrays or GlTexture, optional
+            Output arrays that may be used; only the returned arrays are valid.  Views
+            in textures require the textures for their images.
         until_s : float, optional
             Time of `time.monotonic` after which no more PSFs are computed.
+        times : StageTimes, optional
+            Receives the times of the frame's stages.
 
         Returns
         -------
         Filtered or Preparing
-            The latter if PSFs were not computed by ``until_s``.
+            The latter if PSFs that the frame needs were not computed by ``until_s``.
 
         Raises
         ------
@@ -63,87 +118,54 @@ class PlannedFrame:
             options=options,
             out=out,
             until_s=until_s,
+            times=times or StageTimes(),
+            waits=True,
         )()
 
     def begin(
         self,
         *,
-        options: RenderOptions = DEFAULT_OPTIONS,
-        out: Sequence[NDArray[Any] | None] | None = None,
+        out: Sequence[NDArray[Any] | GlTexture | None] | None = None,
         **values: Any,
     ) -> Callable[[], Filtered | Preparing]:
         """Start rendering; return a function that waits for the result.
 
-        The parameters are those of `render`.  Frames of other eyes may be started
-        before this one is finished.
+        Other values are fields of `ViewRequest`.
         """
-        plan = self.plan
-        arrays = out or [None] * len(self.views)
         started_s = time.monotonic()
-        effects = plan.eye.media_effects
-        options = plan.eye.settings.frame_options(options)
+        outs = out or [None] * len(self.views)
         begun = [
-            begin_through_media(
-                self.builder.engine,
-                ViewRequest(
-                    view,
-                    store,
-                    state,
-                    options=options,
-                    out=array,
-                    **values,
-                ),
-                effects,
-            )
-            for view, store, state, array in zip(
-                self.views, plan.stores, self.states, arrays, strict=True
-            )
+            view.begin(out=own, **values)
+            for view, own in zip(self.views, outs, strict=True)
         ]
         return _BegunFrame(self, begun, started_s)
 
-    def finish(
-        self, begun: Sequence[Pending], started_s: float
-    ) -> Filtered | Preparing:
-        """Wait for the views and return the result."""
-        rendered = []
-        for finish in begun:
-            view = finish()
-            if isinstance(view, MissingPsfs):
-                return Preparing("extending", stage="psfs")
-            rendered.append(view)
-        self.builder.frame_s = time.monotonic() - started_s
-        self.builder.mark_rendered(self.stream, self.plan)
-        eye = self.plan.eye
-        return Filtered(
-            views=tuple(
-                ViewResult(
-                    view.color, "both", eye.profile_id, eye.generation, view.state
-                )
-                for view in rendered
-            ),
-            notes=tuple(
-                dict.fromkeys(note for view in rendered for note in view.notes)
-            ),
-            stage_times_ms=summed_times(view.stage_times_ms for view in rendered),
-            **summed_counts(rendered),
-        )
-
 
 class _BegunFrame:
-    """A frame in progress: while it exists, the stores of its stream are kept.
+    """A frame in progress: while it exists, the stores of its streams are kept.
 
-    A caller may drop it instead of calling it, as when another eye's frame has failed.
+    A caller may drop it instead of calling it.
     """
 
     def __init__(
         self, planned: PlannedFrame, begun: Sequence[Pending], started_s: float
     ) -> None:
-        self._planned, self._begun, self._started_s = planned, begun, started_s
-        planned.stream.begun.add(self)
+        self._views, self._begun, self._started_s = planned.views, begun, started_s
+        for view in self._views:
+            view.stream.begun.add(self)
 
     def __call__(self) -> Filtered | Preparing:
         """Wait for the frame."""
         try:
-            return self._planned.finish(self._begun, self._started_s)
+            found = []
+            for view, begun in zip(self._views, self._begun, strict=True):
+                result = view.finish(begun, self._started_s)
+                if result is None:
+                    return Preparing("extending", stage="psfs")
+                found.append(result)
+            for view in self._views:
+                view.builder.frame_s = time.monotonic() - self._started_s
+            return Filtered.of(found)
         finally:
-            self._planned.stream.begun.discard(self)
+            for view in self._views:
+                view.stream.begun.discard(self)

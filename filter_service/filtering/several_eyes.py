@@ -10,74 +10,26 @@ planned = plan_views(eyes.__getitem__, [left, right], states, ...)
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Unpack
-
-from numpy.typing import NDArray
+from collections.abc import Callable, Sequence
 
 from filter_service.errors import BadMessage, NoProfile, SessionError
 from filter_service.filtering.eye_filter import EyeFilter
-from filter_service.filtering.filtered import Filtered
-from filter_service.filtering.planned_frame import PlannedFrame
-from filter_service.filtering.planned_textures import PlannedTextures, TargetedView
+from filter_service.filtering.planned_frame import PlannedFrame, PlannedView
 from filter_service.filtering.stream_eyes import Preparing
 from filter_service.rgbd_view import RgbdView
-from filter_service.settings import (
-    Output,
-    RenderOptions,
-    RenderOptionValues,
-)
+from filter_service.texture_view import TextureView
 from filter_service.view_state import EyeName, State, ViewState, check_states
-
-
-@dataclass(frozen=True)
-class PlannedViews:
-    """A frame whose eyes are all ready."""
-
-    by_eye: Mapping[EyeName, PlannedFrame | PlannedTextures]
-    indices: Mapping[EyeName, tuple[int, ...]]  # indices of their views
-
-    def render(
-        self,
-        *,
-        output: Output = "srgb8",
-        out: Sequence[NDArray[Any] | None] | None = None,
-        until_s: float | None = None,
-        **options: Unpack[RenderOptionValues],
-    ) -> Filtered | Preparing:
-        """Filter the frame; start all eyes before waiting for one.
-
-        Parameters and results are those of `PlannedFrame.render`.
-        """
-        begun = {
-            eye: planned.begin(
-                output=output,
-                options=RenderOptions(**options),
-                out=None if out is None else [out[i] for i in self.indices[eye]],
-                until_s=until_s,
-            )
-            for eye, planned in self.by_eye.items()
-        }
-        found: dict[EyeName, Filtered] = {}
-        for eye, finish in begun.items():
-            seen = finish()
-            if isinstance(seen, Preparing):
-                return seen
-            found[eye] = seen
-        return Filtered.merged(found, self.indices)
 
 
 def plan_views(
     filter_of: Callable[[EyeName], EyeFilter | None],
-    views: Sequence[RgbdView] | Sequence[TargetedView],
+    views: Sequence[RgbdView | TextureView],
     states: Sequence[ViewState],
     *,
     pupil_diameter_mm: float,
     focus_dpt: float,
     gaze_deg: tuple[float, float] | None = None,
-    plan: Callable[..., PlannedFrame | PlannedTextures | Preparing] = EyeFilter.plan,
-) -> PlannedViews | Preparing:
+) -> PlannedFrame | Preparing:
     """Plan a frame for the eyes of its views; all of them must be ready.
 
     All eyes are prepared at the same time.
@@ -86,17 +38,15 @@ def plan_views(
     ----------
     filter_of : callable
         Returns the filter of an eye.
-    views : sequence of RgbdView, or of views in textures
+    views : sequence of RgbdView or TextureView
     states : sequence of ViewState, one for each view
         Values that are None default to those of the frame.
     pupil_diameter_mm, focus_dpt, gaze_deg
         Values of the frame, as for `EyeFilter.try_filter`.
-    plan : callable
-        `EyeFilter.plan`, or `EyeFilter.plan_textures` for views in textures.
 
     Returns
     -------
-    PlannedViews or Preparing
+    PlannedFrame or Preparing
         The latter, which is false, while an eye is being prepared.
 
     Raises
@@ -122,19 +72,16 @@ def plan_views(
         if found is None:
             raise _with_eye_name(NoProfile("there is no filter"), eye, own[0])
         found.advance_builds()
-    planned: dict[EyeName, PlannedFrame | PlannedTextures] = {}
-    found_states = [vars(state.state(of_frame)) for state in states]
-    own_states = [State.checked(**state) for state in found_states]
+    planned: dict[int, PlannedView] = {}
+    own_states = [State.checked(**vars(state.state(of_frame))) for state in states]
     failure: SessionError | None = None
     preparing: Preparing | None = None
     for eye, own in indices.items():
         eye_filter = filter_of(eye)
         assert eye_filter is not None
         try:
-            frame = plan(
-                eye_filter,
-                [views[i] for i in own],
-                [own_states[i] for i in own],
+            frame = eye_filter.plan(
+                [views[i] for i in own], [own_states[i] for i in own], name=eye
             )
         except SessionError as error:
             failure = failure or _with_eye_name(error, eye, own[0])
@@ -142,12 +89,12 @@ def plan_views(
         if isinstance(frame, Preparing):
             preparing = frame
         else:
-            planned[eye] = frame
+            planned |= zip(own, frame.views, strict=True)
     if failure is not None:
         raise failure.with_traceback(None)
     if preparing is not None:
         return preparing
-    return PlannedViews(planned, indices)
+    return PlannedFrame(tuple(planned[i] for i in range(len(views))))
 
 
 def _with_eye_name(error: SessionError, eye: EyeName, view: int) -> SessionError:

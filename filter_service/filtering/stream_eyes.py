@@ -292,14 +292,6 @@ class FrameHistory:
         return found
 
 
-@dataclass(frozen=True)
-class RenderPlan:
-    """The eye that renders a frame, and the store of each view."""
-
-    eye: AcceptedProfile
-    stores: tuple[LoadedStore, ...]
-
-
 class BuildTarget(NamedTuple):
     """An eye and the camera to build it for."""
 
@@ -351,8 +343,8 @@ class StreamEyes:
 
     def plan(
         self, cameras: Sequence[Camera], *, newest_only: bool = False
-    ) -> RenderPlan | Preparing:
-        """Return how to render a frame, or why no eye can render it yet.
+    ) -> tuple[AcceptedProfile, list[LoadedStore]] | Preparing:
+        """Return the eye and the store of each view, or why no eye is ready.
 
         This requests stores of the newest eye for the frame's cameras.  Frames use the
         previous eye until the newest is ready, unless ``newest_only`` is set; then the
@@ -385,7 +377,7 @@ class StreamEyes:
                 self._retire_older()
             if newest_only and eye is not newest:
                 return Preparing("extending", newest.fraction, newest.stage)
-            return RenderPlan(eye, tuple(s.store for s in found[eye.generation]))
+            return eye, [s.store for s in found[eye.generation]]
         for camera in cameras:
             failure = newest.failure_for(camera)
             if failure is not None:

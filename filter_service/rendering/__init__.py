@@ -22,13 +22,10 @@ Terms, in addition to the rendering terms of ``CONVENTIONS.md``:
 
 Modules:
 
-engine           interface of the frame engines
-request_checks   checks of a request against its store
-filtered_view    result of a frame, for all engines
+engine           interface of the frame engines: requests, results, checks
 white_level      reference light for contrast
 perfect_eye      store that changes nothing, for testing engines
 frame            preparation of a view: missing depth, repeated edges
-gaze             gaze of a frame, clamped to the prepared range
 detection        limits of merging by the angle from the gaze
 image_cells      cells of the image that share kernels
 cell_maps        linear maps from their pixels to those of stored kernels

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,10 +12,9 @@ from estimator.psf.tables import N_EDGE
 from filter_service.planning.grid import GREEN
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.bright_pixels import BrightPixels
-from filter_service.rendering.engine import FrameEngine, ViewRequest
+from filter_service.rendering.engine import ViewRequest, clamped_gaze
 from filter_service.rendering.frame_kernels import interval_count
 from filter_service.rendering.frame_states import FrameStore
-from filter_service.rendering.gaze import clamped_gaze
 from filter_service.rendering.image_cells import ImageCells
 
 BLUR_STEP, BLUR_UNIT_PX = 0.05, 10.0
@@ -37,13 +35,6 @@ END_PX = 6.0
 """Estimated distance from the rays of the spot to the end of a kernel."""
 
 
-class _Untimed:
-    """Stage timer of `FrameStates` that does not measure."""
-
-    def wall(self, name: str) -> AbstractContextManager[None]:
-        return nullcontext()
-
-
 @dataclass(frozen=True)
 class EyeAtFrame:
     """A store in one state of the eye.
@@ -51,7 +42,7 @@ class EyeAtFrame:
     Attributes
     ----------
     corner_change_dpt : (rows + 1, columns + 1)
-        See `FrameStates.corner_change_dpt`.
+        See `FrameStore.corner_change_dpt`.
     """
 
     handle: FrameStore
@@ -60,21 +51,14 @@ class EyeAtFrame:
     corner_change_dpt: NDArray[np.float32]
 
     @classmethod
-    def of(cls, engine: FrameEngine, request: ViewRequest) -> EyeAtFrame:
-        """Return the state of a request, from the engine's cache."""
-        handle, timer = request.handle, _Untimed()
-        states = engine.frame_states(handle)
-        layers = states.layers(
-            timer,
-            handle,
-            request.state,
-            request.options,
-        )
+    def of(cls, request: ViewRequest) -> EyeAtFrame:
+        """Return the state of a request, from the store's cache."""
+        handle, timer = request.handle, request.times
+        layers = handle.layers(timer, request.state, request.options)
         gaze_deg, _ = clamped_gaze(handle.store.spec, request.state.gaze_deg)
-        image = states.cells(timer, handle, gaze_deg)
-        return cls(
-            handle, layers, image, states.corner_change_dpt(timer, layers, image)
-        )
+        image = handle.cells(timer, gaze_deg)
+        change_dpt = handle.corner_change_dpt(timer, layers, image)
+        return cls(handle, layers, image, change_dpt)
 
     def cells_at(
         self, x_px: NDArray[Any], y_px: NDArray[Any]

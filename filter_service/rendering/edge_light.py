@@ -26,7 +26,7 @@ from filter_service.constants import RGB
 from filter_service.native import loops
 from filter_service.rendering.bright_pixels import BrightPixels
 from filter_service.rendering.edge_kinds import EdgeElements, EyeAtFrame, SourceKinds
-from filter_service.rendering.engine import FrameEngine, ViewRequest
+from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.frame_kernels import (
     FrameKernels,
     MissingPsfs,
@@ -126,17 +126,15 @@ class EdgeLight:
         self.view = self._dimmed(view)
 
     @classmethod
-    def of(
-        cls, engine: FrameEngine, request: ViewRequest
-    ) -> EdgeLight | MissingPsfs | None:
-        """Return the light of a request in linear light, or None if nothing is bright.
+    def of(cls, request: ViewRequest, view: RgbdView) -> EdgeLight | MissingPsfs | None:
+        """Return the light of a view in linear light, or None if nothing is bright.
 
         It returns missing PSFs like `FrameEngine.begin`.
         """
         white = request.white_level
         if white is None:
             return None
-        pixels = BrightPixels.of(request.view, white)
+        pixels = BrightPixels.of(view, white)
         if pixels is None:
             return None
         store = request.handle.store
@@ -146,15 +144,16 @@ class EdgeLight:
             return None
         if settings.pipeline == "published":  # which ends at its kernels
             return None
-        state = EyeAtFrame.of(engine, request)
-        kinds = SourceKinds.of(state, pixels)
-        used = np.zeros((state.image.count, interval_count(state.layers)), bool)
-        used[kinds.cell, kinds.interval] = True
-        fill = partial(store.fill, until_s=request.until_s)
-        kernels = frame_kernels(store, state.layers, state.image, used, fill=fill)
-        if isinstance(kernels, MissingPsfs):
-            return kernels
-        return cls(state, request.view, pixels, white, kinds, kernels)
+        with request.times.wall("edge_light_ms"):
+            state = EyeAtFrame.of(request)
+            kinds = SourceKinds.of(state, pixels)
+            used = np.zeros((state.image.count, interval_count(state.layers)), bool)
+            used[kinds.cell, kinds.interval] = True
+            fill = partial(store.fill, until_s=request.until_s)
+            kernels = frame_kernels(store, state.layers, state.image, used, fill=fill)
+            if isinstance(kernels, MissingPsfs):
+                return kernels
+            return cls(state, view, pixels, white, kinds, kernels)
 
     def _find_ends(self, kernels: FrameKernels) -> None:
         """Find where the kernels of the kinds end."""

@@ -1,20 +1,23 @@
-"""Interface of the frame engines."""
+"""Interface of the frame engines: requests, results, and the checks of both."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import Any, Protocol, runtime_checkable
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.rendering.filtered_view import FilteredView
+from estimator.note import Note
+from filter_service.errors import BadMessage, CameraMismatch
+from filter_service.planning.grid import GridSpec
 from filter_service.rendering.frame_kernels import MissingPsfs
-from filter_service.rendering.frame_states import FrameStates
 from filter_service.rendering.sampled_frame import SampledFrame
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
+from filter_service.stage_times import StageTimes
 from filter_service.texture_view import (
     EarlierFrame,
     GlTexture,
@@ -22,7 +25,19 @@ from filter_service.texture_view import (
     TextureSupport,
     TextureView,
 )
-from filter_service.view_state import State
+from filter_service.validation import checked
+from filter_service.view_state import EyeName, State, WithState
+
+ROUNDING_DEG = 1e-6
+
+OUTPUT_DTYPES = {"linear": np.float32, "srgb8": np.uint8, "linear16": np.float16}
+
+SAMPLE_STRIDE_PX = 16
+"""Stride of the check of the depth unit, which takes 25 us."""
+
+FAR_SCENE_M = 100.0
+"""If all depth exceeds this, the unit is probably centimeters or millimeters: scenes
+without a nearer object are rare."""
 
 
 class LoadedStore(Protocol):
@@ -58,85 +73,132 @@ class ViewRequest:
 
     Attributes
     ----------
+    view : RgbdView or TextureView
+        Images as arrays, or as textures of the current OpenGL context.
     handle : LoadedStore
         PSFs of the eye, loaded by the engine.
     state : State
         A gaze outside the prepared range is clamped, and the result has a note.
-    out : array, optional
-        Array of the shape and type of the output, which the engine may fill.
+    output : "srgb8", "linear" or "linear16"
+        Encoding of an output array; a texture has its own.
+    out : array or GlTexture, optional
+        Array of the shape and type of the output, which the engine may fill; or the
+        texture for the image of a `TextureView`, which is required: "rgba8" or
+        "srgb8_a8" for sRGB values, "rgba16f" for linear light.
     until_s : float, optional
         Deadline by `time.monotonic`; the engine computes no PSFs after it.
     white_level : float, optional
-        White level of the view, if it is known; see `white_level`.
+        White level of arrays, if it is known; see `white_level`.
+    times : StageTimes
+        Receives the times of the frame's stages.
+    target_is_top_first : bool, optional
+        Whether the first row of a texture is the top of its image; by default as in
+        the view.
+    gain_ratio : (red, green, blue)
+        Transmittance of the ocular media, for textures.
+    waits : bool
+        Whether to wait until a frame in textures is finished, and to repeat it until it
+        is complete, so that `ViewResult.earlier` describes this frame.
     """
 
-    view: RgbdView
+    view: RgbdView | TextureView
     handle: Any
     state: State
     output: Output = "linear"
     options: RenderOptions = DEFAULT_OPTIONS
-    out: NDArray[Any] | None = None
+    out: NDArray[Any] | GlTexture | None = None
     until_s: float | None = None
     white_level: float | None = None
-
-
-@dataclass(frozen=True)
-class TextureRequest:
-    """One view in textures to filter, with the eye, its state and the options.
-
-    Attributes
-    ----------
-    view : TextureView
-    target : GlTexture
-        Texture for the filtered image: "rgba8" or "srgb8_a8" for sRGB values, "rgba16f"
-        for linear light.
-    handle : LoadedStore
-        PSFs of the eye, loaded by the engine.
-    target_is_top_first : bool
-        Whether the first row of the target is the top of the image.
-    gain_ratio : (red, green, blue)
-        Transmittance of the ocular media.
-    waits : bool
-        Whether to wait until the frame is finished, and to repeat it until it is
-        complete, so that `ShownTexture.earlier` describes this frame.
-    until_s : float, optional
-        Deadline of a frame that waits, as in `ViewRequest`.
-    """
-
-    view: TextureView
-    target: GlTexture
-    handle: Any
-    state: State
-    target_is_top_first: bool = False
+    times: StageTimes = field(default_factory=StageTimes)
+    target_is_top_first: bool | None = None
     gain_ratio: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    options: RenderOptions = DEFAULT_OPTIONS
     waits: bool = False
-    until_s: float | None = None
 
 
-@dataclass(frozen=True)
-class ShownTexture:
-    """State of the eye in a frame of textures, which the GPU may not have finished.
+@dataclass(frozen=True, kw_only=True)
+class FrameCounts:
+    """Counters of a frame that users receive.
+
+    A new counter needs a field here, with the default 0, and a value from each engine.
+    If `Result` has a field of the same name, the service sends the counter.
 
     Attributes
     ----------
-    state : State
-        After clamping to the prepared ranges.
-    number : int
-        Number of the frame among those of the context, from 1 on.
-    notes : tuple of str
-    earlier : EarlierFrame or None
-        The newest frame through this eye that the GPU has finished; this frame, if the
-        request waits.
+    missing_depth_count, clamped_depth_count, bad_color_count : int
+        Pixels whose depth was missing and filled in, whose distance was outside the
+        prepared range, and whose color was not finite and became black.  The last two
+        include the hidden layer where it has depth.
+    overflow_count : int
+        Entries that did not fit a fragment list.  Their light is missing.
     """
 
+    missing_depth_count: int = 0
+    clamped_depth_count: int = 0
+    bad_color_count: int = 0
+    overflow_count: int = 0
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Return the counts by name."""
+        return summed_counts([self])
+
+
+def summed_counts(counts: Sequence[FrameCounts]) -> dict[str, int]:
+    """Return the sums of counts by name."""
+    names = [count.name for count in fields(FrameCounts)]
+    return {name: sum(int(getattr(c, name)) for c in counts) for name in names}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewResult(FrameCounts, WithState):
+    """A filtered view, the eye and state that it was filtered with, and statistics.
+
+    Attributes
+    ----------
+    color : (height, width, 3)
+        uint8 sRGB, or float32 or float16 linear light; empty for a view in textures.
+    state : State
+        Pupil, focus and gaze used.  A profile may limit the pupil, and an eye can only
+        add power.
+    notes : tuple of str
+    stage_times_ms : dict
+        Times of all views of the frame by stage.
+    eye : "both", "left" or "right"
+    profile_id : int
+        The caller's identifier of the profile; by default the generation.
+    generation : int
+        Number of the profile in its stream.
+    number : int
+        Number of a frame in textures among those of the context, from 1 on.
+    earlier : EarlierFrame or None
+        For textures: the newest frame through this eye that the GPU has finished; this
+        frame if the request waits, and otherwise one whose counts this result lacks.
+    fragment_count, merged_count, entry_count : int
+        Fragments, pixels merged into fragments, and entries of the bins' fragment
+        lists.  Rows shared by two strips of a very large frame count twice.  With a
+        hidden layer, the border counts too.
+    kernel_count, kernel_texel_count : int
+        Kernels of the frame, and texels of all their levels.
+    """
+
+    color: NDArray[Any] = field(default_factory=lambda: np.empty((0, 0, 3), np.uint8))
     state: State
-    number: int
-    notes: tuple[str, ...]
-    earlier: EarlierFrame | None
+    notes: tuple[str, ...] = ()
+    stage_times_ms: dict[str, float] = field(default_factory=dict)
+    eye: EyeName = "both"
+    profile_id: int = 0
+    generation: int = 0
+    number: int = 0
+    earlier: EarlierFrame | None = None
+    fragment_count: int = 0
+    merged_count: int = 0
+    entry_count: int = 0
+    kernel_count: int = 0
+    kernel_texel_count: int = 0
+    layer_count: int = 0
 
 
-Pending = Callable[[], FilteredView | MissingPsfs]
+Pending = Callable[[], ViewResult | MissingPsfs]
 """Wait for a view that `FrameEngine.begin` has started, and return it, or the PSFs that
 were not computed by ``until_s``."""
 
@@ -147,6 +209,10 @@ class FrameEngine(Protocol):
     @property
     def name(self) -> str:
         """Name of the renderer in replies and in `ocufilter doctor`."""
+
+    @property
+    def importer(self) -> TextureImporter | None:
+        """Importer of textures of other processes, or None."""
 
     def trim(self) -> None:
         """Release buffers that frames reuse; called after an idle period."""
@@ -162,51 +228,30 @@ class FrameEngine(Protocol):
     def load(self, store: Any) -> LoadedStore:
         """Load a store; its kernels may be computed later."""
 
-    def frame_states(self, handle: Any) -> FrameStates:
-        """Return the cached layers and cells of the frames of a loaded store."""
-
     def begin(self, request: ViewRequest) -> Pending:
         """Start filtering a view; return a function that waits for the result.
 
         The caller may start other views before it calls that function, such as the
         view of the other eye.  An engine without concurrency filters the view at once.
+        A view in textures is submitted to the GPU; only a request that waits waits.
 
         Raises
         ------
         BadMessage
-            Arrays or options are invalid.
+            Images or options are invalid.
         CameraMismatch
             The store is for another camera, see `camera.is_same_camera`.
         RenderError
+            In particular, the engine does not filter textures.
         """
 
 
-@runtime_checkable
-class TextureEngine(Protocol):
-    """An engine that filters frames in textures of the caller's context."""
-
-    def filter_textures(self, request: TextureRequest) -> ShownTexture | None:
-        """Filter a view from textures to a texture, without waiting for the GPU.
-
-        Returns None if the request waits, and PSFs were not computed by ``until_s``.
-
-        Raises
-        ------
-        BadMessage
-            Textures or options are invalid.
-        CameraMismatch
-            The store is for another camera, see `camera.is_same_camera`.
-        RenderError
-        """
-
-
-@runtime_checkable
-class TextureImporter(TextureEngine, Protocol):
-    """An engine that may import textures from memory of other processes."""
+class TextureImporter(Protocol):
+    """Imports textures from memory of other processes."""
 
     @property
-    def texture_support(self) -> TextureSupport | None:
-        """Devices whose memory it can import, or None."""
+    def support(self) -> TextureSupport:
+        """Devices whose memory it can import."""
 
     def import_texture(self, memory: TextureMemory, descriptor: int) -> Any:
         """Return a texture, with the attribute ``texture``, in memory of a descriptor.
@@ -220,7 +265,7 @@ class TextureImporter(TextureEngine, Protocol):
         RenderError
         """
 
-    def release_texture(self, imported: Any) -> None:
+    def release(self, imported: Any) -> None:
         """Free an imported texture."""
 
 
@@ -229,7 +274,7 @@ class OneView:
 
     def render(
         self: FrameEngine, view: RgbdView, handle: Any, **values: Any
-    ) -> FilteredView | MissingPsfs:
+    ) -> ViewResult | MissingPsfs:
         """Filter one view; ``values`` are a state, options or fields of the request."""
         state = State(
             values.pop("pupil_diameter_mm"),
@@ -242,3 +287,136 @@ class OneView:
             view, handle, state, options=RenderOptions(**options), **values
         )
         return self.begin(request)()
+
+
+def check_request(
+    request: ViewRequest, spec: GridSpec
+) -> tuple[tuple[float, float], tuple[str, ...]]:
+    """Check a request; return the clamped gaze, and a note if it was changed.
+
+    Raises
+    ------
+    BadMessage
+        Unknown choice, invalid gaze, or tolerance out of range.
+    CameraMismatch
+        The store is for another camera, see `camera.is_same_camera`.
+    """
+    output: Any = Output  # mypy takes only classes for types as arguments
+    checked(request.output, output, "output")
+    checked(request.options.fields(), RenderOptions)
+    camera = request.view.camera
+    if not spec.serves(camera):
+        raise CameraMismatch(
+            f"the PSFs are for {spec.camera}, the view has {camera}",
+            field="tangents",
+        )
+    return clamped_gaze(spec, request.state.gaze_deg)
+
+
+def output_array(request: ViewRequest) -> NDArray[Any]:
+    """Return the output array of a view: the caller's, or a new one.
+
+    Raises
+    ------
+    BadMessage
+        The array has another shape or type, or is not contiguous and writeable.
+    """
+    assert isinstance(request.view, RgbdView)
+    shape, dtype = request.view.color.shape, np.dtype(OUTPUT_DTYPES[request.output])
+    out = request.out
+    if out is None:
+        return np.empty(shape, dtype)
+    assert isinstance(out, np.ndarray)
+    if out.shape != shape or out.dtype != dtype or not out.flags.carray:
+        raise BadMessage(
+            f"it is {out.dtype} of shape {out.shape}",
+            field="out",
+            allowed=f"{dtype} of shape {shape}, contiguous and writeable",
+        )
+    return out
+
+
+def clamped_gaze(
+    spec: GridSpec, gaze_deg: tuple[float, float] | None
+) -> tuple[tuple[float, float], tuple[str, ...]]:
+    """Return a gaze (h, v) clamped to the prepared range, and a note if it changed.
+
+    Parameters
+    ----------
+    gaze_deg : (h, v) or None
+        Requested gaze; None stands for that of ``spec``.
+
+    Raises
+    ------
+    BadMessage
+        The gaze is not two finite angles.
+    """
+    if gaze_deg is None:
+        return spec.settings.gaze_deg, ()
+    requested_deg = tuple(float(angle) for angle in gaze_deg)
+    if len(requested_deg) != 2 or not all(
+        math.isfinite(angle) for angle in requested_deg
+    ):
+        raise BadMessage(
+            f"{gaze_deg}", field="gaze_deg", allowed="two finite angles (h, v)"
+        )
+    h_deg, v_deg = (
+        min(max(angle, middle - reach), middle + reach)
+        for angle, middle, reach in zip(
+            requested_deg,
+            spec.settings.gaze_deg,
+            spec.settings.gaze_range_deg,
+            strict=True,
+        )
+    )
+    clamped_deg = h_deg, v_deg
+    if not spec.follows_field:
+        clamped_deg = spec.settings.gaze_deg
+    if math.dist(requested_deg, clamped_deg) <= ROUNDING_DEG:
+        return clamped_deg, ()
+    code, reason = (
+        ("gaze_not_prepared", "is outside what was prepared")
+        if spec.follows_field
+        else ("gaze_not_followed", "is not followed in mode on-axis")
+    )
+    note = Note(
+        code,
+        f"gaze {_text(requested_deg)} {reason}: {_text(clamped_deg)} used",
+        h_deg=requested_deg[0],
+        v_deg=requested_deg[1],
+        used_h_deg=clamped_deg[0],
+        used_v_deg=clamped_deg[1],
+    )
+    return clamped_deg, (note,)
+
+
+def _text(gaze_deg: tuple[float, float]) -> str:
+    return "({:.4g}, {:.4g}) deg".format(*gaze_deg)
+
+
+def input_notes(
+    depth_m: NDArray[np.float32], missing_depth_count: int, bad_color_count: int
+) -> tuple[str, ...]:
+    """Return notes on missing depth, an implausible depth unit and invalid color."""
+    return sampled_input_notes(
+        depth_m[::SAMPLE_STRIDE_PX, ::SAMPLE_STRIDE_PX],
+        bad_color_count,
+        has_depth=missing_depth_count < depth_m.size,
+    )
+
+
+def sampled_input_notes(
+    sampled_m: NDArray[np.float32], bad_color_count: int, *, has_depth: bool
+) -> tuple[str, ...]:
+    """Return the same notes, from depth at some pixels."""
+    notes: list[str] = []
+    if not has_depth:
+        notes.append(Note("no_depth", "no pixel has depth; infinity is assumed"))
+    known_m = sampled_m[(sampled_m > 0.0) & (sampled_m < np.inf)]
+    if known_m.size and known_m.min() >= FAR_SCENE_M:
+        text = f"all depth is beyond {FAR_SCENE_M:g} m: is it in meters?"
+        notes.append(Note("depth_implausible", text, beyond_m=FAR_SCENE_M))
+    if bad_color_count:
+        text = f"{bad_color_count} pixels with non-finite color were set to black"
+        notes.append(Note("color_not_finite", text, pixel_count=bad_color_count))
+    return tuple(notes)

@@ -45,10 +45,21 @@ class Timer(Protocol):
 
 @dataclass(eq=False)
 class FrameStore:
-    """A PSF store with the image cells of its camera; base class of engines' stores."""
+    """A PSF store with the cells of its camera and the last frame's layers and cells.
+
+    The base class of engines' stores.  The same objects are returned until the state of
+    frames changes, so that callers can compare states by identity.
+    """
 
     store: PsfStore
     image: ImageCells
+
+    def __post_init__(self) -> None:
+        """Begin without cached states."""
+        self._layers: tuple[tuple[float, ...], FrameLayers] | None = None
+        self._image: tuple[tuple[Any, ...], ImageCells] | None = None
+        self._change: tuple[FrameLayers, ImageCells, NDArray[Any]] | None = None
+        self._corner_weights: tuple[FieldAxes, ImageCells, CornerWeights] | None = None
 
     @cached_property
     def node_scale(self) -> NDArray[np.float64]:
@@ -120,37 +131,13 @@ class FrameStore:
             return self.image
         return image_cells(spec, self.store.plan, gaze_deg, node_scale=self.node_scale)
 
-
-class FrameStates:
-    """Cache of the layers and cells of the last frame, for one store.
-
-    The same objects are returned until the state changes, so that callers can compare
-    states by identity.  Another store replaces the cached one, which can then be freed.
-    """
-
-    def __init__(self) -> None:
-        self._reset(None)
-
-    def _reset(self, handle: FrameStore | None) -> None:
-        self._handle = handle
-        self._layers: tuple[tuple[float, ...], FrameLayers] | None = None
-        self._image: tuple[tuple[Any, ...], ImageCells] | None = None
-        self._change: tuple[FrameLayers, ImageCells, NDArray[Any]] | None = None
-        self._corner_weights: tuple[FieldAxes, ImageCells, CornerWeights] | None = None
-
-    def _reset_if_other(self, handle: FrameStore) -> None:
-        if self._handle is not handle:
-            self._reset(handle)
-
     def layers(
         self,
         timer: Timer,
-        handle: FrameStore,
         state: State,
         options: RenderOptions = DEFAULT_OPTIONS,
     ) -> FrameLayers:
         """Return the layers for a pupil, a focus and the options of a frame."""
-        self._reset_if_other(handle)
         tolerance, spread_px = options.render_tolerance, merge_spread_px(options)
         key = (state.pupil_diameter_mm, state.focus_dpt, tolerance, spread_px)
         if self._layers is None or self._layers[0] != key:
@@ -158,7 +145,7 @@ class FrameStates:
                 self._layers = (
                     key,
                     frame_layers(
-                        handle.store,
+                        self.store,
                         state,
                         step_ratio=layer_step_ratio(tolerance),
                         merge_spread_px=spread_px,
@@ -169,25 +156,23 @@ class FrameStates:
     def cells(
         self,
         timer: Timer,
-        handle: FrameStore,
         gaze_deg: tuple[float, float],
         cell_px: int | None = None,
     ) -> ImageCells:
         """Return the cells for a gaze; ``cell_px`` overrides the default cell size."""
-        self._reset_if_other(handle)
-        spec, state = handle.store.spec, (gaze_deg, cell_px)
+        spec, state = self.store.spec, (gaze_deg, cell_px)
         if state == (spec.settings.gaze_deg, None):
-            return handle.image
+            return self.image
         if self._image is None or self._image[0] != state:
             with timer.wall("psf_plan_ms"):
                 self._image = (
                     state,
                     image_cells(
                         spec,
-                        handle.store.plan,
+                        self.store.plan,
                         gaze_deg,
                         cell_px=cell_px,
-                        node_scale=handle.node_scale,
+                        node_scale=self.node_scale,
                     ),
                 )
         return self._image[1]

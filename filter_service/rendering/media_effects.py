@@ -5,7 +5,6 @@ Spectacles resample the view before it is filtered; the media change the filtere
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,10 +16,15 @@ from estimator.native import shared_threads
 from estimator.profiles.parse import EyeProfile
 from filter_service.constants import RGB
 from filter_service.displays import display_wavelengths_nm
+from filter_service.errors import BadMessage
 from filter_service.native import loops
 from filter_service.rendering.edge_light import EdgeLight
-from filter_service.rendering.engine import FrameEngine, Pending, ViewRequest
-from filter_service.rendering.filtered_view import FilteredView
+from filter_service.rendering.engine import (
+    FrameEngine,
+    Pending,
+    ViewRequest,
+    ViewResult,
+)
 from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rendering.haze import add_haze
 from filter_service.rendering.light_planes import add_plane
@@ -32,6 +36,7 @@ from filter_service.rendering.spectacles import (
 from filter_service.rendering.srgb import half_from_linear
 from filter_service.rendering.white_level import white_level
 from filter_service.rgbd_view import RgbdView
+from filter_service.texture_view import TextureView
 
 UNCHANGED = (1.0, 1.0, 1.0)
 NOTHING = np.empty((0, 0, RGB), np.float32)
@@ -68,12 +73,18 @@ class MediaEffects:
         found = cls(profile.straylight, gain_ratio, spectacle_magnification(profile))
         return None if found == cls(None) else found
 
-    @property
-    def need_arrays(self) -> str | None:
-        """Return the effect that frames in textures lack, in words, or None."""
-        if self.magnification_ratio is not None:
-            return "spectacle magnification"
-        return "straylight" if self.straylight is not None else None
+    def check_textures(self) -> None:
+        """Raise BadMessage for an effect that frames in textures lack."""
+        for name, effect in (
+            ("spectacle magnification", self.magnification_ratio),
+            ("straylight", self.straylight),
+        ):
+            if effect is not None:
+                raise BadMessage(
+                    f"it has {name}",
+                    field="profile",
+                    allowed="none for frames in textures; filter frames of arrays",
+                )
 
     def apply(self, color: NDArray[np.float32], view: RgbdView) -> None:
         """Apply the media to linear light (height, width, 3) of a view, in place."""
@@ -83,71 +94,58 @@ class MediaEffects:
             color *= np.array(self.gain_ratio, np.float32)
 
 
-class _Stages:
-    """Wall times of stages, ms."""
-
-    def __init__(self) -> None:
-        self.times_ms: dict[str, float] = {}
-        self.start()
-
-    def start(self) -> None:
-        """Start the next stage."""
-        self._started_s = time.perf_counter()
-
-    def end(self, name: str) -> None:
-        """Add the time since the last end or start to a stage, and start the next."""
-        elapsed_ms = 1e3 * (time.perf_counter() - self._started_s)
-        self.times_ms[name] = self.times_ms.get(name, 0.0) + elapsed_ms
-        self.start()
-
-
 def begin_through_media(
     engine: FrameEngine, request: ViewRequest, effects: MediaEffects | None
 ) -> Pending:
     """Start filtering a view, with the media and with light beyond the kernels.
 
     See `FrameEngine.begin`.
+
+    Raises
+    ------
+    BadMessage
+        In addition to its errors: effects need arrays, and the view is in textures.
     """
-    stages = _Stages()
-    view = request.view
+    view, times = request.view, request.times
+    if isinstance(view, TextureView):
+        if effects is not None:
+            effects.check_textures()
+            request = replace(request, gain_ratio=effects.gain_ratio)
+        return engine.begin(request)
     if effects is not None and effects.magnification_ratio is not None:
-        view = seen_through(view, effects.magnification_ratio)
+        with times.wall("media_ms"):
+            view = seen_through(view, effects.magnification_ratio)
         request = replace(request, view=view)
-        stages.end("media_ms")
     edge_light: EdgeLight | MissingPsfs | None = None
     if view.color.dtype != np.uint8:
         request = replace(request, white_level=white_level(view.color))
-        edge_light = EdgeLight.of(engine, request)
+        edge_light = EdgeLight.of(request, view)
     if isinstance(edge_light, MissingPsfs):
         missing = edge_light
         return lambda: missing
     if edge_light is not None:
         request = replace(request, view=edge_light.view)
-        stages.end("edge_light_ms")
     elif effects is None:
         return engine.begin(request)
     begun = engine.begin(replace(request, output="linear", out=None))
 
-    def finish() -> FilteredView | MissingPsfs:
+    def finish() -> ViewResult | MissingPsfs:
         rendered = begun()
         if isinstance(rendered, MissingPsfs):
             return rendered
-        stages.start()
         color = np.ascontiguousarray(rendered.color, dtype=np.float32)
         coarse = NOTHING
         if edge_light is not None:
-            coarse = edge_light.add(color)
-        if coarse.size and (effects is not None or request.output != "srgb8"):
-            add_plane(coarse, color)
-            coarse = NOTHING
-        if edge_light is not None:
-            stages.end("edge_light_ms")
-        if effects is not None:
-            effects.apply(color, view)
-        color = encoded(color, request.output, coarse)
-        stages.end("edge_light_ms" if effects is None else "media_ms")
-        times_ms = {**rendered.stage_times_ms, **stages.times_ms}
-        return replace(rendered, color=color, stage_times_ms=times_ms)
+            with times.wall("edge_light_ms"):
+                coarse = edge_light.add(color)
+                if coarse.size and (effects is not None or request.output != "srgb8"):
+                    add_plane(coarse, color)
+                    coarse = NOTHING
+        with times.wall("edge_light_ms" if effects is None else "media_ms"):
+            if effects is not None:
+                effects.apply(color, view)
+            color = encoded(color, request.output, coarse)
+        return replace(rendered, color=color)
 
     return finish
 

@@ -32,8 +32,6 @@ render_worker        event loop of a render worker
 profile_reader       the process that reads large profiles
 session_eyes         one filter for each eye of a session
 frame_reply          the reply to a frame
-shared_memory_frame  the same, with images in shared memory
-texture_frame        the same, with images in textures
 
 `ocufilter.service` is a systemd unit.
 """

@@ -40,7 +40,6 @@ from typing import Any
 from estimator.profiles.parse import EyeProfile
 from filter_service.errors import FilterError, NoProfile, NoSession, RenderFailed
 from filter_service.filtering.builder import Builder
-from filter_service.filtering.planned_textures import texture_importer
 from filter_service.messages import (
     Dropped,
     ErrorReply,
@@ -51,6 +50,7 @@ from filter_service.messages import (
     SharedPlaces,
     ShareTexture,
 )
+from filter_service.service.frame_reply import filter_in_slots, filter_in_textures
 from filter_service.service.process_channel import (
     Link,
     LinkClosed,
@@ -59,8 +59,6 @@ from filter_service.service.process_channel import (
 )
 from filter_service.service.profile_reader import ProfileReader, ReadProfile
 from filter_service.service.session_eyes import SessionEyes
-from filter_service.service.shared_memory_frame import filter_in_slots
-from filter_service.service.texture_frame import filter_in_textures
 from filter_service.shared_memory import Slot
 from filter_service.version import __version__
 
@@ -177,8 +175,8 @@ class RenderWorker:
             "gl_renderer": self._builder.engine.name,  # for older clients
         }
         eyes = [(key, session.profiles) for key, session in self._sessions.items()]
-        importer = texture_importer(self._builder)
-        support = None if importer is None else importer.texture_support
+        importer = self._builder.engine.importer
+        support = None if importer is None else importer.support
         self._send(("started", server, eyes, self._can_interrupt, support))
 
     # Event loop
@@ -323,7 +321,7 @@ class RenderWorker:
 
     def _import_texture(self, key: str, request: ShareTexture, descriptor: int) -> None:
         """Import a texture of a session, or reply with the reason."""
-        importer, reason = texture_importer(self._builder), ""
+        importer, reason = self._builder.engine.importer, ""
         assert importer is not None  # otherwise the front end offers no textures
         try:
             imported = importer.import_texture(request.memory, descriptor)
@@ -335,9 +333,9 @@ class RenderWorker:
         self._send(("texture_reply", key, request.texture, reason))
 
     def _release_texture(self, imported: Any) -> None:
-        importer = texture_importer(self._builder)
+        importer = self._builder.engine.importer
         if imported is not None and importer is not None:
-            importer.release_texture(imported)
+            importer.release(imported)
 
     def _drop_textures(self, key: str) -> None:
         for imported in self._textures.pop(key, {}).values():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, ClassVar, Self
 
 from msgspec import Meta
@@ -115,11 +115,6 @@ class FrameOptions(RenderOptions):
     """Options of a frame on the wire: rendering options, and deprecated ones."""
 
     prepared_only: bool = False
-
-    @property
-    def render_values(self) -> dict[str, Any]:
-        """Return the options that an engine reads, by name."""
-        return {o.name: getattr(self, o.name) for o in fields(RenderOptions)}
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ class FrameRun:
 
     Attributes
     ----------
-    frames : list of FilteredView
+    frames : list of ViewResult
         The last is of the very state that was asked for.
     times_ms : (n,)
     """

@@ -17,7 +17,7 @@ from filter_service.gl.texture_io import TextureIo
 from filter_service.planning.grid import GridSpec
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import PsfStore, build_psf_store
-from filter_service.rendering.engine import TextureRequest, ViewRequest
+from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.native import NativeRenderer
 from filter_service.rgbd_view import RgbdView
@@ -148,11 +148,15 @@ class TextureCase:
         self.memory_mb = self._gpu.memory_mb
 
     def _submit(self, handle, target: GlTexture, state: dict) -> None:
-        shown = self._renderer.filter_textures(
-            TextureRequest(
-                self._view, target, handle, State(**state), target_is_top_first=True
+        shown = self._renderer.begin(
+            ViewRequest(
+                self._view,
+                handle,
+                State(**state),
+                out=target,
+                target_is_top_first=True,
             )
-        )
+        )()
         earlier = shown.earlier
         if earlier and not (earlier.is_filtered and earlier.is_complete):
             self.incomplete_count += 1

@@ -50,7 +50,7 @@ def splat_work(gpu: Gpu, size_px: tuple[int, int], entry_count: int) -> SplatWor
     ----------
     size_px : (width, height)
     entry_count : int
-        That of `FilteredView`.
+        That of `ViewResult`.
 
     Raises
     ------

@@ -7,7 +7,7 @@ test sees which eye a frame went through whatever its header says.
 import os
 import signal
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from filter_service.building.jobs import BuiltStore
 from filter_service.camera import is_same_camera
 from filter_service.errors import BuildCancelled, CameraMismatch, UnknownProfile
 from filter_service.messages import Camera
-from filter_service.rendering.filtered_view import FrameCounts
+from filter_service.rendering.engine import ViewResult
 from filter_service.view_state import State
 
 
@@ -43,19 +43,11 @@ class StoreDouble:
         """Nothing goes."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RenderedDouble(FrameCounts):
-    color: np.ndarray
-    stage_times_ms: dict
-    state: State
-    bad_color_count: int = 0
-    notes: list = field(default_factory=list)
-
-
 class EngineDouble:
     """Inverts colors in the time that the profile or else the command states."""
 
     name = "numpy double"
+    importer = None
 
     def __init__(self, filter_ms: float):
         self.filter_ms = filter_ms
@@ -95,17 +87,17 @@ class EngineDouble:
             if output == "linear16":
                 color = color.astype(np.float16)
         color[0, 0] = handle.mark
-        found = RenderedDouble(
+        request.times.add("filter_ms", 1000 * (time.perf_counter() - start_s))
+        found = ViewResult(
             color=color,
-            stage_times_ms={"filter_ms": 1000 * (time.perf_counter() - start_s)},
+            stage_times_ms=request.times.ms,
             missing_depth_count=int(np.count_nonzero(~(view.depth_m > 0))),
-            clamped_depth_count=0,
             state=State(
                 min(state.pupil_diameter_mm, 7.0),
                 state.focus_dpt,
                 state.gaze_deg or (0.0, 0.0),
             ),
-            notes=[accumulation] if accumulation != "coverage" else [],
+            notes=(accumulation,) if accumulation != "coverage" else (),
         )
         return lambda: found
 

@@ -357,7 +357,7 @@ def test_eyes_without_light_from_the_edge_alone_keep_their_kernels(diffraction, 
     request = ViewRequest(
         view, SimpleNamespace(store=store), State(4.0, 0.0), white_level=1.0
     )
-    assert EdgeLight.of(None, request) is None
+    assert EdgeLight.of(request, view) is None
 
 
 def test_missing_depth_of_a_lamp_is_that_of_its_surroundings(engine):

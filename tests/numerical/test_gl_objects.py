@@ -14,7 +14,7 @@ from filter_service.gl import gpu as gpu_module
 from filter_service.gl.current_context import CurrentContext
 from filter_service.gl.gpu import Gpu
 from filter_service.psfs.store import build_psf_store
-from filter_service.rendering.engine import TextureRequest
+from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rgbd_view import RgbdView
 from filter_service.view_state import State
@@ -186,10 +186,13 @@ def texture_stream(gpu, stores, *, round_count, frames_per_set):
             for formats in SETS:
                 textures = ViewTextures(arrays, formats)
                 for _ in range(frames_per_set):
-                    request = TextureRequest(
-                        *(textures.view, textures.target, handle), State(**next(states))
+                    request = ViewRequest(
+                        textures.view,
+                        handle,
+                        State(**next(states)),
+                        out=textures.target,
                     )
-                    renderer.filter_textures(request)
+                    renderer.begin(request)()
                 assert textures.image().any()
                 textures.delete()
             renderer.render(arrays, handle, output="srgb8", **next(states))

@@ -220,23 +220,13 @@ class Glass:
     """An engine that leaves every picture as it is."""
 
     def begin(self, request):
-        from filter_service.rendering.filtered_view import FilteredView
+        from filter_service.rendering.engine import ViewResult
 
         assert request.output == "linear"
-        none = dict.fromkeys(
-            (
-                *("missing_depth_count", "clamped_depth_count", "bad_color_count"),
-                *("fragment_count", "merged_count", "entry_count"),
-                *("kernel_count", "kernel_texel_count", "layer_count"),
-            ),
-            0,
-        )
-        return lambda: FilteredView(
+        return lambda: ViewResult(
             color=request.view.color.astype(np.float32),
-            stage_times_ms={"splat_ms": 1.0},
+            stage_times_ms=request.times.ms,
             state=request.state,
-            notes=[],
-            **none,
         )
 
 

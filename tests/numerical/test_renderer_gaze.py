@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filter_service.errors import BadMessage
-from filter_service.rendering.gaze import clamped_gaze
+from filter_service.rendering.engine import clamped_gaze
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec
 from tests.numerical.synthetic import assert_same_frame, tangents, texture

@@ -10,7 +10,7 @@ from filter_service.errors import BadMessage, RenderFailed
 from filter_service.gl.current_context import CurrentContext
 from filter_service.gl.gpu import Gpu
 from filter_service.psfs.store import PsfStore
-from filter_service.rendering.engine import TextureRequest
+from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.gl import kernel_passes, texture_frames
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.srgb import linear_from_srgb
@@ -74,8 +74,8 @@ class Caller:
             values.pop("focus_dpt"),
             values.pop("gaze_deg", None),
         )
-        request = TextureRequest(view, target, handle or self.handle, state, **values)
-        return self.renderer.filter_textures(request)
+        request = ViewRequest(view, handle or self.handle, state, out=target, **values)
+        return self.renderer.begin(request)()
 
     def close(self):
         self.gpu.close()

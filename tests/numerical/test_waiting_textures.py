@@ -10,7 +10,8 @@ from filter_service.errors import BadMessage, OutOfGpuMemory, RenderFailed
 from filter_service.gl.gpu import GROWTH, Gpu
 from filter_service.gl.texture_io import TextureImporter
 from filter_service.psfs.store import PsfStore
-from filter_service.rendering.engine import TextureRequest
+from filter_service.rendering.engine import ViewRequest
+from filter_service.rendering.frame_kernels import MissingPsfs
 from filter_service.rendering.gl import texture_frames
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rendering.gl.texture_frames import HEADROOM
@@ -63,8 +64,8 @@ class Waiting:
             values.pop("focus_dpt"),
             values.pop("gaze_deg", None),
         )
-        request = TextureRequest(self.view, self.target, self.handle, state, **values)
-        return self.renderer.filter_textures(request)
+        request = ViewRequest(self.view, self.handle, state, out=self.target, **values)
+        return self.renderer.begin(request)()
 
     def image(self):
         with self._gpu.entered():
@@ -107,7 +108,8 @@ def test_missing_psfs_and_small_buffers_make_it_repeat(own_gpu, bench, rng):
 def test_a_frame_whose_time_is_over_computes_no_psfs(own_gpu, bench, rng):
     store = PsfStore(**bench.store.parts)
     waiting = Waiting(own_gpu, bench, rng, store)
-    assert waiting.filter(**STATES[0], until_s=time.monotonic() - 1.0) is None
+    late = waiting.filter(**STATES[0], until_s=time.monotonic() - 1.0)
+    assert isinstance(late, MissingPsfs)
 
 
 def test_a_frame_is_not_repeated_forever(waiting, monkeypatch):
@@ -128,7 +130,7 @@ def test_a_descriptor_is_closed_whatever_it_is(waiting, tmp_path):
     before = set(os.listdir("/proc/self/fd"))
     for _ in range(3):
         with pytest.raises(BadMessage, match=r"cannot (be read|use it)"):
-            waiting.renderer.import_texture(
+            waiting.renderer.importer.import_texture(
                 TextureMemory(*SIZE_PX, "rgba8", 65536), os.dup(file.fileno())
             )
     assert set(os.listdir("/proc/self/fd")) == before

@@ -21,7 +21,7 @@ from filter_service.messages import (
     decode_request,
     encode,
 )
-from filter_service.service.shared_memory_frame import with_images
+from filter_service.service.frame_reply import with_images
 from filter_service.shared_memory import Slot, aligned_starts
 from tests.unit.message_parts import (
     CAMERA,

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from filter_service.gl.gpu import Gpu
-from filter_service.rendering.frame_states import FrameStates
 from filter_service.rendering.gl.gl_store import GlStore
 from filter_service.rendering.gl.kernel_passes import KernelPasses
 from filter_service.texture_view import EarlierFrame
@@ -21,7 +20,6 @@ class EyeState:
 
     handle: GlStore
     kernels: KernelPasses
-    states: FrameStates = field(default_factory=FrameStates)
     cell_px: int | None = None  # larger cells, if kernels of frames were too large
     is_settled: bool = False  # whether a frame of textures had all its kernels
     earlier: EarlierFrame | None = None  # the newest frame of textures that was read

@@ -34,7 +34,7 @@ from filter_service.rendering.image_cells import KernelsTooLarge
 from filter_service.rendering.white_level import white_level
 from filter_service.rgbd_view import RgbdView
 
-Counts = dict[str, int]
+Counts = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -74,26 +74,24 @@ class FrameRun:
         gpu: Gpu,
         eye: EyeState,
         request: ViewRequest,
+        view: RgbdView,
         out: NDArray[Any],
         *,
         gaze_deg: tuple[float, float],
         fill_depth: bool,
     ):
-        self.timer = StageTimer(gpu)
+        self.timer = StageTimer(gpu, request.times)
         self._gpu, self._eye, self._request = gpu, eye, request
         self._gaze_deg = gaze_deg
         self._out = out
         self._cell_px: int | None = None
         self._missing_count: int | None = None
         self.missing: MissingPsfs | None = None  # at the deadline
-        self.layers: FrameLayers = eye.states.layers(
-            self.timer,
-            eye.handle,
-            request.state,
-            request.options,
+        self.layers: FrameLayers = eye.handle.layers(
+            self.timer, request.state, request.options
         )
         with self.timer.wall("prepare_ms"):
-            self._view = drop_empty_layer(request.view)
+            self._view = drop_empty_layer(view)
         if fill_depth:
             self._fill_depth()
         self._begun = self._begin()
@@ -150,11 +148,11 @@ class FrameRun:
 
     def _plan(self) -> _Plan:
         eye, view = self._eye, self._view
-        image = eye.states.cells(self.timer, eye.handle, self._gaze_deg, self._cell_px)
+        image = eye.handle.cells(self.timer, self._gaze_deg, self._cell_px)
         border_px = border_px_of(view, self.layers, image)
         with self.timer.wall("prepare_ms"):
             whole = extended(view, border_px)
-        change_dpt = eye.states.corner_change_dpt(self.timer, self.layers, image)
+        change_dpt = eye.handle.corner_change_dpt(self.timer, self.layers, image)
         white = self._request.white_level
         if white is None:
             white = white_level(view.color)

@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -34,14 +34,19 @@ from filter_service.gl.stage_timer import Untimed
 from filter_service.gl.texture_io import TextureIo
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.detection import merge_gaze
-from filter_service.rendering.engine import TextureRequest
+from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.gl.eye_states import EyeState
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
 from filter_service.rendering.gl.kernel_passes import FrameState, KernelRun
 from filter_service.rendering.gl.list_passes import ListPasses
 from filter_service.rendering.gl.strip import Strip, dispatch_grid, group_count
 from filter_service.rendering.image_cells import KernelsTooLarge
-from filter_service.texture_view import EarlierFrame, SampledInput, TextureView
+from filter_service.texture_view import (
+    EarlierFrame,
+    GlTexture,
+    SampledInput,
+    TextureView,
+)
 
 SAMPLE_STEP_PX = 16
 """Stride at which the input is sampled for the CPU: 1/256 of the image."""
@@ -126,6 +131,14 @@ def sample_grid(strip: Strip) -> tuple[int, int]:
     return group_count(height_px, SAMPLE_STEP_PX), group_count(width_px, SAMPLE_STEP_PX)
 
 
+class _Input(NamedTuple):
+    """A request, with its view in textures that shaders can read, and its target."""
+
+    request: ViewRequest
+    view: TextureView
+    target: GlTexture
+
+
 class _Passes(NamedTuple):
     """Passes of a frame that later frames repeat."""
 
@@ -172,48 +185,43 @@ class TextureFrames:
         self._submitted: deque[_Submitted] = deque()
         self.number = 0
 
-    def check(self, request: TextureRequest) -> None:
-        """Check the textures of a request.
-
-        Raises
-        ------
-        BadMessage
-        """
-        view = request.view
+    def _input(self, request: ViewRequest) -> _Input:
+        """Check the textures of a request; return them without renderbuffers."""
+        view, target = request.view, request.out
+        assert isinstance(view, TextureView)
+        assert isinstance(target, GlTexture)
         size_px = view.width_px, view.height_px
         for field, texture in (
             ("color", view.color),
             ("depth", view.depth),
-            ("target", request.target),
+            ("target", target),
         ):
             self._io.check(texture, size_px, field)
+        self._read_finished()
+        return _Input(request, self._io.in_textures(view), target)
 
     def filter(
-        self, request: TextureRequest, eye: EyeState, gaze_deg: tuple[float, float]
+        self, request: ViewRequest, eye: EyeState, gaze_deg: tuple[float, float]
     ) -> tuple[FrameLayers, EarlierFrame | None] | None:
         """Filter a frame; return its layers, and the counters of an earlier one.
 
         Returns None if a frame that waits lacks PSFs at its deadline.
+
+        Raises
+        ------
+        BadMessage
+            If the textures do not suit.
         """
-        self._read_finished()
-        view = self._io.in_textures(request.view)
-        if view is not request.view:
-            request = replace(request, view=view)
-        timer = Untimed()
-        layers = eye.states.layers(
-            timer,
-            eye.handle,
-            request.state,
-            request.options,
-        )
+        given, timer = self._input(request), Untimed()
+        layers = eye.handle.layers(timer, request.state, request.options)
         repeats = 0
         while True:
-            image = eye.states.cells(timer, eye.handle, gaze_deg, eye.cell_px)
-            change_dpt = eye.states.corner_change_dpt(timer, layers, image)
+            image = eye.handle.cells(timer, gaze_deg, eye.cell_px)
+            change_dpt = eye.handle.corner_change_dpt(timer, layers, image)
             state = FrameState(layers, image, change_dpt)
             waits = request.waits or not eye.is_settled
             is_counted = len(self._submitted) < MAX_IN_FLIGHT or waits
-            frame = self._run(request, eye, state, is_counted=is_counted)
+            frame = self._run(given, eye, state, is_counted=is_counted)
             if frame is None:
                 break
             if not waits:
@@ -241,15 +249,15 @@ class TextureFrames:
 
     def _run(
         self,
-        request: TextureRequest,
+        given: _Input,
         eye: EyeState,
         state: FrameState,
         *,
         is_counted: bool,
     ) -> _Submitted | None:
-        gpu, view = self._gpu, request.view
+        gpu, view = self._gpu, given.view
         kernels = eye.kernels.begin(eye.handle, state, Untimed())
-        key = self._key(request, state, kernels, is_counted=is_counted)
+        key = self._key(given, state, kernels, is_counted=is_counted)
         if key in eye.recorded:
             passes = eye.recorded[key]
             passes.strip.refresh()
@@ -267,9 +275,9 @@ class TextureFrames:
         else:
             if len(eye.recorded) == MAX_RECORDED:
                 eye.recorded.clear()
-            passes = self._dispatched(request, eye, kernels, is_counted=is_counted)
+            passes = self._dispatched(given, eye, kernels, is_counted=is_counted)
             eye.recorded[key] = passes
-        self._show(request, passes.strip)
+        self._show(given, passes.strip)
         self.number += 1
         if not is_counted:
             return None
@@ -291,19 +299,20 @@ class TextureFrames:
 
     def _key(
         self,
-        request: TextureRequest,
+        given: _Input,
         state: FrameState,
         kernels: KernelRun,
         *,
         is_counted: bool,
     ) -> tuple[Any, ...]:
         """Return what the passes of a frame depend on, besides buffers and state."""
-        view, gpu, image = request.view, self._gpu, state.image
+        request, view, target = given
+        gpu, image = self._gpu, state.image
         return (
             *(view.color.format, view.color.layer, view.depth.format, view.depth.layer),
             *(view.width_px, view.height_px, view.tangents, view.projection),
             *(view.is_top_first, view.white_ratio),
-            *(request.target.format == "rgba16f", request.options),
+            *(target.format == "rgba16f", request.options),
             merge_gaze(request.options, request.state.gaze_deg),
             *(image.cell_px, image.grid, kernels.capacity, kernels.group_counts),
             *(gpu.buffers[name].size for name in LISTS if name in gpu.buffers),
@@ -312,14 +321,15 @@ class TextureFrames:
 
     def _dispatched(
         self,
-        request: TextureRequest,
+        given: _Input,
         eye: EyeState,
         kernels: KernelRun,
         *,
         is_counted: bool,
     ) -> _Passes:
         """Dispatch the passes of a frame, and record them."""
-        view, options, gpu = request.view, request.options, self._gpu
+        request, view, target = given
+        gpu, options = self._gpu, request.options
         state = kernels.state
         strip = Strip(
             gpu,
@@ -343,7 +353,7 @@ class TextureFrames:
             counted_px=(0, 0, *size_px),
             object_range_dpt=eye.handle.prepared_range_dpt,
             white_level=view.white_ratio,
-            is_encoded=request.target.format != "rgba16f",
+            is_encoded=target.format != "rgba16f",
         )
         lists = ListPasses(strip, kernels.atlas, is_late=True)
         with gpu.passes.recorded(frozenset(kernels.uniforms)) as recorded:
@@ -371,16 +381,20 @@ class TextureFrames:
             **input_uniforms(view, self._io),
         )
 
-    def _show(self, request: TextureRequest, strip: Strip) -> None:
+    def _show(self, given: _Input, strip: Strip) -> None:
         """Write the frame to the target."""
-        gpu, view = self._gpu, request.view
+        request, view, target = given
+        is_top_first = request.target_is_top_first
+        if is_top_first is None:
+            is_top_first = view.is_top_first
+        gpu = self._gpu
         program = gpu.passes.drawing("whole", "show_frame", **layer_defines(view))
         gpu.passes.set_uniforms(
             program,
             {
                 "frame_size_px": strip.size,
-                "output_is_encoded": int(request.target.format != "rgba16f"),
-                "target_is_top_first": int(request.target_is_top_first),
+                "output_is_encoded": int(target.format != "rgba16f"),
+                "target_is_top_first": int(is_top_first),
                 "gain": request.gain_ratio,
                 **input_uniforms(view, self._io),
             },
@@ -392,7 +406,7 @@ class TextureFrames:
             input_textures(view, self._io).values(), INPUT_UNITS, strict=True
         ):
             texture.use(unit)
-        self._io.draw(program, request.target, strip.size)
+        self._io.draw(program, target, strip.size)
 
     # ----- counters
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from filter_service.rendering.frame_states import FrameStates
 from filter_service.rendering.native.arrays import Arrays
 from filter_service.rendering.native.frame_record import BlendSizes
 from filter_service.rendering.native.kernel_plan import KernelPlan
@@ -25,7 +24,6 @@ class EyeState:
     Attributes
     ----------
     handle : NativeStore
-    states : FrameStates
     arrays : Arrays
         Arrays of blended kernels.
     plan : KernelPlan or None
@@ -33,7 +31,6 @@ class EyeState:
     """
 
     handle: NativeStore
-    states: FrameStates = field(default_factory=FrameStates)
     arrays: Arrays = field(default_factory=Arrays)
     plan: KernelPlan | None = None
     blended: tuple[KernelPlan, NDArray[np.uint8], BlendSizes] | None = None

@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import OneView, Pending, ViewRequest
-from filter_service.rendering.frame_states import FrameStates
 from filter_service.rendering.native.native_store import NativeStore
 from filter_service.rendering.native.renderer import NativeRenderer
 
@@ -21,6 +20,8 @@ class NativeLanes(OneView):
     def __init__(self) -> None:
         self._main, self._other = NativeRenderer(), NativeRenderer()
         self._is_busy = False
+
+    importer = None
 
     @property
     def name(self) -> str:
@@ -45,10 +46,6 @@ class NativeLanes(OneView):
     def load(self, store: PsfStore) -> NativeStore:
         """Load a store; its kernels may be computed later."""
         return self._other.load(store)
-
-    def frame_states(self, handle: NativeStore) -> FrameStates:
-        """Return the cached layers and cells of the frames of a loaded store."""
-        return (self._other if self._is_busy else self._main).frame_states(handle)
 
     def begin(self, request: ViewRequest) -> Pending:
         """Filter one view; see `FrameEngine.begin`."""

@@ -1,9 +1,7 @@
 """The native frame engine: stages of a frame, and state between frames."""
 
-import time
 import weakref
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -17,8 +15,15 @@ from filter_service.native import Loops, loops
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.detection import merge_gaze
-from filter_service.rendering.engine import OneView, Pending, ViewRequest
-from filter_service.rendering.filtered_view import FilteredView, input_notes
+from filter_service.rendering.engine import (
+    OneView,
+    Pending,
+    ViewRequest,
+    ViewResult,
+    check_request,
+    input_notes,
+    output_array,
+)
 from filter_service.rendering.frame import (
     border_px_of,
     drop_empty_layer,
@@ -26,16 +31,15 @@ from filter_service.rendering.frame import (
     fill_missing_depth,
 )
 from filter_service.rendering.frame_kernels import Fill, MissingPsfs
-from filter_service.rendering.frame_states import FrameStates
 from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
 from filter_service.rendering.native.arrays import Arrays
 from filter_service.rendering.native.eye_states import EyeState, EyeStates
 from filter_service.rendering.native.frame_record import BlendSizes, FrameRecord
 from filter_service.rendering.native.kernel_plan import KernelPlan, plan_kernels
 from filter_service.rendering.native.native_store import NativeStore
-from filter_service.rendering.request_checks import check_request, output_array
 from filter_service.rendering.white_level import white_level
 from filter_service.rgbd_view import RgbdView
+from filter_service.stage_times import StageTimes
 
 
 class NativeRenderer(OneView):
@@ -62,7 +66,7 @@ class NativeRenderer(OneView):
         self._between: object = None
         self._pause_callback: Callable[[], None] | None = None
         self._is_syncing = False
-        self._paused_s = 0.0  # total
+        self._times = StageTimes()  # of the current frame
         self._eyes = EyeStates()
         self._arrays = Arrays()
 
@@ -70,6 +74,8 @@ class NativeRenderer(OneView):
     def name(self) -> str:
         """Instruction set and thread count of the compiled loops."""
         return f"native ({self._loops.variant}, {self._n_threads} threads)"
+
+    importer = None
 
     @property
     def memory_mb(self) -> float:
@@ -97,9 +103,8 @@ class NativeRenderer(OneView):
         def pause() -> None:
             if self._is_syncing:  # another frame would read an incomplete store
                 return
-            started_s = time.perf_counter()
-            function()
-            self._paused_s += time.perf_counter() - started_s
+            with self._times.wall("rests_ms"):
+                function()
 
         self._between = core().call_between(self._threads, pause, interval_s)
         self._pause_callback = pause
@@ -109,55 +114,49 @@ class NativeRenderer(OneView):
         """Load a store; its kernels may be computed later."""
         return NativeStore(store)
 
-    def frame_states(self, handle: NativeStore) -> FrameStates:
-        """Return the cached layers and cells of the frames of a loaded store."""
-        return self._eyes.of(handle).states
-
     def begin(self, request: ViewRequest) -> Pending:
         """Filter one view; see `FrameEngine.begin`.
 
         Raises
         ------
         RenderFailed
-            Out of memory; in addition to the errors of `FrameEngine.begin`.
+            Out of memory, or the view is in textures; in addition to the errors of
+            `FrameEngine.begin`.
         """
-        handle = request.handle
-        gaze_deg, gaze_notes = check_request(request, handle.store)
-        timer = StageTimes(lambda: self._paused_s)
+        handle, timer = request.handle, request.times
+        gaze_deg, gaze_notes = check_request(request, handle.store.spec)
+        if not isinstance(request.view, RgbdView):
+            raise RenderFailed("frames in textures need the engine gl")
+        self._times = timer
         eye = self._eyes.of(handle)
-        layers = eye.states.layers(
-            timer,
-            handle,
-            request.state,
-            request.options,
-        )
+        layers = handle.layers(timer, request.state, request.options)
         fill = partial(self._fill, timer, handle, request.until_s)
         cell_px = None
         while True:
-            image = eye.states.cells(timer, handle, gaze_deg, cell_px)
+            image = handle.cells(timer, gaze_deg, cell_px)
             try:
                 rendered = self._render(
-                    timer, request, gaze_deg, eye, layers, image, fill
+                    request, request.view, gaze_deg, eye, layers, image, fill
                 )
                 break
             except KernelsTooLarge:
                 cell_px = 2 * image.cell_px
-        if isinstance(rendered, FilteredView):
-            notes = [*layers.notes, *gaze_notes, *rendered.notes]
+        if isinstance(rendered, ViewResult):
+            notes = (*layers.notes, *gaze_notes, *rendered.notes)
             rendered = replace(rendered, notes=notes)
         return lambda: rendered
 
     def _render(
         self,
-        timer: "StageTimes",
         request: ViewRequest,
+        view: RgbdView,
         gaze_deg: tuple[float, float],
         eye: EyeState,
         layers: FrameLayers,
         image: ImageCells,
         fill: Fill,
-    ) -> FilteredView | MissingPsfs:
-        view, options = request.view, request.options
+    ) -> ViewResult | MissingPsfs:
+        timer, options = request.times, request.options
         frame = FrameRecord.new(
             self._threads, self._n_threads, self._arrays, eye.arrays
         )
@@ -187,9 +186,9 @@ class NativeRenderer(OneView):
             self._loops.call("splat", frame.c)
         if frame.c.failed:
             raise RenderFailed("out of memory for the fragment lists of a frame")
-        return FilteredView(
+        return ViewResult(
             color=picture,
-            stage_times_ms=timer.result_ms(),
+            stage_times_ms=timer.ms,
             missing_depth_count=missing_count,
             clamped_depth_count=frame.c.clamped_count,
             bad_color_count=frame.c.bad_color_count,
@@ -205,7 +204,7 @@ class NativeRenderer(OneView):
 
     def _pixels(
         self,
-        timer: "StageTimes",
+        timer: StageTimes,
         frame: FrameRecord,
         view: RgbdView,
         eye: EyeState,
@@ -218,7 +217,7 @@ class NativeRenderer(OneView):
             whole = drop_empty_layer(replace(view, depth_m=filled_m))
             border_px = border_px_of(whole, layers, image)
             whole = extended(whole, border_px)
-        change_dpt = eye.states.corner_change_dpt(timer, layers, image)
+        change_dpt = eye.handle.corner_change_dpt(timer, layers, image)
         with timer.wall("fragments_ms"):
             frame.set_view(whole, border_px)
             used = frame.set_state(layers, image, change_dpt)
@@ -250,19 +249,19 @@ class NativeRenderer(OneView):
 
     def _fill(
         self,
-        timer: "StageTimes",
+        timer: StageTimes,
         handle: NativeStore,
         until_s: float | None,
         psfs: NDArray[np.int64],
     ) -> NDArray[np.int64]:
         """Compute the missing PSFs of a frame, timed as a stage of its own."""
-        with timer.inner("psf_compute_ms"):
+        with timer.wall("psf_compute_ms"):
             return handle.store.fill(
                 psfs, until_s=until_s, between=self._pause_callback
             )
 
     def _blend(
-        self, timer: "StageTimes", frame: FrameRecord, plan: KernelPlan, eye: EyeState
+        self, timer: StageTimes, frame: FrameRecord, plan: KernelPlan, eye: EyeState
     ) -> BlendSizes:
         """Blend the kernels at the levels that fragments use, unless they exist."""
         levels = plan.shapes["levels_used"]
@@ -279,35 +278,3 @@ class NativeRenderer(OneView):
             self._loops.call("blend", frame.c)
         eye.blended = plan, levels.copy(), sizes
         return sizes
-
-
-class StageTimes:
-    """Wall times of named stages, ms, without pauses."""
-
-    def __init__(self, paused_s: Callable[[], float]) -> None:
-        self._ms: dict[str, float] = {}
-        self._inner_ms = 0.0
-        self._paused_s = paused_s
-        self._before_s = paused_s()
-
-    @contextmanager
-    def wall(self, name: str) -> Iterator[None]:
-        """Time a stage; the times of equal names are added."""
-        started_s, inner_ms = time.perf_counter() - self._paused_s(), self._inner_ms
-        yield
-        elapsed_ms = 1e3 * (time.perf_counter() - self._paused_s() - started_s)
-        elapsed_ms -= self._inner_ms - inner_ms
-        self._ms[name] = self._ms.get(name, 0.0) + elapsed_ms
-
-    @contextmanager
-    def inner(self, name: str) -> Iterator[None]:
-        """Time a nested stage, which does not count toward the outer stage."""
-        before_ms = sum(self._ms.values())
-        with self.wall(name):
-            yield
-        self._inner_ms += sum(self._ms.values()) - before_ms
-
-    def result_ms(self) -> dict[str, float]:
-        """Return the times by stage, with the total of the pauses if there were any."""
-        pauses_ms = 1e3 * (self._paused_s() - self._before_s)
-        return dict(self._ms) | ({"rests_ms": pauses_ms} if pauses_ms else {})
