@@ -478,33 +478,28 @@ def _known(value: float, digits: int) -> float | None:
 
 def _measured(batch: Batch, profile: str) -> dict[str, Any]:
     """Filter the first frames through a profile, on one thread."""
-    frames = batch.frames[:MEASURED_FRAMES]
     times_ms, sizes, errors = [], [], []
     notes: Notes = {}
-    build_s = 0.0
-    with tempfile.TemporaryDirectory(prefix="ocufilter-dry-run-") as folder:
-        runner = UnitRunner(batch.job, Path(folder))
-        try:
-            for number, frame in enumerate(frames):
-                segment = Path(f"{number}.mkv") if batch.job.is_video else None
-                unit = Unit(number, profile, (frame,), segment)
-                started_s = time.perf_counter()
-                (record,) = runner.run(unit)
-                took_ms = 1e3 * (time.perf_counter() - started_s)
-                if not record["ok"]:
-                    errors.append(record["error"])
-                    continue
-                add_notes(notes, record["notes"])
-                sizes.append(record["bytes"])
-                if "build" not in record["ms"]:
-                    times_ms.append(took_ms)
-            build_s = runner.build_s
-        finally:
-            runner.close()
+    with (
+        tempfile.TemporaryDirectory(prefix="ocufilter-dry-run-") as folder,
+        closing(UnitRunner(batch.job, Path(folder))) as runner,
+    ):
+        for number, frame in enumerate(batch.frames[:MEASURED_FRAMES]):
+            segment = Path(f"{number}.mkv") if batch.job.is_video else None
+            started_s = time.perf_counter()
+            (record,) = runner.run(Unit(number, profile, (frame,), segment))
+            took_ms = 1e3 * (time.perf_counter() - started_s)
+            if not record["ok"]:
+                errors.append(record["error"])
+                continue
+            add_notes(notes, record["notes"])
+            sizes.append(record["bytes"])
+            if "build" not in record["ms"]:
+                times_ms.append(took_ms)
     return {
         "profile": profile,
         "measured_frames": len(times_ms),
-        "build_s": round(build_s, 2),
+        "build_s": round(runner.build_s, 2),
         "ms_per_frame": round(float(np.median(times_ms)), 2) if times_ms else None,
         "bytes_per_frame": round(float(np.mean(sizes))) if sizes else None,
         "errors": errors,

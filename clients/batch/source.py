@@ -191,21 +191,6 @@ class BadFrame(ValueError):
     """The frame cannot be used; the message names its file."""
 
 
-def check_sizes(frame: SourceFrame, color: ImageFile, depth: ImageFile) -> None:
-    """Check that color and depth have the same size and place.
-
-    Raises
-    ------
-    BadFrame
-        If they differ.
-    """
-    if (problem := color.grid.difference(depth.grid)) is not None:
-        found, wanted = problem
-        raise BadFrame(
-            f"'{frame.depth}': {found}; allowed: the size of '{frame.color}', {wanted}"
-        )
-
-
 def center_depth_m(depth_m: NDArray[np.float32]) -> float:
     """Return the median depth at the center of an image.
 
@@ -323,26 +308,19 @@ def read_states(
         If a value is invalid.  The message names the line, the value and the range.
     """
     text = read_text(path, option="states")
-    try:
-        return _states_of(text, path, names)
-    except csv.Error as error:
-        raise InvalidFile(path, f"not CSV ({error})", "CSV", "states") from None
-
-
-def _states_of(
-    text: str, path: Path, names: Sequence[str]
-) -> dict[str, tuple[float | None, float | None]]:
     known = {same_text(name): name for name in names}
     by_number = {int(name): name for name in names if _is_number(name)}
     rows = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True)
-    columns = rows.fieldnames or []
+    try:
+        columns, lines = rows.fieldnames or [], [(rows.line_num, row) for row in rows]
+    except csv.Error as error:
+        raise InvalidFile(path, f"not CSV ({error})", "CSV", "states") from None
     if "frame" not in columns or not set(columns) <= set(COLUMNS):
         found_text = f"columns {', '.join(columns) or 'none':.100}"
         raise InvalidFile(path, found_text, ", ".join(COLUMNS), "states")
     found = {}
-    for row in rows:
-        where = f"line {rows.line_num}"
-        name = row["frame"]
+    for number, row in lines:
+        where, name = f"line {number}", row["frame"]
         if name is None:
             raise InvalidFile(path, f"{where}: no frame", "a name", "states")
         if same_text(name) in known:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.batch.manifest import Record, below, write_whole
-from clients.batch.source import BadFrame, SourceFrame, States, check_sizes
+from clients.batch.source import BadFrame, SourceFrame, States
 from estimator.bounded_files import read_bytes
 from filter_service import (
     Camera,
@@ -291,7 +291,11 @@ class UnitRunner:
             raise BadFrame(frame.fault)
         start_s = time.perf_counter()
         color, depth, inputs = self._read(frame)
-        check_sizes(frame, color, depth)
+        if (problem := color.grid.difference(depth.grid)) is not None:
+            raise BadFrame(
+                f"'{frame.depth}': {problem[0]}; allowed: the size of '{frame.color}', "
+                f"{problem[1]}"
+            )
         view = RgbdView(color.pixels, depth.pixels, frame.optics.tangents(color.grid))
         pupil_mm, focus_dpt = self._job.states.of(frame.name, depth.pixels)
         read_ms, start_s = _ms_since(start_s), time.perf_counter()

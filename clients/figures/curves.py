@@ -44,7 +44,7 @@ from clients.figures.style import (
     style_axes,
     with_grid,
 )
-from clients.figures.wavefront import rms_um
+from clients.figures.wavefront import ARCMIN_PER_MRAD, rms_um
 from estimator import (
     DrawnFields,
     drawn_fields,
@@ -247,7 +247,6 @@ def through_focus_acuity_figure(study: EyeStudy) -> Figure:
 
 
 MIN_RANGE_DPT = 0.25
-ARCMIN_PER_MRAD = 60.0 * 180.0 / np.pi / 1000.0
 LEVEL_COUNT = 14
 
 

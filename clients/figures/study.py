@@ -357,11 +357,6 @@ class EyeStudy:
         )
         return cls(parsed, eye_model(parsed), optics, notes)
 
-    @property
-    def name(self) -> str:
-        """Return the profile's name."""
-        return self.profile.name
-
     @cached_property
     def is_example(self) -> bool:
         """Return whether the eye is a preset, not the measurement of a person."""

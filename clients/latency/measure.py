@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import secrets
@@ -81,14 +82,6 @@ class Target:
     is_moving: bool
 
 
-@dataclass(frozen=True)
-class PictureError:
-    """Error of 8-bit images: PSNR (peak 255), and the largest difference in levels."""
-
-    psnr_db: float
-    worst_difference: int
-
-
 @dataclass
 class Measured:
     """Results of a case.
@@ -106,7 +99,8 @@ class Measured:
         Sessions of other clients at the start.
     server : mapping
         Description of the service.
-    error : PictureError or None
+    error : dict or None
+        Of 8-bit images: PSNR (peak 255), largest difference in levels, and the frames.
         None before `compare`, or if it failed or no frame was filtered.
     """
 
@@ -116,7 +110,7 @@ class Measured:
     change_ms: list[float]
     n_other_sessions: int
     server: Mapping[str, str]
-    error: PictureError | None = None
+    error: dict[str, Any] | None = None
 
     @property
     def label(self) -> str:
@@ -252,13 +246,14 @@ def compare(target: Target, results: Sequence[Measured]) -> None:
                     n_values += difference.size
                     worst = max(worst, int(difference.max()))
             if n_values:
-                found.error = PictureError(_psnr_db(squares / n_values), worst)
-
-
-def _psnr_db(mean_square: float) -> float:
-    if mean_square == 0.0:
-        return EQUAL_PSNR_DB
-    return float(10.0 * np.log10(255.0**2 / mean_square))
+                psnr_db = EQUAL_PSNR_DB
+                if squares > 0.0:
+                    psnr_db = 10.0 * math.log10(255.0**2 * n_values / squares)
+                found.error = {
+                    "psnr_db": round(psnr_db, 3),
+                    "worst_difference": worst,
+                    "frames": [kept.index for kept in found.run.kept],
+                }
 
 
 PERCENTILES = {"p50": 50, "p90": 90, "p99": 99, "max": 100}
@@ -295,7 +290,7 @@ def _row(found: Measured) -> dict[str, Any]:
         "views": found.case.n_views,
         "rate_hz": found.case.rate_hz,
         "frames": {
-            "scheduled": run.n_scheduled,
+            "scheduled": run.settings.n_scheduled,
             "filtered": run.n_filtered,
             "dropped": dict(run.drops),
             "filtered_hz": round(run.n_filtered / run.duration_s, 3),
@@ -312,13 +307,7 @@ def _row(found: Measured) -> dict[str, Any]:
         },
         "profile_change_ms": _percentiles(found.change_ms)
         | {"n": len(found.change_ms)},
-        "error": None
-        if found.error is None
-        else {
-            "psnr_db": round(found.error.psnr_db, 3),
-            "worst_difference": found.error.worst_difference,
-            "frames": [kept.index for kept in run.kept],
-        },
+        "error": found.error,
         "other_sessions": found.n_other_sessions,
         "service_memory_mb": round(run.memory_end_mb, 1),
     }
@@ -456,9 +445,8 @@ def save_plot(results: Sequence[Measured], path: Path) -> None:
 
 def _plot_label(found: Measured) -> str:
     label = found.label.replace(", ", "\n")
-    if found.error is None:
-        return label
-    return f"{label}\n{found.error.psnr_db:.1f} dB PSNR"
+    error = found.error
+    return label if error is None else f"{label}\n{error['psnr_db']:.1f} dB PSNR"
 
 
 def _stages(run: LatencyRun) -> list[str]:

@@ -11,7 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,16 +62,6 @@ SERVICE_STAGES = ("decode_ms", "queue_ms", "copy_out_ms", "other_ms")
 SUMS = ("added_ms", "service_total_ms", "round_trip_ms", "age_ms")
 
 
-class FrameValues(TypedDict):
-    """Keyword arguments of `FilterClient.submit`."""
-
-    pupil_diameter_mm: float
-    focus_dpt: float
-    output: Output
-    depth_encoding: DepthEncoding
-    states: list[ViewState]
-
-
 @dataclass(frozen=True)
 class StreamSettings:
     """Content and transport of a stream."""
@@ -116,8 +106,8 @@ class StreamSettings:
         """Return the number of frames."""
         return max(1, round(self.rate_hz * self.duration_s))
 
-    def frame_values(self, at_s: float) -> FrameValues:
-        """Return the state and the formats of the frame that is due at a time."""
+    def frame_values(self, at_s: float) -> dict[str, Any]:
+        """Return the arguments of `FilterClient.submit` for a frame due at a time."""
         pupil_mm, focus_dpt = self.pupil_diameter_mm, self.focus_dpt
         if self.is_moving:
             pupil_mm = _between(PUPIL_RANGE_MM, at_s / PUPIL_PERIOD_S)
@@ -144,13 +134,13 @@ class KeptFrame:
     ----------
     index : int
         Number of the frame in the schedule.
-    values : FrameValues
+    values : dict
         State that the frame asked for.
     colors : tuple of (height, width, 3) arrays
     """
 
     index: int
-    values: FrameValues
+    values: dict[str, Any]
     colors: tuple[NDArray[Any], ...]
 
 
@@ -192,7 +182,6 @@ class LatencyRun:
     stages_ms: dict[str, list[float]] = field(default_factory=dict)
     due_s: list[float] = field(default_factory=list)
     drops: Counter[str] = field(default_factory=Counter)
-    n_scheduled: int = 0
     duration_s: float = 0.0
     memory_start_mb: float = 0.0
     memory_end_mb: float = 0.0
@@ -284,7 +273,6 @@ def measure_stream(
     ]
     welcome = client.hello()
     run = LatencyRun(settings, welcome.server["renderer"])
-    run.n_scheduled = settings.n_scheduled
     run.memory_start_mb = read_memory_mb()
     before = client.n_bytes
     loop = _Loop(client, run, settings, n_kept)
@@ -294,7 +282,7 @@ def measure_stream(
         ]
     del first_replies
     loop.start_s = time.monotonic()
-    for k in range(run.n_scheduled):
+    for k in range(run.settings.n_scheduled):
         at_s = k / settings.rate_hz
         loop.take_until(loop.start_s + at_s)
         frame_id = client.submit(frames[k % N_FRAMES], **settings.frame_values(at_s))
@@ -383,7 +371,7 @@ class _Loop:
         self._client = client
         self._run = run
         self._settings = settings
-        self._kept_from = [run.n_scheduled * i // n_kept for i in range(n_kept)]
+        self._kept_from = [settings.n_scheduled * i // n_kept for i in range(n_kept)]
         self._arrivals: list[tuple[float, float]] = []  # of frames: due, arrived
         self.first_colors: list[tuple[NDArray[Any], ...]] = []
         self.sent: dict[int, int] = {}
@@ -400,7 +388,9 @@ class _Loop:
         due_s, arrived_s = np.array(self._arrivals).reshape(-1, 2).T
         if not len(due_s):
             return []
-        end_s = max((self._run.n_scheduled - 1) / self._settings.rate_hz, arrived_s[-1])
+        end_s = max(
+            (self._settings.n_scheduled - 1) / self._settings.rate_hz, arrived_s[-1]
+        )
         at_s = np.arange(arrived_s[0], end_s + SHOWN_STEP_S, SHOWN_STEP_S)
         shown = np.searchsorted(arrived_s, at_s, side="right") - 1
         newest_due_s = np.maximum.accumulate(due_s)[shown]

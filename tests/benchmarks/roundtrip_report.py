@@ -79,7 +79,7 @@ def as_json(run: LatencyRun) -> dict[str, Any]:
         "commit": commit(),
         "rows": rows,
         "frames": {
-            "scheduled": run.n_scheduled,
+            "scheduled": run.settings.n_scheduled,
             "filtered": run.n_filtered,
             "dropped": dict(run.drops),
             "filtered_hz": run.n_filtered / run.duration_s,
@@ -112,7 +112,7 @@ def summary(run: LatencyRun) -> str:
     return (
         f"{up_mb:.2f} MB up and {down_mb:.2f} MB down a frame, "
         f"{run.floor_ms:.2f} ms over a bare socket; "
-        f"{run.n_filtered} of {run.n_scheduled} frames filtered "
+        f"{run.n_filtered} of {run.settings.n_scheduled} frames filtered "
         f"({run.n_filtered / run.duration_s:.1f} Hz), dropped: {dropped}; service "
         f"memory {run.memory_start_mb:.0f} to {run.memory_end_mb:.0f} MB; largest "
         f"difference between replies to one frame {run.max_repeat_difference:g}"
