@@ -10,7 +10,7 @@ video       a color video, with depth as a 16-bit gray video or a folder of imag
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -44,25 +44,6 @@ MAX_EXAMINED_FILES = 1000
 """Files whose kinds an error names."""
 
 
-@dataclass(frozen=True)
-class LayoutOptions:
-    """Command-line options that complement or override the data set.
-
-    Attributes
-    ----------
-    depth : Path, optional
-        Folder or video of depth, if it is not in the folder of color.
-    optics : Optics, optional
-        Overrides the layout's camera.
-    depth_scale_m : float, optional
-        Meters per unit of the depth files; overrides the layout's scale.
-    """
-
-    depth: Path | None = None
-    optics: Optics | None = None
-    depth_scale_m: float | None = None
-
-
 Listing = Callable[[Path], list[SourceFrame]]
 
 DETECTED: dict[str, tuple[Callable[[Path], bool], Listing]] = {
@@ -77,9 +58,26 @@ LAYOUTS = ("auto", *DETECTED, "pairs", "video")
 
 
 def list_frames(
-    source: Path, layout: str, options: LayoutOptions
+    source: Path,
+    layout: str,
+    depth: Path | None = None,
+    optics: Optics | None = None,
+    depth_scale_m: float | None = None,
 ) -> tuple[str, list[SourceFrame]]:
     """Return the layout of a data set, and its frames in the order of their names.
+
+    Parameters
+    ----------
+    source : Path
+        Folder or video.
+    layout : str
+        One of `LAYOUTS`.
+    depth : Path, optional
+        Folder or video of depth, if it is not in the folder of color.
+    optics : Optics, optional
+        Overrides the layout's camera.
+    depth_scale_m : float, optional
+        Meters per unit of the depth files; overrides the layout's scale.
 
     Raises
     ------
@@ -90,22 +88,22 @@ def list_frames(
         raise ValueError(f"'{source}': no such file; allowed: a folder or a video")
     layout = _layout_of(source, layout)
     if layout in DETECTED:
-        if options.depth is not None:
+        if depth is not None:
             raise ValueError(f"--depth: the layout {layout} has its own depth")
         frames = DETECTED[layout][1](source)
-    elif options.optics is None:
+    elif optics is None:
         raise ValueError(
             "--fov-deg is not given, and the data set has no calibration; allowed: the "
             "vertical field of view in deg, or --intrinsics FX,FY,CX,CY in px"
         )
     else:
         listed = _video_frames if layout == "video" else pair_frames
-        scaled = Scaled(options.depth_scale_m)
-        frames = listed(source, options.depth, options.optics, scaled)
+        scaled = Scaled(depth_scale_m)
+        frames = listed(source, depth, optics, scaled)
     if not frames:
-        raise ValueError(_nothing_found(source, layout, options.depth))
+        raise ValueError(_nothing_found(source, layout, depth))
     _check_names(frames)
-    return layout, [_with_options(frame, options) for frame in frames]
+    return layout, [_with_options(frame, optics, depth_scale_m) for frame in frames]
 
 
 def _nothing_found(source: Path, layout: str, depth: Path | None) -> str:
@@ -186,15 +184,17 @@ def _video_frames(
     ]
 
 
-def _with_options(frame: SourceFrame, options: LayoutOptions) -> SourceFrame:
+def _with_options(
+    frame: SourceFrame, optics: Optics | None, depth_scale_m: float | None
+) -> SourceFrame:
     """Apply the options of the command line to a frame."""
-    if options.optics is not None:
-        frame = replace(frame, optics=options.optics)
-    if options.depth_scale_m is not None:
+    if optics is not None:
+        frame = replace(frame, optics=optics)
+    if depth_scale_m is not None:
         if not isinstance(frame.depth_form, Scaled):
             kind = type(frame.depth_form).__name__
             raise ValueError(f"--depth-scale: not allowed for depth of the kind {kind}")
-        frame = replace(frame, depth_form=Scaled(options.depth_scale_m))
+        frame = replace(frame, depth_form=Scaled(depth_scale_m))
     return frame
 
 

@@ -11,9 +11,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from clients.batch.layouts import LayoutOptions, list_frames, optics_of
+from clients.batch.layouts import list_frames, optics_of
 from clients.batch.run import Batch
-from clients.batch.source import CENTER, SourceFrame, States, read_states
+from clients.batch.source import CENTER, SourceFrame, States, number_or_nan, read_states
 from clients.batch.work import (
     LINEAR_FORMATS,
     VIDEO_FORMATS,
@@ -167,12 +167,13 @@ def batch_of(options: BatchOptions) -> Batch:
         If an option is invalid.  The message names the option, the value and the range.
     """
     _check(options)
-    layout_options = LayoutOptions(
+    layout, frames = list_frames(
+        options.source,
+        options.layout,
         options.depth,
         optics_of(options.fov_deg, options.intrinsics),
         options.depth_scale,
     )
-    layout, frames = list_frames(options.source, options.layout, layout_options)
     frames = frames[: options.limit]
     if options.fps is not None:
         frames = [replace(frame, time_s=None) for frame in frames]
@@ -228,10 +229,7 @@ def _check(options: BatchOptions) -> None:
 def _states(options: BatchOptions, names: Sequence[str]) -> States:
     focus_dpt: float | None = None
     if options.focus_dpt != CENTER:
-        try:
-            focus_dpt = float(options.focus_dpt)
-        except ValueError:
-            focus_dpt = float("nan")
+        focus_dpt = number_or_nan(options.focus_dpt)
         if not 0.0 <= focus_dpt <= MAX_VERGENCE_DPT:
             hint = f"; allowed: 0 to {MAX_VERGENCE_DPT:g}"
             if math.isnan(focus_dpt):

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clients.batch.layouts import LayoutOptions, list_frames
+from clients.batch.layouts import list_frames
 from clients.batch.manifest import Manifest
 from clients.batch.source import FieldOfView, States
 from clients.batch.work import Job, Unit, UnitRunner, batch_settings
@@ -318,8 +318,8 @@ def test_overwrite_begins_anew(room, tmp_path):
 
 def run_unit(room, out, states):
     """Filter the first frame of a room as a worker does; return its record."""
-    optics = LayoutOptions(optics=FieldOfView(20.0))
-    _, frames = list_frames(room, "pairs", optics)
+    optics = FieldOfView(20.0)
+    _, frames = list_frames(room, "pairs", optics=optics)
     settings = batch_settings(json.loads(MODE[1]), states)
     job = Job({"myopia": {"kind": "preset", "name": "myopia"}}, settings, states)
     with closing(UnitRunner(job, out)) as runner:

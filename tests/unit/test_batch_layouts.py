@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from clients.batch.datasets import counted_depth_m, registered_m
-from clients.batch.layouts import LayoutOptions, list_frames, optics_of
+from clients.batch.layouts import list_frames, optics_of
 from clients.batch.source import (
     FieldOfView,
     Pinhole,
@@ -22,7 +22,7 @@ from clients.batch.work import Job, Unit, UnitRunner
 from filter_service.camera import PixelGrid
 from filter_service.settings import FilterSettings
 
-FOV = LayoutOptions(optics=FieldOfView(40.0))
+FOV = {"optics": FieldOfView(40.0)}
 
 
 def write_color(path, width_px=4, height_px=2, value=(10, 20, 30)):
@@ -62,7 +62,7 @@ def tum(tmp_path):
 
 
 def test_tum_joins_what_is_nearest_in_time_and_uses_each_once(tum):
-    layout, frames = list_frames(tum, "auto", LayoutOptions())
+    layout, frames = list_frames(tum, "auto")
     assert layout == "tum"
     # 14 ms and 16 ms apart; 1.066 lies 19 ms from 1.047, too, but that one is taken
     assert [(frame.name, frame.depth.name) for frame in frames] == [
@@ -73,19 +73,17 @@ def test_tum_joins_what_is_nearest_in_time_and_uses_each_once(tum):
 
 
 def test_tum_depth_is_5000_units_a_meter_and_0_and_65535_are_missing(tum):
-    _, frames = list_frames(tum, "auto", LayoutOptions())
+    _, frames = list_frames(tum, "auto")
     depth_m = frames[0].depth_form.read(frames[0].depth).pixels
     np.testing.assert_allclose(depth_m, [[1.0, 0.0, 0.0002, 0.0]], rtol=1e-6)
 
 
 def test_tum_has_the_camera_of_the_driver_unless_told_otherwise(tum):
-    _, frames = list_frames(tum, "auto", LayoutOptions())
+    _, frames = list_frames(tum, "auto")
     left, right, up, down = frames[0].optics.tangents(PixelGrid(640, 480))
     np.testing.assert_allclose([left, right], [-320 / 525, 320 / 525])
     np.testing.assert_allclose([up, down], [240 / 525, -240 / 525])
-    _, frames = list_frames(
-        tum, "auto", LayoutOptions(optics=Pinhole(100.0, 50.0, 0.0, 0.0))
-    )
+    _, frames = list_frames(tum, "auto", optics=Pinhole(100.0, 50.0, 0.0, 0.0))
     np.testing.assert_allclose(
         frames[0].optics.tangents(PixelGrid(4, 2)), [-0.005, 0.035, 0.01, -0.03]
     )
@@ -96,14 +94,14 @@ def test_tum_takes_a_list_of_pairs_as_it_stands(tum, order):
     parts = ["1.0 rgb/1.000000.png", "2.0 depth/1.050000.png"]
     parts = parts if order == "color first" else parts[::-1]
     (tum / "associations.txt").write_text(" ".join(parts) + "\n")
-    _, (frame,) = list_frames(tum, "auto", LayoutOptions())
+    _, (frame,) = list_frames(tum, "auto")
     assert (frame.name, frame.depth.name) == ("1.000000", "1.050000.png")
 
 
 def test_a_list_that_cannot_be_read_is_refused_by_its_line(tum):
     (tum / "rgb.txt").write_text("# times\n1.0 rgb/1.000000.png\nsoon rgb/2.png\n")
     with pytest.raises(ValueError, match=r"rgb\.txt': line 3: 'soon' is not a time"):
-        list_frames(tum, "auto", LayoutOptions())
+        list_frames(tum, "auto")
 
 
 # --- Middlebury --------------------------------------------------------------
@@ -127,7 +125,7 @@ def write_scene(folder):
 def test_middlebury_depth_is_focal_length_times_baseline_over_disparity(tmp_path):
     write_scene(tmp_path / "Piano")
     write_scene(tmp_path / "Adirondack")
-    layout, frames = list_frames(tmp_path, "auto", LayoutOptions())
+    layout, frames = list_frames(tmp_path, "auto")
     assert layout == "middlebury"
     assert [frame.name for frame in frames] == ["Adirondack", "Piano"]
     depth_m = frames[0].depth_form.read(frames[0].depth).pixels
@@ -137,7 +135,7 @@ def test_middlebury_depth_is_focal_length_times_baseline_over_disparity(tmp_path
 
 def test_middlebury_has_its_calibrations_camera(tmp_path):
     write_scene(tmp_path)
-    _, (frame,) = list_frames(tmp_path, "auto", LayoutOptions())
+    _, (frame,) = list_frames(tmp_path, "auto")
     np.testing.assert_allclose(
         frame.optics.tangents(PixelGrid(4, 2)),
         [-1.75 / 4000, 2.25 / 4000, 1.0 / 4000, -1.0 / 4000],
@@ -150,7 +148,7 @@ def test_a_calibration_without_a_baseline_is_refused(tmp_path):
     text = CALIBRATION.replace("baseline", "base")
     (tmp_path / "calib.txt").write_text(text)
     with pytest.raises(ValueError, match=r"calib\.txt': 'baseline' is missing"):
-        list_frames(tmp_path, "auto", LayoutOptions())
+        list_frames(tmp_path, "auto")
 
 
 # --- NYU depth v2 ------------------------------------------------------------
@@ -159,7 +157,7 @@ def test_a_calibration_without_a_baseline_is_refused(tmp_path):
 def test_nyu_pairs_are_millimeters_with_the_color_camera_of_the_toolbox(tmp_path):
     write_color(tmp_path / "00001_colors.png")
     write_integers(tmp_path / "00001_depth.png", [[1500, 0, 9999, 1]] * 2)
-    layout, (frame,) = list_frames(tmp_path, "auto", LayoutOptions())
+    layout, (frame,) = list_frames(tmp_path, "auto")
     assert (layout, frame.name) == ("nyu", "00001")
     depth_m = frame.depth_form.read(frame.depth).pixels
     np.testing.assert_allclose(depth_m[0], [1.5, 0.0, 9.999, 0.001], rtol=1e-6)
@@ -170,7 +168,7 @@ def test_nyu_pairs_are_millimeters_with_the_color_camera_of_the_toolbox(tmp_path
 def test_a_camera_of_other_images_is_refused(tmp_path):
     write_color(tmp_path / "00001_colors.png")
     write_integers(tmp_path / "00001_depth.png", [[1, 2, 3, 4]] * 2)
-    _, (frame,) = list_frames(tmp_path, "auto", LayoutOptions())
+    _, (frame,) = list_frames(tmp_path, "auto")
     with pytest.raises(ValueError, match=r"4x2 px, but the camera .* is for 640x480"):
         frame.optics.tangents(PixelGrid(4, 2))
 
@@ -178,14 +176,14 @@ def test_a_camera_of_other_images_is_refused(tmp_path):
 def test_pairs_that_are_only_like_nyu_are_not_taken_for_it(tmp_path):
     write_color(tmp_path / "rgb_0001.png")
     write_integers(tmp_path / "depth_0001.png", [[1, 2, 3, 4]] * 2)
-    layout, (frame,) = list_frames(tmp_path, "auto", FOV)
+    layout, (frame,) = list_frames(tmp_path, "auto", **FOV)
     assert (layout, frame.name) == ("pairs", "0001")
 
 
 def test_nyu_pairs_have_other_names_too(tmp_path):
     write_color(tmp_path / "rgb_00045.jpg")
     write_integers(tmp_path / "sync_depth_00045.png", [[1500, 0, 9999, 1]] * 2)
-    layout, (frame,) = list_frames(tmp_path, "auto", LayoutOptions())
+    layout, (frame,) = list_frames(tmp_path, "auto")
     assert (layout, frame.name) == ("nyu", "00045")
     assert frame.depth.name == "sync_depth_00045.png"
 
@@ -218,7 +216,7 @@ def test_nyu_raw_frames_take_the_depth_nearest_in_time(tmp_path):
     for time in ("99.90", "100.45", "100.60"):
         path = tmp_path / f"d-{time}-9.pgm"
         path.write_bytes(b"P5\n640 480\n65535\n" + swapped)
-    layout, frames = list_frames(tmp_path, "auto", LayoutOptions())
+    layout, frames = list_frames(tmp_path, "auto")
     assert layout == "nyu"
     assert [frame.depth.name for frame in frames] == ["d-99.90-9.pgm", "d-100.45-9.pgm"]
     depth_m = frames[0].depth_form.read(frames[0].depth).pixels
@@ -251,7 +249,7 @@ def test_pairs_in_two_folders_take_every_kind_of_depth(tmp_path, suffix):
         write_pfm(path, depth_m)
     else:
         Image.fromarray(depth_m).save(path)
-    layout, (frame,) = list_frames(tmp_path, "auto", FOV)
+    layout, (frame,) = list_frames(tmp_path, "auto", **FOV)
     assert (layout, frame.name) == ("pairs", "a")
     np.testing.assert_array_equal(frame.depth_form.read(frame.depth).pixels, depth_m)
 
@@ -260,7 +258,7 @@ def test_pairs_beside_each_other_are_told_apart_by_their_names(tmp_path):
     for k in (1, 2):
         write_color(tmp_path / f"{k}_color.png")
         write_integers(tmp_path / f"{k}_depth.png", [[1, 2, 3, 4]] * 2)
-    _, frames = list_frames(tmp_path, "auto", FOV)
+    _, frames = list_frames(tmp_path, "auto", **FOV)
     assert [(f.name, f.color.name, f.depth.name) for f in frames] == [
         ("1", "1_color.png", "1_depth.png"),
         ("2", "2_color.png", "2_depth.png"),
@@ -271,7 +269,7 @@ def test_a_file_without_a_partner_is_a_fault_of_its_own(tmp_path):
     write_color(tmp_path / "rgb/a.png")
     write_color(tmp_path / "rgb/b.png")
     write_integers(tmp_path / "depth/b.png", [[1, 2, 3, 4]] * 2)
-    _, (first, second) = list_frames(tmp_path, "auto", FOV)
+    _, (first, second) = list_frames(tmp_path, "auto", **FOV)
     assert "no depth with the name 'a'" in first.fault
     assert second.fault is None
 
@@ -279,8 +277,8 @@ def test_a_file_without_a_partner_is_a_fault_of_its_own(tmp_path):
 def test_a_scale_that_is_told_is_used(tmp_path):
     write_color(tmp_path / "rgb/a.png")
     write_integers(tmp_path / "depth/a.png", [[1, 2, 3, 4]] * 2)
-    told = LayoutOptions(optics=FieldOfView(40.0), depth_scale_m=0.25)
-    _, (frame,) = list_frames(tmp_path, "auto", told)
+    told = None, FieldOfView(40.0), 0.25
+    _, (frame,) = list_frames(tmp_path, "auto", *told)
     assert frame.depth_form == Scaled(0.25)
     np.testing.assert_array_equal(
         frame.depth_form.read(frame.depth).pixels[0], [0.25, 0.5, 0.75, 1.0]
@@ -291,7 +289,7 @@ def test_without_a_calibration_the_field_of_view_is_asked_for(tmp_path):
     write_color(tmp_path / "rgb/a.png")
     write_integers(tmp_path / "depth/a.png", [[1, 2, 3, 4]] * 2)
     with pytest.raises(ValueError, match="--fov-deg is not given"):
-        list_frames(tmp_path, "auto", LayoutOptions())
+        list_frames(tmp_path, "auto")
     with pytest.raises(ValueError, match=r"--fov-deg is 400; allowed: 1 to 150"):
         optics_of(400.0, None)
     with pytest.raises(ValueError, match=r"--intrinsics is '1,2'; allowed: FX,FY"):
@@ -351,14 +349,14 @@ def test_depth_of_a_video_is_scaled_and_other_pixels_are_refused(tmp_path):
     write_video(tmp_path / "c.mkv", colors, "ffv1", "bgr0", "rgb24")
     depths = [np.full((32, 48), 1000 * (k + 1), np.uint16) for k in range(3)]
     write_video(tmp_path / "d.mkv", depths, "ffv1", "gray16le", "gray16le")
-    told = LayoutOptions(tmp_path / "d.mkv", FieldOfView(40.0), 0.0005)
-    layout, frames = list_frames(tmp_path / "c.mkv", "auto", told)
+    told = tmp_path / "d.mkv", FieldOfView(40.0), 0.0005
+    layout, frames = list_frames(tmp_path / "c.mkv", "auto", *told)
     assert (layout, [f.name for f in frames]) == (
         "video",
         ["000000", "000001", "000002"],
     )
-    told = LayoutOptions(tmp_path / "c.mkv", FieldOfView(40.0))
-    _, others = list_frames(tmp_path / "c.mkv", "auto", told)
+    told = tmp_path / "c.mkv", FieldOfView(40.0)
+    _, others = list_frames(tmp_path / "c.mkv", "auto", *told)
     with VideoReader(frames[2].color) as reader:
         assert (reader.color(frames[2].color_index).pixels == 99).all()
     job = Job({}, FilterSettings(), ReadOnly(4.0, 0.0))
@@ -373,10 +371,10 @@ def test_a_video_wants_as_many_depths_as_it_has_frames(tmp_path):
     write_video(tmp_path / "c.mkv", colors, "ffv1", "bgr0", "rgb24")
     write_integers(tmp_path / "depth/0.png", np.ones((32, 48)))
     with pytest.raises(ValueError, match=r"1 frames; allowed: 3, as in"):
-        told = LayoutOptions(tmp_path / "depth", FieldOfView(40.0))
-        list_frames(tmp_path / "c.mkv", "auto", told)
+        told = tmp_path / "depth", FieldOfView(40.0)
+        list_frames(tmp_path / "c.mkv", "auto", *told)
     with pytest.raises(ValueError, match="--depth is not given"):
-        list_frames(tmp_path / "c.mkv", "auto", FOV)
+        list_frames(tmp_path / "c.mkv", "auto", **FOV)
 
 
 def test_segments_become_one_video_in_which_a_gap_is_time(tmp_path, rng):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clients.batch.datasets import in_order
-from clients.batch.layouts import LayoutOptions, list_frames
+from clients.batch.layouts import list_frames
 from clients.batch.source import FieldOfView, read_states
 from tests.unit.test_batch_layouts import (
     FOV,
@@ -21,7 +21,7 @@ def test_frames_are_in_the_order_in_which_people_count(tmp_path):
     for k in range(1, 13):
         write_color(tmp_path / f"color/{k}.png")
         write_integers(tmp_path / f"depth/{k}.png", [[1, 2, 3, 4]] * 2)
-    _, frames = list_frames(tmp_path, "auto", FOV)
+    _, frames = list_frames(tmp_path, "auto", **FOV)
     assert [frame.name for frame in frames] == [str(k) for k in range(1, 13)]
     assert all(frame.color.stem == frame.depth.stem for frame in frames)
 
@@ -52,15 +52,15 @@ def test_depth_of_a_video_is_in_the_order_of_its_frames(tmp_path):
     write_video(tmp_path / "c.mkv", colors, "ffv1", "bgr0", "rgb24")
     for k in range(12):
         write_integers(tmp_path / f"depth/{k}.png", np.full((32, 48), 1000 + k))
-    told = LayoutOptions(tmp_path / "depth", FieldOfView(40.0))
-    _, frames = list_frames(tmp_path / "c.mkv", "auto", told)
+    told = tmp_path / "depth", FieldOfView(40.0)
+    _, frames = list_frames(tmp_path / "c.mkv", "auto", *told)
     assert [frame.depth.name for frame in frames] == [f"{k}.png" for k in range(12)]
 
 
 def test_scenes_are_in_the_order_in_which_people_count(tmp_path):
     for k in (1, 10, 2):
         write_scene(tmp_path / f"scene{k}")
-    _, frames = list_frames(tmp_path, "auto", LayoutOptions())
+    _, frames = list_frames(tmp_path, "auto")
     assert [frame.name for frame in frames] == ["scene1", "scene2", "scene10"]
 
 
@@ -70,7 +70,7 @@ def test_accents_of_macos_and_linux_meet(tmp_path):
     assert one != two
     write_color(tmp_path / f"color/{one}.png")
     write_integers(tmp_path / f"depth/{two}.png", [[1, 2, 3, 4]] * 2)
-    _, (frame,) = list_frames(tmp_path, "auto", FOV)
+    _, (frame,) = list_frames(tmp_path, "auto", **FOV)
     assert frame.fault is None
     assert frame.name == one
     path = tmp_path / "states.csv"
@@ -85,14 +85,14 @@ def test_two_forms_of_a_name_in_one_folder_are_refused(tmp_path):
         write_color(tmp_path / f"color/{name}.png")
     write_integers(tmp_path / "depth/a.png", [[1, 2, 3, 4]] * 2)
     with pytest.raises(ValueError, match="have the same name 'größe'"):
-        list_frames(tmp_path, "auto", FOV)
+        list_frames(tmp_path, "auto", **FOV)
 
 
 @pytest.mark.parametrize("folders", [("RGB", "Depth"), ("Color", "DEPTH")])
 def test_folders_and_suffixes_may_have_any_case(tmp_path, folders):
     write_color(tmp_path / folders[0] / "1.JPG")
     write_integers(tmp_path / folders[1] / "1.PNG", [[1, 2, 3, 4]] * 2)
-    layout, (frame,) = list_frames(tmp_path, "auto", FOV)
+    layout, (frame,) = list_frames(tmp_path, "auto", **FOV)
     assert (layout, frame.name, frame.fault) == ("pairs", "1", None)
     depth = frame.depth_form.read(frame.depth)
     assert depth.pixels.shape == (2, 4)
@@ -103,4 +103,4 @@ def test_a_folder_without_frames_is_refused_with_its_kinds_of_files(tmp_path):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "1.heic").write_bytes(b"x")
     with pytest.raises(ValueError, match=r"files: \.heic; allowed: images \(\.png, "):
-        list_frames(tmp_path, "auto", FOV)
+        list_frames(tmp_path, "auto", **FOV)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from clients.batch.layouts import LayoutOptions, list_frames
+from clients.batch.layouts import list_frames
 from clients.batch.source import FieldOfView, States
 from clients.batch.work import Job, Unit, UnitRunner, batch_settings
 from filter_service.image_files import read_color_file
@@ -153,7 +153,7 @@ def runner(tmp_path_factory):
     out, folder = tmp_path_factory.mktemp("out"), tmp_path_factory.mktemp("first")
     np.save(folder / "a_depth.npy", np.full((HEIGHT_PX, WIDTH_PX), 2.0, np.float32))
     Image.new("RGB", (WIDTH_PX, HEIGHT_PX)).save(folder / "a_color.png")
-    _, frames = list_frames(folder, "pairs", LayoutOptions(optics=FieldOfView(5.0)))
+    _, frames = list_frames(folder, "pairs", optics=FieldOfView(5.0))
     with closing(UnitRunner(job, out)) as running:
         assert [record["ok"] for record in running.run(Unit(0, "eye", tuple(frames)))]
         yield running, out
@@ -178,9 +178,9 @@ def test_an_astigmatic_eye_sees_the_same_in_a_turned_video_and_in_photographs(
     (tmp_path / "video").mkdir()
     np.save(tmp_path / "video/0.npy", depth_m)
     optics = FieldOfView(5.0)
-    _, photos = list_frames(tmp_path, "auto", LayoutOptions(optics=optics))
-    given = LayoutOptions(tmp_path / "video", optics)
-    _, video = list_frames(tmp_path / "a.mov", "auto", given)
+    _, photos = list_frames(tmp_path, "auto", optics=optics)
+    given = tmp_path / "video", optics
+    _, video = list_frames(tmp_path / "a.mov", "auto", *given)
     records = list(running.run(Unit(0, "eye", (*photos, *video))))
     assert [record["ok"] for record in records] == [True] * 3, records
     photo, upright, shot = (np.load(out / record["file"]) for record in records)
@@ -368,8 +368,8 @@ def test_a_variable_frame_rate_is_kept(tmp_path, picture):
     (tmp_path / "depth").mkdir()
     for k in range(len(TIMES_S)):
         np.save(tmp_path / f"depth/{k}.npy", np.ones(picture.shape[:2], np.float32))
-    given = LayoutOptions(tmp_path / "depth", FieldOfView(40.0))
-    _, frames = list_frames(tmp_path / "a.mkv", "auto", given)
+    given = tmp_path / "depth", FieldOfView(40.0)
+    _, frames = list_frames(tmp_path / "a.mkv", "auto", *given)
     times_s = [frame.time_s for frame in frames]
     np.testing.assert_allclose([float(t) for t in times_s], TIMES_S, atol=1e-9)
     for name in ("ffv1", "h264"):
