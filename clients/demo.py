@@ -38,9 +38,9 @@ from clients.sheet import (
     magnified,
     state_panel,
     video_frame,
+    write_video,
 )
 from clients.streaming import change_eye, filter_in_order
-from clients.video import write_video
 from filter_service.atomic_files import replace_atomically
 from filter_service.command_line import CommandFailed, Json, print_json, print_line
 from filter_service.errors import FilterError, RenderFailed

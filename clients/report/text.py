@@ -174,12 +174,11 @@ def design_adds_dpt(rings: DiffractiveRings) -> list[float]:
 
 
 def _progressive(lens: ProgressiveLens) -> tuple[str, ...]:
-    parts = (
+    return (
         f"add {_power(lens.add_dpt)} dpt",
         f"corridor {lens.corridor_mm:g} mm",
-        gaze_text(lens.gaze_deg),
+        f"{gaze_text(lens.gaze_deg)} through {format_prescription(lens)}",
     )
-    return (*parts[:2], f"{parts[2]} through {format_prescription(lens)}")
 
 
 def gaze_text(gaze_deg: tuple[float, float]) -> str:

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 import clients.batch
-from clients import demo, pyrender_stream, sheet, video
+from clients import demo, pyrender_stream, sheet
 from clients.batch import video_writing
 from clients.batch.video_reading import VideoReader
 from clients.commands.options import read_profile, read_size_px
@@ -173,7 +173,7 @@ def test_gif_stands_in_where_the_encoder_fails_or_lacks(broken, monkeypatch, tmp
         kind = replace(video_writing.VIDEO_KINDS["h264"], **broken)
         monkeypatch.setitem(video_writing.VIDEO_KINDS, "h264", kind)
     shades = [np.full((20, 40, 3), shade, np.uint8) for shade in (0, 120, 250)]
-    written = video.write_video(tmp_path / "film", lambda: iter(shades), 10)
+    written = sheet.write_video(tmp_path / "film", lambda: iter(shades), 10)
     assert written == tmp_path / "film.gif"
     assert list(tmp_path.iterdir()) == [written]
     with Image.open(written) as gif:
@@ -186,7 +186,7 @@ def test_gif_stands_in_where_the_encoder_fails_or_lacks(broken, monkeypatch, tmp
 def test_mp4_keeps_colors_and_order(tmp_path):
     colors = ((200, 30, 30), (30, 200, 30), (30, 30, 200))
     images = [np.full((64, 96, 3), color, np.uint8) for color in colors]
-    written = video.write_video(tmp_path / "film", lambda: iter(images), 10)
+    written = sheet.write_video(tmp_path / "film", lambda: iter(images), 10)
     assert written == tmp_path / "film.mp4"
     assert list(tmp_path.iterdir()) == [written]
     means = _decoded(written, 96, 64).mean(axis=(1, 2))
