@@ -108,6 +108,9 @@ Record = dict[str, Any]
 ContentOf = Callable[[Path], Mapping[str, Any]]
 """Function that returns the size and the hash of a file, as `content_of`."""
 
+_VIDEO = ""
+"""Name of a profile's video among frames, whose names are not empty."""
+
 _ESCAPE = re.compile(r"\\(?:\\|x[89a-f][0-9a-f])")
 
 
@@ -177,8 +180,8 @@ class Manifest:
         self._out = out
         self._path = out / LINES
         self._read_only = read_only
-        self._places: dict[tuple[str, str], int] = {}  # byte offsets of lines
-        self._videos: dict[str, Record] = {}
+        # Length and offset of lines by profile and frame, for videos `_VIDEO`
+        self._places: dict[tuple[str, str], tuple[int, int]] = {}
         self._synced_s = time.monotonic()
         flags = os.O_RDONLY if read_only else os.O_RDWR | os.O_CREAT | os.O_APPEND
         flags |= os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
@@ -212,12 +215,9 @@ class Manifest:
                 record = _parsed(line, self._path)
                 if end == 0:
                     _check_same(record, job, self._path)
-                elif record.get("kind") == "frame":
+                elif record.get("kind") in ("frame", "video"):
                     _check(record, self._path)
-                    self._places[record["profile"], record["frame"]] = end
-                elif record.get("kind") == "video":
-                    _check(record, self._path)
-                    self._videos[record["profile"]] = record
+                    self._places[_key(record)] = len(line), end
                 end += len(line)
         if len(line) > MAX_LINE_BYTES:
             found = f"a line has more than {MAX_LINE_BYTES:,} bytes"
@@ -234,11 +234,7 @@ class Manifest:
             key: _AS_TEXT[key](value) if key in _AS_TEXT else value
             for key, value in record.items()
         }
-        place = self._write(_line(written))
-        if record["kind"] == "video":
-            self._videos[record["profile"]] = written
-        else:
-            self._places[record["profile"], written["frame"]] = place
+        self._places[_key(written)] = self._write(_line(written))
 
     def check_in_place(self) -> None:
         """Check that the folder still contains the file.
@@ -256,7 +252,7 @@ class Manifest:
         if not in_place:
             raise OSError(f"'{self._path}' was removed or replaced during the run")
 
-    def _write(self, line: bytes) -> int:
+    def _write(self, line: bytes) -> tuple[int, int]:
         place = os.lseek(self._file, 0, os.SEEK_END)
         written = os.write(self._file, line)
         if written != len(line):  # disk full: remove the partial line
@@ -268,19 +264,15 @@ class Manifest:
         if now_s - self._synced_s > SYNC_S:
             os.fsync(self._file)
             self._synced_s = now_s
-        return place
+        return written, place
 
     def record(self, profile: str, frame: str) -> Record | None:
         """Return the last record of a frame, or None."""
         place = self._places.get((profile, text_of(frame)))
         return None if place is None else self._at(place)
 
-    def _at(self, place: int) -> Record:
-        parts: list[bytes] = []
-        while not parts or b"\n" not in parts[-1]:
-            size = sum(map(len, parts))
-            parts.append(os.pread(self._file, 4096, place + size))
-        return json.loads(b"".join(parts).split(b"\n", 1)[0])
+    def _at(self, place: tuple[int, int]) -> Record:
+        return json.loads(os.pread(self._file, *place))
 
     def records(self) -> Iterator[Record]:
         """Yield the last record of each frame, sorted by profile and name.
@@ -288,7 +280,8 @@ class Manifest:
         Names are those of `text_of`.
         """
         for key in sorted(self._places):
-            yield self._at(self._places[key])
+            if key[1] != _VIDEO:
+                yield self._at(self._places[key])
 
     def is_done(self, profile: str, frame: SourceFrame, content_of: ContentOf) -> bool:
         """Return whether a frame's output is intact and its inputs are unchanged.
@@ -315,8 +308,12 @@ class Manifest:
 
     def has_video(self, profile: str, path: Path, content_of: ContentOf) -> bool:
         """Return whether a file is the last video of a profile, unchanged."""
-        record = self._videos.get(profile)
-        return record is not None and _has_content(path, record, content_of)
+        record = self.record(profile, _VIDEO)
+        return (
+            record is not None
+            and record["kind"] == "video"
+            and _has_content(path, record, content_of)
+        )
 
 
 def begin_manifest(out: Path, job: Mapping[str, Any]) -> None:
@@ -326,6 +323,11 @@ def begin_manifest(out: Path, job: Mapping[str, Any]) -> None:
 
 def _job_line(job: Mapping[str, Any]) -> bytes:
     return _line({"kind": "job", "fingerprint": fingerprint(job), **job})
+
+
+def _key(record: Record) -> tuple[str, str]:
+    name = record["frame"] if record["kind"] == "frame" else _VIDEO
+    return record["profile"], name
 
 
 def _line(record: Mapping[str, Any]) -> bytes:
