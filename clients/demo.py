@@ -225,9 +225,9 @@ def _filmed(
         film = EyeFilm([], {}, FrameLog(), change)
         answers = filter_in_order(client, rendered, film.log)
         for position, (frame, answer) in enumerate(zip(frames, answers, strict=True)):
-            if answer.header.generation != change["generation"]:
+            if answer.generation != change["generation"]:
                 raise RenderFailed(
-                    f"a frame was filtered with generation {answer.header.generation} "
+                    f"a frame was filtered with generation {answer.generation} "
                     f"after {change['generation']} was ready"
                 )
             film.small.append(fitted(answer.color, cell_size_px(size_px)).copy())
@@ -297,7 +297,7 @@ def _cell(
 
 def _used(requested: EyeState, seen: FilteredFrame) -> str:
     """Describe the state used, which far point and measured pupil may limit."""
-    pupil_mm, focus_dpt = seen.header.pupil_diameter_mm, seen.header.focus_dpt
+    pupil_mm, focus_dpt = seen.pupil_diameter_mm, seen.focus_dpt
     text = EyeState("", pupil_mm, focus_dpt).text()
     if focus_dpt > requested.focus_dpt + 0.05:
         text += " (far point)"

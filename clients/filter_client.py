@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Required, Unpack, cast
+from typing import TYPE_CHECKING, Any, Required, Unpack, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from clients.link import Event, FilteredFrame, ServiceLink
 from clients.shared_memory import REPLY_LIMIT_S
 from filter_service import ColorImage, Output, RgbdView, as_views
 from filter_service.errors import BadMessage, FilterError, ServiceTimeout
+from filter_service.filter_protocol import Filter
 from filter_service.keys import load_client_key
 from filter_service.messages import (
     COMPRESSIONS,
@@ -67,7 +68,6 @@ __all__ = ["Event", "FilterClient", "FilteredFrame", "RgbdView", "ViewState"]
 
 
 DEFAULT_SETTINGS = FilterSettings()
-
 SharedViews = Sequence[tuple[Camera, ViewTextures]]
 """Views of a frame in shared textures."""
 
@@ -571,7 +571,7 @@ class FilterClient:
 
     @property
     def n_bytes(self) -> tuple[int, int]:
-        """Return the total size in bytes of messages sent and received."""
+        """Return the total size of messages sent and received, in bytes."""
         return self._link.n_bytes
 
     @property
@@ -594,3 +594,7 @@ class FilterClient:
                 else:
                     self._link.pump_during(wait, "a reply to ping")
         return 1000 * (time.monotonic() - start_s), self._link.pongs[-1]
+
+
+if TYPE_CHECKING:  # mypy checks here that the class implements the protocol
+    _: type[Filter] = FilterClient

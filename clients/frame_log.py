@@ -46,9 +46,9 @@ class FrameLog:
         """Record a filtered frame."""
         self.ages_ms.append(answer.age_ms)
         self.round_trips_ms.append(answer.round_trip_ms)
-        for stage, time_ms in answer.header.stage_times_ms.items():
+        for stage, time_ms in answer.stage_times_ms.items():
             self.stages_ms.setdefault(stage, []).append(time_ms)
-        add_notes(self.notes, answer.header.notes)
+        add_notes(self.notes, answer.notes)
 
     def summary(self) -> dict[str, Any]:
         """Return counts, and p50, p95 and p99 of each stage, age and round trip."""

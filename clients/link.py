@@ -55,29 +55,24 @@ RETRY_SEND_S = 0.002  # the socket accepts messages only shortly after the conne
 _Found = TypeVar("_Found")
 
 
-@dataclass(frozen=True)
-class FilteredFrame:
-    """A filtered frame.
+@dataclass(frozen=True, kw_only=True)
+class FilteredFrame(Result):
+    """A filtered frame: the reply of the service, and how long it took.
 
     Attributes
     ----------
     frame_id : int
         Id that `FilterClient.submit` returned.
-    colors : tuple of (h, w, 3) arrays
+    colors : tuple of (height, width, 3) arrays
         One image per view; none for frames in textures.
-    header : Result
-        Reply of the service.
     age_ms : float
         Time since `FilterClient.submit`.
     round_trip_ms : float
         Time since the frame was sent.
     """
 
-    frame_id: int
-    colors: tuple[NDArray[Any], ...]
-    header: Result
-    age_ms: float
-    round_trip_ms: float
+    age_ms: float = 0.0
+    round_trip_ms: float = 0.0
 
     @property
     def color(self) -> NDArray[Any]:
@@ -474,15 +469,12 @@ class ServiceLink:
         now_s = time.monotonic()
         colors = self._colors_in_memory(outgoing) if reply.in_memory else reply.colors
         outgoing.end()
-        self._events.append(
-            FilteredFrame(
-                frame_id=reply.frame_id,
-                colors=colors,
-                header=reply,
-                age_ms=1000 * (now_s - outgoing.submitted_s),
-                round_trip_ms=1000 * (now_s - outgoing.sent_s),
-            )
-        )
+        times_ms = {
+            "age_ms": 1000 * (now_s - outgoing.submitted_s),
+            "round_trip_ms": 1000 * (now_s - outgoing.sent_s),
+        }
+        frame = FilteredFrame(**vars(reply) | {"colors": colors} | times_ms)
+        self._events.append(frame)
 
     def _colors_in_memory(self, outgoing: Outgoing) -> tuple[NDArray[Any], ...]:
         """Return the images that the service wrote to a slot; none for textures."""

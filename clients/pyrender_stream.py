@@ -290,14 +290,14 @@ def _handle_replies(
         elif isinstance(event, FilteredFrame):
             log.add(event)
             frame = sent.pop(event.frame_id)
-            learn(frame.focus_dpt, event.header.focus_dpt)
+            learn(frame.focus_dpt, event.focus_dpt)
             if show is not None:
                 is_open = show(frame.color, event.color, _title(event)) and is_open
     return is_open
 
 
 def _title(answer: FilteredFrame) -> str:
-    header = answer.header
+    header = answer
     return (
         f"ocufilter   pupil {header.pupil_diameter_mm:.1f} mm   "
         f"focus {header.focus_dpt:.2f} dpt   "

@@ -130,9 +130,9 @@ def change_eye(
             index, next_send_s = index + 1, now_s + 1 / _BUILDING_HZ
         for event in events_of(client):
             if isinstance(event, FilteredFrame):
-                if event.header.generation != accepted.generation:
+                if event.generation != accepted.generation:
                     n_through_previous += 1
-                    previous_generation = event.header.generation
+                    previous_generation = event.generation
             elif getattr(event, "profile_id", None) != accepted.profile_id:
                 continue
             elif isinstance(event, Progress):

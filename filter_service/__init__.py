@@ -8,6 +8,7 @@ Importing this package loads no submodules, which keeps clients light.
     camera           pinhole camera, and which cameras share PSFs
     rgbd_view        color, depth and camera of one view
     texture_view     the same in textures of the caller
+    filter_protocol  what `EyeFilter` and `clients.FilterClient` have in common
     view_state       state of an eye; eye and state of a view
     stage_times      times of a frame's stages
     messages         types of the wire protocol (PROTOCOL.md)

@@ -2,6 +2,8 @@ from .camera import Camera as Camera
 from .camera import tangents_from_fov as tangents_from_fov
 from .errors import BadMessage as BadMessage
 from .errors import FilterError as FilterError
+from .filter_protocol import Filter as Filter
+from .filter_protocol import FilteredImages as FilteredImages
 from .filtering.eye_filter import EyeFilter as EyeFilter
 from .filtering.filtered import Filtered as Filtered
 from .filtering.several_eyes import plan_views as plan_views

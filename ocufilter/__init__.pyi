@@ -69,7 +69,9 @@ from filter_service import DepthProjection as DepthProjection
 from filter_service import EyeFailed as EyeFailed
 from filter_service import EyeFilter as EyeFilter
 from filter_service import EyeReady as EyeReady
+from filter_service import Filter as Filter
 from filter_service import Filtered as Filtered
+from filter_service import FilteredImages as FilteredImages
 from filter_service import FilterError as FilterError
 from filter_service import FilterSettings as FilterSettings
 from filter_service import GlTexture as GlTexture

@@ -341,7 +341,7 @@ class UnitRunner:
             for _ in range(ATTEMPTS):
                 self._failure = None
                 body, settings = self._job.profiles[profile], self._job.settings
-                found.set_profile(body, settings=settings, cameras=[camera])
+                found.set_profile(body, settings=settings, views=camera)
                 try:
                     self.build_s += found.wait().build_ms / 1e3
                 except FilterError as error:

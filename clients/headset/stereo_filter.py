@@ -279,7 +279,7 @@ class LocalFilter(StereoFilter):
     ) -> int:
         body = body_of_eye(profile, eye)
         accepted = self.filters[eye].set_profile(
-            body, settings=settings, cameras=[camera]
+            body, settings=settings, views=[camera]
         )
         return accepted.generation
 
@@ -563,7 +563,7 @@ class ServiceFilter(StereoFilter):
         frame = self._on_way.pop(answer.frame_id, None)
         if frame is None:
             return
-        header = answer.header
+        header = answer
         self._trip_s = answer.round_trip_ms / MS_PER_S
         own_ms = sum(header.stage_times_ms.get(name, 0.0) for name in _OWN_STAGES)
         self._newest = FilteredStereoFrame(

@@ -350,7 +350,7 @@ def profile_change_ms(
             is_first_poll = False
             for event in events_of(client, due_s - time.monotonic()):
                 if isinstance(event, FilteredFrame):
-                    used = [view.profile_id for view in event.header.views]
+                    used = [view.profile_id for view in event.views]
                     if used == wanted:
                         return 1000 * (time.monotonic() - start_s)
     raise ServiceTimeout(
@@ -402,7 +402,7 @@ class _Loop:
             index = self.sent.pop(event.frame_id)
             due_s = index / self._settings.rate_hz
             age_ms = 1000 * (now_s - self.start_s - due_s)
-            header = event.header
+            header = event
             stages_ms = header.stage_times_ms
             wire_ms = event.round_trip_ms - header.total_ms
             own_ms = sum(stages_ms.get(name, 0.0) for name in SERVICE_STAGES)

@@ -385,7 +385,7 @@ def charts_of(
     with EyeFilter(camera=camera) as eye_filter:
         for pupil_mm in pupils_mm:
             settings = _settings(pupil_mm, distances_m)
-            eye_filter.set_profile(study.profile, settings=settings, cameras=[camera])
+            eye_filter.set_profile(study.profile, settings=settings, views=camera)
             eye_filter.wait()
             for distance_m, view in views.items():
                 seen = eye_filter.filter(

@@ -130,7 +130,7 @@ class EyeView:
         try:
             if profile != self._profiles.get(kind):
                 self._profiles[kind] = profile
-                eye_filter.set_profile(body, settings=settings, cameras=[view.camera])
+                eye_filter.set_profile(body, settings=settings, views=view.camera)
             seen = eye_filter.try_filter(
                 [view],
                 pupil_diameter_mm=request.pupil_diameter_mm,

@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any, Literal, Self, Unpack
+from typing import TYPE_CHECKING, Any, Literal, Self, Unpack
 
 from numpy.typing import NDArray
 
@@ -28,6 +28,7 @@ from filter_service.errors import (
     RenderFailed,
     ServiceTimeout,
 )
+from filter_service.filter_protocol import Filter
 from filter_service.filtering.builder import Builder
 from filter_service.filtering.filtered import Filtered
 from filter_service.filtering.planned_frame import PlannedFrame, PlannedView
@@ -80,14 +81,19 @@ def as_profile(profile: Profile) -> EyeProfile:
     return profile
 
 
-def _as_cameras(cameras: Camera | Sequence[Camera]) -> tuple[Camera, ...]:
-    found = (cameras,) if isinstance(cameras, Camera) else tuple(cameras)
-    for camera in found:
+def _as_cameras(
+    views: Camera | RgbdView | Sequence[Camera | RgbdView],
+) -> tuple[Camera, ...]:
+    given = (views,) if isinstance(views, Camera | RgbdView) else tuple(views)
+    found = []
+    for view in given:
+        camera = view.camera if isinstance(view, RgbdView) else view
         if not isinstance(camera, Camera):
             raise BadMessage(
                 f"{camera!r}", field="camera", allowed="a Camera, or a sequence of them"
             )
-    return found
+        found.append(camera)
+    return tuple(found)
 
 
 def _acquired(engine: Engine, gl_context: str) -> tuple[Builder, SharedBuilder]:
@@ -192,7 +198,7 @@ class EyeFilter:
         self.ready: EyeReady | None = None
         if first is not None:
             try:
-                self.set_profile(first, cameras=self.cameras)
+                self.set_profile(first, views=self.cameras)
             except BaseException:
                 self.close()  # the caller gets no filter that it could close
                 raise
@@ -244,7 +250,7 @@ class EyeFilter:
         profile: Profile,
         *,
         settings: FilterSettings | Mapping[str, Any] | None = None,
-        cameras: Sequence[Camera] = (),
+        views: Camera | RgbdView | Sequence[Camera | RgbdView] = (),
         profile_id: int | None = None,
     ) -> AcceptedProfile:
         """Change the eye; frames use the previous one until the new one is ready.
@@ -254,7 +260,7 @@ class EyeFilter:
         profile : EyeProfile, mapping, str or Path
         settings : FilterSettings or mapping, optional
             Settings of the eye; by default those of the filter.
-        cameras : sequence of Camera, optional
+        views : camera or view, or several, optional
             Cameras to prepare for; by default those of the last frame, otherwise those
             of the eye in use.
         profile_id : int, optional
@@ -273,7 +279,7 @@ class EyeFilter:
             self._eyes,
             as_profile(profile),
             self.settings if settings is None else as_settings(settings),
-            _as_cameras(cameras),
+            _as_cameras(views),
             profile_id=profile_id,
         )
         return self._newest
@@ -440,7 +446,8 @@ class EyeFilter:
 
     def try_filter(
         self,
-        views: Sequence[RgbdView],
+        color: ColorImage | RgbdView | Sequence[RgbdView],
+        depth_m: NDArray[Any] | None = None,
         *,
         pupil_diameter_mm: float,
         focus_dpt: float,
@@ -479,7 +486,8 @@ class EyeFilter:
             If the engine failed.
         """
         finish = self.begin(
-            views,
+            color,
+            depth_m,
             pupil_diameter_mm=pupil_diameter_mm,
             focus_dpt=focus_dpt,
             gaze_deg=gaze_deg,
@@ -493,7 +501,8 @@ class EyeFilter:
 
     def begin(
         self,
-        views: Sequence[RgbdView],
+        color: ColorImage | RgbdView | Sequence[RgbdView],
+        depth_m: NDArray[Any] | None = None,
         *,
         pupil_diameter_mm: float,
         focus_dpt: float,
@@ -518,6 +527,7 @@ class EyeFilter:
             The latter, which is false, while the eye is being prepared.  The function
             also returns one if PSFs were not computed by ``until_s``.
         """
+        views = as_views(color, depth_m, next(iter(self.cameras), None))
         self.advance_builds()
         state = State.checked(pupil_diameter_mm, focus_dpt, gaze_deg)
         planned = self.plan(views, [state] * len(views), newest_only=newest_only)
@@ -629,3 +639,7 @@ class EyeFilter:
                 for store, view, state in zip(stores, views, states, strict=True)
             )
         )
+
+
+if TYPE_CHECKING:  # mypy checks here that the class implements the protocol
+    _: type[Filter] = EyeFilter

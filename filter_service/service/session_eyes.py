@@ -121,7 +121,7 @@ class SessionEyes:
             accepted = eye.eye_filter.set_profile(
                 profile,
                 settings=request.settings,
-                cameras=request.views,
+                views=request.views,
                 profile_id=request.profile_id,
             )
         except Exception as error:

@@ -329,7 +329,7 @@ def fairness_rows(n_heavy_frames: int, heavy_px: int) -> list[Row]:
                     client.submit(view, pupil_diameter_mm=4.0, focus_dpt=0.0)
                 for event in client.poll(0.0):
                     if isinstance(event, FilteredFrame):
-                        stages = event.header.stage_times_ms
+                        stages = event.stage_times_ms
                         outside = ("decode_ms", "queue_ms", "other_ms", "rests_ms")
                         cost_s = 1e-3 * sum(
                             ms for name, ms in stages.items() if name not in outside

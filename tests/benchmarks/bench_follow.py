@@ -162,11 +162,11 @@ def served(
             for event in events:
                 if not isinstance(event, FilteredFrame):
                     continue
-                took_s = now_s - sent_s[event.header.frame_id]
+                took_s = now_s - sent_s[event.frame_id]
                 seen.times_ms.append(1e3 * took_s)
-                is_whole = event.header.is_complete
+                is_whole = event.is_complete
                 seen.n_whole += is_whole and took_s <= 2.0 / rate_hz
-                if is_whole and event.header.generation > 1:
+                if is_whole and event.generation > 1:
                     seen.new_eye_s = min(seen.new_eye_s, now_s - changed_s)
 
         for number, moment in enumerate(moments):

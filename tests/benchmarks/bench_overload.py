@@ -79,9 +79,9 @@ def closed_loop(client: FilterClient, view: RgbdView, stream: Stream, is_over) -
             if isinstance(event, FilteredFrame):
                 stream.done_s.append(time.monotonic())
                 stream.ages_ms.append(event.age_ms)
-                stages_ms = event.header.stage_times_ms
+                stages_ms = event.stage_times_ms
                 waits_ms = sum(stages_ms.get(name, 0.0) for name in WAITS)
-                stream.used_ms.append(event.header.total_ms - waits_ms)
+                stream.used_ms.append(event.total_ms - waits_ms)
     while client.n_unanswered:
         client.poll(0.5)
 

@@ -63,7 +63,7 @@ def rows_of(case: str, settings: dict, repeats: int) -> list[Row]:
             killed_s = time.monotonic()
             stream_until(client, view, lambda frame: True)
             first_ms.append(1e3 * (time.monotonic() - killed_s))
-            whole = stream_until(client, view, lambda frame: frame.header.is_complete)
+            whole = stream_until(client, view, lambda frame: frame.is_complete)
             whole_ms.append(1e3 * (time.monotonic() - killed_s))
             errors.append(float(np.sqrt(np.mean((whole.color - before) ** 2))))
         memory_mb = service.memory_mb

@@ -108,7 +108,7 @@ class _Stream:
 
     def shows(self, generation: int) -> bool:
         """Return whether the last frame went through an eye."""
-        return bool(self.frames) and self.frames[-1][1].header.generation == generation
+        return bool(self.frames) and self.frames[-1][1].generation == generation
 
 
 def rows_of(

@@ -133,7 +133,7 @@ def errors(states) -> dict[str, float]:
     with EyeFilter(settings=FULL.changed(tolerance="fine")) as exact:
         for number, changes in enumerate(states, 1):
             wish = _wish(number, picture, changes)
-            exact.set_profile(wish.bodies["OD"], cameras=[picture.view.camera])
+            exact.set_profile(wish.bodies["OD"], views=picture.view.camera)
             state = {
                 "pupil_diameter_mm": wish.pupil_diameter_mm,
                 "focus_dpt": wish.focus_dpt,

@@ -277,7 +277,7 @@ def test_clients_share_time_whatever_their_frames_take(shared_service, flood):
                     client.submit(shown, **SEE)
                 for event in client.poll():
                     if isinstance(event, FilteredFrame):
-                        used_ms[client] += event.header.stage_times_ms["filter_ms"]
+                        used_ms[client] += event.stage_times_ms["filter_ms"]
     assert used_ms[slow] == pytest.approx(used_ms[quick], rel=0.15)
 
 
@@ -312,7 +312,7 @@ def check_mark(event, marks):
     if not isinstance(event, FilteredFrame):
         return None
     mark = int(event.color[0, 0, 0])
-    assert mark == marks.get(event.header.profile_id, 0)
+    assert mark == marks.get(event.profile_id, 0)
     return mark
 
 

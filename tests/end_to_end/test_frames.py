@@ -57,7 +57,7 @@ def test_depth_in_two_bytes_arrives_as_meters(client, encoding):
     client.set_profile(double(7), views=[view])
     for _ in range(8):
         reply = client.filter(view, **SEE, depth_encoding=encoding)
-        assert reply.header.missing_depth_count == 3
+        assert reply.missing_depth_count == 3
         np.testing.assert_array_equal(reply.color[1:], 255 - view.color[1:])
     with pytest.raises(ValueError, match="depth_encoding is 'png'"):
         client.submit(view, **SEE, depth_encoding="png")
@@ -70,7 +70,7 @@ def test_a_result_says_what_it_was_made_with(client):
     reply = client.filter(
         view, pupil_diameter_mm=9.0, focus_dpt=1.5, accumulation="paper"
     )
-    header = reply.header
+    header = reply
     assert (header.profile_id, header.generation) == (
         ready.profile_id,
         ready.generation,
@@ -83,7 +83,7 @@ def test_a_result_says_what_it_was_made_with(client):
 def test_stage_times_are_named_and_sum_to_the_total(client):
     view = make_view()
     client.set_profile(double(7), views=[view])
-    header = client.filter(view, **SEE).header
+    header = client.filter(view, **SEE)
     stages = header.stage_times_ms
     assert {"decode_ms", "queue_ms", "filter_ms", "other_ms"} <= set(stages)
     assert sum(stages.values()) == pytest.approx(header.total_ms, abs=1e-6)
@@ -327,12 +327,12 @@ def test_compressed_frames_and_results_are_those_without(
     ) as thin:
         thin.set_profile(double(7), views=[view])
         seen = thin.filter([view, view], **how)
-    assert seen.header.compression == "lz4"
+    assert seen.compression == "lz4"
     for color, other in zip(seen.colors, usual.colors, strict=True):
         assert color.tobytes() == other.tobytes()
-    stages_ms = seen.header.stage_times_ms
+    stages_ms = seen.stage_times_ms
     assert {"unpack_ms", "copy_out_ms"} <= set(stages_ms)
-    assert sum(stages_ms.values()) == pytest.approx(seen.header.total_ms)
+    assert sum(stages_ms.values()) == pytest.approx(seen.total_ms)
 
 
 def test_parts_that_are_no_blocks_are_refused_by_name(shared_service, raw_client):

@@ -13,6 +13,7 @@ from clients.commands.program import app
 from clients.filter_client import FilterClient
 from clients.service_process import SERVE_COMMAND
 from filter_service import Camera, EyeFilter, FilterSettings, RgbdView
+from filter_service.filter_protocol import Filter
 from tests.batch_kills import start
 
 FOV_DEG = 50.0
@@ -65,14 +66,28 @@ def test_the_command_gives_the_same(in_process, files, tmp_path):
     assert FilterSettings(**settings) == FilterSettings()  # those that it went by
 
 
+def seen_by(chosen: Filter, image):
+    """Show an image through a filter, wherever it is."""
+    view = RgbdView(*image, CAMERA.tangents)
+    with chosen:
+        chosen.set_profile("keratoconus", views=view)
+        seen = chosen.filter(view, **SEE, output="linear")
+        begun = chosen.begin(*image, **SEE, output="linear")
+        assert begun
+        np.testing.assert_array_equal(begun().color, seen.color)
+        return seen
+
+
 @pytest.mark.long("a service traces and computes an eye")
 def test_the_service_gives_the_same(in_process, image, use_service):
     service = use_service(command=SERVE_COMMAND, engine="native")
-    with FilterClient(service.endpoint, timeout_s=60.0) as client:
-        client.set_profile("keratoconus", views=[CAMERA])
-        view = RgbdView(*image, CAMERA.tangents)
-        seen = client.filter(view, **SEE, output="linear")
+    own = seen_by(EyeFilter(camera=CAMERA, engine="native"), image)
+    seen = seen_by(FilterClient(service.endpoint, timeout_s=60.0), image)
+    np.testing.assert_array_equal(own.color, in_process)
     np.testing.assert_array_equal(seen.color, in_process)
+    for name in ("pupil_diameter_mm", "focus_dpt", "generation", "notes"):
+        assert getattr(seen, name) == getattr(own, name)
+    assert "splat_ms" in seen.stage_times_ms.keys() & own.stage_times_ms.keys()
 
 
 @pytest.mark.clients

@@ -65,7 +65,7 @@ def test_frames_go_on_through_the_old_eye_until_the_new_one_is_ready(client):
     frames = [(t, e) for t, e in events if isinstance(e, FilteredFrame)]
     assert not [e for _, e in events if isinstance(e, Dropped | ErrorReply)]
     for _, event in frames:
-        made_with = (event.header.generation, event.header.profile_id)
+        made_with = (event.generation, event.profile_id)
         assert (
             made_with
             == {
@@ -92,14 +92,14 @@ def test_profiles_in_quick_succession_never_mix(client):
         client.submit(view, **SEE)
         for event in client.poll(0.02):
             if isinstance(event, FilteredFrame):
-                assert mark_of(event) == generations.get(event.header.generation, 1)
+                assert mark_of(event) == generations.get(event.generation, 1)
     events = stream(
         client, view, until=lambda e: isinstance(e, Ready) and e.profile_id == 10
     )
     cancelled = [e for _, e in events if isinstance(e, ErrorReply)]
     assert {e.code for e in cancelled} <= {"build_cancelled"}
     reply = client.filter(view, **SEE)
-    assert (mark_of(reply), reply.header.generation) == (11, last.generation)
+    assert (mark_of(reply), reply.generation) == (11, last.generation)
 
 
 def test_a_newer_profile_takes_the_place_of_one_being_built(client):
@@ -228,7 +228,7 @@ def test_a_wrong_profile_is_named_by_field_and_the_stream_goes_on(client):
         client.set_profile(double(900))
     assert (caught.value.field, caught.value.allowed) == ("mark", "0 to 255")
     reply = client.filter(view, **SEE)
-    assert (mark_of(reply), reply.header.generation) == (5, good.generation)
+    assert (mark_of(reply), reply.generation) == (5, good.generation)
 
 
 def test_a_failed_build_is_told_and_the_old_eye_stays(client):

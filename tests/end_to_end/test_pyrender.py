@@ -455,7 +455,7 @@ def test_frames_come_back_filtered_through_the_service(real_service, name):
     with FilterClient(real_service.endpoint) as client:
         client.set_profile("myopia", settings=EYES, views=[frames[0].view])
         answers = list(filter_in_order(client, iter(frames), FrameLog()))
-    assert [a.header.pupil_diameter_mm for a in answers] == [3.0, 4.0, 5.0]
+    assert [a.pupil_diameter_mm for a in answers] == [3.0, 4.0, 5.0]
     for frame, answer in zip(frames, answers, strict=True):
         assert answer.color.shape == frame.color.shape
         sharp = np.abs(np.diff(frame.color.astype(float), axis=1)).max()

@@ -102,7 +102,7 @@ def test_a_killed_engine_s_client_goes_on_and_the_other_loses_no_frame(
             other.submit(view, **SEE)
             n_sent += 1
         for event in struck.poll(0.005):
-            if isinstance(event, FilteredFrame) and event.header.is_complete:
+            if isinstance(event, FilteredFrame) and event.is_complete:
                 np.testing.assert_array_equal(event.color, wanted[0])
                 is_back = True
         for event in other.poll(0.005):

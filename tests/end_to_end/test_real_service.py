@@ -99,8 +99,8 @@ def test_a_myopic_eye_blurs_a_far_edge_and_a_normal_one_does_not(real_client):
         assert ready.psf_count > 0
         reply = real_client.filter(view, **SEE)
         widths_px.append(edge_width_px(reply.color))
-        stages_ms = reply.header.stage_times_ms
-        assert sum(stages_ms.values()) == pytest.approx(reply.header.total_ms)
+        stages_ms = reply.stage_times_ms
+        assert sum(stages_ms.values()) == pytest.approx(reply.total_ms)
         assert stages_ms["splat_ms"] > 0
     # About 11 dpt of defocus over 4 mm blur by 44 mrad, with 8 mrad per pixel.
     assert widths_px[0] <= 1
@@ -116,7 +116,7 @@ def test_the_code_of_a_note_does_not_depend_on_its_numbers(real_client):
     assert {"focus_accuracy", "typical_aberrations", "plane_of_powers"} < {*codes}
     assert "other" not in codes
     headers = [
-        real_client.filter(view, **SEE | {"focus_dpt": focus_dpt}).header
+        real_client.filter(view, **SEE | {"focus_dpt": focus_dpt})
         for focus_dpt in np.linspace(0.0, 3.0, 35)
     ]
     assert len({header.notes for header in headers}) == 35
@@ -232,13 +232,13 @@ def test_a_frame_turns_the_gaze_and_is_told_when_it_turns_too_far(real_client):
         real_client.filter(view, **SEE, gaze_deg=gaze_deg)
         for gaze_deg in (None, (15.0, 0.0), (30.0, 0.0))
     )
-    assert straight.header.gaze_deg == (0.0, 0.0)
-    assert aside.header.gaze_deg == beyond.header.gaze_deg == (15.0, 0.0)
+    assert straight.gaze_deg == (0.0, 0.0)
+    assert aside.gaze_deg == beyond.gaze_deg == (15.0, 0.0)
     assert np.abs(straight.color - aside.color).max() > 0.01
     np.testing.assert_array_equal(aside.color, beyond.color)
-    assert any("gaze (30, 0) deg" in note for note in beyond.header.notes)
-    assert not any("gaze" in note for note in aside.header.notes)
-    assert aside.header.overflow_count == 0
+    assert any("gaze (30, 0) deg" in note for note in beyond.notes)
+    assert not any("gaze" in note for note in aside.notes)
+    assert aside.overflow_count == 0
     with pytest.raises(errors.BuildFailed, match="gaze_range_deg"):
         real_client.set_profile(
             eye, settings=settings | {"gaze_range_deg": (55.0, 0.0)}, views=[view]
@@ -282,7 +282,7 @@ def test_bright_half_floats_scale_through_the_service(real_client):
     assert seen.color.dtype == np.float16
     expected = 100 * plain.color - 10
     assert np.abs(seen.color.astype(np.float32) - expected).max() <= 0.05
-    assert seen.header.views[0].color.dtype == "float16"
+    assert seen.views[0].color.dtype == "float16"
 
 
 @pytest.mark.long("frames are filtered until an eye is built")
@@ -300,7 +300,7 @@ def test_frames_go_on_while_an_eye_is_built_and_each_names_its_own(real_client):
             assert not isinstance(event, Dropped)
             if isinstance(event, FilteredFrame):
                 width_px = edge_width_px(event.color)
-                widths_px[event.header.generation].add(width_px)
+                widths_px[event.generation].add(width_px)
     assert max(widths_px[old.generation]) <= 1
     assert min(widths_px[new.generation]) >= 4
 
@@ -413,8 +413,8 @@ def test_an_eye_is_estimated_and_traced_with_progress_and_answers_larger_pupils(
     assert {"eye", "aberrations", "psfs"} <= set(stages)
     assert any("mean error" in note for note in ready.notes)
     reply = real_client.filter(view, **SEE | {"pupil_diameter_mm": 5.0})
-    assert reply.header.pupil_diameter_mm == pytest.approx(5.0)
-    assert not any("capped" in note for note in reply.header.notes)
+    assert reply.pupil_diameter_mm == pytest.approx(5.0)
+    assert not any("capped" in note for note in reply.notes)
 
 
 def test_each_part_of_an_eye_names_its_error(real_client):
@@ -491,5 +491,5 @@ def test_the_light_option_is_the_measured_wavefront_up_to_its_pupil(real_client)
         views=[view],
     )
     reply = real_client.filter(view, **SEE | {"pupil_diameter_mm": 5.0})
-    assert reply.header.pupil_diameter_mm == pytest.approx(4.0)
-    assert any("capped" in note for note in reply.header.notes)
+    assert reply.pupil_diameter_mm == pytest.approx(4.0)
+    assert any("capped" in note for note in reply.notes)

@@ -25,7 +25,7 @@ def until_shared(client, view):
     deadline_s = time.monotonic() + TIMEOUT_S
     while time.monotonic() < deadline_s:
         reply = client.filter(view, **SEE)
-        if reply.header.in_memory:
+        if reply.in_memory:
             return reply
     raise AssertionError("no memory is shared")
 
@@ -43,11 +43,11 @@ def test_frames_come_back_as_they_do_over_the_wire(shared_client, size, dtype):
     shared_client.set_profile(EYE, views=[view])
     output = "srgb8" if dtype == np.uint8 else "linear"
     by_wire = shared_client.filter(view, **SEE, output=output)
-    assert not by_wire.header.in_memory, "there was no slot yet"
+    assert not by_wire.in_memory, "there was no slot yet"
     shared = until_shared(shared_client, view)
     if output == "linear":
         shared = shared_client.filter(view, **SEE, output=output)
-        while not shared.header.in_memory:
+        while not shared.in_memory:
             shared = shared_client.filter(view, **SEE, output=output)
     np.testing.assert_array_equal(shared.color, by_wire.color)
 
@@ -63,7 +63,7 @@ def test_two_views_with_hidden_layers_lie_in_one_slot(shared_client):
     )
     shared_client.set_profile(EYE, views=[left, right])
     reply = shared_client.filter([left, right], **SEE)
-    while not reply.header.in_memory:
+    while not reply.in_memory:
         reply = shared_client.filter([left, right], **SEE)
     for view, color in zip((left, right), reply.colors, strict=True):
         np.testing.assert_array_equal(color[1:], 255 - view.color[1:])
@@ -98,7 +98,7 @@ def test_a_lent_view_is_rendered_into_and_not_copied(shared_client):
         lent.depth_m[:] = 2.0
         n_slots = len(memory._slots)
         reply = shared_client.filter(lent, **SEE)
-        assert reply.header.in_memory
+        assert reply.in_memory
         assert np.all(reply.color[1:] == 255 - value)
         assert len(memory._slots) == n_slots
         del reply  # else its slot is in use, and another is asked for
@@ -111,11 +111,11 @@ def test_a_client_may_do_without(use_service, shared_service):
         view = make_view()
         client.set_profile(EYE, views=[view])
         for _ in range(4):
-            assert not client.filter(view, **SEE).header.in_memory
+            assert not client.filter(view, **SEE).in_memory
     with FilterClient(shared_service.endpoint, shared_memory=False) as client:
         client.set_profile(EYE, views=[view])
         for _ in range(4):
-            assert not client.filter(view, **SEE).header.in_memory
+            assert not client.filter(view, **SEE).in_memory
 
 
 @pytest.mark.long("a service starts, and a process of it again")

@@ -168,7 +168,7 @@ def test_images_and_counts_are_those_of_arrays(client, gl, kind, is_top_first):
     found = client.filter([(CAMERA, used)], **SEE)
     image = gl.read(exported[2])[flip][..., :3]
     assert_same_frame(image, expected.color)
-    ours, theirs = found.header, expected.header
+    ours, theirs = found, expected
     assert (found.colors, ours.in_memory) == ((), True)
     assert ours.views[0].color == theirs.views[0].color
     for name in ("notes", "focus_dpt", "clamped_depth_count", "overflow_count"):
@@ -199,8 +199,8 @@ def test_missing_depth_is_counted_and_noted(client, gl):
     exported, used = shared_frame(gl, client)
     gl.write(exported[1], np.zeros((HEIGHT, WIDTH), np.float32))
     found = client.filter([(CAMERA, used)], **SEE)
-    assert found.header.missing_depth_count == WIDTH * HEIGHT
-    assert "no pixel has depth; infinity is assumed" in found.header.notes
+    assert found.missing_depth_count == WIDTH * HEIGHT
+    assert "no pixel has depth; infinity is assumed" in found.notes
 
 
 def test_each_view_has_its_eye(client, gl):
@@ -211,7 +211,7 @@ def test_each_view_has_its_eye(client, gl):
     found = client.filter(
         [(CAMERA, left_used), (CAMERA, right_used)], states=states, **SEE
     )
-    assert [view.eye for view in found.header.views] == ["left", "both"]
+    assert [view.eye for view in found.views] == ["left", "both"]
     views = [RgbdView(*scene(seed), CAMERA.tangents) for seed in (1, 2)]
     expected = client.filter(views, states=states, **SEE)
     for exported, color in zip((left, right), expected.colors, strict=True):

@@ -71,9 +71,9 @@ def test_every_frame_shows_one_of_the_two_eyes(built):
     assert ready.psf_count > 0
     assert not [e for e in events if isinstance(e, Dropped)]
     frames = [e for e in events if isinstance(e, FilteredFrame)]
-    assert all(frame.header.is_complete for frame in frames)
-    new = [f for f in frames if f.header.generation == ready.generation]
-    old = [f for f in frames if f.header.generation != ready.generation]
+    assert all(frame.is_complete for frame in frames)
+    new = [f for f in frames if f.generation == ready.generation]
+    old = [f for f in frames if f.generation != ready.generation]
     assert len(old) > 2, "the stream stopped"
     for frame in new:
         np.testing.assert_array_equal(frame.color, last.color)

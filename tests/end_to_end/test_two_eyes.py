@@ -70,13 +70,13 @@ def test_each_view_goes_through_its_own_eye_and_comes_back_with_its_pose(
     for color, view in zip(reply.colors, pair, strict=True):
         np.testing.assert_array_equal(color[1:], 255 - view.color[1:])
     assert marks_of(reply) == [11, 22]
-    left, right = reply.header.views
+    left, right = reply.views
     assert (left.eye, left.pupil_diameter_mm, left.focus_dpt) == ("left", 4.0, 0.5)
     assert (right.eye, right.pupil_diameter_mm, right.focus_dpt) == ("right", 5.0, 1.25)
     assert (left.gaze_deg, right.gaze_deg) == ((2.0, -1.0), (-2.0, -1.0))
     assert (left.pose, right.pose) == (LEFT_POSE, RIGHT_POSE)
-    assert reply.header.display_time_ns == 2**62 + 1
-    assert left.profile_id == reply.header.profile_id != right.profile_id
+    assert reply.display_time_ns == 2**62 + 1
+    assert left.profile_id == reply.profile_id != right.profile_id
 
 
 def test_the_left_eye_is_a_left_one_unless_its_profile_says_otherwise():
@@ -88,11 +88,11 @@ def test_the_left_eye_is_a_left_one_unless_its_profile_says_otherwise():
 def test_the_order_of_views_is_the_frames_own(two_eyes, pair):
     reply = two_eyes.filter(pair[::-1], **SEE, states=EYES[::-1])
     assert marks_of(reply) == [22, 11]
-    assert [view.eye for view in reply.header.views] == ["right", "left"]
+    assert [view.eye for view in reply.views] == ["right", "left"]
 
 
 def test_generations_count_for_each_eye_and_one_changes_alone(two_eyes, pair):
-    before = two_eyes.filter(pair, **SEE, states=EYES).header.views
+    before = two_eyes.filter(pair, **SEE, states=EYES).views
     accepted = two_eyes.set_profile(double(33, build_s=0.3), eye="right", wait=False)
     assert isinstance(accepted, Accepted)
     assert (accepted.eye, accepted.generation) == ("right", before[1].generation + 1)
@@ -104,7 +104,7 @@ def test_generations_count_for_each_eye_and_one_changes_alone(two_eyes, pair):
         for event in two_eyes.poll(0.2):
             if isinstance(event, FilteredFrame):
                 marks.append(marks_of(event))
-                views = event.header.views
+                views = event.views
                 assert views[0].generation == before[0].generation
                 assert (
                     views[1].generation
@@ -210,7 +210,7 @@ def test_both_eyes_are_there_again_after_a_process_is_killed(start_service, pair
     with FilterClient(service.endpoint, timeout_s=TIMEOUT_S) as client:
         for eye, mark, view in zip(("left", "right"), (11, 22), pair, strict=True):
             client.set_profile(double(mark), eye=eye, views=[view])
-        before = client.filter(pair, **SEE, states=EYES).header.views
+        before = client.filter(pair, **SEE, states=EYES).views
         pid = service.pids()[name]
         os.kill(pid, signal.SIGKILL)
         wait_until(lambda: service.pids().get(name, pid) != pid)
@@ -222,7 +222,7 @@ def test_both_eyes_are_there_again_after_a_process_is_killed(start_service, pair
             except errors.FilterError:
                 assert time.monotonic() < deadline_s
         assert marks_of(reply) == [11, 22]
-        for old, new in zip(before, reply.header.views, strict=True):
+        for old, new in zip(before, reply.views, strict=True):
             assert new.profile_id == old.profile_id
             assert new.generation >= old.generation
         assert client.hello().profile_ids.keys() <= {"left", "right"}

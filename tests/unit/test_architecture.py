@@ -40,6 +40,7 @@ MAY_IMPORT = {
         "filter_service.log_lines",  # logs that stop no one
         "filter_service.keys",  # a client's own
         "filter_service.shared_memory",  # memory shared with the service
+        "filter_service.filter_protocol",  # what its filter implements
         "filter_service.settings",
         "filter_service.camera",  # and its options
         "filter_service.image_files",  # pictures and depth in files

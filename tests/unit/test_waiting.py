@@ -29,7 +29,7 @@ from filter_service.building.worker_handle import WorkerHandle
 from filter_service.errors import BuildFailed, ServiceTimeout
 from filter_service.filtering import eye_filter as eye_filter_module
 from filter_service.filtering.builder import Builder
-from filter_service.messages import Accepted, Dropped, Progress, Ready
+from filter_service.messages import Accepted, Dropped, Progress, Ready, ResultView
 from filter_service.progress import Progress as ProgressBars
 from filter_service.waiting import Wait
 from tests.end_to_end.doubles import EngineDouble, ProfileDouble
@@ -240,7 +240,18 @@ def connected(clock):
 ACCEPTED = Accepted(0, 1, is_building=True, n_cameras=1)
 READY = Ready(0, 1, build_ms=1.0, psf_count=1, memory_mb=1.0, pixel_pitch_mrad=1.0)
 PROGRESS = [Progress(0, 1, "eye", fraction) for fraction in FRACTIONS]
-FRAME = FilteredFrame(7, (), None, 1.0, 1.0)
+FRAME = FilteredFrame(
+    frame_id=7,
+    profile_id=0,
+    generation=1,
+    views=(ResultView(16, 8),),
+    pupil_diameter_mm=4.0,
+    focus_dpt=0.0,
+    missing_depth_count=0,
+    clamped_depth_count=0,
+    total_ms=1.0,
+    stage_times_ms={},
+)
 
 
 def test_a_client_waits_for_an_eye_while_it_advances(connected):
