@@ -235,7 +235,14 @@ class EstimatedEye:
     @cached_property
     def accommodating(self) -> AccommodatingEye:
         """Return the eye as one that can focus, with its correction."""
-        return accommodating_eye(self.parameters, self.profile)
+        return AccommodatingEye(
+            self.parameters,
+            retina=self.retina,
+            pupil_diameter_mm=self.profile.pupil_diameter_mm,
+            amplitude_dpt=profile_amplitude_dpt(self.profile),
+            correction=self.profile.correction,
+            rest=self.rest(REFERENCE_WAVELENGTH_NM),
+        )
 
     @property
     def refraction_dpt(self) -> float:
@@ -267,22 +274,6 @@ class EstimatedEye:
     ) -> "EyeSurfaces":
         """Return the surfaces of `focused`."""
         return self.focused(focus_dpt, pupil_diameter_mm=pupil_diameter_mm).surfaces
-
-
-def accommodating_eye(
-    parameters: EyeParameters, profile: EyeProfile
-) -> AccommodatingEye:
-    """Return an eye with the age, addition and correction of its profile."""
-    return AccommodatingEye(
-        parameters,
-        retina=profile.retina,
-        pupil_diameter_mm=profile.pupil_diameter_mm,
-        amplitude_dpt=profile_amplitude_dpt(profile),
-        correction=profile.correction,
-        rest=MeasuredResidual.of(
-            parameters, profile, wavelengths_nm=REFERENCE_WAVELENGTH_NM
-        ),
-    )
 
 
 def estimate_eye(

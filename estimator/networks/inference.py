@@ -189,16 +189,6 @@ class Card:
             raise OutOfDomain(self.network, excesses)
 
 
-def card_path(name: str) -> Path:
-    """Return the path of a network's card."""
-    return WEIGHTS_FOLDER / f"{name}.json"
-
-
-def weights_path(name: str) -> Path:
-    """Return the path of a network's weights."""
-    return WEIGHTS_FOLDER / f"{name}.onnx"
-
-
 def read_card(name: str) -> Card:
     """Read and validate one network's card.
 
@@ -207,7 +197,7 @@ def read_card(name: str) -> Card:
     WeightsMissing, DamagedWeights
         The card is missing or invalid; the message names the file and the remedy.
     """
-    path = card_path(name)
+    path = WEIGHTS_FOLDER / f"{name}.json"
     if not path.is_file():
         raise WeightsMissing(missing_text(path))
     try:
@@ -340,7 +330,7 @@ def load_network(name: str) -> Network:
         A file is invalid.
     """
     card = read_card(name)
-    path = weights_path(name)
+    path = WEIGHTS_FOLDER / f"{name}.onnx"
     if not path.is_file():
         raise WeightsMissing(missing_text(path))
     try:

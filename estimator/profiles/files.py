@@ -120,7 +120,12 @@ def profile_body(
         if str(source) in names:
             return {"kind": kind, "name": str(source)}
     if not _is_path(source):
-        return _inline(str(source))
+        try:
+            return _json_body(str(source), "profile")
+        except ProfileError as error:
+            raise ProfileError(
+                error.field or "profile", error.problem, error.allowed
+            ) from None
     path = Path(source)
     reader = READERS.get(path.suffix.lower())
     allowed = (
@@ -159,15 +164,6 @@ def _is_path(source: str | Path) -> bool:
     text = str(source)
     is_name = any(text in names for names in NAMES.values())
     return not is_name and not text.lstrip().startswith("{")
-
-
-def _inline(text: str) -> dict[str, Any]:
-    try:
-        return _json_body(text, "profile")
-    except ProfileError as error:
-        raise ProfileError(
-            error.field or "profile", error.problem, error.allowed
-        ) from None
 
 
 def _text(path: Path) -> str:

@@ -80,12 +80,6 @@ def _check_view(fields_deg: NDArray[Any], object_dpt: float, fit: str) -> None:
         raise ValueError(f"object_dpt {object_dpt}: allowed is -50 to 50")
 
 
-def _is_at_pupil(plane: str) -> bool:
-    if plane not in PLANES:
-        raise ValueError(f"plane '{plane}': allowed are {', '.join(PLANES)}")
-    return plane == "pupil"
-
-
 def wavefront_grid(
     eye: EyeSurfaces,
     *,
@@ -188,7 +182,8 @@ def wavefront_grids(
     """
     fields_deg = np.atleast_2d(np.asarray(fields_deg, dtype=np.float64))
     _check_view(fields_deg, object_dpt, fit)
-    at_pupil = _is_at_pupil(plane)
+    if plane not in PLANES:
+        raise ValueError(f"plane '{plane}': allowed are {', '.join(PLANES)}")
     needed = fewest_nodes(n_terms)
     if n_rings < needed[0] or n_azimuths < needed[1]:
         raise ValueError(
@@ -210,7 +205,7 @@ def wavefront_grids(
         stop_radii_mm=np.repeat(stops_mm / 2.0, each, axis=0),
         pupil_z_mm=np.repeat(pupils_z_mm, each),
         nodes=stop_nodes(n_rings, n_azimuths),
-        at_pupil=at_pupil,
+        at_pupil=plane == "pupil",
         by_slopes=fit == "slope",
         object_dpt=float(object_dpt),
         n_terms=n_terms,
@@ -279,17 +274,10 @@ def wavefront_aberrations(
         n_threads=1,
     )
     one = (0, 0, 0)
-    *lengths_mm, axis_rad = (float(value) for value in found.ellipse_mm[one])
     return Aberrations(
         zernike_um=found.zernike_um[one],
         zernike_radius_mm=float(found.zernike_radius_mm[one]),
-        pupil_ellipse=PupilEllipse(
-            lengths_mm[0],
-            lengths_mm[1],
-            lengths_mm[2],
-            lengths_mm[3],
-            math.degrees(axis_rad),
-        ),
+        pupil_ellipse=PupilEllipse.of(found.ellipse_mm[one]),
         rms_residual_um=float(found.rms_residual_um[one]),
         stop_diameter_mm=float(stops_mm[0]),
         open_ratio=float(found.open_ratio[one]),
