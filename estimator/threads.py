@@ -8,8 +8,6 @@ import time
 from functools import cache
 from pathlib import Path
 
-import numpy as np
-
 THREADS_VARIABLE = "OCUFILTER_THREADS"
 MAX_THREADS = 256
 
@@ -77,7 +75,8 @@ def relative_core_time() -> float:
     The probe is the fastest of a dozen Fourier transforms, the most common work of a
     PSF, on the calling thread.  It takes 5 ms, once per process.
     """
-    from scipy import fft  # clients need no scientific stack
+    import numpy as np  # whoever counts threads needs no scientific stack
+    from scipy import fft
 
     samples = np.exp(1j * np.arange(SIDE * SIDE).reshape(SIDE, SIDE))
     times_ms = []
