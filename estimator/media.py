@@ -9,10 +9,9 @@ this module models the light outside the core.  The clinical measure is the stra
 parameter s at 7 deg, in deg²/sr: angle² times the scattered light per steradian and
 incident light.
 
-Spectral absorption of the ocular media: the lens yellows with age.
-
-The model is that of van de Kraats & van Norren, J. Opt. Soc. Am. A 24, 1842 (2007),
-adopted by CIE 203:2012: optical density of all media for large fields, 0 to 90 years.
+The lens yellows with age.  The model of spectral absorption is that of van de Kraats &
+van Norren, J. Opt. Soc. Am. A 24, 1842 (2007), adopted by CIE 203:2012: optical density
+of all media for large fields, 0 to 90 years.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Visual Strehl ratio and acuity of a wavefront.
+"""Visual Strehl ratio and acuity: of a wavefront, through focus, over the field.
 
 Acuity is predicted with the template-matching observer of Watson & Ahumada (J. Vision
 8(4):17, 2008).  The image of an optotype, filtered by the optics and by the neural
@@ -11,12 +11,8 @@ Other observers agree less with measured acuity out of focus (Smith, Optom. Vis.
 68, 1991): templates with the eye's own blur read 0.3 to 0.4 logMAR better, and an
 observer that requires correct phase up to the limit reads 0.3 logMAR worse.
 
-Acuity through focus and over the visual field.
-
-Sampling density of the retina, which limits acuity in the periphery.
-
-The retina does not resolve detail finer than the spacing of midget ganglion cells of
-one type (ON or OFF).
+In the periphery the sampling density of the retina limits acuity: it does not resolve
+detail finer than the spacing of midget ganglion cells of one type (ON or OFF).
 """
 
 from collections.abc import Callable

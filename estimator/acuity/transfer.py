@@ -1,9 +1,8 @@
-"""Optical transfer functions: autocorrelations of the pupil function, by FFT.
+"""Optical transfer functions, and the contrast sensitivity of the visual system.
 
-Contrast sensitivity of the visual system, and its optical and neural parts.
-
-The contrast sensitivity of the Standard Spatial Observer, measured with natural optics,
-divided by the modulation transfer of the mean eye is the neural contrast sensitivity.
+A transfer function is the autocorrelation of the pupil function, by FFT.  The contrast
+sensitivity of the Standard Spatial Observer, measured with natural optics, divided by
+the modulation transfer of the mean eye is the neural contrast sensitivity.
 """
 
 import math

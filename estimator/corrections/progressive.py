@@ -1,7 +1,7 @@
 """Progressive spectacle lenses, whose power changes with the direction of gaze.
 
-Manufacturers do not publish their surfaces.  The surface used here is U(y) with
-U'' = F on the corridor x = 0, smoothed along y with a Gaussian of width |x|.  F is the
+Manufacturers do not publish their surfaces.  The surface used here is U(y) with U'' = F
+on the corridor x = 0, smoothed along y with a Gaussian of width |x|.  F is the
 cumulative normal distribution with a quarter of the corridor as its standard deviation.
 
 - On the corridor, the power is F(y) in all meridians, from distance power to addition.
@@ -12,8 +12,6 @@ cumulative normal distribution with a quarter of the corridor as its standard de
   through 4 mm in the middle of a 14 mm corridor with an addition of 2 dpt.  The third
   derivatives of the surface describe all but 0.005 um of them there, and all but
   0.02 um at the ends of the corridor.
-
-Point of a spectacle lens that the line of sight crosses, by gaze and by field.
 """
 
 from dataclasses import dataclass, field, replace

@@ -3,20 +3,18 @@
 The light of the foci interferes.  Through pupils of 2 to 3 mm, interference extends the
 depth of focus of low additions, which an incoherent sum would miss.
 
-Diffraction efficiency of the orders of a diffractive lens, by scalar theory.
+The efficiency of diffractive orders is that of scalar theory.  The zones have equal
+areas, so the profile is periodic in r².  The amplitude of order k is the k-th Fourier
+coefficient of the transmission over a period.  A sawtooth of h waves has an efficiency
+of sinc²(h - k) in order k: 40.5 % in each of two orders for half a wave.  Shading by
+the steps and the dispersion of their material are not modeled.
 
-The zones have equal areas, so the profile is periodic in r².  The amplitude of order k
-is the k-th Fourier coefficient of the transmission over a period.  A sawtooth of h
-waves has an efficiency of sinc²(h - k) in order k: 40.5 % in each of two orders for
-half a wave.  Shading by the steps and the dispersion of their material are not modeled.
-
-Spectacle lenses with lenslets around a clear center, for myopia control.
-
-Each lenslet images a distant point without deviating its chief ray.  On the retina, all
-lenslets together blur the point to a disc of power times diameter, 12 arcmin for 3.5
-dpt and 1.03 mm, regardless of the pupil.  Gaze and field direction determine which
-lenslets cover the pupil.  Their phase is applied unchanged in the plane of the pupil;
-`bench corrections` measures the error of neglecting the 15 mm between lens and pupil.
+Spectacle lenses for myopia control have lenslets around a clear center.  Each lenslet
+images a distant point without deviating its chief ray.  On the retina, all lenslets
+together blur the point to a disc of power times diameter, 12 arcmin for 3.5 dpt and
+1.03 mm, regardless of the pupil.  Gaze and field direction determine which lenslets
+cover the pupil.  Their phase is applied unchanged in the plane of the pupil; `bench
+corrections` measures the error of neglecting the 15 mm between lens and pupil.
 """
 
 from dataclasses import dataclass, replace

@@ -1,11 +1,10 @@
 """Contact and intraocular lenses, and the wavefront that any correction subtracts.
 
-Conversion from the plane of an intraocular lens to that of the entrance pupil.
-
-The cornea converges light, so a ray from a distant object crosses the lens closer to
-the axis than it crosses the entrance pupil.  Diameters in the pupil are larger than in
-the lens by the ratio of the ray heights, and powers are smaller by its square: 3 dpt at
-a depth of 4.6 mm act as 2.2 dpt.
+Powers and diameters of an intraocular lens are converted from its plane to that of the
+entrance pupil.  The cornea converges light, so a ray from a distant object crosses the
+lens closer to the axis than it crosses the entrance pupil.  Diameters in the pupil are
+larger than in the lens by the ratio of the ray heights, and powers are smaller by its
+square: 3 dpt at a depth of 4.6 mm act as 2.2 dpt.
 """
 
 from dataclasses import dataclass, replace

@@ -5,13 +5,12 @@ toward the mean eye of the measured refraction.  It starts from the nearest of a
 of eyes and the eye network's guess.  ``network``: that guess alone, checked by one
 trace.  ``search``: the pattern search of the earlier work.
 
-Properties of an estimated eye that would be unusual in a person.
-
-These limits are soft: the prior draws an eye toward usual values, but a wavefront may
-require others.  Lengths are three deviations about the means of 19,500 to 90,800 eyes
-of ten countries (axial length 23.49 ± 1.35 mm, corneal radius 7.69 ± 0.28 mm, chamber
-depth with the cornea 3.10 ± 0.47 mm: "Global metrics on ocular biometry", Eye 2022).
-The cornea's power follows from its radii; the lens has 22.6 ± 2.1 dpt (Rozema 2012).
+Notes name properties of an estimated eye that would be unusual in a person.  These
+limits are soft: the prior draws an eye toward usual values, but a wavefront may require
+others.  Lengths are three deviations about the means of 19,500 to 90,800 eyes of ten
+countries (axial length 23.49 ± 1.35 mm, corneal radius 7.69 ± 0.28 mm, chamber depth
+with the cornea 3.10 ± 0.47 mm: "Global metrics on ocular biometry", Eye 2022).  The
+cornea's power follows from its radii; the lens has 22.6 ± 2.1 dpt (Rozema 2012).
 """
 
 import json

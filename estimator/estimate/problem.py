@@ -1,20 +1,17 @@
-"""Estimation problem: the measurements of one profile, and a model of them.
+"""Estimation problem: a prior, the measurements of one profile, and a model of them.
 
 Coefficients are compared on the measured circle, with the model's entrance pupil equal
 to the measured pupil, without piston and tilt: the chief ray's zero slope ties tilt to
 coma, so a measured tilt contains no information about the eye.
 
-Prior of the estimation.
-
 27 coefficients do not determine 45 parameters; among the eyes that fit, the prior
 selects the one nearest to the mean eye of that refraction.
 
-Pattern search over the 45 parameters: the baseline of the earlier work.
-
-This is the published generalized pattern search (Csoba & Kunkli 2023): squared error
-with weights by radial order and a penalty on wrong signs, parameters scaled to their
-ranges, mesh factors 1/2 and 2.  It needs no derivatives, at the cost of time; the
-recommended method is in `estimation.py`.
+The baseline is the pattern search over the 45 parameters of the earlier work, the
+published generalized pattern search (Csoba & Kunkli 2023): squared error with weights
+by radial order and a penalty on wrong signs, parameters scaled to their ranges, mesh
+factors 1/2 and 2.  It needs no derivatives, at the cost of time; the recommended method
+is in `estimation.py`.
 """
 
 import time

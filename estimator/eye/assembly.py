@@ -1,16 +1,12 @@
 """Conversion of the 45 parameters to surfaces, for one eye or packed batches.
 
-Shape of the lens from its diameter and volume.
+The shape of the lens follows from its diameter and volume.  Two conic caps that meet at
+the equator cannot represent a real lens, which has a thick rounded rim.  Both rules
+assign part of the volume to the caps and a thickness to the rim.
 
-Two conic caps that meet at the equator cannot represent a real lens, which has a thick
-rounded rim.  Both rules assign part of the volume to the caps and a thickness to the
-rim.
-
-The accommodating lens: changes of diameter at constant volume.
-
-The lens shrinks at constant volume, which steepens both surfaces (rule C).  Its
-anterior pole, and the stop with it, moves forward by the growth of the thickness before
-the equator, so the aqueous thins.  The eye length does not change.
+The accommodating lens shrinks at constant volume, which steepens both surfaces (rule
+C).  Its anterior pole, and the stop with it, moves forward by the growth of the
+thickness before the equator, so the aqueous thins.  The eye length does not change.
 """
 
 import math

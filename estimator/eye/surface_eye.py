@@ -3,8 +3,7 @@
 Light is traced through the surfaces as they are: no typical aberration, periphery or
 chromatic correction is added.
 
-An eye given by surfaces and media, in one state or in several of its accommodation.
-
+A profile gives the surfaces and media in one state or in several of accommodation.
 Between the states every number changes smoothly: along a line between two states, a
 parabola through three, a cubic spline through more.  Laws that are quadratic in the
 accommodation, such as that of the Arizona eye, are therefore exact with three states.

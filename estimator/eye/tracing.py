@@ -6,11 +6,10 @@ measured entrance pupil divided by its magnification, the fit covers the part of
 circle that the projected pupil fills, and the coefficients are rescaled from that
 circle to the measured one.
 
-Least-squares refraction over the area of the pupil.
-
-For a circular pupil about the chief ray it is -4 sqrt(3) C(2,0) / r².  For an
-elliptical or decentered pupil, the fit is over the ellipse: with the wavefront of a
-cataract, the two differ by 0.1 dpt at 7 mm.
+Refraction is the least-squares fit over the area of the pupil.  For a circular pupil
+about the chief ray it is -4 sqrt(3) C(2,0) / r².  For an elliptical or decentered
+pupil, the fit is over the ellipse: with the wavefront of a cataract, the two differ by
+0.1 dpt at 7 mm.
 """
 
 from functools import cache

@@ -14,9 +14,8 @@ The population was measured through `CIRCLE_MM`.  Wider pupils have the same pol
 one that grows more slowly beyond 6 mm gives M a kink of 0.1 to 0.5 dpt/mm there, and
 makes the far periphery of a myope up to 1 dpt more myopic at 7 mm than at 6 mm.
 
-Refraction of the periphery at every accommodation, relative to the axis.
-
-In people, refraction off the axis relative to that on the axis hardly changes with
+The refraction of the periphery is held at every accommodation, relative to the axis: in
+people, refraction off the axis relative to that on the axis hardly changes with
 accommodation: no significant change in Calver et al. 2007 (Vision Res 47:2341) and
 Davies & Mallen 2009 (Br J Ophthalmol 93:1225), 0.1 to 0.5 dpt more myopic over several
 diopters in Whatham et al. 2009 (J Vis 9(3):14) and Lundstrom et al. 2009 (J Vis

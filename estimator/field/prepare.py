@@ -1,9 +1,8 @@
 """Preparation of the eye of a profile for PSFs: measured wavefront or traced model.
 
-Wavefronts over the field, with one wavelength traced at all nodes, others at fewer.
-
-The difference between wavelengths is smaller and smoother than the change over the
-field.  It is therefore traced at fewer fields and accommodations, and interpolated.
+Over the field, one wavelength is traced at all nodes.  The difference of the others is
+smaller and smoother than the change over the field: it is traced at fewer fields and
+accommodations, and interpolated.
 """
 
 from __future__ import annotations

@@ -3,10 +3,9 @@
 The interpolation over field and wavelength is done once (see `FieldValues`), because a
 stream of frames requests the same fields repeatedly.
 
-Total defocus of a traced eye at fixed fields, as pupil and accommodation change.
-
-Terms that depend only on field and wavelength are computed once.  For a state, total
-defocus depends only on sums of monomials, by degree, and on the rim of the pupil.
+For total defocus, terms that depend only on field and wavelength are computed once.
+For a state, total defocus depends only on sums of monomials, by degree, and on the rim
+of the pupil.
 """
 
 from collections.abc import Callable

@@ -4,10 +4,9 @@ ONNX Runtime evaluates the networks on the CPU.  Each is loaded on first use, on
 process.  Inputs outside the training ranges raise `OutOfDomain`, and callers fall back
 to ray tracing.
 
-Card of a trained network: its columns, training ranges and expected error.
-
-The training writes ``weights/<name>.json`` with ``weights/<name>.onnx``.  The columns
-below are the contract between training and inference: both import them from here.
+A card has the columns, training ranges and expected error of a network.  The training
+writes ``weights/<name>.json`` with ``weights/<name>.onnx``.  The columns below are the
+contract between training and inference: both import them from here.
 """
 
 from collections.abc import Mapping

@@ -7,25 +7,22 @@ the covariance of the residuals.  Penalties and shrinkage factors are those with
 smallest cross-validation error that, at every angle, do not predict worse than the
 sphere alone.
 
-Extension of wavefronts from the horizontal meridian to the whole visual field.
-
-Eyes were measured along the horizontal meridian.  About the symmetry axis of a nearly
-rotationally symmetric eye (angle alpha), nodal aberration theory (Thompson, JOSA A 22,
-2005) gives the dependence on direction H = h + iv: defocus is proportional to |H|²,
-astigmatism to H² and coma to H.  A shift of the axis adds terms in H to the first two.
-Terms that are even along the meridian therefore rotate with one multiple of the
-azimuth, and odd terms with another.
+Wavefronts are extended from the horizontal meridian, along which eyes were measured, to
+the whole visual field.  About the symmetry axis of a nearly rotationally symmetric eye
+(angle alpha), nodal aberration theory (Thompson, JOSA A 22, 2005) gives the dependence
+on direction H = h + iv: defocus is proportional to |H|², astigmatism to H² and coma to
+H.  A shift of the axis adds terms in H to the first two.  Terms that are even along the
+meridian therefore rotate with one multiple of the azimuth, and odd terms with another.
 
 For five eyes measured over +-40 x 25 deg (Polans 2015), this is as accurate as the mean
 of the other four.  Separate vertical terms, fitted to those four, are no improvement.
 
-Wavefronts of measured eyes, all as right eyes in the project's frame.
-
-The data are those of Jaeken & Artal, IOVS 53(7), 2012, as distributed with ISETBio (MIT
-license): both eyes of 65 people along the horizontal meridian, 4 mm.  Angles in the
-file are positive in the temporal retina of a right eye, whose visual field is to the
-left: h = -angle.  Coefficients are in the project's frame, as the sign of coma shows.
-Left eyes are mirrored.
+Measured eyes are all right eyes in the project's frame.  The data are those of Jaeken &
+Artal, IOVS 53(7), 2012, as distributed with ISETBio (MIT license): both eyes of 65
+people along the horizontal meridian, 4 mm.  Angles in the file are positive in the
+temporal retina of a right eye, whose visual field is to the left: h = -angle.
+Coefficients are in the project's frame, as the sign of coma shows.  Left eyes are
+mirrored.
 """
 
 import io

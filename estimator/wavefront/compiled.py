@@ -4,12 +4,11 @@ A field has an eye, an index row and a direction.  Its chief ray is traced from 
 through the center of the stop to the retina.  From its retinal point, rays are traced
 out of the eye (Algorithm 1 of the paper), through nodes of the stop or of a circle.
 
-Lateral color: shift of the apparent direction of chief rays with wavelength.
-
-The chief ray of a wavelength from direction u meets the retina at a point.  The
-apparent direction is the one whose 555 nm chief ray meets the same point; it is found
-by tracing from that point back through the center of the stop.  The shift is the angle
-from u to the apparent direction.
+Lateral color is the shift of the apparent direction of chief rays with wavelength.  The
+chief ray of a wavelength from direction u meets the retina at a point.  The apparent
+direction is the one whose 555 nm chief ray meets the same point; it is found by tracing
+from that point back through the center of the stop.  The shift is the angle from u to
+the apparent direction.
 """
 
 from __future__ import annotations
