@@ -370,14 +370,8 @@ class KinectCounts:
             )
         if not ((stored >= 0.0) & (stored <= MAX_COUNT)).all():
             raise InvalidFile(path, "numbers that are not counts", f"0 to {MAX_COUNT}")
-        depth_m, _ = self.of_integers(stored.astype(np.uint16))
-        return replace(file, pixels=depth_m)
-
-    def of_integers(
-        self, stored: NDArray[np.uint16]
-    ) -> tuple[NDArray[np.float32], list[str]]:
-        """Return the depth for the numbers as stored, with swapped bytes."""
-        return registered_m(counted_depth_m(stored.byteswap())), []
+        counts = stored.astype(np.uint16).byteswap()
+        return replace(file, pixels=registered_m(counted_depth_m(counts)))
 
 
 def counted_depth_m(counts: NDArray[np.uint16]) -> NDArray[np.float64]:

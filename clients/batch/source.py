@@ -23,7 +23,6 @@ from estimator.bounded_files import InvalidFile, read_text
 from filter_service.camera import PixelGrid, Tangents
 from filter_service.image_files import (
     ImageFile,
-    depth_of,
     read_depth_file,
     read_stored_depth,
 )
@@ -86,11 +85,6 @@ class DepthForm(Protocol):
         If the content of the file is given, the file is not read.
         """
 
-    def of_integers(
-        self, stored: NDArray[np.uint16]
-    ) -> tuple[NDArray[np.float32], list[str]]:
-        """Return the depth in a video frame, m, and notes."""
-
 
 @dataclass(frozen=True)
 class Scaled:
@@ -102,12 +96,6 @@ class Scaled:
         """Return the depth in a file, m."""
         scale_m = self.depth_scale_m
         return read_depth_file(path, depth_scale=scale_m, option="", content=content)
-
-    def of_integers(
-        self, stored: NDArray[np.uint16]
-    ) -> tuple[NDArray[np.float32], list[str]]:
-        """Return the depth in a video frame, m, and notes."""
-        return depth_of(stored, self.depth_scale_m)
 
 
 @dataclass(frozen=True)
@@ -124,21 +112,12 @@ class Disparity:
     def read(self, path: Path, content: bytes | None = None) -> ImageFile:
         """Return the depth in a file, m; 0 if the disparity is unknown."""
         stored = read_stored_depth(path, option="", content=content)
-        return replace(stored, pixels=self._depth_m(stored.pixels))
-
-    def of_integers(
-        self, stored: NDArray[np.uint16]
-    ) -> tuple[NDArray[np.float32], list[str]]:
-        """Return the depth in a video frame, m, and no notes."""
-        return self._depth_m(stored), []
-
-    def _depth_m(self, disparity_px: NDArray[Any]) -> NDArray[np.float32]:
-        apart_px = disparity_px.astype(np.float64) + self.offset_px
+        apart_px = stored.pixels.astype(np.float64) + self.offset_px
         known = np.isfinite(apart_px) & (apart_px > 0.0)
-        depth_m = np.zeros(disparity_px.shape)
+        depth_m = np.zeros(apart_px.shape)
         with np.errstate(over="ignore"):  # values beyond float32 become infinity
             depth_m[known] = self.focal_px * self.baseline_m / apart_px[known]
-            return depth_m.astype(np.float32)
+            return replace(stored, pixels=depth_m.astype(np.float32))
 
 
 @dataclass(frozen=True)

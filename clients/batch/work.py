@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clients.batch.manifest import Record, below, write_whole
-from clients.batch.source import BadFrame, SourceFrame, States
+from clients.batch.source import BadFrame, Scaled, SourceFrame, States
 from estimator.bounded_files import read_bytes
 from filter_service import (
     Camera,
@@ -28,6 +28,7 @@ from filter_service.camera import PixelGrid
 from filter_service.errors import WorkerCrashed
 from filter_service.image_files import (
     ImageFile,
+    depth_of,
     named_note,
     read_color_file,
     write_image,
@@ -377,7 +378,8 @@ class UnitRunner:
             content = content_of(frame.depth)
             return color, frame.depth_form.read(frame.depth, content), inputs
         stored = self._reader(frame.depth).integers(frame.depth_index)
-        depth_m, notes = frame.depth_form.of_integers(stored)
+        assert isinstance(frame.depth_form, Scaled)  # as in all videos
+        depth_m, notes = depth_of(stored, frame.depth_form.depth_scale_m)
         grid = PixelGrid(depth_m.shape[1], depth_m.shape[0])
         named = tuple(named_note(frame.depth, note) for note in notes)
         return color, ImageFile(depth_m, grid, named), inputs
