@@ -26,7 +26,6 @@ import typer
 from numpy.typing import NDArray
 
 from clients.commands.options import read_profile, read_size_px, with_options
-from clients.extra import PYRENDER_INSTALL, what_to_install
 from clients.filter_client import FilterClient, FilteredFrame
 from clients.frame_log import FrameLog
 from clients.natural_eye import (
@@ -380,10 +379,8 @@ def _source(
         raise ValueError(
             "--hidden requires the renderer own; pyrender renders one layer"
         )
-    try:
-        from clients import pyrender_renderer
-    except ModuleNotFoundError as error:
-        raise CommandFailed(what_to_install(error, PYRENDER_INSTALL)) from None
+    from clients import pyrender_renderer  # which requires pyrender and trimesh
+
     flags, infinite_from_m = 0, np.inf
     if options.file is None:
         built = build_scene(options.scene or USUAL_SCENE)
@@ -414,10 +411,8 @@ def _source(
 
 def _opened_window(size_px: tuple[int, int], stack: ExitStack) -> Show:
     """Open a window until the end of the stack; return its method to show images."""
-    try:
-        from clients import window  # which requires glfw
-    except ModuleNotFoundError as error:
-        raise CommandFailed(what_to_install(error)) from error
+    from clients import window  # which requires glfw
+
     try:
         return stack.enter_context(window.LiveWindow(size_px, "ocufilter")).show
     except window.NoDisplay as error:

@@ -38,6 +38,16 @@ UNITS = (*OTHER_UNITS, "dpt", "px", "hz", "ms", "arcmin", "mrad", "um")
 _NUMBER_AND_UNIT = re.compile(
     r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\W\d]{1,12}|°|%)\s*"
 )
+EXTRAS = {
+    # package: extra of ocufilter that installs it
+    **dict.fromkeys(("pyrender", "trimesh", "OpenGL"), "pyrender"),
+    **dict.fromkeys(("nicegui", "fastapi", "uvicorn"), "web"),
+    "glfw": "clients",
+    "av": "batch",
+    "ray": "batch-ray",
+    "xr": "headset",
+}
+
 # endings of Typer's messages
 _BOUND = re.compile(r"\b(great|less)\w* than or equal to (\S+)")
 _CHOICES = re.compile(r"is not one of (.+?)\.?$")
@@ -84,12 +94,19 @@ def exit_code(app: typer.Typer, arguments: list[str], name: str) -> int:
             raise
         from estimator.bounded_files import printable
 
-        code, text = _code_and_text(error, arguments)
+        code, text = _code_and_text(error, arguments, name)
         sys.stderr.write(f"{name}: {printable(' '.join(text.split()))}\n")
         return code
 
 
-def _code_and_text(error: Exception, arguments: list[str]) -> tuple[int, str]:
+def install_command(extra: str) -> str:
+    """Return the command that installs an extra of ocufilter for this Python."""
+    return f"{sys.executable} -m pip install 'ocufilter[{extra}]'"
+
+
+def _code_and_text(
+    error: Exception, arguments: list[str], name: str
+) -> tuple[int, str]:
     from filter_service.errors import FilterError
 
     if isinstance(error, TyperException):
@@ -102,8 +119,13 @@ def _code_and_text(error: Exception, arguments: list[str]) -> tuple[int, str]:
         return EXIT_BAD_INPUT, str(error)
     if isinstance(error, OSError):
         return EXIT_FAILURE, str(error)
-    kind = type(error).__name__
-    return EXIT_FAILURE, f"{kind}: {error} (see ocufilter --traceback ...)"
+    if isinstance(error, ModuleNotFoundError) and error.name:
+        if extra := EXTRAS.get(error.name.partition(".")[0]):
+            return EXIT_FAILURE, (
+                f"the package {error.name} is not installed: {install_command(extra)}"
+            )
+    where = f" (see {name} --traceback ...)" if name == "ocufilter" else ""
+    return EXIT_FAILURE, f"{type(error).__name__}: {error}{where}"
 
 
 def _with_value(error: TyperException, arguments: list[str]) -> str:

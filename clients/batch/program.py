@@ -40,7 +40,6 @@ from filter_service.command_line import (
 from filter_service.progress import Progress
 
 SHOWN_FAILURES = 10
-INSTALL = f"{sys.executable} -m pip install"
 
 
 def run(options: BatchOptions, *, quiet: bool) -> dict[str, Any]:
@@ -162,13 +161,6 @@ def batch(options: BatchOptions, json_output: Json = False) -> None:
     except KeyboardInterrupt:
         sys.stderr.write("batch: stopped; run the same command again to continue\n")
         raise typer.Exit(EXIT_INTERRUPTED) from None
-    except ModuleNotFoundError as error:
-        if error.name not in ("av", "ray"):
-            raise
-        extra = "batch" if error.name == "av" else "batch-ray"
-        raise CommandFailed(
-            f"{error.name} is not installed: {INSTALL} 'ocufilter[{extra}]'"
-        ) from None
     except EngineUnusable as error:
         raise CommandFailed(str(error)) from error
     if json_output:

@@ -19,7 +19,6 @@ import numpy as np
 import typer
 
 from clients.commands.options import profile_title, read_size_px, with_options
-from clients.extra import HEADSET_INSTALL
 from clients.headset.options import (
     TRACKED_RANGE_DEG,
     EyeOptions,
@@ -37,6 +36,7 @@ from filter_service.command_line import (
     CommandFailed,
     Json,
     check_range,
+    install_command,
     print_json,
     print_line,
 )
@@ -320,8 +320,8 @@ def _openxr(name: str) -> Any:
         return importlib.import_module(f"clients.headset.{name}")
     except ModuleNotFoundError:
         raise ValueError(
-            f"pyopenxr is not installed: {HEADSET_INSTALL}; or use --simulated, "
-            "which requires no headset"
+            f"pyopenxr is not installed: {install_command('headset')}; or use "
+            "--simulated, which requires no headset"
         ) from None
 
 

@@ -14,8 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
-from clients.extra import WEB_INSTALL
-from filter_service.command_line import CommandFailed, Json, print_json, print_line
+from filter_service.command_line import Json, print_json, print_line
 from filter_service.log_lines import configure_logging
 
 DEFAULT_PORT = 8765
@@ -144,10 +143,7 @@ def web(
     if hosts is None:
         sys.stderr.write(f"{EXPOSED}\n")
     token, one_time_token = (secrets.token_urlsafe(TOKEN_BYTES) for _ in range(2))
-    try:
-        from clients.web.server import make_server
-    except ModuleNotFoundError as error:
-        raise CommandFailed(f"{error.name} is not installed: {WEB_INSTALL}") from None
+    from clients.web.server import make_server
 
     def announce() -> None:
         address = address_of(host, port, token)

@@ -1,53 +1,47 @@
 """Programs of the clients without the packages or the checkout that they need."""
 
 import re
-import subprocess
 import sys
 
 import pytest
 
+import clients
+from clients import pyrender_stream
 from clients.commands import checkout
-from clients.extra import INSTALL, PYRENDER_INSTALL
+from filter_service.command_line import EXTRAS, app_of, exit_code
 from tests.commands import run_command
 from tests.source_tree import ROOT
 
-WITHOUT_A_PACKAGE = (
-    "import runpy, sys\n"
-    "sys.modules[sys.argv[2]] = None\n"
-    "sys.argv = [sys.argv[1], *sys.argv[3:]]\n"
-    "runpy.run_module(sys.argv[0], run_name='__main__', alter_sys=True)\n"
-)
-
 
 @pytest.mark.parametrize(
-    ("package", "command", "arguments"),
+    ("package", "module", "arguments"),
     [
-        ("glfw", INSTALL, ("clients.pyrender_stream", "--window")),
-        ("pyrender", PYRENDER_INSTALL, ("clients.pyrender_stream", "--file", "a.stl")),
+        ("glfw", "window", ("--window", "--scene", "primitives")),
+        ("pyrender", "pyrender_renderer", ("--file", "a.stl")),
+        ("trimesh", "pyrender_renderer", ("--renderer", "pyrender")),
     ],
 )
 def test_a_missing_package_is_reported_in_one_line_with_its_command(
-    package, command, arguments
+    package, module, arguments, monkeypatch, capsys
 ):
-    finished = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            WITHOUT_A_PACKAGE,
-            arguments[0],
-            package,
-            *arguments[1:],
-        ],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=60,
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.delitem(sys.modules, f"clients.{module}", raising=False)
+    monkeypatch.delattr(clients, module, raising=False)
+    app = app_of(pyrender_stream.pyrender_stream)
+    assert exit_code(app, list(arguments), "stream") == 1
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err == (
+        f"stream: the package {package} is not installed: {sys.executable} -m pip "
+        f"install 'ocufilter[{EXTRAS[package]}]'\n"
     )
-    assert finished.returncode == 1
-    assert finished.stdout == ""
-    assert finished.stderr.count("\n") == 1, finished.stderr
-    assert f"{package} is not installed" in finished.stderr
-    assert command in finished.stderr
+
+
+def test_every_extra_that_an_error_names_exists():
+    declared = re.findall(
+        r"^([a-z-]+) = \[", (ROOT / "pyproject.toml").read_text("utf-8"), re.MULTILINE
+    )
+    assert set(EXTRAS.values()) <= set(declared)
 
 
 def test_an_installed_package_has_no_benchmarks(monkeypatch, tmp_path):
