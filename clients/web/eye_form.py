@@ -95,6 +95,11 @@ FIELDS_BY_DESIGN: dict[str, tuple[NumberField, ...]] = {
     "trifocal": (MIDDLE_ADD, NEAR_ADD),
     "edof": (EDOF_ADD,),
 }
+ENTERED = {"kind", "higher_order", "eye_side", "age_years", "name"} | {
+    field.name for field in PRESCRIPTION
+}
+"""Fields of a prescription that the page has entries for, or sets itself."""
+
 TRIFOCAL_LIGHT = (0.43, 0.17, 0.26)
 """Light of a trifocal lens at far, intermediate and near: 50:20:30 of 86 %."""
 
@@ -356,7 +361,7 @@ class EyeForm:
             self.worn.take(correction)
         if body.get("kind") == "preset":
             self.source, self.preset = "preset", body["name"]
-        elif _is_plain_prescription(body):
+        elif body.get("kind") == "prescription" and set(body) <= ENTERED:
             self.source = "prescription"
             self.texts = {e.name: e.show(body.get(e.name, 0.0)) for e in PRESCRIPTION}
             self.has_higher_order = body.get("higher_order", "typical") == "typical"
@@ -390,10 +395,3 @@ def read_profile_file(name: str, content: bytes) -> dict[str, Any]:
     if body.get("name") == path.name:  # coefficient files are named after the file
         body["name"] = shown
     return body
-
-
-def _is_plain_prescription(body: Mapping[str, Any]) -> bool:
-    known = {e.name for e in PRESCRIPTION} | {
-        *("kind", "higher_order", "eye_side", "age_years", "name")
-    }
-    return body.get("kind") == "prescription" and set(body) <= known

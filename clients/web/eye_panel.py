@@ -22,11 +22,12 @@ from clients.web.eye_form import (
     DESIGNS,
     DISTANCE_KINDS,
     HINTS,
+    SIDES,
     EyeForm,
     EyeSide,
     preset_titles,
 )
-from clients.web.widgets import SliderRow, select, toggle, upload_entry
+from clients.web.widgets import SliderRow, select, title, toggle, upload_entry
 from estimator import MAX_PROFILE_BYTES, PROFILE_SUFFIXES
 
 SOURCES = {"prescription": "Prescription", "preset": "Preset", "file": "File"}
@@ -55,9 +56,11 @@ class EyePanel:
         self.form = form
         self._on_change, self._on_file = on_change, on_file
         self._entries: dict[tuple[str, bool], ui.input] = {}
-        with ui.element("div").classes("oc-eye") as box:
-            box.props["data-eye-panel"] = form.side
-            self.build()
+        with ui.element("div").classes("oc-eye-box") as self.box:
+            self.heading = title(SIDES[form.side], "h3", "oc-eye-title")
+            with ui.element("div").classes("oc-eye") as entries:
+                entries.props["data-eye-panel"] = form.side
+                self.build()
 
     @ui.refreshable_method
     def build(self) -> None:

@@ -289,13 +289,20 @@ class Bounds:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        is_upload = _is_upload(scope)
-        refusal = self._refusal(scope, is_upload)
+        path = scope["path"]
+        is_upload = (
+            scope["method"] == "POST"
+            and path.startswith(UPLOAD_PREFIX)
+            and UPLOAD_PART in path
+        )
+        limits = self._limits
+        most = limits.upload_bytes if is_upload else limits.message_bytes
+        refusal = self._refusal(scope, is_upload, most)
         if refusal is not None:
             status, reason = refusal
             await _refuse(send, status, page_of(reason))
             return
-        body = _BoundedBody(receive, send, self._max_bytes(is_upload), self._limits)
+        body = _BoundedBody(receive, send, most, limits)
         self._n_uploads += is_upload
         try:
             await self.app(scope, body.receive, body.send)
@@ -305,11 +312,9 @@ class Bounds:
         finally:
             self._n_uploads -= is_upload
 
-    def _max_bytes(self, is_upload: bool) -> int:
-        limits = self._limits
-        return limits.upload_bytes if is_upload else limits.message_bytes
-
-    def _refusal(self, scope: Scope, is_upload: bool) -> tuple[int, str] | None:
+    def _refusal(
+        self, scope: Scope, is_upload: bool, most: int
+    ) -> tuple[int, str] | None:
         """Return status and reason if the request is refused by its head; else None."""
         method, path = scope["method"], scope["path"]
         if method not in ALL_METHODS:
@@ -319,7 +324,6 @@ class Bounds:
         length = _header(scope, b"content-length")
         if length and (not length.isdecimal() or len(length) > 18):
             return 400, "Content-Length: expected a number of bytes"
-        most = self._max_bytes(is_upload)
         if length and int(length) > most:
             return 413, _too_large(most)
         if is_upload and self._n_uploads >= self._limits.uploads:
@@ -370,15 +374,6 @@ class _BoundedBody:
             self._has_responded = True
             await _refuse(self._send, status, page_of(reason))
         return {"type": "http.disconnect"}
-
-
-def _is_upload(scope: Scope) -> bool:
-    path = scope["path"]
-    return (
-        scope["method"] == "POST"
-        and path.startswith(UPLOAD_PREFIX)
-        and UPLOAD_PART in path
-    )
 
 
 def _too_large(max_bytes: int) -> str:

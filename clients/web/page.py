@@ -113,8 +113,6 @@ class Page:
         self._announcement = Delayed(STATUS_DELAY_S)
         self._notes: dict[EyeSide, str] = {}
         self.rows: dict[str, SliderRow] = {}
-        self.panels: dict[EyeSide, EyePanel] = {}
-        self._boxes: dict[EyeSide, tuple[ui.element, ui.element]] = {}
         loop = asyncio.get_running_loop()
         resources.filter_thread.open(
             self.name,
@@ -196,12 +194,10 @@ class Page:
                 kind="oc-shown",
             )
             self._slider(AGE)
-            for side, name in SIDES.items():
-                with ui.element("div").classes("oc-eye-box") as box:
-                    self._boxes[side] = box, title(name, "h3", "oc-eye-title")
-                    self.panels[side] = EyePanel(
-                        self.state.eyes[side], self._change_eye, self._take_file
-                    )
+            self.panels = {
+                side: EyePanel(form, self._change_eye, self._take_file)
+                for side, form in self.state.eyes.items()
+            }
             self._show_boxes()
             self._problem = problem_label()
 
@@ -304,7 +300,7 @@ class Page:
 
     async def _take_file(self, side: EyeSide, name: str, content: bytes) -> None:
         loaded_side = self.state.load_file(side, name, content)
-        self.rows[AGE.name].show(self.state.values[AGE.name])
+        self._show_values()
         for panel in self.panels.values():
             panel.build.refresh()
         if loaded_side != side:
@@ -328,9 +324,9 @@ class Page:
         self.request()
 
     def _show_boxes(self) -> None:
-        for side, (box, heading) in self._boxes.items():
-            box.set_visibility(side in self.state.sides)
-            heading.set_visibility(self.state.shown == "both")
+        for side, panel in self.panels.items():
+            panel.box.set_visibility(side in self.state.sides)
+            panel.heading.set_visibility(self.state.shown == "both")
 
     def _copy_eye(self) -> None:
         side = self.state.sides[0]
@@ -349,7 +345,7 @@ class Page:
 
     def _focus(self, event: events.GenericEventArguments) -> None:
         self.state.look_at(*_position(event))
-        self.rows[FOCUS.name].show(self.state.values[FOCUS.name])
+        self._show_values()
         self.request()
 
     # Pictures
@@ -370,8 +366,7 @@ class Page:
 
     def _set_picture(self, picture: Picture) -> None:
         self.state.set_picture(picture)
-        for name in (PUPIL.name, FOCUS.name, DISTANCE.name):
-            self.rows[name].show(self.state.values[name])
+        self._show_values()
         self.rows[DISTANCE.name].enable(
             picture.distance_dpt is not None, "as in the picture"
         )

@@ -8,6 +8,7 @@ import pytest
 from clients.web.controls import (
     AGE,
     AXIS,
+    CONDITIONS,
     DISTANCE,
     FOCUS,
     GAZE_V,
@@ -350,6 +351,16 @@ def test_a_file_of_the_other_eye_is_loaded_there():
     assert state.load_file("OD", "p.json", json.dumps(body).encode()) == "OS"
     assert state.eyes["OS"].texts["sphere_dpt"] == "-3.00"
     assert state.eyes["OD"] == EyeForm("OD")
+
+
+@pytest.mark.parametrize("number", CONDITIONS, ids=lambda number: number.name)
+def test_a_link_has_every_condition_and_a_new_page_its_initial_value(number):
+    state, again = PageState(), PageState()
+    state.values[number.name] = number.high
+    restore(again, fragment_of(state, "courtyard"))
+    assert again.values == state.values != PageState().values
+    again.reset()
+    assert again.values[number.name] == number.initial
 
 
 def test_a_link_sets_all_entries_also_those_that_it_leaves_out():
