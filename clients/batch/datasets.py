@@ -447,11 +447,6 @@ LARGEST_NUMBER = 1e9
 _NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
 
 
-def is_middlebury(source: Path) -> bool:
-    """Return whether a folder is a scene or contains scenes."""
-    return bool(_scenes(source))
-
-
 def middlebury_frames(source: Path) -> list[SourceFrame]:
     """Return one frame per scene, named after its folder.
 
@@ -461,7 +456,7 @@ def middlebury_frames(source: Path) -> list[SourceFrame]:
         If a calibration cannot be read.  The message names the file and the field.
     """
     frames = []
-    for folder in _scenes(source):
+    for folder in middlebury_scenes(source):
         optics, disparity = read_calibration(folder / "calib.txt")
         color, depth = folder / "im0.png", folder / "disp0.pfm"
         name = folder.resolve().name
@@ -469,7 +464,9 @@ def middlebury_frames(source: Path) -> list[SourceFrame]:
     return frames
 
 
-def _scenes(source: Path) -> list[Path]:
+def middlebury_scenes(source: Path) -> list[Path]:
+    """Return a folder if it is a scene, otherwise the scenes in it."""
+
     def is_scene(folder: Path) -> bool:
         return all((folder / name).is_file() for name in FILES)
 

@@ -16,10 +16,10 @@ from pathlib import Path
 
 from clients.batch.datasets import (
     images_in,
-    is_middlebury,
     is_nyu,
     is_tum,
     middlebury_frames,
+    middlebury_scenes,
     nyu_frames,
     pair_frames,
     tum_frames,
@@ -46,11 +46,11 @@ MAX_EXAMINED_FILES = 1000
 
 Listing = Callable[[Path], list[SourceFrame]]
 
-DETECTED: dict[str, tuple[Callable[[Path], bool], Listing]] = {
+DETECTED: dict[str, tuple[Callable[[Path], object], Listing]] = {
     "tum": (is_tum, tum_frames),
     "nyu": (is_nyu, nyu_frames),
     "middlebury": (
-        is_middlebury,
+        middlebury_scenes,
         middlebury_frames,
     ),
 }

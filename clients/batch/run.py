@@ -405,11 +405,13 @@ def _join_videos(batch: Batch, manifest: Manifest) -> None:
         segments = [
             (number * SEGMENT_FRAMES, batch.out / cast(Path, segment))
             for number, (segment, frames) in enumerate(_parts(batch, profile))
-            if any(_is_ok(manifest, profile, frame) for frame in frames)
+            if any(
+                (record := manifest.record(profile, frame.name)) and record["ok"]
+                for frame in frames
+            )
         ]
         if not segments:
             continue
-
         join = partial(
             join_segments,
             segments=segments,
@@ -421,11 +423,6 @@ def _join_videos(batch: Batch, manifest: Manifest) -> None:
         manifest.append(
             {"kind": "video", "profile": profile, "file": target.name, **content}
         )
-
-
-def _is_ok(manifest: Manifest, profile: str, frame: SourceFrame) -> bool:
-    record = manifest.record(profile, frame.name)
-    return record is not None and record["ok"]
 
 
 MEASURED_FRAMES = 6

@@ -112,7 +112,11 @@ def _add_stream(
     rate: Fraction,
 ) -> av.VideoStream:
     height_px, width_px = shape[:2]
-    check_sides(width_px, height_px, kind)
+    if kind.even_sides and (width_px % 2 or height_px % 2):
+        raise ValueError(
+            f"{width_px}x{height_px} px; allowed: even width and height, or "
+            "--format ffv1"
+        )
     stream = container.add_stream(kind.codec, rate=rate, options=dict(kind.options))
     stream.width, stream.height, stream.pix_fmt = width_px, height_px, kind.pixels
     stream.codec_context.time_base = 1 / rate
@@ -123,21 +127,6 @@ def _add_stream(
         context.colorspace = context.color_primaries = context.color_trc = BT709
         context.color_range = LIMITED
     return stream
-
-
-def check_sides(width_px: int, height_px: int, kind: VideoKind) -> None:
-    """Check an image size against the requirements of an encoding.
-
-    Raises
-    ------
-    ValueError
-        If the encoding does not support the size.
-    """
-    if kind.even_sides and (width_px % 2 or height_px % 2):
-        raise ValueError(
-            f"{width_px}x{height_px} px; allowed: even width and height, or "
-            "--format ffv1"
-        )
 
 
 def join_segments(

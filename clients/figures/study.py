@@ -190,14 +190,6 @@ class AcuityByDistance:
     near_log_mar: NDArray[np.float64]
 
 
-def acuity_by_distance(study: EyeStudy, pupil_diameter_mm: float) -> AcuityByDistance:
-    """Return the acuity of an eye from far to 20 cm, or past its far point."""
-    object_dpt = distances_dpt(study, pupil_diameter_mm)
-    far = through_focus_log_mar(study, pupil_diameter_mm, object_dpt)
-    near = accommodated_log_mar(study, pupil_diameter_mm, object_dpt, far)
-    return AcuityByDistance(object_dpt, far, near)
-
-
 def acuity_log_mar(wavefront: PupilWavefront) -> float:
     """Return the acuity of a wavefront; infinite if it is too steep to be resolved.
 
@@ -462,8 +454,10 @@ class EyeStudy:
     def acuity(self, pupil_diameter_mm: float) -> AcuityByDistance:
         """Return the acuity by distance through a pupil, cached because it is slow."""
         if pupil_diameter_mm not in self._acuity:
-            found = acuity_by_distance(self, pupil_diameter_mm)
-            self._acuity[pupil_diameter_mm] = found
+            at_dpt = distances_dpt(self, pupil_diameter_mm)
+            far = through_focus_log_mar(self, pupil_diameter_mm, at_dpt)
+            near = accommodated_log_mar(self, pupil_diameter_mm, at_dpt, far)
+            self._acuity[pupil_diameter_mm] = AcuityByDistance(at_dpt, far, near)
         return self._acuity[pupil_diameter_mm]
 
     @cached_property

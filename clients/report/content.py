@@ -495,7 +495,11 @@ def _eye_note(moment: str, facts: EyeFacts) -> str:
 def _vision_table(before: EyeFacts, after: EyeFacts) -> Table:
     pupils = before.numbers["pupils"], after.numbers["pupils"]
     of_pupils = list(zip(*pupils, strict=True))
-    groups = tuple((f"{_pair_text(pair)} pupil", 2) for pair in of_pupils)
+    groups = tuple(
+        # with a star if it is wider than measured in one of the eyes
+        (f"{pupil_text(max(pair, key=lambda eye: eye['is_beyond_measured']))} pupil", 2)
+        for pair in of_pupils
+    )
     head = ("far object, 555 nm", *_moments(before, after) * len(of_pupils))
     rows = tuple(
         (label, *(format_value(numbers) for pair in of_pupils for numbers in pair))
@@ -508,11 +512,6 @@ def _vision_table(before: EyeFacts, after: EyeFacts) -> Table:
         groups=(("", 1), *groups),
         note=vision_note([numbers for found in pupils for numbers in found]),
     )
-
-
-def _pair_text(pair: tuple[dict[str, Any], dict[str, Any]]) -> str:
-    """Return the pupil of two eyes, with a star if it is wider than measured in one."""
-    return pupil_text(max(pair, key=lambda numbers: numbers["is_beyond_measured"]))
 
 
 def _curves(before: EyeFacts, after: EyeFacts) -> Section:

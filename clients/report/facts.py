@@ -178,17 +178,6 @@ def refraction_of(study: EyeStudy, zernike_um: NDArray[np.float64]) -> dict[str,
     return refraction_numbers(m + float(to_555_dpt), j0, j45)
 
 
-def worn_refraction_dpt(study: EyeStudy) -> float:
-    """Return M of the relaxed eye through its correction, at its entrance pupil."""
-    return float(
-        study.optics.total_defocus_dpt(
-            pupil_diameter_mm=refraction_pupil_mm(study),
-            accommodation_dpt=0.0,
-            wavelength_nm=WAVELENGTH_NM,
-        )
-    )
-
-
 def state_numbers(seen: PupilWavefront) -> dict[str, Any]:
     """Return the modulation transfer and acuity of a wavefront."""
     found = seen.predicted
@@ -270,7 +259,14 @@ def eye_numbers(study: EyeStudy) -> dict[str, Any]:
             "rms_error_um": float(np.linalg.norm(found.residual_um[3:])),
             "eye_length_mm": length_mm,
             "amplitude_dpt": found.amplitude_dpt,
-            "refraction_through_correction_dpt": worn_refraction_dpt(study),
+            # M of the relaxed eye through its correction, at its entrance pupil
+            "refraction_through_correction_dpt": float(
+                study.optics.total_defocus_dpt(
+                    pupil_diameter_mm=refraction_pupil_mm(study),
+                    accommodation_dpt=0.0,
+                    wavelength_nm=WAVELENGTH_NM,
+                )
+            ),
             "on_bound": list(found.on_bound),
         },
         "correction": None if worn is None else refraction_numbers(*power_vector(worn)),
@@ -318,6 +314,7 @@ def _field_numbers(study: EyeStudy) -> list[dict[str, float]]:
 
 def people_numbers(people: DrawnPeople) -> dict[str, Any]:
     """Return the percentiles of drawn persons, ready for JSON."""
+    at_reported = np.isin(FREQUENCY_CPD, REPORTED_CPD)
     return {
         "count": people.count,
         "pupils": [
@@ -328,7 +325,7 @@ def people_numbers(people: DrawnPeople) -> dict[str, Any]:
                     f"{cpd:g}_cpd": numbers
                     for cpd, numbers in zip(
                         REPORTED_CPD,
-                        percentiles_of(_at_reported_cpd(people.modulation[pupil_mm])),
+                        percentiles_of(people.modulation[pupil_mm][:, at_reported]),
                         strict=True,
                     )
                 },
@@ -343,10 +340,6 @@ def people_numbers(people: DrawnPeople) -> dict[str, Any]:
             if h_deg in REPORTED_FIELD_DEG
         ],
     }
-
-
-def _at_reported_cpd(modulation: NDArray[np.float64]) -> NDArray[np.float64]:
-    return modulation[:, np.isin(FREQUENCY_CPD, REPORTED_CPD)]
 
 
 DISTANCES_M = (0.4, 1.0, 6.0)

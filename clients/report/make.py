@@ -205,12 +205,15 @@ def write_report(
         If the file cannot be written.
     """
     text = html_of(document_of(eyes, record))
-    is_pdf = path.suffix.lower() == ".pdf"
-    write_atomically(path, _render_pdf(text) if is_pdf else text)
+    if path.suffix.lower() != ".pdf":
+        write_atomically(path, text)
+        return
+    pdf: bytes = check_pdf()(string=text).write_pdf(pdf_variant="pdf/ua-1")
+    write_atomically(path, pdf)
 
 
-def check_pdf() -> None:
-    """Raise an error if PDF output is unavailable.
+def check_pdf() -> Any:
+    """Return the class that writes PDF files from HTML.
 
     Raises
     ------
@@ -218,7 +221,7 @@ def check_pdf() -> None:
         If PDF output is unavailable (missing dependency).
     """
     try:
-        import weasyprint  # noqa: F401
+        from weasyprint import HTML
     except ImportError:
         raise ReportError(
             "PDF output requires WeasyPrint: `pip install 'ocufilter[report]'`. HTML "
@@ -229,14 +232,7 @@ def check_pdf() -> None:
             f"PDF output requires the system library Pango ({error}): `apt-get install "
             f"{' '.join(PANGO_PACKAGES)}`. HTML reports need no extra packages."
         ) from None
-
-
-def _render_pdf(text: str) -> bytes:
-    check_pdf()
-    from weasyprint import HTML
-
-    pdf: bytes = HTML(string=text).write_pdf(pdf_variant="pdf/ua-1")
-    return pdf
+    return HTML
 
 
 def report_numbers(eyes: list[EyeFacts]) -> dict[str, Any]:

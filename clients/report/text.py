@@ -113,12 +113,17 @@ def short_text(lens: Prescription) -> str:
 
 def correction_text(lens: Prescription) -> str:
     """Return the type of a correction, its powers and its alignment to the eye."""
+    more: tuple[str, ...] = ()
+    own = lens
     if isinstance(lens, ProgressiveLens):
-        own, more = lens.distance, _progressive(lens)
+        own = lens.distance
+        more = (
+            f"add {_power(lens.add_dpt)} dpt",
+            f"corridor {lens.corridor_mm:g} mm",
+            f"{gaze_text(lens.gaze_deg)} through {format_prescription(lens)}",
+        )
     elif isinstance(lens, WornLens):
-        own, more = lens, _alignment(lens)
-    else:
-        own, more = lens, ()
+        more = _alignment(lens)
     if isinstance(lens, WornLens) and lens.replaces_lens:
         return ", ".join([short_text(lens), *_own_power(lens), *more])
     return ", ".join(
@@ -171,14 +176,6 @@ def design_adds_dpt(rings: DiffractiveRings) -> list[float]:
         light = np.abs(rings.kinoform.amplitudes(middle))
         middle = middle[[int(light.argmax())]]
     return [float(k - lowest) * rings.spacing_dpt for k in (*middle, highest)]
-
-
-def _progressive(lens: ProgressiveLens) -> tuple[str, ...]:
-    return (
-        f"add {_power(lens.add_dpt)} dpt",
-        f"corridor {lens.corridor_mm:g} mm",
-        f"{gaze_text(lens.gaze_deg)} through {format_prescription(lens)}",
-    )
 
 
 def gaze_text(gaze_deg: tuple[float, float]) -> str:
@@ -376,7 +373,13 @@ def _rows(study: EyeStudy, cite: Citations) -> tuple[tuple[str, ...], ...]:
         _shape(study, cite),
         _color(study, cite),
         _media(study, cite),
-        _nerves(cite),
+        (
+            "Acuity",
+            "predicted",
+            "a template observer with a young adult's retina and nerves reads what the "
+            f"optics leave {cite('acuity', 'nerves')}; amblyopia or disease is not in "
+            f"it; visual Strehl ratio {cite('strehl')}, charts {cite('chart')}",
+        ),
         _worn(study),
     )
     return tuple(row for row in rows if row)
@@ -519,15 +522,6 @@ def _media(study: EyeStudy, cite: Citations) -> tuple[str, ...]:
         return ("Straylight", TYPICAL, f"by age and pigment {cite('straylight')}")
     text = f"log s {haze.log_s:g} at 7° {cite('straylight', 'cataract')}"
     return ("Straylight", STATED, text + "; in the letter charts alone")
-
-
-def _nerves(cite: Citations) -> tuple[str, ...]:
-    text = (
-        "a template observer with a young adult's retina and nerves reads what the "
-        f"optics leave {cite('acuity', 'nerves')}; amblyopia or disease is not in it; "
-        f"visual Strehl ratio {cite('strehl')}, charts {cite('chart')}"
-    )
-    return ("Acuity", "predicted", text)
 
 
 def _worn(study: EyeStudy) -> tuple[str, ...]:
