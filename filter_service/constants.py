@@ -127,7 +127,7 @@ DETECTION_MARGIN_DEG = 5.0
 DETECTION_OCTAVES_PER_DEG = 0.103
 DETECTION_MAX_OCTAVES = 3.0
 """Increase of the threshold contrast with the angle from the gaze, beyond a margin
-(rendering/detection.py): 0.031 decades per degree, up to 8 times."""
+(rendering/frame.py): 0.031 decades per degree, up to 8 times."""
 
 PAPER_TIE_BREAK_M = 0.01
 """The paper's rule sorts by distance plus this times the scan position (0..1)."""

@@ -12,8 +12,7 @@ import numpy as np
 from filter_service import constants
 from filter_service.gl.gpu import ATLAS_TEXEL_BYTES, Gpu
 from filter_service.gl.passes import Buffer, BufferPart, Passes
-from filter_service.rendering.gl.compile_passes import compile_passes
-from filter_service.rendering.gl.renderer import FilterRenderer
+from filter_service.rendering.gl.renderer import FilterRenderer, compile_passes
 
 
 @dataclass(frozen=True)

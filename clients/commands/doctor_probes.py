@@ -85,8 +85,7 @@ def probe_devices() -> dict[str, Any]:
 def probe_shaders() -> dict[str, Any]:
     """Compile and run the passes; a perfect eye must leave a frame unchanged."""
     from filter_service.gl.gpu import Gpu
-    from filter_service.rendering.gl.compile_passes import compile_passes
-    from filter_service.rendering.gl.renderer import FilterRenderer
+    from filter_service.rendering.gl.renderer import FilterRenderer, compile_passes
 
     gpu = Gpu()
     try:

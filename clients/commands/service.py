@@ -17,7 +17,7 @@ from filter_service.command_line import (
     print_line,
     typer_app,
 )
-from filter_service.psfs.cache_folder import CACHE_VARIABLE
+from filter_service.psfs.store_cache import CACHE_VARIABLE
 
 if TYPE_CHECKING:
     from filter_service.keys import KeyRing
@@ -334,7 +334,7 @@ def list_cached(folder: EyeFolder = None, json_output: Json = False) -> None:
 
     ocufilter eyes list --dir ~/.cache/ocufilter
     """
-    from filter_service.psfs.cached_eyes import cached_eyes
+    from filter_service.psfs.store_cache import cached_eyes
 
     found = cached_eyes(_folder(folder))
     if json_output:
@@ -369,7 +369,7 @@ def erase(
 
     ocufilter eyes erase anna.json --dir ~/.cache/ocufilter
     """
-    from filter_service.psfs.cached_eyes import erase_eyes
+    from filter_service.psfs.store_cache import erase_eyes
 
     if (profile is not None) + (name is not None) + every != 1:
         raise ValueError(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from filter_service.errors import BuildFailed, FilterError, UnknownProfile
-from filter_service.psfs.cache_folder import default_cache_dir as default_cache_dir
+from filter_service.psfs.store_cache import default_cache_dir as default_cache_dir
 
 if TYPE_CHECKING:
     from estimator.eye.checked_fields import ProfileError

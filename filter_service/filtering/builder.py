@@ -39,7 +39,7 @@ from filter_service.filtering.stream_eyes import (
     StreamEyes,
 )
 from filter_service.rendering.engine import FrameEngine, LoadedStore
-from filter_service.rendering.sampled_frame import first_frame
+from filter_service.rendering.frame_kernels import first_frame
 from filter_service.settings import FilterSettings
 from filter_service.view_state import State
 

@@ -22,9 +22,8 @@ from filter_service.rendering.engine import (
     ViewRequest,
     ViewResult,
 )
-from filter_service.rendering.frame_kernels import MissingPsfs
+from filter_service.rendering.frame_kernels import MissingPsfs, SampledView
 from filter_service.rendering.media_effects import begin_through_media
-from filter_service.rendering.sampled_frame import SampledView
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
 from filter_service.stage_times import StageTimes

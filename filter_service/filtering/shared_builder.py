@@ -17,7 +17,7 @@ from filter_service.constants import ENGINES
 from filter_service.errors import RenderFailed
 from filter_service.filtering.builder import Builder
 from filter_service.gl_device import is_device_selected, may_have_gpu
-from filter_service.psfs.cache_folder import default_cache_dir
+from filter_service.psfs.store_cache import default_cache_dir
 
 if TYPE_CHECKING:
     from filter_service.gl.current_context import CurrentContext
@@ -143,7 +143,7 @@ def _automatic(closing: ExitStack, *, warm_up: bool) -> ChosenEngine:
 
 
 def _native(closing: ExitStack, reason: str) -> ChosenEngine:
-    from filter_service.rendering.native.lanes import NativeLanes
+    from filter_service.rendering.native.renderer import NativeLanes
 
     lanes = NativeLanes()
     closing.callback(lanes.close)
@@ -159,8 +159,7 @@ def _gl(
     current: CurrentContext | None = None,
 ) -> ChosenEngine:
     from filter_service.gl.gpu import Gpu
-    from filter_service.rendering.gl.compile_passes import compile_passes
-    from filter_service.rendering.gl.renderer import FilterRenderer
+    from filter_service.rendering.gl.renderer import FilterRenderer, compile_passes
 
     gpu = Gpu(current=current)
     closing.callback(gpu.close)

@@ -20,8 +20,8 @@ from estimator.profiles.parse import EyeProfile
 from filter_service.camera import Camera, distinct_cameras, is_same_camera
 from filter_service.errors import FilterError, NoProfile
 from filter_service.rendering.engine import LoadedStore
+from filter_service.rendering.frame_kernels import SampledFrame, SampledView
 from filter_service.rendering.media_effects import MediaEffects
-from filter_service.rendering.sampled_frame import SampledFrame, SampledView
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
 from filter_service.view_state import State

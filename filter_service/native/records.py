@@ -142,7 +142,7 @@ class ShrinkJob(c.Structure):
 
 
 class StoreTables(c.Structure):
-    """Tables of a store, see `filter_service.psfs.read_kernels`."""
+    """Tables of a store, see `filter_service.psfs.pack`."""
 
     _fields_ = (
         ("values_dpt", POINTER),
@@ -160,7 +160,7 @@ class StoreTables(c.Structure):
 
 
 class StateReads(c.Structure):
-    """Nodes that a state reads, see `filter_service.psfs.read_kernels`."""
+    """Nodes that a state reads, see `filter_service.psfs.pack`."""
 
     _fields_ = (
         ("groups", POINTER),
@@ -171,7 +171,7 @@ class StateReads(c.Structure):
 
 
 class MapTables(c.Structure):
-    """Maps of cells, see `filter_service.rendering.cell_maps`."""
+    """Maps of cells, see `filter_service.rendering.image_cells`."""
 
     _fields_ = (
         ("node_from_cell", POINTER),

@@ -1,19 +1,12 @@
 """Planner of the PSF cache: the nodes that an eye needs for a given error.
 
-grid              specification of a cache, and limits on its nodes
-field_directions  directions of an image's pixels
-state_samples     sampled states of frames, and their interpolation errors
-slopes            ray slopes over a pupil, by which PSFs are compared
-error_law         image error of blending two PSFs
-readable          defocus that frames read at a node
-axis_nodes        nodes along one axis
-defocus_nodes     nodes of defocus, group by group
-node_wavefronts   wavefronts of the field nodes in one state
-node_blur         geometric blur of nodes
-nodes             a plan, and interpolation between its nodes
-paper_grid        the paper's fixed grids as plans
+grid              specification of a cache, its limits and field directions
+state_samples     sampled states of frames, and the law of errors
+defocus_nodes     nodes of defocus, their blur, and the paper's grid
+node_wavefronts   wavefronts of the field nodes in one state; slopes
+nodes             a plan, its neighbors, and what frames read
 cost              memory and build time of a plan
-plan              entry point of the package
+plan              entry point of the package; nodes of the other axes
 
 Terms
 -----

@@ -17,9 +17,8 @@ from estimator.psf.switch import geometric_shares
 from estimator.threads import relative_core_time, thread_count
 from filter_service.constants import RGB
 from filter_service.planning.grid import GridSpec
-from filter_service.planning.node_wavefronts import PupilStates
+from filter_service.planning.node_wavefronts import PupilStates, state_survey
 from filter_service.planning.nodes import CachePlan
-from filter_service.planning.slopes import state_survey
 
 _LENGTHS = np.unique(
     [2**a * 3**b * 5**c for a in range(5, 24) for b in range(3) for c in range(2)]

@@ -4,23 +4,51 @@ There are two variants.  Either a node is the same defocus for all channels, whi
 deep scenes.  Or it is the defocus of green, and red and blue are shifted by their
 chromatic differences, which suits few object distances, because frames read the three
 channels of a distance together.  Each group uses the variant with fewer nodes.
+
+The layers of frames depend on this blur, so it must not depend on which PSFs have been
+computed.  Landing points of rays are linear in defocus, so two values of defocus
+suffice for each group.
+
+In the paper's grid, angles and distances are those of the released code.  Its foci
+become nodes of accommodation.  Its object distances become nodes of the total defocus
+of green light, and the other channels are shifted by their chromatic differences.
+
+References
+----------
+Csoba & Kunkli 2023, section 7.2.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
 from estimator.native.records import pointer_to
+from estimator.optics.zernike import wavefront_polynomial
+from estimator.psf.pupil import pupil_frames
 from filter_service.constants import RGB
 from filter_service.errors import GridTooLarge
 from filter_service.native import loops
 from filter_service.native.records import NodeJob
-from filter_service.planning.error_law import (
+from filter_service.planning.grid import GREEN, PAPER_REACH_DEG, GridSpec
+from filter_service.planning.node_wavefronts import (
+    NodeWavefronts,
+    PupilStates,
+    main_foci_dpt,
+    main_light_ratio,
+    slopes_px,
+)
+from filter_service.planning.nodes import (
+    PlanAxes,
+    RaggedNodes,
+    ReadableDefocus,
+    joined_ranges,
+)
+from filter_service.planning.state_samples import (
     BLUR_EXPONENT,
     DIFFRACTION_SHARE,
     DOUBLING,
@@ -29,14 +57,76 @@ from filter_service.planning.error_law import (
     half_way_error,
     mean_square,
     spot_covariance,
+    unit_px,
 )
-from filter_service.planning.grid import GridSpec
-from filter_service.planning.node_blur import GroupRays
-from filter_service.planning.node_wavefronts import PupilStates
-from filter_service.planning.nodes import RaggedNodes
-from filter_service.planning.readable import ReadableDefocus, joined_ranges
-from filter_service.planning.slopes import main_foci_dpt, main_light_ratio
-from filter_service.planning.state_samples import unit_px
+
+
+class GroupRays(NamedTuple):
+    """Landing points of each group's green rays at 0 dpt, and their shift per diopter.
+
+    Attributes
+    ----------
+    zero_px, per_dpt : (n_groups, n_rays, 2)
+        In px.
+    """
+
+    zero_px: NDArray[np.float64]
+    per_dpt: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, wavefronts: NodeWavefronts) -> GroupRays:
+        """Trace rays through wavefronts, averaged over the wavelengths of a primary."""
+        zero_um = wavefronts.zernike_um[:, GREEN].mean(axis=1)
+        per_dpt_um = wavefronts.per_dpt_um[:, GREEN].mean(axis=1)
+        both = (2, 1)
+        slopes = slopes_px(
+            pupil_frames(
+                wavefront_polynomial(np.concatenate([zero_um, zero_um + per_dpt_um])),
+                circle_radius_mm=np.tile(
+                    wavefronts.circle_diameter_mm[:, GREEN, 0] / 2.0, 2
+                ),
+                wavelength_nm=np.full(
+                    2 * len(zero_um), wavefronts.wavelength_nm[GREEN].mean()
+                ),
+                pixel_from_mrad=np.tile(wavefronts.pixel_from_mrad, (*both, 1)),
+                pupil_ellipse=np.tile(wavefronts.pupil_ellipse[:, GREEN, 0], both),
+            )
+        )
+        at_zero_px, at_one_px = np.split(slopes, 2)
+        return cls(at_zero_px, at_one_px - at_zero_px)
+
+
+def node_blur_px(
+    eye: EyeOptics,
+    spec: GridSpec,
+    rays: GroupRays,
+    nodes: RaggedNodes,
+    channel_shift_dpt: NDArray[np.float64],
+    shrink_ratio: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """Return the largest distance (n_psfs,), px, of rays from the chief ray.
+
+    With several foci, these are the rays of the nearest focus.
+    """
+    foci_dpt = np.zeros((RGB, 1))
+    if eye.rings is not None:
+        own_dpt = [
+            eye.rings.main_dpt(nm) for nm in spec.channel_wavelengths_nm.tolist()
+        ]
+        foci_dpt = np.full((RGB, max(map(len, own_dpt))), np.inf)
+        for channel, found in enumerate(own_dpt):
+            foci_dpt[channel, : len(found)] = found
+    zero_px, per_dpt = (np.ascontiguousarray(px.swapaxes(1, 2)) for px in rays)
+    blur_px = np.empty(RGB * nodes.values_dpt.size, np.float32)
+    loops().call(
+        "node_blur",
+        *(zero_px, per_dpt, nodes.values_dpt, nodes.starts),
+        np.ascontiguousarray(channel_shift_dpt),
+        *(foci_dpt, blur_px),
+        *(len(zero_px), zero_px.shape[2], foci_dpt.shape[1]),
+    )
+    return blur_px * np.repeat(shrink_ratio, RGB * nodes.counts).astype(np.float32)
+
 
 _SAMPLES = 49
 
@@ -346,3 +436,84 @@ def _spread(
         *(np.ascontiguousarray(needed), counts, nodes, *needed.shape),
     )
     return nodes[:count], counts
+
+
+ANGLE_COUNTS = {"on-axis": (1, 1), "quality": (31, 21), "dynamic": (23, 13)}
+DISTANCE_COUNTS = {"on-axis": 33, "quality": 9, "dynamic": 9}
+PUPILS_MM = {
+    "on-axis": (2.0, 3.0, 4.0, 5.0, 6.0, 7.0),
+    "quality": (5.0,),
+    "dynamic": (2.0, 3.0, 4.0, 5.0, 6.0),
+}
+FOCI_DPT = {
+    "on-axis": tuple(0.125 + np.arange(7.0)),
+    "quality": (0.125,),
+    "dynamic": tuple(0.125 + np.arange(5.0)),
+}
+DISTANCES_DPT = (0.125, 8.125)
+
+
+def paper_ranges(
+    spec: GridSpec,
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the ranges of the nodes of pupil, mm, and focus, dpt."""
+    settings = spec.settings
+    pupils_mm = np.clip(PUPILS_MM[settings.mode], *settings.pupil_range_mm)
+    foci_dpt = np.clip(FOCI_DPT[settings.mode], *settings.focus_range_dpt)
+    return (
+        (float(pupils_mm[0]), float(pupils_mm[-1])),
+        (float(foci_dpt[0]), float(foci_dpt[-1])),
+    )
+
+
+def paper_pupils_mm(eye: EyeOptics, spec: GridSpec) -> NDArray[np.float64]:
+    """Return the nodes (n,) of the pupil, clamped to the ranges of settings and eye."""
+    pupils_mm = np.clip(PUPILS_MM[spec.settings.mode], *spec.settings.pupil_range_mm)
+    return np.unique([eye.usable_pupil_mm(pupil_mm) for pupil_mm in pupils_mm])
+
+
+def paper_axes(eye: EyeOptics, spec: GridSpec) -> PlanAxes:
+    """Return the nodes of field, pupil and accommodation.
+
+    Pupils and foci are clamped to the ranges of the settings.  Foci with the same
+    accommodation, such as those of a myopic eye beyond its far point, are one node.
+    """
+    settings, mode = spec.settings, spec.settings.mode
+    reach_deg = PAPER_REACH_DEG.get(mode, (0.0, 0.0))
+    angles_deg = (
+        np.linspace(-reach, reach, count)
+        for reach, count in zip(reach_deg, ANGLE_COUNTS[mode], strict=True)
+    )
+    foci_dpt = np.clip(FOCI_DPT[mode], *settings.focus_range_dpt)
+    usable_mm = paper_pupils_mm(eye, spec)
+    widest_mm = float(usable_mm[-1])
+    accommodations_dpt = np.unique(
+        [eye.accommodation_dpt(f, pupil_diameter_mm=widest_mm) for f in foci_dpt]
+    )
+    # The ends need other accommodations through smaller pupils.
+    low_dpt, high_dpt = eye.accommodation_range_dpt(
+        (float(foci_dpt[0]), float(foci_dpt[-1])),
+        pupil_range_mm=(float(usable_mm[0]), widest_mm),
+    )
+    accommodations_dpt = np.unique([low_dpt, *accommodations_dpt[1:-1], high_dpt])
+    h_deg, v_deg = angles_deg
+    return PlanAxes(h_deg, v_deg, usable_mm, accommodations_dpt)
+
+
+def paper_defocus(eye: EyeOptics, spec: GridSpec, groups: PupilStates) -> DefocusNodes:
+    """Return the nodes of total defocus of groups, with the shifts of the channels."""
+    at_infinity_dpt = eye.total_defocus_dpt(
+        h_deg=groups.h_deg[:, None],
+        v_deg=groups.v_deg[:, None],
+        pupil_diameter_mm=groups.pupil_diameter_mm[:, None],
+        accommodation_dpt=groups.accommodation_dpt[:, None],
+        wavelength_nm=spec.channel_wavelengths_nm,
+    )
+    green_dpt = at_infinity_dpt[:, GREEN, None]
+    count = DISTANCE_COUNTS[spec.settings.mode]
+    distances_dpt = np.linspace(*DISTANCES_DPT, count)
+    values = green_dpt + eye.vergence.vergence_dpt(distances_dpt)
+    starts = count * np.arange(len(values) + 1)
+    return DefocusNodes.unlimited(
+        RaggedNodes(values.ravel(), starts), at_infinity_dpt - green_dpt
+    )

@@ -1,19 +1,13 @@
 """PSFs at the nodes of a plan: computed on demand, packed, interpolated for frames.
 
 eye_for_spec     the eye of a profile over the ranges of a cache
-compute_kernels  from nodes to packed kernels
-psf_engine       choice of the PSF engine: C, Python or the ENZ series
+compute_kernels  from nodes to packed kernels; choice of the engine
 native_psfs      the engine in C
-boxes            boxes that kernels are cropped to
-pack             kernels cropped to boxes, in 16 bits
+pack             kernels cropped to boxes, in 16 bits, and tables
 store            the PSFs of an eye
 frame_layers     interpolation for a state, and the layers of a frame
 field_defocus    change of defocus over the field
-read_kernels     the cached kernels that a state reads, as plain arrays
-store_cache      on-disk cache of eyes and nodes
-cache_folder     location of the on-disk cache
-cached_eyes      listing and erasing of cached eyes
-store_codec      objects as JSON and arrays
+store_cache      on-disk cache of eyes and nodes, its folder and contents
 store_file       file format of the on-disk cache
 picture          image of a kernel
 

@@ -18,9 +18,13 @@ from estimator.profiles.parse import EyeProfile
 from estimator.psf.compute import plan_psfs
 from estimator.psf.enz import PAPER_DEGREE, captured_ratios
 from filter_service.errors import BadMessage, BuildCancelled
-from filter_service.planning.field_directions import field_range_deg
-from filter_service.planning.grid import GREEN, GridSpec, pupil_nodes_mm
-from filter_service.planning.paper_grid import paper_ranges
+from filter_service.planning.defocus_nodes import paper_ranges
+from filter_service.planning.grid import (
+    GREEN,
+    GridSpec,
+    field_range_deg,
+    pupil_nodes_mm,
+)
 
 NO_LATERAL_COLOR = Note(
     "lateral_color_ignored",

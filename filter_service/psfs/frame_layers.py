@@ -23,10 +23,9 @@ from filter_service.planning.grid import (
     MIN_BLUR_STEP_PX,
     GridSpec,
 )
-from filter_service.planning.nodes import PlanAxes
-from filter_service.planning.readable import usable_pupils_mm
+from filter_service.planning.nodes import PlanAxes, usable_pupils_mm
 from filter_service.psfs.field_defocus import FieldDefocus
-from filter_service.psfs.read_kernels import StateReads, StoreTables, layer_blur_px
+from filter_service.psfs.pack import StateReads, StoreTables, layer_blur_px
 from filter_service.psfs.store import PsfStore
 from filter_service.view_state import State
 

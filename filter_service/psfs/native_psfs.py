@@ -19,8 +19,7 @@ from estimator.psf.screens import BEYOND_EDGE, ONE_CENTER, TABLE_COUNT
 from estimator.psf.stiles_crawford import StilesCrawford
 from filter_service.constants import RGB
 from filter_service.planning.node_wavefronts import NodeWavefronts
-from filter_service.psfs.boxes import CUT_STEPS, MAX_CENTROID_SHIFT_RATIO
-from filter_service.psfs.pack import PackedKernels
+from filter_service.psfs.pack import CUT_STEPS, MAX_CENTROID_SHIFT_RATIO, PackedKernels
 
 MAX_PRIMARIES = 16
 

@@ -1,4 +1,4 @@
-"""Packing of computed kernels: cropped to their boxes, 16 bits per weight.
+"""Packed kernels, cropped to their boxes with 16 bits per weight, and tables of stores.
 
 Off axis, kernels are elongated and displaced from their center.  The box that contains
 the light of such a kernel has a third of the area of the disc about the center.  The
@@ -9,13 +9,45 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimator.psf.compute import PsfBatch
-from filter_service.constants import WEIGHT_MAX
-from filter_service.psfs.boxes import CUT_STEPS, MAX_CENTROID_SHIFT_RATIO, SIDES
+from filter_service.constants import RGB, WEIGHT_MAX
+from filter_service.native import loops, records
+from filter_service.native.records import pointers
+from filter_service.planning.nodes import PlanNodes
+
+SIDES = 4
+
+MAX_CENTROID_SHIFT_RATIO = 0.005
+"""Largest shift of a kernel's centroid by cropping, relative to its spread or at least
+to a pixel.  `GridSpec.kept_energy_ratio` documents the total error of cropping."""
+
+CUT_STEPS = 7
+"""Number of times that the light to crop is halved until the shift of the centroid is
+small enough.  If it never is, nothing is cropped."""
+
+
+def box_sizes(reach_px: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return widths and heights (...) of kernels with reaches (..., 4)."""
+    left, right, up, down = np.moveaxis(np.asarray(reach_px), -1, 0)
+    return left + right + 1, up + down + 1
+
+
+def pack_reach(reach_px: NDArray[Any]) -> NDArray[np.uint32]:
+    """Pack four reaches (..., 4) into the bytes of a word, left in the lowest."""
+    return (np.asarray(reach_px, np.uint32) << np.array([0, 8, 16, 24], np.uint32)).sum(
+        axis=-1, dtype=np.uint32
+    )
+
+
+def unpack_reach(words: NDArray[np.uint32]) -> NDArray[np.uint8]:
+    """Unpack four reaches (..., 4) from words (...)."""
+    little = np.ascontiguousarray(words, "<u4")
+    return little[..., None].view(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -142,3 +174,130 @@ def _ends(line: NDArray[np.float64], allowed: float) -> tuple[int, int, float]:
     shift_px = (line @ places) / max(line.sum(), 1e-12)
     kept_px = (line[kept] @ places[kept]) / max(line[kept].sum(), 1e-12)
     return full - first, full - after, float(kept_px - shift_px)
+
+
+PSF_TABLES = (
+    *("offsets", "reach_words", "radius_px", "spread_px", "peak_ratio"),
+    *("is_computed", "last_used"),
+)
+"""Fields of `StoreTables` that are filled when PSFs are computed."""
+
+
+class StoreTables(NamedTuple):
+    """Data of a store from which frames are planned, as arrays of fixed layout.
+
+    Attributes
+    ----------
+    values_dpt : (n_nodes,)
+    starts : (n_groups + 1,)
+        See `RaggedNodes`.
+    channel_shift_dpt : (n_groups, 3)
+    offsets : (n_psfs,)
+    reach_words : (n_psfs,)
+        Four reaches, one byte each.
+    radius_px, blur_px, spread_px, peak_ratio : (n_psfs,)
+        See `PsfStore`.
+    is_computed : (n_psfs,)
+        Whether there is a kernel; without one, all other fields but the blur are 0.
+    last_used : (n_psfs,)
+        Number of the last frame that read the kernel.
+    """
+
+    values_dpt: NDArray[np.float64]
+    starts: NDArray[np.int64]
+    channel_shift_dpt: NDArray[np.float64]
+    offsets: NDArray[np.uint32]
+    reach_words: NDArray[np.uint32]
+    radius_px: NDArray[np.int32]
+    blur_px: NDArray[np.float32]
+    spread_px: NDArray[np.float32]
+    peak_ratio: NDArray[np.float32]
+    is_computed: NDArray[np.bool_]
+    last_used: NDArray[np.uint32]
+
+    @classmethod
+    def empty(cls) -> StoreTables:
+        """Return tables without nodes."""
+        none = np.zeros(0)
+        return cls(
+            values_dpt=none,
+            starts=np.zeros(1, np.int64),
+            channel_shift_dpt=np.zeros((0, RGB)),
+            offsets=none.astype(np.uint32),
+            reach_words=none.astype(np.uint32),
+            radius_px=none.astype(np.int32),
+            blur_px=none.astype(np.float32),
+            spread_px=none.astype(np.float32),
+            peak_ratio=none.astype(np.float32),
+            is_computed=none.astype(np.bool_),
+            last_used=none.astype(np.uint32),
+        )
+
+    def record(self) -> records.StoreTables:
+        """Return the C record, which is valid as long as the tables."""
+        return records.StoreTables(**pointers(**self._asdict()))
+
+    def grown(self, nodes: PlanNodes) -> StoreTables:
+        """Return tables extended to ``nodes``, which start with those of the tables.
+
+        The PSFs of the new nodes are not computed.
+        """
+        more = len(nodes.blur_px) - self.offsets.size
+        return StoreTables(
+            values_dpt=np.array(nodes.defocus.values_dpt, np.float64),
+            starts=np.array(nodes.defocus.starts, np.int64),
+            channel_shift_dpt=np.array(nodes.channel_shift_dpt, np.float64, order="C"),
+            blur_px=np.array(nodes.blur_px, np.float32),
+            **{
+                name: np.append(known, np.zeros(more, known.dtype))
+                for name, known in self._asdict().items()
+                if name in PSF_TABLES
+            },
+        )
+
+
+class StateReads(NamedTuple):
+    """Neighboring nodes of pupil and accommodation that a state reads.
+
+    Attributes
+    ----------
+    groups : (n_corners,)
+        Group of each neighbor at the first field node; those of the other field nodes
+        follow.
+    scales : (n_corners,)
+        Factors A / A_i of total defocus t.  Neighboring pupils are blended at equal
+        geometric blur: the node of pupil A_i is read at total defocus t A / A_i, so
+        blended kernels have the same size.
+    weights : (n_corners,)
+        Weights with sum 1.
+    """
+
+    groups: NDArray[np.int64]
+    scales: NDArray[np.float64]
+    weights: NDArray[np.float64]
+
+    def record(self) -> records.StateReads:
+        """Return the C record, which is valid as long as the arrays."""
+        return records.StateReads(**pointers(**self._asdict()), count=self.groups.size)
+
+
+def layer_blur_px(
+    tables: StoreTables,
+    reads: StateReads,
+    zero_dpt: NDArray[np.float64],
+    at_dpt: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the geometric blur radii (n_fields * 3, n), px, of n ascending layers.
+
+    Parameters
+    ----------
+    zero_dpt : (n_fields, 3)
+        Total defocus of field nodes and channels at 0 dpt.
+    """
+    blur_px = np.empty((zero_dpt.size, at_dpt.size))
+    loops().call(
+        "layer_blur",
+        *(tables.record(), reads.record(), np.ascontiguousarray(zero_dpt), at_dpt),
+        *(blur_px, len(zero_dpt), at_dpt.size),
+    )
+    return blur_px

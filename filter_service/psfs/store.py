@@ -26,17 +26,16 @@ from filter_service.errors import (
 )
 from filter_service.planning.grid import GridSpec
 from filter_service.planning.nodes import CachePlan, PlanAxes, PlanNodes
-from filter_service.psfs.boxes import pack_reach, unpack_reach
 from filter_service.psfs.field_defocus import EyeDefocus
-from filter_service.psfs.read_kernels import StoreTables
+from filter_service.psfs.pack import StoreTables, pack_reach, unpack_reach
 from filter_service.view_state import State
 
 if TYPE_CHECKING:
     from estimator.profiles.parse import EyeProfile
     from filter_service.planning.plan import NodePlanner
+    from filter_service.psfs.compute_kernels import PsfEngine
     from filter_service.psfs.native_psfs import NodeRings
     from filter_service.psfs.pack import PackedKernels
-    from filter_service.psfs.psf_engine import PsfEngine
 
 BYTES_PER_TEXEL = 2
 FIRST_TEXELS = 2**22
@@ -275,8 +274,7 @@ class PsfStore:
         OutOfMemory
             If the kernels of a frame exceed ``spec.memory_budget_mb``.
         """
-        from filter_service.psfs.compute_kernels import computed_kernels
-        from filter_service.psfs.psf_engine import psf_engine
+        from filter_service.psfs.compute_kernels import computed_kernels, psf_engine
 
         self.engine = self.engine or psf_engine(self.spec.settings.pipeline)
         started_s = time.perf_counter()

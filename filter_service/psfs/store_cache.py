@@ -1,4 +1,4 @@
-"""On-disk cache of estimated eyes and their nodes.
+"""On-disk cache of estimated eyes and their nodes: its folder, contents and limits.
 
 The cache is a folder of files.  A file's name consists of a hash of the profile and one
 of the grid and the code.  Several services may share the folder without a lock: files
@@ -31,14 +31,39 @@ from estimator.profiles.parse import EyeProfile
 from filter_service import native as loops
 from filter_service.gl.passes import SHADER_ROOT
 from filter_service.planning.grid import GridSpec
-from filter_service.psfs.cache_folder import check_is_private
-from filter_service.psfs.store_codec import NotStorable, pack
 from filter_service.psfs.store_file import (
     UNFINISHED,
     DamagedFile,
+    NotStorable,
+    pack,
     read_file,
     write_file,
 )
+
+CACHE_VARIABLE = "OCUFILTER_CACHE_DIR"
+
+
+def default_cache_dir() -> str:
+    """Return the folder in `CACHE_VARIABLE`, or "" for no cache if it is not set.
+
+    The files contain medical data, so the cache must be enabled explicitly.
+    """
+    return os.environ.get(CACHE_VARIABLE, "")
+
+
+def check_is_private(folder: Path) -> None:
+    """Raise if other users have access to a folder.
+
+    Raises
+    ------
+    PermissionError
+    """
+    if folder.stat().st_mode & 0o077:
+        raise PermissionError(
+            f"other users can access {folder}, which contains medical data; run "
+            f"chmod 700 {folder}"
+        )
+
 
 SUFFIX = ".psfs"
 SEPARATOR = "-"
@@ -250,3 +275,69 @@ class StoreCache:
             path.unlink(missing_ok=True)
             n_bytes -= size
             log.info("removed a file from %s: the cache is full", path.parent)
+
+
+@dataclass(frozen=True)
+class CachedEye:
+    """Files of one eye in the on-disk cache.
+
+    Attributes
+    ----------
+    name : str
+        Hash of the eye's profile.
+    n_files, size_bytes : int
+        Number and total size of the files, one for each camera and settings.
+    used_s : float
+        Time of the last use, in seconds since 1970.
+    """
+
+    name: str
+    n_files: int
+    size_bytes: int
+    used_s: float
+
+
+def cached_eyes(folder: Path) -> list[CachedEye]:
+    """Return the eyes cached in a folder, most recently used first.
+
+    Raises
+    ------
+    FileNotFoundError
+    """
+    found: dict[str, CachedEye] = {}
+    for path in _stores(folder):
+        status = path.lstat()
+        name = path.name.split(SEPARATOR)[0]
+        before = found.get(name, CachedEye(name, 0, 0, 0.0))
+        found[name] = CachedEye(
+            name,
+            before.n_files + 1,
+            before.size_bytes + status.st_size,
+            max(before.used_s, status.st_mtime),
+        )
+    return sorted(found.values(), key=lambda eye: -eye.used_s)
+
+
+def erase_eyes(folder: Path, name: str = "") -> int:
+    """Remove cached eyes whose names start with ``name``; return the number of files.
+
+    A service that uses such an eye continues to do so until its client disconnects.
+    """
+    removed = [path for path in _stores(folder) if path.name.startswith(name)]
+    for path in removed:
+        path.unlink(missing_ok=True)
+    return len(removed)
+
+
+def _stores(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder} is not a folder")
+    return [path for path in folder.iterdir() if _is_store(path)]
+
+
+def _is_store(path: Path) -> bool:
+    """Return whether a path is a regular file with the suffix of a store."""
+    try:
+        return path.suffix == SUFFIX and stat.S_ISREG(path.lstat().st_mode)
+    except FileNotFoundError:  # a service removed it
+        return False

@@ -23,26 +23,15 @@ Terms, in addition to the rendering terms of ``CONVENTIONS.md``:
 Modules:
 
 engine           interface of the frame engines: requests, results, checks
-white_level      reference light for contrast
 perfect_eye      store that changes nothing, for testing engines
-frame            preparation of a view: missing depth, repeated edges
-detection        limits of merging by the angle from the gaze
-image_cells      cells of the image that share kernels
-cell_maps        linear maps from their pixels to those of stored kernels
-frame_states     cached plans for an unchanged pupil, focus and gaze
-sampled_frame    sampled depths of a frame, and the PSFs that it needs
-frame_kernels    plan of a frame's kernels
-srgb             conversion between encoded images and linear light
-media_effects    effects of ocular media and spectacles
-bright_pixels    pixels much brighter than white
-pupil_edges      edges of the pupils of a store's nodes
-edge_kinds       kinds of bright pixels, and the edges that send their light
+frame            preparation of a view: missing depth, edges, merging
+image_cells      cells of the image that share kernels, and their maps
+frame_states     stores of engines, with layers and cells of the last frame
+frame_kernels    plan of a frame's kernels, and the PSFs that it needs
+media_effects    effects of ocular media and spectacles; straylight
+edge_kinds       bright pixels, and the edges that send their light
 edge_light       light of bright pixels beyond their kernels
-light_kernels    kernels of their light
-light_planes     addition of their light to images
-visibility       which points of the pupil's edge see a source
-haze             straylight of the ocular media
-spectacles       spectacle magnification
+light_kernels    kernels of their light, its visibility and addition
 gl/              engine of compute shaders
 native/          engine of compiled loops
 """

@@ -24,8 +24,12 @@ from numpy.typing import NDArray
 from estimator.psf.tables import N_EDGE
 from filter_service.constants import RGB
 from filter_service.native import loops
-from filter_service.rendering.bright_pixels import BrightPixels
-from filter_service.rendering.edge_kinds import EdgeElements, EyeAtFrame, SourceKinds
+from filter_service.rendering.edge_kinds import (
+    BrightPixels,
+    EdgeElements,
+    EyeAtFrame,
+    SourceKinds,
+)
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.frame_kernels import (
     FrameKernels,
@@ -37,13 +41,14 @@ from filter_service.rendering.light_kernels import (
     FADE_RATIO,
     FINE,
     RHO_PX,
+    add_plane,
+    add_sources,
     distant_tables,
     light_kernels,
     omitted_shares,
     places_around,
+    seen_by_edges,
 )
-from filter_service.rendering.light_planes import add_plane, add_sources
-from filter_service.rendering.visibility import seen_by_edges
 from filter_service.rgbd_view import RgbdView
 
 RADII_PX = (16, 24, 36, 54, 81, 122, 182, 273, 410)

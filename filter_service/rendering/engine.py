@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from estimator.note import Note
 from filter_service.errors import BadMessage, CameraMismatch
 from filter_service.planning.grid import GridSpec
-from filter_service.rendering.frame_kernels import MissingPsfs
-from filter_service.rendering.sampled_frame import SampledFrame
+from filter_service.rendering.frame_kernels import MissingPsfs, SampledFrame
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
 from filter_service.stage_times import StageTimes

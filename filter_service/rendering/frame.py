@@ -1,4 +1,30 @@
-"""Preparation of a view: missing depth, borders, object distances."""
+"""Preparation of a view: missing depth, borders, object distances, limits of merging.
+
+Pixels may merge more in the periphery, as far as nobody detects it.  Detection sets the
+limit, not resolution: gratings beyond the peripheral resolution
+limit remain visible, as aliases.  At 30 degrees, contrast sensitivity is about 10 at
+3.2 c/deg and falls to 1 near 20 c/deg (OSA 1988), which is beyond what headsets show.
+Spatial frequencies therefore allow nothing, but contrast does.  From the fovea to 30
+degrees, sensitivity falls by
+
+- 0.031 decades per degree at 1 c/deg and 18 Hz, 0.037 at 1 Hz (Virsu et al. 1982),
+- 0.035 and 0.045 at 0.5 and 1 c/deg, static (Virsu & Rovamo 1979),
+- 0.043 at 3.2 c/deg (OSA 1988, relative to a foveal sensitivity of 200).
+
+Merging preserves local means, so its errors are at 1 c/deg and above; they flicker when
+the gaze moves.  The limits grow at the smallest of these rates, beyond a margin of 5
+degrees: 2 for the eye tracker, 1 for pursuit at 20 deg/s and a latency of 50 ms, and 2
+for the fovea.  After a saccade, a latency of 50 to 70 ms is tolerated (Albert et al.
+2017).  The largest gain is the largest `render_tolerance`.
+
+References
+----------
+"Aliasing and contrast sensitivity in peripheral vision", OSA Annual Meeting 1988, TUH3.
+Albert, Patney, Luebke & Kim 2017, ACM Trans. Appl. Percept. 14(4), 25.
+Virsu & Rovamo 1979, Exp. Brain Res., doi:10.1007/BF00236818.
+Virsu, Rovamo, Laurinen & Nasanen 1982, Vision Res., doi:10.1016/0042-6989(82)90087-6.
+Values of both as digitized for castleCSF (github.com/gfxdisp/castleCSF).
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -6,14 +32,23 @@ from math import ceil
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from filter_service.camera import Tangents
-from filter_service.constants import MAX_REACH_PX, TILE_SIZE_PX
+from filter_service.constants import (
+    DETECTION_MARGIN_DEG,
+    DETECTION_MAX_OCTAVES,
+    DETECTION_OCTAVES_PER_DEG,
+    MAX_REACH_PX,
+    MERGE_CONTRAST_POWER,
+    MERGE_MIN_SPREAD_PX,
+    TILE_SIZE_PX,
+)
+from filter_service.planning.grid import unit_direction
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.image_cells import ImageCells
 from filter_service.rgbd_view import MIN_DEPTH_M, RgbdView
-from filter_service.settings import MAX_VERGENCE_DPT
+from filter_service.settings import MAX_VERGENCE_DPT, RenderOptions
 
 BORDER_MARGIN_PX = 2
 
@@ -147,3 +182,84 @@ def object_range_dpt(view: RgbdView) -> tuple[float, float]:
         distance_dpt = np.stack([distance_dpt, object_dpt(view, hidden_m)])
     low_dpt, high_dpt = float(distance_dpt.min()), float(distance_dpt.max())
     return min(low_dpt, MAX_VERGENCE_DPT), min(high_dpt, MAX_VERGENCE_DPT)
+
+
+WHITE_STEP_PX = 8
+"""Stride in pixels at which the white level is sampled."""
+
+LIT_PERCENTILE, PERCENTILE, WHITE_RATIO = 90.0, 99.6, 2.0
+"""The white level of a linear image is its maximum, but at most this ratio times the
+90th percentile of its lit pixels and the 99.6th percentile of all, so that a small
+light source does not set it, even alone in the dark."""
+
+
+def white_level(color: NDArray[Any]) -> float:
+    """Return the white level of an image; it is 1 for 8-bit images.
+
+    The unit of linear light is arbitrary, so the merging threshold must scale with it.
+    """
+    if color.dtype == np.uint8:
+        return 1.0
+    light = np.abs(color[::WHITE_STEP_PX, ::WHITE_STEP_PX].astype(np.float64))
+    light = light[np.isfinite(light)]
+    lit = light[light > 0.0]
+    if lit.size == 0:
+        return 0.0
+    limits = np.percentile(lit, LIT_PERCENTILE), np.percentile(light, PERCENTILE)
+    return float(min(lit.max(), WHITE_RATIO * min(limits)))
+
+
+GazeDirection = tuple[float, float, float]
+"""Unit vector (right, up, forward); zero if merging follows no gaze."""
+
+NO_GAZE: GazeDirection = (0.0, 0.0, 0.0)
+
+
+def merge_gaze(
+    options: RenderOptions, gaze_deg: tuple[float, float] | None
+) -> GazeDirection:
+    """Return the gaze that the merging of a frame follows.
+
+    Parameters
+    ----------
+    gaze_deg : (h, v) or None
+        Gaze of the frame as requested.  It is not clamped to the prepared range,
+        because merging has to follow where the viewer looks.
+    """
+    if gaze_deg is None or not follows_gaze(options):
+        return NO_GAZE
+    right, up, backward = unit_direction(*gaze_deg).tolist()
+    return right, up, -backward
+
+
+def follows_gaze(options: RenderOptions) -> bool:
+    """Return whether the merging of frames with a gaze follows it.
+
+    With the paper's sum, it does not: weights are opacities there, and merging sharp
+    pixels would change the sum.
+    """
+    is_merged = options.merge and options.accumulation == "coverage"
+    return options.peripheral_merging and is_merged
+
+
+def merge_spread_px(options: RenderOptions) -> float:
+    """Return the smallest spread of kernels that merged squares may use."""
+    most = 2.0**DETECTION_MAX_OCTAVES if follows_gaze(options) else 1.0
+    return float(smallest_spread_px(most))
+
+
+def detection_gain(eccentricity_deg: ArrayLike) -> NDArray[np.float64]:
+    """Return the gain of the limits at an angle from the gaze."""
+    beyond_deg = np.maximum(np.subtract(eccentricity_deg, DETECTION_MARGIN_DEG), 0.0)
+    octaves = DETECTION_OCTAVES_PER_DEG * beyond_deg
+    return np.asarray(2.0 ** np.minimum(octaves, DETECTION_MAX_OCTAVES))
+
+
+def smallest_spread_px(gain: ArrayLike) -> NDArray[np.float64]:
+    """Return the smallest spread of kernels that merge at a gain.
+
+    The allowed difference of color is the same at a spread that is smaller by
+    gain**(1 / MERGE_CONTRAST_POWER).
+    """
+    ratio = np.asarray(gain) ** (1.0 / MERGE_CONTRAST_POWER)
+    return np.asarray(MERGE_MIN_SPREAD_PX / ratio)

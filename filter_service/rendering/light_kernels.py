@@ -1,4 +1,4 @@
-"""Kernels of the light that the edges of pupils send beyond ordinary kernels."""
+"""Kernels of light beyond ordinary kernels, its visibility, and its addition."""
 
 import math
 from functools import lru_cache
@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.native import shared_threads
-from filter_service.constants import RGB
+from estimator.psf.tables import N_EDGE
+from filter_service.constants import DEPTH_SQUARE_PX, RGB
 from filter_service.native import loops, records
 from filter_service.native.records import pointers
-from filter_service.rendering.edge_kinds import EyeAtFrame, SourceKinds
+from filter_service.rendering.edge_kinds import BrightPixels, EyeAtFrame, SourceKinds
+from filter_service.rgbd_view import RgbdView
 
 N_PHI = 32
 """Directions from a source, of the tables of distant light."""
@@ -197,3 +199,115 @@ def light_kernels(
     )
     loops().call("fill_light", job)
     return found
+
+
+def add_sources(
+    plane: NDArray[np.float32],
+    source_px: NDArray[np.float64],
+    light: NDArray[np.float64],
+    number: NDArray[np.int64],
+    kernels: NDArray[np.float32],
+    *,
+    pitch_px: int,
+    size_px: tuple[int, int],
+    is_split: bool,
+    is_image: bool = False,
+) -> None:
+    """Add sources times their kernels to a plane, from points of a grid.
+
+    Parameters
+    ----------
+    plane : (rows, columns, 3)
+        Of the pitch of the grid, or the image.
+    source_px : (n, 2)
+        x, y in pixels of the image.
+    light : (n, 3)
+    number : (n,)
+        Kernel of each source, ascending.
+    kernels : (n_kernels, side, side, 3)
+        Round kernels.
+    pitch_px : int
+        Pitch of the grid.
+    size_px : (height, width)
+        Size of the image.
+    is_split : bool
+        Whether each source is divided between the four points around it, and not moved
+        to the nearest.
+    is_image : bool
+        Whether the plane is the image; the pitch is odd.
+    """
+    shape = tuple(-(-n // pitch_px) + 2 for n in size_px)  # with a margin
+    most = 4 * len(number)  # each source is divided between four points
+    at, kernel = np.empty((most, 2), np.int64), np.empty(most, np.int64)
+    gathered = np.zeros((most, RGB), np.float32)
+    count = loops().call(
+        "gather_points",
+        *(source_px, number, light, len(number), pitch_px, is_split),
+        *(np.full(shape, -1, np.int64), shape[1], at, kernel, gathered),
+    )
+    if is_image:  # centers of squares of an odd number of pixels
+        at[:count] = pitch_px * at[:count] + pitch_px // 2
+    loops().call(
+        "add_sources",
+        *(shared_threads(), at, kernel, gathered, count, kernels, kernels.shape[1]),
+        *(plane, *plane.shape[:2]),
+    )
+
+
+def add_plane(coarse: NDArray[np.float32], image: NDArray[np.float32]) -> None:
+    """Add light on pixels of twice the size, interpolated, to an image (h, w, 3)."""
+    sizes = coarse.shape[:2], image.shape[:2]
+    loops().call("add_plane", shared_threads(), coarse, *sizes[0], image, *sizes[1])
+
+
+def seen_by_edges(
+    view: RgbdView,
+    pixels: BrightPixels,
+    kinds: NDArray[np.int64],
+    shift_px: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """Return which elements (n, N_EDGE) of the pupil's edge see sources, from 0 to 1.
+
+    Parameters
+    ----------
+    pixels : BrightPixels
+        Pixels of the view, and their n sources.
+    kinds : (n,)
+        Kind of each source.
+    shift_px : (n_kinds, N_EDGE, 2)
+        Displacement of rays to the elements, per diopter.
+    """
+    depth_m = np.ascontiguousarray(view.depth_m)
+    rows, columns = (-(-n // DEPTH_SQUARE_PX) for n in depth_m.shape)
+    least = np.empty((rows, columns), np.uint32)
+    call, threads = loops().call, shared_threads()
+    bits = depth_m.view(np.uint32)
+    call("least_in_squares", threads, bits, *depth_m.shape, least)
+    nearest_dpt = 1.0 / least.view(np.float32).astype(np.float64)
+    x_px, y_px = np.ascontiguousarray(pixels.source_at_px.T)
+    tangents = view.tangents if view.depth_kind == "planar" else (math.nan,) * 4
+    seen = np.empty((x_px.size, N_EDGE), np.float32)
+    arrays = {
+        "x_px": x_px,
+        "y_px": y_px,
+        "object_dpt": pixels.object_dpt,
+        "kinds": kinds,
+        "is_hidden": pixels.source_surface > 0,
+        "shift_px": shift_px,
+        "depth_m": depth_m,
+        "tangents": np.array(tangents, np.float64),
+        "nearest_dpt": nearest_dpt,
+        "seen": seen,
+    }
+    job = records.VisibilityJob(
+        threads=threads,
+        largest_dpt=nearest_dpt.max(),
+        height=depth_m.shape[0],
+        width=depth_m.shape[1],
+        rows=rows,
+        columns=columns,
+        count=x_px.size,
+        **pointers(**arrays),
+    )
+    call("see_sources", job)
+    return seen

@@ -1,5 +1,5 @@
 // Threshold contrast of a viewer at an angle from the gaze, relative to that at the gaze
-// (filter_service/rendering/detection.py).
+// (filter_service/rendering/frame.py).
 
 uniform vec4 tangents;            // of the frame: left, right, up, down
 uniform vec3 gaze_direction;      // right, up, forward; zero: the same everywhere

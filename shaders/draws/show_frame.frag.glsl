@@ -3,7 +3,7 @@
 // kernels did not fit their buffers, the input is written instead.
 // In:  COLOR_OUT, DISPATCHES (group counts of the splat), the input textures.
 // Out: the target: sRGB values, or linear light.
-// Twin: filter_service.rendering.srgb.srgb_from_linear.
+// Twin: filter_service.rendering.media_effects.srgb_from_linear.
 
 #include "common/color.glsl"
 #include "common/input_textures.glsl"

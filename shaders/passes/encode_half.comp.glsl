@@ -1,7 +1,7 @@
 // Packs the filtered frame as linear half floats, six bytes per pixel.
 // In:  COLOR_OUT (vec4 linear).   Out: COLOR_IN, whose first bytes it overwrites.
 // Dispatch: one thread per two pixels (three words).
-// Twin: filter_service.rendering.srgb.half_from_linear.
+// Twin: filter_service.rendering.media_effects.half_from_linear.
 
 layout(local_size_x = THREADS) in;
 

@@ -1,7 +1,7 @@
 // Packs the filtered frame as 8-bit sRGB, three bytes per pixel.
 // In:  COLOR_OUT (vec4 linear).   Out: COLOR_IN, whose first bytes it overwrites.
 // Dispatch: one thread per four pixels (three words).
-// Twin: filter_service.rendering.srgb.srgb_from_linear.
+// Twin: filter_service.rendering.media_effects.srgb_from_linear.
 
 #include "common/color.glsl"
 

@@ -29,7 +29,7 @@ from estimator.profiles.parse import parse_profile
 from filter_service.constants import TILE_SIZE_PX
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import build_psf_store
-from filter_service.rendering.srgb import srgb_from_linear
+from filter_service.rendering.media_effects import srgb_from_linear
 from filter_service.rgbd_view import RgbdView
 from filter_service.view_state import State
 from tests.benchmarks.cost_law import AGAINST, CostRow, bounds, laws

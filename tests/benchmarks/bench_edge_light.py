@@ -21,7 +21,7 @@ from filter_service.gl.gpu import Gpu
 from filter_service.planning.plan import plan_cache
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import PsfStore, build_psf_store
-from filter_service.rendering import bright_pixels, edge_kinds, edge_light
+from filter_service.rendering import edge_kinds, edge_light
 from filter_service.rendering.edge_light import EdgeLight
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.gl import FilterRenderer
@@ -140,7 +140,7 @@ def scenes(size: tuple[int, int]):
 def exact_limits():
     """Return patches with which every pixel is a source of its own."""
     return [
-        mock.patch.object(bright_pixels, "MAX_SOURCES", 10**9),
+        mock.patch.object(edge_kinds, "MAX_SOURCES", 10**9),
         mock.patch.object(edge_kinds, "MAX_KINDS", 10**9),
         mock.patch.object(edge_kinds, "MAX_KINDS_PX", 10**12),
         mock.patch.object(edge_light, "MAX_FAR_KINDS", 10**9),

@@ -26,7 +26,7 @@ from filter_service.building.jobs import BuildLimits
 from filter_service.building.worker_handle import WorkerHandle
 from filter_service.filtering.builder import Builder
 from filter_service.filtering.stream_eyes import EyeReady
-from filter_service.rendering.native.lanes import NativeLanes
+from filter_service.rendering.native.renderer import NativeLanes
 from tests.benchmarks.harness import Row, memory_mb, publish
 from tests.benchmarks.published_figures import CONDITIONS
 from tests.benchmarks.stream_walks import Moment, demo_walk, photograph_walk

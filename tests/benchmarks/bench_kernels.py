@@ -23,9 +23,13 @@ from estimator.psf.compute import compute_psf_batch
 from filter_service.constants import RGB
 from filter_service.planning.node_wavefronts import NodeWavefronts
 from filter_service.planning.plan import unchecked_plan
-from filter_service.psfs.compute_kernels import computed_kernels, generic_kernels
+from filter_service.psfs.compute_kernels import (
+    PsfEngine,
+    computed_kernels,
+    generic_kernels,
+    psf_engine,
+)
 from filter_service.psfs.pack import PackedKernels
-from filter_service.psfs.psf_engine import PsfEngine, psf_engine
 from filter_service.psfs.store import PsfStore
 from tests.benchmarks.harness import Row, memory_mb, publish
 from tests.benchmarks.psf_rates import FOCUSES_DPT, PUPILS_MM, traced_slices

@@ -26,8 +26,8 @@ from filter_service.planning.grid import GridSpec
 from filter_service.planning.plan import unchecked_plan
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame import object_range_dpt
+from filter_service.rendering.media_effects import srgb_from_linear
 from filter_service.rendering.native import NativeRenderer
-from filter_service.rendering.srgb import srgb_from_linear
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import TOLERANCES, FilterSettings
 from tests.benchmarks.dense_reference import dense_reference

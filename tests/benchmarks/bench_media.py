@@ -20,9 +20,9 @@ from filter_service.camera import Camera
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.engine import ViewRequest
-from filter_service.rendering.haze import add_haze
 from filter_service.rendering.media_effects import (
     MediaEffects,
+    add_haze,
     begin_through_media,
 )
 from filter_service.rendering.native import NativeRenderer

@@ -13,7 +13,7 @@ Errors, against frames without merging: PSNR in linear light, and where the diff
 would be detected: its contrast in octaves around 8, 4, 2 and 1 c/deg, relative to the
 local mean (a Gaussian of half a degree), over the threshold of Virsu & Rovamo 1979 in
 the fovea, which grows by 0.031 decades per degree from the gaze at 1 c/deg (Virsu et
-al. 1982) and by 0.043 above (`filter_service/rendering/detection.py`).
+al. 1982) and by 0.043 above (`filter_service/rendering/frame.py`).
 ``detected_percent`` are the pixels beyond the margin above the threshold, and
 ``direct_percent`` those of the default if the viewer looked at each of them directly.
 
@@ -36,7 +36,7 @@ from scipy.ndimage import gaussian_filter
 from estimator.profiles.parse import parse_profile
 from filter_service.constants import DETECTION_MARGIN_DEG
 from filter_service.gl.gpu import Gpu
-from filter_service.planning.field_directions import unit_direction
+from filter_service.planning.grid import unit_direction
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import PsfStore, build_psf_store
 from filter_service.rendering.gl.renderer import FilterRenderer

@@ -19,9 +19,9 @@ from scipy.optimize import nnls
 
 from estimator.psf.survey import survey_pupils
 from filter_service.planning.cost import cost_terms, plan_states
+from filter_service.planning.node_wavefronts import state_frames
 from filter_service.planning.nodes import CachePlan
 from filter_service.planning.plan import unchecked_plan
-from filter_service.planning.slopes import state_frames
 from filter_service.psfs.pack import pack_kernels
 from tests.benchmarks.harness import (
     Row,

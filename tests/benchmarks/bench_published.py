@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from estimator.networks.inference import load_network
 from filter_service.filtering.eye_filter import EyeFilter
 from filter_service.filtering.shared_builder import open_inline_builder
-from filter_service.rendering.srgb import linear_from_srgb, srgb_from_linear
+from filter_service.rendering.media_effects import linear_from_srgb, srgb_from_linear
 from tests.benchmarks.dense_reference import dense_reference
 from tests.benchmarks.field_methods import PERIPHERY, EyeBench, State
 from tests.benchmarks.harness import ROOT, Row, memory_mb, publish

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from filter_service.rendering.srgb import srgb_from_linear
+from filter_service.rendering.media_effects import srgb_from_linear
 from tests.benchmarks.cost_law import AGAINST
 
 DIFFERENCE_GAIN = 16.0

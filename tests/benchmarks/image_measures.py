@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from filter_service.rendering.srgb import linear_from_srgb, srgb_from_linear
+from filter_service.rendering.media_effects import linear_from_srgb, srgb_from_linear
 
 SSIM_SIGMA_PX = 1.5
 SSIM_CONSTANTS = (0.01**2, 0.03**2)

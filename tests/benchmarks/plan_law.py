@@ -1,4 +1,4 @@
-"""Fits the law of `planning/error_law.py`: what blending two PSFs costs an image.
+"""Fits the law of `planning/state_samples.py`: what blending two PSFs costs an image.
 
     python -m tests.benchmarks.plan_law [--quick]
 
@@ -13,9 +13,8 @@ import math
 import numpy as np
 from scipy.optimize import least_squares
 
-from filter_service.planning import error_law as law
-from filter_service.planning.node_wavefronts import PupilStates
-from filter_service.planning.slopes import slopes_px, state_frames
+from filter_service.planning import state_samples as law
+from filter_service.planning.node_wavefronts import PupilStates, slopes_px, state_frames
 from filter_service.planning.state_samples import moved, sample_states
 from tests.benchmarks.harness import commit_id, machine_info, write_report
 from tests.numerical.plan_cases import (

@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 
 from estimator.field.eye_optics import EyeOptics
 from estimator.psf.compute import PsfBatch, compute_psf_batch
-from filter_service.planning.field_directions import field_deg
-from filter_service.planning.grid import GridSpec
+from filter_service.planning.grid import GridSpec, field_deg
 from filter_service.rendering.frame import fill_missing_depth, object_dpt
-from filter_service.rendering.srgb import linear_from_srgb
+from filter_service.rendering.media_effects import linear_from_srgb
 from filter_service.rgbd_view import RgbdView
 
 ANGLE_BIN_DEG = 0.2

@@ -24,8 +24,8 @@ from filter_service.messages import (
     encode,
     tangents_from_fov,
 )
-from filter_service.rendering.srgb import linear_from_srgb
-from filter_service.rendering.white_level import white_level
+from filter_service.rendering.frame import white_level
+from filter_service.rendering.media_effects import linear_from_srgb
 from tests.end_to_end.conftest import make_view
 from tests.end_to_end.exported_textures import (
     export,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from filter_service import EyeFilter
-from filter_service.rendering.srgb import srgb_from_linear
+from filter_service.rendering.media_effects import srgb_from_linear
 from filter_service.rgbd_view import RgbdView
 from tests.gl_witness.frames import FOCUS_DPT, PUPIL_MM, TIMES
 from tests.numerical.gl_textures import SETS, ViewTextures, arrays_of

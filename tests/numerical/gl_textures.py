@@ -8,8 +8,8 @@ import moderngl
 import numpy as np
 
 from filter_service.gl.current_context import CurrentContext
-from filter_service.rendering.srgb import linear_from_srgb
-from filter_service.rendering.white_level import white_level
+from filter_service.rendering.frame import white_level
+from filter_service.rendering.media_effects import linear_from_srgb
 from filter_service.rgbd_view import RgbdView
 from filter_service.texture_view import DepthProjection, GlTexture, TextureView
 

@@ -14,10 +14,10 @@ from estimator.estimate.estimation import estimate_eye
 from estimator.field.traced_eye import TracedEye
 from estimator.profiles.files import load_profile
 from estimator.psf.compute import compute_psf_batch
+from filter_service.planning.defocus_nodes import DISTANCES_DPT
 from filter_service.planning.grid import pupil_nodes_mm
 from filter_service.planning.node_wavefronts import PupilStates
 from filter_service.planning.nodes import bracket_axis
-from filter_service.planning.paper_grid import DISTANCES_DPT
 from filter_service.planning.state_samples import FIELD_OF_AXIS, sample_states
 from filter_service.psfs.pack import pack_kernels
 from tests.grid_specs import grid_spec

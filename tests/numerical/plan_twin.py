@@ -1,6 +1,6 @@
 """How a frame is planned, stated plainly: arrays of everything, numpy alone.
 
-Twins of `psfs/read_kernels.py`, of `rendering` (`frame_kernels.py`, `cell_maps.py`), of
+Twins of `psfs/pack.py`, of `rendering` (`frame_kernels.py`, `image_cells.py`), of
 the passes that plan kernels, and of the layers' distances.
 """
 
@@ -20,7 +20,7 @@ from filter_service.constants import (
     WEIGHT_MAX,
 )
 from filter_service.planning.grid import BASE_OBJECT_STEP_DPT
-from filter_service.psfs.boxes import box_sizes, pack_reach
+from filter_service.psfs.pack import box_sizes, pack_reach
 
 
 def neighbors(store, reads, fields, total_dpt):

@@ -5,8 +5,7 @@ import pytest
 
 from filter_service.constants import SORT_CAPACITIES
 from filter_service.gl.gpu import Gpu
-from filter_service.rendering.gl.compile_passes import compile_passes
-from filter_service.rendering.gl.renderer import FilterRenderer
+from filter_service.rendering.gl.renderer import FilterRenderer, compile_passes
 from tests.conftest import Engine
 from tests.numerical.synthetic import Bench, texture
 from tests.shader_variants import Kind, renderer_variants

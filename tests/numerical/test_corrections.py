@@ -31,7 +31,7 @@ from estimator.wavefront.field_wavefronts import (
 from filter_service import Camera, FilterSettings
 from filter_service.planning.grid import GridSpec
 from filter_service.psfs.eye_for_spec import eye_for_spec
-from filter_service.psfs.store_codec import pack, unpack
+from filter_service.psfs.store_file import pack, unpack
 from tests.lens_truth import (
     MM_PER_DEG,
     PUBLISHED,

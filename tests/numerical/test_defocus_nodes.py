@@ -7,12 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from filter_service.planning.defocus_nodes import _SAMPLES, _Rays, _spread
-from filter_service.planning.error_law import half_way_error, mean_square
-from filter_service.planning.error_law import spot_covariance as covariance
-from filter_service.planning.node_blur import GroupRays, node_blur_px
+from filter_service.planning.defocus_nodes import (
+    _SAMPLES,
+    GroupRays,
+    _Rays,
+    _spread,
+    node_blur_px,
+)
+from filter_service.planning.node_wavefronts import WEIGHTS
 from filter_service.planning.nodes import RaggedNodes
-from filter_service.planning.slopes import WEIGHTS
+from filter_service.planning.state_samples import half_way_error, mean_square
+from filter_service.planning.state_samples import spot_covariance as covariance
 from tests.reference import defocus_nodes as reference
 
 N_GROUPS = 4

@@ -12,8 +12,8 @@ from filter_service.camera import Camera
 from filter_service.planning.plan import plan_cache
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import PsfStore
-from filter_service.rendering import bright_pixels, edge_kinds, edge_light
-from filter_service.rendering.bright_pixels import FADE_WHITE
+from filter_service.rendering import edge_kinds, edge_light
+from filter_service.rendering.edge_kinds import FADE_WHITE
 from filter_service.rendering.edge_light import EdgeLight
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.media_effects import begin_through_media, encoded
@@ -267,7 +267,10 @@ def test_half_floats_are_like_their_floats(engine):
 @pytest.mark.parametrize("output", ["srgb8", "linear16"])
 def test_outputs_are_encodings_of_the_same_light(engine, output):
     bench = bench_of(engine)
-    from filter_service.rendering.srgb import half_from_linear, srgb_from_linear
+    from filter_service.rendering.media_effects import (
+        half_from_linear,
+        srgb_from_linear,
+    )
 
     linear = seen(bench, lit(900.0))
     found = seen(bench, lit(900.0), output=output).astype(
@@ -329,7 +332,7 @@ def test_shared_kernels_and_merged_pixels_are_near_the_exact_sum(
     color, depth_m = scattered(rng)
     limited, plain = (f(bench, color, depth_m) for f in (seen, without))
     for module, name in (
-        (bright_pixels, "MAX_SOURCES"),
+        (edge_kinds, "MAX_SOURCES"),
         (edge_kinds, "MAX_KINDS"),
         (edge_kinds, "MAX_KINDS_PX"),
         (edge_light, "MAX_FAR_KINDS"),

@@ -5,9 +5,8 @@ import pytest
 
 from estimator.profiles.parse import parse_profile
 from estimator.psf.survey import survey_pupils
-from filter_service.planning.node_wavefronts import PupilStates
+from filter_service.planning.node_wavefronts import PupilStates, state_frames
 from filter_service.planning.plan import plan_cache
-from filter_service.planning.slopes import state_frames
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.field_defocus import EyeDefocus
 from filter_service.psfs.frame_layers import frame_layers

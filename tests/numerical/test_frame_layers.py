@@ -8,7 +8,7 @@ import pytest
 from filter_service.constants import RGB
 from filter_service.native import loops
 from filter_service.planning.nodes import PlanNodes, RaggedNodes
-from filter_service.psfs.read_kernels import StateReads, StoreTables, layer_blur_px
+from filter_service.psfs.pack import StateReads, StoreTables, layer_blur_px
 from tests.reference import layers as reference
 
 module = importlib.import_module("filter_service.psfs.frame_layers")

@@ -11,12 +11,10 @@ from estimator.profiles.parse import parse_profile
 from filter_service.constants import RECIPE_TAPS, RGB
 from filter_service.planning.plan import unchecked_plan
 from filter_service.psfs.frame_layers import frame_layers
-from filter_service.psfs.pack import PackedKernels
-from filter_service.psfs.read_kernels import layer_blur_px
+from filter_service.psfs.pack import PackedKernels, layer_blur_px
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering import frame_kernels
-from filter_service.rendering.cell_maps import CellMaps
-from filter_service.rendering.image_cells import image_cells
+from filter_service.rendering.image_cells import CellMaps, image_cells
 from filter_service.view_state import State
 from tests.numerical import plan_twin
 from tests.numerical.plan_cases import spec_for, traced_eye

@@ -9,7 +9,7 @@ from filter_service.constants import RGB
 from filter_service.gl.gpu import Gpu
 from filter_service.psfs.store import build_psf_store
 from filter_service.rendering.engine import ViewRequest
-from filter_service.rendering.gl import list_bands
+from filter_service.rendering.gl import list_passes
 from filter_service.rendering.gl.renderer import FilterRenderer
 from filter_service.rgbd_view import RgbdView
 from filter_service.view_state import State
@@ -134,7 +134,7 @@ def test_lists_that_do_not_fit_are_made_again(hardware, stores, monkeypatch):
     """The first of two finds its fragments overwritten by the second's."""
     views = list(scenes(2))
     wanted = [alone(hardware, stores[0], view, STATES[0]) for view in views]
-    monkeypatch.setattr(list_bands, "MAX_BAND_ENTRIES", wanted[0].entry_count // 3)
+    monkeypatch.setattr(list_passes, "MAX_BAND_ENTRIES", wanted[0].entry_count // 3)
     renderer = FilterRenderer(hardware)
     handle = renderer.load(stores[0])
     begun = [

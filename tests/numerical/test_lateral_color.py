@@ -13,7 +13,7 @@ from estimator.optics.units import REFERENCE_WAVELENGTH_NM, RGB_WAVELENGTHS_NM
 from estimator.profiles.measured_wavefront import MeasuredWavefront
 from estimator.profiles.parse import parse_profile
 from estimator.wavefront.compiled import Fields, chief_shift_mrad, chief_shifts
-from filter_service.planning.field_directions import field_deg
+from filter_service.planning.grid import field_deg
 from filter_service.psfs.eye_for_spec import NO_LATERAL_COLOR, eye_for_spec
 from filter_service.psfs.store import build_psf_store
 from filter_service.rgbd_view import RgbdView

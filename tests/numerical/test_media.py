@@ -15,9 +15,9 @@ from estimator.media import (
 from estimator.profiles.parse import ProfileError, parse_profile
 from filter_service.camera import Camera
 from filter_service.rendering.engine import ViewRequest
-from filter_service.rendering.haze import add_haze
 from filter_service.rendering.media_effects import (
     MediaEffects,
+    add_haze,
     begin_through_media,
     encoded,
 )

@@ -8,10 +8,9 @@ import pytest
 from estimator.native import shared_threads
 from estimator.psf.tables import N_EDGE
 from filter_service.native import loops
-from filter_service.rendering import bright_pixels
-from filter_service.rendering.bright_pixels import FADE_WHITE, BrightPixels
-from filter_service.rendering.light_planes import add_plane, add_sources
-from filter_service.rendering.visibility import seen_by_edges
+from filter_service.rendering import edge_kinds
+from filter_service.rendering.edge_kinds import FADE_WHITE, BrightPixels
+from filter_service.rendering.light_kernels import add_plane, add_sources, seen_by_edges
 from filter_service.rgbd_view import RgbdView
 
 
@@ -49,7 +48,7 @@ def test_many_bright_pixels_are_merged_with_all_their_light(rng):
     color[20:120, 30:230] = rng.uniform(10.0, 90.0, (100, 200, 3))
     view = RgbdView(color, np.ones((200, 300), np.float32), (-0.3, 0.3, 0.2, -0.2))
     pixels = BrightPixels.of(view, 1.0)
-    assert pixels.light.shape[0] <= bright_pixels.MAX_SOURCES < pixels.x_px.size
+    assert pixels.light.shape[0] <= edge_kinds.MAX_SOURCES < pixels.x_px.size
     np.testing.assert_allclose(
         pixels.light.sum(axis=0), color.sum(axis=(0, 1), dtype=np.float64), rtol=1e-6
     )

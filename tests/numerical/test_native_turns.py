@@ -6,8 +6,8 @@ import weakref
 import numpy as np
 import pytest
 
-from filter_service.rendering.native import eye_states
-from filter_service.rendering.native.lanes import NativeLanes
+from filter_service.rendering.native import renderer
+from filter_service.rendering.native.renderer import NativeLanes
 from filter_service.rendering.perfect_eye import PUPIL_MM
 from filter_service.rgbd_view import RgbdView
 from tests.conftest import Engine
@@ -58,7 +58,7 @@ def test_eyes_in_turn_find_their_kernels_again(lanes, eyes):
 
 
 def test_of_many_eyes_those_used_last_are_kept(lanes, eyes, monkeypatch):
-    monkeypatch.setattr(eye_states, "MAX_EYES", 2)
+    monkeypatch.setattr(renderer, "MAX_EYES", 2)
     handles = [lanes.load(store) for store, _ in eyes]
 
     def blends(number):

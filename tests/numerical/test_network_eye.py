@@ -18,7 +18,7 @@ from estimator.wavefront.moved_plane import moved_polynomial, moved_rim
 from filter_service.filtering.stream_eyes import AcceptedProfile
 from filter_service.planning.cost import predicted_cost
 from filter_service.planning.plan import plan_cache
-from filter_service.psfs.psf_engine import psf_engine
+from filter_service.psfs.compute_kernels import psf_engine
 from filter_service.psfs.store import PsfStore
 from filter_service.settings import FilterSettings
 from tests.grid_specs import grid_spec

@@ -13,19 +13,17 @@ from filter_service.building.worker_handle import WorkerHandle
 from filter_service.camera import Camera
 from filter_service.errors import BuildFailed, OutOfMemory
 from filter_service.planning.cost import states_of
+from filter_service.planning.node_wavefronts import state_survey
 from filter_service.planning.plan import plan_axes, unchecked_plan
-from filter_service.planning.slopes import state_survey
 from filter_service.psfs.frame_layers import frame_layers
 from filter_service.psfs.store import PsfStore, build_psf_store
 from filter_service.rendering.frame_kernels import (
     MissingPsfs,
-    frame_kernels,
-    interval_count,
-)
-from filter_service.rendering.sampled_frame import (
     SampledFrame,
     SampledView,
     first_frame,
+    frame_kernels,
+    interval_count,
 )
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
@@ -196,8 +194,8 @@ def test_the_worker_plans_ahead_until_it_is_asked_for_something_else(monkeypatch
 def test_a_frame_is_the_same_on_one_thread(streamed, views, alone):
     from estimator.native import core
     from estimator.psf.compiled import CompiledPsfs
+    from filter_service.psfs.compute_kernels import psf_engine
     from filter_service.psfs.native_psfs import NativePsfs
-    from filter_service.psfs.psf_engine import psf_engine
     from filter_service.rendering.native import NativeRenderer
 
     threads = core().new_threads(1)

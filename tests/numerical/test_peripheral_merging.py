@@ -4,11 +4,14 @@ import numpy as np
 import pytest
 
 from filter_service import constants as c
-from filter_service.planning.field_directions import unit_direction
-from filter_service.rendering.detection import detection_gain, smallest_spread_px
+from filter_service.planning.grid import unit_direction
+from filter_service.rendering.frame import (
+    detection_gain,
+    smallest_spread_px,
+    white_level,
+)
 from filter_service.rendering.frame_kernels import frame_kernels
 from filter_service.rendering.image_cells import image_cells
-from filter_service.rendering.white_level import white_level
 from filter_service.rgbd_view import RgbdView
 from tests.numerical.made_fragments import made_fragments
 from tests.numerical.synthetic import Bench, psnr_db, texture

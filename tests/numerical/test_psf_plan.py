@@ -8,20 +8,24 @@ import pytest
 
 from estimator.profiles.files import load_profile
 from estimator.profiles.measured_wavefront import MeasuredWavefront
-from filter_service.planning.axis_nodes import TOLERANCE_DB
-from filter_service.planning.error_law import (
-    allowed_difference_px,
-    blend_error,
-    combined_error,
-    equal_share,
-)
 from filter_service.planning.grid import defocus_nodes_dpt, pupil_nodes_mm
 from filter_service.planning.nodes import (
     RaggedNodes,
     bracket_axis,
 )
-from filter_service.planning.plan import PlanTooLarge, plan_cache, unchecked_plan
-from filter_service.planning.state_samples import sample_states
+from filter_service.planning.plan import (
+    TOLERANCE_DB,
+    PlanTooLarge,
+    plan_cache,
+    unchecked_plan,
+)
+from filter_service.planning.state_samples import (
+    allowed_difference_px,
+    blend_error,
+    combined_error,
+    equal_share,
+    sample_states,
+)
 from filter_service.psfs.store import build_psf_store
 from tests.lens_truth import worn_eye
 from tests.numerical.plan_cases import (

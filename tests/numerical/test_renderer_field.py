@@ -7,14 +7,14 @@ import pytest
 
 from estimator.profiles.parse import parse_profile
 from estimator.psf.compute import compute_psf_batch
-from filter_service.planning.error_law import MEAN_OF_HALF_WAY
-from filter_service.planning.field_directions import (
+from filter_service.planning.grid import (
     angles_deg,
     field_deg,
     gaze_rotation,
     pixel_from_mrad,
     unit_direction,
 )
+from filter_service.planning.state_samples import MEAN_OF_HALF_WAY
 from filter_service.psfs.eye_for_spec import eye_for_spec
 from filter_service.psfs.store import build_psf_store
 from filter_service.rgbd_view import RgbdView

@@ -6,8 +6,8 @@ import pytest
 from filter_service.constants import PLAN_KERNELS, PLAN_OLD_KERNELS
 from filter_service.errors import BadMessage, CameraMismatch
 from filter_service.rendering.gl.kernel_passes import KernelRun
+from filter_service.rendering.media_effects import srgb_from_linear
 from filter_service.rendering.perfect_eye import PUPIL_MM
-from filter_service.rendering.srgb import srgb_from_linear
 from filter_service.rgbd_view import RgbdView
 from tests.numerical.made_fragments import made_fragments
 from tests.numerical.one_kernel import OneKernelBench, disc

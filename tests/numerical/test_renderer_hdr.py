@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filter_service.constants import HALF_MAX
-from filter_service.rendering.srgb import half_from_linear
+from filter_service.rendering.media_effects import half_from_linear
 from tests.numerical.synthetic import Bench, assert_same_frame, psnr_db, texture
 
 WIDTH, HEIGHT = 101, 61  # odd: halves of a pixel share words with its neighbors

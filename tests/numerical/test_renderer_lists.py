@@ -7,7 +7,7 @@ import pytest
 
 from filter_service import constants
 from filter_service.gl.stage_timer import StageTimer
-from filter_service.rendering.gl import list_bands, list_passes
+from filter_service.rendering.gl import list_passes
 from filter_service.rendering.gl.list_passes import ListPasses
 from filter_service.rendering.gl.strip import Strip
 from tests.numerical import tile_lists
@@ -212,7 +212,7 @@ def test_a_list_that_overflows_keeps_its_first_entries_and_is_counted(
     assert whole.overflow_count == 0
     lengths = read(bench, "BIN_COUNTS", (n_bins(), 4), np.uint32)[:, 0].astype(int)
     limit = int(np.median(lengths))
-    monkeypatch.setattr(list_bands, "MAX_BAND_ENTRIES", limit)
+    monkeypatch.setattr(list_passes, "MAX_BAND_ENTRIES", limit)
     cut, again = bench.render(view), bench.render(view)
     assert cut.overflow_count == np.maximum(lengths - limit, 0).sum() > 0
     assert cut.entry_count == np.minimum(lengths, limit).sum()
@@ -229,7 +229,7 @@ def test_a_list_that_overflows_keeps_its_first_entries_and_is_counted(
 def test_bands_change_nothing(bench, view, monkeypatch, limit, rule):
     whole = bench.render(view, accumulation=rule)
     few = 7 if limit == "MAX_BAND_BINS" else whole.entry_count // 7
-    monkeypatch.setattr(list_bands, limit, few)
+    monkeypatch.setattr(list_passes, limit, few)
     banded = bench.render(view, accumulation=rule)
     assert (banded.entry_count, banded.overflow_count) == (whole.entry_count, 0)
     assert_same_frame(banded.color, whole.color)

@@ -5,8 +5,11 @@ import pytest
 
 from estimator.profiles.parse import ProfileError, parse_profile
 from filter_service.camera import Camera
-from filter_service.rendering.media_effects import MediaEffects
-from filter_service.rendering.spectacles import seen_through, spectacle_magnification
+from filter_service.rendering.media_effects import (
+    MediaEffects,
+    seen_through,
+    spectacle_magnification,
+)
 from filter_service.rgbd_view import RgbdView
 
 CAMERA = Camera.from_fov(40.0, width_px=160, height_px=120)

@@ -11,8 +11,8 @@ from estimator.profiles.parse import parse_profile
 from estimator.psf.compute import compute_psf_batch
 from estimator.psf.stiles_crawford import StilesCrawford
 from filter_service.planning.plan import plan_cache
+from filter_service.psfs.compute_kernels import PsfEngine
 from filter_service.psfs.eye_for_spec import eye_for_spec
-from filter_service.psfs.psf_engine import PsfEngine
 from filter_service.psfs.store import build_psf_store
 from filter_service.rgbd_view import RgbdView
 from tests.grid_specs import grid_spec

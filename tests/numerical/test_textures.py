@@ -13,7 +13,7 @@ from filter_service.psfs.store import PsfStore
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.gl import kernel_passes, texture_frames
 from filter_service.rendering.gl.renderer import FilterRenderer
-from filter_service.rendering.srgb import linear_from_srgb
+from filter_service.rendering.media_effects import linear_from_srgb
 from filter_service.settings import RenderOptions
 from filter_service.texture_view import DepthProjection, GlTexture, TextureView
 from filter_service.view_state import State
@@ -132,7 +132,7 @@ def test_color_formats(caller, bench, color, rng, kind, is_top_first):
 
 
 def bench_white(color):
-    from filter_service.rendering.white_level import white_level
+    from filter_service.rendering.frame import white_level
 
     return white_level(color)
 

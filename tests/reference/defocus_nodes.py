@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from filter_service.planning.error_law import allowed_difference_px
+from filter_service.planning.state_samples import allowed_difference_px
 
 
 def needed_intervals(rays, group, low_dpt, high_dpt, shifts_dpt, n_samples):

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from filter_service.planning.field_directions import field_deg
+from filter_service.planning.grid import field_deg
 from tests.reference import psf_integral
 
 RIM_MM = 0.35

@@ -35,7 +35,7 @@ from filter_service.rendering.frame_kernels import (
     interval_count,
 )
 from filter_service.rendering.image_cells import ImageCells, image_cells
-from filter_service.rendering.srgb import linear_from_srgb
+from filter_service.rendering.media_effects import linear_from_srgb
 from filter_service.rgbd_view import RgbdView
 from tests.reference.packed_kernels import square_kernel
 

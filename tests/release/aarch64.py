@@ -25,8 +25,8 @@ from estimator.native import library as native
 from estimator.psf.compiled import compiled_psfs
 from estimator.threads import THREADS_VARIABLE, thread_count
 from filter_service.native import loops
+from filter_service.psfs.compute_kernels import psf_engine
 from filter_service.psfs.native_psfs import native_psfs
-from filter_service.psfs.psf_engine import psf_engine
 from filter_service.rendering.native import NativeRenderer
 from tests.conftest import Engine
 from tests.numerical import test_native_psfs as psf_cases

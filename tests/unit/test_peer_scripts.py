@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import fftconvolve
 
 from estimator.profiles.parse import parse_profile
-from filter_service.planning.field_directions import pixel_from_mrad
+from filter_service.planning.grid import pixel_from_mrad
 from tests.benchmarks import peer_process
 from tests.benchmarks.bench_peers import line_of, printed_rows
 from tests.benchmarks.peer_deeplens_script import (

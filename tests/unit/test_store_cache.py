@@ -22,10 +22,16 @@ from estimator.profiles.parse import parse_profile
 from filter_service.errors import BuildCancelled
 from filter_service.messages import Camera
 from filter_service.planning.plan import plan_cache
-from filter_service.psfs import store_cache, store_codec, store_file
-from filter_service.psfs.cached_eyes import cached_eyes, erase_eyes
+from filter_service.psfs import store_cache, store_file
 from filter_service.psfs.store import PsfStore
-from filter_service.psfs.store_cache import StoreCache, Stored, eye_name, store_key
+from filter_service.psfs.store_cache import (
+    StoreCache,
+    Stored,
+    cached_eyes,
+    erase_eyes,
+    eye_name,
+    store_key,
+)
 from tests.grid_specs import grid_spec
 
 PROFILE = parse_profile({"kind": "prescription", "sphere_dpt": -1.0})
@@ -68,7 +74,7 @@ def read_entry(path):
 
 def is_same(first, second):
     """Compare two packed objects, arrays by value."""
-    (tree, arrays), (other_tree, other_arrays) = map(store_codec.pack, (first, second))
+    (tree, arrays), (other_tree, other_arrays) = map(store_file.pack, (first, second))
     return (
         json.dumps(tree) == json.dumps(other_tree)  # where nan is nan
         and arrays.keys() == other_arrays.keys()
@@ -452,7 +458,7 @@ def test_an_entry_nested_too_deep_is_removed(cache, path):
 @pytest.mark.parametrize(
     "copied",
     [
-        lambda note: store_codec.unpack(*store_codec.pack([note]))[0],
+        lambda note: store_file.unpack(*store_file.pack([note]))[0],
         lambda note: pickle.loads(pickle.dumps(note)),
     ],
     ids=["cache", "pickle"],

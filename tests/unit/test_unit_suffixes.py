@@ -37,7 +37,6 @@ DIMENSIONLESS = {
     "srgb": "encoded light, 0 to 1",
     "background_srgb": "encoded light, 0 to 1",
     "defocus_error": "mean square, of a white of 1",
-    "near": "a pupil in mm and a focus in dpt",
     "render_tolerance": "errors over the usual ones",
     "oversampling": "samples per sample",
     "conic_constant": "shape of a conic, 0 sphere, -1 paraboloid",

@@ -5,7 +5,7 @@ import pytest
 
 from filter_service.camera import Camera
 from filter_service.filtering.stream_eyes import LEAD_S, SPEED_S, FrameHistory
-from filter_service.rendering.sampled_frame import STEP_PX, SampledView, first_frame
+from filter_service.rendering.frame_kernels import STEP_PX, SampledView, first_frame
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
 from filter_service.view_state import State

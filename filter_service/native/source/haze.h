@@ -1,5 +1,5 @@
 /* Straylight: means of the cells of a coarse grid, and interpolation between the cells.  The
- * caller convolves the means; see rendering/haze.py. */
+ * caller convolves the means; see rendering/media_effects.py. */
 #ifndef OCU_HAZE_H
 #define OCU_HAZE_H
 

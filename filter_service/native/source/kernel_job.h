@@ -4,7 +4,7 @@
 
 #include <stdint.h>
 
-/* See StoreTables and StateReads in psfs/read_kernels.py. */
+/* See StoreTables and StateReads in psfs/pack.py. */
 typedef struct {
     const double *values_dpt;
     const int64_t *starts;
@@ -22,7 +22,7 @@ typedef struct {
     int64_t count;
 } state_reads;
 
-/* Maps (n_cells, 3, 2, 2) and their ratios (n_cells, 3); see MapTables in cell_maps.py. */
+/* Maps (n_cells, 3, 2, 2) and their ratios (n_cells, 3); see MapTables in image_cells.py. */
 typedef struct {
     const double *node_from_cell, *cell_from_node;
     const double *area_ratio, *box_ratio, *stretch_ratio, *change_ratio;

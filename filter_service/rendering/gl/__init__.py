@@ -1,18 +1,13 @@
 """Frame engine of OpenGL compute shaders.
 
-renderer         the engine
+renderer         the engine, and compilation of all passes
 gl_store         a PSF store with a copy of its kernels on the GPU
-frame_run        one view, from upload to result
+frame_run        one view, from upload to result, and all its passes
 texture_frames   frames from textures to a texture of the caller
-strips           division of a frame into strips that fit the buffers
-strip            size and buffers of a frame or strip
+strip            size and buffers of a strip, and division into strips
 fragment_passes  passes from pixels to fragments
-list_passes      passes that build, sort and splat the fragment lists
-frame_passes     all passes of a strip, and readback of the image
+list_passes      passes that build, sort and splat lists, in bands
 kernel_passes    passes that plan and blend an eye's kernels
-eye_states       cached state of the two most recently used eyes
-list_bands       division of fragment lists into bands that fit a buffer
-compile_passes   compilation of all passes before the first frame
 """
 
 import lazy_loader

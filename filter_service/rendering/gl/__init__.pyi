@@ -1,2 +1,2 @@
-from .compile_passes import compile_passes as compile_passes
 from .renderer import FilterRenderer as FilterRenderer
+from .renderer import compile_passes as compile_passes

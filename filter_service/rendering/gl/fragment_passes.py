@@ -16,7 +16,7 @@ from filter_service.constants import (
     STAT_WORDS,
     THREADS,
 )
-from filter_service.rendering.detection import GazeDirection
+from filter_service.rendering.frame import GazeDirection
 from filter_service.rendering.gl.kernel_passes import KernelRun, words_per_cell
 from filter_service.rendering.gl.strip import Strip, group_count
 from filter_service.rendering.image_cells import ImageCells

@@ -3,36 +3,225 @@
 In between, the CPU is free for another view.
 """
 
+from __future__ import annotations
+
 from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from filter_service.constants import (
+    BYTES_PER_WORD,
+    HALVES_PER_WORD,
+    RGB,
+    THREADS,
+    TOTAL_WORDS,
+)
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.stage_timer import StageTimer
 from filter_service.psfs.frame_layers import FrameLayers
-from filter_service.rendering.detection import merge_gaze
 from filter_service.rendering.engine import ViewRequest
 from filter_service.rendering.frame import (
     border_px_of,
     drop_empty_layer,
     extended,
     fill_missing_depth,
+    merge_gaze,
     reach_px_of,
+    white_level,
 )
-from filter_service.rendering.frame_kernels import MissingPsfs
-from filter_service.rendering.gl.eye_states import EyeState
+from filter_service.rendering.frame_kernels import Fill, MissingPsfs
 from filter_service.rendering.gl.fragment_passes import ArrayFragments
-from filter_service.rendering.gl.frame_passes import FramePasses
-from filter_service.rendering.gl.kernel_passes import FrameState
-from filter_service.rendering.gl.strip import Strip
-from filter_service.rendering.gl.strips import Rows, counted_px, split_into_strips
+from filter_service.rendering.gl.gl_store import GlStore
+from filter_service.rendering.gl.kernel_passes import (
+    FrameState,
+    KernelPasses,
+    KernelRun,
+)
+from filter_service.rendering.gl.list_passes import ListPasses
+from filter_service.rendering.gl.strip import (
+    Rows,
+    Strip,
+    counted_px,
+    dispatch_grid,
+    group_count,
+    split_into_strips,
+)
 from filter_service.rendering.image_cells import KernelsTooLarge
-from filter_service.rendering.white_level import white_level
 from filter_service.rgbd_view import RgbdView
+from filter_service.texture_view import EarlierFrame
+
+ENCODERS = {
+    "srgb8": ("encode_srgb", BYTES_PER_WORD, np.uint8),
+    "linear16": ("encode_half", HALVES_PER_WORD, np.float16),
+    "linear": ("encode_float", 1, np.float32),
+}
+"""Encoding of the image: pass, pixels per thread (which writes whole words), dtype."""
+
+PASSES = "buffers of the passes"
+"""Name of the buffers in `Gpu.claim`."""
+
+
+class FramePasses:
+    """All passes of one strip, in order.
+
+    Parameters
+    ----------
+    strip : Strip
+    fragments : ArrayFragments
+        Fragments of the same strip.
+    begin_kernels : callable
+        Function that begins to plan the kernels of the strip.
+
+    Attributes
+    ----------
+    kernels : KernelRun
+    lists : ListPasses
+        Set by `run`, like the kernels.
+    """
+
+    def __init__(
+        self,
+        strip: Strip,
+        fragments: ArrayFragments,
+        begin_kernels: Callable[[], KernelRun],
+    ):
+        self.strip = strip
+        self.fragments = fragments
+        self._begin_kernels = begin_kernels
+        self.kernels: KernelRun
+        self.lists: ListPasses
+        self._output = ""
+        self._wait: Callable[[], None] = lambda: None
+        self._image, self._totals = np.zeros(0), np.zeros(0, np.uint32)
+
+    def run(self) -> None:
+        """Filter the strip; `begin_read` and `end_read` return the image."""
+        self.strip.gpu.claim(PASSES, self)
+        self.fragments.upload()
+        kernels = self.kernels = self._begin_kernels()
+        self.lists = ListPasses(self.strip, kernels.atlas)
+        kernels.clear()
+        self.fragments.build_fragments(kernels)
+        kernels.make()
+        self.fragments.merge_fragments()
+        self.lists.run()
+
+    def begin_read(self, output: str, out: NDArray[Any] | None = None) -> None:
+        """Start the readback of the image (to ``out`` if given) and the counters."""
+        self._output = output
+        name, pixels_per_thread, dtype = ENCODERS[output]
+        self._encode(name, pixels_per_thread)
+        width, height = self.strip.size
+        if out is None:
+            out = np.empty((height, width, RGB), dtype)
+        self._image = out
+        self._totals = np.empty(TOTAL_WORDS, np.uint32)
+        with self.strip.timer.wall("readback_ms"):
+            self._wait = self.strip.gpu.begin_read(
+                (self.strip.buffers["COLOR_IN"], 0, self._image),
+                (*self.lists.totals, self._totals),
+                *self.kernels.to_read(self.fragments.stats),
+            )
+
+    def end_read(self, fill: Fill) -> NDArray[Any] | None:
+        """Wait for the image; return it, or None if the strip must be filtered again.
+
+        That is the case if kernels were missing, or if the fragment lists did not fit
+        their buffer and another strip has overwritten the inputs since.
+
+        Parameters
+        ----------
+        fill : callable
+            Function that computes missing PSFs, or some of them.
+
+        Raises
+        ------
+        KernelsTooLarge
+            As `KernelRun.is_complete`.
+        """
+        with self.strip.timer.wall("readback_ms"):
+            self._wait()
+        if not self.kernels.is_complete(fill):
+            return None
+        if self.lists.record_totals(self._totals):
+            return self._image
+        if not self.strip.gpu.is_owner(PASSES, self):
+            return None
+        self.lists.splat_bands()
+        self.begin_read(self._output, self._image)
+        with self.strip.timer.wall("readback_ms"):
+            self._wait()
+        return self._image
+
+    def _encode(self, name: str, pixels_per_thread: int) -> None:
+        with self.strip.timer.stage("encode_ms"):
+            threads = group_count(self.strip.pixel_count, pixels_per_thread)
+            self.strip.reserve(
+                COLOR_IN=threads * RGB * BYTES_PER_WORD
+            )  # the input is no longer needed
+            self.strip.run(
+                name,
+                dispatch_grid(group_count(threads, THREADS)),
+                *("COLOR_OUT", "COLOR_IN"),
+                pixel_count=self.strip.pixel_count,
+            )
+
+    def counts(self) -> dict[str, int]:
+        """Return the counts of `FilteredView` by name."""
+        return (
+            self.fragments.counts() | self.kernels.frame_counts() | self.lists.counts()
+        )
+
+
+MAX_EYES = 2
+"""Cache size: the two eyes of a stereo frame; each has its own kernel atlas."""
+
+
+@dataclass(eq=False)
+class EyeState:
+    """Results of an eye's last frame that the next frame can reuse."""
+
+    handle: GlStore
+    kernels: KernelPasses
+    cell_px: int | None = None  # larger cells, if kernels of frames were too large
+    is_settled: bool = False  # whether a frame of textures had all its kernels
+    earlier: EarlierFrame | None = None  # the newest frame of textures that was read
+    recorded: dict[Any, Any] = field(default_factory=dict)  # frames of textures
+
+
+class EyeStates:
+    """Cache of the most recently used eyes; older ones are evicted."""
+
+    def __init__(self, gpu: Gpu) -> None:
+        self._free = [KernelPasses(gpu, slot) for slot in range(MAX_EYES)]
+        self._eyes: list[EyeState] = []  # most recently used last
+
+    def of(self, handle: GlStore) -> EyeState:
+        """Return the state of an eye, which becomes the most recently used."""
+        self.drop_released()
+        found = next((eye for eye in self._eyes if eye.handle is handle), None)
+        others = [eye for eye in self._eyes if eye is not found]
+        if found is None and len(others) == MAX_EYES:
+            self._recycle(others.pop(0))
+        found = found or EyeState(handle, self._free.pop(0))
+        self._eyes = [*others, found]
+        return found
+
+    def drop_released(self) -> None:
+        """Drop the state of eyes whose stores were released."""
+        for eye in [eye for eye in self._eyes if eye.handle.is_released]:
+            self._eyes.remove(eye)
+            self._recycle(eye)
+
+    def _recycle(self, eye: EyeState) -> None:
+        eye.kernels.reset()
+        self._free.append(eye.kernels)
+
 
 Counts = dict[str, Any]
 
@@ -118,7 +307,7 @@ class FrameRun:
             depth_m, self._missing_count = fill_missing_depth(self._view.depth_m)
             self._view = replace(self._view, depth_m=depth_m)
 
-    def _begin(self) -> "_StripRun | None":
+    def _begin(self) -> _StripRun | None:
         """Start a frame of one strip; `finish` runs frames of several strips."""
         plan = self._plan()
         if len(plan.strips) > 1:
@@ -169,7 +358,7 @@ class FrameRun:
         )
 
     def _joined(
-        self, plan: _Plan, runs: "list[_StripRun]"
+        self, plan: _Plan, runs: list[_StripRun]
     ) -> tuple[NDArray[Any], Counts]:
         """Finish the strips and join their images, unless PSFs are missing."""
         counts = Counter[str]()

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from filter_service.constants import PSF_WORDS, STORE_SIDE
 from filter_service.gl.gpu import Gpu
 from filter_service.gl.passes import BufferPart, Pages
-from filter_service.psfs.read_kernels import StoreTables
+from filter_service.psfs.pack import StoreTables
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.image_cells import image_cells

@@ -1,5 +1,6 @@
 """Passes that build the fragment lists, sort them and splat the fragments."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,18 +13,82 @@ from filter_service.constants import (
     DISPATCH_SCATTER,
     DISPATCH_SORT,
     DISPATCH_SPLAT,
+    MAX_GROUPS,
     PAPER_SORT_KEY_BITS,
     SORT_CAPACITIES,
     SORT_KEY_BITS,
     THREADS,
     TILE_SIZE_PX,
     TILES_PER_BIN,
+    TOTAL_ENTRIES,
+    TOTAL_ENTRIES_FLOAT,
+    TOTAL_LONGEST,
+    TOTAL_LOST,
     TOTAL_WORDS,
 )
 from filter_service.gl.passes import Atlas, Buffer
-from filter_service.rendering.gl import list_bands
-from filter_service.rendering.gl.list_bands import ENTRY_BYTES
 from filter_service.rendering.gl.strip import Strip
+
+ENTRY_BYTES = 4
+MAX_BAND_ENTRIES = 16 * 2**20
+"""Largest number of list entries in one band.  A list buffer has at most 64 MB, half of
+the smallest storage block that the service supports.  This is also the capacity of
+one bin's list.  A bin has fewer than 2**19 pixels within the reach of a kernel, so
+entries can only be lost (and counted) if there are many surfaces or a smaller limit."""
+
+MAX_BAND_BINS = MAX_GROUPS
+"""Bins in one band: the passes dispatch a row of work groups, one for each bin."""
+
+
+@dataclass(frozen=True)
+class ListTotals:
+    """Totals of the prefix sum over the lists.
+
+    Attributes
+    ----------
+    entry_count : int
+        Entries of all lists; exact below 2**32, rounded to seven digits above.
+    overflow_count : int
+        Entries that did not fit a bin's list.
+    longest : int
+        Entries of the longest list.
+    """
+
+    entry_count: int = 0
+    overflow_count: int = 0
+    longest: int = 0
+
+
+def read_totals(whole: NDArray[np.uint32]) -> ListTotals:
+    """Return the totals from the words that follow the bins' offsets."""
+    as_float = whole[TOTAL_ENTRIES_FLOAT : TOTAL_ENTRIES_FLOAT + 1].view(np.float32)
+    rounded = round(float(as_float[0]))
+    return ListTotals(
+        entry_count=rounded if rounded > 2**31 else int(whole[TOTAL_ENTRIES]),
+        overflow_count=int(whole[TOTAL_LOST]),
+        longest=int(whole[TOTAL_LONGEST]),
+    )
+
+
+def split(counts: NDArray[np.int64], limit: int) -> tuple[NDArray[np.int64], list[Any]]:
+    """Divide lists into bands of at most ``limit`` entries and MAX_BAND_BINS bins.
+
+    Returns
+    -------
+    offsets : (n_bins,)
+        First entry of each list within its band.
+    bands : list of (first bin, bin count, entries)
+    """
+    bands, offsets = [], np.zeros(len(counts), dtype=np.int64)
+    first = 0
+    while first < len(counts):
+        sums = np.cumsum(counts[first : first + MAX_BAND_BINS])
+        bins = max(int(np.searchsorted(sums, limit, side="right")), 1)
+        offsets[first : first + bins] = sums[:bins] - counts[first : first + bins]
+        bands.append((first, bins, int(sums[bins - 1])))
+        first += bins
+    return offsets, bands
+
 
 SOFTWARE_SPLAT = {
     "PIXELS_PER_THREAD": 8,
@@ -75,7 +140,7 @@ class ListPasses:
         self.strip = strip
         self.atlas = atlas
         self._is_late = is_late
-        self.lists = list_bands.ListTotals()
+        self.lists = ListTotals()
         self.bands: list[tuple[int, int, int]] = []
 
     def run(self) -> None:
@@ -86,7 +151,7 @@ class ListPasses:
         """
         self.strip.reserve(COLOR_OUT=16 * self.strip.pixel_count)
         self.count_bins()
-        if self.strip.bin_count <= list_bands.MAX_BAND_BINS:
+        if self.strip.bin_count <= MAX_BAND_BINS:
             self._make_lists_and_splat(0, self.strip.bin_count, indirect=True)
 
     @property
@@ -99,11 +164,11 @@ class ListPasses:
 
         Otherwise `splat_bands` must run.
         """
-        self.lists = list_bands.read_totals(words)
+        self.lists = read_totals(words)
         entries, spare = self.capacities
         needs_spare = self.lists.longest > SORT_CAPACITIES[-1]
         return (
-            self.strip.bin_count <= list_bands.MAX_BAND_BINS
+            self.strip.bin_count <= MAX_BAND_BINS
             and self.lists.entry_count <= entries
             and (not needs_spare or self.lists.entry_count <= spare)
         )
@@ -163,20 +228,17 @@ class ListPasses:
     def _list_limit(self) -> int:
         """Capacity of a band, and of one list, in entries."""
         fit = self.strip.gpu.max_block_bytes // ENTRY_BYTES - SPARE_ENTRIES
-        return fit if self._is_late else min(list_bands.MAX_BAND_ENTRIES, fit)
+        return fit if self._is_late else min(MAX_BAND_ENTRIES, fit)
 
     def _plan_bands(self) -> list[tuple[int, int, int]]:
         """Return the bands as (first bin, bin count, entries)."""
         limit = self._list_limit
-        if (
-            self.lists.entry_count <= limit
-            and self.strip.bin_count <= list_bands.MAX_BAND_BINS
-        ):
+        if self.lists.entry_count <= limit and self.strip.bin_count <= MAX_BAND_BINS:
             return [(0, self.strip.bin_count, self.lists.entry_count)]
         counts = self.strip.gpu.read(
             self.strip.buffers["BIN_COUNTS"], (self.strip.bin_count, 4), np.uint32
         )[:, 0].astype(np.int64)
-        offsets, bands = list_bands.split(counts, limit)
+        offsets, bands = split(counts, limit)
         self.strip.gpu.write(
             self.strip.buffers["BIN_OFFSETS"], offsets.astype(np.uint32)
         )

@@ -33,10 +33,10 @@ from filter_service.gl.passes import RecordedPass
 from filter_service.gl.stage_timer import Untimed
 from filter_service.gl.texture_io import TextureIo
 from filter_service.psfs.frame_layers import FrameLayers
-from filter_service.rendering.detection import merge_gaze
 from filter_service.rendering.engine import ViewRequest
-from filter_service.rendering.gl.eye_states import EyeState
+from filter_service.rendering.frame import merge_gaze
 from filter_service.rendering.gl.fragment_passes import FragmentPasses
+from filter_service.rendering.gl.frame_run import EyeState
 from filter_service.rendering.gl.kernel_passes import FrameState, KernelRun
 from filter_service.rendering.gl.list_passes import ListPasses
 from filter_service.rendering.gl.strip import Strip, dispatch_grid, group_count

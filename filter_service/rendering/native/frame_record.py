@@ -1,4 +1,4 @@
-"""Input record of the compiled loops."""
+"""Input record of the compiled loops: reusable arrays, and the plan of kernels."""
 
 import math
 from dataclasses import dataclass
@@ -7,24 +7,150 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from filter_service.constants import MAX_LEVEL, MIN_BLUR_RANGE, TILE_SIZE_PX
+from filter_service.constants import (
+    MAX_LEVEL,
+    MIN_BLUR_RANGE,
+    MIN_SPREAD_PX,
+    TILE_SIZE_PX,
+)
 from filter_service.native.records import (
     BLOCK,
     FRAGMENT,
     FRAGMENT_LIGHT,
     KERNEL_IMAGE_BYTES,
+    KERNEL_SHAPE,
     RECIPE_IMAGE_BYTES,
     RESOLUTIONS,
     Frame,
 )
 from filter_service.psfs.frame_layers import FrameLayers
-from filter_service.rendering.detection import GazeDirection
-from filter_service.rendering.frame_kernels import interval_count
-from filter_service.rendering.image_cells import ImageCells
-from filter_service.rendering.native.arrays import Arrays
-from filter_service.rendering.native.kernel_plan import KernelPlan
+from filter_service.psfs.pack import box_sizes
+from filter_service.rendering.frame import GazeDirection
+from filter_service.rendering.frame_kernels import (
+    Fill,
+    FrameKernels,
+    MissingPsfs,
+    frame_kernels,
+    interval_count,
+    pair_index,
+)
+from filter_service.rendering.image_cells import ImageCells, check_texels
 from filter_service.rendering.native.native_store import COARSE_SPREAD_PX, NativeStore
 from filter_service.rgbd_view import RgbdView
+
+
+@dataclass(frozen=True)
+class KernelPlan:
+    """Kernels of a frame in one state.
+
+    Attributes
+    ----------
+    state : (NativeStore, FrameLayers, ImageCells)
+        State that the kernels belong to.
+    used : (n_cells, n_intervals), bool
+        Pairs that have a kernel.
+    kernels : FrameKernels
+    kernel_of : (n_cells, n_intervals), uint32
+    shapes : (n,), KERNEL_SHAPE
+        The stage `merge` writes `levels_used`.
+    sources : tuple of arrays
+        Contiguous inputs of the stage `blend`: cells, parts, near and far recipes,
+        weights, maps, recipes.
+    """
+
+    state: tuple[NativeStore, FrameLayers, ImageCells]
+    used: NDArray[np.bool_]
+    kernels: FrameKernels
+    kernel_of: NDArray[np.uint32]
+    shapes: NDArray[np.void]
+    sources: tuple[NDArray[Any], ...]
+
+    def serves(self, state: tuple[object, ...], used: NDArray[np.bool_]) -> bool:
+        """Return whether the plan is for this state and has a kernel for each pair."""
+        if any(own is not other for own, other in zip(self.state, state, strict=True)):
+            return False
+        return not np.any(used & ~self.used)
+
+
+def plan_kernels(
+    handle: NativeStore,
+    layers: FrameLayers,
+    image: ImageCells,
+    used: NDArray[np.bool_],
+    fill: Fill,
+) -> KernelPlan | MissingPsfs:
+    """Plan the kernels of used pairs, and compute missing PSFs.
+
+    Raises
+    ------
+    KernelsTooLarge
+        There are too many texels, and larger cells are possible.
+    """
+    kernels = frame_kernels(
+        handle.store, layers, image, used, tables=handle.tables, fill=fill
+    )
+    if isinstance(kernels, MissingPsfs):
+        return kernels
+    widths, heights = box_sizes(kernels.reach_px)
+    check_texels(int((widths * heights).sum()), image, handle.store.spec)
+    nodes = kernels.nodes
+    sources = (kernels.cells, kernels.parts, nodes.near, nodes.far)
+    return KernelPlan(
+        state=(handle, layers, image),
+        used=used,
+        kernels=kernels,
+        kernel_of=pair_index(kernels, used.shape),
+        shapes=_shapes(kernels, layers.merge_spread_px),
+        sources=(
+            *(np.ascontiguousarray(numbers, np.int64) for numbers in sources),
+            np.ascontiguousarray(kernels.weight_ratio, np.float64),
+            np.ascontiguousarray(kernels.maps, np.float64),
+            np.ascontiguousarray(nodes.recipes, np.uint32),
+        ),
+    )
+
+
+def _shapes(kernels: FrameKernels, merge_spread_px: float) -> NDArray[np.void]:
+    shapes = np.zeros(kernels.count, KERNEL_SHAPE)
+    shapes["spread_px"] = kernels.spread_px
+    shapes["radius_px"] = kernels.radius_px
+    shapes["reach_px"] = kernels.reach_px
+    widest_px = np.maximum(kernels.spread_px.max(axis=1), MIN_SPREAD_PX)
+    steps = np.floor(np.log2(widest_px / merge_spread_px)) + 1
+    shapes["highest_level"] = np.clip(steps, 0, MAX_LEVEL)
+    return shapes
+
+
+SPARE_RATIO = 1.25
+"""Over-allocation, so that slowly rising sizes do not reallocate in every frame."""
+
+
+class Arrays:
+    """Named arrays that only grow."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[str, NDArray[Any]] = {}
+
+    def get(self, name: str, count: int, dtype: DTypeLike) -> NDArray[Any]:
+        """Return a named array of at least ``count`` elements, not initialized.
+
+        Its contents are lost when it grows.
+        """
+        array = self._arrays.get(name)
+        if array is None or array.size < count:
+            self._arrays.pop(name, None)  # frees it before the next allocation
+            array = self._arrays[name] = np.empty(int(SPARE_RATIO * count) + 1, dtype)
+        return array
+
+    def address(self, name: str, count: int, dtype: DTypeLike) -> int:
+        """Return the address of a named array."""
+        return int(self.get(name, count, dtype).ctypes.data)
+
+    @property
+    def memory_mb(self) -> float:
+        """Memory of all arrays, MB."""
+        return sum(array.nbytes for array in self._arrays.values()) / 1e6
+
 
 COLOR_KINDS = {"uint8": 0, "float32": 1, "float16": 2}
 BLOCK_PIXELS = TILE_SIZE_PX**2

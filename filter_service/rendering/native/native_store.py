@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from filter_service.native import Loops
 from filter_service.native.records import RESOLUTIONS, ShrinkJob
-from filter_service.psfs.boxes import box_sizes, pack_reach, unpack_reach
-from filter_service.psfs.read_kernels import StoreTables
+from filter_service.psfs.pack import StoreTables, box_sizes, pack_reach, unpack_reach
 from filter_service.psfs.store import PsfStore
 from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.image_cells import image_cells

@@ -1,8 +1,10 @@
-"""The native frame engine: stages of a frame, and state between frames."""
+"""The native frame engine: stages of a frame, state between frames, and lanes."""
+
+from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -14,7 +16,6 @@ from filter_service.errors import RenderFailed
 from filter_service.native import Loops, loops
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.psfs.store import PsfStore
-from filter_service.rendering.detection import merge_gaze
 from filter_service.rendering.engine import (
     OneView,
     Pending,
@@ -29,17 +30,66 @@ from filter_service.rendering.frame import (
     drop_empty_layer,
     extended,
     fill_missing_depth,
+    merge_gaze,
+    white_level,
 )
 from filter_service.rendering.frame_kernels import Fill, MissingPsfs
 from filter_service.rendering.image_cells import ImageCells, KernelsTooLarge
-from filter_service.rendering.native.arrays import Arrays
-from filter_service.rendering.native.eye_states import EyeState, EyeStates
-from filter_service.rendering.native.frame_record import BlendSizes, FrameRecord
-from filter_service.rendering.native.kernel_plan import KernelPlan, plan_kernels
+from filter_service.rendering.native.frame_record import (
+    Arrays,
+    BlendSizes,
+    FrameRecord,
+    KernelPlan,
+    plan_kernels,
+)
 from filter_service.rendering.native.native_store import NativeStore
-from filter_service.rendering.white_level import white_level
 from filter_service.rgbd_view import RgbdView
 from filter_service.stage_times import StageTimes
+
+MAX_EYES = 4
+"""Cache size: the eyes of a stereo frame, and those of clients that stream at the same
+time."""
+
+
+@dataclass(eq=False)
+class EyeState:
+    """Results of an eye's last frame that the next frame can reuse.
+
+    Attributes
+    ----------
+    handle : NativeStore
+    arrays : Arrays
+        Arrays of blended kernels.
+    plan : KernelPlan or None
+    blended : (plan, computed levels, sizes) or None
+    """
+
+    handle: NativeStore
+    arrays: Arrays = field(default_factory=Arrays)
+    plan: KernelPlan | None = None
+    blended: tuple[KernelPlan, NDArray[np.uint8], BlendSizes] | None = None
+
+
+class EyeStates:
+    """Cache of the most recently used eyes; released stores are dropped."""
+
+    def __init__(self) -> None:
+        self._eyes: list[EyeState] = []
+
+    def of(self, handle: NativeStore) -> EyeState:
+        """Return the state of an eye, which becomes the most recently used."""
+        found = next((eye for eye in self._eyes if eye.handle is handle), None)
+        others = [
+            eye for eye in self._eyes if eye is not found and not eye.handle.is_released
+        ]
+        found = found or EyeState(handle)
+        self._eyes = [*others[1 - MAX_EYES :], found]
+        return found
+
+    @property
+    def memory_mb(self) -> float:
+        """Memory of all blended kernels, MB."""
+        return sum(eye.arrays.memory_mb for eye in self._eyes)
 
 
 class NativeRenderer(OneView):
@@ -278,3 +328,51 @@ class NativeRenderer(OneView):
             self._loops.call("blend", frame.c)
         eye.blended = plan, levels.copy(), sizes
         return sizes
+
+
+class NativeLanes(OneView):
+    """Reentrant native engine: the callback of `call_between` may use it.
+
+    Everything runs in the caller's thread.  While the callback pauses one renderer, the
+    other may filter a frame or load a store.
+    """
+
+    def __init__(self) -> None:
+        self._main, self._other = NativeRenderer(), NativeRenderer()
+        self._is_busy = False
+
+    importer = None
+
+    @property
+    def name(self) -> str:
+        """Instruction set of the compiled loops, and their number of threads."""
+        return self._main.name
+
+    def trim(self) -> None:
+        """Release the buffers that frames reuse."""
+        self._main.trim()
+        self._other.trim()
+
+    def close(self) -> None:
+        """Stop the threads; the engine cannot be used afterward."""
+        self._main.close()
+        self._other.close()
+
+    def call_between(self, function: Callable[[], None], interval_s: float) -> bool:
+        """Register a callback for pauses during frames; it may use this engine."""
+        self._main.call_between(function, interval_s)
+        return True
+
+    def load(self, store: PsfStore) -> NativeStore:
+        """Load a store; its kernels may be computed later."""
+        return self._other.load(store)
+
+    def begin(self, request: ViewRequest) -> Pending:
+        """Filter one view; see `FrameEngine.begin`."""
+        if self._is_busy:
+            return self._other.begin(request)
+        self._is_busy = True
+        try:
+            return self._main.begin(request)
+        finally:
+            self._is_busy = False

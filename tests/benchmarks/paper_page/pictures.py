@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from filter_service.progress import Progress
-from filter_service.rendering.srgb import srgb_from_linear
+from filter_service.rendering.media_effects import srgb_from_linear
 from tests.benchmarks.dense_reference import dense_reference
 from tests.benchmarks.engines import open_renderer
 from tests.benchmarks.field_methods import METHODS, EyeBench, State
