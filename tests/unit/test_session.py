@@ -72,10 +72,10 @@ def test_the_old_eye_serves_until_the_new_one_is_ready_and_is_then_given_up():
     (old_store,) = build_all(stream)
     new = add(stream, 2)
     assert new.generation == old.generation + 1
-    assert planned(stream, SMALL).eye is old
+    assert planned(stream, SMALL)[0] is old
     (new_store,) = build_all(stream)
     plan = planned(stream, SMALL)
-    assert (plan.eye, plan.stores) == (new, (new_store,))
+    assert plan == (new, [new_store])
     assert stream.retired == [old_store]
 
 
@@ -107,7 +107,7 @@ def test_a_profile_that_never_worked_gives_way_to_the_old_one():
     build_all(stream)
     add(stream, 2, SMALL)
     stream.fail_build(*stream.next_build()[:2], BuildFailed("no"))
-    assert planned(stream, SMALL).eye is old
+    assert planned(stream, SMALL)[0] is old
     assert stream.next_build() is None
 
 
@@ -153,12 +153,12 @@ def test_the_old_eye_serves_until_a_first_frame_through_the_new_one_is_prepared(
     assert stream.store_to_warm() == (new, prepared)
     assert stream.unfinished_eye() is new
     plan = planned(stream, SMALL)
-    assert (plan.eye, plan.stores) == (old, (old_store,))
+    assert plan == (old, [old_store])
     stream.set_ready(new, prepared)
     assert stream.store_to_warm() is None
     assert stream.unfinished_eye() is None
     plan = planned(stream, SMALL)
-    assert (plan.eye, plan.stores) == (new, (prepared.store,))
+    assert plan == (new, [prepared.store])
     assert stream.retired == [old_store]
     assert stream.store_in_use() is prepared
 
@@ -168,7 +168,7 @@ def test_without_an_old_eye_frames_go_through_the_one_that_is_being_prepared():
     add(stream, 1, SMALL)
     assert planned(stream, SMALL) == Preparing("preparing")
     _, prepared = load_one(stream)
-    assert planned(stream, SMALL).stores == (prepared.store,)
+    assert planned(stream, SMALL)[1] == [prepared.store]
     assert stream.store_in_use() is None
 
 
@@ -179,7 +179,7 @@ def test_an_eye_that_fails_while_it_is_prepared_gives_way_to_the_old_one():
     new = add(stream, 2)
     _, prepared = load_one(stream)
     stream.fail_build(new, SMALL, BuildFailed("no"))
-    assert planned(stream, SMALL).eye is old
+    assert planned(stream, SMALL)[0] is old
     assert stream.retired == [prepared.store]
 
 

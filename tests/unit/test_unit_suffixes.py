@@ -32,7 +32,6 @@ DIMENSIONLESS = {
     "maps": "pixels per pixel",
     "node_from_cell": "pixels per pixel",
     "tangents": "of the angles to the image edges",
-    "normals": "unit vectors",
     "uv": "texture position, 0 to 1",
     "srgb": "encoded light, 0 to 1",
     "background_srgb": "encoded light, 0 to 1",
@@ -115,6 +114,8 @@ def quantities(source: str) -> list[tuple[str, str, int]]:
         for entry in node.body:
             if not isinstance(entry, ast.AnnAssign) or _is_mapping(entry.annotation):
                 continue
+            if "typer." in ast.unparse(entry.annotation):
+                continue  # named like its option on the command line
             name = entry.target.id
             physical = _type_words(entry.annotation) & FLOAT_TYPES
             if physical and not name.startswith("_"):
