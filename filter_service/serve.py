@@ -67,8 +67,8 @@ def serve(
 
     ocufilter serve --bind tcp://127.0.0.1:5577
     """
-    from filter_service.service import launch as service_launch
     from filter_service.service.config import load_config
+    from filter_service.service.supervisor import run as run_service
 
     if config is not None and not config.is_file():
         raise ValueError(f"--config '{config}': no such file")
@@ -82,7 +82,7 @@ def serve(
         ready_file=ready_file,
         store_cache_dir=None if keep_eyes is None else str(keep_eyes.absolute()),
     )
-    service_launch.run(load(), reload_config=load)
+    run_service(load(), reload_config=load)
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from clients.commands.options import with_setting_options
+from filter_service.building.jobs import CACHE_VARIABLE
 from filter_service.command_line import (
     CommandFailed,
     Json,
@@ -17,7 +18,6 @@ from filter_service.command_line import (
     print_line,
     typer_app,
 )
-from filter_service.psfs.store_cache import CACHE_VARIABLE
 
 if TYPE_CHECKING:
     from filter_service.keys import KeyRing

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from filter_service.errors import BuildFailed, FilterError, UnknownProfile
-from filter_service.psfs.store_cache import default_cache_dir as default_cache_dir
 
 if TYPE_CHECKING:
     from estimator.eye.checked_fields import ProfileError
@@ -17,7 +17,17 @@ if TYPE_CHECKING:
     from filter_service.settings import FilterSettings
     from filter_service.view_state import State
 
+CACHE_VARIABLE = "OCUFILTER_CACHE_DIR"
+
 log = logging.getLogger("ocufilter.worker")
+
+
+def default_cache_dir() -> str:
+    """Return the folder in `CACHE_VARIABLE`, or "" for no cache if it is not set.
+
+    The files contain medical data, so the cache must be enabled explicitly.
+    """
+    return os.environ.get(CACHE_VARIABLE, "")
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,12 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from filter_service.building.jobs import BuildLimits
+from filter_service.building.jobs import BuildLimits, default_cache_dir
 from filter_service.building.worker_handle import InlineWorker, WorkerHandle
 from filter_service.constants import ENGINES
 from filter_service.errors import RenderFailed
 from filter_service.filtering.builder import Builder
 from filter_service.gl_device import is_device_selected, may_have_gpu
-from filter_service.psfs.store_cache import default_cache_dir
 
 if TYPE_CHECKING:
     from filter_service.gl.current_context import CurrentContext

@@ -40,16 +40,6 @@ from filter_service.psfs.store_file import (
     write_file,
 )
 
-CACHE_VARIABLE = "OCUFILTER_CACHE_DIR"
-
-
-def default_cache_dir() -> str:
-    """Return the folder in `CACHE_VARIABLE`, or "" for no cache if it is not set.
-
-    The files contain medical data, so the cache must be enabled explicitly.
-    """
-    return os.environ.get(CACHE_VARIABLE, "")
-
 
 def check_is_private(folder: Path) -> None:
     """Raise if other users have access to a folder.

@@ -12,8 +12,7 @@ A *session* is the state of one client: its credit (the number of frames that it
 have unanswered), the profiles of its eyes, and its shared memory, in *slots*.  It
 belongs to one device, and can be resumed for `session_keep_s` after a disconnect.
 
-launch               startup: signals, ready message
-supervisor           starts the processes and restarts those that exit
+supervisor           startup; starts the processes and restarts those that exit
 config               settings file, with the names of devices
 process_channel      messages between the processes; their startup and memory
 front_end            event loop of the front end: messages, frames; its main program

@@ -8,7 +8,7 @@ from pathlib import Path
 from filter_service.errors import RenderFailed
 from filter_service.service import supervisor
 from filter_service.service.config import load_config
-from filter_service.service.launch import run
+from filter_service.service.supervisor import run
 
 FILTER_MS = "OCUFILTER_TEST_FILTER_MS"
 GONE_FILE = "OCUFILTER_TEST_GONE_FILE"

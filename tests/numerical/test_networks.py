@@ -338,7 +338,7 @@ def test_everything_runs_with_torch_absent_and_without_a_warning():
     script = (
         "import sys\n"
         "sys.modules['torch'] = sys.modules['onnx'] = None\n"
-        "import estimator.networks.inference, filter_service.service.launch\n"
+        "import estimator.networks.inference, filter_service.service.supervisor\n"
         "from estimator.estimate.estimation import estimate_eye\n"
         "from estimator.profiles.parse import parse_profile\n"
         "profile = parse_profile({'kind': 'preset', 'name': 'myopia'})\n"
