@@ -110,11 +110,11 @@ def empty_buffer(
     radius_px: NDArray[np.int64],
     geometric_ratio: NDArray[np.float64],
 ) -> KernelBuffer:
-    """Return a buffer of zeros for kernels with given radii (P,)."""
+    """Return an uninitialized buffer for kernels with given radii (P,)."""
     counts = (2 * radius_px + 1) ** 2
     ends = np.cumsum(counts)
     return KernelBuffer(
-        flat_kernels=np.zeros(int(ends[-1]) if ends.size else 0, np.float32),
+        flat_kernels=np.empty(int(ends[-1]) if ends.size else 0, np.float32),
         offset_count=ends - counts,
         radius_px=radius_px,
         geometric_ratio=geometric_ratio,

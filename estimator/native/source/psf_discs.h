@@ -1,22 +1,36 @@
 /* PSFs over discs of given radii, in single precision, for the functions of estimator/psf. */
 
-/* Adds a square to a kernel, with zeros outside the disc and a sum of `share`; returns
- * `share` times the light in the disc. */
-static double add_disc(const float *from, int radius, double share, float *to) {
-    int side = 2 * radius + 1;
-    double total = 0.0;
-    for (int y = -radius; y <= radius; ++y) {
-        int reach = disc_reach(radius, y);
-        total += light_of_row(from + (y + radius) * side + radius - reach, 2 * reach + 1).sum;
+typedef double f64x8 __attribute__((vector_size(64)));
+
+/* Largest x of the disc x^2 + y^2 <= (radius + 1/2)^2. */
+INLINE int disc_reach(int radius, int y) {
+    return (int)sqrt(square(radius + 0.5) - square(y));
+}
+
+/* Copies the pixels of a canvas that are in the disc to its square, and returns their sum.
+ * Other pixels keep their values, or get the mean light of the edge if there is a tail; those
+ * outside the disc are zero. */
+static double fill_disc(const canvas *c, const tail *t, int radius, float *square_at) {
+    f64x8 total = {0.0};
+    for (int y = radius; y >= -radius; --y) {
+        int reach = disc_reach(radius, y), row = c->top - y, end = reach + 1;
+        float *to = square_at + (radius - y) * (2 * radius + 1) + radius;
+        int gap[2] = {end, end};
+        if (row >= 0 && row < c->height) {
+            gap[0] = clamp_int(c->left, -reach, end);
+            gap[1] = clamp_int(c->left + c->width, gap[0], end);
+            memcpy(to + gap[0], c->pixels + row * c->width + gap[0] - c->left,
+                   sizeof *to * (size_t)(gap[1] - gap[0]));
+        }
+        if (t != NULL) write_tails(t, &one_weight, 1, y, -reach, end, gap, to);
+        f32x8 sum = all8(0.0f);
+        for (int x = -reach; x <= reach; x += LANES)
+            sum += (f32x8)((i32x8)load8(to + x) & (NUMBERS8 < all8((float)(end - x))));
+        total += __builtin_convertvector(sum, f64x8);
     }
-    if (!(total > 0.0)) return 0.0;
-    float scale = (float)(share / total);
-    for (int y = -radius; y <= radius; ++y) {
-        int reach = disc_reach(radius, y);
-        size_t first = (size_t)((y + radius) * side + radius);
-        for (int x = -reach; x <= reach; ++x) to[first + x] += scale * from[first + x];
-    }
-    return share * total;
+    double light = 0.0;
+    for (int i = 0; i < LANES; ++i) light += total[i];
+    return light;
 }
 
 /* Reads a surveyed pupil. */
@@ -63,27 +77,40 @@ static int32_t compute_disc(const psf_discs_job *discs, int64_t psf, psf_work *w
     grid g;
     take_pupil(discs, psf, &own);
     int radius = (int)discs->radius_px[psf], side = 2 * radius + 1;
-    float *part = room_for(&w->part, (size_t)side * (size_t)side + LANES);
-    if (part == NULL) return PSF_NO_MEMORY;
+    size_t count = (size_t)side * (size_t)side;
+    if (own.rays_ratio < 1.0 && !plan_grid(job, &own, &g)) return PSF_NOT_HERE;
+    /* Box of the light that the methods compute. */
+    int box[4] = {radius, -radius, radius, -radius};
+    widen_box(&own, &g, job->is_diffracting, box);
+    for (int i = 0; i < 4; ++i) box[i] = clamp_int(box[i], -radius, radius);
+    int width = box[1] - box[0] + 1, height = box[3] - box[2] + 1;
+    size_t part_count = (size_t)(width * height);
+    float *plane = room_for(&w->plane, count + LANES);
+    float *part = room_for(&w->part, part_count + LANES);
+    if (plane == NULL || part == NULL) return PSF_NO_MEMORY;
+    memset(plane, 0, sizeof *plane * count);
+    tail t = tail_of(job->tables, &own);
+    float *kernel = discs->kernels + discs->first[psf];
+    canvas c = {part, box[0], box[3], width, height};
     double light = 0.0;
+    int is_first = 1;
     for (int by_rays = 0; by_rays < 2; ++by_rays) {
         double share = by_rays ? own.rays_ratio : 1.0 - own.rays_ratio;
         if (share <= 0.0) continue;
-        canvas c = {part, -radius, radius, side, side, radius};
-        memset(part, 0, sizeof(float) * (size_t)side * (size_t)side);
+        memset(part, 0, sizeof *part * part_count);
         if (by_rays) {
             spot_of_rays(job->tables, &own, job->is_diffracting, &c);
         } else {
-            if (!plan_grid(job, &own, &g)) return PSF_NOT_HERE;
             if (!spot_of_waves(job, &own, &g, &w->waves, &c)) return PSF_NO_MEMORY;
-            const int *filled = g.window;
-            if (filled[0] > -radius || filled[1] < radius || filled[2] > -radius
-                || filled[3] < radius) {
-                tail t = tail_of(job->tables, &own);
-                lift_beyond(&t, &g, &c);
-            }
+            lift_beyond(&t, g.window, &c);
         }
-        light += add_disc(part, radius, share, discs->kernels + discs->first[psf]);
+        const tail *beyond = is_first && job->is_diffracting ? &t : NULL;
+        double total = fill_disc(&c, beyond, radius, plane);
+        float scale = total > 0.0 ? (float)(share / total) : 0.0f;
+        for (size_t i = 0; i < count && is_first; ++i) kernel[i] = scale * plane[i];
+        for (size_t i = 0; i < count && !is_first; ++i) kernel[i] += scale * plane[i];
+        light += share * total;
+        is_first = 0;
     }
     discs->light_ratio[psf] = light;
     return PSF_DONE;

@@ -94,7 +94,7 @@ typedef struct {
     const int64_t *ring_channels;
     const double *rays_ratio;         /* share of ray optics */
     const int64_t *radius_px, *first; /* radii, and offsets in the kernels */
-    float *kernels;                   /* zeros, to which kernels are added */
+    float *kernels;
     double *light_ratio;              /* share of the light in the disc */
     int32_t *outcome;
     int64_t count;

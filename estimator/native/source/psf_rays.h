@@ -6,28 +6,12 @@
 
 typedef float f32x2 __attribute__((vector_size(8)));
 
-/* Part of a kernel's plane: pixel (x, y), y upward, is row top - y, column x - left. */
+/* Part of a kernel's plane: pixel (x, y), y upward, is row top - y, column x - left.  Seven
+ * floats follow the last pixel. */
 typedef struct {
     float *pixels;
     int left, top, width, height;
-    int radius;               /* of the disc about the chief ray that is used; 0: all */
 } canvas;
-
-/* Largest x of the disc x^2 + y^2 <= (radius + 1/2)^2. */
-INLINE int disc_reach(int radius, int y) {
-    return (int)sqrt(square(radius + 0.5) - square(y));
-}
-
-/* First and last column of a row that are used. */
-INLINE int first_column(const canvas *c, int row) {
-    if (c->radius == 0) return 0;
-    return larger_int(0, -disc_reach(c->radius, c->top - row) - c->left);
-}
-
-INLINE int last_column(const canvas *c, int row) {
-    if (c->radius == 0) return c->width - 1;
-    return smaller_int(c->width - 1, disc_reach(c->radius, c->top - row) - c->left);
-}
 
 #define MOST_CELLS 192
 #define PROFILE_STEPS 17      /* of 1/2 px near the edge's image, of 1 px farther out */
@@ -407,26 +391,22 @@ INLINE void add_edge_light(int order, const psf_tables *tables, const pupil *own
     }
 }
 
-/* Raises pixels at least from_px away from the edge to its mean light. */
+/* Raises pixels below zero to zero, and those at least from_px away from the edge to its
+ * mean light. */
 static void lift_to_tail(const tail *t, const canvas *c, float from_px) {
-    f32x8 border2 = all8(from_px * from_px), brightest = all8(t->brightest);
-    for (int row = 0; row < c->height; ++row) {
-        float *to = c->pixels + row * c->width;
-        float y = (float)(c->top - row);
-        int last = last_column(c, row);
-        for (int column = first_column(c, row); column <= last; column += LANES) {
-            int count = smaller_int(LANES, last + 1 - column);
-            f32x8 light = all8(INFINITY);
-            memcpy(&light, to + column, sizeof(float) * (size_t)count);
-            if (!any8(light < brightest)) continue;
-            f32x8 nearest, farthest, x = NUMBERS8 + all8((float)(c->left + column));
-            tail_distances8(t, x, y, &nearest, &farthest);
-            i32x8 is_far = nearest >= border2;
-            if (!any8(is_far)) continue;
-            f32x8 found = tail_light8(t, x, y, nearest, farthest);
-            found = (f32x8)((i32x8)found & is_far);
-            light = larger8(light, found);
-            memcpy(to + column, &light, sizeof(float) * (size_t)count);
+    f32x8 zero = all8(0.0f), brightest = all8(t->brightest);
+    for (int y = c->top; y > c->top - c->height; --y) {
+        tail_row row = tail_row_at(t, y);
+        float *to = c->pixels + (c->top - y) * c->width;
+        for (int i = 0; i < c->width; i += LANES) {
+            f32x8 old = load8(to + i), light = larger8(old, zero);
+            i32x8 is_own = NUMBERS8 < all8((float)(c->width - i));
+            if (any8(light < brightest)) {
+                i32x8 is_far;
+                f32x8 found = tail_light8(&row, c->left + i, from_px * from_px, &is_far);
+                light = larger8(light, (f32x8)((i32x8)found & is_far));
+            }
+            store8(to + i, (f32x8)(((i32x8)light & is_own) | ((i32x8)old & ~is_own)));
         }
     }
 }
@@ -441,11 +421,9 @@ static void spot_of_rays(const psf_tables *tables, const pupil *own, int is_diff
     int n_cells = (int)smaller_double(tables->max_cells, ceil(cells));
     double weight = FOR_ORDER(own->order, splat_pupil, own, dense, n_cells, c);
     float scale = (float)(1.0 / weight);
-    int count = c->width * c->height;
-    for (int i = 0; i < count; ++i) c->pixels[i] *= scale;
+    for (int i = 0; i < c->width * c->height; ++i) c->pixels[i] *= scale;
     if (!is_diffracting) return;
     FOR_ORDER(own->order, add_edge_light, tables, own, dense, c);
-    for (int i = 0; i < count; ++i) c->pixels[i] = larger_float(c->pixels[i], 0.0f);
     tail t = tail_of(tables, own);
     lift_to_tail(&t, c, (float)tables->far_px);
 }

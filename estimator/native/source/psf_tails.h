@@ -2,9 +2,11 @@
 
 #define TAIL_EDGES (N_EDGE / 4)
 #define LANES 8
+#define MOST_PRIMARIES 16
 
+/* Lengths are relative to the mean of the edge. */
 typedef struct {
-    float edge_x[TAIL_EDGES], edge_y[TAIL_EDGES];
+    float edge_x[TAIL_EDGES], edge_y[TAIL_EDGES], square[TAIL_EDGES];
     float center_x, center_y;
     float xx, yy, xy, at_center, factor;
     float brightest;          /* upper limit of pixels at least far_px from the edge */
@@ -14,13 +16,16 @@ static tail tail_of(const psf_tables *tables, const pupil *own) {
     tail t;
     float x = 0.0f, y = 0.0f;
     for (int i = 0; i < TAIL_EDGES; ++i) {
-        t.edge_x[i] = own->edge[0][4 * i];
-        t.edge_y[i] = own->edge[1][4 * i];
-        x += t.edge_x[i];
-        y += t.edge_y[i];
+        x += own->edge[0][4 * i];
+        y += own->edge[1][4 * i];
     }
     t.center_x = x / TAIL_EDGES;
     t.center_y = y / TAIL_EDGES;
+    for (int i = 0; i < TAIL_EDGES; ++i) {
+        t.edge_x[i] = own->edge[0][4 * i] - t.center_x;
+        t.edge_y[i] = own->edge[1][4 * i] - t.center_y;
+        t.square[i] = t.edge_x[i] * t.edge_x[i] + t.edge_y[i] * t.edge_y[i];
+    }
     double a = square(own->half[0]), b = square(own->half[1]);
     double c = own->shear * own->half[0] * own->half[1];
     t.xx = (float)a;
@@ -34,33 +39,61 @@ static tail tail_of(const psf_tables *tables, const pupil *own) {
     return t;
 }
 
-/* Squared distances of eight pixels to the nearest and farthest point of the edge. */
-INLINE void tail_distances8(const tail *t, f32x8 x, float y, f32x8 *nearest,
-                            f32x8 *farthest) {
-    f32x8 near = all8(1e30f), far = all8(0.0f);
+/* A row of pixels. */
+typedef struct {
+    const tail *t;
+    float y, offset[TAIL_EDGES];
+} tail_row;
+
+static tail_row tail_row_at(const tail *t, int y) {
+    tail_row row = {.t = t, .y = (float)y - t->center_y};
+    for (int k = 0; k < TAIL_EDGES; ++k)
+        row.offset[k] = t->square[k] - 2.0f * row.y * t->edge_y[k];
+    return row;
+}
+
+/* Light of the eight pixels from x, and whether each is at least near2^(1/2) away from all
+ * points of the edge.  A squared distance is |p|^2 + (|e|^2 - 2 p.e). */
+INLINE f32x8 tail_light8(const tail_row *row, int x, float near2, i32x8 *is_far) {
+    const tail *t = row->t;
+    f32x8 from_x = NUMBERS8 + all8((float)x - t->center_x), two_x = from_x + from_x;
+    f32x8 rho2 = from_x * from_x + all8(row->y * row->y);
+    f32x8 near = all8(1e30f), far = -near;
     for (int k = 0; k < TAIL_EDGES; ++k) {
-        f32x8 along = x - all8(t->edge_x[k]);
-        f32x8 across = all8((y - t->edge_y[k]) * (y - t->edge_y[k]));
-        f32x8 distance = along * along + across;
+        f32x8 distance = all8(row->offset[k]) - two_x * all8(t->edge_x[k]);
         near = smaller8(near, distance);
         far = larger8(far, distance);
     }
-    *nearest = near;
-    *farthest = far;
+    near += rho2;
+    *is_far = near >= all8(near2);
+    f32x8 close = larger8(near, all8(0.25f)), distant = larger8(far + rho2, close);
+    f32x8 chord2 = (all8(t->xx) * from_x + all8(t->xy * row->y)) * from_x
+                   + all8(t->yy * row->y * row->y);
+    /* Within about this square of the distance, the direction from the center fades. */
+    f32x8 little = all8(1e-6f), from2 = rho2 + little;
+    chord2 += little * all8(t->at_center);
+    f32x8 reach2 = larger8(rho2, close);
+    return all8(t->factor) * (close + distant) * from2 * from2
+           * inverse_root8(chord2 * from2 * reach2) / (chord2 * close * distant);
 }
 
-INLINE f32x8 tail_light8(const tail *t, f32x8 x, float y, f32x8 nearest, f32x8 farthest) {
-    float from_y = y - t->center_y;
-    f32x8 from_x = x - all8(t->center_x);
-    f32x8 close = larger8(nearest, all8(0.25f)), distant = larger8(farthest, close);
-    f32x8 rho2 = from_x * from_x + all8(from_y * from_y);
-    f32x8 chord2 = (all8(t->xx) * from_x + all8(t->xy * from_y)) * from_x
-                   + all8(t->yy * from_y * from_y);
-    f32x8 little = all8(1e-6f);
-    f32x8 ratio2 = (chord2 + little * all8(t->at_center)) / (rho2 + little);
-    f32x8 reach2 = larger8(rho2, close);
-    return all8(t->factor) * (close + distant)
-           / (ratio2 * root8(ratio2 * reach2) * close * distant);
+/* Writes the weighted light of `n` tails to the pixels of a row from `first` up to `end`, not
+ * included, except those from gap[0] up to gap[1].  `to` is the pixel at x = 0; seven floats
+ * after the last pixel must be readable, and keep their values. */
+static void write_tails(const tail *tails, const float *weights, int n, int y, int first,
+                        int end, const int gap[2], float *to) {
+    tail_row rows[MOST_PRIMARIES];
+    for (int p = 0; p < n; ++p) rows[p] = tail_row_at(tails + p, y);
+    const int starts[2] = {first, gap[1]}, ends[2] = {gap[0], end};
+    for (int part = 0; part < 2; ++part)
+        for (int x = starts[part]; x < ends[part]; x += LANES) {
+            f32x8 light = all8(0.0f);
+            i32x8 is_far, is_own = NUMBERS8 < all8((float)(ends[part] - x));
+            for (int p = 0; p < n; ++p)
+                light += all8(weights[p]) * tail_light8(rows + p, x, 0.0f, &is_far);
+            light = (f32x8)(((i32x8)light & is_own) | ((i32x8)load8(to + x) & ~is_own));
+            store8(to + x, light);
+        }
 }
 
 /* Light of the pupil's edge beyond the line x = end (axis 0) or y = end (axis 1), on the

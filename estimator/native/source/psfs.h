@@ -4,7 +4,6 @@
 
 #include "dither.h"
 
-#define MOST_PRIMARIES 16
 #define MOST_REACH_PX 255
 #define WEIGHT_MAX 65535.0
 #define PSFS_AN_ITEM 8
@@ -13,6 +12,7 @@
 
 static const int side_axis[SIDES] = {0, 0, 1, 1};
 static const double side_sign[SIDES] = {-1.0, 1.0, 1.0, -1.0};
+static const float one_weight = 1.0f;
 
 /* Memory of a thread. */
 typedef struct {
@@ -100,24 +100,17 @@ static void widen_box(const pupil *own, const grid *g, int is_diffracting, int b
     }
 }
 
-/* Sets pixels outside a wave window to the mean light of the edge. */
-static void lift_beyond(const tail *t, const grid *g, const canvas *c) {
-    for (int row = 0; row < c->height; ++row) {
-        int y = c->top - row, is_done = y >= g->window[2] && y <= g->window[3];
-        int last = last_column(c, row);
-        for (int column = first_column(c, row); column <= last; column += LANES) {
-            int x0 = c->left + column;
-            if (is_done && x0 >= g->window[0] && x0 + LANES - 1 <= g->window[1]) continue;
-            f32x8 nearest, farthest, x = NUMBERS8 + all8((float)(c->left + column));
-            float found[LANES];
-            tail_distances8(t, x, (float)y, &nearest, &farthest);
-            store8(found, tail_light8(t, x, (float)y, nearest, farthest));
-            for (int i = 0; i < LANES && column + i <= last; ++i) {
-                int at = c->left + column + i;
-                if (is_done && at >= g->window[0] && at <= g->window[1]) continue;
-                c->pixels[row * c->width + column + i] = found[i];
-            }
+/* Sets pixels outside a box x0, x1, y0, y1 (inclusive) to the mean light of the edge. */
+static void lift_beyond(const tail *t, const int box[4], const canvas *c) {
+    int end = c->left + c->width;
+    for (int y = c->top; y > c->top - c->height; --y) {
+        int gap[2] = {end, end};
+        if (y >= box[2] && y <= box[3]) {
+            gap[0] = clamp_int(box[0], c->left, end);
+            gap[1] = clamp_int(box[1] + 1, gap[0], end);
         }
+        write_tails(t, &one_weight, 1, y, c->left, end, gap,
+                    c->pixels + (c->top - y) * c->width - c->left);
     }
 }
 
@@ -305,35 +298,24 @@ static int32_t pack_plane(const psf_job *job, int psf, const pupil *pupils,
     float *kept = room_for(&w->kept, (size_t)(width * height) + LANES);
     uint16_t *words = more_words(w, (int64_t)width * height);
     if (kept == NULL || words == NULL) return PSF_NO_MEMORY;
+    float weights[MOST_PRIMARIES];
+    for (int p = 0; p < job->primaries; ++p) weights[p] = (float)pupils[p].weight;
     double sum = 0.0, peak = 0.0, inside = 0.0; /* inside: light of the plane's own pixels */
     squares = 0.0;
     for (int row = 0; row < height; ++row) {
-        int y = up - row, x = -left;
+        int y = up - row, end = right + 1, gap[2] = {end, end};
         float *to = kept + row * width;
-        int is_inside = y <= c->top && y > c->top - c->height;
-        while (x <= right) {
-            if (is_inside && x >= c->left && x < c->left + c->width) {
-                int count = smaller_int(right, c->left + c->width - 1) - x + 1;
-                const float *from = c->pixels + (c->top - y) * c->width + x - c->left;
-                inside += light_of_row(from, count).sum;
-                memcpy(to + x + left, from, sizeof(float) * (size_t)count);
-                x += count;
-                continue;
-            }
-            int end = is_inside && x < c->left ? smaller_int(right + 1, c->left) : right + 1;
-            for (; x < end; x += LANES) {
-                f32x8 light = all8(0.0f), place = NUMBERS8 + all8((float)x);
-                for (int p = 0; p < job->primaries && job->is_diffracting; ++p) {
-                    f32x8 nearest, farthest;
-                    tail_distances8(tails + p, place, (float)y, &nearest, &farthest);
-                    light += all8((float)pupils[p].weight)
-                             * tail_light8(tails + p, place, (float)y, nearest, farthest);
-                }
-                memcpy(to + x + left, &light,
-                       sizeof(float) * (size_t)smaller_int(LANES, end - x));
-            }
-            x = end;
+        if (!job->is_diffracting) memset(to, 0, sizeof *to * (size_t)width);
+        if (y <= c->top && y > c->top - c->height) {
+            gap[0] = clamp_int(c->left, -left, end);
+            gap[1] = clamp_int(c->left + c->width, gap[0], end);
+            int count = gap[1] - gap[0];
+            const float *from = c->pixels + (c->top - y) * c->width + gap[0] - c->left;
+            inside += light_of_row(from, count).sum;
+            memcpy(to + left + gap[0], from, sizeof(float) * (size_t)count);
         }
+        if (job->is_diffracting)
+            write_tails(tails, weights, job->primaries, y, -left, end, gap, to + left);
         row_light light = light_of_row(to, width);
         sum += light.sum;
         squares += light.squares;
@@ -401,16 +383,13 @@ static int32_t compute_psf(const psf_job *job, int psf, psf_work *w) {
             double weight = own->weight
                             * (by_rays ? own->rays_ratio : 1.0 - own->rays_ratio);
             if (weight <= 0.0) continue;
-            canvas c = {is_first ? plane : part, box[0], box[3], width, height, 0};
+            canvas c = {is_first ? plane : part, box[0], box[3], width, height};
             memset(c.pixels, 0, sizeof(float) * (size_t)count);
             if (by_rays) {
                 spot_of_rays(job->tables, own, job->is_diffracting, &c);
             } else {
                 if (!spot_of_waves(job, own, grids + p, &w->waves, &c)) return PSF_NO_MEMORY;
-                const int *filled = grids[p].window;
-                if (filled[0] > box[0] || filled[1] < box[1] || filled[2] > box[2]
-                    || filled[3] < box[3])
-                    lift_beyond(tails + p, grids + p, &c);
+                lift_beyond(tails + p, grids[p].window, &c);
             }
             float share = (float)weight;
             if (is_first && share != 1.0f)
@@ -420,7 +399,7 @@ static int32_t compute_psf(const psf_job *job, int psf, psf_work *w) {
             is_first = 0;
         }
     job->rays_ratio[psf] = rays_ratio;
-    canvas c = {plane, box[0], box[3], width, height, 0};
+    canvas c = {plane, box[0], box[3], width, height};
     return pack_plane(job, psf, pupils, tails, &c, w);
 }
 
