@@ -18,8 +18,9 @@ FUNCTIONS = {
     "node_blur": "f8[] f8[] f8[] i8[] f8[] f8[] f4[] i8 i8 i8",
     "layer_blur": "record record f8[] f8[] f8[] i8 i8",
     "step_curve": "record record f8[] f8[] f8[] i8 i8 f8 f8 f8 f8 f8",
-    "steps_of_state": "f8[] i8[] f8[] f8[] f8[] f8[] i8 i8 f8 f8",
-    "layers_between": "f8[] f8[] i8[] f8[] i8 -> int",
+    "layers_of_state": (
+        "f8[] i8[] f8[] f8[] f8[] f8[] i8 i8 f8 f8 i8[] i8 f8[] i8 -> int"
+    ),
     "count_bright": "pool i4[] i2[] i8 i8 i8 i8[]",
     "list_bright": "pool i4[] i2[] i8 i8 i8 i8[] i8[] i8[]",
     "fade_light": "f4[] i8 f8 f8 f8 f4[] f8[]",

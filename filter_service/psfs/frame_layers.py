@@ -32,6 +32,9 @@ from filter_service.view_state import State
 CURVE_MARGIN_DPT = 1.0
 """Range of a step curve beyond the layers of its node, for states between nodes."""
 
+USUAL_LAYERS = 256
+"""Layers of a frame that take one call of the C library; more take a second one."""
+
 
 @dataclass(frozen=True)
 class FrameLayers:
@@ -255,16 +258,18 @@ def _layer_distances_dpt(
         return at_dpt
     starts = np.array([0, *accumulate(curve.shape[1] for curve in curves)])
     steps = np.empty(at_dpt.size)
-    loops().call(
-        "steps_of_state",
+    ends = np.unique(np.searchsorted(at_dpt, np.append(inside, high_dpt)))
+    arguments = (
         *(np.concatenate(curves, axis=1), starts, reads.scales, reads.weights),
         *(at_dpt, steps, len(curves), at_dpt.size, zero_dpt, step_ratio),
+        *(ends, ends.size),
     )
-    ends = np.unique(np.searchsorted(at_dpt, np.append(inside, high_dpt)))
-    count = loops().call("layers_between", at_dpt, steps, ends, None, ends.size)
-    found_dpt = np.empty(count)
-    loops().call("layers_between", at_dpt, steps, ends, found_dpt, ends.size)
-    return found_dpt
+    found_dpt = np.empty(USUAL_LAYERS)
+    count = loops().call("layers_of_state", *arguments, found_dpt, found_dpt.size)
+    if count > found_dpt.size:
+        found_dpt = np.empty(count)
+        loops().call("layers_of_state", *arguments, found_dpt, count)
+    return found_dpt[:count]
 
 
 def _edge_reach_px(spec: GridSpec, pupil_mm: float) -> float:

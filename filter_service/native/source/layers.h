@@ -112,17 +112,24 @@ static void steps_of_state(const double *curves, const int64_t *starts, const do
     }
 }
 
-/* Layers at most one step apart that include each of the ascending ends, which are places in
- * at_dpt.  Returns their number; writes them unless found_dpt is NULL. */
-static int64_t layers_between(const double *at_dpt, const double *steps_before,
-                              const int64_t *ends, double *found_dpt, int64_t end_count) {
+/* Layers of a state, at most one step apart, that include each of the ascending ends, which
+ * are places in at_dpt.  Returns their number, and writes them if there is room; steps_before
+ * (n,) is scratch. */
+static int64_t layers_of_state(const double *curves, const int64_t *starts,
+                               const double *scales, const double *weights,
+                               const double *at_dpt, double *steps_before,
+                               int64_t corner_count, int64_t n, double zero_dpt, double pace,
+                               const int64_t *ends, int64_t end_count, double *found_dpt,
+                               int64_t room) {
+    steps_of_state(curves, starts, scales, weights, at_dpt, steps_before, corner_count, n,
+                   zero_dpt, pace);
     int64_t count = 1, first = 0;
     for (int64_t e = 0; e < end_count; ++e) {
         double steps = steps_before[ends[e]] - steps_before[first];
         count += (int64_t)at_least(ceil(steps - 1e-9), 1.0);
         first = ends[e];
     }
-    if (found_dpt == NULL) return count;
+    if (count > room) return count;
     *found_dpt++ = at_dpt[0];
     first = 0;
     for (int64_t e = 0; e < end_count; ++e) {
