@@ -86,7 +86,7 @@ def loops(name, folder, include_dirs=()):
         depends=sorted(
             header for own in (folder, *include_dirs) for header in glob(f"{own}/*.h")
         ),
-        include_dirs=list(include_dirs),
+        include_dirs=[folder, *include_dirs],
         libraries=["m"],
         extra_compile_args=[
             *FLAGS,
