@@ -18,7 +18,7 @@ from clients import demo, pyrender_stream, sheet
 from clients.batch import video_writing
 from clients.batch.video_reading import VideoReader
 from clients.commands.options import read_profile, read_size_px
-from clients.demo_eyes import EYES
+from clients.demo import EYES
 from clients.frame_log import FrameLog, percentiles
 from clients.pyrender_stream import path_settings
 from clients.scenes.catalog import build_scene
