@@ -22,6 +22,8 @@ MIN_CELL_WIDTH_PX = 320
 MAX_CELL_WIDTH_PX = 480
 _MAX_SCALE_DPT = 4.5
 
+_GIF_WIDTH_PX = 1200
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -226,9 +228,6 @@ def _fitting_font(
     while size_px > 9 and draw.textlength(text, font=_font(size_px)) > width_px:
         size_px -= 1
     return _font(size_px)
-
-
-_GIF_WIDTH_PX = 1200
 
 
 def write_video(

@@ -83,10 +83,62 @@ COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images", "left", "frames")
 DEPTH_FOLDERS = ("depth", "depths", "depth_m", "depthmap", "depthmaps")
 COLOR_WORDS = ("colors", "color", "colour", "rgb", "image", "img")
 DEPTH_WORDS = ("sync_depth", "depth", "z")
-
-
 _DIGITS = re.compile(r"(\d+)", re.ASCII)
 _DECIMAL = re.compile(r"(\d+)(\.\d+)", re.ASCII)
+
+_PICTURES = (".png", ".jpg", ".jpeg", ".ppm")
+
+# TUM RGB-D
+TUM_DEPTH_SCALE_M = 1.0 / 5000.0
+TUM_CAMERA = Pinhole(525.0, 525.0, 319.5, 239.5, (640, 480))
+MAX_APART_S = 0.02
+MAX_LINES = 100_000
+"""Length of a list: an hour at 30 Hz. Each line takes 20 us."""
+
+MAX_NEAR = 50
+"""Depth images compared on each side in time; a camera of 30 Hz has one."""
+
+ASSOCIATIONS = ("associations.txt", "associate.txt", "assoc.txt")
+
+# NYU depth v2
+COLOR_CAMERA = Pinhole(
+    518.85790117450188,
+    519.46961112127485,
+    325.58244941119034,
+    253.73616633400465,
+    (640, 480),
+)
+DEPTH_CAMERA = Pinhole(
+    582.62448167737955, 582.69103270988637, 313.04475870804731, 238.43889626620386
+)
+TO_COLOR = np.linalg.inv(
+    -np.array(
+        [
+            [9.9997798940829263e-01, 5.0518419386157446e-03, 4.3011152014118693e-03],
+            [-5.0359919480810989e-03, 9.9998051861143999e-01, -3.6879781309514218e-03],
+            [-4.3196624923060242e-03, 3.6662365748484798e-03, 9.9998394948385538e-01],
+        ]
+    )
+)
+"""Matrix from the frame of the depth camera to that of the color camera. It also
+reverses directions, which the projection cancels."""
+
+SHIFT_M = np.array(
+    [2.5031875059141302e-02, -2.9342312935846411e-04, 6.6238747008330102e-04]
+)
+COUNT_SCALE_M, COUNT_AT_INFINITY = 351.3, 1092.5
+MAX_DEPTH_M = 10.0
+MAX_COUNT = 65535
+_RAW = re.compile(r"^([rd])-(\d+\.\d+)-\d+\.(?i:ppm|pgm)$")
+_EXTRACTED = re.compile(r"^(\d+_colors|sync_depth_\d+)\.(?i:png|jpg)$")
+
+# Middlebury
+M_PER_MM = 1e-3
+CALIBRATION_FIELDS = ("cam0", "doffs", "baseline")
+SCENE_FILES = ("im0.png", "disp0.pfm", "calib.txt")
+MAX_CALIBRATION_BYTES = 65_536
+LARGEST_NUMBER = 1e9
+_NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
 
 
 def in_order(names: Iterable[str]) -> list[str]:
@@ -172,9 +224,6 @@ def _colors_and_depths(
     return _named(colors, _COLOR_WORD), _named(depths, _DEPTH_WORD)
 
 
-_PICTURES = (".png", ".jpg", ".jpeg", ".ppm")
-
-
 def images_in(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     """Return the files of a folder with these suffixes, in the order of their names."""
     found = {
@@ -211,18 +260,6 @@ def _named(paths: list[Path], word: re.Pattern[str]) -> dict[str, Path]:
     return found
 
 
-DEPTH_SCALE_M = 1.0 / 5000.0
-CAMERA = Pinhole(525.0, 525.0, 319.5, 239.5, (640, 480))
-MAX_APART_S = 0.02
-MAX_LINES = 100_000
-"""Length of a list: an hour at 30 Hz. Each line takes 20 us."""
-
-MAX_NEAR = 50
-"""Depth images compared on each side in time; a camera of 30 Hz has one."""
-
-ASSOCIATIONS = ("associations.txt", "associate.txt", "assoc.txt")
-
-
 def is_tum(source: Path) -> bool:
     """Return whether a folder has this layout."""
     lists = [(source / name).is_file() for name in ASSOCIATIONS]
@@ -245,8 +282,8 @@ def tum_frames(source: Path) -> list[SourceFrame]:
             Path(color).stem,
             source / color,
             source / depth,
-            CAMERA,
-            Scaled(DEPTH_SCALE_M),
+            TUM_CAMERA,
+            Scaled(TUM_DEPTH_SCALE_M),
         )
         for color, depth in pairs
     ]
@@ -321,37 +358,6 @@ def _lines(path: Path, count: int) -> list[tuple[int, list[str]]]:
                 raise InvalidFile(path, found, "a path below its folder")
         lines.append((number, fields[:count]))
     return lines
-
-
-COLOR_CAMERA = Pinhole(
-    518.85790117450188,
-    519.46961112127485,
-    325.58244941119034,
-    253.73616633400465,
-    (640, 480),
-)
-DEPTH_CAMERA = Pinhole(
-    582.62448167737955, 582.69103270988637, 313.04475870804731, 238.43889626620386
-)
-TO_COLOR = np.linalg.inv(
-    -np.array(
-        [
-            [9.9997798940829263e-01, 5.0518419386157446e-03, 4.3011152014118693e-03],
-            [-5.0359919480810989e-03, 9.9998051861143999e-01, -3.6879781309514218e-03],
-            [-4.3196624923060242e-03, 3.6662365748484798e-03, 9.9998394948385538e-01],
-        ]
-    )
-)
-"""Matrix from the frame of the depth camera to that of the color camera. It also
-reverses directions, which the projection cancels."""
-SHIFT_M = np.array(
-    [2.5031875059141302e-02, -2.9342312935846411e-04, 6.6238747008330102e-04]
-)
-COUNT_SCALE_M, COUNT_AT_INFINITY = 351.3, 1092.5
-MAX_DEPTH_M = 10.0
-MAX_COUNT = 65535
-_RAW = re.compile(r"^([rd])-(\d+\.\d+)-\d+\.(?i:ppm|pgm)$")
-_EXTRACTED = re.compile(r"^(\d+_colors|sync_depth_\d+)\.(?i:png|jpg)$")
 
 
 @dataclass(frozen=True)
@@ -439,14 +445,6 @@ def _nearest(times_s: list[float], at_s: float) -> float:
     return min(around, key=lambda time_s: abs(time_s - at_s))
 
 
-M_PER_MM = 1e-3
-FIELDS = ("cam0", "doffs", "baseline")
-FILES = ("im0.png", "disp0.pfm", "calib.txt")
-MAX_CALIBRATION_BYTES = 65_536
-LARGEST_NUMBER = 1e9
-_NUMBER = r"[-+]?[\d.]+(?:[eE][-+]?\d+)?"
-
-
 def middlebury_frames(source: Path) -> list[SourceFrame]:
     """Return one frame per scene, named after its folder.
 
@@ -468,7 +466,7 @@ def middlebury_scenes(source: Path) -> list[Path]:
     """Return a folder if it is a scene, otherwise the scenes in it."""
 
     def is_scene(folder: Path) -> bool:
-        return all((folder / name).is_file() for name in FILES)
+        return all((folder / name).is_file() for name in SCENE_FILES)
 
     if is_scene(source):
         return [source]
@@ -486,9 +484,11 @@ def read_calibration(path: Path) -> tuple[Pinhole, Disparity]:
     """
     text = read_text(path, max_bytes=MAX_CALIBRATION_BYTES)
     fields = dict(re.findall(r"^[ \t]*(\w+)[ \t]*=[ \t]*(.*)$", text, re.MULTILINE))
-    for name in FIELDS:
+    for name in CALIBRATION_FIELDS:
         if name not in fields:
-            raise InvalidFile(path, f"'{name}' is missing", ", ".join(FIELDS))
+            raise InvalidFile(
+                path, f"'{name}' is missing", ", ".join(CALIBRATION_FIELDS)
+            )
     numbers = re.findall(_NUMBER, fields["cam0"])
     matrix = [_number(number) for number in numbers]
     usable = len(matrix) == 9 and all(map(math.isfinite, matrix))

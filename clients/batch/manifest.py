@@ -30,6 +30,42 @@ from estimator import InvalidFile
 from estimator.bounded_files import loads_bounded
 from filter_service.atomic_files import PART_NAME, replace_atomically, write_atomically
 
+LINES, SUMMARY = "manifest.jsonl", "manifest.json"
+RESTART = "the same value, another folder, or --overwrite"
+MAX_LINE_BYTES, MAX_LINE_ITEMS = 16_000_000, 2_000_000
+"""Limits of a line; a job with states of 200,000 frames, the maximum, takes half."""
+
+SYNC_S = 2.0
+"""Interval of writes to disk: a power failure loses at most this much work."""
+
+Record = dict[str, Any]
+"""A line of the manifest."""
+
+ContentOf = Callable[[Path], Mapping[str, Any]]
+"""Function that returns the size and the hash of a file, as `content_of`."""
+
+_VIDEO = ""
+"""Name of a profile's video among frames, whose names are not empty."""
+
+_ESCAPE = re.compile(r"\\(?:\\|x[89a-f][0-9a-f])")
+_FRAME = [("profile", str), ("frame", str), ("ok", bool)]
+_CONTENT = [("bytes", int), ("sha256", str)]
+_COUNTS = ("missing_depth_count", "clamped_depth_count", "overflow_count")
+_Failed = defstruct("_Failed", [*_FRAME, ("error", str)])
+_Video = defstruct("_Video", [("profile", str), ("file", str), *_CONTENT])
+_Input = defstruct("_Input", _CONTENT)
+_Done = defstruct(
+    "_Done",
+    [
+        *_FRAME,
+        ("file", str),
+        *_CONTENT,
+        ("inputs", list[_Input]),  # type: ignore[valid-type]
+        ("notes", list[str]),
+        *((name, int) for name in _COUNTS),
+    ],
+)
+
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> dict[str, Any]:
     """Write a file atomically, and its folder if that is missing.
@@ -91,27 +127,6 @@ def below(folder: Path, name: object) -> Path | None:
     path = folder / inner
     is_inside = path.parent.resolve().is_relative_to(folder.resolve())
     return path if is_inside else None
-
-
-LINES, SUMMARY = "manifest.jsonl", "manifest.json"
-RESTART = "the same value, another folder, or --overwrite"
-MAX_LINE_BYTES, MAX_LINE_ITEMS = 16_000_000, 2_000_000
-"""Limits of a line; a job with states of 200,000 frames, the maximum, takes half."""
-
-SYNC_S = 2.0
-"""Interval of writes to disk: a power failure loses at most this much work."""
-
-
-Record = dict[str, Any]
-"""A line of the manifest."""
-
-ContentOf = Callable[[Path], Mapping[str, Any]]
-"""Function that returns the size and the hash of a file, as `content_of`."""
-
-_VIDEO = ""
-"""Name of a profile's video among frames, whose names are not empty."""
-
-_ESCAPE = re.compile(r"\\(?:\\|x[89a-f][0-9a-f])")
 
 
 def text_of(name: str) -> str:
@@ -365,25 +380,6 @@ def _parsed(line: bytes, path: Path) -> Record:
         found = f"a line is not a JSON object: {line[:60]!r}"
         raise InvalidFile(path, found, "the manifest of a batch")
     return record
-
-
-_FRAME = [("profile", str), ("frame", str), ("ok", bool)]
-_CONTENT = [("bytes", int), ("sha256", str)]
-_COUNTS = ("missing_depth_count", "clamped_depth_count", "overflow_count")
-_Failed = defstruct("_Failed", [*_FRAME, ("error", str)])
-_Video = defstruct("_Video", [("profile", str), ("file", str), *_CONTENT])
-_Input = defstruct("_Input", _CONTENT)
-_Done = defstruct(
-    "_Done",
-    [
-        *_FRAME,
-        ("file", str),
-        *_CONTENT,
-        ("inputs", list[_Input]),  # type: ignore[valid-type]
-        ("notes", list[str]),
-        *((name, int) for name in _COUNTS),
-    ],
-)
 
 
 def _check(record: Record, path: Path) -> None:

@@ -43,6 +43,8 @@ GRACE_S = 1.0
 """Time to finish a frame after the pipe has closed.  A batch that resumes a killed one
 waits longer for the lock, which the workers hold."""
 
+LOCAL = "local"
+
 
 @dataclass(eq=False)
 class _Worker:
@@ -221,9 +223,6 @@ def _exit_after(descriptor: int) -> None:
     closed.poll()
     time.sleep(GRACE_S)
     os._exit(1)
-
-
-LOCAL = "local"
 
 
 class _RayWorker(UnitRunner):

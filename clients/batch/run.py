@@ -66,6 +66,12 @@ LOCK_WAIT_S = 3.0
 _CHECKED_AT_ONCE = 1000
 _SEGMENT_NAME = re.compile(r"\d{8}\.mkv")
 
+MEASURED_FRAMES = 6
+"""Frames per profile, of which the first one is a warm-up."""
+
+SECONDS_PER_HOUR = 3600.0
+MILLION = 1_000_000
+
 
 @dataclass(frozen=True)
 class Batch:
@@ -423,13 +429,6 @@ def _join_videos(batch: Batch, manifest: Manifest) -> None:
         manifest.append(
             {"kind": "video", "profile": profile, "file": target.name, **content}
         )
-
-
-MEASURED_FRAMES = 6
-"""Frames per profile, of which the first one is a warm-up."""
-
-SECONDS_PER_HOUR = 3600.0
-MILLION = 1_000_000
 
 
 def dry_run(

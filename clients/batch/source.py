@@ -28,6 +28,12 @@ from filter_service.image_files import (
 )
 from filter_service.settings import MAX_PUPIL_MM, MAX_VERGENCE_DPT, MIN_PUPIL_MM
 
+CENTER = "center"
+CENTER_RANGE_DPT = (0.0, 10.0)
+"""Range of a focus that follows depth: few eyes focus closer than 10 cm."""
+
+COLUMNS = ("frame", "pupil_mm", "focus_dpt")
+
 
 @dataclass(frozen=True)
 class FieldOfView:
@@ -191,13 +197,6 @@ def center_depth_m(depth_m: NDArray[np.float32]) -> float:
             # neither.
             return float(np.sort(known_m, axis=None)[(known_m.size - 1) // 2])
     return math.inf
-
-
-CENTER = "center"
-CENTER_RANGE_DPT = (0.0, 10.0)
-"""Range of a focus that follows depth: few eyes focus closer than 10 cm."""
-
-COLUMNS = ("frame", "pupil_mm", "focus_dpt")
 
 
 def same_text(name: str) -> str:

@@ -66,6 +66,23 @@ ORIENTATIONS = {
 }
 """Orientations of EXIF by the signs of a display matrix."""
 
+GRAY = ("gray16le", "gray16be")
+MAX_VIDEO_PIXELS = 1 << 25
+"""Pixels of a frame, as in 8K. A decoder keeps up to 17 frames, and the reader one more
+in sRGB."""
+
+MAX_VIDEO_FRAMES = 1_000_000
+"""Nine hours at 30 Hz; the time of a frame takes 40 bytes of memory."""
+
+MAX_PACKETS_AHEAD = 10_000
+"""Packets decoded without a frame; key frames are some hundred packets apart."""
+
+FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi,mpeg,mpegts,mpegvideo"
+"""Allowed formats, whatever the file name. Playlists are excluded, because they
+reference other files."""
+
+OPTIONS = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
+
 
 def color_of(
     frame: av.VideoFrame, context: av.VideoCodecContext
@@ -201,25 +218,6 @@ def pixel_aspect_ratio_of(stream: av.VideoStream) -> float:
             f"a sample aspect ratio of {ratio:g}; allowed: {low:g} to {high:g}"
         )
     return ratio
-
-
-GRAY = ("gray16le", "gray16be")
-
-MAX_VIDEO_PIXELS = 1 << 25
-"""Pixels of a frame, as in 8K. A decoder keeps up to 17 frames, and the reader one more
-in sRGB."""
-
-MAX_VIDEO_FRAMES = 1_000_000
-"""Nine hours at 30 Hz; the time of a frame takes 40 bytes of memory."""
-
-MAX_PACKETS_AHEAD = 10_000
-"""Packets decoded without a frame; key frames are some hundred packets apart."""
-
-FORMATS = "matroska,webm,mov,mp4,m4a,3gp,3g2,mj2,avi,mpeg,mpegts,mpegvideo"
-"""Allowed formats, whatever the file name. Playlists are excluded, because they
-reference other files."""
-
-OPTIONS = {"format_whitelist": FORMATS, "protocol_whitelist": "file"}
 
 
 def frames_per_second(path: Path) -> float:

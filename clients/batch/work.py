@@ -44,6 +44,13 @@ VIDEO_FORMATS = ("ffv1", "h264")
 
 Format = Literal["png", "npy", "exr", "ffv1", "h264"]
 
+ATTEMPTS = 2
+PNG_LEVEL = 1
+"""Files are a fifth larger than by default and take a quarter of the time."""
+
+FAILURES = (ValueError, FilterError, OSError, MemoryError)
+"""Exceptions that make a frame fail, but not the batch."""
+
 
 @dataclass(frozen=True)
 class Job:
@@ -130,18 +137,8 @@ def batch_settings(given: Mapping[str, Any], states: States) -> FilterSettings:
     )
 
 
-ATTEMPTS = 2
-
-
 class EngineUnusable(RuntimeError):
     """The engine does not work on this machine; the message says what to install."""
-
-
-PNG_LEVEL = 1
-"""Files are a fifth larger than by default and take a quarter of the time."""
-
-FAILURES = (ValueError, FilterError, OSError, MemoryError)
-"""Exceptions that make a frame fail, but not the batch."""
 
 
 @dataclass(frozen=True)

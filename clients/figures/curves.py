@@ -59,6 +59,27 @@ CORRECTED: dict[str, Any] = {"linestyle": "-", "linewidth": LINE_PT}
 AS_IT_IS: dict[str, Any] = {"linestyle": "--", "linewidth": LINE_PT}
 PERFECT: dict[str, Any] = {"linestyle": ":", "linewidth": 0.8}
 
+WORST_LOG_MAR, BEST_LOG_MAR = 1.6, -0.3
+ACCOMMODATING: dict[str, Any] = {"linestyle": "-", "linewidth": LINE_PT}
+FOCUSED_FAR: dict[str, Any] = {"linestyle": "--", "linewidth": LINE_PT}
+EDGE_RATIO = 0.95
+"""Position along the axis beyond which a centered text would cross its end."""
+
+MARKS = {0.0: " far", 1.0: "1 m", 2.5: "40 cm", 5.0: "20 cm", 10.0: "10 cm"}
+MIN_RANGE_DPT = 0.25
+LEVEL_COUNT = 14
+ACUITY_PUPIL_MM = PUPILS_MM[0]
+"""Pupil of the acuity of drawn persons; the larger one would take another 0.1 s."""
+
+SHARP_STEP_CPD, BLURRED_STEP_CPD, N_SAMPLES, N_BISECTIONS = 1.0, 0.5, 64, 8
+"""Coarser than by default.  In 12 persons of three prescriptions, modulation is within
+0.003 (of one in three at 5 mm 0.012) and acuity within 0.05 logMAR (one value 0.08)."""
+
+UNRESOLVED_LOG_MAR = 2.5
+"""Acuity of wavefronts that are too steep to be resolved, as for `log_mar_of`."""
+
+INNER, INNER_ALPHA = (25.0, 75.0), 0.25
+
 
 def modulation(
     study: EyeStudy,
@@ -157,15 +178,6 @@ def mtf_figure(study: EyeStudy) -> Figure:
     return figure_of(90.0, 65.0, draw_mtf, study)
 
 
-WORST_LOG_MAR, BEST_LOG_MAR = 1.6, -0.3
-ACCOMMODATING: dict[str, Any] = {"linestyle": "-", "linewidth": LINE_PT}
-FOCUSED_FAR: dict[str, Any] = {"linestyle": "--", "linewidth": LINE_PT}
-EDGE_RATIO = 0.95
-"""Position along the axis beyond which a centered text would cross its end."""
-
-MARKS = {0.0: " far", 1.0: "1 m", 2.5: "40 cm", 5.0: "20 cm", 10.0: "10 cm"}
-
-
 def draw_through_focus_acuity(
     axes: Axes,
     study: EyeStudy,
@@ -246,10 +258,6 @@ def through_focus_acuity_figure(study: EyeStudy) -> Figure:
     return figure_of(90.0, 65.0, draw_through_focus_acuity, study)
 
 
-MIN_RANGE_DPT = 0.25
-LEVEL_COUNT = 14
-
-
 def blur_arcmin(study: EyeStudy) -> NDArray[np.float64]:
     """Return the blur (n,) of each direction for an eye focused far, arcmin.
 
@@ -325,17 +333,6 @@ def field_maps_figure(study: EyeStudy) -> Figure:
     figure = new_figure(125.0, 85.0)
     draw_field_maps(figure, study)
     return figure
-
-
-ACUITY_PUPIL_MM = PUPILS_MM[0]
-"""Pupil of the acuity of drawn persons; the larger one would take another 0.1 s."""
-
-SHARP_STEP_CPD, BLURRED_STEP_CPD, N_SAMPLES, N_BISECTIONS = 1.0, 0.5, 64, 8
-"""Coarser than by default.  In 12 persons of three prescriptions, modulation is within
-0.003 (of one in three at 5 mm 0.012) and acuity within 0.05 logMAR (one value 0.08)."""
-
-UNRESOLVED_LOG_MAR = 2.5
-"""Acuity of wavefronts that are too steep to be resolved, as for `log_mar_of`."""
 
 
 @dataclass(frozen=True)
@@ -460,9 +457,6 @@ def _log_mar(person: EyeStudy, distance_dpt: float) -> float:
     except ValueError:
         return UNRESOLVED_LOG_MAR
     return log_mar_of(transfer, n_bisections=N_BISECTIONS)
-
-
-INNER, INNER_ALPHA = (25.0, 75.0), 0.25
 
 
 def draw_field_line(axes: Axes, study: EyeStudy, people: DrawnPeople) -> None:

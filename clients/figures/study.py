@@ -39,6 +39,32 @@ from estimator import (
 SECOND_ORDER = slice(3, 6)
 TILTS = slice(1, 3)
 
+STEP_COUNT, ACCOMMODATED_COUNT = 11, 3
+"""Number of distances of a curve, and of its part within the accommodation range."""
+
+FINE_STEP_DPT = 0.25
+"""Step of the curve of a lens with several foci, which lie 1 dpt apart."""
+
+PAST_LAST_FOCUS_DPT = 1.0
+NEAREST_DPT = 5.0
+PAST_FAR_POINT_DPT = 2.0
+HIGHEST_DPT = 20.0
+MIN_ACCOMMODATION_DPT = 1e-6
+"""Smallest accommodation range; an eye with less is treated as fixed-focus."""
+
+PUPILS_MM = (3.0, 5.0)
+"""Pupils in daylight and at dusk."""
+
+WAVELENGTH_NM = 555.0
+FOCUS_RANGE_DPT = (-80.0, 20.0)
+"""From the relaxed state of the most hyperopic eye to the nearest possible focus."""
+
+FIELD_H_DEG = np.arange(-30.0, 31.0, 5.0)
+FIELD_V_DEG = np.arange(-20.0, 21.0, 5.0)
+FIELD_PUPIL_MM = 4.0
+Profile = EyeProfile | Mapping[str, Any] | str | Path
+ProgressCallback = Callable[[float, str], None]
+
 
 @dataclass(frozen=True)
 class PupilWavefront:
@@ -158,21 +184,6 @@ class PupilWavefront:
         return optical_transfer(zernike_um, **self._pupil, **options)
 
 
-STEP_COUNT, ACCOMMODATED_COUNT = 11, 3
-"""Number of distances of a curve, and of its part within the accommodation range."""
-
-FINE_STEP_DPT = 0.25
-"""Step of the curve of a lens with several foci, which lie 1 dpt apart."""
-
-PAST_LAST_FOCUS_DPT = 1.0
-
-NEAREST_DPT = 5.0
-PAST_FAR_POINT_DPT = 2.0
-HIGHEST_DPT = 20.0
-MIN_ACCOMMODATION_DPT = 1e-6
-"""Smallest accommodation range; an eye with less is treated as fixed-focus."""
-
-
 @dataclass(frozen=True)
 class AcuityByDistance:
     """Acuity through one pupil, logMAR; infinite where the blur is too wide.
@@ -273,21 +284,6 @@ def accommodated_log_mar(
             within, sampled_dpt, predict(sampled_dpt)
         )
     return found
-
-
-PUPILS_MM = (3.0, 5.0)
-"""Pupils in daylight and at dusk."""
-
-WAVELENGTH_NM = 555.0
-FOCUS_RANGE_DPT = (-80.0, 20.0)
-"""From the relaxed state of the most hyperopic eye to the nearest possible focus."""
-
-FIELD_H_DEG = np.arange(-30.0, 31.0, 5.0)
-FIELD_V_DEG = np.arange(-20.0, 21.0, 5.0)
-FIELD_PUPIL_MM = 4.0
-
-Profile = EyeProfile | Mapping[str, Any] | str | Path
-ProgressCallback = Callable[[float, str], None]
 
 
 def profile_of(profile: Profile) -> EyeProfile:

@@ -55,6 +55,25 @@ MIN_AXIS_LIMIT_UM = 0.1
 LOWEST_BLURRING_ORDER, LOWEST_HIGHER_ORDER = 2, 3
 """Lowest order that blurs, and lowest order that spectacles do not correct."""
 
+SIDE_COUNT = 161
+LEVEL_COUNT = 13
+MIN_RANGE_UM = 0.05
+"""Smallest half range of the colors; below a tenth of a wave there is no shape."""
+
+SIDE_PX = 161
+MIN_SIDE_ARCMIN = 20.0
+SIDE_RATIO = 1.25
+"""Ratio of the image's side to the diameter of the blur."""
+
+ARCMIN_PER_MRAD = 60.0 * math.degrees(1e-3)
+SLOPE_COUNT = 81
+"""Number of points across a pupil at which ray directions are computed."""
+
+DECADES = 2.0
+"""Decades of light from white to black."""
+
+NICE_ARCMIN = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600)
+
 
 def order_range(order: int) -> slice:
     """Return the slice of the terms of a radial order."""
@@ -155,12 +174,6 @@ def draw_terms(axes: Axes, study: EyeStudy) -> None:
 def terms_figure(study: EyeStudy) -> Figure:
     """Return `draw_terms` as a figure."""
     return figure_of(180.0, 55.0, draw_terms, study)
-
-
-SIDE_COUNT = 161
-LEVEL_COUNT = 13
-MIN_RANGE_UM = 0.05
-"""Smallest half range of the colors; below a tenth of a wave there is no shape."""
 
 
 def wavefront_values_um(
@@ -264,21 +277,6 @@ def wavefront_map_figure(study: EyeStudy) -> Figure:
     figure = new_figure(125.0, 56.0)
     draw_wavefront_maps(figure, study)
     return figure
-
-
-SIDE_PX = 161
-MIN_SIDE_ARCMIN = 20.0
-SIDE_RATIO = 1.25
-"""Ratio of the image's side to the diameter of the blur."""
-
-ARCMIN_PER_MRAD = 60.0 * math.degrees(1e-3)
-SLOPE_COUNT = 81
-"""Number of points across a pupil at which ray directions are computed."""
-
-DECADES = 2.0
-"""Decades of light from white to black."""
-
-NICE_ARCMIN = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600)
 
 
 def ray_directions_mrad(wavefront: PupilWavefront) -> NDArray[np.float64]:

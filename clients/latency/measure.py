@@ -43,6 +43,10 @@ REFERENCE = (
 EQUAL_PSNR_DB = 300.0
 """Value for equal images, since JSON has no infinity."""
 
+PERCENTILES = {"p50": 50, "p90": 90, "p99": 99, "max": 100}
+NAME_COLUMN = 44  # at least
+_percentiles = partial(percentiles, percents=PERCENTILES)
+
 
 @dataclass(frozen=True)
 class Case:
@@ -254,13 +258,6 @@ def compare(target: Target, results: Sequence[Measured]) -> None:
                     "worst_difference": worst,
                     "frames": [kept.index for kept in found.run.kept],
                 }
-
-
-PERCENTILES = {"p50": 50, "p90": 90, "p99": 99, "max": 100}
-NAME_COLUMN = 44  # at least
-
-
-_percentiles = partial(percentiles, percents=PERCENTILES)
 
 
 def as_json(target: Target, results: Sequence[Measured]) -> dict[str, Any]:

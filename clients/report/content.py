@@ -83,6 +83,18 @@ NOT_A_DEVICE = (
     "treatment may rest on it."
 )
 
+KIND_LABELS = {
+    "prescription": "a prescription",
+    "zernike": "a measured wavefront",
+    "zernike_set": "a set of measured wavefronts",
+    "eye": "a given eye model",
+    "surfaces": "a given eye, by its surfaces",
+    "pseudophakic": "biometry and the geometry of an implant",
+    "published": "a schematic eye of the literature",
+}
+PAIR_MAP_MM, PAIR_CURVES_MM, PAIR_FIELD_MM, PAIR_SECTION_MM = 46.0, 49.0, 64.0, 50.0
+"""Heights in the report of two eyes."""
+
 
 def eye_document(facts: EyeFacts) -> Document:
     """Return the report of one eye."""
@@ -138,17 +150,6 @@ def subtitle(study: EyeStudy) -> str:
     lens = profile.correction
     worn = "" if lens is None else f"; {correction_text(lens)}"
     return f"{side}, {age}, {source}{worn}"
-
-
-KIND_LABELS = {
-    "prescription": "a prescription",
-    "zernike": "a measured wavefront",
-    "zernike_set": "a set of measured wavefronts",
-    "eye": "a given eye model",
-    "surfaces": "a given eye, by its surfaces",
-    "pseudophakic": "biometry and the geometry of an implant",
-    "published": "a schematic eye of the literature",
-}
 
 
 def summary(facts: EyeFacts) -> Section:
@@ -322,10 +323,6 @@ def _coefficient_rows(facts: EyeFacts) -> tuple[Row, ...]:
 def sources(cite: Citations) -> Section:
     """Return the section of cited papers."""
     return Section("Sources", (Row((Text((" ".join(cite.listed()),), n_columns=2),)),))
-
-
-PAIR_MAP_MM, PAIR_CURVES_MM, PAIR_FIELD_MM, PAIR_SECTION_MM = 46.0, 49.0, 64.0, 50.0
-"""Heights in the report of two eyes."""
 
 
 def comparison_document(before: EyeFacts, after: EyeFacts) -> Document:

@@ -57,6 +57,30 @@ MAX_TEXT_LENGTH = 60
 JOINERS = "\u200c\u200d"
 """Invisible characters that some scripts need."""
 
+PRESCRIBED_PUPIL_MM = 4.0
+"""Pupil of reported refractions, unless the measured pupil is smaller."""
+
+SPECTACLE_VERTEX_MM = 12.0
+"""Usual distance of spectacles from the cornea."""
+
+REPORTED_CPD = (10.0, 20.0, 30.0)
+REPORTED_FIELD_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
+DISTANCES_M = (0.4, 1.0, 6.0)
+FIELD_DEG = 8.2
+LOG_MAR = tuple(round(1.0 - 0.1 * k, 1) for k in range(13))
+SIDE_PX, LEAST_SIDE_PX = 860, 180
+LARGEST_BLUR_PX = 190.0
+"""Largest blur radius that PSFs are computed for, with a margin for the edge."""
+
+Chart = tuple[float, float]
+"""Pupil, mm, and distance, m."""
+
+NUMBERS_START_FRACTION, CHARTS_START_FRACTION = 0.1, 0.5
+"""Progress fractions at which numbers and charts begin."""
+
+PEOPLE_START_FRACTION = 0.5
+"""Progress fraction at which drawn persons begin, after everything else."""
+
 
 def check_text(field: str, text: str) -> None:
     """Reject a text that cannot be printed in one line of the page margin.
@@ -107,16 +131,6 @@ def distinct_labels(labels: tuple[str, str], sides: tuple[str, str]) -> tuple[st
         marks = [SIDE_NAMES[side] for side in sides] if differ else ORDINALS
         names = [f"{name} ({mark})" for name, mark in zip(names, marks, strict=True)]
     return names[0], names[1]
-
-
-PRESCRIBED_PUPIL_MM = 4.0
-"""Pupil of reported refractions, unless the measured pupil is smaller."""
-
-SPECTACLE_VERTEX_MM = 12.0
-"""Usual distance of spectacles from the cornea."""
-
-REPORTED_CPD = (10.0, 20.0, 30.0)
-REPORTED_FIELD_DEG = (-30.0, -20.0, -10.0, 0.0, 10.0, 20.0, 30.0)
 
 
 def refraction_numbers(m_dpt: float, j0_dpt: float, j45_dpt: float) -> dict[str, float]:
@@ -342,17 +356,6 @@ def people_numbers(people: DrawnPeople) -> dict[str, Any]:
     }
 
 
-DISTANCES_M = (0.4, 1.0, 6.0)
-FIELD_DEG = 8.2
-LOG_MAR = tuple(round(1.0 - 0.1 * k, 1) for k in range(13))
-SIDE_PX, LEAST_SIDE_PX = 860, 180
-LARGEST_BLUR_PX = 190.0
-"""Largest blur radius that PSFs are computed for, with a margin for the edge."""
-
-Chart = tuple[float, float]
-"""Pupil, mm, and distance, m."""
-
-
 def charts_of(
     study: EyeStudy,
     *,
@@ -425,13 +428,6 @@ def picture_side_px(
     reach_arcmin = max(reach_mrad * ARCMIN_PER_MRAD, 1e-6)
     fitting = math.floor(LARGEST_BLUR_PX * FIELD_DEG * 60.0 / reach_arcmin)
     return max(min(SIDE_PX, fitting), LEAST_SIDE_PX)
-
-
-NUMBERS_START_FRACTION, CHARTS_START_FRACTION = 0.1, 0.5
-"""Progress fractions at which numbers and charts begin."""
-
-PEOPLE_START_FRACTION = 0.5
-"""Progress fraction at which drawn persons begin, after everything else."""
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,64 @@ CONTENT_WIDTH_MM = 210.0 - 2.0 * MARGIN_MM
 GAP_MM = 5.0
 """Gap between the blocks of a row."""
 
+JPEG_QUALITY = 88
+STYLE = """
+@page { size: A4; margin: 11mm 12mm 13mm;
+  @bottom-left { content: string(running) "\\A" string(footer); white-space: pre-line;
+    font: 7.5pt "DejaVu Sans", sans-serif; color: #4c5866; width: 165mm; }
+  @bottom-right { content: "page " counter(page) " of " counter(pages);
+    font: 7.5pt "DejaVu Sans", sans-serif; color: #4c5866; } }
+* { box-sizing: border-box; }
+body { font: 9.5pt/1.35 "DejaVu Sans", Verdana, system-ui, sans-serif; color: #1b2430;
+  background: #eef1f4; margin: 0; }
+main { background: #fff; max-width: 210mm; margin: 0 auto; padding: 12mm;
+  string-set: running attr(data-running), footer attr(data-footer); }
+header { border-bottom: 1.5pt solid #1f5fa8; margin-bottom: 4mm; }
+h1 { font-size: 16pt; margin: 0; }
+header p { margin: 1mm 0; color: #4c5866; }
+header .origin { font-size: 9pt; }
+.origin span { white-space: nowrap; margin-right: 4mm; }
+h2 { font-size: 12pt; color: #1f5fa8; margin: 5mm 0 2mm; }
+h3 { font-size: 10pt; margin: 0 0 1mm; }
+section:first-of-type h2 { display: none; }
+
+.row { display: grid; gap: 5mm; margin-bottom: 3mm; align-items: start; }
+table { border-collapse: collapse; width: 100%; font-size: 9pt; }
+th, td { text-align: left; vertical-align: top; padding: .4mm 2mm .4mm 0;
+  border-bottom: .4pt solid #d9dee4; font-variant-numeric: tabular-nums; }
+thead th { color: #4c5866; font-weight: 600; }
+thead tr:last-child th { border-bottom-color: #4c5866; }
+tbody th { font-weight: normal; }
+table.short td, table.short th { white-space: nowrap; }
+.note, figcaption, .plain { font-size: 9pt; color: #4c5866; margin: 1mm 0 0; }
+ul { margin: 0; padding-left: 4mm; font-size: 9pt; }
+figure { margin: 0; }
+figure img { display: block; width: 100%; height: auto; }
+figure.picture img { border: .6pt solid #d9dee4; }
+.marked { position: relative; padding-right: 16.5mm; }
+.marks { position: absolute; top: 0; right: 0; bottom: 0; width: 24mm; margin: 0;
+  padding: 0; list-style: none; }
+.marks li { position: absolute; right: 0; margin-top: -1.6mm; text-align: right;
+  white-space: nowrap; font-size: 9pt; line-height: 3.2mm; color: #4c5866; }
+.marks li.read { color: #1b2430; font-weight: bold; }
+footer { border-top: .4pt solid #4c5866; margin-top: 4mm; padding-top: 1.5mm;
+  font-size: 9pt; color: #4c5866; }
+@media screen and (max-width: 700px) { main { padding: 5mm; }
+  .row { grid-template-columns: minmax(0, 1fr) !important; }
+  .row > div { overflow-x: auto; }
+  table.short td, table.short th { white-space: normal; } }
+@media print { body { background: #fff; } main { padding: 0; max-width: none; }
+  h2, h3 { break-after: avoid; } .row, tr, figure { break-inside: avoid; }
+  .row.list { break-inside: auto; } footer { display: none; } }
+"""
+"""Style for screen and paper.  On paper, the footer is in the page margins."""
+
+MARK_MM = 16.5
+"""Width of the marks beside an image."""
+
+MARK_LINE_MM = 3.2
+"""Height of a mark's line."""
+
 
 @dataclass(frozen=True)
 class Table:
@@ -128,66 +186,6 @@ class Document:
     footer: str
     origin: tuple[tuple[str, str], ...] = ()
     running: str = ""
-
-
-JPEG_QUALITY = 88
-
-STYLE = """
-@page { size: A4; margin: 11mm 12mm 13mm;
-  @bottom-left { content: string(running) "\\A" string(footer); white-space: pre-line;
-    font: 7.5pt "DejaVu Sans", sans-serif; color: #4c5866; width: 165mm; }
-  @bottom-right { content: "page " counter(page) " of " counter(pages);
-    font: 7.5pt "DejaVu Sans", sans-serif; color: #4c5866; } }
-* { box-sizing: border-box; }
-body { font: 9.5pt/1.35 "DejaVu Sans", Verdana, system-ui, sans-serif; color: #1b2430;
-  background: #eef1f4; margin: 0; }
-main { background: #fff; max-width: 210mm; margin: 0 auto; padding: 12mm;
-  string-set: running attr(data-running), footer attr(data-footer); }
-header { border-bottom: 1.5pt solid #1f5fa8; margin-bottom: 4mm; }
-h1 { font-size: 16pt; margin: 0; }
-header p { margin: 1mm 0; color: #4c5866; }
-header .origin { font-size: 9pt; }
-.origin span { white-space: nowrap; margin-right: 4mm; }
-h2 { font-size: 12pt; color: #1f5fa8; margin: 5mm 0 2mm; }
-h3 { font-size: 10pt; margin: 0 0 1mm; }
-section:first-of-type h2 { display: none; }
-
-.row { display: grid; gap: 5mm; margin-bottom: 3mm; align-items: start; }
-table { border-collapse: collapse; width: 100%; font-size: 9pt; }
-th, td { text-align: left; vertical-align: top; padding: .4mm 2mm .4mm 0;
-  border-bottom: .4pt solid #d9dee4; font-variant-numeric: tabular-nums; }
-thead th { color: #4c5866; font-weight: 600; }
-thead tr:last-child th { border-bottom-color: #4c5866; }
-tbody th { font-weight: normal; }
-table.short td, table.short th { white-space: nowrap; }
-.note, figcaption, .plain { font-size: 9pt; color: #4c5866; margin: 1mm 0 0; }
-ul { margin: 0; padding-left: 4mm; font-size: 9pt; }
-figure { margin: 0; }
-figure img { display: block; width: 100%; height: auto; }
-figure.picture img { border: .6pt solid #d9dee4; }
-.marked { position: relative; padding-right: 16.5mm; }
-.marks { position: absolute; top: 0; right: 0; bottom: 0; width: 24mm; margin: 0;
-  padding: 0; list-style: none; }
-.marks li { position: absolute; right: 0; margin-top: -1.6mm; text-align: right;
-  white-space: nowrap; font-size: 9pt; line-height: 3.2mm; color: #4c5866; }
-.marks li.read { color: #1b2430; font-weight: bold; }
-footer { border-top: .4pt solid #4c5866; margin-top: 4mm; padding-top: 1.5mm;
-  font-size: 9pt; color: #4c5866; }
-@media screen and (max-width: 700px) { main { padding: 5mm; }
-  .row { grid-template-columns: minmax(0, 1fr) !important; }
-  .row > div { overflow-x: auto; }
-  table.short td, table.short th { white-space: normal; } }
-@media print { body { background: #fff; } main { padding: 0; max-width: none; }
-  h2, h3 { break-after: avoid; } .row, tr, figure { break-inside: avoid; }
-  .row.list { break-inside: auto; } footer { display: none; } }
-"""
-"""Style for screen and paper.  On paper, the footer is in the page margins."""
-
-MARK_MM = 16.5
-"""Width of the marks beside an image."""
-
-MARK_LINE_MM = 3.2
-"""Height of a mark's line."""
 
 
 def html_of(document: Document) -> str:

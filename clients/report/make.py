@@ -18,6 +18,13 @@ from filter_service.atomic_files import write_atomically
 SHOWN_DIGITS = 16
 """Digits of a profile's digest that are shown: 64 bits."""
 
+SUFFIXES = (".html", ".pdf")
+PANGO_PACKAGES = ("libpango-1.0-0", "libpangoft2-1.0-0", "libharfbuzz-subset0")
+"""Debian packages of the system libraries that WeasyPrint loads."""
+
+WRITING_START_FRACTION = 0.85
+"""Progress fraction at which computation ends and writing begins."""
+
 
 @dataclass(frozen=True)
 class Record:
@@ -60,14 +67,6 @@ def running_footer(title: str, origin: tuple[tuple[str, str], ...]) -> str:
         if name in ("Patient", "Reference", "Date")
     ]
     return " · ".join([title, *shown])
-
-
-SUFFIXES = (".html", ".pdf")
-PANGO_PACKAGES = ("libpango-1.0-0", "libpangoft2-1.0-0", "libharfbuzz-subset0")
-"""Debian packages of the system libraries that WeasyPrint loads."""
-
-WRITING_START_FRACTION = 0.85
-"""Progress fraction at which computation ends and writing begins."""
 
 
 class ReportError(RuntimeError):

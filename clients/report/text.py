@@ -59,6 +59,41 @@ SOURCES = {
     "cataract": "J Ophthalmol 2017:5649532: straylight of cataracts before surgery",
 }
 
+DESIGNS = {
+    "monofocal": "monofocal",
+    "bifocal": "bifocal",
+    "trifocal": "trifocal",
+    "edof": "extended depth of focus",
+    "zones": "zones of several powers",
+}
+STRAIGHT_DEG = 0.5
+IMPLANT_LIMITS = (
+    "Intraocular lens: it acts as a phase in the pupil. Wavefront maps and "
+    "coefficients exclude it and the cornea's spherical aberration, and the section "
+    "shows the eye model with its natural lens; point images, contrast, acuity and "
+    "charts include both."
+)
+COMPUTED_BY = ("eye estimated", "eye as given", "focus traced", "aberrations traced")
+"""Prefixes of notes on the computation, which `_model_text` replaces."""
+
+POOR_FIT = "eye estimated poorly"
+REPLACEMENTS = {
+    "+-": "±",
+    " um": " µm",
+    " deg ": "° ",
+    "vertex_mm is missing: the powers of spectacles need it, usually 12 to 14 mm": (
+        "no vertex distance was given; powers of spectacles usually refer to a lens "
+        "12 to 14 mm in front of it"
+    ),
+}
+OPTION_HINT = '; "higher_order"'
+"""Start of the part of a note that names an option of the profile."""
+
+WELL_DETERMINED = 0.5
+"""Fraction of the prior's variance that a measurement must remove."""
+
+MEASURED, TYPICAL, STATED, EXAMPLE = "measured", "assumed", "entered", "example"
+
 
 class Citations:
     """Numbers the sources in the order of citation."""
@@ -79,23 +114,6 @@ class Citations:
         return tuple(
             f"[{k + 1}] {SOURCES[name]}." for k, name in enumerate(self._names)
         )
-
-
-DESIGNS = {
-    "monofocal": "monofocal",
-    "bifocal": "bifocal",
-    "trifocal": "trifocal",
-    "edof": "extended depth of focus",
-    "zones": "zones of several powers",
-}
-STRAIGHT_DEG = 0.5
-
-IMPLANT_LIMITS = (
-    "Intraocular lens: it acts as a phase in the pupil. Wavefront maps and "
-    "coefficients exclude it and the cornea's spherical aberration, and the section "
-    "shows the eye model with its natural lens; point images, contrast, acuity and "
-    "charts include both."
-)
 
 
 def short_text(lens: Prescription) -> str:
@@ -241,23 +259,6 @@ def _eye_at_gaze(gaze_deg: tuple[float, float]) -> str:
     return f"an eye that is {gaze_text(gaze_deg)}"
 
 
-COMPUTED_BY = ("eye estimated", "eye as given", "focus traced", "aberrations traced")
-"""Prefixes of notes on the computation, which `_model_text` replaces."""
-POOR_FIT = "eye estimated poorly"
-
-REPLACEMENTS = {
-    "+-": "±",
-    " um": " µm",
-    " deg ": "° ",
-    "vertex_mm is missing: the powers of spectacles need it, usually 12 to 14 mm": (
-        "no vertex distance was given; powers of spectacles usually refer to a lens "
-        "12 to 14 mm in front of it"
-    ),
-}
-OPTION_HINT = '; "higher_order"'
-"""Start of the part of a note that names an option of the profile."""
-
-
 def method_text(study: EyeStudy) -> tuple[str, ...]:
     """Return sentences on how the eye was computed and what its powers refer to."""
     notes = (n for n in study.field.notes if not n.startswith(COMPUTED_BY))
@@ -317,12 +318,6 @@ def _plain_text(note: str) -> str:
     for technical, plain in REPLACEMENTS.items():
         text = text.replace(technical, plain)
     return text.replace(" -", " −")
-
-
-WELL_DETERMINED = 0.5
-"""Fraction of the prior's variance that a measurement must remove."""
-
-MEASURED, TYPICAL, STATED, EXAMPLE = "measured", "assumed", "entered", "example"
 
 
 def provenance_table(
