@@ -17,7 +17,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from typing import Annotated, Any, Literal
 
@@ -207,17 +207,12 @@ def looking_naturally(
     for frame in frames:
         height_px, width_px = frame.depth_m.shape
         camera = Camera(width_px, height_px, frame.tangents)
-        distance_m = distance_at(
-            frame.depth_m, camera, frame.gaze_deg or STRAIGHT_AHEAD
-        )
-        light_cd_m2 = luminance_cd_m2(frame.color, white_cd_m2)
+        gaze_deg = frame.gaze_deg or STRAIGHT_AHEAD
+        distance_m = distance_at(frame.depth_m, camera, gaze_deg)
         vergence_dpt = 0.0 if distance_m is None else 1.0 / distance_m
+        light_cd_m2 = luminance_cd_m2(frame.color, white_cd_m2)
         state = eye.look(light_cd_m2, vergence_dpt, clock())
-        yield replace(
-            frame,
-            pupil_diameter_mm=state.pupil_diameter_mm,
-            focus_dpt=state.focus_dpt,
-        )
+        yield replace(frame, **asdict(state))
 
 
 def stream(
@@ -225,7 +220,7 @@ def stream(
     frames: Iterator[SceneFrame],
     log: FrameLog,
     show: Show | None = None,
-    learn: Learn = lambda asked_dpt, used_dpt: None,
+    learn: Learn | None = None,
 ) -> int:
     """Submit frames as they are rendered until they end or the window closes.
 
@@ -239,7 +234,7 @@ def stream(
         Receives the statistics of the frames.
     show : callable, optional
         Called with (input, filtered, title) for each result; False ends the stream.
-    learn : callable
+    learn : callable, optional
         Called with the focus that a frame requested and the focus that was used.
 
     Returns
@@ -271,7 +266,7 @@ def _handle_replies(
     sent: dict[int, SceneFrame],
     log: FrameLog,
     show: Show | None,
-    learn: Learn,
+    learn: Learn | None,
     *,
     timeout_s: float,
 ) -> bool:
@@ -289,7 +284,8 @@ def _handle_replies(
         elif isinstance(event, FilteredFrame):
             log.add(event)
             frame = sent.pop(event.frame_id)
-            learn(frame.focus_dpt, event.focus_dpt)
+            if learn is not None:
+                learn(frame.focus_dpt, event.focus_dpt)
             if show is not None:
                 is_open = show(frame.color, event.color, _title(event)) and is_open
     return is_open
@@ -325,17 +321,17 @@ def run(options: StreamOptions) -> dict[str, Any]:
         if reach_deg:
             frames = looking_around(frames, reach_deg)
             settings["gaze_range_deg"] = (reach_deg, 0.5 * reach_deg)
-        learn: dict[str, Learn] = {}
         if eye is not None:
             frames = looking_naturally(frames, eye)
             settings |= NATURAL_RANGES
-            learn = {"learn": eye.learn}
         first = next(frames)
         if show is not None:
             show(first.color, np.zeros_like(first.color), "ocufilter   preparing")
         for side, profile in profiles.items():
             client.set_profile(profile, eye=side, settings=settings, views=[first.view])
-        n_sent = stream(client, chain([first], frames), log, show, **learn)
+        n_sent = stream(
+            client, chain([first], frames), log, show, eye.learn if eye else None
+        )
     return {"sent": n_sent, **log.summary()}
 
 

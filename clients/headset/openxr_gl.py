@@ -12,7 +12,7 @@ import ctypes
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from ctypes import POINTER, byref, c_int, c_uint, c_ulong, c_void_p
 from typing import Any, cast
 
@@ -68,15 +68,13 @@ def open_context() -> Iterator[moderngl.Context]:
 
 def _wanted() -> str:
     wanted = os.environ.get(GRAPHICS_VARIABLE, "")
-    if wanted in ("egl", "glx"):
-        return wanted
-    if wanted:
+    if wanted not in ("", "egl", "glx"):
         raise ValueError(f"{GRAPHICS_VARIABLE} is {wanted!r}; allowed: egl, glx")
-    try:
-        offered = offered_extensions()
-    except xr.XrException:
-        return "egl"
-    return "egl" if EGL_ENABLE in offered else "glx"
+    if not wanted:
+        wanted = "egl"  # also if there is no runtime yet
+        with suppress(xr.XrException):
+            wanted = "egl" if EGL_ENABLE in offered_extensions() else "glx"
+    return wanted
 
 
 @contextmanager
@@ -391,15 +389,18 @@ class StereoImages:
     ) -> None:
         offered = list(xr.enumerate_swapchain_formats(session))
         usage = xr.SwapchainUsageFlags
-        color = _first_of(_COLOR_FORMATS, offered)
-        depth = _first_of(_DEPTH_FORMATS, offered) if with_depth else None
         self._color, self._depth = (
-            [_Swapchain(session, kind, bit, size_px) for _ in range(2)]
-            if kind is not None
-            else []
-            for kind, bit in (
-                (color, usage.COLOR_ATTACHMENT_BIT),
-                (depth, usage.DEPTH_STENCIL_ATTACHMENT_BIT),
+            [
+                _Swapchain(session, kind, bit, size_px)
+                for kind in [k for k in formats if k in offered][:1]
+                for _ in range(2)
+            ]
+            for formats, bit in (
+                (_COLOR_FORMATS, usage.COLOR_ATTACHMENT_BIT),
+                (
+                    _DEPTH_FORMATS if with_depth else (),
+                    usage.DEPTH_STENCIL_ATTACHMENT_BIT,
+                ),
             )
         )
         if not self._color:
@@ -407,13 +408,9 @@ class StereoImages:
                 f"the runtime offers the color formats {offered}; expected one of "
                 f"{_COLOR_FORMATS}"
             )
+        self.has_depth = bool(self._depth)
         self._framebuffers = Framebuffers(context)
         self._presenter = Presenter(context, size_px)
-
-    @property
-    def has_depth(self) -> bool:
-        """Return whether depth is submitted."""
-        return bool(self._depth)
 
     def release(self) -> None:
         """Free the OpenGL objects and the swapchains."""
@@ -457,10 +454,6 @@ class StereoImages:
                 )
             )
         return xr.CompositionLayerProjection(space=space, views=views), kept
-
-
-def _first_of(wanted: Sequence[int], offered: Sequence[int]) -> int | None:
-    return next((kind for kind in wanted if kind in offered), None)
 
 
 def posef(pose: Pose) -> xr.Posef:

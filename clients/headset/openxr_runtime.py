@@ -50,11 +50,24 @@ _END_S = 3.0
 _TRACKED = (
     xr.ViewStateFlags.POSITION_VALID_BIT | xr.ViewStateFlags.ORIENTATION_VALID_BIT
 )
+_LOCATED = (
+    xr.SpaceLocationFlags.POSITION_VALID_BIT
+    | xr.SpaceLocationFlags.ORIENTATION_VALID_BIT
+)
 _WORDS = {
     xr.SessionState.FOCUSED: "the headset shows this program",
     xr.SessionState.VISIBLE: "the headset shows this program without input",
     xr.SessionState.SYNCHRONIZED: "the headset is not worn",
     xr.SessionState.STOPPING: "the headset is ending the session",
+}
+
+_REASONS: dict[type[Exception], str] = {
+    xr.RuntimeUnavailableError: "no OpenXR runtime is set up here: install one, such "
+    "as Monado or SteamVR, or set XR_RUNTIME_JSON to its file",
+    xr.RuntimeFailureError: "the OpenXR runtime does not respond; is its service "
+    "running?",
+    xr.FormFactorUnavailableError: "the OpenXR runtime found no headset; is it "
+    "connected and switched on?",
 }
 
 log = logging.getLogger("ocufilter.headset")
@@ -126,7 +139,13 @@ class OpenXrRuntime:
         needed = self._platform.extensions
         missing = [name for name in needed if name not in offered]
         if missing:
-            raise NoRuntime(_lacks(missing))
+            words = f"the OpenXR runtime does not support {', '.join(missing)}"
+            if missing == [EGL_ENABLE]:
+                words += (
+                    "; start it before this program, or set "
+                    f"{GRAPHICS_VARIABLE}=glx, which requires an X display"
+                )
+            raise NoRuntime(words)
         optional = [name for name in (_DEPTH, EYE_GAZE) if name in offered]
         self._instance = xr.create_instance(
             xr.InstanceCreateInfo(
@@ -153,9 +172,8 @@ class OpenXrRuntime:
         self._actions = Actions(
             self._instance, self._session, with_gaze=self.tracks_eyes
         )
-        self.notes = []
-        if not self.tracks_eyes:
-            self.notes.append("no eye tracker; gaze is straight ahead")
+        lost = "no eye tracker; gaze is straight ahead"
+        self.notes = [] if self.tracks_eyes else [lost]
         with self._context:
             self._images = StereoImages(
                 self._session,
@@ -163,6 +181,7 @@ class OpenXrRuntime:
                 self.size_px,
                 with_depth=_DEPTH in optional,
             )
+        self.has_depth = self._images.has_depth
         self._closing.callback(self._release_images)
 
     def _size(self) -> tuple[int, int]:
@@ -224,11 +243,6 @@ class OpenXrRuntime:
         )
         return bool(eyes.supports_eye_gaze_interaction)
 
-    @property
-    def has_depth(self) -> bool:
-        """Return whether depth is submitted to the compositor."""
-        return self._images.has_depth
-
     # Frames
 
     @_or_lost
@@ -263,14 +277,14 @@ class OpenXrRuntime:
     def end_frame(self, due: DueFrame, shown: Sequence[ShownView]) -> None:
         """Show a frame; show nothing if ``shown`` is empty."""
         with self._context:
-            kept: list[xr.CompositionLayerDepthInfoKHR]
-            layers, kept = [], []
+            layers: list[Any] = []
+            kept = None  # the layer points to it until the frame has ended
             if shown:
                 layer, kept = self._images.layer(self._room, shown)
                 layers = [ctypes.byref(layer)]
             info = xr.FrameEndInfo(due.display_time_ns, self._blend, layers=layers)
             xr.end_frame(self._session, info)
-            del kept  # the layer points to it until here
+            del kept
 
     def _views(self, time_ns: int) -> tuple[EyeView, ...]:
         state, views = xr.locate_views(
@@ -285,9 +299,7 @@ class OpenXrRuntime:
 
     def _head_pose(self, time_ns: int) -> Pose | None:
         location = xr.locate_space(self._head, self._room, time_ns)
-        flags = xr.SpaceLocationFlags
-        wanted = int(flags.POSITION_VALID_BIT | flags.ORIENTATION_VALID_BIT)
-        if int(location.location_flags) & wanted != wanted:
+        if int(location.location_flags) & int(_LOCATED) != int(_LOCATED):
             return None
         return pose_of(location.pose)
 
@@ -355,26 +367,10 @@ def _quietly(release: Callable[..., Any], *arguments: Any) -> None:
         log.debug("%s: %s", getattr(release, "__name__", release), error)
 
 
-def _lacks(missing: Sequence[str]) -> str:
-    words = f"the OpenXR runtime does not support {', '.join(missing)}"
-    if missing == [EGL_ENABLE]:
-        words += (
-            "; start it before this program, or set "
-            f"{GRAPHICS_VARIABLE}=glx, which requires an X display"
-        )
-    return words
-
-
 def _explained(error: Exception) -> str:
-    if isinstance(error, xr.RuntimeUnavailableError):
-        return (
-            "no OpenXR runtime is set up here: install one, such as Monado or SteamVR, "
-            "or set XR_RUNTIME_JSON to its file"
-        )
-    if isinstance(error, xr.RuntimeFailureError):
-        return "the OpenXR runtime does not respond; is its service running?"
-    if isinstance(error, xr.FormFactorUnavailableError):
-        return "the OpenXR runtime found no headset; is it connected and switched on?"
+    for kind, reason in _REASONS.items():
+        if isinstance(error, kind):
+            return reason
     return f"{type(error).__name__}: {error}"
 
 
@@ -453,9 +449,9 @@ class Actions:
             state = xr.get_action_state_boolean(
                 self._session, xr.ActionStateGetInfo(action)
             )
-            if state.is_active and state.changed_since_last_sync:
-                if state.current_state:
-                    pressed.append(name)
+            is_new = state.is_active and state.changed_since_last_sync
+            if is_new and state.current_state:
+                pressed.append(name)
         return tuple(pressed)
 
     def gaze(self, head_space: xr.Space, time_ns: int) -> GazeSample | None:

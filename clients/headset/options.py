@@ -1,4 +1,4 @@
-"""Options of both eyes, as `ocufilter headset` and `layer` have them."""
+"""Both eyes of `ocufilter headset` and `layer`: options, profiles, range of gaze."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ from typing import Annotated, Any
 
 import typer
 
-from clients.commands.options import read_object, read_profile
+from clients.commands.options import profile_title, read_object, read_profile
 from clients.headset.runtime import EYES, Eye
+from clients.headset.stereo_filter import Say, StereoFilter
+from clients.headset.stereo_gaze import StereoGaze
 from clients.natural_eye import USUAL_AGE_YEARS, USUAL_WHITE_CD_M2
 from filter_service import FilterSettings
 
@@ -121,3 +123,62 @@ def profiles_of(options: EyeOptions) -> dict[Eye, Mapping[str, Any]]:
         )
         for eye in EYES
     }
+
+
+class Eyes:
+    """Profiles and range of gaze of both eyes, which change while frames are filtered.
+
+    Parameters
+    ----------
+    options : EyeOptions
+    settings : FilterSettings
+        Settings of the filter.
+    seeing : StereoFilter
+        Filter that is told of each change.
+    look : StereoGaze
+        Gaze, focus and pupils.
+    say : callable
+        Called with each message for the user, one line.
+
+    Raises
+    ------
+    ValueError
+        If a profile cannot be read.
+    """
+
+    def __init__(
+        self,
+        options: EyeOptions,
+        settings: FilterSettings,
+        seeing: StereoFilter,
+        look: StereoGaze,
+        say: Say,
+    ) -> None:
+        self.profiles = profiles_of(options)
+        self._is_range_given = options.gaze_range is not None
+        self._settings, self._say = settings, say
+        self._seeing, self._look = seeing, look
+        self._is_begun = False
+
+    def begin(self, *, tracks_eyes: bool) -> None:
+        """Request both eyes, again if the range of gaze changes.
+
+        An eye tracker has `TRACKED_RANGE_DEG` unless the user gives a range.
+        """
+        reach_deg = self._settings.gaze_range_deg
+        if tracks_eyes and not self._is_range_given and not any(reach_deg):
+            reach_deg = TRACKED_RANGE_DEG
+        if self._is_begun and reach_deg == self._look.gaze_range_deg:
+            return
+        self._is_begun = True
+        self._look.gaze_range_deg = reach_deg
+        self._seeing.settings = self._settings.changed(gaze_range_deg=reach_deg)
+        for eye, profile in self.profiles.items():
+            self.change(eye, profile)
+
+    def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
+        """Request another eye."""
+        self.profiles[eye] = profile
+        self._look.change(eye)
+        self._seeing.change(eye, profile)
+        self._say(f"{eye} eye: {profile_title(profile)}")

@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import typer
 
-from clients.commands.options import profile_title, read_size_px, with_options
+from clients.commands.options import read_size_px, with_options
 from clients.headset.options import (
-    TRACKED_RANGE_DEG,
     EyeOptions,
+    Eyes,
     profiles_of,
     settings_of,
 )
-from clients.headset.runtime import Eye, NoRuntime, Runtime, ShownView, upright
+from clients.headset.runtime import NoRuntime, Runtime, ShownView, upright
 from clients.headset.stereo_filter import LocalFilter, ServiceFilter, StereoFilter
 from clients.headset.stereo_gaze import StereoGaze
 from clients.headset.viewer import HELP, Controls, TerminalKeys, Viewer, ViewerLog
@@ -143,15 +143,6 @@ def say(line: str) -> None:
     print(f"headset: {printable(line)}", file=sys.stderr, flush=True)
 
 
-def gaze_range_of(
-    settings: FilterSettings, runtime: Runtime, *, is_given: bool
-) -> tuple[float, float]:
-    """Return the gaze range in deg: as given, or a default for eye trackers."""
-    if runtime.tracks_eyes and not is_given and not any(settings.gaze_range_deg):
-        return TRACKED_RANGE_DEG
-    return settings.gaze_range_deg
-
-
 def scenery_of(options: HeadsetOptions, context: moderngl.Context) -> Any:
     """Return the renderer of both eyes' images: the built-in one or the user's.
 
@@ -191,39 +182,11 @@ def scene_of(name: str) -> tuple[Scene, Array]:
     return scene, upright(viewpoint(scene))
 
 
-@dataclass
-class _Eyes:
-    """Requested profiles and gaze of both eyes."""
-
-    settings: FilterSettings
-    is_range_given: bool
-    look: StereoGaze
-    seeing: StereoFilter
-    profiles: dict[Eye, Mapping[str, Any]]
-    is_begun: bool = False
-
-    def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
-        """Request another eye."""
-        self.look.change(eye)
-        self.seeing.change(eye, profile)
-        say(f"{eye} eye: {profile_title(profile)}")
-
-    def begin(self, runtime: Runtime) -> None:
-        """Request both eyes once the gaze range is known, and when it changes."""
-        reach_deg = gaze_range_of(self.settings, runtime, is_given=self.is_range_given)
-        if self.is_begun and reach_deg == self.look.gaze_range_deg:
-            return
-        self.is_begun = True
-        self.look.gaze_range_deg = reach_deg
-        self.seeing.settings = self.settings.changed(gaze_range_deg=reach_deg)
-        for eye, profile in self.profiles.items():
-            self.change(eye, profile)
-
-
 def run(options: HeadsetOptions) -> dict[str, Any]:
     """Show the scene until the user or a limit ends it; return a report."""
     options.check()
-    settings, profiles = settings_of(options), profiles_of(options)
+    settings = settings_of(options)
+    profiles_of(options)  # which may be wrong
     size_px = read_size_px(options.size or "448x504")
     look = StereoGaze(
         age_years=options.age,
@@ -240,9 +203,8 @@ def run(options: HeadsetOptions) -> dict[str, Any]:
         scenery = scenery_of(options, context)
         stack.callback(getattr(scenery, "close", lambda: None))
         seeing = _seeing(options, settings, context, stack)
-        is_range_given = options.gaze_range is not None
-        eyes = _Eyes(settings, is_range_given, look, seeing, profiles)
-        controls = Controls(profiles, eyes.change, say)
+        eyes = Eyes(options, settings, seeing, look, say)
+        controls = Controls(eyes.profiles, eyes.change, say)
         viewer = Viewer(
             lambda: _runtime(options, context, size_px, pictures),
             scenery,
@@ -251,7 +213,7 @@ def run(options: HeadsetOptions) -> dict[str, Any]:
             controls,
             read_keys=stack.enter_context(TerminalKeys()).pressed,
             say=say,
-            on_session=eyes.begin,
+            on_session=lambda runtime: eyes.begin(tracks_eyes=runtime.tracks_eyes),
         )
         took_s = _view(viewer, controls, options)
         if options.out is not None:

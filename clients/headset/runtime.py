@@ -140,10 +140,8 @@ class ShownView:
     def size_px(self) -> tuple[int, int]:
         """Return width and height of the image."""
         if isinstance(self.color, np.ndarray):
-            height_px, width_px = self.color.shape[:2]
-            return width_px, height_px
-        width_px, height_px = self.color.size
-        return width_px, height_px
+            return self.color.shape[1], self.color.shape[0]
+        return self.color.size
 
 
 class Runtime(Protocol):
@@ -333,8 +331,6 @@ class SimulatedRuntime:
     """
 
     name = "simulated headset"
-    notes: Sequence[str] = ()
-    has_depth = True
 
     def __init__(
         self,
@@ -372,8 +368,11 @@ class SimulatedRuntime:
         if happening.is_paused:
             time.sleep(self._period_s)
             return None
-        self._wait()
-        at_s = self._next_s
+        # Sleep until the next frame of the display; skip missed frames.
+        now_s = time.monotonic() - self._start_s
+        missed = math.floor((now_s - self._next_s) / self._period_s)
+        at_s = self._next_s = self._next_s + self._period_s * (1 + max(0, missed))
+        time.sleep(max(0.0, at_s - now_s))
         head = self._head_at(at_s)
         gaze = happening.gaze_deg
         pressed, happening.pressed = tuple(happening.pressed), []
@@ -389,13 +388,6 @@ class SimulatedRuntime:
         )
         return self._begun
 
-    def _wait(self) -> None:
-        """Sleep until the next frame of the display; skip missed frames."""
-        now_s = time.monotonic() - self._start_s
-        missed = math.floor((now_s - self._next_s) / self._period_s)
-        self._next_s += self._period_s * (1 + max(0, missed))
-        time.sleep(max(0.0, self._next_s - now_s))
-
     def end_frame(self, due: DueFrame, shown: Sequence[ShownView]) -> None:
         """Show a frame."""
         if due is not self._begun:
@@ -406,11 +398,9 @@ class SimulatedRuntime:
         for view in shown:
             if view.size_px != self.size_px:
                 raise ValueError(f"color of {view.size_px}; expected {self.size_px}")
-            depth_m, (width, height) = view.depth_m, self.size_px
-            if isinstance(depth_m, np.ndarray) and depth_m.shape != (height, width):
-                raise ValueError(
-                    f"depth of shape {depth_m.shape}; expected {(height, width)}"
-                )
+            depth_m, shape = view.depth_m, self.size_px[::-1]
+            if isinstance(depth_m, np.ndarray) and depth_m.shape != shape:
+                raise ValueError(f"depth of shape {depth_m.shape}; expected {shape}")
         self._finish()
         if self._on_shown is not None:
             self._on_shown(due, shown)
@@ -424,13 +414,9 @@ def eye_views(head: Pose) -> tuple[EyeView, EyeView]:
     matrix = matrix_of(head)
     left, right, up, down = (math.tan(math.radians(e)) for e in LEFT_EDGES_DEG)
     found = []
-    for eye, side, tangents in zip(
-        EYES,
-        (-0.5, 0.5),
-        ((left, right, up, down), (-right, -left, up, down)),
-        strict=True,
+    for eye, side, edges in zip(
+        EYES, (-0.5, 0.5), ((left, right), (-right, -left)), strict=True
     ):
-        place = matrix[:3, 3] + matrix[:3, 0] * side * EYE_DISTANCE_M
-        x, y, z = (float(value) for value in place)
-        found.append(EyeView(eye, (x, y, z, *head[3:]), tangents))
+        x, y, z = (matrix[:3, 3] + matrix[:3, 0] * side * EYE_DISTANCE_M).tolist()
+        found.append(EyeView(eye, (x, y, z, *head[3:]), (*edges, up, down)))
     return found[0], found[1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -51,12 +51,13 @@ class SceneScenery:
         self, views: Sequence[EyeView], size_px: tuple[int, int]
     ) -> tuple[TexturePicture, ...]:
         """Render the image of each eye; the next call overwrites the images."""
-        found = []
-        for number, view in enumerate(views):
-            pose = self._stand @ matrix_of(view.pose)
-            image = self._view_of(size_px).draw(pose, view.tangents, image=number)
-            found.append(TexturePicture(view, image))
-        return tuple(found)
+        images = [
+            self._view_of(size_px).draw(
+                self._stand @ matrix_of(view.pose), view.tangents, image=number
+            )
+            for number, view in enumerate(views)
+        ]
+        return tuple(map(TexturePicture, views, images))
 
     def _view_of(self, size_px: tuple[int, int]) -> SceneView:
         if self._view is None or self._view.size_px != size_px:
@@ -99,17 +100,18 @@ class Presenter:
     def __init__(self, context: moderngl.Context, size_px: tuple[int, int]) -> None:
         self._context = context
         self._size_px = size_px
-        names = ("resolve.vert", "present.frag")
-        vertex, fragment = ((_ASSETS / name).read_text("utf-8") for name in names)
-        self._program = context.program(vertex_shader=vertex, fragment_shader=fragment)
-        self._triangle = context.vertex_array(self._program, [])
+        vertex = (_ASSETS / "resolve.vert").read_text("utf-8")
+        fragment = (_ASSETS / "present.frag").read_text("utf-8")
+        program: Any = context.program(vertex_shader=vertex, fragment_shader=fragment)
+        self._program = program
+        self._triangle = context.vertex_array(program, [])
         self._seen = context.texture(size_px, 3, alignment=1)
         self._plain = context.texture(size_px, 3, alignment=1)
         self._depth_m = context.texture(size_px, 1, dtype="f4")
         for unit, name in enumerate(("seen", "plain", "depth_m")):
-            cast("moderngl.Uniform", self._program[name]).value = unit
-        cast("moderngl.Uniform", self._program["near_m"]).value = NEAR_M
-        cast("moderngl.Uniform", self._program["size_px"]).value = size_px
+            program[name].value = unit
+        program["near_m"].value = NEAR_M
+        program["size_px"].value = size_px
 
     def release(self) -> None:
         """Free the OpenGL objects."""
@@ -123,11 +125,11 @@ class Presenter:
         """Draw color and depth of a view into a framebuffer."""
         seen = _in_texture(shown.color, self._seen)
         depth_m = _in_texture(shown.depth_m, self._depth_m)
-        ratio = 0.0 if shown.plain is None else shown.plain_ratio
-        plain = self._plain
-        if shown.plain is not None and ratio > 0.0:
+        plain, ratio = self._plain, 0.0
+        if shown.plain is not None and shown.plain_ratio > 0.0:
             plain = _in_texture(shown.plain, self._plain)
-        cast("moderngl.Uniform", self._program["plain_ratio"]).value = ratio
+            ratio = shown.plain_ratio
+        self._program["plain_ratio"].value = ratio
         context = self._context
         with context.scope(target, moderngl.DEPTH_TEST):
             context.depth_func = (

@@ -74,11 +74,10 @@ class ViewerLog:
     n_incomplete: int = 0
     notes: Notes = field(default_factory=dict)
 
-    def add(self, **times_ms: float) -> None:
+    def add(self, times_ms: Mapping[str, float]) -> None:
         """Record a filtered frame's times."""
         self.n_filtered += 1
-        if self.first_filtered_s is None:
-            self.first_filtered_s = time.monotonic()
+        self.first_filtered_s = self.first_filtered_s or time.monotonic()
         for name, value_ms in times_ms.items():
             self.stages_ms.setdefault(name, []).append(value_ms)
 
@@ -142,7 +141,7 @@ class Viewer:
         self._say = say
         self._on_session = on_session
         self._last: FilteredStereoFrame | None = None
-        self._was_tracked: bool | None = None
+        self._was_tracked = False
         self._was_stale = False
         self.log = ViewerLog()
 
@@ -286,24 +285,25 @@ class Viewer:
         self._look.learn(frame.pictures, frame.eyes, seen.used_focus_dpt)
         add_notes(self.log.notes, seen.notes)
         self.log.n_incomplete += not seen.is_complete
-        age_s = time.monotonic() - frame.begun_s
         scene_ms, look_ms, show_ms = times_ms.values()
+        age_ms = MS_PER_S * (time.monotonic() - frame.begun_s)
         self.log.add(
-            scene_ms=scene_ms,
-            look_ms=look_ms,
-            **seen.stages_ms,
-            show_ms=show_ms,
-            age_ms=MS_PER_S * age_s,
+            {
+                "scene_ms": scene_ms,
+                "look_ms": look_ms,
+                **seen.stages_ms,
+                "show_ms": show_ms,
+                "age_ms": age_ms,
+            }
         )
 
     def _tell_tracking(self) -> None:
-        is_tracked = self._look.is_tracked
-        if is_tracked != self._was_tracked:
-            before, self._was_tracked = self._was_tracked, is_tracked
-            if is_tracked:
-                self._say("eyes are tracked")
-            elif before:
-                self._say("the eye tracker lost the eyes: gaze is straight ahead")
+        is_tracked, before = self._look.is_tracked, self._was_tracked
+        self._was_tracked = is_tracked
+        if is_tracked and not before:
+            self._say("eyes are tracked")
+        elif before and not is_tracked:
+            self._say("the eye tracker lost the eyes: gaze is straight ahead")
 
 
 # Run-time switches

@@ -26,10 +26,6 @@ _DTYPES: dict[int, np.dtype[Any]] = {
     wire.LINEAR8: np.dtype(np.uint8),
     wire.LINEAR16F: np.dtype(np.float16),
 }
-OPAQUE: dict[np.dtype[Any], float] = {
-    np.dtype(np.uint8): 255,
-    np.dtype(np.float16): 1.0,
-}
 
 
 def check_frame(frame: wire.Frame) -> None:
@@ -42,9 +38,14 @@ def check_frame(frame: wire.Frame) -> None:
     if frame.color_format not in _DTYPES:
         raise ValueError(f"color format {frame.color_format}")
     for view in frame.views:
-        sides_px = view.color.width_px, view.color.height_px
-        if not all(1 <= side_px <= wire.MAX_SIDE_PX for side_px in sides_px):
-            raise ValueError(f"an image of {sides_px[0]}x{sides_px[1]} px")
+        width_px, height_px = view.color.width_px, view.color.height_px
+        if (
+            not 1
+            <= min(width_px, height_px)
+            <= max(width_px, height_px)
+            <= wire.MAX_SIDE_PX
+        ):
+            raise ValueError(f"an image of {width_px}x{height_px} px")
         if max(view.depth.width_px, view.depth.height_px) > wire.MAX_SIDE_PX:
             raise ValueError("a depth image is too large")
         if not all(map(math.isfinite, view.pose)):
@@ -113,9 +114,9 @@ class FrameImages:
         if depth_m is None:
             depth_m = np.full(color.shape[:2], flat_m, np.float32)
             away = "infinitely far" if math.isinf(flat_m) else f"{flat_m:g} m away"
-            note = f"{note}; everything is {away}"
-        left, right, up, down = given.tangents
-        view = EyeView(eye, given.pose, (left, right, max(up, down), min(up, down)))
+            note += f"; everything is {away}"
+        left, right, *edges = given.tangents
+        view = EyeView(eye, given.pose, (left, right, max(edges), min(edges)))
         return RgbdPicture(view, color, depth_m), note
 
     def _rows(self, index: int) -> slice:
@@ -128,11 +129,9 @@ class FrameImages:
             return None, "there is none"
         stated = DepthRange(given.min_depth, given.max_depth, given.near_m, given.far_m)
         meant, note = corrected_range(stated, self._engine)
-        depth_m, other_note = planar_depth(
-            np.ascontiguousarray(values[self._rows(index)]),
-            meant,
-            (given.color.width_px, given.color.height_px),
-        )
+        values = np.ascontiguousarray(values[self._rows(index)])
+        size_px = given.color.width_px, given.color.height_px
+        depth_m, other_note = planar_depth(values, meant, size_px)
         return depth_m, other_note or note
 
     def put(
@@ -151,11 +150,10 @@ class FrameImages:
             Fraction of the width, from the left, that stays unfiltered.
         """
         to = self._colors[index]
-        rows = self._rows(index)
         begin = round(plain_ratio * to.shape[1])
         if self._frame.color_format == wire.LINEAR8:
             color = _BYTE_OF_HALF[color.view(np.uint16)]
-        _copy_channels(to[rows, begin:], color[:, begin:])
+        _copy_channels(to[self._rows(index), begin:], color[:, begin:])
         # Runtimes ignore the alpha of a layer that is not blended; screenshots do not.
         if not self._frame.flags & wire.IS_BLENDED:
             to[..., 3] = 255 if to.dtype == np.uint8 else 1.0

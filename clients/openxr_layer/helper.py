@@ -13,13 +13,14 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
+import typer
 from numpy.typing import NDArray
 
-from clients.commands.options import profile_title, read_profile
+from clients.commands.options import read_profile
 from clients.frame_log import percentiles, without_numbers
-from clients.headset.options import TRACKED_RANGE_DEG, EyeOptions, profiles_of
+from clients.headset.options import EyeOptions, Eyes
 from clients.headset.runtime import (
     EYES,
     DueFrame,
@@ -33,12 +34,19 @@ from clients.headset.stereo_gaze import RgbdPicture, StereoGaze
 from clients.headset.viewer import SPLIT_RATIO
 from clients.openxr_layer import wire
 from clients.openxr_layer.frame_images import FrameImages, check_frame
-from clients.openxr_layer.wire import is_trusted, listening
+from clients.openxr_layer.wire import (
+    SOCKET_VARIABLE,
+    is_trusted,
+    listening,
+    socket_path,
+)
 from estimator.bounded_files import loads_bounded, printable
+from filter_service.command_line import check_range
 from filter_service.errors import FilterError
 from filter_service.shared_memory import Slot
 
 USUAL_AGE_MS = 150
+MAX_WAIT_MS = 600_000
 WAIT_S = 1.0
 """Period that is told to a service's filter, which waits for a result accordingly."""
 
@@ -55,26 +63,53 @@ MAX_WAITING = 64
 a layer and a command send their first message at once."""
 
 
-@dataclass(frozen=True)
-class HelperOptions:
-    """How frames are filtered.
+Socket = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="PATH",
+        help=f"Socket of the helper; by default ${SOCKET_VARIABLE}, or a file of this "
+        "user.",
+    ),
+]
 
-    Attributes
-    ----------
-    wait_ms : int
-        Longest wait of the program for the result of its frame.
-    max_age_ms : int
-        Age up to which a filtered frame is shown.
-    flat_dpt : float
-        Distance of everything in programs without depth, 1/m; 0 is infinity.
-    is_split : bool
-        Whether the left half stays unfiltered.
-    """
 
-    wait_ms: int = 0
-    max_age_ms: int = USUAL_AGE_MS
-    flat_dpt: float = 1.0
-    is_split: bool = False
+@dataclass(frozen=True, kw_only=True)
+class LayerOptions(EyeOptions):
+    """Options of `ocufilter layer run` and `serve`."""
+
+    flat_dpt: Annotated[
+        float,
+        typer.Option(
+            metavar="D",
+            help="Distance of everything in programs that submit no depth, dpt; 0 is "
+            "infinity.",
+        ),
+    ] = 1.0
+    wait_ms: Annotated[
+        int,
+        typer.Option(
+            metavar="MS",
+            help="Longest wait of the program for the result of each frame; 0 shows "
+            "the newest result.",
+        ),
+    ] = 0
+    max_age_ms: Annotated[
+        int,
+        typer.Option(
+            metavar="MS",
+            help="Age up to which a filtered frame is shown; then the program's own is "
+            "shown.",
+        ),
+    ] = USUAL_AGE_MS
+    split: Annotated[
+        bool, typer.Option("--split", help="Leave the left half unfiltered.")
+    ] = False
+    socket: Socket = None
+
+    @property
+    def socket_file(self) -> Path:
+        """Return the socket of the helper."""
+        return self.socket or socket_path()
 
     @property
     def longest_age_ms(self) -> int:
@@ -88,6 +123,18 @@ class HelperOptions:
     def flat_m(self) -> float:
         """Return the planar depth of programs without depth."""
         return 1.0 / self.flat_dpt if self.flat_dpt else float("inf")
+
+    def check(self) -> None:
+        """Check the limits.
+
+        Raises
+        ------
+        ValueError
+            If a value is out of range.  The message names the option.
+        """
+        check_range("--flat-dpt", self.flat_dpt, (0.0, 20.0))
+        check_range("--wait-ms", self.wait_ms, (0, MAX_WAIT_MS))
+        check_range("--max-age-ms", self.max_age_ms, (1, MAX_WAIT_MS))
 
 
 @dataclass(eq=False)
@@ -112,7 +159,7 @@ class LayerHelper:
         Gaze, focus and pupils.
     say : callable
         Called with each message for the user, one line.
-    options : HelperOptions
+    options : LayerOptions
     change : callable
         Called with (eye, profile text) by `ocufilter layer set`; raises `ValueError`.
     path : Path
@@ -129,7 +176,7 @@ class LayerHelper:
         seeing: StereoFilter,
         look: StereoGaze,
         say: Say,
-        options: HelperOptions,
+        options: LayerOptions,
         change: Callable[[Eye, str], None],
         path: Path,
     ) -> None:
@@ -363,7 +410,7 @@ class LayerHelper:
         if seen is None or seen.frame is not frame:
             return False
         for index, color in enumerate(seen.colors):
-            ratio = SPLIT_RATIO if self._options.is_split else 0.0
+            ratio = SPLIT_RATIO if self._options.split else 0.0
             images.put(index, cast("NDArray[Any]", color), ratio)  # as the input
         self._look.learn(pictures, eyes, seen.used_focus_dpt)
         took_ms = MS_PER_S * (time.monotonic() - begun_s)
@@ -442,40 +489,18 @@ def _stamp(path: Path) -> tuple[int, int] | None:
     return found.st_mtime_ns, found.st_size
 
 
-class Eyes:
-    """Profiles of both eyes, which change while frames are filtered.
+class WatchedEyes(Eyes):
+    """Eyes whose profiles may be files, which are read again when they change.
 
-    Parameters
-    ----------
-    options : EyeOptions
-    seeing : StereoFilter
-        Filter that is told of each change.
-    look : StereoGaze
-        Gaze, focus and pupils.
-    say : callable
-        Called with each message for the user, one line.
-
-    Raises
-    ------
-    ValueError
-        If a profile cannot be read.
+    The parameters are those of `Eyes`.
     """
 
-    def __init__(
-        self,
-        options: EyeOptions,
-        seeing: StereoFilter,
-        look: StereoGaze,
-        say: Say,
-    ) -> None:
-        self._seeing, self._look, self._say = seeing, look, say
+    def __init__(self, options: EyeOptions, *others: Any) -> None:
+        super().__init__(options, *others)
         self._files: dict[Eye, tuple[Path, tuple[int, int] | None]] = {}
         for eye in EYES:
             text = getattr(options, eye)
             self._watch(eye, options.profile if text is None else text)
-        self._profiles = profiles_of(options)
-        self._is_range_given = options.gaze_range is not None
-        self._request()
 
     def _watch(self, eye: Eye, text: str) -> None:
         """Watch the file of an eye's profile if it is one."""
@@ -484,20 +509,7 @@ class Eyes:
         if not text.lstrip().startswith("{") and path.is_file():
             self._files[eye] = path, _stamp(path)
 
-    def _request(self) -> None:
-        for eye, profile in self._profiles.items():
-            self._seeing.change(eye, profile)
-
-    def prepare_for_gaze(self) -> None:
-        """Prepare a range of gaze for an eye tracker, unless the user gave one."""
-        if self._is_range_given or any(self._look.gaze_range_deg):
-            return
-        self._look.gaze_range_deg = TRACKED_RANGE_DEG
-        settings = self._seeing.settings
-        self._seeing.settings = settings.changed(gaze_range_deg=TRACKED_RANGE_DEG)
-        self._request()
-
-    def change(self, eye: Eye, text: str) -> None:
+    def change_to(self, eye: Eye, text: str) -> None:
         """Change an eye's profile.
 
         Raises
@@ -507,10 +519,7 @@ class Eyes:
         """
         profile = read_profile(text, f"--{eye}")
         self._watch(eye, text)
-        self._profiles[eye] = profile
-        self._look.change(eye)
-        self._seeing.change(eye, profile)
-        self._say(f"{eye} eye: {profile_title(profile)}")
+        self.change(eye, profile)
 
     def reread(self) -> None:
         """Read the files that have changed."""
@@ -520,6 +529,6 @@ class Eyes:
                 continue
             self._files[eye] = path, stamp
             try:
-                self.change(eye, str(path))
+                self.change_to(eye, str(path))
             except ValueError as error:
                 self._say(f"{eye} eye is unchanged: {error}")

@@ -12,25 +12,28 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
 from clients.commands.options import read_profile, with_options
-from clients.headset.options import EyeOptions, profiles_of, settings_of
-from clients.openxr_layer.helper import USUAL_AGE_MS, Eyes, HelperOptions, LayerHelper
+from clients.headset.options import profiles_of, settings_of
+from clients.openxr_layer.helper import (
+    LayerHelper,
+    LayerOptions,
+    Socket,
+    WatchedEyes,
+)
 from clients.openxr_layer.wire import SOCKET_VARIABLE, ask, socket_path
 from estimator import ProfileError, parse_profile
 from estimator.bounded_files import printable
-from filter_service import FilterSettings
 from filter_service.atomic_files import replace_atomically
 from filter_service.command_line import (
     EXIT_FAILURE,
     CommandFailed,
     Json,
-    check_range,
     print_json,
     print_line,
     typer_app,
@@ -40,8 +43,6 @@ CHECK_S = 0.25
 """Period at which profile files and the program are looked at."""
 
 STOP_S = 5.0
-MAX_WAIT_MS = 600_000
-
 LAYER_NAME = "XR_APILAYER_ocufilter_eye"
 OFF_VARIABLE = "DISABLE_XR_APILAYER_OCUFILTER_EYE"
 LIBRARY_VARIABLE = "OCUFILTER_LAYER_LIBRARY"
@@ -55,15 +56,6 @@ def say(line: str) -> None:
     """Print a message for the user to stderr."""
     print(f"layer: {printable(line)}", file=sys.stderr, flush=True)
 
-
-Socket = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="PATH",
-        help=f"Socket of the helper; by default ${SOCKET_VARIABLE}, or a file of this "
-        "user.",
-    ),
-]
 
 layer = typer_app(
     help="""See another OpenXR program, unmodified, through simulated eyes.
@@ -82,63 +74,12 @@ layer = typer_app(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class LayerOptions(EyeOptions):
-    """Options of `run` and `serve`."""
-
-    flat_dpt: Annotated[
-        float,
-        typer.Option(
-            metavar="D",
-            help="Distance of everything in programs that submit no depth, dpt; 0 is "
-            "infinity.",
-        ),
-    ] = 1.0
-    wait_ms: Annotated[
-        int,
-        typer.Option(
-            metavar="MS",
-            help="Longest wait of the program for the result of each frame; 0 shows "
-            "the newest result.",
-        ),
-    ] = 0
-    max_age_ms: Annotated[
-        int,
-        typer.Option(
-            metavar="MS",
-            help="Age up to which a filtered frame is shown; then the program's own is "
-            "shown.",
-        ),
-    ] = USUAL_AGE_MS
-    split: Annotated[
-        bool, typer.Option("--split", help="Leave the left half unfiltered.")
-    ] = False
-    socket: Socket = None
-
-    @property
-    def socket_file(self) -> Path:
-        """Return the socket of the helper."""
-        return self.socket or socket_path()
-
-
-def _checked(options: LayerOptions) -> tuple[HelperOptions, FilterSettings]:
-    """Check the options before the engine is loaded."""
-    check_range("--flat-dpt", options.flat_dpt, (0.0, 20.0))
-    check_range("--wait-ms", options.wait_ms, (0, MAX_WAIT_MS))
-    check_range("--max-age-ms", options.max_age_ms, (1, MAX_WAIT_MS))
-    profiles_of(options)
-    return (
-        HelperOptions(
-            options.wait_ms, options.max_age_ms, options.flat_dpt, options.split
-        ),
-        settings_of(options),
-    )
-
-
 @contextlib.contextmanager
-def _helper(options: LayerOptions) -> Iterator[tuple[LayerHelper, Eyes]]:
+def _helper(options: LayerOptions) -> Iterator[tuple[LayerHelper, WatchedEyes]]:
     """Return the helper, which listens, and its eyes."""
-    helper_options, settings = _checked(options)
+    options.check()
+    settings = settings_of(options)
+    profiles_of(options)  # which may be wrong, before the engine is loaded
     from clients.headset.stereo_filter import LocalFilter, ServiceFilter, StereoFilter
     from clients.headset.stereo_gaze import StereoGaze
 
@@ -155,11 +96,12 @@ def _helper(options: LayerOptions) -> Iterator[tuple[LayerHelper, Eyes]]:
     else:
         seeing = LocalFilter(settings, say)
     with contextlib.closing(seeing):
-        eyes = Eyes(options, seeing, look, say)
+        eyes = WatchedEyes(options, settings, seeing, look, say)
+        eyes.begin(tracks_eyes=False)
         helper = LayerHelper(
-            seeing, look, say, helper_options, eyes.change, options.socket_file
+            seeing, look, say, options, eyes.change_to, options.socket_file
         )
-        helper.on_gaze = eyes.prepare_for_gaze
+        helper.on_gaze = partial(eyes.begin, tracks_eyes=True)
         with contextlib.closing(helper):
             yield helper, eyes
 
@@ -210,7 +152,9 @@ def run(
     """
     if not program:
         raise ValueError("there is no program; put it after --")
-    _checked(options)
+    options.check()
+    settings_of(options)
+    profiles_of(options)
     path = _library()
     ending = _Ending()
     with _helper(options) as (helper, eyes), tempfile.TemporaryDirectory() as folder:

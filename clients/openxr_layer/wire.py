@@ -79,7 +79,7 @@ class View(ctypes.Structure):
     @property
     def tangents(self) -> tuple[float, float, float, float]:
         """Return the tangents of the angles to the edges: left, right, up, down."""
-        left, right, up, down = (math.tan(angle) for angle in self.fov_rad)
+        left, right, up, down = map(math.tan, self.fov_rad)
         return left, right, up, down
 
 
@@ -147,11 +147,8 @@ MAX_ANSWER_BYTES = 1 << 20
 
 def socket_path() -> Path:
     """Return where the layer looks for its helper, as source/link.c does."""
-    given = os.environ.get(SOCKET_VARIABLE)
-    if given:
-        return Path(given)
     folder = os.environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.getuid()}"
-    return Path(folder) / SOCKET_NAME
+    return Path(os.environ.get(SOCKET_VARIABLE) or Path(folder) / SOCKET_NAME)
 
 
 def ask(
@@ -211,5 +208,4 @@ def is_trusted(connection: socket.socket) -> bool:
     """Whether the peer is a process of this user, or of root."""
     size = struct.calcsize("3i")
     peer = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size)
-    _, user, _ = struct.unpack("3i", peer)
-    return user in (0, os.getuid())
+    return struct.unpack("3i", peer)[1] in (0, os.getuid())

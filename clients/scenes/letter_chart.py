@@ -125,18 +125,21 @@ def letter_chart(
     sizes = [letter_height(value) for value in log_mar]
     middles = _middles(sizes)
     _check_fits(camera, texts, sizes, middles)
+    up, per_px = camera.tangents[2], camera.pixel_pitch_mrad[1] / 1000.0
     ink = np.zeros((camera.height_px, camera.width_px))
-    for text, size, middle in zip(texts, sizes, middles, strict=True):
+    rows = []
+    for text, value, size, middle in zip(texts, log_mar, sizes, middles, strict=True):
         for k, letter in enumerate(text):
             left = (2 * k - (len(text) - 0.5)) * size
             _draw(ink, camera, letter, size, left, middle - 0.5 * size)
-    return LetterChart(
-        view=_view(camera, ink, distance_m),
-        rows=tuple(
-            _row(camera, *row)
-            for row in zip(texts, log_mar, sizes, middles, strict=True)
-        ),
+        rows.append(ChartRow(text, value, size / per_px, (up - middle) / per_px))
+    gray = np.round(255.0 * srgb_from_linear(1.0 - ink)).astype(np.uint8)
+    view = RgbdView(
+        color=np.repeat(gray[..., None], 3, axis=2),
+        depth_m=np.full(gray.shape, distance_m, np.float32),
+        tangents=camera.tangents,
     )
+    return LetterChart(view, tuple(rows))
 
 
 def _check(distance_m: float, log_mar: Sequence[float], letters: Sequence[str]) -> None:
@@ -181,14 +184,6 @@ def _check_fits(
         )
 
 
-def _row(
-    camera: Camera, text: str, log_mar: float, size: float, middle: float
-) -> ChartRow:
-    up = camera.tangents[2]
-    per_px = camera.pixel_pitch_mrad[1] / 1000.0
-    return ChartRow(text, log_mar, size / per_px, (up - middle) / per_px)
-
-
 def _draw(
     ink: NDArray[Any],
     camera: Camera,
@@ -215,15 +210,6 @@ def _draw(
 def _pixels(start: float, size: float, pitch: float, count: int) -> NDArray[np.int64]:
     first, last = math.floor(start / pitch), math.floor((start + size) / pitch)
     return np.arange(max(first, 0), min(last + 1, count))
-
-
-def _view(camera: Camera, ink: NDArray[Any], distance_m: float) -> RgbdView:
-    gray = np.round(255.0 * srgb_from_linear(1.0 - ink)).astype(np.uint8)
-    return RgbdView(
-        color=np.repeat(gray[..., None], 3, axis=2),
-        depth_m=np.full(gray.shape, distance_m, np.float32),
-        tangents=camera.tangents,
-    )
 
 
 # The ten Sloan letters as shapes, five units high and wide.  A shape is a function of

@@ -10,7 +10,7 @@ import numpy as np
 
 from clients.headset.runtime import eye_views, still
 from clients.openxr_layer import wire
-from clients.openxr_layer.helper import HelperOptions, LayerHelper
+from clients.openxr_layer.helper import LayerHelper, LayerOptions
 from filter_service.shared_memory import Slot, aligned_starts
 
 TIMEOUT_S = 60.0
@@ -103,7 +103,7 @@ class RunningHelper:
     make_eyes : callable
         Returns its filter and its `StereoGaze`; its argument prints a line.
     **options
-        Those of `HelperOptions`.
+        Those of `LayerOptions`.
 
     Attributes
     ----------
@@ -142,7 +142,7 @@ class RunningHelper:
             with contextlib.closing(seeing):
                 self.helper = LayerHelper(
                     *(seeing, look, self.lines.append),
-                    *(HelperOptions(**self._options), self._change, self._path),
+                    *(LayerOptions(**self._options), self._change, self._path),
                 )
                 self._is_listening.set()
                 with contextlib.closing(self.helper):

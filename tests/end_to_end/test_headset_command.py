@@ -9,14 +9,15 @@ import time
 import numpy as np
 import pytest
 
-from clients.headset import program
-from clients.headset.options import EyeOptions, settings_of
+from clients.headset.options import EyeOptions, Eyes, settings_of
 from clients.headset.runtime import (
     Happening,
     SimulatedRuntime,
 )
+from clients.headset.stereo_gaze import StereoGaze
 from clients.service_process import CHECKOUT
 from tests.commands import run_command
+from tests.end_to_end.headset_doubles import Inverting
 
 
 def run_program(*arguments, **options):
@@ -165,11 +166,14 @@ def test_how_far_eyes_turn_follows_from_the_tracker_unless_it_is_told():
         ({"gaze_range": "0,0"}, with_tracker, (0.0, 0.0)),
         ({"settings": '{"gaze_range_deg": [5, 4]}'}, without, (5.0, 4.0)),
     ):
-        options = EyeOptions(**given)
-        settings = settings_of(options)
-        is_told = options.gaze_range is not None
-        found = program.gaze_range_of(settings, runtime, is_given=is_told)
-        assert found == expected
+        options, seeing = EyeOptions(**given), Inverting()
+        look = StereoGaze(age_years=30.0)
+        eyes = Eyes(options, settings_of(options), seeing, look, lambda line: None)
+        eyes.begin(tracks_eyes=runtime.tracks_eyes)
+        assert look.gaze_range_deg == seeing.settings.gaze_range_deg == expected
+        assert [eye for eye, _ in seeing.changes] == ["left", "right"]
+        eyes.begin(tracks_eyes=runtime.tracks_eyes)
+        assert len(seeing.changes) == 2, "the same range needs no other eye"
 
 
 @pytest.mark.slow

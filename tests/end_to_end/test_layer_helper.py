@@ -13,7 +13,7 @@ from clients.commands.options import profile_title
 from clients.headset.stereo_filter import LocalFilter
 from clients.headset.stereo_gaze import StereoGaze
 from clients.openxr_layer import program, wire
-from clients.openxr_layer.helper import MAX_WAITING, HelperOptions, LayerHelper
+from clients.openxr_layer.helper import MAX_WAITING, LayerHelper, LayerOptions
 from clients.openxr_layer.wire import ask
 from filter_service import Camera, EyeFilter, FilterSettings, RgbdView
 from filter_service.messages import body_of_eye
@@ -217,7 +217,7 @@ def test_views_that_are_upside_down(helper, path, connect):
 
 @pytest.mark.clients
 def test_without_depth_everything_is_at_the_flat_distance(path, connect):
-    with running_helper(path, flat_dpt=2.0, is_split=True) as helper:
+    with running_helper(path, flat_dpt=2.0, split=True) as helper:
         layer = connect()
         layer.welcome()
         color, depth_m, _ = stripes(6)
@@ -377,7 +377,7 @@ def test_notes_on_depth_are_not_repeated_for_other_numbers(helper, path, connect
 
 def test_one_helper_per_socket(helper, path, connect):
     with pytest.raises(OSError, match="another helper listens"):
-        LayerHelper(None, None, print, HelperOptions(), print, path)
+        LayerHelper(None, None, print, LayerOptions(), print, path)
     assert ask(path, {})["filtered"] == 0
 
 

@@ -189,7 +189,7 @@ def test_a_space_that_is_destroyed_while_its_frame_is_filtered(stage, moving_hea
 HELPER = """
 import sys
 from pathlib import Path
-from clients.openxr_layer.helper import HelperOptions, LayerHelper
+from clients.openxr_layer.helper import LayerOptions, LayerHelper
 from tests.openxr_layer.layered import (
     Inverting,
     frozen_look,
@@ -197,7 +197,7 @@ from tests.openxr_layer.layered import (
     layer_lines,
 )
 seeing, look = inverting_eyes(print)
-helper = LayerHelper(seeing, look, print, HelperOptions(), print, Path(sys.argv[1]))
+helper = LayerHelper(seeing, look, print, LayerOptions(), print, Path(sys.argv[1]))
 print("listening", flush=True)
 while True:
     helper.run_once(0.1)
