@@ -43,6 +43,7 @@ from clients.streaming import change_eye, filter_in_order
 from filter_service.atomic_files import replace_atomically
 from filter_service.command_line import CommandFailed, Json, print_json, print_line
 from filter_service.errors import FilterError, RenderFailed
+from filter_service.messages import State
 from filter_service.progress import Progress
 
 if TYPE_CHECKING:
@@ -165,8 +166,7 @@ class DemoFrame:
     @property
     def state(self) -> EyeState:
         """Return the state of the eye, for captions."""
-        pupil_mm, focus_dpt = self.rendered.pupil_diameter_mm, self.rendered.focus_dpt
-        return EyeState(self.scene.title(), pupil_mm, focus_dpt)
+        return EyeState(self.scene.title(), self.rendered.state)
 
 
 @dataclass
@@ -394,7 +394,7 @@ def _cell(
 def _used(requested: EyeState, seen: FilteredFrame) -> str:
     """Describe the state used, which far point and measured pupil may limit."""
     pupil_mm, focus_dpt = seen.pupil_diameter_mm, seen.focus_dpt
-    text = EyeState("", pupil_mm, focus_dpt).text()
+    text = EyeState("", State(pupil_mm, focus_dpt)).text()
     if focus_dpt > requested.focus_dpt + 0.05:
         text += " (far point)"
     if pupil_mm < requested.pupil_diameter_mm - 0.05:

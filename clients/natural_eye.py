@@ -9,7 +9,6 @@ The dynamics are those of `estimator.dynamics`, which lists their sources.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from clients.scenes.geometry import linear_from_srgb
 from estimator.dynamics import AccommodationResponse, PupilReflex
 from filter_service.command_line import likely_unit
-from filter_service.messages import Camera
+from filter_service.messages import Camera, State
 
 MAX_VERGENCE_DPT = 20.0
 USUAL_WHITE_CD_M2 = 100.0
@@ -34,17 +33,10 @@ _LINEAR_OF_SRGB8 = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)  # of sRGB's primaries
 
 
-@dataclass(frozen=True)
-class EyeState:
-    """Pupil and focus of an eye, as sent with a frame."""
-
-    pupil_diameter_mm: float
-    focus_dpt: float
-
-    def with_pupil(self, diameter_mm: float) -> EyeState:
-        """Return the state with a measured pupil, clipped to `PUPIL_RANGE_MM`."""
-        low_mm, high_mm = PUPIL_RANGE_MM
-        return EyeState(min(max(diameter_mm, low_mm), high_mm), self.focus_dpt)
+def state_of(pupil_diameter_mm: float, focus_dpt: float) -> State:
+    """Return the state of a frame, with the pupil clipped to `PUPIL_RANGE_MM`."""
+    low_mm, high_mm = PUPIL_RANGE_MM
+    return State(min(max(pupil_diameter_mm, low_mm), high_mm), focus_dpt)
 
 
 class NaturalEye:
@@ -90,9 +82,7 @@ class NaturalEye:
         self._focus = AccommodationResponse(0.0, MAX_VERGENCE_DPT)
         self._far_dpt, self._near_dpt = 0.0, MAX_VERGENCE_DPT
 
-    def look(
-        self, luminance_cd_m2: float, distance_dpt: float, at_s: float
-    ) -> EyeState:
+    def look(self, luminance_cd_m2: float, distance_dpt: float, at_s: float) -> State:
         """Set the luminance and the distance from now on; return the current state.
 
         Parameters
@@ -126,7 +116,7 @@ class NaturalEye:
             focus_dpt = min(wanted_dpt, far_dpt)
         elif focus_dpt >= near_dpt:
             focus_dpt = max(wanted_dpt, near_dpt)
-        return EyeState(pupil_mm, focus_dpt).with_pupil(pupil_mm)
+        return state_of(pupil_mm, focus_dpt)
 
     def learn(self, asked_dpt: float, used_dpt: float) -> None:
         """Learn the far and near point from the focus that a filter used.

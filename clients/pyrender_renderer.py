@@ -42,6 +42,7 @@ from clients.scenes.scene_view import (
 )
 from estimator import InvalidFile
 from filter_service.errors import RenderFailed
+from filter_service.messages import State
 
 _PLATFORMS = {"egl": "EGLPlatform", "osmesa": "OSMesaPlatform"}
 _PLATFORM = os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
@@ -338,7 +339,7 @@ def pyrender_frames(
     if camera is None:
         camera = main.camera
     if path is None:
-        path = [Moment(scene.get_pose(main), USUAL_PUPIL_MM, 0.0)]
+        path = [Moment(scene.get_pose(main), State(USUAL_PUPIL_MM, 0.0))]
     tangents = camera_tangents(camera, size_px)
     with PyrenderRenderer(
         scene,
@@ -579,5 +580,6 @@ def orbit(
         ratio = (1.0 + np.cos(turn)) / 2.0
         focus_dpt = float(ratio / near_m + (1.0 - ratio) / far_m)
         pupil_mm = float(_PUPILS_MM[0] + (_PUPILS_MM[1] - _PUPILS_MM[0]) * ratio)
-        moments.append(Moment(look_at(position_m, center_m), pupil_mm, focus_dpt))
+        state = State(pupil_mm, focus_dpt)
+        moments.append(Moment(look_at(position_m, center_m), state))
     return camera, moments

@@ -17,7 +17,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Annotated, Any, Literal
 
@@ -193,7 +193,8 @@ def looking_around(
     for number, frame in enumerate(frames):
         turn = 2 * np.pi * number / FRAMES_PER_ROUND
         h_deg, v_deg = reach_deg * np.sin(turn), 0.5 * reach_deg * np.cos(turn)
-        yield replace(frame, gaze_deg=(float(h_deg), float(v_deg)))
+        gaze_deg = float(h_deg), float(v_deg)
+        yield replace(frame, state=replace(frame.state, gaze_deg=gaze_deg))
 
 
 def looking_naturally(
@@ -207,12 +208,12 @@ def looking_naturally(
     for frame in frames:
         height_px, width_px = frame.depth_m.shape
         camera = Camera(width_px, height_px, frame.tangents)
-        gaze_deg = frame.gaze_deg or STRAIGHT_AHEAD
+        gaze_deg = frame.state.gaze_deg or STRAIGHT_AHEAD
         distance_m = distance_at(frame.depth_m, camera, gaze_deg)
         vergence_dpt = 0.0 if distance_m is None else 1.0 / distance_m
         light_cd_m2 = luminance_cd_m2(frame.color, white_cd_m2)
         state = eye.look(light_cd_m2, vergence_dpt, clock())
-        yield replace(frame, **asdict(state))
+        yield replace(frame, state=replace(state, gaze_deg=frame.state.gaze_deg))
 
 
 def stream(

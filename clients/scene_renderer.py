@@ -16,10 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 from clients.scenes.geometry import Array, Scene
 from clients.scenes.scene_view import Picture, SceneView, Tangents, open_context
 from filter_service import RgbdView
+from filter_service.messages import State, WithState
 
 
 @dataclass(frozen=True)
-class SceneFrame:
+class SceneFrame(WithState):
     """An RGB-D frame and the state of the eye that looks at it.
 
     Attributes
@@ -32,10 +33,8 @@ class SceneFrame:
         Tangents of the angles to the image edges.
     pose : (4, 4) array
         Camera to world.
-    pupil_diameter_mm, focus_dpt : float
-        State of the eye at this point of the path.
-    gaze_deg : (h, v), optional
-        Gaze direction in the image; None is straight ahead.
+    state : State
+        State of the eye at this point of the path; without a gaze, straight ahead.
     hidden_color, hidden_depth_m : arrays, optional
         Color and depth of the hidden layer; depth is 0 where nothing is hidden.
     right_view : RgbdView, optional
@@ -47,9 +46,7 @@ class SceneFrame:
     depth_m: NDArray[np.float32]
     tangents: tuple[float, float, float, float]
     pose: Array
-    pupil_diameter_mm: float
-    focus_dpt: float
-    gaze_deg: tuple[float, float] | None = None
+    state: State
     hidden_color: NDArray[np.uint8] | None = None
     hidden_depth_m: NDArray[np.float32] | None = None
     right_view: RgbdView | None = None
@@ -220,8 +217,7 @@ def frame_at(
     eyes = []
     for pose in eye_poses(moment.pose, ipd_mm):
         color, depth_m, *hidden = render(pose)
-        state = moment.pupil_diameter_mm, moment.focus_dpt, None
-        eyes.append(SceneFrame(color, depth_m, tangents, pose, *state, *hidden))
+        eyes.append(SceneFrame(color, depth_m, tangents, pose, moment.state, *hidden))
     return replace(eyes[0], right_view=eyes[1].view) if len(eyes) > 1 else eyes[0]
 
 
@@ -254,12 +250,11 @@ class Key:
 
 
 @dataclass(frozen=True)
-class Moment:
+class Moment(WithState):
     """State of the eye, and pose of the camera (4, 4, camera to world), in a frame."""
 
     pose: Array
-    pupil_diameter_mm: float
-    focus_dpt: float
+    state: State
 
 
 PATHS = {
@@ -316,7 +311,7 @@ def path_moments(path: tuple[Key, ...], n_frames: int) -> list[Moment]:
         row = _catmull_rom(values, t)
         focus_dpt = float(max(row[7], 0.0))
         pose = look_at(row[:3], row[3:6])
-        moments.append(Moment(pose, float(row[6]), focus_dpt))
+        moments.append(Moment(pose, State(float(row[6]), focus_dpt)))
     return moments
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from filter_service.atomic_files import replace_atomically
+from filter_service.messages import State, WithState
 
 _PAPER, _BAR, _INK = "#14181c", "#1f262d", "#f2f4f5"
 _SOFT, _ACCENT = "#a9b4bd", "#ffc46b"
@@ -48,12 +49,11 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class EyeState:
+class EyeState(WithState):
     """State of the eye at one moment, for captions."""
 
     scene: str
-    pupil_diameter_mm: float
-    focus_dpt: float
+    state: State
 
     def text(self) -> str:
         """Return the state as one line for a caption."""

@@ -36,7 +36,7 @@ def submit(client: FilterClient, frame: SceneFrame) -> int:
         frame.views,
         pupil_diameter_mm=frame.pupil_diameter_mm,
         focus_dpt=frame.focus_dpt,
-        gaze_deg=frame.gaze_deg,
+        gaze_deg=frame.state.gaze_deg,
         states=(ViewState("left"), ViewState("right")) if is_stereo else (),
     )
 

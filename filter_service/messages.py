@@ -26,6 +26,7 @@ from filter_service.view_state import (
     Pose,
     State,
     ViewState,
+    WithState,
     body_of_eye,
     check_states,
 )
@@ -144,6 +145,7 @@ __all__ = [
     "ViewState",
     "ViewTextures",
     "Welcome",
+    "WithState",
     "body_of_eye",
     "check_states",
     "decode_reply",

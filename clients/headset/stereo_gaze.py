@@ -23,14 +23,14 @@ from clients.headset.runtime import (
 from clients.natural_eye import (
     MAX_VERGENCE_DPT,
     USUAL_WHITE_CD_M2,
-    EyeState,
     NaturalEye,
     field_area_deg2,
     luminance_cd_m2,
     planar_depth_at,
+    state_of,
 )
 from estimator.dynamics import GazeFollower
-from filter_service.messages import Camera
+from filter_service.messages import Camera, State
 
 if TYPE_CHECKING:
     import moderngl
@@ -126,7 +126,7 @@ class EyeAndGaze:
 
     Attributes
     ----------
-    state : EyeState
+    state : State
         Pupil and focus.
     gaze_deg : (h, v)
         Gaze direction in the eye's image.
@@ -135,7 +135,7 @@ class EyeAndGaze:
         image center if displays are canted.
     """
 
-    state: EyeState
+    state: State
     gaze_deg: tuple[float, float]
     ahead_deg: tuple[float, float] = STRAIGHT_AHEAD
 
@@ -224,9 +224,9 @@ class StereoGaze:
             eye = self._eye(picture)
             state = eye.look(light_cd_m2, 1.0 / distance_m, at_s)
             if self._focus_dpt is not None:
-                state = EyeState(state.pupil_diameter_mm, self._focus_dpt)
+                state = State(state.pupil_diameter_mm, self._focus_dpt)
             if due.pupil_diameter_mm is not None:
-                state = state.with_pupil(due.pupil_diameter_mm)
+                state = state_of(due.pupil_diameter_mm, state.focus_dpt)
             point = head[:3, 3] + min(distance_m, FAR_M) * direction
             own = matrix_of(picture.view.pose)
             gaze_deg = angles_of(own[:3, :3].T @ (point - own[:3, 3]))

@@ -22,6 +22,7 @@ from typing import Any, Literal
 from clients.web.eye_form import EyeSide, depends_on_gaze
 from clients.web.picture import Picture, coarser, jpeg_of, png_of
 from filter_service import EyeFilter, FilterError, FilterSettings
+from filter_service.messages import State, WithState
 from filter_service.settings import Pipeline
 
 PAUSE_S = 0.12
@@ -48,7 +49,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class PictureRequest:
+class PictureRequest(WithState):
     """One requested state of the page.
 
     Attributes
@@ -60,9 +61,7 @@ class PictureRequest:
     number: int
     picture: Picture
     bodies: Mapping[EyeSide, Mapping[str, Any]]
-    pupil_diameter_mm: float
-    focus_dpt: float
-    gaze_deg: tuple[float, float]
+    state: State
     pipeline: Pipeline = "exact"
 
 

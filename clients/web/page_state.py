@@ -40,6 +40,7 @@ from clients.web.eye_form import (
 from clients.web.filter_thread import PictureRequest
 from clients.web.picture import Picture
 from estimator.bounded_files import loads_bounded
+from filter_service.messages import State
 from filter_service.settings import Pipeline
 
 Shown = Literal["OD", "OS", "both"]
@@ -240,9 +241,8 @@ class PageState:
             number=self.number,
             picture=self.picture,
             bodies=bodies,
-            gaze_deg=self.picture_gaze_deg,
+            state=State(**self.eye_state, gaze_deg=self.picture_gaze_deg),
             pipeline=self.pipeline,
-            **self.eye_state,
         )
 
     def look_at(self, x: float, y: float) -> None:

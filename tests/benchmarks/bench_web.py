@@ -29,6 +29,7 @@ from playwright.sync_api import sync_playwright
 from clients.web.filter_thread import FULL, EyeView, PictureRequest
 from clients.web.picture import linear_from_srgb8, scene_picture
 from filter_service import EyeFilter
+from filter_service.messages import State
 from tests.benchmarks.harness import ROOT, Row, publish
 from tests.web.browser import PageUnderTest, open_browser
 
@@ -123,7 +124,9 @@ def _wish(number: int, picture, changes) -> PictureRequest:
     state = {"pupil_diameter_mm": PUPIL_MM, "focus_dpt": FOCUS_DPT} | changes
     sphere_dpt = state.pop("sphere_dpt", SPHERE_DPT)
     body = {"kind": "prescription", "sphere_dpt": sphere_dpt, "age_years": 30.0}
-    return PictureRequest(number, picture, {"OD": body}, gaze_deg=(0.0, 0.0), **state)
+    return PictureRequest(
+        number, picture, {"OD": body}, State(**state, gaze_deg=(0.0, 0.0))
+    )
 
 
 def errors(states) -> dict[str, float]:

@@ -25,6 +25,7 @@ from clients.scenes.catalog import build_scene
 from clients.service_process import CHECKOUT, ServiceProcess
 from estimator.profiles.files import profile_body
 from filter_service.command_line import app_of, exit_code
+from filter_service.messages import State
 from filter_service.progress import INTERVAL_S
 from tests.commands import run_command
 
@@ -204,7 +205,7 @@ def test_odd_sizes_become_even_cells():
     ("focus_dpt", "text"), [(0.0, "far away"), (0.25, "4.0 m"), (2.5, "40 cm")]
 )
 def test_focus_is_said_as_a_distance(focus_dpt, text):
-    assert sheet.EyeState("Courtyard", 4.0, focus_dpt).distance() == text
+    assert sheet.EyeState("Courtyard", State(4.0, focus_dpt)).distance() == text
 
 
 def test_percentiles_of_a_known_series():

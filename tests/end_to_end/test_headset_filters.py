@@ -22,8 +22,9 @@ from clients.headset.stereo_filter import (
     ServiceFilter,
     StereoFrame,
 )
-from clients.headset.stereo_gaze import EyeAndGaze, EyeState, RgbdPicture
+from clients.headset.stereo_gaze import EyeAndGaze, RgbdPicture
 from filter_service import FilterSettings
+from filter_service.messages import State
 from tests.end_to_end.conftest import TIMEOUT_S
 from tests.end_to_end.headset_doubles import (
     SIZE_PX,
@@ -52,7 +53,7 @@ def test_an_eye_learns_from_its_own_pictures_only():
     frame = StereoFrame(
         DueFrame(0, True, tuple(views)),
         tuple(RgbdPicture(view, color, depth_m) for view in views),
-        (EyeAndGaze(EyeState(4.0, 0.0), (0.0, 0.0)),) * 2,
+        (EyeAndGaze(State(4.0, 0.0), (0.0, 0.0)),) * 2,
         0.0,
     )
 
@@ -101,7 +102,7 @@ def test_in_this_process_each_eye_sees_its_own_profile():
         frame = StereoFrame(
             DueFrame(0, True, tuple(views)),
             tuple(RgbdPicture(view, color, depth_m) for view in views),
-            (EyeAndGaze(EyeState(4.0, 0.25), (0.0, 0.0)),) * 2,
+            (EyeAndGaze(State(4.0, 0.25), (0.0, 0.0)),) * 2,
             0.0,
         )
         seen = None

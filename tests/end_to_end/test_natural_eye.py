@@ -16,6 +16,7 @@ from clients.pyrender_stream import looking_naturally
 from clients.scene_renderer import SceneFrame
 from estimator.dynamics import steady_pupil_mm
 from filter_service import Camera
+from filter_service.messages import State
 
 CAMERA = Camera.from_fov(60.0, width_px=160, height_px=120)
 
@@ -28,7 +29,7 @@ def wall(depth_m, *, gray=128):
 def frame(depth_m, *, gray=128, gaze_deg=None):
     color, depth = wall(depth_m, gray=gray)
     return SceneFrame(
-        color, depth, CAMERA.tangents, np.eye(4), 9.0, 9.0, gaze_deg=gaze_deg
+        color, depth, CAMERA.tangents, np.eye(4), State(9.0, 9.0, gaze_deg)
     )
 
 

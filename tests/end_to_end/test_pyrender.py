@@ -31,6 +31,7 @@ from clients.scenes.catalog import build_scene
 from clients.scenes.geometry import Batch, Scene
 from clients.streaming import filter_in_order
 from estimator import InvalidFile
+from filter_service.messages import State
 from tests.source_tree import ROOT
 
 pytestmark = pytest.mark.clients
@@ -283,7 +284,7 @@ def test_the_scene_moves_while_the_path_goes_on():
     def path():
         for distance_m in (1.0, 1.5, 2.0):
             scene.set_pose(node, translation_matrix((0.0, 0.0, -distance_m)))
-            yield Moment(np.eye(4), 3.0 + distance_m, 1.0 / distance_m)
+            yield Moment(np.eye(4), State(3.0 + distance_m, 1.0 / distance_m))
 
     frames = pyrender_frames(scene, SIZE_PX, camera=CAMERAS["infinite"], path=path())
     found = [(f.depth_m.min(), f.pupil_diameter_mm, f.focus_dpt) for f in frames]
@@ -295,7 +296,7 @@ def test_two_eyes_see_a_near_thing_in_two_directions():
     card = trimesh.creation.box((0.3, 0.3, 1e-4))
     card.apply_transform(rotation_matrix(0.2, (0.0, 0.0, 1.0)))
     card.apply_translation((0.0, 0.0, -1.0))
-    path = [Moment(np.eye(4), 4.0, 1.0)]
+    path = [Moment(np.eye(4), State(4.0, 1.0))]
     (frame,) = pyrender_frames(
         pyrender_scene([card]),
         SIZE_PX,
@@ -448,7 +449,7 @@ def test_frames_come_back_filtered_through_the_service(real_service, name):
     scene = pyrender_scene(three_meshes())
     camera = CAMERAS[name]
     path = [
-        Moment(look_at((x_m, 0.3, 2.0), (0.0, 0.0, 0.0)), pupil_mm, 0.5)
+        Moment(look_at((x_m, 0.3, 2.0), (0.0, 0.0, 0.0)), State(pupil_mm, 0.5))
         for x_m, pupil_mm in ((0.0, 3.0), (0.2, 4.0), (0.4, 5.0))
     ]
     frames = list(pyrender_frames(scene, SIZE_PX, camera=camera, path=path, flags=FLAT))

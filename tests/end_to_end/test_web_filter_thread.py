@@ -13,6 +13,7 @@ from PIL import Image
 from clients.web.filter_thread import FilterThread, PictureRequest
 from clients.web.picture import linear_from_srgb8
 from filter_service import EyeFilter, FilterSettings
+from filter_service.messages import State
 from tests.unit.web_parts import a_picture
 
 WAIT_S = 60.0
@@ -55,7 +56,7 @@ def request(number, sphere_dpt=-3.0, eyes=("OD",), pupil_mm=4.0, picture=None):
         for eye in eyes
     }
     picture = picture or a_picture()
-    return PictureRequest(number, picture, bodies, pupil_mm, 0.0, (0.0, 0.0))
+    return PictureRequest(number, picture, bodies, State(pupil_mm, 0.0, (0.0, 0.0)))
 
 
 def pixels(seen):
@@ -138,7 +139,7 @@ def test_what_cannot_be_seen_is_told_and_the_next_is_seen(filter_thread, screen)
 def test_a_fault_of_one_page_does_not_end_the_others(filter_thread, screen):
     other = Screen()
     filter_thread.open("other", other.seen.put)
-    broken = dataclasses.replace(request(1), gaze_deg=("far", 0.0))
+    broken = dataclasses.replace(request(1), state=State(4.0, 0.0, ("far", 0.0)))
     filter_thread.request("other", broken)
     failed = other.until("failed", 1)[-1]
     assert failed.facts["error"]
