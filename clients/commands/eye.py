@@ -12,6 +12,8 @@ from clients.commands.optics import (
     FOCUS_LIMITS_DPT,
     PUPIL_LIMITS_MM,
     WAVELENGTH_LIMITS_NM,
+    Pupil,
+    Wavelength,
     ellipse_facts,
 )
 from filter_service.command_line import (
@@ -27,6 +29,13 @@ if TYPE_CHECKING:
     from estimator.field.field_table import DrawnFields, FieldTable
     from estimator.profiles.eye_profile import EyeProfile
 
+Profile = Annotated[
+    str,
+    typer.Argument(
+        metavar="PROFILE",
+        help="Preset name, or a .json, .abp, .csv or .zmx profile.",
+    ),
+]
 TIME_LIMITS_S = (0.1, 86400.0)
 
 
@@ -34,13 +43,7 @@ Method = Literal["network", "refined", "search"]
 
 
 def estimate(
-    profile: Annotated[
-        str,
-        typer.Argument(
-            metavar="PROFILE",
-            help="Preset name, or a .json, .abp, .csv or .zmx profile.",
-        ),
-    ],
+    profile: Profile,
     method: Annotated[
         Method,
         typer.Option(
@@ -144,15 +147,9 @@ HORIZONTAL, VERTICAL = "-40,-30,-20,-10,0,10,20,30,40", "0"
 
 
 def field(
-    profile: Annotated[
-        str,
-        typer.Argument(
-            metavar="PROFILE",
-            help="Preset name, or a .json, .abp, .csv or .zmx profile.",
-        ),
-    ],
-    pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")],
-    wavelength_nm: Annotated[float, typer.Option(help="Wavelength, nm.")],
+    profile: Profile,
+    pupil_mm: Pupil,
+    wavelength_nm: Wavelength,
     h_deg: Annotated[
         str, typer.Option(metavar="LIST", help="Azimuths, deg; positive is right.")
     ] = HORIZONTAL,

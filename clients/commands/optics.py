@@ -38,6 +38,23 @@ ARCMIN_PER_DEG = 60.0
 MAX_RADIUS_PX = 1023
 """Largest radius of a kernel written to a file; the service has a lower limit."""
 
+Eye = Annotated[
+    str,
+    typer.Argument(
+        metavar="EYE",
+        help="Name of a preset or schematic eye, or a .json, .abp, .csv or .zmx "
+        "profile.",
+    ),
+]
+Pupil = Annotated[float, typer.Option(help="Entrance pupil, mm.")]
+Wavelength = Annotated[float, typer.Option(help="Wavelength, nm.")]
+Azimuth = Annotated[
+    float, typer.Option(help="Azimuth of the source, deg; positive is right.")
+]
+Elevation = Annotated[
+    float, typer.Option(help="Elevation of the source, deg; positive is up.")
+]
+
 OF_THE_MODEL = (
     "--fit slope is that of the estimated eye model, without the rest of the "
     "measurement and the periphery of people; --fit opd includes them"
@@ -48,15 +65,8 @@ Fit = Literal["opd", "slope"]
 
 
 def wavefront(
-    eye: Annotated[
-        str,
-        typer.Argument(
-            metavar="EYE",
-            help="Name of a preset or schematic eye, or a .json, .abp, .csv or .zmx "
-            "profile.",
-        ),
-    ],
-    wavelength_nm: Annotated[float, typer.Option(help="Wavelength, nm.")],
+    eye: Eye,
+    wavelength_nm: Wavelength,
     stop_mm: Annotated[
         float | None, typer.Option(help="Diameter of the iris, mm.")
     ] = None,
@@ -64,12 +74,8 @@ def wavefront(
         float | None,
         typer.Option(help="Entrance pupil at 555 nm, mm, instead of the iris."),
     ] = None,
-    h_deg: Annotated[
-        float, typer.Option(help="Azimuth of the source, deg; positive is right.")
-    ] = 0.0,
-    v_deg: Annotated[
-        float, typer.Option(help="Elevation of the source, deg; positive is up.")
-    ] = 0.0,
+    h_deg: Azimuth = 0.0,
+    v_deg: Elevation = 0.0,
     focus_dpt: Annotated[
         float | None,
         typer.Option(help="Focus distance, dpt; relaxed if not given."),
@@ -302,16 +308,9 @@ class _State:
 
 
 def psf(
-    eye: Annotated[
-        str,
-        typer.Argument(
-            metavar="EYE",
-            help="Name of a preset or schematic eye, or a .json, .abp, .csv or .zmx "
-            "profile.",
-        ),
-    ],
-    pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")],
-    wavelength_nm: Annotated[float, typer.Option(help="Wavelength, nm.")],
+    eye: Eye,
+    pupil_mm: Pupil,
+    wavelength_nm: Wavelength,
     pixel_arcmin: Annotated[float, typer.Option(help="Pixel size, arcmin.")],
     out: Annotated[
         Path,
@@ -324,12 +323,8 @@ def psf(
         float | None,
         typer.Option(help="Focus distance, dpt; infinity if not given."),
     ] = None,
-    h_deg: Annotated[
-        float, typer.Option(help="Azimuth of the source, deg; positive is right.")
-    ] = 0.0,
-    v_deg: Annotated[
-        float, typer.Option(help="Elevation of the source, deg; positive is up.")
-    ] = 0.0,
+    h_deg: Azimuth = 0.0,
+    v_deg: Elevation = 0.0,
     method: Annotated[
         Method,
         typer.Option(

@@ -22,18 +22,21 @@ from filter_service.command_line import (
 if TYPE_CHECKING:
     from filter_service.keys import KeyRing
 
+DEFAULT_ENDPOINT = "tcp://127.0.0.1:5577"
+Endpoint = Annotated[
+    str, typer.Argument(metavar="ENDPOINT", help="Endpoint of the service.")
+]
+Key = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Key file of the client.")
+]
 Seconds = Annotated[
     float, typer.Option("--timeout", metavar="S", help="Longest wait for a reply, s.")
 ]
 
 
 def status(
-    endpoint: Annotated[
-        str, typer.Argument(metavar="ENDPOINT", help="Endpoint of the service.")
-    ] = "tcp://127.0.0.1:5577",
-    key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Key file of the client.")
-    ] = None,
+    endpoint: Endpoint = DEFAULT_ENDPOINT,
+    key: Key = None,
     timeout_s: Seconds = 3.0,
     json_output: Json = False,
 ) -> None:
@@ -84,9 +87,7 @@ TRANSPORTS = ("auto", "tcp", "shared-memory")
 
 @with_setting_options()
 def latency(
-    endpoint: Annotated[
-        str, typer.Argument(metavar="ENDPOINT", help="Endpoint of the service.")
-    ] = "tcp://127.0.0.1:5577",
+    endpoint: Endpoint = DEFAULT_ENDPOINT,
     transport: Annotated[
         list[str] | None,
         typer.Option(
@@ -130,9 +131,7 @@ def latency(
         str,
         typer.Option(help="Preset name, JSON, or a .json, .abp, .csv or .zmx profile."),
     ] = DEFAULT_PROFILE,
-    key: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Key file of the client.")
-    ] = None,
+    key: Key = None,
     plot: Annotated[
         Path | None,
         typer.Option(metavar="OUT.png", help="Plot the distribution of the times."),
