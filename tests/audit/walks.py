@@ -82,7 +82,7 @@ def walk_photograph(recorder: Recorder, folder: Path) -> dict[str, set[str]]:
     with recorder.recorded() as found:
         subprocess.run(
             [
-                *(sys.executable, "-m", "filter_service", "filter"),
+                *(sys.executable, "-m", "ocufilter", "filter"),
                 *("--color", folder / "color.png", "--depth", folder / "depth.npy"),
                 *("--fov-deg", "40", "--profile", "myopia", "--pupil-mm", "4"),
                 *("--engine", "native", "-o", folder / "seen.png"),
