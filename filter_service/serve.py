@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from filter_service import one_blas_thread  # noqa: F401  (before any numpy)
-from filter_service.command_line import app_of, run
+from filter_service.command_line import EXIT_BAD_INPUT, app_of, run
 from filter_service.settings import Engine
 
 
@@ -90,6 +90,13 @@ def main() -> None:
 
     python -m filter_service serve --bind tcp://127.0.0.1:5577
     """
-    if sys.argv[1:2] == ["serve"]:  # the only command
-        del sys.argv[1]
+    match sys.argv[1:]:
+        case ["serve", *_]:
+            del sys.argv[1]
+        case [word, *_] if not word.startswith("-"):
+            sys.stderr.write(
+                f"python -m filter_service: unknown command '{word:.60}'; allowed: "
+                "serve; for other commands, use `ocufilter` or `python -m ocufilter`\n"
+            )
+            sys.exit(EXIT_BAD_INPUT)
     run(app_of(serve), "python -m filter_service")

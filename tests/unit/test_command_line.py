@@ -13,7 +13,7 @@ from clients.batch.options import Layout
 from clients.commands.options import OPTION_HELP
 from clients.commands.program import COMMANDS, app
 from clients.natural_eye import NaturalEye
-from filter_service import command_line
+from filter_service import command_line, serve
 from filter_service.command_line import (
     check_range,
     exit_code,
@@ -145,6 +145,15 @@ def test_the_service_starts_without_the_clients(words):
     assert "--bind ENDPOINT" in shown
     assert "filter_service.serve" in loaded
     assert not [name for name in loaded if name.split(".")[0] == "clients"]
+
+
+def test_the_service_names_where_other_commands_are(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["filter_service", "demo", "--frames", "2"])
+    with pytest.raises(SystemExit) as ended:
+        serve.main()
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "unknown command 'demo'; allowed: serve; for other commands, use" in line
 
 
 def test_a_pupil_in_meters_is_recognized(capsys):
