@@ -52,6 +52,7 @@ if TYPE_CHECKING:
 
 EyeEvent = BuildingEye | EyeFailed | EyeReady
 Say = Callable[[str], None]
+Body = dict[str, Any]
 
 MS_PER_S = 1e3
 KEPT_VIEWS = 16
@@ -159,8 +160,8 @@ class StereoFilter(ABC):
 
     def __init__(self, settings: FilterSettings, say: Say) -> None:
         self.settings, self._say = settings, say
-        self._wanted: dict[EyeName, dict[str, Any]] = {}
-        self._asked: dict[EyeName, tuple[int, dict[str, Any]]] = {}
+        self._wanted: dict[EyeName, Body] = {}
+        self._asked: dict[EyeName, tuple[int, Body]] = {}
 
     def change(self, eye: Eye, profile: Mapping[str, Any]) -> None:
         """Request another eye; frames use the previous one until it is ready."""
@@ -203,11 +204,7 @@ class StereoFilter(ABC):
 
     @abstractmethod
     def _set_profile(
-        self,
-        eye: Eye,
-        profile: dict[str, Any],
-        settings: FilterSettings,
-        camera: Camera,
+        self, eye: Eye, body: Body, settings: FilterSettings, camera: Camera
     ) -> int:
         """Prepare an eye; return a number of the request, which results contain."""
 
@@ -217,9 +214,6 @@ class StereoFilter(ABC):
         """Return the focus of a result; None if it is not of the requested eye."""
         asked = self._asked.get(eye)
         return None if asked is None or asked[0] != number else focus_dpt
-
-    def _say_ready(self, eye: EyeName, build_ms: float) -> None:
-        self._say(f"{eye} eye: ready after {build_ms:.0f} ms")
 
 
 class LocalFilter(StereoFilter):
@@ -264,22 +258,17 @@ class LocalFilter(StereoFilter):
     def _tell(self, eye: Eye, event: EyeEvent) -> None:
         if isinstance(event, EyeReady):
             self._needs_arrays = False  # perhaps not of this eye
-            self._say_ready(eye, event.build_ms)
+            self._say(f"{eye} eye: ready after {event.build_ms:.0f} ms")
         elif isinstance(event, EyeFailed) and not isinstance(
             event.error, BuildCancelled
         ):
             self._say(f"{eye} eye: {event.error}")
 
     def _set_profile(
-        self,
-        eye: Eye,
-        profile: dict[str, Any],
-        settings: FilterSettings,
-        camera: Camera,
+        self, eye: Eye, body: Body, settings: FilterSettings, camera: Camera
     ) -> int:
-        body = body_of_eye(profile, eye)
         accepted = self.filters[eye].set_profile(
-            body, settings=settings, views=[camera]
+            body_of_eye(body, eye), settings=settings, views=[camera]
         )
         return accepted.generation
 
@@ -477,14 +466,10 @@ class ServiceFilter(StereoFilter):
         self._client.hello()
 
     def _set_profile(
-        self,
-        eye: Eye,
-        profile: dict[str, Any],
-        settings: FilterSettings,
-        camera: Camera,
+        self, eye: Eye, body: Body, settings: FilterSettings, camera: Camera
     ) -> int:
         return self._client.request_profile(
-            profile, eye=eye, settings=settings, views=[camera]
+            body, eye=eye, settings=settings, views=[camera]
         )
 
     def see(self, frame: StereoFrame) -> FilteredStereoFrame | None:
@@ -544,7 +529,7 @@ class ServiceFilter(StereoFilter):
                 self._on_way.pop(event.frame_id, None)
                 self._take_error(event)
             elif isinstance(event, Ready):
-                self._say_ready(event.eye, event.build_ms)
+                self._say(f"{event.eye} eye: ready after {event.build_ms:.0f} ms")
 
     def _take_error(self, reply: ErrorReply) -> None:
         """Report an error once; send profiles again that the service has lost."""
