@@ -138,7 +138,6 @@ class EyeView:
                 newest_only=True,
                 until_s=time.monotonic() + PSF_SLICE_S,
             )
-            eye_filter.advance()  # this frame has requested its PSFs
         except FilterError as error:
             self._profiles.pop(kind, None)
             if kind == "full" and view.width_px >= 2 * MIN_WIDTH_PX:

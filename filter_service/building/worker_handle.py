@@ -17,7 +17,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from estimator.threads import THREADS_VARIABLE
 from filter_service.building.jobs import (
@@ -96,6 +96,7 @@ class WorkerHandle:
     niceness: int = NICENESS
     task: str = "computes PSFs"
     n_restarts: int = 0
+    has_process: ClassVar[bool] = True
     _queue: deque[tuple[int, Any]] = field(default_factory=deque)
     _next_ticket: int = 1
     _running: int | None = None
@@ -294,6 +295,7 @@ class InlineWorker:
     For programs that filter one image: starting a process takes longer than a build.
     """
 
+    has_process = False
     file_descriptor = None
     is_busy = False
     needs_poll = False

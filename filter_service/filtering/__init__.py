@@ -11,6 +11,7 @@ several_eyes      `plan_views`: a frame whose views use different eyes
 filtered          `Filtered` frames
 stream_eyes       the profiles of a stream, their stores and events, and its frames
 builder           builder and engine shared by all streams
+turns             turns of frames and of the thread that prepares eyes
 shared_builder    builders shared within a process, and the choice of their engine
 """
 

@@ -1,16 +1,22 @@
 """Builder: prepares the eyes of all streams of a process.
 
-The build worker estimates the eye of a profile, the engine loads it, and the PSFs of a
-first frame are computed in small batches between frames.  Streams receive events.
+The build worker estimates the eye of a profile, the engine loads it, and a thread
+computes the PSFs of a first frame in small batches between frames.
 """
 
 from __future__ import annotations
 
 import logging
+import queue
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
+from multiprocessing.connection import wait
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from estimator.profiles.parse import EyeProfile
 from filter_service.building.jobs import (
@@ -33,11 +39,14 @@ from filter_service.filtering.stream_eyes import (
     AcceptedProfile,
     BuildingEye,
     BuildTarget,
+    EyeEvent,
     EyeFailed,
     EyeReady,
     PreparedStore,
+    Preparing,
     StreamEyes,
 )
+from filter_service.filtering.turns import Signal, Turns
 from filter_service.rendering.engine import FrameEngine, LoadedStore
 from filter_service.rendering.frame_kernels import first_frame
 from filter_service.settings import FilterSettings
@@ -52,17 +61,13 @@ EVICTION_SHARE = 0.8
 """Eviction reduces an eye's PSFs to this share of its limit, so that it is rare."""
 
 FIRST_RANGE_S, FIRST_SHARE = (0.004, 0.08), 1.0
-"""Time between two frames for the first PSFs of a new eye: this share of a frame's
-duration, within the range.  During a stream of 1280x720 that takes both cores, with a
-worker of niceness 0, new eyes appeared after 0.7 to 1.5 s; with half of the time, and
-at most 0.03 s, after 1.1 to 2.5 s."""
-
-AHEAD_RANGE_S, AHEAD_SHARE = (0.004, 0.03), 0.5
-"""The same for predicted PSFs: half of a frame's duration, so that they never delay a
-stream by a whole frame."""
+"""Time that a frame leaves to the first PSFs of a new eye before the next one: this
+share of its duration, within the range.  During a stream of 1280x720 that takes both
+cores, with a worker of niceness 0, new eyes appeared after 0.7 to 1.5 s; with half of
+the time, and at most 0.03 s, after 1.1 to 2.5 s."""
 
 WARM_BATCH = 256
-"""PSFs per batch, 5 ms on two cores; the deadline is checked after each batch."""
+"""PSFs per batch, 5 ms on two cores: so long a frame waits for the preparation."""
 
 CHECK_GROWTH = 4
 """Factor by which each check allows more missing PSFs than the last, from `WARM_BATCH`
@@ -77,20 +82,33 @@ frame waited for the current batch."""
 PROGRESS_INTERVAL_S = 0.1
 """Minimum interval between two progress events of an eye."""
 
+IDLE_WAIT_S, RESTART_WAIT_S = 0.5, 0.1
+"""Longest waits for the worker's next message, and while it is not running."""
+
 log = logging.getLogger("ocufilter")
 
 
 class Builder:
     """Builds eyes in the build worker, and computes PSFs before frames need them.
 
+    A thread does both, from the first profile on.  It and the calls of the builder's
+    methods take turns; a call waits for one batch of PSFs at most.  The thread uses no
+    OpenGL, and no events are delivered in it.
+
     Parameters
     ----------
-    worker : WorkerHandle
-        Build worker, started by the first `advance` if necessary; closed by `close`.
+    worker : WorkerHandle or InlineWorker
+        Build worker, closed by `close`.  With one that has no process, there is no
+        thread; eyes are then prepared in `await_event`.
     engine : FrameEngine
     limits : BuildLimits
     engine_name : str
         Name of the engine in the settings.
+
+    Attributes
+    ----------
+    has_events : object with a descriptor
+        It can be read from when there are events for `deliver_all`.
     """
 
     def __init__(
@@ -107,11 +125,15 @@ class Builder:
         self.streams: list[StreamEyes] = []
         self.frame_s = 0.0  # duration of the last frame
         self.n_advances = 0  # of builds and of first PSFs: it changes as they advance
+        self.has_events = Signal()
         self._last_progress: BuildProgress | None = None
         self._limits = limits
         self._released: list[Any] = []
         self._dropping: list[Any] = []
-        self._is_warming = False
+        self._thread: threading.Thread | None = None
+        self._is_closed = False
+        self._wake = Signal()
+        self._turns = Turns()
 
     @property
     def stores_mb(self) -> float:
@@ -126,10 +148,86 @@ class Builder:
             for prepared in eye.stores
         ]
 
-    @property
-    def is_warming(self) -> bool:
-        """Return whether `advance` has work that does not wait for an event."""
-        return self._is_warming
+    # Frames
+
+    @contextmanager
+    def frame(self) -> Iterator[None]:
+        """Exclude preparation while a frame is begun, after the time that it gets."""
+        self._turns.wait_until_paid(FIRST_RANGE_S[1])
+        with self.turn():
+            yield
+
+    def turn(self) -> AbstractContextManager[None]:
+        """Exclude preparation during a call, which goes first."""
+        return self._turns.call()
+
+    def end_frame(self, stream: StreamEyes, duration_s: float) -> None:
+        """Note that a frame was rendered, and deliver the events of its stream."""
+        self.frame_s = duration_s
+        # A frame that interrupts another cannot wait.
+        if self._thread and not self._turns.has_calls and self._to_warm() is not None:
+            low_s, high_s = FIRST_RANGE_S
+            self._turns.owe(min(max(FIRST_SHARE * duration_s, low_s), high_s))
+        self._wake.set()
+        self.deliver(stream)
+
+    def lend_turn(self) -> None:
+        """Let the thread work during a frame that pauses, if it has anything to do."""
+        self._turns.lend(FIRST_RANGE_S[1])
+
+    def trim(self) -> None:
+        """Release buffers of the engine after an idle period."""
+        with self.turn():
+            self.engine.trim()
+
+    # Events
+
+    def _emit(self, stream: StreamEyes, event: EyeEvent) -> None:
+        if isinstance(event, BuildingEye):
+            event.eye.fraction, event.eye.stage = event.fraction, event.stage
+        stream.events.put(event)
+        self.has_events.set()
+
+    def deliver(self, stream: StreamEyes, timeout_s: float = 0.0) -> None:
+        """Call a stream's ``on_event`` with its events, in the caller's thread.
+
+        Parameters
+        ----------
+        timeout_s : float
+            Longest time to wait for the first event.
+        """
+        self.free_retired(stream)
+        with suppress(queue.Empty):
+            while True:
+                event = stream.events.get(timeout=timeout_s)
+                timeout_s = 0.0
+                stream.on_event(event)
+
+    def deliver_all(self) -> None:
+        """Deliver the events of all streams."""
+        self.has_events.clear()
+        for stream in list(self.streams):
+            self.deliver(stream)
+
+    def await_event(self, stream: StreamEyes, timeout_s: float = 0.0) -> None:
+        """Wait for an event of a stream and deliver it.
+
+        Without a thread, this prepares eyes for a moment.
+        """
+        if not self.worker.has_process and self._step():
+            timeout_s = 0.0
+        self.deliver(stream, timeout_s)
+
+    # Streams
+
+    def prepare(self) -> None:
+        """Let the thread look for new work; start it if there is none."""
+        if self._thread is None and self.worker.has_process:
+            self._thread = threading.Thread(
+                target=self._run, name="preparer", daemon=True
+            )
+            self._thread.start()
+        self._wake.set()
 
     def accept(
         self,
@@ -144,37 +242,64 @@ class Builder:
 
         The parameters are those of `StreamEyes.add_profile`.
         """
-        # Also one whose build has not started: its sender expects an outcome.
-        building = stream.building
-        replaced = [building.eye] if building is not None else []
-        unfinished = stream.unfinished_eye()
-        if unfinished is not None and unfinished not in replaced:
-            replaced.append(unfinished)
-        self.cancel(stream)
-        for old in replaced:
+        with self.turn():
+            # Also one whose build has not started: its sender expects an outcome.
+            building = stream.building
+            replaced = [building.eye] if building is not None else []
+            unfinished = stream.unfinished_eye()
+            if unfinished is not None and unfinished not in replaced:
+                replaced.append(unfinished)
+            self._cancel(stream)
             newer = "a newer profile" if profile_id is None else f"profile {profile_id}"
-            error = BuildCancelled(f"{newer} replaced profile {old.profile_id}")
-            stream.on_event(EyeFailed(old, error))
-        eye = stream.add_profile(profile, settings, cameras, profile_id=profile_id)
-        self.free_retired(stream)
+            for old in replaced:
+                error = BuildCancelled(f"{newer} replaced profile {old.profile_id}")
+                self._emit(stream, EyeFailed(old, error))
+            eye = stream.add_profile(profile, settings, cameras, profile_id=profile_id)
+        self.prepare()
+        self.deliver(stream)
         return eye
+
+    def plan(
+        self,
+        stream: StreamEyes,
+        cameras: Sequence[Camera],
+        *,
+        newest_only: bool = False,
+    ) -> tuple[AcceptedProfile, list[LoadedStore]] | Preparing:
+        """Return the eye and the store of each view; see `StreamEyes.plan`."""
+        self.await_event(stream)
+        with self.turn():
+            plan = stream.plan(cameras, newest_only=newest_only)
+        self.prepare()
+        self.free_retired(stream)
+        return plan
 
     def end(self, stream: StreamEyes) -> None:
         """End a stream and release its eyes."""
-        if stream in self.streams:
-            self.streams.remove(stream)
-        self.cancel(stream)
-        stream.end()
-        stream.begun.clear()
+        with self.turn():
+            if stream in self.streams:
+                self.streams.remove(stream)
+            self._cancel(stream)
+            stream.end()
+            stream.begun.clear()
         self.free_retired(stream)
+        self._wake.set()
 
     def close(self) -> None:
-        """End all streams and close the worker."""
+        """End the thread and all streams, and close the worker."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        if self._thread is not None:
+            self._wake.set()
+            self._thread.join()
         for stream in list(self.streams):
             self.end(stream)
         self.worker.close()
+        self._wake.close()
+        self.has_events.close()
 
-    def cancel(self, stream: StreamEyes) -> None:
+    def _cancel(self, stream: StreamEyes) -> None:
         """Cancel the current build of a stream, if there is one."""
         if stream.ticket is not None:
             self.worker.cancel(stream.ticket)
@@ -182,36 +307,56 @@ class Builder:
 
     def free_retired(self, stream: StreamEyes) -> None:
         """Free the stores that a stream has retired, unless frames are unfinished."""
-        if stream.begun:
+        if stream.begun or not stream.retired:
             return
-        for store in stream.retired:
-            store.release()
-        self._released += stream.retired
-        stream.retired = []
+        with self.turn():
+            retired, stream.retired = stream.retired, []
+            for store in retired:
+                store.release()
+            if self._thread is not None:
+                self._released += retired
+        self._wake.set()
 
-    def _drop_released(self) -> None:
-        """Free released stores in a thread, one iteration later.
+    # The thread
+
+    def _run(self) -> None:
+        """Prepare eyes until the builder is closed."""
+        while not self._is_closed:
+            with self._turns.work() as has_turn:
+                if not has_turn:
+                    continue
+                try:
+                    has_more = self._step()
+                except Exception:  # must not end the preparation of other eyes
+                    log.exception("eyes could not be prepared")
+                    has_more = False
+                if self._to_warm() is None:
+                    self._turns.owe(0.0)
+                if not has_more:
+                    self._turns.end_loan()
+            if self._drop_released() or has_more:
+                continue
+            worker = self.worker.file_descriptor
+            watched: list[Any] = (
+                [self._wake] if worker is None else [self._wake, worker]
+            )
+            wait(watched, RESTART_WAIT_S if self.worker.needs_poll else IDLE_WAIT_S)
+            self._wake.clear()
+
+    def _drop_released(self) -> bool:
+        """Drop released stores, one iteration later; return whether any are left.
 
         Returning half a gigabyte to the system takes 0.2 s.  By the next iteration the
         renderer has dropped its references.
         """
-        dropped, self._dropping = self._dropping, self._released
-        self._released = []
-        if dropped:
-            threading.Thread(target=dropped.clear, daemon=True).start()
+        self._dropping, self._released = self._released, []
+        return bool(self._dropping)
 
-    def advance(self, *, ahead: bool = True) -> None:
-        """Process the worker's events, then compute PSFs for a limited time.
+    def _step(self) -> bool:
+        """Process the worker's events, then compute a batch of PSFs.
 
-        `FIRST_SHARE` and `AHEAD_SHARE` define the limits.
-
-        Parameters
-        ----------
-        ahead : bool
-            Whether to also compute predicted PSFs of eyes in use; otherwise only PSFs
-            of new eyes.
+        Returns whether more PSFs can be computed now.
         """
-        self._drop_released()
         for event in self.worker.poll():
             self._count_advance(event)
             if isinstance(event, BuildPart):
@@ -234,10 +379,26 @@ class Builder:
                         near=_likely_state(stream, following),
                     )
                 )
-        self._warm_first_frames()
-        if ahead:
-            self._warm_ahead_of_streams()
+        found = self._to_warm()
+        if found is not None:
+            self._warm_first(*found)
+            _, _, prepared = found
+            n_computed = prepared.store.computed_count
+            # Not those that were evicted and are computed again, without end.
+            if n_computed > prepared.n_most_computed:
+                prepared.n_most_computed = n_computed
+                self.n_advances += 1
+        has_more = found is not None or any(map(self._warm_ahead, self.streams))
         self._limit_memory()
+        return has_more
+
+    def _to_warm(self) -> tuple[StreamEyes, AcceptedProfile, PreparedStore] | None:
+        """Return a stream, its newest eye and a store of that that is not ready."""
+        for stream in list(self.streams):
+            found = stream.store_to_warm()
+            if found is not None:
+                return stream, *found
+        return None
 
     def _count_advance(self, event: BuildEvent) -> None:
         """Count an event, unless a build reports the same progress again."""
@@ -253,7 +414,7 @@ class Builder:
         target = stream.building
         if isinstance(event, BuildProgress):
             fraction = EYE_PROGRESS * event.fraction
-            self._report(stream, target.eye, fraction, event.stage)
+            self._emit(stream, BuildingEye(target.eye, fraction, event.stage))
         elif isinstance(event, BuildDone):
             stream.ticket = stream.building = None
             try:
@@ -266,7 +427,6 @@ class Builder:
                 ticket=event.ticket,
             )
             stream.add_store(target.eye, prepared)
-            self.free_retired(stream)
         elif isinstance(event, BuildError):
             self._fail(stream, target, event.error)
 
@@ -278,72 +438,36 @@ class Builder:
 
     # PSFs that are computed before frames need them
 
-    def _share_of_frame_s(self, share: float, range_s: tuple[float, float]) -> float:
-        """Return a share of a frame's duration, within a range."""
-        low_s, high_s = range_s
-        return min(max(share * self.frame_s, low_s), high_s)
-
-    def _warm_first_frames(self) -> None:
-        """Compute PSFs of new eyes' first frames, for a limited time."""
-        until_s = time.monotonic() + self._share_of_frame_s(FIRST_SHARE, FIRST_RANGE_S)
-        self._is_warming = False
-        for stream in list(self.streams):
-            while (found := stream.store_to_warm()) is not None:
-                is_over = self._warm_first(stream, *found, until_s)
-                _, prepared = found
-                n_computed = prepared.store.computed_count
-                # Not those that were evicted and are computed again, without end.
-                if n_computed > prepared.n_most_computed:
-                    prepared.n_most_computed = n_computed
-                    self.n_advances += 1
-                if time.monotonic() > until_s:
-                    self._is_warming |= not is_over
-                    break
-
-    def _warm_ahead_of_streams(self) -> None:
-        """Compute predicted PSFs of eyes in use, for a limited time."""
-        until_s = time.monotonic() + self._share_of_frame_s(AHEAD_SHARE, AHEAD_RANGE_S)
-        for stream in self.streams:
-            if self._is_warming or time.monotonic() > until_s:
-                return
-            if stream.store_to_warm() is None:
-                self._warm_ahead(stream, until_s)
-
     def _warm_first(
         self,
         stream: StreamEyes,
         eye: AcceptedProfile,
         prepared: PreparedStore,
-        until_s: float,
-    ) -> bool:
-        """Compute the PSFs of a first frame; return whether the store is finished."""
+    ) -> None:
+        """Compute a batch of the PSFs of a first frame."""
         store, use = prepared.store, stream.history.last
         is_all = eye.settings.prepare == "ranges"
         try:
             if not prepared.pending.size:
                 use = use or first_frame(prepared.camera, eye.settings)
                 prepared.pending = store.missing_psfs(None if is_all else use)
+                prepared.n_missing = prepared.pending.size
+            if prepared.n_missing:
+                self._report_progress(stream, eye, prepared)
+                prepared.pending = _without_batch(store, prepared.pending)
                 if prepared.pending.size:
-                    self._report_progress(stream, eye, prepared)
-            n_pending = prepared.pending.size
-            if n_pending:
-                left = store.fill(
-                    prepared.pending, until_s=until_s, batch_count=WARM_BATCH
-                )
-                if left.size:
-                    self._report_progress(stream, eye, prepared)
-                    return False
-                prepared.pending = left
+                    return
                 # Pupil and focus may have changed meanwhile, so check again.
                 prepared.n_checks += 1
-                if n_pending > WARM_BATCH * CHECK_GROWTH ** (prepared.n_checks - 1):
-                    return False
+                if prepared.n_missing > WARM_BATCH * CHECK_GROWTH ** (
+                    prepared.n_checks - 1
+                ):
+                    return
         except Exception as error:  # must not affect other streams
             target = BuildTarget(eye, prepared.camera)
             self._fail(stream, target, _to_filter_error(error))
-            return True
+            return
         self._set_ready(stream, eye, prepared)
-        return True
 
     def _report_progress(
         self, stream: StreamEyes, eye: AcceptedProfile, prepared: PreparedStore
@@ -355,13 +479,7 @@ class Builder:
         n_computed = prepared.store.computed_count
         share = n_computed / (n_computed + prepared.pending.size)
         fraction = EYE_PROGRESS + (1.0 - EYE_PROGRESS) * share
-        self._report(stream, eye, fraction, "psfs")
-
-    def _report(
-        self, stream: StreamEyes, eye: AcceptedProfile, fraction: float, stage: str
-    ) -> None:
-        eye.fraction, eye.stage = fraction, stage
-        stream.on_event(BuildingEye(eye, fraction, stage))
+        self._emit(stream, BuildingEye(eye, fraction, "psfs"))
 
     def mark_rendered(
         self, stream: StreamEyes, eye: AcceptedProfile, store: LoadedStore
@@ -374,8 +492,9 @@ class Builder:
     def _set_ready(
         self, stream: StreamEyes, eye: AcceptedProfile, prepared: PreparedStore
     ) -> None:
-        stream.set_ready(eye, prepared)
-        stream.on_event(
+        # The event first: who finds the store ready also finds the event.
+        self._emit(
+            stream,
             EyeReady(
                 eye,
                 prepared.camera,
@@ -383,30 +502,31 @@ class Builder:
                 psf_count=prepared.store.computed_count,
                 memory_mb=prepared.store.memory_mb,
                 notes=prepared.notes,
-            )
+            ),
         )
+        stream.set_ready(eye, prepared)
 
-    def _warm_ahead(self, stream: StreamEyes, until_s: float) -> None:
-        """Compute the PSFs of a stream's predicted states."""
+    def _warm_ahead(self, stream: StreamEyes) -> bool:
+        """Compute PSFs of a stream's predicted states; return whether some are left."""
         prepared, last = stream.store_in_use(), stream.history.last
         if prepared is None or last is None or last is stream.history.last_warmed:
-            return
+            return False
         if self.frame_s > BUSY_SHARE * stream.history.interval_s:
-            return
+            return False
         store = prepared.store
         try:
             for state in stream.history.predicted_states():
                 left = store.missing_psfs(last, state=state)
-                if left.size:
-                    left = store.fill(left, until_s=until_s, batch_count=WARM_BATCH)
-                if left.size:
-                    self._is_warming = True
-                    return
+                while left.size:
+                    left = _without_batch(store, left)
+                    if self._turns.has_calls:  # their frame may need other PSFs
+                        return True
         except Exception as error:  # a frame that needs the PSFs reports it
             log.info(
                 "predicted PSFs could not be computed: %s", _to_filter_error(error)
             )
         stream.history.last_warmed = last
+        return False
 
     def _limit_memory(self) -> None:
         """Evict PSFs of the least recently used eyes beyond ``max_stores_mb``."""
@@ -424,10 +544,15 @@ class Builder:
         self, stream: StreamEyes, target: BuildTarget, error: FilterError
     ) -> None:
         """Record and report that an eye cannot be prepared for a camera."""
-        self.cancel(stream)
+        self._cancel(stream)
+        self._emit(stream, EyeFailed(target.eye, error))
         stream.fail_build(target.eye, target.camera, error)
-        self.free_retired(stream)
-        stream.on_event(EyeFailed(target.eye, error))
+
+
+def _without_batch(store: LoadedStore, psfs: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Compute a batch of PSFs (n,); return the others."""
+    left = store.fill(psfs[:WARM_BATCH], until_s=0.0, batch_count=WARM_BATCH)
+    return np.concatenate([left, psfs[WARM_BATCH:]])
 
 
 def _likely_state(stream: StreamEyes, target: BuildTarget) -> State:

@@ -14,7 +14,6 @@ import os
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, Unpack
 
@@ -139,7 +138,8 @@ class EyeFilter:
         Frames given as arrays use the first one.
     settings : FilterSettings or mapping, optional
     on_event : callable, optional
-        Called with each `BuildingEye`, `EyeReady` and `EyeFailed` event.
+        Called with each `BuildingEye`, `EyeReady` and `EyeFailed` event, during calls
+        of the filter.
     builder : Builder, optional
         Builder with its engine; by default shared by all filters of the process.
     max_cameras : int
@@ -284,23 +284,15 @@ class EyeFilter:
         )
         return self._newest
 
-    def advance_builds(self) -> None:
-        """Advance builds of new eyes, if the filter uses the shared builder."""
-        if self._shared is not None:
-            self.builder.advance(ahead=False)
-
-    def keep_going(self) -> None:
-        """Call `advance_builds`; deprecated, will be removed in version 0.3."""
+    def advance(self) -> None:
+        """Do nothing; deprecated, will be removed in version 0.3."""
         warnings.warn(
-            "keep_going is now advance_builds; it will be removed in version 0.3",
+            "a thread prepares eyes; advance will be removed in version 0.3",
             DeprecationWarning,
             stacklevel=2,
         )
-        self.advance_builds()
 
-    def advance(self) -> None:
-        """Advance builds of new eyes between frames, and compute PSFs ahead."""
-        self.builder.advance()
+    advance_builds = keep_going = advance
 
     def wait(self, timeout_s: float = 120.0) -> EyeReady:
         """Wait until the newest eye is ready for all requested cameras.
@@ -323,11 +315,12 @@ class EyeFilter:
             raise BadMessage("there is no profile", field="profile")
         with self._new_wait("Preparing the eye", timeout_s) as waiting:
             while True:
-                self.builder.advance()
+                is_over = not self._newest.requested  # before its events are read
+                self.builder.deliver(self._eyes)
                 failure, self._failure = self._failure, None
                 if failure is not None and failure.eye is self._newest:
                     raise failure.error
-                if not self._newest.requested:
+                if is_over:
                     return self._outcome(self._newest)
                 self._wait_for_worker(waiting, "the eye to be ready")
 
@@ -361,12 +354,7 @@ class EyeFilter:
         remaining_s = waiting.remaining_s
         if remaining_s <= 0.0:
             raise ServiceTimeout(f"timed out while waiting for {what}")
-        descriptor = self.builder.worker.file_descriptor
-        watched = [] if descriptor is None else [descriptor]
-        if not self.builder.is_warming:
-            wait(
-                watched, min(remaining_s, WAIT_SLICE_S)
-            )  # select() fails above descriptor 1024
+        self.builder.await_event(self._eyes, min(remaining_s, WAIT_SLICE_S))
 
     # Frames
 
@@ -439,7 +427,6 @@ class EyeFilter:
                     newest_only=whole,
                     **options,
                 )
-                self.builder.advance(ahead=False)  # after this frame's request
                 if seen:
                     return seen
                 self._wait_for_worker(waiting, "the eye to be prepared for this camera")
@@ -528,7 +515,6 @@ class EyeFilter:
             also returns one if PSFs were not computed by ``until_s``.
         """
         views = as_views(color, depth_m, next(iter(self.cameras), None))
-        self.advance_builds()
         state = State.checked(pupil_diameter_mm, focus_dpt, gaze_deg)
         planned = self.plan(views, [state] * len(views), newest_only=newest_only)
         if isinstance(planned, Preparing):
@@ -562,9 +548,7 @@ class EyeFilter:
         `Preparing`, which is false.
 
         A frame that needs PSFs that are not computed yet uses others instead; the
-        next frames have them.  To compute PSFs before frames need them, call `advance`
-        between frames, which takes some milliseconds, or prepare all of them with the
-        setting ``prepare="ranges"``.
+        next frames have them.  The setting ``prepare="ranges"`` prepares all of them.
 
         Parameters
         ----------
@@ -596,7 +580,6 @@ class EyeFilter:
                 "frames in textures need EyeFilter(..., gl_context='current')"
             )
         state = State.checked(pupil_diameter_mm, focus_dpt, gaze_deg)
-        self.advance_builds()
         planned = self.plan([view], [state], newest_only=newest_only)
         if isinstance(planned, Preparing):
             return planned
@@ -626,10 +609,10 @@ class EyeFilter:
         """
         arrays = [view for view in views if isinstance(view, RgbdView)]
         if arrays:
-            self._eyes.history.record(arrays, states[0], at_s=time.monotonic())
+            with self.builder.turn():
+                self._eyes.history.record(arrays, states[0], at_s=time.monotonic())
         cameras = [view.camera for view in views]
-        found = self._eyes.plan(cameras, newest_only=newest_only)
-        self.builder.free_retired(self._eyes)
+        found = self.builder.plan(self._eyes, cameras, newest_only=newest_only)
         if isinstance(found, Preparing):
             return found
         eye, stores = found

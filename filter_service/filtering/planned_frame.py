@@ -50,21 +50,23 @@ class PlannedView:
             self.view, self.store, self.state, options=options, **values
         )
         engine, effects = self.builder.engine, self.eye.media_effects
-        return begin_through_media(engine, request, effects)
+        with self.builder.frame():
+            return begin_through_media(engine, request, effects)
 
     def finish(self, begun: Pending, started_s: float) -> ViewResult | None:
         """Wait for the view; return None if PSFs are missing."""
-        found = begun()
-        if isinstance(found, MissingPsfs):
-            return None
-        self.builder.mark_rendered(self.stream, self.eye, self.store)
-        earlier, camera = found.earlier, self.view.camera
-        if earlier is not None:
-            self.stream.history.record_sampled(
-                lambda: (SampledView.of_samples(camera, earlier.sampled),),
-                self.state,
-                at_s=started_s,
-            )
+        with self.builder.turn():
+            found = begun()
+            if isinstance(found, MissingPsfs):
+                return None
+            self.builder.mark_rendered(self.stream, self.eye, self.store)
+            earlier, camera = found.earlier, self.view.camera
+            if earlier is not None:
+                self.stream.history.record_sampled(
+                    lambda: (SampledView.of_samples(camera, earlier.sampled),),
+                    self.state,
+                    at_s=started_s,
+                )
         return replace(
             found,
             eye=self.name,
@@ -163,7 +165,8 @@ class _BegunFrame:
                     return Preparing("extending", stage="psfs")
                 found.append(result)
             for view in self._views:
-                view.builder.frame_s = time.monotonic() - self._started_s
+                duration_s = time.monotonic() - self._started_s
+                view.builder.end_frame(view.stream, duration_s)
             return Filtered.of(found)
         finally:
             for view in self._views:

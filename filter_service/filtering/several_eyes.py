@@ -71,7 +71,6 @@ def plan_views(
         found = filter_of(eye)
         if found is None:
             raise _with_eye_name(NoProfile("there is no filter"), eye, own[0])
-        found.advance_builds()
     planned: dict[int, PlannedView] = {}
     own_states = [State.checked(**vars(state.state(of_frame))) for state in states]
     failure: SessionError | None = None

@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from queue import SimpleQueue
 from typing import Any, Literal, NamedTuple
 from weakref import WeakSet
 
@@ -53,6 +54,8 @@ class PreparedStore:
         Indices of the PSFs of a first frame that are being computed.
     next_progress_s : float
         Earliest time of the next progress event.
+    n_missing : int
+        Number of PSFs that the last check found to be missing.
     n_checks : int
         Number of completed checks for missing PSFs of a first frame.
     n_most_computed : int
@@ -69,6 +72,7 @@ class PreparedStore:
     last_used_s: float = field(default_factory=time.monotonic)
     pending: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     next_progress_s: float = 0.0
+    n_missing: int = 0
     n_checks: int = 0
     n_most_computed: int = 0
     ticket: int = 0
@@ -326,6 +330,8 @@ class StreamEyes:
         Frames that are begun and neither finished nor dropped.
     history : FrameHistory
         Last frames.
+    events : SimpleQueue
+        Events that were not delivered yet.
     """
 
     on_event: Callable[[EyeEvent], None]
@@ -338,6 +344,7 @@ class StreamEyes:
     retired: list[LoadedStore] = field(default_factory=list)
     begun: WeakSet[Any] = field(default_factory=WeakSet)
     history: FrameHistory = field(default_factory=FrameHistory)
+    events: SimpleQueue[EyeEvent] = field(default_factory=SimpleQueue)
     _n_accepted: int = 0
     _last_cameras: tuple[Camera, ...] = ()
 

@@ -185,9 +185,9 @@ class RenderWorker:
         wanted: dict[int, tuple[int, Link | None]] = {
             control.fileno(): (selectors.EVENT_READ, control)
         }
-        for worker in (self._builder.worker, self._reader):
-            if worker.file_descriptor is not None:
-                wanted[worker.file_descriptor] = selectors.EVENT_READ, None
+        wanted[self._builder.has_events.fileno()] = selectors.EVENT_READ, None
+        if self._reader.file_descriptor is not None:
+            wanted[self._reader.file_descriptor] = selectors.EVENT_READ, None
         if self._front_end is not None:
             events = selectors.EVENT_READ
             if self._front_end.has_unsent:
@@ -205,11 +205,7 @@ class RenderWorker:
                 selector.modify(descriptor, events, link)
 
     def _wait_s(self) -> float:
-        if self._builder.is_warming:
-            return 0.0
-        if self._builder.worker.needs_poll or self._reader.needs_poll:
-            return WORKER_POLL_S
-        return IDLE_WAIT_S
+        return WORKER_POLL_S if self._reader.needs_poll else IDLE_WAIT_S
 
     def _run_once(self, *, is_short: bool = False) -> None:
         if self._front_end is not None:
@@ -228,10 +224,12 @@ class RenderWorker:
             self._accept_profile(key, request, found)
         if is_short:
             return
-        self._builder.advance()
+        if self._frame_since_s is not None:
+            self._builder.lend_turn()
+        self._builder.deliver_all()
         if self._frame_since_s is None and self._is_time_to_trim:
             self._trim_at_s = None
-            self._builder.engine.trim()
+            self._builder.trim()
             trim_heap()
         self._send_state()
 

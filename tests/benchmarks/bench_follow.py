@@ -119,7 +119,6 @@ class Following:
                 seen.n_dropped += 1
                 continue
             while time.monotonic() < due_s:
-                self.filter.advance()
                 time.sleep(0.0005)
             begin_s = time.perf_counter()
             shown = self.filter.try_filter(
@@ -133,7 +132,6 @@ class Following:
             seen.n_whole += is_whole and end_s - due_s <= 2.0 / rate_hz
             if is_whole and shown.generation > 1:
                 seen.new_eye_s = min(seen.new_eye_s, end_s - changed_s)
-            self.filter.advance()
         for prepared in self.filter.prepared_stores:
             store: Any = prepared.store.store
             seen.psf_count += getattr(store, "computed_count", store.psf_count)

@@ -158,7 +158,6 @@ def test_a_filter_that_could_not_be_made_holds_nothing(builder, monkeypatch):
 
 def test_a_newer_profile_takes_the_place_of_one_that_is_being_built(eye_filter, events):
     eye_filter.set_profile(eye(1, build_s=30.0))
-    eye_filter.advance()
     eye_filter.set_profile(eye(2))
     eye_filter.wait(10.0)  # the end of the other is not its own
     assert mark_of(eye_filter.filter(COLOR, DEPTH_M, **SEE)) == 2
@@ -287,7 +286,7 @@ def test_psfs_of_the_eye_used_longest_ago_are_evicted(rng):
         second.filter(color, depth_m, **SEE)
         assert stored.generation == 0
         own._limits = BuildLimits(max_stores_mb=0.5 * own.stores_mb)
-        second.advance()
+        own.await_event(second._eyes)
         assert stored.generation == 1
         assert stored.memory_mb < 0.5 * own.stores_mb
         np.testing.assert_array_equal(first.filter(color, depth_m, **SEE).color, before)

@@ -82,8 +82,9 @@ def test_the_argument_accuracy():
     assert [warning.filename for warning in caught] == [__file__]
 
 
-def test_keep_going():
+@pytest.mark.parametrize("name", ["advance", "advance_builds", "keep_going"])
+def test_advance(name):
     with EyeFilter(None, CAMERA) as eye_filter:
-        with pytest.warns(DeprecationWarning, match="advance_builds") as caught:
-            eye_filter.keep_going()
+        with pytest.warns(DeprecationWarning, match="thread prepares") as caught:
+            getattr(eye_filter, name)()
     assert [warning.filename for warning in caught] == [__file__]

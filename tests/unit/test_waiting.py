@@ -82,6 +82,7 @@ def test_the_limit_is_the_time_since_the_last_change_of_the_mark(clock):
 class WorkerDouble:
     """A worker whose events come one at each poll, `STEP_S` after the other."""
 
+    has_process = False
     file_descriptor = None
 
     def __init__(self, clock, events):

@@ -36,8 +36,6 @@ class GlStore(FrameStore):
         self._parts: dict[str, BufferPart] = {}
         self._tables: StoreTables | None = None  # of which the parts are a copy
         self._n_batches = 0
-        with gpu.entered():
-            self.sync()
         _ = store.defocus  # computed here and not by the first frame
 
     @property
