@@ -195,3 +195,25 @@ def _check_views(color: object) -> None:
                 field="color",
                 allowed="an array (height, width, 3), an RgbdView, or several",
             )
+
+
+def as_cameras(
+    views: Camera | RgbdView | Sequence[Camera | RgbdView],
+) -> tuple[Camera, ...]:
+    """Return the cameras of one or several cameras or views.
+
+    Raises
+    ------
+    BadMessage
+        If an item is neither.
+    """
+    given = (views,) if isinstance(views, Camera | RgbdView) else tuple(views)
+    found = []
+    for view in given:
+        camera = view.camera if isinstance(view, RgbdView) else view
+        if not isinstance(camera, Camera):
+            raise BadMessage(
+                f"{camera!r}", field="camera", allowed="a Camera, or a sequence of them"
+            )
+        found.append(camera)
+    return tuple(found)

@@ -292,7 +292,7 @@ class EarlierFrame:
 
     @cached_property
     def counts(self) -> Mapping[str, int]:
-        """Counts of `FilteredView` by name."""
+        """Counts of `ViewResult` by name."""
         return self.count()
 
     @cached_property

@@ -47,8 +47,9 @@ from filter_service.filtering.stream_eyes import (
     StreamEyes,
 )
 from filter_service.filtering.turns import Signal, Turns
-from filter_service.rendering.engine import FrameEngine, LoadedStore
+from filter_service.rendering.engine import FrameEngine
 from filter_service.rendering.frame_kernels import first_frame
+from filter_service.rendering.frame_states import FrameStore
 from filter_service.settings import FilterSettings
 from filter_service.view_state import State
 
@@ -265,7 +266,7 @@ class Builder:
         cameras: Sequence[Camera],
         *,
         newest_only: bool = False,
-    ) -> tuple[AcceptedProfile, list[LoadedStore]] | Preparing:
+    ) -> tuple[AcceptedProfile, list[FrameStore]] | Preparing:
         """Return the eye and the store of each view; see `StreamEyes.plan`."""
         self.await_event(stream)
         with self.turn():
@@ -482,7 +483,7 @@ class Builder:
         self._emit(stream, BuildingEye(eye, fraction, "psfs"))
 
     def mark_rendered(
-        self, stream: StreamEyes, eye: AcceptedProfile, store: LoadedStore
+        self, stream: StreamEyes, eye: AcceptedProfile, store: FrameStore
     ) -> None:
         """Mark the store that a view was rendered with as ready."""
         for prepared in list(eye.stores):
@@ -549,7 +550,7 @@ class Builder:
         stream.fail_build(target.eye, target.camera, error)
 
 
-def _without_batch(store: LoadedStore, psfs: NDArray[np.int64]) -> NDArray[np.int64]:
+def _without_batch(store: FrameStore, psfs: NDArray[np.int64]) -> NDArray[np.int64]:
     """Compute a batch of PSFs (n,); return the others."""
     left = store.fill(psfs[:WARM_BATCH], until_s=0.0, batch_count=WARM_BATCH)
     return np.concatenate([left, psfs[WARM_BATCH:]])

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 import os
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self, Unpack
@@ -31,7 +30,7 @@ from filter_service.filter_protocol import Filter
 from filter_service.filtering.builder import Builder
 from filter_service.filtering.filtered import Filtered
 from filter_service.filtering.planned_frame import PlannedFrame, PlannedView
-from filter_service.filtering.shared_builder import SharedBuilder, shared
+from filter_service.filtering.shared_builder import SharedBuilder, acquired
 from filter_service.filtering.stream_eyes import (
     AcceptedProfile,
     BuildingEye,
@@ -42,7 +41,7 @@ from filter_service.filtering.stream_eyes import (
     Preparing,
     StreamEyes,
 )
-from filter_service.rgbd_view import ColorImage, RgbdView, as_views
+from filter_service.rgbd_view import ColorImage, RgbdView, as_cameras, as_views
 from filter_service.settings import (
     DEFAULTS,
     Engine,
@@ -58,8 +57,6 @@ from filter_service.view_state import EyeName, State
 from filter_service.waiting import Wait
 
 WAIT_SLICE_S = 0.02
-
-GL_CONTEXTS = ("own", "current")
 
 Profile = EyeProfile | Mapping[str, Any] | str | Path
 
@@ -78,41 +75,6 @@ def as_profile(profile: Profile) -> EyeProfile:
     if isinstance(profile, str | Path):
         return load_profile(str(profile))
     return profile
-
-
-def _as_cameras(
-    views: Camera | RgbdView | Sequence[Camera | RgbdView],
-) -> tuple[Camera, ...]:
-    given = (views,) if isinstance(views, Camera | RgbdView) else tuple(views)
-    found = []
-    for view in given:
-        camera = view.camera if isinstance(view, RgbdView) else view
-        if not isinstance(camera, Camera):
-            raise BadMessage(
-                f"{camera!r}", field="camera", allowed="a Camera, or a sequence of them"
-            )
-        found.append(camera)
-    return tuple(found)
-
-
-def _acquired(engine: Engine, gl_context: str) -> tuple[Builder, SharedBuilder]:
-    """Return the shared builder of an engine and a context, with a reference."""
-    if gl_context not in GL_CONTEXTS:
-        raise BadMessage(
-            f"{gl_context!r}", field="gl_context", allowed=" or ".join(GL_CONTEXTS)
-        )
-    if gl_context == "own":
-        found = shared(engine)
-        return found.acquire(), found
-    if engine == "native":
-        raise BadMessage(
-            "'native'", field="engine", allowed="gl or auto in the current context"
-        )
-    from filter_service.gl.current_context import CurrentContext
-
-    current = CurrentContext()
-    found = shared("gl", current.handle)
-    return found.acquire(current), found
 
 
 class EyeFilter:
@@ -175,7 +137,7 @@ class EyeFilter:
         gl_context: Literal["own", "current"] = "own",
     ) -> None:
         first = None if profile is None else as_profile(profile)
-        self.cameras = _as_cameras(camera)
+        self.cameras = as_cameras(camera)
         self.settings = as_settings(settings)
         self._on_event = on_event
         self._pid = os.getpid()
@@ -183,7 +145,7 @@ class EyeFilter:
         self._takes_textures = builder is not None or gl_context == "current"
         if builder is None:
             with self._new_wait("Opening the filter"):
-                builder, self._shared = _acquired(engine, gl_context)
+                builder, self._shared = acquired(engine, gl_context)
         self._builder: Builder | None = builder
         self._eyes = StreamEyes(
             self._handle_event,
@@ -279,20 +241,10 @@ class EyeFilter:
             self._eyes,
             as_profile(profile),
             self.settings if settings is None else as_settings(settings),
-            _as_cameras(views),
+            as_cameras(views),
             profile_id=profile_id,
         )
         return self._newest
-
-    def advance(self) -> None:
-        """Do nothing; deprecated, will be removed in version 0.3."""
-        warnings.warn(
-            "a thread prepares eyes; advance will be removed in version 0.3",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-
-    advance_builds = keep_going = advance
 
     def wait(self, timeout_s: float = 120.0) -> EyeReady:
         """Wait until the newest eye is ready for all requested cameras.

@@ -17,12 +17,12 @@ from filter_service.filtering.stream_eyes import (
     StreamEyes,
 )
 from filter_service.rendering.engine import (
-    LoadedStore,
     Pending,
     ViewRequest,
     ViewResult,
 )
 from filter_service.rendering.frame_kernels import MissingPsfs, SampledView
+from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.media_effects import begin_through_media
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
@@ -38,7 +38,7 @@ class PlannedView:
     builder: Builder  # the filter may be closed during the frame
     stream: StreamEyes
     eye: AcceptedProfile
-    store: LoadedStore
+    store: FrameStore
     view: RgbdView | TextureView
     state: State
     name: EyeName

@@ -14,12 +14,15 @@ from typing import TYPE_CHECKING, Any
 from filter_service.building.jobs import BuildLimits, default_cache_dir
 from filter_service.building.worker_handle import InlineWorker, WorkerHandle
 from filter_service.constants import ENGINES
-from filter_service.errors import RenderFailed
+from filter_service.errors import BadMessage, RenderFailed
 from filter_service.filtering.builder import Builder
 from filter_service.gl_device import is_device_selected, may_have_gpu
+from filter_service.settings import Engine
 
 if TYPE_CHECKING:
     from filter_service.gl.current_context import CurrentContext
+
+GL_CONTEXTS = ("own", "current")
 
 log = logging.getLogger("ocufilter")
 
@@ -222,6 +225,26 @@ def shared(engine: str, context: int = 0) -> SharedBuilder:
     """Return the shared builder of an engine setting and a context of the caller."""
     _opened.append(SharedBuilder(engine, context))
     return _opened[-1]
+
+
+def acquired(engine: Engine, gl_context: str) -> tuple[Builder, SharedBuilder]:
+    """Return the shared builder of an engine and a context, with a reference."""
+    if gl_context not in GL_CONTEXTS:
+        raise BadMessage(
+            f"{gl_context!r}", field="gl_context", allowed=" or ".join(GL_CONTEXTS)
+        )
+    if gl_context == "own":
+        found = shared(engine)
+        return found.acquire(), found
+    if engine == "native":
+        raise BadMessage(
+            "'native'", field="engine", allowed="gl or auto in the current context"
+        )
+    from filter_service.gl.current_context import CurrentContext
+
+    current = CurrentContext()
+    found = shared("gl", current.handle)
+    return found.acquire(current), found
 
 
 def _reset_after_fork() -> None:

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from estimator.profiles.parse import EyeProfile
 from filter_service.camera import Camera, distinct_cameras, is_same_camera
 from filter_service.errors import FilterError, NoProfile
-from filter_service.rendering.engine import LoadedStore
 from filter_service.rendering.frame_kernels import SampledFrame, SampledView
+from filter_service.rendering.frame_states import FrameStore
 from filter_service.rendering.media_effects import MediaEffects
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import FilterSettings
@@ -41,7 +41,7 @@ class PreparedStore:
     Attributes
     ----------
     camera : Camera
-    store : LoadedStore
+    store : FrameStore
     started_s : float
         Time when its profile was accepted, or when a frame first used the camera.
     notes : tuple of str
@@ -65,7 +65,7 @@ class PreparedStore:
     """
 
     camera: Camera
-    store: LoadedStore
+    store: FrameStore
     started_s: float
     notes: tuple[str, ...] = ()
     is_ready: bool = False
@@ -324,7 +324,7 @@ class StreamEyes:
         Current build in the worker.
     eyes : list of AcceptedProfile
         The newest one and, while that is not ready, the previous one.
-    retired : list of LoadedStore
+    retired : list of FrameStore
         Stores to be released.
     begun : WeakSet
         Frames that are begun and neither finished nor dropped.
@@ -341,7 +341,7 @@ class StreamEyes:
     ticket: int | None = None
     building: BuildTarget | None = None
     eyes: list[AcceptedProfile] = field(default_factory=list)
-    retired: list[LoadedStore] = field(default_factory=list)
+    retired: list[FrameStore] = field(default_factory=list)
     begun: WeakSet[Any] = field(default_factory=WeakSet)
     history: FrameHistory = field(default_factory=FrameHistory)
     events: SimpleQueue[EyeEvent] = field(default_factory=SimpleQueue)
@@ -350,7 +350,7 @@ class StreamEyes:
 
     def plan(
         self, cameras: Sequence[Camera], *, newest_only: bool = False
-    ) -> tuple[AcceptedProfile, list[LoadedStore]] | Preparing:
+    ) -> tuple[AcceptedProfile, list[FrameStore]] | Preparing:
         """Return the eye and the store of each view, or why no eye is ready.
 
         This requests stores of the newest eye for the frame's cameras.  Frames use the

@@ -1,3 +1,3 @@
 from .engine import FrameEngine as FrameEngine
-from .engine import LoadedStore as LoadedStore
 from .engine import ViewRequest as ViewRequest
+from .frame_states import FrameStore as FrameStore

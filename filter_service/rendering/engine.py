@@ -13,15 +13,14 @@ from numpy.typing import NDArray
 from estimator.note import Note
 from filter_service.errors import BadMessage, CameraMismatch
 from filter_service.planning.grid import GridSpec
-from filter_service.rendering.frame_kernels import MissingPsfs, SampledFrame
+from filter_service.rendering.frame_kernels import MissingPsfs
+from filter_service.rendering.frame_states import FrameStore
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
 from filter_service.stage_times import StageTimes
 from filter_service.texture_view import (
     EarlierFrame,
     GlTexture,
-    TextureMemory,
-    TextureSupport,
     TextureView,
 )
 from filter_service.validation import checked
@@ -39,33 +38,6 @@ FAR_SCENE_M = 100.0
 without a nearer object are rare."""
 
 
-class LoadedStore(Protocol):
-    """A PSF store that an engine can filter frames with; see `FrameStore`."""
-
-    @property
-    def computed_count(self) -> int: ...  # noqa: D102
-    @property
-    def memory_mb(self) -> float: ...  # noqa: D102
-
-    def missing_psfs(  # noqa: D102
-        self,
-        frame: SampledFrame | None = None,
-        *,
-        state: State | None = None,
-    ) -> NDArray[np.int64]: ...
-
-    def fill(  # noqa: D102
-        self, psfs: NDArray[np.int64], *, until_s: float, batch_count: int
-    ) -> NDArray[np.int64]: ...
-
-    def evict(self, max_mb: float) -> None: ...  # noqa: D102
-
-    def add_part(self, part: Any) -> None: ...  # noqa: D102
-
-    def release(self) -> None:
-        """Free the engine's resources for this store; call it once."""
-
-
 @dataclass(frozen=True)
 class ViewRequest:
     """One view to filter, with the eye, its state and the options.
@@ -74,7 +46,7 @@ class ViewRequest:
     ----------
     view : RgbdView or TextureView
         Images as arrays, or as textures of the current OpenGL context.
-    handle : LoadedStore
+    handle : FrameStore
         PSFs of the eye, loaded by the engine.
     state : State
         A gaze outside the prepared range is clamped, and the result has a note.
@@ -210,8 +182,8 @@ class FrameEngine(Protocol):
         """Name of the renderer in replies and in `ocufilter doctor`."""
 
     @property
-    def importer(self) -> TextureImporter | None:
-        """Importer of textures of other processes, or None."""
+    def importer(self) -> Any:
+        """Importer of textures of other processes (`gl.renderer.Importer`), or None."""
 
     def trim(self) -> None:
         """Release buffers that frames reuse; called after an idle period."""
@@ -224,7 +196,7 @@ class FrameEngine(Protocol):
         will call it.
         """
 
-    def load(self, store: Any) -> LoadedStore:
+    def load(self, store: Any) -> FrameStore:
         """Load a store; its kernels may be computed later."""
 
     def begin(self, request: ViewRequest) -> Pending:
@@ -243,29 +215,6 @@ class FrameEngine(Protocol):
         RenderError
             In particular, the engine does not filter textures.
         """
-
-
-class TextureImporter(Protocol):
-    """Imports textures from memory of other processes."""
-
-    @property
-    def support(self) -> TextureSupport:
-        """Devices whose memory it can import."""
-
-    def import_texture(self, memory: TextureMemory, descriptor: int) -> Any:
-        """Return a texture, with the attribute ``texture``, in memory of a descriptor.
-
-        The descriptor is closed.
-
-        Raises
-        ------
-        BadMessage
-            The memory cannot be used for such a texture.
-        RenderError
-        """
-
-    def release(self, imported: Any) -> None:
-        """Free an imported texture."""
 
 
 class OneView:

@@ -175,6 +175,11 @@ class FrameStore:
 
     The base class of engines' stores.  The same objects are returned until the state of
     frames changes, so that callers can compare states by identity.
+
+    Attributes
+    ----------
+    is_released : bool
+        Whether the store was released; engines then drop all state of it.
     """
 
     store: PsfStore
@@ -182,6 +187,7 @@ class FrameStore:
 
     def __post_init__(self) -> None:
         """Begin without cached states."""
+        self.is_released = False
         self._layers: tuple[tuple[float, ...], FrameLayers] | None = None
         self._image: tuple[tuple[Any, ...], ImageCells] | None = None
         self._change: tuple[FrameLayers, ImageCells, NDArray[Any]] | None = None
@@ -246,6 +252,10 @@ class FrameStore:
     def add_part(self, part: Any) -> None:
         """Add a part of the plan that the worker has prepared."""
         self.store.take(part)
+
+    def release(self) -> None:
+        """Free the engine's resources for this store; call it once."""
+        self.is_released = True
 
     def evict(self, max_mb: float) -> None:
         """Evict the least recently used PSFs, see `PsfStore.evict`."""

@@ -80,11 +80,3 @@ def test_the_argument_accuracy():
             accuracy="fast",
         )
     assert [warning.filename for warning in caught] == [__file__]
-
-
-@pytest.mark.parametrize("name", ["advance", "advance_builds", "keep_going"])
-def test_advance(name):
-    with EyeFilter(None, CAMERA) as eye_filter:
-        with pytest.warns(DeprecationWarning, match="thread prepares") as caught:
-            getattr(eye_filter, name)()
-    assert [warning.filename for warning in caught] == [__file__]

@@ -178,7 +178,7 @@ class FragmentPasses:
         return min(highest, cell_px.bit_length() - 1) if cell_px else highest
 
     def counts(self) -> dict[str, int]:
-        """Return the counts of `FilteredView` by name, after the readback."""
+        """Return the counts of `ViewResult` by name, after the readback."""
         stats = self.stats.sum(axis=0, dtype=np.int64).tolist()
         return {
             "missing_depth_count": stats[STAT_MISSING],

@@ -172,7 +172,7 @@ class FramePasses:
             )
 
     def counts(self) -> dict[str, int]:
-        """Return the counts of `FilteredView` by name."""
+        """Return the counts of `ViewResult` by name."""
         return (
             self.fragments.counts() | self.kernels.frame_counts() | self.lists.counts()
         )

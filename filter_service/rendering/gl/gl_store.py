@@ -18,19 +18,12 @@ _WORD_BYTES = 4
 
 
 class GlStore(FrameStore):
-    """A store with a copy of its kernels and tables on the GPU, which `sync` updates.
-
-    Attributes
-    ----------
-    is_released : bool
-        Whether the store was released; the engine then drops all state of it.
-    """
+    """A store with a copy of kernels and tables on the GPU, which `sync` updates."""
 
     def __init__(self, gpu: Gpu, store: PsfStore) -> None:
         super().__init__(store, image_cells(store.spec, store.plan))
         self._gpu = gpu
         self._pages: Pages | None = None
-        self.is_released = False
         self._n_words = self._capacity = 0
         self._generation = store.generation
         self._parts: dict[str, BufferPart] = {}
@@ -97,7 +90,7 @@ class GlStore(FrameStore):
 
     def release(self) -> None:
         """Free the GPU copy."""
-        self.is_released = True
+        super().release()
         if self._gpu.is_lost:
             return
         with self._gpu.entered():  # without a context, the driver frees nothing

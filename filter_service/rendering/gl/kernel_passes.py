@@ -522,7 +522,7 @@ class KernelRun:
             self.owner.grow(counts, headroom=HEADROOM * ratio)
 
     def frame_counts(self) -> dict[str, int]:
-        """Return the counts of `FilteredView` by name, after the readback."""
+        """Return the counts of `ViewResult` by name, after the readback."""
         return {
             "kernel_count": int(self.counts[PLAN_KERNELS]),
             "kernel_texel_count": int(self.counts[PLAN_TEXELS]),

@@ -355,7 +355,7 @@ class ListPasses:
         return {**(SOFTWARE_SPLAT if software else HARDWARE_SPLAT), **self._rule}
 
     def counts(self) -> dict[str, int]:
-        """Return the counts of `FilteredView` by name."""
+        """Return the counts of `ViewResult` by name."""
         return {
             "entry_count": self.lists.entry_count,
             "overflow_count": self.lists.overflow_count,

@@ -2,11 +2,10 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from filter_service.camera import Tangents
 from filter_service.constants import BIN_SIZE_PX, BIN_TILES, MAX_GROUPS, TILE_SIZE_PX
 from filter_service.errors import OutOfGpuMemory
 from filter_service.gl.gpu import Gpu
@@ -15,6 +14,7 @@ from filter_service.gl.stage_timer import Timer
 from filter_service.psfs.frame_layers import FrameLayers
 from filter_service.rendering.frame import map_images
 from filter_service.rgbd_view import RgbdView
+from filter_service.texture_view import TextureView
 
 
 def group_count(count: int, size: int) -> int:
@@ -26,21 +26,6 @@ def dispatch_grid(groups: int) -> tuple[int, int]:
     """Return a dispatch (columns, rows) with at least this many work groups."""
     columns = min(groups, MAX_GROUPS)
     return columns, group_count(groups, columns)
-
-
-class StripView(Protocol):
-    """What the passes of a strip need to know of its image."""
-
-    @property
-    def width_px(self) -> int: ...  # noqa: D102
-    @property
-    def height_px(self) -> int: ...  # noqa: D102
-    @property
-    def tangents(self) -> Tangents: ...  # noqa: D102
-    @property
-    def depth_kind(self) -> str: ...  # noqa: D102
-    @property
-    def surface_count(self) -> int: ...  # noqa: D102
 
 
 class Strip:
@@ -58,7 +43,7 @@ class Strip:
     def __init__(
         self,
         gpu: Gpu,
-        view: StripView,
+        view: RgbdView | TextureView,
         timer: Timer,
         *,
         layers: FrameLayers,

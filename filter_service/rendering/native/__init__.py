@@ -1,7 +1,6 @@
 """Frame engine of compiled loops (C), for machines without a GPU.
 
 renderer      the engine, its state between frames, and two lanes
-native_store  a PSF store with additional kernels of coarse resolution
 frame_record  input record of the loops, its arrays and kernel plan
 """
 

@@ -40,9 +40,9 @@ from filter_service.rendering.native.frame_record import (
     BlendSizes,
     FrameRecord,
     KernelPlan,
+    NativeStore,
     plan_kernels,
 )
-from filter_service.rendering.native.native_store import NativeStore
 from filter_service.rgbd_view import RgbdView
 from filter_service.stage_times import StageTimes
 
