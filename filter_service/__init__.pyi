@@ -5,8 +5,8 @@ from .errors import FilterError as FilterError
 from .filter_protocol import Filter as Filter
 from .filter_protocol import FilteredImages as FilteredImages
 from .filtering.eye_filter import EyeFilter as EyeFilter
-from .filtering.filtered import Filtered as Filtered
-from .filtering.several_eyes import plan_views as plan_views
+from .filtering.planned_frame import Filtered as Filtered
+from .filtering.planned_frame import plan_views as plan_views
 from .filtering.stream_eyes import BuildingEye as BuildingEye
 from .filtering.stream_eyes import EyeFailed as EyeFailed
 from .filtering.stream_eyes import EyeReady as EyeReady

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from estimator.profiles.parse import EyeProfile
     from filter_service.camera import PixelGrid, Tangents
-    from filter_service.filtering.filtered import Filtered
+    from filter_service.filtering.planned_frame import Filtered
     from filter_service.filtering.stream_eyes import EyeEvent
     from filter_service.image_files import ImageFile
     from filter_service.planning.nodes import CachePlan

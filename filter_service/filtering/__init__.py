@@ -6,9 +6,7 @@ replaces the previous one.  A *store* is the PSF cache of one eye for one camera
 *builder* advances the builds of all streams of a process.
 
 eye_filter        `EyeFilter`: one stream
-planned_frame     a frame whose eye is prepared
-several_eyes      `plan_views`: a frame whose views use different eyes
-filtered          `Filtered` frames
+planned_frame     a frame whose eyes are prepared, and `Filtered`
 stream_eyes       the profiles of a stream, their stores and events, and its frames
 builder           builder and engine shared by all streams
 turns             turns of frames and of the thread that prepares eyes

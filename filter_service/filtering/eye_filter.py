@@ -28,8 +28,7 @@ from filter_service.errors import (
 )
 from filter_service.filter_protocol import Filter
 from filter_service.filtering.builder import Builder
-from filter_service.filtering.filtered import Filtered
-from filter_service.filtering.planned_frame import PlannedFrame, PlannedView
+from filter_service.filtering.planned_frame import Filtered, PlannedFrame, PlannedView
 from filter_service.filtering.shared_builder import SharedBuilder, acquired
 from filter_service.filtering.stream_eyes import (
     AcceptedProfile,

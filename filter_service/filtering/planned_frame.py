@@ -1,25 +1,38 @@
-"""Rendering of a frame whose eyes are ready."""
+"""Rendering of a frame whose eyes are ready, and its result.
+
+Views may use different eyes:
+
+eyes = {
+"left": EyeFilter("myopia", left_camera),
+"right": EyeFilter("keratoconus", right_camera),
+}
+states = [ViewState("left"), ViewState("right", gaze_deg=(3.0, 0.0))]
+planned = plan_views(eyes.__getitem__, [left, right], states, ...)
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 from numpy.typing import NDArray
 
+from estimator.note import Note
+from filter_service.errors import BadMessage, NoProfile, SessionError
 from filter_service.filtering.builder import Builder
-from filter_service.filtering.filtered import Filtered
 from filter_service.filtering.stream_eyes import (
     AcceptedProfile,
     Preparing,
     StreamEyes,
 )
 from filter_service.rendering.engine import (
+    FrameCounts,
     Pending,
     ViewRequest,
     ViewResult,
+    summed_counts,
 )
 from filter_service.rendering.frame_kernels import MissingPsfs, SampledView
 from filter_service.rendering.frame_states import FrameStore
@@ -27,8 +40,101 @@ from filter_service.rendering.media_effects import begin_through_media
 from filter_service.rgbd_view import RgbdView
 from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
 from filter_service.stage_times import StageTimes
-from filter_service.texture_view import GlTexture, TextureView
-from filter_service.view_state import EyeName, State
+from filter_service.texture_view import EarlierFrame, GlTexture, TextureView
+from filter_service.view_state import EyeName, State, ViewState, WithState, check_states
+
+if TYPE_CHECKING:
+    from filter_service.filtering.eye_filter import EyeFilter
+
+
+@dataclass(frozen=True, kw_only=True)
+class Filtered(FrameCounts, WithState):
+    """A filtered frame, and the eyes and states that it was filtered with.
+
+    The properties `color`, `profile_id`, `generation`, `pupil_diameter_mm`, `focus_dpt`
+    and `gaze_deg` are those of the first view.
+
+    Attributes
+    ----------
+    views : tuple of ViewResult
+        One for each view of the frame.
+    missing_depth_count, clamped_depth_count, bad_color_count, overflow_count : int
+        Number of pixels whose depth was missing and filled in; whose depth was outside
+        the prepared range; whose color was not finite; and number of list entries lost
+        to full buffers.
+    notes : tuple of str
+        Notes for the user; those about a left or right eye name it.
+    stage_times_ms : dict
+        Duration of each stage.
+    """
+
+    views: tuple[ViewResult, ...]
+
+    @classmethod
+    def of(cls, views: Sequence[ViewResult]) -> Self:
+        """Return a frame of these views."""
+        return cls(views=tuple(views), **summed_counts(views))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Return the notes of all views, each once."""
+        by_eye: dict[EyeName, list[str]] = {}
+        for view in self.views:
+            by_eye.setdefault(view.eye, []).extend(view.notes)
+        return tuple(
+            note if eye == "both" else _with_prefix(note, f"{eye} eye: ")
+            for eye, notes in by_eye.items()
+            for note in dict.fromkeys(notes)
+        )
+
+    @property
+    def stage_times_ms(self) -> dict[str, float]:
+        """Return the duration of each stage, of all views."""
+        return self.views[0].stage_times_ms
+
+    @property
+    def number(self) -> int:
+        """Return the number of a frame in textures; see `ViewResult`."""
+        return self.views[0].number
+
+    @property
+    def earlier(self) -> EarlierFrame | None:
+        """Return what is known of an earlier frame in textures; see `ViewResult`."""
+        return self.views[0].earlier
+
+    @property
+    def color(self) -> NDArray[Any]:
+        """Return the first view's image, (height, width, 3)."""
+        return self.views[0].color
+
+    @property
+    def colors(self) -> tuple[NDArray[Any], ...]:
+        """Return the images of all views."""
+        return tuple(view.color for view in self.views)
+
+    @property
+    def state(self) -> State:
+        """Return the state used for the first view."""
+        return self.views[0].state
+
+    @property
+    def gazes_deg(self) -> tuple[tuple[float, float], ...]:
+        """Return the gaze of each view."""
+        return tuple(view.gaze_deg for view in self.views)
+
+    @property
+    def profile_id(self) -> int:
+        """Return the identifier of the first view's profile."""
+        return self.views[0].profile_id
+
+    @property
+    def generation(self) -> int:
+        """Return the generation of the first view's profile."""
+        return self.views[0].generation
+
+
+def _with_prefix(note: str, prefix: str) -> str:
+    return note.with_prefix(prefix) if isinstance(note, Note) else prefix + note
 
 
 @dataclass(frozen=True)
@@ -171,3 +277,89 @@ class _BegunFrame:
         finally:
             for view in self._views:
                 view.stream.begun.discard(self)
+
+
+def plan_views(
+    filter_of: Callable[[EyeName], EyeFilter | None],
+    views: Sequence[RgbdView | TextureView],
+    states: Sequence[ViewState],
+    *,
+    pupil_diameter_mm: float,
+    focus_dpt: float,
+    gaze_deg: tuple[float, float] | None = None,
+) -> PlannedFrame | Preparing:
+    """Plan a frame for the eyes of its views; all of them must be ready.
+
+    All eyes are prepared at the same time.
+
+    Parameters
+    ----------
+    filter_of : callable
+        Returns the filter of an eye.
+    views : sequence of RgbdView or TextureView
+    states : sequence of ViewState, one for each view
+        Values that are None default to those of the frame.
+    pupil_diameter_mm, focus_dpt, gaze_deg
+        Values of the frame, as for `EyeFilter.try_filter`.
+
+    Returns
+    -------
+    PlannedFrame or Preparing
+        The latter, which is false, while an eye is being prepared.
+
+    Raises
+    ------
+    BadMessage
+        If an argument is out of range, or views of one eye have different states.
+    SessionError
+        If an eye has no profile (field ``views[i].eye``), or its build failed.
+    """
+    if len(states) != len(views):
+        raise BadMessage(
+            f"there are {len(states)}",
+            field="states",
+            allowed=f"{len(views)}, as views",
+        )
+    of_frame = State(pupil_diameter_mm, focus_dpt, gaze_deg)
+    check_states(states, of_frame)
+    indices: dict[EyeName, tuple[int, ...]] = {}
+    for i, state in enumerate(states):
+        indices[state.eye] = (*indices.get(state.eye, ()), i)
+    for eye, own in indices.items():
+        found = filter_of(eye)
+        if found is None:
+            raise _with_eye_name(NoProfile("there is no filter"), eye, own[0])
+    planned: dict[int, PlannedView] = {}
+    own_states = [State.checked(**vars(state.state(of_frame))) for state in states]
+    failure: SessionError | None = None
+    preparing: Preparing | None = None
+    for eye, own in indices.items():
+        eye_filter = filter_of(eye)
+        assert eye_filter is not None
+        try:
+            frame = eye_filter.plan(
+                [views[i] for i in own], [own_states[i] for i in own], name=eye
+            )
+        except SessionError as error:
+            failure = failure or _with_eye_name(error, eye, own[0])
+            continue
+        if isinstance(frame, Preparing):
+            preparing = frame
+        else:
+            planned |= zip(own, frame.views, strict=True)
+    if failure is not None:
+        raise failure.with_traceback(None)
+    if preparing is not None:
+        return preparing
+    return PlannedFrame(tuple(planned[i] for i in range(len(views))))
+
+
+def _with_eye_name(error: SessionError, eye: EyeName, view: int) -> SessionError:
+    """Name the eye in an error about a missing profile."""
+    if not isinstance(error, NoProfile):
+        return error
+    return NoProfile(
+        f"the eye {eye} has no profile",
+        field=f"views[{view}].eye",
+        allowed=error.allowed,
+    )

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from filter_service.errors import BadMessage
 from filter_service.filtering.eye_filter import EyeFilter
-from filter_service.filtering.filtered import Filtered
-from filter_service.filtering.several_eyes import plan_views
+from filter_service.filtering.planned_frame import Filtered, plan_views
 from filter_service.filtering.stream_eyes import Preparing
 from filter_service.messages import (
     LINEAR16,
