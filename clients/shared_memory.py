@@ -33,7 +33,7 @@ from filter_service.shared_memory import PAGE_BYTES, Slot, aligned_starts
 
 SEND_LIMIT_S = 1.0
 REPLY_LIMIT_S = 5.0
-"""Longest wait for an import; a service of another user ignores the descriptor."""
+"""Longest wait for an import; a service run by another user ignores descriptors."""
 
 
 class SharedTextures:
@@ -42,7 +42,7 @@ class SharedTextures:
     def __init__(self) -> None:
         self.offer: TextureOffer | None = None
         self._next_number = 1
-        self._reasons: dict[int, str] = {}  # of the replies, by texture
+        self._reasons: dict[int, str] = {}  # from the replies, by texture number
         self._reported = ""
 
     def begin(self, offer: TextureOffer | None) -> None:
@@ -186,7 +186,7 @@ class SharedMemory:
     def array(
         self, held: ClientSlot, start: int, shape: tuple[int, ...], dtype: Any
     ) -> NDArray[Any]:
-        """Return an array in a slot, which it uses while it is referenced."""
+        """Return an array in a slot; while it is referenced, the slot stays in use."""
         array = held.slot.array(start, shape, np.dtype(dtype))
         held.n_users += 1
         # Views of the array keep a reference to its base.

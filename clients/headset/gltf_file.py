@@ -1,4 +1,4 @@
-"""Header, buffers and arrays of a glTF file, within limits.
+"""Reader for the header, buffers and arrays of a glTF file, with size limits.
 
 A file may reference other files. These must be in its folder or below, even after
 symbolic links are resolved, and count toward the same limit.
@@ -47,7 +47,7 @@ class Container:
     path : Path
         Path of the file.
     header : dict
-        JSON of the file, of which nothing is checked but that it is an object.
+        JSON object of the file.  Its content is not validated.
     """
 
     def __init__(self, path: Path) -> None:
@@ -58,7 +58,7 @@ class Container:
         self._lists: dict[str, list[dict[str, Any]]] = {}
 
     def list_of(self, name: str) -> list[dict[str, Any]]:
-        """Return a list of objects of the header; empty if absent."""
+        """Return a list of objects in the header; empty if absent."""
         if name not in self._lists:
             found = self.header.get(name, [])
             if not isinstance(found, list):
@@ -71,7 +71,7 @@ class Container:
         return self._lists[name]
 
     def entry(self, name: str, index: object) -> dict[str, Any]:
-        """Return an entry of a list of the header."""
+        """Return an entry of a list in the header."""
         entries = self.list_of(name)
         if type(index) is not int or not 0 <= index < len(entries):
             self.refuse(f"'{name}' {index!r:.20}", f"0 to {len(entries) - 1}")
@@ -100,7 +100,7 @@ class Container:
 
     @staticmethod
     def are_numbers(given: object, count: int) -> bool:
-        """Return whether a value of the header is a list of so many numbers."""
+        """Return whether a value of the header is a list of ``count`` numbers."""
         return (
             isinstance(given, list)
             and len(given) == count
@@ -166,7 +166,7 @@ def read_header(path: Path, content: bytes) -> tuple[dict[str, Any], memoryview]
     Raises
     ------
     InvalidFile
-        If the content is not a glTF 2 file, or beyond the limits.
+        If the content is not a glTF 2 file, or exceeds a limit.
     """
     text, binary = _split(path, content)
     return _parsed(path, text), binary

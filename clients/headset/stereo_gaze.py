@@ -1,4 +1,4 @@
-"""Gaze, focus and pupils of the two eyes of a person who looks at a scene."""
+"""Model of a viewer's two eyes: gaze, focus and pupils for each stereo frame."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ Picture = RgbdPicture | TexturePicture
 def images_of(
     picture: Picture,
 ) -> tuple[Image, NDArray[np.float32] | moderngl.Texture]:
-    """Return color and depth of a picture as it has them: arrays or textures."""
+    """Return color and depth of a picture, as arrays or textures."""
     if isinstance(picture, TexturePicture):
         return picture.image.color, picture.image.depth_m
     return picture.color, picture.depth_m
@@ -177,7 +177,7 @@ class StereoGaze:
             raise ValueError(
                 f"white_cd_m2 is {white_cd_m2}; allowed: above 0, up to 100000"
             )
-        # which refuses wrong values before anything expensive starts
+        # Raises for invalid values before anything expensive starts.
         NaturalEye(age_years=age_years, pupil_diameter_mm=pupil_diameter_mm)
         self._age_years, self._pupil_mm = age_years, pupil_diameter_mm
         self._white_cd_m2 = white_cd_m2
@@ -201,9 +201,9 @@ class StereoGaze:
         due : DueFrame
         pictures : sequence of RgbdPicture or TexturePicture
             Images of the frame.
-        known : sequence of the same, optional
-            Images whose light and depth the eyes follow, such as smaller ones of the
-            previous frame; by default those of the frame.
+        known : sequence of RgbdPicture or TexturePicture, optional
+            Images that provide luminance and depth, such as smaller images of the
+            previous frame; by default ``pictures``.
         """
         known = pictures if known is None else known
         at_s = due.now_s
@@ -215,7 +215,7 @@ class StereoGaze:
         head = _head(due, pictures)
         direction = head[:3, :3] @ direction_of(gaze.h_deg, gaze.v_deg)
         distance_m = self._distance(head[:3, 3], direction, known)
-        # Both pupils follow the light of both eyes, and both lenses the same command.
+        # Both pupils follow the mean luminance; both lenses get the same command.
         light_cd_m2 = float(
             np.mean([luminance_cd_m2(p.color, self._white_cd_m2) for p in known])
         )
@@ -257,7 +257,7 @@ class StereoGaze:
         asked : sequence of EyeAndGaze
             Requested state of each eye.
         used_dpt : sequence of float or None
-            Focus of each eye; None teaches nothing.
+            Focus of each eye; None is ignored.
         """
         for picture, eye, found_dpt in zip(pictures, asked, used_dpt, strict=True):
             if found_dpt is not None and picture.view.eye in self._eyes:
@@ -281,10 +281,10 @@ class StereoGaze:
     def _distance(
         self, origin: Array, direction: Array, pictures: Sequence[Picture]
     ) -> float:
-        """Return the distance of the point of fixation from between the eyes.
+        """Return the distance from the midpoint of the eyes to the point of fixation.
 
-        If the images have no depth there, it is the previous distance, or infinity
-        before the first one.
+        Without depth there, return the previous distance, or infinity if there is
+        none.
         """
         before_m = self._distance_m or math.inf
         for picture in reversed(pictures):
@@ -332,7 +332,7 @@ def _along(
 
 
 def _head(due: DueFrame, pictures: Sequence[Picture]) -> Array:
-    """Return the matrix of the head; if unknown, that of the eyes' mean pose."""
+    """Return the matrix of the head, or of the eyes' mean pose if it is unknown."""
     if due.head is not None:
         return matrix_of(due.head)
     poses = np.array([picture.view.pose for picture in pictures])
@@ -345,6 +345,6 @@ def _head(due: DueFrame, pictures: Sequence[Picture]) -> Array:
 
 
 def _rounded(angles_deg: tuple[float, float]) -> tuple[float, float]:
-    """Round angles, for which PSFs are prepared, to remove noise."""
+    """Round angles: noise must not cause PSFs to be prepared again."""
     h, v = (round(angle_deg, 2) + 0.0 for angle_deg in angles_deg)
     return h, v

@@ -1,8 +1,8 @@
 """Courtyard: a café garden in the evening sun, with depths from 0.3 to 30 m.
 
-It takes the place of San Miguel, the scene used in the literature, and has similar
-content: thin occluders, nearby foliage, furniture, text of several sizes, repeated
-arches and small lamps.
+It replaces San Miguel, a scene from the literature, and has similar content: thin
+occluders, nearby foliage, furniture, text in several sizes, repeated arches and small
+lamps.
 """
 
 from collections.abc import Sequence
@@ -88,7 +88,7 @@ def build() -> Scene:
 
 
 def _put(parts: list[Mesh], position_m: ArrayLike, turn_deg: float = 0.0) -> list[Mesh]:
-    """Return the parts of a thing, rotated about the vertical axis and moved."""
+    """Rotate the parts of an object about the vertical axis and move them."""
     return [placed(part, position_m, turn_deg=turn_deg) for part in parts]
 
 
@@ -524,7 +524,7 @@ def potted_tree(
     crown_m: float = 0.95,
     fruit: str = "",
 ) -> list[Mesh]:
-    """Return a small tree in a clay pot, standing on the origin."""
+    """Return a small tree in a clay pot at the origin."""
     pot = lathe(
         [(0.0, 0.0), (0.17, 0.0), (0.25, 0.36), (0.28, 0.38), (0.28, 0.44),
          (0.24, 0.44), (0.0, 0.40)],
@@ -547,7 +547,7 @@ def potted_tree(
 
 
 def cypress(*, rng: np.random.Generator, height_m: float = 7.0) -> Mesh:
-    """Return a tall dark tree, standing on the origin."""
+    """Return a tall dark tree at the origin."""
     return cloud(
         [0, height_m / 2, 0],
         [1.5, height_m, 1.5],

@@ -1,6 +1,6 @@
 """Triangle meshes as plain arrays, and the basic shapes of the scenes.
 
-The frame of every scene is that of OpenGL: meters, x right, y up, z toward the viewer.
+Every scene uses OpenGL coordinates: meters, x right, y up, z toward the viewer.
 """
 
 import itertools
@@ -114,7 +114,7 @@ def vertex_normals(vertices_m: Array, faces: NDArray[np.int64]) -> Array:
 
 
 def unit(vectors: Array) -> Array:
-    """Return vectors (..., 3) with length 1; those without a length stay 0."""
+    """Normalize vectors (..., 3) to length 1; zero vectors stay 0."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
@@ -125,7 +125,7 @@ def painted(mesh: Mesh, color: str, *, emission: float = 0.0) -> Mesh:
 
 
 def transformed(mesh: Mesh, matrix: Array) -> Mesh:
-    """Apply a (4, 4) matrix to a mesh, which may scale its axes differently."""
+    """Apply a (4, 4) matrix to a mesh; the matrix may scale axes differently."""
     linear = matrix[:3, :3]
     return replace(
         mesh,
@@ -226,7 +226,7 @@ def box(size_m: ArrayLike, *, cells: int = 1, **look: Unpack[Look]) -> Mesh:
 
 
 def block(size_m: ArrayLike, center_m: ArrayLike, **look: Unpack[Look]) -> Mesh:
-    """Return a box about a point."""
+    """Return a box centered on a point."""
     return placed(box(size_m, **look), center_m)
 
 
@@ -246,7 +246,7 @@ def lathe(profile_m: ArrayLike, *, sides: int = 20, **look: Unpack[Look]) -> Mes
 
 
 def sphere(radius_m: float, *, sides: int = 12, **look: Unpack[Look]) -> Mesh:
-    """Return a sphere about the origin."""
+    """Return a sphere centered on the origin."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, sides // 2 + 1)
     profile = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return lathe(profile, sides=sides, **look)

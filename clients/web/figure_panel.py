@@ -1,4 +1,4 @@
-"""Side panel: the point under the pointer, and figures of the eye."""
+"""Side panel of the web page: point-spread function at the pointer, and figures."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """Optical transfer functions of eyes and predicted visual acuity.
 
-transfer         optical transfer functions, and the contrast sensitivity of people
-predict          visual Strehl ratio and acuity: of a wavefront, through focus, over the
-                 field, where the sampling density of the retina limits it
-best_correction  sphere and cylinder of the highest visual Strehl ratio
+transfer         optical transfer functions, and human contrast sensitivity
+predict          visual Strehl ratio and acuity of a wavefront, through focus and over
+                 the field, where the density of retinal cells limits acuity
+best_correction  sphere and cylinder with the highest visual Strehl ratio
 
 Spatial frequencies are in cycles per degree (``_cpd``).  Acuity is in logMAR, the
 decimal logarithm of the smallest legible gap in minutes of arc.

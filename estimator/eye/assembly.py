@@ -1,12 +1,12 @@
 """Conversion of the 45 parameters to surfaces, for one eye or packed batches.
 
 The shape of the lens follows from its diameter and volume.  Two conic caps that meet at
-the equator cannot represent a real lens, which has a thick rounded rim.  Both rules
-assign part of the volume to the caps and a thickness to the rim.
+the equator cannot represent a real lens, which has a thick rounded rim.  Two rules, A
+and C, assign part of the volume to the caps and a thickness to the rim.
 
 The accommodating lens shrinks at constant volume, which steepens both surfaces (rule
-C).  Its anterior pole, and the stop with it, moves forward by the growth of the
-thickness before the equator, so the aqueous thins.  The eye length does not change.
+C).  The part before the equator gets thicker, which moves the anterior pole and the
+stop forward and makes the aqueous thinner.  The eye length does not change.
 """
 
 import math
@@ -180,7 +180,7 @@ def eye_surfaces(
     Parameters
     ----------
     parameters : EyeParameters
-        Relaxed eye, or one with the lens diameter and aqueous of an accommodated state.
+        Relaxed or accommodated eye (other lens diameter and aqueous thickness).
     retina : RetinaShape, optional
         Shape of the retina; by default a sphere of radius eye length / 2.
     lens_rule : {"C", "compat"}
@@ -276,7 +276,7 @@ def _lens_surfaces(
 def pack_eyes(
     vectors: NDArray[np.float64], *, retina: RetinaShape | None = None
 ) -> NDArray[np.float64]:
-    """Pack many eyes at once: `pack_eye` of `eye_surfaces`, without the objects.
+    """Pack many eyes at once, like `pack_eye(eye_surfaces(...))` without objects.
 
     Parameters
     ----------

@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 OUT_OF_REACH_DPT = 0.01
 """Distance from the eye's range beyond which a focus is reported as out of reach.
 
-A traced eye matches its prescription to this.  It is invisible: through 6 mm it moves
-rays by 0.1 arcmin to either side.
+A traced eye matches its prescription within this limit.  The difference is invisible:
+it displaces rays through a 6 mm pupil by at most 0.1 arcmin.
 """
 
 RANGE_PUPIL_COUNT = 5
-"""Number of pupils in a range at which the accommodation for a focus is evaluated: it
-changes slowly and smoothly with the pupil."""
+"""Number of pupils in a range for which the accommodation is computed.  A few suffice,
+because the accommodation changes slowly and smoothly with the pupil."""
 
 
 class Focusing(ABC):
@@ -41,8 +41,8 @@ class Focusing(ABC):
     Attributes
     ----------
     refraction_dpt : float
-        Least-squares M at the cornea and 555 nm of the relaxed eye at the measured
-        pupil, through the correction: the clinical refraction.
+        Clinical refraction: least-squares M of the relaxed eye and its correction, at
+        the cornea, at 555 nm and for the measured pupil.
     amplitude_dpt : float
         Largest accommodation.
     vergence : ObjectVergence
@@ -63,7 +63,7 @@ class Focusing(ABC):
     def accommodation_for_dpt(
         self, refraction_dpt: float, *, pupil_diameter_mm: float
     ) -> float:
-        """Return the reachable accommodation whose M at a pupil is closest to this."""
+        """Return the reachable accommodation with M closest to this refraction."""
 
     @abstractmethod
     def largest_accommodation_dpt(self, pupil_diameter_mm: float) -> float:
@@ -217,10 +217,10 @@ NEAREST_PUPIL_MM = 0.6
 """Standard pupils closer than this to the eye's own pupil are omitted."""
 
 SAME_NODE = 1e-12
-"""Distance from a node at which a polynomial has its value."""
+"""Distance within which a position counts as the node itself."""
 
 LEAST_STATES = 3
-"""Number of accommodations at which light must fill a pupil; others are omitted."""
+"""Pupils that light fills at fewer accommodations than this are omitted."""
 
 
 def table_pupils_mm(own_mm: float) -> list[float]:
@@ -258,9 +258,9 @@ class FocusTable:
         self._last: tuple[float, list[float], _Polynomial | None] = (0.0, [], None)
 
     def _at_pupil(self, pupil_mm: float) -> tuple[list[float], _Polynomial]:
-        """Return refractions (m,) at a pupil, and the polynomial over them.
+        """Return refractions (m,) at a pupil, and the polynomial through them.
 
-        Those of the last pupil are cached: a frame asks for one pupil several times.
+        The last result is cached: a frame requests the same pupil several times.
         """
         last_mm, found_dpt, inverse = self._last
         if inverse is None or last_mm != pupil_mm:
@@ -278,7 +278,7 @@ class FocusTable:
     def accommodation_dpt(self, *, pupil_mm: float, refraction_dpt: float) -> float:
         """Return the accommodation in the table with the nearest refraction.
 
-        Only those up to which the refraction falls are in reach.
+        Accommodations beyond the first minimum of the refraction cannot be reached.
         """
         found_dpt, inverse = self._at_pupil(pupil_mm)
         used_dpt = self._over_accommodation.nodes[: len(inverse.nodes)]
@@ -290,12 +290,12 @@ class FocusTable:
 class _Polynomial:
     """Polynomial through values at fixed nodes, by the barycentric formula.
 
-    It has few nodes, so that NumPy would take five times as long.
+    It uses lists: for so few nodes, NumPy would take five times as long.
     """
 
     def __init__(self, nodes: list[float]):
         self.nodes = nodes
-        # so that many nodes do not overflow
+        # Scaling to 4 keeps the products of many nodes from overflowing.
         unit = 4.0 / ((max(nodes) - min(nodes)) or 1.0)
         self._shares = [
             1.0 / math.prod((node - other) * unit for other in nodes if other != node)
@@ -312,13 +312,13 @@ class _Polynomial:
         return [term / total for term in terms]
 
     def through(self, values: list[float], at: float) -> float:
-        """Return the value at a position of the polynomial through values (n,)."""
+        """Evaluate the polynomial through values (n,) at a position."""
         weights = self.weights(at)
         return sum(w * value for w, value in zip(weights, values, strict=True))
 
 
 def _falling(values: list[float]) -> list[float]:
-    """Return the first of values, as long as they fall."""
+    """Return the leading values that strictly decrease."""
     for count, (value, following) in enumerate(pairwise(values), start=1):
         if following >= value:
             return values[:count]
@@ -326,11 +326,11 @@ def _falling(values: list[float]) -> list[float]:
 
 
 def _filled(nodes: NDArray[Any], rows: NDArray[Any]) -> NDArray[Any]:
-    """Return rows (n, m) whose NaN are replaced by the polynomial through the others.
+    """Fill NaN in rows (n, m) by the polynomial through the other values.
 
-    A strongly curved lens does not pass the light of a wide pupil.  Without that pupil,
-    M at all accommodations would be extrapolated from narrower ones: in the cataract
-    preset, it was off by 0.06 dpt at 6 mm and 0.17 dpt at 7 mm.
+    A strongly curved lens blocks part of the light of a wide pupil.  Omitting that pupil
+    would extrapolate M at all accommodations from narrower ones: in the cataract
+    preset, M was off by 0.06 dpt at 6 mm and 0.17 dpt at 7 mm.
     """
     rows = rows.copy()
     for row in rows:

@@ -1,11 +1,13 @@
-"""The eye of the published pipeline: parameters, focus and wavefronts by network.
+"""Eye of the published pipeline: neural networks compute parameters and wavefronts.
 
-The networks are those of Csoba & Kunkli (2023), section 5.  They know the eye model
-alone: its spherical retina and its periphery, and no correction.  What a measurement
-has beyond the eye network's eye is not added.
+The PSF cache uses this eye if the setting ``pipeline`` is "published".  The three
+networks of Csoba & Kunkli (2023), section 5, estimate the parameters of the eye, focus
+it and predict its wavefronts.  They were trained on the eye model, with its spherical
+retina and its own periphery, and without a correction.  The residual between the
+measurement and the estimated eye is not added.
 
-The aberration network does not know vignetting.  Its error in this eye is measured at
-the axis and at the corners of the field, which are traced.
+The aberration network does not model vignetting.  To report its error in this eye, the
+axis and the corners of the field are ray-traced, too.
 """
 
 import math
@@ -53,24 +55,24 @@ PUPIL_STEP_MM = 1.0
 """Step of the pupils at which the network is evaluated, as in the published grid."""
 
 CORNEA_RADIUS_MM = 7.8
-"""Radius of the sphere that represents the cornea in the distance to the entrance
-pupil, with an error of 0.05 mm at 45 deg."""
+"""Radius of the sphere that approximates the cornea.  The distance from the cornea to
+the entrance pupil has an error of 0.05 mm at 45 deg."""
 
 ESTIMATED_SHARE, FOCUSED_SHARE = 0.3, 0.5
-"""Progress once the eye is estimated, and once it is focused."""
+"""Progress after estimating the eye, and after focusing it."""
 
 
 class NetworkEye(TracedEye):
-    """A `TracedEye` whose wavefronts are those of the aberration network.
+    """A `TracedEye` with wavefronts from the aberration network.
 
-    Fields beyond the network's training range have the wavefront at its edge.  Pupils
-    are limited to that range, too.
+    Directions outside the network's training range get the wavefront at the edge of
+    that range.  Pupils are limited to the range, too.
     """
 
     pupil_limit = "network's"
 
     def usable_pupil_mm(self, pupil_diameter_mm: float) -> float:
-        """Return the pupil, limited to those that the network was trained for."""
+        """Return the pupil, limited to the training range of the network."""
         smallest_mm = float(self.grid.pupil_diameters_mm[0])
         return max(super().usable_pupil_mm(pupil_diameter_mm), smallest_mm)
 
@@ -99,7 +101,7 @@ def network_eye(
     field_range_deg: FieldRange,
     progress: Callable[[float, str], None] | None = None,
 ) -> tuple[NetworkEye, tuple[str, ...]]:
-    """Return the eye of a profile by network over its visual field, and notes on it.
+    """Estimate the eye of a profile by network; return it with notes.
 
     Parameters
     ----------
@@ -159,7 +161,7 @@ def network_eye(
 
 
 def _check_profile(profile: EyeProfile) -> None:
-    """Refuse what the networks were not trained for.
+    """Raise if the networks were not trained for this kind of profile.
 
     Raises
     ------
@@ -184,12 +186,12 @@ def trained_range(network: str, column: str) -> tuple[float, float]:
 
 
 def _bare(found: EstimatedEye) -> EstimatedEye:
-    """Return the eye as one given by its parameters: no residual is added to it."""
+    """Return the eye as defined by its parameters alone, without a residual."""
     return replace(found, profile=replace(found.profile, eye=found.parameters))
 
 
 def _pupils_mm(low_mm: float, high_mm: float) -> NDArray[np.float64]:
-    """Return pupils (n,) over a range, in whole steps where it has several."""
+    """Return pupils (n,): both ends of a range and whole millimeters in between."""
     inner = np.arange(math.ceil(low_mm), math.floor(high_mm) + 1, PUPIL_STEP_MM)
     return np.unique([low_mm, *inner, high_mm])
 
@@ -197,10 +199,11 @@ def _pupils_mm(low_mm: float, high_mm: float) -> NDArray[np.float64]:
 def network_focused(
     eye: EstimatedEye, accommodations_dpt: ArrayLike
 ) -> list[FocusedEye]:
-    """Return the eye at accommodations (n,) within its amplitude, by focus network.
+    """Return the eye at accommodations (n,) within its amplitude.
 
-    The relaxed eye is known.  Of the network's two outputs, only the lens diameter is
-    used; the chamber depth follows from it by the rule of `accommodated_eyes`.
+    The focus network predicts the accommodated states.  Only one of its two outputs is
+    used, the lens diameter: the chamber depth follows from the diameter by the rule of
+    `accommodated_eyes`.
 
     Raises
     ------
@@ -299,9 +302,9 @@ def traced_errors_um(
 ) -> NDArray[np.float64]:
     """Return the mean error (n,) of 27 terms of a grid at some of its fields.
 
-    They are traced with the largest pupil and the shortest wavelength, at the least and
-    the greatest accommodation.  Nodes at which light passes a part of the pupil only
-    are left out.
+    The reference is ray tracing with the largest pupil and the shortest wavelength, at
+    the least and the greatest accommodation.  Nodes where light does not fill the pupil
+    are omitted.
 
     Parameters
     ----------
