@@ -295,7 +295,7 @@ class _Polynomial:
 
     def __init__(self, nodes: list[float]):
         self.nodes = nodes
-        # Scaling to 4 keeps the products of many nodes from overflowing.
+        # Scaling keeps the products over many nodes from overflowing.
         unit = 4.0 / ((max(nodes) - min(nodes)) or 1.0)
         self._shares = [
             1.0 / math.prod((node - other) * unit for other in nodes if other != node)
@@ -328,9 +328,9 @@ def _falling(values: list[float]) -> list[float]:
 def _filled(nodes: NDArray[Any], rows: NDArray[Any]) -> NDArray[Any]:
     """Fill NaN in rows (n, m) by the polynomial through the other values.
 
-    A strongly curved lens blocks part of the light of a wide pupil.  Omitting that pupil
-    would extrapolate M at all accommodations from narrower ones: in the cataract
-    preset, M was off by 0.06 dpt at 6 mm and 0.17 dpt at 7 mm.
+    A strongly curved lens blocks part of the light of a wide pupil.  If that pupil were
+    omitted, M would be extrapolated from narrower ones at all accommodations: in the
+    cataract preset, M was off by 0.06 dpt at 6 mm and 0.17 dpt at 7 mm.
     """
     rows = rows.copy()
     for row in rows:
