@@ -176,8 +176,11 @@ class TracedEye(FocusingEye):
         range_dpt = eye.accommodating.accommodation_range_dpt(
             focus_range_dpt, pupil_range_mm=(pupils_mm[0], pupils_mm[-1])
         )
+        nodes_dpt = accommodation_nodes_dpt(*range_dpt)
         states: dict[str, Any] = {
-            "accommodations_dpt": accommodation_nodes_dpt(*range_dpt),
+            "accommodations_dpt": nodes_dpt,
+            # both grids trace the same eyes, which take 2 to 5 ms to find and pack
+            "states": eye.accommodating.states_at(nodes_dpt),
             "wavelengths_nm": np.unique(wavelengths_nm),
             "n_terms": traced_terms(eye),
         }

@@ -30,7 +30,6 @@ from estimator.optics.surfaces import (
     check_eye,
     horner_order,
     media_indices,
-    pack_eye,
 )
 from estimator.optics.units import MM_PER_M
 from estimator.optics.zernike import EXPONENTS
@@ -221,7 +220,7 @@ def cardinal_points(eye: EyeSurfaces, *, wavelength_nm: float) -> CardinalPoints
         The eye cannot be traced, or the wavelength is out of range.
     """
     check_eye(eye)
-    packed, indices = pack_eye(eye), media_indices(eye, wavelength_nm)
+    packed, indices = eye.packed, media_indices(eye, wavelength_nm)
     n_surfaces = len(eye.surfaces)
     n_before = int(packed[-1, N_BEFORE_STOP])
     whole = system_matrix(packed, indices, first=0, last=n_surfaces)
@@ -257,7 +256,7 @@ def cardinal_points(eye: EyeSurfaces, *, wavelength_nm: float) -> CardinalPoints
 
 def entrance_pupil_mm(eye: EyeSurfaces, *, wavelength_nm: float) -> float:
     """Return the position of the entrance pupil, mm behind the corneal apex."""
-    return entrance_pupil_of_packed(pack_eye(eye), media_indices(eye, wavelength_nm))
+    return entrance_pupil_of_packed(eye.packed, media_indices(eye, wavelength_nm))
 
 
 def entrance_pupil_of_packed(packed: NDArray[Any], indices: NDArray[Any]) -> float:

@@ -13,7 +13,7 @@ parameters of each gradient-index medium.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -168,6 +168,13 @@ class EyeSurfaces:
     retina: Retina
     indices: Mapping[str, float] | None = field(default=None)
     media: Mapping[str, Dispersion | Gradient] | None = field(default=None)
+
+    @cached_property
+    def packed(self) -> NDArray[np.float64]:
+        """Return the result of `pack_eye`, read-only; grids and chief rays share it."""
+        packed = pack_eye(self)
+        packed.setflags(write=False)
+        return packed
 
 
 @cache

@@ -30,7 +30,6 @@ from estimator.optics.surfaces import (
     EyeSurfaces,
     check_eye,
     media_indices,
-    pack_eye,
 )
 from estimator.optics.units import MRAD_PER_RAD, REFERENCE_WAVELENGTH_NM
 from estimator.optics.zernike import N_TERMS, monomial_matrix
@@ -180,7 +179,7 @@ def packed_eyes(eyes: Sequence[EyeSurfaces]) -> NDArray[np.float64]:
         raise ValueError(f"eyes with {sorted(counts)} surfaces: must have as many each")
     for eye in eyes:
         check_eye(eye)
-    return np.stack([pack_eye(eye) for eye in eyes])
+    return np.stack([eye.packed for eye in eyes])
 
 
 @contextmanager
