@@ -15,7 +15,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 from numpy.typing import NDArray
 
@@ -42,9 +42,6 @@ from filter_service.settings import DEFAULT_OPTIONS, Output, RenderOptions
 from filter_service.stage_times import StageTimes
 from filter_service.texture_view import EarlierFrame, GlTexture, TextureView
 from filter_service.view_state import EyeName, State, ViewState, WithState, check_states
-
-if TYPE_CHECKING:
-    from filter_service.filtering.eye_filter import EyeFilter
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -280,7 +277,7 @@ class _BegunFrame:
 
 
 def plan_views(
-    filter_of: Callable[[EyeName], EyeFilter | None],
+    filter_of: Callable[[EyeName], Any],
     views: Sequence[RgbdView | TextureView],
     states: Sequence[ViewState],
     *,
@@ -295,7 +292,7 @@ def plan_views(
     Parameters
     ----------
     filter_of : callable
-        Returns the filter of an eye.
+        Returns the `EyeFilter` of an eye, or None.
     views : sequence of RgbdView or TextureView
     states : sequence of ViewState, one for each view
         Values that are None default to those of the frame.
