@@ -115,11 +115,6 @@ class Filtered(FrameCounts, WithState):
         return self.views[0].state
 
     @property
-    def gazes_deg(self) -> tuple[tuple[float, float], ...]:
-        """Return the gaze of each view."""
-        return tuple(view.gaze_deg for view in self.views)
-
-    @property
     def profile_id(self) -> int:
         """Return the identifier of the first view's profile."""
         return self.views[0].profile_id
