@@ -271,7 +271,9 @@ class Builder:
         self.await_event(stream)
         with self.turn():
             plan = stream.plan(cameras, newest_only=newest_only)
-        self.prepare()
+            has_work = stream.next_build() is not None
+        if has_work:  # otherwise predictions would go before the frame
+            self.prepare()
         self.free_retired(stream)
         return plan
 

@@ -180,6 +180,17 @@ def test_frames_that_never_wait_are_enough_to_prepare_an_eye():
     assert seen.color.shape == COLOR.shape
 
 
+def test_an_eye_is_prepared_while_its_filter_is_not_called(eye_filter, events):
+    eye_filter.set_profile(eye(4))
+    end_s = time.monotonic() + 20.0
+    while not [store for store in eye_filter.prepared_stores if store.is_ready]:
+        assert time.monotonic() < end_s, "the eye was never ready"
+        time.sleep(0.001)
+    assert events == [], "events were delivered in another thread"
+    eye_filter.wait(10.0)
+    assert isinstance(events[-1], EyeReady)
+
+
 def test_a_new_eye_keeps_the_settings_unless_told_others(builder):
     own = FilterSettings(mode="on-axis")
     with EyeFilter(None, CAMERA, own, builder=builder) as made:
