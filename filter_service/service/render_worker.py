@@ -66,7 +66,8 @@ IDLE_WAIT_S = 0.5
 WORKER_POLL_S = 0.1
 STATE_INTERVAL_S = 0.5
 INTERRUPTION_INTERVAL_S = 0.01
-"""Minimum time between two interruptions of a frame."""
+"""Minimum time between two interruptions of a frame.  Beside a stream of 1280x720,
+frames of 160x90 took 29 and 45 ms (median), and 154 and 118 without interruptions."""
 
 LONG_FRAME_S = 0.2
 """Duration of a frame after which its interruptions also advance builds of eyes."""
