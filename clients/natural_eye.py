@@ -1,9 +1,9 @@
-"""Eye whose pupil follows the light and whose focus follows the viewed distance.
+"""Eye whose pupil follows the luminance and whose focus follows the viewed distance.
 
     eye = NaturalEye(age_years=35)
     state = eye.look(luminance_cd_m2, distance_dpt, at_s)
 
-The dynamics are those of `estimator.dynamics`, which lists their sources.
+The dynamics come from `estimator.dynamics`, which lists their sources.
 """
 
 from __future__ import annotations

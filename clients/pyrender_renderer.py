@@ -137,7 +137,7 @@ class _SampledCamera(pyrender.Camera):
 
     @zfar.setter
     def zfar(self, value: float | None) -> None:
-        """Keep that of the camera; pyrender's setter accepts no None."""
+        """Keep the camera's zfar; pyrender's setter does not accept None."""
 
     def get_projection_matrix(
         self, width: int | None = None, height: int | None = None
@@ -192,10 +192,10 @@ class PyrenderRenderer:
 
     Notes
     -----
-    A pixel's color is the mean of its samples in linear light, and its depth that of
-    one sample, as for `SceneView`.  Samples are taken at their centers: pyrender's own
-    four-fold multisampling averages sRGB values, and takes the depth of a point that
-    OpenGL does not specify, which is wrong by 0.4 px of slope.
+    A pixel's color is the mean of its samples in linear light, and its depth the
+    depth of one sample, as for `SceneView`.  Samples are taken at their centers:
+    pyrender's own four-fold multisampling averages sRGB values, and takes the depth of
+    a point that OpenGL does not specify, which is wrong by 0.4 px of slope.
     """
 
     def __init__(
@@ -262,7 +262,7 @@ class PyrenderRenderer:
         Raises
         ------
         ValueError
-            If the pose or the camera is not that of a perspective view.
+            If the pose or the camera does not describe a perspective view.
         RenderFailed
             If OpenGL reports an error.
         """
@@ -317,8 +317,8 @@ def pyrender_frames(
         `clients.scene_renderer`).  None is one frame from the pose of the scene's main
         camera, with a pupil of 4 mm and the focus at infinity.
     ipd_mm : float, optional
-        Interpupillary distance of stereo frames, whose poses are those of the point
-        between the eyes; None renders one view.
+        Interpupillary distance of stereo frames.  Their poses refer to the midpoint
+        between the eyes.  None renders one view.
     flags, supersampling, infinite_from_m
         As for `PyrenderRenderer`.
 

@@ -118,7 +118,7 @@ class StreamOptions:
         str | None,
         typer.Option(
             metavar="PROFILE",
-            help="Profile of the right eye for --stereo; by default that of --profile.",
+            help="Profile of the right eye for --stereo; by default same as --profile.",
         ),
     ] = None
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of a view in px.")] = (

@@ -64,7 +64,7 @@ class SceneFrame(WithState):
 
     @property
     def views(self) -> list[RgbdView]:
-        """Return one view, or those of the left and the right eye."""
+        """Return one view, or the views of the left and the right eye."""
         return [self.view] if self.right_view is None else [self.view, self.right_view]
 
 
@@ -209,8 +209,8 @@ def frame_at(
     moment : Moment
         Pose of the point between the eyes, pupil and focus.
     render : callable
-        Returns color and depth seen from a pose (4, 4), followed by those of the hidden
-        layer if there is one.
+        Returns color and depth seen from a pose (4, 4), followed by color and
+        depth of the hidden layer, if there is one.
     tangents, ipd_mm
         As for `SceneFrame` and `scene_frames`.
     """

@@ -120,7 +120,7 @@ TO_COLOR = np.linalg.inv(
         ]
     )
 )
-"""Matrix from the frame of the depth camera to that of the color camera. It also
+"""Matrix from the frame of the depth camera to the frame of the color camera. It also
 reverses directions, which the projection cancels."""
 
 SHIFT_M = np.array(
@@ -158,7 +158,7 @@ def _counted(name: str) -> tuple[list[str | float], str]:
 
 def _at_an_end(words: tuple[str, ...]) -> re.Pattern[str]:
     any_of = "|".join(words)
-    # Not on the text in lower case: that of some letters has another length.
+    # Not on lowercase text: the lowercase form of some letters has another length.
     return re.compile(rf"^({any_of})[-_.]|[-_.]({any_of})\Z", re.ASCII | re.IGNORECASE)
 
 

@@ -292,7 +292,7 @@ class Manifest:
     def records(self) -> Iterator[Record]:
         """Yield the last record of each frame, sorted by profile and name.
 
-        Names are those of `text_of`.
+        Names are in the form that `text_of` returns.
         """
         for key in sorted(self._places):
             if key[1] != _VIDEO:
@@ -332,7 +332,7 @@ class Manifest:
 
 
 def begin_manifest(out: Path, job: Mapping[str, Any]) -> None:
-    """Replace the manifest of a folder by that of a new job, atomically."""
+    """Replace the manifest of a folder by a new one for a job, atomically."""
     write_atomically(out / LINES, _job_line(job))
 
 

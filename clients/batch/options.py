@@ -77,7 +77,7 @@ class BatchOptions:
         typer.Option(metavar="FX,FY,CX,CY", help="Camera matrix in px."),
     ] = None
     limit: Annotated[
-        int | None, typer.Option(metavar="N", help="Use the first N frames only.")
+        int | None, typer.Option(metavar="N", help="Use only the first N frames.")
     ] = None
     pupil_mm: Annotated[float, typer.Option(help="Entrance pupil, mm.")] = 4.0
     focus_dpt: Annotated[
@@ -92,7 +92,7 @@ class BatchOptions:
         Path | None,
         typer.Option(
             metavar="CSV",
-            help="A line for each frame, with the columns frame, pupil_mm and "
+            help="Table with one row per frame and the columns frame, pupil_mm and "
             "focus_dpt.",
         ),
     ] = None

@@ -21,7 +21,7 @@ MAX_RATIO = 1000
 """Largest denominator of the shape of a pixel."""
 
 MAX_DENOMINATOR = 1001
-"""Largest denominator of a frame rate; that of NTSC, 30000/1001, is exact."""
+"""Largest denominator of a frame rate; NTSC (30000/1001) is exact."""
 
 VARIABLE_TICK_S = Fraction(1, 90_000)
 """Unit of the times of a video whose frame rate varies, as in MPEG."""

@@ -419,5 +419,5 @@ def _ms_since(start_s: float) -> float:
 
 
 def _cpu_ms_since(start_s: float) -> float:
-    """Return the CPU time of this process, without that of building PSFs."""
+    """Return the CPU time of this process, without the time for building PSFs."""
     return round(1e3 * (time.process_time() - start_s), 2)

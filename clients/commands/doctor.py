@@ -129,7 +129,7 @@ def examine() -> dict[str, Any]:
 def gl_devices() -> list[dict[str, Any]]:
     """Return the EGL devices, each with its ``renderer`` or ``error``.
 
-    Each device is probed in a process of its own, which a broken driver may crash.
+    Each device is probed in a separate process, which a broken driver may crash.
     """
     devices = run_probe("devices").get("devices", [])
     for device in devices:
@@ -142,7 +142,7 @@ def gl_devices() -> list[dict[str, Any]]:
 def run_probe(
     name: str, timeout_s: float = PROBE_TIMEOUT_S, *, gl_device: str = ""
 ) -> dict[str, Any]:
-    """Run a probe in a process of its own; on failure, return the ``error``."""
+    """Run a probe in a separate process; on failure, return the ``error``."""
     command = [sys.executable, "-m", "clients.commands.doctor_probes", name]
     try:
         finished = subprocess.run(

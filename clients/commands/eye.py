@@ -47,9 +47,9 @@ def estimate(
     method: Annotated[
         Method,
         typer.Option(
-            help="network: the eye network alone, checked by ray tracing; refined: "
-            "least squares on traced coefficients, from a table's first guess; search: "
-            "the pattern search of the paper."
+            help="network: eye network only, verified by ray tracing; refined: least "
+            "squares on traced coefficients, starting from a lookup table; search: "
+            "the paper's pattern search."
         ),
     ] = "refined",
     max_time_s: Annotated[
@@ -179,15 +179,16 @@ def field(
     """Print refraction and aberrations over a grid of visual field directions.
 
     The grid combines each azimuth with each elevation.  Coefficients are OSA, um, at
-    the cornea, on the circle about the chief ray that encloses the pupil; the table has
-    its radius.  M, J0 and J45 are the least-squares refraction.  Off-axis values are
-    those of a measured population with the same on-axis values.  They follow the
-    off-axis measurements in the profile, within about 0.05 dpt if these are typical
-    of people.  With "periphery": "model" in the profile, they are those of the eye
-    model.
+    the cornea, on the circle about the chief ray that encloses the pupil; the table
+    lists its radius.  M, J0 and J45 are the least-squares refraction.
 
-    With --people, the table describes persons drawn from the population: people with
-    this prescription or this wavefront on the axis differ in everything else.
+    Off-axis values are the most probable ones of a measured population with the same
+    on-axis values.  They match off-axis measurements in the profile, within about 0.05
+    dpt if the measurements are typical.  With "periphery": "model" in the profile, they
+    are traced through the eye model instead.
+
+    With --people, the table describes persons drawn from the population, who share the
+    prescription, or the wavefront on the axis, and differ in everything else.
 
     ocufilter field keratoconus --pupil-mm 4 --wavelength-nm 555 --v-deg=-20,0,20
     """

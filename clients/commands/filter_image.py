@@ -79,7 +79,7 @@ def filter_image(
             metavar="FILE",
             help="Depth: floats in meters (.npy, TIFF, .exr, .pfm), or integers in "
             "millimeters or units of --depth-scale (16-bit PNG, .pgm, TIFF, .npy).  "
-            "inf is infinity; 0, negative, NaN and 65535 of 16 bits are missing.",
+            "inf is infinity; 0, negative, NaN and 16-bit 65535 are missing.",
         ),
     ] = None,
     distance_m: Annotated[

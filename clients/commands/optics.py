@@ -56,8 +56,8 @@ Elevation = Annotated[
 ]
 
 OF_THE_MODEL = (
-    "--fit slope is that of the estimated eye model, without the rest of the "
-    "measurement and the periphery of people; --fit opd includes them"
+    "--fit slope describes the estimated eye model, without the residual of the "
+    "measurement and the population's periphery; --fit opd includes them"
 )
 
 
@@ -86,20 +86,21 @@ def wavefront(
     fit: Annotated[
         Fit,
         typer.Option(
-            help="Fit the traced wavefront (opd) or its slopes; slopes are those of "
-            "the eye model."
+            help="Fit the traced wavefront (opd), or the slopes of the eye model's "
+            "wavefront (slope)."
         ),
     ] = "opd",
     json_output: Json = False,
 ) -> None:
     """Print the Zernike coefficients of an eye's wavefront in one direction.
 
-    Coefficients are OSA, um, at the cornea.  A measurement, prescription or preset has
-    the wavefront that frames and the commands `field` and `psf` use, through the
-    correction, on the circle of the entrance pupil: on the axis the measured wavefront,
-    and off the axis that of people with the same wavefront on the axis.  An eye that is
-    given by its surfaces or parameters is traced as it is, to where the chief ray meets
-    the cornea, on the circle there that encloses the projected pupil.
+    Coefficients are OSA, um, at the cornea.  For a measurement, prescription or preset,
+    they describe the wavefront that frames and the commands `field` and `psf` use,
+    through the correction, on the circle of the entrance pupil.  On the axis, this is
+    the measured wavefront.  Off the axis, it is the most probable wavefront of people
+    with the same wavefront on the axis.  An eye given by its surfaces or parameters is
+    traced to the point where the chief ray meets the cornea, on the circle that
+    encloses the projected pupil.
 
     ocufilter wavefront eye.json --stop-mm 4 --wavelength-nm 555 --h-deg 20
     """
@@ -341,9 +342,10 @@ def psf(
     """Compute one PSF, integrated over pixels that are square in visual angle.
 
     The kernel is an array [y, x] in image orientation (rows grow downward), with the
-    chief ray at its center and unit sum.  It is the PSF that the filter uses, of the
-    traced eye with its elliptical pupil: on the axis it has the measured wavefront, and
-    off the axis that of people with the same wavefront on the axis.
+    chief ray at its center and unit sum.  It is the PSF that the filter uses, for the
+    traced eye with its elliptical pupil.  On the axis, it is based on the measured
+    wavefront.  Off the axis, it is based on the most probable wavefront of people with
+    the same wavefront on the axis.
 
     ocufilter psf keratoconus --pupil-mm 5 --wavelength-nm 549
     --pixel-arcmin 1 --h-deg 20 -o psf.png

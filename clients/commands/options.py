@@ -40,10 +40,10 @@ OPTION_HELP = {
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command an option for each field of the dataclass ``options`` it receives.
+    """Give a command an option for each field of its argument, a dataclass.
 
-    Fields are annotated as parameters of a command are.  Commands that share options
-    derive their dataclasses from one.
+    Annotate fields like parameters of a command.  Commands that share options derive
+    their dataclasses from a common base.
     """
     record = get_type_hints(command)["options"]
     hints = get_type_hints(record, include_extras=True)
@@ -92,7 +92,7 @@ def _expanded(
     options: list[inspect.Parameter],
     value_of: Callable[[dict[str, Any]], Any],
 ) -> Callable[..., None]:
-    """Return a command that has several options in place of one parameter.
+    """Replace one parameter of a command with several options.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def _expanded(
         The parameter.
     options : list of inspect.Parameter
     value_of : callable
-        Function of the values of the options that returns that of the parameter.
+        Function that maps the values of the options to the value of the parameter.
     """
 
     @functools.wraps(command)
@@ -163,7 +163,7 @@ def _plain_type(kind: Any) -> Any:
 
 
 def _settings(given: dict[str, Any]) -> dict[str, Any]:
-    """Convert the values of options to those of settings.
+    """Convert values of options to values of settings.
 
     Raises
     ------

@@ -114,8 +114,8 @@ def latency(
         bool,
         typer.Option(
             "--stereo",
-            help="Also measure frames of two views, each of which has its own eye and "
-            "the field of view of a headset.",
+            help="Also measure frames of two views, each with its own eye and a "
+            "headset's field of view.",
         ),
     ] = False,
     frames: Annotated[
@@ -143,11 +143,11 @@ def latency(
 ) -> None:
     """Time frames through a running service, and compute the error of the images.
 
-    Frames are sent at a fixed rate, each with another pupil and focus, and their ages
-    count from that schedule.  Prints the median, the 90th and 99th percentile and the
-    maximum of the round trip, the ages and each stage; the frames that were dropped;
-    the time from a change of the profile to its first frame; and, computed afterward
-    on this machine, the PSNR to exact frames.
+    Frames are sent at a fixed rate, each with a different pupil and focus, and their
+    ages are relative to that schedule.  Prints the median, the 90th and 99th percentile
+    and the maximum of the round trip, the ages and each stage; the frames that were
+    dropped; the time from a change of the profile to its first frame; and, computed
+    afterward on this machine, the PSNR to exact frames.
 
     ocufilter latency tcp://127.0.0.1:5577 --size 640x360 --size 1280x720
     """
@@ -259,7 +259,7 @@ def add(
 
     Send the file to the client, and only to the client, over a secure channel.  A
     service that runs with this folder (keys_dir in its configuration) accepts the key
-    at once.
+    immediately.
 
     ocufilter keys add lab
     """

@@ -1,7 +1,7 @@
 """Curves of an eye by spatial frequency, distance and direction, and of drawn persons.
 
 Drawn persons have the prescription of an eye, or its wavefront on the axis, and differ
-in everything else.  Their curves are coarser than those of an `EyeStudy`: a person
+in everything else.  Their curves are coarser than the curves of an `EyeStudy`: a person
 takes 0.3 s instead of 5 s.
 """
 

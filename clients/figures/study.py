@@ -108,8 +108,8 @@ class PupilWavefront:
         """Return the wavefront with the best sphere and cylinder for this pupil.
 
         These have the highest visual Strehl ratio at which neither that ratio nor the
-        acuity is worse than without them.  Through lenslets, they are those of least
-        squares.
+        acuity is worse than without them.  Through lenslets, they
+        are the least-squares sphere and cylinder.
         """
         if not self.is_readable:
             return self._least_squares
@@ -122,7 +122,7 @@ class PupilWavefront:
     def near_best_corrected(self, *, n_samples: int) -> PupilWavefront:
         """Return the wavefront with the best sphere and cylinder near least squares.
 
-        Without large higher orders it is that of `best_corrected`, in less time.
+        Without large higher orders, it equals `best_corrected` and takes less time.
 
         Parameters
         ----------
@@ -376,7 +376,7 @@ class EyeStudy:
 
     @property
     def is_field_assumed(self) -> bool:
-        """Return whether all off-axis wavefronts are those of the population."""
+        """Return whether all off-axis wavefronts come from the population."""
         profile = self.profile
         measured = any(not m.is_on_axis for m in profile.measurements)
         return profile.periphery == "people" and not measured

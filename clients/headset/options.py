@@ -44,7 +44,7 @@ class EyeOptions:
         float | None,
         typer.Option(
             metavar="MM",
-            help="Fixed pupil diameter; by default the pupil follows the light.",
+            help="Fixed pupil diameter; by default the pupil follows the luminance.",
         ),
     ] = None
     focus_dpt: Annotated[
@@ -134,7 +134,7 @@ class Eyes:
     settings : FilterSettings
         Settings of the filter.
     seeing : StereoFilter
-        Filter that is told of each change.
+        Filter to update after each change.
     look : StereoGaze
         Gaze, focus and pupils.
     say : callable

@@ -119,7 +119,7 @@ class ShownView:
     Attributes
     ----------
     view : EyeView
-        View that the image was rendered for, possibly that of an earlier frame.
+        View that the image was rendered for, possibly from an earlier frame.
     color : (h, w, 3) uint8, or moderngl.Texture
         sRGB, top row first.
     depth_m : (h, w) float32, or moderngl.Texture

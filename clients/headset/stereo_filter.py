@@ -92,7 +92,7 @@ class StereoFrame:
 
     @property
     def output(self) -> Output:
-        """Return the format of the results, which is that of the images."""
+        """Return the format of the results, which equals the format of the images."""
         is_srgb = all(picture.color.dtype == np.uint8 for picture in self.pictures)
         return "srgb8" if is_srgb else "linear16"
 
@@ -118,7 +118,7 @@ class FilteredStereoFrame:
     Attributes
     ----------
     frame : StereoFrame
-        Input frame, whose views are those of the images.
+        Input frame, with the views of the images.
     colors : tuple of (h, w, 3) uint8 or float16, or of moderngl.Texture
         Filtered image of each eye, sRGB or linear light as the input.
     used_focus_dpt : tuple of float or None

@@ -243,7 +243,7 @@ def planar_depth(
         Depth buffer, 0 to 1.
     given : DepthRange
     size_px : (int, int)
-        Width and height of the image, which may differ from those of the buffer.
+        Width and height of the image, which may differ from the buffer's.
 
     Returns
     -------

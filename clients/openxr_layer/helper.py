@@ -492,7 +492,7 @@ def _stamp(path: Path) -> tuple[int, int] | None:
 class WatchedEyes(Eyes):
     """Eyes whose profiles may be files, which are read again when they change.
 
-    The parameters are those of `Eyes`.
+    The parameters are the same as for `Eyes`.
     """
 
     def __init__(self, options: EyeOptions, *others: Any) -> None:

@@ -40,7 +40,7 @@ from filter_service.command_line import (
 )
 
 CHECK_S = 0.25
-"""Period at which profile files and the program are looked at."""
+"""Interval of the checks of profile files and of the program."""
 
 STOP_S = 5.0
 LAYER_NAME = "XR_APILAYER_ocufilter_eye"
@@ -60,13 +60,13 @@ def say(line: str) -> None:
 layer = typer_app(
     help="""See another OpenXR program, unmodified, through simulated eyes.
 
-    `run` starts the program with an OpenXR API layer, which copies each frame, has it
-    filtered by this process, and shows the result in place of the program's own frame.
-    When there is no result, the program's own frames are shown.
+    `run` starts the program with an OpenXR API layer, which copies each frame,
+    sends it to this process, and shows the result in place of the program's own frame.
+    If there is no result, the program's own frames are shown.
 
     ocufilter layer run --left myopia --right keratoconus -- hello_xr -g OpenGL
 
-    `install` makes the layer known to all programs of this user, such as those that a
+    `install` registers the layer for all programs of this user, such as those that a
     game launcher starts.  XR_ENABLE_API_LAYERS=XR_APILAYER_ocufilter_eye enables it for
     one of them, --implicit for all.  Frames are filtered while `ocufilter layer serve`
     runs.""",
@@ -146,7 +146,7 @@ def run(
     ] = None,
     json_output: Json = False,
 ) -> None:
-    """Run a program with the layer, and end with its exit code.
+    """Run a program with the layer; return its exit code.
 
     ocufilter layer run --left myopia --right keratoconus -- hello_xr -g OpenGL
     """
@@ -254,7 +254,7 @@ def install(
         ),
     ] = False,
 ) -> None:
-    """Make the layer known to the OpenXR loader.
+    """Register the layer with the OpenXR loader.
 
     ocufilter layer install --implicit
     """

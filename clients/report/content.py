@@ -1,6 +1,6 @@
-"""The report of one eye, and of two, or of one at two times or with two corrections.
+"""Reports on one eye, or on two: different eyes, times or corrections.
 
-The report of one eye begins with a summary page, that of two with the differences.
+A report on one eye begins with a summary page, a report on two with the differences.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def eye_document(facts: EyeFacts) -> Document:
 
 
 def _title(facts: EyeFacts) -> str:
-    """Return the name of an eye, or its side, and that of its preset."""
+    """Return the name of an eye, or its side, and the name of its preset."""
     profile = facts.study.profile
     label = facts.label or SIDE_NAMES[profile.eye_side]
     if facts.study.is_example and profile.name not in label:

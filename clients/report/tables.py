@@ -45,7 +45,7 @@ def refraction_text(refraction: dict[str, Any], name: str) -> str:
 
 
 def refraction_table(facts: EyeFacts) -> Table:
-    """Return the entered or measured refraction, and that of the estimated eye."""
+    """Return the refraction entered or measured, and of the estimated eye."""
     numbers = facts.numbers
     pairs = numbers["measured"]["refraction"], numbers["eye"]["refraction"]
     return Table(

@@ -33,7 +33,7 @@ def at_units(x: float, y: float, z: float) -> Array:
 def build_primitives() -> Scene:
     """Build the primitives, seen from near the origin along -z.
 
-    The layout is that of the published test scene: the letter E at 4.17 m, a rotated
+    The layout matches the published test scene: the letter E at 4.17 m, a rotated
     cube at 0.39 m and a sphere at 0.19 m, with 180 scene units per meter and a field of
     view of 50°.
     """

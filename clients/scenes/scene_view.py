@@ -151,9 +151,9 @@ class SceneView:
 
     Notes
     -----
-    A pixel's color is the mean of its samples in linear light.  Its depth is that of
-    one sample, a quarter of the way from the nearest to the farthest.  The mean across
-    an edge would be a depth at which there is no surface.
+    A pixel's color is the mean of its samples in linear light.  Its depth is the
+    depth of one sample, a quarter of the way from the nearest to the farthest.  The
+    mean across an edge would be a depth without a surface.
 
     Every call makes the context current.  If moderngl obtained the context through EGL,
     no context is current afterward: other drawing in the same thread must be in a

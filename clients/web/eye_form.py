@@ -333,7 +333,7 @@ class EyeForm:
         self.wears_correction = True
 
     def choose_worn(self, kind: WornKind) -> None:
-        """Select a kind of lens; without power, it takes that of the prescription."""
+        """Select a kind of lens; without power, it gets the prescription's power."""
         self.worn.kind = kind
         if kind in ("progressive", "lenslets") and self.source == "prescription":
             with suppress(ValueError):  # an invalid entry stays

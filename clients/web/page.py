@@ -62,8 +62,8 @@ RESPONSE_S = 120.0
 as many as may be open wait for each other."""
 
 AMPLITUDE = (
-    "The amplitude is that of objective accommodation; a push-up measurement also "
-    "includes the depth of focus and reads higher."
+    "The amplitude is objective accommodation; a push-up measurement also includes "
+    "the depth of focus and is higher."
 )
 
 PICTURES_PATH = "/pictures/"

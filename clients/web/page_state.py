@@ -55,7 +55,7 @@ MAX_CHARACTERS = 8000
 
 MAX_ENTRY_CHARACTERS = 40
 SCENES = ("courtyard", "primitives", "chart")
-"""Scenes that need no file; the first one is that of a new page."""
+"""Scenes that need no file; a new page shows the first one."""
 
 
 @dataclass
@@ -69,8 +69,8 @@ class PageState:
     picture : the scene; None until one is ready
     empty_reason : text in place of the picture, or an empty string
     shown : which eye, or both
-    pipeline : that of full pictures; previews are exact
-    number : of the last request
+    pipeline : pipeline of full pictures; previews are exact
+    number : number of the last request
     valid_profiles : the last valid profile of each eye
     """
 
